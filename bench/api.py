@@ -44,6 +44,7 @@ class Settings(TypedDict, total=False):
     backends: Names
     estimators: Names
     optimizers: Names
+    trainers: Names
     sweep: Mapping[str, Any]
     scene: Values
     contact: Values
@@ -51,6 +52,7 @@ class Settings(TypedDict, total=False):
     backend: Values
     estimator: Values
     optimizer: Values
+    trainer: Values
     theta: Names
     theta0: Sequence[float] | np.ndarray | None
     samples: int

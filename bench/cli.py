@@ -462,7 +462,7 @@ VERBS = {
     ),
     "list": Verb(
         _list, "list [KIND or NAME ...] [plugins=DIR]", "plugins: parameters, capabilities, availability",
-        "KIND is scenes, contacts, integrators, backends, estimators, optimizers, policies or studies.\n", "Experiments",
+        "KIND is scenes, contacts, integrators, backends, estimators, optimizers, policies, trainers or studies.\n", "Experiments",
     ),
     "engines": Verb(
         _main_of("bench.engines.command"), "engines [install NAME ... [--again]] [plugins=DIR]", "physics engines in a Python of their own: versions, installation",

@@ -18,8 +18,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from bench.experiment import config
 from bench.report.text import number
 from bench.studies.bias_variance import trust
+from bench.studies.train import aggregate, findings
 from docs.results import STANDARD, comparison, rmse_interval, rows_of, select
 
 MARK = re.compile(r"<!--=([\w.-]+)-->(.*?)<!--/-->", re.DOTALL)
@@ -216,6 +218,45 @@ def hidden() -> str:
     known = [np.isfinite(np.array(values, dtype=float)) for values in rows["hidden"]]
     total = sum(fits * keep.sum() for fits, keep in zip(rows["fits"], known, strict=True))
     return f"{count(sum(np.sum(values) for values in rows['hidden']))} of {count(total)}"
+
+
+@cache
+def trained() -> pd.DataFrame:
+    """Return the runs of ``train``, with the problem and the method of each."""
+    return aggregate.runs_of(config.load(["experiment=train"]), rows_of("train"))
+
+
+def trained_in_range(low: float, high: float) -> str:
+    """Return how many runs of ``shac`` with its published settings end with a mean return in a range, of how many."""
+    final = trained().query("method == 'shac'")["final_return"]
+    return f"{((low <= final) & (final <= high)).sum()} of {len(final)}"
+
+
+def trained_table() -> str:
+    """Return the final return, steps and times by trainer as a Markdown table."""
+    head = [
+        "| trainer | final return | worst seed | control steps | training | compilation |",
+        "|---" + "|--:" * 5 + "|",
+    ]
+    return block(head + [
+        f"| `{line['method']}` | {number(line['final'], 3)} [{number(line['final_low'], 3)}, {number(line['final_high'], 3)}] | "
+        f"{number(line['worst'], 3)} | {count(line['steps'])} | {number(line['train_s'])} s | {number(line['compile_s'])} s |"
+        for line in aggregate.summarise(trained()).to_dict("records")
+    ])  # fmt: skip
+
+
+def windows_table() -> str:
+    """Return gradient, bias and final return by the length of a window as a Markdown table."""
+    head = [
+        "| window [steps] | norm of its gradient | bias against a whole episode | runs with a bias above 0 | final return |",
+        "|--:" * 5 + "|",
+    ]
+    return block(head + [
+        f"| {line['window']:.0f} | {number(line['window_gradient'])} | "
+        f"{number(line['bias'])} [{number(line['bias_low'])}, {number(line['bias_high'])}] | {line['resolved']} | "
+        f"{number(line['final'], 3)} [{number(line['final_low'], 3)}, {number(line['final_high'], 3)}] |"
+        for line in aggregate.windows(trained()).to_dict("records")
+    ])  # fmt: skip
 
 
 @cache
@@ -453,6 +494,10 @@ FIGURES: dict[str, Callable[[], str]] = {
     "rate-effect": lambda: span((rates := learning_rates())["score"] - rates["median_score"]),
     "rate-methods": lambda: number(float(np.ptp(learning_rates()["score"]))),
     "rate-diverged": lambda: diverged("learning_rates"),
+    "train-finding": lambda: findings.recommendation(aggregate.summarise(trained())),
+    "train-range": lambda: trained_in_range(-560.0, -480.0),
+    "train-table": trained_table,
+    "train-windows": windows_table,
     "fits-hidden": hidden,
     "fits-bound": lambda: span(fits("error", "rk4", (0, 1))),
     "fits-coverage": lambda: span(100 * fits("coverage", "rk4", (0, 1)), suffix="%"),

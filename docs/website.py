@@ -39,7 +39,7 @@ PAGES: Mapping[str, str] = {
 SECTIONS: Mapping[str, Sequence[str]] = {
     "start": ("reading-results", "python"),
     "trust": ("gradcheck", "examine", "stability"),
-    "results": ("experiment/*", "estimators", "claims", "controller", "dose-response", "engines", "speed"),
+    "results": ("experiment/*", "estimators", "claims", "controller", "dose-response", "training", "engines", "speed"),
     "extending": ("architecture", "contributing"),
     "reference": (
         "commands",

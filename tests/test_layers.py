@@ -17,6 +17,7 @@ LAYERS = [
     ["model"],
     ["engines"],
     ["measure", "plugins"],
+    ["training"],
     ["experiment", "conformance"],
     ["run"],
     ["report"],
@@ -101,6 +102,8 @@ def test_plugins_import_only_public_names(path):
             family = path.parent.name == "backends" or path.parent == ROOT / "plugins"
             family = family or (ROOT / "plugins" / f"{name.split('.')[2]}.py").is_file()  # a module that kinds share
             assert family or name.split(".")[2] == path.parent.name, f"{path.name} imports {name} of another kind"
+        elif name.startswith("bench.training."):
+            assert path.parent.name == "trainers", f"{path.name} imports {name}, which is for trainers"
         elif name.partition(".")[0] == "bench" and name != "bench.engines.backend.EngineBackend":
             assert name.rpartition(".")[0] == "bench.model", f"a plugin imports bench.model, not {name}"
             assert name.rpartition(".")[2] in model.__all__, f"{name} is not in bench.model.__all__"

@@ -23,7 +23,7 @@ PAGES = [
     ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md",
     *(ROOT / folder / "README.md" for folder in ("plugins", "conf", "results")), *(ROOT / "docs" / name for name in DOCS),
 ]  # fmt: skip
-EXAMPLES = dict(re.findall(r"```python\n# (\S+\.py)\n(.*?)```", DOCS["extending.md"], re.DOTALL))
+EXAMPLES = dict(re.findall(r"```python\n# (\S+\.py)\n(.*?)```", DOCS["extending.md"] + DOCS["training.md"], re.DOTALL))
 START = 2500
 """Most words of what one reads to begin: the README, how to read a result, and Python."""
 SOFT = "# @package _global_\nscenes: [heaviside]\nbackends: [numpy]\n"
@@ -234,3 +234,15 @@ def test_the_study_of_the_example_writes_its_table(folder, tmp_path):
     python(folder, "-m", "bench", *words, f"results_dir={tmp_path}")
     header = (tmp_path / "norms" / "gradient_norm.csv").read_text().partition("\n")[0]
     assert "gradient_norm" in header.split(",")
+
+
+@pytest.mark.slow
+def test_the_trainer_of_the_example_trains(folder, tmp_path):
+    python(
+        folder, "-m", "bench", "name=climb", "study=train[starts=8,evaluations=1]", "plugins=my_trainers",
+        "scenes=[cartpole_swing[horizon=20,substeps=1]]", "backends=[jax]", "trainers=[hill_climbing]",
+        "trainer.hill_climbing.steps=6400", f"results_dir={tmp_path}",
+    )  # fmt: skip
+    (row,) = bench.load(tmp_path / "climb").to_dict("records")
+    assert row["status"] == "ok"
+    assert row["final_return"] > row["first_return"]

@@ -64,6 +64,7 @@ from bench.model.scene import (
     ZeroOrderHoldScene,
 )
 from bench.model.simulator import load_simulator, simulator_files
+from bench.model.trainer import Trainer
 
 __all__ = [
     "SURROGATE",
@@ -117,6 +118,7 @@ __all__ = [
     "Slopes",
     "Smoothing",
     "State",
+    "Trainer",
     "Trajectory",
     "Unsupported",
     "Usage",

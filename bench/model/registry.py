@@ -34,7 +34,9 @@ from bench.model.parameters import Plugin, build, parameters, remember, singular
 CORE = "bench.studies"
 """The package of the built-in studies, which are imported without a trial in a separate process."""
 BUILT_IN = ("bench.plugins", CORE)
-KINDS = ("scenes", "contacts", "integrators", "backends", "estimators", "optimizers", "policies", "studies")
+KINDS = (
+    "scenes", "contacts", "integrators", "backends", "estimators", "optimizers", "policies", "trainers", "studies",
+)  # fmt: skip
 """The built-in kinds, in listing order. A plugin may declare another kind."""
 NOT_PLUGINS = ("engines", "robots")
 """Names of the folders with files that only the Pythons of engines import, and with models of robots."""

@@ -29,6 +29,7 @@ CELLS = {
     "dose_response": ["study=dose_response", *PUSH, "estimators=[fobg]", "optimizers=[adam]"],
     **{study: [f"study={study}", *PUSH] for study in ("engines", "gradient_check", "growth", "stability", "three_errors", "twins")},
     "solver": ["study=solver", "scenes=[pushing]", "contacts=[penalty]", "backends=[mujoco]"],
+    "train": ["study=train", "scenes=[cartpole_swing]", "integrators=[rk4]", "backends=[jax]", "trainers=[shac]"],
     "identify": ["study=identify", "scenes=[spring_record]", "integrators=[rk4]", "backends=[numpy]"],
 }  # fmt: skip
 """One cell of every kind whose keys are compared."""
@@ -49,13 +50,13 @@ MOVED = {
     "measure/gradcheck/verdicts": "gradient_check",
     "measure/identification": "identify",
     "measure/jumps": f"{REFERENCED} gradient_check",
-    "measure/noise": f"{BIAS} engines adam cem dose_response gradient_check growth solver three_errors twins identify",
+    "measure/noise": f"{BIAS} engines adam cem dose_response gradient_check growth solver three_errors twins identify train",
     "measure/performance": "identify",
     "measure/quadrature": REFERENCED,
     "measure/reference": REFERENCED,
     "measure/smoothed": REFERENCED,
     "measure/solve": "adam cem dose_response",
-    "measure/statistics": REFERENCED,
+    "measure/statistics": f"{REFERENCED} train",
     "measure/timing": f"{BIAS} engines solver twins",
     "model/__init__": "",
     "model/adjoint": "engines windowed total_propagation",
@@ -63,6 +64,8 @@ MOVED = {
     "model/estimator": ESTIMATED,
     "model/known_solutions": "windowed adam cem dose_response identify",
     "model/optimizer": "adam cem dose_response identify",
+    "model/policy": "train",
+    "model/trainer": "train",
     "model/simulator/__init__": "",
     "model/simulator/clock": "callable",
     "model/simulator/example": "",
@@ -81,6 +84,7 @@ MOVED = {
     "studies/solver/measure": "solver",
     "studies/stability/measure": "stability",
     "studies/three_errors/measure": "engines three_errors",
+    "studies/train/measure": "train",
     "studies/twins/measure": "twins",
 }
 """Files, each with the cells whose keys its code is in. A file that is not listed must be in all keys, or harmless."""

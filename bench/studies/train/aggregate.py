@@ -1,0 +1,156 @@
+"""Aggregates runs over seeds: final returns and curves by method, with bootstrap intervals, and windows by length."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from bench.experiment.experiment import Experiment
+from bench.experiment.parameters import flatten
+from bench.measure.performance import bootstrap, bootstrap_along, interquartile_mean
+from bench.report.problems import problem_names
+from bench.report.views import arrange, attempted
+
+PARTS = ("scene", "contact", "integrator", "backend")
+"""Parts of the grid that identify a problem."""
+
+
+def runs_of(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:
+    """Return the runs that gave a curve, with the columns ``problem``, ``method``, ``family`` and ``window``.
+
+    A method is a trainer with its parameters, its family the trainer's name.
+    """
+    runs = attempted(rows)
+    runs = runs[runs["curve_return"].map(len) > 0]
+    if runs.empty:
+        return runs.assign(problem="", method="", family="", window=math.nan)
+    names = problem_names(arrange(experiment, rows), PARTS, rows=runs)
+    given = flatten(runs)
+    window = given["trainer.window"].astype(float) if "trainer.window" in given else math.nan
+    return runs.assign(
+        problem=names, method=runs["trainer"], family=runs["trainer"].str.partition("[")[0], window=window
+    )
+
+
+def final_returns(part: pd.DataFrame) -> np.ndarray:
+    """Return the final return of each run, ``(n,)``; a run that ended early counts as its untrained policy."""
+    return np.asarray(part["final_return"].where(part["status"] == "ok", part["first_return"]), dtype=float)
+
+
+def summarise(runs: pd.DataFrame) -> pd.DataFrame:
+    """Return a line per problem and method, best first: interquartile mean of the final return over seeds, and medians."""
+    lines = []
+    for (problem, method), part in runs.groupby(["problem", "method"], sort=False):
+        final = final_returns(part)
+        low, high = interval(final)
+        cosines = np.concatenate([np.asarray(c, float) for c in part["cosine"]]) if len(part) else np.empty(0)
+        lines.append({
+            "problem": problem, "method": method, "family": part["family"].iloc[0], "seeds": len(part),
+            "failed": int((part["status"] != "ok").sum()), "final": interquartile_mean(final), "final_low": low,
+            "final_high": high, "worst": float(final.min()), "steps": float(part["steps"].max()),
+            "train_s": float(part["train_s"].median()), "compile_s": float(part["compile_s"].max()),
+            "gradient_typical": float(part["gradient_typical"].median()),
+            "gradient_peak": float(part["gradient_peak"].max()),
+            "cosine": float(np.nanmean(cosines)) if np.isfinite(cosines).any() else math.nan,
+        })  # fmt: skip
+    frame = pd.DataFrame(lines)
+    return frame.sort_values(["problem", "final"], ascending=[True, False], kind="stable").reset_index(drop=True)
+
+
+MIN_SEEDS = 5
+"""Fewest seeds for an interval: a resample cannot leave the range of its values, which covers too little for fewer."""
+
+
+def interval(values: np.ndarray) -> tuple[float, float]:
+    """Return the bootstrap interval of an interquartile mean; NaN for fewer than :data:`MIN_SEEDS` values."""
+    if len(values) < MIN_SEEDS:
+        return math.nan, math.nan
+    return bootstrap([values], lambda drawn: interquartile_mean(drawn[0]))
+
+
+def curves(runs: pd.DataFrame) -> pd.DataFrame:
+    """Return a line per problem, method and evaluation: cost of an episode, interquartile mean over seeds with interval.
+
+    The cost is minus the return. A run that ended early keeps the cost of its untrained policy from there on.
+    """
+    lines = []
+    for (problem, method), part in runs.groupby(["problem", "method"], sort=False):
+        count = max(part["curve_return"].map(len))
+        longest = part.loc[part["curve_return"].map(len).idxmax()]
+        costs = np.array([_filled(-np.asarray(row, float), count) for row in part["curve_return"]])
+        seconds = [np.asarray(row, float) for row in part["curve_s"] if len(row) == count]
+        middle = np.array([interquartile_mean(column) for column in costs.T])
+        ends = (
+            bootstrap_along([costs], lambda drawn: np.array([interquartile_mean(c) for c in drawn[0].T]))
+            if len(part) >= MIN_SEEDS
+            else [(math.nan, math.nan)] * count
+        )
+        for i in range(count):
+            lines.append({
+                "problem": problem, "method": method, "step": float(longest["curve_step"][i]),
+                "seconds": float(np.median([s[i] for s in seconds])) if seconds else math.nan,
+                "cost": middle[i], "cost_low": ends[i][0], "cost_high": ends[i][1],
+            })  # fmt: skip
+    return pd.DataFrame(lines, columns=["problem", "method", "step", "seconds", "cost", "cost_low", "cost_high"])
+
+
+def _filled(values: np.ndarray, count: int) -> np.ndarray:
+    known = np.where(np.isfinite(values), values, values[0])
+    return np.append(known, np.full(count - len(known), values[0])) if len(known) < count else known
+
+
+def windows(runs: pd.DataFrame) -> pd.DataFrame:
+    """Return a line per problem, family and window, for families with several: gradient, bias and final return.
+
+    The interval of the bias contains those of all runs.
+    """
+    known = runs[runs["window"].notna() & runs["window_gradient"].notna()]
+    lines = []
+    for (problem, family, window), part in known.groupby(["problem", "family", "window"]):
+        final = final_returns(part)
+        low, high = interval(final)
+        bias = part[["window_bias", "window_bias_low", "window_bias_high"]].dropna()
+        lines.append({
+            "problem": problem, "family": family, "window": window, "seeds": len(part),
+            "window_gradient": float(part["window_gradient"].median()), "gradient_typical": float(part["gradient_typical"].median()),
+            "bias": interquartile_mean(bias["window_bias"].to_numpy(float)),
+                "bias_low": float(bias["window_bias_low"].min()), "bias_high": float(bias["window_bias_high"].max()),
+                "resolved": f"{(bias['window_bias_low'] > 0).sum()} of {len(part)}",
+            "final": interquartile_mean(final), "final_low": low, "final_high": high,
+        })  # fmt: skip
+    frame = pd.DataFrame(lines)
+    if frame.empty:
+        return frame
+    return frame[frame.groupby(["problem", "family"])["window"].transform("nunique") > 1]
+
+
+def faults(runs: pd.DataFrame) -> pd.DataFrame:
+    """Return a line per run and fault: problem, method, seed and the fault's numbers in ``fault``."""
+    lines: list[dict[str, Any]] = []
+    for row in runs.to_dict("records"):
+        lines += [
+            {"problem": row["problem"], "method": row["method"], "seed": row["seed"], "fault": fault}
+            for fault in json.loads(row["verdicts"] or "[]")
+        ]
+    return pd.DataFrame(lines, columns=["problem", "method", "seed", "fault"])
+
+
+def logs(runs: pd.DataFrame, quantities: Sequence[str]) -> pd.DataFrame:
+    """Return a line per problem, method, quantity and log entry of the first seed, at its control steps."""
+    lines = []
+    for (problem, method), part in runs.groupby(["problem", "method"], sort=False):
+        row = part.sort_values("seed").iloc[0]
+        per_update = row["steps"] / row["updates"] if row["updates"] else math.nan
+        for quantity in quantities:
+            places = row["cosine_update" if quantity == "cosine" else "log_update"]
+            values = row[quantity if quantity == "cosine" else f"log_{quantity}"]
+            lines += [
+                (problem, method, quantity, place * per_update, value)
+                for place, value in zip(np.asarray(places, float), np.asarray(values, float), strict=False)
+            ]
+    return pd.DataFrame(lines, columns=["problem", "method", "quantity", "step", "value"])

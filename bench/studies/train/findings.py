@@ -1,0 +1,183 @@
+"""States what runs show: which trainer ends best, what windows do, and which faults the logs have, in words."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from bench.report.text import counted, listed, number
+
+NAMED = 3
+"""Most tied methods that a sentence names."""
+DIGITS = 3
+"""Significant digits of returns."""
+
+
+def sentences(summary: pd.DataFrame, windows: pd.DataFrame, faults: pd.DataFrame, n_runs: int) -> list[str]:
+    """Return at most three findings: the trainer to use, the window to use, and the faults in the logs."""
+    texts = [recommendation(summary), window(windows), frequent_faults(faults, n_runs)]
+    return [sentence for sentence in texts if sentence]
+
+
+def recommendation(summary: pd.DataFrame) -> str:
+    """Return the best final return on each problem, the methods not distinguishable from it, and those behind."""
+    parts = []
+    for problem, part in summary.groupby("problem", sort=False):
+        part = part.sort_values("final", ascending=False, kind="stable")
+        best = part.iloc[0]
+        where = f" on {problem}" if summary["problem"].nunique() > 1 else ""
+        if not math.isfinite(best["final"]):
+            parts.append(f"No run{where} ends with a finite return")
+            continue
+        others = part.iloc[1:]
+        is_behind = np.array([is_below(row, best) for _, row in others.iterrows()], dtype=bool)
+        tied, behind = others[~is_behind], others[is_behind]
+        value = f"The best final return{where} is {_interval(best)} ({best['method']})"
+        if others.empty:
+            parts.append(f"The final return{where} of {best['method']} is {_interval(best)}")
+        elif behind.empty:
+            reason = (
+                "no other is distinguishable" if math.isfinite(best["final_low"]) else "too few seeds for an interval"
+            )
+            parts.append(f"Which trainer is best{where} is open: {best['method']} has {_interval(best)}, and {reason}")
+        else:
+            also = f", not distinguishable from {_names(tied['method'])}" if len(tied) else ""
+            parts.append(f"{value}{also}; {_names(behind['method'])} end lower ({_interval(behind.iloc[0])} or less)")
+    return f"{'. '.join(parts)}.".replace("; ", ", and ")
+
+
+def is_below(row: Mapping[str, Any] | pd.Series, best: Mapping[str, Any] | pd.Series) -> bool:
+    """Return whether a final return is certainly below another: their intervals over seeds do not overlap."""
+    return bool(row["final_high"] < best["final_low"])
+
+
+def _interval(row: pd.Series) -> str:
+    value = number(row["final"], DIGITS)
+    if not math.isfinite(row["final_low"]):
+        return f"{value} (no interval)"
+    return f"{value} [{number(row['final_low'], DIGITS)}, {number(row['final_high'], DIGITS)}]"
+
+
+def _names(methods: Iterable[str]) -> str:
+    methods = list(methods)
+    return listed(methods) if len(methods) <= NAMED else counted(len(methods), "other trainer")
+
+
+def window(windows: pd.DataFrame) -> str:
+    """Return which window ends best within each family, and where the bias of the gradient goes with its length."""
+    parts = []
+    for (problem, family), part in windows.groupby(["problem", "family"], sort=False) if len(windows) else ():
+        part = part.sort_values("window")
+        best = part.loc[part["final"].idxmax()]
+        behind = part[[is_below(row, best) for _, row in part.iterrows()]]
+        where = f" on {problem}" if windows["problem"].nunique() > 1 else ""
+        lengths = _lengths(behind["window"])
+        shown = (
+            f"{_lengths([best['window']])} steps end best{where}, {lengths} steps end lower"
+            if len(behind)
+            else f"which length ends best{where} is open"
+        )
+        first, last = part.iloc[0], part.iloc[-1]
+        bias = ""
+        if first["bias_low"] > last["bias_high"]:  # the intervals of all runs
+            bias = f", and the gradient's bias falls from {number(first['bias'])} at {first['window']:.0f} to {number(last['bias'])} at {last['window']:.0f} steps"
+        parts.append(f"Among windows of {family}, {shown}{bias}")
+    return f"{'. '.join(parts)}." if parts else ""
+
+
+def _lengths(values: Any) -> str:
+    return listed([f"{value:.0f}" for value in values]) if len(values) else ""
+
+
+def frequent_faults(faults: pd.DataFrame, n_runs: int) -> str:
+    """Return in how many runs the logs show a fault, and the words of the most frequent one."""
+    if faults.empty:
+        return f"The logs of {counted(n_runs, 'run')} show no fault."
+    codes = faults["fault"].map(lambda fault: fault["code"])
+    count = faults[["problem", "method", "seed"]].drop_duplicates().shape[0]
+    first = faults[codes == codes.mode().iloc[0]].iloc[0]
+    words = describe(first["fault"])
+    return f"The logs of {count} of {counted(n_runs, 'run')} show a fault, most often this: {words} ({first['method']}, seed {first['seed']:.0f})."
+
+
+# ------------------------------------------------------------------------------------------------------ one fault
+
+
+def describe(fault: Mapping[str, Any]) -> str:
+    """Return a fault in words with its numbers, as a clause without a full stop."""
+    return WORDS[fault["code"]](fault)
+
+
+def _explodes(fault: Mapping[str, Any]) -> str:
+    start, update = fault.get("contact"), fault["update"]
+    when = f"at update {update}"
+    if start is not None:
+        lag = update - start
+        after = "in the update in which" if lag == 0 else f"{counted(lag, 'update')} after"
+        when = f"{after} the contact starts (update {update})"
+    text = f"the gradient explodes {when}, to {number(fault['factor'])} times its median before"
+    if fault["peaks"] > 1:
+        text += f", and {fault['peaks'] - 1} times more"
+    if fault.get("with_contact") is not None and fault["peaks"] > 1:
+        text += f" ({fault['with_contact']} of {fault['peaks']} peaks in updates with contact)"
+    return text
+
+
+def _zero(fault: Mapping[str, Any]) -> str:
+    everywhere = fault["zero"] == fault["updates"]
+    span = (
+        f"in all {fault['updates']} updates"
+        if everywhere
+        else f"from update {fault['update']} on, in {fault['zero']} of {fault['updates']} updates"
+    )
+    return f"the gradient is exactly zero {span}"
+
+
+def _soft_contact(fault: Mapping[str, Any]) -> str:
+    growth = "doubles" if fault["factor"] < 3 else f"grows {number(fault['factor'])} times"
+    depth = f"{number(fault['before'])} to {number(fault['after'])} m"
+    reward = f"{number(fault['reward_before'])} to {number(fault['reward_after'])}"
+    return f"the reward rises ({reward} per step) while the penetration {growth} ({depth}): the policy uses the soft contact"
+
+
+def _worse(fault: Mapping[str, Any]) -> str:
+    return (
+        f"the loss falls ({number(fault['loss_before'])} to {number(fault['loss_after'])}) while the return worsens from "
+        f"{number(fault['best'], DIGITS)} at update {fault['update']} to {number(fault['last'], DIGITS)}"
+    )
+
+
+WORDS: dict[str, Callable[[Mapping[str, Any]], str]] = {
+    "not_finite": lambda f: f"NaN at update {f['update']}: the {f['quantity']} is not finite",
+    "zero": _zero,
+    "explodes": _explodes,
+    "returns": lambda f: (
+        f"the gradient nearly vanishes before update {f['update']} and then grows {number(f['factor'])} times, to its usual size"
+    ),
+    "differences": lambda f: (
+        f"the gradient disagrees with central differences of every step tried (relative error of at least {number(f['error'])})"
+    ),
+    "opposed": lambda f: (
+        "the first-order gradient points away from the zeroth-order one: cosine "
+        f"{number(f['cosine'])} [{number(f['low'])}, {number(f['high'])}]"
+    ),
+    "worse": _worse,
+    "soft_contact": _soft_contact,
+    "parameters": lambda f: (
+        f"the policy's parameters are unphysical: the largest is {number(f['value'])} at update {f['update']}, "
+        f"{number(f['first'])} at first"
+    ),
+    "deviation": lambda f: f"the actions' deviation is unphysical: {number(f['value'])} at update {f['update']}",
+    "cut": lambda f: f"the gradient is cut in {f['share']:.0%} of windows, so that it seldom reaches their ends",
+}
+"""Words of each fault, by its code."""
+
+
+def title(summary: pd.DataFrame) -> str:
+    """Return the title of the curves: the best method of the first problem, or that it is open."""
+    text = recommendation(summary[summary["problem"] == summary["problem"].iloc[0]])
+    return text.partition(", and ")[0].rstrip(".")

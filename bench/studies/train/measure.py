@@ -1,0 +1,147 @@
+"""Runs one training: updates, evaluations on the way, comparisons of gradients, and the log with its verdicts."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+import time
+from typing import Any
+
+import numpy as np
+
+from bench.experiment.cell import Cell
+from bench.experiment.session import Session
+from bench.measure import noise
+from bench.measure.statistics import Sampling, bias_interval
+from bench.model import Trainer
+from bench.model.trainer import LOGGED
+from bench.studies.train.verdicts import Log, judge
+from bench.training.environment import Environment
+from bench.training.run import Training
+
+Settings = Any
+"""A ``Train`` study: its parameters are the settings. Its module imports this module, so its type cannot be named."""
+MEANS = frozenset({"loss", "reward", "value_loss", "cut", "contacts", "step_length", "deviation"})
+"""Quantities whose mean an entry of a stored log has; it has the largest value of the others, so that no peak is lost."""
+Z = 1.959963984540054
+"""The 0.975 quantile of the standard normal distribution."""
+SHIFTS = {"float64": (1e-3, 1e-4, 1e-5, 1e-6), "float32": (1e-2, 1e-3, 1e-4, 1e-5)}
+"""Lengths of the change of the actor's parameters in central differences: curvature spoils long ones, rounding short ones."""
+
+
+def measure(cell: Cell, session: Session, settings: Settings) -> dict[str, Any]:
+    """Return one cell's results by column."""
+    trainer, backend = cell.parts["trainer"], cell.backend
+    assert isinstance(trainer, Trainer)
+    env = Environment(cell.program(), backend.ops(), backend.dtype)  # type: ignore[attr-defined]
+    training = Training(env, trainer)
+    # all trainers and seeds are evaluated from the same starts
+    starts = noise.draw(0, cell.scene.name, 1, settings.starts, env.n_start, "train: starts")[0].T
+    total, per_update = trainer.updates(env), trainer.steps_per_update(env)
+    marks = set(np.unique(np.linspace(0, total, min(settings.evaluations, total) + 1).round().astype(int)).tolist())
+    checks = _spread(total, settings.cosines) if trainer.first_order else set()
+    halfway = max(total // 2, 1) if trainer.first_order else 0
+
+    state = training.start(cell.seed)
+    training.returns(state, starts)
+    training.compile_update(state)
+    compile_s = training.compile_s
+    curve: list[tuple[float, ...]] = []
+    cosines: list[tuple[float, float, float]] = []
+    log = Log()
+    probe: dict[str, float] = {}
+    spent = 0.0
+    pending: list[Any] = []
+    for update in range(total + 1):
+        if update in marks or update == total:
+            log.extend(pending)
+            pending = []
+            curve.append((update, update * per_update, spent, *_interval(training.returns(state, starts))))
+            if log.first_not_finite is not None or update == total:
+                break
+        if update in checks:
+            agreement = training.agreement(state, update + 1, settings.copies)
+            cosines.append((update, agreement["cosine"], agreement["cosine_denoised"]))
+        if update == halfway and trainer.first_order:
+            probe = _probe(training, state, settings.batches)
+        started = time.perf_counter()
+        state, entry = training.update(state)
+        training.wait(state)
+        spent += time.perf_counter() - started
+        pending.append(entry)
+
+    table = np.array(curve)
+    faults = judge(log, table[:, 0], table[:, 3:6], np.array(cosines).reshape(-1, 3), probe)
+    bad = log.first_not_finite
+    final = table[-1, 3:]
+    norms = log.column("gradient_norm")
+    return {
+        "status": "ok" if bad is None else "nonfinite",
+        "reason": "" if bad is None else f"{bad[1]} is not finite at update {bad[0]}",
+        "first_return": table[0, 3], "final_return": final[0], "final_return_low": final[1], "final_return_high": final[2],
+        "final_median": final[3], "updates": int(table[-1, 0]), "steps": int(table[-1, 1]), "train_s": spent,
+        "compile_s": compile_s, "gradient_typical": float(np.nanmedian(norms)), "gradient_peak": float(np.nanmax(norms)),
+        **probe,
+        "verdicts": json.dumps(faults),
+        "curve_update": table[:, 0].tolist(), "curve_step": table[:, 1].tolist(), "curve_s": table[:, 2].tolist(),
+        "curve_return": table[:, 3].tolist(), "curve_return_low": table[:, 4].tolist(),
+        "curve_return_high": table[:, 5].tolist(),
+        **{name: [row[i] for row in cosines] for i, name in enumerate(("cosine_update", "cosine", "cosine_denoised"))},
+        **_thinned(log, settings.entries),
+    }  # fmt: skip
+
+
+def _spread(total: int, count: int) -> set[int]:
+    """Return ``count`` updates spread over a run, in the middles of equal parts."""
+    return {int(total * (i + 0.5) / count) for i in range(count)} if count else set()
+
+
+def _interval(returns: np.ndarray) -> tuple[float, float, float, float]:
+    """Return mean, ends of its 95% interval, and median of returns ``(B,)``."""
+    mean, half = float(returns.mean()), Z * float(returns.std(ddof=1)) / math.sqrt(len(returns))
+    return mean, mean - half, mean + half, float(np.median(returns))
+
+
+def _probe(training: Training, state: Any, batches: int) -> dict[str, float]:
+    """Return the error of a directional derivative, and norm and bias of a window's gradient, at one state of a run.
+
+    The direction is that of the gradient of the same rollouts, and the error the smallest over :data:`SHIFTS`. The bias is relative to the gradient of windows as long
+    as an episode, both from new starts, and has the interval of :func:`bias_interval`.
+    """
+    gradient = training.gradient(state, 0)
+    norm = float(np.linalg.norm(gradient))
+    result = {"difference_error": math.nan}
+    if norm > 0 and math.isfinite(norm):
+        errors = []
+        for length in SHIFTS[training.env.dtype]:
+            shift = length * gradient / norm
+            slope = training.mean_return(state, 0, shift) - training.mean_return(state, 0, -shift)
+            errors.append(abs(slope / (2 * length) / norm - 1.0))
+        result["difference_error"] = float(np.nanmin(errors)) if np.isfinite(errors).any() else math.nan
+    if batches > 1 and hasattr(training.trainer, "window"):
+        window = np.array([training.gradient(state, 1 + i) for i in range(batches)])
+        whole = np.array([training.gradient(state, 1 + i, training.env.length) for i in range(batches)])
+        result["window_gradient"] = float(np.linalg.norm(window.mean(axis=0)))
+        scale = float(np.linalg.norm(whole.mean(axis=0)))
+        if np.isfinite(window).all() and np.isfinite(whole).all() and scale > 0:
+            difference = window - whole
+            bias = bias_interval(difference.mean(axis=0), Sampling.of(difference))
+            names = ("window_bias", "window_bias_low", "window_bias_high")
+            result |= {name: value / scale for name, value in zip(names, bias, strict=True)}
+    return result
+
+
+def _thinned(log: Log, entries: int) -> dict[str, list[float]]:
+    """Return the log in at most ``entries`` entries per quantity, with five significant digits."""
+    count = len(log)
+    edges = np.unique(np.linspace(0, count, min(entries, count) + 1).round().astype(int))
+    result = {"log_update": edges[1:].tolist()}
+    for name in LOGGED:
+        values = log.column(name)
+        if np.isnan(values).all():
+            continue
+        parts = [values[a:b] for a, b in itertools.pairwise(edges)]
+        reduced = [part.mean() if name in MEANS else part.max() for part in parts]
+        result[f"log_{name}"] = [float(f"{value:.5g}") for value in reduced]
+    return result

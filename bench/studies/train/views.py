@@ -1,0 +1,177 @@
+"""What the study of training shows: returns by trainer, windows by length, faults, and the log of each trainer."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+
+from bench.experiment.axes import table
+from bench.experiment.columns import Column, text
+from bench.experiment.experiment import Experiment
+from bench.experiment.views import Chart, Style, Table, Views
+from bench.report.style import DEVIANT, VARIANTS, colour, marker
+from bench.report.text import number
+from bench.report.writer import reasons
+from bench.studies.train import aggregate, findings
+
+PROBLEM, METHOD = text("problem"), text("method", label="trainer")
+FINAL = Column("final", label="final return", low="final_low", high="final_high", digits=3, log=False)
+SUMMARY = (
+    PROBLEM, METHOD, FINAL, Column("worst", label="worst seed", digits=3), Column("seeds", format="setting"),
+    Column("failed", label="not finite", format="setting"), Column("steps", unit="steps", label="control steps", digits=3),
+    Column("train_s", label="training", format="seconds"), Column("compile_s", label="compilation", format="seconds"),
+    Column("gradient_typical", label="gradient norm"), Column("gradient_peak", label="largest gradient"),
+    Column("cosine", label="cosine"),
+)  # fmt: skip
+WINDOWS = (
+    PROBLEM, text("family", label="trainer"), Column("window", label="window", unit="steps", format="setting"),
+    Column("window_gradient", label="norm of a window's gradient"),
+    Column("bias", label="bias against a whole episode", low="bias_low", high="bias_high", log=False),
+    text("resolved", label="runs with a bias above 0"),
+    Column("gradient_typical", label="gradient norm in training"), FINAL,
+)  # fmt: skip
+FAULTS = (PROBLEM, METHOD, Column("seed", format="setting"), text("words", label="the log shows"))
+COST = Column("cost", label="cost of an episode", low="cost_low", high="cost_high")
+STEP, SECONDS = (
+    Column("step", label="control steps", log=False),
+    Column("seconds", label="training time [s]", log=False),
+)
+QUANTITIES = {
+    "reward": "reward per step",
+    "gradient_norm": "log10 of the gradient norm",
+    "gradient_largest": "log10 of its largest entry",
+    "cosine": "cosine with zeroth order",
+    "step_length": "step length",
+    "cut": "share of rollouts cut",
+    "contacts": "closed contacts",
+    "penetration": "penetration [m]",
+    "contact_force": "contact force [N]",
+}
+"""The quantities of the chart of logs, with their headings."""
+LOGARITHMIC = ("gradient_norm", "gradient_largest")
+"""Quantities that are drawn as their logarithms, since spikes are orders of magnitude high."""
+MAX_LOGS = 4
+"""Most trainers in the printed chart of logs, the best of each family; the page has all."""
+LINES = (*VARIANTS, *DEVIANT)
+NOTES = (
+    "final return: interquartile mean over seeds of the mean undiscounted return of the deterministic policy from the same "
+    "starts, with a 95% bootstrap interval over seeds. A run that is not finite counts as its untrained policy. training: "
+    "median over seeds, without compilation and evaluations. gradient norm: median over updates before clipping, of the "
+    "trainer's own objective, so compare it within a trainer only. cosine: between first- and zeroth-order gradients of the "
+    "same objective along the runs, mean; noise in either lowers it.",
+)
+WINDOW_NOTES = (
+    "norm and bias of a window's gradient: of the return of rollouts from new starts, with the policy and critic halfway "
+    "through the run, against windows as long as an episode, relative to the norm of the latter. The policies differ "
+    "between windows. bias: interquartile mean over runs; its interval contains the 95% intervals of all runs. final return: "
+    "interquartile mean over seeds with a 95% bootstrap interval.",
+)
+PAGE = ("final_return", "first_return", "final_median", "updates", "steps", "train_s", "compile_s", "gradient_typical",
+        "gradient_peak", "window_gradient", "window_bias", "difference_error")  # fmt: skip
+
+
+def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
+    """Return findings, tables and charts of the runs."""
+    runs = aggregate.runs_of(experiment, rows)
+    data = table(experiment, rows)
+    if runs.empty:
+        every = Table("train", rows, [text("scene"), text("trainer"), text("status")], data=data)
+        return Views(["No run gave a result: the table has the reason of each."], [every], remarks=reasons(rows))
+    summary, windows, faults = aggregate.summarise(runs), aggregate.windows(runs), aggregate.faults(runs)
+    texts = findings.sentences(summary, windows, faults, len(runs))
+    tables = [
+        Table("train", summary, SUMMARY, "final return by trainer", NOTES, terminal=True, page=True, data=data,
+              details=["compile_s", "gradient_typical", "gradient_peak"]),
+    ]  # fmt: skip
+    if len(windows):
+        tables.append(Table("windows", windows, WINDOWS, "Windows", WINDOW_NOTES, terminal=True, page=True))
+    worded = faults.assign(words=[findings.describe(fault) for fault in faults["fault"]]).drop(columns="fault")
+    if len(worded):
+        tables.append(Table("faults", worded, FAULTS, "Faults in the logs", terminal=True, page=True))
+    cells = rows.assign(problem=runs["problem"], method=runs["method"]).fillna({"problem": "", "method": ""})
+    by_name = experiment.columns.by_name
+    return Views(texts, tables, _charts(runs, summary, windows, texts), cells,
+                 [METHOD, *(by_name[name] for name in PAGE)], reasons(rows))  # fmt: skip
+
+
+def _styles(summary: pd.DataFrame) -> dict[str, Style]:
+    """Return a colour and marker per trainer, and a line style per family."""
+    families = list(dict.fromkeys(summary["family"]))
+    return {
+        method: Style(colour(i), marker(i), LINES[families.index(family) % len(LINES)])
+        for i, (method, family) in enumerate(dict(zip(summary["method"], summary["family"], strict=True)).items())
+    }
+
+
+def _charts(runs: pd.DataFrame, summary: pd.DataFrame, windows: pd.DataFrame, texts: list[str]) -> list[Chart]:
+    looks = _styles(summary)
+    frame = aggregate.curves(runs)
+    seeds = f"interquartile mean over {runs['seed'].nunique()} seeds with its 95% bootstrap interval"
+    cost = replace(COST, log=bool((frame["cost"] > 0).all()))
+    curves = [
+        Chart(
+            name, findings.title(summary), frame, [x], [cost], series="method", panel="problem", styles=looks, band=True,
+            subtitle=f"cost: minus the return; {seeds}", text="A line per trainer, at its evaluations.",
+        )
+        for name, x in (("train", STEP), ("train_seconds", SECONDS))
+    ]  # fmt: skip
+    curves = [curves[0], *(chart for chart in curves[1:] if np.isfinite(frame["seconds"]).any())]
+    charts = [*curves, *_logs(runs, summary, looks)]
+    if len(windows):
+        charts.append(_windows(windows))
+    return charts
+
+
+def _windows(windows: pd.DataFrame) -> Chart:
+    title = findings.window(windows).split(".")[0]
+    return Chart(
+        "windows", title, windows, [replace(WINDOWS[2], log=True)], [WINDOWS[4], FINAL, WINDOWS[3]], series="family",
+        panel="problem", text="A point per length of window. Choose the quantity.",
+    )  # fmt: skip
+
+
+def _logs(runs: pd.DataFrame, summary: pd.DataFrame, looks: dict[str, Style]) -> list[Chart]:
+    """Return a chart of the logs per problem: a panel per quantity over the same control steps."""
+    charts = []
+    for i, (problem, part) in enumerate(runs.groupby("problem", sort=False)):
+        frame = aggregate.logs(part, tuple(QUANTITIES)).dropna(subset=["value"])
+        size = frame["quantity"].isin(LOGARITHMIC)
+        frame = frame.assign(
+            value=np.where(size, np.log10(frame["value"].where(size & (frame["value"] > 0))), frame["value"])
+        )
+        frame = frame.dropna(subset=["value"])
+        varies = frame.groupby("quantity")["value"].agg(["min", "max"])
+        shown = [
+            name for name in QUANTITIES if name in varies.index and varies.loc[name, "min"] < varies.loc[name, "max"]
+        ]
+        frame = frame[frame["quantity"].isin(shown)]
+        if frame.empty:
+            continue
+        frame = frame.assign(quantity=frame["quantity"].map(QUANTITIES))
+        own = summary[summary["problem"] == problem]
+        methods = list(own.drop_duplicates("family")["method"])[:MAX_LOGS]
+        charts.append(Chart(
+            "train_log" if i == 0 else f"train_log_{i + 1}", _log_title(part, methods), frame, [STEP],
+            [Column("value", label=" ")], series="method", panel="quantity", styles={m: replace(s, marker="") for m, s in looks.items()},
+            chosen=[("method", methods)], own_scales=True, across=1, height=1.1,
+            subtitle=f"{problem}, first seed; an entry is the mean or largest value of its updates",
+            text="All quantities have the same axis of control steps, so that spikes can be compared.",
+        ))  # fmt: skip
+    return charts
+
+
+def _log_title(runs: pd.DataFrame, methods: list[str]) -> str:
+    """Return the title of a chart of logs: a fault of a drawn run, or the largest spike of a gradient."""
+    drawn = runs[runs["method"].isin(methods)]
+    faults = aggregate.faults(drawn[drawn["seed"] == drawn["seed"].min()])
+    if len(faults):
+        first = faults.iloc[0]
+        words = findings.describe(first["fault"]).partition(",")[0].partition(" (")[0]
+        return f"{first['method']}: {words}"
+    ratio = drawn["gradient_peak"] / drawn["gradient_typical"]
+    worst = drawn.loc[ratio.idxmax()] if ratio.notna().any() else None
+    if worst is None:
+        return "Logs of the trainings"
+    return f"The largest gradient is {number(ratio.max())} times the median of its run ({worst['method']})"

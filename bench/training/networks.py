@@ -1,0 +1,76 @@
+"""Multilayer perceptrons for policies and values, on batch-last arrays, by Equinox."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from bench.model.ops import Array
+
+Activation = Any
+ACTIVATIONS = {"elu": jax.nn.elu, "tanh": jnp.tanh, "relu": jax.nn.relu, "silu": jax.nn.silu}
+"""Activation functions by name."""
+
+
+SMALLEST_VARIANCE = 1e-5
+"""Added to the variance of a hidden layer, so that equal outputs do not divide by 0."""
+
+
+class Network(eqx.Module):
+    """A perceptron ``(n_in, B) -> (n_out, B)``: weights ``(n_out, n_in)`` and biases ``(n_out, 1)`` by layer.
+
+    The outputs of each hidden layer are normalised over its units (Ba et al. 2016, arXiv 1607.06450, without gain and
+    bias). Without it, SHAC misses its published range on cart-pole for one seed in five.
+    """
+
+    weights: list[Array]
+    biases: list[Array]
+    activation: str = eqx.field(static=True)
+
+    def __init__(
+        self, key: Array, sizes: Sequence[int], dtype: Any, activation: str = "elu", last_gain: float = 1.0
+    ) -> None:
+        """Draw orthogonal weights with gain sqrt(2), ``last_gain`` in the last layer; biases are 0."""
+        keys = jax.random.split(key, len(sizes) - 1)
+        gains = [2.0**0.5] * (len(sizes) - 2) + [last_gain]
+        self.weights = [
+            jax.nn.initializers.orthogonal(gain)(k, (n_out, n_in), dtype)
+            for k, gain, n_in, n_out in zip(keys, gains, sizes[:-1], sizes[1:], strict=True)
+        ]
+        self.biases = [jnp.zeros((n, 1), dtype) for n in sizes[1:]]
+        self.activation = activation
+
+    def __call__(self, x: Array) -> Array:
+        """Return the outputs ``(n_out, B)`` of ``x (n_in, B)``."""
+        function = ACTIVATIONS[self.activation]
+        for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
+            x = function(weight @ x + bias)
+            x = (x - x.mean(axis=0)) / jnp.sqrt(x.var(axis=0) + SMALLEST_VARIANCE)
+        return self.weights[-1] @ x + self.biases[-1]
+
+
+class Actor(eqx.Module):
+    """A normal distribution of actions: the mean is a network of the observation, the log deviation is learned."""
+
+    mean: Network
+    log_deviation: Array
+    """``(n_u, 1)``, the same for all observations."""
+
+    def __init__(
+        self, key: Array, sizes: Sequence[int], dtype: Any, activation: str = "elu", log_deviation: float = -1.0
+    ) -> None:
+        self.mean = Network(key, sizes, dtype, activation)
+        self.log_deviation = jnp.full((sizes[-1], 1), log_deviation, dtype)
+
+    def sample(self, observation: Array, noise: Array) -> Array:
+        """Return actions ``(n_u, B)`` from standard normal ``noise (n_u, B)``."""
+        return self.mean(observation) + jnp.exp(self.log_deviation) * noise
+
+    def log_probability(self, observation: Array, action: Array) -> Array:
+        """Return the log density of ``action (n_u, B)``, ``(B,)``."""
+        z = (action - self.mean(observation)) / jnp.exp(self.log_deviation)
+        return -(0.5 * z**2 + self.log_deviation + 0.5 * jnp.log(2 * jnp.pi)).sum(axis=0)

@@ -1,0 +1,126 @@
+"""Compiles a trainer on an environment, once for all seeds and parameter values."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from bench.model.trainer import Trainer
+from bench.training import evaluation
+from bench.training.environment import Environment
+
+_compiled: dict[tuple[Any, ...], tuple[Callable[..., Any], float]] = {}
+"""Executables and the seconds of their compilation, by environment structure, trainer, function and shapes."""
+
+
+class Training:
+    """A trainer on an environment: compiled functions that start, update and evaluate runs."""
+
+    def __init__(self, env: Environment, trainer: Trainer) -> None:
+        self.env, self.trainer = env, trainer
+        self.compile_s = 0.0
+        """Seconds of the compilations that this object uses, also if another one has made them."""
+        self._used: set[tuple[Any, ...]] = set()
+
+    def start(self, seed: int) -> Any:
+        """Return the state before the first update."""
+        return self._call("start", lambda env, seed: self.trainer.start(env, seed), np.uint32(seed))
+
+    def update(self, state: Any) -> tuple[Any, dict[str, Any]]:
+        """Return the state after one update and its log. The arrays of ``state`` are used up."""
+        return self._call("update", self.trainer.update, state)  # type: ignore[no-any-return]
+
+    def compile_update(self, state: Any) -> None:
+        """Compile the update without running it, so that its time is not part of the first update's."""
+        self._executable("update", self.trainer.update, (state,))
+
+    def wait(self, state: Any) -> None:
+        """Wait until a state is computed, since JAX returns before that."""
+        import jax
+
+        jax.block_until_ready(state)
+
+    def returns(self, state: Any, numbers: np.ndarray) -> np.ndarray:
+        """Return the returns ``(B,)`` of the deterministic policy from starts ``numbers (n_start, B)``."""
+
+        def evaluate(env: Environment, state: Any, numbers: Any) -> Any:
+            return evaluation.returns(env, lambda seen: self.trainer.action(env, state, seen), numbers)
+
+        numbers = np.asarray(numbers, dtype=self.env.dtype)
+        return np.asarray(self._call("returns", evaluate, state, numbers), dtype=np.float64)
+
+    def agreement(self, state: Any, seed: int, copies: int) -> dict[str, float]:
+        """Return the cosines of :func:`agreement.cosine` at a first-order trainer's state, from ``copies`` per rollout."""
+
+        def compare(env: Environment, state: Any, seed: Any) -> Any:
+            import jax
+
+            from bench.training import agreement
+
+            def parts(actor: Any, key: Any) -> Any:
+                return self.trainer.parts(env, state, actor, key)
+
+            return agreement.cosine(parts, state.actor, jax.random.PRNGKey(seed), copies)
+
+        cosines = self._call(f"agreement {copies}", compare, state, np.uint32(seed))
+        return {name: float(value) for name, value in cosines.items()}
+
+    def gradient(self, state: Any, seed: int, window: int | None = None) -> np.ndarray:
+        """Return the derivative of the mean return of rollouts from new starts by the actor's parameters, ``(d,)``.
+
+        ``window`` replaces the number of control steps of a trainer with windows.
+        """
+        trainer: Any = self.trainer if window is None else dataclasses.replace(self.trainer, window=window)  # type: ignore[call-arg]
+
+        def differentiate(env: Environment, state: Any, seed: Any) -> Any:
+            import jax
+            from jax.flatten_util import ravel_pytree
+
+            return ravel_pytree(jax.grad(lambda actor: _mean_return(trainer, env, state, actor, seed))(state.actor))[0]
+
+        return np.asarray(self._call(f"gradient {window}", differentiate, state, np.uint32(seed)), dtype=np.float64)
+
+    def mean_return(self, state: Any, seed: int, shift: np.ndarray) -> float:
+        """Return the mean return that :meth:`gradient` differentiates, at the actor's parameters plus ``shift (d,)``."""
+
+        def evaluate(env: Environment, state: Any, seed: Any, shift: Any) -> Any:
+            from jax.flatten_util import ravel_pytree
+
+            theta, unflatten = ravel_pytree(state.actor)
+            return _mean_return(self.trainer, env, state, unflatten(theta + shift), seed)
+
+        return float(self._call("mean return", evaluate, state, np.uint32(seed), np.asarray(shift, self.env.dtype)))
+
+    def _call(self, name: str, function: Callable[..., Any], *arguments: Any) -> Any:
+        return self._executable(name, function, arguments)(self.env.parameters(), *arguments)
+
+    def _executable(self, name: str, function: Callable[..., Any], arguments: tuple[Any, ...]) -> Callable[..., Any]:
+        import jax
+
+        shapes = tuple((np.shape(x), str(x.dtype)) for x in jax.tree.leaves(arguments))
+        key = (self.env.structure, self.trainer, name, shapes)
+        if key not in _compiled:
+            env = self.env
+            donated = (1,) if name == "update" else ()
+            # one thread per program: the matrices are too small to share
+            options: Any = {"xla_cpu_multi_thread_eigen": False} if jax.default_backend() == "cpu" else None
+            started = time.perf_counter()
+            jitted = jax.jit(lambda p, *given: function(env.bind(p), *given), donate_argnums=donated)
+            call = jitted.lower(self.env.parameters(), *arguments).compile(options)
+            _compiled[key] = (call, time.perf_counter() - started)
+        executable, seconds = _compiled[key]
+        if key not in self._used:
+            self._used.add(key)
+            self.compile_s += seconds
+        return executable
+
+
+def _mean_return(trainer: Trainer, env: Environment, state: Any, actor: Any, seed: Any) -> Any:
+    import jax
+
+    key_start, key = jax.random.split(jax.random.PRNGKey(seed))
+    return trainer.parts(env, trainer.fresh(env, state, key_start), actor, key)[0].sum(axis=0).mean()

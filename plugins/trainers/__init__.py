@@ -1,0 +1,1 @@
+"""Trainers: one class per file."""

@@ -1,0 +1,106 @@
+"""Evolution strategies: a search over the policy's parameters that uses returns only."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from bench.model import Trainer, param
+
+
+class Search(NamedTuple):
+    """The state of a search between two updates."""
+
+    theta: Any
+    """Parameters of the policy's network, flattened, ``(d,)``."""
+    memory: Any
+    normaliser: Any
+    key: Any
+
+
+@dataclass(frozen=True)
+class Evolution(Trainer):
+    """Evolution strategies (Salimans et al. 2017, arXiv 1703.03864) on the flattened parameters of a network.
+
+    An update runs one episode each of ``population`` policies, theta plus and minus ``width`` times normal numbers,
+    from the same start for both signs. Returns are replaced by their ranks, from -1/2 to 1/2, and Adam ascends the mean
+    of rank times direction. A covariance matrix of all parameters, as in CMA-ES, would have d^2 entries, 2e7 by
+    default, so it is left out.
+    """
+
+    name = "evolution"
+
+    population: int = param(64, "policies per update, an even number", low=2)
+    width: float = param(0.05, "standard deviation of the parameters", positive=True)
+    hidden: int = param(64, "width of the two hidden layers", positive=True)
+    rate: float = param(0.02, "first learning rate", positive=True)
+    clip: float = param(1e6, "norm at which gradients are clipped", positive=True)
+
+    def steps_per_update(self, env: Any) -> int:
+        """Return population times the length of an episode."""
+        return 2 * (self.population // 2) * int(env.length)
+
+    def _optimizer(self, env: Any) -> Any:
+        from bench.training.steps import adam
+
+        return adam(self.rate, self.updates(env), self.clip, 0.9, 0.999)
+
+    def _network(self, env: Any, key: Any) -> tuple[Any, Any]:
+        from jax.flatten_util import ravel_pytree
+
+        from bench.training.networks import Network
+
+        return ravel_pytree(Network(key, [env.n_observations, self.hidden, self.hidden, env.n_actions], env.dtype))
+
+    def start(self, env: Any, seed: Any) -> Search:
+        """Return a new network."""
+        import jax
+
+        from bench.training import normaliser
+
+        key, key_network = jax.random.split(jax.random.PRNGKey(seed))
+        theta, _ = self._network(env, key_network)
+        return Search(theta, self._optimizer(env).init(theta), normaliser.start(env.n_observations, env.dtype), key)
+
+    def update(self, env: Any, state: Search) -> tuple[Search, dict[str, Any]]:
+        """Return the state after one population."""
+        import jax
+        import jax.numpy as jnp
+        import optax
+
+        from bench.training import normaliser, steps, windows
+
+        key, key_points, key_start, key_rollout = jax.random.split(state.key, 4)
+        _, unflatten = self._network(env, key)
+        half = self.population // 2
+        direction = env.normal(key_points, (half, state.theta.size))
+        points = state.theta + self.width * jnp.concatenate([direction, -direction])
+        networks = jax.vmap(unflatten)(points)
+
+        def policy(observation: Any, noise: Any) -> Any:
+            seen = normaliser.normalised(state.normaliser, observation).T[:, :, None]
+            return jax.vmap(lambda network, x: network(x))(networks, seen)[:, :, 0].T
+
+        numbers = env.normal(key_start, (env.n_start, half))
+        first = env.start(jnp.concatenate([numbers, numbers], axis=1))
+        _, window = windows.rollout(env, policy, first, env.length, key_rollout)
+        # an episode counts up to its first end
+        is_running = jnp.cumsum(window.ended, axis=0) - window.ended == 0
+        total = jnp.where(is_running, window.reward, 0.0).sum(axis=0)
+        rank = jnp.argsort(jnp.argsort(jnp.where(jnp.isfinite(total), total, -jnp.inf))) / (2 * half - 1) - 0.5
+        rank = rank.astype(state.theta.dtype)
+        gradient = -(rank[:half] - rank[half:]) @ direction / (2 * half * self.width)
+        change, memory = self._optimizer(env).update(gradient, state.memory)
+        theta = optax.apply_updates(state.theta, change)
+        log = {"loss": -total.mean() / env.length, **windows.log_of(window), **steps.step_log(gradient, change, theta)}
+        known = normaliser.updated(state.normaliser, windows.flat(window.observation))
+        return Search(theta, memory, known, key), log
+
+    def action(self, env: Any, state: Search, observation: Any) -> Any:
+        """Return the network's output."""
+        import jax
+
+        from bench.training import normaliser
+
+        _, unflatten = self._network(env, jax.random.PRNGKey(0))
+        return unflatten(state.theta)(normaliser.normalised(state.normaliser, observation))

@@ -1,0 +1,77 @@
+"""The base of trainers of neural networks: their parameters, their state, and how a run starts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from bench.model import Trainer, param
+
+
+class Critic(NamedTuple):
+    """A value network, the target network that follows it, and the memory of its optimizer."""
+
+    network: Any
+    target: Any
+    memory: Any
+
+
+class Run(NamedTuple):
+    """The state of a run between two updates."""
+
+    actor: Any
+    memory: Any
+    """Memory of the actor's optimizer."""
+    normaliser: Any
+    episodes: Any
+    key: Any
+    critic: Critic | None = None
+    returns: Any = None
+    """Running mean and variance of returns, for a critic in their unit; None for a critic of raw returns."""
+
+
+@dataclass(frozen=True)
+class Neural(Trainer):
+    """Trains an actor with two hidden layers on normalised observations, by Adam with rates that fall linearly to 1e-5."""
+
+    rollouts: int = param(64, "parallel rollouts", positive=True)
+    hidden: int = param(64, "width of the two hidden layers of each network", positive=True)
+    actor_rate: float = param(1e-2, "first learning rate of the actor", positive=True)
+    log_deviation: float = param(-1.0, "initial log standard deviation of the actions")
+    clip: float = param(1.0, "norm at which gradients are clipped", positive=True)
+    beta1: float = param(0.7, "decay of Adam's mean gradient", low=0.0, high=0.999999)
+    beta2: float = param(0.95, "decay of Adam's mean square", low=0.0, high=0.999999)
+
+    def adam(self, rate: float, steps: int) -> Any:
+        """Return the optimizer of a network that takes ``steps`` steps in a run."""
+        from bench.training.steps import adam
+
+        return adam(rate, steps, self.clip, self.beta1, self.beta2)
+
+    def actor_optimizer(self, env: Any) -> Any:
+        """Return the actor's optimizer, which takes one step per update."""
+        return self.adam(self.actor_rate, self.updates(env))
+
+    def start(self, env: Any, seed: Any) -> Run:
+        """Return a new actor, and episodes at their starts."""
+        import jax
+
+        from bench.training import normaliser
+        from bench.training.networks import Actor
+
+        key, key_actor, key_start = jax.random.split(jax.random.PRNGKey(seed), 3)
+        layers = [env.n_observations, self.hidden, self.hidden, env.n_actions]
+        actor = Actor(key_actor, layers, env.dtype, log_deviation=self.log_deviation)
+        episodes = env.start(env.normal(key_start, (env.n_start, self.rollouts)))
+        known = normaliser.start(env.n_observations, env.dtype)
+        return Run(actor, self.actor_optimizer(env).init(actor), known, episodes, key)
+
+    def fresh(self, env: Any, state: Any, key: Any) -> Any:
+        """Return the state with all episodes at new starts."""
+        return state._replace(episodes=env.start(env.normal(key, (env.n_start, self.rollouts))))
+
+    def action(self, env: Any, state: Any, observation: Any) -> Any:
+        """Return the mean of the policy's distribution."""
+        from bench.training import normaliser
+
+        return state.actor.mean(normaliser.normalised(state.normaliser, observation))

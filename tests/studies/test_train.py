@@ -1,0 +1,132 @@
+"""The study of training: what it shows of made-up runs, what it refuses, and one small run of it all."""
+
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import bench
+from bench.errors import UserError
+from bench.experiment import config
+from bench.experiment.grid import cells
+from bench.run.tasks import blank_row
+from bench.studies.train import aggregate, findings
+from bench.studies.train.views import views
+
+BASE = ["study=train", "scenes=[cartpole_swing]", "integrators=[semi_implicit_euler]", "backends=[jax]", "samples=1"]
+FINAL = {"shac": -530.0, "shac[window=8]": -700.0, "ppo": -900.0}
+
+
+def made_up(final=FINAL, seeds=range(5), spread=10.0, **columns):
+    """Return an experiment and its rows: a curve of three evaluations per run, noise of ``spread`` between seeds."""
+    names = ",".join(f'"{name}"' for name in final)
+    experiment = config.load([*BASE, f"trainers=[{names}]", f"sweep.seed={list(seeds)}"])
+    rows, rng = [], np.random.default_rng(0)
+    for cell in cells(experiment):
+        row = blank_row(experiment, cell)
+        last = final[row["trainer"]] + spread * rng.standard_normal()
+        curve = [-2000.0, -1200.0, last]
+        window = getattr(cell.parts["trainer"], "window", np.nan)
+        rows.append(row | {
+            "status": "ok", "first_return": -2000.0, "final_return": last, "steps": 1e6, "updates": 500, "train_s": 30.0,
+            "compile_s": 9.0, "gradient_typical": 1.0, "gradient_peak": 5.0, "verdicts": "[]", "curve_return": curve,
+            "curve_step": [0, 5e5, 1e6], "curve_update": [0, 250, 500], "curve_s": [0.0, 15.0, 30.0],
+            "window_gradient": 10.0, "window_bias": 10.0 / window, "window_bias_low": 9.0 / window, "window_bias_high": 11.0 / window,
+            "log_update": [250, 500], "log_reward": [-8.0, -3.0], "log_gradient_norm": [1.0, 5.0],
+            "cosine_update": [100, 300], "cosine": [0.9, 0.8],
+        } | columns)  # fmt: skip
+    return experiment, experiment.columns.typed(pd.DataFrame(rows))
+
+
+def test_the_best_trainer_is_named_with_its_interval_and_those_behind_it():
+    experiment, rows = made_up()
+    first, second, third = views(experiment, rows).findings
+    assert first.startswith("The best final return is -5")
+    assert "(shac), and shac[window=8] and ppo end lower" in first
+    assert second.startswith(
+        "Among windows of shac, 32 steps end best, 8 steps end lower, and the gradient's bias falls from 1.2 at 8 to 0.31 at 32 steps"
+    )
+    assert third == "The logs of 15 runs show no fault."
+    assert all(text.endswith(".") and ";" not in text for text in (first, second, third))
+
+
+def test_trainers_whose_intervals_overlap_are_open():
+    experiment, rows = made_up({"shac": -530.0, "ppo": -535.0}, spread=40.0)
+    assert views(experiment, rows).findings[0].startswith("Which trainer is best is open: ")
+
+
+def test_few_seeds_give_no_interval_and_no_order():
+    experiment, rows = made_up(seeds=range(4))
+    text = views(experiment, rows).findings[0]
+    assert text.startswith("Which trainer is best is open: shac has -5")
+    assert "too few seeds for an interval" in text
+
+
+def test_a_run_that_is_not_finite_counts_as_its_untrained_policy():
+    experiment, rows = made_up({"shac": -530.0})
+    rows.loc[0, ["status", "final_return"]] = ["nonfinite", -100.0]
+    rows.at[0, "curve_return"] = [-2000.0, np.nan]
+    runs = aggregate.runs_of(experiment, rows)
+    assert aggregate.final_returns(runs)[0] == -2000.0
+    assert np.isfinite(aggregate.curves(runs)["cost"]).all()
+    assert aggregate.summarise(runs)["failed"].tolist() == [1]
+
+
+def test_a_fault_is_reported_in_words_with_its_run():
+    experiment, rows = made_up(verdicts=json.dumps([{"code": "not_finite", "update": 7, "quantity": "loss"}]))
+    shown = views(experiment, rows)
+    assert shown.findings[2] == (
+        "The logs of 15 of 15 runs show a fault, most often this: NaN at update 7: the loss is not finite (shac, seed 0)."
+    )
+    table = next(table for table in shown.tables if table.name == "faults")
+    assert set(table.frame["words"]) == {"NaN at update 7: the loss is not finite"}
+
+
+def test_the_chart_of_logs_has_one_axis_of_steps_for_all_quantities():
+    experiment, rows = made_up()
+    chart = next(chart for chart in views(experiment, rows).charts if chart.name == "train_log")
+    assert set(chart.frame["quantity"]) == {"reward per step", "log10 of the gradient norm", "cosine with zeroth order"}
+    assert chart.across == 1
+    assert chart.frame["step"].max() == 1e6
+
+
+def test_a_return_above_another_by_less_than_noise_is_not_below():
+    low, high = {"final_low": -10.0, "final_high": -8.0}, {"final_low": -8.5, "final_high": -7.0}
+    assert not findings.is_below(low, high)
+    assert findings.is_below({**low, "final_high": -9.0}, high)
+
+
+def test_rows_without_a_run_show_their_reasons():
+    experiment, rows = made_up(status="error", reason="planted", curve_return=[])
+    shown = views(experiment, rows)
+    assert shown.findings == ["No run gave a result: the table has the reason of each."]
+    assert shown.remarks == ["planted"]
+
+
+def test_a_scene_without_observations_is_refused_with_the_reason(tmp_path):
+    with pytest.raises(UserError, match="scene pendulum has no observations, from which a policy acts"):
+        bench.run(study="train", results_dir=tmp_path, scenes=["pendulum"], backends=["jax"], trainers=["shac"])
+
+
+def test_a_backend_without_jax_is_refused_with_the_reason(tmp_path):
+    with pytest.raises(UserError, match="backend numpy does not run programs in JAX"):
+        bench.run(study="train", results_dir=tmp_path, scenes=["cartpole_swing"], backends=["numpy"], trainers=["shac"])
+
+
+def test_an_unknown_trainer_names_the_nearest_one():
+    with pytest.raises(UserError, match="unknown trainer 'shack'; did you mean 'shac'"):
+        config.load([*BASE, "trainers=[shack]"])
+
+
+@pytest.mark.slow
+def test_the_quick_experiment_runs_and_its_report_is_written(tmp_path):
+    """Two windows and a search, with logs, comparisons of gradients, and finite returns that repeat."""
+    overrides = {"results_dir": tmp_path, "workers": 0, "timing": False}
+    rows = bench.run("train/quick", **overrides)
+    assert (rows["status"] == "ok").all()
+    assert np.isfinite(rows["final_return"]).all()
+    shac = rows[rows["trainer"].str.startswith("shac")]
+    assert (shac["difference_error"] < 0.1).all()
+    assert all(len(values) == 3 for values in shac["cosine"])
+    assert (rows["log_gradient_norm"].map(len) > 0).all()

@@ -1,0 +1,63 @@
+"""Policy problems of the tests: cart-pole, and a mass that a policy presses onto the ground."""
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from bench.model import Array, ContactScene, State, compose, param, registry
+from bench.model.policy import PolicyScene, uniform
+
+
+def cartpole_program(**parameters: Any) -> Any:
+    """Return the program of cart-pole with semi-implicit Euler."""
+    return compose(
+        registry.make("scenes", "cartpole_swing", parameters), None, registry.make("integrators", "semi_implicit_euler")
+    )
+
+
+@dataclass(frozen=True)
+class Pressed(PolicyScene, ContactScene):
+    """A mass of 1 kg that a policy presses onto the ground: q is its height [m]."""
+
+    name = "pressed"
+    n_q: ClassVar[int] = 1
+    n_u: ClassVar[int] = 1
+    n_contacts: ClassVar[int] = 1
+    n_observations: ClassVar[int] = 2
+    n_start: ClassVar[int] = 2
+
+    horizon: int = param(20, "control steps", "steps", positive=True)
+    dt: float = param(0.01, "length of a control step", "s", positive=True)
+
+    def initial_state(self, xp: Any, theta: Array) -> State:
+        return State(0.05 + 0.0 * theta[:1], 0.0 * theta[:1])
+
+    def random_start(self, xp: Any, e: Array) -> State:
+        return State(0.05 + 0.02 * uniform(xp, e), 0.0 * e[:1])
+
+    def observation(self, xp: Any, q: Array, v: Array) -> Array:
+        return xp.stack([q[0], v[0]])
+
+    def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
+        return u - 9.81
+
+    def gap(self, xp: Any, q: Array) -> Array:
+        return q
+
+    def gap_rate(self, xp: Any, q: Array, v: Array) -> Array:
+        return v
+
+    def contact_acceleration(self, xp: Any, q: Array, force: Array) -> Array:
+        return force
+
+    def stage_cost(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
+        return (q[0] + 0.01) ** 2
+
+    def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
+        return 0.0 * q[0]
+
+
+def pressed_program(contact: str = "penalty", **parameters: Any) -> Any:
+    """Return the program of the pressed mass under a contact law."""
+    return compose(
+        Pressed(), registry.make("contacts", contact, parameters), registry.make("integrators", "semi_implicit_euler")
+    )

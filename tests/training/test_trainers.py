@@ -1,0 +1,147 @@
+"""Trainers: runs that resume bit for bit, PPO on a problem with a closed form, gradients of both orders that agree."""
+
+import pickle
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from problems import cartpole_program
+
+from bench.model import registry
+from bench.training.agreement import cosine
+from bench.training.environment import Environment
+from bench.training.networks import Actor
+from bench.training.run import Training
+
+SMALL = {"hidden": 8, "steps": 4000}
+TRAINERS = {
+    "shac": {**SMALL, "rollouts": 4, "window": 5, "passes": 2, "batches": 2},
+    "bptt": {**SMALL, "rollouts": 4},
+    "ppo": {**SMALL, "rollouts": 4, "window": 5, "passes": 2, "batches": 2},
+    "evolution": {**SMALL, "population": 4},
+}
+
+
+def training(name, dtype="float64", horizon=12, substeps=1, **parameters):
+    env = Environment(
+        cartpole_program(horizon=horizon, substeps=substeps), registry.make("backends", "jax").ops(), dtype
+    )
+    return Training(env, registry.make("trainers", name, {**TRAINERS[name], **parameters}))
+
+
+@pytest.mark.parametrize(
+    "name", [name if name == "shac" else pytest.param(name, marks=pytest.mark.slow) for name in TRAINERS]
+)
+def test_a_run_that_is_stored_and_resumed_takes_the_same_path_bit_for_bit(name):
+    run = training(name, "float32")
+    state = run.start(3)
+    whole = []
+    for _ in range(4):
+        state, log = run.update(state)
+        whole.append({key: float(value) for key, value in log.items()})
+    last = jax.device_get(state)
+    state = run.start(3)
+    again = []
+    for update in range(4):
+        if update == 2:
+            state = pickle.loads(pickle.dumps(jax.device_get(state)))
+        state, log = run.update(state)
+        again.append({key: float(value) for key, value in log.items()})
+    assert whole == again
+    for a, b in zip(jax.tree.leaves(last), jax.tree.leaves(jax.device_get(state)), strict=True):
+        assert np.array_equal(a, b)
+        assert np.asarray(a).dtype != np.float64, "a float32 run computes in float32"
+
+
+def test_seeds_give_different_runs_from_one_compilation():
+    run = training("shac", "float32")
+    first, second = run.start(0), run.start(1)
+    assert not np.array_equal(first.actor.mean.weights[0], second.actor.mean.weights[0])
+    run.update(first)
+    seconds = run.compile_s
+    run.update(second)
+    assert run.compile_s == seconds
+
+
+def test_first_and_zeroth_order_gradients_of_a_window_agree():
+    """Both estimate the derivative of the same objective: with enough rollouts their cosine is 1."""
+    run = training("shac", "float32")
+    cosines = run.agreement(run.start(0), 1, 256)
+    assert cosines["cosine_denoised"] == pytest.approx(1.0, abs=0.02)  # eight times its spread over seeds
+
+
+def test_a_planted_first_order_gradient_of_the_wrong_sign_is_seen_in_the_cosine():
+    key = jax.random.PRNGKey(0)
+    registry.make("backends", "jax").ops()
+    theta = jnp.array([0.5])
+
+    def parts(sign):
+        def of(actor, key):
+            noise = jax.random.normal(key, (1, 256))
+            action = jax.lax.stop_gradient(theta)[:, None] + noise
+            through = actor[:, None] + noise
+            # values are the same in both; the planted one passes the derivative on with the wrong sign
+            gained = -((jax.lax.stop_gradient(2 * through) - through) ** 2) if sign < 0 else -(through**2)
+            return gained, jnp.ones((1, 256), bool), -((action - actor[:, None]) ** 2) / 2
+
+        return of
+
+    assert float(cosine(parts(1), theta, key, 64)["cosine"]) == pytest.approx(1.0)
+    assert float(cosine(parts(-1), theta, key, 64)["cosine"]) == pytest.approx(-1.0)
+
+
+def test_the_first_step_of_ppo_is_the_policy_gradient_of_a_one_step_problem():
+    """For actions a ~ N(m, s^2), reward -(a - c)^2 and a linear policy of a constant, all in closed form.
+
+    At the old policy the ratio is 1, so the derivative of the objective by the mean is E[A (a - m) / s^2]. With
+    A = (r - E r) / std(r), r = -(a - c)^2: E[(r - E r)(a - m)] = -2 (m - c) s^2, Var r = 2 s^4 + 4 s^2 (m - c)^2.
+    """
+    trainer = registry.make("trainers", "ppo", {})
+    registry.make("backends", "jax").ops()
+    s, c = 0.5, 0.7
+    actor = Actor(jax.random.PRNGKey(0), [1, 1], "float64", log_deviation=float(np.log(s)))
+    seen, noise = jnp.ones((1, 50_000)), jax.random.normal(jax.random.PRNGKey(1), (1, 50_000), "float64")
+    mean = float(actor.mean(seen[:, :1])[0, 0])
+    action = actor.sample(seen, noise)
+    reward = -((action[0] - c) ** 2)
+    advantage = (reward - reward.mean()) / reward.std()
+    gradient = jax.grad(trainer.surrogate)(actor, seen, action, actor.log_probability(seen, action), advantage)
+    expected = 2 * (mean - c) / np.sqrt(2 * s**4 + 4 * s**2 * (mean - c) ** 2)
+    assert float(gradient.mean.biases[0][0, 0]) == pytest.approx(expected, abs=0.04)  # six standard errors
+
+
+def test_the_objective_of_ppo_is_flat_where_its_ratio_is_clipped():
+    """A better action whose probability has already grown by more than the range moves the policy no further."""
+    trainer = registry.make("trainers", "ppo", {"range": 0.2})
+    registry.make("backends", "jax").ops()
+    actor = Actor(jax.random.PRNGKey(0), [1, 1], "float64")
+    seen, action = jnp.ones((1, 1)), jnp.full((1, 1), 0.3)
+    now = actor.log_probability(seen, action)
+    for change, advantage, is_flat in ((0.3, 1.0, True), (0.1, 1.0, False), (-0.3, -1.0, True), (-0.3, 1.0, False)):
+        gradient = jax.grad(trainer.surrogate)(actor, seen, action, now - change, jnp.array([advantage]))
+        size = sum(float(jnp.abs(leaf).sum()) for leaf in jax.tree.leaves(gradient))
+        assert (size == 0.0) == is_flat, (change, advantage)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(2))
+def test_shac_swings_the_cartpole_up(seed):
+    """A fifth of the published steps: from about -2,000 for hanging still to above -800."""
+    run = training(
+        "shac",
+        "float32",
+        horizon=240,
+        substeps=4,
+        rollouts=64,
+        window=32,
+        hidden=64,
+        passes=16,
+        batches=4,
+        steps=512_000,
+    )
+    numbers = np.random.default_rng(0).standard_normal((8, 256))
+    state = run.start(seed)
+    for _ in range(run.trainer.updates(run.env)):
+        state, _ = run.update(state)
+    assert run.returns(state, numbers).mean() > -800

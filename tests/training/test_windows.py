@@ -1,0 +1,151 @@
+"""The gradient of a window: against central differences, against the sweep's program, and at the ends of episodes."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from problems import cartpole_program
+
+from bench.model import Rollout, State, registry
+from bench.training import windows
+from bench.training.environment import Environment, Episodes
+from bench.training.networks import Actor
+
+DIFFERENCE = 1e-5
+"""Relative error allowed to a central difference of step 1e-6 in float64: curvature and rounding give 1e-7 to 1e-6."""
+ROUNDING = 1e-10
+"""Relative error allowed to two orders of the same float64 operations."""
+
+
+def environment(horizon=240, **parameters):
+    parameters = {"substeps": 1, **parameters}  # a quarter of the program to compile
+    return Environment(cartpole_program(horizon=horizon, **parameters), registry.make("backends", "jax").ops())
+
+
+def window_return(env, actor, length, key, cut=0.0, first=None, discount=0.99):
+    """Return gains of a window without a value at its end, and the window."""
+    first = env.start(jnp.asarray(np.random.default_rng(0).standard_normal((8, 6)))) if first is None else first
+    _, window = windows.rollout(env, actor.sample, first, length, key, cut)
+    return windows.gains(window, jnp.zeros_like(window.reward), discount).sum(), window
+
+
+@pytest.fixture
+def actor():
+    environment()
+    return Actor(jax.random.PRNGKey(1), [5, 8, 1], "float64")
+
+
+def test_the_gradient_of_a_window_agrees_with_central_differences(actor):
+    env, key = environment(), jax.random.PRNGKey(2)
+    gradient = jax.grad(lambda a: window_return(env, a, 5, key)[0])(actor)
+    rng, step = np.random.default_rng(3), 1e-6
+    direction = jax.tree.map(lambda x: jnp.asarray(rng.standard_normal(x.shape)), actor)
+    ends = [
+        window_return(env, jax.tree.map(lambda x, d, s=sign: x + s * step * d, actor, direction), 5, key)[0]
+        for sign in (1, -1)
+    ]
+    along = sum(jnp.vdot(g, d) for g, d in zip(jax.tree.leaves(gradient), jax.tree.leaves(direction), strict=True))
+    assert float(ends[0] - ends[1]) / (2 * step) == pytest.approx(float(along), rel=DIFFERENCE)
+
+
+def test_the_gradient_of_a_window_is_that_of_fobg_on_the_whole_program():
+    """Without discount and value, a window as long as the horizon has the cost of the sweep's own program."""
+    steps, count, sigma = 5, 6, 0.3
+    program = cartpole_program(horizon=steps, substeps=1, sigma=sigma, policy="mlp[hidden=4]")
+    backend, key = registry.make("backends", "jax"), jax.random.PRNGKey(2)
+    env, scene = Environment(program, backend.ops()), program.scene
+    noise = np.asarray(env.normal(jax.random.split(key)[0], (steps, 1, count)))
+    numbers = np.random.default_rng(0).standard_normal((8, count))
+    w = np.concatenate([noise.reshape(steps, count), numbers])
+    problem, theta = backend.compile(program), scene.theta0() + 0.1
+    fobg = registry.make("estimators", "fobg").estimate(problem, theta, np.moveaxis(w, 0, -1)[None])[0]
+
+    def mean_return(theta):
+        def policy(observation, noise):
+            return scene.plugin.act(jnp, theta[:, None], observation) + sigma * noise
+
+        _, window = windows.rollout(env, policy, env.start(jnp.asarray(numbers)), steps, key)
+        return windows.gains(window, jnp.zeros_like(window.reward), 1.0).sum(axis=0).mean()
+
+    gradient = -np.asarray(jax.grad(mean_return)(jnp.asarray(theta)))
+    assert np.abs(fobg).max() > 0
+    np.testing.assert_allclose(gradient, fobg, rtol=ROUNDING, atol=ROUNDING * np.abs(fobg).max())
+
+
+def test_no_gradient_crosses_the_end_of_an_episode(actor):
+    """With an end after step 4, the derivative of all later rewards by the state at the window's start is zero."""
+    env = environment(horizon=4)
+    first = env.start(jnp.asarray(np.random.default_rng(0).standard_normal((8, 6))))
+
+    def late_reward(q, leak=False):
+        moved, total = Episodes(State(q, first.state.v), first.age), 0.0
+        for t in range(6):
+            u = actor.mean(env.observe(moved.state))
+            result = env.step(moved, u, jnp.zeros((8, 6)))
+            total += result.reward.sum() if t >= 4 else 0.0
+            after = result.next
+            if leak and t == 3:
+                # a planted fault: the start after the reset depends on the state before it
+                after = Episodes(State(after.state.q + 0.1 * result.reached.q, after.state.v), after.age)
+            moved = after
+        return total
+
+    assert float(jnp.abs(jax.grad(late_reward)(first.state.q)).max()) == 0.0
+    assert float(jnp.abs(jax.grad(lambda q: late_reward(q, leak=True))(first.state.q)).max()) > 0.0
+
+
+def test_the_return_of_a_window_restarts_at_an_end_with_the_value_of_the_state_before_the_reset(actor):
+    env, key = environment(horizon=3), jax.random.PRNGKey(2)
+    _, window = window_return(env, actor, 5, key)
+    assert np.asarray(window.ended)[:, 0].tolist() == [False, False, True, False, False]
+    value = jnp.asarray(np.random.default_rng(5).standard_normal(window.reward.shape))
+    gained = windows.gains(window, value, 0.9).sum(axis=0)
+    r, v = np.asarray(window.reward), np.asarray(value)
+    expected = r[0] + 0.9 * r[1] + 0.81 * r[2] + 0.729 * v[2] + r[3] + 0.9 * r[4] + 0.81 * v[4]
+    np.testing.assert_allclose(gained, expected, rtol=ROUNDING)
+    # the reached observation is that of the state before the reset: its angle is still close to the previous one
+    np.testing.assert_allclose(window.reached[1], window.observation[2], rtol=ROUNDING, atol=ROUNDING)
+    assert not np.allclose(window.reached[2], window.observation[3])
+
+
+def test_a_cut_stops_the_gradient_where_the_jacobian_is_too_large(actor):
+    env, key = environment(), jax.random.PRNGKey(2)
+    free = window_return(env, actor, 8, key)[1]
+    always = window_return(env, actor, 8, key, cut=1e-9)[1]
+    never = window_return(env, actor, 8, key, cut=1e9)[1]
+    assert np.asarray(always.cut).all()
+    assert not np.asarray(never.cut).any()
+    np.testing.assert_array_equal(free.reward, always.reward)
+
+
+def test_the_norm_of_a_jacobian_agrees_with_differences():
+    env = environment()
+    state = env.start(jnp.asarray(np.random.default_rng(0).standard_normal((8, 2)))).state
+    u, step = jnp.full((1, 2), 0.3), 1e-6
+    x = np.concatenate(state)
+
+    def advance(x):
+        return np.concatenate(env.program.step(env.ops, State(jnp.asarray(x[:2]), jnp.asarray(x[2:])), u))
+
+    columns = [(advance(x + step * e[:, None]) - advance(x - step * e[:, None])) / (2 * step) for e in np.eye(4)]
+    expected = np.sqrt((np.array(columns) ** 2).sum(axis=(0, 1)))
+    np.testing.assert_allclose(windows.jacobian_norm(env, state, u), expected, rtol=DIFFERENCE)
+
+
+def test_a_state_that_is_not_finite_ends_its_episode():
+    env = environment()
+    first = env.start(jnp.zeros((8, 2)))
+    broken = Episodes(State(first.state.q.at[0, 1].set(jnp.nan), first.state.v), first.age)
+    moved = env.step(broken, jnp.zeros((1, 2)), jnp.ones((8, 2)))
+    assert np.asarray(moved.terminated).tolist() == [False, True]
+    assert np.isfinite(np.concatenate(moved.next.state)).all()
+
+
+def test_a_scene_without_observations_is_refused():
+    from bench.errors import Unsupported
+    from bench.model import compose
+
+    program = compose(registry.make("scenes", "pendulum"), None, registry.make("integrators", "rk4"))
+    assert isinstance(program, Rollout)
+    with pytest.raises(Unsupported, match="no observations and random starts"):
+        Environment(program, registry.make("backends", "jax").ops())
