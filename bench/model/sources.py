@@ -15,38 +15,27 @@ from bench.model.parameters import remember
 
 EQUIVALENT: dict[str, str] = {
     # bench/model/program.py: a scene may name the class of its programs
-    "bed84ff2417bfd99b7f0fac6e608d37ed5b18f42634106417cbb1bd8beae31ef":
-        "537e21f7c1463cf5e114b297818ea6abf2ec7e5556f8f0da67faa3578015e5ff",
+    "bed84ff2417bfd99b7f0fac6e608d37ed5b18f42634106417cbb1bd8beae31ef": "537e21f7c1463cf5e114b297818ea6abf2ec7e5556f8f0da67faa3578015e5ff",
     # bench/model/scene.py: a scene may name the class of its programs, the derivative of its feedback, and an MJCF file
-    "92f2c777d31e715efc8865cb8aba45e68f5ae954bbca5beb09361cb6edf1244e":
-        "19a77ee56a6a214a4dc2c76e08a14257a51fb50b9c3cdad578f647101743edcb",
+    "92f2c777d31e715efc8865cb8aba45e68f5ae954bbca5beb09361cb6edf1244e": "19a77ee56a6a214a4dc2c76e08a14257a51fb50b9c3cdad578f647101743edcb",
     # bench/measure/reference.py: noise on the actions beside a scene's own noise, which no stored scene has
-    "8e9c1980ecf41fda3cffe337a73bda5f04f968b11b11f7bd78492e9239172a70":
-        "f4ea930fd9b4c514b92e905d9ee99b00899e60ecef16cc4e558020bce228ddd2",
+    "8e9c1980ecf41fda3cffe337a73bda5f04f968b11b11f7bd78492e9239172a70": "f4ea930fd9b4c514b92e905d9ee99b00899e60ecef16cc4e558020bce228ddd2",
     # bench/model/estimator.py: noise on the actions beside a scene's own noise, which no stored scene has
-    "d7e31de64a5307aa7f7f65dbdf54b7c9c13a4e599a1d4303edfbd8131e19ad15":
-        "297f51107543e92425d4da900ff76f5713b7be2f7b41083c98ff121267327fdc",
+    "d7e31de64a5307aa7f7f65dbdf54b7c9c13a4e599a1d4303edfbd8131e19ad15": "297f51107543e92425d4da900ff76f5713b7be2f7b41083c98ff121267327fdc",
     # bench/model/problem.py: noise on the actions beside a scene's own noise, which no stored scene has
-    "fb66e3862742a7acb080bbaf2136a9569274a440ddd3aae74b0feba3375a853b":
-        "b537cd67e11a1065dce873c040744092aa6c8dbc2af87f4d4b4942d39197585c",
+    "fb66e3862742a7acb080bbaf2136a9569274a440ddd3aae74b0feba3375a853b": "b537cd67e11a1065dce873c040744092aa6c8dbc2af87f4d4b4942d39197585c",
     # bench/model/adjoint.py: uses a scene's own derivative of the feedback, which no stored scene has
-    "e0958a7545f9add2424859c00b7668d2829211af02c2fa3ccb27141fb9af5351":
-        "d6d35bf0003a6041adf76a4e9ccca9ede0b96e1241a58774c8fbf795bedcd942",
+    "e0958a7545f9add2424859c00b7668d2829211af02c2fa3ccb27141fb9af5351": "d6d35bf0003a6041adf76a4e9ccca9ede0b96e1241a58774c8fbf795bedcd942",
     # bench/model/manifold.py: the joints of a scene may depend on its parameters
-    "c38492d867e6f03e0243c75cef3741d9cb79210f93ea28080e68b0c514e4eb05":
-        "e8ce151ce4c198a1b8893f9f61339c4ec86bdcf2b79d517068441741c4451491",
+    "c38492d867e6f03e0243c75cef3741d9cb79210f93ea28080e68b0c514e4eb05": "e8ce151ce4c198a1b8893f9f61339c4ec86bdcf2b79d517068441741c4451491",
     # plugins/mjcf.py: models from files, which no stored scene has
-    "a10a11c5d22283bf0703cbcd49e1de126e3a95ab356bfcb2df25c47b08476f45":
-        "9588c6383692c78b228217c715da2ccb1545a8adcc91db6c170db7531606f85c",
+    "a10a11c5d22283bf0703cbcd49e1de126e3a95ab356bfcb2df25c47b08476f45": "9588c6383692c78b228217c715da2ccb1545a8adcc91db6c170db7531606f85c",
     # plugins/backends/mujoco.py: programs with a policy, which no stored scene has
-    "1a555d92164f8c4baccad410063cb3522ebd754103b5d4bab414aa2a80e8dd4a":
-        "b1b262672b057e5f7cdafaf36a41d335c4543c3e9956d73e60a0d9ede57e60e2",
+    "1a555d92164f8c4baccad410063cb3522ebd754103b5d4bab414aa2a80e8dd4a": "b1b262672b057e5f7cdafaf36a41d335c4543c3e9956d73e60a0d9ede57e60e2",
     # plugins/backends/mjx.py: programs with a policy and models from files, which no stored scene has
-    "83af6933de9db8db4fa550ecf199a971996b1876196ba16c9576c83a5cd7fcac":
-        "785dd047351f2bee8e0aeb5c2c6d36ef7616c3cb47fd9e7d898f13a91ae57769",
+    "83af6933de9db8db4fa550ecf199a971996b1876196ba16c9576c83a5cd7fcac": "785dd047351f2bee8e0aeb5c2c6d36ef7616c3cb47fd9e7d898f13a91ae57769",
     # plugins/estimators/total_propagation.py: leaves out the numbers of a random start, which no stored scene has
-    "993ab3f7c080de843a73361c06091c0a87e41a1614fba3f7a60b05942e3e8857":
-        "03dfa4afb84aaf70b769fd9471f75081d552d3453ff8b965b69e49b686737d8b",
+    "993ab3f7c080de843a73361c06091c0a87e41a1614fba3f7a60b05942e3e8857": "03dfa4afb84aaf70b769fd9471f75081d552d3453ff8b965b69e49b686737d8b",
 }
 """Hashes of files whose changes decide no number of a stored row: the new hash, and the one that rows are stored under.
 

@@ -1,4 +1,4 @@
-"""The task of the quadruped: stand upright and walk forward at 0.5 m/s."""
+"""The task of the quadruped: stand upright and move forward at 0.5 m/s."""
 
 from typing import Any
 

@@ -43,15 +43,15 @@ class Mjcf(PolicyScene, JointScene):
     A Python file, by default beside the MJCF file and of the same name, defines ``observation(xp, q, v)``, ``(n, B)``,
     and ``stage_cost(xp, q, v, u)``, ``(B,)``, and may define ``terminal_cost(xp, q, v)``, ``has_ended(xp, q, v)`` and
     ``random_start(xp, q0, v0, e)``, which returns (q, v) from ``n_start`` standard normal numbers e. q0, v0 and u0 are
-    those of the first keyframe if there is one, else of the model's reference pose. Contacts, limits, friction, springs,
-    actuators and the friction cone are those of the file; the backend decides integrator and solver, ``dt / substeps``
-    is the engine's time step. Orientations are unit quaternions (w, x, y, z).
+    the first keyframe if there is one, else the model's reference pose. Contacts, limits, friction, springs, actuators
+    and the friction cone come from the file; the backend decides integrator and solver, ``dt / substeps`` is the
+    engine's time step. Orientations are unit quaternions (w, x, y, z).
 
     Not supported: actuators with activation states, mocap bodies, plugins.
     """
 
     name = "mjcf"
-    neglected_effects = "those that the file neglects"
+    neglected_effects = "the effects that its file neglects"
     continuous: ClassVar[bool] = False  # the force of a contact with the engine's default impedance jumps at touch-down
     requires: ClassVar[tuple[str, ...]] = ("mujoco",)
     backends: ClassVar[tuple[str, ...]] = ("mujoco", "mjx")
@@ -75,7 +75,7 @@ class Mjcf(PolicyScene, JointScene):
         built_in = sorted(path.name for path in ROBOTS.glob("*.xml"))
         if place.suffix == ".xml" and len(place.parts) == 1:
             raise unknown("MJCF file, or built-in robot:", self.file, built_in)
-        raise UserError(f"mjcf.file={self.file}: there is no such file; built-in robots are {', '.join(built_in)}")
+        raise UserError(f"mjcf.file={self.file}: this file does not exist; built-in robots are {', '.join(built_in)}")
 
     @property
     def module(self) -> ModuleType:
@@ -84,7 +84,9 @@ class Mjcf(PolicyScene, JointScene):
         if not place.is_file() and (ROBOTS / place.name).is_file():
             place = ROBOTS / place.name
         if not place.is_file():
-            raise UserError(f"mjcf.functions: there is no file {place} with the functions {', '.join(FUNCTIONS[:2])}")
+            raise UserError(
+                f"mjcf.functions: the file {place} does not exist; it should have the functions {', '.join(FUNCTIONS[:2])}"
+            )
         module = load_module(str(place))
         for name in FUNCTIONS[:2]:
             if not callable(getattr(module, name, None)):

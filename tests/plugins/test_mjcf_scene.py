@@ -125,9 +125,9 @@ def test_a_changed_file_changes_the_key(pendulum):
     ("values", "message"),
     [
         ({"file": "quadrupd.xml"}, "quadrupd.xml.*quadruped.xml"),
-        ({"file": "/nowhere/robot.xml"}, "there is no such file"),
+        ({"file": "/nowhere/robot.xml"}, "this file does not exist"),
         ({"file": "nosuchpackage:robot.xml"}, "pip install nosuchpackage"),
-        ({"functions": "/nowhere/task.py"}, "there is no file /nowhere/task.py"),
+        ({"functions": "/nowhere/task.py"}, "/nowhere/task.py does not exist"),
     ],
 )
 def test_a_missing_file_is_named(values, message):

@@ -107,7 +107,7 @@ def _filled(values: np.ndarray, count: int) -> np.ndarray:
 def windows(runs: pd.DataFrame) -> pd.DataFrame:
     """Return a line per problem, family and window, for families with several: gradient, bias and final return.
 
-    The interval of the bias contains those of all runs.
+    The interval of the bias contains the intervals of all runs.
     """
     known = runs[runs["window"].notna() & runs["window_gradient"].notna()]
     lines = []
