@@ -210,7 +210,7 @@ def described(entry: registry.Entry, availability: bool = True) -> str:
         if issubclass(plugin, Backend):
             facts.append(f"provides {', '.join(sorted(plugin.provides))}")
         elif issubclass(plugin, Estimator):
-            facts.append(f"needs {', '.join(sorted(plugin.needs))}")
+            facts.append(f"needs {', '.join(sorted(plugin().needs))}")
             if not plugin.unbiased:
                 facts.append("biased at finite N")
             elif plugin.unbiased_at_discontinuities:

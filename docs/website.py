@@ -259,7 +259,7 @@ def estimator_page(name: str, plugin: Any, table: pd.DataFrame) -> str:
 def facts(plugin: Any) -> str:
     """Return what an estimator needs and whether it is unbiased, as declared and verified by the conformance kit."""
     words = {"value": "costs", "grad": "gradients", "score": "scores"}
-    needs = ", ".join(words.get(need, need) for need in ("value", "grad", "score") if need in plugin.needs)
+    needs = ", ".join(words.get(need, need) for need in ("value", "grad", "score") if need in plugin().needs)
     jumps = "also for costs with jumps" if plugin.unbiased_at_discontinuities else "for costs without jumps"
     unbiased = f"unbiased, {jumps}" if plugin.unbiased else "biased"
     return f"- Needs: {needs}\n- Declared: {unbiased}\n- Check: `python -m bench check {plugin.name}`"
@@ -329,7 +329,7 @@ def estimators_page(results: Path) -> str:
         counts = [f"{keep.sum()} of {len(lowest)}" for keep in (lowest["best"], lowest["verdict"] == FAILS)]
         what = " ".join(markdown((plugin.__doc__ or "").partition("\n\n")[0]).replace("|", "\\|").split())
         lines.append(
-            f"| [{name}](estimator/{name}.md) | {what} | {', '.join(sorted(plugin.needs))} | "
+            f"| [{name}](estimator/{name}.md) | {what} | {', '.join(sorted(plugin().needs))} | "
             + " | ".join(counts)
             + " |"
         )
