@@ -244,7 +244,11 @@ def estimator_page(name: str, plugin: Any, table: pd.DataFrame) -> str:
     if parameters := registry_parameters(plugin):
         head = "| parameter | default | meaning |\n|---|---|---|\n"
         parts.append("## Parameters\n\n" + head + "\n".join(parameters))
-    if not table.empty:
+    if table.empty:
+        parts.append(
+            "## Where it wins and fails\n\nIt is not in the experiment [estimators](../experiment/estimators.md)."
+        )
+    else:
         parts += ["## Where it wins and fails", summary(table), comparison_table(table)]
         parts.append(
             "Relative RMSE of one estimate with its 95% interval, at equal samples, in the experiment "

@@ -10,7 +10,7 @@ traced value, so Python code must not branch on it. All other types are static.
 """
 
 from bench import deprecated
-from bench.errors import Unsupported
+from bench.errors import Unsupported, UserError, unknown
 from bench.model.adjoint import Slopes, by_actions, by_theta, slopes
 from bench.model.adjoint import gradient as adjoint_gradient
 from bench.model.backend import Backend
@@ -37,7 +37,7 @@ from bench.model.ops import Array, LoopOps, Ops, State, stopped
 from bench.model.optimizer import Answer, Descent, Optimizer, Population
 from bench.model.optimizer import State as OptimizerState
 from bench.model.parameters import Plugin, param
-from bench.model.policy import Policy, PolicyRollout, PolicyScene
+from bench.model.policy import Policy, PolicyRollout, PolicyScene, affine, uniform
 from bench.model.problem import Compilations, Jacobians, Problem, Trajectory, Usage
 from bench.model.program import (
     SURROGATE,
@@ -63,7 +63,7 @@ from bench.model.scene import (
     Scene,
     ZeroOrderHoldScene,
 )
-from bench.model.simulator import load_simulator, simulator_files
+from bench.model.simulator import load_module, load_simulator, simulator_files
 from bench.model.trainer import Trainer
 
 __all__ = [
@@ -122,8 +122,10 @@ __all__ = [
     "Trajectory",
     "Unsupported",
     "Usage",
+    "UserError",
     "ZeroOrderHoldScene",
     "adjoint_gradient",
+    "affine",
     "by_actions",
     "by_theta",
     "columns",
@@ -132,6 +134,7 @@ __all__ = [
     "difference",
     "first_order",
     "halves",
+    "load_module",
     "load_simulator",
     "n_changes",
     "param",
@@ -142,6 +145,8 @@ __all__ = [
     "slope_by_changes",
     "slopes",
     "stopped",
+    "uniform",
+    "unknown",
     "zeroth_order",
 ]
 

@@ -5,8 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.model import Array, param
-from bench.model.policy import Policy, affine
+from bench.model import Array, Policy, affine, param
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.errors import UserError
-from bench.model import Array, param
-from bench.model.policy import Policy, affine
+from bench.model import Array, Policy, UserError, affine, param
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,7 @@ import math
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from bench.model import Array, State, param
-from bench.model.policy import PolicyScene, uniform
+from bench.model import Array, PolicyScene, State, param, uniform
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from bench.errors import Unsupported, UserError, unknown
-from bench.model import Array, JointScene, State, param
-from bench.model.policy import PolicyScene
-from bench.model.simulator import load_module
+from bench.model import Array, JointScene, PolicyScene, State, Unsupported, UserError, load_module, param, unknown
 
 ROBOTS = Path(__file__).parents[1] / "robots"
 """The folder of the built-in robots."""
@@ -57,7 +54,7 @@ class Mjcf(PolicyScene, JointScene):
     backends: ClassVar[tuple[str, ...]] = ("mujoco", "mjx")
 
     sigma: float = param(0.05, "standard deviation of the noise on the controls, or on theta", positive=True)
-    horizon: int = param(20, "number of control steps", "steps", positive=True)
+    horizon: int = param(10, "number of control steps", "steps", positive=True)
     dt: float = param(0.01, "length of a control step", "s", positive=True)
     substeps: int = param(2, "steps of the engine per control step", positive=True)
     file: str = param("quadruped.xml", "MJCF file; PACKAGE:FILE of an installed Python package, or a built-in robot")

@@ -676,10 +676,10 @@ def test_a_wrong_physical_gradient_is_finite_and_of_the_right_shape():
 
 
 def test_line_per_check_and_exit_status(capsys):
-    assert main(["linear", "explicit_euler"]) == 0
+    assert main(["cubic", "explicit_euler"]) == 0
     *lines, empty, summary = capsys.readouterr().out.splitlines()
     assert {line.split()[0] for line in lines} <= {"pass", "skip"}
-    assert {line.split()[1] for line in lines} == {"linear", "explicit_euler"}
+    assert {line.split()[1] for line in lines} == {"cubic", "explicit_euler"}
     assert not empty
     assert summary.startswith(f"2 plugins, {len(lines)} checks: ")
     assert " 0 failed" in summary

@@ -1,12 +1,16 @@
 """Trainers: runs that resume bit for bit, PPO on a problem with a closed form, gradients of both orders that agree."""
 
+import os
 import pickle
+import subprocess
+import sys
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from problems import cartpole_program
+from trees import ROOT
 
 from bench.model import registry
 from bench.training.agreement import cosine
@@ -145,3 +149,10 @@ def test_shac_swings_the_cartpole_up(seed):
     for _ in range(run.trainer.updates(run.env)):
         state, _ = run.update(state)
     assert run.returns(state, numbers).mean() > -800
+
+
+def test_training_leaves_a_failed_solve_of_the_implicit_backend_in_its_column():
+    code = "import os, bench.training.networks; print(os.environ['EQX_ON_ERROR'])"
+    environ = {name: value for name, value in os.environ.items() if name != "EQX_ON_ERROR"}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environ, cwd=ROOT)
+    assert done.stdout.strip() == "off", done.stderr

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from bench.experiment.cell import Cell
-from bench.experiment.columns import Column, Columns, numbers, text
+from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.session import Session
 from bench.experiment.study import Study
@@ -36,7 +36,8 @@ class DoseResponse(Study):
         Column("error_start", "relative error at the start"),
         Column("budget", "most updates of a search: a search that misses a target is censored there", format="setting"),
         Column("runs", "searches that score; 1 if the gradient does not depend on the noise", format="setting"),
-        Column("lowest", "lowest regret of the searches at the rate of the last target, share of the first, median"),
+        Column("lowest", "lowest regret of the searches at the rate of the last target, share of the first, median",
+               comparison=ComparisonRule("exact", "lowest regret")),
         Column("start_cost", "objective at the start"),
         Column("optimum", "lowest cost known, from before the searches", label="J*"),
         text("optimum_status", "source of the optimum"),
