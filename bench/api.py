@@ -210,7 +210,9 @@ def described(entry: registry.Entry, availability: bool = True) -> str:
         if issubclass(plugin, Backend):
             facts.append(f"provides {', '.join(sorted(plugin.provides))}")
         elif issubclass(plugin, Estimator):
-            facts.append(f"needs {', '.join(sorted(plugin().needs))}")
+            # needs that depend on the parameters are a property
+            needs = plugin.needs if isinstance(plugin.needs, frozenset) else plugin().needs
+            facts.append(f"needs {', '.join(sorted(needs))}")
             if not plugin.unbiased:
                 facts.append("biased at finite N")
             elif plugin.unbiased_at_discontinuities:
