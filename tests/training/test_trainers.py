@@ -129,9 +129,8 @@ def test_the_objective_of_ppo_is_flat_where_its_ratio_is_clipped():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(2))
-def test_shac_swings_the_cartpole_up(seed):
-    """A fifth of the published steps: from about -2,000 for hanging still to above -800."""
+def test_shac_swings_the_cartpole_up():
+    """Half of the published steps; results/standard/train has five seeds with all of them: from about -2,000 for hanging still to above -800."""
     run = training(
         "shac",
         "float32",
@@ -145,7 +144,7 @@ def test_shac_swings_the_cartpole_up(seed):
         steps=512_000,
     )
     numbers = np.random.default_rng(0).standard_normal((8, 256))
-    state = run.start(seed)
+    state = run.start(0)
     for _ in range(run.trainer.updates(run.env)):
         state, _ = run.update(state)
     assert run.returns(state, numbers).mean() > -800
