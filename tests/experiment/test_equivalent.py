@@ -14,8 +14,8 @@ from bench.experiment.by_name import compile_problem
 from bench.measure import noise
 from bench.model.sources import EQUIVALENT, code_hash, hash_of_tree
 
-SAME = 1e-9
-"""Relative difference of numbers computed by other versions of the same libraries on another processor."""
+SAME = 1e-7
+"""Relative difference allowed: tests compile with other flags, and the double pendulum multiplies rounding by 1e7."""
 FILES = [path for folder in ("bench", "plugins") for path in sorted((ROOT / folder).rglob("*.py"))]
 
 
@@ -28,12 +28,15 @@ def test_every_entry_is_in_use_and_leads_to_one_earlier_version():
     assert [code_hash(path) for path in changed] == [EQUIVALENT[own[path]] for path in changed]
 
 
-@pytest.mark.parametrize("name", ["quick", "estimators", "windows", "stiffness_sweep"])
-def test_stored_estimates_come_out_again(name):
+@pytest.mark.parametrize(
+    ("name", "backend"),
+    [("quick", "jax"), ("estimators", "jax"), ("windows", "jax"), ("stiffness_sweep", "jax"), ("engines", "mujoco")],
+)
+def test_stored_estimates_come_out_again(name, backend):
     experiment = config.load([f"experiment={name}", f"results_dir={ROOT / 'results/standard'}"])
     rows = bench.load(experiment.directory)
-    rows = rows[(rows.status == "ok") & rows.backend.str.startswith("jax")]
-    for _, row in rows.groupby("estimator").head(1).iterrows():
+    rows = rows[(rows.status == "ok") & rows.backend.str.startswith(backend)]
+    for _, row in rows.groupby(["scene", "estimator"]).head(1).iterrows():
         parts = build_plugins(json.loads(row["parameters"]))
         problem = compile_problem(parts["scene"], parts["contact"], parts["integrator"], row["backend"])
         drawn = noise.shared(

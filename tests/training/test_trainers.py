@@ -130,7 +130,7 @@ def test_the_objective_of_ppo_is_flat_where_its_ratio_is_clipped():
 
 @pytest.mark.slow
 def test_shac_swings_the_cartpole_up():
-    """Half of the published steps; results/standard/train has five seeds with all of them: from about -2,000 for hanging still to above -800."""
+    """Half of the published steps, from about -2,000 for hanging still to above -800; results/standard/train has all."""
     run = training(
         "shac",
         "float32",
