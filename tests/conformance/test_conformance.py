@@ -11,6 +11,7 @@ import pytest
 from bench.plugins.backends.numpy import Numpy, NumpyProblem
 from bench.plugins.contacts.penalty import Penalty
 from bench.plugins.contacts.softplus import Softplus
+from bench.plugins.estimators.sobol import Sobol
 from bench.plugins.integrators.explicit_euler import ExplicitEuler
 from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
 from bench.plugins.scenes.cubic import Cubic
@@ -153,6 +154,14 @@ class SixteenSamples(SecondHalfIsTheFirst):
 
     def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
         return SampleMean.estimate(self, problem, theta, noise[:, :16])
+
+
+@dataclass(frozen=True)
+class UndeclaredCoupling(Sobol):
+    """Zeroth-order along quasi-random directions, which it does not declare."""
+
+    name = "undeclared_coupling"
+    couples_samples: ClassVar[bool] = False
 
 
 @dataclass(frozen=True)
@@ -619,6 +628,7 @@ PLANTED = {
     SecondHalfIsTheFirst: {"uses_every_sample"},
     RepeatsAreTheFirst: {"repeats_are_independent"},
     SixteenSamples: {"variance_falls_as_one_over_n"},
+    UndeclaredCoupling: {"variance_falls_as_one_over_n"},
     OwnSampleInBaseline: {"bias_is_as_declared"},
     OpenLoopScore: {"bias_under_action_feedback"},
     OwnNoise: {"shape_and_repeatability"},
