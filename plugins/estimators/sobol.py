@@ -22,9 +22,10 @@ class Sobol(Estimator):
     The v of a repeat are the first N points of the Sobol sequence with a random digital shift, mapped to the normal
     distribution (L'Ecuyer, Lemieux 2002). Each v is normally distributed, so the estimate is unbiased for any cost, and
     repeats are independent. Its variance can fall faster than 1 / N, as for other gradients by quasi-Monte Carlo
-    (Buchholz et al. 2018): the most for a smooth cost of few variables and N a power of 2. In many variables, or across
-    a jump of a cost of several variables, the gain over ``randomized_smoothing`` shrinks. The shift is the mean of the
-    repeat's noise, the only random number that it uses except for noise of the scene's own. Requires only costs.
+    (Buchholz et al. 2018): the most for a smooth cost of few variables and N a power of 2. At a jump the gain depends on
+    d: the variance is of order N^-2 for one variable, and about N^(-1 - 1/d) for a plane oblique to the axes, as it cuts
+    N^(1 - 1/d) of N cells. The shift is the mean of the repeat's noise, the only random number that it uses besides noise
+    of the scene's own. Requires only costs.
     """
 
     name = "sobol"

@@ -1,5 +1,6 @@
 """Zeroth-order estimators of low variance against closed forms, and against themselves when 5% too large."""
 
+from dataclasses import dataclass
 from unittest import mock
 
 import numpy as np
@@ -17,7 +18,7 @@ from bench.plugins.scenes.quadratic import Quadratic
 from scipy import stats
 
 import bench
-from bench.model import compose
+from bench.model import FunctionScene, compose, param
 
 ROUNDING = 1e-9
 """Relative rounding of a fit of 21 coefficients."""
@@ -213,8 +214,33 @@ def test_variance_along_quasi_random_directions_falls_faster_than_one_over_n(sce
     assert abs(plain + 1) < LIMIT * plain_error + 0.02
 
 
+@dataclass(frozen=True)
+class HalfSpace(FunctionScene):
+    """f = 1 where the sum of the d coordinates is above 0: theta is on the jump, whose plane is oblique to the axes."""
+
+    name = "half_space"
+    dimension: int = param(8, "d", positive=True)
+
+    def theta0(self):
+        return np.zeros(self.dimension)
+
+    def cost(self, xp, x):
+        return xp.where(xp.sum(x, axis=0) > 0, 1.0, 0.0)
+
+    def closed_form_gradient(self, contact, integrator):
+        return np.full(self.dimension, stats.norm.pdf(0.0) / (self.sigma * np.sqrt(self.dimension)))
+
+
+def test_across_an_oblique_jump_of_many_variables_quasi_random_directions_gain_little():
+    """A plane cuts about N^(1 - 1/d) of N cells of volume 1/N, whose errors are independent: variance N^(-1 - 1/d)."""
+    many, error = slope(Sobol(), HalfSpace(dimension=8))
+    assert -1 - 3 / 8 - LIMIT * error < many < -1 + LIMIT * error
+    one, other = slope(Sobol(), HalfSpace(dimension=1))
+    assert one + LIMIT * np.hypot(error, other) < many
+
+
 UNBIASED = [OptimalBaseline(), QuadraticModel(), Sobol()]
-ORACLES = [Cubic(dimension=2, sigma=0.5), Heaviside(theta=0.05)]
+ORACLES = [Cubic(dimension=2, sigma=0.5), Heaviside(theta=0.05), HalfSpace(dimension=3)]
 
 
 def bias_in_standard_errors(estimator, scene):
