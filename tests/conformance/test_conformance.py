@@ -54,7 +54,12 @@ PLUGINS = [entry.plugin for entry in ENTRIES if entry.plugin is not None]
 
 
 def _is_long(plugin: type[Plugin]) -> bool:
-    """Whether its checks take a minute or many: backends that compile each program for seconds, or run it eagerly."""
+    """Whether its checks take long: backends that compile each program for seconds, or run it eagerly.
+
+    A contact law with a surrogate gradient that solves equations is long too, and its motion is that of another law.
+    """
+    if getattr(plugin, "surrogate", False) and getattr(plugin, "needs_root", False):
+        return True
     return bool({"physics", "root"} & set(getattr(plugin, "provides", ()))) or bool(
         {"torch", "numba"} & set(plugin.requires)
     )
