@@ -530,7 +530,9 @@ def test_gradients_that_spread_too_widely_are_not_called_right():
     assert report.smoothed[0].best.name == "smoothing"
 
 
-@pytest.mark.parametrize(("height", "cause", "status"), [(0.01, "smooth", 0), (0.138, "spread", 3), (0.18, "biased", 1)])
+@pytest.mark.parametrize(
+    ("height", "cause", "status"), [(0.01, "smooth", 0), (0.138, "spread", 3), (0.18, "biased", 1)]
+)
 def test_gradient_is_usable_only_where_the_whole_interval_of_its_bias_is_below_the_limit(height, cause, status):
     """f = theta with a jump at one sigma: the gradient misses height phi(1) / sigma, which is 10% of grad J at .138."""
     report = bench.examine(
