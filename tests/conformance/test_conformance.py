@@ -286,6 +286,15 @@ class GradientOfAnotherLaw(Faulty):
     faulty = OtherLawProblem
 
 
+@dataclass(frozen=True)
+class ClaimsSurrogates(Faulty):
+    """Declares surrogate gradients and returns derivatives by differences."""
+
+    name = "claims_surrogates"
+    provides = Numpy.provides | {"surrogate"}
+    faulty = NumpyProblem
+
+
 class SofterProblem(NumpyProblem):
     def _grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         program = self.program
@@ -630,6 +639,7 @@ PLANTED = {
     RefusesEverything: {"something_was_checked"},
     GradientOfAnotherLaw: {"gradient_is_that_of_value"},
     HalfStiffnessGradient: {"gradient_is_that_of_value"},
+    ClaimsSurrogates: {"gradient_is_that_of_value"},
     GradientOfItsOwnTheta: {"gradient_is_that_of_value"},
     WrongScore: {"score_is_that_of_actions"},
     LeakyColumns: {"columns_are_independent", "value_agrees"},
