@@ -23,7 +23,7 @@ class HopperRun(PolicyScene, FrictionScene):
     and its angle a from straight down, positive forward, it pushes both apart with k (rest length - l) - b l' +
     ``thrust`` tanh(u_0). The hip turns the leg forward with ``torque`` tanh(u_1) - k_h (a - pitch), and the body
     backward, which is positive pitch. The foot meets the ground with Coulomb friction. An episode ends when the body is
-    below ``low`` or its pitch beyond ``tilt``.
+    below ``low`` or its pitch beyond ``tilt``; the step in which this happens changes with theta, so f has jumps.
 
     f = minus the sum of x' + h + 1 - (pitch / 30 deg)^2 - ``effort`` |tanh u|^2 over the states before each step. The
     height term h is d = z - low - ``margin`` up to 0.3 m, and -200 d^2 for negative d. These are the terms of the hopper
@@ -34,7 +34,7 @@ class HopperRun(PolicyScene, FrictionScene):
 
     name = "hopper_run"
     neglected_effects = "size of the foot, end stops, the leg's own mass, speed limits of the actuators"
-    continuous: ClassVar[bool] = True
+    continuous: ClassVar[bool] = False
     n_q: ClassVar[int] = 5
     n_u: ClassVar[int] = 2
     n_contacts: ClassVar[int] = 1
