@@ -221,9 +221,10 @@ def hidden() -> str:
 
 
 @cache
-def trained() -> pd.DataFrame:
-    """Return the runs of ``train``, with the problem and the method of each."""
-    return aggregate.runs_of(config.load(["experiment=train"]), rows_of("train"))
+def trained(experiment: str = "train") -> pd.DataFrame:
+    """Return the runs of an experiment with the study ``train``, with the problem and the method of each."""
+    loaded = config.load([f"experiment={experiment}"])
+    return aggregate.runs_of(loaded, rows_of(loaded.name))
 
 
 def trained_in_range(low: float, high: float) -> str:
@@ -232,7 +233,7 @@ def trained_in_range(low: float, high: float) -> str:
     return f"{((low <= final) & (final <= high)).sum()} of {len(final)}"
 
 
-def trained_table() -> str:
+def trained_table(experiment: str = "train") -> str:
     """Return the final return, steps and times by trainer as a Markdown table."""
     head = [
         "| trainer | final return | worst seed | control steps | training | compilation |",
@@ -241,11 +242,11 @@ def trained_table() -> str:
     return block(head + [
         f"| `{line['method']}` | {number(line['final'], 3)} [{number(line['final_low'], 3)}, {number(line['final_high'], 3)}] | "
         f"{number(line['worst'], 3)} | {count(line['steps'])} | {number(line['train_s'])} s | {number(line['compile_s'])} s |"
-        for line in aggregate.summarise(trained()).to_dict("records")
+        for line in aggregate.summarise(trained(experiment)).to_dict("records")
     ])  # fmt: skip
 
 
-def windows_table() -> str:
+def windows_table(experiment: str = "train") -> str:
     """Return gradient, bias and final return by the length of a window as a Markdown table."""
     head = [
         "| window [steps] | norm of its gradient | bias against a whole episode | runs with a bias above 0 | final return |",
@@ -255,7 +256,7 @@ def windows_table() -> str:
         f"| {line['window']:.0f} | {number(line['window_gradient'])} | "
         f"{number(line['bias'])} [{number(line['bias_low'])}, {number(line['bias_high'])}] | {line['resolved']} | "
         f"{number(line['final'], 3)} [{number(line['final_low'], 3)}, {number(line['final_high'], 3)}] |"
-        for line in aggregate.windows(trained()).to_dict("records")
+        for line in aggregate.windows(trained(experiment)).to_dict("records")
     ])  # fmt: skip
 
 
