@@ -260,6 +260,17 @@ def windows_table(experiment: str = "train") -> str:
     ])  # fmt: skip
 
 
+def faults_table(experiment: str) -> str:
+    """Return in how many runs of each trainer the log shows each fault, with the words of the first, as a Markdown table."""
+    runs = trained(experiment)
+    seeds = runs.groupby("method")["seed"].nunique()
+    named = aggregate.faults(runs).assign(code=lambda frame: [fault["code"] for fault in frame["fault"]])
+    return block(["| trainer | runs | the log of the first one |", "|---|--:|---|"] + [
+        f"| `{method}` | {len(part)} of {seeds[method]} | seed {part['seed'].iloc[0]}: {findings.describe(part['fault'].iloc[0])} |"
+        for (method, _), part in named.groupby(["method", "code"])
+    ])  # fmt: skip
+
+
 @cache
 def speeds() -> dict[str, float]:
     """Return the lines of the stored run of ``bench-self`` by name."""
@@ -499,6 +510,10 @@ FIGURES: dict[str, Callable[[], str]] = {
     "train-range": lambda: trained_in_range(-560.0, -480.0),
     "train-table": trained_table,
     "train-windows": windows_table,
+    "hopper-finding": lambda: findings.recommendation(aggregate.summarise(trained("train/hopper"))),
+    "hopper-table": lambda: trained_table("train/hopper"),
+    "hopper-windows": lambda: windows_table("train/hopper"),
+    "hopper-faults": lambda: faults_table("train/hopper"),
     "fits-hidden": hidden,
     "fits-bound": lambda: span(fits("error", "rk4", (0, 1))),
     "fits-coverage": lambda: span(100 * fits("coverage", "rk4", (0, 1)), suffix="%"),
