@@ -233,6 +233,12 @@ def trained_in_range(low: float, high: float) -> str:
     return f"{((low <= final) & (final <= high)).sum()} of {len(final)}"
 
 
+def final_return(line: dict[str, Any]) -> str:
+    """Return a final return with its interval, or without one where there are too few seeds."""
+    ends = f" [{number(line['final_low'], 3)}, {number(line['final_high'], 3)}]"
+    return number(line["final"], 3) + (ends if np.isfinite(line["final_low"]) else "")
+
+
 def trained_table(experiment: str = "train") -> str:
     """Return the final return, steps and times by trainer as a Markdown table."""
     head = [
@@ -240,7 +246,7 @@ def trained_table(experiment: str = "train") -> str:
         "|---" + "|--:" * 5 + "|",
     ]
     return block(head + [
-        f"| `{line['method']}` | {number(line['final'], 3)} [{number(line['final_low'], 3)}, {number(line['final_high'], 3)}] | "
+        f"| `{line['method']}` | {final_return(line)} | "
         f"{number(line['worst'], 3)} | {count(line['steps'])} | {number(line['train_s'])} s | {number(line['compile_s'])} s |"
         for line in aggregate.summarise(trained(experiment)).to_dict("records")
     ])  # fmt: skip
@@ -255,7 +261,7 @@ def windows_table(experiment: str = "train") -> str:
     return block(head + [
         f"| {line['window']:.0f} | {number(line['window_gradient'])} | "
         f"{number(line['bias'])} [{number(line['bias_low'])}, {number(line['bias_high'])}] | {line['resolved']} | "
-        f"{number(line['final'], 3)} [{number(line['final_low'], 3)}, {number(line['final_high'], 3)}] |"
+        f"{final_return(line)} |"
         for line in aggregate.windows(trained(experiment)).to_dict("records")
     ])  # fmt: skip
 
@@ -266,7 +272,7 @@ def faults_table(experiment: str) -> str:
     seeds = runs.groupby("method")["seed"].nunique()
     named = aggregate.faults(runs).assign(code=lambda frame: [fault["code"] for fault in frame["fault"]])
     return block(["| trainer | runs | the log of the first one |", "|---|--:|---|"] + [
-        f"| `{method}` | {len(part)} of {seeds[method]} | seed {part['seed'].iloc[0]}: {findings.describe(part['fault'].iloc[0])} |"
+        f"| `{method}` | {len(part)} of {seeds[method]} | seed {part['seed'].iloc[0]:.0f}: {findings.describe(part['fault'].iloc[0])} |"
         for (method, _), part in named.groupby(["method", "code"])
     ])  # fmt: skip
 
