@@ -53,10 +53,14 @@ PLUGINS = [entry.plugin for entry in ENTRIES if entry.plugin is not None]
 
 
 def _is_long(plugin: type[Plugin]) -> bool:
-    """Whether its checks take a minute or many: backends that compile each program for seconds, or run it eagerly."""
-    return bool({"physics", "root"} & set(getattr(plugin, "provides", ()))) or bool(
-        {"torch", "numba"} & set(plugin.requires)
+    """Whether its checks take a minute or many: backends that compile each program for seconds, or run it eagerly.
+
+    A rollout of ``hopper_run`` has 1,920 steps of the integrator.
+    """
+    slow_backend = {"physics", "root"} & set(getattr(plugin, "provides", ())) or {"torch", "numba"} & set(
+        plugin.requires
     )
+    return bool(slow_backend) or plugin.name == "hopper_run"
 
 
 @pytest.mark.parametrize("entry", ENTRIES, ids=lambda entry: f"{entry.kind}-{entry.name}")
