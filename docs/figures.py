@@ -157,6 +157,37 @@ def estimators(estimator: str, params: str = "", column: str = "rmse_rel", **con
     return rows[column]
 
 
+def equal_rollouts() -> pd.DataFrame:
+    """Return the relative RMSE of ``equal_rollouts`` at 128 rollouts with its interval, a row per setting, by problem."""
+    rows = select(rows_of("equal_rollouts"), status="ok")
+    rows = rows[rows["rollouts"].round() == N_ROLLOUTS]  # the centre's rollout is shared by all repeats
+    low, high = rmse_interval(rows)
+    rows = rows.assign(low=low, high=high)
+    settings = rows["estimator_params"].fillna("").str.replace("(.+)", r"[\1]", regex=True)
+    return rows.assign(setting=rows["estimator"] + settings)
+
+
+N_ROLLOUTS = 128
+"""Rollouts of one estimate at which zeroth-order estimators are compared."""
+
+
+def equal_rollouts_table() -> str:
+    """Return the relative RMSE of zeroth-order estimators at equal rollouts as a Markdown table."""
+    rows = equal_rollouts()
+    scenes = list(dict.fromkeys(rows["scene"]))
+    dims = rows.groupby("scene")["dim"].first()
+    head = [
+        "| estimator | samples | " + " | ".join(f"`{scene}`, d = {dims[scene]:.0f}" for scene in scenes) + " |",
+        "|---" + "|--:" * (1 + len(scenes)) + "|",
+    ]
+    lines = []
+    for setting, part in rows.groupby("setting", sort=False):
+        errors = part.set_index("scene").loc[scenes]
+        cells = [f"{number(row.rmse_rel)} [{number(row.low)}, {number(row.high)}]" for row in errors.itertuples()]
+        lines.append(f"| `{setting}` | {errors['samples'].iloc[0]:.0f} | " + " | ".join(cells) + " |")
+    return block(head + lines)
+
+
 def windows(params: str, scene: str = "") -> pd.DataFrame:
     """Return the supported rows of ``windows`` whose windows are shorter than the horizon, with some terminal value."""
     rows = rows_of("windows")
@@ -502,6 +533,7 @@ FIGURES: dict[str, Callable[[], str]] = {
     "difference-long": lambda: span(estimators("finite_difference", "step=0.1", problem=CONTACT)),
     "weights-contact": lambda: span(estimators("total_propagation", "per=action", problem=CONTACT)),
     "weights-jump": lambda: span(estimators("total_propagation", problem=JUMP)),
+    "equal-rollouts": equal_rollouts_table,
     "measure-samples": lambda: count(estimators("measure_valued", column="best").sum()),
     "window-bias": lambda: number(short_windows()["bias_rel"].min()),
     "window-hopper": lambda: number(windows("steps=100", "hopper")["bias_rel"].max()),

@@ -11,6 +11,7 @@ import pytest
 from bench.plugins.backends.numpy import Numpy, NumpyProblem
 from bench.plugins.contacts.penalty import Penalty
 from bench.plugins.contacts.softplus import Softplus
+from bench.plugins.estimators.sobol import Sobol
 from bench.plugins.integrators.explicit_euler import ExplicitEuler
 from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
 from bench.plugins.scenes.cubic import Cubic
@@ -53,14 +54,14 @@ PLUGINS = [entry.plugin for entry in ENTRIES if entry.plugin is not None]
 
 
 def _is_long(plugin: type[Plugin]) -> bool:
-    """Whether its checks take a minute or many: backends that compile each program for seconds, or run it eagerly.
+    """Whether its checks take long: backends that compile each program for seconds or run it eagerly, and two more.
 
-    A rollout of ``hopper_run`` has 1,920 steps of the integrator.
+    A rollout of ``hopper_run`` has 1,920 steps of the integrator, and ``surrogate_backward`` solves two equations each step.
     """
-    slow_backend = {"physics", "root"} & set(getattr(plugin, "provides", ())) or {"torch", "numba"} & set(
+    is_slow_backend = {"physics", "root"} & set(getattr(plugin, "provides", ())) or {"torch", "numba"} & set(
         plugin.requires
     )
-    return bool(slow_backend) or plugin.name == "hopper_run"
+    return bool(is_slow_backend) or plugin.name in ("hopper_run", "surrogate_backward")
 
 
 @pytest.mark.parametrize("entry", ENTRIES, ids=lambda entry: f"{entry.kind}-{entry.name}")
@@ -157,6 +158,14 @@ class SixteenSamples(SecondHalfIsTheFirst):
 
     def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
         return SampleMean.estimate(self, problem, theta, noise[:, :16])
+
+
+@dataclass(frozen=True)
+class UndeclaredCoupling(Sobol):
+    """Zeroth-order along quasi-random directions, which it does not declare."""
+
+    name = "undeclared_coupling"
+    couples_samples: ClassVar[bool] = False
 
 
 @dataclass(frozen=True)
@@ -632,6 +641,7 @@ PLANTED = {
     SecondHalfIsTheFirst: {"uses_every_sample"},
     RepeatsAreTheFirst: {"repeats_are_independent"},
     SixteenSamples: {"variance_falls_as_one_over_n"},
+    UndeclaredCoupling: {"variance_falls_as_one_over_n"},
     OwnSampleInBaseline: {"bias_is_as_declared"},
     OpenLoopScore: {"bias_under_action_feedback"},
     OwnNoise: {"shape_and_repeatability"},

@@ -11,6 +11,7 @@ from bench.plugins.backends.numpy import Numpy
 from bench.plugins.backends.torch import Torch
 from bench.plugins.estimators.alpha_order import AlphaOrder
 from bench.plugins.estimators.inverse_variance import InverseVariance
+from bench.plugins.estimators.optimal_baseline import OptimalBaseline
 from bench.plugins.estimators.reinforce import Reinforce
 from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
 from bench.plugins.scenes.cartpole import Cartpole
@@ -135,7 +136,9 @@ def test_backends_agree_on_score_and_explicit_derivative(scene):
         assert getattr(plain, name)(theta, w) == pytest.approx(exact, abs=DIFFERENCED * scale)
 
 
-@pytest.mark.parametrize("estimator", [Reinforce(), Reinforce(baseline="none"), Reinforce(baseline="leave_one_out")])
+@pytest.mark.parametrize(
+    "estimator", [Reinforce(), Reinforce(baseline="none"), Reinforce(baseline="leave_one_out"), OptimalBaseline()]
+)
 def test_reinforce_is_unbiased_where_theta_is_the_start(estimator):
     problem = Torch().compile(composed(Gusts()))
     w = noise.draw(3, "gusts", 64, 32, problem.program.n_noise, "explicit")

@@ -1,16 +1,21 @@
-"""straight_through: the motion of one law, the gradient of another, and words for it wherever it is shown."""
+"""Laws with the motion of one law and the gradient of another, and words for it wherever it is shown."""
 
 import numpy as np
 import pytest
+from bench.plugins.backends.implicit import Implicit
 from bench.plugins.backends.jax import Jax
 from bench.plugins.backends.numpy import Numpy
 from bench.plugins.backends.torch import Torch
+from bench.plugins.contacts.complementarity import Complementarity
 from bench.plugins.contacts.penalty import Penalty
 from bench.plugins.contacts.softplus import Softplus
 from bench.plugins.contacts.straight_through import StraightThrough
+from bench.plugins.contacts.surrogate_backward import SurrogateBackward
+from bench.plugins.estimators.control_variate import ControlVariate
 from bench.plugins.estimators.fobg import Fobg
 from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
 from bench.plugins.scenes.billiard import Billiard
+from bench.plugins.scenes.bounce_once import BounceOnce
 
 import bench
 from bench.measure.reference import certify
@@ -72,6 +77,54 @@ def test_differences_cannot_give_a_surrogate():
     program = compose(Billiard(horizon=5), StraightThrough(), SemiImplicitEuler())
     assert "surrogate" in Fobg().incompatibility(program, Numpy().provides, "numpy")
     assert Fobg().incompatibility(program, Jax().provides, "jax") is None
+
+
+NEAR = np.array([[0.101, 0.1001, 0.12], [-2.0, -1.0, 0.0], [0.0, 0.0, 0.0]])
+"""Heights, velocities and forces of balls of radius 0.1 that hit the ground in one step, nearly hit it, or miss it."""
+
+
+def ball(law, horizon=1):
+    return Implicit().compile(compose(BounceOnce(horizon=horizon), law, SemiImplicitEuler()))
+
+
+def test_a_rigid_motion_is_that_of_its_kappa_and_one_step_has_the_derivative_of_the_softer_kappa():
+    """After one step the cost is linear in the state, so its gradient is the step's derivative."""
+    law, still = SurrogateBackward(kappa=1e-7, soft_kappa=0.1), np.zeros((3, 3))
+    surrogate, hard, soft = (ball(law) for law in (law, Complementarity(kappa=1e-7), Complementarity(kappa=0.1)))
+    np.testing.assert_allclose(surrogate.value(NEAR, still), hard.value(NEAR, still), rtol=1e-12)  # compiled anew
+    found, expected, other = (problem.grad(NEAR, still) for problem in (surrogate, soft, hard))
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
+    assert (np.abs(found - other)[0] > 0.01).any()
+    wrong = ball(SurrogateBackward(kappa=1e-7, soft_kappa=0.105)).grad(NEAR, still)
+    assert np.abs(wrong - expected).max() > 1e-3  # an error of 5% in kappa is seen
+
+
+@pytest.mark.slow
+def test_a_rigid_law_with_equal_kappas_has_the_derivative_of_its_motion():
+    theta, still = np.array([[0.15, 0.3], [-2.0, -1.0], [0.0, 0.0]]), np.zeros((3, 2))
+    equal, plain = (
+        ball(law, 60) for law in (SurrogateBackward(kappa=1e-4, soft_kappa=1e-4), Complementarity(kappa=1e-4))
+    )
+    np.testing.assert_allclose(equal.grad(theta, still), plain.grad(theta, still), rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_control_variate_stays_unbiased_with_a_surrogate_gradient():
+    surrogate = ball(SurrogateBackward(soft_kappa=0.1), 60)
+    assert surrogate.program.surrogate
+    assert not Fobg().declares_unbiased(surrogate.program)
+    assert ControlVariate().declares_unbiased(surrogate.program)
+    theta = np.array([0.2, -1.0, 0.0])
+    w = np.random.default_rng(0).standard_normal((200, 32, 3))
+    estimates = ControlVariate().estimate(surrogate, theta, w)
+    samples = w.reshape(-1, 3).T
+    # without jumps, the first order of the motion's own law is unbiased, with an error far below that of the estimates
+    true = ball(Complementarity(kappa=1e-6), 60).grad(theta, samples)
+    bias = np.abs(estimates.mean(axis=0) - true.mean(axis=1))
+    assert (bias < 4.5 * estimates.std(axis=0) / np.sqrt(len(estimates))).all()
+    error = surrogate.grad(theta, samples) - true
+    standard_error = error.std(axis=1) / np.sqrt(samples.shape[1])
+    assert (np.abs(error.mean(axis=1)) > 4.5 * standard_error).any()  # the surrogate itself is biased
 
 
 def test_rows_tables_and_charts_say_it_in_words(tmp_path):

@@ -53,6 +53,7 @@ EL, EF, EX, ES, EG, EQ = (
 OF_PLAN, OF_MECHANISMS = "tests/examine/test_budget.py", "tests/examine/test_mechanisms.py"
 OF_EXAMINE = "-m not\\ slow tests/examine/test_examine.py --deselect tests/examine/test_examine.py::test_python_number_from_torch_is_disconnected_in_double_precision"
 OF_ESTIMATORS = "tests/plugins/test_weights.py tests/plugins/test_estimators.py"
+OF_VARIANCE = "tests/plugins/test_variance_reduction.py"
 
 FAULTS = [
     # quadrature
@@ -311,7 +312,14 @@ FAULTS = [
     Fault(X + "inverse_variance.py", "weight * first.mean(axis=1) + (1 - weight)", "(1 - weight) * first.mean(axis=1) + weight", OF_ESTIMATORS),
     Fault(X + "measure_valued.py", "np.sqrt(-2.0 * log_ndtr(w))", "np.sqrt(-log_ndtr(w))", OF_ESTIMATORS),
     Fault(X + "measure_valued.py", "np.sqrt(2.0 * np.pi)", "np.pi", OF_ESTIMATORS),
+    Fault(X + "optimal_baseline.py", "keepdims=True) - sums for sums", "keepdims=True) for sums", OF_VARIANCE),
+    Fault(X + "optimal_baseline.py", "product, square = terms * score, score**2", "product, square = terms / score, score / score", OF_VARIANCE),
     Fault(X + "orthogonal.py", "else np.sqrt(d)", "else 1.0", OF_ESTIMATORS),
+    Fault(X + "quadratic_model.py", "/ (1.0 - (q**2).sum(axis=2))", "", OF_VARIANCE),
+    Fault(X + "quadratic_model.py", "n * along - np.einsum(\"rnk,rn->rk\", q, errors)", "n * along", OF_VARIANCE),
+    Fault(X + "quadratic_model.py", "coefficients[:, 1 : d + 1]", "coefficients[:, :d]", OF_VARIANCE),
+    Fault(X + "sobol.py", "math.sqrt(count) * noise.mean", "noise.mean", OF_VARIANCE),
+    Fault(X + "sobol.py", "change * shift / (2.0 * s * s)", "change * shift / (s * s)", OF_VARIANCE),
     Fault(X + "randomized_smoothing.py", "* direction / (2 * s)", "* direction / s", OF_ESTIMATORS),
     Fault(X + "randomized_smoothing.py", "centre)) * direction / s", "centre)) * direction / (2 * s)", OF_ESTIMATORS),
     Fault(X + "randomized_smoothing.py", "self.radius != program.scene.sigma", "False", "tests/measure/test_unexplained.py"),

@@ -1,0 +1,39 @@
+"""Zeroth order with the baseline of lowest variance for each coordinate."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bench.model import Estimator, Problem, columns, per_repeat
+
+
+@dataclass(frozen=True)
+class OptimalBaseline(Estimator):
+    """Approximates grad J_sigma with the mean of (f - b_i) s_i, s the score, b_i = E[f s_i^2] / E[s_i^2].
+
+    b_i has the lowest variance of all constant baselines of coordinate i (Greensmith et al. 2004; Peters, Schaal 2008).
+    Each sample's b_i is computed from the other samples, so the result is unbiased for any cost. On a + g w + h w^2
+    with w standard normal, the variance per sample is 2 g^2 + 6 h^2 in units of 1 / sigma^2, against 2 g^2 + 10 h^2
+    with the mean of f as baseline. If theta also sets the initial state, the explicit derivative of f is added, and b_i
+    minimises the variance of the sum. Requires costs and scores, and at least 2 samples.
+    """
+
+    name = "optimal_baseline"
+    needs = frozenset({"value", "score"})
+    includes_explicit_derivative = True
+    unbiased_at_discontinuities = True
+
+    def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        """Return the mean of the terms over samples, ``(R, d)``; ValueError for fewer than 2 samples."""
+        if noise.shape[1] < 2:
+            raise ValueError(f"{self.name} needs at least 2 samples, got {noise.shape[1]}")
+        w = columns(noise)
+        f = per_repeat(problem.value(theta, w), noise)[..., None]
+        score = per_repeat(problem.score(theta, w), noise)
+        # a constant added to f is removed by every baseline, and a small f has smaller rounding errors
+        terms = (f - f.mean(axis=1, keepdims=True)) * score + per_repeat(problem.explicit(theta, w), noise)
+        product, square = terms * score, score**2
+        above, below = (sums.sum(axis=1, keepdims=True) - sums for sums in (product, square))
+        # without a score of another sample, any baseline is correct
+        baseline = np.divide(above, below, out=np.zeros_like(above), where=below > 0)
+        return np.asarray((terms - baseline * score).mean(axis=1))

@@ -1,0 +1,279 @@
+"""Zeroth-order estimators of low variance against closed forms, and against themselves when 5% too large."""
+
+from dataclasses import dataclass
+from unittest import mock
+
+import numpy as np
+import pytest
+from bench.plugins.backends.numpy import Numpy
+from bench.plugins.estimators.optimal_baseline import OptimalBaseline
+from bench.plugins.estimators.quadratic_model import QuadraticModel
+from bench.plugins.estimators.randomized_smoothing import RandomizedSmoothing
+from bench.plugins.estimators.reinforce import Reinforce
+from bench.plugins.estimators.sobol import Sobol, directions, points
+from bench.plugins.scenes.cubic import Cubic
+from bench.plugins.scenes.heaviside import Heaviside
+from bench.plugins.scenes.linear import Linear
+from bench.plugins.scenes.quadratic import Quadratic
+from scipy import stats
+
+import bench
+from bench.model import FunctionScene, compose, param
+
+ROUNDING = 1e-9
+"""Relative rounding of a fit of 21 coefficients."""
+UNLIKELY = 1e-4
+"""Probability below which samples have another distribution."""
+LIMIT = 4.5
+"""Standard errors within which a mean agrees with its expectation."""
+LEFT_OUT = 0.05
+"""Relative excess of the variance at 512 samples, as the baseline or model of each sample is itself an estimate."""
+
+
+def problem(scene):
+    return Numpy().compile(compose(scene))
+
+
+def drawn(repeats, samples, d, seed=0):
+    return np.random.default_rng(seed).standard_normal((repeats, samples, d))
+
+
+def estimates(estimator, scene, repeats=1500, samples=512, seed=0):
+    p = problem(scene)
+    return estimator.estimate(p, p.program.theta0, drawn(repeats, samples, p.dim, seed))
+
+
+def variances(estimator, scene, **sizes):
+    """Return the variance per sample of each coordinate times sigma^2, and its standard error."""
+    values = estimates(estimator, scene, **sizes) - scene.closed_form_gradient(None, None)
+    squares = values**2 * sizes.get("samples", 512) * scene.sigma**2
+    return squares.mean(axis=0), squares.std(axis=0) / np.sqrt(len(squares))
+
+
+def quadratic_variances(g, h, offset):
+    """Return N sigma^2 times the variance of (f - b) s_i for f = sum_j g_j w_j + h_j w_j^2, with b = E f - offset.
+
+    E[(offset + u_i + rest)^2 w_i^2] - g_i^2, u = g w + h (w^2 - 1), where E[w^4] = 3 and E[w^6] = 15.
+    """
+    rest = (g**2 + 2 * h**2).sum() - g**2 - 2 * h**2
+    return 2 * g**2 + 10 * h**2 + 4 * offset * h + offset**2 + rest
+
+
+def expansion(scene):
+    """Return g and h of a linear or quadratic scene whose x is theta + sigma w."""
+    if isinstance(scene, Linear):
+        return scene.sigma * scene.closed_form_gradient(None, None), np.zeros(scene.dimension)
+    curvature = scene.closed_form_gradient(None, None) / scene.theta0()
+    return scene.sigma * curvature * scene.theta0(), scene.sigma**2 * curvature / 2
+
+
+SCENES = [Linear(sigma=0.5, dimension=3), Quadratic(sigma=1.0, dimension=1), Quadratic(sigma=2.0, dimension=3)]
+
+
+@pytest.mark.parametrize("scene", SCENES, ids=["linear", "one variable", "quadratic"])
+@pytest.mark.parametrize("estimator", [OptimalBaseline(), Reinforce(baseline="leave_one_out")], ids=str)
+def test_baselines_have_their_closed_form_variance(scene, estimator):
+    g, h = expansion(scene)
+    # the best b_i is E[f w_i^2] = E f + 2 h_i
+    expected = quadratic_variances(g, h, -2 * h if isinstance(estimator, OptimalBaseline) else 0.0)
+    measured, error = variances(estimator, scene)
+    assert (measured > expected - LIMIT * error).all()
+    assert (measured < expected * (1 + LEFT_OUT) + LIMIT * error).all()
+
+
+def test_no_other_constant_baseline_has_a_lower_variance():
+    g, h = expansion(SCENES[2])
+    best = quadratic_variances(g, h, -2 * h)
+    for offset in np.linspace(-20, 20, 81):
+        assert (quadratic_variances(g, h, offset) >= best).all()
+    assert (quadratic_variances(g, h, 0.0) > 1.2 * best).any()
+
+
+def test_optimal_baseline_is_computed_from_the_other_samples():
+    scene = Quadratic(dimension=2)
+    p, w = problem(scene), drawn(3, 7, 2)
+    expected = np.zeros((3, 2))
+    for r in range(3):
+        f, s = p.value(p.program.theta0, w[r].T), w[r] / scene.sigma
+        for n in range(7):
+            others = np.arange(7) != n
+            b = (f[others, None] * s[others] ** 2).sum(axis=0) / (s[others] ** 2).sum(axis=0)
+            expected[r] += (f[n] - b) * s[n] / 7
+    np.testing.assert_allclose(OptimalBaseline().estimate(p, p.program.theta0, w), expected, rtol=ROUNDING)
+
+
+def test_a_constant_added_to_the_cost_does_not_change_the_optimal_baselines_estimate():
+    p, w = problem(Quadratic(dimension=2)), drawn(3, 7, 2)
+    plain = OptimalBaseline().estimate(p, p.program.theta0, w)
+    value = p.value
+    with mock.patch.object(p, "value", lambda theta, w: value(theta, w) + 1e6):
+        moved = OptimalBaseline().estimate(p, p.program.theta0, w)
+    np.testing.assert_allclose(moved, plain, rtol=1e-7)  # 1e6 leaves 10 digits of the cost
+
+
+def test_quadratic_model_has_no_error_on_a_quadratic_cost():
+    scene = Quadratic(dimension=5)
+    values = estimates(QuadraticModel(), scene, repeats=20, samples=46)
+    np.testing.assert_allclose(values, np.tile(scene.closed_form_gradient(None, None), (20, 1)), rtol=ROUNDING)
+
+
+@pytest.mark.parametrize(("samples", "block"), [(12, 256), (25, 256), (50, 256), (50, 20)])
+def test_quadratic_model_is_fitted_without_the_sample_it_is_subtracted_from(samples, block):
+    """Equals a fit for each sample by lstsq: of c, of g too, of the diagonal too, and of all of H."""
+    scene = Cubic(dimension=3, sigma=0.7)
+    p, w = problem(scene), drawn(2, samples, 3)
+    expected = np.zeros((2, 3))
+    for r in range(2):
+        f = p.value(p.program.theta0, w[r].T)
+        for part in np.array_split(np.arange(samples), -(-samples // block)):
+            x, room = [np.ones(len(part))], len(part) // 2 - 2
+            i, j = np.triu_indices(3, 1)
+            x += [*w[r, part].T] * (room >= 3) + [*w[r, part].T ** 2] * (room >= 6)
+            x += [*(w[r, part][:, i] * w[r, part][:, j]).T] * (room >= 9)
+            x = np.array(x).T
+            for n in range(len(part)):
+                others = np.arange(len(part)) != n
+                fit = np.linalg.lstsq(x[others], f[part][others], rcond=None)[0]
+                g = fit[1:4] if len(fit) > 1 else 0.0
+                expected[r] += ((f[part][n] - x[n] @ fit) * w[r, part[n]] + g) / (samples * scene.sigma)
+    values = QuadraticModel(block=block).estimate(p, p.program.theta0, w)
+    np.testing.assert_allclose(values, expected, rtol=ROUNDING)
+
+
+def test_quadratic_model_leaves_only_the_third_hermite_polynomial_of_a_cubic_cost():
+    """f = sigma^3 w^3 / 3 + lower powers: E[(w^3 - 3 w)^2 w^2] = 105 - 90 + 27 = 42."""
+    scene = Cubic(dimension=1, sigma=2.0)
+    expected = 42 * scene.sigma**6 / 9
+    (measured,), (error,) = variances(QuadraticModel(block=512), scene, repeats=6000)
+    excess = 0.1  # three coefficients from 512 samples, where errors of the model are largest far from the mean
+    assert expected - LIMIT * error < measured < expected * (1 + excess) + LIMIT * error
+    (plain,), (plain_error,) = variances(Reinforce(baseline="leave_one_out"), scene)
+    assert plain - LIMIT * plain_error > 1.5 * measured  # 96 / 42 for w^3 without lower powers
+
+
+def test_quadratic_model_explains_the_linear_part_of_a_jump():
+    """The correlation of a step with w is phi(0) / (1/2): its square is 2 / pi."""
+    p = problem(Heaviside())
+    _, decided = QuadraticModel().estimate_with_diagnostics(p, p.program.theta0, drawn(500, 256, 1))
+    error = decided["explained"].std() / np.sqrt(500)
+    assert decided["explained"].mean() == pytest.approx(2 / np.pi, abs=LIMIT * error + 4 / 256)  # 3 coefficients of 256
+
+
+def test_quadratic_model_of_few_samples_is_the_leave_one_out_mean():
+    scene = Linear(dimension=5)
+    model, plain = (
+        estimates(e, scene, repeats=9, samples=13) for e in (QuadraticModel(), Reinforce(baseline="leave_one_out"))
+    )
+    np.testing.assert_allclose(model, plain, rtol=ROUNDING)
+
+
+def test_every_quasi_random_direction_is_normal_and_those_of_a_repeat_differ():
+    v = directions(drawn(3000, 8, 2))
+    for n in range(8):
+        for i in range(2):
+            assert stats.kstest(v[:, n, i], "norm").pvalue > UNLIKELY
+        assert abs(np.corrcoef(v[:, n].T)[0, 1]) < LIMIT / np.sqrt(3000)
+    assert (np.diff(np.sort(v, axis=1), axis=1) > 0).all()
+
+
+def test_a_repeats_directions_have_one_in_each_of_n_equal_parts_of_every_coordinate():
+    v = directions(drawn(50, 64, 5))
+    parts = np.sort(np.floor(stats.norm.cdf(v) * 64), axis=1)
+    assert (parts == np.arange(64)[:, None]).all()
+
+
+def test_points_are_those_of_scipy():
+    sequence = stats.qmc.Sobol(3, scramble=False).random_base2(5)
+    np.testing.assert_array_equal(points(32, 3) / 2.0**52, sequence)
+    np.testing.assert_array_equal(points(20, 3), points(32, 3)[:20])
+
+
+def slope(estimator, scene, counts=(64, 256, 1024), repeats=128):
+    """Return the slope of log variance against log N with its standard error, from 8 groups."""
+    logs = []
+    for i, n in enumerate(counts):
+        values = estimates(estimator, scene, repeats=8 * repeats, samples=n, seed=i)
+        logs.append(np.log(values.reshape(8, repeats, -1).var(axis=1).sum(axis=-1)))
+    slopes = np.polyfit(np.log(counts), np.array(logs), 1)[0]
+    return slopes.mean(), slopes.std(ddof=1) / np.sqrt(8)
+
+
+@pytest.mark.parametrize(
+    ("scene", "steepest", "flattest"),
+    [
+        # bounds of the variance: N^-2 and steeper for two smooth variables, N^-2 for a jump of one
+        pytest.param(Cubic(dimension=2, sigma=0.3), -4.0, -1.5, id="smooth"),
+        pytest.param(Heaviside(theta=0.03), -2.3, -1.7, id="jump"),
+    ],
+)
+def test_variance_along_quasi_random_directions_falls_faster_than_one_over_n(scene, steepest, flattest):
+    measured, error = slope(Sobol(), scene)
+    assert steepest - LIMIT * error < measured < flattest + LIMIT * error
+    assert measured + LIMIT * error < -1
+    plain, plain_error = slope(RandomizedSmoothing(), scene)
+    assert abs(plain + 1) < LIMIT * plain_error + 0.02
+
+
+@dataclass(frozen=True)
+class HalfSpace(FunctionScene):
+    """f = 1 where the sum of the d coordinates is above 0: theta is on the jump, whose plane is oblique to the axes."""
+
+    name = "half_space"
+    dimension: int = param(8, "d", positive=True)
+
+    def theta0(self):
+        return np.zeros(self.dimension)
+
+    def cost(self, xp, x):
+        return xp.where(xp.sum(x, axis=0) > 0, 1.0, 0.0)
+
+    def closed_form_gradient(self, contact, integrator):
+        return np.full(self.dimension, stats.norm.pdf(0.0) / (self.sigma * np.sqrt(self.dimension)))
+
+
+def test_across_an_oblique_jump_of_many_variables_quasi_random_directions_gain_little():
+    """A plane cuts about N^(1 - 1/d) of N cells of volume 1/N, whose errors are independent: variance N^(-1 - 1/d)."""
+    many, error = slope(Sobol(), HalfSpace(dimension=8))
+    assert -1 - 3 / 8 - LIMIT * error < many < -1 + LIMIT * error
+    one, other = slope(Sobol(), HalfSpace(dimension=1))
+    assert one + LIMIT * np.hypot(error, other) < many
+
+
+UNBIASED = [OptimalBaseline(), QuadraticModel(), Sobol()]
+ORACLES = [Cubic(dimension=2, sigma=0.5), Heaviside(theta=0.05), HalfSpace(dimension=3)]
+
+
+def bias_in_standard_errors(estimator, scene):
+    values = estimates(estimator, scene, repeats=4000, samples=32)
+    bias = values.mean(axis=0) - scene.closed_form_gradient(None, None)
+    return float(np.max(np.abs(bias) / values.std(axis=0))) * np.sqrt(len(values))
+
+
+@pytest.mark.parametrize("estimator", UNBIASED, ids=str)
+@pytest.mark.parametrize("scene", ORACLES, ids=lambda scene: scene.name)
+def test_estimates_are_unbiased_and_not_if_5_percent_large(estimator, scene):
+    assert bias_in_standard_errors(estimator, scene) < LIMIT
+    method = "estimate_with_diagnostics" if isinstance(estimator, QuadraticModel) else "estimate"
+    original = getattr(type(estimator), method)
+
+    def large(self, *arguments):
+        result = original(self, *arguments)
+        return (1.05 * result[0], result[1]) if isinstance(result, tuple) else 1.05 * result
+
+    with mock.patch.object(type(estimator), method, large):
+        assert bias_in_standard_errors(estimator, scene) > LIMIT
+
+
+def test_too_few_samples_are_an_error_that_says_how_many_are_needed():
+    p = problem(Linear())
+    for estimator, needed in ((OptimalBaseline(), 2), (QuadraticModel(), 4)):
+        with pytest.raises(ValueError, match=f"{estimator.name} needs at least {needed} samples, got {needed - 1}"):
+            estimator.estimate(p, p.program.theta0, drawn(1, needed - 1, p.dim))
+
+
+def test_unsupported_programs_are_refused_with_a_reason():
+    policy = bench.problem("cartpole", backend="numpy").program
+    assert "noise on theta" in QuadraticModel().unsupported_reason(policy)
+    assert not Sobol().declares_unbiased(policy)
+    wide = compose(Linear(dimension=21202))
+    assert "21,201 coordinates" in Sobol().unsupported_reason(wide)
