@@ -300,8 +300,8 @@ def columns_are_independent(backend: Backend) -> str:
         for capability in sorted(backend.provides & {"value", "grad", "score"}):
             function = getattr(problem, capability)
             whole, other = function(theta, w), function(*with_changed_column(theta, w))
-            kept = np.arange(COLUMNS) != 2
-            off = distance(other[..., kept], whole[..., kept])
+            rest = np.arange(COLUMNS) != 2
+            off = distance(other[..., rest], whole[..., rest])
             require(off < DIFFERENCED, f"{capability} of {describe(program)}: a column changes others by {off:.1e}")
             off = max(off, distance(function(theta[:, ::-1], w[:, ::-1])[..., ::-1], whole))
             require(

@@ -63,7 +63,7 @@ def _left_out(w: np.ndarray, f: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the sum over samples of g without that sample, ``(R, d)``, and each sample's error without it, ``(R, n)``.
 
     With X = QU the features and e the residuals of the whole fit, the error of sample n is r_n = e_n / (1 - |Q_n|^2),
-    and its coefficients are those of the whole fit minus U^-1 Q_n r_n.
+    and its coefficients are the coefficients of the whole fit minus U^-1 Q_n r_n.
     """
     n, d = w.shape[1:]
     x = np.concatenate([np.ones((*w.shape[:2], 1)), *_features(w)], axis=2)
