@@ -252,9 +252,10 @@ def hidden() -> str:
 
 
 @cache
-def trained() -> pd.DataFrame:
-    """Return the runs of ``train``, with the problem and the method of each."""
-    return aggregate.runs_of(config.load(["experiment=train"]), rows_of("train"))
+def trained(experiment: str = "train") -> pd.DataFrame:
+    """Return the runs of an experiment with the study ``train``, with the problem and the method of each."""
+    loaded = config.load([f"experiment={experiment}"])
+    return aggregate.runs_of(loaded, rows_of(loaded.name))
 
 
 def trained_in_range(low: float, high: float) -> str:
@@ -263,20 +264,26 @@ def trained_in_range(low: float, high: float) -> str:
     return f"{((low <= final) & (final <= high)).sum()} of {len(final)}"
 
 
-def trained_table() -> str:
+def final_return(line: dict[str, Any]) -> str:
+    """Return a final return with its interval, or without one where there are too few seeds."""
+    ends = f" [{number(line['final_low'], 3)}, {number(line['final_high'], 3)}]"
+    return number(line["final"], 3) + (ends if np.isfinite(line["final_low"]) else "")
+
+
+def trained_table(experiment: str = "train") -> str:
     """Return the final return, steps and times by trainer as a Markdown table."""
     head = [
         "| trainer | final return | worst seed | control steps | training | compilation |",
         "|---" + "|--:" * 5 + "|",
     ]
     return block(head + [
-        f"| `{line['method']}` | {number(line['final'], 3)} [{number(line['final_low'], 3)}, {number(line['final_high'], 3)}] | "
+        f"| `{line['method']}` | {final_return(line)} | "
         f"{number(line['worst'], 3)} | {count(line['steps'])} | {number(line['train_s'])} s | {number(line['compile_s'])} s |"
-        for line in aggregate.summarise(trained()).to_dict("records")
+        for line in aggregate.summarise(trained(experiment)).to_dict("records")
     ])  # fmt: skip
 
 
-def windows_table() -> str:
+def windows_table(experiment: str = "train") -> str:
     """Return gradient, bias and final return by the length of a window as a Markdown table."""
     head = [
         "| window [steps] | norm of its gradient | bias against a whole episode | runs with a bias above 0 | final return |",
@@ -285,8 +292,19 @@ def windows_table() -> str:
     return block(head + [
         f"| {line['window']:.0f} | {number(line['window_gradient'])} | "
         f"{number(line['bias'])} [{number(line['bias_low'])}, {number(line['bias_high'])}] | {line['resolved']} | "
-        f"{number(line['final'], 3)} [{number(line['final_low'], 3)}, {number(line['final_high'], 3)}] |"
-        for line in aggregate.windows(trained()).to_dict("records")
+        f"{final_return(line)} |"
+        for line in aggregate.windows(trained(experiment)).to_dict("records")
+    ])  # fmt: skip
+
+
+def faults_table(experiment: str) -> str:
+    """Return in how many runs of each trainer the log shows each fault, with the words of the first, as a Markdown table."""
+    runs = trained(experiment)
+    seeds = runs.groupby("method")["seed"].nunique()
+    named = aggregate.faults(runs).assign(code=lambda frame: [fault["code"] for fault in frame["fault"]])
+    return block(["| trainer | runs | the log of the first one |", "|---|--:|---|"] + [
+        f"| `{method}` | {len(part)} of {seeds[method]} | seed {part['seed'].iloc[0]:.0f}: {findings.describe(part['fault'].iloc[0])} |"
+        for (method, _), part in named.groupby(["method", "code"])
     ])  # fmt: skip
 
 
@@ -530,6 +548,10 @@ FIGURES: dict[str, Callable[[], str]] = {
     "train-range": lambda: trained_in_range(-560.0, -480.0),
     "train-table": trained_table,
     "train-windows": windows_table,
+    "hopper-finding": lambda: findings.recommendation(aggregate.summarise(trained("train/hopper"))),
+    "hopper-table": lambda: trained_table("train/hopper"),
+    "hopper-windows": lambda: windows_table("train/hopper"),
+    "hopper-faults": lambda: faults_table("train/hopper"),
     "fits-hidden": hidden,
     "fits-bound": lambda: span(fits("error", "rk4", (0, 1))),
     "fits-coverage": lambda: span(100 * fits("coverage", "rk4", (0, 1)), suffix="%"),

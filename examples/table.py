@@ -25,7 +25,7 @@ from typing import Any
 HERE = Path(__file__).resolve().parent
 ORDER = (
     "nimble_ball", "newton_ball", "newton_cartpole", "brax_ball", "drake_ball", "genesis_ball", "taichi_ball", "warp_kernel", "mujoco_cube",
-    "gymnasium_cartpole", "jax_rollout", "torch_module", "numpy_loop",
+    "gymnasium_cartpole", "jax_rollout", "torch_module", "numpy_loop", "mpc",
 )  # fmt: skip
 LIMIT = 1800
 """Seconds for one example; the examples have budgets of their own."""

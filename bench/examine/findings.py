@@ -13,7 +13,7 @@ import numpy as np
 from bench.examine.diagnosis import NEAR, SUSPICIOUS, Horizon, grows, may_be_adaptive
 from bench.examine.gradient import recaused
 from bench.examine.lines import ALIKE, LineScan
-from bench.examine.smoothing import TARGET_ERROR, Method, Smoothed
+from bench.examine.smoothing import PAIRS, TARGET_ERROR, Method, Smoothed
 from bench.measure.gradcheck import FAULTS, MEANING, TRUSTED, VERDICTS, Check, Part
 from bench.model.simulator.simulator import Printed
 from bench.report.text import counted, duration, number
@@ -50,7 +50,7 @@ EXPLANATIONS = {
     "no_effect": "an input has no effect on the cost and is not in allow_zero: does it reach the simulator?",
     "jumps": "the gradient is right at theta, and misses jumps around it that no gradient sees",
     "biased": "each gradient is right, and their mean misses jumps",
-    "spread": "the gradients vary too widely to show whether their mean is grad J",
+    "spread": "the gradients vary too widely to show whether their mean is grad J within 10%",
     "unmeasured": "the budget ended before the noise of sigma was measured",
 }
 """The meaning of each cause for the simulator's author, with likely reasons."""
@@ -418,9 +418,11 @@ class Findings:
             if not one.defined:
                 problems.append(f"nonfinite: at sigma {number(one.sigma)} J is not defined: {one.remark}")
             if one.unshown:
+                low, high = one.bias_low / one.norm, one.bias_high / one.norm
                 problems.append(
-                    f"spread: at sigma {number(one.sigma)} the gradients vary so widely that {one.pairs} pairs do not show "
-                    "whether their mean is grad J: use costs, as the table recommends"
+                    f"spread: at sigma {number(one.sigma)} the bias of the mean gradient is {number(100 * low)} to "
+                    f"{number(100 * high)}% of grad J after {one.pairs} pairs, which does not show whether it is below "
+                    f"{100 * TARGET_ERROR:g}%"
                 )
             if one.biased:
                 low, high = one.bias_low / one.norm, one.bias_high / one.norm
@@ -760,8 +762,11 @@ class Findings:
                 f"{self._again('refined=COST')}, the cost at a tighter tolerance, and compare; "
                 f"or {self._again('expect=adaptive')} if it is known"
             )
+        costs = "estimate the gradient from costs (smoothing), as the table recommends for each sigma"
+        if cause == "spread" and any(one.unshown and one.pairs < PAIRS for one in self.smoothed):
+            return f"{self._again(longer)}: more pairs narrow the interval; or {costs}"
         if cause in ("biased", "jumps", "spread", "staircase"):
-            return "estimate the gradient from costs (smoothing), as the table recommends for each sigma"
+            return costs
         if cause == "nondeterministic":
             return "fix the seed, or pass the noise as w and set noise=N; reset states that persist between calls"
         if cause == "overwritten":
@@ -922,7 +927,7 @@ class Findings:
         if not one.known:
             return "unknown"
         low, high = 100 * one.bias_low / one.norm, 100 * one.bias_high / one.norm
-        if one.unshown:
+        if one.bias_high > one.norm and not one.biased:
             return "unknown: the gradients vary too widely"
         if low <= 0:
             return f"none seen, below {number(high)}%"

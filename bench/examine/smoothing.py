@@ -94,8 +94,8 @@ class Smoothed:
 
     @property
     def unshown(self) -> bool:
-        """Whether the bias interval is so wide that the bias may, but need not, exceed |grad J|."""
-        return self.known and not self.biased and bool(self.bias_high > self.norm)
+        """Whether the bias interval contains 10% of |grad J|, so that it shows neither a usable nor a biased gradient."""
+        return self.known and not self.biased and bool(self.bias_high > TARGET_ERROR * self.norm)
 
     @property
     def best(self) -> Method | None:

@@ -11,7 +11,7 @@ from bench.model import Contact, ImpulseLaw, Ops, State, param, stopped
 
 @dataclass(frozen=True)
 class SurrogateBackward(ImpulseLaw):
-    """Applies the impulses of ``complementarity`` at ``kappa``, with its derivatives at ``soft_kappa`` at the same states.
+    """Applies the impulses of ``complementarity`` at ``kappa``, but the derivatives at ``soft_kappa`` in the same states.
 
     Costs equal the costs of ``complementarity`` at kappa. The gradient is a surrogate, not the derivative of the
     program: each step is differentiated as if bodies pushed each other from a distance, so it is not 0 for bodies that

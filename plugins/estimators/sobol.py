@@ -53,7 +53,7 @@ class Sobol(Estimator):
 
 
 def directions(noise: np.ndarray) -> np.ndarray:
-    """Return quasi-random, standard normal directions ``(R, N, d)``: repeat r uses ``noise[r]`` only."""
+    """Return quasi-random, standard normal directions ``(R, N, d)``. Repeat r depends on ``noise[r]`` only."""
     from scipy.special import ndtr, ndtri
 
     count, d = noise.shape[1:]

@@ -54,15 +54,14 @@ PLUGINS = [entry.plugin for entry in ENTRIES if entry.plugin is not None]
 
 
 def _is_long(plugin: type[Plugin]) -> bool:
-    """Whether its checks take long: backends that compile each program for seconds, or run it eagerly.
+    """Whether its checks take long: backends that compile each program for seconds or run it eagerly, and two more.
 
-    A contact law with a surrogate gradient that solves equations is long too, and its motion is that of another law.
+    A rollout of ``hopper_run`` has 1,920 steps of the integrator, and ``surrogate_backward`` solves two equations each step.
     """
-    if getattr(plugin, "surrogate", False) and getattr(plugin, "needs_root", False):
-        return True
-    return bool({"physics", "root"} & set(getattr(plugin, "provides", ()))) or bool(
-        {"torch", "numba"} & set(plugin.requires)
+    is_slow_backend = {"physics", "root"} & set(getattr(plugin, "provides", ())) or {"torch", "numba"} & set(
+        plugin.requires
     )
+    return bool(is_slow_backend) or plugin.name in ("hopper_run", "surrogate_backward")
 
 
 @pytest.mark.parametrize("entry", ENTRIES, ids=lambda entry: f"{entry.kind}-{entry.name}")
@@ -298,6 +297,15 @@ class GradientOfAnotherLaw(Faulty):
 
     name = "gradient_of_another_law"
     faulty = OtherLawProblem
+
+
+@dataclass(frozen=True)
+class ClaimsSurrogates(Faulty):
+    """Declares surrogate gradients and returns derivatives by differences."""
+
+    name = "claims_surrogates"
+    provides = Numpy.provides | {"surrogate"}
+    faulty = NumpyProblem
 
 
 class SofterProblem(NumpyProblem):
@@ -645,6 +653,7 @@ PLANTED = {
     RefusesEverything: {"something_was_checked"},
     GradientOfAnotherLaw: {"gradient_is_that_of_value"},
     HalfStiffnessGradient: {"gradient_is_that_of_value"},
+    ClaimsSurrogates: {"gradient_is_that_of_value"},
     GradientOfItsOwnTheta: {"gradient_is_that_of_value"},
     WrongScore: {"score_is_that_of_actions"},
     LeakyColumns: {"columns_are_independent", "value_agrees"},

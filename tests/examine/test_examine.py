@@ -254,7 +254,8 @@ def under_noise(error, low, high):
         ({"smoothed": [under_noise(0.01, 0.2, 0.4)]}, "biased"),
         ({"smoothed": [under_noise(0.5, 0.2, 0.4)]}, "smooth"),
         ({"smoothed": [under_noise(0.01, 0.0, 2.0)]}, "spread"),
-        ({"smoothed": [under_noise(0.01, 0.0, 0.5)]}, "smooth"),
+        ({"smoothed": [under_noise(0.01, 0.06, 0.2)]}, "spread"),
+        ({"smoothed": [under_noise(0.01, 0.0, 0.09)]}, "smooth"),
     ],
 )
 def test_what_was_found_decides_the_cause_and_the_status(right, found, cause):
@@ -527,6 +528,18 @@ def test_gradients_that_spread_too_widely_are_not_called_right():
     )  # fmt: skip
     assert (report.status, report.cause) == (3, "spread")
     assert report.smoothed[0].best.name == "smoothing"
+
+
+@pytest.mark.parametrize(
+    ("height", "cause", "status"), [(0.01, "smooth", 0), (0.138, "spread", 3), (0.18, "biased", 1)]
+)
+def test_gradient_is_usable_only_where_the_whole_interval_of_its_bias_is_below_the_limit(height, cause, status):
+    """f = theta with a jump at one sigma: the gradient misses height phi(1) / sigma, which is 10% of grad J at .138."""
+    report = bench.examine(
+        lambda x: x[0] + height * (x[0] > 0.7), [1.0], grad=lambda x: [1.0], sigma=0.3, calls=20_000, progress=False
+    )
+    assert (report.cause, report.status) == (cause, status)
+    assert (": usable. " in str(report)) == (status == 0)
 
 
 def test_jumps_off_the_grid_of_steps_are_seen_by_the_integral():

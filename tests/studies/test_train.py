@@ -83,6 +83,13 @@ def test_a_fault_is_reported_in_words_with_its_run():
     assert set(table.frame["words"]) == {"NaN at update 7: the loss is not finite"}
 
 
+@pytest.mark.parametrize(("cosine_update", "count"), [([100, 300], 15), ([], 0)])
+def test_a_cut_gradient_is_a_fault_only_of_trainers_that_differentiate_the_simulation(cosine_update, count):
+    fault = json.dumps([{"code": "cut", "share": 1.0}])
+    experiment, rows = made_up(verdicts=fault, cosine_update=cosine_update, difference_error=np.nan)
+    assert len(aggregate.faults(aggregate.runs_of(experiment, rows))) == count
+
+
 def test_the_chart_of_logs_has_one_axis_of_steps_for_all_quantities():
     experiment, rows = made_up()
     chart = next(chart for chart in views(experiment, rows).charts if chart.name == "train_log")

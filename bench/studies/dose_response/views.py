@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pandas as pd
+from threadpoolctl import threadpool_limits
 
 from bench.experiment.axes import table as csv_table
 from bench.experiment.columns import Column, text
@@ -60,6 +61,12 @@ FIT_NOTES = (
 
 def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     """Return the findings, tables and charts."""
+    # in small problems, several threads of linear algebra wait for each other most of the time
+    with threadpool_limits(limits=1):
+        return _views(experiment, rows)
+
+
+def _views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     table = analysis.searches(rows)
     data = csv_table(experiment, rows)
     if table.empty or (table["kind"] == BEST).sum() == 0:

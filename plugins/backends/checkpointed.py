@@ -1,0 +1,125 @@
+"""JAX with a choice of what the backward pass keeps: everything, step Jacobians, or states at checkpoints."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import wraps
+from typing import Any
+
+import numpy as np
+
+from bench.model import Array, Ops, Problem, Program, Rollout, adjoint_gradient, param, slopes
+
+from . import rows
+from .jax import Jax, JaxOps, JaxProblem, use_double_precision
+
+
+@dataclass(frozen=True)
+class Checkpointed(Jax):
+    """Gradients as ``jax`` computes them, in less memory or in less time; float64 or float32; no root finder.
+
+    ``keep=everything`` keeps the results of all operations, as plain reverse mode through lax.scan does.
+    ``keep=jacobians`` keeps the states and their step Jacobians and multiplies adjoints by these. ``keep=states`` keeps
+    states and computes the steps between them again. With ``levels=1`` these are the states of all T steps, as on
+    ``jax``. With L levels the steps are cut into about T^(1/L) pieces, each piece into as many, and so on: about
+    L T^(1/L) states are kept at a time, and each step is computed L + 1 times (Griewank and Walther 2000 minimise the
+    number of computed steps for a given number of states, at the same order of growth).
+    """
+
+    name = "checkpointed"
+    provides = Jax.provides - {"surrogate"}
+    reference_rank = None
+
+    keep: str = param("states", "what the backward pass keeps", choices=("states", "everything", "jacobians"))
+    levels: int = param(2, "levels of checkpoints, for keep=states", positive=True)
+
+    def compile(self, program: Program) -> Problem:
+        """Return the program as jitted functions; each batch shape is compiled at its first call."""
+        return _CheckpointedProblem(program, self)
+
+    def ops(self) -> Ops:
+        """Return the operations for the model code."""
+        use_double_precision()
+        return _CheckpointedOps(self.levels if self.keep == "states" else 0)
+
+    def unsupported_reason(self, program: Program) -> str | None:
+        """Return why step Jacobians do not give the gradient, or None."""
+        if self.keep != "jacobians":
+            return None
+        if not isinstance(program, Rollout):
+            return f"{self.name}[keep=jacobians] needs time steps, and scene {program.scene.name} is a plain function"
+        if program.decision.names:
+            return f"{self.name}[keep=jacobians] differentiates by the scene's own theta, not by {list(program.decision.names)}"
+        return None
+
+
+class _CheckpointedOps(JaxOps):
+    """Operations of jax.numpy whose ``scan`` has some levels of checkpoints; with 0 levels everything is kept."""
+
+    def __init__(self, levels: int) -> None:
+        super().__init__()
+        self._levels = levels
+
+    def scan(self, step: Callable[[Any, Any], Any], carry: Any, xs: Any, length: int) -> Any:
+        """Return the last carry of nested lax.scans over rows."""
+        import jax
+
+        leaves, tree = jax.tree.flatten(carry)
+        inputs, input_tree = jax.tree.flatten(xs)
+
+        def flat(*arguments: Array) -> list[Array]:
+            state, x = arguments[: len(leaves)], arguments[len(leaves) :]
+            return jax.tree.leaves(step(jax.tree.unflatten(tree, state), jax.tree.unflatten(input_tree, x)))
+
+        traced = jax.make_jaxpr(flat)(*leaves, *(jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for x in inputs))
+
+        def body(state: list[Any], x: list[Any]) -> list[Any]:
+            return rows.evaluate(traced.jaxpr, traced.consts, [*state, *x])
+
+        split = [rows.split(x, axis=1) for x in inputs]
+        last = _nested(body, [rows.split(x) for x in leaves], split, length, self._levels)
+        return jax.tree.unflatten(tree, [rows.join(x) for x in last])
+
+
+def _nested(body: Callable[[Any, Any], Any], carry: Any, xs: Any, length: int, levels: int) -> Any:
+    """Return the last carry of ``body`` over ``length`` steps, whose backward pass keeps states at some levels."""
+    import jax
+
+    def scan(function: Callable[[Any, Any], Any], carry: Any, xs: Any, count: int) -> Any:
+        # within a scan XLA cannot merge the two evaluations, so common-subexpression elimination need not be prevented
+        one = jax.checkpoint(function, prevent_cse=False) if levels else function
+        return jax.lax.scan(lambda state, x: (one(state, x), None), carry, xs, count)[0]
+
+    if levels <= 1:
+        return scan(body, carry, xs, length)
+    size = math.ceil(length ** (1 - 1 / levels))
+    count = length // size
+    whole = jax.tree.map(lambda x: x[: count * size].reshape(count, size, *x.shape[1:]), xs)
+    carry = scan(lambda state, x: _nested(body, state, x, size, levels - 1), carry, whole, count)
+    rest = length - count * size
+    return _nested(body, carry, jax.tree.map(lambda x: x[count * size :], xs), rest, levels - 1) if rest else carry
+
+
+class _CheckpointedProblem(JaxProblem):
+    """A program of ``jax`` with executables of its own, whose gradient may come from step Jacobians."""
+
+    def __init__(self, program: Program, backend: Checkpointed) -> None:
+        super().__init__(program, backend.ops(), backend.dtype, backend.mode)
+        self._kept, self._levels = backend.keep, backend.levels
+
+    def _grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        if self._kept != "jacobians":
+            return super()._grad(theta, w)
+        shared = theta[:, 0] if theta.shape[1] == 1 else theta
+        return np.asarray(adjoint_gradient(self, slopes(self, shared, w)))
+
+    def _run(self, function: Callable[..., Any], theta: np.ndarray, w: np.ndarray) -> Any:
+        @wraps(function)
+        def named(*arguments: Array) -> Any:
+            return function(*arguments)
+
+        # executables are shared by the name of their function
+        named.__name__ = f"{function.__name__}_{self._kept}_{self._levels}"
+        return super()._run(named, theta, w)

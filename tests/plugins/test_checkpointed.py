@@ -1,0 +1,84 @@
+"""The backend checkpointed: the gradient of jax from what is kept, and memory that grows as its levels promise."""
+
+import math
+
+import numpy as np
+import pytest
+
+from bench.model import compose, registry
+
+pytest.importorskip("jax")
+
+from bench.plugins.backends.checkpointed import _nested
+
+SAME = 1e-12
+"""Relative difference allowed from JAX, which adds the same terms in another order."""
+DIFFERENCES = 1e-8
+"""Relative error of a pass over step Jacobians, whose derivatives of costs are central differences with a step of 1e-6."""
+BATCH = 256
+"""Rollouts, so that the states dominate the memory."""
+ORDERS = {0: 1.0, 1: 1.0, 2: 1 / 2, 3: 1 / 3}
+"""p in memory ~ T^p by levels of checkpoints."""
+ROUNDED = 0.06
+"""Error of p between 4,096 and 262,144 steps: some arrays of one step are kept at any horizon."""
+
+
+def problem(horizon, backend="checkpointed", scene="cartpole", **values):
+    """A cart-pole, or another scene, with a backend's parameters."""
+    plugin = registry.make("backends", backend, values)
+    parts = (
+        registry.make("scenes", scene, {"horizon": horizon}),
+        None,
+        registry.make("integrators", "semi_implicit_euler"),
+    )
+    return plugin.compile(compose(*parts))
+
+
+def gradient(one):
+    w = np.random.default_rng(0).standard_normal((one.program.n_noise, 3))
+    return one.grad(one.program.theta0, w)
+
+
+@pytest.mark.parametrize("horizon", [1, 7])
+def test_the_gradient_is_that_of_jax_whatever_is_kept(horizon):
+    expected = gradient(problem(horizon, "jax"))
+    for values in ({"keep": "everything"}, {"levels": 1}, {"levels": 2}, {"levels": 3}):
+        np.testing.assert_allclose(
+            gradient(problem(horizon, **values)), expected, rtol=SAME, atol=SAME * abs(expected).max()
+        )
+    by_jacobians = gradient(problem(horizon, keep="jacobians"))
+    np.testing.assert_allclose(by_jacobians, expected, rtol=0, atol=DIFFERENCES * abs(expected).max())
+
+
+@pytest.mark.parametrize("levels", ORDERS)
+def test_memory_grows_with_the_horizon_as_the_levels_promise(levels):
+    """In the compiler's own plan of its buffers, for x = x + sin(x) / T, whose derivative needs each x."""
+    import jax
+    import jax.numpy as jnp
+
+    def planned(steps):
+        def end(x):
+            return jnp.sum(_nested(lambda x, _: [x[0] + jnp.sin(x[0]) / steps], [x], None, steps, levels)[0])
+
+        compiled = jax.jit(jax.grad(end)).lower(jnp.ones(BATCH)).compile()
+        return compiled.memory_analysis().temp_size_in_bytes
+
+    short, long = planned(4096), planned(262144)
+    assert math.log(long / short) / math.log(64) == pytest.approx(ORDERS[levels], abs=ROUNDED)
+
+
+def test_backends_that_keep_something_else_share_no_executable():
+    counts = []
+    for values in ({"levels": 1}, {"levels": 2}, {"keep": "everything"}):
+        one = problem(3, **values)
+        gradient(one)
+        counts.append(one.compilations.shapes)
+    jax = problem(3, "jax")
+    gradient(jax)
+    assert len(set().union(*counts, jax.compilations.shapes)) == 4
+
+
+def test_a_plain_function_has_no_step_jacobians():
+    plugin = registry.make("backends", "checkpointed", {"keep": "jacobians"})
+    program = compose(registry.make("scenes", "quadratic"))
+    assert "needs time steps" in plugin.incompatibility(program)

@@ -1,0 +1,175 @@
+"""The running hopper: conserved quantities, rest on the ground, rewards, and gradients around touch-down."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from bench.plugins.scenes.hopper_run import HopperRun
+
+from bench.model import State, compose, registry
+from bench.model.ops import LoopOps
+
+jax.config.update("jax_enable_x64", True)
+
+EXACT = 1e-12
+"""Relative rounding error of a few hundred steps in float64."""
+DIFFERENCE = 1e-7
+"""Length of the change in central differences: truncation and rounding are both below :data:`AGREES`."""
+AGREES = 1e-4
+"""Relative error of central differences of a cost whose second derivative jumps at touch-down."""
+
+STEPS = 24
+"""Control steps that contain a touch-down and a lift-off."""
+
+
+def program_of(contact="penalty", law=None, **parameters):
+    scene = registry.make("scenes", "hopper_run", parameters)
+    law = registry.make("contacts", contact, {"stiffness": 1e4} | (law or {}))
+    return compose(scene, law, registry.make("integrators", "semi_implicit_euler"))
+
+
+def start_of(*, foot=0.1, speed=0.0, fall=0.0, angle=0.0, pitch=0.0, spin=0.0):
+    """Return one state with the leg at its rest length."""
+    q = [0.0, foot + 0.5 * np.cos(angle), pitch, 0.5 * np.sin(angle), foot]
+    return State(np.array(q)[:, None], np.array([speed, -fall, spin, speed, -fall])[:, None])
+
+
+def steps(program, state, count, u=0.0):
+    """Return the states before and after each of ``count`` control steps; ``u`` is a number or a function of the step."""
+    states = [state]
+    for t in range(count):
+        value = u(t) if callable(u) else u
+        states.append(program.step(LoopOps(), states[-1], np.zeros((2, 1)) + value))
+    return states
+
+
+def momentum(scene, state):
+    """Return total angular momentum about the centre of mass, positive as the leg swings forward."""
+    (x, z, _, foot_x, foot_z), (v_x, v_z, spin, w_x, w_z) = state.q[:, 0], state.v[:, 0]
+    reduced = scene.body_mass * scene.foot_mass / (scene.body_mass + scene.foot_mass)
+    return scene.inertia * spin + reduced * ((foot_x - x) * (w_z - v_z) - (foot_z - z) * (w_x - v_x))
+
+
+def energy(scene, stiffness, state):
+    """Return kinetic energy, and the energy of gravity, leg, hip and contact."""
+    q, v = state.q[:, 0], state.v[:, 0]
+    masses = np.array([scene.body_mass, scene.body_mass, scene.inertia, scene.foot_mass, scene.foot_mass])
+    length = np.hypot(q[3] - q[0], q[4] - q[1])
+    hip = np.arctan2(q[3] - q[0], q[1] - q[4]) - q[2]
+    weight = scene.gravity * (scene.body_mass * q[1] + scene.foot_mass * q[4])
+    springs = scene.leg_stiffness * (scene.leg - length) ** 2 + scene.hip_stiffness * hip**2
+    return 0.5 * (masses @ v**2 + springs + stiffness * min(q[4], 0.0) ** 2) + weight
+
+
+def test_flight_is_a_parabola_and_conserves_angular_momentum_under_any_actions():
+    program = program_of()
+    scene = program.scene
+    first = start_of(foot=2.0, speed=1.0, angle=0.3, pitch=-0.2, spin=0.5)
+    states = steps(program, first, 20, u=lambda t: np.array([[np.sin(t)], [np.cos(2 * t)]]))
+    assert min(state.q[4, 0] for state in states) > 0
+    share = scene.foot_mass / (scene.body_mass + scene.foot_mass)
+    n = 20 * scene.substeps
+    h = scene.dt / scene.substeps
+    for axis, fall in ((0, 0.0), (1, scene.gravity * h * h * n * (n + 1) / 2)):
+        centre = [(1 - share) * s.q[axis, 0] + share * s.q[axis + 3, 0] for s in states]
+        speed = first.v[axis, 0]
+        assert centre[-1] == pytest.approx(centre[0] + n * h * speed - fall, rel=EXACT)
+    assert momentum(scene, states[-1]) == pytest.approx(momentum(scene, first), rel=1e3 * EXACT)
+    assert abs(states[-1].v[2, 0] - 0.5) > 0.1  # the actions do turn the body
+
+
+def test_energy_is_conserved_through_a_bounce_in_the_limit_of_short_steps():
+    errors = []
+    for substeps in (50, 100):
+        program = program_of(substeps=substeps, leg_damping=0.0, friction=0.0)
+        states = steps(program, start_of(foot=0.05, fall=1.0, angle=0.1, spin=0.3), 25)
+        assert min(s.q[4, 0] for s in states) < -1e-3
+        values = [energy(program.scene, 1e4, s) for s in states]
+        errors.append(max(abs(value - values[0]) for value in values))
+    assert errors[1] < 0.6 * errors[0]  # first order: half
+    assert errors[1] < 0.02 * (values[0] - program.scene.gravity * 4.5 * 0.2)
+
+
+@pytest.mark.parametrize("stiffness", [1e3, 1e4])
+def test_the_foot_at_rest_sinks_by_the_weight_over_the_stiffness(stiffness):
+    program = program_of(law={"stiffness": stiffness, "damping": 200.0}, leg_damping=60.0, hip_stiffness=200.0)
+    last = steps(program, start_of(foot=0.0), 300)[-1]
+    assert -last.q[4, 0] == pytest.approx(4.5 * 9.81 / stiffness, rel=1e-6)
+    assert last.q[1, 0] - last.q[4, 0] == pytest.approx(0.5 - 4.0 * 9.81 / 1500.0, rel=1e-6)
+
+
+def test_friction_slows_a_sliding_foot_by_at_most_its_coefficient():
+    scene = HopperRun()
+    sliding = program_of().dynamics(LoopOps())
+    state = start_of(foot=-0.01, speed=5.0)
+    pushed = sliding.acceleration(state.q, state.v, np.zeros((2, 1)))
+    assert pushed[3, 0] == pytest.approx(-scene.friction * 100.0 / scene.foot_mass)  # 1e4 N/m times 0.01 m
+
+
+def test_rewards_are_the_sum_of_their_terms_and_0_after_the_end():
+    scene = HopperRun()
+    u = np.array([[100.0], [0.0]])  # a saturated leg and no hip
+    cost = partial(scene.stage_cost, np)
+
+    def reward(z, pitch, speed=2.0):
+        return -cost(np.array([[0.0], [z], [pitch], [0.0], [0.0]]), np.array([[speed], [0], [0], [0], [0.0]]), u)[0]
+
+    assert reward(0.5, 0.0) == pytest.approx(2.0 + 0.2 + 1.0 - 0.1)
+    assert reward(5.0, 0.0) == pytest.approx(2.0 + 0.3 + 1.0 - 0.1)
+    assert reward(0.25, 0.0) == pytest.approx(2.0 - 200 * 0.05**2 + 1.0 - 0.1)
+    assert reward(0.5, np.pi / 6) == pytest.approx(2.0 + 0.2 - 0.1)
+    assert reward(0.19, 0.0) == 0.0
+    assert reward(0.5, 1.21) == 0.0
+
+
+def test_random_starts_are_in_the_air_and_inside_their_ranges():
+    state = HopperRun().random_start(np, np.random.default_rng(0).standard_normal((10, 1000)))
+    length = np.hypot(state.q[3] - state.q[0], state.q[4] - state.q[1])
+    np.testing.assert_allclose(length, 0.5)
+    assert 0 <= state.q[4].min() < 0.01
+    assert 0.19 < state.q[4].max() <= 0.2
+    assert np.abs(state.q[2]).max() <= 0.1
+    assert np.abs(state.v).max() <= 0.5
+    assert not HopperRun().has_ended(np, state.q, state.v).any()
+
+
+def slopes(program, count):
+    """Return derivative and central difference of a cost after each of ``count`` steps by the height of the start."""
+    ops = registry.make("backends", "jax").ops()
+    first = start_of(foot=0.02, fall=0.6, speed=0.4, angle=0.1, pitch=0.05)
+    lifted = jnp.array([0.0, 1.0, 0.0, 0.0, 1.0])[:, None]
+    weights = jnp.array([0.3, 1.0, -0.5, 0.2, 0.7])[:, None]
+
+    @jax.jit
+    def step(state, u):
+        return program.step(ops, state, u)
+
+    def costs(height):
+        state = State(first.q + height * lifted, jnp.asarray(first.v))
+        values, gaps = [], []
+        for t in range(count):
+            state = step(state, jnp.array([[0.5 * np.sin(t)], [0.3]]))
+            values.append((weights * state.q).sum() + (0.1 * weights * state.v).sum())
+            gaps.append(state.q[4, 0])
+        return jnp.array(values), jnp.array(gaps)
+
+    (_, gaps), (derivative, _) = jax.jvp(costs, (0.0,), (1.0,))
+    high, low = costs(DIFFERENCE)[0], costs(-DIFFERENCE)[0]
+    return np.asarray(derivative), np.asarray(high - low) / (2 * DIFFERENCE), np.asarray(gaps)
+
+
+def test_the_gradient_equals_differences_before_in_and_after_the_step_of_touch_down():
+    derivative, difference, gap = slopes(program_of(substeps=2), STEPS)
+    touch_down = int(np.flatnonzero(gap < 0)[0])
+    lift_off = touch_down + int(np.flatnonzero(gap[touch_down:] > 0)[0])
+    assert 0 < touch_down < lift_off < STEPS - 1
+    np.testing.assert_allclose(derivative, difference, rtol=AGREES)
+
+
+def test_a_gradient_without_the_contact_force_is_caught():
+    derivative, difference, gap = slopes(program_of("straight_through", {"backward": "none"}, substeps=2), STEPS)
+    touch_down = int(np.flatnonzero(gap < 0)[0])
+    np.testing.assert_allclose(derivative[:touch_down], difference[:touch_down], rtol=AGREES)
+    assert abs(derivative[-1] / difference[-1] - 1) > 100 * AGREES

@@ -1,0 +1,174 @@
+"""The study of backward passes: peaks in processes of their own, their growth along the horizon, and what it says of them."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from bench.errors import Crashed
+from bench.experiment import config
+from bench.experiment.grid import cells
+from bench.studies.backward_memory import views
+from bench.studies.backward_memory.measure import in_process, spread
+
+CLOSE = 0.03
+"""Relative error of a peak: the interpreter allocates beside the planted array."""
+PLANTED_MB = 64
+PLUGIN = f'''
+"""NumPy with a planted array in each gradient, or a planted end of the process."""
+
+import os
+from dataclasses import dataclass
+
+import numpy as np
+
+from bench.plugin import param
+from bench.plugins.backends.numpy import Numpy, NumpyProblem
+
+
+@dataclass(frozen=True)
+class Greedy(Numpy):
+    """Gradients: those of numpy."""
+
+    name = "greedy"
+    reference_rank = None
+
+    ends: bool = param(False, "whether the process ends")
+
+    def compile(self, program):
+        """Return the problem."""
+        return GreedyProblem(program, self.dtype, 1e-6, self.ends)
+
+
+class GreedyProblem(NumpyProblem):
+    """Fills an array."""
+
+    def __init__(self, program, dtype, step, ends):
+        super().__init__(program, dtype, step)
+        self.ends = ends
+
+    def _grad(self, theta, w):
+        if self.ends:
+            os._exit(3)
+        planted = np.ones({PLANTED_MB} << 17)
+        return super()._grad(theta, w) + 0.0 * planted[0]
+'''
+WORDS = ("study=backward_memory", "scenes=[mass_spring]", "scene.mass_spring.horizon=2", "samples=4")
+
+
+@pytest.fixture(scope="module")
+def greedy(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("greedy") / "backends"
+    folder.mkdir()
+    (folder / "greedy.py").write_text(PLUGIN)
+    return [
+        cells(config.load([*WORDS, f"plugins={folder}", f"backends=['greedy[ends={ends}]']"]))[0]
+        for ends in ("false", "true")
+    ]
+
+
+def test_a_planted_array_is_the_peak_of_each_call(greedy):
+    answer = in_process(greedy[0], 6, None)
+    assert answer["peaks"] == pytest.approx([PLANTED_MB] * 6, rel=CLOSE)
+    assert len(answer["seconds"]) == 6
+    assert min(answer["before"]) > 20, "an interpreter with NumPy"
+
+
+def test_the_end_of_the_process_is_a_crash(greedy):
+    with pytest.raises(Crashed, match="exit status 3"):
+        in_process(greedy[1], 6, None)
+
+
+def test_an_error_in_the_process_is_the_cells_status(greedy):
+    cell = replace(greedy[0], parts={**greedy[0].parts, "scene": None})
+    assert in_process(cell, 6, None)["status"] == "error"
+
+
+def test_the_range_of_six_calls_covers_a_median():
+    draws = np.random.default_rng(0).exponential(size=(4000, 6))
+    ends = [spread("x", list(row)) for row in draws]
+    covered = np.mean([one["x_low"] <= math.log(2) <= one["x_high"] for one in ends])
+    assert covered == pytest.approx(1 - 2**-5, abs=0.01), "closed form, and four standard errors of 4,000 draws"
+
+
+# ----------------------------------------------------------------------------------------------------- views
+
+
+def rows(times=(1.0, 2.0, 1.5), apart=0.1, error=1e-13):
+    """An experiment, and rows of three backends at three horizons: memory T, T / 10, and the root of T."""
+    given = config.load(
+        [
+            "study=backward_memory",
+            "scenes=[mass_spring]",
+            "backends=[jax,torch,fused]",
+            "sweep.horizon=[100,1000,10000]",
+        ]
+    )
+    lines = []
+    for cell in cells(given):
+        steps, name = cell.scene.horizon, cell.backend.name
+        memory = {"jax": steps, "torch": steps / 10, "fused": math.sqrt(steps)}[name]
+        seconds = dict(zip(("jax", "torch", "fused"), times, strict=True))[name]
+        lines.append(given.columns.blank() | cell.columns() | {
+            "experiment": given.name, "status": "ok", "compared_with": "jax", "gradient_error_rel": error,
+            **spread("memory_mb", [memory * 0.99, memory, memory * 1.01]),
+            **spread("gradient_s", [seconds * (1 - apart), seconds, seconds * (1 + apart)]),
+        })  # fmt: skip
+    return given, given.columns.typed(pd.DataFrame(lines))
+
+
+def test_orders_and_ratios_at_the_longest_horizon_are_those_of_the_memory():
+    table = views.views(*rows()).tables[0].frame
+    assert list(table["method"]) == ["jax", "torch", "fused"]
+    assert list(table["order"]) == pytest.approx([1.0, 1.0, 0.5])
+    assert list(table["less"]) == pytest.approx([1.0, 10.0, 100.0])
+    assert (table["order_low"] < table["order"]).all()
+    assert (table["order"] < table["order_high"]).all()
+    assert list(table["longer"]) == pytest.approx([1.0, 2.0, 1.5])
+
+
+def test_findings_state_ratios_with_intervals():
+    least, fastest, same = views.views(*rows()).findings
+    assert least == (
+        "At T = 10,000, on mass_spring fused needs 100 [98, 100] times less memory than jax at 1.5 [1.2, 1.8] times its time."
+    )
+    assert fastest == "The fastest there is jax on mass_spring."
+    assert same.startswith("All 9 gradients agree with jax within 1e-6")
+
+
+def test_overlapping_times_leave_the_fastest_open():
+    assert (
+        views.views(*rows(apart=0.4)).findings[1] == "The fastest there is jax or torch or fused (open) on mass_spring."
+    )
+
+
+def test_a_gradient_that_differs_is_counted():
+    given, table = rows()
+    table.loc[4, "gradient_error_rel"] = 0.5
+    found = views.views(given, table).findings[2]
+    assert found.startswith("8 of 9 gradients agree")
+    assert "0.50 (torch, mass_spring, T = 1,000)" in found
+
+
+def test_memory_below_the_resolution_is_an_upper_limit_without_an_order():
+    given, table = rows()
+    columns = ["memory_mb", "memory_mb_low", "memory_mb_high"]
+    table.loc[table["backend"] == "fused", columns] = 0.01
+    shown = views.views(given, table)
+    line = shown.tables[0].frame.set_index("method").loc["fused"]
+    assert math.isnan(line["order"])
+    assert line["less"] == pytest.approx(10000 / views.FLOOR)
+    drawn = shown.charts[0].plotted()
+    assert drawn["is_small"].sum() == 3
+    assert drawn["memory_mb"].min() == views.FLOOR
+
+
+def test_backends_without_gradients_are_refused():
+    given = config.load(["study=backward_memory", "scenes=[mass_spring]", "backends=[numpy]"])
+    (cell,) = cells(given)
+    blind = replace(cell.backend)
+    object.__setattr__(blind, "provides", frozenset({"value"}))
+    assert given.study.unsupported_reason(cell) is None
+    assert "computes no gradients" in given.study.unsupported_reason(cell.with_part("backend", blind))
