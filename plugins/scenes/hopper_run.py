@@ -21,9 +21,10 @@ class HopperRun(PolicyScene, FrictionScene):
 
     q = (x, z, pitch) of the body and (x, z) of the foot. The leg joins the body's centre to the foot. With its length l
     and its angle a from straight down, positive forward, it pushes both apart with k (rest length - l) - b l' +
-    ``thrust`` tanh(u_0). The hip turns the leg forward with ``torque`` tanh(u_1) - k_h (a - pitch), and the body
-    backward, which is positive pitch. The foot meets the ground with Coulomb friction. An episode ends when the body is
-    below ``low`` or its pitch beyond ``tilt``; the step in which this happens changes with theta, so f has jumps.
+    ``thrust`` tanh(u_0). The hip turns the leg forward with the torque ``torque`` tanh(u_1) - k_h (a - pitch), and the
+    body with the opposite one. Positive pitch leans backward. The foot meets the ground with Coulomb friction. An
+    episode ends when the body is below ``low`` or its pitch beyond ``tilt``; the step in which this happens changes
+    with theta, so f has jumps.
 
     f = minus the sum of x' + h + 1 - (pitch / 30 deg)^2 - ``effort`` |tanh u|^2 over the states before each step. The
     height term h is d = z - low - ``margin`` up to 0.3 m, and -200 d^2 for negative d. These are the terms of Xu et al.
