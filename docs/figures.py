@@ -298,12 +298,13 @@ def windows_table(experiment: str = "train") -> str:
 
 
 def faults_table(experiment: str) -> str:
-    """Return in how many runs of each trainer the log shows each fault, with the words of the first, as a Markdown table."""
+    """Return per trainer and fault the number of runs whose log shows it, with the words of the first, as Markdown."""
     runs = trained(experiment)
     seeds = runs.groupby("method")["seed"].nunique()
     named = aggregate.faults(runs).assign(code=lambda frame: [fault["code"] for fault in frame["fault"]])
     return block(["| trainer | runs | the log of the first one |", "|---|--:|---|"] + [
-        f"| `{method}` | {len(part)} of {seeds[method]} | seed {part['seed'].iloc[0]:.0f}: {findings.describe(part['fault'].iloc[0])} |"
+        f"| `{method}` | {len(part)} of {seeds[method]} | "
+        f"seed {part['seed'].iloc[0]:.0f}: {findings.describe(part['fault'].iloc[0])} |"
         for (method, _), part in named.groupby(["method", "code"])
     ])  # fmt: skip
 

@@ -21,14 +21,15 @@ class HopperRun(PolicyScene, FrictionScene):
 
     q = (x, z, pitch) of the body and (x, z) of the foot. The leg joins the body's centre to the foot. With its length l
     and its angle a from straight down, positive forward, it pushes both apart with k (rest length - l) - b l' +
-    ``thrust`` tanh(u_0). The hip turns the leg forward with ``torque`` tanh(u_1) - k_h (a - pitch), and the body
-    backward, which is positive pitch. The foot meets the ground with Coulomb friction. An episode ends when the body is
-    below ``low`` or its pitch beyond ``tilt``; the step in which this happens changes with theta, so f has jumps.
+    ``thrust`` tanh(u_0). The hip turns the leg forward with the torque ``torque`` tanh(u_1) - k_h (a - pitch), and the
+    body with the opposite one. Positive pitch leans backward. The foot meets the ground with Coulomb friction. An
+    episode ends when the body is below ``low`` or its pitch beyond ``tilt``; the step in which this happens changes
+    with theta, so f has jumps.
 
     f = minus the sum of x' + h + 1 - (pitch / 30 deg)^2 - ``effort`` |tanh u|^2 over the states before each step. The
-    height term h is d = z - low - ``margin`` up to 0.3 m, and -200 d^2 for negative d. These are the terms of the hopper
-    of Xu et al. 2022 (arXiv 2204.07137, appendix), with lengths of this body. It starts in the air with its foot up to
-    0.2 m above the ground, pitch and leg angle in +-0.1, x' and z' in +-0.5 m/s, each uniform.
+    height term h is d = z - low - ``margin`` up to 0.3 m, and -200 d^2 for negative d. These are the terms of Xu et al.
+    2022 for their hopper (arXiv 2204.07137, appendix), with lengths of this body. It starts in the air with its foot up
+    to 0.2 m above the ground, pitch and leg angle in +-0.1, x' and z' in +-0.5 m/s, each uniform.
     Observation (z, l - rest length, foot's z, pitch, a - pitch, and the rates z', l', x', pitch', a' - pitch').
     """
 
@@ -136,7 +137,7 @@ class HopperRun(PolicyScene, FrictionScene):
         return 0.0 * q[0]
 
     def _leg(self, xp: Any, q: Array, v: Array) -> tuple[Array, Array, tuple[Array, Array], tuple[Array, Array]]:
-        """Return the leg's length and angle, its direction, and the foot's velocity from the body along and across it."""
+        """Return the leg's length, angle, direction, and the foot's velocity from the body along and across it."""
         x, z, v_x, v_z = q[3] - q[0], q[4] - q[1], v[3] - v[0], v[4] - v[1]
         length = xp.sqrt(x**2 + z**2)
         x, z, angle = x / length, z / length, xp.atan2(x, -z)

@@ -77,9 +77,8 @@ def test_shac_learns_to_run_by_hopping():
     assert np.median(run.returns(state, numbers)) > 500
 
     def step(episodes, _):
-        moved = env.step(
-            episodes, trainer.action(env, state, env.observe(episodes.state)), jnp.zeros((env.n_start, 64))
-        )
+        action = trainer.action(env, state, env.observe(episodes.state))
+        moved = env.step(episodes, action, jnp.zeros((env.n_start, 64), env.dtype))
         return moved.next, (episodes.state.q, moved.ended)
 
     first = env.start(jnp.asarray(numbers, "float32"))
