@@ -90,6 +90,8 @@ Beside the files of [every run](reading-results.md#files), each study writes its
 - `gradient_check.csv`: one line per check and step size. `gradient_components.csv`: one line per component of theta.
 - `twins.csv`: differences between an engine's model of a scene and the scene's own program, and their times.
 - `engines.csv`: one line per engine and scene: errors, statistics, times and memory of its gradients.
+- `backward_memory.csv`: one line per cell. `backward_memory_methods.csv`: per problem and method, at the longest horizon, memory and
+  processor time, their ratios to the first method, and the order p of memory ~ T^p between the two longest horizons.
 - `optimise.csv`: one line per search. `summary.csv`: per method the score with its interval, the probability of beating the
   baseline, and the share of targets reached in time. `targets.csv`: per problem, method and target (the first regret over
   10, 100 and 1,000) the successes with Wilson's interval and the average runtime in rollouts. The runtime includes failed

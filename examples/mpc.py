@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from scipy.optimize import minimize
 
 jax.config.update("jax_enable_x64", True)
-STEPS, LIMIT, stop = 12, 5.0, jax.lax.stop_gradient  # near upright; states (position, angle, rates) at steps of 0.1 s
+STEPS, LIMIT, stop = 12, 3.0, jax.lax.stop_gradient  # near upright; states (position, angle, rates) at steps of 0.1 s
 A = jnp.eye(4) + 0.1 * jnp.array([[0, 0, 1, 0], [0, 0, 0, 1], [0, -0.981, 0, 0], [0, 21.582, 0, 0]])
 PATH = jnp.linalg.inv(jnp.eye(4 * STEPS) - jnp.kron(jnp.eye(STEPS, k=-1), A))  # states = FORCED forces + FREE start
 FORCED, FREE = PATH @ jnp.kron(jnp.eye(STEPS), jnp.array([[0.0], [0.0], [0.1], [-0.2]])), PATH[:, :4] @ A

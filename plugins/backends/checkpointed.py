@@ -107,10 +107,10 @@ class _CheckpointedProblem(JaxProblem):
 
     def __init__(self, program: Program, backend: Checkpointed) -> None:
         super().__init__(program, backend.ops(), backend.dtype, backend.mode)
-        self._kept, self._levels = backend.keep, backend.levels
+        self._keep, self._levels = backend.keep, backend.levels
 
     def _grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        if self._kept != "jacobians":
+        if self._keep != "jacobians":
             return super()._grad(theta, w)
         shared = theta[:, 0] if theta.shape[1] == 1 else theta
         return np.asarray(adjoint_gradient(self, slopes(self, shared, w)))
@@ -121,5 +121,5 @@ class _CheckpointedProblem(JaxProblem):
             return function(*arguments)
 
         # executables are shared by the name of their function
-        named.__name__ = f"{function.__name__}_{self._kept}_{self._levels}"
+        named.__name__ = f"{function.__name__}_{self._keep}_{self._levels}"
         return super()._run(named, theta, w)

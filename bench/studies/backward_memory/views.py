@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
+from bench.experiment import grid
 from bench.experiment.columns import Column, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Style, Table, Views
@@ -67,6 +68,9 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     good = shown.rows[(shown.rows["status"] == "ok") & shown.rows["memory_mb"].notna()]
     if good.empty:
         return Views(["No cell gave a result: the table has the reason of each."], [cells], remarks=reasons(rows))
+    # the first method is the experiment's first, in whatever order rows were stored
+    places = {cell.key: place for place, cell in enumerate(grid.cells(experiment))}
+    good = good.iloc[good["key"].map(places).fillna(len(places)).to_numpy().argsort(kind="stable")]
     over = axes_of(shown, "horizon")
     good = good.assign(
         problem=problem_names(shown, ["scene", "contact", "integrator"], over, always=["scene"], rows=good),
