@@ -188,6 +188,40 @@ def equal_rollouts_table() -> str:
     return block(head + lines)
 
 
+def backward_memory() -> pd.DataFrame:
+    """Return memory and time of each method of ``backward_memory`` at its longest horizon, the first scene first."""
+    return pd.read_csv(STANDARD / "backward_memory" / "backward_memory_methods.csv")
+
+
+def backward_memory_table() -> str:
+    """Return memory, its growth and time of a long backward pass by method and scene as a Markdown table."""
+    lines = backward_memory()
+    scenes = list(dict.fromkeys(lines["problem"]))
+    head = [
+        "| backend | " + " | ".join(f"`{scene}`: MB | p | seconds" for scene in scenes) + " |",
+        "|---" + "|--:" * (3 * len(scenes)) + "|",
+    ]
+    return block(head + [
+        f"| `{method}` | " + " | ".join(
+            f"{number(row.memory_mb)} | {number(row.order) if np.isfinite(row.order) else '-'} | {number(row.gradient_s)}"
+            for row in part.set_index("problem").loc[scenes].itertuples()
+        ) + " |"
+        for method, part in lines.groupby("method", sort=False)
+    ])  # fmt: skip
+
+
+def backward_memory_finding() -> str:
+    """Return what two levels of checkpoints save on the first scene."""
+    lines = backward_memory().drop_duplicates(["problem", "method"]).set_index(["problem", "method"])
+    scene = lines.index[0][0]
+    plain, two = (lines.loc[(scene, name)] for name in ("checkpointed[keep=everything]", "checkpointed"))
+    return (
+        f"At T = {count(two['horizon'])}, two levels of checkpoints take {number(two['memory_mb'])} MB and "
+        f"{number(two['gradient_s'])} s for 256 gradients of `{scene}`, where plain reverse mode takes "
+        f"{number(plain['memory_mb'])} MB and {number(plain['gradient_s'])} s."
+    )
+
+
 def windows(params: str, scene: str = "") -> pd.DataFrame:
     """Return the supported rows of ``windows`` whose windows are shorter than the horizon, with some terminal value."""
     rows = rows_of("windows")
@@ -535,6 +569,8 @@ FIGURES: dict[str, Callable[[], str]] = {
     "weights-contact": lambda: span(estimators("total_propagation", "per=action", problem=CONTACT)),
     "weights-jump": lambda: span(estimators("total_propagation", problem=JUMP)),
     "equal-rollouts": equal_rollouts_table,
+    "backward-memory": backward_memory_table,
+    "backward-memory-finding": backward_memory_finding,
     "measure-samples": lambda: count(estimators("measure_valued", column="best").sum()),
     "window-bias": lambda: number(short_windows()["bias_rel"].min()),
     "window-hopper": lambda: number(windows("steps=100", "hopper")["bias_rel"].max()),
