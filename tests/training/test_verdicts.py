@@ -55,7 +55,7 @@ def test_a_gradient_that_explodes_without_contact_names_none():
     found = verdicts(gradient_norm=with_value("gradient_norm", [30, 60, 61], 1e4))
     assert "contact" not in words(found)
     assert words(found).startswith("the gradient explodes at update 31, to ")
-    assert words(found).endswith("and 2 times more")
+    assert words(found).endswith("and 2 more times")
 
 
 def test_a_contact_long_before_the_explosion_is_not_named():

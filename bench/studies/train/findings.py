@@ -121,7 +121,7 @@ def _explodes(fault: Mapping[str, Any]) -> str:
         when = f"{after} the contact starts (update {update})"
     text = f"the gradient explodes {when}, to {number(fault['factor'])} times its median before"
     if fault["peaks"] > 1:
-        text += f", and {fault['peaks'] - 1} times more"
+        text += ", and once more" if fault["peaks"] == 2 else f", and {fault['peaks'] - 1} more times"
     if fault.get("with_contact") is not None and fault["peaks"] > 1:
         text += f" ({fault['with_contact']} of {fault['peaks']} peaks in updates with contact)"
     return text
