@@ -136,10 +136,10 @@ def findings(fits: Sequence[ClassFit], costs: pd.DataFrame) -> list[str]:
         f"The factor is {listed(sides)}."
     ]
     ratio = {one.scene_class: one.quantities["bias_over_spread"] for one in main}
-    more = [f"{name} ({_text(q)})" for name, q in ratio.items() if q.low > 1]
+    more = [f"{name} ({_text(q)} times as much)" for name, q in ratio.items() if q.low > 1]
     rest = [name for name, q in ratio.items() if not q.low > 1]
     result.append(
-        (f"Bias costs more than spread of the same size on {listed(more)} problems" if more else
+        (f"Bias costs more than spread of the same size on {listed(more)}" if more else
          "Whether bias costs more than spread of the same size is open")
         + (f", and this is open on {listed(rest)}." if more and rest else ".")
     )  # fmt: skip
