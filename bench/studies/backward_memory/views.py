@@ -184,7 +184,7 @@ def _charts(experiment: Experiment, good: pd.DataFrame, lines: pd.DataFrame) -> 
             [horizon], [memory], text="Peak of the resident memory beyond the memory before the gradients. An arrow: at most so much.", **shared,
         ),
         Chart(
-            "backward_time", f"{quick['method']} takes down to {number(quick['longer'])} times the time of {first}", frame,
+            "backward_time", f"{quick['method']} is up to {number(1.0 / quick['longer'])} times as fast as {first}", frame,
             [horizon], [seconds], text="Median and range of the measured calls.", **shared,
         ),
     ]  # fmt: skip
