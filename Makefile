@@ -5,8 +5,8 @@ RUN := $(BIN)/python -m bench
 
 .PHONY: run test lint slow docs site gallery examples clean
 
-# Twice JAX crashed while it compiled a program of MJX in a process that had compiled hundreds of others; the cause is unknown.
-MJX := tests/plugins/test_engines.py tests/plugins/test_mjx_solver.py
+# Three times JAX crashed while it compiled or stored a large program in a process that had compiled hundreds; the cause is unknown.
+FRESH := tests/plugins/test_engines.py tests/plugins/test_mjx_solver.py tests/studies/test_train.py tests/training
 
 run: $(VENV)/.installed
 	$(RUN) +experiment=stiffness_sweep
@@ -15,8 +15,8 @@ test: $(VENV)/.installed
 	$(BIN)/python -m pytest
 
 slow: $(VENV)/.installed
-	$(BIN)/python -m pytest -m slow --dist worksteal $(addprefix --ignore=,$(MJX))
-	$(BIN)/python -m pytest -m slow --dist worksteal $(MJX)
+	$(BIN)/python -m pytest -m slow --dist worksteal $(addprefix --ignore=,$(FRESH))
+	$(BIN)/python -m pytest -m slow --dist worksteal $(FRESH)
 
 lint: $(VENV)/.installed
 	$(BIN)/ruff check .
