@@ -291,7 +291,7 @@ FAULTS = [
     Fault(EG, "self.has_state = bool(is_alike and self.spread > self._floor)", "self.has_state = False", OF_MECHANISMS),
     Fault(ES, "return self.known and bool(self.bias_low > TARGET_ERROR * self.norm)", "return bool(self.bias_low > TARGET_ERROR * self.norm)", OF_EXAMINE),
     Fault(ES, "return self.known and bool(self.bias_low > TARGET_ERROR * self.norm)", "return self.known and bool(self.bias_low > 1e9 * self.norm)", OF_EXAMINE),
-    Fault(ES, "return self.known and not self.biased and bool(self.bias_high > self.norm)", "return False", OF_EXAMINE),
+    Fault(ES, "return self.known and not self.biased and bool(self.bias_high > TARGET_ERROR * self.norm)", "return False", OF_EXAMINE),
     Fault(ES, "float(truth @ truth) - error**2", "float(truth @ truth)", OF_EXAMINE),
     Fault(ES, "_means(slopes) - groups", "_means(slopes)", OF_EXAMINE),
     Fault(ES, "room = TARGET_ERROR**2 - bias**2", "room = TARGET_ERROR**2", OF_EXAMINE),
