@@ -257,7 +257,7 @@ def variance_falls_as_one_over_n(estimator: Estimator) -> str:
     allowed = LIMIT * error + 0.02  # 0.02 allows terms of order 1/N^2 (leave-one-out baselines) at N = 32
     detail = f"slope {slope:.3f} +- {error:.3f}"
     require(slope < -1 + allowed, f"{detail}: falls slower than 1/N")
-    is_coupled = getattr(estimator, "couples_samples", False) and not isinstance(estimator, SampleMean)
+    is_coupled = estimator.couples_samples and not isinstance(estimator, SampleMean)
     if (isinstance(estimator, SampleMean) or estimator.unbiased) and not is_coupled:
         require(slope > -1 - allowed, f"{detail}: falls faster than 1/N, without couples_samples = True")
     return detail

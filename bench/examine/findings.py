@@ -418,17 +418,17 @@ class Findings:
             if not one.defined:
                 problems.append(f"nonfinite: at sigma {number(one.sigma)} J is not defined: {one.remark}")
             if one.unshown:
-                low, high = one.bias_low / one.norm, one.bias_high / one.norm
+                low, high = one.bias_percent
                 problems.append(
-                    f"spread: at sigma {number(one.sigma)} the bias of the mean gradient is {number(100 * low)} to "
-                    f"{number(100 * high)}% of grad J after {one.pairs} pairs, which does not show whether it is below "
+                    f"spread: at sigma {number(one.sigma)} the bias of the mean gradient is {number(low)} to "
+                    f"{number(high)}% of grad J after {one.pairs} pairs, which does not show whether it is below "
                     f"{100 * TARGET_ERROR:g}%"
                 )
             if one.biased:
-                low, high = one.bias_low / one.norm, one.bias_high / one.norm
+                low, high = one.bias_percent
                 problems.append(
-                    f"biased: at sigma {number(one.sigma)} the mean of the gradients misses {number(100 * low)} to "
-                    f"{number(100 * high)}% of grad J, though each gradient is right: it does not see the jumps"
+                    f"biased: at sigma {number(one.sigma)} the mean of the gradients misses {number(low)} to "
+                    f"{number(high)}% of grad J, though each gradient is right: it does not see the jumps"
                 )
         if self.noise_cause == "unmeasured":
             problems.append(f"unmeasured: {EXPLANATIONS['unmeasured']}")
@@ -495,7 +495,7 @@ class Findings:
         worst = max(self.smoothed, key=lambda one: one.bias_high / one.norm if one.norm > 0 else math.inf)
         if not worst.known:
             return f"{where}: not shown. grad J is not distinguishable from 0"
-        return f"{where}: usable. The bias of the mean gradient is below {number(100 * worst.bias_high / worst.norm)}%"
+        return f"{where}: usable. The bias of the mean gradient is below {number(worst.bias_percent[1])}%"
 
     @property
     def warnings(self) -> list[str]:
@@ -926,7 +926,7 @@ class Findings:
             return "-"
         if not one.known:
             return "unknown"
-        low, high = 100 * one.bias_low / one.norm, 100 * one.bias_high / one.norm
+        low, high = one.bias_percent
         if one.bias_high > one.norm and not one.biased:
             return "unknown: the gradients vary too widely"
         if low <= 0:

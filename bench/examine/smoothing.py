@@ -77,6 +77,11 @@ class Smoothed:
         return math.isfinite(self.norm)
 
     @property
+    def bias_percent(self) -> tuple[float, float]:
+        """The ends of the bias interval in percent of |grad J|, which is not 0."""
+        return 100 * self.bias_low / self.norm, 100 * self.bias_high / self.norm
+
+    @property
     def known(self) -> bool:
         """Whether grad J is clearly larger than its own error."""
         return self.norm > 4.0 * self.error

@@ -48,6 +48,8 @@ class Estimator(Plugin):
     """
     needs_directions: ClassVar[bool] = False
     """Whether it uses each sample's noise as a direction in theta space, which needs at least d numbers per sample."""
+    couples_samples: ClassVar[bool] = False
+    """Whether its directions are chosen together or a model is fitted to them, so that the variance may fall faster than 1/N."""
     gives_gradient: ClassVar[bool] = True
     """Whether the estimate is a gradient that an optimizer can use."""
 

@@ -12,8 +12,7 @@ import numpy as np
 
 from bench.model import Array, Ops, Problem, Program, Rollout, adjoint_gradient, param, slopes
 
-from . import rows
-from .jax import Jax, JaxOps, JaxProblem, use_double_precision
+from .jax import Jax, JaxOps, JaxProblem, loop, use_double_precision
 
 
 @dataclass(frozen=True)
@@ -56,48 +55,27 @@ class Checkpointed(Jax):
 
 
 class _CheckpointedOps(JaxOps):
-    """Operations of jax.numpy whose ``scan`` has some levels of checkpoints; with 0 levels everything is kept."""
+    """Operations of jax.numpy whose loops have some levels of checkpoints; with 0 levels everything is kept."""
 
     def __init__(self, levels: int) -> None:
         super().__init__()
         self._levels = levels
 
-    def scan(self, step: Callable[[Any, Any], Any], carry: Any, xs: Any, length: int) -> Any:
-        """Return the last carry of nested lax.scans over rows."""
-        import jax
-
-        leaves, tree = jax.tree.flatten(carry)
-        inputs, input_tree = jax.tree.flatten(xs)
-
-        def flat(*arguments: Array) -> list[Array]:
-            state, x = arguments[: len(leaves)], arguments[len(leaves) :]
-            return jax.tree.leaves(step(jax.tree.unflatten(tree, state), jax.tree.unflatten(input_tree, x)))
-
-        traced = jax.make_jaxpr(flat)(*leaves, *(jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for x in inputs))
-
-        def body(state: list[Any], x: list[Any]) -> list[Any]:
-            return rows.evaluate(traced.jaxpr, traced.consts, [*state, *x])
-
-        split = [rows.split(x, axis=1) for x in inputs]
-        last = _nested(body, [rows.split(x) for x in leaves], split, length, self._levels)
-        return jax.tree.unflatten(tree, [rows.join(x) for x in last])
+    def loop(self, body: Callable[[Any, Any], Any], carry: Any, xs: Any, length: int) -> Any:
+        """Return the last carry of nested loops."""
+        return _nested(body, carry, xs, length, self._levels)
 
 
 def _nested(body: Callable[[Any, Any], Any], carry: Any, xs: Any, length: int, levels: int) -> Any:
     """Return the last carry of ``body`` over ``length`` steps, whose backward pass keeps states at some levels."""
     import jax
 
-    def scan(function: Callable[[Any, Any], Any], carry: Any, xs: Any, count: int) -> Any:
-        # within a scan XLA cannot merge the two evaluations, so common-subexpression elimination need not be prevented
-        one = jax.checkpoint(function, prevent_cse=False) if levels else function
-        return jax.lax.scan(lambda state, x: (one(state, x), None), carry, xs, count)[0]
-
     if levels <= 1:
-        return scan(body, carry, xs, length)
+        return loop(body, carry, xs, length, recomputes=levels == 1)
     size = math.ceil(length ** (1 - 1 / levels))
     count = length // size
     whole = jax.tree.map(lambda x: x[: count * size].reshape(count, size, *x.shape[1:]), xs)
-    carry = scan(lambda state, x: _nested(body, state, x, size, levels - 1), carry, whole, count)
+    carry = loop(lambda state, x: _nested(body, state, x, size, levels - 1), carry, whole, count)
     rest = length - count * size
     return _nested(body, carry, jax.tree.map(lambda x: x[count * size :], xs), rest, levels - 1) if rest else carry
 

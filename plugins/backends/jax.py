@@ -65,7 +65,7 @@ class JaxOps(LoopOps):
         super().__init__(jax.numpy)
 
     def scan(self, step: Callable[[Any, Any], Any], carry: Any, xs: Any, length: int) -> Any:
-        """Return the last carry of lax.scan over rows. The backward pass stores only carries and recomputes each step."""
+        """Return the last carry of :meth:`loop` over rows."""
         import jax
 
         leaves, tree = jax.tree.flatten(carry)
@@ -77,15 +77,27 @@ class JaxOps(LoopOps):
 
         traced = jax.make_jaxpr(flat)(*leaves, *(jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for x in slices))
 
-        def body(state: list[Any], x: list[Any]) -> tuple[list[Any], None]:
-            return rows.evaluate(traced.jaxpr, traced.consts, [*state, *x]), None
+        def body(state: list[Any], x: list[Any]) -> list[Any]:
+            return rows.evaluate(traced.jaxpr, traced.consts, [*state, *x])
 
-        # within a scan XLA cannot merge the two evaluations, so common-subexpression elimination need not be prevented
-        recomputed = jax.checkpoint(body, prevent_cse=False)
-        last, _ = jax.lax.scan(
-            recomputed, [rows.split(x) for x in leaves], [rows.split(x, axis=1) for x in slices], length
-        )
+        last = self.loop(body, [rows.split(x) for x in leaves], [rows.split(x, axis=1) for x in slices], length)
         return jax.tree.unflatten(tree, [rows.join(x) for x in last])
+
+    def loop(self, body: Callable[[Any, Any], Any], carry: Any, xs: Any, length: int) -> Any:
+        """Return the last carry. The backward pass stores only carries and recomputes each step."""
+        return loop(body, carry, xs, length)
+
+
+def loop(body: Callable[[Any, Any], Any], carry: Any, xs: Any, length: int, recomputes: bool = True) -> Any:
+    """Return the last carry of ``carry = body(carry, x)`` by lax.scan.
+
+    The backward pass stores only carries and recomputes each step, or else keeps the results of all operations.
+    """
+    import jax
+
+    # within a scan XLA cannot merge the two evaluations, so common-subexpression elimination need not be prevented
+    one = jax.checkpoint(body, prevent_cse=False) if recomputes else body
+    return jax.lax.scan(lambda state, x: (one(state, x), None), carry, xs, length)[0]
 
 
 def _platform() -> str:

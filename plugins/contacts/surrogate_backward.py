@@ -6,11 +6,11 @@ from typing import ClassVar
 import numpy as np
 from bench.plugins.contacts.complementarity import Complementarity
 
-from bench.model import Contact, ImpulseLaw, Ops, State, param, stopped
+from bench.model import Contact, Ops, State, param, stopped
 
 
 @dataclass(frozen=True)
-class SurrogateBackward(ImpulseLaw):
+class SurrogateBackward(Complementarity):
     """Applies the impulses of ``complementarity`` at ``kappa``, but the derivatives at ``soft_kappa`` in the same states.
 
     Costs equal the costs of ``complementarity`` at kappa. The gradient is a surrogate, not the derivative of the
@@ -21,27 +21,16 @@ class SurrogateBackward(ImpulseLaw):
     """
 
     name = "surrogate_backward"
-    smoothing: ClassVar[str] = "kappa"
     surrogate: ClassVar[bool] = True
-    needs_root: ClassVar[bool] = True
 
     kappa: float = param(1e-6, "central-path parameter of the motion, force times gap", "N m", positive=True)
     soft_kappa: float = param(1e-2, "central-path parameter of the gradient, force times gap", "N m", positive=True)
-    stiffness: float = param(float("inf"), "force per remaining penetration, of both; inf: rigid", "N/m", positive=True)
-
-    @property
-    def continuous(self) -> bool:
-        """True: on the central path, the force is smooth in the state."""
-        return True
 
     def impulse(self, ops: Ops, contact: Contact, before: State, free: State, dt: float) -> State:
         """Return the velocity change over the step at ``kappa``, with the derivatives at ``soft_kappa``."""
-        ahead, behind = (
-            Complementarity(kappa=kappa, stiffness=self.stiffness) for kappa in (self.kappa, self.soft_kappa)
-        )
-        hard = ahead.impulse(ops, contact, before, free, dt)
+        hard = super().impulse(ops, contact, before, free, dt)
         if isinstance(hard.v, np.ndarray):  # without derivatives
             return hard
-        soft = behind.impulse(ops, contact, before, free, dt)
+        soft = Complementarity(kappa=self.soft_kappa, stiffness=self.stiffness).impulse(ops, contact, before, free, dt)
         q, v = (stopped(h) + (s - stopped(s)) for h, s in zip(hard, soft, strict=True))
         return State(q, v)
