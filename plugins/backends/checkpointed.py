@@ -28,7 +28,6 @@ class Checkpointed(Jax):
     """
 
     name = "checkpointed"
-    provides = Jax.provides - {"surrogate"}
     reference_rank = None
 
     keep: str = param("states", "what the backward pass keeps", choices=("states", "everything", "jacobians"))
