@@ -15,6 +15,7 @@ import pytest
 import bench.report
 from bench.experiment import config
 from bench.experiment.axes import axes, table
+from bench.experiment.columns import COMMON
 from bench.experiment.grid import cells
 from bench.measure.gradcheck import EPS, TRUSTED, VERDICTS
 from bench.model import registry
@@ -543,3 +544,11 @@ def test_the_command_of_a_gradient_check_repeats_its_cell(words):
 def test_the_command_of_a_gradient_check_without_time_steps_has_no_horizon():
     (cell,) = cells(config.load(["study=gradient_check", "scenes=[quadratic]", "estimators=[fobg]"]))
     assert reproduce.check_of(cell) == "python -m bench gradcheck quadratic 'backends=[jax]' seed=0"
+
+
+@pytest.mark.parametrize("name", sorted(registry.entries()["studies"]))
+def test_times_and_memory_are_declared_to_depend_on_the_machine(name):
+    """So that rows of cells without timing have the same bits wherever they are computed."""
+    study = registry.usable("studies", name)
+    own = [column for column in study.columns.all if column.name not in COMMON and column.format != "setting"]
+    assert [column.name for column in own if column.unit in ("s", "MB") and not column.measured] == []

@@ -33,8 +33,8 @@ class Solver(Study):
         Column("gradient_cosine", "cosine between the gradient and the converged program's gradient", label="cosine"),
         Column("wrong_signs", "share of coordinates whose sign is not that of the converged program's gradient", label="wrong signs",
                comparison=ComparisonRule("exact", "wrong signs")),
-        Column("gradient_s", "time of the gradients of `samples` rollouts", "s", label="gradients", format="seconds"),
-        Column("compile_s", "time of compiling the gradient", "s", label="compilation", format="seconds"),
+        Column("gradient_s", "time of the gradients of `samples` rollouts", "s", measured=True, label="gradients", format="seconds"),
+        Column("compile_s", "time of compiling the gradient", "s", measured=True, label="compilation", format="seconds"),
         numbers("gradient", "gradient at w = 0, by coordinate of theta"),
         numbers("converged_gradient", "the converged program's gradient at w = 0, by coordinate of theta"),
     )  # fmt: skip
