@@ -9,7 +9,7 @@ const page = JSON.parse(document.getElementById("data").textContent);
 const rowCount = size("rows");
 const SMALL = 12; // size of the smallest text in a chart [px]
 const PANELS = 4; // most panels of a chart that are drawn at once
-const CROWD = 2000; // most points that a panel draws, of more only one is drawn of those close together
+const CROWD = 1000; // most points that a panel draws, of more only one is drawn of those close together
 const FIRST = 60, MORE = 240; // rows of the table at first, and with every "Show more"
 const GLYPHS = {
   circle: "●", square: "■", diamond: "◆", "triangle-up": "▲", "triangle-down": "▼", cross: "✚", x: "✖", star: "★", line: "━",
