@@ -38,6 +38,8 @@ EQUIVALENT: dict[str, str] = {
     "d4fd1ca7df941e541b95c6d2269a99997af4415110b5a73fa63bb870d4a397ff": "a46ed4d792f61433071933b66bd03d3ad33ff491c1585d8568ee77b069d5cb09",
     # plugins/backends/checkpointed.py: calls the loop of jax, and provides surrogate gradients, which no stored row uses
     "5576d15eeb6545cec4296d7010d7d149086dc768d2a57e2f659edca4ec8148e6": "03679d6ad1a4de8ee22b01b239b9c167376e447e916100529ce2b69e6dde1377",
+    # plugins/backends/compiling.py: forgets executables, which are compiled again
+    "27d56e4ba057fcb79d853751889cc30fda409b81bbc89020fe4cd3edc32f24fa": "4181f1e484759a64addabae4f926aed7167bbbb97d59b298236d4f7c2dbd30d6",
     # plugins/estimators/total_propagation.py: leaves out the numbers of a random start, which no stored scene has
     "993ab3f7c080de843a73361c06091c0a87e41a1614fba3f7a60b05942e3e8857": "03dfa4afb84aaf70b769fd9471f75081d552d3453ff8b965b69e49b686737d8b",
     # plugins/scenes/cartpole_swing.py: imports from the public names

@@ -1,4 +1,4 @@
-"""Compiles JAX functions once per process, counts the compilations, and stores executables in a folder between runs."""
+"""Compiles JAX functions, keeps the executables used last, counts the compilations, and stores executables between runs."""
 
 from __future__ import annotations
 
@@ -10,6 +10,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from bench.model import Compilations
+
+KEPT = 256
+"""Executables kept per process. Each has 20 to 40 memory mappings, and Linux ends a process that needs more than 65,530."""
 
 _known: dict[tuple[Any, ...], Compiled] = {}
 _busy = threading.Lock()
@@ -39,12 +42,15 @@ def compiled(
     """
     # one at a time, since JAX's cache folder is a global setting
     with _busy:
-        executable = _known.get(key)
+        executable = _known.pop(key, None)
         if executable is None or (fresh and executable.loaded):
             name = executable.name if executable else hashlib.sha256(repr(key).encode()).hexdigest()[:16]
             folder = None if fresh or count.folder is None else str(count.folder)
-            executable = _known[key] = _compile(name, function, arguments, folder)
+            executable = _compile(name, function, arguments, folder)
             count.made += not executable.loaded
+        _known[key] = executable
+        if len(_known) > KEPT:
+            del _known[next(iter(_known))]
         count.shapes.add(executable.name)
         return executable
 
