@@ -5,9 +5,6 @@ RUN := $(BIN)/python -m bench
 
 .PHONY: run test lint slow docs site gallery examples clean
 
-# Three times JAX crashed while it compiled or stored a large program in a process that had compiled hundreds; the cause is unknown.
-FRESH := tests/plugins/test_engines.py tests/plugins/test_mjx_solver.py tests/studies/test_train.py tests/training
-
 run: $(VENV)/.installed
 	$(RUN) +experiment=stiffness_sweep
 
@@ -15,8 +12,7 @@ test: $(VENV)/.installed
 	$(BIN)/python -m pytest
 
 slow: $(VENV)/.installed
-	$(BIN)/python -m pytest -m slow --dist worksteal $(addprefix --ignore=,$(FRESH))
-	$(BIN)/python -m pytest -m slow --dist worksteal $(FRESH)
+	$(BIN)/python -m pytest -m slow --dist worksteal
 
 lint: $(VENV)/.installed
 	$(BIN)/ruff check .

@@ -515,9 +515,9 @@ def test_upper_end_of_a_variance_is_that_of_hall() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("noise", ["normal", "t5", "joint t5", "lognormal 0.5", "lognormal 1"])
 def test_coverage_study(noise: str, capsys: pytest.CaptureFixture[str]) -> None:
-    """Prints the coverage of the bias interval in every setting; 400 cells each, known to about 1.1 points."""
+    """Prints the coverage of the bias interval in every setting; 200 cells each, known to about 1.5 points."""
     rng = np.random.default_rng(20)
-    cells = 400
+    cells = 200
     shares, lines = [], []
     sizes = [(0.0, "most"), *((size, along) for size in (1.0, 3.0, 10.0) for along in ("most", "least", "all"))]
     head = " ".join(f"{size:>4.0f} {along:<5}" for size, along in sizes)
