@@ -15,6 +15,7 @@ from bench.examine.gradient import recaused
 from bench.examine.lines import ALIKE, LineScan
 from bench.examine.smoothing import PAIRS, TARGET_ERROR, Method, Smoothed
 from bench.measure.gradcheck import FAULTS, MEANING, TRUSTED, VERDICTS, Check, Part
+from bench.measure.gradcheck.direction import Sample
 from bench.model.simulator.simulator import Printed
 from bench.report.text import counted, duration, number
 
@@ -35,6 +36,7 @@ EXPLANATIONS = {
     "wrong_adjoint": "the differences agree with each other, but not with the gradient",
     "nonfinite": "the cost is not a number at theta or near it",
     "unsettled": "the differences agree at no step, so the check is inconclusive: the cost is chaotic, or too noisy at every step",
+    "unresolved": "the cost's rounding or noise hides its slope at every step, so the check can show neither a right nor a wrong value",
     "jump": "the cost jumps at theta, so it has no derivative",
     "kink": "theta is on a kink, with two slopes and no derivative",
     "saturated": "the gradient is right and exactly 0, though wider steps show a slope: the input is clipped, or has no effect here",
@@ -60,8 +62,12 @@ SEEN = 0.01
 """Share of a cost's change along a line that the integral of the gradient may miss without a warning."""
 NOTEWORTHY = ("zero", "saturated")
 """Verdicts of right gradients that deserve a warning."""
-NOT_SHOWN = ("undecided", "unsettled", "nonfinite", "adaptive", "zero", "spread", "unmeasured")
+NOT_SHOWN = ("undecided", "unsettled", "unresolved", "nonfinite", "adaptive", "zero", "spread", "unmeasured")
 """Causes that decide neither for nor against a gradient: exit status 3."""
+DIGIT = 0.1
+"""Largest uncertainty of a difference that shows a derivative, relative to the derivative or to slopes nearby."""
+CONTRADICTED = 10.0
+"""Uncertainties of a difference from which a derivative is not called right, even if it is small beside the others."""
 DIFFERENT = 1e-6
 """Relative difference of two costs that must agree, in double precision."""
 REFINED, REFINED_FAR = 0.1, 0.3
@@ -75,6 +81,12 @@ HEADLINE = 200
 """Most characters of an exception in a headline."""
 RIGHT, WRONG, UNSHOWN, NONE = "right", "wrong", "not shown", "none given"
 """Answers about the derivative."""
+
+
+def _slope_nearby(sample: Sample) -> float:
+    """Return the largest one-sided slope of a sample that exceeds its noise, less the noise."""
+    slopes = np.maximum(np.abs(sample.left), np.abs(sample.right)) - 3.0 * sample.uncertainty
+    return float(np.nanmax(np.where(np.isfinite(slopes), slopes, 0.0), initial=0.0))
 
 
 @dataclass(frozen=True)
@@ -208,6 +220,31 @@ class Findings:
         parts = [part for part in self.check.parts if self._is_small(part)]
         return sorted(parts, key=lambda part: -part.error)
 
+    @cached_property
+    def unresolved(self) -> list[Part]:
+        """The components that the check accepts, though differences cannot see them or contradict them.
+
+        A component is seen if its difference has one correct digit, compared with the derivative or with the slopes of
+        wider steps, which are not 0 at a minimum. Unseen components that are small beside the seen ones do not count.
+        """
+        parts = (
+            []
+            if self.settled is None
+            else [p for p in self.settled.components if p.verdict in TRUSTED and p.verdict != "zero"]
+        )
+        seen = [p for p in parts if p.uncertainty < DIGIT * max(abs(p.difference), _slope_nearby(p.sample))]
+        largest = max((abs(p.difference) * p.sample.scale for p in seen), default=0.0)
+        hidden = [p for p in parts if p not in seen and abs(p.program) * p.sample.scale > DIGIT * largest]
+        contradicted = [
+            p
+            for p in seen
+            if abs(p.program - p.difference)
+            > max(CONTRADICTED * p.uncertainty, DIGIT * max(abs(p.difference), abs(p.program)))
+            and p.uncertainty < DIGIT * abs(p.difference)
+            and not self._is_small(replace(p, verdict="wrong_adjoint"))
+        ]
+        return hidden + contradicted
+
     @property
     def zeros(self) -> list[str]:
         """The inputs without any effect that ``allow_zero`` does not name."""
@@ -247,6 +284,8 @@ class Findings:
             return "undecided" if cause in SUSPICIOUS and self.is_unexplained and self.refined is None else cause
         if not check.components or not self.is_complete:
             return "undecided"
+        if self.gradient and self.unresolved:
+            return "unresolved"
         if any(line.steps for line in self.lines) or self.tread:
             return "staircase"
         is_allowed = self.allow_zero is not None and bool(self.allow_zero.all())
@@ -293,16 +332,24 @@ class Findings:
         """The cause of the first problem around theta or under noise; empty if there is none."""
         if self.derivative not in (RIGHT, NONE):
             return ""
-        if self.missed > TARGET_ERROR:
+        if self._misses_jumps:
             return "jumps"
         for cause, is_found in (
             ("nonfinite", [not one.defined for one in self.smoothed]),
             ("biased", [one.biased for one in self.smoothed]),
-            ("spread", [one.unshown for one in self.smoothed]),
+            ("spread", [one.unshown or one.hidden for one in self.smoothed]),
         ):
             if any(is_found):
                 return cause
         return "unmeasured" if self.gradient and len(self.smoothed) < len(self.requested) else ""
+
+    @property
+    def _misses_jumps(self) -> bool:
+        """Whether a line shows jumps that bias the gradient, and no measured bias says more."""
+        is_measured = len(self.smoothed) >= len(self.requested) > 0 and all(
+            one.known and one.decided for one in self.smoothed
+        )
+        return self.missed > TARGET_ERROR and not is_measured
 
     @property
     def cause(self) -> str:
@@ -379,6 +426,10 @@ class Findings:
             return "zero: no input moves the cost, and its gradient is 0, or below rounding: does theta reach the simulator?"
         if cause == "no_effect":
             return f"{text} ({', '.join(self.zeros[:6])})"
+        if cause == "unresolved":
+            part = self.unresolved[0]
+            numbers = f"program {_as_text(part.program)}, differences {_as_text(part.difference)} +- {number(part.uncertainty, 1)}"
+            return f"{text} ({self.label(part)}: {numbers})"
         if cause == "rough":
             return f"{text} (by {number(self.settled.noise if self.settled else math.nan)})"
         if cause == "undecided" and self.wrong_checks:
@@ -408,15 +459,18 @@ class Findings:
 
     def _noise_problems(self) -> list[str]:
         problems = []
-        missed = self.missed
-        if missed > TARGET_ERROR:
+        if self._misses_jumps:
             problems.append(
-                f"jumps: along a line the integral of the gradient misses {number(100 * missed)}% of the cost's change, "
+                f"jumps: along a line the integral of the gradient misses {number(100 * self.missed)}% of the cost's change, "
                 "which comes from jumps that no gradient sees"
             )
         for one in self.smoothed:
             if not one.defined:
                 problems.append(f"nonfinite: at sigma {number(one.sigma)} J is not defined: {one.remark}")
+            if one.hidden:
+                problems.append(
+                    f"spread: at sigma {number(one.sigma)} grad J is not distinguishable from 0 after {one.pairs} pairs"
+                )
             if one.unshown:
                 low, high = one.bias_percent
                 problems.append(
@@ -487,15 +541,17 @@ class Findings:
             answer = "not shown" if self.noise_cause in NOT_SHOWN else "NOT usable"
             return f"{where}: {answer}. {self._noise_problems()[0]}"
         if self.derivative != RIGHT:
-            return f"{where}: not usable, since the derivative at theta is {self.derivative}"
+            answer = "not shown" if self.derivative == UNSHOWN else "not usable"
+            return f"{where}: {answer}, since the derivative at theta is {self.derivative}"
         if not self.requested:
             return "Under noise: not measured, since no sigma is given"
         if self.noise_cause:
             return f"{where}: not measured, since the budget ended"
         worst = max(self.smoothed, key=lambda one: one.bias_high / one.norm if one.norm > 0 else math.inf)
         if not worst.known:
-            return f"{where}: not shown. grad J is not distinguishable from 0"
-        return f"{where}: usable. The bias of the mean gradient is below {number(worst.bias_percent[1])}%"
+            return f"{where}: usable. Its mean is 0, as grad J"
+        bias = max(worst.bias_percent[1], 1e-3)
+        return f"{where}: usable. The bias of the mean gradient is below {number(bias)}%"
 
     @property
     def warnings(self) -> list[str]:
@@ -612,8 +668,7 @@ class Findings:
         text = f"{name}: program {_as_text(part.program)}, differences {_as_text(part.difference)}"
         if math.isfinite(part.error):
             ratio = part.program / part.difference if part.difference else math.inf
-            share = number(100 * abs(ratio - 1)) if part.difference else "-"
-            how = f"off by {share}%"
+            how = f"off by {number(100 * abs(ratio - 1))}%" if part.difference else "is not 0"
             if 2 < ratio < math.inf:
                 how = f"is {number(ratio, 3)} times too large"
             elif ratio < 0:
@@ -729,6 +784,10 @@ class Findings:
             lines.append(text)
         rest = [] if self.gradient else ["any gradient"]
         rest += [f"{what} (budget)" for what in self.left_out]
+        if self.smoothed and self.gradient:
+            rest.append(
+                f"jumps that fewer than 3 in {2 * min(one.pairs for one in self.smoothed)} draws of the noise meet"
+            )
         is_said = any("other thetas" in what for what in self.left_out)
         if self.gradient and self.check is not None and not self.check.draws and not is_said:
             rest.append("the gradient at other thetas around this one (budget)")

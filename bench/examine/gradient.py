@@ -261,6 +261,7 @@ class GradientStages:
             self._repeated = True
         except OutOfTime:
             self.left_out.append("repeating a call")
+        self._repeat_gradient(other)
         spreads = []
         for values in ([*after["theta"], *after["other"], self.value], others):
             if len(values) > 1 and np.isfinite(values).all():
@@ -272,6 +273,20 @@ class GradientStages:
             is_alike = max(np.ptp(after["theta"]), np.ptp(last)) <= STATE * apart
             # last digits that vary at random are alike by chance
             self.has_state = bool(is_alike and self.spread > self._floor)
+
+    def _repeat_gradient(self, other: np.ndarray) -> None:
+        """Compare the gradient with that of an equal call after one at ``other (d,)``."""
+        if self.gradient is None or not np.isfinite(self.gradient).all():
+            return
+        try:
+            self.gradient_at(other)
+            again = self.gradient_at(self.theta)
+        except OutOfTime:
+            self.left_out.append("repeating a gradient")
+            return
+        size = float(np.linalg.norm(self.gradient))
+        if size and np.isfinite(again).all():
+            self.gradient_spread = float(np.linalg.norm(again - self.gradient)) / size
 
     def _has_hidden_single(self) -> bool:
         """Return whether a cost that returns float64 computes in float32: its values have single precision, or it reads
@@ -379,7 +394,7 @@ class GradientStages:
     def _run_stage(self, space: Subspace, options: Options) -> None:
         outcome = self._check_once(space, options)
         self.spread = max(self.spread, self._costs_store.spread)
-        self.gradient_spread = self._spread_of_gradients(space)
+        self.gradient_spread = max(self.gradient_spread, self._spread_of_gradients(space))
         if outcome.cause == "nondeterministic" and self.is_small_spread and self.spread > 0.0:
             self._refresh()
             outcome = self._check_once(space, replace(options, repeated=False))

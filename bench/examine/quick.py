@@ -23,6 +23,8 @@ CLEAR = 2.0
 """Least distance of a wrong derivative from the difference, in multiples of the difference's uncertainty."""
 SETTLED = 0.1
 """Largest uncertainty of a difference that decides, relative to the derivative."""
+SHRINKS = 0.5
+"""Largest ratio of the bounds at two steps, ten times apart or more, at which a cost counts as smooth."""
 FLOOR = 4.0
 """Allowed non-repeatability of a cost, in multiples of the largest difference seen between equal calls."""
 
@@ -100,7 +102,9 @@ class QuickCheck:
         best = int(np.nanargmin(np.where(np.isfinite(bounds), bounds, np.inf)))
         difference, uncertainty = float(differences[best]), float(bounds[best])
         others = np.abs(np.delete(differences, best) - difference)
-        if others.size and np.isfinite(others).all():
+        # at a kink central differences agree, and the bounds do not shrink with the step
+        shrinks = bool(bounds[best] <= SHRINKS * np.max(bounds, initial=0.0, where=np.isfinite(bounds)))
+        if others.size and np.isfinite(others).all() and shrinks:
             uncertainty = min(uncertainty, float(others.min() + noise[best]))
         program = difference if self.gradient is None else float(self.gradient[index])
         sample = Sample(step, minus, self.centre, plus, program, np.zeros(step.size, bool), scale=float(self.scale[index]),

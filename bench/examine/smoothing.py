@@ -87,6 +87,11 @@ class Smoothed:
         return self.norm > 4.0 * self.error
 
     @property
+    def hidden(self) -> bool:
+        """Whether grad J is not distinguishable from 0, though its error is not 0."""
+        return not self.known and self.error > 0.0
+
+    @property
     def decided(self) -> bool:
         """Whether the bias interval is entirely above or entirely below 10% of |grad J|."""
         edge = TARGET_ERROR * self.norm
