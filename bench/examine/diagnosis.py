@@ -9,15 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from bench.examine.gradient import GradientStages
+from bench.examine.gradient import SUSPICIOUS, GradientStages
 from bench.examine.lines import LineScan, scan
 from bench.examine.quick import QuickCheck
 from bench.examine.subspace import choose
 from bench.measure.gradcheck import Check
 from bench.model.simulator.simulator import Simulator
 
-SUSPICIOUS = ("wrong_factor", "missing_term", "wrong_adjoint")
-"""Causes that adaptive steps imitate."""
 NEAR = 0.05
 """Largest relative error of a gradient that small jumps may explain."""
 FAR, FAR_JUMPS = 0.25, 0.5

@@ -14,7 +14,7 @@ import numpy as np
 from bench.errors import UserError
 from bench.examine import diagnosis
 from bench.examine.clock import ExaminationClock
-from bench.examine.gradient import GradientStages
+from bench.examine.gradient import SUSPICIOUS, GradientStages
 from bench.examine.lines import HALVINGS, PLACES, POINTS, LineScan, scan
 from bench.examine.report import Report
 from bench.examine.smoothing import FEWEST, PAIRS, Smoothed, directions, measure_smoothed
@@ -262,7 +262,7 @@ class _Examination:
             other["growth"] = growth or []
         can_go_on = not (stages.gradient is None and simulator.has_gradient) and not stages.is_failed
         self._lines = lines = self._scan_lines(checked) if can_go_on else []
-        if checked is not None and checked.cause in diagnosis.SUSPICIOUS and can_go_on and self.is_adaptive is None:
+        if checked is not None and checked.cause in SUSPICIOUS and can_go_on and self.is_adaptive is None:
             self.is_adaptive = self._compare_along_lines(checked)
         smoothed = self._measure_noise(checked) if can_go_on else []
         if clock.is_terminated:

@@ -10,12 +10,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bench.examine.diagnosis import NEAR, SUSPICIOUS, Horizon, grows, may_be_adaptive
-from bench.examine.gradient import recaused
+from bench.examine.diagnosis import NEAR, Horizon, grows, may_be_adaptive
+from bench.examine.gradient import SUSPICIOUS, recaused
 from bench.examine.lines import ALIKE, LineScan
 from bench.examine.smoothing import PAIRS, TARGET_ERROR, Method, Smoothed
-from bench.measure.gradcheck import FAULTS, MEANING, TRUSTED, VERDICTS, Check, Part
-from bench.measure.gradcheck.direction import Sample
+from bench.measure.gradcheck import FAULTS, MEANING, TRUSTED, VERDICTS, Check, Part, Sample
 from bench.model.simulator.simulator import Printed
 from bench.report.text import counted, duration, number
 

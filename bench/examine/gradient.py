@@ -17,7 +17,8 @@ import numpy as np
 
 from bench.examine.quick import ROUNDS, QuickCheck, is_nothing
 from bench.examine.subspace import Subspace, choose, locate
-from bench.measure.gradcheck import EPS, FAULTS, TRUSTED, Check, Options, Part, check, most_severe
+from bench.measure.gradcheck import EPS, FAULTS, TRUSTED, Check, Options, Part, Sample, check, most_severe
+from bench.measure.gradcheck.direction import ALIKE
 from bench.model.simulator.clock import Clock, OutOfTime
 from bench.model.simulator.simulator import Simulator
 
@@ -41,6 +42,10 @@ IN_CELL = 0.4
 """Distance from a float32 number, in units of its last place, that float32 rounds away."""
 CELLS, DISTINCT_CELLS = 9, 6
 """Number of neighbouring float32 thetas at which costs are compared, and fewest different costs of a cost in float32."""
+SUSPICIOUS = ("wrong_factor", "missing_term", "wrong_adjoint")
+"""Causes that adaptive steps and kinks imitate."""
+KINKED = 1e3
+"""Ratio of the steps over which two slopes at a kink differ by a constant."""
 STATE = 0.1
 """Largest share of the difference between histories by which a cost with equal histories differs."""
 
@@ -419,7 +424,7 @@ class GradientStages:
             outcome = recaused(
                 replace(outcome, draws=tuple(part for part in outcome.draws if np.isfinite(part.program)))
             )
-        return self._with_roughness(self._without_small_spread(space, _with_zeros(outcome)))
+        return self._with_roughness(self._without_small_spread(space, _with_kinks(_with_zeros(outcome))))
 
     def _spread_of_gradients(self, space: Subspace) -> float:
         """Return the largest difference between equal calls of the gradient, relative to its norm."""
@@ -498,6 +503,31 @@ def _with_zeros(outcome: Check) -> Check:
     if all(part.verdict == "zero" for part in zeros):
         return outcome
     return recaused(outcome, lambda part: replace(part, verdict="zero") if any(part is p for p in zeros) else part)
+
+
+def _with_kinks(outcome: Check) -> Check:
+    """Return a check with the verdict ``kink`` on faults that a change of slope at theta explains."""
+    kinks = [p for p in outcome.parts if p.verdict in SUSPICIOUS and is_between_slopes(p.sample)]
+    if not kinks:
+        return outcome
+    return recaused(outcome, lambda part: replace(part, verdict="kink") if any(part is p for p in kinks) else part)
+
+
+def is_between_slopes(sample: Sample) -> bool:
+    """Return whether the two one-sided slopes differ by a constant over :data:`KINKED` of step, and hold the derivative.
+
+    At a smooth point the slopes approach each other in proportion to the step, and at a jump they part.
+    """
+    bend, noise = sample.right - sample.left, sample.uncertainty
+    for i, step in enumerate(sample.step):
+        inside = (sample.step <= step) & (sample.step >= step / KINKED) & (np.abs(bend) > 10.0 * noise)
+        if sample.step[inside].size < 3 or sample.step[inside].min() > 1.5 * step / KINKED:
+            continue
+        allowed = ALIKE * abs(bend[i])
+        low, high = sorted((float(sample.left[inside][-1]), float(sample.right[inside][-1])))
+        if np.ptp(bend[inside]) <= allowed and low - allowed <= sample.derivative <= high + allowed:
+            return True
+    return False
 
 
 def recaused(outcome: Check, replaced: Callable[[Part], Part] = lambda part: part) -> Check:

@@ -125,3 +125,19 @@ def test_an_undecided_derivative_leaves_its_use_undecided():
     report = bench.examine(cost, np.zeros(2), grad=lambda t: np.ones(2), calls=300)
     assert report.derivative == "not shown"
     assert "not usable" not in str(report)
+
+
+@pytest.mark.parametrize("bend", [0.3, 3e-4])
+def test_a_small_change_of_slope_is_a_kink_at_every_number_of_steps(bend):
+    """The first slope changes at theta by little, where 9 steps of a decade do not show it over three decades of noise."""
+
+    def cost(theta):
+        side = theta[0] - 0.3 + theta[1] - 0.9
+        rough = 1e-14 * np.sin(1e17 * theta.sum())
+        return float(0.02 * np.sin(theta[0]) + 0.1 * theta[1] ** 2 + bend * abs(side) + rough)
+
+    theta = np.array([0.3, 0.9])
+    given = np.array([0.02 * np.cos(0.3) + bend, 0.2 * 0.9 + bend])
+    assert bench.examine(cost, theta, grad=lambda t: given, calls=1500).cause == "kink"
+    wrong = bench.examine(cost, theta, grad=lambda t: given + 3 * bend, calls=1500)
+    assert (wrong.status, wrong.cause == "kink") == (1, False), str(wrong)
