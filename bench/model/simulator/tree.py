@@ -205,9 +205,11 @@ class ParameterTree:
         flat = len(parts) == 1 or (len(self.leaves) == 1 and _is_structure(value))
         if total == self.vector.size and ([part.size for part in parts] == sizes or flat):
             return np.concatenate([part.ravel() for part in parts])
-        shapes = ", ".join(f"{path} {part.shape}".strip() for path, part in leaves) or type(value).__name__
-        expected = ", ".join(f"{leaf.path or 'theta'} {leaf.shape}" for leaf in self.leaves)
-        raise UserError(f"{what} has shape {shapes}, and theta has {expected}")
+        numeric = leaves and all(part.dtype.kind in "biufc" for _, part in leaves)
+        shapes = ", ".join(f"{path} {part.shape}".strip() for path, part in leaves)
+        given = f"has shape {shapes}" if numeric else f"is {type(value).__name__} {value!r}"[:200]
+        expected = ", ".join(f"{leaf.path} {leaf.shape}".strip() for leaf in self.leaves)
+        raise UserError(f"{what} {given}, and theta has shape {expected}")
 
     def _reorder(self, value: Any, leaves: list[tuple[str, np.ndarray]]) -> list[np.ndarray]:
         """Return the arrays in theta's order, matched by path if possible, since some libraries sort dict keys."""
