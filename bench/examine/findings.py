@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -847,7 +848,9 @@ class Findings:
         return ""
 
     def _again(self, setting: str) -> str:
-        return f"{self.command} {setting}" if self.command else setting
+        """Return the command of this report with another setting."""
+        name = setting.partition("=")[0]
+        return f"{re.sub(rf' {name}=[^ ]+', '', self.command)} {setting}" if self.command else setting
 
     def _exception(self) -> list[str]:
         text = self.error or self.elsewhere

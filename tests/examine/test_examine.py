@@ -586,3 +586,8 @@ def test_file_that_ends_the_process_is_bad_input(tmp_path, capsys):
     path.write_text("def cost(x): return x[0]\nraise SystemExit(0)\n")
     assert cli.main(["examine", f"{path}:cost", "theta=1"]) == 2
     assert "ends the process when it is imported" in capsys.readouterr().err
+
+
+def test_the_next_command_replaces_a_setting(right):
+    report = dataclasses.replace(right, command="python -m bench examine f.py:cost calls=300 sigma=0.1")
+    assert report._again("calls=600") == "python -m bench examine f.py:cost sigma=0.1 calls=600"
