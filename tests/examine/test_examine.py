@@ -89,7 +89,7 @@ def test_gradients_are_matched_by_name_whatever_their_order():
 def test_list_of_numbers_of_any_library_is_a_vector():
     layout = ParameterTree([1.0, 2.0])
     np.testing.assert_array_equal(layout.flatten([np.float32(3), np.array(4.0)]), [3.0, 4.0])
-    with pytest.raises(UserError, match="theta has theta"):
+    with pytest.raises(UserError, match="theta has shape"):
         layout.flatten([np.float32(3)])
 
 
