@@ -318,17 +318,17 @@ def trained_table(experiment: str = "train") -> str:
 
 
 def windows_table(experiment: str = "train") -> str:
-    """Return gradient, bias and final return by the length of a window as a Markdown table."""
-    head = [
-        "| window [steps] | norm of its gradient | bias against a whole episode | runs with a bias above 0 | final return |",
-        "|--:" * 5 + "|",
-    ]
+    """Return gradient and final return by the length of a window as a Markdown table."""
+    head = ["| window [steps] | norm of its gradient | final return |", "|--:" * 3 + "|"]
     return block(head + [
-        f"| {line['window']:.0f} | {number(line['window_gradient'])} | "
-        f"{number(line['bias'])} [{number(line['bias_low'])}, {number(line['bias_high'])}] | {line['resolved']} | "
-        f"{final_return(line)} |"
+        f"| {line['window']:.0f} | {number(line['window_gradient'])} | {final_return(line)} |"
         for line in aggregate.windows(trained(experiment)).to_dict("records")
     ])  # fmt: skip
+
+
+def windows_finding(experiment: str = "train") -> str:
+    """Return which window ends best, which are not distinguishable from it, and which end lower."""
+    return findings.window(aggregate.windows(trained(experiment)))
 
 
 def faults_table(experiment: str) -> str:
@@ -585,6 +585,7 @@ FIGURES: dict[str, Callable[[], str]] = {
     "train-range": lambda: trained_in_range(-560.0, -480.0),
     "train-table": trained_table,
     "train-windows": windows_table,
+    "train-windows-finding": windows_finding,
     "hopper-finding": lambda: findings.recommendation(aggregate.summarise(trained("train/hopper"))),
     "hopper-table": lambda: trained_table("train/hopper"),
     "hopper-windows": lambda: windows_table("train/hopper"),
