@@ -107,8 +107,8 @@ def _lengths(values: Any) -> str:
 
 def frequent_faults(faults: pd.DataFrame, n_runs: int) -> str:
     """Return in how many runs the logs show a fault, the words of the most frequent one, and in how many one is open."""
-    is_open = faults["fault"].map(lambda fault: fault["code"] in OPEN).astype(bool)
-    known, unknown = faults[~is_open], _runs(faults[is_open])
+    known = certain(faults)
+    unknown = _runs(faults.drop(known.index))
     also = f", and in {unknown} central differences do not agree with the gradient, which is open" if unknown else ""
     if known.empty:
         return f"The logs of {counted(n_runs, 'run')} show no fault{also}."
@@ -116,6 +116,11 @@ def frequent_faults(faults: pd.DataFrame, n_runs: int) -> str:
     first = known[codes == codes.mode().iloc[0]].iloc[0]
     words = f"{describe(first['fault'])} ({first['method']}, seed {first['seed']:.0f})"
     return f"The logs of {_runs(known)} of {counted(n_runs, 'run')} show a fault, most often this: {words}{also}."
+
+
+def certain(faults: pd.DataFrame) -> pd.DataFrame:
+    """Return the faults that are certain, without what is open."""
+    return faults[[fault["code"] not in OPEN for fault in faults["fault"]]]
 
 
 def _runs(faults: pd.DataFrame) -> int:

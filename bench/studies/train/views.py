@@ -164,7 +164,7 @@ def _logs(runs: pd.DataFrame, summary: pd.DataFrame, looks: dict[str, Style]) ->
 def _log_title(runs: pd.DataFrame, methods: list[str]) -> str:
     """Return the title of a chart of logs: a fault of a drawn run, or the largest spike of a gradient."""
     drawn = runs[runs["method"].isin(methods)]
-    faults = aggregate.faults(drawn[drawn["seed"] == drawn["seed"].min()])
+    faults = findings.certain(aggregate.faults(drawn[drawn["seed"] == drawn["seed"].min()]))
     if len(faults):
         first = faults.iloc[0]
         words = findings.describe(first["fault"]).partition(",")[0].partition(" (")[0]
