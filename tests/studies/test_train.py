@@ -94,7 +94,10 @@ def test_a_trainer_without_a_run_that_ends_is_not_the_best_by_its_untrained_poli
     rows.loc[planted, ["status", "first_return"]] = ["nonfinite", -100.0]
     text = views(experiment, rows).findings[0]
     assert "(shac), and shac[window=8] end lower" in text
+    assert text.endswith(", and no run of ppo ends with a finite return.")
     assert "-100" not in text
+    rows.loc[rows["trainer"] == "shac[window=8]", ["status", "first_return"]] = ["nonfinite", -100.0]
+    assert not any("windows" in found for found in views(experiment, rows).findings), "one window is left"
     rows["status"] = "nonfinite"
     assert views(experiment, rows).findings[0] == "No run ends with a finite return."
 

@@ -118,10 +118,12 @@ def _filled(values: np.ndarray, count: int) -> np.ndarray:
 
 
 def windows(runs: pd.DataFrame) -> pd.DataFrame:
-    """Return a line per problem, family and window, for families with several: gradient and final return."""
+    """Return a line per problem, family and window with a run that ended, for families with several: gradient and final return."""
     known = runs[runs["window"].notna() & runs["window_gradient"].notna()]
     lines = []
     for (problem, family, window), part in known.groupby(["problem", "family", "window"]):
+        if not (part["status"] == "ok").any():
+            continue
         final = final_returns(part)
         low, high = interval(final)
         lines.append({

@@ -31,7 +31,9 @@ def recommendation(summary: pd.DataFrame) -> str:
     for problem, part in summary.groupby("problem", sort=False):
         where = f" on {problem}" if summary["problem"].nunique() > 1 else ""
         # a method without a run that ended has the return of its untrained policy only
-        part = part[(part["failed"] < part["seeds"]) & np.isfinite(part["final"])]
+        has_ended = (part["failed"] < part["seeds"]) & np.isfinite(part["final"])
+        lost = part[~has_ended]["method"]
+        part = part[has_ended]
         if part.empty:
             parts.append(f"No run{where} ends with a finite return")
             continue
@@ -56,6 +58,8 @@ def recommendation(summary: pd.DataFrame) -> str:
         else:
             also = f", not distinguishable from {_names(tied['method'])}" if len(tied) else ""
             parts.append(f"{value}{also}; {_names(behind['method'])} end lower ({_interval(behind.iloc[0])} or less)")
+        if len(lost):
+            parts[-1] += f"; no run of {_names(lost)} ends with a finite return"
     return f"{'. '.join(parts)}.".replace("; ", ", and ")
 
 
