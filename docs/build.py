@@ -96,8 +96,8 @@ Beside the files of [every run](reading-results.md#files), each study writes its
   baseline, and the share of targets reached in time. `targets.csv`: per problem, method and target (the first regret over
   10, 100 and 1,000) the successes with Wilson's interval and the average runtime in rollouts. The runtime includes failed
   searches, and is infinite where none succeeded. Methods are compared at their best tuning on each problem.
-- `train.csv`: one line per run, with the return before and after it. `windows.csv`: per length of a window the norm and bias of its
-  gradient and the final return. `faults.csv`: what the logs show, in words.
+- `train.csv`: one line per run, with the return before and after it. `windows.csv`: per length of a window the norm of its gradient
+  and the final return. `faults.csv`: what the logs show, in words.
 - `identify.csv`: one line per problem, with lists by method of fitting (`shooting`) and by product of powers (`invariants`).
 """
 ALSO_IN_CSV = ("study", "parameters")

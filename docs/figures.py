@@ -198,16 +198,26 @@ def backward_memory_table() -> str:
     lines = backward_memory()
     scenes = list(dict.fromkeys(lines["problem"]))
     head = [
-        "| backend | " + " | ".join(f"`{scene}`: MB | p | seconds" for scene in scenes) + " |",
+        "| backend | " + " | ".join(f"`{scene}`: MiB | p | seconds" for scene in scenes) + " |",
         "|---" + "|--:" * (3 * len(scenes)) + "|",
     ]
     return block(head + [
         f"| `{method}` | " + " | ".join(
-            f"{number(row.memory_mb)} | {number(row.order) if np.isfinite(row.order) else '-'} | {number(row.gradient_s)}"
-            for row in part.set_index("problem").loc[scenes].itertuples()
+            f"{backward_memory_of(row)} | {with_ends(row, 'order') if np.isfinite(row['order']) else '-'} | {number(row['gradient_s'])}"
+            for _, row in part.set_index("problem").loc[scenes].iterrows()
         ) + " |"
         for method, part in lines.groupby("method", sort=False)
     ])  # fmt: skip
+
+
+def with_ends(row: pd.Series, name: str) -> str:
+    """Return a number with the ends of its interval."""
+    return f"{number(row[name])} [{number(row[f'{name}_low'])}, {number(row[f'{name}_high'])}]"
+
+
+def backward_memory_of(row: pd.Series) -> str:
+    """Return the memory of a method with its interval, or its upper limit."""
+    return f"< {number(row['memory_mb_high'])}" if row["is_small"] else with_ends(row, "memory_mb")
 
 
 def backward_memory_finding() -> str:
@@ -216,9 +226,9 @@ def backward_memory_finding() -> str:
     scene = lines.index[0][0]
     plain, two = (lines.loc[(scene, name)] for name in ("checkpointed[keep=everything]", "checkpointed"))
     return (
-        f"At T = {count(two['horizon'])}, two levels of checkpoints take {number(two['memory_mb'])} MB and "
+        f"At T = {count(two['horizon'])}, two levels of checkpoints take {backward_memory_of(two)} MiB and "
         f"{number(two['gradient_s'])} s for 256 gradients of `{scene}`, where plain reverse mode takes "
-        f"{number(plain['memory_mb'])} MB and {number(plain['gradient_s'])} s."
+        f"{backward_memory_of(plain)} MiB and {number(plain['gradient_s'])} s."
     )
 
 
@@ -318,17 +328,17 @@ def trained_table(experiment: str = "train") -> str:
 
 
 def windows_table(experiment: str = "train") -> str:
-    """Return gradient, bias and final return by the length of a window as a Markdown table."""
-    head = [
-        "| window [steps] | norm of its gradient | bias against a whole episode | runs with a bias above 0 | final return |",
-        "|--:" * 5 + "|",
-    ]
+    """Return gradient and final return by the length of a window as a Markdown table."""
+    head = ["| window [steps] | norm of its gradient | final return |", "|--:" * 3 + "|"]
     return block(head + [
-        f"| {line['window']:.0f} | {number(line['window_gradient'])} | "
-        f"{number(line['bias'])} [{number(line['bias_low'])}, {number(line['bias_high'])}] | {line['resolved']} | "
-        f"{final_return(line)} |"
+        f"| {line['window']:.0f} | {number(line['window_gradient'])} | {final_return(line)} |"
         for line in aggregate.windows(trained(experiment)).to_dict("records")
     ])  # fmt: skip
+
+
+def windows_finding(experiment: str = "train") -> str:
+    """Return which window ends best, which are not distinguishable from it, and which end lower."""
+    return findings.window(aggregate.windows(trained(experiment)))
 
 
 def faults_table(experiment: str) -> str:
@@ -585,6 +595,7 @@ FIGURES: dict[str, Callable[[], str]] = {
     "train-range": lambda: trained_in_range(-560.0, -480.0),
     "train-table": trained_table,
     "train-windows": windows_table,
+    "train-windows-finding": windows_finding,
     "hopper-finding": lambda: findings.recommendation(aggregate.summarise(trained("train/hopper"))),
     "hopper-table": lambda: trained_table("train/hopper"),
     "hopper-windows": lambda: windows_table("train/hopper"),

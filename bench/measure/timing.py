@@ -145,7 +145,7 @@ def reset_peak_memory() -> None:
 
 
 def peak_memory_mb() -> float:
-    """Return the peak resident memory of this process since the reset, libraries included [MB]; NaN if unknown."""
+    """Return the peak resident memory of this process since the reset, libraries included [MiB]; NaN if unknown."""
     with suppress(OSError, IndexError, ValueError):
         status = Path("/proc/self/status").read_text()
         return int(status.partition("VmHWM:")[2].split()[0]) / 1024

@@ -36,7 +36,7 @@ class Trainer(Plugin):
     """Trains a policy by pure functions of its state, so that a run can stop between two updates and go on elsewhere.
 
     ``env`` is a ``bench.training.Environment``. :meth:`start`, :meth:`update` and :meth:`action` are traced by JAX.
-    Random numbers come from keys in the state, so the same seed gives the same run.
+    Random numbers come from keys in the state, so the same seed gives the same run on one machine.
     """
 
     kind: ClassVar[str] = "trainers"

@@ -24,6 +24,6 @@ def returns(env: Environment, policy: Callable[[Array], Array], numbers: Array) 
         return (moved.next, total, over | moved.ended), None
 
     first = env.start(numbers)
-    carry = (first, jnp.zeros_like(numbers[0]), jnp.zeros(numbers.shape[1], dtype=bool))
+    carry = (first, jnp.zeros(numbers.shape[1], numbers.dtype), jnp.zeros(numbers.shape[1], dtype=bool))
     (_, total, _), _ = jax.lax.scan(step, carry, None, length=env.length)
     return total

@@ -7,11 +7,16 @@ from typing import Any
 import jax
 import optax
 
+from bench.errors import UserError
 from bench.model.ops import Array
 
 
 def batches_of(key: Array, count: int, passes: int, batches: int) -> Array:
     """Return the columns of each batch, ``(passes * batches, count // batches)``: a new order of all in each pass."""
+    if batches > count:
+        raise UserError(
+            f"batches = {batches}, but a window has {count} states (rollouts times steps): each batch needs at least one"
+        )
     size = count // batches
     orders = jax.vmap(lambda k: jax.random.permutation(k, count)[: batches * size])(jax.random.split(key, passes))
     return orders.reshape(passes * batches, size)

@@ -23,6 +23,7 @@ from bench.experiment.study import Study
 from bench.experiment.views import Chart, Mark, Style, Views
 from bench.model import registry
 from bench.report import reproduce
+from bench.report.draw import series_styles
 from bench.report.finish import views_of
 from bench.report.web import document
 from bench.report.web.data import encode
@@ -538,6 +539,30 @@ def test_a_chart_may_have_names_on_its_axis_and_lines_of_no_cell(browser, tmp_pa
     assert browser.do(f"{plot}.layout.annotations.map((one) => one.text)") == ["large", "one"]
     browser.do("state.find = 'nothing has this'; refresh(); settled()")
     assert browser.do(f"{plot}.data.filter((one) => one.text).length") == 2
+    assert browser.said == []
+
+
+def test_charts_have_their_own_looks_and_panels_their_own_scales_where_print_has_them(browser, tmp_path):
+    """The faults: a name had one colour on the whole page, so that two series of a chart could share it, and one scale."""
+    frame = pd.DataFrame({
+        "x": [1.0, 2.0] * 4, "y": [0.0, 1.0, 0.2, 0.8, 0.0, 100.0, 20.0, 80.0], "panel": ["small"] * 4 + ["large"] * 4,
+        "name": ["one", "one", "two", "two"] * 2,
+    })  # fmt: skip
+    x, y = Column("x", log=False), Column("y", log=False)
+    both = Chart("both", "Both", frame, [x], [y], series="name", panel="panel", own_scales=True)
+    alone = Chart("alone", "Alone", frame[frame["name"] == "two"], [x], [y], series="name", panel="panel")
+    rows = small_rows()
+    path = tmp_path / "report.html"
+    views = Views(["It works"], charts=[both, alone])
+    path.write_text(document.assemble(experiment(), rows, views, [["a=1"]] * len(rows), {}))
+    browser.open(path)
+    for k, chart in enumerate((both, alone)):
+        plots = f"[...charts[{k}].panels.querySelectorAll('.plot')]"
+        drawn = browser.do(f"{plots}.flatMap((plot) => plot.data).map((one) => one.line.color)")
+        printed = [style.colour.lower() for style in series_styles(chart).values()]
+        assert drawn == printed * 2
+        ends = browser.do(f"{plots}.map((plot) => plot.layout.yaxis.range[1])")
+        assert ends == pytest.approx([1.08, 108.0] if chart.own_scales else [86.4, 86.4], rel=0.01)
     assert browser.said == []
 
 

@@ -1,11 +1,14 @@
 """Returns of a policy, and environments."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from problems import cartpole_program
 
+from bench.errors import UserError
 from bench.model import LoopOps, State, compose, registry
-from bench.training import evaluation
+from bench.training import evaluation, fitting
 from bench.training.environment import Environment
 
 ROUNDING = 1e-9
@@ -47,3 +50,28 @@ def test_an_episode_counts_up_to_its_first_end():
     returns = evaluation.returns(env, lambda seen: 0.0 * seen[:1], jnp.zeros((8, 3)))
     # at 1.1 m/s the cart passes 0.05 m in the third step of 1/60 s
     assert np.asarray(returns).tolist() == [-3.0] * 3
+
+
+def test_a_scene_without_random_starts_has_returns():
+    from dataclasses import dataclass
+
+    @dataclass(frozen=True)
+    class Fixed(registry.usable("scenes", "cartpole_swing")):
+        name = "fixed"
+        n_start = 0
+
+        def initial_state(self, xp, theta):
+            return State(0.0 * theta[:1] + xp.asarray([[0.0], [3.0]]), 0.0 * theta[:1] + xp.asarray([[0.0], [0.0]]))
+
+    program = compose(Fixed(horizon=5), None, registry.make("integrators", "semi_implicit_euler"))
+    env = Environment(program, registry.make("backends", "jax").ops())
+    returns = np.asarray(evaluation.returns(env, lambda seen: 0.0 * seen[:1], jnp.zeros((0, 3))))
+    assert returns.shape == (3,)
+    assert np.isfinite(returns).all()
+    assert len(set(returns.tolist())) == 1
+
+
+def test_more_batches_than_states_are_refused():
+    with pytest.raises(UserError, match="batches = 9, but a window has 8 states"):
+        fitting.batches_of(jax.random.PRNGKey(0), 8, passes=2, batches=9)
+    assert fitting.batches_of(jax.random.PRNGKey(0), 8, passes=2, batches=8).shape == (16, 1)

@@ -68,7 +68,6 @@ def page_data(
         "tables": tables,
         "columns": columns,
         "charts": list(drawn.values()),
-        "looks": {name: _look(style) for chart in charts for name, style in draw.series_styles(chart).items()},
         "filters": filters,
         "identity": identity,
         "command": {"head": reproduce.HEAD, "words": [encode(pd.Series(part, dtype=object)) for part in words]},
@@ -152,6 +151,8 @@ def _chart(chart: Chart) -> dict[str, Any]:
         "join": chart.join,
         "marks": _marks(chart, "x"),
         "y_marks": _marks(chart, "y"),
+        "own_scales": chart.own_scales,
+        "looks": {name: _look(style) for name, style in draw.series_styles(chart).items()},
         "notes": dict(chart.panel_notes),
         "texts": [{"text": note.text, "x": note.x, "y": note.y, "panel": note.panel} for note in chart.notes],
     }

@@ -283,13 +283,13 @@ function dark() {
 }
 
 const LOST = { colour: ["#757575", "#9a9a9a"], symbol: "circle", dash: "solid" };
-const looks = (name) => page.looks[name] || LOST;
-const filling = (name) => looks(name).colour[dark() ? 1 : 0];
+const looks = (chart, name) => chart.looks[name] || LOST;
+const filling = (chart, name) => looks(chart, name).colour[dark() ? 1 : 0];
 const GROUND = ["#ffffff", "#14171a"], INK = ["#16191d", "#e9ecef"];
 const MARK = 3, TEXT = 4.5; // contrasts that WCAG level AA asks for
 const ground = () => GROUND[dark() ? 1 : 0];
 const ink = () => INK[dark() ? 1 : 0];
-const colour = (name) => readable(filling(name), MARK);
+const colour = (chart, name) => readable(filling(chart, name), MARK);
 
 const channels = (hex) => [1, 3, 5].map((k) => parseInt(hex.slice(k, k + 2), 16));
 
@@ -342,6 +342,8 @@ function drawChart(chart) {
   chart.note.textContent = names.length ? "" : "nothing to draw among the cells shown";
   chart.panels.dataset.count = drawn.length;
   const range = isMap(chart) ? null : ranges(chart, drawn.map((name) => facets.get(name)));
+  const own = isText(chart.table, chart.yAxis.column) ? "x" : "y"; // the axis whose scale a panel may have for itself
+  const rangeOf = (panel) => (chart.own_scales ? { ...range, [own]: ranges(chart, [panel])[own] } : range);
   while (chart.panels.children.length > drawn.length) {
     Plotly.purge(chart.panels.lastChild.lastChild);
     chart.panels.lastChild.remove();
@@ -359,7 +361,7 @@ function drawChart(chart) {
     const lines = lineCount(chart, facets.get(name));
     plot.style.height = lines > 12 ? `${60 + 24 * lines}px` : "";
     plot.style.minHeight = isMap(chart) && lines <= 12 ? `${150 + 24 * lines}px` : ""; // with slanted names below, on a phone
-    const [traces, layout] = isMap(chart) ? mapFigure(chart, facets.get(name)) : pointFigure(chart, name, facets.get(name), range);
+    const [traces, layout] = isMap(chart) ? mapFigure(chart, facets.get(name)) : pointFigure(chart, name, facets.get(name), rangeOf(facets.get(name)));
     Plotly.react(plot, traces, layout, { displayModeBar: false, responsive: true });
     plot.removeAllListeners("plotly_click");
     plot.on("plotly_click", (event) => {
@@ -373,12 +375,12 @@ function drawChart(chart) {
 function drawLegend(chart, panels) {
   const names = new Set();
   for (const panel of panels) for (const name of panel.names) names.add(name);
-  const ordered = Object.keys(page.looks).filter((name) => names.has(name));
+  const ordered = Object.keys(chart.looks).filter((name) => names.has(name));
   chart.legend.replaceChildren(...ordered.map((name) => {
-    const look = looks(name);
+    const look = looks(chart, name);
     const mark = element("b", { textContent: chart.level ? look.letter || "\u2003" : GLYPHS[look.symbol] });
-    if (chart.level) { mark.className = "level"; mark.style.background = filling(name); mark.style.color = inkOn(filling(name)); }
-    else mark.style.color = colour(name);
+    if (chart.level) { mark.className = "level"; mark.style.background = filling(chart, name); mark.style.color = inkOn(filling(chart, name)); }
+    else mark.style.color = colour(chart, name);
     return element("li", {}, mark, " " + (look.meaning || name));
   }));
 }
@@ -415,7 +417,7 @@ function append(map, key, value) {
   else map.set(key, [value]);
 }
 
-/* One range of each axis for all panels that are drawn. */
+/* One range of each axis for some panels together. */
 function ranges(chart, panels) {
   const find = (axis, values) => {
     if (!values.length || values.some((value) => typeof value === "string")) return undefined;
@@ -443,7 +445,7 @@ function pointFigure(chart, name, panel, range) {
   if (chart.front) traces.push(...frontTraces(panel, kept));
   if (chart.join) traces.unshift(...joins(panel));
   const chosen = [...panel.lines.values()].flat().filter((point) => point.row >= 0 && point.row === state.selected);
-  if (chosen.length) traces.push(rings(chosen, 17, 3, colour("")));
+  if (chosen.length) traces.push(rings(chosen, 17, 3, colour(chart, "")));
   const shapes = [], annotations = [];
   if (range.y && chart.yAxis.log && chart.yAxis.above_one && range.y[1] > 0) {
     shapes.push({ type: "rect", xref: "paper", x0: 0, x1: 1, y0: 1, y1: 10 ** range.y[1], layer: "below",
@@ -524,15 +526,15 @@ function backendNames(chart, panel, joined, range) {
     const [x, y, name] = [scaled(p.x, chart.xAxis), scaled(p.y, chart.yAxis), read(p.row)];
     const place = names.find((one) => near(one.x, x, range.x, 0.12) && near(one.y, y, range.y, 0.07));
     if (place) place.told.add(name);
-    else names.push({ x, y, told: new Set([name]), color: readable(filling(p.series), TEXT) });
+    else names.push({ x, y, told: new Set([name]), color: readable(filling(chart, p.series), TEXT) });
   }
   return names.map(({ x, y, told: here, color }) => ({ x, y, xanchor: "left", xshift: 4, yanchor: "bottom",
     showarrow: false, text: plotted([...here].join(", ")), font: { size: SMALL, color } }));
 }
 
 function trace(chart, points, joined) {
-  const look = looks(points[0].series);
-  const own = colour(points[0].series);
+  const look = looks(chart, points[0].series);
+  const own = colour(chart, points[0].series);
   const symbol = points.some((p) => p.limit || p.leftLimit)
     ? points.map((p) => look.symbol + (p.limit || p.leftLimit ? "-open" : "")) : look.symbol;
   const made = {
@@ -656,7 +658,7 @@ function mapPanels(chart) {
 }
 
 function mapFigure(chart, panel) {
-  const names = Object.keys(page.looks);
+  const names = Object.keys(chart.looks);
   const order = (axis, values) => {
     const column = page.tables[chart.table][axis.column] || page.tables.rows[axis.column];
     if (!column.index) return [...values].sort((a, b) => a - b);
@@ -667,8 +669,8 @@ function mapFigure(chart, panel) {
   const at = (x, y) => panel.places.get(JSON.stringify([x, y]));
   const grid = (make) => ys.map((y) => xs.map((x) => (at(x, y) ? make(at(x, y), x, y) : null)));
   const worst = (found) => found.reduce((a, b) => (names.indexOf(b.level) > names.indexOf(a.level) ? b : a));
-  const fill = (found) => worst(found).fill || filling(worst(found).level);
-  const letter = (found) => looks(worst(found).level).letter || "";
+  const fill = (found) => worst(found).fill || filling(chart, worst(found).level);
+  const letter = (found) => looks(chart, worst(found).level).letter || "";
   const isNarrow = 0.75 * chart.panels.clientWidth < NARROWEST * xs.length;
   const text = (found) => (chart.cell && !(isNarrow && letter(found)) ? worst(found).cell : letter(found));
   const label = (found, x, y) => [`<b>${plotted(worst(found).level || text(found))}</b>`,

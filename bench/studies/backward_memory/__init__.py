@@ -25,14 +25,14 @@ class BackwardMemory(Study):
     axes: ClassVar[tuple[str, ...]] = ("scene", "contact", "integrator", "backend")
     columns: ClassVar[Columns] = Columns.of(
         Column("memory_mb", "largest resident memory during `samples` gradients beyond the memory before, median over calls",
-               "MB", label="memory", low="memory_mb_low", high="memory_mb_high", measured=True),
-        Column("memory_mb_low", "smallest of the calls: lower end of the interval", "MB", measured=True),
-        Column("memory_mb_high", "largest of the calls: upper end of the interval", "MB", measured=True),
+               "MiB", label="memory", low="memory_mb_low", high="memory_mb_high", measured=True),
+        Column("memory_mb_low", "smallest of the calls: lower end of the interval", "MiB", measured=True),
+        Column("memory_mb_high", "largest of the calls: upper end of the interval", "MiB", measured=True),
         Column("gradient_s", "processor time of `samples` gradients on one thread, median over calls", "s", label="gradients",
                low="gradient_s_low", high="gradient_s_high", measured=True, format="seconds"),
         Column("gradient_s_low", "smallest of the calls: lower end of the interval", "s", measured=True),
         Column("gradient_s_high", "largest of the calls: upper end of the interval", "s", measured=True),
-        Column("process_mb", "resident memory before the gradients: libraries, compiled program, theta and noise", "MB",
+        Column("process_mb", "resident memory before the gradients: libraries, compiled program, theta and noise", "MiB",
                label="process", measured=True),
         Column("gradient_error_rel", "distance of the mean gradient from that of the backend in `compared_with`, relative to "
                "its norm", label="difference", comparison=ComparisonRule("exact", "difference of gradients")),
@@ -47,7 +47,7 @@ class BackwardMemory(Study):
     )
 
     def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
-        """Return one cell's results by column: memory [MB] and time [s] of a batch of gradients, and their agreement."""
+        """Return one cell's results by column: memory [MiB] and time [s] of a batch of gradients, and their agreement."""
         from bench.studies.backward_memory.measure import measure
 
         return measure(cell, session, self.calls)

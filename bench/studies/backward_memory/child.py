@@ -36,7 +36,7 @@ def main() -> None:
 
 
 def measured(cell: Cell, calls: int, cache: Path | None) -> dict[str, Any]:
-    """Return the mean gradient, and processor times [s] and peaks of memory [MB] of some calls after one that compiles.
+    """Return the mean gradient, and processor times [s] and peaks of memory [MiB] of some calls after one that compiles.
 
     The whole batch is one block on one thread. Memory freed by earlier calls is returned to the system before each call.
     On one thread, processor time is the time on an otherwise idle machine, and other load hardly changes it.

@@ -6,7 +6,6 @@ import math
 from dataclasses import replace
 from typing import Any, NamedTuple
 
-import numpy as np
 import pandas as pd
 
 from bench.experiment import grid
@@ -20,15 +19,17 @@ from bench.report.text import listed, number
 from bench.report.views import arrange
 from bench.report.writer import reasons
 
-FLOOR = 0.1
-"""Smallest memory in MB that is drawn: the kernel counts resident pages of a thread only to within about this."""
+FLOOR = 0.3
+"""Error of a measured memory in MiB: the kernel counts resident pages late, so that peaks are 0.1 to 0.25 MiB too low."""
+SMALL = 1.0
+"""Memory in MiB, about three floors, below which a memory is an upper limit without ratios and orders."""
 AGREES = 1e-6
 """Relative difference up to which gradients agree: rounding, and central differences of costs in a pass over Jacobians."""
 SHOWN = ("memory_mb", "gradient_s", "process_mb", "gradient_error_rel")
 LINES = (
     text("problem"),
     text("method"),
-    Column("memory_mb", unit="MB", label="memory", low="memory_mb_low", high="memory_mb_high"),
+    Column("memory_mb", unit="MiB", label="memory", low="memory_mb_low", high="memory_mb_high", limit="is_small"),
     Column("less", label="times less memory", low="less_low", high="less_high"),
     Column("gradient_s", label="gradients", low="gradient_s_low", high="gradient_s_high", format="seconds"),
     Column("longer", label="times the time", low="longer_low", high="longer_high"),
@@ -37,17 +38,20 @@ LINES = (
 """The columns of the table with a line per problem and method."""
 NOTE = (
     "At the longest horizon of each problem. Memory is the peak of a batch of gradients beyond the memory of the process before. "
-    "Ratios are to the first method. order: p in memory ~ T^p between the two longest horizons. Intervals are ranges of "
-    "the measured calls, which contain a median with probability 97% or more, and ratios of their ends."
+    "Ratios are to the experiment's first method, where it has a result. order: p in memory ~ T^p between the two longest "
+    "horizons. Intervals are ranges of the measured calls, which contain a median with probability 97% or more, and ratios of "
+    f"their ends. Intervals of memory are {FLOOR} MiB wider on both sides, the error of the measurement, and memory below "
+    f"{SMALL:.0f} MiB has neither ratio nor order."
 )
 CELLS_NOTE = (
     "One process per cell. Memory is the peak of a batch of gradients beyond `process`, the memory before. Difference: the "
-    "relative distance of the mean gradient from that of the first backend that computes references."
+    "relative distance of the mean gradient from that of the first backend that computes references. "
+    f"Intervals of memory are {FLOOR} MiB wider on both sides than the range of the calls, the error of the measurement."
 )
 
 
 class Ratio(NamedTuple):
-    """A ratio of two positive numbers with its interval."""
+    """A ratio of two positive numbers with its interval, NaN where it is not known."""
 
     value: float
     low: float
@@ -57,44 +61,70 @@ class Ratio(NamedTuple):
         return f"{number(self.value)} [{number(self.low)}, {number(self.high)}]"
 
 
+UNKNOWN = Ratio(math.nan, math.nan, math.nan)
+
+
 def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     """Return the findings, the tables of the longest horizon and of all cells, and the charts of memory and time."""
     shown = arrange(experiment, rows)
+    shown = replace(shown, rows=with_error(shown.rows))
     own = [replace(experiment.columns.by_name[name], digits=3) for name in SHOWN]
+    own[0] = replace(own[0], limit="is_small")
     cells = engine_table(
         experiment, rows, shown, own, "memory and time of a backward pass", [CELLS_NOTE], always=("scene", "backend", "horizon")
     )  # fmt: skip
     cells = replace(cells, terminal=False)
-    good = shown.rows[(shown.rows["status"] == "ok") & shown.rows["memory_mb"].notna()]
-    if good.empty:
+    tried = shown.rows
+    if not _has_result(tried).any():
         return Views(["No cell gave a result: the table has the reason of each."], [cells], remarks=reasons(rows))
     # the first method is the experiment's first, in whatever order rows were stored
     places = {cell.key: place for place, cell in enumerate(grid.cells(experiment))}
-    good = good.iloc[good["key"].map(places).fillna(len(places)).to_numpy().argsort(kind="stable")]
+    tried = tried.iloc[tried["key"].map(places).fillna(len(places)).to_numpy().argsort(kind="stable")]
     over = axes_of(shown, "horizon")
-    good = good.assign(
-        problem=problem_names(shown, ["scene", "contact", "integrator"], over, always=["scene"], rows=good),
-        method=problem_names(shown, ["backend"], over, always=["backend"], rows=good),
+    tried = tried.assign(
+        problem=problem_names(shown, ["scene", "contact", "integrator"], over, always=["scene"], rows=tried),
+        method=problem_names(shown, ["backend"], over, always=["backend"], rows=tried),
     )
-    lines = longest(good)
+    first, good = str(tried["method"].iloc[0]), tried[_has_result(tried)]
+    lines = longest(good, first)
     table = Table("backward_memory_methods", lines, LINES, "Memory and time of a backward pass", [NOTE], terminal=True, page=True)  # fmt: skip
-    charts = _charts(experiment, good, lines)
-    return Views(findings(good, lines), [table, cells], charts, remarks=reasons(rows))
+    charts = _charts(experiment, good, lines, first)
+    return Views(findings(good, lines, first), [table, cells], charts, remarks=reasons(rows))
 
 
-def longest(good: pd.DataFrame) -> pd.DataFrame:
-    """Return a line per problem and method at the problem's longest horizon, with ratios to the first method."""
+def with_error(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return rows whose intervals of memory contain the error of the measurement, and which memories are only limits.
+
+    A limit is the upper end of its interval, at least :data:`SMALL`.
+    """
+    memory, is_small = rows["memory_mb"], rows["memory_mb"] < SMALL
+    low, high = (rows["memory_mb_low"] - FLOOR).clip(lower=0.0), rows["memory_mb_high"] + FLOOR
+    limit = high.clip(lower=SMALL)
+    return rows.assign(
+        memory_mb=memory.mask(is_small, limit), memory_mb_low=low.mask(is_small, 0.0),
+        memory_mb_high=high.mask(is_small, limit), is_small=is_small,
+    )  # fmt: skip
+
+
+def _has_result(rows: pd.DataFrame) -> pd.Series:
+    return (rows["status"] == "ok") & rows["memory_mb"].notna()
+
+
+def longest(good: pd.DataFrame, first: str) -> pd.DataFrame:
+    """Return a line per problem and method at the problem's longest horizon, with ratios to the method ``first``."""
     entries: list[dict[str, Any]] = []
     for _, part in good.groupby("problem", sort=False):
         horizon = part["horizon"].max()
         last = part[part["horizon"] == horizon].drop_duplicates("method", keep="last")
         before = part[part["horizon"] < horizon]
-        first = last.iloc[0]
+        base = last[last["method"] == first]
         for _, row in last.iterrows():
-            less, longer = ratio(first, row, "memory_mb"), ratio(row, first, "gradient_s")
+            less = longer = UNKNOWN
+            if len(base) and row["method"] != first:
+                less, longer = ratio(base.iloc[0], row, "memory_mb"), ratio(row, base.iloc[0], "gradient_s")
             earlier = before[before["method"] == row["method"]].sort_values("horizon").tail(1)
-            order = _order(earlier.iloc[0], row) if len(earlier) else Ratio(*[math.nan] * 3)
-            names = ("problem", "method", "horizon", *(f"{n}{e}" for n in ("memory_mb", "gradient_s") for e in ("", "_low", "_high")))  # fmt: skip
+            order = _order(earlier.iloc[0], row) if len(earlier) else UNKNOWN
+            names = ("problem", "method", "horizon", "is_small", *(f"{n}{e}" for n in ("memory_mb", "gradient_s") for e in ("", "_low", "_high")))  # fmt: skip
             entries.append({name: row[name] for name in names} | {
                 f"{name}{end}": value
                 for name, one in (("less", less), ("longer", longer), ("order", order))
@@ -104,49 +134,83 @@ def longest(good: pd.DataFrame) -> pd.DataFrame:
 
 
 def ratio(a: pd.Series, b: pd.Series, name: str) -> Ratio:
-    """Return the ratio of a column of two rows. Memory below :data:`FLOOR` counts as the floor.
+    """Return the ratio of a column of two rows; unknown where a memory is only an upper limit.
 
     The interval divides the ends of both intervals, so it covers at least as often as both of them together.
     """
-    floor = FLOOR if name == "memory_mb" else 0.0
-    above, below = ([max(float(row[f"{name}{end}"]), floor) for end in ("", "_low", "_high")] for row in (a, b))
+    if name == "memory_mb" and (a["is_small"] or b["is_small"]):
+        return UNKNOWN
+    above, below = ([float(row[f"{name}{end}"]) for end in ("", "_low", "_high")] for row in (a, b))
     return Ratio(above[0] / below[0], above[1] / below[2], above[2] / below[1])
 
 
 def _order(earlier: pd.Series, later: pd.Series) -> Ratio:
-    """Return p in memory ~ T^p between two horizons; NaN where a memory is below the floor."""
-    if min(earlier["memory_mb_low"], later["memory_mb_low"]) < FLOOR:
-        return Ratio(*[math.nan] * 3)
+    """Return p in memory ~ T^p between two horizons; unknown where a memory is only an upper limit."""
     steps = math.log(later["horizon"] / earlier["horizon"])
     return Ratio(*(math.log(value) / steps for value in ratio(later, earlier, "memory_mb")))
 
 
-def findings(good: pd.DataFrame, lines: pd.DataFrame) -> list[str]:
-    """Return the method with the least memory at the longest horizon, the fastest one, and whether gradients agree."""
-    parts = []
-    for problem, part in lines.groupby("problem", sort=False):
-        least = part.loc[part["memory_mb"].idxmin()]
-        less, longer = (Ratio(*(least[f"{name}{end}"] for end in ("", "_low", "_high"))) for name in ("less", "longer"))
-        parts.append(
-            f"on {problem} {least['method']} needs {less} times less memory than {part.iloc[0]['method']} at {longer} times its time"
+def findings(good: pd.DataFrame, lines: pd.DataFrame, first: str) -> list[str]:
+    """Return what the methods with the least memory save at the longest horizon, the fastest one, and whether gradients agree."""
+    parts = [
+        f"On {problem} at T = {int(part['horizon'].max()):,}, {_least(part, first)}."
+        for problem, part in lines.groupby("problem", sort=False)
+    ]
+    texts = [" ".join(parts), fastest(lines), agreement(good)]
+    return [text for text in texts if text]
+
+
+def _least(part: pd.DataFrame, first: str) -> str:
+    """Return what the method with the least memory on one problem saves, compared with the method ``first``."""
+    base, others = part[part["method"] == first], part[part["method"] != first]
+    if base.empty:
+        return f"{first} has no result, so that nothing is compared with it"
+    own = base.iloc[0]
+    if others.empty:
+        return f"{first} needs {_memory(own)}, and no other method has a result"
+    small = others[others["is_small"]]
+    if own["is_small"] or not len(small):
+        least = others.loc[others["memory_mb"].idxmin()]
+        less = _ratio(least, "less")
+        if not less.low > 1.0:
+            return f"no method needs distinguishably less memory than {first} ({_memory(own)})"
+        return (
+            f"{least['method']} needs {less} times less memory than {first} at {_ratio(least, 'longer')} times its time"
         )
-    first = f"At T = {int(lines['horizon'].max()):,}, {listed(parts)}."
-    return [first, fastest(lines), agreement(good)]
+    times = [f"{row['method']} at {_ratio(row, 'longer')} times the time" for _, row in small.iterrows()]
+    return f"{first} needs {_memory(own)}, and {_limit(small)} is enough for {listed(times)}"
+
+
+def _ratio(line: pd.Series, name: str) -> Ratio:
+    return Ratio(*(line[f"{name}{end}"] for end in ("", "_low", "_high")))
+
+
+def _memory(line: pd.Series) -> str:
+    value = Ratio(*(line[f"memory_mb{end}"] for end in ("", "_low", "_high")))
+    return _limit(line.to_frame().T) if line["is_small"] else f"{value} MiB"
+
+
+def _limit(small: pd.DataFrame) -> str:
+    return f"less than {float(small['memory_mb_high'].max()):.3g} MiB"
 
 
 def fastest(lines: pd.DataFrame) -> str:
-    """Return the fastest method of each problem at the longest horizon, or the methods whose intervals overlap."""
+    """Return the fastest of several methods on each problem at the longest horizon, or those whose intervals overlap."""
     names: dict[str, list[str]] = {}
     for problem, part in lines.groupby("problem", sort=False):
+        if len(part) < 2:
+            continue
         limit = part.loc[part["gradient_s"].idxmin(), "gradient_s_high"]
         close = part[part["gradient_s_low"] <= limit]["method"]
         names.setdefault(" or ".join(close) + (" (open)" if len(close) > 1 else ""), []).append(str(problem))
+    if not names:
+        return ""
     return f"The fastest there is {', '.join(f'{name} on {listed(problems)}' for name, problems in names.items())}."
 
 
 def agreement(good: pd.DataFrame) -> str:
-    """Return in how many cells the gradient agrees with that of the backend it is compared with, and the largest difference."""
-    known = good[good["gradient_error_rel"].notna()]
+    """Return in how many cells the gradient agrees with that of another backend, and the largest difference."""
+    known = good[good["gradient_error_rel"].notna() & (good["backend"] != good["compared_with"])]
     if known.empty:
         return "No gradient was compared with another one."
     same = int((known["gradient_error_rel"] <= AGREES).sum())
@@ -158,33 +222,54 @@ def agreement(good: pd.DataFrame) -> str:
     )
 
 
-def _charts(experiment: Experiment, good: pd.DataFrame, lines: pd.DataFrame) -> list[Chart]:
+def _charts(experiment: Experiment, good: pd.DataFrame, lines: pd.DataFrame, first: str) -> list[Chart]:
     """Return the charts of memory and of time along the horizon, a panel per problem and a line per method."""
     own = experiment.columns.by_name
-    names = [f"memory_mb{end}" for end in ("", "_low", "_high")]
-    frame = good.assign(
-        row=good.index, is_small=good["memory_mb"] < FLOOR, **{n: good[n].clip(lower=FLOOR) for n in names}
-    )
+    frame = good.assign(row=good.index)
     methods = list(dict.fromkeys(good["method"]))
     styles = {method: Style(colour(i), marker(i)) for i, method in enumerate(methods)}
     horizon = replace(own["horizon"], label="horizon T", log=True)
     memory = replace(own["memory_mb"], limit="is_small", log=True)
     seconds = replace(own["gradient_s"], label="time of a batch of gradients", log=True)
     samples = " or ".join(f"{count:g}" for count in good["samples"].unique())
-    least = lines.loc[lines["less"].idxmax()] if np.isfinite(lines["less"]).any() else lines.iloc[0]
-    quick = lines.loc[lines["longer"].idxmin()]
-    first = lines.iloc[0]["method"]
+    conditions = f"Batches of {samples} rollouts on one thread, a process per point"
+    limits = (
+        f". Hollow: at most so much, since little is known below {SMALL:.0f} MiB" if frame["is_small"].any() else ""
+    )
     shared: dict[str, Any] = dict(
         series="method", panel="problem", styles=styles, across=2,
-        subtitle=f"Batches of {samples} rollouts on one thread, a process per point",
     )  # fmt: skip
     return [
         Chart(
-            "backward_memory", f"{least['method']} needs up to {number(least['less'])} times less memory than {first}", frame,
-            [horizon], [memory], text="Peak of the resident memory beyond the memory before the gradients. An arrow: at most so much.", **shared,
+            "backward_memory", _memory_title(lines, first), frame, [horizon], [memory],
+            text="Peak of the resident memory beyond the memory before the gradients.", subtitle=conditions + limits, **shared,
         ),
         Chart(
-            "backward_time", f"{quick['method']} is up to {number(1.0 / quick['longer'])} times as fast as {first}", frame,
-            [horizon], [seconds], text="Median and range of the measured calls.", **shared,
+            "backward_time", _time_title(lines, first), frame, [horizon], [seconds],
+            text="Median and range of the measured calls.", subtitle=conditions, **shared,
         ),
     ]  # fmt: skip
+
+
+def _memory_title(lines: pd.DataFrame, first: str) -> str:
+    """Return the title of the chart of memory: which methods need much less than the first, as far as intervals show it."""
+    base = lines[(lines["method"] == first) & ~lines["is_small"]]
+    small = lines[lines["is_small"] & lines["problem"].isin(base["problem"])]
+    if len(small):
+        methods = small["method"].unique()
+        needs = "needs" if len(methods) == 1 else "need"
+        return f"{listed(methods)} {needs} {_limit(small)} at the longest horizon, where {first} needs at least {number(base['memory_mb_low'].min())} MiB"
+    saving = lines[lines["less_low"] > 1.0]
+    if saving.empty:
+        return "Memory of a batch of gradients along the horizon"
+    least = saving.loc[saving["less"].idxmax()]
+    return f"{least['method']} needs up to {number(least['less'])} times less memory than {first}"
+
+
+def _time_title(lines: pd.DataFrame, first: str) -> str:
+    """Return the title of the chart of time: the method that saves most time, if its interval shows that it saves some."""
+    faster = lines[lines["longer_high"] < 1.0]
+    if faster.empty:
+        return "Time of a batch of gradients along the horizon"
+    quick = faster.loc[faster["longer"].idxmin()]
+    return f"{quick['method']} is up to {number(1.0 / quick['longer'])} times as fast as {first}"

@@ -43,8 +43,9 @@ class Train(Study):
         Column("gradient_typical", "median norm of the actor's gradient over updates", label="gradient norm"),
         Column("gradient_peak", "largest norm of the actor's gradient over updates", label="largest gradient"),
         Column("window_gradient", "norm of the gradient of a window's return, halfway through the run"),
-        Column("window_bias", "its relative distance from the gradient of a whole episode's discounted return",
-               low="window_bias_low", high="window_bias_high", label="bias against a whole episode"),
+        Column("window_bias", "its relative distance from the gradient of a whole episode's discounted return: no bias, since "
+               "the episode is longer and its gradient sums over more actions", low="window_bias_low", high="window_bias_high",
+               label="difference from the whole episode's gradient"),
         Column("window_bias_low", "lower end of its 95% interval over independent batches of rollouts"),
         Column("window_bias_high", "upper end of its 95% interval"),
         Column("difference_error", "relative distance of a directional derivative halfway from its central difference, the smallest over step lengths"),

@@ -14,6 +14,7 @@ from bench.experiment.experiment import Experiment
 from bench.experiment.parameters import flatten
 from bench.measure.performance import bootstrap, bootstrap_along, interquartile_mean
 from bench.report.problems import problem_names
+from bench.report.text import counted
 from bench.report.views import arrange, attempted
 
 PARTS = ("scene", "contact", "integrator", "backend")
@@ -66,6 +67,18 @@ MIN_SEEDS = 5
 """Fewest seeds for an interval: a resample cannot leave the range of its values, which covers too little for fewer."""
 
 
+def interval_words(runs: pd.DataFrame) -> str:
+    """Return what a mean over the seeds of runs is, and whether it has an interval, in words."""
+    counts = runs.groupby(["problem", "method"]).size()
+    least, most = int(counts.min()), int(counts.max())
+    seeds = counted(most, "seed") if least == most else f"{least} to {most} seeds"
+    if least >= MIN_SEEDS:
+        return f"interquartile mean over {seeds} with its 95% bootstrap interval"
+    if most < MIN_SEEDS:
+        return f"interquartile mean over {seeds}, too few for an interval"
+    return f"interquartile mean over {seeds}, with its 95% bootstrap interval where there are {MIN_SEEDS} or more"
+
+
 def interval(values: np.ndarray) -> tuple[float, float]:
     """Return the bootstrap interval of an interquartile mean; NaN for fewer than :data:`MIN_SEEDS` values."""
     if len(values) < MIN_SEEDS:
@@ -105,22 +118,17 @@ def _filled(values: np.ndarray, count: int) -> np.ndarray:
 
 
 def windows(runs: pd.DataFrame) -> pd.DataFrame:
-    """Return a line per problem, family and window, for families with several: gradient, bias and final return.
-
-    The interval of the bias contains the intervals of all runs.
-    """
+    """Return a line per problem, family and window with a run that ended, for families with several: gradient and final return."""
     known = runs[runs["window"].notna() & runs["window_gradient"].notna()]
     lines = []
     for (problem, family, window), part in known.groupby(["problem", "family", "window"]):
+        if not (part["status"] == "ok").any():
+            continue
         final = final_returns(part)
         low, high = interval(final)
-        bias = part[["window_bias", "window_bias_low", "window_bias_high"]].dropna()
         lines.append({
             "problem": problem, "family": family, "window": window, "seeds": len(part),
             "window_gradient": float(part["window_gradient"].median()), "gradient_typical": float(part["gradient_typical"].median()),
-            "bias": interquartile_mean(bias["window_bias"].to_numpy(float)),
-                "bias_low": float(bias["window_bias_low"].min()), "bias_high": float(bias["window_bias_high"].max()),
-                "resolved": f"{(bias['window_bias_low'] > 0).sum()} of {len(part)}",
             "final": interquartile_mean(final), "final_low": low, "final_high": high,
         })  # fmt: skip
     frame = pd.DataFrame(lines)
@@ -132,16 +140,21 @@ def windows(runs: pd.DataFrame) -> pd.DataFrame:
 def faults(runs: pd.DataFrame) -> pd.DataFrame:
     """Return a line per run and fault: problem, method, seed and the fault's numbers in ``fault``.
 
-    A gradient that is cut at the ends of episodes is a fault only of trainers that differentiate the simulation.
+    A gradient that is cut at the ends of episodes is a fault only of trainers that differentiate windows shorter than an
+    episode: whole episodes are cut at their end by construction. Where every update has contact, that a peak has it says
+    nothing, and ``with_contact`` is left out.
     """
     lines: list[dict[str, Any]] = []
     for row in runs.to_dict("records"):
         is_first_order = len(row["cosine_update"]) > 0 or math.isfinite(row["difference_error"])
-        lines += [
-            {"problem": row["problem"], "method": row["method"], "seed": row["seed"], "fault": fault}
-            for fault in json.loads(row["verdicts"] or "[]")
-            if is_first_order or fault["code"] != "cut"
-        ]
+        has_windows = is_first_order and row["window"] < row["horizon"]
+        always_contact = min(np.asarray(row["log_contacts"], float), default=0.0) > 0
+        for fault in json.loads(row["verdicts"] or "[]"):
+            if fault["code"] == "cut" and not has_windows:
+                continue
+            if always_contact:
+                fault.pop("with_contact", None)
+            lines.append({"problem": row["problem"], "method": row["method"], "seed": row["seed"], "fault": fault})
     return pd.DataFrame(lines, columns=["problem", "method", "seed", "fault"])
 
 

@@ -15,6 +15,8 @@ NAMED = 3
 """Most tied methods that a sentence names."""
 DIGITS = 3
 """Significant digits of returns."""
+OPEN = frozenset({"differences"})
+"""Codes of what may be a fault or not: jumps of a cost and rounding make central differences disagree as well."""
 
 
 def sentences(summary: pd.DataFrame, windows: pd.DataFrame, faults: pd.DataFrame, n_runs: int) -> list[str]:
@@ -27,26 +29,37 @@ def recommendation(summary: pd.DataFrame) -> str:
     """Return the best final return on each problem, the methods not distinguishable from it, and those behind."""
     parts = []
     for problem, part in summary.groupby("problem", sort=False):
-        part = part.sort_values("final", ascending=False, kind="stable")
-        best = part.iloc[0]
         where = f" on {problem}" if summary["problem"].nunique() > 1 else ""
-        if not math.isfinite(best["final"]):
+        # a method without a run that ended has the return of its untrained policy only
+        has_ended = (part["failed"] < part["seeds"]) & np.isfinite(part["final"])
+        lost = part[~has_ended]["method"]
+        part = part[has_ended]
+        if part.empty:
             parts.append(f"No run{where} ends with a finite return")
             continue
+        part = part.sort_values("final", ascending=False, kind="stable")
+        best = part.iloc[0]
         others = part.iloc[1:]
         is_behind = np.array([is_below(row, best) for _, row in others.iterrows()], dtype=bool)
         tied, behind = others[~is_behind], others[is_behind]
-        value = f"The best final return{where} is {_interval(best)} ({best['method']})"
+        value = f"The best final return{where} is {_interval(best)} ({best['method']}{_failed(best)})"
         if others.empty:
-            parts.append(f"The final return{where} of {best['method']} is {_interval(best)}")
-        elif behind.empty:
-            reason = (
-                "no other is distinguishable" if math.isfinite(best["final_low"]) else "too few seeds for an interval"
+            parts.append(f"The final return{where} of {best['method']} is {_interval(best)}{_failed(best)}")
+        elif not math.isfinite(best["final_low"]):
+            parts.append(
+                f"Which trainer is best{where} is open, since {counted(best['seeds'], 'seed is', 'seeds are')} too few for an "
+                f"interval: the highest final return is {number(best['final'], DIGITS)} ({best['method']}{_failed(best)})"
             )
-            parts.append(f"Which trainer is best{where} is open: {best['method']} has {_interval(best)}, and {reason}")
+        elif behind.empty:
+            parts.append(
+                f"Which trainer is best{where} is open: {best['method']} has {_interval(best)}{_failed(best)}, and no other is "
+                "distinguishable"
+            )
         else:
             also = f", not distinguishable from {_names(tied['method'])}" if len(tied) else ""
             parts.append(f"{value}{also}; {_names(behind['method'])} end lower ({_interval(behind.iloc[0])} or less)")
+        if len(lost):
+            parts[-1] += f"; no run of {_names(lost)} ends with a finite return"
     return f"{'. '.join(parts)}.".replace("; ", ", and ")
 
 
@@ -62,46 +75,60 @@ def _interval(row: pd.Series) -> str:
     return f"{value} [{number(row['final_low'], DIGITS)}, {number(row['final_high'], DIGITS)}]"
 
 
+def _failed(row: pd.Series) -> str:
+    return f", {row['failed']} of {row['seeds']} runs not finite" if row["failed"] else ""
+
+
 def _names(methods: Iterable[str]) -> str:
     methods = list(methods)
     return listed(methods) if len(methods) <= NAMED else counted(len(methods), "other trainer")
 
 
 def window(windows: pd.DataFrame) -> str:
-    """Return which window ends best within each family, and where the bias of the gradient goes with its length."""
+    """Return which window ends best within each family, those not distinguishable from it, and those behind."""
     parts = []
     for (problem, family), part in windows.groupby(["problem", "family"], sort=False) if len(windows) else ():
         part = part.sort_values("window")
         best = part.loc[part["final"].idxmax()]
-        behind = part[[is_below(row, best) for _, row in part.iterrows()]]
+        others = part[part["window"] != best["window"]]
+        is_behind = np.array([is_below(row, best) for _, row in others.iterrows()], dtype=bool)
+        tied, behind = others[~is_behind], others[is_behind]
         where = f" on {problem}" if windows["problem"].nunique() > 1 else ""
-        lengths = _lengths(behind["window"])
-        shown = (
-            f"{_lengths([best['window']])} steps end best{where}, {lengths} steps end lower"
-            if len(behind)
-            else f"which length ends best{where} is open"
-        )
-        first, last = part.iloc[0], part.iloc[-1]
-        bias = ""
-        if first["bias_low"] > last["bias_high"]:  # the intervals of all runs
-            bias = f", and the gradient's bias falls from {number(first['bias'])} at {first['window']:.0f} to {number(last['bias'])} at {last['window']:.0f} steps"
-        parts.append(f"Among windows of {family}, {shown}{bias}")
+        also = f", not distinguishable from {_lengths(tied['window'])} steps" if len(tied) else ""
+        if len(behind):
+            shown = (
+                f"{best['window']:.0f} steps end best{where}{also}, and {_lengths(behind['window'])} steps end lower"
+            )
+        else:
+            shown = f"which length ends best{where} is open"
+        parts.append(f"Among windows of {family}, {shown}")
     return f"{'. '.join(parts)}." if parts else ""
 
 
 def _lengths(values: Any) -> str:
-    return listed([f"{value:.0f}" for value in values]) if len(values) else ""
+    return listed([f"{value:.0f}" for value in values])
 
 
 def frequent_faults(faults: pd.DataFrame, n_runs: int) -> str:
-    """Return in how many runs the logs show a fault, and the words of the most frequent one."""
-    if faults.empty:
-        return f"The logs of {counted(n_runs, 'run')} show no fault."
-    codes = faults["fault"].map(lambda fault: fault["code"])
-    count = faults[["problem", "method", "seed"]].drop_duplicates().shape[0]
-    first = faults[codes == codes.mode().iloc[0]].iloc[0]
-    words = describe(first["fault"])
-    return f"The logs of {count} of {counted(n_runs, 'run')} show a fault, most often this: {words} ({first['method']}, seed {first['seed']:.0f})."
+    """Return in how many runs the logs show a fault, the words of the most frequent one, and in how many one is open."""
+    known = certain(faults)
+    unknown = _runs(faults.drop(known.index))
+    also = f", and in {unknown} central differences do not agree with the gradient, which is open" if unknown else ""
+    if known.empty:
+        return f"The logs of {counted(n_runs, 'run')} show no fault{also}."
+    codes = known["fault"].map(lambda fault: fault["code"])
+    first = known[codes == codes.mode().iloc[0]].iloc[0]
+    words = f"{describe(first['fault'])} ({first['method']}, seed {first['seed']:.0f})"
+    return f"The logs of {_runs(known)} of {counted(n_runs, 'run')} show a fault, most often this: {words}{also}."
+
+
+def certain(faults: pd.DataFrame) -> pd.DataFrame:
+    """Return the faults that are certain, without what is open."""
+    return faults[[fault["code"] not in OPEN for fault in faults["fault"]]]
+
+
+def _runs(faults: pd.DataFrame) -> int:
+    return len(faults[["problem", "method", "seed"]].drop_duplicates())
 
 
 # ------------------------------------------------------------------------------------------------------ one fault
@@ -159,7 +186,8 @@ WORDS: dict[str, Callable[[Mapping[str, Any]], str]] = {
         f"the gradient nearly vanishes before update {f['update']} and then grows {number(f['factor'])} times, to its usual size"
     ),
     "differences": lambda f: (
-        f"the gradient disagrees with central differences of every step tried (relative error of at least {number(f['error'])})"
+        f"open: central differences at the steps tried do not agree with the gradient (relative error of at least {number(f['error'])}), "
+        "which decides nothing where the cost has jumps or rounding is large"
     ),
     "opposed": lambda f: (
         "the first-order gradient points away from the zeroth-order one: cosine "

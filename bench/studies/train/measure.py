@@ -104,10 +104,11 @@ def _interval(returns: np.ndarray) -> tuple[float, float, float, float]:
 
 
 def _probe(training: Training, state: Any, batches: int) -> dict[str, float]:
-    """Return the error of a directional derivative, and norm and bias of a window's gradient, at one state of a run.
+    """Return the error of a directional derivative, and a window's gradient against a whole episode's, at one state of a run.
 
-    The direction is that of the gradient of the same rollouts, and the error the smallest over :data:`SHIFTS`. The bias is relative to the gradient of windows as long
-    as an episode, both from new starts, and has the interval of :func:`bias_interval`.
+    The direction is that of the gradient of the same rollouts, and the error the smallest over :data:`SHIFTS`. ``window_bias``
+    is the distance from the gradient of windows as long as an episode, relative to the latter, both from new starts, with the
+    interval of :func:`bias_interval`. It does not measure a bias: a window of h steps sums over h actions, the episode over all.
     """
     gradient = training.gradient(state, 0)
     norm = float(np.linalg.norm(gradient))

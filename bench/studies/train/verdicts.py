@@ -29,7 +29,7 @@ DEVIATIONS = (1e-3, 1e2)
 ALWAYS = 0.9
 """Share of cut windows above which a gradient seldom reaches the end of a window."""
 DISAGREES = 0.1
-"""Relative error of a directional derivative above which it disagrees with central differences; rounding stays below."""
+"""Relative error of a directional derivative above which it disagrees with central differences; rounding of float64 stays below."""
 MIN_CHECKS = 3
 """Fewest comparisons of gradients for an interval of their cosine."""
 

@@ -25,11 +25,11 @@ SUMMARY = (
     Column("gradient_typical", label="gradient norm"), Column("gradient_peak", label="largest gradient"),
     Column("cosine", label="cosine"),
 )  # fmt: skip
+WINDOW = Column("window", label="window", unit="steps", format="setting")
+WINDOW_GRADIENT = Column("window_gradient", label="norm of a window's gradient")
 WINDOWS = (
-    PROBLEM, text("family", label="trainer"), Column("window", label="window", unit="steps", format="setting"),
-    Column("window_gradient", label="norm of a window's gradient"),
-    Column("bias", label="bias against a whole episode", low="bias_low", high="bias_high", log=False),
-    text("resolved", label="runs with a bias above 0"),
+    PROBLEM, text("family", label="trainer"), WINDOW,
+    WINDOW_GRADIENT,
     Column("gradient_typical", label="gradient norm in training"), FINAL,
 )  # fmt: skip
 FAULTS = (PROBLEM, METHOD, Column("seed", format="setting"), text("words", label="the log shows"))
@@ -55,21 +55,19 @@ LOGARITHMIC = ("gradient_norm", "gradient_largest")
 MAX_LOGS = 4
 """Most trainers in the printed chart of logs, the best of each family; the page has all."""
 LINES = (*VARIANTS, *DEVIANT)
-NOTES = (
-    "final return: interquartile mean over seeds of the mean undiscounted return of the deterministic policy from the same "
-    "starts, with a 95% bootstrap interval over seeds. A run that is not finite counts as its untrained policy. training: "
+NOTE = (
+    "final return: the mean undiscounted return of the deterministic policy from the same starts, {seeds}. A run that is not finite counts as its untrained policy. training: "
     "median over seeds, without compilation and evaluations. gradient norm: median over updates before clipping, of the "
     "trainer's own objective, so compare it within a trainer only. cosine: between first- and zeroth-order gradients of the "
-    "same objective along the runs, mean; noise in either lowers it.",
+    "same objective along the runs, mean; noise in either lowers it."
 )
-WINDOW_NOTES = (
-    "norm and bias of a window's gradient: of the return of rollouts from new starts, with the policy and critic halfway "
-    "through the run, against windows as long as an episode, relative to the norm of the latter. The policies differ "
-    "between windows. bias: interquartile mean over runs; its interval contains the 95% intervals of all runs. final return: "
-    "interquartile mean over seeds with a 95% bootstrap interval.",
+WINDOW_NOTE = (
+    "norm of a window's gradient: of the return of rollouts from new starts, with the policy and critic halfway through the "
+    "run, median over runs. A longer window sums over more actions, and the policies differ between windows, so norms of "
+    "different windows do not say which gradient is better. final return: {seeds}."
 )
 PAGE = ("final_return", "first_return", "final_median", "updates", "steps", "train_s", "compile_s", "gradient_typical",
-        "gradient_peak", "window_gradient", "window_bias", "difference_error")  # fmt: skip
+        "gradient_peak", "window_gradient", "difference_error")  # fmt: skip
 
 
 def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
@@ -81,18 +79,20 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
         return Views(["No run gave a result: the table has the reason of each."], [every], remarks=reasons(rows))
     summary, windows, faults = aggregate.summarise(runs), aggregate.windows(runs), aggregate.faults(runs)
     texts = findings.sentences(summary, windows, faults, len(runs))
+    seeds = aggregate.interval_words(runs)
     tables = [
-        Table("train", summary, SUMMARY, "final return by trainer", NOTES, terminal=True, page=True, data=data,
+        Table("train", summary, SUMMARY, "final return by trainer", [NOTE.format(seeds=seeds)], terminal=True, page=True, data=data,
               details=["compile_s", "gradient_typical", "gradient_peak"]),
     ]  # fmt: skip
     if len(windows):
-        tables.append(Table("windows", windows, WINDOWS, "Windows", WINDOW_NOTES, terminal=True, page=True))
+        note = WINDOW_NOTE.format(seeds=seeds)
+        tables.append(Table("windows", windows, WINDOWS, "Windows", [note], terminal=True, page=True))
     worded = faults.assign(words=[findings.describe(fault) for fault in faults["fault"]]).drop(columns="fault")
     if len(worded):
         tables.append(Table("faults", worded, FAULTS, "Faults in the logs", terminal=True, page=True))
     cells = rows.assign(problem=runs["problem"], method=runs["method"]).fillna({"problem": "", "method": ""})
     by_name = experiment.columns.by_name
-    return Views(texts, tables, _charts(runs, summary, windows, texts), cells,
+    return Views(texts, tables, _charts(runs, summary, windows, seeds), cells,
                  [METHOD, *(by_name[name] for name in PAGE)], reasons(rows))  # fmt: skip
 
 
@@ -105,10 +105,9 @@ def _styles(summary: pd.DataFrame) -> dict[str, Style]:
     }
 
 
-def _charts(runs: pd.DataFrame, summary: pd.DataFrame, windows: pd.DataFrame, texts: list[str]) -> list[Chart]:
+def _charts(runs: pd.DataFrame, summary: pd.DataFrame, windows: pd.DataFrame, seeds: str) -> list[Chart]:
     looks = _styles(summary)
     frame = aggregate.curves(runs)
-    seeds = f"interquartile mean over {runs['seed'].nunique()} seeds with its 95% bootstrap interval"
     cost = replace(COST, log=bool((frame["cost"] > 0).all()))
     curves = [
         Chart(
@@ -120,15 +119,15 @@ def _charts(runs: pd.DataFrame, summary: pd.DataFrame, windows: pd.DataFrame, te
     curves = [curves[0], *(chart for chart in curves[1:] if np.isfinite(frame["seconds"]).any())]
     charts = [*curves, *_logs(runs, summary, looks)]
     if len(windows):
-        charts.append(_windows(windows))
+        charts.append(_windows(windows, seeds))
     return charts
 
 
-def _windows(windows: pd.DataFrame) -> Chart:
+def _windows(windows: pd.DataFrame, seeds: str) -> Chart:
     title = findings.window(windows).split(".")[0]
     return Chart(
-        "windows", title, windows, [replace(WINDOWS[2], log=True)], [WINDOWS[4], FINAL, WINDOWS[3]], series="family",
-        panel="problem", text="A point per length of window. Choose the quantity.",
+        "windows", title, windows, [replace(WINDOW, log=True)], [FINAL, WINDOW_GRADIENT], series="family", panel="problem",
+        subtitle=f"final return: {seeds}", text="A point per length of window. Choose the quantity.",
     )  # fmt: skip
 
 
@@ -165,7 +164,7 @@ def _logs(runs: pd.DataFrame, summary: pd.DataFrame, looks: dict[str, Style]) ->
 def _log_title(runs: pd.DataFrame, methods: list[str]) -> str:
     """Return the title of a chart of logs: a fault of a drawn run, or the largest spike of a gradient."""
     drawn = runs[runs["method"].isin(methods)]
-    faults = aggregate.faults(drawn[drawn["seed"] == drawn["seed"].min()])
+    faults = findings.certain(aggregate.faults(drawn[drawn["seed"] == drawn["seed"].min()]))
     if len(faults):
         first = faults.iloc[0]
         words = findings.describe(first["fault"]).partition(",")[0].partition(" (")[0]
