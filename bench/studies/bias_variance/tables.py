@@ -40,6 +40,7 @@ from bench.studies.bias_variance.comparisons import (
     verdicts_by_estimator,
 )
 from bench.studies.bias_variance.findings import span, value_range
+from bench.studies.bias_variance.time_to_accuracy import limits
 
 FAILURES = {
     "nonfinite": ("∞", "a result that is not finite"),
@@ -72,7 +73,10 @@ def tables(
         result.append(ranking(methods))
     result.append(recommendations(methods, comparisons[comparisons["basis"] == EQUAL_SAMPLES]))
     joined = comparisons.drop(columns="setting").assign(tied=[", ".join(names) for names in comparisons["tied"]])
-    result.append(Table("comparisons", joined, COMPARED, "the first and the next at each setting", COMPARISON_NOTES))
+    noted = joined.assign(factor_note=limits(joined))
+    columns = [replace(c, note="factor_note") if c.name == "factor" else c for c in COMPARED]
+    title = "the first and the next at each setting"
+    result.append(Table("comparisons", noted, columns, title, COMPARISON_NOTES, data=joined))
     return result
 
 
