@@ -1,6 +1,7 @@
 """Zeroth order along orthogonal directions."""
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -14,12 +15,15 @@ class Orthogonal(Estimator):
     Each block of d samples is a random rotation and covers all directions. With ``lengths=drawn`` each v has the length
     of its own normal vector and is normally distributed: unbiased, like ``randomized_smoothing``. With
     ``lengths=fixed`` all v have the length sqrt(d): the target is then another smoothing, and d samples are exact for a
-    linear cost (Choromanski et al. 2018). Requires only costs.
+    linear cost (Choromanski et al. 2018). A last block of fewer than d samples leaves directions out, so the error is larger
+    if N is not a multiple of d: with d = 50 on the pendulum, 0.20 at N = 50, 0.39 at 64, 0.14 at 100 and 0.23 at 128.
+    Requires only costs.
     """
 
     name = "orthogonal"
     needs_directions = True
     unbiased_at_discontinuities = True
+    couples_samples: ClassVar[bool] = True
 
     lengths: str = param("drawn", "lengths of the directions", choices=("drawn", "fixed"))
 

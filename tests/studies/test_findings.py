@@ -152,11 +152,46 @@ def test_the_recommendation_comes_first_then_the_failure_then_what_removes_it():
     texts = made(*cells)[2]
     assert texts == [
         "Use fobg up to stiffness 1000 with penalty and at every stiffness with complementarity: it has the lowest error "
-        "(relative RMSE 0.10).",
+        "at equal samples, of 1 to 2 rollouts or gradients each (relative RMSE 0.10).",
         "fobg fails beyond the limit (stiffness 6400) with penalty: its error is at least 81 times the gradient, where "
         "randomized_smoothing is usable (0.50).",
         "With complementarity fobg does not fail there (0.10).",
     ]
+
+
+def by_samples(estimator, rollouts, gradients=0.0, scale=1.0):
+    """Cells whose error is ``scale`` over the root of N, with some rollouts and gradients per sample."""
+    return [
+        cell(
+            e := scale / math.sqrt(n), 0.99 * e, 1.01 * e, estimator=estimator, samples=n, rollouts=rollouts * n + 0.01,
+            gradients=gradients * n,
+        )
+        for n in (64, 128)
+    ]  # fmt: skip
+
+
+def test_costs_of_several_rollouts_per_sample_are_compared_at_equal_rollouts():
+    """At equal samples `b` has 1 / 1.2 of the error of `a`, at equal rollouts 1.18 times."""
+    cells = [*by_samples("a", 1), *by_samples("b", 2, scale=1 / 1.2)]
+    _, compared, texts = made(*cells, sweep={"samples": [64, 128]})
+    assert compared[["axis", "at", "basis", "first", "second"]].values.tolist() == [
+        ["rollouts", 128.0, "relative RMSE at equal rollouts", "a", "b"]
+    ]
+    assert compared["factor"].iloc[0] == pytest.approx(math.sqrt(2) / 1.2)
+    assert texts[0].startswith("Use a on pushing, penalty: it has the lowest error (relative RMSE 0.088).")
+
+
+def test_gradients_are_compared_at_equal_samples_and_the_sentence_says_so():
+    cells = [*by_samples("a", 0, 1), *by_samples("b", 2, scale=3.0)]
+    _, compared, texts = made(*cells, sweep={"samples": [64, 128]})
+    assert set(compared["basis"]) == {"relative RMSE at equal samples"}
+    assert "the lowest error at equal samples, of 1 to 2 rollouts or gradients each (" in texts[0]
+
+
+def test_costs_of_one_rollout_per_sample_are_compared_at_each_number_of_samples():
+    _, compared, texts = made(*by_samples("a", 1), *by_samples("b", 1, scale=3.0), sweep={"samples": [64, 128]})
+    assert compared["at"].tolist() == [64, 128]
+    assert "at equal samples" not in texts[0]
 
 
 def test_an_interval_around_1_is_no_failure():
@@ -172,7 +207,10 @@ def test_without_an_axis_the_worst_case_is_ranked():
         for scene, e in zip(("pendulum", "cartpole", "pushing"), errors, strict=True)
     ]
     texts = made(*cells, sweep={})[2]
-    assert texts[0] == "reinforce has the lowest worst case on the 3 problems: 0.30 to 0.50."
+    assert texts[0] == (
+        "reinforce has the lowest worst case on the 3 problems at equal samples, of 1 to 2 rollouts or gradients each: "
+        "0.30 to 0.50."
+    )
     assert "fobg is best or tied on pendulum, penalty, and cartpole, penalty (0.010)" in texts[1]
     assert "fails on pushing, penalty (at least 45 times the gradient)" in texts[1]
     assert texts[2] == "1 of 2 estimators fails at some setting, 1 works at every setting (reinforce)."

@@ -12,7 +12,7 @@ from bench.experiment import config
 from bench.measure.statistics import UNEXPLAINED
 from bench.report.views import Curve, arrange
 from bench.studies.bias_variance.costs import ROLLOUTS, TIME, TIME_COMPILED, with_gradient_cost
-from bench.studies.bias_variance.time_to_accuracy import finding, required_cost, sentence
+from bench.studies.bias_variance.time_to_accuracy import finding, limits, required_cost, sentence
 from bench.studies.bias_variance.time_to_accuracy import table as table_of
 
 SAMPLES = (16, 64, 256)
@@ -110,6 +110,72 @@ def test_a_bias_that_may_exceed_the_error_is_not_extrapolated():
     assert required_cost(line(bias=0.01, resolved=False), 0.1, TIME).how == "extrapolated"
 
 
+@pytest.mark.parametrize("name", ["quadratic_model", "sobol", "orthogonal"])
+def test_samples_that_are_coupled_are_not_extrapolated(name):
+    """The error of such an estimator need not fall as the root of 1 / N: only measured counts tell."""
+    curve = Curve(name, "", {"b": True}, line().rows, {"b": 1.0}, frozenset(), 0)
+    beyond = required_cost(curve, 0.1, ROLLOUTS)
+    assert (beyond.how, beyond.beyond) == ("unknown", 512)
+    assert math.isnan(beyond.cost)
+    assert required_cost(curve, 0.2, TIME).samples == pytest.approx(100)
+
+
+def test_a_cost_that_is_not_known_because_of_the_bias_is_at_least_that_without_bias():
+    found = required_cost(line(bias=0.1, resolved=False), 0.1, TIME)
+    assert found.beyond == pytest.approx(0.4)
+
+
+def entry_of(tmp_path, *parts, target=0.1, width=1.01):
+    given = config.load(["sweep.samples=[16,64,256]", f"results_dir={tmp_path}"])
+    found = table(given, with_intervals(pd.concat(parts, ignore_index=True), width))
+    return found[(found["by"] == "rollouts") & (found["relative error"] == target)].iloc[0]
+
+
+def test_an_estimator_beyond_the_measured_samples_leaves_the_order_open(tmp_path):
+    """The first takes 800 rollouts; the other has half the error at 256 samples, and more than 512 rollouts to go."""
+    other = rows(estimator="orthogonal").assign(
+        rmse_rel=lambda r: r["rmse_rel"] * 0.9, variance=lambda r: r["variance"] * 0.81
+    )
+    entry = entry_of(tmp_path, rows(), other)
+    assert (entry["fastest"], entry["next"], entry["tied"], entry["unknown"]) == (
+        "e",
+        "orthogonal",
+        ("orthogonal",),
+        "orthogonal",
+    )
+    assert sentence(entry) == "10%: open, e, orthogonal not known"
+    assert finding(pd.DataFrame([entry])).startswith("Nobody is certainly first to 10%")
+    assert limits(pd.DataFrame([entry])) == ["not known"]
+
+
+def test_an_estimator_beyond_the_measured_samples_is_behind_one_that_needs_fewer(tmp_path):
+    """A hundredth of the variance takes 4 samples for 0.1: measured at 16, and the other takes more than 512 rollouts."""
+    good = rows().assign(rmse_rel=lambda r: r["rmse_rel"] / 3, variance=lambda r: r["variance"] / 9)
+    entry = entry_of(tmp_path, good, rows(estimator="sobol"))
+    assert math.isnan(entry["factor"])
+    assert entry["factor_low"] == pytest.approx(512 / (800 / 9), rel=0.05)
+    assert sentence(entry) == f"10%: e, at least {entry['factor_low']:.1f} times ahead"
+    assert finding(pd.DataFrame([entry])).startswith("e is first to 10% error on 1 of 1 problem, at least 5.")
+
+
+def test_all_others_not_known_is_not_only_one(tmp_path):
+    close = rows().assign(rmse_rel=lambda r: r["rmse_rel"] / 2, variance=lambda r: r["variance"] / 4)
+    others = [rows(estimator=name, bias=0.2, resolved=False) for name in ("x", "y")]
+    entry = entry_of(tmp_path, close, *(part.assign(variance=close["variance"] * 1.001) for part in others), width=1.2)
+    assert sentence(entry) == "10%: open, e, others not known"
+
+
+def test_a_cost_at_the_fewest_samples_is_a_limit(tmp_path):
+    """The first reaches 50% with 16 samples and may with fewer, the other with 64: at least 4 times, less the interval."""
+    quick, slow = (rows(estimator=name) for name in ("quick", "slow"))
+    quick = quick.assign(rmse_rel=lambda r: r["rmse_rel"] / 10, variance=lambda r: r["variance"] / 100)
+    entry = entry_of(tmp_path, quick, slow, width=1.001)
+    assert entry["how"] == "at once"
+    assert (math.isnan(entry["factor"]), entry["factor_high"]) == (True, math.inf)
+    assert sentence(entry) == "10%: quick, at least 25 times ahead"
+    assert limits(pd.DataFrame([entry])) == ["at least 25"]
+
+
 def test_failed_rows_tell_nothing():
     assert required_cost(line(status="nonfinite"), 0.1, TIME).how == "unknown"
 
@@ -185,7 +251,8 @@ def test_a_leader_is_an_estimator_and_its_backend_where_that_is_one():
     def entries(*given):
         names = ("fastest", "next", "factor_low")
         return pd.DataFrame([
-            {"by": "time", "relative error": target, "factor": 2.0, "how": "measured"} | dict(zip(names, one, strict=True))
+            {"by": "time", "relative error": target, "factor": 2.0, "factor_high": 3.0, "how": "measured"}
+            | dict(zip(names, one, strict=True)) | {"tied": () if one[2] > 1 else (one[1],)}
             for one in given
             for target in (0.1, 0.01)
         ])  # fmt: skip

@@ -137,7 +137,12 @@ def _frame(chart: Chart) -> pd.DataFrame:
 def _chart(chart: Chart) -> dict[str, Any]:
     return {
         "title": (chart.page_title or chart.title).rstrip("."),
-        "text": " ".join(filter(None, (chart.text, "" if chart.chosen else chart.subtitle))),
+        "text": " ".join(
+            filter(
+                None,
+                (chart.text, "" if chart.chosen or not chart.subtitle else f"Shown: {chart.subtitle.rstrip('.')}."),
+            )
+        ),
         "x": [_axis(column, chart) for column in chart.x],
         "y": [_axis(column, chart) for column in chart.y],
         "table": chart.name,

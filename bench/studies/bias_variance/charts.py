@@ -337,23 +337,33 @@ def _costs_matrix(shown: Arranged, best: pd.DataFrame) -> Chart | None:
         if problem.rows["x"].nunique() < 2:
             continue
         for target in TARGETS:
-            needed: dict[str, float] = {}
+            needed: dict[str, time_to_accuracy.RequiredCost] = {}
             for method, way in time_to_accuracy.methods(problem, target, cost).items():
                 name = time_to_accuracy.estimator_of(method)
-                needed[name] = min(way.cost if math.isfinite(way.cost) else math.inf, needed.get(name, math.inf))
-            lowest = min(needed.values(), default=math.inf)
-            for name, value in needed.items():
-                factor = value / lowest if math.isfinite(value) else math.nan
+                needed[name] = min(way, needed.get(name, way), key=time_to_accuracy.order)
+            first = min(needed.values(), key=time_to_accuracy.order, default=None)
+            for name, way in needed.items():
+                factor = way.cost / first.cost if first else math.nan
                 lines.append({
                     "panel": f"to {target:.0%} error", "series": name, "problem": problem.title(), "factor": factor,
-                    "cell": number(factor) if math.isfinite(factor) else "-",
+                    "cell": _factor_cell(way, first, factor),
                 })  # fmt: skip
     what = "Time" if timed else "Rollouts"
     return Chart(
-        "summary_matrix", f"{what} to reach an error, relative to the first of each column", pd.DataFrame(lines),
+        "summary_matrix", f"{what} to reach an error, relative to the lowest known of each column", pd.DataFrame(lines),
         [text("problem", label="")], [ESTIMATOR], "grid", panel="panel", value="factor", cell="cell", across=1, height=0.24,
-        subtitle="-: no estimate is known to have a bias below the error",
+        subtitle="costs over the lowest, -: never reached, as the bias is larger, ?: not known, ≥ and ≤: limits, as the fewest "
+        "samples suffice",
     )  # fmt: skip
+
+
+def _factor_cell(way: time_to_accuracy.RequiredCost, first: time_to_accuracy.RequiredCost | None, factor: float) -> str:
+    """Format a cost over the lowest: a limit where one of them suffices with the fewest samples, as fewer may do."""
+    if not math.isfinite(factor) or first is None:
+        return "-" if way.how == "never" else "?"
+    limits = [end.is_at_fewest and end.down > 0 for end in (way, first)]
+    sign = "" if way is first or limits[0] == limits[1] else "≤ " if limits[0] else "≥ "
+    return "?" if way is not first and all(limits) else sign + number(factor)
 
 
 def _error_and_cost(shown: Arranged, styles: Mapping[str, Style], subtitle: str, title: str) -> Chart:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -27,12 +28,12 @@ VERDICTS = {
     OPEN: "its interval contains the gradient's norm, or is not known",
     NO_RESULT: "the cell failed: see its status and reason",
 }
-EQUAL_SAMPLES = "relative RMSE at equal samples"
+EQUAL_SAMPLES, EQUAL_ROLLOUTS = "relative RMSE at equal samples", "relative RMSE at equal rollouts"
 COLUMNS = (
     text("problem", "what distinguishes the problem from the others"),
     text("axis", "the swept quantity along which the problem is reported"),
     Column("at", "its value", format="setting"),
-    text("basis", "what is compared: the error at equal samples, or the cost of reaching an error"),
+    text("basis", "what is compared: the error at equal samples or rollouts, or the cost of reaching an error"),
     text("first", "the method with the lowest value"),
     Column("value", "its value", low="value_low", high="value_high"),
     text("second", "the next method, of another estimator where there is one"),
@@ -71,11 +72,14 @@ def method_names(curves: Sequence[Curve]) -> list[str]:
 def method_table(shown: Arranged) -> pd.DataFrame:
     """Return a line per setting and method: its relative RMSE with a 95% interval, its verdict, and its cost.
 
-    The column ``setting`` identifies a setting.
+    The column ``setting`` identifies a setting. Along samples, estimators that use costs only, of which some take more
+    rollouts per sample than others, are compared at the numbers of rollouts that all have, if there are any.
     """
     lines = []
     for axis, problem in problems_by_axis(shown):
+        axis, problem = _at_equal_rollouts(axis, problem)
         curves = estimator_curves(problem.rows)
+        along_samples = axis is not None and axis.column == "samples"
         kinds = {name: str(problem.rows[name].iloc[0]) for name in CATEGORIES}
         for curve, name in zip(curves, method_names(curves), strict=True):
             for x, row in curve.at.items():
@@ -87,10 +91,29 @@ def method_table(shown: Arranged) -> pd.DataFrame:
                     "method": name, "estimator": curve.label, "error": error, "low": low, "high": high,
                     "verdict": verdict(row["status"], error, low, high), "status": row["status"],
                     "remark": row["reason"], "bias_share": (row["bias_low"] / row["rmse"]) ** 2 if error > 0 else math.nan,
-                    "evaluations": (row["rollouts"] + row["gradients"]) / row["samples"],
+                    "evaluations": (row["rollouts"] + row["gradients"]) / (x if along_samples else row["samples"]),
                     "time_s": min((t for t in curve.seconds.values() if t > 0), default=math.nan),
                 })  # fmt: skip
     return pd.DataFrame(lines)
+
+
+ROLLOUTS = Axis("rollouts", ("rollouts",))
+
+
+def _at_equal_rollouts(axis: Axis | None, problem: ProblemRows) -> tuple[Axis | None, ProblemRows]:
+    """Return a problem along its rollouts instead of samples where that is needed and possible."""
+    rows = attempted(problem.rows)
+    # the rollout at w = 0 is shared by all repeats, a fraction of a rollout each
+    spent = rows["rollouts"].round()
+    per_sample = (spent / rows["x"]).groupby(rows["estimator"] + rows["estimator_params"]).median()
+    if axis is None or axis.column != "samples" or (rows["gradients"] > 0).any() or not per_sample.nunique() > 1:
+        return axis, problem
+    methods = rows["estimator"] + rows["estimator_params"]
+    shared = methods.groupby(spent).nunique()
+    kept = spent.isin(shared.index[shared == methods.nunique()])
+    if not kept.any():
+        return axis, problem
+    return ROLLOUTS, replace(problem, rows=rows[kept].assign(x=spent[kept]))
 
 
 def verdict(status: str, error: float, low: float, high: float) -> str:
@@ -128,7 +151,7 @@ def compare_errors(methods: pd.DataFrame) -> pd.DataFrame:
     for _, part in methods.groupby("setting", sort=False):
         good = part[np.isfinite(part["error"]) & np.isfinite(part["low"])].sort_values("error", kind="stable")
         line: dict[str, Any] = part.iloc[0][["setting", "problem", "axis", "at"]].to_dict() | {
-            "basis": EQUAL_SAMPLES, "first": "", "value": math.nan, "value_low": math.nan,
+            "basis": EQUAL_ROLLOUTS if part["axis"].iloc[0] == ROLLOUTS.column else EQUAL_SAMPLES, "first": "", "value": math.nan, "value_low": math.nan,
             "value_high": math.nan, "second": "", "factor": math.nan, "factor_low": math.nan, "factor_high": math.nan,
             "tied": (),
         }  # fmt: skip

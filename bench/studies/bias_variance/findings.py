@@ -16,6 +16,7 @@ from bench.studies.bias_variance.comparisons import (
     FAILS,
     NO_RESULT,
     OPEN,
+    ROLLOUTS,
     WORKS,
     estimators,
     known,
@@ -24,6 +25,8 @@ from bench.studies.bias_variance.comparisons import (
     verdicts_by_estimator,
 )
 
+COUNTS = ("samples", ROLLOUTS.column)
+"""Axes of numbers of samples or rollouts."""
 NAMED = 3
 """Most problems or estimators that a sentence names."""
 FEWEST = 3
@@ -85,7 +88,7 @@ def _use(main: str, methods: pd.DataFrame, comparisons: pd.DataFrame) -> str:
         else "ties for the lowest error"
     )
     where = _where(methods, mine, named)
-    return f"Use {main} {where}: it {how} (relative RMSE {value_range(errors)})."
+    return f"Use {main} {where}: it {how}{work_of_a_sample(methods)} (relative RMSE {value_range(errors)})."
 
 
 def _worst_case(methods: pd.DataFrame) -> str:
@@ -104,8 +107,18 @@ def _worst_case(methods: pd.DataFrame) -> str:
     others = _join(tied) if len(tied) < NAMED else f"{len(tied)} others"
     also = f", not distinguishable from {others}" if tied else ""
     return (
-        f"{best} has the lowest worst case on the {methods['problem'].nunique()} problems: {value_range(errors)}{also}."
+        f"{best} has the lowest worst case on the {methods['problem'].nunique()} problems{work_of_a_sample(methods)}: "
+        f"{value_range(errors)}{also}."
     )
+
+
+def work_of_a_sample(methods: pd.DataFrame) -> str:
+    """Return that errors are at equal samples and what a sample takes, where estimators differ in that; else empty."""
+    compared = methods[methods["axis"] != ROLLOUTS.column]
+    each = known(compared["evaluations"].round())
+    if not each or min(each) == max(each):
+        return ""
+    return f" at equal samples, of {axis_value(min(each))} to {axis_value(max(each))} rollouts or gradients each"
 
 
 def _record(name: str, methods: pd.DataFrame, comparisons: pd.DataFrame) -> str:
@@ -273,6 +286,8 @@ def _where(
                 return ", and ".join(parts) if any(" and " in part for part in parts) else " and ".join(parts)
     if len(set(spans.values())) == 1 and len(some) == len(by_problem):
         return next(iter(spans.values()))
+    if len(set(spans.values())) == 1 and len(some) <= NAMED:
+        return f"{next(iter(spans.values()))} on {_names(some)}"
     if len(some) <= 2:
         return _join([f"{where} on {name}" for name, where in spans.items()])
     return n_settings
@@ -281,7 +296,9 @@ def _where(
 def span(where: Mapping[float, bool], axis: str, marks: Mapping[str, float] = MappingProxyType({})) -> str:
     """Format where something holds along an axis: ``up to stiffness 3000``, ``at every stiffness``, ``at 10 and 100``."""
     if all(where.values()):
-        return f"at every {'number of samples' if axis == 'samples' else axis}"
+        if axis in COUNTS and len(where) == 1:
+            return f"at {axis_value(next(iter(where)))} {axis}"
+        return f"at every {f'number of {axis}' if axis in COUNTS else axis}"
     values = list(where)
     runs = [[x for x, _ in run] for holds, run in itertools.groupby(where.items(), lambda item: item[1]) if holds]
     if len(runs) == 1:
@@ -298,6 +315,6 @@ def span(where: Mapping[float, bool], axis: str, marks: Mapping[str, float] = Ma
 
 def _from(axis: str, word: str, value: float) -> str:
     """Format an end of a range: ``from stiffness 1e4``, ``with at most 256 samples``."""
-    if axis == "samples":
-        return f"with at {'least' if word == 'from' else 'most'} {axis_value(value)} samples"
+    if axis in COUNTS:
+        return f"with at {'least' if word == 'from' else 'most'} {axis_value(value)} {axis}"
     return f"{word} {axis} {axis_value(value)}"

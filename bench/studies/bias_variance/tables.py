@@ -31,15 +31,18 @@ from bench.report.views import (
 from bench.studies.bias_variance.columns import COLUMNS
 from bench.studies.bias_variance.comparisons import COLUMNS as COMPARED
 from bench.studies.bias_variance.comparisons import (
+    EQUAL_ROLLOUTS,
     EQUAL_SAMPLES,
     FAILS,
     NO_RESULT,
+    ROLLOUTS,
     leaders,
     method_names,
     problems_by_axis,
     verdicts_by_estimator,
 )
-from bench.studies.bias_variance.findings import span, value_range
+from bench.studies.bias_variance.findings import span, value_range, work_of_a_sample
+from bench.studies.bias_variance.time_to_accuracy import limits
 
 FAILURES = {
     "nonfinite": ("∞", "a result that is not finite"),
@@ -70,9 +73,13 @@ def tables(
     result.append(Table("speed_accuracy", speed_accuracy(rows), columns, files=["csv"]))
     if methods["estimator"].nunique() >= LEAST and methods["problem"].nunique() > 1:
         result.append(ranking(methods))
-    result.append(recommendations(methods, comparisons[comparisons["basis"] == EQUAL_SAMPLES]))
+    errors = comparisons[comparisons["basis"].isin((EQUAL_SAMPLES, EQUAL_ROLLOUTS))]
+    result.append(recommendations(methods, errors))
     joined = comparisons.drop(columns="setting").assign(tied=[", ".join(names) for names in comparisons["tied"]])
-    result.append(Table("comparisons", joined, COMPARED, "the first and the next at each setting", COMPARISON_NOTES))
+    noted = joined.assign(factor_note=limits(joined))
+    columns = [replace(c, note="factor_note") if c.name == "factor" else c for c in COMPARED]
+    title = "the first and the next at each setting"
+    result.append(Table("comparisons", noted, columns, title, COMPARISON_NOTES, data=joined))
     return result
 
 
@@ -244,12 +251,18 @@ def ranking(methods: pd.DataFrame) -> Table:
         ),
     ]
     notes = (
-        "Sorted by the worst case. Relative RMSE [95% interval] at equal samples; where a problem was swept, the largest along "
+        f"Sorted by the worst case. Relative RMSE [95% interval] at equal {_basis(methods)}; where a problem was swept, the largest along "
         "the axis. works: the whole interval is below 1; fails: it is above 1; open: it contains 1 or is not known. biased: more "
         "than half of the squared error is bias. (40x): it evaluates 40 costs and gradients per sample, where others take "
         "one or two.",
     )
     return Table("ranking", frame, columns, "estimators by their worst case", notes)
+
+
+def _basis(methods: pd.DataFrame) -> str:
+    """Return at what errors are equal: rollouts, samples, or either by problem."""
+    along = set(methods["axis"] == ROLLOUTS.column)
+    return "samples or rollouts" if len(along) > 1 else ROLLOUTS.column if along == {True} else "samples"
 
 
 def recommendations(methods: pd.DataFrame, comparisons: pd.DataFrame) -> Table:
@@ -270,7 +283,9 @@ def recommendations(methods: pd.DataFrame, comparisons: pd.DataFrame) -> Table:
     columns = [
         text("problem"), text("where"), text("use"), text("error", label="relative RMSE"), text("fails", label="fails there"),
     ]  # fmt: skip
-    return Table("recommendations", pd.DataFrame(lines), columns, "What to use where", files=(), page=True)
+    equal = work_of_a_sample(methods) or f" at equal {_basis(methods)}"
+    notes = [f"Errors are compared{equal}."]
+    return Table("recommendations", pd.DataFrame(lines), columns, "What to use where", notes, files=(), page=True)
 
 
 def remarks(rows: pd.DataFrame) -> list[str]:

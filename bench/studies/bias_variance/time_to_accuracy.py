@@ -1,7 +1,9 @@
 """Finds the method (estimator and backend) that reaches a relative error at the lowest cost, and its lead over the next.
 
 The mean square error of an estimate from N samples is bias^2 + v / N. Between two measured N the error is interpolated.
-Beyond the largest N it is extrapolated by that law, only to errors above the 95% limit of the bias.
+Beyond the largest N it is extrapolated by that law, only to errors above the 95% limit of the bias, and only for
+estimators whose samples are independent. Else its cost is not known, but above that of the most samples measured, and
+for independent samples above v / N without bias: an order is stated where that decides it.
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ from bench.experiment.axes import Axis
 from bench.experiment.columns import Column, text
 from bench.experiment.views import Table
 from bench.measure.statistics import is_unexplained
+from bench.model import registry
 from bench.report.problems import ProblemRows, split_by_problem
 from bench.report.text import counted, number
 from bench.report.views import Arranged, Curve, estimator_curves
@@ -26,13 +29,18 @@ from bench.studies.bias_variance.costs import ROLLOUTS, TIME, Cost
 SAMPLES = Axis("samples", ("samples",))
 TARGETS = (0.1, 0.01)
 """Target relative errors."""
+NAMED = 2
+"""Most methods, besides the first, that an open line names."""
 NOTES = (
     "cost: of the cheapest estimate that reaches the error, in seconds without compilation, or in rollouts, where a "
     "gradient counts as the rollouts that take as long (as measured at the most samples; as one where it was not). how: "
     "`measured` between two sample counts, `at once` where the fewest samples already suffice (the cost is an upper "
     "limit), `extrapolated` by RMSE^2 = bias^2 + v / N beyond the most samples measured, where the 95% limit of the bias "
-    "lies below the error asked for. never: methods whose bias exceeds that error. unknown: methods whose bias is not known "
-    "to be below it, or is one that they declare not to have.",
+    "lies below the error asked for and samples are independent. fastest: the cheapest of known cost. factor: `at least` where the first suffices with the fewest "
+    "samples, or the next is not known and its lower limit decides: the cost of the most samples measured, or "
+    "of an unbiased estimate for independent samples. never: methods whose bias exceeds that "
+    "error. unknown: methods whose bias is not known to be below it, or is one that they declare not to have, and methods that "
+    "choose samples together or fit a model to them, whose error beyond the most samples is not known.",
 )
 
 
@@ -48,8 +56,16 @@ class RequiredCost:
     """Log of cost over the lower end of its 95% interval; NaN where the variance has no interval."""
     up: float = math.nan
     """Log of the upper end over the cost; infinite where it is not certain that the error is reached."""
+    beyond: float = math.inf
+    """A cost that is not known exceeds this one: that of the most samples measured, or that of an estimate without bias.
+    Infinite without any result."""
     times: float = 0.0
     """Interquartile range of the time of one estimate over its median; 0 for rollouts."""
+
+    @property
+    def is_at_fewest(self) -> bool:
+        """Whether the fewest samples measured suffice, so that fewer may do."""
+        return self.how == "at once"
 
 
 def required_cost(line: Curve, target: float, cost: Cost) -> RequiredCost:
@@ -57,17 +73,28 @@ def required_cost(line: Curve, target: float, cost: Cost) -> RequiredCost:
     rows = cost.known(line.rows).sort_index()
     if rows.empty:
         return RequiredCost("unknown")
-    way = _required_cost(rows, target, cost)
+    is_coupled = couples_samples(line.estimator)
+    way = _required_cost(rows, target, cost, is_coupled)
     last = rows.iloc[-1]
     times = float(last["time_iqr_s"] / last["time_s"]) if cost is not ROLLOUTS else 0.0
-    if not math.isfinite(way.cost) or "variance_high" not in rows:
+    if "variance_high" not in rows:
         return replace(way, times=times)
-    least, most = (_required_cost(_at_interval_end(rows, end), target, cost).cost for end in ("low", "high"))
-    if way.how == "at once":  # fewer samples may be enough, down to one
+    ends = (_at_interval_end(rows, end) for end in ("low", "high"))
+    low, high = (_required_cost(end, target, cost, is_coupled) for end in ends)
+    if not math.isfinite(way.cost):
+        return replace(way, beyond=low.cost if math.isfinite(low.cost) else low.beyond, times=times)
+    least, most = low.cost, high.cost
+    if way.is_at_fewest:  # fewer samples may be enough, down to one
         least = _cost_of_one_sample(rows, cost)
     down = max(0.0, math.log(way.cost / least)) if least > 0 else math.inf
     up = max(0.0, math.log(most / way.cost)) if math.isfinite(most) else math.inf
     return replace(way, down=down, up=up, times=times)
+
+
+def couples_samples(estimator: str) -> bool:
+    """Return whether an estimator declares that its samples are not independent, so that v / N need not hold."""
+    entry = registry.entries()["estimators"].get(estimator)
+    return bool(getattr(entry and entry.plugin, "couples_samples", False))
 
 
 def _cost_of_one_sample(rows: pd.DataFrame, cost: Cost) -> float:
@@ -87,19 +114,24 @@ def _at_interval_end(rows: pd.DataFrame, end: str) -> pd.DataFrame:
 def lead(first: RequiredCost, second: RequiredCost, alike: bool = False) -> tuple[float, float, float]:
     """Return the ratio of the second cost to the first, and the ends of its 95% interval.
 
-    ``alike`` means the same estimator on two backends: only the noise of timing counts.
+    ``alike`` means the same estimator on two backends: only the noise of timing counts. Where only a lower limit is
+    known, the ratio is NaN and the upper end infinite.
     """
-    factor = second.cost / first.cost
     noise = (first.times, second.times)
+    if second.how == "unknown":
+        return math.nan, second.beyond / first.cost * math.exp(-math.hypot(first.up, *noise)), math.inf
+    factor = second.cost / first.cost
     low = math.hypot(*noise) if alike else math.hypot(first.up, second.down, *noise)
+    if not alike and first.is_at_fewest and first.down > 0:
+        return math.nan, factor * math.exp(-low), math.inf
     high = math.hypot(*noise) if alike else math.hypot(first.down, second.up, *noise)
     return factor, factor * math.exp(-low), factor * math.exp(high)
 
 
-def _required_cost(rows: pd.DataFrame, target: float, cost: Cost) -> RequiredCost:
+def _required_cost(rows: pd.DataFrame, target: float, cost: Cost, is_coupled: bool) -> RequiredCost:
     n, error, price = (rows.index.to_numpy(float), rows["rmse_rel"].to_numpy(float), cost.of(rows).to_numpy(float))
     if not (error <= target).any():
-        return _extrapolated_cost(rows.iloc[-1], n[-1], price[-1], target)
+        return _extrapolated_cost(rows.iloc[-1], n[-1], price[-1], target, is_coupled)
     # more samples may cost less: the fixed cost of a call dominates small batches
     ways = [RequiredCost("measured", price[i], n[i]) for i in range(1, len(n)) if error[i] <= target]
     for i in range(1, len(n)):
@@ -112,17 +144,21 @@ def _required_cost(rows: pd.DataFrame, target: float, cost: Cost) -> RequiredCos
     return min(ways, key=lambda way: (way.cost, way.samples))
 
 
-def _extrapolated_cost(row: Any, samples: float, price: float, target: float) -> RequiredCost:
-    """Extrapolate the cost from the row with most samples: v is N times its variance, and cost is proportional to N."""
+def _extrapolated_cost(row: Any, samples: float, price: float, target: float, is_coupled: bool) -> RequiredCost:
+    """Extrapolate the cost from the row with most samples: v is N times its variance, and cost is proportional to N.
+
+    Coupled samples have no such law.
+    """
     low, high, bias = (row[name] / row["reference_norm"] for name in ("bias_low", "bias_high", "bias"))
-    if low >= target:
-        # an estimator without declared bias may only have heavy tails that the samples missed
-        return RequiredCost("unknown" if is_unexplained(str(row.get("reason", ""))) else "never")
-    if not high < target:
-        return RequiredCost("unknown")
-    certain_bias = bias if low > 0 else 0.0
+    # an estimator without declared bias may only have heavy tails that the samples missed
+    if low >= target and not is_unexplained(str(row.get("reason", ""))):
+        return RequiredCost("never")
+    is_known = not is_coupled and high < target
+    certain_bias = bias if is_known and low > 0 else 0.0
     needed = samples * row["variance"] / row["reference_norm"] ** 2 / (target**2 - certain_bias**2)
-    factor = max(needed / samples, 1.0)
+    factor = 1.0 if is_coupled else max(needed / samples, 1.0)
+    if not is_known:
+        return RequiredCost("unknown", beyond=price * factor)
     return RequiredCost("extrapolated", price * factor, samples * factor)
 
 
@@ -148,9 +184,14 @@ def methods(problem: ProblemRows, target: float, cost: Cost) -> dict[str, Requir
     for curve in estimator_curves(problem.rows, close=None):
         name = curve.label if cost is ROLLOUTS else f"{curve.label} on {curve.rows['backend'].iloc[0]}"
         needed = required_cost(curve, target, cost)
-        if name not in reached or needed.cost < reached[name].cost or math.isnan(reached[name].cost):
+        if name not in reached or order(needed) < order(reached[name]):
             reached[name] = needed
     return reached
+
+
+def order(needed: RequiredCost) -> tuple[float, float, bool]:
+    """Return a key that sorts known costs first, then those known to exceed the least, and failed methods last."""
+    return needed.cost if math.isfinite(needed.cost) else math.inf, needed.beyond, needed.how == "unknown"
 
 
 def estimator_of(method: str) -> str:
@@ -171,21 +212,42 @@ def line(problem: ProblemRows, target: float, kind: str, cost: Cost) -> dict[str
         "factor": math.nan,
         "factor_low": math.nan,
         "factor_high": math.nan,
+        "tied": (),
     }
     if ranked:
-        best = reached[ranked[0][1]]
-        entry |= {"fastest": ranked[0][1], "cost": best.cost, "samples": math.ceil(best.samples), "how": best.how}
-    elif any(r.how == "unknown" for r in reached.values()):
-        entry["how"] = "no bias known to be below"
+        first = ranked[0][1]
+        best = reached[first]
+        entry |= {"fastest": first, "cost": best.cost, "samples": math.ceil(best.samples), "how": best.how}
+        entry |= _following(first, [name for _, name in ranked[1:]], reached)
     else:
-        entry["how"] = "never"
-    others = [name for _, name in ranked if estimator_of(name) != estimator_of(ranked[0][1])]
-    following = others[0] if others else ranked[1][1] if len(ranked) > 1 else ""
-    if following:
-        factor, low, high = lead(reached[ranked[0][1]], reached[following], alike=not others)
-        entry |= {"next": following, "factor": factor, "factor_low": low, "factor_high": high}
+        entry["how"] = "not known" if any(r.how == "unknown" for r in reached.values()) else "never"
     out = {how: ", ".join(name for name, r in reached.items() if r.how == how) or "-" for how in ("never", "unknown")}
     return {"problem": problem.title(), "relative error": target, "by": kind, **entry, **out}
+
+
+def _following(first: str, known: list[str], reached: dict[str, RequiredCost]) -> dict[str, Any]:
+    """Return the next method after the first, the factor between them, and the methods that may be as cheap.
+
+    A method whose cost is not known is the next if it may be cheaper than the next of known cost.
+    """
+    best = reached[first]
+    unknown = [name for name, r in reached.items() if r.how == "unknown" and math.isfinite(r.beyond)]
+    others = [name for name in (*known, *unknown) if estimator_of(name) != estimator_of(first)]
+    leads = {name: lead(best, reached[name]) for name in others}
+    tied = tuple(name for name in others if not leads[name][1] > 1.0)
+    if not others:
+        if not known:
+            return {}
+        leads = {known[0]: lead(best, reached[known[0]], alike=True)}
+        tied = tuple(name for name, factors in leads.items() if not factors[1] > 1.0)
+    ranked = [name for name in leads if name in known]
+    following = ranked[0] if ranked else min(leads, key=lambda name: leads[name][1])
+    factor, low, high = leads[following]
+    nearer = [name for name in leads if name in unknown and leads[name][1] < (low if math.isnan(factor) else factor)]
+    if nearer:
+        following = min(nearer, key=lambda name: leads[name][1])
+        factor, low, high = math.nan, min(low, leads[following][1]), math.inf
+    return {"next": following, "factor": factor, "factor_low": low, "factor_high": high, "tied": tied}
 
 
 def accuracy_table(best: pd.DataFrame) -> Table:
@@ -198,12 +260,26 @@ def accuracy_table(best: pd.DataFrame) -> Table:
     columns = [
         text("problem"), Column("relative error", format="percent"), text("by"), text("fastest"), text("cost_text", label="cost"),
         Column("samples", format="setting"), text("how"), text("next"),
-        Column("factor", low="factor_low", high="factor_high"), text("never"), text("unknown"),
+        Column("factor", low="factor_low", high="factor_high", note="factor_note"), text("never"), text("unknown"),
     ]  # fmt: skip
     return Table(
-        "time_to_accuracy", best.assign(cost_text=costs), columns, "the method that reaches an error at the lowest cost", NOTES,
-        terminal=True, details=("never", "unknown"), data=best,
+        "time_to_accuracy", best.assign(cost_text=costs, factor_note=limits(best)), columns,
+        "the method that reaches an error at the lowest cost", NOTES, terminal=True, details=("never", "unknown"),
+        data=best.assign(tied=[", ".join(names) for names in best["tied"]]),
     )  # fmt: skip
+
+
+def limits(table: pd.DataFrame) -> list[str]:
+    """Return the words for each factor without a value: ``at least 2.4``, or ``not known`` where the limit is below 1."""
+    factors = zip(table["factor"], table["factor_low"], table["factor_high"], strict=True)
+    return [
+        "" if not _is_limit(factor, high) else f"at least {number(low)}" if low > 1.0 else "not known"
+        for factor, low, high in factors
+    ]
+
+
+def _is_limit(factor: float, high: float) -> bool:
+    return math.isnan(factor) and high == math.inf
 
 
 def comparisons(best: pd.DataFrame) -> pd.DataFrame:
@@ -214,7 +290,7 @@ def comparisons(best: pd.DataFrame) -> pd.DataFrame:
         "first": best["fastest"].where(best["fastest"] != "-", ""), "value": best["cost"],
         "value_low": math.nan, "value_high": math.nan, "second": best["next"].where(best["next"] != "-", ""),
         "factor": best["factor"], "factor_low": best["factor_low"], "factor_high": best["factor_high"],
-        "tied": [(e["next"],) if e["next"] != "-" and not e["factor_low"] > 1 else () for e in best.to_dict("records")],
+        "tied": best["tied"],
     })  # fmt: skip
 
 
@@ -222,26 +298,35 @@ def sentence(entry: Any) -> str:
     """Format a line of the table in a few words: ``10%: fobg on jax, 3.8 times ahead [2.7, 5.2]``, or why it is open."""
     what = f"{entry['relative error']:.0%}: "
     if entry["fastest"] == "-":
-        return what + (
-            "none, all have a larger bias" if entry["how"] == "never" else "open, no bias is known to be below"
-        )
+        return what + ("none, all have a larger bias" if entry["how"] == "never" else "not known")
     if entry["next"] == "-":
         return f"{what}only {entry['fastest']}"
-    if not entry["factor_low"] > 1.0:
-        first, second = entry["fastest"], entry["next"]
-        if estimator_of(first) != estimator_of(second):
-            first, second = estimator_of(first), estimator_of(second)
-        return f"{what}open, {first} or {second}"
+    if not _is_clearly_first(entry):
+        return f"{what}open, {_candidates(entry)}"
     low, high = number(entry["factor_low"]), number(entry["factor_high"])
+    if _is_limit(entry["factor"], entry["factor_high"]):
+        return f"{what}{estimator_of(entry['fastest'])}, at least {low} times ahead"
     return f"{what}{estimator_of(entry['fastest'])}, {number(entry['factor'])} times ahead [{low}, {high}]"
 
 
+def _candidates(entry: Any) -> str:
+    """Format the methods that may be first: of known cost, and how many are not known."""
+    first, tied = entry["fastest"], list(entry["tied"]) or [entry["next"]]
+    if any(estimator_of(name) != estimator_of(first) for name in tied):
+        first, tied = estimator_of(first), list(dict.fromkeys(map(estimator_of, tied)))
+    unknown = {estimator_of(name) for name in str(entry["unknown"]).split(", ")} & set(tied)
+    known = [name for name in tied if name not in unknown]
+    others = "" if not unknown else ", others not known" if len(unknown) > 1 else f", {unknown.pop()} not known"
+    named = known if len(known) <= NAMED else [f"{len(known)} others"]
+    return " or ".join([first, *named]) + others
+
+
 def _is_clearly_first(entry: Any) -> bool:
-    """Return whether the first estimator's lead is certain: no other reaches the error, or the interval lies above 1."""
+    """Return whether the first estimator's lead is certain: no other reaches the error, or all intervals lie above 1."""
     if entry["fastest"] == "-":
         return False
     alone = entry["next"] == "-" or estimator_of(entry["next"]) == estimator_of(entry["fastest"])
-    return alone or bool(entry["factor_low"] > 1.0)
+    return alone or (len(entry["tied"]) == 0 and bool(entry["factor_low"] > 1.0))
 
 
 def finding(best: pd.DataFrame) -> str:
@@ -259,17 +344,21 @@ def finding(best: pd.DataFrame) -> str:
         leader, count = Counter(map(estimator_of, clear)).most_common(1)[0]
         ways = {method for method in clear if estimator_of(method) == leader}
         name = ways.pop() if len(ways) == 1 else leader
-        factors = [e["factor"] for e in asked if e["fastest"] in (name, leader) and _is_clearly_first(e)]
-        ahead = (
-            f", {_range([f for f in factors if math.isfinite(f)])} times ahead"
-            if any(map(math.isfinite, factors))
-            else ""
-        )
+        ahead = _ahead([e for e in asked if estimator_of(e["fastest"]) == leader and _is_clearly_first(e)])
         who = "" if name == before else f"{name} is first "
         before = name
         clauses.append(f"{who}to {target:.0%} error on {count} of {counted(len(asked), 'problem')}{ahead}")
     text = ", and ".join(clauses)
     return f"{text[0].upper() if text.startswith('nobody') else text[0]}{text[1:]}."
+
+
+def _ahead(entries: list[Any]) -> str:
+    """Format the range of factors of some lines: ``, 2.0 to 3.1 times ahead``, or ``, at least 2.4 times ahead``."""
+    factors = [e["factor"] for e in entries if math.isfinite(e["factor"])]
+    lows = [e["factor_low"] for e in entries if _is_limit(e["factor"], e["factor_high"])]
+    if lows:
+        return f", at least {number(min(factors + lows))} times ahead"
+    return f", {_range(factors)} times ahead" if factors else ""
 
 
 def _range(values: list[float]) -> str:
