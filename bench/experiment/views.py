@@ -118,7 +118,7 @@ class Chart:
     chosen: Sequence[tuple[str, Sequence[Any]]] = ()
     """What print draws of the table: columns with the values to keep, in this order. The page draws all."""
     own_scales: bool = False
-    """Whether each panel has its own scale of y (of x, for dots)."""
+    """Whether each panel has its own scale of y (of x, for dots); panels above each other then share that of x."""
     printed: bool = True
     """Whether the chart is drawn as a file."""
     on_page: bool = True

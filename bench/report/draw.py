@@ -91,9 +91,11 @@ def draw(chart: Chart, width: float | None = None) -> Figure:
     FigureCanvasAgg(figure)
     head.write(figure)
     shared = not chart.own_scales
+    # quantities of the same runs above each other, so that their features can be compared
+    stacked = chart.own_scales and across == 1 and chart.kind in ("lines", "points")
     grid = figure.subplots(
         down, across, squeeze=False, sharey=shared and chart.kind in ("lines", "points"),
-        sharex=shared and chart.kind == "dots", height_ratios=ratios,
+        sharex=stacked or (shared and chart.kind == "dots"), height_ratios=ratios,
     ).ravel()  # fmt: skip
     for spare in grid[len(panels) :]:
         spare.remove()
@@ -105,7 +107,8 @@ def draw(chart: Chart, width: float | None = None) -> Figure:
         if chart.kind == "dots" and same and place % across:
             panel.tick_params(labelleft=False)
         if chart.kind in ("lines", "points"):
-            _label_axes(chart, panel, first=place % across == 0 or chart.own_scales)
+            first, last = place % across == 0 or chart.own_scales, not stacked or place == len(panels) - 1
+            _label_axes(chart, panel, first, last)
     if chart.kind in ("lines", "points"):
         _scale(chart, axes, panels)
         for panel in axes if places else ():
@@ -383,8 +386,9 @@ def _draw_lines(chart: Chart, panel: Axes, name: str, part: pd.DataFrame, styles
             )  # fmt: skip
 
 
-def _label_axes(chart: Chart, panel: Axes, first: bool) -> None:
-    panel.set_xlabel(axis_text(chart.x[0]))
+def _label_axes(chart: Chart, panel: Axes, first: bool, last: bool) -> None:
+    if last:
+        panel.set_xlabel(axis_text(chart.x[0]))
     if first:
         panel.set_ylabel(axis_text(chart.y[0]))
 
