@@ -188,6 +188,13 @@ def equal_rollouts_table() -> str:
     return block(head + lines)
 
 
+def equal_rollouts_reference() -> str:
+    """Return the largest standard error of a reference gradient of ``equal_rollouts``, and its scene."""
+    rows = equal_rollouts()
+    errors = (rows["reference_se"] / rows["reference_norm"]).groupby(rows["scene"]).max()
+    return f"{percent(errors.max())} of the norm on `{errors.idxmax()}`"
+
+
 def backward_memory() -> pd.DataFrame:
     """Return memory and time of each method of ``backward_memory`` at its longest horizon, the first scene first."""
     return pd.read_csv(STANDARD / "backward_memory" / "backward_memory_methods.csv")
@@ -579,6 +586,7 @@ FIGURES: dict[str, Callable[[], str]] = {
     "weights-contact": lambda: span(estimators("total_propagation", "per=action", problem=CONTACT)),
     "weights-jump": lambda: span(estimators("total_propagation", problem=JUMP)),
     "equal-rollouts": equal_rollouts_table,
+    "equal-rollouts-reference": equal_rollouts_reference,
     "backward-memory": backward_memory_table,
     "backward-memory-finding": backward_memory_finding,
     "measure-samples": lambda: count(estimators("measure_valued", column="best").sum()),
