@@ -4,6 +4,7 @@ import gc
 import itertools
 import os
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -80,9 +81,14 @@ tests_run = itertools.count(1)
 
 @pytest.fixture(autouse=True)
 def drop_compiled_programs():
-    """Drop JAX's compiled programs if the process nears the limit of memory mappings, which is checked every tenth test."""
+    """Drop JAX's compiled programs if the process nears the limit of memory mappings.
+
+    That is checked after every tenth test, and after tests of a second or more, which may have compiled much.
+    """
+    started = time.monotonic()
     yield
-    if next(tests_run) % 10 or "jax" not in sys.modules:
+    is_due = next(tests_run) % 10 == 0 or time.monotonic() - started > 1.0
+    if not is_due or "jax" not in sys.modules:
         return
     maps = Path("/proc/self/maps")
     if maps.exists() and maps.read_bytes().count(b"\n") > MOST_MAPPINGS:
