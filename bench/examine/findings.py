@@ -83,6 +83,11 @@ RIGHT, WRONG, UNSHOWN, NONE = "right", "wrong", "not shown", "none given"
 """Answers about the derivative."""
 
 
+def _is_resolved(part: Part) -> bool:
+    """Return whether a part's difference has at least one correct digit."""
+    return part.uncertainty < DIGIT * abs(part.difference)
+
+
 def _slope_nearby(sample: Sample) -> float:
     """Return the largest one-sided slope of a sample that exceeds its noise, less the noise."""
     slopes = np.maximum(np.abs(sample.left), np.abs(sample.right)) - 3.0 * sample.uncertainty
@@ -240,7 +245,7 @@ class Findings:
             for p in seen
             if abs(p.program - p.difference)
             > max(CONTRADICTED * p.uncertainty, DIGIT * max(abs(p.difference), abs(p.program)))
-            and p.uncertainty < DIGIT * abs(p.difference)
+            and _is_resolved(p)
             and not self._is_small(replace(p, verdict="wrong_adjoint"))
         ]
         return hidden + contradicted
@@ -519,7 +524,7 @@ class Findings:
     def _resolved_parts(self) -> list[Part]:
         """Return the components whose differences have at least one correct digit."""
         parts = () if self.check is None else self.check.components
-        return [part for part in parts if math.isfinite(part.error) and part.uncertainty < 0.1 * abs(part.difference)]
+        return [part for part in parts if math.isfinite(part.error) and _is_resolved(part)]
 
     def _n_checked(self) -> str:
         n_seen = len(self.check.components) if self.check is not None else 0
