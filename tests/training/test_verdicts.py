@@ -71,6 +71,43 @@ def test_a_gradient_that_returns_to_its_usual_size_does_not_explode():
     assert text.endswith("to its usual size")
 
 
+def test_a_gradient_that_explodes_and_stays_large():
+    norm = HEALTHY["gradient_norm"] * np.where(np.arange(N) < 30, 1.0, 1e4)
+    text = words(verdicts(gradient_norm=norm, contacts=with_value("contacts", slice(29, None), 1.0)))
+    assert text.startswith("the gradient explodes 1 update after the contact starts (update 31), to ")
+    assert text.endswith("times its median before, and stays at about 1.0e4 times")
+
+
+def test_a_gradient_that_grows_step_by_step():
+    """By 12% an update: 25 updates before, where the median lies, it was 17 times smaller, so that no update jumps.
+
+    The medians of the first and last 10 updates are 90 updates apart: 1.12^90 = 2.7e4.
+    """
+    text = words(verdicts(gradient_norm=1.12 ** np.arange(N)))
+    assert text.startswith("the gradient grows step by step, 2.7e4 times in all")
+    assert text.endswith("above 100 times its first size from update 47 on")
+
+
+RISING_NO_MORE = [*RETURNS[:2], [-60, -62, -58], [-61, -63, -59], [-60, -62, -58]]
+
+
+def test_a_gradient_that_vanishes_while_the_return_rises_no_more():
+    vanishing = HEALTHY["gradient_norm"] * np.where(np.arange(N) < 40, 1.0, 1e-4)
+    text = words(verdicts(gradient_norm=vanishing, returns=RISING_NO_MORE[:1] + [RISING_NO_MORE[2]] * 4))
+    assert text.startswith("the gradient nearly vanishes from update 41 on, 9900 times below its size before")
+    assert text.endswith("converged or is stuck")
+
+
+def test_a_gradient_that_becomes_small_while_the_return_rises_is_no_fault():
+    assert verdicts(gradient_norm=HEALTHY["gradient_norm"] * np.where(np.arange(N) < 40, 1.0, 1e-4)) == []
+
+
+def test_a_gradient_that_vanishes_and_returns_is_named_by_its_return_only():
+    """Also where it was small for most of the run: what counts is its size before."""
+    text = words(verdicts(gradient_norm=with_value("gradient_norm", slice(20, 80), 1e-4), returns=RISING_NO_MORE))
+    assert text.startswith("the gradient nearly vanishes before update 81")
+
+
 def test_a_gradient_of_all_zeros():
     assert words(verdicts(gradient_norm=np.zeros(N))) == "the gradient is exactly zero in all 100 updates"
 
@@ -149,7 +186,7 @@ def test_every_code_has_words_without_a_full_stop_or_semicolon(code):
     numbers = {"update": 3, "quantity": "loss", "zero": 10, "updates": 20, "factor": 4.0, "peaks": 2, "error": 0.5,
                "cosine": -0.5, "low": -0.6, "high": -0.4, "best": 1.0, "last": 0.0, "loss_before": 2.0, "loss_after": 1.0,
                "before": 0.1, "after": 0.4, "reward_before": 0.0, "reward_after": 1.0, "first": 1.0, "value": 200.0,
-               "share": 0.95}  # fmt: skip
+               "share": 0.95, "lasting": 500.0}  # fmt: skip
     text = describe({"code": code, **numbers})
     assert text
     assert ";" not in text

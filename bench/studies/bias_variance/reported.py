@@ -1,4 +1,4 @@
-"""Summarises the diagnostics that estimators report, such as a weight: where it is 0, the method has no effect."""
+"""Summarises what rows report beside their errors: diagnostics of estimators, and references outside their tolerance."""
 
 from __future__ import annotations
 
@@ -29,3 +29,16 @@ def sentences(rows: pd.DataFrame) -> list[str]:
                 + (f", and 0 in most estimates of {off} of them: it does nothing there" if off else "")
             )
     return texts
+
+
+def loose_references(rows: pd.DataFrame, tolerance: float) -> list[str]:
+    """Return in how many cells the reference's relative standard error is above the experiment's ``tolerance``, and the largest."""
+    good = rows[(rows["status"] == "ok") & (rows["reference_norm"] > 0)]
+    error = good["reference_se"] / good["reference_norm"]
+    loose = error[error > tolerance]
+    if loose.empty:
+        return []
+    return [
+        f"the standard error of the reference is above its tolerance of {100 * tolerance:g}% in {counted(len(loose), 'cell')}, up to "
+        f"{100 * loose.max():.2g}% ({good.loc[loose.idxmax(), 'scene']}): more reference.samples make it smaller"
+    ]

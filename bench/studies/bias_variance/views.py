@@ -46,5 +46,9 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
             replace(COLUMNS.by_name["time_s"], label="time"),
             *(COLUMNS.by_name[name] for name in RESULTS),
         ],
-        remarks=[*tables.remarks(rows), *reported.sentences(rows)],
+        remarks=[
+            *tables.remarks(rows),
+            *reported.loose_references(rows, experiment.reference.tolerance),
+            *reported.sentences(rows),
+        ],
     )

@@ -67,7 +67,11 @@ class Train(Study):
     evaluations: int = param(20, "evaluations along a run, besides the first", positive=True)
     cosines: int = param(4, "comparisons of first- with zeroth-order gradients along a run", low=0)
     copies: int = param(16, "rollouts from each start in such a comparison", low=4)
-    batches: int = param(16, "independent batches that measure the bias of a window; 0: not measured", low=0)
+    batches: int = param(
+        16,
+        "independent batches of rollouts that compare the gradient of a window with that of an episode; 0: not compared",
+        low=0,
+    )
     entries: int = param(
         250, "most entries of a stored log; an entry is the mean or largest value of its updates", low=10
     )

@@ -147,6 +147,8 @@ def _explodes(fault: Mapping[str, Any]) -> str:
         after = "in the update in which" if lag == 0 else f"{counted(lag, 'update')} after"
         when = f"{after} the contact starts (update {update})"
     text = f"the gradient explodes {when}, to {number(fault['factor'])} times its median before"
+    if fault.get("lasting"):
+        text += f", and stays at about {number(fault['lasting'])} times"
     if fault["peaks"] > 1:
         text += ", and once more" if fault["peaks"] == 2 else f", and {fault['peaks'] - 1} more times"
     if fault.get("with_contact") is not None and fault["peaks"] > 1:
@@ -184,6 +186,14 @@ WORDS: dict[str, Callable[[Mapping[str, Any]], str]] = {
     "explodes": _explodes,
     "returns": lambda f: (
         f"the gradient nearly vanishes before update {f['update']} and then grows {number(f['factor'])} times, to its usual size"
+    ),
+    "vanishes": lambda f: (
+        f"the gradient nearly vanishes from update {f['update']} on, {number(f['factor'])} times below its size before, and the "
+        "return rises no more, so that the training has converged or is stuck"
+    ),
+    "grows": lambda f: (
+        f"the gradient grows step by step, {number(f['factor'])} times in all, and is above 100 times its first size from "
+        f"update {f['update']} on"
     ),
     "differences": lambda f: (
         f"open: central differences at the steps tried do not agree with the gradient (relative error of at least {number(f['error'])}), "

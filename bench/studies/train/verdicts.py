@@ -11,7 +11,7 @@ import numpy as np
 EXPLODES = 100.0
 """Factor on the median norm of the updates before, above which a gradient explodes."""
 LARGE = 10.0
-"""Factor on a run's median norm that an explosion exceeds too; below it, the gradient was small before."""
+"""Factor on the largest of those medians so far that an explosion exceeds too; below it, the gradient was small before."""
 MEMORY = 50
 """Updates before, whose median norm is compared."""
 SETTLED = 10
@@ -76,9 +76,10 @@ def judge(
     return there, ``cosines (c, 3)`` update, cosine and cosine without noise. A statement about means needs their
     intervals apart; what noise can explain does not count.
     """
+    explosion = _explodes(log)
     checks = [
-        _not_finite(log), _zero(log), _explodes(log), _differences(probe), _cosine(cosines), _worse(log, evaluated, returns),
-        _soft_contact(log), _parameters(log), _always_cut(log),
+        _not_finite(log), _zero(log), _vanishes(log, evaluated, returns), explosion or _grows(log), _differences(probe),
+        _cosine(cosines), _worse(log, evaluated, returns), _soft_contact(log), _parameters(log), _always_cut(log),
     ]  # fmt: skip
     return [verdict for verdict in checks if verdict is not None]
 
@@ -116,28 +117,64 @@ def _run_of(flags: np.ndarray, length: int) -> int | None:
 
 def _explodes(log: Log) -> Verdict | None:
     norms = log.column("gradient_norm")
-    usual = float(np.median(norms[np.isfinite(norms)])) if np.isfinite(norms).any() else math.nan
-    jumps = []
-    for i in range(SETTLED, len(norms)):
-        before = norms[max(0, i - MEMORY) : i]
-        typical = float(np.median(before[np.isfinite(before)])) if np.isfinite(before).any() else math.nan
-        if typical > 0 and norms[i] > EXPLODES * typical:
-            jumps.append((i, norms[i] / typical))
+    typical, highest = _medians(norms)
+    jumps = [i for i in range(len(norms)) if typical[i] > 0 and norms[i] > EXPLODES * typical[i]]
     if not jumps:
         return None
-    peaks = [(i, factor) for i, factor in jumps if norms[i] > LARGE * usual]
+    peaks = [i for i in jumps if norms[i] > LARGE * highest[i]]
     if not peaks:
-        return {"code": "returns", "update": jumps[0][0] + 1, "factor": float(jumps[0][1])}
-    first, factor = peaks[0]
-    verdict: Verdict = {"code": "explodes", "update": first + 1, "factor": float(factor), "peaks": len(peaks)}
-    start = contact_start(log.column("contacts"))
+        return {"code": "returns", "update": jumps[0] + 1, "factor": float(norms[jumps[0]] / typical[jumps[0]])}
+    first = peaks[0]
+    verdict: Verdict = {"code": "explodes", "update": first + 1, "factor": float(norms[first] / typical[first])}
+    contacts = log.column("contacts")
+    start = contact_start(contacts)
     if start is not None and 0 <= first + 1 - start <= RECENT:
         verdict["contact"] = start
+    later = norms[first:][np.isfinite(norms[first:])]
+    if len(later) >= SETTLED and np.median(later) > EXPLODES * highest[first]:
+        return verdict | {"peaks": 1, "lasting": float(np.median(later) / typical[first])}
+    verdict["peaks"] = len(peaks)
     # whether peaks come with contact: updates with more contacts than the median
-    contacts = log.column("contacts")
     if np.nanmax(contacts, initial=0.0) > 0:
-        verdict["with_contact"] = int(sum(contacts[i] > 0 for i, _ in peaks))
+        verdict["with_contact"] = int(sum(contacts[i] > 0 for i in peaks))
     return verdict
+
+
+def _medians(norms: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return, by update, the median norm of the :data:`MEMORY` updates before, and its largest value so far; NaN at first."""
+    typical = np.full(len(norms), math.nan)
+    for i in range(SETTLED, len(norms)):
+        before = norms[max(0, i - MEMORY) : i]
+        if np.isfinite(before).any():
+            typical[i] = np.median(before[np.isfinite(before)])
+    return typical, np.fmax.accumulate(typical) if len(typical) else typical
+
+
+def _vanishes(log: Log, evaluated: np.ndarray, returns: np.ndarray) -> Verdict | None:
+    """Return that the gradient has become small, not 0, and stays so, while the return does not rise."""
+    norms, tenth = log.column("gradient_norm"), max(len(log) // 10, SETTLED)
+    if len(norms) < 2 * tenth or not np.isfinite(norms).all() or not norms[-tenth:].any():
+        return None
+    highest = float(np.nanmax(_medians(norms)[1]))
+    start = int(np.flatnonzero(norms >= highest / EXPLODES)[-1]) + 1
+    if start > len(norms) - tenth:
+        return None
+    before = returns[evaluated <= start]
+    if len(before) and returns[-1, 1] > before[-1, 2]:
+        return None
+    return {"code": "vanishes", "update": start + 1, "factor": highest / float(np.median(norms[start:]))}
+
+
+def _grows(log: Log) -> Verdict | None:
+    """Return that the gradient grows without a jump: at the end of a run it is much larger than at its start."""
+    norms, tenth = log.column("gradient_norm"), max(len(log) // 10, SETTLED)
+    if len(norms) < 2 * tenth or not np.isfinite(norms).all():
+        return None
+    first = float(np.median(norms[:tenth]))
+    if not (first > 0 and (norms[-tenth:] > EXPLODES * first).all()):
+        return None
+    start = int(np.flatnonzero(norms <= EXPLODES * first)[-1]) + 1
+    return {"code": "grows", "update": start + 1, "factor": float(np.median(norms[-tenth:])) / first}
 
 
 def _differences(probe: Mapping[str, float]) -> Verdict | None:

@@ -168,9 +168,16 @@ def _log_title(runs: pd.DataFrame, methods: list[str]) -> str:
     if len(faults):
         first = faults.iloc[0]
         words = findings.describe(first["fault"]).partition(",")[0].partition(" (")[0]
-        return f"{first['method']}: {words}"
+        return f"{first['method']}: {words}{_place(drawn, first)}"
     ratio = drawn["gradient_peak"] / drawn["gradient_typical"]
     worst = drawn.loc[ratio.idxmax()] if ratio.notna().any() else None
     if worst is None:
         return "Logs of the trainings"
     return f"The largest gradient is {number(ratio.max())} times the median of its run ({worst['method']})"
+
+
+def _place(runs: pd.DataFrame, line: pd.Series) -> str:
+    """Return where a fault starts on the axis of control steps, in words."""
+    run = runs[(runs["method"] == line["method"]) & (runs["seed"] == line["seed"])].iloc[0]
+    update = line["fault"].get("update")
+    return f" (at {number(update * run['steps'] / run['updates'], 3)} control steps)" if update else ""
