@@ -152,7 +152,7 @@ def test_the_recommendation_comes_first_then_the_failure_then_what_removes_it():
     texts = made(*cells)[2]
     assert texts == [
         "Use fobg up to stiffness 1000 with penalty and at every stiffness with complementarity: it has the lowest error "
-        "at equal samples, of 1 to 2 rollouts or gradients each (relative RMSE 0.10).",
+        "at equal samples, each of 1 to 2 rollouts or gradients (relative RMSE 0.10).",
         "fobg fails beyond the limit (stiffness 6400) with penalty: its error is at least 81 times the gradient, where "
         "randomized_smoothing is usable (0.50).",
         "With complementarity fobg does not fail there (0.10).",
@@ -185,7 +185,7 @@ def test_gradients_are_compared_at_equal_samples_and_the_sentence_says_so():
     cells = [*by_samples("a", 0, 1), *by_samples("b", 2, scale=3.0)]
     _, compared, texts = made(*cells, sweep={"samples": [64, 128]})
     assert set(compared["basis"]) == {"relative RMSE at equal samples"}
-    assert "the lowest error at equal samples, of 1 to 2 rollouts or gradients each (" in texts[0]
+    assert "the lowest error at equal samples, each of 1 to 2 rollouts or gradients (" in texts[0]
 
 
 def test_costs_of_one_rollout_per_sample_are_compared_at_each_number_of_samples():
@@ -208,7 +208,7 @@ def test_without_an_axis_the_worst_case_is_ranked():
     ]
     texts = made(*cells, sweep={})[2]
     assert texts[0] == (
-        "reinforce has the lowest worst case on the 3 problems at equal samples, of 1 to 2 rollouts or gradients each: "
+        "reinforce has the lowest worst case on the 3 problems at equal samples, each of 1 to 2 rollouts or gradients: "
         "0.30 to 0.50."
     )
     assert "fobg is best or tied on pendulum, penalty, and cartpole, penalty (0.010)" in texts[1]

@@ -118,7 +118,7 @@ def work_of_a_sample(methods: pd.DataFrame) -> str:
     each = known(compared["evaluations"].round())
     if not each or min(each) == max(each):
         return ""
-    return f" at equal samples, of {axis_value(min(each))} to {axis_value(max(each))} rollouts or gradients each"
+    return f" at equal samples, each of {axis_value(min(each))} to {axis_value(max(each))} rollouts or gradients"
 
 
 def _record(name: str, methods: pd.DataFrame, comparisons: pd.DataFrame) -> str:
