@@ -335,12 +335,18 @@ def trained_table(experiment: str = "train") -> str:
 
 
 def windows_table(experiment: str = "train") -> str:
-    """Return gradient and final return by the length of a window as a Markdown table."""
-    head = ["| window [steps] | norm of its gradient | final return |", "|--:" * 3 + "|"]
+    """Return gradient, its bias and final return by the length of a window as a Markdown table."""
+    head = ["| window [steps] | norm of the gradient | its bias | final return |", "|--:" * 4 + "|"]
     return block(head + [
-        f"| {line['window']:.0f} | {number(line['window_gradient'])} | {final_return(line)} |"
+        f"| {line['window']:.0f} | {number(line['window_gradient'])} | {window_bias(line)} | {final_return(line)} |"
         for line in aggregate.windows(trained(experiment)).to_dict("records")
     ])  # fmt: skip
+
+
+def window_bias(line: dict[str, Any]) -> str:
+    """Return the relative bias of the windows' gradient with its interval over seeds, or without one for too few seeds."""
+    ends = f" [{number(line['window_bias_low'])}, {number(line['window_bias_high'])}]"
+    return number(line["window_bias"]) + (ends if np.isfinite(line["window_bias_low"]) else "")
 
 
 def windows_finding(experiment: str = "train") -> str:

@@ -75,6 +75,7 @@ class Trainer(Plugin):
 
         Three arrays ``(h, B)``: the gain of each step, whose sum over a rollout is its return; whether the gradient is
         cut after the step; and the log probability of its action under ``actor``, as a function of ``actor`` only.
-        Needed only if the trainer is :attr:`first_order`.
+        Needed only if the trainer is :attr:`first_order`. That of a trainer with a field ``window`` also takes ``every=0``:
+        a number of steps after each of which the gradient is cut and the critic's value is added, as at a window's end.
         """
         raise Unsupported(f"trainer {self.name} takes no first-order steps")

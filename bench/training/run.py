@@ -69,10 +69,11 @@ class Training:
         cosines = self._call(f"agreement {copies}", compare, state, np.uint32(seed))
         return {name: float(value) for name, value in cosines.items()}
 
-    def gradient(self, state: Any, seed: int, window: int | None = None) -> np.ndarray:
+    def gradient(self, state: Any, seed: int, window: int | None = None, every: int = 0) -> np.ndarray:
         """Return the derivative of the mean return of rollouts from new starts by the actor's parameters, ``(d,)``.
 
-        ``window`` replaces the number of control steps of a trainer with windows.
+        For trainers with windows: ``window`` replaces the number of control steps, and a positive ``every`` cuts them into
+        windows of that length, each of which ends in the critic's value. The noise is the same for each ``every``.
         """
         trainer: Any = self.trainer if window is None else dataclasses.replace(self.trainer, window=window)  # type: ignore[call-arg]
 
@@ -80,9 +81,13 @@ class Training:
             import jax
             from jax.flatten_util import ravel_pytree
 
-            return ravel_pytree(jax.grad(lambda actor: _mean_return(trainer, env, state, actor, seed))(state.actor))[0]
+            return ravel_pytree(
+                jax.grad(lambda actor: _mean_return(trainer, env, state, actor, seed, every))(state.actor)
+            )[0]
 
-        return np.asarray(self._call(f"gradient {window}", differentiate, state, np.uint32(seed)), dtype=np.float64)
+        return np.asarray(
+            self._call(f"gradient {window} {every}", differentiate, state, np.uint32(seed)), dtype=np.float64
+        )
 
     def mean_return(self, state: Any, seed: int, shift: np.ndarray) -> float:
         """Return the mean return that :meth:`gradient` differentiates, at the actor's parameters plus ``shift (d,)``."""
@@ -119,8 +124,9 @@ class Training:
         return executable
 
 
-def _mean_return(trainer: Trainer, env: Environment, state: Any, actor: Any, seed: Any) -> Any:
+def _mean_return(trainer: Trainer, env: Environment, state: Any, actor: Any, seed: Any, every: int = 0) -> Any:
     import jax
 
     key_start, key = jax.random.split(jax.random.PRNGKey(seed))
-    return trainer.parts(env, trainer.fresh(env, state, key_start), actor, key)[0].sum(axis=0).mean()
+    windows = {"every": every} if every else {}
+    return trainer.parts(env, trainer.fresh(env, state, key_start), actor, key, **windows)[0].sum(axis=0).mean()

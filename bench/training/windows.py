@@ -33,12 +33,13 @@ class Window(NamedTuple):
 
 
 def rollout(
-    env: Environment, policy: Policy, first: Episodes, length: int, key: Array, cut: float = 0.0
+    env: Environment, policy: Policy, first: Episodes, length: int, key: Array, cut: float = 0.0, every: int = 0
 ) -> tuple[Episodes, Window]:
     """Return the episodes after ``length`` control steps, and what the steps gave.
 
     A positive ``cut`` cuts the gradient after a step whose Jacobian has a larger Frobenius norm, per rollout (Georgiev
-    et al. 2024, arXiv 2405.17784: adaptive horizons).
+    et al. 2024, arXiv 2405.17784: adaptive horizons). A positive ``every`` cuts it after each ``every`` steps, as windows of
+    that length do.
     """
     import jax
     import jax.numpy as jnp
@@ -48,15 +49,16 @@ def rollout(
     noise = env.normal(key_action, (length, env.n_actions, count))
     numbers = env.normal(key_start, (length, env.n_start, count))
 
-    def step(episodes: Episodes, drawn: tuple[Array, Array]) -> tuple[Episodes, Window]:
+    def step(episodes: Episodes, drawn: tuple[Array, Array, Array]) -> tuple[Episodes, Window]:
         observation = env.observe(episodes.state)
         action = policy(observation, drawn[0])
         moved = env.step(episodes, action, drawn[1])
         following, is_cut = moved.next, moved.ended
         if cut > 0:
             is_stiff = jacobian_norm(env, episodes.state, action) > cut
-            state = [jnp.where(is_stiff, jax.lax.stop_gradient(part), part) for part in following.state]
-            following, is_cut = Episodes(State(*state), following.age), is_cut | is_stiff
+            following, is_cut = _constant_where(is_stiff, following), is_cut | is_stiff
+        if every > 0:
+            following = _constant_where((drawn[2] + 1) % every == 0, following)
         contacts = jax.lax.stop_gradient(env.contacts(moved.reached))
         reached = env.observe(moved.reached)
         return following, Window(
@@ -64,8 +66,17 @@ def rollout(
         )
 
     # the state at the start of a window is a constant
-    last, window = jax.lax.scan(step, jax.lax.stop_gradient(first), (noise, numbers))
+    last, window = jax.lax.scan(step, jax.lax.stop_gradient(first), (noise, numbers, jnp.arange(length)))
     return jax.lax.stop_gradient(last), window
+
+
+def _constant_where(is_cut: Array, episodes: Episodes) -> Episodes:
+    """Return the same episodes, whose states have no derivative where ``is_cut``."""
+    import jax
+    import jax.numpy as jnp
+
+    parts = [jnp.where(is_cut, jax.lax.stop_gradient(part), part) for part in episodes.state]
+    return Episodes(State(*parts), episodes.age)
 
 
 def jacobian_norm(env: Environment, state: State, action: Array) -> Array:
@@ -85,16 +96,21 @@ def jacobian_norm(env: Environment, state: State, action: Array) -> Array:
     return jnp.sqrt((columns**2).sum(axis=(0, 1)))
 
 
-def gains(window: Window, values: Array, discount: Any) -> Array:
+def gains(window: Window, values: Array, discount: Any, every: int = 0) -> Array:
     """Return what each step adds to the discounted return of its part of the window, ``(h, B)``.
 
     ``values (h, B)`` are of the reached states, 0 where none follows. A part lasts from the window's start or a cut to
     the next cut or the window's end; its return is ``sum_t gamma^t r_t + gamma^n V`` (Xu et al. 2022, equation 5).
+    With a positive ``every``, V is added after each ``every`` steps too, and the powers of gamma go on: where the rollout
+    cuts the gradient there as well, the derivative of the sum is that of all its windows of that length.
     """
     import jax
     import jax.numpy as jnp
 
-    is_last = jnp.arange(window.reward.shape[0]) == window.reward.shape[0] - 1
+    step = jnp.arange(1, window.reward.shape[0] + 1)
+    is_last = step == window.reward.shape[0]
+    if every > 0:
+        is_last |= step % every == 0
 
     def add(factor: Array, at: tuple[Array, Array, Array, Array]) -> tuple[Array, Array]:
         reward, value, cut, last = at

@@ -68,11 +68,12 @@ class Shac(ActorCritic):
         known = normaliser.updated(state.normaliser, seen)
         return Run(actor, memory, known, episodes, key, Critic(network, target, critic_memory)), log
 
-    def parts(self, env: Any, state: Run, actor: Any, key: Any) -> tuple[Any, Any, Any]:
+    def parts(self, env: Any, state: Run, actor: Any, key: Any, every: int = 0) -> tuple[Any, Any, Any]:
         """Return gains, cuts and log probabilities of the next window of an actor, each ``(h, B)``."""
         from bench.training import windows
 
         assert state.critic is not None
-        _, window = self.window_of(env, state, actor, key, self.cut)
-        gained = windows.gains(window, self.values_of(state, state.critic.target, window), self.discount)
+        _, window = self.window_of(env, state, actor, key, self.cut, every)
+        value = self.values_of(state, state.critic.target, window)
+        gained = windows.gains(window, value, self.discount, every)
         return gained, window.cut, windows.log_probability(actor, state.normaliser, window)

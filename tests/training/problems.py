@@ -56,8 +56,21 @@ class Pressed(PolicyScene, ContactScene):
         return 0.0 * q[0]
 
 
-def pressed_program(contact: str = "penalty", **parameters: Any) -> Any:
-    """Return the program of the pressed mass under a contact law."""
+@dataclass(frozen=True)
+class Untouched(Pressed):
+    """The same mass, which the policy does not move; each step costs the squared distance of the action from its height."""
+
+    name = "untouched"
+
+    def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
+        return 0.0 * u
+
+    def stage_cost(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
+        return (u[0] - q[0]) ** 2
+
+
+def pressed_program(contact: str = "penalty", scene: PolicyScene | None = None, **parameters: Any) -> Any:
+    """Return the program of the pressed mass, or of another scene with a contact, under a contact law."""
     return compose(
-        Pressed(), registry.make("contacts", contact, parameters), registry.make("integrators", "semi_implicit_euler")
+        scene or Pressed(), registry.make("contacts", contact, parameters), registry.make("integrators", "semi_implicit_euler")
     )

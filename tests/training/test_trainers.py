@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from problems import cartpole_program
+from problems import Untouched, cartpole_program, pressed_program
 from trees import ROOT
 
 from bench.model import registry
@@ -66,6 +66,23 @@ def test_seeds_give_different_runs_from_one_compilation():
     seconds = run.compile_s
     run.update(second)
     assert run.compile_s == seconds
+
+
+def test_windows_have_no_bias_where_actions_move_nothing_and_one_where_they_do():
+    """Without dynamics every action is rewarded at once, so that neither a cut nor a wrong critic changes the gradient."""
+
+    def gradients(env):
+        run = Training(env, registry.make("trainers", "shac", TRAINERS["shac"]))
+        state = run.start(0)
+        return run.gradient(state, 1, 12), run.gradient(state, 1, 12, 12), run.gradient(state, 1, 12, 5)
+
+    ops = registry.make("backends", "jax").ops()
+    whole, same, cut = gradients(Environment(pressed_program(scene=Untouched(horizon=12)), ops, "float64"))
+    np.testing.assert_allclose(same, whole, rtol=1e-10)
+    np.testing.assert_allclose(cut, whole, rtol=1e-10, atol=1e-10 * np.abs(whole).max())
+    whole, same, cut = gradients(Environment(cartpole_program(horizon=12, substeps=1), ops, "float64"))
+    np.testing.assert_allclose(same, whole, rtol=1e-10)
+    assert np.linalg.norm(cut - whole) > 1e-3 * np.linalg.norm(whole)
 
 
 def test_first_and_zeroth_order_gradients_of_a_window_agree():

@@ -117,6 +117,38 @@ def test_a_cut_stops_the_gradient_where_the_jacobian_is_too_large(actor):
     np.testing.assert_array_equal(free.reward, always.reward)
 
 
+def test_the_gradient_of_an_episode_in_windows_is_the_sum_of_theirs(actor):
+    """By a loop over windows whose first states are constants: rewards and the last value, times gamma^steps before."""
+    env, key, length, every, discount = environment(), jax.random.PRNGKey(2), 10, 4, 0.9
+    first = env.start(jnp.asarray(np.random.default_rng(0).standard_normal((8, 3))))
+    noise = env.normal(jax.random.split(key)[0], (length, 1, 3))
+
+    def value(seen):
+        return jnp.sin(seen).sum(axis=-2)
+
+    def in_windows(actor):
+        _, window = windows.rollout(env, actor.sample, first, length, key, every=every)
+        return windows.gains(window, value(window.reached), discount, every).sum()
+
+    def by_hand(actor):
+        episodes, total = first, 0.0
+        for t in range(length):
+            if t % every == 0:
+                episodes = jax.lax.stop_gradient(episodes)
+            moved = env.step(episodes, actor.sample(env.observe(episodes.state), noise[t]), jnp.zeros((8, 3)))
+            total += discount**t * moved.reward.sum()
+            if (t + 1) % every == 0 or t + 1 == length:
+                total += discount ** (t + 1) * value(env.observe(moved.reached)).sum()
+            episodes = moved.next
+        return total
+
+    found, expected = jax.jit(jax.grad(in_windows))(actor), jax.jit(jax.grad(by_hand))(actor)
+    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-8, atol=1e-8 * np.abs(other).max())
+    free = jax.jit(jax.grad(lambda a: window_return(env, a, length, key, first=first, discount=discount)[0]))(actor)
+    assert not np.allclose(jax.tree.leaves(found)[0], jax.tree.leaves(free)[0], rtol=1e-3)
+
+
 def test_the_norm_of_a_jacobian_agrees_with_differences():
     env = environment()
     state = env.start(jnp.asarray(np.random.default_rng(0).standard_normal((8, 2)))).state

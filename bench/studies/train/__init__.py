@@ -42,10 +42,10 @@ class Train(Study):
                format="seconds"),
         Column("gradient_typical", "median norm of the actor's gradient over updates", label="gradient norm"),
         Column("gradient_peak", "largest norm of the actor's gradient over updates", label="largest gradient"),
-        Column("window_gradient", "norm of the gradient of a window's return, halfway through the run"),
-        Column("window_bias", "its relative distance from the gradient of a whole episode's discounted return: no bias, since "
-               "the episode is longer and its gradient sums over more actions", low="window_bias_low", high="window_bias_high",
-               label="difference from the whole episode's gradient"),
+        Column("window_gradient", "norm of the gradient of whole episodes that is cut into windows, each of which ends in the "
+               "critic's value, halfway through the run"),
+        Column("window_bias", "bias of that gradient: its distance from the gradient without cuts, relative to the latter",
+               low="window_bias_low", high="window_bias_high", label="bias of the windows"),
         Column("window_bias_low", "lower end of its 95% interval over independent batches of rollouts"),
         Column("window_bias_high", "upper end of its 95% interval"),
         Column("difference_error", "relative distance of a directional derivative halfway from its central difference, the smallest over step lengths"),
@@ -69,7 +69,7 @@ class Train(Study):
     copies: int = param(16, "rollouts from each start in such a comparison", low=4)
     batches: int = param(
         16,
-        "independent batches of rollouts that compare the gradient of a window with that of an episode; 0: not compared",
+        "independent batches of rollouts that measure the bias of windows; 0: not measured",
         low=0,
     )
     entries: int = param(

@@ -104,11 +104,12 @@ def _interval(returns: np.ndarray) -> tuple[float, float, float, float]:
 
 
 def _probe(training: Training, state: Any, batches: int) -> dict[str, float]:
-    """Return the error of a directional derivative, and a window's gradient against a whole episode's, at one state of a run.
+    """Return the error of a directional derivative, and the bias of windows, at one state of a run.
 
-    The direction is that of the gradient of the same rollouts, and the error the smallest over :data:`SHIFTS`. ``window_bias``
-    is the distance from the gradient of windows as long as an episode, relative to the latter, both from new starts, with the
-    interval of :func:`bias_interval`. It does not measure a bias: a window of h steps sums over h actions, the episode over all.
+    The direction is that of the gradient of the same rollouts, and the error the smallest over :data:`SHIFTS`. The gradient of
+    whole episodes is computed without cuts, and cut into the trainer's windows, each of which ends in the critic's value:
+    without the critic's error and the cuts, both would be equal. ``window_bias`` is the distance of their means, relative to
+    the gradient without cuts, with the interval of :func:`bias_interval`. Both have the same noise.
     """
     gradient = training.gradient(state, 0)
     norm = float(np.linalg.norm(gradient))
@@ -121,8 +122,9 @@ def _probe(training: Training, state: Any, batches: int) -> dict[str, float]:
             errors.append(abs(slope / (2 * length) / norm - 1.0))
         result["difference_error"] = float(np.nanmin(errors)) if np.isfinite(errors).any() else math.nan
     if batches > 1 and hasattr(training.trainer, "window"):
-        window = np.array([training.gradient(state, 1 + i) for i in range(batches)])
-        whole = np.array([training.gradient(state, 1 + i, training.env.length) for i in range(batches)])
+        length, every = training.env.length, training.trainer.window
+        whole = np.array([training.gradient(state, 1 + i, length) for i in range(batches)])
+        window = np.array([training.gradient(state, 1 + i, length, every) for i in range(batches)])
         result["window_gradient"] = float(np.linalg.norm(window.mean(axis=0)))
         scale = float(np.linalg.norm(whole.mean(axis=0)))
         if np.isfinite(window).all() and np.isfinite(whole).all() and scale > 0:

@@ -26,10 +26,13 @@ SUMMARY = (
     Column("cosine", label="cosine"),
 )  # fmt: skip
 WINDOW = Column("window", label="window", unit="steps", format="setting")
-WINDOW_GRADIENT = Column("window_gradient", label="norm of a window's gradient")
+WINDOW_GRADIENT = Column("window_gradient", label="norm of the windows' gradient")
+WINDOW_BIAS = Column(
+    "window_bias", label="bias of the windows' gradient", low="window_bias_low", high="window_bias_high"
+)
 WINDOWS = (
     PROBLEM, text("family", label="trainer"), WINDOW,
-    WINDOW_GRADIENT,
+    WINDOW_GRADIENT, WINDOW_BIAS,
     Column("gradient_typical", label="gradient norm in training"), FINAL,
 )  # fmt: skip
 FAULTS = (PROBLEM, METHOD, Column("seed", format="setting"), text("words", label="the log shows"))
@@ -62,12 +65,12 @@ NOTE = (
     "same objective along the runs, mean; noise in either lowers it."
 )
 WINDOW_NOTE = (
-    "norm of a window's gradient: of the return of rollouts from new starts, with the policy and critic halfway through the "
-    "run, median over runs. A longer window sums over more actions, and the policies differ between windows, so norms of "
-    "different windows do not say which gradient is better. final return: {seeds}."
+    "norm of the windows' gradient: of whole episodes from new starts, cut into windows that end in the critic's value, with the "
+    "policy and critic halfway through the run, median over runs. bias: the distance from the gradient without cuts, relative "
+    "to it. The policies differ between windows. final return and bias: {seeds}."
 )
 PAGE = ("final_return", "first_return", "final_median", "updates", "steps", "train_s", "compile_s", "gradient_typical",
-        "gradient_peak", "window_gradient", "difference_error")  # fmt: skip
+        "gradient_peak", "window_gradient", "window_bias", "difference_error")  # fmt: skip
 
 
 def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
@@ -126,8 +129,8 @@ def _charts(runs: pd.DataFrame, summary: pd.DataFrame, windows: pd.DataFrame, se
 def _windows(windows: pd.DataFrame, seeds: str) -> Chart:
     title = findings.window(windows).split(".")[0]
     return Chart(
-        "windows", title, windows, [replace(WINDOW, log=True)], [FINAL, WINDOW_GRADIENT], series="family", panel="problem",
-        subtitle=f"final return: {seeds}", text="A point per length of window. Choose the quantity.",
+        "windows", title, windows, [replace(WINDOW, log=True)], [FINAL, WINDOW_BIAS, WINDOW_GRADIENT], series="family", panel="problem",
+        subtitle=seeds, text="A point per length of window. Choose the quantity.",
     )  # fmt: skip
 
 
