@@ -72,5 +72,7 @@ class Untouched(Pressed):
 def pressed_program(contact: str = "penalty", scene: PolicyScene | None = None, **parameters: Any) -> Any:
     """Return the program of the pressed mass, or of another scene with a contact, under a contact law."""
     return compose(
-        scene or Pressed(), registry.make("contacts", contact, parameters), registry.make("integrators", "semi_implicit_euler")
+        scene or Pressed(),
+        registry.make("contacts", contact, parameters),
+        registry.make("integrators", "semi_implicit_euler"),
     )
