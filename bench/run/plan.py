@@ -87,7 +87,7 @@ def _rows_of_older_code(experiment: Experiment, rows: pd.DataFrame, keys: set[st
     experiment is not, or the reverse.
     """
     rows = rows[~rows["key"].isin(keys) & (rows["parameters"] != "")]
-    seconds = [column.name for column in experiment.columns.all if column.measured and column.kind == "number"]
+    seconds = [name for name in experiment.columns.measured if experiment.columns.by_name[name].kind == "number"]
     if seconds:
         is_timed = rows.reindex(columns=seconds).notna().any(axis=1)
         rows = rows[(is_timed == experiment.timing) | (rows["status"] != "ok")]

@@ -394,9 +394,10 @@ class Ledger:
         return int((rows["status"] == "error").any()), err.getvalue().strip()
 
     def stored(self, name: str, folder: Path) -> dict[str, dict[str, Any]]:
-        """Return the rows stored under ``name`` in a folder, by key, as :func:`exact.bits`."""
+        """Return the rows stored under ``name`` in a folder, by key, as :func:`exact.bits`, without times that are kept."""
         columns = registry.usable("studies", name.rpartition("_")[0]).columns
-        return by_key(Store(folder / name, columns).load())
+        kept = [column.name for column in columns.all if column.kept]
+        return by_key(Store(folder / name, columns).load().drop(columns=kept))
 
     def check(self, words: list[str], charts: bool = False) -> None:
         """Run a configuration, and count lost or changed rows and other faults."""

@@ -251,6 +251,11 @@ def test_every_cell_of_a_run_has_a_row_with_the_hash_of_the_hypotheses(run):
     assert len(hypotheses_hash()) == 12
 
 
+def test_times_are_kept_in_a_run_without_timing_since_the_cost_of_a_gradient_is_their_ratio(run):
+    assert run["gradient_s"].gt(0).all()
+    assert run["rollout_s"].gt(0).all()
+
+
 def test_planted_errors_of_a_run_have_their_size_on_the_common_path(run):
     table = analysis.searches(run)
     biased = table[table["kind"] == analysis.BIAS]

@@ -22,6 +22,7 @@ class Twins(Study):
     """Measures the difference between a physics engine's twin and the scene's own program, and the time of gradients."""
 
     name = "twins"
+    timed: ClassVar[bool] = True
     columns: ClassVar[Columns] = Columns.of(
         Column("state_difference", "largest difference of states over time and coordinates", label="states"),
         Column("state_difference_rel", "largest difference of states, each coordinate in units of its largest value",
