@@ -306,12 +306,15 @@ def _counted_minima(scan: pd.DataFrame) -> str:
     """Return the counts of one scan, and the values that they hold for."""
     one, windows = scan.iloc[0], scan.iloc[1:]
     unit = f" {one['unit']}" if one["unit"] else ""
-    span = f"{one['unknown']} from {axis_value(one['from'])} to {axis_value(one['to'])}{unit}"
-    said = f"The loss on {one['problem']} over {one['values']:,} values of {span} has {counted(int(one['minima']), 'local minimum', 'local minima')}"
-    said += f" for the whole record of {one['steps']} steps"
-    return said + (
-        f", and {_counts(windows)} for windows of {listed(map(str, windows['steps']))} steps" if len(windows) else ""
+    values = (
+        f"{one['values']:,} values of {one['unknown']} from {axis_value(one['from'])} to {axis_value(one['to'])}{unit}"
     )
+    whole = (
+        f"{counted(int(one['minima']), 'local minimum', 'local minima')} for the whole record of {one['steps']} steps"
+    )
+    lengths = listed(map(str, windows["steps"])) if len(windows) else ""
+    rest = f", and {_counts(windows)} for windows of {lengths} steps" if lengths else ""
+    return f"The loss on {one['problem']} over {values} has {whole}{rest}"
 
 
 def scan_charts(scans: pd.DataFrame) -> list[Chart]:
