@@ -288,7 +288,7 @@ def scan(model: Model, n_windows: int, data: np.ndarray, settings: Settings) -> 
 
     ``scan`` equally spaced values from the truth over ``span`` to the truth times ``span``, within the parameter's
     declared bounds, with all other unknowns at the truth. The loss is the mean square of the residuals in units of the
-    noise, for the whole record and for independent windows: those of the fit, and others twice, four times, ... as long.
+    noise, for the whole record and for independent windows: the fit's own, and others twice, four times, ... as long.
     Windows start where fits start them, at the measurements. ``minima`` counts the grid's inner points whose loss is
     below that of both neighbours; ``minima_open`` does it without the last sample of each window, see :class:`Fitting`.
     """
@@ -297,15 +297,15 @@ def scan(model: Model, n_windows: int, data: np.ndarray, settings: Settings) -> 
         counts.insert(1, n_windows)
         n_windows = n_windows // 2 if n_windows % 2 == 0 else 1
     horizon, steps = model.program.scene.horizon, np.repeat(model.steps, len(model.measured))
-    found: dict[str, list[Any]] = {
+    result: dict[str, list[Any]] = {
         "scan_steps": [horizon // count for count in counts], "scan_low": [], "scan_high": [],
         "minima": [], "minima_open": [], "scan_loss": [],
     }  # fmt: skip
     for i, (low, high) in enumerate(_ranges(model, settings.span)):
         theta = np.repeat(model.values[:, None], settings.scan, axis=1)
         theta[i] = np.linspace(low, high, settings.scan)
-        found["scan_low"].append(low)
-        found["scan_high"].append(high)
+        result["scan_low"].append(low)
+        result["scan_high"].append(high)
         for count in counts:
             unit = np.ones(len(model.initial_states(theta[:, :1])))
             fitting = Fitting(model, "windows", count, settings.measurement, unit)
@@ -314,10 +314,10 @@ def scan(model: Model, n_windows: int, data: np.ndarray, settings: Settings) -> 
                 square = np.square(fitting.residuals_at(theta, np.repeat(start, settings.scan, axis=1), data))
             inner = steps % (horizon // count) != 0
             loss = square.mean(axis=0)
-            found["minima"].append(int(is_minimum(loss).sum()))
-            found["minima_open"].append(int(is_minimum(square[inner].mean(axis=0)).sum()) if inner.any() else math.nan)
-            found["scan_loss"].extend(loss.tolist())
-    return found
+            result["minima"].append(int(is_minimum(loss).sum()))
+            result["minima_open"].append(int(is_minimum(square[inner].mean(axis=0)).sum()) if inner.any() else math.nan)
+            result["scan_loss"].extend(loss.tolist())
+    return result
 
 
 def is_minimum(values: np.ndarray) -> np.ndarray:

@@ -265,7 +265,7 @@ def scanned(shown: Arranged) -> pd.DataFrame:
 
 
 def fitted(row: Mapping[str, Any], unknown: str, shooting: str) -> float:
-    """Return the value that a shooting method gave an unknown in the first record; NaN if it is not identifiable alone."""
+    """Return the value that a shooting method gave an unknown in the first record; NaN if only a product with it is identifiable."""
     methods, invariants = list(row["shooting"]), list(row["invariants"])
     if shooting not in methods or unknown not in invariants:
         return np.nan
@@ -278,8 +278,8 @@ def unit_of(name: str, given: Mapping[str, Any]) -> str:
         registry.entries().get(kind, {}).get(str((given.get(axis) or {}).get("name")))
         for axis, kind in (("scene", "scenes"), ("contact", "contacts"))
     ]
-    found = named([entry.plugin for entry in entries if entry is not None and entry.plugin is not None], name)
-    return found.unit if found is not None else ""
+    declared = named([entry.plugin for entry in entries if entry is not None and entry.plugin is not None], name)
+    return declared.unit if declared is not None else ""
 
 
 def landscape(scans: pd.DataFrame) -> str:
@@ -346,7 +346,7 @@ def _scan_chart(scan: pd.DataFrame, name: str) -> Chart:
         "lines", series="part", panel="window", across=3, height=1.9, labels="legend",
         styles={CURVE: Style(PALETTE[0], "", width=0.8), MINIMUM: Style(PALETTE[1], ".", line="none"), FIT: Style(PALETTE[2], "D", line="none")},
         marks=[Mark("scene" if one["is_own"] else "truth", one["truth"]), Mark("", 1.0, axis="y")],
-        subtitle="grey line: 1, the noise of the samples alone; fit: of the first record",
+        subtitle="grey line: 1, the noise of a sample; fit: of the first record",
         text="The loss along one unknown, all others at their own values. Windows start at the measurements.",
     )  # fmt: skip
 
