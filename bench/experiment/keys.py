@@ -16,7 +16,7 @@ from typing import Any
 
 from bench.engines.backend import EngineBackend
 from bench.model import PolicyScene, Scene
-from bench.model.parameters import Plugin, remember, values
+from bench.model.parameters import Plugin, deciding, remember
 from bench.model.sources import code_of, file_of, hash_of, hash_of_tree, imports_of_tree, is_below
 
 HARMLESS = {
@@ -52,11 +52,14 @@ _fingerprints: dict[int, tuple[Plugin, str]] = {}
 
 
 def fingerprint(plugin: Plugin | None) -> str:
-    """Return the hash of a plugin's kind, name, parameters and code, as JSON: floats exactly, strings in quotes."""
+    """Return the hash of a plugin's kind, name, parameters and code, as JSON: floats exactly, strings in quotes.
+
+    A parameter at its neutral value is left out, as is the declaration of one that a study has gained.
+    """
     if plugin is None:
         return ""
     if id(plugin) not in _fingerprints:
-        parameters = dict(sorted(values(plugin).items()))
+        parameters = dict(sorted(deciding(plugin).items()))
         hashes = [
             plugin_hash(type(plugin)),
             *(
@@ -149,7 +152,7 @@ def _without_imports(tree: ast.Module) -> ast.Module:
 
 
 def _measuring(module: str) -> ast.Module:
-    """Return the syntax tree of a study's module without its columns and the methods that only show its rows."""
+    """Return the syntax tree of a study's module without what :func:`_shows` names."""
     tree = ast.parse(_file(module).read_bytes())
     for node in tree.body:
         if isinstance(node, ast.ClassDef):
@@ -158,9 +161,17 @@ def _measuring(module: str) -> ast.Module:
 
 
 def _shows(part: ast.stmt) -> bool:
-    """Return whether a part of a study's class is a method that shows rows, or its declaration of columns."""
+    """Return whether a part of a study's class shows rows, declares its columns, or declares a parameter it has gained.
+
+    The value of a parameter with a neutral value is in the key wherever it can decide a number.
+    """
     if isinstance(part, ast.FunctionDef):
         return part.name in DISPLAY
     targets: Iterable[ast.expr] = part.targets if isinstance(part, ast.Assign) else ()
     targets = [part.target] if isinstance(part, ast.AnnAssign) else targets
-    return any(isinstance(target, ast.Name) and target.id == "columns" for target in targets)
+    is_gained = (
+        isinstance(part, ast.AnnAssign)
+        and isinstance(part.value, ast.Call)
+        and any(word.arg == "neutral" for word in part.value.keywords)
+    )
+    return is_gained or any(isinstance(target, ast.Name) and target.id == "columns" for target in targets)

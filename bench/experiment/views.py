@@ -22,7 +22,7 @@ class Style:
     marker: str = "o"
     """A Matplotlib marker; empty for a line without markers."""
     line: Any = "-"
-    """A Matplotlib line style."""
+    """A Matplotlib line style; ``none`` for points without a line, each with its marker."""
     letter: str = ""
     """The letter in the cells of a grid."""
     meaning: str = ""

@@ -33,6 +33,6 @@ class Identified(ABC):
     unknowns: ClassVar[tuple[str, ...]]
     """Default names of the parameters to identify."""
     measured: ClassVar[tuple[int, ...] | None] = None
-    """Indices of the positions measured after each step; None for all."""
+    """Indices of the entries of the state (q, v) measured after each step; None for all positions."""
     end_only: ClassVar[bool] = False
     """Whether only the final positions are measured."""

@@ -8,7 +8,7 @@ import sys
 import types
 import typing
 from abc import ABC
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, ClassVar, Self, TypeVar, cast
@@ -35,15 +35,25 @@ def param(
     low: float | None = None,
     high: float | None = None,
     choices: tuple[str, ...] | None = None,
+    neutral: Any = dataclasses.MISSING,
 ) -> Any:
     """Declare a plugin parameter: its default, meaning, unit and allowed values.
 
     ``positive`` requires a value above 0, ``low`` and ``high`` are inclusive bounds, and ``choices`` are the allowed
-    strings.
+    strings. ``neutral`` is for a parameter that a study gains: the value with which it measures what it did before. A
+    cell with that value keeps its key, and stored rows stay valid.
     """
     return dataclasses.field(
         default=default,
-        metadata=dict(doc=doc, unit=unit, positive=positive, low=low, high=high, choices=choices),
+        metadata=dict(
+            doc=doc,
+            unit=unit,
+            positive=positive,
+            low=low,
+            high=high,
+            choices=choices,
+            neutral=() if neutral is dataclasses.MISSING else (neutral,),
+        ),
     )
 
 
@@ -86,6 +96,8 @@ class Parameter:
     low: float | None = None
     high: float | None = None
     choices: tuple[str, ...] | None = None
+    neutral: tuple[Any, ...] = ()
+    """The value, if any, that leaves a cell's key as it was before the parameter existed."""
 
 
 def _require_annotations(plugin: type[Plugin]) -> None:
@@ -136,6 +148,21 @@ def parameters(plugin: type[Plugin]) -> dict[str, Parameter]:
 def values(plugin: Plugin) -> dict[str, Any]:
     """Return all parameters of a plugin with their values, defaults included."""
     return {name: getattr(plugin, name) for name in parameters(type(plugin))}
+
+
+def deciding(plugin: Plugin) -> dict[str, Any]:
+    """Return the parameters of a plugin that can decide its numbers: all but those at their neutral value."""
+    declared = parameters(type(plugin))
+    return {name: value for name, value in values(plugin).items() if repr((value,)) != repr(declared[name].neutral)}
+
+
+def named(plugins: Iterable[type[Plugin]], name: str) -> Parameter | None:
+    """Return the parameter that theta names ``mass`` or ``pushing.mass``, of the first of the plugins that has it."""
+    owner, _, own = name.rpartition(".")
+    for plugin in plugins:
+        if own in parameters(plugin) and owner in ("", singular(plugin.kind), plugin.name):
+            return parameters(plugin)[own]
+    return None
 
 
 def traced(plugin: Plugin) -> list[str]:

@@ -50,6 +50,8 @@ EQUIVALENT: dict[str, str] = {
     "45d784282200121fe5ae6ecaaa166982a3a954568bc057f953aaf9a400a28f7b": "ff27737fdc555092e07c9f70f2a93164b7ec250445e3efc42278a093373d3f6c",
     # plugins/policies/linear.py: imports from the public names
     "26bc2dc370a8bbfb34e2c59db3fc7bb53d236dceb31c8f1384a0952a0bfae12d": "b186ee7bb2b0a68808573a8e9a9d5662031dbd8ee5a9a8892345afd57fb98207",
+    # bench/studies/identify/measure.py: scans of the loss, and windows of first-order scenes that start at the measurements, which no stored row has
+    "b33d60a4c966cc89cf9252f7208ac6baf0c3f5a610e1bcd5b55f76a4b1a62d32": "d6b0adf289c73e9f1242412c760ffac520af75030cdc93cd8a9f8d2ff6fca860",
     # bench/training/evaluation.py: scenes without a random start, which no stored row has
     "4e4e92ad12ad459268276452de9d92447609b50b51f136a670a8894f55dcde11": "fee1e09006427e51ebe8172ecbdc8ac76366922b7225e35c26a1993d121e599c",
     # bench/training/fitting.py: refuses more batches than states, which no stored row has

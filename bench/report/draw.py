@@ -288,7 +288,7 @@ def _legend(chart: Chart, styles: dict[str, Style], width: float) -> list[Any]:
     bare = line and chart.frame.groupby(keys).size().min() > MANY
     colours = [
         Line2D(
-            [], [], color=style.colour, marker="s" if chart.shape else "" if bare else style.marker,
+            [], [], color=style.colour, marker="s" if chart.shape else "" if bare and style.line != "none" else style.marker,
             linestyle=style.line if line else "none", linewidth=style.width, label=labels[name],
         )
         for name, style in styles.items()
@@ -352,7 +352,8 @@ def _draw_lines(chart: Chart, panel: Axes, name: str, part: pd.DataFrame, styles
         places = points[x.name].to_numpy(float)
         limit = points[y.limit].to_numpy(bool) if y.limit else np.zeros(len(points), dtype=bool)
         line = style.line if chart.kind == "lines" else "none"
-        mark = style.marker if chart.kind == "points" or len(points) <= MANY else ""
+        is_short = chart.kind == "points" or len(points) <= MANY or style.line == "none"
+        mark = style.marker if is_short else ""
         mark = shapes[str(points[chart.shape].iloc[0])] if chart.shape else mark
         common: dict[str, Any] = {"color": style.colour, "zorder": 3 + 0.01 * order}
         panel.plot(places, values, linestyle=line, linewidth=style.width, **common)

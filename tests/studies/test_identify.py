@@ -19,7 +19,16 @@ from bench.report.views import newest_rows
 from bench.run.execute import store_of
 from bench.run.plan import plan
 from bench.studies.identify import views as shown
-from bench.studies.identify.measure import Fitting, count_windows, information, measure, model_of, run_fits
+from bench.studies.identify.measure import (
+    Fitting,
+    count_windows,
+    information,
+    is_minimum,
+    measure,
+    model_of,
+    run_fits,
+    scan,
+)
 
 STANDARD = Path(__file__).resolve().parents[2] / "results" / "standard"
 SPRING = ("scenes=[mass_spring_damper]", "integrators=[rk4]")
@@ -420,3 +429,122 @@ def test_own_measurements_have_no_coverage_to_show(standard):
     views = study_of(given).views(given, rows.assign(**gone))
     assert views.findings[0] == "No fit is known to reach the Cramer-Rao bound."
     assert [column.name for column in views.charts[0].x] == ["converged", "condition", "step_shift"]
+
+
+# ------------------------------------------------------------------------------------------------- scans of the loss
+
+CHAOS = ("scenes=[logistic_map[horizon=200]]", "integrators=[explicit_euler]", "repeats=2")
+SCAN = "study=identify[scan=2001,span=1.89,windows=40,measurement=1e-6,start=1.02,iterations=1]"
+
+
+def minima_of_the_map(window, last, values=2001, step_of=lambda r, x: r * x * (1 - x)):
+    """Local minima of the mean square over the rates 2 to 4, counted without the harness, in windows that start at the data.
+
+    ``last`` is whether a window's sample at which the next one starts is compared.
+    """
+    rates, record = np.linspace(2, 4, values), [0.5]
+    for _ in range(200):
+        record.append(step_of(3.78, record[-1]))
+    loss = np.zeros(values)
+    for begin in range(0, 200, window):
+        x = np.full(values, record[begin])
+        for step in range(1, window + 1):
+            x = step_of(rates, x)
+            if last or step < window:
+                loss += (x - record[begin + step]) ** 2
+    return sum(loss[i] < min(loss[i - 1], loss[i + 1]) for i in range(1, values - 1))
+
+
+@pytest.mark.parametrize(("window", "with_last", "without"), [(200, 131, 130), (10, 17, 10), (5, 1, 1)])
+def test_local_minima_of_the_logistic_map_depend_on_the_window_and_on_its_last_sample(window, with_last, without):
+    """130, 10 and 1 without the last sample of a window; with it, as fits compare it, 131, 17 and 1."""
+    assert minima_of_the_map(window, True) == with_last
+    assert minima_of_the_map(window, False) == without
+    cell = cell_of(*CHAOS)
+    model, settings = model_of(cell), made(SCAN).study
+    found = scan(model, 40, model.record(model.values[:, None]), settings)
+    place = found["scan_steps"].index(window)
+    assert (found["scan_low"], found["scan_high"]) == ([2.0], [4.0])
+    assert (found["minima"][place], found["minima_open"][place]) == (with_last, without)
+
+
+def test_a_count_of_local_minima_holds_for_its_grid_and_rounding():
+    """As docs/controller.md states it."""
+    otherwise = [minima_of_the_map(window, False, step_of=lambda r, x: r * x - r * x**2) for window in (200, 10, 5)]
+    assert otherwise == [139, 14, 1]
+    assert 1.9 < minima_of_the_map(200, False, 4001) / minima_of_the_map(200, False) < 2.3
+
+
+def test_a_map_step_is_exact():
+    model = model_of(cell_of(*CHAOS))
+    x, record = 0.5, model.record(model.values[:, None])[:, 0]
+    for found in record:
+        x = 3.78 * x * (1 - x)
+        assert found == x
+
+
+def test_scanned_loss_of_an_undamped_spring_is_the_closed_form():
+    """Along the stiffness the mean square is that of cos(wt) - cos(2t); every window is compared with its last sample."""
+    model = model_of(cell_of("scenes=[mass_spring_damper[damping=1e-12]]", "integrators=[rk4]", "theta=[stiffness]"))
+    settings = made("study=identify[scan=301,span=2.5,measurement=1.0]").study
+    t = 0.05 * np.arange(1, 201)
+    found = scan(model, 4, np.cos(2 * t)[:, None], settings)
+    assert found["scan_steps"] == [200, 100, 50]
+    rates = np.sqrt(np.linspace(1.6, 10.0, 301))
+    expected = ((np.cos(np.outer(rates, t)) - np.cos(2 * t)) ** 2).mean(axis=1)
+    loss = np.reshape(found["scan_loss"], (3, 301))
+    assert loss[0] == pytest.approx(expected, abs=2e-3)
+    assert found["minima"][0] == is_minimum(expected).sum() > found["minima"][2] == 1
+    # from a difference of 4.4934 / T of the frequencies, descent ends elsewhere
+    wrong = rates[is_minimum(loss[0])]
+    assert all(abs(w - 2) < 0.02 or abs(w - 2) > 4.4934 / 10 for w in wrong)
+
+
+def test_a_record_of_its_end_only_has_one_scan_without_an_open_count():
+    model = model_of(cell_of("scenes=[sliding_block]"))
+    found = scan(model, 1, model.record(model.values[:, None]), made("study=identify[scan=11]").study)
+    assert found["scan_steps"] == [60]
+    assert len(found["scan_loss"]) == 11
+    assert math.isnan(found["minima_open"][0])
+
+
+def test_without_a_scan_keys_are_those_of_the_study_before_it_had_one():
+    """The keys of the stored rows, which have neither parameter; a scan has a key of its own."""
+    given = config.load(["experiment=identify", f"results_dir={STANDARD}"])
+    assert set(newest_rows(store_of(given).load())["key"]) == {cell.key for cell in cells(given)}
+    (plain,), (scanned,) = (cells(made(*SPRING, f"study=identify[scan={n}]")) for n in (0, 11))
+    (wide,) = cells(made(*SPRING, "study=identify[scan=11,span=3.0]"))
+    assert len({plain.key, scanned.key, wide.key}) == 3
+    assert plain.key == cell_of(*SPRING).key
+
+
+@pytest.fixture(scope="module")
+def chaos():
+    given = config.load([SCAN, "backends=[numpy]", "optimizers=[gauss_newton]", "samples=1", *CHAOS])
+    (cell,) = cells(given)
+    rows = pd.DataFrame([cell.columns() | measure(cell, given.study) | {"experiment": "chaos"}])
+    return study_of(given).views(given, rows)
+
+
+def test_the_scan_is_stated_with_its_grid_and_drawn(chaos):
+    assert chaos.findings[-1].startswith(
+        "The loss on logistic_map over 2,001 values of rate from 2 to 4 1/s has 131 local minima for the whole record of 200 "
+        "steps, and "
+    )
+    assert "17 and 1 for windows of 40, 20, 10 and 5 steps (130, " in chaos.findings[-1]
+    assert "10 and 1 if the last sample of a window, at which the next starts, is not compared)" in chaos.findings[-1]
+    assert ";" not in chaos.findings[-1]
+    (chart,) = [chart for chart in chaos.charts if chart.name == "scan_rate"]
+    counts = chart.frame[chart.frame["part"] == "local minimum"].groupby("window", sort=False).size()
+    assert counts["whole record of 200 steps: 131 minima"] == 131
+    assert counts["windows of 10 steps: 17 minima"] == 17
+    assert chart.x[0].heading == "rate [1/s]"
+    assert [mark.at for mark in chart.marks if mark.name == "truth"] == [3.78]
+    table = chaos.tables[-1].frame.set_index("steps")
+    assert table.loc[[200, 10, 5], "minima"].tolist() == [131, 17, 1]
+    assert table.loc[[200, 10, 5], "minima_open"].tolist() == [130, 10, 1]
+
+
+def test_rows_without_a_scan_show_none(standard):
+    assert not [chart for chart in standard[2].charts if chart.name.startswith("scan")]
+    assert not any("local minim" in text for text in standard[2].findings)

@@ -21,7 +21,7 @@ SYMBOLS = dict(
     zip(MARKERS, ("circle", "square", "diamond", "triangle-up", "triangle-down", "cross", "x", "star"), strict=True)
 )
 """Plotly's name of each Matplotlib marker."""
-DASHES = dict(zip(map(str, VARIANTS), ("solid", "dash", "dot"), strict=True))
+DASHES = dict(zip(map(str, (*VARIANTS, "none")), ("solid", "dash", "dot", "none"), strict=True))
 """Plotly's name of each Matplotlib line style."""
 DARK = {"#000000": "#ffffff"}
 """Replacements for colours on a dark page; all other colours are visible on both backgrounds."""

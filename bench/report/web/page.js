@@ -538,7 +538,7 @@ function trace(chart, points, joined) {
   const symbol = points.some((p) => p.limit || p.leftLimit)
     ? points.map((p) => look.symbol + (p.limit || p.leftLimit ? "-open" : "")) : look.symbol;
   const made = {
-    type: "scatter", mode: look.symbol === "line" ? "lines" : joined ? "lines+markers" : "markers", x: points.map((p) => coordinate(p.x)), y: points.map((p) => coordinate(p.y)),
+    type: "scatter", mode: look.symbol === "line" ? "lines" : joined && look.dash !== "none" ? "lines+markers" : "markers", x: points.map((p) => coordinate(p.x)), y: points.map((p) => coordinate(p.y)),
     customdata: points.map((p) => (p.row < 0 ? null : p.row)), text: points.map((p) => hover(chart, p)), hovertemplate: "%{text}<extra></extra>",
     marker: { color: own, symbol, size: points.length > 500 ? 6 : 8,
       ...(joined ? {} : { line: { color: ground(), width: 1 } }) }, // an outline separates points that overlap

@@ -62,6 +62,13 @@ class Identify(Study):
         numbers("estimate_low", "by shooting method and invariant, lower end of the 95% interval of the first fit"),
         numbers("estimate_high", "by shooting method and invariant, its upper end"),
         numbers("first", "by shooting method and invariant, the estimate of the first record"),
+        numbers("scan_steps", "steps of the windows of each scan of the loss, the whole record first"),
+        numbers("scan_low", "by unknown, the first value of the scan"),
+        numbers("scan_high", "by unknown, its last value"),
+        numbers("minima", "by unknown and window, local minima of the loss over the values of the scan"),
+        numbers("minima_open", "the same if the last sample of a window, where the next one starts, is not compared"),
+        numbers("scan_loss", "by unknown, window and value, mean squared residual of the first record in units of the noise",
+                table=False),
     )  # fmt: skip
 
     measurement: float = param(0.01, "standard deviation of the noise on each measurement", "m", positive=True)
@@ -69,6 +76,10 @@ class Identify(Study):
     windows: int = param(8, "windows of multiple shooting and of windows", low=2)
     iterations: int = param(40, "steps of the optimizer", positive=True)
     refine: int = param(1, "the records come from a step this many times shorter", positive=True)
+    scan: int = param(
+        0, "values of each unknown at which the loss is scanned; 0: no scan", low=0, high=10_000, neutral=0
+    )
+    span: float = param(2.0, "a scan covers the truth over this to the truth times this", low=1.0, neutral=2.0)
     data: str | None = param(None, "CSV file with measurements of your own, a line per step; null: made from the truth")
 
     def measure(self, cell: Cell, session: Session) -> dict[str, Any]:

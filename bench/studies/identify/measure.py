@@ -17,6 +17,7 @@ from bench.experiment.cell import Cell
 from bench.measure import adequacy, noise, performance
 from bench.measure.identification import Information
 from bench.model import Answer, Decision, Identified, LoopOps, MechanicalScene, Optimizer, Rollout, State, compose
+from bench.model.parameters import named
 
 STEP = 1e-5
 """Step of central differences in the logarithms of parameters. Its relative error is about 1e-10."""
@@ -49,7 +50,7 @@ class Model:
     program: Rollout
     names: tuple[str, ...]
     measured: tuple[int, ...]
-    """Indices of the measured positions."""
+    """Indices of the measured entries of the state (q, v)."""
     steps: tuple[int, ...]
     """Numbers of the steps after which positions are measured, from 1."""
 
@@ -144,7 +145,8 @@ class Fitting:
     """The residuals of a batch of fits by one shooting method.
 
     The unknowns are the logarithms of the parameters, then the initial states of all windows but the first, divided by
-    ``unit``.
+    ``unit``. A window of L steps is compared with the L samples after its start, the last one included: that is the
+    sample at which the next window starts. Each sample of the record is compared exactly once.
     """
 
     model: Model
@@ -166,10 +168,14 @@ class Fitting:
 
     def residuals(self, points: np.ndarray, data: np.ndarray) -> np.ndarray:
         """Return residuals ``(m, B)`` of ``points (dim, B)`` against ``data (m', B)``, and of gaps, in units of the noise."""
-        p, batch, n = len(self.model.names), points.shape[1], len(self.unit)
-        theta = np.exp(points[:p])
+        p = len(self.model.names)
+        return self.residuals_at(np.exp(points[:p]), points[p:], data)
+
+    def residuals_at(self, theta: np.ndarray, starts_later: np.ndarray, data: np.ndarray) -> np.ndarray:
+        """Return :meth:`residuals` of parameters ``theta (p, B)`` themselves and of the other unknowns ``(dim - p, B)``."""
+        batch, n = theta.shape[1], len(self.unit)
         first = self.model.initial_states(theta)
-        later = points[p:].reshape(self.n_windows - 1, n, batch) * self.unit[:, None]
+        later = starts_later.reshape(self.n_windows - 1, n, batch) * self.unit[:, None]
         starts = np.concatenate([first[None], later])
         flat = np.moveaxis(starts, 0, 1).reshape(n, -1)  # columns ordered by window, then by fit
         begin = np.repeat(np.arange(self.n_windows) * self.window_steps, batch)
@@ -193,8 +199,8 @@ class Fitting:
     def start(self, theta: np.ndarray, data: np.ndarray) -> np.ndarray:
         """Return the initial unknowns ``(dim, B)`` for ``theta (p, B)`` and ``data (m', B)``.
 
-        Windows after the first start at the measured positions and finite differences of them. Positions that are not
-        measured start on the rollout of theta.
+        Windows after the first start at the measured positions and finite differences of them; in a first-order scene at
+        the measured states. What is not measured starts on the rollout of theta.
         """
         batch, n = data.shape[1], len(self.unit)
         states = np.zeros((self.n_windows - 1, n, batch))
@@ -206,9 +212,9 @@ class Fitting:
             states[:] = rollout[at - 1]
             table = data.reshape(-1, len(self.model.measured), batch)
             n_q, dt = self.model.program.scene.n_q, self.model.program.scene.dt
-            if n == 2 * n_q:
-                for column, coordinate in enumerate(self.model.measured):
-                    states[:, coordinate] = table[at - 1, column]
+            for column, coordinate in enumerate(self.model.measured if n_q == 0 or n == 2 * n_q else ()):
+                states[:, coordinate] = table[at - 1, column]
+                if n_q:
                     states[:, n_q + coordinate] = (table[at, column] - table[at - 2, column]) / (2 * dt)
         return np.concatenate([np.log(theta), (states / self.unit[:, None]).reshape(-1, batch)])
 
@@ -272,7 +278,68 @@ def measure(cell: Cell, settings: Settings) -> dict[str, Any]:
             lines[name].extend(value if isinstance(value, list) else [value])
     if has_windows and (apart := _difference_of_fits(lines, known)):
         result["reason"] = "; ".join(part for part in (result["reason"], apart) if part)
+    if settings.scan:
+        lines |= scan(model, n_windows if has_windows else 1, data[:, :1], settings)
     return result | lines
+
+
+def scan(model: Model, n_windows: int, data: np.ndarray, settings: Settings) -> dict[str, list[Any]]:
+    """Return the loss of one record ``data (m, 1)`` along each unknown, and how many local minima it has.
+
+    ``scan`` equally spaced values from the truth over ``span`` to the truth times ``span``, within the parameter's
+    declared bounds, with all other unknowns at the truth. The loss is the mean square of the residuals in units of the
+    noise, for the whole record and for independent windows: the fit's own, and others twice, four times, ... as long.
+    Windows start where fits start them, at the measurements. ``minima`` counts the grid's inner points whose loss is
+    below that of both neighbours; ``minima_open`` does it without the last sample of each window, see :class:`Fitting`.
+    """
+    counts = [1]
+    while n_windows > 1:
+        counts.insert(1, n_windows)
+        n_windows = n_windows // 2 if n_windows % 2 == 0 else 1
+    horizon, steps = model.program.scene.horizon, np.repeat(model.steps, len(model.measured))
+    result: dict[str, list[Any]] = {
+        "scan_steps": [horizon // count for count in counts], "scan_low": [], "scan_high": [],
+        "minima": [], "minima_open": [], "scan_loss": [],
+    }  # fmt: skip
+    for i, (low, high) in enumerate(_ranges(model, settings.span)):
+        theta = np.repeat(model.values[:, None], settings.scan, axis=1)
+        theta[i] = np.linspace(low, high, settings.scan)
+        result["scan_low"].append(low)
+        result["scan_high"].append(high)
+        for count in counts:
+            unit = np.ones(len(model.initial_states(theta[:, :1])))
+            fitting = Fitting(model, "windows", count, settings.measurement, unit)
+            start = fitting.start(model.values[:, None], data)[len(theta) :]
+            with np.errstate(all="ignore"):
+                square = np.square(fitting.residuals_at(theta, np.repeat(start, settings.scan, axis=1), data))
+            inner = steps % (horizon // count) != 0
+            loss = square.mean(axis=0)
+            result["minima"].append(int(is_minimum(loss).sum()))
+            result["minima_open"].append(int(is_minimum(square[inner].mean(axis=0)).sum()) if inner.any() else math.nan)
+            result["scan_loss"].extend(loss.tolist())
+    return result
+
+
+def is_minimum(values: np.ndarray) -> np.ndarray:
+    """Return which values are below both of their neighbours; the first and the last are not.
+
+    >>> is_minimum(np.array([2.0, 1.0, 2.0, 2.0, 0.0, 1.0, 0.5])).nonzero()[0].tolist()
+    [1, 4]
+    """
+    inner = values[1:-1]
+    return np.concatenate([[False], (inner < values[:-2]) & (inner < values[2:]), [False]])
+
+
+def _ranges(model: Model, span: float) -> list[tuple[float, float]]:
+    """Return the ends of the scan of each unknown: the truth over and times ``span``, within the declared bounds."""
+    ranges = []
+    for name, value in zip(model.names, model.values.tolist(), strict=True):
+        declared = named(map(type, model.program.parts.values()), name)
+        assert declared is not None
+        low = value / span if declared.low is None else max(value / span, declared.low)
+        high = value * span if declared.high is None else min(value * span, declared.high)
+        ranges.append((low, high))
+    return ranges
 
 
 def _explanation(

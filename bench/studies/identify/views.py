@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -12,12 +13,16 @@ from scipy.stats import chi2
 from bench.experiment.axes import table
 from bench.experiment.columns import Column, text
 from bench.experiment.experiment import Experiment
+from bench.experiment.parameters import parse
 from bench.experiment.views import Chart, Mark, Style, Table, Views
+from bench.model import registry
+from bench.model.parameters import named
 from bench.report.problems import problem_names
 from bench.report.style import PALETTE
-from bench.report.text import counted, number
+from bench.report.text import axis_value, counted, listed, number
 from bench.report.views import Arranged, arrange, attempted
 from bench.report.writer import reasons
+from bench.studies.identify.measure import is_minimum
 
 PARTS = ("scene", "contact", "integrator")
 STATISTICS = (
@@ -33,6 +38,14 @@ NOTES = (
     "with more identifiable directions than the record has. single: one rollout. multiple: windows whose ends must meet. "
     "windows: independent windows.",
 )
+SCANNED = (
+    "local minima: values of the scan at which the loss is below that at both neighbours; all other unknowns have their own "
+    "values, and windows start at the measurements. A count holds for its values: others, and for a chaotic record another "
+    "rounding, give another.",
+    "A window is compared with all samples after its start, its last one included, at which the next window starts. without "
+    "the last sample: the same windows if that sample is not compared.",
+)
+CURVE, MINIMUM, FIT = "loss", "local minimum", "fit"
 
 
 def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
@@ -57,10 +70,38 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
             terminal=True, details=["step_note"],
         ),
     ]  # fmt: skip
+    scans = scanned(shown)
+    if len(scans):
+        one = by_name["scan_steps"]
+        tables.append(
+            Table(
+                "identify",
+                scans.drop(columns=["loss", "unit"]),
+                [
+                    PROBLEM,
+                    text("unknown"),
+                    Column("values", "values of the scan", format="setting"),
+                    Column("from", format="setting"),
+                    Column("to", format="setting"),
+                    replace(one, name="steps", kind="number", label="window", unit="steps", format="setting"),
+                    *(
+                        replace(by_name[name], kind="number", format="setting", label=label)
+                        for name, label in (("minima", "local minima"), ("minima_open", "without the last sample"))
+                    ),
+                ],
+                "Local minima of the loss along each unknown",
+                SCANNED,
+                terminal=True,
+                page=True,
+            )
+        )
     if lines.empty:
         return Views(["No fit gave a result: the table has the reason of each."], tables[:1], remarks=reasons(rows))
     texts = findings(lines)
-    return Views(texts, tables, charts(lines, fits, by_name, texts[0]), remarks=reasons(rows))
+    return Views(
+        [*texts, *([landscape(scans)] if len(scans) else [])], tables,
+        [*charts(lines, fits, by_name, texts[0]), *scan_charts(scans)], remarks=reasons(rows),
+    )  # fmt: skip
 
 
 def flatten(shown: Arranged) -> pd.DataFrame:
@@ -191,6 +232,123 @@ def _hidden(lines: pd.DataFrame) -> str:
 def _range(values: pd.Series) -> str:
     low, high = number(values.min()), number(values.max())
     return low if low == high else f"{low} to {high}"
+
+
+# ---------------------------------------------------------------------------------------------------------- scans
+
+
+def scanned(shown: Arranged) -> pd.DataFrame:
+    """Return one line per problem, unknown and window of a scan; ``loss`` has a number per value of the unknown.
+
+    Rows that differ by optimizer or seed only have one scan each: the first is shown.
+    """
+    rows = attempted(shown.rows)
+    rows = rows[rows["status"] == "ok"]
+    if rows.empty or "scan_steps" not in rows:
+        return pd.DataFrame()
+    rows = rows[[isinstance(steps, list | np.ndarray) and len(steps) > 0 for steps in rows["scan_steps"]]]
+    rows = rows.assign(problem=problem_names(shown, PARTS, rows=rows)).drop_duplicates("problem")
+    lines = []
+    for index, row, given in zip(rows.index, rows.to_dict("records"), parse(rows), strict=True):
+        steps, names = list(row["scan_steps"]), list(row["unknowns"])
+        losses = np.array(row["scan_loss"], dtype=float).reshape(len(names), len(steps), -1)
+        for i, name in enumerate(names):
+            for j, window in enumerate(steps):
+                lines.append({
+                    "row": index, "problem": row["problem"], "unknown": name, "unit": unit_of(name, given),
+                    "values": losses.shape[2], "from": row["scan_low"][i], "to": row["scan_high"][i], "steps": window,
+                    "minima": row["minima"][i * len(steps) + j], "minima_open": row["minima_open"][i * len(steps) + j],
+                    "truth": row["truth"][i], "fit": fitted(row, name, {len(steps) - 1: "windows", 0: "single"}.get(j, "")),
+                    "is_own": bool((given.get("study") or {}).get("data")), "loss": losses[i, j],
+                })  # fmt: skip
+    return pd.DataFrame(lines)
+
+
+def fitted(row: Mapping[str, Any], unknown: str, shooting: str) -> float:
+    """Return the value that a shooting method gave an unknown in the first record; NaN if only a product with it is identifiable."""
+    methods, invariants = list(row["shooting"]), list(row["invariants"])
+    if shooting not in methods or unknown not in invariants:
+        return np.nan
+    return float(row["first"][methods.index(shooting) * len(invariants) + invariants.index(unknown)])
+
+
+def unit_of(name: str, given: Mapping[str, Any]) -> str:
+    """Return the unit of an unknown, from the plugins of its row; empty if they are not installed."""
+    entries = [
+        registry.entries().get(kind, {}).get(str((given.get(axis) or {}).get("name")))
+        for axis, kind in (("scene", "scenes"), ("contact", "contacts"))
+    ]
+    declared = named([entry.plugin for entry in entries if entry is not None and entry.plugin is not None], name)
+    return declared.unit if declared is not None else ""
+
+
+def landscape(scans: pd.DataFrame) -> str:
+    """Return how many local minima the loss has by window, over which values, along the unknown with most."""
+    every = _each(scans)
+    worst = max(every, key=lambda scan: scan["minima"].iloc[0])
+    several = f" of {len(every)} scans of the loss this has most" if len(every) > 1 else ""
+    opened = ""
+    if worst["minima_open"].notna().all():
+        opened = f" ({_counts(worst, 'minima_open')} if the last sample of a window, at which the next starts, is not compared)"
+    return f"{_counted_minima(worst)}{opened}{',' if several else ''}{several}."
+
+
+def _each(scans: pd.DataFrame) -> list[pd.DataFrame]:
+    """Return the lines of each scan, the whole record first."""
+    return [scan for _, scan in scans.groupby(["problem", "unknown"], sort=False)]
+
+
+def _counts(scan: pd.DataFrame, name: str = "minima") -> str:
+    return listed(scan[name].astype(float).map("{:.0f}".format))
+
+
+def _counted_minima(scan: pd.DataFrame) -> str:
+    """Return the counts of one scan, and the values that they hold for."""
+    one, windows = scan.iloc[0], scan.iloc[1:]
+    unit = f" {one['unit']}" if one["unit"] else ""
+    values = (
+        f"{one['values']:,} values of {one['unknown']} from {axis_value(one['from'])} to {axis_value(one['to'])}{unit}"
+    )
+    whole = (
+        f"{counted(int(one['minima']), 'local minimum', 'local minima')} for the whole record of {one['steps']} steps"
+    )
+    lengths = listed(map(str, windows["steps"])) if len(windows) else ""
+    rest = f", and {_counts(windows)} for windows of {lengths} steps" if lengths else ""
+    return f"The loss on {one['problem']} over {values} has {whole}{rest}"
+
+
+def scan_charts(scans: pd.DataFrame) -> list[Chart]:
+    """Return a chart of the loss along each unknown: a panel per window, with its local minima, the truth and the fit."""
+    names: dict[str, int] = {}
+    drawn = []
+    for scan in _each(scans) if len(scans) else ():
+        unknown = scan["unknown"].iloc[0]
+        names[unknown] = names.get(unknown, 0) + 1
+        drawn.append(_scan_chart(scan, f"scan_{unknown}" + (f"_{names[unknown]}" if names[unknown] > 1 else "")))
+    return drawn
+
+
+def _scan_chart(scan: pd.DataFrame, name: str) -> Chart:
+    one, parts = scan.iloc[0], []
+    for line in scan.to_dict("records"):
+        loss = np.where(np.isfinite(line["loss"]), line["loss"], np.nan)
+        values = np.linspace(line["from"], line["to"], len(loss))
+        whole = line["steps"] == one["steps"]
+        panel = f"{'whole record' if whole else 'windows'} of {line['steps']} steps: {line['minima']:.0f} {'minimum' if line['minima'] == 1 else 'minima'}"
+        curve = pd.DataFrame({"value": values, "loss": loss, "part": CURVE, "window": panel, "row": line["row"]})
+        parts += [curve, curve[is_minimum(loss)].assign(part=MINIMUM)]
+        if line["from"] <= line["fit"] <= line["to"]:
+            parts.append(curve[:1].assign(value=line["fit"], loss=np.interp(line["fit"], values, loss), part=FIT))
+    return Chart(
+        name, f"{_counted_minima(scan)}.", pd.concat(parts, ignore_index=True),
+        [Column("value", label=str(one["unknown"]), unit=str(one["unit"]), log=False)],
+        [Column("loss", label="mean square of residual / noise", log=True)],
+        "lines", series="part", panel="window", across=3, height=1.9, labels="legend",
+        styles={CURVE: Style(PALETTE[0], "", width=0.8), MINIMUM: Style(PALETTE[1], ".", line="none"), FIT: Style(PALETTE[2], "D", line="none")},
+        marks=[Mark("scene" if one["is_own"] else "truth", one["truth"]), Mark("", 1.0, axis="y")],
+        subtitle="grey line: 1, the noise of a sample; fit: of the first record",
+        text="The loss along one unknown, all others at their own values. Windows start at the measurements.",
+    )  # fmt: skip
 
 
 # --------------------------------------------------------------------------------------------------------- charts
