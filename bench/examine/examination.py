@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import partial, wraps
 from typing import Any
 
 import numpy as np
@@ -108,9 +108,11 @@ def examine(
     if not isinstance(noise, int | np.integer) or noise < 0:
         raise UserError(f"noise={noise} is not the length of w in cost(theta, w): give a whole number")
     layout = ParameterTree(theta)
+    with np.errstate(over="ignore"):
+        scales = layout.scales()
     setup = Setup(
         levels=_levels(sigma, layout),
-        scale=layout.scales() if scale is None else _positive(layout.spread(scale, "scale", 1.0), "scale", "size"),
+        scale=scales if scale is None else _positive(layout.spread(scale, "scale", 1.0), "scale", "size"),
         rtol=_tolerance(layout, tolerance, "tolerance", TOLERANCE),
         atol=_tolerance(layout, atol, "atol", 0.0),
         allow_zero=_allowed(layout, allow_zero),
@@ -119,8 +121,11 @@ def examine(
         name=name or _function_name(cost),
         horizons=tuple(int(steps) for steps in horizons),
     )
+    source = _function_name(grad)
+    cost, grad, twin, twin_grad, refined = map(_with_own_warnings, (cost, grad, twin, twin_grad, refined))
     clock.start_stage("first call")
-    with end_on_sigterm(clock):
+    # a cost of huge or infinite numbers overflows in the differences too, where a warning would tell nothing
+    with end_on_sigterm(clock), np.errstate(all="ignore"):
         try:
             simulator = Simulator(cost, layout, grad, int(noise), batch, clock)
         except OutOfTime:
@@ -129,7 +134,7 @@ def examine(
             raise UserError(f"{took}: give a larger compile_budget or a shorter rollout") from None
         examination = _Examination(simulator, setup, clock)
         try:
-            return examination.run(_function_name(grad), twin, twin_grad, refined)
+            return examination.run(source, twin, twin_grad, refined)
         finally:
             clock.clear_progress()
 
@@ -213,6 +218,20 @@ def _expected(cause: str) -> str:
     if cause and cause not in CAUSES:
         raise unknown("expect", cause, CAUSES)
     return cause
+
+
+def _with_own_warnings(function: Any) -> Any:
+    """Return a user's function that warns of its own arithmetic as it does outside of an examination."""
+    if not callable(function):
+        return function
+    own = np.geterr()
+
+    @wraps(function, updated=())
+    def call(*arguments: Any, **settings: Any) -> Any:
+        with np.errstate(**own):
+            return function(*arguments, **settings)
+
+    return call
 
 
 def _function_name(function: Any) -> str:
