@@ -14,6 +14,7 @@ import numpy as np
 from bench.errors import UserError
 from bench.examine import diagnosis
 from bench.examine.clock import ExaminationClock
+from bench.examine.findings import GroupSize
 from bench.examine.gradient import SUSPICIOUS, GradientStages
 from bench.examine.lines import HALVINGS, PLACES, POINTS, LineScan, scan
 from bench.examine.report import Report
@@ -311,6 +312,7 @@ class _Examination:
             is_quick=stages.is_quick,
             is_complete=stages.is_complete,
             located=stages.located,
+            groups=self._group_sizes(),
             more=stages.more,
             rtol=setup.rtol,
             atol=setup.atol,
@@ -331,6 +333,21 @@ class _Examination:
             left_out=self.left_out,
             **other,
         )
+
+    def _group_sizes(self) -> dict[str, GroupSize]:
+        """Return, by name of a group of numbers, what errors of its numbers do to the slope along its direction."""
+        gradient, setup = self.stages.gradient, self.setup
+        if gradient is None:
+            return {}
+        sizes = {}
+        for group in self.stages.groups:
+            part = slice(group.first, group.last)
+            slope, scale = np.abs(gradient[part]), self.scale[part]
+            allowed, whole = (
+                float(np.linalg.norm(scale * each)) for each in (setup.atol[part] + setup.rtol[part] * slope, slope)
+            )
+            sizes[group.name] = GroupSize(group.last - group.first, allowed, whole)
+        return sizes
 
     def _exceptions(self) -> list[str]:
         return [f"the cost raised {count} times: {text}" for text, count in list(self.simulator.raised.items())[:3]]

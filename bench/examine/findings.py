@@ -68,6 +68,10 @@ DIGIT = 0.1
 """Largest uncertainty of a difference that shows a derivative, relative to the derivative or to slopes nearby."""
 CONTRADICTED = 10.0
 """Uncertainties of a difference from which a derivative is not called right, even if it is small beside the others."""
+DEVIATIONS = 4.0
+"""Standard deviations of the slope along a random direction that errors within the tolerance do not exceed."""
+SEEN_ALONE = 4.0
+"""Multiple of a slope's error from which the error of one number shows along most random directions."""
 DIFFERENT = 1e-6
 """Relative difference of two costs that must agree, in double precision."""
 REFINED, REFINED_FAR = 0.1, 0.3
@@ -93,6 +97,30 @@ def _slope_nearby(sample: Sample) -> float:
     """Return the largest one-sided slope of a sample that exceeds its noise, less the noise."""
     slopes = np.maximum(np.abs(sample.left), np.abs(sample.right)) - 3.0 * sample.uncertainty
     return float(np.nanmax(np.where(np.isfinite(slopes), slopes, 0.0), initial=0.0))
+
+
+@dataclass(frozen=True)
+class GroupSize:
+    """What errors of a group's numbers do to the slope along its random direction, in units of their scales."""
+
+    count: int
+    """Number of numbers n."""
+    allowed: float
+    """Norm of the tolerated errors of the numbers."""
+    slope: float
+    """Norm of the gradient of the numbers."""
+
+    @property
+    def tolerated(self) -> float:
+        """Largest error of the slope from errors of its numbers that are all within their tolerance.
+
+        The direction is random and of length 1, so the slope's error has a standard deviation of ``allowed / sqrt(n)``.
+        """
+        return min(DEVIATIONS / math.sqrt(self.count), 1.0) * self.allowed
+
+    def hidden(self, error: float) -> float:
+        """Return the error of one number that a slope with ``error`` may hide, relative to the numbers' root mean square."""
+        return SEEN_ALONE * error * self.count / self.slope if self.slope > 0 else math.inf
 
 
 @dataclass(frozen=True)
@@ -143,6 +171,8 @@ class Findings:
     """Whether every chosen component and group was checked."""
     located: dict[str, str]
     """By name of a wrong group: the numbers that cause its error."""
+    groups: dict[str, GroupSize]
+    """By name of a group of numbers that move along one random direction: its size."""
     more: Sequence[Check]
     """Checks under further draws of the simulator's own noise."""
     rtol: np.ndarray
@@ -213,6 +243,8 @@ class Findings:
         if part.component is not None:
             rtol, atol = self.rtol[part.component], self.atol[part.component]
             allowed = atol + rtol * abs(part.difference)
+        elif part.name in self.groups:
+            allowed = self.groups[part.name].tolerated
         else:  # along a direction of length 1 in units of the scales
             sizes = [p.difference * p.sample.scale for p in self.check.components]
             along = max(float(np.linalg.norm(np.nan_to_num(sizes))), abs(part.difference))
@@ -251,6 +283,19 @@ class Findings:
             and not self._is_small(replace(p, verdict="wrong_adjoint"))
         ]
         return hidden + contradicted
+
+    @property
+    def hidden(self) -> float:
+        """Relative error of one typical number that the check of its group may not show; 0 without groups."""
+        parts = [] if self.check is None else [part for part in self.check.parts if part.name in self.groups]
+        errors = [
+            self.groups[part.name].hidden(
+                max(abs(part.program - part.difference), CONTRADICTED * part.uncertainty + part.sample.doubt)
+            )
+            for part in parts
+            if part.verdict in TRUSTED or self._is_small(part)
+        ]
+        return max((error for error in errors if math.isfinite(error)), default=0.0)
 
     @property
     def zeros(self) -> list[str]:
@@ -801,6 +846,11 @@ class Findings:
         if self.smoothed and self.gradient:
             rest.append(
                 f"jumps that fewer than 3 in {2 * min(one.pairs for one in self.smoothed)} draws of the noise meet"
+            )
+        if self.hidden:
+            rest.append(
+                f"the numbers of a group one by one: an error of one number below {number(100 * self.hidden)}% of their root mean "
+                "square (gradient times scale) may not show"
             )
         is_said = any("other thetas" in what for what in self.left_out)
         if self.gradient and self.check is not None and not self.check.draws and not is_said:

@@ -52,6 +52,7 @@ EL, EF, EX, ES, EG, EQ = (
 )
 OF_PLAN, OF_MECHANISMS = "tests/examine/test_budget.py", "tests/examine/test_mechanisms.py"
 OF_UNRESOLVED = "tests/examine/test_unresolved.py"
+OF_GROUPS = "tests/examine/test_mechanisms.py -k 10_000\\ or\\ may_hide"
 OF_EXAMINE = "-m not\\ slow tests/examine/test_examine.py --deselect tests/examine/test_examine.py::test_python_number_from_torch_is_disconnected_in_double_precision"
 OF_ESTIMATORS = "tests/plugins/test_weights.py tests/plugins/test_estimators.py"
 OF_VARIANCE = "tests/plugins/test_variance_reduction.py"
@@ -285,6 +286,11 @@ FAULTS = [
     Fault(EF, "return hidden + contradicted", "return contradicted", OF_UNRESOLVED),
     Fault(EF, "DIGIT * max(abs(p.difference), _slope_nearby(p.sample))", "DIGIT * abs(p.difference)", OF_UNRESOLVED),
     Fault(EG, "        self._repeat_gradient(other)\n", "", OF_UNRESOLVED),
+    Fault(EG, "                        self._check_number(index, part.verdict)", "                        pass", OF_GROUPS),
+    Fault(EF, "return min(DEVIATIONS / math.sqrt(self.count), 1.0) * self.allowed", "return self.allowed", OF_GROUPS),
+    Fault(EF, "DEVIATIONS = 4.0", "DEVIATIONS = 0.1", OF_GROUPS),
+    Fault(EF, "CONTRADICTED * part.uncertainty + part.sample.doubt", "CONTRADICTED * part.uncertainty", OF_GROUPS),
+    Fault(EF, "return SEEN_ALONE * error * self.count / self.slope if", "return error / self.slope if", OF_GROUPS),
     Fault(EQ, "shrinks = bool(", "shrinks = True or bool(", OF_UNRESOLVED),
     Fault(EF, "checks = [self.settled, *self.more]", "checks = [self.settled]", OF_EXAMINE),
     Fault(EF, "[one.unshown or one.hidden for one in self.smoothed]", "[one.hidden for one in self.smoothed]", OF_EXAMINE),
