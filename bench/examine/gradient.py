@@ -482,7 +482,7 @@ class GradientStages:
             self.left_out.append("the place of the error in its group")
 
     def _check_number(self, index: int, verdict: str) -> None:
-        """Check one number of theta alone, and add it to the check with a verdict if it is wrong.
+        """Check a single number of theta, and add it to the check with a verdict if it is wrong.
 
         Its error is a small part of the slope of its group, which may be within the tolerance.
         """
