@@ -13,6 +13,7 @@ import pytest
 import bench
 from bench.errors import UserError
 from bench.examine import lines
+from bench.examine.findings import GroupSize
 from bench.examine.subspace import groups_of
 from bench.model.simulator.tree import ParameterTree
 from bench.report.text import number
@@ -516,6 +517,11 @@ def test_one_wrong_number_among_10_000_is_not_within_the_tolerance(factor):
 def test_wrong_numbers_all_over_a_group_are_not_within_the_tolerance():
     report = examined(np.where(np.arange(10_000) % 10 == 3, 1.01, 1.0))
     assert report.derivative == "wrong"
+
+
+@pytest.mark.parametrize(("count", "tolerated"), [(10_000, 0.04), (400, 0.2), (4, 1.0)])
+def test_the_tolerance_along_a_random_direction_of_up_to_10_000_numbers(count, tolerated):
+    assert GroupSize(count, allowed=1.0, slope=1.0).tolerated == pytest.approx(tolerated)
 
 
 @pytest.mark.parametrize("errors", [np.full(10_000, 9e-5), 9e-5 * WIDE.choice([-1, 1], 10_000)])
