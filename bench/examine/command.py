@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import re
+import shutil
 import sys
+import textwrap
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from difflib import get_close_matches
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -27,6 +31,10 @@ SETTINGS = (
 OUTPUTS = ("markdown", "junit")
 """Files of a whole command."""
 QUIET, MATRIX = "--quiet", "--matrix"
+WIDTH, LEAST_WIDTH = 100, 40
+"""Width of the text without a terminal, and the least width, in characters."""
+NEAREST = 5
+"""Most names that are listed beside an unknown one."""
 
 
 def run(words: Sequence[str]) -> Report:
@@ -36,7 +44,7 @@ def run(words: Sequence[str]) -> Report:
     """
     (cost, settings), _ = _parse(words)
     report = _examined(cost, settings, QUIET not in words)
-    print(report)
+    print(_wrapped(str(report)))
     _save(report, settings)
     return report
 
@@ -69,13 +77,29 @@ def _parse(words: Sequence[str]) -> tuple[tuple[str, dict[str, str]], dict[str, 
     return (costs[0], settings), outputs
 
 
+def _wrapped(text: str) -> str:
+    """Return text with its sentences wrapped to the width of the terminal; rows of tables and commands stay whole."""
+    width = max(shutil.get_terminal_size((WIDTH, 0)).columns, LEAST_WIDTH)
+    lines = []
+    for line in text.splitlines():
+        bare = line.lstrip()
+        if len(line) <= width or "  " in bare or "python -m bench " in bare:
+            lines.append(line)
+        else:
+            indent = " " * (len(line) - len(bare) + 2)
+            lines += textwrap.wrap(
+                line, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False
+            )
+    return "\n".join(lines)
+
+
 def _examined(cost: str, settings: Mapping[str, Any], progress: bool) -> Report:
     """Return the report on a cost ``FILE:NAME`` with settings as on the command line, or as in a TOML file."""
-    function = imports.load_attribute(cost)
+    function = _attribute(cost)
     module = imports.load_module(cost.rpartition(":")[0])
 
     def other(key: str) -> Any:
-        return _function(str(settings[key]), module, key) if settings.get(key) else None
+        return _attribute(str(settings[key]), module, key) if settings.get(key) else None
 
     report = examine(
         function,
@@ -135,7 +159,7 @@ def _run_matrix(words: Sequence[str]) -> int:
             continue
         report = replace(report, name=name)
         reports.append(report)
-        print(f"{report}\n")
+        print(_wrapped(str(report)) + "\n")
         _save(report, settings)
     print(ci.as_text(reports, refused))
     print(ci.as_line(reports, refused))
@@ -249,18 +273,37 @@ def _theta(given: Any, module: Any, is_given: bool) -> Any:
     if re.fullmatch(r"[A-Za-z_][\w.]*", given):
         if not is_given and not hasattr(module, given):
             raise UserError("theta is missing: give theta=1,0 or define theta in the file")
-        theta = imports.load_attribute(given, module)
+        theta = _attribute(given, module, "theta")
         return theta() if callable(theta) else theta
     pairs = _pairs(given)
     return pairs if pairs is not None else np.array(_numbers(given, "theta"))
 
 
-def _function(text: str, module: Any, what: str) -> Any:
-    if ":" not in text and not hasattr(module, text):
-        names = [name for name, value in vars(module).items() if callable(value) and not name.startswith("_")]
-        raise unknown(what, text, (*LIBRARIES, *names) if what == "grad" else names)
+def _attribute(text: str, module: ModuleType | None = None, what: str = "name") -> Any:
+    """Return the object ``FILE:NAME``, or a name in ``module``. Raises :class:`UserError` with the nearest names."""
+    place, _, name = text.rpartition(":")
+    owner = imports.load_module(place) if place else module
+    if owner is not None and not hasattr(owner, name.partition(".")[0]):
+        where = f"{what} in {place}:" if place else what
+        raise UserError(_unknown_name(where, name, owner, LIBRARIES if what == "grad" else ()))
     return imports.load_attribute(text, module)
 
 
+def _unknown_name(where: str, name: str, module: ModuleType, more: Iterable[str]) -> str:
+    """Return the message on an unknown name, with the nearest names: functions that the module defines come first."""
+    public = {key: value for key, value in vars(module).items() if not key.startswith("_")}
+    own = [*more, *(key for key, value in public.items() if _is_defined_in(value, module))]
+    others = [key for key in public if key not in own]
+    near = [key for part in (own, others) for key in get_close_matches(name, part, NEAREST, 0.4)][:NEAREST]
+    shown = near or (own or others)[:NEAREST]
+    hint = f"; did you mean '{near[0]}'?" if near else ""
+    rest = len(own) + len(others) - len(shown)
+    return f"unknown {where} '{name}'{hint} (names: {', '.join(shown) or 'none'}{f', and {rest} more' if rest else ''})"
+
+
+def _is_defined_in(value: Any, module: ModuleType) -> bool:
+    return callable(value) and getattr(value, "__module__", None) == module.__name__
+
+
 def _gradient(text: Any, module: Any) -> Any:
-    return text if text is None or text in LIBRARIES else _function(str(text), module, "grad")
+    return text if text is None or text in LIBRARIES else _attribute(str(text), module, "grad")

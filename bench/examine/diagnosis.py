@@ -73,8 +73,10 @@ def compare_gradients(stages: GradientStages, twin_grad: Any) -> tuple[float, fl
     parts = [by_name.get(name) for name in names]
     differences = np.array([np.nan if part is None else part.difference for part in parts]) * space.scale
     own, others = space.project(stages.gradient) * space.scale, space.project(second) * space.scale
-    size = np.nanmax(np.abs(differences))
-    return float(np.nanmax(np.abs(own - differences)) / size), float(np.nanmax(np.abs(others - differences)) / size)
+    size, own_error, other_error = (
+        np.nanmax(np.abs(values), initial=0.0) for values in (differences, own - differences, others - differences)
+    )
+    return float(own_error / size), float(other_error / size)
 
 
 def check_refined(stages: GradientStages, refined: Callable[..., Any]) -> Check | None:
@@ -119,6 +121,7 @@ def grows(horizons: Sequence[Horizon], tolerance: float) -> bool:
     return last in wrong and (len(wrong) == 1 or last.error > GROWTH * wrong[0].error)
 
 
+@np.errstate(all="ignore")
 def relative_error(outcome: Check) -> float:
     """Return the norm of gradient minus differences over that of the differences, in units of each input's scale.
 

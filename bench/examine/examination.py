@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import partial, wraps
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ import numpy as np
 from bench.errors import UserError
 from bench.examine import diagnosis
 from bench.examine.clock import ExaminationClock
+from bench.examine.findings import GroupSize
 from bench.examine.gradient import SUSPICIOUS, GradientStages
 from bench.examine.lines import HALVINGS, PLACES, POINTS, LineScan, scan
 from bench.examine.report import Report
@@ -108,9 +109,11 @@ def examine(
     if not isinstance(noise, int | np.integer) or noise < 0:
         raise UserError(f"noise={noise} is not the length of w in cost(theta, w): give a whole number")
     layout = ParameterTree(theta)
+    with np.errstate(over="ignore"):
+        scales = layout.scales()
     setup = Setup(
         levels=_levels(sigma, layout),
-        scale=layout.scales() if scale is None else _positive(layout.spread(scale, "scale", 1.0), "scale", "size"),
+        scale=scales if scale is None else _positive(layout.spread(scale, "scale", 1.0), "scale", "size"),
         rtol=_tolerance(layout, tolerance, "tolerance", TOLERANCE),
         atol=_tolerance(layout, atol, "atol", 0.0),
         allow_zero=_allowed(layout, allow_zero),
@@ -119,8 +122,11 @@ def examine(
         name=name or _function_name(cost),
         horizons=tuple(int(steps) for steps in horizons),
     )
+    source = _function_name(grad)
+    cost, grad, twin, twin_grad, refined = map(_with_own_warnings, (cost, grad, twin, twin_grad, refined))
     clock.start_stage("first call")
-    with end_on_sigterm(clock):
+    # a cost of huge or infinite numbers overflows in the differences too, where a warning would tell nothing
+    with end_on_sigterm(clock), np.errstate(all="ignore"):
         try:
             simulator = Simulator(cost, layout, grad, int(noise), batch, clock)
         except OutOfTime:
@@ -129,7 +135,7 @@ def examine(
             raise UserError(f"{took}: give a larger compile_budget or a shorter rollout") from None
         examination = _Examination(simulator, setup, clock)
         try:
-            return examination.run(_function_name(grad), twin, twin_grad, refined)
+            return examination.run(source, twin, twin_grad, refined)
         finally:
             clock.clear_progress()
 
@@ -215,6 +221,20 @@ def _expected(cause: str) -> str:
     return cause
 
 
+def _with_own_warnings(function: Any) -> Any:
+    """Return a user's function that warns of its own arithmetic as it does outside of an examination."""
+    if not callable(function):
+        return function
+    own = np.geterr()
+
+    @wraps(function, updated=())
+    def call(*arguments: Any, **settings: Any) -> Any:
+        with np.errstate(**own):
+            return function(*arguments, **settings)
+
+    return call
+
+
 def _function_name(function: Any) -> str:
     """Return the name of a function, such as ``mysim.cost``, or of the library that differentiates."""
     if function is None or isinstance(function, str):
@@ -292,6 +312,7 @@ class _Examination:
             is_quick=stages.is_quick,
             is_complete=stages.is_complete,
             located=stages.located,
+            groups=self._group_sizes(),
             more=stages.more,
             rtol=setup.rtol,
             atol=setup.atol,
@@ -312,6 +333,21 @@ class _Examination:
             left_out=self.left_out,
             **other,
         )
+
+    def _group_sizes(self) -> dict[str, GroupSize]:
+        """Return, by name of a group of numbers, what errors of its numbers do to the slope along its direction."""
+        gradient, setup = self.stages.gradient, self.setup
+        if gradient is None:
+            return {}
+        sizes = {}
+        for group in self.stages.groups:
+            part = slice(group.first, group.last)
+            slope, scale = np.abs(gradient[part]), self.scale[part]
+            allowed, whole = (
+                float(np.linalg.norm(scale * each)) for each in (setup.atol[part] + setup.rtol[part] * slope, slope)
+            )
+            sizes[group.name] = GroupSize(group.last - group.first, allowed, whole)
+        return sizes
 
     def _exceptions(self) -> list[str]:
         return [f"the cost raised {count} times: {text}" for text, count in list(self.simulator.raised.items())[:3]]

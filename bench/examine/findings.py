@@ -68,6 +68,10 @@ DIGIT = 0.1
 """Largest uncertainty of a difference that shows a derivative, relative to the derivative or to slopes nearby."""
 CONTRADICTED = 10.0
 """Uncertainties of a difference from which a derivative is not called right, even if it is small beside the others."""
+DEVIATIONS = 4.0
+"""Standard deviations of the slope along a random direction that errors within the tolerance do not exceed."""
+SEEN_ALONE = 4.0
+"""Multiple of a slope's error from which the error of one number shows along most random directions."""
 DIFFERENT = 1e-6
 """Relative difference of two costs that must agree, in double precision."""
 REFINED, REFINED_FAR = 0.1, 0.3
@@ -88,10 +92,35 @@ def _is_resolved(part: Part) -> bool:
     return part.uncertainty < DIGIT * abs(part.difference)
 
 
+@np.errstate(all="ignore")
 def _slope_nearby(sample: Sample) -> float:
     """Return the largest one-sided slope of a sample that exceeds its noise, less the noise."""
     slopes = np.maximum(np.abs(sample.left), np.abs(sample.right)) - 3.0 * sample.uncertainty
     return float(np.nanmax(np.where(np.isfinite(slopes), slopes, 0.0), initial=0.0))
+
+
+@dataclass(frozen=True)
+class GroupSize:
+    """What errors of a group's numbers do to the slope along its random direction, in units of their scales."""
+
+    count: int
+    """Number of numbers n."""
+    allowed: float
+    """Norm of the tolerated errors of the numbers."""
+    slope: float
+    """Norm of the gradient of the numbers."""
+
+    @property
+    def tolerated(self) -> float:
+        """Largest error of the slope from errors of its numbers that are all within their tolerance.
+
+        The direction is random and of length 1, so the slope's error has a standard deviation of ``allowed / sqrt(n)``.
+        """
+        return min(DEVIATIONS / math.sqrt(self.count), 1.0) * self.allowed
+
+    def hidden(self, error: float) -> float:
+        """Return the error of one number that a slope with ``error`` may hide, relative to the numbers' root mean square."""
+        return SEEN_ALONE * error * self.count / self.slope if self.slope > 0 else math.inf
 
 
 @dataclass(frozen=True)
@@ -142,6 +171,8 @@ class Findings:
     """Whether every chosen component and group was checked."""
     located: dict[str, str]
     """By name of a wrong group: the numbers that cause its error."""
+    groups: dict[str, GroupSize]
+    """By name of a group of numbers that move along one random direction: its size."""
     more: Sequence[Check]
     """Checks under further draws of the simulator's own noise."""
     rtol: np.ndarray
@@ -203,6 +234,7 @@ class Findings:
             return self.check
         return recaused(self.check, lambda part: replace(part, verdict="nonlinear") if self._is_small(part) else part)
 
+    @np.errstate(all="ignore")
     def _is_small(self, part: Part) -> bool:
         """Return whether a wrong part's error is within the tolerance."""
         assert self.check is not None
@@ -211,6 +243,8 @@ class Findings:
         if part.component is not None:
             rtol, atol = self.rtol[part.component], self.atol[part.component]
             allowed = atol + rtol * abs(part.difference)
+        elif part.name in self.groups:
+            allowed = self.groups[part.name].tolerated
         else:  # along a direction of length 1 in units of the scales
             sizes = [p.difference * p.sample.scale for p in self.check.components]
             along = max(float(np.linalg.norm(np.nan_to_num(sizes))), abs(part.difference))
@@ -249,6 +283,19 @@ class Findings:
             and not self._is_small(replace(p, verdict="wrong_adjoint"))
         ]
         return hidden + contradicted
+
+    @property
+    def hidden(self) -> float:
+        """Relative error of one typical number that the check of its group may not show; 0 without groups."""
+        parts = [] if self.check is None else [part for part in self.check.parts if part.name in self.groups]
+        errors = [
+            self.groups[part.name].hidden(
+                max(abs(part.program - part.difference), CONTRADICTED * part.uncertainty + part.sample.doubt)
+            )
+            for part in parts
+            if part.verdict in TRUSTED or self._is_small(part)
+        ]
+        return max((error for error in errors if math.isfinite(error)), default=0.0)
 
     @property
     def zeros(self) -> list[str]:
@@ -291,16 +338,15 @@ class Findings:
             return "undecided"
         if self.gradient and self.unresolved:
             return "unresolved"
-        if any(line.steps for line in self.lines) or self.tread:
-            return "staircase"
         is_allowed = self.allow_zero is not None and bool(self.allow_zero.all())
-        if all(part.verdict == "zero" for part in check.parts) and not is_allowed:
+        if all(part.verdict == "zero" for part in check.parts) and not is_allowed and not self.has_steps:
             return "zero"
-        if self.allow_zero is not None and self.zeros:
+        if self.allow_zero is not None and self.zeros and not self.has_steps:
             return "no_effect"
         return "saturated" if check.cause == "zero" else check.cause
 
     @property
+    @np.errstate(all="ignore")
     def is_discretisation_gap(self) -> bool:
         """Whether the differences of the cost and of the refined cost are as far apart as the gradient is from the former."""
         if self.refined is None or self.check is None:
@@ -337,6 +383,8 @@ class Findings:
         """The cause of the first problem around theta or under noise; empty if there is none."""
         if self.derivative not in (RIGHT, NONE):
             return ""
+        if self.has_steps:
+            return "staircase"
         if self._misses_jumps:
             return "jumps"
         for cause, is_found in (
@@ -412,17 +460,6 @@ class Findings:
             if self.gradient_spread > 0:
                 return f"{text} (gradients differ by {number(100 * self.gradient_spread)}%)"
             return text
-        if cause == "staircase" and self.settled is not None and self.settled.trusted:
-            if any(line.steps for line in self.lines):
-                return (
-                    "staircase: the cost is constant between jumps, here and on a line: its derivative is 0 and carries no "
-                    "information; smooth the cost, as sigma= does"
-                )
-            return (
-                f"staircase: jumps of one height, {number(self.tread)}, at even distances on every line: a part of the cost "
-                "is rounded, cast to int or looked up on a grid, and the gradient misses this part, "
-                f"{number(100 * self.missed)}% of the cost's change on a line"
-            )
         if cause == "adaptive":
             return f"{text} ({self._worst_size(self.wrong_checks[0])}{self._refined_text()})"
         if cause == "overwritten":
@@ -464,11 +501,13 @@ class Findings:
 
     def _noise_problems(self) -> list[str]:
         problems = []
-        if self._misses_jumps:
+        if self.has_steps:
             problems.append(
-                f"jumps: along a line the integral of the gradient misses {number(100 * self.missed)}% of the cost's change, "
-                "which comes from jumps that no gradient sees"
+                "staircase: the cost is constant between jumps on a line: its derivative is 0 there and carries no "
+                "information; smooth the cost, as sigma= does"
             )
+        if self._misses_jumps:
+            problems.append(self._missed_text())
         for one in self.smoothed:
             if not one.defined:
                 problems.append(f"nonfinite: at sigma {number(one.sigma)} J is not defined: {one.remark}")
@@ -603,9 +642,7 @@ class Findings:
                 f"cost and gradient printed {counted(self.printed.count, 'line')}; the first: {shortened(self.printed.lines[0])}"
             )
         if not self.status and self.missed > SEEN and self.noise_cause != "jumps":
-            warnings.append(
-                f"jumps: along a line the integral of the gradient misses {number(100 * self.missed)}% of the cost's change"
-            )
+            warnings.append(self._missed_text())
         warnings += [f"not done within the budget: {what}" for what in self.left_out]
         return warnings
 
@@ -615,11 +652,28 @@ class Findings:
         return max((line.missed for line in self.lines if math.isfinite(line.missed)), default=0.0)
 
     @property
+    def has_steps(self) -> bool:
+        """Whether the cost is constant between jumps on a line."""
+        return any(line.steps for line in self.lines)
+
+    @property
     def tread(self) -> float:
-        """Height of the jumps, if all lines have equal, evenly spaced jumps that the gradient misses; else 0."""
+        """Height of the jumps, if all lines have equal, evenly spaced jumps; else 0."""
         treads = [line.tread for line in self.lines] or [0.0]
-        alike = min(treads) > (1 - ALIKE) * max(treads)
-        return max(treads) if alike and self.missed > SEEN else 0.0
+        return max(treads) if min(treads) > (1 - ALIKE) * max(treads) else 0.0
+
+    def _missed_text(self) -> str:
+        """Return how much of the cost's change the gradient misses, and what jumps of one height at even distances show."""
+        text = (
+            f"jumps: along a line the integral of the gradient misses {number(100 * self.missed)}% of the cost's change, "
+            "which comes from jumps that no gradient sees"
+        )
+        if not self.tread:
+            return text
+        return (
+            f"{text}: they have one height, {number(self.tread)}, at even distances on every line, so a part of the cost is "
+            "rounded, cast to int or looked up on a grid"
+        )
 
     @property
     def _unit(self) -> float:
@@ -759,9 +813,9 @@ class Findings:
     def _answers(self) -> list[str]:
         lines = [self.conclusion]
         lines += [f"  {text}" for text in self.problems[1:] if self.derivative in (WRONG, UNSHOWN)]
-        if self.noise_answer:
-            lines += [self.noise_answer]
-            lines += [f"  {text}" for text in self._noise_problems()[1:] if self.noise_cause]
+        lines += [self.noise_answer] if self.noise_answer else []
+        if self.noise_cause:  # the answer states the first problem
+            lines += [f"  {text}" for text in self._noise_problems()[1 if self.noise_answer else 0 :]]
         lines += [f"since the baseline: {text}" for text in self.changes]
         return lines + [f"warning: {text}" for text in self.warnings]
 
@@ -792,6 +846,11 @@ class Findings:
         if self.smoothed and self.gradient:
             rest.append(
                 f"jumps that fewer than 3 in {2 * min(one.pairs for one in self.smoothed)} draws of the noise meet"
+            )
+        if self.hidden:
+            rest.append(
+                f"the numbers of a group one by one: an error of one number below {number(100 * self.hidden)}% of their root mean "
+                "square (gradient times scale) may not show"
             )
         is_said = any("other thetas" in what for what in self.left_out)
         if self.gradient and self.check is not None and not self.check.draws and not is_said:

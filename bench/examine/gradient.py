@@ -16,7 +16,7 @@ from functools import partial
 import numpy as np
 
 from bench.examine.quick import ROUNDS, QuickCheck, is_nothing
-from bench.examine.subspace import Subspace, choose, locate
+from bench.examine.subspace import Group, Subspace, choose, locate
 from bench.measure.gradcheck import EPS, FAULTS, TRUSTED, Check, Options, Part, Sample, check, most_severe
 from bench.measure.gradcheck.direction import ALIKE
 from bench.model.simulator.clock import Clock, OutOfTime
@@ -105,6 +105,8 @@ class GradientStages:
         """Checks under other draws of the simulator's own noise."""
         self.located: dict[str, str] = {}
         """By name of a wrong group: the numbers that cause its error."""
+        self.groups: list[Group] = []
+        """The groups of a large theta that are checked along one direction each."""
         self.left_out: list[str] = []
         self.spread = self.gradient_spread = 0.0
         """Largest difference between equal calls, of the cost, and of the gradient relative to its norm."""
@@ -193,6 +195,7 @@ class GradientStages:
         if self.is_failed:
             return
         space = choose(self.layout, self.scale, self.gradient, self.seed)
+        self.groups = space.groups
         if self.gradient is not None:
             self._gradients_store.put(space.origin().tobytes(), space.project(self.gradient), is_fresh=True)
         try:
@@ -469,12 +472,36 @@ class GradientStages:
             for part in self.check.parts:
                 if part.name in groups and part.verdict in FAULTS and math.isfinite(part.program):
                     group = groups[part.name]
-                    self.located[part.name] = locate(
+                    self.located[part.name], index = locate(
                         self.layout, group, self.theta, self.gradient, self.costs, part.step,
                         part.difference - part.program, part.uncertainty,
                     )  # fmt: skip
+                    if index is not None and index not in space.components:
+                        self._check_number(index, part.verdict)
         except OutOfTime:
             self.left_out.append("the place of the error in its group")
+
+    def _check_number(self, index: int, verdict: str) -> None:
+        """Check a single number of theta, and add it to the check with a verdict if it is wrong.
+
+        Its error is a small part of the slope of its group, which may be within the tolerance.
+        """
+        assert self.check is not None
+        assert self.gradient is not None
+
+        def cost(z: np.ndarray) -> np.ndarray:
+            thetas = np.repeat(self.theta[:, None], z.shape[1], axis=1)
+            thetas[index] = z[0]
+            return self.costs(thetas)
+
+        one, unit = [index], self.simulator.unit
+        quick = QuickCheck(cost, self.theta[one], self.scale[one], self.gradient[one], self.value, unit, self.spread)
+        for _ in ROUNDS:
+            quick.run_round()
+        outcome = quick.check([f"component {index}"])
+        if outcome is not None and outcome.cause in FAULTS:
+            added = replace(outcome.parts[0], component=index, verdict=verdict)
+            self.check = replace(self.check, parts=(added, *self.check.parts))
 
     def _check_under_other_noise(self) -> None:
         """Check the gradient along random directions under other draws of the simulator's own noise."""

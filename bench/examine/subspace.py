@@ -171,8 +171,8 @@ def locate(
     step: float,
     error: float,
     noise: float,
-) -> str:
-    """Return the name of the numbers of a group that cause the ``error`` of its slope, by halving.
+) -> tuple[str, int | None]:
+    """Return the name of the numbers of a group that cause the ``error`` of its slope, by halving, and the index of a single one.
 
     Each halving takes two costs. The search ends at one number, at ``noise`` (the uncertainty of a slope), or where both
     halves have a share of the error.
@@ -193,4 +193,4 @@ def locate(
         first, last, error = (first, middle, left_error) if abs(left_error) > abs(rest) else (middle, last, rest)
     inside = [leaf for leaf in layout.leaves if leaf.start < last and leaf.start + leaf.size > first]
     blocks = [leaf.block(max(first - leaf.start, 0), min(last - leaf.start, leaf.size)) for leaf in inside]
-    return blocks[0] if len(blocks) == 1 else f"{blocks[0]} to {blocks[-1]}"
+    return blocks[0] if len(blocks) == 1 else f"{blocks[0]} to {blocks[-1]}", first if last - first == 1 else None

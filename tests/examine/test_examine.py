@@ -6,6 +6,7 @@ import math
 import re
 import signal
 import time
+import warnings
 from collections import namedtuple
 
 import numpy as np
@@ -221,13 +222,51 @@ def test_kink_has_its_change_of_slope_and_rounding_has_no_breaks():
     assert not scan(lambda x: 1e-9 * rough.standard_normal(x.shape[1]), np.zeros(1), np.ones(1), noise=1e-9).breaks
 
 
-def test_treads_that_a_gradient_misses_are_a_staircase_though_they_are_small():
+def test_treads_that_a_gradient_misses_are_named_though_they_are_small():
     def cost(x):
         return float(np.sin(x[0]) * x[1] + 2e-4 * np.floor(1000 * x[0] + 0.5))
 
     report = bench.examine(cost, [0.5, 0.7], grad=lambda x: [np.cos(x[0]) * x[1], np.sin(x[0])], **QUICK)
-    assert report.cause == "staircase"
-    assert "at even distances" in str(report)
+    assert (report.derivative, report.cause, report.status) == ("right", "jumps", 1)
+    assert "at even distances" in report.noise_answer
+
+
+@pytest.mark.parametrize("inputs", [1, 2])
+@pytest.mark.parametrize(("step", "start"), [(1e-4, 1.0123456789), (1e-2, 1.0123456789), (1e-2, 0.7531)])
+def test_a_staircase_beside_a_smooth_part_has_a_right_derivative_between_its_jumps(inputs, step, start):
+    """The gradient is the derivative at theta, and misses the jumps around it, in any number of dimensions."""
+
+    def cost(x):
+        return float(np.exp(x[0]) + step * np.floor(x[0] / step) + (x[1:] ** 2).sum())
+
+    def grad(x, factor=1.0):
+        return factor * np.r_[np.exp(x[0]), 2.0 * x[1:]]
+
+    theta = [start, 0.7][:inputs]
+    report = bench.examine(cost, theta, grad=grad, progress=False, calls=20_000)
+    assert (report.derivative, report.cause, report.status) == ("right", "jumps", 1)
+    report = bench.examine(cost, theta, grad=lambda x: grad(x, -1.0), progress=False, calls=20_000)
+    assert (report.derivative, report.cause in ("wrong_factor", "staircase")) == ("wrong", True)
+    report = bench.examine(cost, theta, grad=lambda x: grad(x, 1.1), progress=False, calls=20_000)
+    # jumps that are larger than the error may be those of adaptive steps
+    assert (report.derivative, report.cause) in (
+        ("wrong", "wrong_factor"), ("wrong", "staircase"), ("not shown", "adaptive"),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("treads", "start", "sigma"), [(20, 1.01, 0.1), (2, 1.2, 0.3)])
+@pytest.mark.parametrize("allowed", [None, False])
+def test_a_gradient_of_0_on_a_wide_tread_is_right_and_not_usable(treads, start, sigma, allowed):
+    report = bench.examine(
+        lambda x: np.floor(treads * x[0]) / treads,
+        [start],
+        grad=lambda x: [0.0],
+        sigma=sigma,
+        allow_zero=allowed,
+        **QUICK,
+    )
+    assert (report.derivative, report.cause, report.status) == ("right", "staircase", 1)
+    assert ": NOT usable. staircase" in report.noise_answer
 
 
 @pytest.fixture(scope="module")
@@ -248,9 +287,8 @@ def under_noise(error, low, high):
 @pytest.mark.parametrize(
     ("found", "cause"),
     [
-        ({"lines": jumpy(0.02, 0.3, 0.3)}, "staircase"),
-        ({"lines": jumpy(0.005, 0.3, 0.3)}, "smooth"),
-        ({"lines": jumpy(0.02, 0.3, 0.4)}, "smooth"),
+        ({"lines": jumpy(0.02, 0.3, 0.3)}, "smooth"),
+        ({"lines": jumpy(0.2, 0.3, 0.3)}, "jumps"),
         ({"lines": jumpy(0.2, 0.3, 0.4)}, "jumps"),
         ({"smoothed": [under_noise(0.01, 0.2, 0.4)]}, "biased"),
         ({"smoothed": [under_noise(0.5, 0.2, 0.4)]}, "spread"),
@@ -262,6 +300,12 @@ def under_noise(error, low, high):
 def test_what_was_found_decides_the_cause_and_the_status(right, found, cause):
     report = dataclasses.replace(right, **found)
     assert (report.cause, report.status) == (cause, {"smooth": 0, "spread": 3}.get(cause, 1))
+
+
+@pytest.mark.parametrize(("second", "said"), [(0.3, True), (0.4, False)])
+def test_jumps_of_one_height_on_every_line_are_said_to_be_so(right, second, said):
+    report = dataclasses.replace(right, lines=jumpy(0.2, 0.3, second))
+    assert ("they have one height, 0.30, at even distances" in report.noise_answer) == said
 
 
 def test_a_check_under_other_noise_decides_too(right):
@@ -451,6 +495,8 @@ def test_command_gives_text_and_status(mysim, capsys, words, status, said):
     ("words", "said"),
     [
         (["{}:cots"], "did you mean 'cost'"),
+        (["{}:cost", "theta=thetta"], "did you mean 'theta'"),
+        (["{0}:cost", "grad={0}:rihgt"], "did you mean 'right'"),
         (["nothing.py:cost"], "there is no file"),
         (["{}:cost", "grad=jaxx"], "did you mean 'jax'"),
         (["{}:cost", "thta=1"], "did you mean 'theta'"),
@@ -465,6 +511,58 @@ def test_command_gives_text_and_status(mysim, capsys, words, status, said):
 def test_command_says_what_is_wrong_with_its_words(mysim, capsys, words, said):
     assert cli.main(["examine", *(word.format(mysim) for word in words)]) == 2
     assert said in capsys.readouterr().err
+
+
+def test_an_unknown_name_is_answered_by_the_nearest_functions_of_the_file(tmp_path, capsys):
+    path = tmp_path / "manynames.py"
+    path.write_text(
+        "from math import *\ncosts = 3\n"
+        + "".join(
+            f"def cost_{name}(x): return x[0]\n" for name in ("ball", "cart", "drone", "hopper", "walker", "worm")
+        )
+    )
+    assert cli.main(["examine", f"{path}:cost_bal", "theta=1"]) == 2
+    said = capsys.readouterr().err
+    names = said.partition("(names: ")[2].partition(")")[0]
+    first, *_, last = names.split(", ")
+    assert "did you mean 'cost_ball'?" in said
+    assert first == "cost_ball"
+    assert len(names.split(", ")) == 6
+    assert last.startswith("and ")
+    assert last.endswith(" more")
+    assert int(last.split()[1]) > 30
+    assert "atan2" not in names
+    assert cli.main(["examine", f"{path}:zzz", "theta=1"]) == 2
+    assert "(names: cost_ball, cost_cart, cost_drone, cost_hopper, cost_walker, and " in capsys.readouterr().err
+
+
+def test_sentences_on_the_terminal_are_wrapped_and_rows_are_not(mysim, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "70")
+    words = ["examine", f"{mysim}:cost", "--quiet", "grad=wrong", "theta=1,2", f"junit={mysim.parent}/out.xml"]
+    assert cli.main(words) == 1
+    out = capsys.readouterr().out
+    long = [line for line in out.splitlines() if len(line) > 70 and " " in line]
+    assert all("  " in line.strip() or "python -m bench" in line for line in long), long
+    assert any(len(line) > 60 for line in out.splitlines())
+    conclusion = "Derivative: WRONG. wrong_factor: the ratio is constant: a factor or a sign is wrong"
+    assert conclusion in " ".join(out.split())
+    assert conclusion in (mysim.parent / "out.xml").read_text()
+
+
+@pytest.mark.parametrize("size", [1e308, np.inf])
+def test_own_arithmetic_does_not_warn_and_the_cost_still_does(size):
+    """Warnings of the cost are kept with what it prints."""
+
+    def cost(x):
+        np.float64(1.0) / np.float64(0.0)
+        return float(x[0]) if x[0] <= 1.0 else size * (-1.0 if int(1e6 * x[0]) % 2 else 1.0)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(bench.UserError, match="divide by zero"):
+            bench.examine(cost, [1.0], **QUICK)
+        with np.errstate(divide="ignore"):
+            str(bench.examine(cost, [1.0], grad=lambda x: [size], twin=cost, twin_grad=lambda x: [np.inf], **QUICK))
 
 
 def test_command_takes_named_numbers(mysim, capsys):
@@ -520,6 +618,7 @@ def test_cost_that_is_constant_between_jumps_is_no_right_gradient():
     """Its derivative is 0 wherever it exists, as a check of one theta would say."""
     report = bench.examine(lambda x: np.floor(20 * x[0]) / 20, [1.01], sigma=0.1, **QUICK)
     assert (report.status, report.cause) == (1, "staircase")
+    assert "staircase: the cost is constant between jumps" in str(report)
 
 
 def test_gradients_that_spread_too_widely_are_not_called_right():

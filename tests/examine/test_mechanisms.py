@@ -13,8 +13,10 @@ import pytest
 import bench
 from bench.errors import UserError
 from bench.examine import lines
+from bench.examine.findings import GroupSize
 from bench.examine.subspace import groups_of
 from bench.model.simulator.tree import ParameterTree
+from bench.report.text import number
 
 QUICK = {"progress": False, "calls": 3000}
 START = [0.7, 0.3]
@@ -485,6 +487,63 @@ def test_the_wrong_part_of_a_large_theta_is_named(planted):
     assert "16 of 20301 components" in str(report)
     if planted.said:
         assert f"{planted.said}" in report.conclusion
+
+
+WIDE = np.random.default_rng(1)
+SIZES = np.exp(2.0 * WIDE.standard_normal(10_000)) * WIDE.choice([-1, 1], 10_000)
+"""Slopes of very different sizes: a few components are 1000 times as large as most."""
+PLACES = WIDE.uniform(0.5, 1.5, 10_000)
+
+
+def examined(factor):
+    """Examine 10,000 inputs with a gradient that is off by a factor for each."""
+    return bench.examine(
+        lambda x: float(SIZES @ np.sin(x)),
+        PLACES,
+        grad=lambda x: factor * SIZES * np.cos(x),
+        progress=False,
+        calls=4000,
+    )
+
+
+@pytest.mark.parametrize("factor", [2.0, -1.0, 1.1])
+def test_one_wrong_number_among_10_000_is_not_within_the_tolerance(factor):
+    """It changes the slope of its group by less than 0.4%, in proportion less than a tolerated error of the largest number."""
+    report = examined(np.where(np.arange(10_000) == 7360, factor, 1.0))
+    assert report.derivative == "wrong"
+    assert "theta[7360]" in report.conclusion
+
+
+def test_wrong_numbers_all_over_a_group_are_not_within_the_tolerance():
+    report = examined(np.where(np.arange(10_000) % 10 == 3, 1.01, 1.0))
+    assert report.derivative == "wrong"
+
+
+@pytest.mark.parametrize(("count", "tolerated"), [(10_000, 0.04), (400, 0.2), (4, 1.0)])
+def test_the_tolerance_along_a_random_direction_of_up_to_10_000_numbers(count, tolerated):
+    assert GroupSize(count, allowed=1.0, slope=1.0).tolerated == pytest.approx(tolerated)
+
+
+@pytest.mark.parametrize("errors", [np.full(10_000, 9e-5), 9e-5 * WIDE.choice([-1, 1], 10_000)])
+def test_errors_of_10_000_numbers_within_the_tolerance_are_right(errors):
+    report = examined(1.0 + errors)
+    assert (report.derivative, report.status) == ("right", 0)
+    assert any("within the tolerance" in text for text in report.warnings)
+
+
+def test_the_error_of_one_number_that_its_group_may_hide_is_stated():
+    report = examined(1.0)
+    assert report.derivative == "right"
+    assert 0 < report.hidden < 0.1
+    assert f"an error of one number below {number(100 * report.hidden)}%" in str(report)
+    # a number of the first group that is a thousandth of the root mean square, and not one that hardly moves
+    moves = np.abs(groups_of(ParameterTree(PLACES), np.abs(PLACES), 0)[0].vector / PLACES[:2500])
+    slopes = np.abs(SIZES * np.cos(PLACES) * PLACES)[:2500]
+    size = np.sqrt(np.mean(slopes**2))
+    small = int(np.argmin(np.abs(slopes - size / 1000) + (moves < np.median(moves)) * size))
+    for share, answer in ((0.01, "right"), (2.0, "wrong")):
+        error = share * report.hidden * size / slopes[small]
+        assert examined(1.0 + error * (np.arange(10_000) == small)).derivative == answer
 
 
 def test_components_too_small_to_resolve_do_not_set_the_agreement():
