@@ -338,15 +338,9 @@ def windows_table(experiment: str = "train") -> str:
     """Return gradient, its bias and final return by the length of a window as a Markdown table."""
     head = ["| window [steps] | norm of the gradient | its bias | final return |", "|--:" * 4 + "|"]
     return block(head + [
-        f"| {line['window']:.0f} | {number(line['window_gradient'])} | {window_bias(line)} | {final_return(line)} |"
+        f"| {line['window']:.0f} | {number(line['window_gradient'])} | {findings.bias_words(line)} | {final_return(line)} |"
         for line in aggregate.windows(trained(experiment)).to_dict("records")
     ])  # fmt: skip
-
-
-def window_bias(line: dict[str, Any]) -> str:
-    """Return the relative bias of the windows' gradient with its interval over seeds, or without one for too few seeds."""
-    ends = f" [{number(line['window_bias_low'])}, {number(line['window_bias_high'])}]"
-    return number(line["window_bias"]) + (ends if np.isfinite(line["window_bias_low"]) else "")
 
 
 def windows_finding(experiment: str = "train") -> str:
@@ -613,6 +607,7 @@ FIGURES: dict[str, Callable[[], str]] = {
     "hopper-finding": lambda: findings.recommendation(aggregate.summarise(trained("train/hopper"))),
     "hopper-table": lambda: trained_table("train/hopper"),
     "hopper-windows": lambda: windows_table("train/hopper"),
+    "hopper-windows-finding": lambda: windows_finding("train/hopper"),
     "hopper-faults": lambda: faults_table("train/hopper"),
     "fits-hidden": hidden,
     "fits-bound": lambda: span(fits("error", "rk4", (0, 1))),

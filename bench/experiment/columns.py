@@ -59,12 +59,12 @@ class Column:
     table: bool = True
     """Whether the CSV has this column; ``rows.parquet`` always does."""
     measured: bool = False
-    """Whether the value depends on the machine and its load; it is missing if cells are not timed, unless ``kept``."""
+    """Whether the value depends on the machine and its load; it is missing if cells are not timed, unless ``untimed``."""
     judged: InitVar[ComparisonRule | None] = None
     """The old name of ``comparison``."""
     label: str = field(default="", kw_only=True)
     """The name in headings and on axes; by default the column's name with spaces."""
-    kept: bool = field(default=False, kw_only=True)
+    untimed: bool = field(default=False, kw_only=True)
     """Whether a measured value is recorded also if cells are not timed: beside other cells, for a ratio of costs only."""
     format: Format = field(default="number", kw_only=True)
     digits: int = field(default=2, kw_only=True)
@@ -192,7 +192,7 @@ class Columns:
     @property
     def measured(self) -> list[str]:
         """Names of the columns that are missing if cells are not timed."""
-        return [column.name for column in self.all if column.measured and not column.kept]
+        return [column.name for column in self.all if column.measured and not column.untimed]
 
     @property
     def compared(self) -> list[Column]:

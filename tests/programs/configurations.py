@@ -394,10 +394,10 @@ class Ledger:
         return int((rows["status"] == "error").any()), err.getvalue().strip()
 
     def stored(self, name: str, folder: Path) -> dict[str, dict[str, Any]]:
-        """Return the rows stored under ``name`` in a folder, by key, as :func:`exact.bits`, without times that are kept."""
+        """Return the rows stored under ``name`` in a folder, by key, as :func:`exact.bits`, without times of untimed cells."""
         columns = registry.usable("studies", name.rpartition("_")[0]).columns
-        kept = [column.name for column in columns.all if column.kept]
-        return by_key(Store(folder / name, columns).load().drop(columns=kept))
+        untimed = [column.name for column in columns.all if column.untimed]
+        return by_key(Store(folder / name, columns).load().drop(columns=untimed))
 
     def check(self, words: list[str], charts: bool = False) -> None:
         """Run a configuration, and count lost or changed rows and other faults."""

@@ -99,7 +99,7 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
         return Views(["No fit gave a result: the table has the reason of each."], tables[:1], remarks=reasons(rows))
     texts = findings(lines)
     return Views(
-        [*texts, *([landscape(scans)] if len(scans) else [])], tables,
+        [*texts[:2], landscape(scans)] if len(scans) else texts, tables,
         [*charts(lines, fits, by_name, texts[0]), *scan_charts(scans)], remarks=reasons(rows),
     )  # fmt: skip
 

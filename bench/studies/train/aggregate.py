@@ -118,7 +118,7 @@ def _filled(values: np.ndarray, count: int) -> np.ndarray:
 
 
 def windows(runs: pd.DataFrame) -> pd.DataFrame:
-    """Return a line per problem, family and window with a run that ended, for families with several: their gradient, its bias, and the final return."""
+    """Return a line per problem, family and window with a run that ended, for families with several windows."""
     known = runs[runs["window"].notna() & runs["window_gradient"].notna()]
     lines = []
     for (problem, family, window), part in known.groupby(["problem", "family", "window"]):
@@ -126,12 +126,9 @@ def windows(runs: pd.DataFrame) -> pd.DataFrame:
             continue
         final = final_returns(part)
         low, high = interval(final)
-        bias = part["window_bias"].dropna().to_numpy(dtype=float)
-        bias_low, bias_high = interval(bias)
         lines.append({
             "problem": problem, "family": family, "window": window, "seeds": len(part),
-            "window_bias": interquartile_mean(bias) if len(bias) else math.nan, "window_bias_low": bias_low,
-            "window_bias_high": bias_high,
+            **{name: float(part[name].median()) for name in ("window_bias", "window_bias_low", "window_bias_high")},
             "window_gradient": float(part["window_gradient"].median()), "gradient_typical": float(part["gradient_typical"].median()),
             "final": interquartile_mean(final), "final_low": low, "final_high": high,
         })  # fmt: skip

@@ -109,6 +109,16 @@ def _lengths(values: Any) -> str:
     return listed([f"{value:.0f}" for value in values])
 
 
+def bias_words(line: Mapping[str, Any]) -> str:
+    """Return the bias of windows with its interval, or that none was found."""
+    low, high = number(line["window_bias_low"]), number(line["window_bias_high"])
+    return (
+        f"{number(line['window_bias'])} [{low}, {high}]"
+        if line["window_bias_low"] > 0
+        else f"not distinguishable from 0 (up to {high})"
+    )
+
+
 def frequent_faults(faults: pd.DataFrame, n_runs: int) -> str:
     """Return in how many runs the logs show a fault, the words of the most frequent one, and in how many one is open."""
     known = certain(faults)

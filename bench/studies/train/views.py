@@ -32,7 +32,7 @@ WINDOW_BIAS = Column(
 )
 WINDOWS = (
     PROBLEM, text("family", label="trainer"), WINDOW,
-    WINDOW_GRADIENT, WINDOW_BIAS,
+    WINDOW_GRADIENT, text("bias", label="its bias"),
     Column("gradient_typical", label="gradient norm in training"), FINAL,
 )  # fmt: skip
 FAULTS = (PROBLEM, METHOD, Column("seed", format="setting"), text("words", label="the log shows"))
@@ -67,7 +67,7 @@ NOTE = (
 WINDOW_NOTE = (
     "norm of the windows' gradient: of whole episodes from new starts, cut into windows that end in the critic's value, with the "
     "policy and critic halfway through the run, median over runs. bias: the distance from the gradient without cuts, relative "
-    "to it. The policies differ between windows. final return and bias: {seeds}."
+    "to it, with its 95% interval, each the median over runs. The policies differ between windows. final return: {seeds}."
 )
 PAGE = ("final_return", "first_return", "final_median", "updates", "steps", "train_s", "compile_s", "gradient_typical",
         "gradient_peak", "window_gradient", "window_bias", "difference_error")  # fmt: skip
@@ -89,7 +89,19 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     ]  # fmt: skip
     if len(windows):
         note = WINDOW_NOTE.format(seeds=seeds)
-        tables.append(Table("windows", windows, WINDOWS, "Windows", [note], terminal=True, page=True))
+        lines = windows.assign(bias=[findings.bias_words(line) for line in windows.to_dict("records")])
+        tables.append(
+            Table(
+                "windows",
+                lines,
+                WINDOWS,
+                "Windows",
+                [note],
+                terminal=True,
+                page=True,
+                details=["gradient_typical"],
+            )
+        )
     worded = faults.assign(words=[findings.describe(fault) for fault in faults["fault"]]).drop(columns="fault")
     if len(worded):
         tables.append(Table("faults", worded, FAULTS, "Faults in the logs", terminal=True, page=True))
@@ -130,7 +142,7 @@ def _windows(windows: pd.DataFrame, seeds: str) -> Chart:
     title = findings.window(windows).split(".")[0]
     return Chart(
         "windows", title, windows, [replace(WINDOW, log=True)], [FINAL, WINDOW_BIAS, WINDOW_GRADIENT], series="family", panel="problem",
-        subtitle=seeds, text="A point per length of window. Choose the quantity.",
+        subtitle=f"final return: {seeds}", text="A point per length of window. Choose the quantity.",
     )  # fmt: skip
 
 
@@ -183,4 +195,4 @@ def _place(runs: pd.DataFrame, line: pd.Series) -> str:
     """Return where a fault starts on the axis of control steps, in words."""
     run = runs[(runs["method"] == line["method"]) & (runs["seed"] == line["seed"])].iloc[0]
     update = line["fault"].get("update")
-    return f" (at {number(update * run['steps'] / run['updates'], 3)} control steps)" if update else ""
+    return f" ({update * run['steps'] / run['updates']:,.0f} control steps)" if update else ""
