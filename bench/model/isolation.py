@@ -139,6 +139,13 @@ def _write_affinity(cores: Any) -> None:
         os.sched_setaffinity(0, cores)
 
 
+def _decimal_settings() -> tuple[Any, ...]:
+    """Return the arguments of a context like the present one, without flags: arithmetic sets them, and they decide nothing."""
+    now = decimal.getcontext()
+    traps = [signal for signal, is_on in now.traps.items() if is_on]
+    return now.prec, now.rounding, now.Emin, now.Emax, now.capitals, now.clamp, [], traps
+
+
 def _rounding() -> int:
     """Return the processor's rounding mode, of <fenv.h>."""
     return int(_C.fegetround()) if hasattr(_C, "fegetround") else 0
@@ -165,7 +172,7 @@ SETTINGS = (
     Setting("the processor cores", _affinity, _write_affinity),
     Setting("the rounding mode", _rounding, lambda mode: _C.fesetround(mode)),
     Setting("denormal numbers", lambda: SMALLEST * ONE != 0.0, lambda _: "torch" in sys.modules and _torch().set_flush_denormal(False)),
-    Setting("the decimal context", lambda: repr(decimal.getcontext()), lambda _: decimal.setcontext(decimal.Context()), is_scoped=True),
+    Setting("the decimal context", _decimal_settings, lambda settings: decimal.setcontext(decimal.Context(*settings)), is_scoped=True),
     Setting("the seed of random", random.getstate, random.setstate),
     Setting("NumPy's error state", np.geterr, lambda state: np.seterr(**state), names_parts=True, is_scoped=True),
     Setting("NumPy's error handler", np.geterrcall, np.seterrcall, is_scoped=True),

@@ -1,5 +1,6 @@
 """A change of the process by a plugin is named and undone, and reaches no other cell."""
 
+import decimal
 import importlib
 import os
 import subprocess
@@ -59,6 +60,20 @@ def test_a_change_of_the_process_is_named_and_undone(kind):
         assert words in "; ".join(changes)
         assert len(changes) <= 2
         assert state.changes() == []
+
+
+def test_decimal_arithmetic_before_and_after_is_no_change_and_settings_come_back():
+    """Arithmetic sets flags of the context: with them in the comparison, settings that were restored still looked changed."""
+    with decimal.localcontext() as own:
+        own.prec, own.flags[decimal.Inexact] = 31, True
+        with followed() as state:
+            decimal.Decimal(2).sqrt()
+            assert state.changes() == []
+            decimal.getcontext().prec = 5
+            assert "the decimal context" in "; ".join(state.changes())
+            state.restore()
+            assert state.changes() == []
+            assert decimal.getcontext().prec == 31
 
 
 # ------------------------------------------------------------------------------------------------------------- runs

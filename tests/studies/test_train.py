@@ -76,16 +76,16 @@ def test_windows_that_are_not_distinguishable_from_the_best_are_named():
     }
 
 
-def test_lengths_of_windows_are_compared_by_their_returns_only():
-    """The gradient of a window sums over fewer actions than that of an episode, so their distance is no bias."""
+def test_lengths_of_windows_are_compared_by_their_returns_and_a_bias_is_named_only_where_its_interval_excludes_0():
     experiment, rows = made_up()
+    rows.loc[rows["trainer"] == "shac[window=8]", "window_bias_low"] = 0.0
     shown = views(experiment, rows)
     chart = next(chart for chart in shown.charts if chart.name == "windows")
-    assert [column.name for column in chart.y] == ["final", "window_gradient"]
-    table = next(table for table in shown.tables if table.name == "windows")
-    assert "bias" not in " ".join(
-        [*table.frame, *table.notes, *(column.heading for column in table.columns), *shown.findings]
-    )
+    assert [column.name for column in chart.y] == ["final", "window_bias", "window_gradient"]
+    assert "bias" not in " ".join(shown.findings)
+    lines = next(table for table in shown.tables if table.name == "windows").frame.set_index("window")
+    assert lines.loc[8, "bias"] == "not distinguishable from 0 (up to 1.4)"
+    assert lines.loc[32, "bias"] == "0.31 [0.28, 0.34]"
 
 
 def test_a_trainer_without_a_run_that_ends_is_not_the_best_by_its_untrained_policy():
