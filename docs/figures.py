@@ -498,6 +498,25 @@ def dose_data() -> str:
     ])  # fmt: skip
 
 
+def mjx_solver(column: str) -> pd.Series:
+    """Return a column of the rows of MJX in ``solver_iterations``, by iterations."""
+    rows = rows_of("solver_iterations")
+    rows = rows[rows["backend"].str.startswith("mjx") & (rows["status"] == "ok")]
+    return rows.set_index("iterations")[column]
+
+
+def mjx_solver_compile() -> str:
+    """Return the compile times of the gradients of MJX."""
+    seconds = mjx_solver("compile_s")
+    return f"{seconds.min():.0f} to {seconds.max():.0f} s"
+
+
+def mjx_solver_error() -> str:
+    """Return the largest error of MJX's gradients with 2 iterations or more, relative to the converged program's."""
+    errors = mjx_solver("gradient_error_rel")
+    return number(errors[errors.index > 1].max())
+
+
 def dose_rates() -> str:
     """Return what a wrong rate costs the best gradient."""
     rows = dose("controls")
@@ -513,6 +532,8 @@ def dose_rates() -> str:
 
 
 FIGURES: dict[str, Callable[[], str]] = {
+    "mjx-solver-compile": mjx_solver_compile,
+    "mjx-solver-error": mjx_solver_error,
     "dose-answer": dose_answer,
     "dose-fits": dose_fits,
     "dose-hash": lambda: ", ".join(sorted(set(rows_of("dose_response")["hypotheses"]) - {""})),
