@@ -386,7 +386,7 @@ class Findings:
         if self.has_steps:
             return "staircase"
         if self._misses_jumps:
-            return "jumps"
+            return "staircase" if self.tread else "jumps"
         for cause, is_found in (
             ("nonfinite", [not one.defined for one in self.smoothed]),
             ("biased", [one.biased for one in self.smoothed]),
@@ -402,7 +402,8 @@ class Findings:
         is_measured = len(self.smoothed) >= len(self.requested) > 0 and all(
             one.known and one.decided for one in self.smoothed
         )
-        return self.missed > TARGET_ERROR and not is_measured
+        # a part of the cost that is rounded everywhere is a fault of its own, however small
+        return self.missed > (SEEN if self.tread else TARGET_ERROR) and not is_measured
 
     @property
     def cause(self) -> str:
@@ -641,7 +642,7 @@ class Findings:
             warnings.append(
                 f"cost and gradient printed {counted(self.printed.count, 'line')}; the first: {shortened(self.printed.lines[0])}"
             )
-        if not self.status and self.missed > SEEN and self.noise_cause != "jumps":
+        if not self.status and self.missed > SEEN and self.noise_cause not in ("jumps", "staircase"):
             warnings.append(self._missed_text())
         warnings += [f"not done within the budget: {what}" for what in self.left_out]
         return warnings
@@ -665,7 +666,7 @@ class Findings:
     def _missed_text(self) -> str:
         """Return how much of the cost's change the gradient misses, and what jumps of one height at even distances show."""
         text = (
-            f"jumps: along a line the integral of the gradient misses {number(100 * self.missed)}% of the cost's change, "
+            f"{'staircase' if self.tread else 'jumps'}: along a line the integral of the gradient misses {number(100 * self.missed)}% of the cost's change, "
             "which comes from jumps that no gradient sees"
         )
         if not self.tread:

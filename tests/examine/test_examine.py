@@ -227,7 +227,7 @@ def test_treads_that_a_gradient_misses_are_named_though_they_are_small():
         return float(np.sin(x[0]) * x[1] + 2e-4 * np.floor(1000 * x[0] + 0.5))
 
     report = bench.examine(cost, [0.5, 0.7], grad=lambda x: [np.cos(x[0]) * x[1], np.sin(x[0])], **QUICK)
-    assert (report.derivative, report.cause, report.status) == ("right", "jumps", 1)
+    assert (report.derivative, report.cause, report.status) == ("right", "staircase", 1)
     assert "at even distances" in report.noise_answer
 
 
@@ -244,7 +244,9 @@ def test_a_staircase_beside_a_smooth_part_has_a_right_derivative_between_its_jum
 
     theta = [start, 0.7][:inputs]
     report = bench.examine(cost, theta, grad=grad, progress=False, calls=20_000)
-    assert (report.derivative, report.cause, report.status) == ("right", "jumps", 1)
+    assert (report.derivative, report.status) == ("right", 1)
+    # across a staircase that only one input climbs, jumps on two lines are not equally far apart
+    assert report.cause == "staircase" if inputs == 1 else report.cause in ("staircase", "jumps")
     report = bench.examine(cost, theta, grad=lambda x: grad(x, -1.0), progress=False, calls=20_000)
     assert (report.derivative, report.cause in ("wrong_factor", "staircase")) == ("wrong", True)
     report = bench.examine(cost, theta, grad=lambda x: grad(x, 1.1), progress=False, calls=20_000)
@@ -287,8 +289,9 @@ def under_noise(error, low, high):
 @pytest.mark.parametrize(
     ("found", "cause"),
     [
-        ({"lines": jumpy(0.02, 0.3, 0.3)}, "smooth"),
-        ({"lines": jumpy(0.2, 0.3, 0.3)}, "jumps"),
+        ({"lines": jumpy(0.005, 0.3, 0.3)}, "smooth"),
+        ({"lines": jumpy(0.02, 0.3, 0.3)}, "staircase"),
+        ({"lines": jumpy(0.02, 0.3, 0.4)}, "smooth"),
         ({"lines": jumpy(0.2, 0.3, 0.4)}, "jumps"),
         ({"smoothed": [under_noise(0.01, 0.2, 0.4)]}, "biased"),
         ({"smoothed": [under_noise(0.5, 0.2, 0.4)]}, "spread"),
