@@ -7,11 +7,9 @@ import shutil
 import sys
 import textwrap
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from difflib import get_close_matches
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -33,8 +31,6 @@ OUTPUTS = ("markdown", "junit")
 QUIET, MATRIX = "--quiet", "--matrix"
 WIDTH, LEAST_WIDTH = 100, 40
 """Width of the text without a terminal, and the least width, in characters."""
-NEAREST = 5
-"""Most names that are listed beside an unknown one."""
 
 
 def run(words: Sequence[str]) -> Report:
@@ -95,11 +91,11 @@ def _wrapped(text: str) -> str:
 
 def _examined(cost: str, settings: Mapping[str, Any], progress: bool) -> Report:
     """Return the report on a cost ``FILE:NAME`` with settings as on the command line, or as in a TOML file."""
-    function = _attribute(cost)
+    function = imports.load_attribute(cost)
     module = imports.load_module(cost.rpartition(":")[0])
 
     def other(key: str) -> Any:
-        return _attribute(str(settings[key]), module, key) if settings.get(key) else None
+        return imports.load_attribute(str(settings[key]), module, key) if settings.get(key) else None
 
     report = examine(
         function,
@@ -273,37 +269,11 @@ def _theta(given: Any, module: Any, is_given: bool) -> Any:
     if re.fullmatch(r"[A-Za-z_][\w.]*", given):
         if not is_given and not hasattr(module, given):
             raise UserError("theta is missing: give theta=1,0 or define theta in the file")
-        theta = _attribute(given, module, "theta")
+        theta = imports.load_attribute(given, module, "theta")
         return theta() if callable(theta) else theta
     pairs = _pairs(given)
     return pairs if pairs is not None else np.array(_numbers(given, "theta"))
 
 
-def _attribute(text: str, module: ModuleType | None = None, what: str = "name") -> Any:
-    """Return the object ``FILE:NAME``, or a name in ``module``. Raises :class:`UserError` with the nearest names."""
-    place, _, name = text.rpartition(":")
-    owner = imports.load_module(place) if place else module
-    if owner is not None and not hasattr(owner, name.partition(".")[0]):
-        where = f"{what} in {place}:" if place else what
-        raise UserError(_unknown_name(where, name, owner, LIBRARIES if what == "grad" else ()))
-    return imports.load_attribute(text, module)
-
-
-def _unknown_name(where: str, name: str, module: ModuleType, more: Iterable[str]) -> str:
-    """Return the message on an unknown name, with the nearest names: functions that the module defines come first."""
-    public = {key: value for key, value in vars(module).items() if not key.startswith("_")}
-    own = [*more, *(key for key, value in public.items() if _is_defined_in(value, module))]
-    others = [key for key in public if key not in own]
-    near = [key for part in (own, others) for key in get_close_matches(name, part, NEAREST, 0.4)][:NEAREST]
-    shown = near or (own or others)[:NEAREST]
-    hint = f"; did you mean '{near[0]}'?" if near else ""
-    rest = len(own) + len(others) - len(shown)
-    return f"unknown {where} '{name}'{hint} (names: {', '.join(shown) or 'none'}{f', and {rest} more' if rest else ''})"
-
-
-def _is_defined_in(value: Any, module: ModuleType) -> bool:
-    return callable(value) and getattr(value, "__module__", None) == module.__name__
-
-
 def _gradient(text: Any, module: Any) -> Any:
-    return text if text is None or text in LIBRARIES else _attribute(str(text), module, "grad")
+    return text if text is None or text in LIBRARIES else imports.load_attribute(str(text), module, "grad", LIBRARIES)
