@@ -419,9 +419,9 @@ def with_interval(row: Any, name: str) -> str:
     return f"{number(value)} [{number(low)}, {number(high) if high < 1e4 else 'no limit'}]"
 
 
-def dose_answer() -> str:
-    """Return the findings of ``dose_response``, a line each."""
-    found = json.loads((STANDARD / "dose_response" / "findings.json").read_text())
+def dose_answer(name: str = "dose_response") -> str:
+    """Return the findings of an experiment, a line each."""
+    found = json.loads((STANDARD / name / "findings.json").read_text())
     return block([f"- {sentence}" for sentence in (found["findings"] if isinstance(found, dict) else found)])
 
 
@@ -517,6 +517,11 @@ def mjx_solver_error() -> str:
     return number(errors[errors.index > 1].max())
 
 
+def dose_controls() -> str:
+    """Return what methods that use only costs take, by problem, as a Markdown table."""
+    return block((STANDARD / "dose_response_controls" / "reached.md").read_text().split("\n\n")[1].splitlines())
+
+
 def dose_rates() -> str:
     """Return what a wrong rate costs the best gradient."""
     rows = dose("controls")
@@ -543,6 +548,8 @@ FIGURES: dict[str, Callable[[], str]] = {
     "dose-data": dose_data,
     "dose-shapes": dose_shapes,
     "dose-rates": dose_rates,
+    "dose-controls-answer": lambda: dose_answer("dose_response_controls"),
+    "dose-controls": dose_controls,
     "fobg-soft": lambda: span(pushing("fobg", stiffness=SOFT)["rmse_rel"]),
     "reinforce-soft": lambda: span(pushing("reinforce", stiffness=SOFT)["rmse_rel"]),
     "fobg-stiff": lambda: interval(pushing("fobg", stiffness=1e4)),

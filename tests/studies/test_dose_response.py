@@ -12,7 +12,7 @@ from bench.plugins.optimizers.gradient_descent import GradientDescent
 from bench.plugins.scenes.quadratic import Quadratic
 
 import bench
-from bench.studies.dose_response import analysis, model
+from bench.studies.dose_response import analysis, controls, model
 from bench.studies.dose_response.measure import compare, hypotheses_hash
 from bench.studies.dose_response.model import Data, Estimate, bootstrap, estimate, fit
 from bench.studies.dose_response.search import TARGETS, Method, Task, follow, run_searches, tune, unit_rate
@@ -273,3 +273,59 @@ def test_problems_that_the_best_gradient_solves_in_a_few_updates_do_not_count():
     assert known["fine"] == ""
     assert known["easy"] == "the best gradient needs 2 updates"
     assert known["hard"] == "the best gradient misses the target"
+
+
+# ---------------------------------------------------------------------------------------------------- costs only
+
+
+def searches_of(problem, **methods):
+    """Return lines as of ``analysis.searches``: by method its kind, evaluations of an update, and updates to each target."""
+    return [
+        {
+            "row": f"{problem} {method}", "problem": problem, "scene_class": "smooth", "kind": kind, "method": method,
+            "target": target, "times": np.asarray(times, dtype=float), "median": float(np.median(times)),
+            "rollouts_per_update": rollouts, "gradients_per_update": gradients,
+        }
+        for method, (kind, rollouts, gradients, by_target) in methods.items()
+        for target, times in zip((10.0, 100.0), by_target, strict=True)
+    ]  # fmt: skip
+
+
+LOST = [[math.inf] * 3] * 2
+
+
+def test_methods_that_use_only_costs_stand_beside_the_best_gradient():
+    best = ("best gradient", 0, 1, [[2, 2, 2], [4, 4, 4]])
+    table = pd.DataFrame(
+        searches_of("easy", **{"best gradient": best, "cem[population=40]": ("costs only", 40, 0, [[1, 1, 1], [2, 3, 5]])})
+        + searches_of("hard", **{
+            "best gradient": best, "cem[population=40]": ("costs only", 40, 0, [[9, 9, 9], [math.inf, 9, math.inf]]),
+            "fobg": ("first order", 0, 64, LOST),
+        })
+    )  # fmt: skip
+    known = controls.lines(table)
+    cem = known[(known["method"] == "cem") & (known["problem"] == "easy")].iloc[0]
+    assert (cem["fewest"], cem["evaluations"], cem["most"], cem["reached"]) == (80.0, 120.0, 200.0, "3 of 3")
+    assert controls.findings(known) == [
+        "On hard, no search of fobg reaches 1/10 of the first regret, and all of best gradient reach 1/100.",
+        "To 1/100, cem takes 30 to 30 times the evaluations of the best gradient on 1 of 2 problems, and most searches miss "
+        "it on 1 of 2.",
+    ]
+    assert (
+        controls.title(known)
+        == "Methods that use only costs take at least 20 times the evaluations of the best gradient"
+    )
+    wide = controls.tables(known)[0].frame.set_index("problem")
+    assert wide.loc["easy", "cem"] == 120.0
+    assert np.isnan(wide.loc["hard", "cem"])
+    assert np.isnan(wide.loc["hard", "fobg"])
+
+
+def test_a_method_that_is_sometimes_faster_than_the_best_gradient_is_not_called_slower():
+    kinds = {"best gradient": ("best gradient", 0, 1, [[9, 9, 9], [90, 90, 90]])}
+    table = pd.DataFrame(searches_of("p", **kinds, ppo=("costs only", 10, 0, [[1, 1, 1], [8, 20, 20]])))
+    assert "not always" in controls.title(controls.lines(table))
+
+
+def test_without_methods_that_use_only_costs_nothing_is_compared():
+    assert controls.lines(pd.DataFrame(searches_of("p", fobg=("first order", 0, 1, LOST)))).empty

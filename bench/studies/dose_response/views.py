@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -17,7 +18,7 @@ from bench.measure.performance import wilson
 from bench.report.style import PALETTE, VARIANTS
 from bench.report.text import listed, number
 from bench.report.writer import reasons
-from bench.studies.dose_response import analysis
+from bench.studies.dose_response import analysis, controls
 from bench.studies.dose_response.analysis import BEST, BIAS, FIXED, MAIN, RANDOM, ROTATION, SHOWN, TAILS, ClassFit
 from bench.studies.dose_response.model import Estimate
 
@@ -77,7 +78,7 @@ def _views(experiment: Experiment, rows: pd.DataFrame) -> Views:
             shown,
             remarks=reasons(rows),
         )
-    lines = analysis.counted(table)
+    lines, beside = analysis.counted(table), controls.lines(table)
     fits = list(analysis.class_fits(lines))
     costs, rates, smallest = analysis.costs(lines), analysis.wrong_rates(lines), analysis.cheapest_samples(lines)
     models = analysis.left_out(lines)
@@ -110,9 +111,16 @@ def _views(experiment: Experiment, rows: pd.DataFrame) -> Views:
                                   Column("below", label="a tenth of it")], "The best gradient with a wrong rate", RATE_NOTES),
     ]  # fmt: skip
     charts = [_chart(lines, fits, target) for target in (MAIN, 10.0, 1000.0)]
+    found = findings(fits, costs)
+    if len(beside):  # then the question is what such methods take, and there are few fits or none
+        if not any(one.quantities for one in fits):
+            found, tables = [], [table for table in tables if table.name in ("methods", "problems", "controls")]
+        found = controls.findings(beside) + found
+        tables = [*controls.tables(beside), *(replace(table, terminal=False) for table in tables)]
+        charts.insert(0, controls.chart(beside))
     cells = rows.assign(problem=[analysis.problem_name(row) for _, row in rows.iterrows()])
     return Views(
-        findings(fits, costs), tables, [chart for chart in charts if chart is not None], rows=cells,
+        found, tables, [chart for chart in charts if chart is not None], rows=cells,
         columns=[experiment.columns.by_name[name] for name in ("scene_class", "error", "bias", "spread", "cosine", "lowest")],
         remarks=reasons(rows),
     )  # fmt: skip
