@@ -38,14 +38,14 @@ def lines(table: pd.DataFrame) -> pd.DataFrame:
     times = [np.asarray(values, dtype=float) for values in main["times"]]
     hits = np.array([int(np.isfinite(values).sum()) for values in times])
     missed = ~np.isfinite(main["median"].to_numpy(float))
-    found = {
+    spent = {
         "evaluations": [np.median(v) * u for v, u in zip(times, unit, strict=True)],
         "fewest": [v.min() * u for v, u in zip(times, unit, strict=True)],
         "most": [v[np.isfinite(v)].max(initial=0.0) * u for v, u in zip(times, unit, strict=True)],
     }
     frame = main[["problem", "scene_class", "kind"]].assign(
         method=_short(main["method"]), runs=[len(v) for v in times], hits=hits, begun=begun.loc[main["row"]].to_numpy(),
-        missed=missed, **{name: np.where(missed, np.nan, values) for name, values in found.items()},
+        missed=missed, **{name: np.where(missed, np.nan, values) for name, values in spent.items()},
     )  # fmt: skip
     frame["reached"] = [f"{h} of {n}" for h, n in zip(frame["hits"], frame["runs"], strict=True)]
     return frame.reset_index(drop=True)

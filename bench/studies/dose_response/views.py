@@ -111,16 +111,16 @@ def _views(experiment: Experiment, rows: pd.DataFrame) -> Views:
                                   Column("below", label="a tenth of it")], "The best gradient with a wrong rate", RATE_NOTES),
     ]  # fmt: skip
     charts = [_chart(lines, fits, target) for target in (MAIN, 10.0, 1000.0)]
-    found = findings(fits, costs)
+    sentences = findings(fits, costs)
     if len(beside):  # then the question is what such methods take, and there are few fits or none
         if not any(one.quantities for one in fits):
-            found, tables = [], [table for table in tables if table.name in ("methods", "problems", "controls")]
-        found = controls.findings(beside) + found
+            sentences, tables = [], [table for table in tables if table.name in ("methods", "problems", "controls")]
+        sentences = controls.findings(beside) + sentences
         tables = [*controls.tables(beside), *(replace(table, terminal=False) for table in tables)]
         charts.insert(0, controls.chart(beside))
     cells = rows.assign(problem=[analysis.problem_name(row) for _, row in rows.iterrows()])
     return Views(
-        found, tables, [chart for chart in charts if chart is not None], rows=cells,
+        sentences, tables, [chart for chart in charts if chart is not None], rows=cells,
         columns=[experiment.columns.by_name[name] for name in ("scene_class", "error", "bias", "spread", "cosine", "lowest")],
         remarks=reasons(rows),
     )  # fmt: skip
