@@ -20,6 +20,7 @@ import pandas as pd
 
 from bench.experiment import config
 from bench.report.text import number
+from bench.report.text import span as ends_of
 from bench.studies.bias_variance import trust
 from bench.studies.train import aggregate, findings
 from docs.results import STANDARD, comparison, rmse_interval, rows_of, select
@@ -38,8 +39,7 @@ def span(values: Any, digits: int = 2, suffix: str = "") -> str:
     """
     if not np.size(values) or not np.all(np.isfinite(values)):
         raise LookupError(f"not finite: {values}")
-    low, high = (number(float(value), digits) + suffix for value in (np.min(values), np.max(values)))
-    return low if low == high else f"{low} to {high}"
+    return ends_of(float(np.min(values)), float(np.max(values)), digits, suffix)
 
 
 def percent(share: float) -> str:

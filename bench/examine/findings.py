@@ -17,7 +17,7 @@ from bench.examine.lines import ALIKE, LineScan
 from bench.examine.smoothing import PAIRS, TARGET_ERROR, Method, Smoothed
 from bench.measure.gradcheck import FAULTS, MEANING, TRUSTED, VERDICTS, Check, Part, Sample
 from bench.model.simulator.simulator import Printed
-from bench.report.text import counted, duration, number
+from bench.report.text import counted, duration, number, span
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -519,15 +519,15 @@ class Findings:
             if one.unshown:
                 low, high = one.bias_percent
                 problems.append(
-                    f"spread: at sigma {number(one.sigma)} the bias of the mean gradient is {number(low)} to "
-                    f"{number(high)}% of grad J after {one.pairs} pairs, which does not show whether it is below "
+                    f"spread: at sigma {number(one.sigma)} the bias of the mean gradient is "
+                    f"{span(low, high)}% of grad J after {one.pairs} pairs, which does not show whether it is below "
                     f"{100 * TARGET_ERROR:g}%"
                 )
             if one.biased:
                 low, high = one.bias_percent
                 problems.append(
-                    f"biased: at sigma {number(one.sigma)} the mean of the gradients misses {number(low)} to "
-                    f"{number(high)}% of grad J, though each gradient is right: it does not see the jumps"
+                    f"biased: at sigma {number(one.sigma)} the mean of the gradients misses "
+                    f"{span(low, high)}% of grad J, though each gradient is right: it does not see the jumps"
                 )
         if self.noise_cause == "unmeasured":
             problems.append(f"unmeasured: {EXPLANATIONS['unmeasured']}")

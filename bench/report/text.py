@@ -55,6 +55,16 @@ def duration(seconds: float) -> str:
     return f"{number(seconds)} s"
 
 
+def span(low: float, high: float, digits: int = 2, suffix: str = "") -> str:
+    """Return two ends as short strings, or one number where both print the same.
+
+    >>> span(0.1, 0.15), span(1501.0, 1502.0)
+    ('0.10 to 0.15', '1500')
+    """
+    ends = number(low, digits) + suffix, number(high, digits) + suffix
+    return ends[0] if ends[0] == ends[1] else f"{ends[0]} to {ends[1]}"
+
+
 def counted(count: int, one: str, many: str = "") -> str:
     """Return a count with its noun in the singular or plural.
 

@@ -8,7 +8,7 @@ import pandas as pd
 from bench.experiment.columns import Column, text
 from bench.experiment.views import Chart, Style, Table
 from bench.report.style import MARKERS, PALETTE
-from bench.report.text import counted, listed, number
+from bench.report.text import counted, listed, number, span
 from bench.studies.dose_response.analysis import BEST, MAIN, PLANTED
 
 COSTS_ONLY = "costs only"
@@ -73,7 +73,7 @@ def findings(known: pd.DataFrame) -> list[str]:
         parts = []
         if len(factors):
             parts.append(
-                f"takes {number(min(factors))} to {number(max(factors))} times the evaluations of the best gradient on "
+                f"takes {span(min(factors), max(factors))} times the evaluations of the best gradient on "
                 f"{len(factors)} of {counted(n, 'problem')}"
             )
         if missed:
