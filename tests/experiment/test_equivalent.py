@@ -30,7 +30,13 @@ def test_every_entry_is_in_use_and_leads_to_one_earlier_version():
 
 @pytest.mark.parametrize(
     ("name", "backend"),
-    [("quick", "jax"), ("estimators", "jax"), ("windows", "jax"), ("stiffness_sweep", "jax"), ("engines", "mujoco")],
+    [
+        ("quick", "jax"),
+        pytest.param("estimators", "jax", marks=pytest.mark.slow),  # 25 estimators on 5 problems, each compiled
+        ("windows", "jax"),
+        ("stiffness_sweep", "jax"),
+        ("engines", "mujoco"),
+    ],
 )
 def test_stored_estimates_come_out_again(name, backend):
     experiment = config.load([f"experiment={name}", f"results_dir={ROOT / 'results/standard'}"])

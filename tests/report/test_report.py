@@ -61,6 +61,14 @@ def written(made, rows):
     return writer.write(made, made.study.views(made, rows))
 
 
+@pytest.fixture(scope="module")
+def full(tmp_path_factory):
+    """An experiment with many rows, the rows, and the names of its written files: for tests that only read them."""
+    found, rows = experiment(tmp_path_factory.mktemp("full")), stiffness_rows()
+    found.directory.mkdir()
+    return found, rows, {path.name for path in written(found, rows)}
+
+
 def tables_of(made, rows, name="bias_variance"):
     return [table for table in made.study.views(made, rows).tables if table.name == name]
 
@@ -68,9 +76,8 @@ def tables_of(made, rows, name="bias_variance"):
 # ---------------------------------------------------------------------------------------------------------- tables
 
 
-def test_csv_has_the_promised_columns_in_order_and_every_digit(made):
-    rows = stiffness_rows()
-    written(made, rows)
+def test_csv_has_the_promised_columns_in_order_and_every_digit(full):
+    made, rows, _ = full
     with open(made.directory / "bias_variance.csv", newline="") as file:
         assert next(csv.reader(file)) == [*TABLE, "study", "parameters"]
     back = pd.read_csv(made.directory / "bias_variance.csv")
@@ -80,8 +87,8 @@ def test_csv_has_the_promised_columns_in_order_and_every_digit(made):
     assert set(back["samples"].astype(str)) == {"100"}
 
 
-def test_every_promised_file_is_written(made):
-    names = {path.name for path in written(made, stiffness_rows())}
+def test_every_promised_file_is_written(full):
+    made, _, names = full
     assert {
         "bias_variance.csv",
         "bias_variance.md",
@@ -117,9 +124,8 @@ def test_bias_within_its_noise_is_told_apart(made):
     assert "0.500 [0.400, 0.600]" in text
 
 
-def test_failed_cells_are_rows_with_their_reason(made):
-    rows = stiffness_rows()
-    written(made, rows)
+def test_failed_cells_are_rows_with_their_reason(full):
+    made, rows, _ = full
     text = (made.directory / "bias_variance.md").read_text()
     lines = [line for line in text.partition("**Every cell**")[2].splitlines() if line.startswith("|")]
     assert len(lines) == 2 + len(rows)

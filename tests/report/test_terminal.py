@@ -101,14 +101,15 @@ def test_columns_of_the_environment_count_in_a_pipe(monkeypatch):
     assert "[red]" in out.getvalue() or "[red" in out.getvalue()
 
 
-@pytest.mark.parametrize("width", [40, 80])
 @pytest.mark.parametrize("name", ["quick", "twins", "three_errors", "horizon_growth", "identify", "stability_map"])
-def test_what_a_command_prints_of_standard_results_fits(name, width, monkeypatch, capsys):
-    monkeypatch.setenv("COLUMNS", str(width))
+def test_what_a_command_prints_of_standard_results_fits(name, monkeypatch, capsys):
     experiment = config.load([f"experiment={name}", "results_dir=results/standard"])
     rows = newest_rows(store_of(experiment).load())
     rows = rows[rows["seed"] == rows["seed"].min()].head(150).reset_index(drop=True)
-    writer.show(experiment, rows, finish.views_of(experiment, rows))
-    lines = capsys.readouterr().out.splitlines()
-    assert len(lines) > 10
-    assert max(map(cell_len, lines)) <= width
+    views = finish.views_of(experiment, rows)
+    for width in (40, 80):
+        monkeypatch.setenv("COLUMNS", str(width))
+        writer.show(experiment, rows, views)
+        lines = capsys.readouterr().out.splitlines()
+        assert len(lines) > 10
+        assert max(map(cell_len, lines)) <= width
