@@ -406,9 +406,26 @@ def scenes_table() -> str:
     return block(head + [f"| {scene} | " + " | ".join(map(number, values)) + " |" for scene, values in ratios.items()])
 
 
-def dose(table: str) -> pd.DataFrame:
-    """Return a table of ``dose_response`` as stored."""
-    return pd.read_csv(STANDARD / "dose_response" / f"{table}.csv", keep_default_na=True)
+def dose(table: str, name: str = "dose_response") -> pd.DataFrame:
+    """Return a table of a study of errors as stored."""
+    return pd.read_csv(STANDARD / name / f"{table}.csv", keep_default_na=True)
+
+
+def dose_pairs(name: str = "dose_response") -> str:
+    """Return the ratios of updates to 1/100 by class and comparison as a Markdown table."""
+    rows = dose("pairs", name).query("target == 100")
+    names = list(dict.fromkeys(rows["comparison"]))
+    head = [f"| class | problems | {' | '.join(names)} |", f"|---|--:|{'--:|' * len(names)}"]
+    lines = []
+    for scene_class, own in rows.groupby("scene_class", sort=False):
+        cells = []
+        for row in own.itertuples():
+            value, low, high = (
+                number(x) if np.isfinite(x) else "inf" for x in (row.ratio, row.ratio_low, row.ratio_high)
+            )
+            cells.append(f"{value} [{low}, {high}]" if own["problems"].max() >= 6 else value)
+        lines.append(f"| {scene_class} | {own['problems'].max()} | {' | '.join(cells)} |")
+    return block([*head, *lines])
 
 
 def with_interval(row: Any, name: str) -> str:
@@ -540,6 +557,9 @@ FIGURES: dict[str, Callable[[], str]] = {
     "mjx-solver-compile": mjx_solver_compile,
     "mjx-solver-error": mjx_solver_error,
     "dose-answer": dose_answer,
+    "dose-pairs": dose_pairs,
+    "dose-descent-answer": lambda: dose_answer("dose_response_descent"),
+    "dose-descent-pairs": lambda: dose_pairs("dose_response_descent"),
     "dose-fits": dose_fits,
     "dose-hash": lambda: ", ".join(sorted(set(rows_of("dose_response")["hypotheses"]) - {""})),
     "dose-verdicts": dose_verdicts,

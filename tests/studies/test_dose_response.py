@@ -12,7 +12,7 @@ from bench.plugins.optimizers.gradient_descent import GradientDescent
 from bench.plugins.scenes.quadratic import Quadratic
 
 import bench
-from bench.studies.dose_response import analysis, controls, model
+from bench.studies.dose_response import analysis, controls, model, views
 from bench.studies.dose_response.measure import compare, hypotheses_hash
 from bench.studies.dose_response.model import Data, Estimate, bootstrap, estimate, fit
 from bench.studies.dose_response.search import TARGETS, Method, Task, follow, run_searches, tune, unit_rate
@@ -329,3 +329,54 @@ def test_a_method_that_is_sometimes_faster_than_the_best_gradient_is_not_called_
 
 def test_without_methods_that_use_only_costs_nothing_is_compared():
     assert controls.lines(pd.DataFrame(searches_of("p", fobg=("first order", 0, 1, LOST)))).empty
+
+
+# ------------------------------------------------------------------------------------------------ without a model
+
+
+@pytest.mark.parametrize(("n", "low", "high"), [(6, 1, 6), (8, 1, 8), (9, 2, 8), (25, 8, 18)])
+def test_interval_of_a_median_has_the_order_statistics_of_the_tables(n, low, high):
+    """Of n values the k-th from either end, with k from the sign test at 5% (Conover 1999, Practical Nonparametric Statistics)."""
+    values = np.random.default_rng(0).permutation(np.arange(1.0, n + 1))
+    assert analysis.median_interval(values) == ((n + 1) / 2, low, high)
+
+
+def test_interval_of_a_median_covers_and_fewer_than_six_values_leave_it_open():
+    assert analysis.median_interval(np.arange(1.0, 6)) == (3.0, 0.0, math.inf)
+    rng = np.random.default_rng(1)
+    intervals = [analysis.median_interval(rng.lognormal(0.0, 1.0, 8)) for _ in range(2000)]
+    assert np.mean([low <= 1.0 <= high for _, low, high in intervals]) >= 0.95
+
+
+def planted(problem, kind, dose, updates):
+    return {"problem": problem, "scene_class": "smooth", "kind": kind, "dose": dose, "target": 100.0, "median": updates}
+
+
+def test_ratios_are_those_of_the_same_problem_and_missed_targets_count():
+    lines = pd.DataFrame(
+        [planted(f"p{i}", analysis.BEST, 0.0, 10.0 * i) for i in range(1, 8)]
+        + [planted(f"p{i}", analysis.RANDOM, 0.3, 10.0 * i) for i in range(1, 8)]
+        + [planted(f"p{i}", analysis.RANDOM, 3.0, 40.0 * i if i < 6 else math.inf) for i in range(1, 8)]
+        + [planted(f"p{i}", analysis.RANDOM, 1.0, math.inf if i == 7 else 20.0 * i) for i in range(1, 8)]
+        + [planted(f"p{i}", analysis.BIAS, 0.9, math.inf if i == 7 else 60.0 * i) for i in range(1, 8)]
+    )
+    found = analysis.paired(lines).set_index(["scene_class", "comparison"])
+    assert set(found.loc["smooth"].index) == {"random error 0.3", "random error 1", "random error 3", "random error 3 / 0.3",
+                                              "bias 0.9", "bias 0.9 / random error 1"}  # fmt: skip
+    tenfold = found.loc[("smooth", analysis.TENFOLD)]
+    assert (tenfold["ratio"], tenfold["ratio_low"], tenfold["ratio_high"]) == (4.0, 4.0, math.inf)
+    both = found.loc[("smooth", analysis.BIAS_OVER_RANDOM)]
+    assert (both["problems"], both["ratio"], both["ratio_low"], both["ratio_high"]) == (6, 3.0, 3.0, 3.0)
+    assert found.loc["all classes"].equals(found.loc["smooth"])
+
+
+def test_findings_say_above_1_only_where_the_interval_does():
+    lines = [planted(f"p{i}", kind, dose, updates) for i in range(8)
+             for kind, dose, updates in ((analysis.RANDOM, 0.3, 10.0), (analysis.RANDOM, 3.0, 30.0 if i else 9.0))]  # fmt: skip
+    costs = pd.DataFrame({"target": [], "scene_class": [], "verdict": []})
+    first, *_ = views.findings(analysis.paired(pd.DataFrame(lines)), costs)
+    assert first == (
+        "Ten times as much random error (3 times the gradient instead of 0.3) takes 3.0 [0.90, 3.0] times the updates to 1/100 "
+        "of the first regret, over 8 problems. This is open on smooth and all together."
+    )
+    assert "not known" in views.findings(analysis.paired(pd.DataFrame(lines[:0], columns=list(lines[0]))), costs)[0]

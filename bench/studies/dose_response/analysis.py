@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.special import stdtrit
+from scipy.special import bdtr, stdtrit
 
 from bench.measure.performance import wilson
 from bench.report.text import axis_value
@@ -347,21 +347,75 @@ def wrong_rates(lines: pd.DataFrame, target: float = MAIN) -> pd.DataFrame:
     return pd.DataFrame(result, columns=["problem", "scene_class", "above", "below"])
 
 
-def relative_times(lines: pd.DataFrame, target: float, draws: int = 400) -> pd.DataFrame:
+def median_interval(values: np.ndarray) -> tuple[float, float, float]:
+    """Return a median and its 95% interval between two order statistics, which holds for any distribution.
+
+    k is the largest for which x_(k) and x_(n + 1 - k) enclose the median in 95% of samples; fewer than six values give 0
+    and infinity. Infinite values are allowed. Source: David and Nagaraja 2003, Order Statistics, section 7.1.
+    """
+    values = np.sort(values)
+    n = len(values)
+    if not n:
+        return math.nan, 0.0, math.inf
+    k = sum(2 * bdtr(k, n, 0.5) <= 0.05 for k in range(n // 2))
+    low, high = (float(values[k - 1]), float(values[n - k])) if k else (0.0, math.inf)
+    return float(np.median(values)), low, high
+
+
+ALL = "all classes"
+"""The name of all problems together."""
+RANDOM_ONE, BIAS_BELOW_ONE = "random error 1", "bias 0.9"
+BIAS_OVER_RANDOM = f"{BIAS_BELOW_ONE} / {RANDOM_ONE}"
+TENFOLD = "random error 3 / 0.3"
+COMPARISONS: dict[str, tuple[tuple[str, float], tuple[str, float]]] = {
+    "random error 0.3": ((RANDOM, 0.3), (BEST, 0.0)),
+    RANDOM_ONE: ((RANDOM, 1.0), (BEST, 0.0)),
+    "random error 3": ((RANDOM, 3.0), (BEST, 0.0)),
+    TENFOLD: ((RANDOM, 3.0), (RANDOM, 0.3)),
+    "bias 0.6": ((BIAS, 0.6), (BEST, 0.0)),
+    BIAS_BELOW_ONE: ((BIAS, 0.9), (BEST, 0.0)),
+    BIAS_OVER_RANDOM: ((BIAS, 0.9), (RANDOM, 1.0)),
+}
+"""Planted errors that are compared on the same problem, by name: numerator and denominator, each a kind and a size."""
+
+
+def paired(lines: pd.DataFrame, targets: Sequence[float] = SHOWN) -> pd.DataFrame:
+    """Return, by class, target and comparison, the ratio of updates on the same problem: its median over problems.
+
+    No model is fitted. A missed target is infinite, and a problem on which both are missed is left out. The class
+    ``all classes`` has all problems. Columns: scene_class, target, comparison, problems, ratio, ratio_low, ratio_high (:func:`median_interval`).
+    """
+    result = []
+    main = lines[lines["target"].isin(targets) & lines["kind"].isin((RANDOM, BIAS, BEST))]
+    main = pd.concat([main, main.assign(scene_class=ALL)])
+    for (scene_class, target), part in main.groupby(["scene_class", "target"], sort=False):
+        by_size = {size: own.set_index("problem")["median"] for size, own in part.groupby(["kind", "dose"])}
+        for name, sides in COMPARISONS.items():
+            if not by_size.keys() >= set(sides):
+                continue
+            pairs = pd.concat([by_size[side] for side in sides], axis=1, join="inner").to_numpy(float)
+            pairs = pairs[np.isfinite(pairs).any(axis=1)]
+            value, low, high = median_interval(pairs[:, 0] / pairs[:, 1])
+            result.append({
+                "scene_class": scene_class, "target": target, "comparison": name, "problems": len(pairs), "ratio": value,
+                "ratio_low": low, "ratio_high": high,
+            })  # fmt: skip
+    columns = ["scene_class", "target", "comparison", "problems", "ratio", "ratio_low", "ratio_high"]
+    return pd.DataFrame(result, columns=columns)
+
+
+def relative_times(lines: pd.DataFrame, target: float) -> pd.DataFrame:
     """Return the points of the chart: by class, kind and dose, median error and updates over the best gradient's.
 
-    The interval is the bootstrap's over problems. Where half of the problems miss the target the time is missing and
+    The interval is that of a median over problems. Where half of the problems miss the target the time is missing and
     ``is_missed`` is true.
     """
-    rng = np.random.default_rng(0)
     part = lines[(lines["target"] == target) & (lines["kind"] != BEST)]
     part = part.assign(size=part["dose"].fillna(part["samples"]), relative=part["median"] / part["floor"])
     result = []
     for (scene_class, kind, method, size), own in part.groupby(["scene_class", "kind", "method", "size"], sort=False):
         values = own["relative"].to_numpy()
-        medians = np.median(values[rng.integers(0, len(values), (draws, len(values)))], axis=1)
-        low, high = np.quantile(medians, [0.025, 0.975], method="inverted_cdf")
-        value = float(np.median(values))
+        value, low, high = median_interval(values)
         result.append({
             "scene_class": scene_class, "kind": kind, "method": method, "size": size, "error": float(own["error"].median()),
             "time": value if math.isfinite(value) else math.nan, "time_low": low,

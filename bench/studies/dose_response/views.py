@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -16,7 +17,7 @@ from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Style, Table, Views
 from bench.measure.performance import wilson
 from bench.report.style import PALETTE, VARIANTS
-from bench.report.text import listed, number
+from bench.report.text import counted, listed, number
 from bench.report.writer import reasons
 from bench.studies.dose_response import analysis, controls
 from bench.studies.dose_response.analysis import BEST, BIAS, FIXED, MAIN, RANDOM, ROTATION, SHOWN, TAILS, ClassFit
@@ -84,11 +85,13 @@ def _views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     models = analysis.left_out(lines)
     verdicts = hypotheses(fits, costs, models, rates, smallest)
     hashes = sorted(set(rows["hypotheses"]) - {""})
+    pairs = analysis.paired(lines)
     second, shapes = analysis.second_analysis(lines), analysis.shapes(lines)
     fit_lines = _fit_lines(fits)
     tables = [
-        Table("dose_response", fit_lines, FITS, "What an error costs in updates",
-              [note.format(hash=listed(hashes) if hashes else "none") for note in FIT_NOTES], terminal=True, page=True, data=data),
+        _pair_table(pairs),
+        Table("dose_response", fit_lines, FITS, "Planned fit of what an error costs in updates",
+              [note.format(hash=listed(hashes) if hashes else "none") for note in FIT_NOTES], page=True, data=data),
         Table("fits", fit_lines, [], files=["csv"]),
         Table("hypotheses", verdicts, [text("hypothesis"), CLASS, TARGET, text("verdict"), text("evidence"),
                                        Column("needed", label="problems needed", format="setting")], "Hypotheses", VERDICT_NOTES, page=True),
@@ -110,10 +113,10 @@ def _views(experiment: Experiment, rows: pd.DataFrame) -> Views:
         Table("controls", rates, [text("problem"), CLASS, Column("above", label="ten times the best rate"),
                                   Column("below", label="a tenth of it")], "The best gradient with a wrong rate", RATE_NOTES),
     ]  # fmt: skip
-    charts = [_chart(lines, fits, target) for target in (MAIN, 10.0, 1000.0)]
-    sentences = findings(fits, costs)
-    if len(beside):  # then the question is what such methods take, and there are few fits or none
-        if not any(one.quantities for one in fits):
+    charts = [_chart(lines, fits, pairs, target) for target in (MAIN, 10.0, 1000.0)]
+    sentences = findings(pairs, costs)
+    if len(beside):  # then the question is what such methods take, and there are no planted errors
+        if pairs.empty:
             sentences, tables = [], [table for table in tables if table.name in ("methods", "problems", "controls")]
         sentences = controls.findings(beside) + sentences
         tables = [*controls.tables(beside), *(replace(table, terminal=False) for table in tables)]
@@ -129,30 +132,49 @@ def _views(experiment: Experiment, rows: pd.DataFrame) -> Views:
 # ------------------------------------------------------------------------------------------------------ findings
 
 
-def findings(fits: Sequence[ClassFit], costs: pd.DataFrame) -> list[str]:
-    """Return what a factor of ten in the error is worth, whether bias costs more than spread, and which order is cheaper."""
-    main = [one for one in fits if one.target == MAIN and one.quantities]
-    if not main:
-        return [f"What an error costs is not known: no class has {analysis.LEAST_PROBLEMS} problems that count."]
-    worth = [f"{one.scene_class} {_text(one.quantities['tenfold'])}" for one in main]
-    above = [one.scene_class for one in main if one.quantities["tenfold"].low > 1]
-    rest = [one.scene_class for one in main if not one.quantities["tenfold"].low > 1]
-    sides = [f"above 1 on {listed(above)}"] if above else []
-    sides += [f"not distinguishable from 1 on {listed(rest)}"] if rest else []
+def findings(pairs: pd.DataFrame, costs: pd.DataFrame) -> list[str]:
+    """Return what ten times more error, an error as large as the gradient, and a bias of that size cost; and which order is cheaper."""
+    main = {(row.scene_class, row.comparison): row for row in pairs[pairs["target"] == MAIN].itertuples()}
+    tenfold = main.get((analysis.ALL, analysis.TENFOLD))
+    if tenfold is None:
+        return ["What an error costs is not known: no problem that counts has planted errors of both sizes."]
+    goal = f"{_regret(MAIN)} of the first regret"
     result = [
-        f"Updates to {_regret(MAIN)} of the first regret with a random error of 1 over those with 0.1: {', '.join(worth)}. "
-        f"The factor is {listed(sides)}."
+        f"Ten times as much random error (3 times the gradient instead of 0.3) takes {_interval(tenfold)} times the updates to "
+        f"{goal}, over {counted(tenfold.problems, 'problem')}. {_sides(main, analysis.TENFOLD)}."
     ]
-    ratio = {one.scene_class: one.quantities["bias_over_spread"] for one in main}
-    more = [f"{name} ({_text(q)} times as much)" for name, q in ratio.items() if q.low > 1]
-    rest = [name for name, q in ratio.items() if not q.low > 1]
-    result.append(
-        (f"Bias costs more than spread of the same size on {listed(more)}" if more else
-         "Whether bias costs more than spread of the same size is open")
-        + (f", and this is open on {listed(rest)}." if more and rest else ".")
-    )  # fmt: skip
-    result.append(cost_sentence(costs))
-    return result
+    sizes = [(name, main.get((analysis.ALL, name))) for name in (analysis.RANDOM_ONE, analysis.BIAS_BELOW_ONE)]
+    words = {
+        analysis.RANDOM_ONE: "a random error as large as the gradient",
+        analysis.BIAS_BELOW_ONE: "a bias of 0.9 of it",
+    }
+    known = [f"{words[name]} takes {_interval(row)}" for name, row in sizes if row is not None]
+    if known:
+        result.append(f"Against the updates of the best gradient, {listed(known)} times as many.")
+    both = main.get((analysis.ALL, analysis.BIAS_OVER_RANDOM))
+    if both is not None:
+        result.append(
+            f"A bias of 0.9 takes {_interval(both)} times the updates of a random error of 1. {_sides(main, analysis.BIAS_OVER_RANDOM)}."
+        )
+    return [*result, cost_sentence(costs)]
+
+
+def _sides(main: Mapping[tuple[str, str], Any], comparison: str) -> str:
+    """Return on which classes a ratio is above 1, below 1 and open."""
+    names: dict[str, list[str]] = {"above 1": [], "below 1": [], "open": []}
+    for (scene_class, name), row in main.items():
+        if name == comparison:
+            names["above 1" if row.ratio_low > 1 else "below 1" if row.ratio_high < 1 else "open"].append(
+                "all together" if scene_class == analysis.ALL else scene_class
+            )
+    return f"This is {listed(f'{side} on {listed(classes)}' for side, classes in names.items() if classes)}"
+
+
+def _interval(row: Any) -> str:
+    """Return a ratio of updates with its interval; an infinite ratio is one beyond the budget of the searches."""
+    value = number(row.ratio) if math.isfinite(row.ratio) else "beyond the budget"
+    high = number(row.ratio_high) if math.isfinite(row.ratio_high) else "no limit"
+    return f"{value} [{number(row.ratio_low)}, {high}]"
 
 
 def cost_sentence(costs: pd.DataFrame, target: float = MAIN) -> str:
@@ -197,6 +219,10 @@ VERDICT_NOTES = (
 )
 COST_NOTES = (
     "Share of problems on which the first order needs fewer rollouts. Not known where its interval contains a half.",
+)
+PAIR_NOTES = (
+    "Ratios of updates on the same problem: medians over problems with 95% intervals by order statistics, which need six problems. "
+    "One size: over the best gradient. Random error 3 / 0.3, bias 0.9 / random error 1: over the second. inf: more than half miss.",
 )
 MODEL_NOTES = (
     "Gain: log likelihood per search on problems left out of the fit, minus that of 1 + c error^p, with the 95% interval over "
@@ -309,6 +335,32 @@ PROBLEM_NOTES = (
 )
 
 
+def _pair_table(pairs: pd.DataFrame) -> Table:
+    """Return the table of planted errors on the same problem: a row per class and target, a column per comparison."""
+    lines = []
+    for (scene_class, target), part in pairs.groupby(["scene_class", "target"], sort=False):
+        line = {"scene_class": scene_class, "target_name": _regret(target), "problems": part["problems"].max()}
+        for row in part.itertuples():
+            line |= {
+                row.comparison: row.ratio,
+                f"{row.comparison}_low": row.ratio_low,
+                f"{row.comparison}_high": row.ratio_high,
+            }
+        lines.append(line)
+    names = [name for name in analysis.COMPARISONS if name in set(pairs["comparison"])]
+    columns = [CLASS, TARGET, PROBLEMS, *(interval(name, name) for name in names)]
+    return Table(
+        "pairs",
+        pd.DataFrame(lines),
+        columns,
+        "What an error costs in updates",
+        PAIR_NOTES,
+        terminal=True,
+        page=True,
+        data=pairs,
+    )
+
+
 def _fit_lines(fits: Sequence[ClassFit]) -> pd.DataFrame:
     lines = []
     for one in fits:
@@ -354,7 +406,7 @@ def _problem_lines(table: pd.DataFrame) -> pd.DataFrame:
 # --------------------------------------------------------------------------------------------------------- chart
 
 
-def _chart(lines: pd.DataFrame, fits: Sequence[ClassFit], target: float) -> Chart | None:
+def _chart(lines: pd.DataFrame, fits: Sequence[ClassFit], pairs: pd.DataFrame, target: float) -> Chart | None:
     """Return the cost of an error: updates over the best gradient's against the relative error, a panel per class."""
     own = [one for one in fits if one.target == target and one.quantities]
     points = analysis.relative_times(lines[lines["scene_class"].isin([one.scene_class for one in own])], target)
@@ -364,14 +416,16 @@ def _chart(lines: pd.DataFrame, fits: Sequence[ClassFit], target: float) -> Char
     looks = {name: Style(colour, marker, "none") for name, (colour, marker) in zip(natural, NATURAL * 9, strict=False)}
     points = points[points["error"] > 0].assign(time_low=lambda f: f["time_low"].where(f["time_high"].notna()))
     panels = [one.scene_class for one in own]
-    worth = {one.scene_class: one.quantities["tenfold"] for one in own}
     points = points.assign(place=points["scene_class"].map(panels.index)).sort_values(
         ["place", "method"], kind="stable"
     )
-    spans = [f"{_text(q)} on {name}" for name, q in worth.items() if q.low > 1]
+    tenfold = pairs[
+        (pairs["target"] == target) & (pairs["comparison"] == analysis.TENFOLD) & (pairs["scene_class"] == analysis.ALL)
+    ]
+    known = [_interval(row) for row in tenfold.itertuples() if row.ratio_low > 1 or row.ratio_high < 1]
     title = (
-        f"Ten times less random error saves a factor in updates of {listed(spans)}" if spans
-        else "What ten times less random error saves is open in every class"
+        f"Ten times as much random error takes {known[0]} times the updates" if known
+        else "What ten times as much random error costs is open"
     )  # fmt: skip
     return Chart(
         "cost_of_error" if target == MAIN else f"cost_of_error_{target:g}", title, points,
@@ -381,6 +435,6 @@ def _chart(lines: pd.DataFrame, fits: Sequence[ClassFit], target: float) -> Char
         panel_notes={one.scene_class: f"{one.n} problems" for one in own},
         subtitle=f"To {_regret(target)} of the first regret, each method at its best rate. Cross: half of the problems miss it",
         text="Lines: planted errors. Points: natural methods, one per number of samples. Medians over problems, with 95% "
-        "bootstrap intervals over problems. The error is the median over ten thetas that all methods of a problem share.",
+        "intervals where six problems count. The error is the median over ten thetas that all methods of a problem share.",
         on_page=True,
     )  # fmt: skip
