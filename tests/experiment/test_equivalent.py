@@ -4,6 +4,7 @@ import ast
 import json
 
 import numpy as np
+import pandas as pd
 import pytest
 from trees import ROOT
 
@@ -11,6 +12,7 @@ import bench
 from bench.experiment import config
 from bench.experiment.axes import build_plugins
 from bench.experiment.by_name import compile_problem
+from bench.experiment.grid import cells
 from bench.measure import noise
 from bench.model.sources import EQUIVALENT, code_hash, hash_of_tree
 
@@ -51,3 +53,15 @@ def test_stored_estimates_come_out_again(name, backend):
         mean = parts["estimator"].estimate(problem, problem.program.theta0, drawn).mean(axis=0)
         stored = np.asarray(row["mean_estimate"])
         assert np.abs(mean - stored).max() <= SAME * np.abs(stored).max(), row["estimator"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", sorted((ROOT / "conf/experiment").rglob("*.yaml")), ids=lambda path: path.stem)
+def test_stored_rows_are_those_of_the_cells_of_their_experiment(path):
+    """Documents count the rows of a folder, so a row from an earlier version of the experiment would count too."""
+    experiment = config.load([f"+experiment={path.relative_to(ROOT / 'conf/experiment').with_suffix('')}"])
+    stored = ROOT / "results/standard" / experiment.name / "rows.parquet"
+    if stored.exists():
+        keys = pd.read_parquet(stored, columns=["key"])["key"]
+        assert not keys.duplicated().any()
+        assert set(keys) <= {cell.key for cell in cells(experiment)}
