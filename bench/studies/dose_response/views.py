@@ -167,7 +167,7 @@ def _sides(main: Mapping[tuple[str, str], Any], comparison: str) -> str:
             names["above 1" if row.ratio_low > 1 else "below 1" if row.ratio_high < 1 else "open"].append(
                 "all together" if scene_class == analysis.ALL else scene_class
             )
-    return f"This is {listed(f'{side} on {listed(classes)}' for side, classes in names.items() if classes)}"
+    return f"This is {', and '.join(f'{side} on {listed(classes)}' for side, classes in names.items() if classes)}"
 
 
 def _interval(row: Any) -> str:
