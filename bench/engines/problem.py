@@ -110,7 +110,7 @@ class EngineProblem(Problem):
                 return np.asarray(program.control(_OPS, moved, state, tuple(x[t] for x in scanned)), dtype=np.float64)
 
             first = np.concatenate(state)
-            if self._is_open_loop():
+            if program.is_open_loop:
                 controls = np.stack([control(t, state) for t in range(horizon)])
                 states, *carries = self.call("rollout", first, controls, *self.start(first))
                 return states, controls, carries
@@ -121,11 +121,6 @@ class EngineProblem(Problem):
                 path.append(self.call("step", x, applied[-1], *carry))
             states, *carries = [np.stack(parts) for parts in zip(*path, strict=True)]
             return states, np.stack(applied), carries
-
-    def _is_open_loop(self) -> bool:
-        scene = self._rolled.scene
-        zero = np.zeros((scene.n_q, 1))
-        return scene.feedback(np, np.zeros((self.dim, 1)), zero, zero) is None
 
     def _cost(self, states: np.ndarray, controls: np.ndarray) -> np.ndarray:
         scene = self._rolled.scene

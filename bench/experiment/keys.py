@@ -17,7 +17,7 @@ from typing import Any
 from bench.engines.backend import EngineBackend
 from bench.model import PolicyScene, Scene
 from bench.model.parameters import Plugin, deciding, remember
-from bench.model.sources import code_of, file_of, hash_of, hash_of_tree, imports_of_tree, is_below
+from bench.model.sources import code_of, file_of, hash_of, imports_of_tree, is_below, stored_hash
 
 HARMLESS = {
     "bench.deprecated": "old names of the same things",
@@ -133,15 +133,12 @@ def _file(module: str) -> Path:
 
 def _class_hash(study: type[Plugin]) -> str:
     """Return the hash of the modules that define a study, without what only shows rows."""
-    return "".join(
-        hash_of_tree(_without_imports(_measuring(module)))
-        for module in _defining(study)
-        if not is_below(module, HARMLESS)
-    )
+    return "".join(stored_hash(study_tree(module)) for module in _defining(study) if not is_below(module, HARMLESS))
 
 
-def _without_imports(tree: ast.Module) -> ast.Module:
-    """Return a module's tree without its imports: the files that they import are hashed themselves."""
+def study_tree(module: str) -> ast.Module:
+    """Return the tree of a study's module without what only shows rows, and without imports, which are hashed themselves."""
+    tree = _measuring(module)
     tree.body = [
         node
         for node in tree.body

@@ -53,11 +53,7 @@ def slopes(problem: Problem, theta: np.ndarray, w: np.ndarray) -> Slopes:
     """
     program = rollout(problem.program)
     full = np.repeat(np.reshape(theta, (program.dim, -1)), w.shape[1] if np.ndim(theta) == 1 else 1, axis=1)
-    path = (
-        problem.jacobians(full, w)
-        if type(problem).jacobians is not Problem.jacobians
-        else _difference_jacobians(program, full, w)
-    )
+    path = problem.jacobians(full, w) if problem.gives_jacobians else _difference_jacobians(program, full, w)
     scene, (horizon, m, count) = program.scene, path.controls.shape
     noisy = full if program.action_noise else full + scene.sigma * w[: program.dim]
     before, controls = _flatten(path.states[:-1]), _flatten(path.controls)

@@ -170,6 +170,11 @@ class Problem(ABC):
             f"{type(self).__name__} does not expose the states of a rollout: use a backend with trajectory()"
         )
 
+    @property
+    def gives_jacobians(self) -> bool:
+        """Whether :meth:`jacobians` is defined."""
+        return type(self).jacobians is not Problem.jacobians
+
     def jacobians(self, theta: np.ndarray, w: np.ndarray) -> Jacobians:
         """Return states, controls and step Jacobians; raises :class:`Unsupported` if the backend has none."""
         raise Unsupported(f"{type(self).__name__} gives no step Jacobians: use a backend with jacobians()")

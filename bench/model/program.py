@@ -324,7 +324,19 @@ class Rollout(Program):
     @property
     def noise_on_theta(self) -> bool:
         """Whether noise is on theta: parameter noise, or action noise if theta is only the sequence of controls."""
-        return not self.action_noise or (self.scene.open_loop and self._only_controls and not self._moves_start)
+        return not self.action_noise or self.plans_controls
+
+    @property
+    def plans_controls(self) -> bool:
+        """Whether theta is the sequence of controls, and nothing else."""
+        return self.scene.open_loop and self._only_controls and not self._moves_start
+
+    @property
+    def is_open_loop(self) -> bool:
+        """Whether the control law does not depend on the state."""
+        scene = self.scene
+        n_v = scene.n_q if scene.n_v is None else scene.n_v
+        return scene.feedback(np, np.zeros((self.dim, 1)), np.zeros((scene.n_q, 1)), np.zeros((n_v, 1))) is None
 
     @property
     def explicit(self) -> bool:

@@ -13,7 +13,6 @@ from bench.model import (
     Array,
     Backend,
     Jacobians,
-    MechanicalScene,
     Ops,
     Problem,
     Program,
@@ -90,7 +89,7 @@ class MujocoProblem(NumpyProblem):
         scene = self._rolled.scene
         self._substeps = getattr(scene, "substeps", 1)
         self._engine = Engine(mjcf.build(backend, program), self._substeps)
-        self._open_loop = _is_open_loop(self._rolled.scene, self.dim)
+        self._open_loop = self._rolled.is_open_loop
 
     def _value(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         states, _ = self._rollout(theta, w)
@@ -277,9 +276,3 @@ def _reverse(program: Program, theta: np.ndarray, w: np.ndarray, scored: bool) -
     (gradient,) = torch.autograd.grad(result.sum(), free, materialize_grads=True)
     # torch.where between NaN and a number would have the number's derivative
     return np.asarray(gradient.masked_fill(~torch.isfinite(result.detach()), float("nan")))
-
-
-def _is_open_loop(scene: MechanicalScene, dim: int) -> bool:
-    """Return whether the control law does not depend on the state."""
-    n_v = scene.n_q if scene.n_v is None else scene.n_v
-    return scene.feedback(np, np.zeros((dim, 1)), np.zeros((scene.n_q, 1)), np.zeros((n_v, 1))) is None

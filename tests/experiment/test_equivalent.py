@@ -13,6 +13,7 @@ from bench.experiment import config
 from bench.experiment.axes import build_plugins
 from bench.experiment.by_name import compile_problem
 from bench.experiment.grid import cells
+from bench.experiment.keys import study_tree
 from bench.measure import noise
 from bench.model.sources import EQUIVALENT, code_hash, hash_of_tree
 
@@ -23,7 +24,12 @@ FILES = [path for folder in ("bench", "plugins") for path in sorted((ROOT / fold
 
 def test_every_entry_is_in_use_and_leads_to_one_earlier_version():
     own = {path: hash_of_tree(ast.parse(path.read_bytes())) for path in FILES}
-    present = set(own.values())
+    studies = {
+        hash_of_tree(study_tree(f"bench.studies.{path.parent.name}"))
+        for path in FILES
+        if path.match("studies/*/__init__.py")
+    }
+    present = set(own.values()) | studies
     assert set(EQUIVALENT) <= present, "an entry whose file has changed since belongs to no file"
     assert not set(EQUIVALENT.values()) & set(EQUIVALENT), "an earlier version is itself listed as a later one"
     changed = [path for path in FILES if own[path] in EQUIVALENT]

@@ -754,7 +754,7 @@ def test_who_reaches_most_targets_needs_an_interval():
     tied = findings.recommendation(table_of_rates(a_adam=4 / 6, b_adam=4 / 6, cem=0.0))
     assert "not distinguishable from b, adam" in tied
     assert findings.recommendation(table_of_rates(a_adam=4 / 6, b_adam=4 / 6)).startswith("Which method to use is open")
-    assert "with gradients b, adam" in findings.recommendation(table_of_rates(cem=1.0, b_adam=0.5))
+    assert "with an estimator b, adam" in findings.recommendation(table_of_rates(cem=1.0, b_adam=0.5))
     assert findings.recommendation(table_of_rates(a_adam=0.0, cem=0.0)) == "No method reaches any target."
     partial = table_of_rates(a_adam=1.0, b_adam=0.5).assign(problems=[3, 10])  # run on three problems only
     assert findings.recommendation(partial).startswith("Use b, adam")

@@ -101,6 +101,11 @@ class Lane(Problem):
             self.usage.gradients += w.shape[1]
         return self._call("explicit", theta, w)
 
+    @property
+    def gives_jacobians(self) -> bool:
+        """Whether the shared problem defines :meth:`jacobians`."""
+        return self._inner.gives_jacobians
+
     def jacobians(self, theta: np.ndarray, w: np.ndarray) -> Any:
         """Return the step Jacobians."""
         return self._inner.jacobians(theta, w)
@@ -178,7 +183,12 @@ def measure_batched(cell: Cell, session: Session, settings: Settings) -> dict[st
 
 
 def _seed_group(cell: Cell, session: Session) -> list[Cell]:
-    """Return the cell and the later cells of the experiment that differ from it only in their seed."""
+    """Return the cell and the later cells of the experiment that differ from it only in their seed.
+
+    The processes of several workers do not know the other cells: there the cell is searched for separately.
+    """
+    if not session.experiment.choices:
+        return [cell]
     if session not in _groups:
         groups: dict[str, list[Cell]] = {}
         for other in cells(session.experiment):

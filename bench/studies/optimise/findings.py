@@ -30,7 +30,7 @@ def sentences(runs: RunSet, default: float, name: Name = str) -> list[str]:
     return [sentence for sentence in texts if sentence]
 
 
-def uses_gradients(method: str) -> bool:
+def has_estimator(method: str) -> bool:
     """Return whether a method has an estimator: its name is then ``estimator, optimizer``."""
     return ", " in method
 
@@ -49,7 +49,7 @@ def tied_with_best(summary: pd.DataFrame) -> pd.DataFrame:
 
 
 def recommendation(summary: pd.DataFrame, name: Name = str) -> str:
-    """Return which method reaches most targets, its ties, and the best method that uses gradients."""
+    """Return which method reaches most targets, its ties, and the best method with an estimator."""
     tied = tied_with_best(summary)
     best = tied.iloc[0]
     if not best["reached"] > 0:
@@ -61,14 +61,14 @@ def recommendation(summary: pd.DataFrame, name: Name = str) -> str:
     others = [name(method) for method in tied["method"][1:]]
     also = f", not distinguishable from {_join(others) if len(others) <= NAMED else counted(len(others), 'other')}"
     text = f"Use {name(best['method'])}: it reaches most targets ({_share(best)}{also if others else ''})"
-    graded = summary[[uses_gradients(method) for method in summary["method"]]]
-    if uses_gradients(best["method"]) or graded.empty:
+    graded = summary[[has_estimator(method) for method in summary["method"]]]
+    if has_estimator(best["method"]) or graded.empty:
         return f"{text}."
     tied = tied_with_best(graded)
     first = tied.iloc[0]
     others = [name(method) for method in tied["method"][1:]]
     also = f" or {_join(others)}" if 0 < len(others) <= NAMED else ""
-    return f"{text}, or with gradients {name(first['method'])} ({_share(first)}){also}."
+    return f"{text}, or with an estimator {name(first['method'])} ({_share(first)}){also}."
 
 
 def failures(runs: RunSet, summary: pd.DataFrame, name: Name = str) -> str:

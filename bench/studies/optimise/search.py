@@ -51,6 +51,11 @@ class ScaledNoiseProblem(Problem):
         """Return scores ``(d, B)`` under the scaled noise. They are linear in w and inverse to the noise's variance."""
         return self._inner.score(theta, self._factor * w) / self._factor**2
 
+    @property
+    def gives_jacobians(self) -> bool:
+        """Whether the problem defines :meth:`jacobians`."""
+        return self._inner.gives_jacobians
+
     def jacobians(self, theta: np.ndarray, w: np.ndarray) -> Any:
         """Return the step Jacobians under the scaled noise."""
         return self._inner.jacobians(theta, self._factor * w)
@@ -112,7 +117,8 @@ class OptimizerRun:
         wanted = self.optimizer.required_fields(state)
         value = self._values(points, iteration) if "value" in wanted else None
         gradient = self._gradients(points, iteration) if "gradient" in wanted else None
-        return self.optimizer.tell(state, points, Answer(value, gradient))
+        path = self.optimizer.expansion(self.problem, self.cell.backend, points[:, 0]) if "path" in wanted else None
+        return self.optimizer.tell(state, points, Answer(value, gradient, path=path))
 
     def _noise(self, iteration: int) -> np.ndarray:
         width = self.problem.program.n_noise

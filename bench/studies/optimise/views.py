@@ -23,7 +23,7 @@ from bench.studies.optimise import aggregate, findings
 from bench.studies.optimise.aggregate import TARGETS, RunSet
 
 CONTEXT = tuple(zip(("#666666", "#8c8c8c", "#4d4d4d", "#767676"), (*VARIANTS[1:], *DEVIANT[:2]), strict=True))
-"""Grey and line style of each method that uses only costs."""
+"""Grey and line style of each method without an estimator."""
 STEPS = 40
 """Number of points of a drawn curve."""
 DEPTH = 3e-4
@@ -51,8 +51,8 @@ NOTES = (
     "share of targets reached within 1 to 4 times the best method's runtime. average runtime (aRT): expected rollouts per "
     "target reached, where a gradient counts as many rollouts as take its time: the rollouts of all searches over the number "
     "of searches that reached the target, inf if none did. Each method is shown at its best tuning on each problem, chosen by "
-    "median final cost of {seeds}, next to the number of tunings and the median score over all of them. Methods that use "
-    "costs only (dashed in charts) are context and do not enter findings about gradients.",
+    "median final cost of {seeds}, next to the number of tunings and the median score over all of them. Methods without "
+    "an estimator (dashed in charts) are context and do not enter findings about its gradients.",
 )
 PAGE = (
     "stopped", "scene_class", "final_cost", "best_known", "score", "rollouts", "gradients", "search_s", "quality_rmse_rel",
@@ -140,11 +140,11 @@ def notes(runs: RunSet) -> list[str]:
 
 
 def styles(methods: Sequence[str], name: Callable[[str], str] = str) -> dict[str, Style]:
-    """Return each method's style by its short name: its estimator's colour, or grey and dashed if it uses only costs."""
+    """Return each method's style by its short name: its estimator's colour, or grey and dashed if it has none."""
     looks: dict[str, Style] = {}
     uses: Counter[str] = Counter()
     for method in methods:
-        estimator = re.split(r"[\[,]", method)[0] if findings.uses_gradients(method) else ""
+        estimator = re.split(r"[\[,]", method)[0] if findings.has_estimator(method) else ""
         turn = uses[estimator]
         uses[estimator] += 1
         grey, dashes = CONTEXT[turn % len(CONTEXT)]
