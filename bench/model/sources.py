@@ -28,12 +28,12 @@ EQUIVALENT: dict[str, str] = {
     "e0958a7545f9add2424859c00b7668d2829211af02c2fa3ccb27141fb9af5351": "d6d35bf0003a6041adf76a4e9ccca9ede0b96e1241a58774c8fbf795bedcd942",
     # bench/model/manifold.py: the joints of a scene may depend on its parameters
     "c38492d867e6f03e0243c75cef3741d9cb79210f93ea28080e68b0c514e4eb05": "e8ce151ce4c198a1b8893f9f61339c4ec86bdcf2b79d517068441741c4451491",
-    # plugins/mjcf.py: models from files, which no stored scene has
-    "a10a11c5d22283bf0703cbcd49e1de126e3a95ab356bfcb2df25c47b08476f45": "9588c6383692c78b228217c715da2ccb1545a8adcc91db6c170db7531606f85c",
-    # plugins/backends/mujoco.py: programs with a policy, which no stored scene has
-    "1a555d92164f8c4baccad410063cb3522ebd754103b5d4bab414aa2a80e8dd4a": "b1b262672b057e5f7cdafaf36a41d335c4543c3e9956d73e60a0d9ede57e60e2",
-    # plugins/backends/mjx.py: programs with a policy and models from files, which no stored scene has
-    "83af6933de9db8db4fa550ecf199a971996b1876196ba16c9576c83a5cd7fcac": "785dd047351f2bee8e0aeb5c2c6d36ef7616c3cb47fd9e7d898f13a91ae57769",
+    # plugins/mjcf.py: models from files, which no stored scene has; contacts for gradient checks and traces
+    "b68d3d6eb6965e70c1e8bfc719ba31805a1b015f5fb9e06ea7e86b84727b837e": "9588c6383692c78b228217c715da2ccb1545a8adcc91db6c170db7531606f85c",
+    # plugins/backends/mujoco.py: programs with a policy, which no stored scene has; contacts for gradient checks and traces
+    "d5840e52d5557651b355154a9f2eaa76aaa13b2aea7db6f6433d4442b00a7cda": "b1b262672b057e5f7cdafaf36a41d335c4543c3e9956d73e60a0d9ede57e60e2",
+    # plugins/backends/mjx.py: programs with a policy and models from files, which no stored scene has; contacts for gradient checks and traces
+    "d1195db78f86b4b797d65dc673564680e2e2b3dd1ed81326d12833049208aa37": "785dd047351f2bee8e0aeb5c2c6d36ef7616c3cb47fd9e7d898f13a91ae57769",
     # plugins/backends/jax.py: its loop is a function that other backends call
     "d4fd1ca7df941e541b95c6d2269a99997af4415110b5a73fa63bb870d4a397ff": "a46ed4d792f61433071933b66bd03d3ad33ff491c1585d8568ee77b069d5cb09",
     # plugins/backends/checkpointed.py: calls the loop of jax, and provides surrogate gradients, which no stored row uses
@@ -56,6 +56,10 @@ EQUIVALENT: dict[str, str] = {
     "4e4e92ad12ad459268276452de9d92447609b50b51f136a670a8894f55dcde11": "fee1e09006427e51ebe8172ecbdc8ac76366922b7225e35c26a1993d121e599c",
     # bench/training/fitting.py: refuses more batches than states, which no stored row has
     "4ccf81bc6d7e8b7c66e350f09cbade82b42523e1933928d90fe9e0a773edf604": "c09fb2d21730de2566b1607dd2f5cf30cc0f2f9a6a97f395b798f3378a996fe0",
+    # bench/measure/contacts.py: the contacts that an engine reports, which no stored row has
+    "e3b2615ea6b0d83015e84a0eee2bab51fbe9c5a4f32fb20648ecf1fb0448eaba": "8c3394de2fc039661d7c5950c75bad263cf80a8bc7e3dcf4740d978438af1e67",
+    # bench/studies/gradient_check/measure.py: the contacts that an engine reports, and names of contact switches, which decide no number of a stored row
+    "1c1303470ac56351d5e4d6bf4d2841c34cdaf24e5223a7568bb1d2707ab0552f": "03778fb4f46929c215ca6edd20560649d5f6ee282b739277d1e4804127712e51",
 }
 """Hashes of files whose changes decide no number of a stored row: the new hash, and the one that rows are stored under.
 
