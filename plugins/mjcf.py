@@ -167,7 +167,7 @@ FAR = 1e3
 class Contacts:
     """The contacts of a model: which pairs of geoms can touch, and where they do, by the C engine's collisions.
 
-    ``names`` are those of the moving geoms, such as ``front_left``, or of both: ``cube-arm``.
+    ``names`` has the moving geom of each contact, such as ``front_left``, or both geoms: ``cube-arm``.
     """
 
     def __init__(self, model: Any) -> None:

@@ -88,7 +88,7 @@ def by_point(rows: pd.DataFrame) -> pd.DataFrame:
 def not_right(rows: pd.DataFrame) -> str:
     """Return which checks show a gradient that is wrong or open, by verdict, in words; empty without any.
 
-    A jump that only noise reaches is no fault of the gradient.
+    A jump that only noise reaches does not count as a fault of the gradient.
     """
     points: dict[str, list[str]] = {}
     cells = set()
