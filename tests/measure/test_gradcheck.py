@@ -332,11 +332,13 @@ def test_contacts_of_an_engine_are_asked_from_the_engine(monkeypatch):
     assert measure.contact_modes(box) is None
 
 
+@pytest.mark.slow
 def test_the_foot_that_switches_is_named_and_both_sides_are_checked(tmp_path, capsys):
     """The damper's force starts where a foot touches: the cost jumps there, and has a derivative on both sides."""
-    words = ["contacts=[penalty]", "backends=[mujoco]", "sweep.horizon=[4]", "workers=0", "formats=[]"]
-    main(["gradcheck", "quadruped", *words, f"results_dir={tmp_path}"])
-    shown = capsys.readouterr().out
+    words = ["sweep.horizon=[4]", "workers=0", "formats=[]", f"results_dir={tmp_path}"]
+    main(["gradcheck", "quadruped", *words])
+    shown, notes = capsys.readouterr()
+    assert "only engines run these scenes: backends=[mujoco] contacts=[penalty]" in notes
     assert "Contact switches with checks on both sides" in shown
     row = store.Store(tmp_path / "gradcheck", GradientCheck.columns, "gradient_check").load().iloc[0]
     named = {point: name for point, name in zip(row["point"], row["contact_switch"], strict=True) if name}

@@ -21,8 +21,9 @@ from bench.plugins.scenes.pushing import Pushing
 
 from bench.cli import main
 from bench.experiment import config
+from bench.experiment.grid import cells
 from bench.measure import noise
-from bench.measure.contacts import active_contacts, split
+from bench.measure.contacts import active_contacts, engine_contacts, split
 from bench.model import Decision, FrictionScene, Jacobians, LoopOps, Unsupported, compose
 from bench.trace.adjoints import adjoints
 from bench.trace.chart import chart
@@ -160,9 +161,26 @@ def test_the_impulse_of_a_bounce_is_read_from_the_velocity_jump():
     assert list(np.flatnonzero(table["switch"])) == [hit[0], hit[0] + 1]
 
 
-@pytest.mark.parametrize(
-    "scene", ["quadruped", pytest.param("mjcf[file=quadruped.xml,policy=linear]", marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("scene", ["quadruped", "mjcf[file=quadruped.xml,policy=linear]"])
+def test_an_engine_reports_the_contacts_of_the_feet(scene):
+    """By the collisions of the C engine: of the model's pairs, or of the geoms that its filters let collide."""
+    (cell,) = cells(config.load([f"scenes=[{scene}]", "estimators=[fobg]", "backends=[mujoco]", "sweep.horizon=[8]"]))
+    problem = cell.backend.compile(cell.program())
+    theta, w = problem.program.theta0[:, None], np.zeros((problem.program.n_noise, 1))
+    states, controls = problem.trajectory(theta, w)
+    contacts = engine_contacts(problem)
+    assert {name.lower().replace("back", "rear")[0] for name in contacts.names} == {"f", "r"}
+    touching, gaps = contacts.touching(states), contacts.gaps(states)
+    assert touching.shape == gaps.shape == (9, 4, 1)
+    assert touching.any()
+    np.testing.assert_array_equal(touching, gaps < 0)
+    forces = contacts.forces(states[:-1], controls)
+    assert (forces[touching[:-1]] > 0).all()
+    assert not forces[~touching[:-1]].any()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scene", ["quadruped", "mjcf[file=quadruped.xml,policy=linear]"])
 def test_the_feet_of_an_engines_robot_are_named_and_carry_its_weight(scene, tmp_path):
     """Slides and hinges, and a free joint, whose states have one number more than their changes."""
     words = [f"scenes=[{scene}]", "backends=[mujoco]", "sweep.horizon=[6]", f"results_dir={tmp_path}"]
