@@ -21,6 +21,8 @@ import pandas as pd
 from bench.experiment import config
 from bench.report.text import number
 from bench.studies.bias_variance import trust
+from bench.studies.gradient_check.points import is_trusted
+from bench.studies.growth import views as growth
 from bench.studies.train import aggregate, findings
 from docs.results import STANDARD, comparison, rmse_interval, rows_of, select
 
@@ -517,6 +519,40 @@ def mjx_solver_error() -> str:
     return number(errors[errors.index > 1].max())
 
 
+def quadruped_growth(horizon: float) -> str:
+    """Return the median norm of the quadruped's gradient at a horizon, with 5% to 95% of the samples."""
+    row = select(rows_of("quadruped_growth"), horizon=horizon).iloc[0]
+    low, median, high = (number(row[f"gradient_{name}"]) for name in ("low", "median", "high"))
+    return f"{median} [{low}, {high}]"
+
+
+def quadruped_order() -> str:
+    """Return the order of the power law that fits the norm of the quadruped's gradient, with its interval."""
+    given = config.load(["experiment=quadruped_growth", f"results_dir={STANDARD}"])
+    (table,) = (t for t in growth.views(given, rows_of("quadruped_growth")).tables if t.name == "growth_verdicts")
+    row = table.frame.iloc[0]
+    return f"{number(row['order'])} [{number(row['order_low'])}, {number(row['order_high'])}]"
+
+
+def switch_verdicts(point: str, folder: str = "quadruped_check") -> list[str]:
+    """Return the verdicts of all checks of a robot's gradient at a point: ``before``, ``at`` or ``after`` a switch."""
+    rows = select(rows_of(folder), scene="quadruped", status="ok")
+    pairs = (zip(row["point"], row["check_verdict"], strict=True) for _, row in rows.iterrows())
+    return [verdict for every in pairs for name, verdict in every if name == point]
+
+
+def sides_right() -> str:
+    """Return how many checks of the quadruped's gradient beside a contact switch are right, of how many."""
+    verdicts = [verdict for point in ("before", "after") for verdict in switch_verdicts(point)]
+    return f"{sum(is_trusted('before', verdict) for verdict in verdicts)} of {len(verdicts)}"
+
+
+def jumps_at_switches() -> str:
+    """Return at how many of the quadruped's contact switches the cost jumps, of how many."""
+    verdicts = switch_verdicts("at")
+    return f"{verdicts.count('jump')} of {len(verdicts)}"
+
+
 def dose_rates() -> str:
     """Return what a wrong rate costs the best gradient."""
     rows = dose("controls")
@@ -534,6 +570,12 @@ def dose_rates() -> str:
 FIGURES: dict[str, Callable[[], str]] = {
     "mjx-solver-compile": mjx_solver_compile,
     "mjx-solver-error": mjx_solver_error,
+    "quadruped-sides": sides_right,
+    "quadruped-jumps": jumps_at_switches,
+    "quadruped-jump-share": lambda: span(100 * rows_of("quadruped_check")["jump_share"], suffix="%"),
+    "quadruped-norm-10": lambda: quadruped_growth(10),
+    "quadruped-norm-100": lambda: quadruped_growth(100),
+    "quadruped-order": quadruped_order,
     "dose-answer": dose_answer,
     "dose-fits": dose_fits,
     "dose-hash": lambda: ", ".join(sorted(set(rows_of("dose_response")["hypotheses"]) - {""})),
