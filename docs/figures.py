@@ -553,6 +553,19 @@ def jumps_at_switches() -> str:
     return f"{verdicts.count('jump')} of {len(verdicts)}"
 
 
+def engines_agree() -> str:
+    """Return the largest distance of MJX's gradient of the quadruped from the C engine's, relative to its norm."""
+    rows = rows_of("quadruped_check")
+    distances = []
+    for _, part in rows.groupby("horizon"):
+        mjx, mujoco = (
+            np.asarray(part.loc[part["backend"].str.startswith(name), "component_program"].item(), dtype=float)
+            for name in ("mjx", "mujoco")
+        )
+        distances.append(np.linalg.norm(mjx - mujoco) / np.linalg.norm(mujoco))
+    return number(max(distances))
+
+
 def dose_rates() -> str:
     """Return what a wrong rate costs the best gradient."""
     rows = dose("controls")
@@ -575,6 +588,7 @@ FIGURES: dict[str, Callable[[], str]] = {
     "quadruped-jump-share": lambda: span(100 * rows_of("quadruped_check")["jump_share"], suffix="%"),
     "quadruped-norm-10": lambda: quadruped_growth(10),
     "quadruped-norm-100": lambda: quadruped_growth(100),
+    "quadruped-engines": engines_agree,
     "quadruped-order": quadruped_order,
     "dose-answer": dose_answer,
     "dose-fits": dose_fits,
