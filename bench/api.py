@@ -63,6 +63,7 @@ class Settings(TypedDict, total=False):
     timeout: float | str | None
     memory: float | str | None
     on_error: str
+    ladder: bool
     retry: Names
     versions: str
     timing: bool | None

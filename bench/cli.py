@@ -402,12 +402,19 @@ def _gradcheck(words: list[str]) -> int:
     from dataclasses import replace
 
     from bench.experiment.study import study_of
+    from bench.model import EngineScene
     from bench.model.parameters import parameters
 
     scenes, settings = _split_scenes(words, "gradcheck")
     _refer("gradcheck", words[: len(words) - len(settings)])
     experiment = _load(["experiment=gradient_check", *scenes, "name=gradcheck", *settings])
     plugins = [choice.entry.plugin for choice in experiment.choices["scene"]]
+    in_engines = [word for word in IN_ENGINES if not _is_given(word.partition("=")[0], settings)]
+    if in_engines and all(plugin and issubclass(plugin, EngineScene) for plugin in plugins):
+        print(f"bench: only engines run these scenes: {' '.join(in_engines)}", file=sys.stderr)
+        experiment = _load(
+            ["experiment=gradient_check", *scenes, "name=gradcheck", *in_engines, *settings], notes=False
+        )
     horizons = [word for word in words if _sets_horizon(word)]
     is_swept = any(word.startswith("sweep.horizon=") for word in settings)
     if horizons:
@@ -420,6 +427,14 @@ def _gradcheck(words: list[str]) -> int:
         return finished
     status, rows = _finish(finished, ["gradcheck", *words])
     return 1 if status or study_of(experiment).faults(rows) else 0
+
+
+IN_ENGINES = ("backends=[mujoco]", "contacts=[penalty]")
+"""What ``gradcheck`` takes for scenes that only engines run, unless it is given."""
+
+
+def _is_given(key: str, settings: Sequence[str]) -> bool:
+    return any(word.lstrip("+").startswith(f"{key}=") for word in settings)
 
 
 def _trace(words: list[str]) -> int:

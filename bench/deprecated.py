@@ -32,7 +32,7 @@ MEMBERS = {
     "wants": "required_fields",
 }
 """New names of plugin members, by old name."""
-EXPERIMENTS = {"quick_optimise": "optimise/small", "ladder": "optimise/large"}
+EXPERIMENTS = {"quick_optimise": "optimise/small"}
 """New names of experiments, by old name."""
 MODULES = {
     "bench.face": ("bench.api",),

@@ -15,7 +15,7 @@ if sys.platform == "win32":
         "bench runs on Linux and macOS, where processes can be killed in groups; on Windows use it inside WSL"
     )
 
-Status = Literal["ok", "nonfinite", "diverged", "timeout", "crashed", "unsupported", "unavailable", "error"]
+Status = Literal["ok", "nonfinite", "diverged", "timeout", "crashed", "unsupported", "unavailable", "error", "waiting"]
 STATUSES: tuple[str, ...] = get_args(Status)
 INTERRUPTED = threading.Event()
 """Set while a KeyboardInterrupt is pending, since plugin code may swallow the exception before it is handled."""

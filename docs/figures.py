@@ -22,6 +22,8 @@ from bench.experiment import config
 from bench.report.text import number
 from bench.report.text import span as ends_of
 from bench.studies.bias_variance import trust
+from bench.studies.gradient_check.points import is_trusted
+from bench.studies.growth import views as growth
 from bench.studies.train import aggregate, findings
 from docs.results import STANDARD, comparison, rmse_interval, rows_of, select
 
@@ -539,6 +541,53 @@ def dose_controls() -> str:
     return block((STANDARD / "dose_response_controls" / "reached.md").read_text().split("\n\n")[1].splitlines())
 
 
+def quadruped_growth(horizon: float) -> str:
+    """Return the median norm of the quadruped's gradient at a horizon, with 5% to 95% of the samples."""
+    row = select(rows_of("quadruped_growth"), horizon=horizon).iloc[0]
+    low, median, high = (number(row[f"gradient_{name}"]) for name in ("low", "median", "high"))
+    return f"{median} [{low}, {high}]"
+
+
+def quadruped_order() -> str:
+    """Return the order of the power law that fits the norm of the quadruped's gradient, with its interval."""
+    given = config.load(["experiment=quadruped_growth", f"results_dir={STANDARD}"])
+    (table,) = (t for t in growth.views(given, rows_of("quadruped_growth")).tables if t.name == "growth_verdicts")
+    row = table.frame.iloc[0]
+    return f"{number(row['order'])} [{number(row['order_low'])}, {number(row['order_high'])}]"
+
+
+def switch_verdicts(point: str, folder: str = "quadruped_check") -> list[str]:
+    """Return the verdicts of all checks of a robot's gradient at a point: ``before``, ``at`` or ``after`` a switch."""
+    rows = select(rows_of(folder), scene="quadruped", status="ok")
+    pairs = (zip(row["point"], row["check_verdict"], strict=True) for _, row in rows.iterrows())
+    return [verdict for every in pairs for name, verdict in every if name == point]
+
+
+def sides_right() -> str:
+    """Return how many checks of the quadruped's gradient beside a contact switch are right, of how many."""
+    verdicts = [verdict for point in ("before", "after") for verdict in switch_verdicts(point)]
+    return f"{sum(is_trusted('before', verdict) for verdict in verdicts)} of {len(verdicts)}"
+
+
+def jumps_at_switches() -> str:
+    """Return at how many of the quadruped's contact switches the cost jumps, of how many."""
+    verdicts = switch_verdicts("at")
+    return f"{verdicts.count('jump')} of {len(verdicts)}"
+
+
+def engines_agree() -> str:
+    """Return the largest distance of MJX's gradient of the quadruped from the C engine's, relative to its norm."""
+    rows = rows_of("quadruped_check")
+    distances = []
+    for _, part in rows.groupby("horizon"):
+        mjx, mujoco = (
+            np.asarray(part.loc[part["backend"].str.startswith(name), "component_program"].item(), dtype=float)
+            for name in ("mjx", "mujoco")
+        )
+        distances.append(np.linalg.norm(mjx - mujoco) / np.linalg.norm(mujoco))
+    return number(max(distances))
+
+
 def dose_rates() -> str:
     """Return what a wrong rate costs the best gradient."""
     rows = dose("controls")
@@ -556,6 +605,13 @@ def dose_rates() -> str:
 FIGURES: dict[str, Callable[[], str]] = {
     "mjx-solver-compile": mjx_solver_compile,
     "mjx-solver-error": mjx_solver_error,
+    "quadruped-sides": sides_right,
+    "quadruped-jumps": jumps_at_switches,
+    "quadruped-jump-share": lambda: span(100 * rows_of("quadruped_check")["jump_share"], suffix="%"),
+    "quadruped-norm-10": lambda: quadruped_growth(10),
+    "quadruped-norm-100": lambda: quadruped_growth(100),
+    "quadruped-engines": engines_agree,
+    "quadruped-order": quadruped_order,
     "dose-answer": dose_answer,
     "dose-pairs": dose_pairs,
     "dose-descent-answer": lambda: dose_answer("dose_response_descent"),

@@ -5,6 +5,7 @@ A backend's ``unsupported_reason`` may call :func:`unsupported_reason` and then 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -157,3 +158,94 @@ def contact_dimensions(program: Program) -> set[int]:
     assert isinstance(program.scene, EngineTwin)
     model = mujoco.MjModel.from_xml_string(f"<mujoco>{program.scene.mjcf()}</mujoco>")
     return {int(dimension) for dimension in model.pair_dim}
+
+
+FAR = 1e3
+"""Distance up to which gaps are measured [m]."""
+
+
+class Contacts:
+    """The contacts of a model: which pairs of geoms can touch, and where they do, by the C engine's collisions.
+
+    ``names`` has the moving geom of each contact, such as ``front_left``, or both geoms: ``cube-arm``.
+    """
+
+    def __init__(self, model: Any) -> None:
+        import mujoco
+
+        self._mujoco, self._model, self._data = mujoco, model, mujoco.MjData(model)
+        self._pairs = {pair: i for i, pair in enumerate(_pairs(model))}
+        self.names = tuple(_pair_name(model, *pair) for pair in self._pairs)
+
+    def touching(self, states: np.ndarray) -> np.ndarray:
+        """Return which contacts act in the step from each state ``(T, n, B)``: boolean ``(T, n_contacts, B)``."""
+        result = np.zeros((len(states), len(self._pairs), states.shape[-1]), dtype=bool)
+        for (t, column), q in self._positions(states):
+            self._data.qpos[:] = q
+            self._mujoco.mj_kinematics(self._model, self._data)
+            self._mujoco.mj_collision(self._model, self._data)
+            for contact, _ in self._active():
+                result[t, contact, column] = True
+        return result
+
+    def gaps(self, states: np.ndarray) -> np.ndarray:
+        """Return the distance at which each contact would act, negative where it does, ``(T, n_contacts, B)`` [m]."""
+        result = np.full((len(states), len(self._pairs), states.shape[-1]), np.nan)
+        for (t, column), q in self._positions(states):
+            self._data.qpos[:] = q
+            self._mujoco.mj_kinematics(self._model, self._data)
+            for i, pair in enumerate(self._pairs):
+                result[t, i, column] = self._mujoco.mj_geomDistance(self._model, self._data, *pair, FAR, None)
+        return result
+
+    def forces(self, states: np.ndarray, controls: np.ndarray) -> np.ndarray:
+        """Return the normal forces at the start of steps from ``(T, n, B)``, ``(T, n_contacts, B)`` [N]."""
+        result = np.zeros((len(states), len(self._pairs), states.shape[-1]))
+        force = np.zeros(6)
+        for (t, column), q in self._positions(states):
+            self._data.qpos[:], self._data.qvel[:] = q, states[t, self._model.nq :, column]
+            self._data.ctrl[:] = controls[t, :, column]
+            self._mujoco.mj_forward(self._model, self._data)
+            for contact, i in self._active():
+                self._mujoco.mj_contactForce(self._model, self._data, i, force)
+                result[t, contact, column] += force[0]
+        return result
+
+    def _positions(self, states: np.ndarray) -> Iterator[tuple[tuple[int, int], np.ndarray]]:
+        """Yield step, column and positions of each finite state."""
+        every = np.ascontiguousarray(np.moveaxis(states[:, : self._model.nq], 1, -1))
+        for t, column in np.argwhere(np.isfinite(every).all(axis=-1)).tolist():
+            yield (t, column), every[t, column]
+
+    def _active(self) -> list[tuple[int, int]]:
+        """Return the contacts that act, each with its number among the engine's, in the simulation data."""
+        if not self._data.ncon:
+            return []
+        contacts = self._data.contact
+        is_active = contacts.dist < contacts.includemargin
+        return [
+            (self._pairs[min(pair), max(pair)], i)
+            for i, pair in enumerate(contacts.geom.tolist())
+            if is_active[i] and (min(pair), max(pair)) in self._pairs
+        ]
+
+
+def _pairs(model: Any) -> list[tuple[int, int]]:
+    """Return the pairs of geoms that can touch: the model's own, and those that its collision filters let through."""
+    pairs = [(min(pair), max(pair)) for pair in zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)]
+    welded = model.body_weldid[model.geom_bodyid]
+    parent = model.body_weldid[model.body_parentid[welded]]
+    excluded = set(model.exclude_signature.tolist())
+    meets = (model.geom_contype[:, None] & model.geom_conaffinity[None]) != 0
+    for a, b in np.argwhere(np.triu(meets | meets.T, 1)).tolist():
+        is_joined = welded[a] and welded[b] and (parent[a] == welded[b] or parent[b] == welded[a])
+        low, high = sorted((int(model.geom_bodyid[a]), int(model.geom_bodyid[b])))
+        if welded[a] != welded[b] and not is_joined and (low << 16) + high not in excluded:
+            pairs.append((a, b))
+    return list(dict.fromkeys(pairs))
+
+
+def _pair_name(model: Any, a: int, b: int) -> str:
+    """Return the names of a pair's geoms, without a geom that is fixed to the world."""
+    moving = [i for i in (a, b) if model.body_weldid[model.geom_bodyid[i]]] or [a, b]
+    return "-".join(model.geom(i).name or f"{model.body(model.geom_bodyid[i]).name or 'body'}.{i}" for i in moving)

@@ -243,7 +243,7 @@ def test_the_subject_of_another_command_is_sent_there(words, right, capsys):
     assert capsys.readouterr().err.strip().endswith(f"python -m bench {right}")
 
 
-@pytest.mark.parametrize(("old", "new"), [("quick_optimise", "optimise/small"), ("ladder", "optimise/large")])
+@pytest.mark.parametrize(("old", "new"), [("quick_optimise", "optimise/small")])
 def test_an_experiment_by_its_old_name_is_a_size_of_another(old, new, capsys):
     with pytest.warns(DeprecationWarning, match=f"experiment={old} is now called experiment={new};"):
         assert main(["plan", f"+experiment={old}", "sweep.seed=[0]"]) == 0

@@ -30,7 +30,7 @@ ERROR = Column("error", label="relative error", digits=3)
 ERRORS = ("paired", "interval", "exact")
 """Comparison rules of columns that contain an error. A series is followed by the column that has a ratio in the most
 cells, the first of them if several have."""
-NOT_RUN = ("unsupported", "unavailable")
+NOT_RUN = ("unsupported", "unavailable", "waiting")
 """Statuses of cells that never ran, which do not count as failures."""
 LONGEST = 18
 """Largest number of characters of a result's name in the chart. The end of a longer name is shown."""

@@ -415,6 +415,7 @@ def _execution(config: Mapping[str, Any]) -> Execution:
         timeout=_amount("timeout", config["timeout"], SECONDS, "600, 10m"),
         memory=None if memory is None else math.ceil(memory),
         stop=_one_of("on_error", config["on_error"], ("continue", "stop")) == "stop",
+        ladder=coerce(bool, config["ladder"], "ladder"),
         versions=_one_of("versions", config["versions"], ("ignore", "warn", "rerun")),
         retry=tuple(_one_of("retry", status, STATUSES) for status in _as_list(config["retry"]) if status is not None),
         launcher=_one_of("launcher", config["launcher"], tuple(CLUSTERS)),

@@ -39,6 +39,8 @@ class Execution:
     """Bytes of memory that a worker may use."""
     stop: bool = False
     """Whether the first failed cell ends the run."""
+    ladder: bool = False
+    """Whether the cells of a scene start only when the checks of the scene before it pass."""
     versions: str = "warn"
     """How to treat stored rows computed with other library versions: ``ignore``, ``warn`` or ``rerun``."""
     retry: tuple[str, ...] = ()

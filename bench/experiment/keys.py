@@ -44,7 +44,7 @@ REFERENCE = "bench.run.references"
 """The module that computes reference gradients."""
 PROGRAM = "bench.model.program"
 """The module that composes scene, contact law and integrator."""
-DISPLAY = ("views", "write", "show", "page", "chart", "faults")
+DISPLAY = ("views", "write", "show", "page", "chart", "faults", "failure")
 """Methods of a study that only show its rows."""
 
 _fingerprints: dict[int, tuple[Plugin, str]] = {}

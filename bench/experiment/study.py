@@ -58,6 +58,11 @@ class Study(Plugin):
         """Return the number of rows with a fault, such as a wrong gradient: ``gradcheck`` then exits with 1."""
         return 0
 
+    def failure(self, rows: pd.DataFrame) -> str:
+        """Return why measured rows do not pass as a rung of a ladder, in words; empty if they pass, as without faults."""
+        count = self.faults(rows)
+        return f"{count} of {len(rows)} cells {'has' if count == 1 else 'have'} a fault" if count else ""
+
 
 def study_of(experiment: Experiment) -> Study:
     """Return the experiment's study; raises :class:`UserError` for a plugin that is not a :class:`Study`."""

@@ -2,9 +2,61 @@
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import numpy as np
 
-from bench.model import Array, ContactScene, ForceLaw, MechanicalScene, Rollout, State, Unsupported
+from bench.model import (
+    Array,
+    ContactScene,
+    EngineScene,
+    ForceLaw,
+    MechanicalScene,
+    Problem,
+    Rollout,
+    State,
+    Unsupported,
+)
+
+
+class EngineContacts(Protocol):
+    """The contacts of an engine's model, which only the engine knows, along states ``(T, n, B)``."""
+
+    names: tuple[str, ...]
+    """What touches, such as a foot."""
+
+    def touching(self, states: np.ndarray) -> np.ndarray:
+        """Return which contacts act in the step from each state, boolean ``(T, n_contacts, B)``."""
+        ...
+
+    def gaps(self, states: np.ndarray) -> np.ndarray:
+        """Return the distances, negative where a contact acts, ``(T, n_contacts, B)`` [m]."""
+        ...
+
+    def forces(self, states: np.ndarray, controls: np.ndarray) -> np.ndarray:
+        """Return the normal forces at the start of each step, ``(T, n_contacts, B)`` [N]."""
+        ...
+
+
+def engine_contacts(problem: Problem) -> EngineContacts:
+    """Return the contacts of an engine's model; raises :class:`Unsupported` for a backend that does not report them.
+
+    A problem that reports them has a method ``engine_contacts()``.
+    """
+    report = getattr(problem, "engine_contacts", None)
+    if report is None:
+        raise Unsupported(f"the backend does not report the contacts of scene {problem.program.scene.name}")
+    contacts: EngineContacts = report()
+    return contacts
+
+
+def contact_names(problem: Problem) -> tuple[str, ...]:
+    """Return the names of a problem's contacts: an engine's own, else numbers from 1, and ``contact`` where there is only one."""
+    scene = problem.program.scene
+    if isinstance(scene, EngineScene):
+        return engine_contacts(problem).names
+    count = int(getattr(scene, "n_contacts", 0))
+    return tuple(f"contact {i + 1}" for i in range(count)) if count > 1 else ("contact",) * count
 
 
 def active_contacts(

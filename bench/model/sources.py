@@ -28,12 +28,12 @@ EQUIVALENT: dict[str, str] = {
     "199f4a0dd1f16ecfe50c34223c5b4e7c1b27bcf03013f946651eccf457a8fdba": "d6d35bf0003a6041adf76a4e9ccca9ede0b96e1241a58774c8fbf795bedcd942",
     # bench/model/manifold.py: the joints of a scene may depend on its parameters
     "c38492d867e6f03e0243c75cef3741d9cb79210f93ea28080e68b0c514e4eb05": "e8ce151ce4c198a1b8893f9f61339c4ec86bdcf2b79d517068441741c4451491",
-    # plugins/mjcf.py: models from files, which no stored scene has
-    "a10a11c5d22283bf0703cbcd49e1de126e3a95ab356bfcb2df25c47b08476f45": "9588c6383692c78b228217c715da2ccb1545a8adcc91db6c170db7531606f85c",
-    # plugins/backends/mujoco.py: programs with a policy, which no stored scene has
-    "354f5c5d4bf484fc59afb7107570f17aab38454d967e1564bac4407ad4cb4a6b": "b1b262672b057e5f7cdafaf36a41d335c4543c3e9956d73e60a0d9ede57e60e2",
-    # plugins/backends/mjx.py: programs with a policy and models from files, which no stored scene has
-    "83af6933de9db8db4fa550ecf199a971996b1876196ba16c9576c83a5cd7fcac": "785dd047351f2bee8e0aeb5c2c6d36ef7616c3cb47fd9e7d898f13a91ae57769",
+    # plugins/mjcf.py: models from files, which no stored scene has; contacts for gradient checks and traces
+    "b68d3d6eb6965e70c1e8bfc719ba31805a1b015f5fb9e06ea7e86b84727b837e": "9588c6383692c78b228217c715da2ccb1545a8adcc91db6c170db7531606f85c",
+    # plugins/backends/mujoco.py: programs with a policy, which no stored scene has; contacts for gradient checks and traces
+    "b392988da4aa3f807e846c0a0cbebc04c3700897b947dcb409b45f3c4da71371": "b1b262672b057e5f7cdafaf36a41d335c4543c3e9956d73e60a0d9ede57e60e2",
+    # plugins/backends/mjx.py: programs with a policy and models from files, which no stored scene has; contacts for gradient checks and traces
+    "d1195db78f86b4b797d65dc673564680e2e2b3dd1ed81326d12833049208aa37": "785dd047351f2bee8e0aeb5c2c6d36ef7616c3cb47fd9e7d898f13a91ae57769",
     # plugins/backends/jax.py: its loop is a function that other backends call
     "d4fd1ca7df941e541b95c6d2269a99997af4415110b5a73fa63bb870d4a397ff": "a46ed4d792f61433071933b66bd03d3ad33ff491c1585d8568ee77b069d5cb09",
     # plugins/backends/checkpointed.py: calls the loop of jax, and provides surrogate gradients, which no stored row uses
@@ -68,6 +68,10 @@ EQUIVALENT: dict[str, str] = {
     "da6a2b11bbeaec7bf6c9aa0a063f4add0835b4cc691d9e4c6b83704c26191c32": "fea6cd6d956324bdbb44b35de8201df8b71c45ad683e76e6c767657dae6cb62f",
     # the class of bench/studies/identify/__init__.py: refuses an optimizer that no stored row has
     "7708dadb06abe2e733e4dd7c0601193cda5a08a6ec88403e333a4ff574b585b0": "5145bf1bccd6c12f885cda3572cab4b5252ad9489bc13409b54dae2b165eb14d",
+    # bench/measure/contacts.py: the contacts that an engine reports, which no stored row has
+    "e3b2615ea6b0d83015e84a0eee2bab51fbe9c5a4f32fb20648ecf1fb0448eaba": "8c3394de2fc039661d7c5950c75bad263cf80a8bc7e3dcf4740d978438af1e67",
+    # bench/studies/gradient_check/measure.py: the contacts that an engine reports, and names of contact switches, which decide no number of a stored row
+    "1c1303470ac56351d5e4d6bf4d2841c34cdaf24e5223a7568bb1d2707ab0552f": "03778fb4f46929c215ca6edd20560649d5f6ee282b739277d1e4804127712e51",
 }
 """Hashes of files, and of classes of studies, whose changes decide no stored number: the new hash, and the one in the keys of rows.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from bench.experiment.experiment import Experiment
 from bench.experiment.study import study_of
 from bench.experiment.views import Views
 from bench.model import guard
-from bench.report import averages, generic, web, writer
+from bench.report import averages, generic, ladder, web, writer
 from bench.report.cores import run_tasks
 from bench.report.views import newest_rows
 from bench.run.execute import Finished, store_of
@@ -71,4 +72,7 @@ def write(experiment: Experiment, rows: pd.DataFrame) -> tuple[Views, list[Path]
 def views_of(experiment: Experiment, rows: pd.DataFrame) -> Views:
     """Return what the study shows of its rows, or else a table of its numbers and a chart of any two of them."""
     rows = rows.reset_index(drop=True)
-    return study_of(experiment).views(experiment, rows) or generic.views(experiment, rows)
+    views = study_of(experiment).views(experiment, rows) or generic.views(experiment, rows)
+    if not experiment.execution.ladder:
+        return views
+    return replace(views, findings=[*ladder.findings(experiment, rows), *views.findings])

@@ -22,7 +22,7 @@ from bench.run.rows import read_object, read_parquet
 
 YEAR_3000 = 32503680000.0
 """Seconds since 1970 that no run has stored."""
-GOOD = ("ok", "unsupported", "unavailable")
+GOOD = ("ok", "unsupported", "unavailable", "waiting")
 """Statuses that do not count as failures: the cell has a result, or was refused with a reason."""
 MARKERS = ("rows.parquet", "run.json", "findings.json")
 """Files whose folder is listed."""

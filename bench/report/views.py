@@ -38,7 +38,7 @@ EXACT, CLOSE = 1e-6, 1e-2
 
 def attempted(rows: pd.DataFrame) -> pd.DataFrame:
     """Return the rows of cells that were run, without refused cells."""
-    return rows[~rows["status"].isin(("unsupported", "unavailable"))]
+    return rows[~rows["status"].isin(("unsupported", "unavailable", "waiting"))]
 
 
 def newest_rows(rows: pd.DataFrame) -> pd.DataFrame:

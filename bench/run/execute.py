@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 from bench.errors import StorageError, Unsupported, UserError
 from bench.experiment.experiment import Experiment
@@ -13,6 +14,7 @@ from bench.experiment.study import study_of
 from bench.measure import timing
 from bench.run import progress, runner
 from bench.run.files import remove_stale
+from bench.run.ladder import climb
 from bench.run.plan import Planned, plan
 from bench.run.store import Store
 
@@ -80,9 +82,17 @@ def execute(experiment: Experiment, quiet: bool = True) -> Finished:
 def _run(experiment: Experiment, planned: list[Planned], store: Store, quiet: bool) -> None:
     with progress.show_progress(experiment.name, planned, quiet) as shown:
         try:
-            runner.run(experiment, planned, store, shown.finished, shown.working)
+            run = partial(_run_cells, experiment, store, shown)
+            if experiment.execution.ladder:
+                climb(experiment, planned, store, run, quiet)
+            else:
+                run(planned)
         finally:
             _compact(store, planned)
+
+
+def _run_cells(experiment: Experiment, store: Store, shown: progress.Progress, planned: list[Planned]) -> None:
+    runner.run(experiment, planned, store, shown.finished, shown.working)
 
 
 def _refuse_without_supported_cells(experiment: Experiment, planned: Sequence[Planned]) -> None:

@@ -73,7 +73,8 @@ def _planned(
     status, row_versions, machine = stored[cell.key]
     rules = experiment.execution
     is_current = rules.versions == "ignore" or status != "ok" or row_versions == versions(cell.backend)
-    again = status in rules.retry or (not is_current and rules.versions == "rerun")
+    # a rung of a ladder waits for the rung below it
+    again = status in (*rules.retry, "waiting") or (not is_current and rules.versions == "rerun")
     # a plugin that was missing when the row was stored is installed now
     is_installed = status == "unavailable" and refusal is None
     timed = machine if cell.timing and status == "ok" and not again else ""

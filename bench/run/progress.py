@@ -34,7 +34,7 @@ NAME_WIDTH = 20
 """Most characters of the experiment's name beside a bar."""
 BAR_WIDTHS = (10, 24)
 """Characters of a bar on a narrow and on a wide terminal."""
-NOT_FAILED = ("ok", "unsupported")
+NOT_FAILED = ("ok", "unsupported", "waiting")
 """Statuses that are not counted as failures."""
 
 
@@ -55,7 +55,7 @@ class Progress:
     def finished(self, cell: Cell, row: dict[str, Any]) -> None:
         """Count one cell that is finished and stored."""
         self._n_done += 1
-        if row["status"] not in ("unsupported", "unavailable"):
+        if row["status"] not in ("unsupported", "unavailable", "waiting"):
             self._ends.append(time.monotonic())
         if row["status"] not in NOT_FAILED:
             self._failed[row["status"]] += 1

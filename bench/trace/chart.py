@@ -19,6 +19,7 @@ from bench.report.figures import save, styled
 from bench.report.scales import log_axis
 from bench.report.style import GREY, PALETTE, SHADE, STYLE, plain, wrapped
 from bench.run.files import make_directory, write_whole
+from bench.trace.contacts import TOUCHES
 from bench.trace.sentences import three_digits
 from bench.trace.spikes import MEASURES, align, spikes
 from bench.trace.trace import Trace
@@ -56,12 +57,12 @@ def write(trace: Trace, results_dir: Path, formats: Sequence[str] = ("png",)) ->
 def chart(trace: Trace) -> Figure:
     """Return a figure of gap (or positions), force, |dF/dx|, |dL/dx| and cost against time.
 
-    Contact switches are thin vertical lines through all panels, states in contact are shaded, and spikes are thick and
+    Several contacts have a panel with a row each, in which a bar shows where the contact acts. Contact switches are thin vertical lines through all panels, states in contact are shaded, and spikes are thick and
     red.
     """
     table = trace.table
     contact = bool(table["gap"].notna().any())
-    drawn = [_gap, _force] if contact else [_positions]
+    drawn = [_gap, *([_rows] if _names(table) else []), _force] if contact else [_positions]
     figure = Figure(figsize=(WIDTH, PANEL * (len(drawn) + 3) + 1.0), layout="constrained")
     axes: Sequence[Axes] = figure.subplots(len(drawn) + 3, 1, sharex=True)
     for panel, ax in zip([*drawn, _jacobian, _adjoint, _cost], axes, strict=True):
@@ -107,6 +108,26 @@ def _gap(ax: Axes, table: pd.DataFrame) -> None:
     ax.axhline(0.0, color=GREY, linewidth=0.6, linestyle=(0, (4, 3)))
     _line(ax, table, factor * table["gap"], BLUE)
     ax.set_ylabel(f"gap [{unit}]")
+
+
+def _names(table: pd.DataFrame) -> list[str]:
+    """Return the columns of the contacts that act somewhere, or all of them if none does."""
+    every = [str(name) for name in table if str(name).startswith(TOUCHES)]
+    return [name for name in every if table[name].any()] or every
+
+
+def _rows(ax: Axes, table: pd.DataFrame) -> None:
+    """Draw a row per contact, with a bar over the states in which it acts."""
+    time, names = table["time"].to_numpy(), _names(table)
+    half = 0.5 * (time[1] - time[0])
+    for row, name in enumerate(names):
+        edges = np.diff(np.concatenate([[0], table[name].to_numpy(dtype=int), [0]]))
+        runs = zip(np.flatnonzero(edges == 1), np.flatnonzero(edges == -1), strict=True)
+        bars = [(time[start] - half, time[end - 1] - time[start] + 2 * half) for start, end in runs]
+        ax.broken_barh(bars, (row - 0.3, 0.6), color=BLUE, linewidth=0)
+    ax.set_yticks(range(len(names)), [plain(name.removeprefix(TOUCHES)) for name in names])
+    ax.set_ylim(len(names) - 0.4, -0.6)
+    ax.set_ylabel("in contact")
 
 
 def _force(ax: Axes, table: pd.DataFrame) -> None:

@@ -2,44 +2,91 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
-from bench.measure.contacts import active_contacts, split
-from bench.model import ContactScene, ForceLaw, FrictionScene, Jacobians, Rollout, compose
+from bench.measure.contacts import active_contacts, contact_names, engine_contacts, split
+from bench.model import ContactScene, EngineScene, ForceLaw, FrictionScene, Jacobians, Problem, Rollout, compose
+from bench.report.text import listed
 from bench.trace import equations
 from bench.trace.equations import Newton, solved_again, stepped
 
 REAL = ("gap", "penetration", "force", "force_peak", "sticking", "slipping")
 
 
-def contact_columns(program: Rollout, path: Jacobians) -> dict[str, np.ndarray]:
-    """Return the columns on contacts and on the equations of the steps, each ``(T + 1,)``; NaN where undefined."""
+TOUCHES = "touches_"
+"""Prefix of the columns of scenes with several contacts: 1 where the contact of that name acts."""
+
+
+def contact_columns(problem: Problem, program: Rollout, path: Jacobians) -> dict[str, np.ndarray]:
+    """Return the columns on contacts and on the equations of the steps, each ``(T + 1,)``; NaN where undefined.
+
+    ``program`` is that of ``problem`` with the parameters of the rollout.
+    """
     scene, law = program.scene, program.contact
     count = len(path.states)
     columns = dict.fromkeys((*REAL, *equations.COLUMNS), np.full(count, np.nan))
     columns |= {"contacts": np.zeros(count, dtype=int), "switch": np.zeros(count, dtype=int)}
+    columns["switched"] = np.full(count, "", dtype=object)
     after = None
     if program.needs_root:
         after, solver = solved_again(program, path)
         columns |= solver
-    if law is None or not isinstance(scene, ContactScene):
+    if isinstance(scene, EngineScene):
+        touching, gap, force = _of_engine(problem, path)
+        if not len(gap):
+            return columns
+        names = contact_names(problem)
+    elif law is None or not isinstance(scene, ContactScene):
         return columns
-    state = split(scene, path.states.T)
-    gap = scene.gap(np, state.q)
-    touching, force = _touching(program, scene, path, after)
+    else:
+        state = split(scene, path.states.T)
+        gap = scene.gap(np, state.q)
+        touching, force = _touching(program, scene, path, after)
+        names = contact_names(problem)
     mode = touching.astype(int)
     if isinstance(scene, FrictionScene) and scene.friction > 0:
         mode = np.where(touching & (np.abs(scene.slip(np, *state)) > scene.slip_speed), 2, mode)
         columns |= {"sticking": (mode == 1).sum(axis=0), "slipping": (mode == 2).sum(axis=0)}
     total = force.sum(axis=0)
+    if len(names) > 1:
+        columns |= {f"{TOUCHES}{name}": row.astype(int) for name, row in zip(names, touching, strict=True)}
     return columns | {
         "contacts": touching.sum(axis=0),
         "switch": np.append(0, (mode[:, 1:] != mode[:, :-1]).any(axis=0).astype(int)),
+        "switched": np.array(["", *map(_switched, [names] * (count - 1), mode.T[:-1], mode.T[1:])], dtype=object),
         "gap": gap.min(axis=0),
         "penetration": np.maximum(0.0, -gap).max(axis=0),
         "force": total,
         "force_peak": np.fmax.accumulate(total),
     }
+
+
+VERBS = {(0, 1): "touch", (0, 2): "touch", (1, 0): "leave", (2, 0): "leave", (1, 2): "slip", (2, 1): "stick"}
+"""What a contact does between two modes: 0 apart, 1 touching, 2 slipping."""
+
+
+def _switched(names: Sequence[str], before: np.ndarray, after: np.ndarray) -> str:
+    """Return which contacts change between the modes of two states, in words; empty if none does."""
+    groups: dict[str, list[str]] = {}
+    for name, *pair in zip(names, before.tolist(), after.tolist(), strict=True):
+        if verb := VERBS.get((pair[0], pair[1])):
+            groups.setdefault(verb, []).append(name)
+    parts = [
+        f"{listed(some)} {verb}{'' if len(some) > 1 else 'es' if verb == 'touch' else 's'}"
+        for verb, some in groups.items()
+    ]
+    return ", ".join(parts)
+
+
+def _of_engine(problem: Problem, path: Jacobians) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return which contacts of an engine's model act at each state, gaps and normal forces, ``(n_contacts, T + 1)``."""
+    contacts = engine_contacts(problem)
+    states, controls = path.states[..., None], path.controls[..., None]
+    touching, gap = (part[..., 0].T for part in (contacts.touching(states), contacts.gaps(states)))
+    force = contacts.forces(states[:-1], controls)[..., 0].T
+    return touching, gap, np.append(force, np.full((len(force), 1), np.nan), axis=1)
 
 
 def _touching(

@@ -6,12 +6,20 @@ import numpy as np
 import pandas as pd
 
 from bench.report.text import counted
-from bench.trace.spikes import LEVEL, MEASURES, SPIKE, Alignment, align, changes
+from bench.trace.spikes import LEVEL, MEASURES, SPIKE, Alignment, align, changes, spikes
+
+LISTED = 5
+"""Most switches and spikes that a sentence lists."""
 
 
 def report(table: pd.DataFrame, gradient_error: float) -> list[str]:
     """Return sentences on contact, on the range of the gradient measures, and on spikes at contact switches."""
-    return [_contact_summary(table), _gradient_summary(table, gradient_error), *verdict(table)]
+    return [
+        _contact_summary(table),
+        *_switch_list(table),
+        _gradient_summary(table, gradient_error),
+        *verdict(table),
+    ]
 
 
 def verdict(table: pd.DataFrame) -> list[str]:
@@ -26,11 +34,14 @@ def verdict(table: pd.DataFrame) -> list[str]:
     if not switches:
         return [f"Contact never switches in this rollout, so no spike can line up with it; per step, {change}."]
     return [
-        _sentence(MEASURES[name], align(table[name], table["switch"]), switches, largest[name]) for name in MEASURES
+        _sentence(
+            MEASURES[name], align(table[name], table["switch"]), switches, largest[name], _spike_list(table, name)
+        )
+        for name in MEASURES
     ]
 
 
-def _sentence(name: str, alignment: Alignment, switches: int, largest: float) -> str:
+def _sentence(name: str, alignment: Alignment, switches: int, largest: float, places: str) -> str:
     at = counted(switches, "contact switch", "contact switches")
     if not alignment.spikes:
         return f"{name} has no spike at the {at}: it changes by at most {three_digits(largest)}x over a step."
@@ -38,8 +49,32 @@ def _sentence(name: str, alignment: Alignment, switches: int, largest: float) ->
     return (
         f"{name}: {counted(alignment.spikes, 'spike')} (largest tenth of the changes, above {SPIKE:g}x per step), "
         f"{alignment.near} within one step of the {at}: {share} against {chance} by chance, p = {alignment.p_value:.2g}. "
-        f"{_conclusion(alignment)}"
+        f"{_conclusion(alignment)}{places}"
     )
+
+
+def _switch_list(table: pd.DataFrame) -> list[str]:
+    """Return a sentence with the first switches: which contact is made or lost at which state."""
+    if "switched" not in table or not table["switch"].any():
+        return []
+    switches = [f"{step} {name}" for step, name in zip(table["step"], table["switched"], strict=True) if name]
+    more = f", and {len(switches) - LISTED} more (column switched)" if len(switches) > LISTED else ""
+    return [f"Contact switches, by step: {'; '.join(switches[:LISTED])}{more}."]
+
+
+def _spike_list(table: pd.DataFrame, name: str) -> str:
+    """Return a sentence with the largest spikes of a measure, each with the contact switches within one step of it."""
+    if "switched" not in table:
+        return ""
+    sizes, at = changes(table[name]), np.flatnonzero(spikes(table[name]))
+    largest = sorted(sorted(at, key=lambda k: -sizes[k])[:LISTED])
+    parts = []
+    for k in largest:
+        near = dict.fromkeys(name for name in table["switched"].iloc[k : k + 3] if name)
+        parts.append(f"{k + 1} ({three_digits(float(np.exp(sizes[k])))}x, {', '.join(near) or 'no switch'})")
+    which = "The spikes are" if len(at) > 1 else "The spike is"
+    which = which if len(largest) == len(at) else "The largest spikes are"
+    return f" {which} at {'steps' if len(parts) > 1 else 'step'} {'; '.join(parts)}."
 
 
 def _conclusion(alignment: Alignment) -> str:

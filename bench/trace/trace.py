@@ -19,7 +19,7 @@ from bench.experiment.grid import cells
 from bench.experiment.reference_backends import backends_with_jacobians
 from bench.measure import noise
 from bench.measure.contacts import split
-from bench.model import EngineScene, Jacobians, LoopOps, MechanicalScene, Problem, Program, Unsupported, rollout
+from bench.model import Jacobians, LoopOps, MechanicalScene, Problem, Program, Unsupported, rollout
 from bench.model.identity import label
 from bench.run.session import Session
 from bench.trace import sentences
@@ -28,7 +28,7 @@ from bench.trace.contacts import contact_columns
 from bench.trace.states import per_state
 
 COLUMNS = (
-    "step", "time", "contacts", "switch", "gap", "penetration", "force", "force_peak", "sticking", "slipping",
+    "step", "time", "contacts", "switch", "switched", "gap", "penetration", "force", "force_peak", "sticking", "slipping",
     "solver_residual", "solver_iterations", "solver_mismatch", "jacobian_norm", "adjoint_norm", "cost_stage",
     "cost_terminal",
 )  # fmt: skip
@@ -84,8 +84,6 @@ def _of_cell(session: Session, cell: Cell, seeded: bool) -> Trace:
     scene = cell.scene
     if not isinstance(scene, MechanicalScene):
         raise UserError(f"scene {scene.name} is a plain function: it has no steps to trace")
-    if isinstance(scene, EngineScene):
-        raise UserError(f"scene {scene.name} runs only in physics engines, which do not report their contacts")
     try:
         program = cell.program()
     except Unsupported as error:
@@ -125,7 +123,7 @@ def trace(problem: Problem, w: np.ndarray) -> tuple[pd.DataFrame, float]:
     scene = bound.scene
     with np.errstate(all="ignore"):
         adjoint, gradient = adjoints(program, theta, w, path)
-        columns = {**contact_columns(bound, path), **_costs(scene, path)}
+        columns = {**contact_columns(problem, bound, path), **_costs(scene, path)}
         columns["jacobian_norm"] = per_state(_norms(path.a))
         columns["adjoint_norm"] = np.linalg.norm(adjoint, axis=1)
     columns["step"] = np.arange(scene.horizon + 1)

@@ -157,6 +157,11 @@ class MjxProblem(JaxProblem):
         a, b = jax.lax.map(derivatives, (states[:-1], controls, states[1:]))
         return states, controls, a, b
 
+    def engine_contacts(self) -> mjcf.Contacts:
+        """Return the contacts of the twin's model, by the C engine's collisions."""
+        assert isinstance(self.program, MjxProgram)
+        return mjcf.Contacts(self.program.source)
+
     def solver_residual(self, w: np.ndarray) -> float:
         """Return the largest relative residual of the constraint solver along rollouts from theta0 with ``w (n_w, B)``."""
         theta = self.program.theta0.reshape(self.dim, 1)
@@ -186,7 +191,7 @@ class MjxProgram(Rollout):
 
         mjx = mjx_solver.library()
         super().__init__(program.scene, program.contact, program.integrator, program.decision)
-        model = mjcf.build(backend, program)
+        self.source = model = mjcf.build(backend, program)
         leaves, self._tree = jax.tree.flatten(mjx.put_model(model))
         self._leaves = [np.asarray(leaf) for leaf in leaves]
         self._model: Any = None

@@ -108,6 +108,10 @@ class MujocoProblem(NumpyProblem):
         """Return the engine's states and controls."""
         return Trajectory(*self._rollout(np.asarray(theta, dtype=np.float64).reshape(self.dim, -1), w))
 
+    def engine_contacts(self) -> mjcf.Contacts:
+        """Return the contacts of the twin's model."""
+        return mjcf.Contacts(mjcf.build(self._backend, self.program))
+
     def jacobians(self, theta: np.ndarray, w: np.ndarray) -> Jacobians:
         """Return states, controls and finite-difference Jacobians of the steps (``mjd_transitionFD``)."""
         theta = np.asarray(theta, dtype=np.float64).reshape(self.dim, -1)

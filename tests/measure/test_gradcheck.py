@@ -1,6 +1,7 @@
 """Gradient checks: each planted fault gets its name, right gradients get none, and the command says so."""
 
 import json
+import re
 import shlex
 
 import numpy as np
@@ -13,6 +14,7 @@ from bench.experiment.columns import IDENTITY
 from bench.measure import noise
 from bench.measure.gradcheck import EPS, FAULTS, VERDICTS, Sample, diagnose
 from bench.model import Problem, compose, registry
+from bench.run import store
 from bench.studies.gradient_check import GradientCheck, measure
 from bench.studies.gradient_check.lines import by_point
 from bench.studies.gradient_check.points import is_trusted
@@ -315,7 +317,7 @@ def test_unsupported_cells_are_rows(tmp_path):
 
 
 def test_contacts_of_an_engine_are_asked_from_the_engine(monkeypatch):
-    """An engine's steps cannot be taken in NumPy, and some of its contacts are known to nobody else."""
+    """An engine's steps cannot be taken in NumPy, and some of its contacts are known to the engine only."""
     scene = plugin("scenes", "bounce_once", horizon=10, height=0.1 + 5.3 * 2.0 / 480.0)
     problem = compiled(scene, plugin("contacts", "penalty", stiffness=1e4), "mujoco")
     problem.provides = problem.provides | {"physics"}
@@ -323,7 +325,28 @@ def test_contacts_of_an_engine_are_asked_from_the_engine(monkeypatch):
     assert modes(problem.program.theta0[:, None], np.zeros((3, 1))) == ["6-9"]
     box = compiled(plugin("scenes", "tossed_box", horizon=2), plugin("contacts", "penalty"), "mujoco")
     box.provides = box.provides | {"physics"}
+    modes = measure.contact_modes(box)
+    assert len(modes.names) == 4
+    assert modes(box.program.theta0[:, None], np.zeros((box.program.n_noise, 1))) == ["-;-;-;-"]
+    monkeypatch.delattr(type(box), "engine_contacts")
     assert measure.contact_modes(box) is None
+
+
+@pytest.mark.slow
+def test_the_foot_that_switches_is_named_and_both_sides_are_checked(tmp_path, capsys):
+    """The damper's force starts where a foot touches: the cost jumps there, and has a derivative on both sides."""
+    words = ["sweep.horizon=[4]", "workers=0", "formats=[]", f"results_dir={tmp_path}"]
+    main(["gradcheck", "quadruped", *words])
+    shown, notes = capsys.readouterr()
+    assert "only engines run these scenes: backends=[mujoco] contacts=[penalty]" in notes
+    assert "Contact switches with checks on both sides" in shown
+    row = store.Store(tmp_path / "gradcheck", GradientCheck.columns, "gradient_check").load().iloc[0]
+    named = {point: name for point, name in zip(row["point"], row["contact_switch"], strict=True) if name}
+    assert set(named) == {"at"}
+    assert re.fullmatch(r"(front|back)_(left|right) in step [0-3] \((apart|touching) before, .* after\)", named["at"])
+    verdicts = dict(zip(row["point"], row["check_verdict"], strict=True))
+    assert is_trusted("before", verdicts["before"])
+    assert is_trusted("after", verdicts["after"])
 
 
 def test_horizon_set_for_a_scene_is_checked_and_said(tmp_path, capsys):

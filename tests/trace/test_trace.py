@@ -1,5 +1,6 @@
 """The trace of one rollout: adjoints, contacts, solver, the verdict on spikes, and the command."""
 
+import re
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,13 +21,14 @@ from bench.plugins.scenes.pushing import Pushing
 
 from bench.cli import main
 from bench.experiment import config
+from bench.experiment.grid import cells
 from bench.measure import noise
-from bench.measure.contacts import active_contacts, split
+from bench.measure.contacts import active_contacts, engine_contacts, split
 from bench.model import Decision, FrictionScene, Jacobians, LoopOps, Unsupported, compose
 from bench.trace.adjoints import adjoints
 from bench.trace.chart import chart
 from bench.trace.equations import Newton
-from bench.trace.sentences import verdict
+from bench.trace.sentences import report, verdict
 from bench.trace.spikes import align, changes, spikes
 from bench.trace.trace import COLUMNS, Trace, run, trace
 
@@ -157,6 +159,57 @@ def test_the_impulse_of_a_bounce_is_read_from_the_velocity_jump():
     assert table["force"][hit[0]] == pytest.approx(4 * 480, rel=1e-12)
     assert table["force"].drop(hit[0]).dropna().abs().max() == 0
     assert list(np.flatnonzero(table["switch"])) == [hit[0], hit[0] + 1]
+
+
+@pytest.mark.parametrize("scene", ["quadruped", "mjcf[file=quadruped.xml,policy=linear]"])
+def test_an_engine_reports_the_contacts_of_the_feet(scene):
+    """By the collisions of the C engine: of the model's pairs, or of the geoms that its filters let collide."""
+    (cell,) = cells(config.load([f"scenes=[{scene}]", "estimators=[fobg]", "backends=[mujoco]", "sweep.horizon=[8]"]))
+    problem = cell.backend.compile(cell.program())
+    theta, w = problem.program.theta0[:, None], np.zeros((problem.program.n_noise, 1))
+    states, controls = problem.trajectory(theta, w)
+    contacts = engine_contacts(problem)
+    assert {name.lower().replace("back", "rear")[0] for name in contacts.names} == {"f", "r"}
+    touching, gaps = contacts.touching(states), contacts.gaps(states)
+    assert touching.shape == gaps.shape == (9, 4, 1)
+    assert touching.any()
+    np.testing.assert_array_equal(touching, gaps < 0)
+    forces = contacts.forces(states[:-1], controls)
+    assert (forces[touching[:-1]] > 0).all()
+    assert not forces[~touching[:-1]].any()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scene", ["quadruped", "mjcf[file=quadruped.xml,policy=linear]"])
+def test_the_feet_of_an_engines_robot_are_named_and_carry_its_weight(scene, tmp_path):
+    """Slides and hinges, and a free joint, whose states have one number more than their changes."""
+    words = [f"scenes=[{scene}]", "backends=[mujoco]", "sweep.horizon=[6]", f"results_dir={tmp_path}"]
+    (result,) = run(config.load(words), seeded=True)
+    table = result.table
+    feet = [name for name in table if name.startswith("touches_")]
+    assert len(feet) == 4
+    assert list(table["contacts"]) == list(table[feet].sum(axis=1))
+    # exactly where a foot is below the ground there is a force on the robot
+    assert list(table["gap"].iloc[:-1] < 0) == list(table["force"].iloc[:-1] > 0)
+    assert list(table["switch"] == 1) == list(table["switched"] != "")
+    first = table["switched"][table["switch"] == 1].iloc[0]
+    assert "touch" in first
+    assert any(name.removeprefix("touches_") in first for name in feet)
+    # the adjoint pass over differences of steps, whose relative error is about 1e-8 per step
+    assert result.gradient_error < 1e-5
+    said = " ".join(result.report())
+    assert first in said
+    assert "Contact switches, by step" in said
+    labels = [text.get_text() for ax in chart(result).axes for text in ax.get_yticklabels()]
+    assert {name.removeprefix("touches_") for name in feet if table[name].any()} <= set(labels)
+
+
+def test_a_spike_is_listed_with_the_switch_beside_it():
+    scene = BounceOnce(horizon=40, dt=0.02, height=0.5, velocity=-1.0)
+    table, error = trace(compiled(scene, Penalty(stiffness=2e3)), np.zeros((3, 1)))
+    said = " ".join(report(table, error))
+    (at,) = (k for k in np.flatnonzero(table["switch"]) if "touches" in table["switched"][k])
+    assert re.search(rf"at steps? {at} \([0-9.]+x, contact touches", said)
 
 
 @pytest.mark.slow

@@ -52,6 +52,7 @@ FAILURES = {
     "error": ("‡", "an error"),
     "unsupported": ("–", "a combination that cannot work"),
     "unavailable": ("∅", "a library that is not installed"),
+    "waiting": ("…", "a rung of a ladder whose lower rung has not passed"),
 }
 """Sign and meaning of each status other than ``ok``."""
 REMARKED = "?"

@@ -53,3 +53,9 @@ class GradientCheck(Study):
     def faults(self, rows: pd.DataFrame) -> int:
         """Return the number of rows with a gradient that cannot be trusted, or without a finite cost."""
         return int(((rows["untrusted"] > 0) | (rows["status"] == "nonfinite")).sum())
+
+    def failure(self, rows: pd.DataFrame) -> str:
+        """Return which checks show a gradient that is wrong or open; empty without any, also where noise reaches a jump."""
+        from bench.studies.gradient_check.lines import not_right
+
+        return not_right(rows)

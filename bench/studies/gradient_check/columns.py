@@ -35,6 +35,10 @@ COLUMNS = Columns.of(
     ),
     numbers("sample", "of each check, 0 without noise, 1 with it"),
     numbers("direction", "of each check, the number of its direction; -1 - i for component i"),
+    numbers(
+        "contact_switch",
+        "of each check at a contact switch, the contact and the first step that differ between its two sides",
+    ),
     numbers("derivative_program", "of each check, the program's directional derivative"),
     numbers("check_verdict", "of each check, its verdict"),
     numbers("check_error", "of each check, the smallest relative error over all steps"),

@@ -11,6 +11,7 @@ import pandas as pd
 from bench.experiment.columns import IDENTITY
 from bench.measure.gradcheck import VERDICTS
 from bench.report.problems import problem_numbers
+from bench.report.text import counted, listed
 from bench.studies.gradient_check.columns import COLUMNS
 from bench.studies.gradient_check.points import is_trusted
 
@@ -82,6 +83,22 @@ def by_point(rows: pd.DataFrame) -> pd.DataFrame:
     table = pd.DataFrame(lines, columns=names)
     table = table.sort_values(["rank", "error"], ascending=[True, False], kind="stable")
     return table.drop_duplicates(["row", "point"]).sort_index()
+
+
+def not_right(rows: pd.DataFrame) -> str:
+    """Return which checks show a gradient that is wrong or open, by verdict, in words; empty without any.
+
+    A jump that only noise reaches does not count as a fault of the gradient.
+    """
+    points: dict[str, list[str]] = {}
+    cells = set()
+    for row, i, verdict in checks(rows):
+        point = row["point"][i]
+        if not is_trusted(point, verdict) and (point, verdict) != ("noise", "jump"):
+            points.setdefault(verdict, []).append(point)
+            cells.add(row["key"])
+    verdicts = listed(f"{verdict} ({', '.join(dict.fromkeys(at))})" for verdict, at in points.items()) if points else ""
+    return f"{verdicts} in {len(cells)} of {counted(len(rows), 'cell')}" if points else ""
 
 
 def untrusted(summary: pd.DataFrame) -> pd.DataFrame:

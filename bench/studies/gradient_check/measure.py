@@ -15,9 +15,9 @@ from bench.experiment.cell import Cell
 from bench.experiment.session import Session
 from bench.measure import gradcheck, noise
 from bench.measure.batches import in_columns
-from bench.measure.contacts import active_contacts
+from bench.measure.contacts import active_contacts, contact_names, engine_contacts
 from bench.measure.jumps import jump_under_noise
-from bench.model import SURROGATE, ContactScene, ForceLaw, LoopOps, Problem, Rollout, Unsupported
+from bench.model import SURROGATE, ContactScene, EngineScene, ForceLaw, LoopOps, Problem, Rollout, Unsupported
 from bench.studies.gradient_check.points import is_trusted
 
 COLUMNS_AT_ONCE = 128
@@ -42,6 +42,8 @@ class Place:
     """Number of the direction."""
     sample: int
     """0 without noise, 1 with it."""
+    switch: str = ""
+    """The contact switch that the place is at, in words."""
 
 
 @dataclass(frozen=True)
@@ -111,6 +113,7 @@ def measure(cell: Cell, session: Session, search: SwitchSearch) -> dict[str, Any
         "point": [point.point for point in points],
         "sample": [point.noise for point in points],
         "direction": [point.number for point in points],
+        "contact_switch": [point.switch for point in points],
         "derivative_program": [point.sample.derivative for point in points],
         "check_verdict": verdicts,
         "check_error": errors,
@@ -142,6 +145,9 @@ class Point:
     minus: Sequence[str]
     """Contact modes on the minus side, one per step of the differences."""
     plus: Sequence[str]
+    """Contact modes on the plus side."""
+    switch: str = ""
+    """The contact switch that it is at, in words."""
 
 
 def start(problem: Problem, theta: np.ndarray, unit: float, search: SwitchSearch, seed: int) -> gradcheck.Check:
@@ -225,7 +231,7 @@ def _number(part: gradcheck.Part) -> int:
 def _checked(place: Place, sample: gradcheck.Sample, sides: Sequence[tuple[str, str]]) -> Point:
     minus, plus = zip(*sides, strict=True)
     verdict = "jump" if place.point == "noise" else gradcheck.diagnose(sample)
-    return Point(place.point, place.sample, place.number, verdict, sample, minus, plus)
+    return Point(place.point, place.sample, place.number, verdict, sample, minus, plus, place.switch)
 
 
 def _settled(problem: Problem, unit: float, point: Point, place: Place) -> Point:
@@ -279,9 +285,6 @@ def scale_of(theta: np.ndarray) -> float:
 
 # ----------------------------------------------------------------------------------------------------- checks
 
-Modes = Callable[[np.ndarray, np.ndarray], list[str]]
-"""Returns the contact mode of each rollout with ``theta (d, B)`` and ``w (n_w, B)``, as B short names."""
-
 
 def examine(
     problem: Problem,
@@ -333,7 +336,7 @@ def examine(
 
 
 def boundary(
-    modes: Modes, theta: np.ndarray, direction: np.ndarray, w: np.ndarray, number: int, search: SwitchSearch
+    modes: ContactModes, theta: np.ndarray, direction: np.ndarray, w: np.ndarray, number: int, search: SwitchSearch
 ) -> list[Place]:
     """Return places before, at and after the contact switch nearest to theta along a direction; empty without a switch."""
     scale = scale_of(theta)
@@ -347,7 +350,11 @@ def boundary(
     inner, outer = edge
     side = np.sign(outer - inner)
     at = {"before": inner - side * search.aside * scale, "at": inner, "after": outer + side * search.aside * scale}
-    return [Place(point, theta + s * direction, direction, w, number, 0) for point, s in at.items()]
+    name = modes.switch(theta + inner * direction, theta + outer * direction, w)
+    return [
+        Place(point, theta + s * direction, direction, w, number, 0, name if point == "at" else "")
+        for point, s in at.items()
+    ]
 
 
 def switch(names: Callable[[np.ndarray], list[str]], reach: float) -> tuple[float, float] | None:
@@ -382,30 +389,62 @@ def _change(names: Sequence[str]) -> int | None:
 # ---------------------------------------------------------------------------------------------- contact modes
 
 
-def contact_modes(problem: Problem) -> Modes | None:
-    """Return the function that names contact modes; None without contacts or if the states cannot be computed."""
-    program = problem.program
-    if not isinstance(program, Rollout) or not program.scene.n_contacts:
-        return None
-    # engines and implicit steps need the backend; other programs are faster in NumPy
-    rollout = _backend_rollout if program.needs_root or "physics" in problem.provides else _numpy_rollout
-    try:
-        active_contacts(
-            program, *rollout(problem, program.theta0[:, None], np.zeros((program.n_noise, COLUMNS_AT_ONCE)))
-        )
-    except Unsupported:
-        return None
+@dataclass(frozen=True)
+class ContactModes:
+    """Names the contact modes of rollouts: the contacts that act in each step."""
 
-    def modes(theta: np.ndarray, w: np.ndarray) -> list[str]:
+    touching: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    """Returns which contacts act, boolean ``(horizon, n_contacts, B)``, for ``theta (d, B)`` and ``w (n_w, B)``."""
+    names: tuple[str, ...]
+
+    def __call__(self, theta: np.ndarray, w: np.ndarray) -> list[str]:
+        """Return a short name of each rollout's mode."""
+        return [signature(column) for column in self._every(theta, w)]
+
+    def switch(self, inner: np.ndarray, outer: np.ndarray, w: np.ndarray) -> str:
+        """Return the first difference between the modes of two thetas ``(d,)``, in words; empty without one."""
+        before, after = self._every(np.stack([inner, outer], axis=1), np.repeat(w[:, None], 2, axis=1))
+        differences = np.argwhere((before != after).T)
+        if not len(differences):
+            return ""
+        step, contact = (int(i) for i in differences[0])
+        sides = ("touching", "apart") if before[contact, step] else ("apart", "touching")
+        return f"{self.names[contact]} in step {step} ({sides[0]} before, {sides[1]} after)"
+
+    def _every(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        """Return which contacts act, ``(B, n_contacts, horizon)``, from batches of a fixed width."""
         width = w.shape[1]
         index = np.arange(-(-width // COLUMNS_AT_ONCE) * COLUMNS_AT_ONCE).clip(max=width - 1)
         parts = []
         for part in index.reshape(-1, COLUMNS_AT_ONCE):
             with np.errstate(all="ignore"):
-                parts.append(active_contacts(program, *rollout(problem, theta[:, part], w[:, part])))
-        return [signature(column) for column in np.concatenate(parts, axis=-1)[..., :width].transpose(2, 1, 0)]
+                parts.append(self.touching(theta[:, part], w[:, part]))
+        return np.concatenate(parts, axis=-1)[..., :width].transpose(2, 1, 0)
 
-    return modes
+
+def contact_modes(problem: Problem) -> ContactModes | None:
+    """Return the function that names contact modes; None without contacts or if the states cannot be computed."""
+    program = problem.program
+    if not isinstance(program, Rollout) or not (program.scene.n_contacts or isinstance(program.scene, EngineScene)):
+        return None
+    try:
+        touching = _touching(problem)
+        touching(program.theta0[:, None], np.zeros((program.n_noise, COLUMNS_AT_ONCE)))
+        return ContactModes(touching, contact_names(problem))
+    except Unsupported:
+        return None
+
+
+def _touching(problem: Problem) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """Return the function of theta and noise that finds the active contacts, see :class:`ContactModes`."""
+    program = problem.program
+    assert isinstance(program, Rollout)
+    # engines and implicit steps need the backend; other programs are faster in NumPy
+    rollout = _backend_rollout if program.needs_root or "physics" in problem.provides else _numpy_rollout
+    if isinstance(program.scene, EngineScene):
+        contacts = engine_contacts(problem)
+        return lambda theta, w: contacts.touching(rollout(problem, theta, w)[0][:-1])
+    return lambda theta, w: active_contacts(program, *rollout(problem, theta, w))
 
 
 def _numpy_rollout(problem: Problem, theta: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

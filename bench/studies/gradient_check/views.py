@@ -154,6 +154,8 @@ def _notes(rows: pd.DataFrame, faults: pd.DataFrame) -> list[str]:
         notes.append("Gradients that cannot be trusted, and the command that repeats each:")
         for command, part in faults.groupby("command", sort=False):
             notes += [f"- {', '.join(dict.fromkeys(part['verdict']))}", f"      {command}"]
+    switches = [f"- {line}" for line in _switches(rows)]
+    notes += ["Contact switches with checks on both sides:", *switches] if switches else []
     remarks = [f"- {reason} ({counted(count, 'cell')})" for reason, count in _count_reasons(rows, True)]
     return [*notes, *(["Remarks:", *remarks] if remarks else [])]
 
@@ -179,12 +181,25 @@ def _tally(points: pd.DataFrame) -> list[str]:
 
 def _remarks(rows: pd.DataFrame, points: pd.DataFrame) -> list[str]:
     """Return the untrusted checks with the command that repeats each, and the reasons in the rows."""
-    lines = []
+    switches = _switches(rows)
+    lines = ["\nContact switches with checks on both sides:", *(f"  {line}" for line in switches)] if switches else []
     for command, part in untrusted(points).groupby("command", sort=False):
         at = part.groupby("verdict", sort=False)["point"]
         verdicts = [f"{verdict} ({', '.join(dict.fromkeys(points))})" for verdict, points in at]
         lines.append(f"\n{', '.join(verdicts)}; repeat with\n  {command}")
     return [*lines, *(f"\n{counted(count, 'cell')}: {reason}" for reason, count in _count_reasons(rows))]
+
+
+def _switches(rows: pd.DataFrame) -> list[str]:
+    """Return a line per problem, backend and horizon with the contact switches that were checked."""
+    lines = []
+    for row in rows.to_dict("records"):
+        every = row["contact_switch"] if "contact_switch" in rows else []
+        names = [] if isinstance(every, float) else dict.fromkeys(name for name in every if name)  # NaN: an older row
+        if names:
+            problem = ", ".join([row["scene"], row["contact"], row["backend"], counted(int(row["horizon"]), "step")])
+            lines.append(f"{problem}: {listed(names)}")
+    return list(dict.fromkeys(lines))
 
 
 def _count_reasons(rows: pd.DataFrame, of_checked: bool = False) -> Sequence[tuple[str, int]]:

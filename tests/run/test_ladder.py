@@ -1,0 +1,135 @@
+"""A ladder of scenes: a rung starts when the checks of the rung below pass, and the run says how far it came."""
+
+import pandas as pd
+import pytest
+from trees import Tree
+
+from bench.cli import main
+from bench.experiment import config
+from bench.report.finish import views_of
+from bench.run.execute import store_of
+
+FORGETFUL = '''
+from dataclasses import dataclass
+
+from bench.plugin import Backend, param
+from bench.plugins.backends.numpy import NumpyProblem
+
+
+@dataclass(frozen=True)
+class NAME(Backend):
+    """Differences, without a term on one scene."""
+
+    name = "NAME"
+    forgets: str = param("SCENE", "scene whose gradient lacks a term")
+
+    def compile(self, program):
+        """Return the problem."""
+        return Forgetful(program, self.dtype, 1e-6, program.scene.name == self.forgets)
+
+
+class Forgetful(NumpyProblem):
+    """A problem without a term of the gradient."""
+
+    def __init__(self, program, dtype, step, forgets):
+        super().__init__(program, dtype, step)
+        self._forgets = forgets
+
+    def _grad(self, theta, w):
+        gradient = super()._grad(theta, w)
+        if self._forgets:
+            gradient[0] = 0.0
+        return gradient
+'''
+SCENES = ["double_integrator", "pendulum", "cartpole", "mass_spring"]
+WORDS = [
+    "name=climb", "study=gradient_check", f"scenes=[{','.join(SCENES)}]", "estimators=[fobg]",
+    "sweep.horizon=[3]", "ladder=true", "workers=0", "formats=[]",
+]  # fmt: skip
+
+
+def backend(name: str, scene: str) -> str:
+    return FORGETFUL.replace("NAME", name).replace("SCENE", scene)
+
+
+@pytest.fixture(scope="module")
+def climbed(tmp_path_factory):
+    """The words and the experiment of a climb with a fault on the second of four rungs, for one of two backends."""
+    folder = tmp_path_factory.mktemp("climb")
+    (folder / "plugins").mkdir()
+    (folder / "plugins" / "forgetful_climber.py").write_text(backend("forgetful_climber", "pendulum"))
+    words = [
+        *WORDS,
+        "backends=[forgetful_climber,numpy]",
+        f"plugins={folder / 'plugins'}",
+        f"results_dir={folder / 'out'}",
+    ]
+    assert main(words) == 0
+    return words, config.load(words)
+
+
+def statuses(experiment, backend) -> dict[str, str]:
+    rows = store_of(experiment).load()
+    rows = rows[rows["backend"] == backend]
+    return dict(zip(rows["scene"], rows["status"], strict=True))
+
+
+def test_a_fault_on_a_rung_stops_the_climb_of_its_backend_there(climbed):
+    _, experiment = climbed
+    waiting = {"double_integrator": "ok", "pendulum": "ok", "cartpole": "waiting", "mass_spring": "waiting"}
+    assert statuses(experiment, "forgetful_climber") == waiting
+    assert statuses(experiment, "numpy") == dict.fromkeys(SCENES, "ok")
+    rows = store_of(experiment).load()
+    (reason,) = set(rows.loc[rows["status"] == "waiting", "reason"])
+    assert reason.startswith("the rung below (pendulum) did not pass: ")
+    assert "missing_term" in reason or "disconnected" in reason or "wrong_adjoint" in reason
+
+
+def test_the_report_says_which_rung_was_reached_and_what_was_not_started(climbed):
+    _, experiment = climbed
+    first, second = views_of(experiment, store_of(experiment).load()).findings[:2]
+    assert first.startswith("With forgetful_climber the climb stops at pendulum, after double_integrator passed: ")
+    assert first.endswith(", so cartpole and mass_spring above it are not started.")
+    assert second == "All 4 rungs pass with numpy: double_integrator, pendulum, cartpole and mass_spring."
+
+
+def test_a_second_run_starts_no_rung_above_the_fault(climbed, capsys):
+    words, experiment = climbed
+    before = store_of(experiment).load()
+    assert main(words) == 0
+    assert "rung pendulum did not pass" in capsys.readouterr().err
+    after = store_of(experiment).load()
+    measured = before[before["status"] == "ok"].set_index("key")["stored_at"]
+    pd.testing.assert_series_equal(after[after["status"] == "ok"].set_index("key")["stored_at"], measured)
+    assert (after["status"] == "waiting").sum() == 2
+
+
+def test_without_the_ladder_the_waiting_cells_run(climbed):
+    words, experiment = climbed
+    assert main([*words, "ladder=false", "scenes=[mass_spring]", "backends=[forgetful_climber]"]) == 0
+    assert statuses(experiment, "forgetful_climber")["mass_spring"] == "ok"
+
+
+def test_a_rung_that_its_backend_cannot_run_stops_the_climb(tmp_path):
+    words = [*WORDS, "scenes=[pendulum,quadruped,double_integrator]", "backends=[numpy]", f"results_dir={tmp_path}"]
+    assert main(words) == 0
+    experiment = config.load(words)
+    assert statuses(experiment, "numpy") == {
+        "pendulum": "ok", "quadruped": "unsupported", "double_integrator": "waiting",
+    }  # fmt: skip
+    assert "no cell could be checked" in views_of(experiment, store_of(experiment).load()).findings[0]
+
+
+@pytest.mark.slow
+def test_a_mended_rung_resumes_the_climb_from_there(tmp_path):
+    tree = Tree(tmp_path)
+    (tree.root / "own").mkdir()
+    words = [*WORDS, "backends=[mended]", "plugins=own", "results_dir=out"]
+    tree.add("own/mended.py", backend("mended", "pendulum"))
+    assert "the climb stops at pendulum" in " ".join(tree.run(*words).stdout.split())
+    # the code of the backend has changed, so that its lower rung is measured again too
+    tree.add("own/mended.py", backend("mended", "none"))
+    done = tree.run(*words)
+    assert "All 4 rungs pass with mended" in " ".join(done.stdout.split()), done.stderr
+    rows = pd.read_parquet(tree.root / "out" / "climb" / "rows.parquet")
+    assert set(rows.loc[rows["parameters"].str.contains('"none"'), "status"]) == {"ok"}
