@@ -24,6 +24,9 @@ from bench.run.plan import requested_rows
 from bench.run.record import record
 from bench.run.store import sort_rows
 
+FINDINGS = 3
+"""Most findings; a ladder's come first, and further ones are remarks."""
+
 
 def finish(finished: Finished, words: Sequence[str]) -> tuple[pd.DataFrame, Views, list[Path]]:
     """Write the files of a run, the record first; return the rows in the order of the cells, their views, and the files' paths."""
@@ -75,4 +78,5 @@ def views_of(experiment: Experiment, rows: pd.DataFrame) -> Views:
     views = study_of(experiment).views(experiment, rows) or generic.views(experiment, rows)
     if not experiment.execution.ladder:
         return views
-    return replace(views, findings=[*ladder.findings(experiment, rows), *views.findings])
+    every = [*ladder.findings(experiment, rows), *views.findings]
+    return replace(views, findings=every[:FINDINGS], remarks=[*every[FINDINGS:], *views.remarks])
