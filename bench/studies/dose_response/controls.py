@@ -60,26 +60,23 @@ def _short(methods: pd.Series) -> list[str]:
 
 def findings(known: pd.DataFrame) -> list[str]:
     """Return which methods find nothing where others arrive, and what methods that use only costs take."""
-    result = []
+    nothing, parts = [], []
     for problem, own in known.groupby("problem", sort=False):
         lost, safe = own[own["begun"] == 0]["method"], own[own["hits"] == own["runs"]]["method"]
         if len(lost) and len(safe):
-            result.append(
+            nothing.append(
                 f"On {problem}, no search of {listed(lost)} reaches 1/{FIRST_TARGET:g} of the first regret, and all of "
                 f"{listed(safe)} reach 1/{MAIN:g}."
             )
     for method, factors, missed in factors_by_method(known):
         n = len(factors) + len(missed)
-        parts = []
-        if len(factors):
-            parts.append(
-                f"takes {span(min(factors), max(factors))} times the evaluations of the best gradient on "
-                f"{len(factors)} of {counted(n, 'problem')}"
-            )
-        if missed:
-            parts.append(f"most searches miss it on {len(missed)} of {n}")
-        result.append(f"To 1/{MAIN:g}, {method} {', and '.join(parts)}.")
-    return result
+        range_ = (
+            f"{span(min(factors), max(factors))} times on {len(factors)} of {counted(n, 'problem')}" if factors else ""
+        )
+        misses = f"most searches miss it on {len(missed)} of {n}" if missed else ""
+        parts.append(f"{method} {range_} ({misses})" if factors and missed else f"{method} {range_}{misses}")
+    compared = f"To 1/{MAIN:g}, over the evaluations of the best gradient: {', '.join(parts)}."
+    return [compared, *([" ".join(nothing)] if nothing else [])]
 
 
 def factors_by_method(known: pd.DataFrame) -> list[tuple[str, list[float], list[str]]]:

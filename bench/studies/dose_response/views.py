@@ -150,12 +150,12 @@ def findings(pairs: pd.DataFrame, costs: pd.DataFrame) -> list[str]:
     }
     known = [f"{words[name]} takes {_interval(row)}" for name, row in sizes if row is not None]
     if known:
-        result.append(f"Against the updates of the best gradient, {listed(known)} times as many.")
-    both = main.get((analysis.ALL, analysis.BIAS_OVER_RANDOM))
-    if both is not None:
+        both = main.get((analysis.ALL, analysis.BIAS_OVER_RANDOM))
         result.append(
-            f"A bias of 0.9 takes {_interval(both)} times the updates of a random error of 1. {_sides(main, analysis.BIAS_OVER_RANDOM)}."
-        )
+            f"Against the updates of the best gradient, {listed(known)} times as many."
+            + (f" That bias takes {_interval(both)} times the updates of that random error. {_sides(main, analysis.BIAS_OVER_RANDOM)}."
+               if both is not None else "")
+        )  # fmt: skip
     return [*result, cost_sentence(costs)]
 
 
