@@ -563,7 +563,7 @@ def engines_agree() -> str:
             for name in ("mjx", "mujoco")
         )
         distances.append(np.linalg.norm(mjx - mujoco) / np.linalg.norm(mujoco))
-    return number(max(distances))
+    return number(float(max(distances)))
 
 
 def dose_rates() -> str:
