@@ -56,6 +56,10 @@ EQUIVALENT: dict[str, str] = {
     "4e4e92ad12ad459268276452de9d92447609b50b51f136a670a8894f55dcde11": "fee1e09006427e51ebe8172ecbdc8ac76366922b7225e35c26a1993d121e599c",
     # bench/training/fitting.py: refuses more batches than states, which no stored row has
     "4ccf81bc6d7e8b7c66e350f09cbade82b42523e1933928d90fe9e0a773edf604": "c09fb2d21730de2566b1607dd2f5cf30cc0f2f9a6a97f395b798f3378a996fe0",
+    # plugins/backends/newton.py: further solvers, which no stored row has
+    "06cfc646591fe242ec9400a4a4d4ede724ae70d6048f0f460bb2989056e1d6ba": "64df3841b2e4db4d7a0757bd8d9c2b81434c43b04f25b6588ca77cd10286eb99",
+    # plugins/engines/newton.py: further solvers, which no stored row has
+    "6a41f4b411d48281440f07cc48c4d12cfca166bbf6ac3427646ca15b566a40ba": "39d955ef59f7db0ae6018390c235e35f54ce33fe319a977ab24f9cd5b7b02a0a",
 }
 """Hashes of files whose changes decide no number of a stored row: the new hash, and the one that rows are stored under.
 

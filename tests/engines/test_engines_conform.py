@@ -3,14 +3,21 @@
 ``BENCH_ENGINES=DIR`` names the folder of the environments, which ``python -m bench engines install`` makes.
 """
 
+import subprocess
+from pathlib import Path
+
 import numpy as np
 import pytest
+from bench.plugins.backends.numpy import Numpy
+from bench.plugins.contacts.impulse import Impulse
 from bench.plugins.contacts.penalty import Penalty
 from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
 from bench.plugins.scenes.bounce_once import BounceOnce
 
 import bench.conformance
 from bench.conformance.subjects import law_for
+from bench.engines import environments
+from bench.experiment import by_name
 from bench.model import compose, registry
 
 ENGINES = ("brax", "drake", "mujoco_warp", "newton", "nimble", "taichi")
@@ -27,12 +34,42 @@ def test_engine_conforms(plugin, check):
     check(plugin)
 
 
-@pytest.mark.parametrize(("name", "error"), [("newton", 1e-5), ("taichi", 1e-6), ("brax", 1e-4)])
-def test_gradient_of_one_bounce_is_that_of_the_discrete_spring(name, error):
-    backend = registry.usable("backends", name)()
+def installed(name):
+    backend = by_name.make("backends", name)
     if reason := backend.unavailable_reason():
         pytest.skip(reason)
+    return backend
+
+
+@pytest.mark.parametrize(
+    ("name", "error"), [("newton", 1e-5), ("newton[solver=semi_implicit]", 1e-5), ("taichi", 1e-6), ("brax", 1e-4)]
+)
+def test_gradient_of_one_bounce_is_that_of_the_discrete_spring(name, error):
+    backend = installed(name)
     scene = BounceOnce()
     problem = backend.compile(compose(scene, law_for(scene, Penalty), SemiImplicitEuler()))
     gradient = problem.grad(problem.program.theta0, np.zeros((problem.program.n_noise, 1)))[:, 0]
     np.testing.assert_allclose(gradient, SPRING, rtol=error)
+
+
+def test_a_bounce_of_the_xpbd_solver_is_rigid():
+    """It corrects the position within the ground after its step, and not by the time of impact: by less than v dt."""
+    backend, scene = installed("newton[solver=xpbd]"), BounceOnce()
+    of = compose(scene, law_for(scene, Impulse), SemiImplicitEuler())
+    still = np.zeros((of.n_noise, 1))
+    own, rigid = (b.compile(of).trajectory(of.theta0, still).states for b in (backend, Numpy()))
+    np.testing.assert_allclose(own[-1, 1], rigid[-1, 1], rtol=1e-6)
+    assert np.abs(own[:, 0] - rigid[:, 0]).max() < abs(scene.velocity) * scene.dt
+
+
+def test_the_tape_of_an_xpbd_step_leaves_out_the_bounce():
+    """So the backend offers no gradients there."""
+    python = installed("newton").python or str(environments.python_of("newton"))
+    program = Path(__file__).resolve().parents[1] / "programs" / "xpbd_tape.py"
+    result = subprocess.run([python, str(program)], capture_output=True, text=True, check=True)
+    lines = [line.partition(": ")[2] for line in result.stdout.splitlines() if line.startswith("restitution")]
+    assert lines == [
+        "tape 0.200, a second pass over it 0.200, differences 0.200",
+        "tape 0.200, a second pass over it 0.600, differences 0.200",
+        "tape 0.200, a second pass over it 0.600, differences -1.000",
+    ]
