@@ -13,13 +13,14 @@ from ..contacts.penalty import Penalty
 class Brax(EngineBackend):
     """Gradients: JAX's forward mode of each step of Brax's generalized pipeline, chained; float64.
 
-    A contact cancels a share ``impedance`` of all other forces. At 1e-4, Brax's contacts have no force at all. Brax's
-    physics is no longer maintained.
+    A contact cancels a share ``impedance`` of all other forces. At 1e-4, Brax's contacts have no force at all. Its solver of
+    contact forces stops at a tolerance. Brax's physics is no longer maintained.
     """
 
     name = "brax"
     file = "../engines/brax.py"
     helpers: ClassVar[tuple[str, ...]] = ("mujoco_twin.py",)
+    solver_error = 1e-6
     libraries: ClassVar[tuple[str, ...]] = ("brax", "jax", "mujoco", "mujoco-mjx", "numpy")
 
     dtype: str = param("float64", "floating-point type of the simulation", choices=("float64",))

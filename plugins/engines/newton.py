@@ -19,6 +19,7 @@ class Model:
     def __init__(self, program):
         self._program, self._batches = program, {}
         self.device = str(wp.get_device())
+        self.settings = {"deterministic": getattr(wp.config, "deterministic", "not an option")}
 
     def step(self, x, u):
         """Return the states after one step."""

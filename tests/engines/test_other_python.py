@@ -83,6 +83,16 @@ def test_calls_are_counted_and_compilation_is_charged_once():
     assert problem.peak_memory_mb > 10
 
 
+def test_settings_that_change_the_last_digits_are_those_of_the_engines_process(monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", "--xla_a=1")
+    problem = toy().compile(program(BouncingBall()))
+    assert problem.settings == {}
+    problem.value(problem.program.theta0, noise(problem))
+    assert problem.settings["XLA_FLAGS"] == "--xla_a=1"
+    assert int(problem.settings["processors"]) >= 1
+    assert problem.settings["speed"] == "slow"
+
+
 def test_two_programs_share_one_process_of_the_engine():
     problems = [toy().compile(program(scene)) for scene in (BounceOnce(), BouncingBall())]
     for problem in problems * 2:
@@ -349,6 +359,14 @@ def test_the_default_solver_keeps_the_key_of_rows_from_before_there_were_others(
     newton = registry.usable("backends", "newton")
     assert "solver" not in deciding(newton())
     assert len({fingerprint(newton(solver=name)) for name in ("featherstone", "semi_implicit", "xpbd")}) == 3
+
+
+def test_only_an_engine_that_declares_an_error_of_its_solver_may_differ_by_it(monkeypatch):
+    """And only where there are contact forces to solve for."""
+    allowed = [(program(BounceOnce()), 1e-9 + 1e-6), (program(Cartpole()), 1e-9)]
+    assert [backends._allowed(toy(), of, 1e-9) for of, _ in allowed] == [1e-9, 1e-9]
+    monkeypatch.setattr(type(toy()), "solver_error", 1e-6)
+    assert [backends._allowed(toy(), of, 1e-9) for of, _ in allowed] == pytest.approx([error for _, error in allowed])
 
 
 # ----------------------------------------------------------------------------------------------- carries and nodes
