@@ -62,18 +62,18 @@ EQUIVALENT: dict[str, str] = {
     "85a197dd224966ccf3faf36d1e9d45e382f8eea58bf9e54d9a2652d29a864e76": "39d955ef59f7db0ae6018390c235e35f54ce33fe319a977ab24f9cd5b7b02a0a",
     # plugins/engines/mujoco_warp.py: its settings for the row
     "d4a60d30eadbf659aa896206e48fd0992bc3664be956e8b1a68ff1386898c0d6": "ae7cf60ca2bb31ff44f49ac80efabe621f833ec5564e04074c508338eac1c19e",
-    # plugins/engines/brax.py: its device for the row
-    "922af730c38115990b3053ce82e28e8ab13a122299aa0e44aa0881cc75585ac1": "9e4c53a5136be0b1a2edfa629aa430ee2371c98ce4560c55b18a4df7d2a385a3",
     # bench/engines/server.py: an engine's settings for the row
     "3f58a0cafa88e53d66ef3bf68f0e216cf87dd0bc3cd3641445dd8a7fe5de3156": "873da910c2050a965b4df6f85a6a055e1b4351ad8c23649263608a68e9ae2cf9",
     # bench/engines/problem.py: an engine's settings for the row
     "e201879e2cbfa9ba20897865621a88cbf1ee08356278debe6db77dc50e334034": "48ac5bce93078bdac75ea14151589c5fb68141cf5ddd768e00982181f06b8495",
     # bench/engines/backend.py: a declaration for the kit
     "6149abe5f46587b3d8eb8f470e37bdce77c01374e361aab5999d084ae18a276d": "76a879a70ed24fc4311af996e4bb5f593c109c0f65d4214ffd54f7073c02f695",
-    # plugins/backends/brax.py: a declaration for the kit
-    "c29e85265398a02967734b7f615bf1525a0d34292494bf344cb18bdc45e38062": "b02da5fb62beb221c4faa4ec8bec64a1192225bd29092f16f11de55d9ab2bee7",
     # bench/studies/engines/measure.py: device and settings of the engine for the row
     "d5e3901c746d9f377a69747b31e0164647a326cb0e6f97f86045a2fa2832e07e": "46d42f6782eabcab65ff6473c1eacca1641a5345b5388a93bc429743b02174fd",
+    # plugins/engines/brax.py: its device for the row, and a parameter at its earlier value
+    "e46f435036a6d46f7d11f4543f6de2048a7ebcc1556e81f58ba8762ae89d08c8": "9e4c53a5136be0b1a2edfa629aa430ee2371c98ce4560c55b18a4df7d2a385a3",
+    # plugins/backends/brax.py: a declaration for the kit, and a parameter at its earlier value
+    "9c57a048aee219a3b22b3470fef728ac39db6ede045fcb117e2e542ebe6da99a": "b02da5fb62beb221c4faa4ec8bec64a1192225bd29092f16f11de55d9ab2bee7",
 }
 """Hashes of files whose changes decide no number of a stored row: the new hash, and the one that rows are stored under.
 
