@@ -142,13 +142,17 @@ def _precision(backend: Backend) -> Precision:
 def _allowed(backend: Backend, program: Program, exact: float) -> float:
     """Return the allowed relative difference from the scene's own program: ``exact``, or more for physics engines.
 
-    A contact's error is proportional to the declared impedance, the share of other forces that it cancels.
+    A contact's error is proportional to the declared impedance, the share of other forces that it cancels. An engine in
+    another Python may declare a further error of its contact solver.
     """
     scene = program.scene
-    if "physics" in backend.provides and isinstance(scene, EngineTwin):
-        ratio = getattr(backend, "impedance", IMPEDANCE) / IMPEDANCE if isinstance(backend, EngineBackend) else 1.0
-        return max(exact, scene.twin_difference * ratio)
-    return exact
+    if "physics" not in backend.provides or not isinstance(scene, EngineTwin):
+        return exact
+    if not isinstance(backend, EngineBackend):
+        return max(exact, scene.twin_difference)
+    ratio = getattr(backend, "impedance", IMPEDANCE) / IMPEDANCE
+    error = backend.solver_error if program.contact is not None else 0.0
+    return max(exact, scene.twin_difference * ratio + error)
 
 
 @verifies(Backend)

@@ -38,6 +38,9 @@ class EngineBackend(Backend):
     own_contact: ClassVar[bool] = False
     """Whether contacts are the engine's own, with at most the law's stiffness and damping, and not compared with the law."""
 
+    solver_error: ClassVar[float] = 0.0
+    """Relative difference that an iterative solver of contact forces, which stops early, causes in costs."""
+
     has_friction: ClassVar[bool] = False
     """Whether it runs contacts with friction."""
 

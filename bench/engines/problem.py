@@ -55,6 +55,11 @@ class EngineProblem(Problem):
         by_state, by_control = a.reshape(n, n, horizon, count), b.reshape(n, n_u, horizon, count)
         return Jacobians(states, controls, np.moveaxis(by_state, 2, 0), np.moveaxis(by_control, 2, 0))
 
+    @property
+    def settings(self) -> dict[str, str]:
+        """The engine's settings that can change its last digits, by name; empty before the first call."""
+        return self._model.settings
+
     def step_node(self) -> StepNode:
         """Return the engine's step with its vector-Jacobian product, for programs in NumPy, torch and JAX."""
         return EngineStep(self)

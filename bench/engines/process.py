@@ -116,6 +116,8 @@ class EngineModel:
         self._name, self._python, self._file, self._description = name, python, file, description
         self._key = next(_keys)
         self.device = "cpu"
+        self.settings: dict[str, str] = {}
+        """The engine's settings that can change its last digits, by name."""
         self.has_carry: bool | None = None
         """Whether steps read and write numbers beside the states; None before the first call."""
         self.build_s = 0.0
@@ -146,6 +148,7 @@ class EngineModel:
                 answer, _ = process.call({"call": "build", "model": self._key, "description": self._description}, [])
                 self._raise(answer)
                 process.models[self._key] = self.device = answer["device"]
+                self.settings = answer["settings"]
                 self.build_s, self.has_carry = answer["seconds"], answer["has_carry"]
             answer, results = process.call({"call": name, "model": self._key}, list(arrays))
             self._raise(answer)

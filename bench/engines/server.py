@@ -14,7 +14,8 @@ description of a program, with
 - ``takes_forces``, optional: whether u are the generalised forces ``(n_q, B)`` of motors, springs and dampers, in place of
   the controls;
 - ``widths``, optional: the batch sizes B that it can compute, otherwise all;
-- ``device``, optional: the device that it computes on.
+- ``device``, optional: the device that it computes on;
+- ``settings``, optional: a dictionary of the engine's settings that can change its last digits, such as its determinism.
 
 The file may import its libraries, and other files of its folder.
 """
@@ -38,6 +39,8 @@ LENGTHS = struct.Struct(">QQ")
 """The lengths in bytes of a message's header and of all its arrays."""
 KEPT = 4
 """Number of models that a server stores."""
+SETTINGS = ("OMP_NUM_THREADS", "XLA_FLAGS", "JAX_PLATFORMS", "CUDA_VISIBLE_DEVICES")
+"""Environment variables that can change an engine's last digits."""
 
 
 class Closed(Exception):
@@ -163,6 +166,7 @@ class _Forced:
     def __init__(self, model: Any, forces: dict[str, Any]) -> None:
         self._model = model
         self.widths, self.device = getattr(model, "widths", None), getattr(model, "device", "cpu")
+        self.settings = getattr(model, "settings", {})
         n = len(forces["constant"])
         self._constant = np.reshape(np.array(forces["constant"], dtype=np.float64), (n, 1))
         self._by_state = np.reshape(np.array(forces["by_state"], dtype=np.float64), (n, 2 * n))
@@ -213,6 +217,7 @@ def serve(file: str, requests: int, answers: int) -> None:
                 if getattr(models[key], "takes_forces", False):
                     models[key] = _Forced(models[key], header["description"]["forces"])
                 answer["device"] = str(getattr(models[key], "device", "cpu"))
+                answer["settings"] = _settings(models[key])
                 answer["has_carry"] = hasattr(models[key], "start")
                 while len(models) > KEPT:
                     del models[next(iter(models))]
@@ -236,6 +241,13 @@ def serve(file: str, requests: int, answers: int) -> None:
             send(answers, answer, results)
         except Closed:
             return
+
+
+def _settings(model: Any) -> dict[str, str]:
+    """Return the number of processors, the variables of :data:`SETTINGS` that are set, and the model's own settings."""
+    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    given = {name: os.environ[name] for name in SETTINGS if name in os.environ}
+    return {"processors": str(count), **given, **{k: str(v) for k, v in getattr(model, "settings", {}).items()}}
 
 
 def _peak_memory_mb() -> float:

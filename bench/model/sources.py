@@ -56,8 +56,8 @@ EQUIVALENT: dict[str, str] = {
     "4e4e92ad12ad459268276452de9d92447609b50b51f136a670a8894f55dcde11": "fee1e09006427e51ebe8172ecbdc8ac76366922b7225e35c26a1993d121e599c",
     # bench/training/fitting.py: refuses more batches than states, which no stored row has
     "4ccf81bc6d7e8b7c66e350f09cbade82b42523e1933928d90fe9e0a773edf604": "c09fb2d21730de2566b1607dd2f5cf30cc0f2f9a6a97f395b798f3378a996fe0",
-    # bench/engines/problem.py: asks the program whether its law is open-loop
-    "3fb55e862b6aac7be17ede050c2a0cceb97656da37e5cd56dac273f8adc4f23e": "48ac5bce93078bdac75ea14151589c5fb68141cf5ddd768e00982181f06b8495",
+    # bench/engines/problem.py: asks the program whether its law is open-loop, and an engine's settings for the row
+    "cffc1219dfc227492e89d6e560deebdb8b79c68d45e0ddc1116debfd49b061b9": "48ac5bce93078bdac75ea14151589c5fb68141cf5ddd768e00982181f06b8495",
     # bench/model/optimizer.py: answers have a field that no stored row uses
     "3eade79e9325d352ff0765c87f98a09ab2b8bd083fbf5d237cb869655811b6d5": "6f4d0e199929423d63585facc347881eeffde26603a3145be3d59d374a71cc60",
     # bench/studies/optimise/batched.py: step Jacobians by differences where searches share batches, and a cell without an experiment around it, which both failed
@@ -72,6 +72,22 @@ EQUIVALENT: dict[str, str] = {
     "e3b2615ea6b0d83015e84a0eee2bab51fbe9c5a4f32fb20648ecf1fb0448eaba": "8c3394de2fc039661d7c5950c75bad263cf80a8bc7e3dcf4740d978438af1e67",
     # bench/studies/gradient_check/measure.py: the contacts that an engine reports, and names of contact switches, which decide no number of a stored row
     "ecb06c3571bcdcf19550f7f8d7347377120d9d8e3745978b6b65532c07f1cec7": "03778fb4f46929c215ca6edd20560649d5f6ee282b739277d1e4804127712e51",
+    # plugins/backends/newton.py: further solvers, which no stored row has
+    "06cfc646591fe242ec9400a4a4d4ede724ae70d6048f0f460bb2989056e1d6ba": "64df3841b2e4db4d7a0757bd8d9c2b81434c43b04f25b6588ca77cd10286eb99",
+    # plugins/engines/newton.py: further solvers, which no stored row has, and its settings for the row
+    "85a197dd224966ccf3faf36d1e9d45e382f8eea58bf9e54d9a2652d29a864e76": "39d955ef59f7db0ae6018390c235e35f54ce33fe319a977ab24f9cd5b7b02a0a",
+    # plugins/engines/mujoco_warp.py: its settings for the row
+    "d4a60d30eadbf659aa896206e48fd0992bc3664be956e8b1a68ff1386898c0d6": "ae7cf60ca2bb31ff44f49ac80efabe621f833ec5564e04074c508338eac1c19e",
+    # bench/engines/server.py: an engine's settings for the row
+    "3f58a0cafa88e53d66ef3bf68f0e216cf87dd0bc3cd3641445dd8a7fe5de3156": "873da910c2050a965b4df6f85a6a055e1b4351ad8c23649263608a68e9ae2cf9",
+    # bench/engines/backend.py: a declaration for the kit
+    "6149abe5f46587b3d8eb8f470e37bdce77c01374e361aab5999d084ae18a276d": "76a879a70ed24fc4311af996e4bb5f593c109c0f65d4214ffd54f7073c02f695",
+    # bench/studies/engines/measure.py: device and settings of the engine for the row
+    "d5e3901c746d9f377a69747b31e0164647a326cb0e6f97f86045a2fa2832e07e": "46d42f6782eabcab65ff6473c1eacca1641a5345b5388a93bc429743b02174fd",
+    # plugins/engines/brax.py: its device for the row, and a parameter at its earlier value
+    "e46f435036a6d46f7d11f4543f6de2048a7ebcc1556e81f58ba8762ae89d08c8": "9e4c53a5136be0b1a2edfa629aa430ee2371c98ce4560c55b18a4df7d2a385a3",
+    # plugins/backends/brax.py: a declaration for the kit, and a parameter at its earlier value
+    "9c57a048aee219a3b22b3470fef728ac39db6ede045fcb117e2e542ebe6da99a": "b02da5fb62beb221c4faa4ec8bec64a1192225bd29092f16f11de55d9ab2bee7",
 }
 """Hashes of files, and of classes of studies, whose changes decide no stored number: the new hash, and the one in the keys of rows.
 

@@ -1,4 +1,4 @@
-"""Newton: the scene's twin in Newton's Featherstone solver, on Warp, in a Python of its own."""
+"""Newton: the scene's twin in one of Newton's solvers, on Warp, in a Python of its own."""
 
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -8,13 +8,20 @@ from bench.model import Program, param
 
 from ..contacts.penalty import Penalty
 
+RIGID = {"provides": frozenset({"value", "score", "physics"}), "laws": ("impulse",), "own_contact": True}
+"""What is different for ``solver=xpbd``: contacts are rigid, with the scene's restitution, and there are no gradients."""
+
 
 @dataclass(frozen=True)
 class Newton(EngineBackend):
     """Gradients: adjoint pass over step Jacobians from a reverse-mode tape per step; float32.
 
     One tape over several steps of the Featherstone solver gives wrong gradients, since the solver overwrites its
-    matrices. The solver's contacts are springs whose damper acts only while bodies approach.
+    matrices. Contacts are springs whose damper acts only while bodies approach.
+
+    ``semi_implicit`` and ``xpbd`` have no joint coordinates: they run bodies on slides of the world, without linked
+    bodies or hinges. ``xpbd`` stands for the law ``impulse`` and has no gradients: the tape of its step leaves out the
+    bounce.
     """
 
     name = "newton"
@@ -22,10 +29,24 @@ class Newton(EngineBackend):
     libraries: ClassVar[tuple[str, ...]] = ("newton", "warp-lang", "numpy")
 
     dtype: str = param("float32", "floating-point type of the simulation", choices=("float32",))
+    solver: str = param(
+        "featherstone", "Newton's solver", choices=("featherstone", "semi_implicit", "xpbd"), neutral="featherstone"
+    )
+
+    def __post_init__(self) -> None:
+        if self.solver == "xpbd":
+            for name, value in RIGID.items():
+                object.__setattr__(self, name, value)
 
     def unsupported_twin(self, program: Program, model: dict[str, Any]) -> str | None:
-        """Return why the solver cannot run the twin: a contact damper that acts while bodies part; or None."""
+        """Return why the solver cannot run the twin: a damper that acts while bodies part, hinges or links; or None."""
         law = program.contact
         if isinstance(law, Penalty) and law.damping and law.damping_mode != "approach":
             return f"newton's contact damper acts on approach only: it supports damping_mode=approach, not {law.damping_mode}"
+        has_links = any(body["joint"] != "slide" or body["parent"] >= 0 for body in model["bodies"])
+        if self.solver != "featherstone" and has_links:
+            return (
+                f"newton's {self.solver} solver has no joint coordinates: it supports bodies on slides only, each attached "
+                "to the world; use solver=featherstone"
+            )
         return None

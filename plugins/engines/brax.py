@@ -16,7 +16,9 @@ class Model:
     widths = (64, 512)
 
     def __init__(self, program):
+        self.device = jax.default_backend()
         n, system = len(program["bodies"]), mjcf.load_model(mujoco_model(program))
+        system = system.replace(solver_maxls=program["backend"]["halvings"])
         if program["contacts"]:
             _check_contacts(system)
 

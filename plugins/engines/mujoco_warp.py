@@ -21,6 +21,7 @@ class Model:
         self._mujoco.opt.disableflags |= int(bit.mjDSBL_WARMSTART | bit.mjDSBL_EULERDAMP | bit.mjDSBL_REFSAFE)
         self._model, self._data = mujoco_warp.put_model(self._mujoco), {}
         self.device = str(wp.get_device())
+        self.settings = {"deterministic": getattr(wp.config, "deterministic", "not an option")}
 
     def step(self, x, u):
         """Return the states after one step."""

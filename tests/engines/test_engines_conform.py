@@ -3,20 +3,29 @@
 ``BENCH_ENGINES=DIR`` names the folder of the environments, which ``python -m bench engines install`` makes.
 """
 
+import subprocess
+from pathlib import Path
+
 import numpy as np
 import pytest
+from bench.plugins.backends.numpy import Numpy
+from bench.plugins.contacts.impulse import Impulse
 from bench.plugins.contacts.penalty import Penalty
 from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
 from bench.plugins.scenes.bounce_once import BounceOnce
+from bench.plugins.scenes.pushing import Pushing
 
 import bench.conformance
 from bench.conformance.subjects import law_for
+from bench.engines import environments
+from bench.experiment import by_name
 from bench.model import compose, registry
 
 ENGINES = ("brax", "drake", "mujoco_warp", "newton", "nimble", "taichi")
 SPRING = (-1.56802, -1.22481, -1.22481 / 480)
 """Gradient of one bounce on an undamped spring of 1e4 N/m under semi-implicit Euler, as in the tests of MuJoCo and MJX."""
 WRONG = {
+    "brax-value_agrees": "contacts of light bodies have no force at 20 halvings of the solver's step",
     "nimble-gradient_is_that_of_value": "its Jacobians are of rigid contact, its costs bounce once per step boundary",
 }
 pytestmark = pytest.mark.slow
@@ -27,12 +36,56 @@ def test_engine_conforms(plugin, check):
     check(plugin)
 
 
-@pytest.mark.parametrize(("name", "error"), [("newton", 1e-5), ("taichi", 1e-6), ("brax", 1e-4)])
-def test_gradient_of_one_bounce_is_that_of_the_discrete_spring(name, error):
-    backend = registry.usable("backends", name)()
+def installed(name):
+    backend = by_name.make("backends", name)
     if reason := backend.unavailable_reason():
         pytest.skip(reason)
+    return backend
+
+
+@pytest.mark.parametrize(
+    ("name", "error"), [("newton", 1e-5), ("newton[solver=semi_implicit]", 1e-5), ("taichi", 1e-6), ("brax", 1e-4)]
+)
+def test_gradient_of_one_bounce_is_that_of_the_discrete_spring(name, error):
+    backend = installed(name)
     scene = BounceOnce()
     problem = backend.compile(compose(scene, law_for(scene, Penalty), SemiImplicitEuler()))
     gradient = problem.grad(problem.program.theta0, np.zeros((problem.program.n_noise, 1)))[:, 0]
     np.testing.assert_allclose(gradient, SPRING, rtol=error)
+
+
+def test_a_bounce_of_the_xpbd_solver_is_rigid():
+    """It corrects the position within the ground after its step, and not by the time of impact: by less than v dt."""
+    backend, scene = installed("newton[solver=xpbd]"), BounceOnce()
+    of = compose(scene, law_for(scene, Impulse), SemiImplicitEuler())
+    still = np.zeros((of.n_noise, 1))
+    own, rigid = (b.compile(of).trajectory(of.theta0, still).states for b in (backend, Numpy()))
+    np.testing.assert_allclose(own[-1, 1], rigid[-1, 1], rtol=1e-6)
+    assert np.abs(own[:, 0] - rigid[:, 0]).max() < abs(scene.velocity) * scene.dt
+
+
+def test_the_tape_of_an_xpbd_step_leaves_out_the_bounce():
+    """So the backend offers no gradients there."""
+    python = installed("newton").python or str(environments.python_of("newton"))
+    program = Path(__file__).resolve().parents[1] / "programs" / "xpbd_tape.py"
+    result = subprocess.run([python, str(program)], capture_output=True, text=True, check=True)
+    lines = [line.partition(": ")[2] for line in result.stdout.splitlines() if line.startswith("restitution")]
+    assert lines == [
+        "tape 0.200, a second pass over it 0.200, differences 0.200",
+        "tape 0.200, a second pass over it 0.600, differences 0.200",
+        "tape 0.200, a second pass over it 0.600, differences -1.000",
+    ]
+
+
+def test_balls_of_a_tenth_of_a_kilogram_touch_in_brax_with_more_halvings():
+    """With 20, the second ball stays where it is."""
+    scene = Pushing()
+    of = compose(scene, law_for(scene, Penalty), SemiImplicitEuler())
+    still = np.zeros((of.n_noise, 1))
+    ends = [
+        installed(name).compile(of).trajectory(of.theta0, still).states[-1, 1, 0]
+        for name in ("brax", "brax[halvings=60]")
+    ]
+    own = Numpy().compile(of).trajectory(of.theta0, still).states[-1, 1, 0]
+    assert ends[0] == 1.0
+    assert abs(ends[1] - own) < 0.1 * abs(own - 1.0)

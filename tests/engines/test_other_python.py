@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import pickle
 import shutil
 import signal
 import subprocess
@@ -12,6 +13,7 @@ import numpy as np
 import psutil
 import pytest
 from bench.plugins.backends.numpy import Numpy
+from bench.plugins.contacts.impulse import Impulse
 from bench.plugins.contacts.penalty import Penalty
 from bench.plugins.integrators.rk4 import Rk4
 from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
@@ -31,6 +33,7 @@ from bench.engines.process import close_engines
 from bench.errors import Crashed, Unsupported
 from bench.experiment.keys import fingerprint
 from bench.model import LoopOps, Problem, compose, registry
+from bench.model.parameters import deciding
 
 TOYS = Path(__file__).parent / "toys"
 HERE = sys.executable
@@ -78,6 +81,16 @@ def test_calls_are_counted_and_compilation_is_charged_once():
     assert problem.engine_s > 0
     assert problem.pipe_s > 0
     assert problem.peak_memory_mb > 10
+
+
+def test_settings_that_change_the_last_digits_are_those_of_the_engines_process(monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", "--xla_a=1")
+    problem = toy().compile(program(BouncingBall()))
+    assert problem.settings == {}
+    problem.value(problem.program.theta0, noise(problem))
+    assert problem.settings["XLA_FLAGS"] == "--xla_a=1"
+    assert int(problem.settings["processors"]) >= 1
+    assert problem.settings["speed"] == "slow"
 
 
 def test_two_programs_share_one_process_of_the_engine():
@@ -319,6 +332,43 @@ def test_programs_that_an_engine_does_not_run_are_refused():
     damped = compose(BouncingBall(), law_for(BouncingBall(), Penalty, {"damping": 1.0}), SemiImplicitEuler())
     newton = registry.usable("backends", "newton")()
     assert "supports damping_mode=approach, not clipped" in newton.incompatibility(damped)
+
+
+@pytest.mark.parametrize("solver", ["semi_implicit", "xpbd"])
+def test_solvers_without_joint_coordinates_run_bodies_on_slides_only(solver):
+    newton = registry.usable("backends", "newton")
+    assert f"{solver} solver has no joint coordinates" in newton(solver=solver).incompatibility(program(Cartpole()))
+    assert newton().incompatibility(program(Cartpole())) is None
+
+
+def test_a_rigid_solver_stands_for_impulses_and_has_no_gradients():
+    newton = registry.usable("backends", "newton")
+    rigid, spring = newton(solver="xpbd"), newton(solver="semi_implicit")
+    impulse = compose(BouncingBall(), law_for(BouncingBall(), Impulse), SemiImplicitEuler())
+    assert rigid.incompatibility(impulse) is None
+    assert "replaces impulse, not penalty" in rigid.incompatibility(program(BouncingBall()))
+    assert "replaces penalty, not impulse" in spring.incompatibility(impulse)
+    assert spring.provides - rigid.provides == {"grad"}
+    assert newton().provides == spring.provides
+    assert (
+        pickle.loads(pickle.dumps(rigid)).provides == dataclasses.replace(rigid, python=HERE).provides == rigid.provides
+    )
+
+
+def test_default_solvers_keep_the_keys_of_rows_from_before_there_were_others():
+    newton, brax = (registry.usable("backends", name) for name in ("newton", "brax"))
+    assert "solver" not in deciding(newton())
+    assert "halvings" not in deciding(brax())
+    assert fingerprint(brax(halvings=60)) != fingerprint(brax())
+    assert len({fingerprint(newton(solver=name)) for name in ("featherstone", "semi_implicit", "xpbd")}) == 3
+
+
+def test_only_an_engine_that_declares_an_error_of_its_solver_may_differ_by_it(monkeypatch):
+    """And only where there are contact forces to solve for."""
+    allowed = [(program(BounceOnce()), 1e-9 + 1e-6), (program(Cartpole()), 1e-9)]
+    assert [backends._allowed(toy(), of, 1e-9) for of, _ in allowed] == [1e-9, 1e-9]
+    monkeypatch.setattr(type(toy()), "solver_error", 1e-6)
+    assert [backends._allowed(toy(), of, 1e-9) for of, _ in allowed] == pytest.approx([error for _, error in allowed])
 
 
 # ----------------------------------------------------------------------------------------------- carries and nodes

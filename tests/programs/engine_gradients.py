@@ -1,6 +1,6 @@
 """Prints an engine's gradients without noise, their distance from NumPy's, and the times of 64: ``engine_gradients.py ENGINE [SCENE ...]``.
 
-The Python of the engine is that of `python -m bench engines install ENGINE`.
+ENGINE may have parameters: ``'newton[solver=semi_implicit]'``. Its Python is that of `python -m bench engines install`.
 """
 
 import sys
@@ -9,6 +9,7 @@ import time
 import numpy as np
 
 from bench.engines.problem import EngineProblem
+from bench.experiment import by_name
 from bench.model import compose, registry
 from bench.model.parameters import build, parameters
 
@@ -19,7 +20,7 @@ COLUMNS = 64
 def main() -> None:
     """Print a line per scene of an engine."""
     engine, *scenes = sys.argv[1:]
-    backend = registry.make("backends", engine)
+    backend = by_name.make("backends", engine)
     integrator = registry.make("integrators", "semi_implicit_euler")
     for name in scenes or SCENES:
         scene = registry.make("scenes", name)

@@ -53,6 +53,8 @@ def test_shares_of_the_time_are_of_engines_in_another_python_only(results):
     assert 0 < theirs["pass_share"] < 1
     assert theirs["pipe_share"] + theirs["pass_share"] < 1
     assert 10 < theirs["memory_mb"] < ours["memory_mb"]
+    assert ours["device"] == theirs["device"] == "cpu"
+    assert "processors=" in theirs["engine_settings"]
 
 
 def test_the_table_and_the_grid_are_written(results):

@@ -52,6 +52,9 @@ class Engines(Study):
                measured=True),
         Column("memory_mb", "largest resident memory of the process that runs the engine", "MB", label="memory",
                measured=True),
+        text("device", "device that computes, such as cpu or cuda:0"),
+        text("engine_settings", "settings of an engine's process that can change its last digits: processors, environment "
+             "variables, and its own, such as its determinism"),
         numbers("gradient", "gradient at theta without noise, by coordinate of theta",
                 comparison=ComparisonRule("vector", "gradient")),
         numbers("model_gradient", "the gradient that model_error_rel compares with, by coordinate of theta"),

@@ -56,6 +56,9 @@ def measure(cell: Cell, session: Session, batch: int, timed_calls: int) -> dict[
         result["reason"] = "; ".join(part for part in (result["reason"], summary["note"]) if part)
     else:
         result["reason"] = "; ".join(part for part in (result["reason"], "computes no gradients") if part)
+    result["device"] = problem.device
+    if isinstance(problem, EngineProblem):
+        result["engine_settings"] = ";".join(f"{name}={value}" for name, value in problem.settings.items())
     result["memory_mb"] = problem.peak_memory_mb if isinstance(problem, EngineProblem) else timing.peak_memory_mb()
     return result
 

@@ -11,6 +11,7 @@ class Model:
     """One program's model."""
 
     takes_forces = True
+    settings = {"speed": "slow"}
 
     def __init__(self, program):
         print("a line that an engine prints while it starts")
