@@ -71,7 +71,7 @@ EQUIVALENT: dict[str, str] = {
     # bench/measure/contacts.py: the contacts that an engine reports, which no stored row has
     "e3b2615ea6b0d83015e84a0eee2bab51fbe9c5a4f32fb20648ecf1fb0448eaba": "8c3394de2fc039661d7c5950c75bad263cf80a8bc7e3dcf4740d978438af1e67",
     # bench/studies/gradient_check/measure.py: the contacts that an engine reports, and names of contact switches, which decide no number of a stored row
-    "ecb06c3571bcdcf19550f7f8d7347377120d9d8e3745978b6b65532c07f1cec7": "03778fb4f46929c215ca6edd20560649d5f6ee282b739277d1e4804127712e51",
+    "1c1303470ac56351d5e4d6bf4d2841c34cdaf24e5223a7568bb1d2707ab0552f": "03778fb4f46929c215ca6edd20560649d5f6ee282b739277d1e4804127712e51",
     # plugins/backends/newton.py: further solvers, which no stored row has
     "06cfc646591fe242ec9400a4a4d4ede724ae70d6048f0f460bb2989056e1d6ba": "64df3841b2e4db4d7a0757bd8d9c2b81434c43b04f25b6588ca77cd10286eb99",
     # plugins/engines/newton.py: further solvers, which no stored row has, and its settings for the row

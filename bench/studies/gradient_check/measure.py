@@ -26,8 +26,6 @@ COMPLEX_STEP = 1e-100
 """Largest imaginary part of theta in a complex step; its square underflows beside every cost."""
 SAME_COST = 1e-3
 """Relative difference between the costs of two array libraries: a chaotic rollout amplifies their rounding."""
-SAME_DIGITS = 8
-"""Rounding units by which the costs of two equal calls may differ."""
 NEUTRAL = 1e-9
 """Relative growth of the state per step up to which rounding may be the cause."""
 
@@ -331,17 +329,10 @@ def examine(
         np.array([place.direction @ gradients[:, i] for i, place in enumerate(places)]),
         unit,
         crossing=minus != plus,
-        repeatable=repeats(first, second, unit).all(axis=1),
+        repeatable=((first == second) | (np.isnan(first) & np.isnan(second))).all(axis=1),
     )
     sides = [list(zip(*both, strict=True)) for both in zip(minus, plus, strict=True)]
     return places, list(zip(samples, sides, strict=True))
-
-
-def repeats(first: np.ndarray, second: np.ndarray, unit: float) -> np.ndarray:
-    """Return where two calls return the same cost up to rounding by ``unit``: threads add up in any order."""
-    with np.errstate(invalid="ignore"):
-        is_close = np.abs(first - second) <= SAME_DIGITS * unit * np.abs(first)
-    return np.asarray((first == second) | (np.isnan(first) & np.isnan(second)) | is_close)
 
 
 def boundary(
