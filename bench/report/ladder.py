@@ -50,5 +50,6 @@ def _sentence(climb: Climb, backends: Sequence[str]) -> str:
         return f"All {counted(len(climb.passed), 'rung')} pass with {who}: {listed(climb.passed)}."
     reached = f"after {listed(climb.passed)} passed" if climb.passed else "at the lowest rung"
     are = "is" if len(climb.above) == 1 else "are"
-    above = f", so {listed(climb.above)} above it {are} not started" if climb.above else ", which is the highest rung"
-    return f"With {who} the climb stops at {climb.stop}, {reached}: {climb.reason}{above}."
+    above = f", so {listed(climb.above)} above it {are} not started" if climb.above else ""
+    rung = climb.stop if climb.above else f"the highest rung, {climb.stop}"
+    return f"With {who} the climb stops at {rung}, {reached}: {climb.reason}{above}."
