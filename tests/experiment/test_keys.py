@@ -26,6 +26,7 @@ CELLS = {
                  "estimators=[fobg]"],
     "adam": [*OPTIMISE, "optimizers=[adam]"],
     "cem": [*OPTIMISE, "optimizers=[cem]"],
+    "ilqr": [*OPTIMISE, "optimizers=[ilqr]"],
     "dose_response": ["study=dose_response", *PUSH, "estimators=[fobg]", "optimizers=[adam]"],
     **{study: [f"study={study}", *PUSH] for study in ("backward_memory", "engines", "gradient_check", "growth", "stability", "three_errors", "twins")},
     "solver": ["study=solver", "scenes=[pushing]", "contacts=[penalty]", "backends=[mujoco]"],
@@ -35,7 +36,7 @@ CELLS = {
 """One cell of every kind whose keys are compared."""
 BIAS = "fobg windowed total_propagation callable"
 REFERENCED = f"{BIAS} engines three_errors"
-ESTIMATED = f"{BIAS} engines adam cem dose_response gradient_check growth stability three_errors twins"
+ESTIMATED = f"{BIAS} engines adam cem ilqr dose_response gradient_check growth stability three_errors twins"
 MOVED = {
     "measure/__init__": "",
     "measure/adequacy": "identify",
@@ -50,20 +51,21 @@ MOVED = {
     "measure/gradcheck/verdicts": "gradient_check",
     "measure/identification": "identify",
     "measure/jumps": f"{REFERENCED} gradient_check",
-    "measure/noise": f"{BIAS} backward_memory engines adam cem dose_response gradient_check growth solver three_errors twins identify train",
+    "measure/noise": f"{BIAS} backward_memory engines adam cem ilqr dose_response gradient_check growth solver three_errors twins identify train",
     "measure/performance": "identify",
     "measure/quadrature": REFERENCED,
     "measure/reference": REFERENCED,
     "measure/smoothed": REFERENCED,
-    "measure/solve": "adam cem dose_response",
+    "measure/solve": "adam cem ilqr dose_response",
     "measure/statistics": f"{REFERENCED} train",
     "measure/timing": f"{BIAS} backward_memory engines solver twins",
     "model/__init__": "",
-    "model/adjoint": "engines windowed total_propagation",
-    "model/manifold": "engines windowed total_propagation solver",
+    "model/expansion": "ilqr",
+    "model/adjoint": "engines windowed total_propagation ilqr",
+    "model/manifold": "engines windowed total_propagation solver ilqr",
     "model/estimator": ESTIMATED,
-    "model/known_solutions": "windowed adam cem dose_response identify",
-    "model/optimizer": "adam cem dose_response identify",
+    "model/known_solutions": "windowed adam cem ilqr dose_response identify",
+    "model/optimizer": "adam cem ilqr dose_response identify",
     "model/policy": "train",
     "model/trainer": "train",
     "model/simulator/__init__": "",
@@ -81,7 +83,7 @@ MOVED = {
     "studies/gradient_check/measure": "gradient_check",
     "studies/growth/measure": "growth",
     "studies/identify/measure": "identify",
-    "studies/optimise/measure": "adam cem",
+    "studies/optimise/measure": "adam cem ilqr",
     "studies/solver/measure": "solver",
     "studies/stability/measure": "stability",
     "studies/three_errors/measure": "engines three_errors",

@@ -255,8 +255,10 @@ def test_twins_study_measures_writes_and_draws(tmp_path):
         assert row["gradient_s"] > 0
 
 
-def test_scene_for_engines_cannot_be_traced(capsys):
-    assert main(["trace", "tossed_box", "backends=[mujoco]"]) == 2
+def test_scene_for_engines_is_traced_by_engines_only(tmp_path, capsys):
+    assert main(["trace", "tossed_box", "backends=[mujoco]", f"results_dir={tmp_path}"]) == 0
+    assert "corner1-1 touches" in capsys.readouterr().out
+    assert main(["trace", "tossed_box", "backends=[jax]", f"results_dir={tmp_path}"]) == 2
     assert "runs only in physics engines" in capsys.readouterr().err
 
 
