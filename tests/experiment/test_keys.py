@@ -107,23 +107,33 @@ def cells() -> dict[str, Cell]:
     return {name: grid.cells(config.load(words))[0] for name, words in CELLS.items()}
 
 
-def keys_of(cells: dict[str, Cell]) -> dict[str, str]:
-    """Return the keys of cells, computed anew."""
+def forget() -> None:
+    """Forget the hashes that keys are computed from."""
     keys.module_hash.cache_clear()
     keys.plugin_hash.cache_clear()
     keys._fingerprints.clear()
     cell_module._rest.clear()
+
+
+def keys_of(cells: dict[str, Cell]) -> dict[str, str]:
+    """Return the keys of cells, computed anew."""
+    forget()
     return {name: replace(cell).key for name, cell in cells.items()}
 
 
-def moved(cells: dict[str, Cell], planted: Path, monkeypatch: pytest.MonkeyPatch) -> set[str]:
+@pytest.fixture(scope="module")
+def before(cells: dict[str, Cell]) -> dict[str, str]:
+    """The keys without a planted constant."""
+    return keys_of(cells)
+
+
+def moved(cells: dict[str, Cell], before: dict[str, str], planted: Path, monkeypatch: pytest.MonkeyPatch) -> set[str]:
     """Return the names of the cells whose keys a constant planted in a file changes."""
-    before = keys_of(cells)
     read = sources.code_hash
     with monkeypatch.context() as patch:
         patch.setattr(sources, "code_hash", lambda path: read(path) + ("PLANTED = 1" if path == planted else ""))
         after = keys_of(cells)
-    keys_of(cells)
+    forget()
     return {name for name in cells if before[name] != after[name]}
 
 
@@ -132,9 +142,9 @@ def module_of(path: Path) -> str:
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
-def test_a_constant_planted_in_a_file_changes_the_keys_that_it_can_decide(path, cells, monkeypatch):
+def test_a_constant_planted_in_a_file_changes_the_keys_that_it_can_decide(path, cells, before, monkeypatch):
     name = str(path.relative_to(ROOT / "bench").with_suffix(""))
-    changed = moved(cells, path, monkeypatch)
+    changed = moved(cells, before, path, monkeypatch)
     if is_below(module_of(path), HARMLESS):
         assert not changed
     elif name not in MOVED:
