@@ -71,7 +71,7 @@ EQUIVALENT: dict[str, str] = {
     # bench/measure/contacts.py: the contacts that an engine reports, which no stored row has
     "e3b2615ea6b0d83015e84a0eee2bab51fbe9c5a4f32fb20648ecf1fb0448eaba": "8c3394de2fc039661d7c5950c75bad263cf80a8bc7e3dcf4740d978438af1e67",
     # bench/studies/gradient_check/measure.py: the contacts that an engine reports, and names of contact switches, which decide no number of a stored row
-    "1c1303470ac56351d5e4d6bf4d2841c34cdaf24e5223a7568bb1d2707ab0552f": "03778fb4f46929c215ca6edd20560649d5f6ee282b739277d1e4804127712e51",
+    "c2e7455a4cdf5dcd6425e42260e6d4ab7d2d5b10c364b79b66579ddaebe7f747": "03778fb4f46929c215ca6edd20560649d5f6ee282b739277d1e4804127712e51",
     # plugins/backends/newton.py: further solvers, which no stored row has
     "06cfc646591fe242ec9400a4a4d4ede724ae70d6048f0f460bb2989056e1d6ba": "64df3841b2e4db4d7a0757bd8d9c2b81434c43b04f25b6588ca77cd10286eb99",
     # plugins/engines/newton.py: further solvers, which no stored row has, and its settings for the row
@@ -88,6 +88,12 @@ EQUIVALENT: dict[str, str] = {
     "e46f435036a6d46f7d11f4543f6de2048a7ebcc1556e81f58ba8762ae89d08c8": "9e4c53a5136be0b1a2edfa629aa430ee2371c98ce4560c55b18a4df7d2a385a3",
     # plugins/backends/brax.py: a declaration for the kit, and a parameter at its earlier value
     "9c57a048aee219a3b22b3470fef728ac39db6ede045fcb117e2e542ebe6da99a": "b02da5fb62beb221c4faa4ec8bec64a1192225bd29092f16f11de55d9ab2bee7",
+    # bench/measure/gradcheck/sampling.py: calls may differ in their last digits, which those of stored rows do not
+    "125fdea2e0627bb5099d28e792220cbf54827953ddcfedc82e6bd59984763f25": "bb6236b81dbeaf081607d32f4a1811a5f525b89a60406f69babb3123cb2bd12a",
+    # bench/measure/gradcheck/check.py: calls may differ in their last digits, which those of stored rows do not
+    "68ff709898b81a8338d9c6b5a7a9dffa958a5f79fe387b1d35163d59c8329710": "022e3f0543d013eba1fdcd4af5c8eaa83d6e118c9e76b19b822e78bcd7a551b0",
+    # bench/measure/gradcheck/__init__.py: one more name
+    "393f225cbaafb140fb5e64053a0d8756db2de946bc0aa4ab264483b416b31692": "f965dfe680d35ea51da514344bfdf1e2a7728d16485d4c8d967fee9fd5fe25e9",
 }
 """Hashes of files, and of classes of studies, whose changes decide no stored number: the new hash, and the one in the keys of rows.
 

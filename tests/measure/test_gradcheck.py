@@ -108,6 +108,19 @@ def test_noisy_value_is_nondeterministic(pendulum):
     assert verdicts(noisy) == {"start": {"nondeterministic"}}
 
 
+@pytest.mark.parametrize("of", ["value", "grad"])
+@pytest.mark.parametrize(("size", "is_repeated"), [(2, True), (1000, False)])
+def test_the_last_digits_of_equal_calls_may_differ(pendulum, of, size, is_repeated):
+    """Threads add up in any order, so that equal calls of MJX differ by a few units in the last place."""
+    generator = np.random.default_rng(0)
+
+    def last(f, _):
+        return f + size * generator.integers(-1, 2, f.shape) * np.spacing(f)
+
+    check = measure.start(Planted(pendulum, **{of: last}), pendulum.program.theta0, FLOAT64, SEARCH, 0)
+    assert (check.cause != "nondeterministic") == is_repeated
+
+
 def test_float32_is_rounding(pendulum):
     single = compiled(pendulum.program.scene, dtype="float32")
     assert verdicts(single, FLOAT32) == {"start": {"rounding"}}

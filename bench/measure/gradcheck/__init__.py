@@ -2,7 +2,7 @@
 
 from .check import AGREES, Check, Options, Part, check
 from .direction import EPS, FINE, SHORT_WINDOW, WINDOW, Finding, Sample, best, diagnose, judge
-from .sampling import order, points, samples
+from .sampling import order, points, repeats, samples
 from .verdicts import BROKEN, FAULTS, MEANING, TRUSTED, UNDECIDED, UNTRUSTED, VERDICTS, most_severe
 
 __all__ = [
@@ -30,5 +30,6 @@ __all__ = [
     "most_severe",
     "order",
     "points",
+    "repeats",
     "samples",
 ]  # fmt: skip

@@ -13,7 +13,7 @@ import numpy as np
 from . import roughness
 from .causes import Ratio, causes_of_ratios
 from .direction import EPS, FINE, GUARD, Finding, Sample, judge
-from .sampling import order, points, samples
+from .sampling import order, points, repeats, samples
 from .verdicts import FAULTS, MEANING, TRUSTED, most_severe
 
 Cost = Callable[[np.ndarray], np.ndarray]
@@ -277,7 +277,7 @@ class _Checker:
         causes += [part.verdict for part in draws if part.verdict in FAULTS]
         if not np.isfinite(first).all() and self._gradient is not None and np.isfinite(self.cost(theta[:, None])).all():
             causes.append("nan_gradient")
-        elif not np.array_equal(first, again, equal_nan=True):
+        elif not repeats(first, again, self.unit).all():
             causes.append("nondeterministic")
         centres = [part.sample for part in parts]
         noise = max((sample.noise or 0.0 for sample in centres), default=0.0)
@@ -340,7 +340,7 @@ class _Checker:
         if twice and self.options.repeated:
             # in reverse order, which exposes columns that depend on their neighbours
             again = self.cost(at[:, ::-1])[::-1].reshape(count, -1)
-            repeatable = np.asarray(((values == again) | (np.isnan(values) & np.isnan(again))).all(axis=1))
+            repeatable = np.asarray(repeats(values, again, self.unit).all(axis=1))
         minus, plus = self._sides(at, count)
         with np.errstate(invalid="ignore"):
             program = np.where(vectors != 0.0, vectors * gradients, 0.0).sum(axis=0) / lengths

@@ -9,6 +9,20 @@ import numpy as np
 from .direction import EPS, Sample
 from .roughness import POINTS, noise, offsets, scatter
 
+LAST_DIGITS = 8
+"""Rounding units by which the results of two equal calls may differ: threads add up in any order."""
+
+
+def repeats(first: np.ndarray, second: np.ndarray, unit: float) -> np.ndarray:
+    """Return where two calls return the same numbers, but for their last digits and those of the largest number.
+
+    Both have the shape ``(M, S)``, and the largest number is that of a row.
+    """
+    with np.errstate(invalid="ignore"):
+        size = np.abs(np.where(np.isfinite(first), first, 0.0)).max(axis=-1, keepdims=True, initial=0.0)
+        is_close = np.abs(first - second) <= LAST_DIGITS * unit * size
+    return np.asarray((first == second) | (np.isnan(first) & np.isnan(second)) | is_close)
+
 
 def shifts(unit: float, eps: np.ndarray = EPS) -> np.ndarray:
     """Return displacements ``(S,)``, relative to a direction's length: -eps, +eps, 0 and the noise estimate's offsets."""

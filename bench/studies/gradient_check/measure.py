@@ -329,7 +329,7 @@ def examine(
         np.array([place.direction @ gradients[:, i] for i, place in enumerate(places)]),
         unit,
         crossing=minus != plus,
-        repeatable=((first == second) | (np.isnan(first) & np.isnan(second))).all(axis=1),
+        repeatable=np.asarray(gradcheck.repeats(first, second, unit).all(axis=1)),
     )
     sides = [list(zip(*both, strict=True)) for both in zip(minus, plus, strict=True)]
     return places, list(zip(samples, sides, strict=True))
