@@ -402,19 +402,12 @@ def _gradcheck(words: list[str]) -> int:
     from dataclasses import replace
 
     from bench.experiment.study import study_of
-    from bench.model import EngineScene
     from bench.model.parameters import parameters
 
     scenes, settings = _split_scenes(words, "gradcheck")
     _refer("gradcheck", words[: len(words) - len(settings)])
-    experiment = _load(["experiment=gradient_check", *scenes, "name=gradcheck", *settings])
+    experiment = _with_engine(["experiment=gradient_check", *scenes, "name=gradcheck"], settings)
     plugins = [choice.entry.plugin for choice in experiment.choices["scene"]]
-    in_engines = [word for word in IN_ENGINES if not _is_given(word.partition("=")[0], settings)]
-    if in_engines and all(plugin and issubclass(plugin, EngineScene) for plugin in plugins):
-        print(f"bench: only engines run these scenes: {' '.join(in_engines)}", file=sys.stderr)
-        experiment = _load(
-            ["experiment=gradient_check", *scenes, "name=gradcheck", *in_engines, *settings], notes=False
-        )
     horizons = [word for word in words if _sets_horizon(word)]
     is_swept = any(word.startswith("sweep.horizon=") for word in settings)
     if horizons:
@@ -430,7 +423,20 @@ def _gradcheck(words: list[str]) -> int:
 
 
 IN_ENGINES = ("backends=[mujoco]", "contacts=[penalty]")
-"""What ``gradcheck`` takes for scenes that only engines run, unless it is given."""
+"""What ``gradcheck`` and ``trace`` take for scenes that only engines run, unless it is given."""
+
+
+def _with_engine(words: list[str], settings: list[str], notes: bool = True) -> Experiment:
+    """Return the experiment of words and settings, with :data:`IN_ENGINES` where only engines run its scenes."""
+    from bench.model import EngineScene
+
+    experiment = _load([*words, *settings], notes=notes)
+    plugins = [choice.entry.plugin for choice in experiment.choices["scene"]]
+    in_engines = [word for word in IN_ENGINES if not _is_given(word.partition("=")[0], settings)]
+    if in_engines and all(plugin and issubclass(plugin, EngineScene) for plugin in plugins):
+        print(f"bench: only engines run these scenes: {' '.join(in_engines)}", file=sys.stderr)
+        return _load([*words, *in_engines, *settings], notes=False)
+    return experiment
 
 
 def _is_given(key: str, settings: Sequence[str]) -> bool:
@@ -442,7 +448,7 @@ def _trace(words: list[str]) -> int:
     from bench import trace
 
     scenes, settings = _split_scenes(words, "trace")
-    experiment = _load([*scenes, *settings], notes=False)
+    experiment = _with_engine(scenes, settings, notes=False)
     for rollout in trace.run(experiment, any(word.startswith("seed=") for word in settings)):
         paths = trace.write(rollout, experiment.results_dir, experiment.formats)
         print(f"\n{printable(rollout.title)}")

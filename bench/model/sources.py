@@ -88,9 +88,9 @@ EQUIVALENT: dict[str, str] = {
     "e46f435036a6d46f7d11f4543f6de2048a7ebcc1556e81f58ba8762ae89d08c8": "9e4c53a5136be0b1a2edfa629aa430ee2371c98ce4560c55b18a4df7d2a385a3",
     # plugins/backends/brax.py: a declaration for the kit, and a parameter at its earlier value
     "9c57a048aee219a3b22b3470fef728ac39db6ede045fcb117e2e542ebe6da99a": "b02da5fb62beb221c4faa4ec8bec64a1192225bd29092f16f11de55d9ab2bee7",
-    # bench/measure/gradcheck/sampling.py: calls may differ in their last digits, which those of stored rows do not
+    # bench/measure/gradcheck/sampling.py: calls may differ in their last digits, as no stored row's do
     "125fdea2e0627bb5099d28e792220cbf54827953ddcfedc82e6bd59984763f25": "bb6236b81dbeaf081607d32f4a1811a5f525b89a60406f69babb3123cb2bd12a",
-    # bench/measure/gradcheck/check.py: calls may differ in their last digits, which those of stored rows do not
+    # bench/measure/gradcheck/check.py: calls may differ in their last digits, as no stored row's do
     "68ff709898b81a8338d9c6b5a7a9dffa958a5f79fe387b1d35163d59c8329710": "022e3f0543d013eba1fdcd4af5c8eaa83d6e118c9e76b19b822e78bcd7a551b0",
     # bench/measure/gradcheck/__init__.py: one more name
     "393f225cbaafb140fb5e64053a0d8756db2de946bc0aa4ab264483b416b31692": "f965dfe680d35ea51da514344bfdf1e2a7728d16485d4c8d967fee9fd5fe25e9",

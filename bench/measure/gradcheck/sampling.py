@@ -14,10 +14,7 @@ LAST_DIGITS = 8
 
 
 def repeats(first: np.ndarray, second: np.ndarray, unit: float) -> np.ndarray:
-    """Return where two calls return the same numbers, but for their last digits and those of the largest number.
-
-    Both have the shape ``(M, S)``, and the largest number is that of a row.
-    """
+    """Return where two calls return the same numbers up to rounding of the largest number of a row, ``(M, S)`` each."""
     with np.errstate(invalid="ignore"):
         size = np.abs(np.where(np.isfinite(first), first, 0.0)).max(axis=-1, keepdims=True, initial=0.0)
         is_close = np.abs(first - second) <= LAST_DIGITS * unit * size
