@@ -57,8 +57,8 @@ def write(trace: Trace, results_dir: Path, formats: Sequence[str] = ("png",)) ->
 def chart(trace: Trace) -> Figure:
     """Return a figure of gap (or positions), force, |dF/dx|, |dL/dx| and cost against time.
 
-    Several contacts have a panel with a row each, in which a bar shows where the contact acts. Contact switches are thin vertical lines through all panels, states in contact are shaded, and spikes are thick and
-    red.
+    Several contacts have a panel with a row each, in which a bar shows where the contact acts. Contact switches are thin
+    vertical lines through all panels, states in contact are shaded, and spikes are thick and red.
     """
     table = trace.table
     contact = bool(table["gap"].notna().any())

@@ -171,10 +171,7 @@ def _sides(main: Mapping[tuple[str, str], Any], comparison: str) -> str:
 
 
 def _interval(row: Any) -> str:
-    """Return a ratio of updates with its interval; an infinite ratio is one beyond the budget of the searches."""
-    value = number(row.ratio) if math.isfinite(row.ratio) else "beyond the budget"
-    high = number(row.ratio_high) if math.isfinite(row.ratio_high) else "no limit"
-    return f"{value} [{number(row.ratio_low)}, {high}]"
+    return _text(Estimate(row.ratio, row.ratio_low, row.ratio_high, row.problems))
 
 
 def cost_sentence(costs: pd.DataFrame, target: float = MAIN) -> str:
@@ -195,8 +192,10 @@ def cost_sentence(costs: pd.DataFrame, target: float = MAIN) -> str:
 
 
 def _text(quantity: Estimate) -> str:
+    """Return a ratio of updates with its interval; an infinite ratio is beyond the budget of the searches."""
+    value = "beyond the budget" if quantity.value == math.inf else number(quantity.value)
     high = number(quantity.high) if quantity.high < 1e4 else "no limit"
-    return f"{number(quantity.value)} [{number(quantity.low) if quantity.low > 1e-4 else '0'}, {high}]"
+    return f"{value} [{number(quantity.low) if quantity.low > 1e-4 else '0'}, {high}]"
 
 
 def _regret(target: float) -> str:
