@@ -94,7 +94,7 @@ def test_from_the_command_line(tmp_path, capsys):
     assert main(words) == 0
     for name in ("csv", "md", "png"):
         assert (tmp_path / "small" / f"growth.{name}").stat().st_size > 0
-    assert "follow no curve beyond doubt on double_integrator and double_pendulum" in capsys.readouterr().out
+    assert "show no clear law of growth on double_integrator and double_pendulum" in capsys.readouterr().out
     rows = Store(tmp_path / "small", COLUMNS).load().set_index(["scene", "horizon"])
     assert rows.loc[("double_integrator", 50.0), "growth"] == "neutral"
     chaotic = rows.loc[("double_pendulum", 50.0)]
@@ -203,7 +203,7 @@ def test_ranges_of_variances_that_overlap_and_lost_horizons_are_open():
     assert shown.findings == [
         "Which order has the lower variance is open at the longest horizon.",
         "Gradients explode on no problem.",
-        "They follow no curve beyond doubt on bouncing_ball and hopper.",
+        "They show no clear law of growth on bouncing_ball and hopper.",
     ]
     assert len(shown.tables[1].frame) == len(rows)
     rows["status"], rows["gradient_median"], rows["reason"] = "nonfinite", math.nan, "not finite"

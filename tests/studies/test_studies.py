@@ -161,9 +161,8 @@ def test_findings_of_the_standard_gradient_check_computed_from_its_rows():
     checks = checks[checks["point"].notna()]
     worst = checks.assign(rank=checks["check_verdict"].map(VERDICTS.index)).groupby(["key", "point"])["rank"].min()
     beyond = worst[(worst < VERDICTS.index("saturated")) & (worst.index.get_level_values("point") != "at")]
-    distrusted = f"{len(beyond)} of {len(worst)} checked points have a gradient that cannot be trusted"
     assert shown.findings[0].startswith(
-        distrusted if len(beyond) else f"No wrong gradient at {len(worst)} checked points."
+        f"No wrong gradient at {len(worst)} checked points, but noise reaches a jump of the cost at {len(beyond)} of them, on "
     )
     assert set(beyond.index.get_level_values("point")) <= {"noise"}, "only where the noise reaches a jump"
     errors = checks.set_index(["key", "point"])
@@ -190,6 +189,12 @@ def test_untrusted_undecided_and_missing_gradients_come_first_and_are_never_righ
         "2 of 4 checked points have a gradient that cannot be trusted (wrong_factor, nonfinite)"
     )
     assert shown.findings[1] == "The largest error of a right gradient is 1.0e-9 (pendulum)."
+    rows.at[1, "check_verdict"], rows.at[1, "point"] = ["jump"], ["noise"]
+    mixed = gradient_check.views(given, rows).findings[0]
+    assert mixed.startswith(
+        "1 of 4 checked points has a gradient that cannot be trusted (wrong_factor), on pendulum, and noise"
+    )
+    rows.at[1, "check_verdict"], rows.at[1, "point"] = ["nonfinite"], ["start"]
     assert shown.charts[0].title == shown.findings[0]
     assert list(shown.charts[0].frame["letter"]) == ["X", "ok"], "the worse verdict of the backends"
     assert "      python -m bench gradcheck 0" in shown.tables[1].notes

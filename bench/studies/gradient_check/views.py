@@ -68,18 +68,19 @@ def findings(points: pd.DataFrame) -> list[str]:
     if points.empty:
         return ["No gradient could be checked: the table has the reason of each cell."]
     faults = untrusted(points)
-    if faults.empty:
+    under_noise = (faults["point"] == "noise") & (faults["verdict"] == "jump")
+    wrong, jumps = faults[~under_noise], faults[under_noise]
+    if wrong.empty:
         first = f"No wrong gradient at {counted(len(points), 'checked point')}"
+        first += (
+            f", but noise reaches a jump of the cost at {len(jumps)} of them, on {_places(jumps)}" if len(jumps) else ""
+        )
     else:
-        problems = " and ".join(
-            dict.fromkeys(
-                faults["scene"].where(faults["contact"] == "none", faults["scene"] + " with " + faults["contact"])
-            )
-        )
         first = (
-            f"{len(faults)} of {counted(len(points), 'checked point')} {'has' if len(faults) == 1 else 'have'} a gradient "
-            f"that cannot be trusted ({', '.join(faults['verdict'].unique())}), on {problems}"
+            f"{len(wrong)} of {counted(len(points), 'checked point')} {'has' if len(wrong) == 1 else 'have'} a gradient "
+            f"that cannot be trusted ({', '.join(wrong['verdict'].unique())}), on {_places(wrong)}"
         )
+        first += f", and noise reaches a jump of the cost at {counted(len(jumps), 'other')}" if len(jumps) else ""
     broken = points["verdict"].isin(UNTRUSTED)
     errors = points.loc[~broken, "error"].dropna()
     largest = (
@@ -94,6 +95,12 @@ def findings(points: pd.DataFrame) -> list[str]:
         if len(edges) else []
     )  # fmt: skip
     return [f"{first}.", *largest, *one_sided]
+
+
+def _places(points: pd.DataFrame) -> str:
+    """Return the scenes of points, each with its contact law if it has one."""
+    names = points["scene"].where(points["contact"] == "none", points["scene"] + " with " + points["contact"])
+    return listed(dict.fromkeys(names))
 
 
 # ------------------------------------------------------------------------------------------------------- tables

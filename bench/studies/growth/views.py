@@ -157,7 +157,7 @@ def _growth(entries: Sequence[dict[Any, Any]], name: Callable[[dict[Any, Any]], 
     """Return on which problems gradients explode, and then how they grow on the others."""
     verbs = {
         "exploding": "explode on", "polynomial": "grow like a power of the horizon on", "vanishing": "vanish on",
-        "open": "follow no curve beyond doubt on",
+        "open": "show no clear law of growth on",
     }  # fmt: skip
     names = {verdict: [name(line) for line in entries if line["verdict"] == verdict] for verdict in verbs}
     others = [f"{verbs[verdict]} {listed(given)}" for verdict, given in names.items() if given]
