@@ -160,6 +160,10 @@ class PolicyScene(MechanicalScene):
         """Return the controls of the policy, ``(n_u, B)``."""
         return self.plugin.act(xp, theta, self.observation(xp, q, v))
 
+    def controls_of(self, xp: Any, action: Array) -> Array:
+        """Return the controls of a trained network's actions ``(n_u, B)``, which have no bound: the actions themselves."""
+        return action
+
     def pullback(
         self, theta: np.ndarray, states: np.ndarray, weights: np.ndarray, by_theta: bool = True
     ) -> tuple[np.ndarray, np.ndarray] | None:

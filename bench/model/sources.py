@@ -33,7 +33,7 @@ EQUIVALENT: dict[str, str] = {
     # plugins/backends/mujoco.py: programs with a policy, which no stored scene has; contacts for gradient checks and traces
     "b392988da4aa3f807e846c0a0cbebc04c3700897b947dcb409b45f3c4da71371": "b1b262672b057e5f7cdafaf36a41d335c4543c3e9956d73e60a0d9ede57e60e2",
     # plugins/backends/mjx.py: programs with a policy and models from files, which no stored scene has; contacts for gradient checks and traces
-    "d1195db78f86b4b797d65dc673564680e2e2b3dd1ed81326d12833049208aa37": "785dd047351f2bee8e0aeb5c2c6d36ef7616c3cb47fd9e7d898f13a91ae57769",
+    "552daf16d16a3031ce2de6a8eb13325db9421a8b3e45f4281e340480a8c8b6f5": "785dd047351f2bee8e0aeb5c2c6d36ef7616c3cb47fd9e7d898f13a91ae57769",
     # plugins/backends/jax.py: its loop is a function that other backends call
     "d4fd1ca7df941e541b95c6d2269a99997af4415110b5a73fa63bb870d4a397ff": "a46ed4d792f61433071933b66bd03d3ad33ff491c1585d8568ee77b069d5cb09",
     # plugins/backends/checkpointed.py: calls the loop of jax, and provides surrogate gradients, which no stored row uses
@@ -94,6 +94,18 @@ EQUIVALENT: dict[str, str] = {
     "68ff709898b81a8338d9c6b5a7a9dffa958a5f79fe387b1d35163d59c8329710": "022e3f0543d013eba1fdcd4af5c8eaa83d6e118c9e76b19b822e78bcd7a551b0",
     # bench/measure/gradcheck/__init__.py: one more name
     "393f225cbaafb140fb5e64053a0d8756db2de946bc0aa4ab264483b416b31692": "f965dfe680d35ea51da514344bfdf1e2a7728d16485d4c8d967fee9fd5fe25e9",
+    # bench/model/policy.py: controls of a trained network's actions, which are the actions in all stored rows
+    "2a57fac59c1ebc96fbb047e5106954b3ab8e3ece5d7a5532fe053c4a1ea6b525": "c7bd75c4ea4fa863abffd86725712f9e9798a0f8a5b7c41c2c52b43c890e1c58",
+    # bench/training/environment.py: controls of a trained network's actions, which are the actions in all stored rows
+    "f5754d87028a92ed79b569d6110954964d82ba295ff14cf8f381acec6e51d2e4": "6aa866f73c01dfeda2b1d4c2a289a10da52f29ab8768c4a76018c39488fa779b",
+    # bench/training/windows.py: controls of a trained network's actions, which are the actions in all stored rows
+    "42acbd247be5e409f9f5b031ccce299de23779a8d881cde645985148c3b2b05c": "b32815416608beb1d442f5a7fb2d50ee6443130c23b9f3dd3cfc7056935083f5",
+    # bench/studies/train/measure.py: trains on the program that a backend runs, which is the scene's own in all stored rows
+    "9b1e924cb067200642a908d1017565baa94d7576dc1bfce79cc9f01614140c4e": "dff6e39f186adc16bad4f8cb9475359cce455caee025705db5a25b219b479c4a",
+    # plugins/scenes/mjcf.py: controls of a trained network's actions, which no stored row has
+    "40f5a560fa0e9fb3cea4708ff14d1a00aad69004bd9e49d4705131ded8a3da14": "f302f032f1e6e1b031801f5896df99bc0f3f8a962349db73ed6aeec772b7945c",
+    # plugins/trainers/evolution.py: shares its episodes with another trainer
+    "686532575ae796c4217d1d3d7d95c9b0f48ca9dbc3792a9b6dd451d0f65968bc": "604abd01749d1f0cf4c1bc84d6045238660ab504dacb683d96a39c67f8465455",
 }
 """Hashes of files, and of classes of studies, whose changes decide no stored number: the new hash, and the one in the keys of rows.
 

@@ -45,7 +45,7 @@ class Environment:
         if not isinstance(scene, PolicyScene):
             raise Unsupported(f"scene {scene.name} is not a policy problem: it has no observations and random starts")
         if getattr(ops.xp, "__name__", "") != "jax.numpy":
-            raise Unsupported("training needs a backend with the operations of jax.numpy, such as jax or implicit")
+            raise Unsupported("training needs a backend with the operations of jax.numpy, such as jax, implicit or mjx")
         self.program, self.ops, self.dtype = program, ops, dtype
 
     @property
@@ -116,8 +116,9 @@ class Environment:
         import jax.numpy as jnp
 
         scene, xp, before = self.scene, self.ops.xp, episodes.state
-        reward = -scene.stage_cost(xp, before.q, before.v, action)
-        reached = State(*self.program.step(self.ops, before, action))
+        controls = scene.controls_of(xp, action)
+        reward = -scene.stage_cost(xp, before.q, before.v, controls)
+        reached = State(*self.program.step(self.ops, before, controls))
         age = episodes.age + 1
         finite = jnp.isfinite(jnp.concatenate(reached)).all(axis=0)
         over = scene.has_ended(xp, reached.q, reached.v)
@@ -132,9 +133,14 @@ class Environment:
     def contacts(self, state: State) -> tuple[Array, Array, Array]:
         """Return, per rollout ``(B,)``, closed contacts, largest penetration [m] and largest contact force [N].
 
-        The force is NaN for a law without forces. Without contacts all are 0.
+        The force is NaN for a law without forces. Without contacts all are 0. The program of an engine says which contacts
+        it has by ``contacts(state)``.
         """
+        import jax
         import jax.numpy as jnp
+
+        if hasattr(self.program, "contacts"):
+            return self.program.contacts(jax.lax.stop_gradient(state))  # type: ignore[no-any-return]
 
         scene, law, xp = self.scene, self.program.contact, self.ops.xp
         zero = jnp.zeros_like(state.q[0])

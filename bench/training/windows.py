@@ -84,12 +84,12 @@ def jacobian_norm(env: Environment, state: State, action: Array) -> Array:
     import jax
     import jax.numpy as jnp
 
-    state, action = jax.lax.stop_gradient((state, action))
+    state, controls = jax.lax.stop_gradient((state, env.scene.controls_of(env.ops.xp, action)))
     split = state.q.shape[0]
     x = jnp.concatenate(state)
 
     def advance(x: Array) -> Array:
-        return jnp.concatenate(env.program.step(env.ops, State(x[:split], x[split:]), action))
+        return jnp.concatenate(env.program.step(env.ops, State(x[:split], x[split:]), controls))
 
     basis = jnp.eye(x.shape[0], dtype=x.dtype)[:, :, None] + jnp.zeros_like(x)
     columns = jax.vmap(lambda e: jax.jvp(advance, (x,), (e,))[1])(basis)

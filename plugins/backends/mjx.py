@@ -253,6 +253,21 @@ class MjxProgram(Rollout):
 
         return self._columns(column, state, u)
 
+    def contacts(self, state: State) -> tuple[Array, Array, Array]:
+        """Return, per column ``(B,)``, closed contacts, largest penetration [m] and force, which is NaN: not computed."""
+        import jax.numpy as jnp
+
+        def column(data: Any) -> Any:
+            return mjx_solver.library().fwd_position(self._model, data)._impl.contact.dist
+
+        nothing = jnp.zeros((self._model.nu, state.q.shape[1]), state.q.dtype)
+        gap = self._columns(column, state, nothing)
+        return (
+            (gap < 0).sum(axis=0).astype(gap.dtype),
+            jnp.maximum(-gap, 0.0).max(axis=0, initial=0.0),
+            jnp.nan * gap[0],
+        )
+
     def _columns(self, function: Callable[[Any], Any], state: State, u: Array) -> Any:
         """Return ``function`` of the MJX data of each column, stacked along the last axis."""
         import jax

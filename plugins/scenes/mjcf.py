@@ -161,6 +161,10 @@ class Mjcf(PolicyScene, JointScene):
         act = self.plugin.act(xp, theta, self.observation(xp, q, v))
         return xp.asarray(self.robot.controls[:, None], dtype=act.dtype) + self.action_scale * act
 
+    def controls_of(self, xp: Any, action: Array) -> Array:
+        """Return u0 + action_scale tanh(action), since actuators have limits, beyond which a derivative is 0."""
+        return xp.asarray(self.robot.controls[:, None], dtype=action.dtype) + self.action_scale * xp.tanh(action)
+
     def stage_cost(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
         """Return the cost of a step of the Python file; 0 after the end."""
         cost = self.module.stage_cost(xp, q, v, u)

@@ -1,4 +1,4 @@
-"""Evolution strategies: a search over the policy's parameters that uses returns only."""
+"""Evolution strategies: searches over a policy's parameters that use returns only."""
 
 from __future__ import annotations
 
@@ -19,38 +19,72 @@ class Search(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Evolution(Trainer):
-    """Evolution strategies (Salimans et al. 2017, arXiv 1703.03864) on the flattened parameters of a network.
-
-    An update runs one episode each of ``population`` policies, theta plus and minus ``width`` times normal numbers,
-    from the same start for both signs. Returns are replaced by their ranks, from -1/2 to 1/2, and Adam ascends the mean
-    of rank times direction. A covariance matrix of all parameters, as in CMA-ES, would have d^2 entries, 2e7 by
-    default, so it is left out.
-    """
-
-    name = "evolution"
+class PopulationTrainer(Trainer):
+    """Runs one episode each of ``population`` policies per update. A state has ``theta`` and ``normaliser``."""
 
     population: int = param(64, "policies per update, an even number", low=2)
     width: float = param(0.05, "standard deviation of the parameters", positive=True)
     hidden: int = param(64, "width of the two hidden layers", positive=True)
-    rate: float = param(0.02, "first learning rate", positive=True)
-    clip: float = param(1e6, "norm at which gradients are clipped", positive=True)
 
     def steps_per_update(self, env: Any) -> int:
         """Return population times the length of an episode."""
         return 2 * (self.population // 2) * int(env.length)
 
-    def _optimizer(self, env: Any) -> Any:
-        from bench.training.steps import adam
-
-        return adam(self.rate, self.updates(env), self.clip, 0.9, 0.999)
-
-    def _network(self, env: Any, key: Any) -> tuple[Any, Any]:
+    def network(self, env: Any, key: Any) -> tuple[Any, Any]:
+        """Return a new network's parameters, flattened, ``(d,)``, and the function from these to the network."""
         from jax.flatten_util import ravel_pytree
 
         from bench.training.networks import Network
 
         return ravel_pytree(Network(key, [env.n_observations, self.hidden, self.hidden, env.n_actions], env.dtype))
+
+    def returns(self, env: Any, state: Any, points: Any, first: Any, keys: tuple[Any, Any]) -> tuple[Any, Any]:
+        """Return the returns ``(B,)`` of policies with parameters ``points (B, d)`` from given starts, and the window."""
+        import jax
+        import jax.numpy as jnp
+
+        from bench.training import normaliser, windows
+
+        _, unflatten = self.network(env, keys[0])
+        networks = jax.vmap(unflatten)(points)
+
+        def policy(observation: Any, noise: Any) -> Any:
+            seen = normaliser.normalised(state.normaliser, observation).T[:, :, None]
+            return jax.vmap(lambda network, x: network(x))(networks, seen)[:, :, 0].T
+
+        _, window = windows.rollout(env, policy, first, env.length, keys[1])
+        # an episode counts up to its first end
+        is_running = jnp.cumsum(window.ended, axis=0) - window.ended == 0
+        return jnp.where(is_running, window.reward, 0.0).sum(axis=0), window
+
+    def action(self, env: Any, state: Any, observation: Any) -> Any:
+        """Return the network's output."""
+        import jax
+
+        from bench.training import normaliser
+
+        _, unflatten = self.network(env, jax.random.PRNGKey(0))
+        return unflatten(state.theta)(normaliser.normalised(state.normaliser, observation))
+
+
+@dataclass(frozen=True)
+class Evolution(PopulationTrainer):
+    """Evolution strategies (Salimans et al. 2017, arXiv 1703.03864) on the flattened parameters of a network.
+
+    An update runs one episode each of ``population`` policies, theta plus and minus ``width`` times normal numbers,
+    from the same start for both signs. Returns are replaced by their ranks, from -1/2 to 1/2, and Adam ascends the mean
+    of rank times direction.
+    """
+
+    name = "evolution"
+
+    rate: float = param(0.02, "first learning rate", positive=True)
+    clip: float = param(1e6, "norm at which gradients are clipped", positive=True)
+
+    def _optimizer(self, env: Any) -> Any:
+        from bench.training.steps import adam
+
+        return adam(self.rate, self.updates(env), self.clip, 0.9, 0.999)
 
     def start(self, env: Any, seed: Any) -> Search:
         """Return a new network."""
@@ -59,7 +93,7 @@ class Evolution(Trainer):
         from bench.training import normaliser
 
         key, key_network = jax.random.split(jax.random.PRNGKey(seed))
-        theta, _ = self._network(env, key_network)
+        theta, _ = self.network(env, key_network)
         return Search(theta, self._optimizer(env).init(theta), normaliser.start(env.n_observations, env.dtype), key)
 
     def update(self, env: Any, state: Search) -> tuple[Search, dict[str, Any]]:
@@ -71,22 +105,12 @@ class Evolution(Trainer):
         from bench.training import normaliser, steps, windows
 
         key, key_points, key_start, key_rollout = jax.random.split(state.key, 4)
-        _, unflatten = self._network(env, key)
         half = self.population // 2
         direction = env.normal(key_points, (half, state.theta.size))
         points = state.theta + self.width * jnp.concatenate([direction, -direction])
-        networks = jax.vmap(unflatten)(points)
-
-        def policy(observation: Any, noise: Any) -> Any:
-            seen = normaliser.normalised(state.normaliser, observation).T[:, :, None]
-            return jax.vmap(lambda network, x: network(x))(networks, seen)[:, :, 0].T
-
         numbers = env.normal(key_start, (env.n_start, half))
         first = env.start(jnp.concatenate([numbers, numbers], axis=1))
-        _, window = windows.rollout(env, policy, first, env.length, key_rollout)
-        # an episode counts up to its first end
-        is_running = jnp.cumsum(window.ended, axis=0) - window.ended == 0
-        total = jnp.where(is_running, window.reward, 0.0).sum(axis=0)
+        total, window = self.returns(env, state, points, first, (key, key_rollout))
         rank = jnp.argsort(jnp.argsort(jnp.where(jnp.isfinite(total), total, -jnp.inf))) / (2 * half - 1) - 0.5
         rank = rank.astype(state.theta.dtype)
         gradient = -(rank[:half] - rank[half:]) @ direction / (2 * half * self.width)
@@ -95,12 +119,3 @@ class Evolution(Trainer):
         log = {"loss": -total.mean() / env.length, **windows.log_of(window), **steps.step_log(gradient, change, theta)}
         known = normaliser.updated(state.normaliser, windows.flat(window.observation))
         return Search(theta, memory, known, key), log
-
-    def action(self, env: Any, state: Search, observation: Any) -> Any:
-        """Return the network's output."""
-        import jax
-
-        from bench.training import normaliser
-
-        _, unflatten = self._network(env, jax.random.PRNGKey(0))
-        return unflatten(state.theta)(normaliser.normalised(state.normaliser, observation))

@@ -12,7 +12,7 @@ import pytest
 from problems import Untouched, cartpole_program, pressed_program
 from trees import ROOT
 
-from bench.model import registry
+from bench.model import Answer, registry
 from bench.training.agreement import cosine
 from bench.training.environment import Environment
 from bench.training.networks import Actor
@@ -24,6 +24,7 @@ TRAINERS = {
     "bptt": {**SMALL, "rollouts": 4},
     "ppo": {**SMALL, "rollouts": 4, "window": 5, "passes": 2, "batches": 2},
     "evolution": {**SMALL, "population": 4},
+    "sep_cma_es": {**SMALL, "population": 4},
 }
 
 
@@ -66,6 +67,24 @@ def test_seeds_give_different_runs_from_one_compilation():
     seconds = run.compile_s
     run.update(second)
     assert run.compile_s == seconds
+
+
+def test_the_first_step_of_sep_cma_es_is_the_diagonal_of_that_of_cma_es():
+    """From equal variances both draw the same points; learning rates of the variances differ by (d + 2) / 3."""
+    run = training("sep_cma_es", population=6)
+    state = jax.device_get(run.start(3))
+    key, key_points, key_start, key_rollout = jax.random.split(state.key, 4)
+    y = np.asarray(run.env.normal(key_points, (6, state.theta.size)))
+    points = state.theta + state.sigma * y
+    numbers = jnp.broadcast_to(run.env.normal(key_start, (run.env.n_start, 1)), (run.env.n_start, 6))
+    total, _ = run.trainer.returns(run.env, state, points, run.env.start(numbers), (key, key_rollout))
+    full = registry.make("optimizers", "cma_es", {"width": 0.05})
+    expected = full.tell(full.start(state.theta), points.T, Answer(value=-np.asarray(total)))
+    after, _ = run.update(run.start(3))
+    np.testing.assert_allclose(after.theta, expected["theta"], rtol=1e-9)
+    assert float(after.sigma) == pytest.approx(expected["sigma"], rel=1e-9)
+    change = np.diag(expected["covariance"]) - 1.0
+    np.testing.assert_allclose(after.variance - 1.0, change * (state.theta.size + 2) / 3, rtol=1e-6, atol=1e-9)
 
 
 def test_windows_have_no_bias_where_actions_move_nothing_and_one_where_they_do():

@@ -34,7 +34,8 @@ def measure(cell: Cell, session: Session, settings: Settings) -> dict[str, Any]:
     """Return one cell's results by column."""
     trainer, backend = cell.parts["trainer"], cell.backend
     assert isinstance(trainer, Trainer)
-    env = Environment(cell.program(), backend.ops(), backend.dtype)  # type: ignore[attr-defined]
+    problem = backend.compile(cell.program())
+    env = Environment(problem.program, backend.ops(), backend.dtype)  # type: ignore[attr-defined]
     training = Training(env, trainer)
     # all trainers and seeds are evaluated from the same starts
     starts = noise.draw(0, cell.scene.name, 1, settings.starts, env.n_start, "train: starts")[0].T
