@@ -180,7 +180,7 @@ SETTINGS = (
     Setting("the seed of numpy.random", _numpy_generator, _write_numpy_generator),
     Setting("SciPy's error state", lambda: sys.modules["scipy.special"].geterr(), lambda state: sys.modules["scipy.special"].seterr(**state), "scipy.special", names_parts=True, is_scoped=True),
     Setting("the threads of scipy.fft", lambda: sys.modules["scipy.fft"].get_workers(), None, "scipy.fft"),
-    Setting("JAX's configuration", _jax_settings, _write_jax, "jax", True),
+    Setting("JAX's configuration", _jax_settings, _write_jax, "jax", True, is_scoped=True),
     Setting("torch's default type", lambda: _torch().get_default_dtype(), lambda kind: _torch().set_default_dtype(kind), "torch"),
     Setting("torch's threads", lambda: _torch().get_num_threads(), lambda count: _torch().set_num_threads(count), "torch"),
     Setting("torch's gradients", lambda: _torch().is_grad_enabled(), lambda on: _torch().set_grad_enabled(on), "torch"),
