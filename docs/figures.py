@@ -345,6 +345,12 @@ def windows_table(experiment: str = "train") -> str:
     ])  # fmt: skip
 
 
+def gradient_norms(experiment: str, window: int) -> str:
+    """Return the range over seeds of the median norm of a run's gradients, for ``shac`` with one length of window."""
+    runs = trained(experiment)
+    return span(runs.loc[runs["trainer"].str.contains(f"window={window}]", regex=False), "gradient_typical"])
+
+
 def windows_finding(experiment: str = "train") -> str:
     """Return which window ends best, which are not distinguishable from it, and which end lower."""
     return findings.window(aggregate.windows(trained(experiment)))
@@ -713,6 +719,11 @@ FIGURES: dict[str, Callable[[], str]] = {
     "hopper-windows": lambda: windows_table("train/hopper"),
     "hopper-windows-finding": lambda: windows_finding("train/hopper"),
     "hopper-faults": lambda: faults_table("train/hopper"),
+    "cheetah-finding": lambda: findings.recommendation(aggregate.summarise(trained("train/half_cheetah"))),
+    "cheetah-table": lambda: trained_table("train/half_cheetah"),
+    "cheetah-norms-8": lambda: gradient_norms("train/half_cheetah", 8),
+    "cheetah-norms-16": lambda: gradient_norms("train/half_cheetah", 16),
+    "cheetah-faults": lambda: faults_table("train/half_cheetah"),
     "fits-hidden": hidden,
     "fits-bound": lambda: span(fits("error", "rk4", (0, 1))),
     "fits-coverage": lambda: span(100 * fits("coverage", "rk4", (0, 1)), suffix="%"),

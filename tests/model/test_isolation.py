@@ -7,6 +7,7 @@ import subprocess
 import sys
 from contextlib import contextmanager
 
+import jax
 import numpy as np
 import pandas as pd
 import pytest
@@ -178,14 +179,20 @@ def test_an_import_of_an_installed_library_is_no_change(tmp_path, monkeypatch):
         assert "environment variables (OWN_THINGS)" in state.changes()
 
 
-def test_an_import_within_a_block_that_changes_a_setting_is_no_change(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    "block",
+    [lambda: np.errstate(over="ignore", invalid="ignore"), lambda: jax.enable_x64(not jax.config.jax_enable_x64)],
+    ids=["numpy", "jax"],
+)
+def test_an_import_within_a_block_that_changes_a_setting_is_no_change(tmp_path, monkeypatch, block):
     """The setting is as before when the block ends."""
+    monkeypatch.delitem(sys.modules, "set_inside", raising=False)
     library = tmp_path / "site-packages" / "set_inside.py"
     library.parent.mkdir()
     library.write_text("INSIDE = 1\n")
     monkeypatch.syspath_prepend(library.parent)
     with followed() as state:
-        with np.errstate(over="ignore", invalid="ignore"):
+        with block():
             importlib.import_module("set_inside")
         assert state.changes() == []
         np.seterr(under="raise")
