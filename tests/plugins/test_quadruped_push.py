@@ -44,6 +44,15 @@ def test_the_block_has_no_gradient_without_contact():
     assert np.linalg.norm(problem().grad(pushing.program.theta0, STILL)) > 1e-2
 
 
+@pytest.mark.parametrize(("sigma", "low", "high"), [(0.02, 0.0, 0.0), (0.2, 0.15, 0.25)])
+def test_the_noise_decides_how_many_plans_touch(sigma, low, high):
+    pushing = problem(sigma=sigma)
+    w = np.random.default_rng(0).standard_normal((12, 1000))
+    block = pushing.trajectory(pushing.program.theta0, w).states[-1, 18]
+    assert low <= np.mean(block > 0) <= high
+    assert block.min() >= 0
+
+
 def test_in_contact_the_gradient_moves_the_block():
     pushing = problem(lean=0.2, **DOWN)
     theta = pushing.program.theta0
@@ -90,12 +99,13 @@ def test_the_plan_fills_every_horizon(horizon):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("lean", [0.0, 0.2])
-def test_the_converged_solver_of_mjx_gives_the_same_gradient(lean):
+@pytest.mark.parametrize("values", [{"lean": 0.0, **DOWN}, {"lean": 0.2}])
+def test_the_converged_solver_of_mjx_gives_the_same_gradient(values):
     if not registry.find("backends", "mjx").available:
         pytest.skip("MJX is not installed")
-    theta = QuadrupedPush(lean=lean).theta0()
-    mjx, c = (problem(b, lean=lean) for b in (Mjx(impedance=0.9, iterations=20, mode="reverse"), Mujoco(impedance=0.9)))
+    theta = QuadrupedPush(**values).theta0()
+    mjx = problem(Mjx(impedance=0.9, iterations=20, mode="reverse"), **values)
+    c = problem(Mujoco(impedance=0.9), **values)
     assert mjx.value(theta, STILL)[0] == pytest.approx(c.value(theta, STILL)[0], rel=1e-8)
     expected = c.grad(theta, STILL)
     np.testing.assert_allclose(mjx.grad(theta, STILL), expected, rtol=0, atol=1e-5 * np.linalg.norm(expected))
