@@ -99,7 +99,7 @@ def test_the_plan_fills_every_horizon(horizon):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("values", [{"lean": 0.0, **DOWN}, {"lean": 0.2}])
+@pytest.mark.parametrize("values", [{"lean": 0.0}, {"lean": 0.2}])
 def test_the_converged_solver_of_mjx_gives_the_same_gradient(values):
     if not registry.find("backends", "mjx").available:
         pytest.skip("MJX is not installed")
