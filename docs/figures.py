@@ -19,6 +19,7 @@ import numpy as np
 import pandas as pd
 
 from bench.experiment import config
+from bench.measure.performance import wilson
 from bench.report.text import number
 from bench.report.text import span as ends_of
 from bench.studies.bias_variance import trust
@@ -594,6 +595,68 @@ def engines_agree() -> str:
     return number(float(max(distances)))
 
 
+PUSH = {
+    "apart, noise 0.02": {"lean": 0.0, "sigma": 0.02},
+    "apart, noise 0.2": {"lean": 0.0, "sigma": 0.2},
+    "in contact, noise 0.02": {"lean": 0.2, "sigma": 0.02},
+}
+"""The problems of ``push``: whether the first plan touches the block, and the noise [rad]."""
+PUSHED = 0.1
+"""Cost at which the block counts as pushed: it is within a third of the way from its target."""
+
+
+def pushes() -> pd.DataFrame:
+    """Return the searches of ``push`` with their problem, method, first rollouts below :data:`PUSHED`, and if they touch.
+
+    Without contact the cost is at least 1, so that a search with a lower cost on its path has touched.
+    """
+    rows = select(rows_of("push"), status="ok")
+    lean = [json.loads(text)["scene"]["lean"] for text in rows["parameters"]]
+    weight = [json.loads(text)["study"]["gradient_cost"] for text in rows["parameters"]]
+    rows = rows.assign(lean=lean, weight=weight, method=[
+        ", ".join(filter(None, (row.estimator, row.optimizer.partition("[")[0]))) for row in rows.itertuples()
+    ])  # fmt: skip
+    for problem, values in PUSH.items():
+        rows.loc[select(rows, **values).index, "problem"] = problem
+    spent = [
+        next((r + row.weight * g for c, r, g in zip(row.path_cost, row.path_rollouts, row.path_gradients, strict=True) if c < PUSHED), np.inf)
+        for row in rows.itertuples()
+    ]  # fmt: skip
+    return rows.assign(touched=rows["best_cost"] < 1.0, spent=spent)
+
+
+def share_touched(problem: str, *methods: str, pushed: bool = False) -> str:
+    """Return how many searches of the methods touched the block, or ``pushed`` it, of how many, with a 95% interval."""
+    rows = pushes()
+    rows = rows[(rows["problem"] == problem) & rows["method"].isin(methods)]
+    counted = np.isfinite(rows["spent"]) if pushed else rows["touched"]
+    low, high = wilson(int(counted.sum()), len(counted))
+    return f"{counted.sum()} of {len(counted)} [{low:.0%}, {high:.0%}]"
+
+
+def push_table() -> str:
+    """Return by method and problem how many searches touch and push the block, and after how many rollouts, as a table."""
+    rows, head = pushes(), ["| method | " + " | ".join(PUSH) + " |", "|---" + "|---" * len(PUSH) + "|"]
+    lines = []
+    for method in dict.fromkeys(rows.sort_values("method")["method"]):
+        cells = []
+        for problem in PUSH:
+            part = rows[(rows["problem"] == problem) & (rows["method"] == method)]
+            pushed = sorted({f"{spent:.0f}" for spent in part["spent"] if np.isfinite(spent)}, key=float)
+            after = f", after {' to '.join(dict.fromkeys([pushed[0], pushed[-1]]))}" if pushed else ""
+            counts = (part["touched"].sum(), np.isfinite(part["spent"]).sum())
+            cells.append(f"{counts[0]} touch, {counts[1]} push{after}")
+        lines.append(f"| `{method.replace(', ', '`, `')}` | {' | '.join(cells)} |")
+    return block([*head, *lines])
+
+
+def push_costs(problem: str, *methods: str) -> str:
+    """Return the lowest and highest final cost of the methods' searches."""
+    rows = pushes()
+    costs = rows.loc[(rows["problem"] == problem) & rows["method"].isin(methods), "final_cost"]
+    return f"{costs.min():.3g} to {costs.max():.3g}" if costs.max() < 1 else f"{costs.min():.4f} to {costs.max():.4f}"
+
+
 def dose_rates() -> str:
     """Return what a wrong rate costs the best gradient."""
     rows = dose("controls")
@@ -618,6 +681,24 @@ FIGURES: dict[str, Callable[[], str]] = {
     "quadruped-norm-100": lambda: quadruped_growth(100),
     "quadruped-engines": engines_agree,
     "quadruped-order": quadruped_order,
+    "push-still": lambda: share_touched("apart, noise 0.02", "fobg, adam", "fobg, lbfgs"),
+    "push-still-cost": lambda: push_costs("apart, noise 0.02", "fobg, adam", "fobg, lbfgs"),
+    "push-still-smoothed": lambda: share_touched(
+        "apart, noise 0.02", "randomized_smoothing, adam", "randomized_smoothing, lbfgs"
+    ),
+    "push-noisy": lambda: share_touched("apart, noise 0.2", "fobg, adam", "randomized_smoothing, adam"),
+    "push-line": lambda: share_touched("apart, noise 0.2", "fobg, lbfgs"),
+    "push-line-smoothed": lambda: share_touched("apart, noise 0.2", "randomized_smoothing, lbfgs"),
+    "push-search": lambda: share_touched("apart, noise 0.02", "cma_es", "cem"),
+    "push-near": lambda: share_touched("in contact, noise 0.02", "fobg, adam", "fobg, lbfgs", pushed=True),
+    "push-near-lbfgs": lambda: push_costs("in contact, noise 0.02", "fobg, lbfgs"),
+    "push-near-cem": lambda: push_costs("in contact, noise 0.02", "cem"),
+    "push-near-cma": lambda: push_costs("in contact, noise 0.02", "cma_es"),
+    "push-table": push_table,
+    "push-on-start": lambda: span(rows_of("push_on")["start_cost"], digits=3),
+    "push-on-lbfgs": lambda: span(select(rows_of("push_on"), optimizer="lbfgs")["final_cost"], digits=3),
+    "push-on-adam": lambda: span(select(rows_of("push_on"), optimizer="adam[rate=0.03]")["final_cost"], digits=3),
+    "push-on-cem": lambda: push_costs("apart, noise 0.02", "cem"),
     "dose-answer": dose_answer,
     "dose-pairs": dose_pairs,
     "dose-descent-answer": lambda: dose_answer("dose_response_descent"),
