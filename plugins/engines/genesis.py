@@ -102,7 +102,7 @@ class Model:
     def pull(self, x, u, slope):
         """Return the derivatives of the sum of slope times the next states, by one backward pass.
 
-        A joint's position is no input of Genesis' tape, so its derivative is read from the solver.
+        Genesis' tape does not have a joint's position as an input, so its derivative is read from the solver.
         """
         after, velocity, force, scene = self._run(x, u, True)
         by_velocity, by_force = torch.autograd.grad((after * torch.as_tensor(slope.T.copy())).sum(), (velocity, force))
