@@ -84,10 +84,6 @@ EQUIVALENT: dict[str, str] = {
     "6149abe5f46587b3d8eb8f470e37bdce77c01374e361aab5999d084ae18a276d": "76a879a70ed24fc4311af996e4bb5f593c109c0f65d4214ffd54f7073c02f695",
     # bench/studies/engines/measure.py: device and settings of the engine for the row
     "d5e3901c746d9f377a69747b31e0164647a326cb0e6f97f86045a2fa2832e07e": "46d42f6782eabcab65ff6473c1eacca1641a5345b5388a93bc429743b02174fd",
-    # plugins/engines/brax.py: its device for the row, and a parameter at its earlier value
-    "e46f435036a6d46f7d11f4543f6de2048a7ebcc1556e81f58ba8762ae89d08c8": "9e4c53a5136be0b1a2edfa629aa430ee2371c98ce4560c55b18a4df7d2a385a3",
-    # plugins/backends/brax.py: a declaration for the kit, and a parameter at its earlier value
-    "9c57a048aee219a3b22b3470fef728ac39db6ede045fcb117e2e542ebe6da99a": "b02da5fb62beb221c4faa4ec8bec64a1192225bd29092f16f11de55d9ab2bee7",
     # bench/measure/gradcheck/sampling.py: calls may differ in their last digits, as no stored row's do
     "125fdea2e0627bb5099d28e792220cbf54827953ddcfedc82e6bd59984763f25": "bb6236b81dbeaf081607d32f4a1811a5f525b89a60406f69babb3123cb2bd12a",
     # bench/measure/gradcheck/check.py: calls may differ in their last digits, as no stored row's do

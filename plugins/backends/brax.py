@@ -14,8 +14,8 @@ class Brax(EngineBackend):
     """Gradients: JAX's forward mode of each step of Brax's generalized pipeline, chained; float64.
 
     A contact cancels a share ``impedance`` of all other forces. The solver of contact forces starts with a step of 1 and
-    halves it at most ``halvings`` times: at Brax's 20, contacts of light bodies and of small impedances have no force,
-    without an error. It stops at a tolerance. Brax's physics is no longer maintained.
+    halves it at most ``halvings`` times: at Brax's own default, 20, contacts of light bodies and of small impedances have
+    no force, without an error. It stops at a tolerance. Brax's physics is no longer maintained.
     """
 
     name = "brax"
@@ -26,7 +26,7 @@ class Brax(EngineBackend):
 
     dtype: str = param("float64", "floating-point type of the simulation", choices=("float64",))
     impedance: float = param(0.01, "share of other forces that a contact cancels", low=1e-3, high=0.9999)
-    halvings: int = param(20, "most halvings of a step of the contact solver", positive=True, neutral=20)
+    halvings: int = param(60, "most halvings of a step of the contact solver", positive=True)
 
     def unsupported_twin(self, program: Program, model: dict[str, Any]) -> str | None:
         """Return why Brax cannot run the program: a damper that pulls; or None."""

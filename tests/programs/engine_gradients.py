@@ -1,8 +1,10 @@
 """Prints an engine's gradients without noise, their distance from NumPy's, and the times of 64: ``engine_gradients.py ENGINE [SCENE ...]``.
 
+It also says whether two equal calls return equal bits, with a hash of them: equal hashes of two runs are equal bits.
 ENGINE may have parameters: ``'newton[solver=semi_implicit]'``. Its Python is that of `python -m bench engines install`.
 """
 
+import hashlib
 import sys
 import time
 
@@ -38,7 +40,7 @@ def main() -> None:
         function = problem.grad if "grad" in backend.provides else problem.value
         expected = own.grad(program.theta0, w) if "grad" in backend.provides else own.value(program.theta0, w)
         started = time.perf_counter()
-        function(program.theta0, w)
+        before = function(program.theta0, w)
         first = time.perf_counter() - started
         inside = (problem.engine_s, problem.pipe_s) if isinstance(problem, EngineProblem) else (0.0, 0.0)
         started = time.perf_counter()
@@ -50,8 +52,11 @@ def main() -> None:
             shares = f"  engine {parts[0] / seconds:.0%} pipe {parts[1] / seconds:.1%}"
         still = function(program.theta0, 0.0 * w[:, :1])
         off = np.abs(result - expected).max() / np.abs(expected).max()
+        bits = "equal" if before.tobytes() == result.tobytes() else "different"
         print(
             f"{name:<14} {np.ravel(still)[:2]}  from NumPy {off:.1e}  first {first:.1f} s  then {seconds:.3f} s{shares}"
+            f"  again {bits} {hashlib.sha256(result.tobytes()).hexdigest()[:8]}",
+            flush=True,
         )
 
 

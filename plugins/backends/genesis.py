@@ -1,0 +1,42 @@
+"""Genesis: the scene's twin in its rigid solver, in a Python of its own."""
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from bench.engines.backend import EngineBackend
+from bench.model import Program, param
+
+from ..contacts.penalty import Penalty
+
+
+@dataclass(frozen=True)
+class Genesis(EngineBackend):
+    """Gradients: Genesis' own backward pass of each step, chained; float64.
+
+    A contact cancels a share ``impedance`` of all other forces. Genesis has no contact without friction, so it runs a
+    contact of bodies on slides along its normal, where friction has no effect.
+    """
+
+    name = "genesis"
+    file = "../engines/genesis.py"
+    libraries: ClassVar[tuple[str, ...]] = ("genesis-world", "torch", "numpy")
+
+    dtype: str = param("float64", "floating-point type of the simulation", choices=("float64",))
+    impedance: float = param(3e-4, "share of other forces that a contact cancels", low=3e-4, high=0.99)
+
+    def unsupported_twin(self, program: Program, model: dict[str, Any]) -> str | None:
+        """Return why Genesis cannot run the program: contacts that slide, several of them, or a damper that pulls; or None."""
+        law, contacts = program.contact, model["contacts"]
+        if isinstance(law, Penalty) and law.damping and law.damping_mode != "clipped":
+            return f"genesis' contacts never pull: it supports damping_mode=clipped only, not {law.damping_mode}"
+        if len(contacts) > 1:
+            return "genesis runs one contact per program"
+        bodies = [model["bodies"][i] for contact in contacts for i in contact["bodies"] if i >= 0]
+        is_free = all(body["joint"] == "slide" and body["parent"] < 0 for body in bodies)
+        between = np.subtract(bodies[0]["centre"], bodies[-1]["centre"]) if len(bodies) == 2 else [0.0, 0.0, 1.0]
+        lines = [body["axis"] for body in bodies] + [between]
+        if not is_free or any(np.cross(lines[0], line).any() for line in lines):
+            return "genesis has no contact without friction: it supports contacts along the slides of their bodies only"
+        return None
