@@ -86,7 +86,7 @@ class Experiment:
     """Parameters set for plugins by axis, plugin name and parameter."""
     sweep: Mapping[str, Any] = field(default_factory=dict)
     also: tuple[Experiment, ...] = ()
-    """Experiments of the same study whose cells join those of this one."""
+    """Experiments of the same study whose cells join its own."""
     decision: Decision = OWN
     """The meaning of theta, and the point at which gradients are taken."""
     samples: int = 256
