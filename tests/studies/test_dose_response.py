@@ -12,6 +12,7 @@ from bench.plugins.optimizers.gradient_descent import GradientDescent
 from bench.plugins.scenes.quadratic import Quadratic
 
 import bench
+from bench.experiment import config
 from bench.report.cells import readable
 from bench.studies.dose_response import analysis, controls, model, views
 from bench.studies.dose_response.measure import compare, hypotheses_hash
@@ -394,3 +395,12 @@ def test_an_interval_above_1_is_not_printed_as_if_it_held_1():
     assert "This is above 1 on smooth and all together." in first
     (line, *_) = readable(views._pair_table(pairs)).to_dict("records")
     assert line["random error 3 / 0.3"] == "2.5 [1.03, 6.9]"
+
+
+def test_planted_errors_alone_have_a_report_that_compares_no_orders(run):
+    """The fault: without natural methods the tables of costs had no columns, and the report ended in a KeyError."""
+    experiment = config.load(["experiment=dose_response/quick"])
+    for rows in (run[run["estimator"] == "planted"], run[run["estimator_params"] == "base=best"]):
+        shown = views.views(experiment, rows.reset_index(drop=True))
+        assert shown.findings
+        assert not any("In rollouts" in sentence for sentence in shown.findings)

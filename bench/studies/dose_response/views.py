@@ -157,7 +157,7 @@ def findings(pairs: pd.DataFrame, costs: pd.DataFrame) -> list[str]:
             + (f" That bias takes {_interval(both)} times the updates of that random error. {_sides(main, analysis.BIAS_OVER_RANDOM)}."
                if both is not None else "")
         )  # fmt: skip
-    return [*result, cost_sentence(costs)]
+    return [*result, *([cost_sentence(costs)] if (costs["target"] == MAIN).any() else [])]
 
 
 def _sides(main: Mapping[tuple[str, str], Any], comparison: str) -> str:
