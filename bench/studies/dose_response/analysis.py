@@ -283,12 +283,9 @@ def costs(lines: pd.DataFrame) -> pd.DataFrame:
     """Return, by class, target and ratio, on how many problems the first order is cheaper than the zeroth order.
 
     Each is taken at the number of samples with the lowest median cost. The ratio is the number of rollouts that a
-    gradient is charged as; NaN is the measured one. Problems on which neither reaches the target are not counted, nor
-    those that were measured with fewer numbers of samples than others.
+    gradient is charged as; NaN is the measured one. Problems on which neither reaches the target are not counted.
     """
     natural = lines[lines["kind"].isin(("first order", "zeroth order")) & lines["target"].isin(SHOWN)]
-    sizes = natural.groupby("problem")["samples"].transform("nunique")
-    natural = natural[sizes == sizes.max()]
     result = []
     for (scene_class, target), part in natural.groupby(["scene_class", "target"], sort=False):
         for ratio in (*RATIOS, math.nan):
