@@ -20,7 +20,8 @@ import pandas as pd
 
 from bench.experiment import config
 from bench.measure.performance import wilson
-from bench.report.text import number
+from bench.report.text import apart, number
+from bench.report.text import interval as text_of_interval
 from bench.report.text import span as ends_of
 from bench.studies.bias_variance import trust
 from bench.studies.gradient_check.points import is_trusted
@@ -429,9 +430,7 @@ def dose_pairs(name: str = "dose_response") -> str:
     for scene_class, own in rows.groupby("scene_class", sort=False):
         cells = []
         for row in own.itertuples():
-            value, low, high = (
-                number(x) if np.isfinite(x) else "inf" for x in (row.ratio, row.ratio_low, row.ratio_high)
-            )
+            value, low, high = number(row.ratio), apart(row.ratio_low, 1.0), apart(row.ratio_high, 1.0)
             cells.append(f"{value} [{low}, {high}]" if own["problems"].max() >= 6 else value)
         lines.append(f"| {scene_class} | {own['problems'].max()} | {' | '.join(cells)} |")
     return block([*head, *lines])
@@ -442,7 +441,7 @@ def with_interval(row: Any, name: str) -> str:
     value, low, high = (float(getattr(row, f"{name}{end}")) for end in ("", "_low", "_high"))
     if not np.isfinite(value):
         return "-"
-    return f"{number(value)} [{number(low)}, {number(high) if high < 1e4 else 'no limit'}]"
+    return text_of_interval(value, low, high)
 
 
 def dose_answer(name: str = "dose_response") -> str:

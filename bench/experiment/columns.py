@@ -72,6 +72,8 @@ class Column:
     low: str = field(default="", kw_only=True)
     high: str = field(default="", kw_only=True)
     """The columns with the ends of the 95% interval, empty if there is none."""
+    boundary: float | None = field(default=None, kw_only=True)
+    """The value that intervals are compared with: an end that differs from it never prints as it."""
     limit: str = field(default="", kw_only=True)
     """The column that is true where the value is an upper limit."""
     log: bool | None = field(default=None, kw_only=True)

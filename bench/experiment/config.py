@@ -6,6 +6,7 @@ import math
 import os
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -85,7 +86,20 @@ def load(overrides: Sequence[str], config_dirs: Sequence[Path] = ()) -> Experime
         lines = [str(part).strip().partition("\n")[0] for part in (error, error.__cause__) if part is not None]
         raise UserError(printable(": ".join(lines)).replace("override ++", "")[:1000]) from None
     assert isinstance(plain, dict)
-    return experiment({str(k): values.restore(v) for k, v in plain.items()})
+    settings = {str(k): values.restore(v) for k, v in plain.items()}
+    return _joined(experiment(settings), _as_list(settings["also"]), overrides, config_dirs)
+
+
+def _joined(
+    main: Experiment, names: Sequence[Any], overrides: Sequence[str], config_dirs: Sequence[Path]
+) -> Experiment:
+    """Return an experiment with those that join it, which have the same settings of the command line."""
+    common = [word for word in overrides if word.lstrip("+").partition("=")[0] not in ("experiment", "also")]
+    also = tuple(load([f"experiment={name}", *common, "also=[]"], config_dirs) for name in names)
+    for name, other in zip(names, also, strict=True):
+        if other.study != main.study:
+            raise UserError(f"also: {name} has another study or other settings of it than {main.name}")
+    return replace(main, also=also)
 
 
 def _file_of(name: str, config_dirs: Sequence[Path]) -> Path:

@@ -85,6 +85,8 @@ class Experiment:
     values: Mapping[str, Mapping[str, Mapping[str, Any]]] = field(default_factory=dict)
     """Parameters set for plugins by axis, plugin name and parameter."""
     sweep: Mapping[str, Any] = field(default_factory=dict)
+    also: tuple[Experiment, ...] = ()
+    """Experiments of the same study whose cells join its own."""
     decision: Decision = OWN
     """The meaning of theta, and the point at which gradients are taken."""
     samples: int = 256
@@ -129,6 +131,7 @@ class Experiment:
             **{registry.kind_of(axis): [str(choice) for choice in some] for axis, some in self.choices.items()},
             "parameters": self.values,
             "sweep": self.sweep,
+            "also": [other.record() for other in self.also],
             "theta": list(self.decision.names),
             "theta0": None if self.decision.at is None else list(self.decision.at),
             **{name: getattr(self, name) for name in ("samples", "repeats", "seed", "timing", "marks", "compile_time")},

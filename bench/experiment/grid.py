@@ -41,7 +41,7 @@ def parameter_name(axis: str) -> str:
 
 
 def cells(experiment: Experiment) -> list[Cell]:
-    """Return the cells of an experiment, each once, in sweep order; raises :class:`UserError` for invalid values."""
+    """Return the cells of an experiment and of those that join it, each once, in sweep order; raises :class:`UserError` for invalid values."""
     refuse_too_many(experiment.sweep, math.prod(len(some) for some in experiment.choices.values()))
     _check_axes(experiment)
     unique: dict[str, Cell] = {}
@@ -50,6 +50,8 @@ def cells(experiment: Experiment) -> list[Cell]:
         for choices in itertools.product(*experiment.choices.values()):
             cell = expansion.cell(point, dict(zip(experiment.choices, choices, strict=True)))
             unique.setdefault(cell.key, cell)
+    for cell in (cell for other in experiment.also for cell in cells(other)):
+        unique.setdefault(cell.key, cell)
     if not unique:
         raise UserError("the experiment has no cells: choose at least one of each of scenes, backends, estimators")
     if any(cell.decision != OWN for cell in unique.values()):

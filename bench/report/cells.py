@@ -13,7 +13,7 @@ import pandas as pd
 
 from bench.experiment.columns import Column
 from bench.experiment.views import Table
-from bench.report.text import axis_value, duration, number
+from bench.report.text import apart, axis_value, duration, number
 
 BLOCK = 4096
 """Rows that are turned into dictionaries at a time."""
@@ -50,7 +50,7 @@ def cell(column: Column, row: Mapping[Any, Any]) -> TableCell:
     if column.low and column.high:
         ends = [float(row[name]) for name in (column.low, column.high)]
         if not all(map(math.isnan, ends)):
-            interval = "[{}, {}]".format(*(value_text(column, end) for end in ends))
+            interval = "[{}, {}]".format(*(end_text(column, end) for end in ends))
     return TableCell(value_text(column, value), interval, note, bold)
 
 
@@ -63,6 +63,15 @@ def value_text(column: Column, value: float) -> str:
     if column.format == "setting":
         return axis_value(value)
     return number(value, column.digits)
+
+
+def end_text(column: Column, value: float) -> str:
+    """Return an end of an interval in the format of a column, apart from the column's boundary."""
+    if column.boundary is None or column.format not in ("number", "percent"):
+        return value_text(column, value)
+    if column.format == "percent":
+        return "-" if math.isnan(value) else f"{apart(100 * value, 100 * column.boundary, column.digits)}%"
+    return apart(value, column.boundary, column.digits)
 
 
 def readable(table: Table) -> pd.DataFrame:

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 from bench.errors import printable as one_line
 
-__all__ = ["axis_value", "counted", "duration", "listed", "number", "one_line"]
+__all__ = ["apart", "axis_value", "counted", "duration", "interval", "listed", "number", "one_line"]
 
 
 def number(value: float, digits: int = 2) -> str:
@@ -25,6 +25,29 @@ def number(value: float, digits: int = 2) -> str:
     if -4 < power < max(digits, 4):
         return f"{float(f'{mantissa}e{power}'):.{max(digits - 1 - power, 0)}f}"
     return f"{mantissa}e{power}"
+
+
+def apart(value: float, boundary: float, digits: int = 2) -> str:
+    """Return a number with at least ``digits`` significant digits, and so many that it does not print as a boundary that it differs from.
+
+    >>> apart(1.0312, 1.0), apart(1.0, 1.0), apart(0.9996, 1.0), apart(6.94, 1.0)
+    ('1.03', '1.0', '0.9996', '6.9')
+    """
+    if not math.isfinite(value) or value == boundary:
+        return number(value, digits)
+    return next(text for text in (number(value, places) for places in range(digits, 18)) if float(text) != boundary)
+
+
+def interval(value: float, low: float, high: float, boundary: float = 1.0) -> str:
+    """Return a ratio with its interval, whose ends never print as the boundary that they differ from.
+
+    Ratios above 10,000 and below 1/10,000 are as good as infinite and 0.
+
+    >>> interval(2.83, 1.03, 6.9), interval(2.0, 0.0, math.inf)
+    ('2.8 [1.03, 6.9]', '2.0 [0, no limit]')
+    """
+    ends = apart(low, boundary) if low > 1e-4 else "0", apart(high, boundary) if high < 1e4 else "no limit"
+    return f"{number(value)} [{', '.join(ends)}]"
 
 
 def axis_value(value: float) -> str:

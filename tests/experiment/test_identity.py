@@ -10,6 +10,7 @@ from trees import ROOT, Tree
 
 from bench import model
 from bench.cli import main
+from bench.errors import UserError
 from bench.experiment import config, grid, keys
 from bench.experiment.cell import Cell
 from bench.experiment.keys import fingerprint
@@ -230,3 +231,34 @@ def test_what_was_unavailable_runs_once_it_is_installed(tmp_path, capsys):
     capsys.readouterr()
     assert main(["plan", *words]) == 0
     assert "1 stored, 1 to run" in capsys.readouterr().out
+
+
+# ------------------------------------------------------------------------------------------ experiments that join
+
+
+def folder_with(tmp_path, **files):
+    (tmp_path / "experiment").mkdir()
+    for name, lines in files.items():
+        (tmp_path / "experiment" / f"{name}.yaml").write_text("# @package _global_\n" + "\n".join(lines) + "\n")
+    return [tmp_path]
+
+
+OWN = ["name: main", "scenes: [pushing]", "contacts: [penalty]", "backends: [numpy]", "estimators: [fobg]"]
+OTHER = ["name: other", "scenes: [pushing, pendulum]", "contacts: [impulse]", "backends: [numpy]", "estimators: [fobg]"]
+
+
+def test_cells_of_an_experiment_that_joins_have_their_own_contact_law_and_the_settings_of_the_command_line(tmp_path):
+    folders = folder_with(tmp_path, main=[*OWN, "also: [other]"], other=[*OTHER, "also: [main]"])
+    found = grid.cells(config.load(["experiment=main", "samples=8"], folders))
+    assert [(cell.scene.name, cell.contact.name if cell.contact else "") for cell in found] == [
+        ("pushing", "penalty"), ("pushing", "impulse"), ("pendulum", ""),
+    ]  # fmt: skip
+    assert {cell.samples for cell in found} == {8}
+    alone = grid.cells(config.load(["experiment=other", "samples=8", "also=[]"], folders))
+    assert [cell.key for cell in found[1:]] == [cell.key for cell in alone]
+
+
+def test_an_experiment_of_another_study_cannot_join(tmp_path):
+    folders = folder_with(tmp_path, main=[*OWN, "also: [other]"], other=[*OTHER, "study: optimise"])
+    with pytest.raises(UserError, match="also: other has another study"):
+        config.load(["experiment=main"], folders)

@@ -542,6 +542,44 @@ def test_a_chart_may_have_names_on_its_axis_and_lines_of_no_cell(browser, tmp_pa
     assert browser.said == []
 
 
+def test_points_without_a_value_are_crosses_at_the_edge_and_the_dots_of_a_row_do_not_overlap(browser, tmp_path):
+    """The faults: a row that nobody reaches was left out where the text spoke of crosses, and a row's dots hid each other."""
+    frame = pd.DataFrame({
+        "problem": ["hard", "hard", "easy", "easy"], "kind": list("abab"), "cost": [np.nan, np.nan, 10.0, 10.0],
+        "missed": [True, True, False, False], "error": [1.0, 2.0, 3.0, 4.0],
+    })  # fmt: skip
+    cost = Column("cost", log=True)
+    dots = Chart(
+        "reached", "Reached", frame, [cost], [Column("problem", kind="text")], "dots", series="kind", failed="missed"
+    )
+    lines = Chart("errors", "Errors", frame, [Column("error")], [cost], series="kind", failed="missed")
+    rows = small_rows()
+    path = tmp_path / "report.html"
+    views = Views(["It works"], charts=[dots, lines])
+    path.write_text(document.assemble(experiment(), rows, views, [["a=1"]] * len(rows), {}))
+    browser.open(path)
+
+    def drawn(chart, symbol):
+        browser.do(f"drawChart(charts[{chart}])")
+        plot = f"charts[{chart}].panels.querySelector('.plot')"
+        is_cross = "(one) => one.marker && one.marker.symbol === 'x-thin'"
+        found = f"{plot}.data.filter((one) => one.text && ({is_cross})(one) === {symbol}).map((one) => [one.x[0], one.y[0]])"
+        return browser.do(found), plot
+
+    crosses, plot = drawn(0, "true")
+    points, _ = drawn(0, "false")
+    assert [x for x, _ in points] == [10, 10]
+    assert all(x > 10 for x, _ in crosses)
+    heights = [y for _, y in [*crosses, *points]]
+    assert len(set(heights)) == 4
+    assert [round(y) for y in heights] == [0, 0, 1, 1]  # "hard" is the first row, at the top
+    assert browser.do(f"{plot}.layout.yaxis.ticktext") == ["hard", "easy"]
+    crosses, _ = drawn(1, "true")
+    assert [x for x, _ in crosses] == [1, 2]
+    assert all(y > 10 for _, y in crosses)
+    assert browser.said == []
+
+
 def test_charts_have_their_own_looks_and_panels_their_own_scales_where_print_has_them(browser, tmp_path):
     """The faults: a name had one colour on the whole page, so that two series of a chart could share it, and one scale."""
     frame = pd.DataFrame({

@@ -12,6 +12,8 @@ from bench.plugins.optimizers.gradient_descent import GradientDescent
 from bench.plugins.scenes.quadratic import Quadratic
 
 import bench
+from bench.experiment import config
+from bench.report.cells import readable
 from bench.studies.dose_response import analysis, controls, model, views
 from bench.studies.dose_response.measure import compare, hypotheses_hash
 from bench.studies.dose_response.model import Data, Estimate, bootstrap, estimate, fit
@@ -379,3 +381,26 @@ def test_findings_say_above_1_only_where_the_interval_does():
         "of the first regret, over 8 problems. This is open on smooth and all together."
     )
     assert "not known" in views.findings(analysis.paired(pd.DataFrame(lines[:0], columns=list(lines[0]))), costs)[0]
+
+
+def test_an_interval_above_1_is_not_printed_as_if_it_held_1():
+    """Of eight ratios the interval is from the lowest to the highest: 1.03 rounds to 1.0 with two digits."""
+    ratios = (1.03, 2.0, 2.0, 2.5, 2.5, 3.0, 3.0, 6.94)
+    lines = [planted(f"p{i}", kind, dose, updates) for i, ratio in enumerate(ratios)
+             for kind, dose, updates in ((analysis.RANDOM, 0.3, 100.0), (analysis.RANDOM, 3.0, 100.0 * ratio))]  # fmt: skip
+    costs = pd.DataFrame({"target": [], "scene_class": [], "verdict": []})
+    pairs = analysis.paired(pd.DataFrame(lines))
+    first, *_ = views.findings(pairs, costs)
+    assert "takes 2.5 [1.03, 6.9] times" in first
+    assert "This is above 1 on smooth and all together." in first
+    (line, *_) = readable(views._pair_table(pairs)).to_dict("records")
+    assert line["random error 3 / 0.3"] == "2.5 [1.03, 6.9]"
+
+
+def test_planted_errors_alone_have_a_report_that_compares_no_orders(run):
+    """The fault: without natural methods the tables of costs had no columns, and the report ended in a KeyError."""
+    experiment = config.load(["experiment=dose_response/quick"])
+    for rows in (run[run["estimator"] == "planted"], run[run["estimator_params"] == "base=best"]):
+        shown = views.views(experiment, rows.reset_index(drop=True))
+        assert shown.findings
+        assert not any("In rollouts" in sentence for sentence in shown.findings)

@@ -58,6 +58,7 @@ def page_data(
     needed = needed.union(*map(_columns_of, drawn.values()))
     flags = {column["flag"] for column in columns}
     limits = {axis["limit"] for chart in drawn.values() for axis in (*chart["x"], *chart["y"])}
+    limits |= {chart["failed"] for chart in drawn.values()}
     tables = {"rows": _encoded(cells, needed, flags | limits)}
     tables |= {
         chart.name: _encoded(_frame(chart), {"row", *_columns_of(drawn[chart.name])}, limits) for chart in charts
@@ -150,6 +151,7 @@ def _chart(chart: Chart) -> dict[str, Any]:
         "facet": "facet_" if chart.panel_row else chart.panel,
         "line": "line_" if chart.kind == "lines" else "",
         "front": chart.front,
+        "failed": chart.failed,
         "level": chart.level,
         "fill": "fill_" if chart.kind == "grid" and chart.value else "",
         "cell": chart.cell,
@@ -165,7 +167,7 @@ def _chart(chart: Chart) -> dict[str, Any]:
 
 def _columns_of(chart: dict[str, Any]) -> set[str]:
     axes = {axis[key] for axis in (*chart["x"], *chart["y"]) for key in ("column", "low", "high", "limit")}
-    return axes | {chart[key] for key in ("series", "facet", "line", "front", "level", "fill", "cell")}
+    return axes | {chart[key] for key in ("series", "facet", "line", "front", "failed", "level", "fill", "cell")}
 
 
 def _marks(chart: Chart, axis: str) -> dict[str, float | list[float | None]]:

@@ -316,13 +316,13 @@ function readable(hex, least) {
 }
 
 const NARROWEST = 52; // width of a map's column in pixels below which its cells have letters instead of their texts
+const hasNames = (chart) => isText(chart.table, chart.yAxis.column); // then x has the values, and y a row per name
 const isMap = (chart) => Boolean(chart.level || chart.fill);
 
-/* The number of names on the vertical axis, each of which takes a line. */
+/* The height of the names on the vertical axis, in lines of text. */
 function lineCount(chart, panel) {
   if (isMap(chart)) return panel.y.size;
-  if (!isText(chart.table, chart.yAxis.column)) return 0;
-  return new Set([...panel.lines.values()].flat().map((point) => point.y)).size;
+  return hasNames(chart) ? panel.rows.size * Math.max(1, 0.5 * (panel.names.size - 1) * panel.isSpread) : 0;
 }
 
 function drawChart(chart) {
@@ -342,7 +342,7 @@ function drawChart(chart) {
   chart.note.textContent = names.length ? "" : "nothing to draw among the cells shown";
   chart.panels.dataset.count = drawn.length;
   const range = isMap(chart) ? null : ranges(chart, drawn.map((name) => facets.get(name)));
-  const own = isText(chart.table, chart.yAxis.column) ? "x" : "y"; // the axis whose scale a panel may have for itself
+  const own = hasNames(chart) ? "x" : "y"; // the axis whose scale a panel may have for itself
   const rangeOf = (panel) => (chart.own_scales ? { ...range, [own]: ranges(chart, [panel])[own] } : range);
   while (chart.panels.children.length > drawn.length) {
     Plotly.purge(chart.panels.lastChild.lastChild);
@@ -393,24 +393,47 @@ function pointPanels(chart) {
   const read = (name) => (name ? reader(chart.table, name) : () => null);
   const [X, Y, low, high, limit, left, right, leftLimit] =
     [x.column, y.column, y.low, y.high, y.limit, x.low, x.high, x.limit].map(read);
-  const [series, facet, line, front] = [chart.series, chart.facet, chart.line, chart.front].map(read);
+  const [series, facet, line, front, failed] = [chart.series, chart.facet, chart.line, chart.front, chart.failed].map(read);
+  const isKnown = (axis, value) => value !== null && !(axis.log && value <= 0);
   const row = rowOf(chart.table);
   const panels = new Map();
   for (let i = 0, count = size(chart.table); i < count; i++) {
     const point = { row: row(i), x: X(i), y: Y(i) };
-    if (!isShown(point.row) || point.x === null || point.y === null) continue;
-    if ((x.log && point.x <= 0) || (y.log && point.y <= 0)) continue;
+    const [hasX, hasY] = [isKnown(x, point.x), isKnown(y, point.y)];
+    const isLost = Boolean(failed(i)) && (hasNames(chart) ? hasY && !hasX : hasX && !hasY);
+    if (!isShown(point.row) || !((hasX && hasY) || isLost)) continue;
     Object.assign(point, { low: low(i), high: high(i), limit: limit(i), series: series(i) || "" });
     Object.assign(point, { left: left(i), right: right(i), leftLimit: leftLimit(i) });
     const name = facet(i) || "";
-    if (!panels.has(name)) panels.set(name, { lines: new Map(), fronts: new Map(), names: new Set() });
+    if (!panels.has(name)) panels.set(name, { lines: new Map(), fronts: new Map(), names: new Set(), lost: [] });
     const panel = panels.get(name);
     panel.names.add(point.series);
+    if (isLost) {
+      panel.lost.push(point);
+      continue;
+    }
     append(panel.lines, chart.line ? line(i) : point.series, point);
     if (chart.front) append(panel.fronts, front(i), point);
   }
+  if (hasNames(chart)) for (const panel of panels.values()) placeRows(chart, panel);
   return panels;
 }
+
+/* Rows of names in the order of the table, the first at the top, with the series of a row below each other. */
+function placeRows(chart, panel) {
+  const values = page.tables[chart.table][chart.yAxis.column] || page.tables.rows[chart.yAxis.column];
+  const points = [...[...panel.lines.values()].flat(), ...panel.lost];
+  const here = new Set(points.map((point) => point.y));
+  const series = Object.keys(chart.looks).filter((name) => panel.names.has(name));
+  panel.rows = new Map(values.values.filter((name) => here.has(name)).map((name, k) => [name, k]));
+  panel.isSpread = series.length > 1 && !chart.join && here.size < points.length;
+  for (const point of points) {
+    const place = panel.isSpread ? (0.7 * (series.indexOf(point.series) - (series.length - 1) / 2)) / series.length : 0;
+    point.height = panel.rows.get(point.y) + place;
+  }
+}
+
+const heightOf = (point) => (point.height === undefined ? coordinate(point.y) : point.height);
 
 function append(map, key, value) {
   if (map.has(key)) map.get(key).push(value);
@@ -424,8 +447,9 @@ function ranges(chart, panels) {
     const scaled = axis.log ? values.map(Math.log10) : values;
     const [first, last] = [scaled.reduce((a, b) => Math.min(a, b)), scaled.reduce((a, b) => Math.max(a, b))];
     const margin = Math.max(0.08 * (last - first), axis.log ? 0.08 : 1e-9);
-    return [first - margin, last + margin];
+    return [first - margin, last + margin * (axis === lossy ? 2 : 1)]; // room for crosses
   };
+  const lossy = panels.some((panel) => panel.lost.length) ? (hasNames(chart) ? chart.xAxis : chart.yAxis) : null;
   const points = panels.flatMap((panel) => [...panel.lines.values()].flat());
   const ends = (marks) => (points.length ? Object.values(marks).flat().filter((end) => end !== null) : []);
   return { x: find(chart.xAxis, [...points.map((p) => p.x), ...ends(chart.marks)]),
@@ -436,6 +460,7 @@ function pointFigure(chart, name, panel, range) {
   const traces = [];
   const joined = Boolean(chart.line);
   const every = [...panel.lines.values()];
+  if (panel.lost.length) traces.push(...crosses(chart, panel.lost, range));
   const kept = apart(chart, every.flat(), range);
   if (kept) chart.note.textContent = `${kept.size} of ${every.flat().length} points are drawn: of those close together one`;
   for (const points of every) {
@@ -496,12 +521,26 @@ function mark(chart, axis, name, value, range, shapes, annotations) {
     text: plotted(name), showarrow: false, font: { size: SMALL } });
 }
 
+/* A cross at the far edge for each point without a value, as in print. */
+function crosses(chart, lost, range) {
+  const edge = (axis, limits = [0, 1]) => {
+    const at = limits[1] - 0.02 * (limits[1] - limits[0]);
+    return axis.log ? 10 ** at : at;
+  };
+  return lost.map((p) => ({
+    type: "scatter", mode: "markers", x: [hasNames(chart) ? edge(chart.xAxis, range.x) : coordinate(p.x)],
+    y: [hasNames(chart) ? p.height : edge(chart.yAxis, range.y)], customdata: [p.row < 0 ? null : p.row],
+    text: [hover(chart, p)], hovertemplate: "%{text}<extra></extra>",
+    marker: { symbol: "x-thin", size: 7, line: { color: colour(chart, p.series), width: 1.5 } },
+  }));
+}
+
 /* A line through the dots of each row of a dot plot. */
 function joins(panel) {
   const rows = new Map();
   for (const point of [...panel.lines.values()].flat()) append(rows, point.y, point);
   return [...rows.values()].map((points) => ({ type: "scatter", mode: "lines", hoverinfo: "skip",
-    x: points.map((p) => coordinate(p.x)), y: points.map((p) => coordinate(p.y)), line: { color: readable("#8a8a8a", MARK), width: 2 } }));
+    x: points.map((p) => coordinate(p.x)), y: points.map(heightOf), line: { color: readable("#8a8a8a", MARK), width: 2 } }));
 }
 
 /* Colour and symbol are the estimator, so a backend is told by its name: beside points, or where those lines of one
@@ -538,7 +577,7 @@ function trace(chart, points, joined) {
   const symbol = points.some((p) => p.limit || p.leftLimit)
     ? points.map((p) => look.symbol + (p.limit || p.leftLimit ? "-open" : "")) : look.symbol;
   const made = {
-    type: "scatter", mode: look.symbol === "line" ? "lines" : joined && look.dash !== "none" ? "lines+markers" : "markers", x: points.map((p) => coordinate(p.x)), y: points.map((p) => coordinate(p.y)),
+    type: "scatter", mode: look.symbol === "line" ? "lines" : joined && look.dash !== "none" ? "lines+markers" : "markers", x: points.map((p) => coordinate(p.x)), y: points.map(heightOf),
     customdata: points.map((p) => (p.row < 0 ? null : p.row)), text: points.map((p) => hover(chart, p)), hovertemplate: "%{text}<extra></extra>",
     marker: { color: own, symbol, size: points.length > 500 ? 6 : 8,
       ...(joined ? {} : { line: { color: ground(), width: 1 } }) }, // an outline separates points that overlap
@@ -550,7 +589,7 @@ function trace(chart, points, joined) {
       color: own, thickness: 1, width: 0 };
   };
   if (joined && chart.yAxis.high) made.error_y = bars("low", "high", "y", "limit");
-  if (isText(chart.table, chart.yAxis.column) && chart.xAxis.high) made.error_x = bars("left", "right", "x", "leftLimit");
+  if (hasNames(chart) && chart.xAxis.high) made.error_x = bars("left", "right", "x", "leftLimit");
   return made;
 }
 
@@ -576,7 +615,7 @@ function hover(chart, point) {
 }
 
 function rings(points, size, width, color) {
-  return { type: "scatter", mode: "markers", x: points.map((p) => coordinate(p.x)), y: points.map((p) => coordinate(p.y)), hoverinfo: "skip",
+  return { type: "scatter", mode: "markers", x: points.map((p) => coordinate(p.x)), y: points.map(heightOf), hoverinfo: "skip",
     marker: { symbol: "circle-open", size, color, line: { width } } };
 }
 
@@ -598,13 +637,15 @@ function frontTraces(panel, among) {
 
 function frame(chart, panel, range) {
   const [x, y] = [chart.xAxis, chart.yAxis];
-  const names = {}; // axes of names, in the order of the table, the first at the top
-  for (const [axis, key] of [[x, "x"], [y, "y"]]) {
-    if (!isText(chart.table, axis.column)) continue;
-    const values = page.tables[chart.table][axis.column] || page.tables.rows[axis.column];
-    const here = new Set([...panel.lines.values()].flat().map((p) => p[key]));
-    names[axis.column] = { type: "category", categoryarray: values.values.filter((name) => here.has(name)).map(plotted), tickfont: { size: SMALL },
-      ...(key === "y" ? { autorange: "reversed" } : {}) };
+  const names = {}; // axes of names, in the order of the table
+  if (isText(chart.table, x.column)) {
+    const values = page.tables[chart.table][x.column] || page.tables.rows[x.column];
+    const here = new Set([...[...panel.lines.values()].flat(), ...panel.lost].map((p) => p.x));
+    names[x.column] = { type: "category", categoryarray: values.values.filter((name) => here.has(name)).map(plotted), tickfont: { size: SMALL } };
+  }
+  if (hasNames(chart)) {
+    names[y.column] = { tickvals: [...panel.rows.values()], ticktext: [...panel.rows.keys()].map(plotted), tickfont: { size: SMALL },
+      range: [panel.rows.size - 0.45, -0.55] };
   }
   const style = (axis, limits) => ({
     title: { text: plotted(axis.label), standoff: 6 }, type: axis.log ? "log" : "linear", range: limits, automargin: true,

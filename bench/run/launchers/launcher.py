@@ -90,4 +90,4 @@ def local_launcher(experiment: Experiment, timed: bool = False, n_workers: int |
 
 def without_grid(experiment: Experiment) -> Experiment:
     """Return the experiment without its grid, which workers do not need since tasks contain their plugins."""
-    return replace(experiment, choices={}, values={}, sweep={}, marks={})
+    return replace(experiment, choices={}, values={}, sweep={}, also=(), marks={})

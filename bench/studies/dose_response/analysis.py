@@ -304,7 +304,19 @@ def costs(lines: pd.DataFrame) -> pd.DataFrame:
                 "cost_ratio": math.exp(float(np.median(logs))) if logs else math.nan,
                 "verdict": "first order" if low > 0.5 else "zeroth order" if high < 0.5 else "not known",
             })  # fmt: skip
-    return pd.DataFrame(result)
+    columns = [
+        "scene_class",
+        "target",
+        "ratio",
+        "wins",
+        "problems",
+        "share",
+        "share_low",
+        "share_high",
+        "cost_ratio",
+        "verdict",
+    ]
+    return pd.DataFrame(result, columns=columns)
 
 
 def rollouts_to_target(lines: pd.DataFrame, ratio: float) -> pd.Series:
@@ -328,7 +340,7 @@ def cheapest_samples(lines: pd.DataFrame, target: float = MAIN) -> pd.DataFrame:
                 hits += int(own["samples"].min() == own.loc[rollouts_to_target(own, 1.0).idxmin(), "samples"])
         low, high = wilson(hits, total) if total else (0.0, 1.0)
         result.append({"scene_class": scene_class, "kind": kind, "hits": hits, "of": total, "low": low, "high": high})
-    return pd.DataFrame(result)
+    return pd.DataFrame(result, columns=["scene_class", "kind", "hits", "of", "low", "high"])
 
 
 def wrong_rates(lines: pd.DataFrame, target: float = MAIN) -> pd.DataFrame:

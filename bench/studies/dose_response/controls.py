@@ -128,8 +128,7 @@ def chart(known: pd.DataFrame) -> Chart:
     }
     return Chart(
         "reached", title(known), known, [EVALUATIONS],
-        [text("problem", label="")], "dots", series="method", styles=looks, failed="missed", height=0.42,
+        [text("problem", label="")], "dots", series="method", styles=looks, failed="missed", height=0.55,
         subtitle=f"To 1/{MAIN:g} of the first regret, each method at its best rate. Cross: most searches miss it",
-        text="A dot is the median over the searches of a method and a bar their range. No dot: most searches miss it. "
-        "A gradient counts as one rollout.",
+        text="A dot is the median over the searches of a method and a bar their range. A gradient counts as one rollout.",
     )  # fmt: skip

@@ -18,6 +18,7 @@ from bench.experiment.views import Chart, Style, Table, Views
 from bench.measure.performance import wilson
 from bench.report.style import PALETTE, VARIANTS
 from bench.report.text import counted, listed, number
+from bench.report.text import interval as text_of_interval
 from bench.report.writer import reasons
 from bench.studies.dose_response import analysis, controls
 from bench.studies.dose_response.analysis import BEST, BIAS, FIXED, MAIN, RANDOM, ROTATION, SHOWN, TAILS, ClassFit
@@ -41,9 +42,9 @@ TARGET = text("target_name", label="regret")
 PROBLEMS = Column("problems", format="setting")
 
 
-def interval(name: str, label: str, **more: object) -> Column:
-    """Return the column of a quantity with its interval."""
-    return Column(name, label=label, low=f"{name}_low", high=f"{name}_high", **more)  # type: ignore[arg-type]
+def interval(name: str, label: str, boundary: float = 1.0, **more: object) -> Column:
+    """Return the column of a quantity with its interval, which is compared with a boundary."""
+    return Column(name, label=label, low=f"{name}_low", high=f"{name}_high", boundary=boundary, **more)  # type: ignore[arg-type]
 
 
 FITS = (
@@ -97,7 +98,7 @@ def _views(experiment: Experiment, rows: pd.DataFrame) -> Views:
                                        Column("needed", label="problems needed", format="setting")], "Hypotheses", VERDICT_NOTES, page=True),
         Table("costs", costs.assign(target_name=costs["target"].map(_regret), ratio_name=costs["ratio"].map(_ratio)),
               [CLASS, TARGET, text("ratio_name", label="a gradient costs"), PROBLEMS,
-               interval("share", "first order cheaper", format="percent"),
+               interval("share", "first order cheaper", 0.5, format="percent"),
                Column("cost_ratio", label="cost, first / zeroth order"), text("verdict", label="cheaper")],
               "Rollouts to the target, each order at its best number of samples", COST_NOTES),
         Table("models", models, [CLASS, text("model"), Column("gain", low="low", high="high"), Column("n", label="problems", format="setting")],
@@ -156,7 +157,7 @@ def findings(pairs: pd.DataFrame, costs: pd.DataFrame) -> list[str]:
             + (f" That bias takes {_interval(both)} times the updates of that random error. {_sides(main, analysis.BIAS_OVER_RANDOM)}."
                if both is not None else "")
         )  # fmt: skip
-    return [*result, cost_sentence(costs)]
+    return [*result, *([cost_sentence(costs)] if (costs["target"] == MAIN).any() else [])]
 
 
 def _sides(main: Mapping[tuple[str, str], Any], comparison: str) -> str:
@@ -191,11 +192,10 @@ def cost_sentence(costs: pd.DataFrame, target: float = MAIN) -> str:
     return f"In rollouts to {_regret(target)}, with a gradient charged as 1, 2, 4 or the measured number: {', and '.join(parts)}."
 
 
-def _text(quantity: Estimate) -> str:
+def _text(quantity: Estimate, boundary: float = 1.0) -> str:
     """Return a ratio of updates with its interval; an infinite ratio is beyond the budget of the searches."""
-    value = "beyond the budget" if quantity.value == math.inf else number(quantity.value)
-    high = number(quantity.high) if quantity.high < 1e4 else "no limit"
-    return f"{value} [{number(quantity.low) if quantity.low > 1e-4 else '0'}, {high}]"
+    shown = text_of_interval(quantity.value, quantity.low, quantity.high, boundary)
+    return shown if quantity.value < math.inf else f"beyond the budget{shown.removeprefix('inf')}"
 
 
 def _regret(target: float) -> str:
@@ -246,7 +246,7 @@ def hypotheses(
         needed = value.problems_needed(boundary) if verdict == "open" else math.nan
         lines.append({
             "hypothesis": name, "scene_class": one.scene_class, "target_name": _regret(one.target), "verdict": verdict,
-            "evidence": _text(value), "needed": math.ceil(needed) if math.isfinite(needed) else math.nan,
+            "evidence": _text(value, boundary), "needed": math.ceil(needed) if math.isfinite(needed) else math.nan,
         })  # fmt: skip
 
     for one in fits:
