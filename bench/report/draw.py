@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import re
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -212,12 +212,12 @@ def plain_lines(text: str) -> str:
 
 
 def _fill(text: str, width: float) -> str:
-    """Break text into lines of at most ``width`` inches, measured in the charts' font."""
+    """Break text into lines of at most ``width`` inches, measured in the charts' font; wider words after a comma or slash."""
     lines: list[str] = []
     for paragraph in text.split("\n"):
         line = ""
-        for word in paragraph.split():
-            longer = f"{line} {word}".strip()
+        for space, word in _words(paragraph, width):
+            longer = f"{line}{space}{word}".strip()
             if line and width_in_inches(plain(longer)) > width:
                 lines.append(line)
                 line = word
@@ -225,6 +225,13 @@ def _fill(text: str, width: float) -> str:
                 line = longer
         lines.append(line)
     return "\n".join(lines)
+
+
+def _words(paragraph: str, width: float) -> Iterator[tuple[str, str]]:
+    """Yield each word with the space before it, and the parts of a word that is wider than ``width`` inches without one."""
+    for word in paragraph.split():
+        parts = re.split(r"(?<=[,/])", word) if width_in_inches(plain(word)) > width else [word]
+        yield from zip([" ", *[""] * (len(parts) - 1)], parts, strict=True)
 
 
 def _panels(chart: Chart) -> list[tuple[str, pd.DataFrame]]:
@@ -250,7 +257,7 @@ def _label_width(chart: Chart, row_names: Sequence[str], across: int, room: floa
     if row_names:
         return max(map(width_in_inches, map(plain, row_names))) + 0.6
     if chart.kind != "dots":
-        return 0.0
+        return 0.7 if across == 1 else 0.0  # the numbers of the vertical axis
     names = map(str, chart.frame[chart.y[0].name].unique())
     return across * min(room, max(map(width_in_inches, map(plain, names)), default=0.0))
 

@@ -32,7 +32,7 @@ class SepCmaEs(PopulationTrainer):
     """CMA-ES with a diagonal covariance (Ros, Hansen 2008, https://doi.org/10.1007/978-3-540-87700-4_30).
 
     An update draws ``population`` policies from a normal distribution of all parameters, runs one episode of each from
-    the same start, and moves mean, step size and variances to the better half. The strategy's constants are those of
+    the same start, and moves mean, step size and variances to the better half. The constants are the same as in
     the optimizer ``cma_es``, with both learning rates of the covariance times (d + 2) / 3. A full covariance would
     have d^2 entries, 2e7 by default. A policy without a finite return is ranked last.
     """
