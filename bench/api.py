@@ -46,6 +46,7 @@ class Settings(TypedDict, total=False):
     optimizers: Names
     trainers: Names
     sweep: Mapping[str, Any]
+    also: Names
     scene: Values
     contact: Values
     integrator: Values
