@@ -649,11 +649,10 @@ def push_table() -> str:
     return block([*head, *lines])
 
 
-def push_costs(problem: str, *methods: str) -> str:
+def push_costs(problem: str, *methods: str, digits: int = 3) -> str:
     """Return the lowest and highest final cost of the methods' searches."""
     rows = pushes()
-    costs = rows.loc[(rows["problem"] == problem) & rows["method"].isin(methods), "final_cost"]
-    return f"{costs.min():.3g} to {costs.max():.3g}" if costs.max() < 1 else f"{costs.min():.4f} to {costs.max():.4f}"
+    return span(rows.loc[(rows["problem"] == problem) & rows["method"].isin(methods), "final_cost"], digits)
 
 
 def dose_rates() -> str:
@@ -681,7 +680,7 @@ FIGURES: dict[str, Callable[[], str]] = {
     "quadruped-engines": engines_agree,
     "quadruped-order": quadruped_order,
     "push-still": lambda: share_touched("apart, noise 0.02", "fobg, adam", "fobg, lbfgs"),
-    "push-still-cost": lambda: push_costs("apart, noise 0.02", "fobg, adam", "fobg, lbfgs"),
+    "push-still-cost": lambda: push_costs("apart, noise 0.02", "fobg, adam", "fobg, lbfgs", digits=5),
     "push-still-smoothed": lambda: share_touched(
         "apart, noise 0.02", "randomized_smoothing, adam", "randomized_smoothing, lbfgs"
     ),
