@@ -85,6 +85,10 @@ def by_point(rows: pd.DataFrame) -> pd.DataFrame:
     return table.drop_duplicates(["row", "point"]).sort_index()
 
 
+JUMP_UNDER_NOISE = ("noise", "jump")
+"""Point and verdict of a jump that only noise reaches: the gradient itself can be right."""
+
+
 def not_right(rows: pd.DataFrame) -> str:
     """Return which checks show a gradient that is wrong or open, by verdict, in words; empty without any.
 
@@ -94,7 +98,7 @@ def not_right(rows: pd.DataFrame) -> str:
     cells = set()
     for row, i, verdict in checks(rows):
         point = row["point"][i]
-        if not is_trusted(point, verdict) and (point, verdict) != ("noise", "jump"):
+        if not is_trusted(point, verdict) and (point, verdict) != JUMP_UNDER_NOISE:
             points.setdefault(verdict, []).append(point)
             cells.add(row["key"])
     verdicts = listed(f"{verdict} ({', '.join(dict.fromkeys(at))})" for verdict, at in points.items()) if points else ""

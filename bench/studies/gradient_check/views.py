@@ -17,7 +17,14 @@ from bench.report.problems import axes_of, label_columns, problem_names, titled
 from bench.report.style import PALETTE
 from bench.report.text import counted, listed, number
 from bench.report.views import Arranged, arrange
-from bench.studies.gradient_check.lines import PROBLEM, by_point, component_table, long_table, untrusted
+from bench.studies.gradient_check.lines import (
+    JUMP_UNDER_NOISE,
+    PROBLEM,
+    by_point,
+    component_table,
+    long_table,
+    untrusted,
+)
 from bench.studies.gradient_check.points import POINTS
 
 KINDS: dict[str, tuple[tuple[str, ...], Style]] = {
@@ -68,7 +75,7 @@ def findings(points: pd.DataFrame) -> list[str]:
     if points.empty:
         return ["No gradient could be checked: the table has the reason of each cell."]
     faults = untrusted(points)
-    under_noise = (faults["point"] == "noise") & (faults["verdict"] == "jump")
+    under_noise = (faults[["point", "verdict"]] == list(JUMP_UNDER_NOISE)).all(axis=1)
     wrong, jumps = faults[~under_noise], faults[under_noise]
     if wrong.empty:
         first = f"No wrong gradient at {counted(len(points), 'checked point')}"
