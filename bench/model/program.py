@@ -40,6 +40,8 @@ class Decision:
 
 N_TRIALS = 8
 """Number of random thetas per perturbation size at which the initial state is compared with the one at theta0."""
+OWN_DRAWS = 32
+"""Fixed draws of a scene's own noise over which a cost without noise is averaged."""
 OWN = Decision()
 """The default decision: the scene's own theta at its own value."""
 
@@ -157,6 +159,18 @@ class Program(ABC):
     def n_noise(self) -> int:
         """n_w, the number of normal numbers per rollout."""
         return self.dim + self.exogenous
+
+    @cached_property
+    def noise_free(self) -> np.ndarray:
+        """The noise of the cost without noise on theta or actions: ``(n_w, 1)`` zeros.
+
+        For a scene with its own noise, such as a random start: ``(n_w, 32)`` with fixed draws of it, over which the cost
+        is averaged.
+        """
+        if not self.exogenous:
+            return np.zeros((self.n_noise, 1))
+        own = np.random.default_rng(0).standard_normal((self.exogenous, OWN_DRAWS))
+        return np.concatenate([np.zeros((self.n_noise - self.exogenous, OWN_DRAWS)), own])
 
     @cached_property
     def structure(self) -> tuple[Any, ...]:

@@ -15,7 +15,7 @@ from bench.model.parameters import remember
 
 EQUIVALENT: dict[str, str] = {
     # bench/model/program.py: a scene may name the class of its programs
-    "9ae5b1689df59e23a97fbf2a6398fc92eb921a67d4cdd04846d258711776ae07": "537e21f7c1463cf5e114b297818ea6abf2ec7e5556f8f0da67faa3578015e5ff",
+    "4ca125ff3b8e7c2feaace687069e2bce6b8a417fd1465b72294431df505b4a18": "537e21f7c1463cf5e114b297818ea6abf2ec7e5556f8f0da67faa3578015e5ff",
     # bench/model/scene.py: a scene may name the class of its programs, the derivative of its feedback, and an MJCF file
     "92f2c777d31e715efc8865cb8aba45e68f5ae954bbca5beb09361cb6edf1244e": "19a77ee56a6a214a4dc2c76e08a14257a51fb50b9c3cdad578f647101743edcb",
     # bench/measure/reference.py: noise on the actions beside a scene's own noise, which no stored scene has
@@ -102,6 +102,10 @@ EQUIVALENT: dict[str, str] = {
     "40f5a560fa0e9fb3cea4708ff14d1a00aad69004bd9e49d4705131ded8a3da14": "f302f032f1e6e1b031801f5896df99bc0f3f8a962349db73ed6aeec772b7945c",
     # plugins/trainers/evolution.py: shares its episodes with another trainer
     "686532575ae796c4217d1d3d7d95c9b0f48ca9dbc3792a9b6dd451d0f65968bc": "604abd01749d1f0cf4c1bc84d6045238660ab504dacb683d96a39c67f8465455",
+    # plugins/estimators/planted.py: the best gradient of a scene with noise of its own, which no stored row has
+    "f1df51b78d9e08c126d0d06f9489e59b9df8e17060c27db8da31a3bcb7af0e1a": "e9e0cd36e6596cd749d22fa2823919c2c7ea91c732d37d2e4486f36f769021e8",
+    # bench/studies/dose_response/ground.py: the objective of a scene with noise of its own, which no stored row has
+    "2af1f4ae249ee3a458509132a1098efa3017c735b33d9ec65daffd10352337b7": "b4c6f2bd35d60a5908e9e38ac4d0d9adf001763508ae271a68e5860a738d5e56",
 }
 """Hashes of files, and of classes of studies, whose changes decide no stored number: the new hash, and the one in the keys of rows.
 

@@ -17,7 +17,7 @@ class Planted(Estimator):
     vector whose root mean square length is noise |g|; with ``tails`` it is a multivariate Student t vector of the same
     root mean square length. With ``scale=start``, bias and noise are relative to |g| at the start instead, and their
     relative size grows as the gradient falls, as sampling noise does. g is the mean gradient of the samples, or with
-    ``base=best`` the gradient at w = 0 (the mean of costs times scores where the cost jumps). Without an error and with
+    ``base=best`` the gradient without noise, as a mean over fixed draws of a random start (the mean of costs times scores where the cost jumps). Without an error and with
     ``base=samples`` it equals ``fobg``. Requires gradients.
     """
 
@@ -77,8 +77,8 @@ class Planted(Estimator):
 
     def _base(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
         if self._is_exact(problem.program):
-            still = np.zeros((problem.program.n_noise, 1))
-            return np.repeat(problem.grad(theta, still).T, len(noise), axis=0)
+            gradient = problem.grad(theta, problem.program.noise_free).mean(axis=1, keepdims=True)
+            return np.repeat(gradient.T, len(noise), axis=0)
         if self.base == "best":
             return np.asarray(zeroth_order(problem, theta, noise).mean(axis=1))
         return np.asarray(per_repeat(problem.grad(theta, columns(noise)), noise).mean(axis=1))

@@ -33,7 +33,7 @@ SEARCHED = 4000
 
 
 class BestGradient(Estimator):
-    """The best gradient available: at w = 0 for a continuous cost, else the mean of costs times scores."""
+    """The best gradient available: without noise for a continuous cost, else the mean of costs times scores."""
 
     name = ""  # not a plugin
     includes_explicit_derivative = True
@@ -41,8 +41,8 @@ class BestGradient(Estimator):
     def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Return the gradient of the scored objective, ``(R, d)``."""
         if problem.program.continuous:
-            still = np.zeros((problem.program.n_noise, 1))
-            return np.repeat(problem.grad(theta, still).T, len(noise), axis=0)
+            gradient = problem.grad(theta, problem.program.noise_free).mean(axis=1, keepdims=True)
+            return np.repeat(gradient.T, len(noise), axis=0)
         return np.asarray(zeroth_order(problem, theta, noise).mean(axis=1))
 
 
@@ -63,10 +63,10 @@ class Ground:
 
 
 def scored_noise(problem: Problem, scene: str) -> np.ndarray:
-    """Return the noise ``(n_w, M)`` of the objective: none for a continuous cost, else a fixed sample."""
+    """Return the noise ``(n_w, M)`` of the objective: none but a scene's own for a continuous cost, else a fixed sample."""
     width = problem.program.n_noise
     if problem.program.continuous:
-        return np.zeros((width, 1))
+        return problem.program.noise_free
     return noise.draw(0, scene, 1, SCORED, width, "dose_response: scores")[0].T  # type: ignore[no-any-return]
 
 
@@ -124,7 +124,10 @@ def _compute(cell: Cell, problem: Problem, session: Session, settings: Any, opti
 def _gradients(problem: Problem, scene: str, thetas: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     width = problem.program.n_noise
     if problem.program.continuous:
-        return problem.grad(thetas.T, np.zeros((width, len(thetas)))).T, np.zeros(len(thetas))
+        still = problem.program.noise_free
+        count = still.shape[1]
+        per_draw = problem.grad(np.repeat(thetas.T, count, axis=1), np.tile(still, (1, len(thetas))))
+        return per_draw.reshape(problem.dim, len(thetas), count).mean(axis=2).T, np.zeros(len(thetas))
     w = noise.draw(1, scene, 1, EXACT, width, "dose_response: exact")
     terms = [zeroth_order(problem, theta, w)[0] for theta in thetas]
     return np.array([t.mean(axis=0) for t in terms]), np.array([t.var(axis=0, ddof=1).sum() / EXACT for t in terms])
@@ -132,7 +135,7 @@ def _gradients(problem: Problem, scene: str, thetas: np.ndarray) -> tuple[np.nda
 
 def _optimum(cell: Cell, problem: Problem, session: Session, scored: np.ndarray) -> tuple[float, str]:
     """Return the lowest cost of the scored objective and its source."""
-    if problem.program.continuous:
+    if problem.program.continuous and not problem.program.exogenous:
         optimum, how = known_optimum(cell, problem, session, SimpleNamespace(scored="plain"))
         if np.isfinite(optimum):
             return optimum, how
