@@ -421,6 +421,16 @@ def dose(table: str, name: str = "dose_response") -> pd.DataFrame:
     return pd.read_csv(STANDARD / name / f"{table}.csv", keep_default_na=True)
 
 
+LEAST_RATIOS = 6
+"""Fewest problems at which the median of a ratio has a finite interval."""
+
+
+def ratio(row: Any) -> str:
+    """Return a ratio of updates with its interval."""
+    low, high = apart(row.ratio_low, 1.0), apart(row.ratio_high, 1.0)
+    return f"{number(row.ratio)} [{low}, {high}]"
+
+
 def dose_pairs(name: str = "dose_response") -> str:
     """Return the ratios of updates to 1/100 by class and comparison as a Markdown table."""
     rows = dose("pairs", name).query("target == 100")
@@ -428,11 +438,32 @@ def dose_pairs(name: str = "dose_response") -> str:
     head = [f"| class | problems | {' | '.join(names)} |", f"|---|--:|{'--:|' * len(names)}"]
     lines = []
     for scene_class, own in rows.groupby("scene_class", sort=False):
-        cells = []
-        for row in own.itertuples():
-            value, low, high = number(row.ratio), apart(row.ratio_low, 1.0), apart(row.ratio_high, 1.0)
-            cells.append(f"{value} [{low}, {high}]" if own["problems"].max() >= 6 else value)
+        shown = own["problems"].max() >= LEAST_RATIOS
+        cells = [ratio(row) if shown else number(row.ratio) for row in own.itertuples()]
         lines.append(f"| {scene_class} | {own['problems'].max()} | {' | '.join(cells)} |")
+    return block([*head, *lines])
+
+
+DOSE_RUNS = {
+    "Adam": "dose_response",
+    "Adam, 20 seeds": "dose_response_seeds",
+    "Adam, neural policies": "dose_response_policy",
+    "plain descent": "dose_response_descent",
+    "clipped descent": "dose_response_clipped",
+    "L-BFGS": "dose_response_lbfgs",
+}
+"""What each experiment with planted errors is called in the table of their ratios."""
+
+
+def dose_runs() -> str:
+    """Return the ratios of updates to 1/100 over all problems of each experiment with planted errors as a Markdown table."""
+    names = ("random error 0.3", "random error 1", "random error 3 / 0.3", "bias 0.9", "bias 0.9 / random error 1")
+    head = [f"| searches | problems | {' | '.join(names)} |", f"|---|--:|{'--:|' * len(names)}"]
+    lines = []
+    for label, name in DOSE_RUNS.items():
+        rows = dose("pairs", name).query("target == 100 and scene_class == 'all classes'").set_index("comparison")
+        cells = [ratio(rows.loc[comparison]) for comparison in names]
+        lines.append(f"| {label} | {int(rows['problems'].max())} | {' | '.join(cells)} |")
     return block([*head, *lines])
 
 
@@ -699,8 +730,7 @@ FIGURES: dict[str, Callable[[], str]] = {
     "push-on-cem": lambda: push_costs("apart, noise 0.02", "cem"),
     "dose-answer": dose_answer,
     "dose-pairs": dose_pairs,
-    "dose-descent-answer": lambda: dose_answer("dose_response_descent"),
-    "dose-descent-pairs": lambda: dose_pairs("dose_response_descent"),
+    "dose-runs": dose_runs,
     "dose-fits": dose_fits,
     "dose-hash": lambda: ", ".join(sorted(set(rows_of("dose_response")["hypotheses"]) - {""})),
     "dose-verdicts": dose_verdicts,

@@ -40,7 +40,7 @@ class Decision:
 
 N_TRIALS = 8
 """Number of random thetas per perturbation size at which the initial state is compared with the one at theta0."""
-OWN_DRAWS = 32
+OWN_DRAWS = 8
 """Fixed draws of a scene's own noise over which a cost without noise is averaged."""
 OWN = Decision()
 """The default decision: the scene's own theta at its own value."""
@@ -164,7 +164,7 @@ class Program(ABC):
     def noise_free(self) -> np.ndarray:
         """The noise of the cost without noise on theta or actions: ``(n_w, 1)`` zeros.
 
-        For a scene with its own noise, such as a random start: ``(n_w, 32)`` with fixed draws of it, over which the cost
+        For a scene with its own noise, such as a random start: ``(n_w, 8)`` with fixed draws of it, over which the cost
         is averaged.
         """
         if not self.exogenous:

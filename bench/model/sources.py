@@ -15,7 +15,7 @@ from bench.model.parameters import remember
 
 EQUIVALENT: dict[str, str] = {
     # bench/model/program.py: a scene may name the class of its programs
-    "4ca125ff3b8e7c2feaace687069e2bce6b8a417fd1465b72294431df505b4a18": "537e21f7c1463cf5e114b297818ea6abf2ec7e5556f8f0da67faa3578015e5ff",
+    "55c7c911a32078be57451be8702e153baec58333859031b5fbd7430408e52ad3": "537e21f7c1463cf5e114b297818ea6abf2ec7e5556f8f0da67faa3578015e5ff",
     # bench/model/scene.py: a scene may name the class of its programs, the derivative of its feedback, and an MJCF file
     "92f2c777d31e715efc8865cb8aba45e68f5ae954bbca5beb09361cb6edf1244e": "19a77ee56a6a214a4dc2c76e08a14257a51fb50b9c3cdad578f647101743edcb",
     # bench/measure/reference.py: noise on the actions beside a scene's own noise, which no stored scene has
