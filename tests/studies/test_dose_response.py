@@ -9,15 +9,17 @@ import pytest
 from bench.plugins.estimators.planted import Planted
 from bench.plugins.optimizers.adam import Adam
 from bench.plugins.optimizers.gradient_descent import GradientDescent
+from bench.plugins.scenes.cartpole_swing import CartpoleSwing
 from bench.plugins.scenes.quadratic import Quadratic
 
 import bench
 from bench.experiment import config
 from bench.report.cells import readable
 from bench.studies.dose_response import analysis, controls, model, views
+from bench.studies.dose_response.ground import BestGradient, scored_noise
 from bench.studies.dose_response.measure import compare, hypotheses_hash
 from bench.studies.dose_response.model import Data, Estimate, bootstrap, estimate, fit
-from bench.studies.dose_response.search import TARGETS, Method, Task, follow, run_searches, tune, unit_rate
+from bench.studies.dose_response.search import TARGETS, Method, Task, follow, objective, run_searches, tune, unit_rate
 
 D = 8
 DIFFERENCED = 1e-6
@@ -75,6 +77,25 @@ def test_descent_with_relative_noise_has_the_mean_regret_of_its_closed_form(bowl
     ratio = squares[:, -1] / squares[:, 0]
     factor = (1 - share) ** 2 + (share * noise) ** 2
     assert ratio.mean() == pytest.approx(factor**steps, abs=4 * ratio.std() / math.sqrt(seeds))
+
+
+def test_with_random_starts_the_best_gradient_is_that_of_the_scored_cost():
+    """Both are means over the same fixed starts, so that differences of the cost give the gradient, and no noise remains."""
+    scene = CartpoleSwing(horizon=6, noise="parameter", sigma=0.05, policy="mlp[hidden=2]")
+    problem = bench.problem(scene, integrator="semi_implicit_euler", backend="jax")
+    program, theta = problem.program, problem.program.theta0
+    scored = scored_noise(problem, "cartpole_swing")
+    assert scored.shape == (program.dim + 8, 8)
+    assert not scored[: program.dim].any()
+    assert len(np.unique(scored[program.dim :])) == 64
+    noise = np.random.default_rng(0).standard_normal((3, 2, program.n_noise))
+    direction, step = np.random.default_rng(1).standard_normal(program.dim), 1e-5
+    ahead, behind = (objective(problem, theta + s * direction, scored) for s in (step, -step))
+    slope = (ahead - behind) / (2 * step)
+    for estimator in (BestGradient(), Planted(base="best")):
+        gradients = estimator.estimate(problem, theta, noise)
+        assert gradients.shape == (3, program.dim)
+        assert gradients @ direction == pytest.approx([slope] * 3, rel=1e-6)
 
 
 def test_tuning_finds_the_rate_that_solves_a_quadratic_in_one_step(bowl):
