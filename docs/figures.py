@@ -347,6 +347,19 @@ def windows_table(experiment: str = "train") -> str:
     ])  # fmt: skip
 
 
+def stiffness_table() -> str:
+    """Return gradient, its bias and final return by the stiffness of the ground and the length of a window, as Markdown."""
+    head = [
+        "| stiffness [N/m] | window [steps] | norm of the gradient | its bias | final return |",
+        "|--:" * 5 + "|",
+    ]
+    return block(head + [
+        f"| {count(stiffness)} | {line['window']:.0f} | {number(line['window_gradient'])} | {findings.bias_words(line)} | {final_return(line)} |"
+        for stiffness, part in trained("train/stiffness").groupby("stiffness")
+        for line in aggregate.windows(part).to_dict("records")
+    ])  # fmt: skip
+
+
 def gradient_norms(experiment: str, window: int) -> str:
     """Return the range over seeds of the median norm of a run's gradients, for ``shac`` with one length of window."""
     runs = trained(experiment)
@@ -825,6 +838,7 @@ FIGURES: dict[str, Callable[[], str]] = {
     "train-windows-finding": windows_finding,
     "hopper-finding": lambda: findings.recommendation(aggregate.summarise(trained("train/hopper"))),
     "hopper-table": lambda: trained_table("train/hopper"),
+    "hopper-stiffness": stiffness_table,
     "hopper-windows": lambda: windows_table("train/hopper"),
     "hopper-windows-finding": lambda: windows_finding("train/hopper"),
     "hopper-faults": lambda: faults_table("train/hopper"),
