@@ -76,6 +76,21 @@ def test_windows_that_are_not_distinguishable_from_the_best_are_named():
     }
 
 
+def test_titles_over_several_problems_count_them_instead_of_naming_the_first():
+    runs = []
+    for k, final in (("1e3", FINAL), ("1e4", dict.fromkeys(FINAL, -600.0))):
+        experiment, rows = made_up(final, spread=10.0 if k == "1e3" else 100.0)
+        runs.append(aggregate.runs_of(experiment, rows).assign(problem=f"stiffness={k}"))
+    every = pd.concat(runs, ignore_index=True)
+    summary, windows = aggregate.summarise(every), aggregate.windows(every)
+    assert findings.title(summary) == "Trainers end lower than the best on 1 of 2 problems"
+    assert findings.window_title(windows) == "Among windows of shac, 32 steps end best on 1 of 2 problems"
+    last = windows[windows["problem"] == "stiffness=1e4"]
+    assert findings.window_title(pd.concat([last, last.assign(problem="other")])) == (
+        "Among windows of shac, which length ends best is open"
+    )
+
+
 def test_lengths_of_windows_are_compared_by_their_returns_and_a_bias_is_named_only_where_its_interval_excludes_0():
     experiment, rows = made_up()
     rows.loc[rows["trainer"] == "shac[window=8]", "window_bias_low"] = 0.0
@@ -93,7 +108,7 @@ def test_a_trainer_without_a_run_that_ends_is_not_the_best_by_its_untrained_poli
     planted = rows["trainer"] == "ppo"
     rows.loc[planted, ["status", "first_return"]] = ["nonfinite", -100.0]
     text = views(experiment, rows).findings[0]
-    assert "(shac), and shac[window=8] end lower" in text
+    assert "(shac), and shac[window=8] ends lower" in text
     assert text.endswith(", and no run of ppo ends with a finite return.")
     assert "-100" not in text
     rows.loc[rows["trainer"] == "shac[window=8]", ["status", "first_return"]] = ["nonfinite", -100.0]

@@ -37,13 +37,9 @@ def recommendation(summary: pd.DataFrame) -> str:
         if part.empty:
             parts.append(f"No run{where} ends with a finite return")
             continue
-        part = part.sort_values("final", ascending=False, kind="stable")
-        best = part.iloc[0]
-        others = part.iloc[1:]
-        is_behind = np.array([is_below(row, best) for _, row in others.iterrows()], dtype=bool)
-        tied, behind = others[~is_behind], others[is_behind]
+        best, tied, behind = ranked(part)
         value = f"The best final return{where} is {_interval(best)} ({best['method']}{_failed(best)})"
-        if others.empty:
+        if len(part) == 1:
             parts.append(f"The final return{where} of {best['method']} is {_interval(best)}{_failed(best)}")
         elif not math.isfinite(best["final_low"]):
             parts.append(
@@ -57,10 +53,20 @@ def recommendation(summary: pd.DataFrame) -> str:
             )
         else:
             also = f", not distinguishable from {_names(tied['method'])}" if len(tied) else ""
-            parts.append(f"{value}{also}; {_names(behind['method'])} end lower ({_interval(behind.iloc[0])} or less)")
+            ends = "ends lower" if len(behind) == 1 else "end lower"
+            most = _interval(behind.iloc[0]) + (" or less" if len(behind) > 1 else "")
+            parts.append(f"{value}{also}; {_names(behind['method'])} {ends} ({most})")
         if len(lost):
             parts[-1] += f"; no run of {_names(lost)} ends with a finite return"
     return f"{'. '.join(parts)}.".replace("; ", ", and ")
+
+
+def ranked(part: pd.DataFrame) -> tuple[pd.Series, pd.DataFrame, pd.DataFrame]:
+    """Return the line with the highest final return, those not distinguishable from it, and those certainly below it."""
+    part = part.sort_values("final", ascending=False, kind="stable")
+    best, others = part.iloc[0], part.iloc[1:]
+    is_behind = np.array([is_below(row, best) for _, row in others.iterrows()], dtype=bool)
+    return best, others[~is_behind], others[is_behind]
 
 
 def is_below(row: Mapping[str, Any] | pd.Series, best: Mapping[str, Any] | pd.Series) -> bool:
@@ -88,11 +94,7 @@ def window(windows: pd.DataFrame) -> str:
     """Return which window ends best within each family, those not distinguishable from it, and those behind."""
     parts = []
     for (problem, family), part in windows.groupby(["problem", "family"], sort=False) if len(windows) else ():
-        part = part.sort_values("window")
-        best = part.loc[part["final"].idxmax()]
-        others = part[part["window"] != best["window"]]
-        is_behind = np.array([is_below(row, best) for _, row in others.iterrows()], dtype=bool)
-        tied, behind = others[~is_behind], others[is_behind]
+        best, tied, behind = ranked(part.sort_values("window"))
         where = f" on {problem}" if windows["problem"].nunique() > 1 else ""
         also = f", not distinguishable from {_lengths(tied['window'])} steps" if len(tied) else ""
         if len(behind):
@@ -106,7 +108,7 @@ def window(windows: pd.DataFrame) -> str:
 
 
 def _lengths(values: Any) -> str:
-    return listed([f"{value:.0f}" for value in values])
+    return listed([f"{value:.0f}" for value in sorted(values)])
 
 
 def bias_words(line: Mapping[str, Any]) -> str:
@@ -226,6 +228,23 @@ WORDS: dict[str, Callable[[Mapping[str, Any]], str]] = {
 
 
 def title(summary: pd.DataFrame) -> str:
-    """Return the title of the curves: the best method of the first problem, or that it is open."""
-    text = recommendation(summary[summary["problem"] == summary["problem"].iloc[0]])
-    return text.partition(", and ")[0].rstrip(".")
+    """Return the title of the curves: the best method, or that it is open; or on how many problems methods are behind the best."""
+    problems = [part for _, part in summary.groupby("problem", sort=False)]
+    if len(problems) == 1:
+        return recommendation(summary).partition(", and ")[0].rstrip(".")
+    decided = sum(len(ranked(part)[2]) > 0 for part in problems)
+    return f"Trainers end lower than the best on {decided} of {len(problems)} problems"
+
+
+def window_title(windows: pd.DataFrame) -> str:
+    """Return the title of the windows: the length that ends best, or that it is open; or on how many problems it does."""
+    problems = windows["problem"].nunique()
+    if problems == 1:
+        return window(windows).split(".")[0]
+    parts = []
+    for family, own in windows.groupby("family", sort=False):
+        every = [ranked(part) for _, part in own.groupby("problem", sort=False)]
+        decided = pd.Series([best["window"] for best, _, behind in every if len(behind)], dtype=float).value_counts()
+        shown = [f"{length:.0f} steps end best on {n} of {problems} problems" for length, n in decided.items()]
+        parts.append(f"Among windows of {family}, {listed(shown) if shown else 'which length ends best is open'}")
+    return ". ".join(parts)

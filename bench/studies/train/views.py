@@ -139,9 +139,8 @@ def _charts(runs: pd.DataFrame, summary: pd.DataFrame, windows: pd.DataFrame, se
 
 
 def _windows(windows: pd.DataFrame, seeds: str) -> Chart:
-    title = findings.window(windows).split(".")[0]
     return Chart(
-        "windows", title, windows, [replace(WINDOW, log=True)], [FINAL, WINDOW_BIAS, WINDOW_GRADIENT], series="family", panel="problem",
+        "windows", findings.window_title(windows), windows, [replace(WINDOW, log=True)], [FINAL, WINDOW_BIAS, WINDOW_GRADIENT], series="family", panel="problem",
         subtitle=f"final return: {seeds}", text="A point per length of window. Choose the quantity.",
     )  # fmt: skip
 
