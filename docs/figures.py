@@ -470,7 +470,7 @@ DOSE_RUNS = {
 
 def dose_runs() -> str:
     """Return the ratios of updates to 1/100 over all problems of each experiment with planted errors as a Markdown table."""
-    names = ("random error 0.3", "random error 1", "random error 3 / 0.3", "bias 0.9", "bias 0.9 / random error 1")
+    names = ("random error 0.3", "random error 1", "random error 3", "random error 3 / 0.3", "bias 0.9", "bias 0.9 / random error 1")
     head = [f"| searches | problems | {' | '.join(names)} |", f"|---|--:|{'--:|' * len(names)}"]
     lines = []
     for label, name in DOSE_RUNS.items():
