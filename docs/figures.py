@@ -24,6 +24,7 @@ from bench.report.text import apart, number
 from bench.report.text import interval as text_of_interval
 from bench.report.text import span as ends_of
 from bench.studies.bias_variance import trust
+from bench.studies.dose_response import analysis
 from bench.studies.gradient_check.points import is_trusted
 from bench.studies.growth import views as growth
 from bench.studies.train import aggregate, findings
@@ -470,7 +471,14 @@ DOSE_RUNS = {
 
 def dose_runs() -> str:
     """Return the ratios of updates to 1/100 over all problems of each experiment with planted errors as a Markdown table."""
-    names = ("random error 0.3", "random error 1", "random error 3", "random error 3 / 0.3", "bias 0.9", "bias 0.9 / random error 1")
+    names = (
+        "random error 0.3",
+        "random error 1",
+        "random error 3",
+        "random error 3 / 0.3",
+        "bias 0.9",
+        "bias 0.9 / random error 1",
+    )
     head = [f"| searches | problems | {' | '.join(names)} |", f"|---|--:|{'--:|' * len(names)}"]
     lines = []
     for label, name in DOSE_RUNS.items():
@@ -478,6 +486,22 @@ def dose_runs() -> str:
         cells = [ratio(rows.loc[comparison]) for comparison in names]
         lines.append(f"| {label} | {int(rows['problems'].max())} | {' | '.join(cells)} |")
     return block([*head, *lines])
+
+
+def dose_windows() -> str:
+    """Return bias and updates to 1/100 of truncated windows by problem, beside the best gradient, as a Markdown table."""
+    names = {"windowed[steps=8]": "8 steps", "windowed": "16 steps", "windowed[steps=32]": "32 steps"}
+    lines = analysis.searches(rows_of("dose_response_windows")).query("target == 100")
+    head = [f"| problem | best gradient | {' | '.join(names.values())} |", f"|---|--:|{'--:|' * len(names)}"]
+    rows = []
+    for problem, own in lines.groupby("problem", sort=False):
+        by_method = own.drop_duplicates("method").set_index("method")
+        cells = [number(by_method.loc[analysis.BEST, "median"])]
+        for name in names:
+            median, bias = by_method.loc[name, "median"], by_method.loc[name, "bias"]
+            cells.append(f"{number(median) if np.isfinite(median) else '-'} ({number(bias)})")
+        rows.append(f"| {problem} | {' | '.join(cells)} |")
+    return block([*head, *rows])
 
 
 def with_interval(row: Any, name: str) -> str:
@@ -744,6 +768,7 @@ FIGURES: dict[str, Callable[[], str]] = {
     "dose-answer": dose_answer,
     "dose-pairs": dose_pairs,
     "dose-runs": dose_runs,
+    "dose-windows": dose_windows,
     "dose-fits": dose_fits,
     "dose-hash": lambda: ", ".join(sorted(set(rows_of("dose_response")["hypotheses"]) - {""})),
     "dose-verdicts": dose_verdicts,

@@ -11,10 +11,14 @@ from bench.plugins.optimizers.adam import Adam
 from bench.plugins.optimizers.gradient_descent import GradientDescent
 from bench.plugins.scenes.cartpole_swing import CartpoleSwing
 from bench.plugins.scenes.quadratic import Quadratic
+from matplotlib.collections import LineCollection
 
 import bench
 from bench.experiment import config
+from bench.experiment.columns import Column
+from bench.experiment.views import Chart
 from bench.report.cells import readable
+from bench.report.draw import draw
 from bench.studies.dose_response import analysis, controls, model, views
 from bench.studies.dose_response.ground import BestGradient, scored_noise
 from bench.studies.dose_response.measure import compare, hypotheses_hash
@@ -416,6 +420,25 @@ def test_an_interval_above_1_is_not_printed_as_if_it_held_1():
     assert "This is above 1 on smooth and all together." in first
     (line, *_) = readable(views._pair_table(pairs)).to_dict("records")
     assert line["random error 3 / 0.3"] == "2.5 [1.03, 6.9]"
+
+
+def test_a_ratio_beyond_the_budget_has_only_a_lower_end_in_words_and_in_its_chart():
+    """Of eight problems five miss the target with the larger error: the median is infinite, and the least ratio is 27 / 17."""
+    missed = [planted(f"p{i}", analysis.RANDOM, 3.0, math.inf if i < 5 else 20.0 + i) for i in range(8)]
+    small = [planted(f"p{i}", analysis.RANDOM, 0.3, math.inf if i < 2 else 10.0 + i) for i in range(8)]
+    lines = pd.DataFrame(small + missed)
+    costs = pd.DataFrame({"target": [], "scene_class": [], "verdict": []})
+    assert " takes at least 1.6 times the updates to 1/100" in views.findings(analysis.paired(lines), costs)[0]
+    points = analysis.relative_times(
+        lines.assign(method="", samples=256, error=lines["dose"], floor=10.0), 100.0
+    ).set_index("size")
+    assert (points.loc[0.3, "time_high"], points.loc[3.0, "is_missed"]) == (math.inf, True)
+    chart = Chart("x", "title", pd.DataFrame({"a": [1.0], "b": [2.0], "low": [1.0], "high": [math.inf]}), [Column("a")],
+                  [Column("b", low="low", high="high", log=True)])  # fmt: skip
+    (bars,) = [item for item in draw(chart).axes[0].collections if isinstance(item, LineCollection)]
+    (ends,) = bars.get_segments()
+    assert ends[0][1] == 1.0
+    assert ends[1][1] > 1e100
 
 
 def test_planted_errors_alone_have_a_report_that_compares_no_orders(run):

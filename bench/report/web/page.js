@@ -584,7 +584,8 @@ function trace(chart, points, joined) {
     line: { color: own, dash: look.dash, width: 1.5 },
   };
   const bars = (low, high, at, limit) => {
-    const length = (p, end) => (p[limit] || p[end] === null ? 0 : Math.abs(p[end] - p[at]));
+    const toTop = (p) => (p[low] === null ? 0 : 1e9 * Math.abs(p[at])); // an interval without an upper end
+    const length = (p, end) => (p[limit] ? 0 : p[end] === null ? (end === high ? toTop(p) : 0) : Math.abs(p[end] - p[at]));
     return { type: "data", array: points.map((p) => length(p, high)), arrayminus: points.map((p) => length(p, low)),
       color: own, thickness: 1, width: 0 };
   };
@@ -605,7 +606,7 @@ function hover(chart, point) {
   const { xAxis, yAxis } = chart;
   const value = (axis, at, low, high, limit) => {
     const text = (value) => valueText(axis, value);
-    const interval = low !== null && high !== null && !limit ? ` [${text(low)}, ${text(high)}]` : "";
+    const interval = low !== null && !limit ? ` [${text(low)}, ${high === null ? "no limit" : text(high)}]` : "";
     return `${axis.label ? plotted(axis.label) + ": " : ""}${limit ? "&lt; " : ""}${plotted(text(at))}${interval}`;
   };
   if (point.row >= 0 && !cellTexts[point.row]) cellTexts[point.row] = tellingColumns.map((c) => plotted(`${c.label} ${shownAs(c, point.row)}`)).join("<br>");

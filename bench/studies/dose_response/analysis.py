@@ -431,7 +431,7 @@ def relative_times(lines: pd.DataFrame, target: float) -> pd.DataFrame:
         result.append({
             "scene_class": scene_class, "kind": kind, "method": method, "size": size, "error": float(own["error"].median()),
             "time": value if math.isfinite(value) else math.nan, "time_low": low,
-            "time_high": high if math.isfinite(high) else math.nan, "is_missed": not math.isfinite(value),
+            "time_high": high, "is_missed": not math.isfinite(value),
             "problems": len(own), "reached": float(np.isfinite(values).mean()),
         })  # fmt: skip
     return pd.DataFrame(result)

@@ -193,9 +193,9 @@ def cost_sentence(costs: pd.DataFrame, target: float = MAIN) -> str:
 
 
 def _text(quantity: Estimate, boundary: float = 1.0) -> str:
-    """Return a ratio of updates with its interval; an infinite ratio is beyond the budget of the searches."""
+    """Return a ratio of updates with its interval; of an infinite ratio, beyond the budget of the searches, only the lower end."""
     shown = text_of_interval(quantity.value, quantity.low, quantity.high, boundary)
-    return shown if quantity.value < math.inf else f"beyond the budget{shown.removeprefix('inf')}"
+    return shown if quantity.value < math.inf else f"at least {shown.partition('[')[2].partition(',')[0]}"
 
 
 def _regret(target: float) -> str:
@@ -413,7 +413,7 @@ def _chart(lines: pd.DataFrame, fits: Sequence[ClassFit], pairs: pd.DataFrame, t
         return None
     natural = list(dict.fromkeys(points.loc[~points["kind"].isin(analysis.PLANTED), "method"]))
     looks = {name: Style(colour, marker, "none") for name, (colour, marker) in zip(natural, NATURAL * 9, strict=False)}
-    points = points[points["error"] > 0].assign(time_low=lambda f: f["time_low"].where(f["time_high"].notna()))
+    points = points[points["error"] > 0].assign(time_low=lambda f: f["time_low"].where(f["time_low"] > 0))
     panels = [one.scene_class for one in own]
     points = points.assign(place=points["scene_class"].map(panels.index)).sort_values(
         ["place", "method"], kind="stable"
