@@ -552,6 +552,14 @@ def dose_costs() -> str:
     return block(head + lines)
 
 
+def dose_unreached() -> str:
+    """Return on how many stiff problems that count no natural method reaches 1/100, of how many."""
+    stiff = dose("problems").query("scene_class == 'stiff'")
+    counted = int((stiff["reason_100"].fillna("") == "").sum())
+    reached = dose("costs").query("target == 100 and scene_class == 'stiff'")["problems"].iloc[0]
+    return f"{counted - int(reached)} of {counted}"
+
+
 def dose_second() -> str:
     """Return the second analysis of ``dose_response`` as a Markdown table."""
     head = ["| class | analysis | problems | random error 1 / 0.1 | c_b / c_s |", "|---|---|--:|--:|--:|"]
@@ -768,6 +776,7 @@ FIGURES: dict[str, Callable[[], str]] = {
     "dose-answer": dose_answer,
     "dose-pairs": dose_pairs,
     "dose-runs": dose_runs,
+    "dose-unreached": dose_unreached,
     "dose-windows": dose_windows,
     "dose-fits": dose_fits,
     "dose-hash": lambda: ", ".join(sorted(set(rows_of("dose_response")["hypotheses"]) - {""})),

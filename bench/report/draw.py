@@ -39,8 +39,8 @@ BOLD = 1.3
 """Width of a bold title relative to the same text elsewhere."""
 UPRIGHT = 1.15
 """Height in inches of the titles of panels too narrow for them; these titles read upwards."""
-UNLIMITED = 1e300
-"""Where the bar of an interval without an upper end stops, beyond every axis."""
+UNLIMITED = 1e9
+"""Factor on a value at which the bar of an interval without an upper end stops, beyond every logarithmic axis."""
 MANY = 12
 """Most points of a line that are drawn with markers; longer lines are drawn without."""
 
@@ -380,15 +380,15 @@ def _draw_lines(chart: Chart, panel: Axes, name: str, part: pd.DataFrame, styles
         if y.low and y.high:
             low, high = (points[end].to_numpy(float) for end in (y.low, y.high))
             low = np.where(low > 0, low, np.nan) if log and chart.band else low
-            known = np.isfinite(values) & np.isfinite(low) & ~np.isnan(high) & ~limit
+            high = np.where(np.isinf(high), values * UNLIMITED, high) if log and not chart.band else high
+            known = np.isfinite(values) & np.isfinite(low) & np.isfinite(high) & ~limit
             if chart.band:
                 panel.fill_between(
                     places, low, high, where=known, color=style.colour, alpha=0.18, linewidth=0, zorder=2
                 )
             else:
                 bottom = np.maximum(low, 1e-300) if log else low
-                top = np.minimum(high, UNLIMITED)
-                panel.vlines(places[known], bottom[known], top[known], linewidth=0.9, **common)
+                panel.vlines(places[known], bottom[known], high[known], linewidth=0.9, **common)
         lost = points[chart.failed].to_numpy(bool) if chart.failed else np.zeros(len(points), dtype=bool)
         if lost.any():
             panel.plot(

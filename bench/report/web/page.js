@@ -584,7 +584,7 @@ function trace(chart, points, joined) {
     line: { color: own, dash: look.dash, width: 1.5 },
   };
   const bars = (low, high, at, limit) => {
-    const toTop = (p) => (p[low] === null ? 0 : 1e9 * Math.abs(p[at])); // an interval without an upper end
+    const toTop = (p) => (p[low] !== null && chart.yAxis.log ? 1e9 * p[at] : 0); // an interval without an upper end
     const length = (p, end) => (p[limit] ? 0 : p[end] === null ? (end === high ? toTop(p) : 0) : Math.abs(p[end] - p[at]));
     return { type: "data", array: points.map((p) => length(p, high)), arrayminus: points.map((p) => length(p, low)),
       color: own, thickness: 1, width: 0 };

@@ -432,7 +432,8 @@ def _chart(lines: pd.DataFrame, fits: Sequence[ClassFit], pairs: pd.DataFrame, t
         [Column("time", label="updates / best gradient's", low="time_low", high="time_high", log=True)],
         kind="lines", series="method", panel="scene_class", styles=STYLES | looks, failed="is_missed", across=3, height=2.0,
         panel_notes={one.scene_class: f"{one.n} problems" for one in own},
-        subtitle=f"To {_regret(target)} of the first regret, each method at its best rate. Cross: half of the problems miss it",
+        subtitle=f"To {_regret(target)} of the first regret, each method at its best rate. Cross: half of the problems miss it. "
+        "A bar to the top: no upper end",
         text="Lines: planted errors. Points: natural methods, one per number of samples. Medians over problems, with 95% "
         "intervals where six problems count. The error is the median over ten thetas that all methods of a problem share.",
         on_page=True,
