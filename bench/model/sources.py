@@ -16,8 +16,8 @@ from bench.model.parameters import remember
 EQUIVALENT: dict[str, str] = {
     # bench/model/program.py: a scene may name the class of its programs
     "9ae5b1689df59e23a97fbf2a6398fc92eb921a67d4cdd04846d258711776ae07": "537e21f7c1463cf5e114b297818ea6abf2ec7e5556f8f0da67faa3578015e5ff",
-    # bench/model/scene.py: a scene may name the class of its programs, the derivative of its feedback, and an MJCF file
-    "92f2c777d31e715efc8865cb8aba45e68f5ae954bbca5beb09361cb6edf1244e": "19a77ee56a6a214a4dc2c76e08a14257a51fb50b9c3cdad578f647101743edcb",
+    # bench/model/scene.py: a scene may name the class of its programs, the derivative of its feedback, an MJCF file, and its events
+    "6a6212885eb95dbb5126a0a4aa4c76c68a8da7354e0e7c2e16be8773d5f523fe": "19a77ee56a6a214a4dc2c76e08a14257a51fb50b9c3cdad578f647101743edcb",
     # bench/measure/reference.py: noise on the actions beside a scene's own noise, which no stored scene has
     "8e9c1980ecf41fda3cffe337a73bda5f04f968b11b11f7bd78492e9239172a70": "f4ea930fd9b4c514b92e905d9ee99b00899e60ecef16cc4e558020bce228ddd2",
     # bench/model/estimator.py: noise on the actions beside a scene's own noise, which no stored scene has; a declaration for the kit
@@ -102,6 +102,8 @@ EQUIVALENT: dict[str, str] = {
     "40f5a560fa0e9fb3cea4708ff14d1a00aad69004bd9e49d4705131ded8a3da14": "f302f032f1e6e1b031801f5896df99bc0f3f8a962349db73ed6aeec772b7945c",
     # plugins/trainers/evolution.py: shares its episodes with another trainer
     "686532575ae796c4217d1d3d7d95c9b0f48ca9dbc3792a9b6dd451d0f65968bc": "604abd01749d1f0cf4c1bc84d6045238660ab504dacb683d96a39c67f8465455",
+    # plugins/scenes/heaviside.py: declares its event, which no stored row uses
+    "ce37ea8f704c52f80bdf9637ce2855b40b905e23de7825d8247dc52578c7cc7d": "62b7d378b702a48097b07a0eef7f6aac386d34c77b3028567ec40bdf3f8a570f",
 }
 """Hashes of files, and of classes of studies, whose changes decide no stored number: the new hash, and the one in the keys of rows.
 
