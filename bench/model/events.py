@@ -18,8 +18,8 @@ def events_of(problem: Problem, theta: np.ndarray, w: np.ndarray) -> Events:
     if not isinstance(scene, EventScene):
         return Events(np.empty((0, len(w))), np.empty((0, w.shape[1])), np.empty((0, problem.dim, w.shape[1])))
     scale = problem.sigma / scene.sigma
-    found = scene.events(np.asarray(theta), scale * w)
-    return Events(found.directions, found.limits / scale, found.slopes / scale)
+    directions, limits, slopes = scene.events(np.asarray(theta), scale * w)
+    return Events(directions, limits / scale, slopes / scale)
 
 
 def undeclared_jumps(program: Program) -> str | None:
@@ -30,5 +30,5 @@ def undeclared_jumps(program: Program) -> str | None:
     if program.contact is not None and not program.contact.continuous:
         return f"contact law {program.contact.name} may jump, and declares no events"
     if isinstance(program.scene, EventScene):
-        return f"the events of {name} are those of its own theta" if program.decision.names else None
+        return f"the events of {name} are declared for its own theta" if program.decision.names else None
     return None if program.continuous else f"the cost of {name} jumps, and the scene declares no events (EventScene)"

@@ -18,8 +18,7 @@ class Boundary(SampleMean):
     discrete event it is dp/dtheta times the jump. Needs a scene that declares its events, or a continuous cost, on
     which it equals ``fobg``. Requires costs and gradients, 2 rollouts per sample and event. Unbiased.
 
-    The costs are ``gap`` on either side of the boundary, so that float64 tells the sides apart. In float32 it should be
-    about 1e-3.
+    The costs are ``gap`` on either side of the boundary, which float64 resolves. In float32 it should be about 1e-3.
     """
 
     name = "boundary"

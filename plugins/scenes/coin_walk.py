@@ -1,4 +1,4 @@
-"""A walk by coins whose odds depend on theta and on the place: discrete events in a row."""
+"""Eight steps up or down by coins whose odds depend on theta and on the place: discrete events in a row."""
 
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -13,12 +13,13 @@ _NODES = 24
 
 @dataclass(frozen=True)
 class CoinWalk(EventScene, DisturbedScene):
-    """From 0, a walker takes 8 steps up (+1) or down (-1), up with the probability Phi(x_0 - x_1 q) at place q.
+    """From 0, q takes 8 steps up (+1) or down (-1), up with the probability Phi(x_0 - x_1 q) at place q.
 
     x = theta + sigma u is (push, pull), and f = (q_end - goal)^2 + effort x_0^2. A step is up where the scene's own
     normal number e is below x_0 - x_1 q, so that theta changes probabilities only, and the derivative of f at given
     noise is (2 effort x_0, 0). The distribution of q has a recursion, whose derivative gives grad J, averaged over u by a
-    Gauss-Hermite rule. Random walks with such odds are an example of Arya et al. 2022.
+    Gauss-Hermite rule. Markov chains in
+    discrete time are among the examples of Arya et al. 2022.
     """
 
     name = "coin_walk"
@@ -29,7 +30,7 @@ class CoinWalk(EventScene, DisturbedScene):
 
     push: float = param(0.2, "x_0 at theta, in standard deviations of the coin's normal number")
     pull: float = param(0.15, "x_1 at theta, per step away from 0")
-    goal: float = param(3.0, "place where the walk should end", "steps")
+    goal: float = param(3.0, "place where the steps should end", "steps")
     effort: float = param(2.0, "weight of the squared push", low=0.0)
 
     def theta0(self) -> np.ndarray:
@@ -37,12 +38,13 @@ class CoinWalk(EventScene, DisturbedScene):
         return np.array([self.push, self.pull])
 
     def disturbed_cost(self, xp: Any, x: Array, e: Array) -> Array:
-        """Return the cost of one walk per column."""
+        """Return the cost of each path."""
         q = 0.0 * x[0] + 0.0 * e[0]
         for t in range(self.exogenous):
             up = e[t] < x[0] - x[1] * q
             q = q + xp.where(up, 0.0 * q + 1.0, 0.0 * q - 1.0)
-        return (q - self.goal) ** 2 + self.effort * x[0] ** 2
+        cost: Array = (q - self.goal) ** 2 + self.effort * x[0] ** 2
+        return cost
 
     def events(self, theta: np.ndarray, w: np.ndarray) -> Events:
         """Return the steps up, one event per step."""
