@@ -43,8 +43,7 @@ class CoinWalk(EventScene, DisturbedScene):
         for t in range(self.exogenous):
             up = e[t] < x[0] - x[1] * q
             q = q + xp.where(up, 0.0 * q + 1.0, 0.0 * q - 1.0)
-        cost: Array = (q - self.goal) ** 2 + self.effort * x[0] ** 2
-        return cost
+        return (q - self.goal) ** 2 + self.effort * x[0] ** 2
 
     def events(self, theta: np.ndarray, w: np.ndarray) -> Events:
         """Return the steps up, one event per step."""
@@ -63,7 +62,8 @@ class CoinWalk(EventScene, DisturbedScene):
         weights = weights / weights.sum()
         u = np.stack(np.meshgrid(nodes, nodes, indexing="ij")).reshape(2, -1)
         slope = self._slope(self.theta0()[:, None] + self.sigma * u)
-        return np.asarray(slope @ np.outer(weights, weights).ravel()) + np.array([2 * self.effort * self.push, 0.0])
+        mean = np.asarray(slope @ np.outer(weights, weights).ravel())
+        return np.asarray(mean + np.array([2 * self.effort * self.push, 0.0]))
 
     def _slope(self, x: np.ndarray) -> np.ndarray:
         """Return the gradient of the mean of (q_end - goal)^2 at ``x (2, B)``, without noise on it, ``(2, B)``."""
