@@ -30,6 +30,7 @@ from bench.model.estimator import (
     per_repeat,
     zeroth_order,
 )
+from bench.model.events import events_of, undeclared_jumps
 from bench.model.expansion import PathOptimizer
 from bench.model.integrator import Integrator
 from bench.model.known_solutions import Identified, KnownOptimum, KnownValue
@@ -56,6 +57,8 @@ from bench.model.scene import (
     DisturbedScene,
     EngineScene,
     EngineTwin,
+    Events,
+    EventScene,
     FrictionScene,
     FunctionScene,
     MechanicalScene,
@@ -63,6 +66,7 @@ from bench.model.scene import (
     ProcessNoiseScene,
     Scene,
     ZeroOrderHoldScene,
+    half_spaces,
 )
 from bench.model.simulator import load_module, load_simulator, simulator_files
 from bench.model.trainer import Trainer
@@ -88,6 +92,8 @@ __all__ = [
     "EngineScene",
     "EngineTwin",
     "Estimator",
+    "EventScene",
+    "Events",
     "Expansion",
     "ForceLaw",
     "FrictionScene",
@@ -135,7 +141,9 @@ __all__ = [
     "compose",
     "cores",
     "difference",
+    "events_of",
     "first_order",
+    "half_spaces",
     "halves",
     "load_module",
     "load_simulator",
@@ -148,6 +156,7 @@ __all__ = [
     "slope_by_changes",
     "slopes",
     "stopped",
+    "undeclared_jumps",
     "uniform",
     "unknown",
     "zeroth_order",

@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -323,3 +323,46 @@ class Oscillator(ABC):
 
         They are the arguments of :meth:`Integrator.transition`.
         """
+
+
+class Events(NamedTuple):
+    """K events of B samples. Event k happens where ``directions[k] . w < limits[k]``.
+
+    The limit of a sample may depend on all of its noise except the number ``directions[k] . w``. Given the other noise,
+    event k thus has the probability Phi(limit), with the derivative phi(limit) slope.
+    """
+
+    directions: np.ndarray
+    """Unit vectors in the space of the noise, ``(K, n_w)``."""
+    limits: np.ndarray
+    """Limits, in standard deviations of the noise, ``(K, B)``."""
+    slopes: np.ndarray
+    """Derivatives of the limits by theta, at constant noise and with the other events as they are, ``(K, d, B)``."""
+
+
+class EventScene(ABC):
+    """A role: the scene declares its events, and its cost jumps nowhere else."""
+
+    discrete: ClassVar[bool] = False
+    """Whether the numbers ``directions[k] . w`` affect the cost only through the events."""
+
+    @abstractmethod
+    def events(self, theta: np.ndarray, w: np.ndarray) -> Events:
+        """Return the events at ``theta (d,)`` with noise ``w (n_w, B)``."""
+
+
+def half_spaces(normals: np.ndarray, offsets: np.ndarray, sigma: float, theta: np.ndarray, w: np.ndarray) -> Events:
+    """Return the events that theta + sigma w is where ``normals[k] . x >= offsets[k]``, for normals ``(K, d)``.
+
+    >>> half_spaces(np.array([[2.0]]), np.array([1.0]), 0.5, np.array([1.0]), np.zeros((1, 1))).limits
+    array([[1.]])
+    """
+    sizes = np.linalg.norm(normals, axis=1)
+    units = normals / sizes[:, None]
+    limits = (units @ np.reshape(theta, -1) - offsets / sizes) / sigma
+    directions = np.zeros((len(units), w.shape[0]))
+    directions[:, : units.shape[1]] = -units
+    count = w.shape[1]
+    return Events(
+        directions, np.repeat(limits[:, None], count, axis=1), np.repeat(units[:, :, None] / sigma, count, axis=2)
+    )

@@ -16,8 +16,8 @@ from bench.model.parameters import remember
 EQUIVALENT: dict[str, str] = {
     # bench/model/program.py: a scene may name the class of its programs
     "55c7c911a32078be57451be8702e153baec58333859031b5fbd7430408e52ad3": "537e21f7c1463cf5e114b297818ea6abf2ec7e5556f8f0da67faa3578015e5ff",
-    # bench/model/scene.py: a scene may name the class of its programs, the derivative of its feedback, and an MJCF file
-    "92f2c777d31e715efc8865cb8aba45e68f5ae954bbca5beb09361cb6edf1244e": "19a77ee56a6a214a4dc2c76e08a14257a51fb50b9c3cdad578f647101743edcb",
+    # bench/model/scene.py: a scene may name the class of its programs, the derivative of its feedback, an MJCF file, and its events
+    "6a6212885eb95dbb5126a0a4aa4c76c68a8da7354e0e7c2e16be8773d5f523fe": "19a77ee56a6a214a4dc2c76e08a14257a51fb50b9c3cdad578f647101743edcb",
     # bench/measure/reference.py: noise on the actions beside a scene's own noise, which no stored scene has
     "8e9c1980ecf41fda3cffe337a73bda5f04f968b11b11f7bd78492e9239172a70": "f4ea930fd9b4c514b92e905d9ee99b00899e60ecef16cc4e558020bce228ddd2",
     # bench/model/estimator.py: noise on the actions beside a scene's own noise, which no stored scene has; a declaration for the kit
@@ -106,6 +106,8 @@ EQUIVALENT: dict[str, str] = {
     "f1df51b78d9e08c126d0d06f9489e59b9df8e17060c27db8da31a3bcb7af0e1a": "e9e0cd36e6596cd749d22fa2823919c2c7ea91c732d37d2e4486f36f769021e8",
     # bench/studies/dose_response/ground.py: the objective of a scene with noise of its own, which no stored row has
     "2af1f4ae249ee3a458509132a1098efa3017c735b33d9ec65daffd10352337b7": "b4c6f2bd35d60a5908e9e38ac4d0d9adf001763508ae271a68e5860a738d5e56",
+    # plugins/scenes/heaviside.py: declares its event, which no stored row uses
+    "ce37ea8f704c52f80bdf9637ce2855b40b905e23de7825d8247dc52578c7cc7d": "62b7d378b702a48097b07a0eef7f6aac386d34c77b3028567ec40bdf3f8a570f",
 }
 """Hashes of files, and of classes of studies, whose changes decide no stored number: the new hash, and the one in the keys of rows.
 

@@ -6,11 +6,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from bench.model import Array, ContactLaw, FunctionScene, Plugin, param
+from bench.model import Array, ContactLaw, Events, EventScene, FunctionScene, Plugin, half_spaces, param
 
 
 @dataclass(frozen=True)
-class Heaviside(FunctionScene):
+class Heaviside(EventScene, FunctionScene):
     """f = 1 where x >= 0, else 0, with x = theta + sigma w (d = 1).
 
     Its derivative is 0 wherever it exists, while grad J = phi(theta / sigma) / sigma. Source: Suh et al. 2022.
@@ -30,6 +30,10 @@ class Heaviside(FunctionScene):
         """Return the step, with derivative 0."""
         zero = 0.0 * x[0]
         return xp.where(x[0] >= 0, zero + 1.0, zero)
+
+    def events(self, theta: np.ndarray, w: np.ndarray) -> Events:
+        """Return the event x >= 0."""
+        return half_spaces(np.ones((1, 1)), np.zeros(1), self.sigma, theta, w)
 
     def breakpoints(self) -> tuple[tuple[float, ...], ...]:
         """Return the position of the jump."""

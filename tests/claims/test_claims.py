@@ -68,11 +68,18 @@ def test_every_claim_holds_and_would_fail_with_a_wrong_figure(name):
 def test_every_plugin_has_a_planted_bug():
     for kind, planted_ in planted_claims.CLAIMS.items():
         # the errors of `planted` are its purpose, and tests/plugins/test_planted.py has their sizes. Those in no claim
-        # have planted errors in test_variance_reduction.py, test_surrogate.py and test_ilqr.py of tests/plugins.
+        # have planted errors in test_variance_reduction.py, test_events.py, test_surrogate.py and test_ilqr.py of tests/plugins.
         unclaimed = {
             "contacts": {"surrogate_backward"},
-            "optimizers": {"ilqr"},
-            "estimators": {"planted", "optimal_baseline", "quadratic_model", "sobol"},
+            "optimizers": {"homotopy", "ilqr"},
+            "estimators": {
+                "boundary",
+                "planted",
+                "optimal_baseline",
+                "quadratic_model",
+                "sobol",
+                "stochastic_derivative",
+            },
         }
         own = unclaimed.get(kind, set()) | ({"impulse", "complementarity"} if kind == "contacts" else set())
         entries = {n for n, e in registry.entries()[kind].items() if e.plugin.__module__.startswith("bench.plugins")}

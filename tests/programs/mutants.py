@@ -56,6 +56,7 @@ OF_GROUPS = "tests/examine/test_mechanisms.py -k 10_000\\ or\\ may_hide"
 OF_EXAMINE = "-m not\\ slow tests/examine/test_examine.py --deselect tests/examine/test_examine.py::test_python_number_from_torch_is_disconnected_in_double_precision"
 OF_ESTIMATORS = "tests/plugins/test_weights.py tests/plugins/test_estimators.py"
 OF_VARIANCE = "tests/plugins/test_variance_reduction.py"
+OF_EVENTS = "tests/plugins/test_events.py"
 
 FAULTS = [
     # quadrature
@@ -332,6 +333,16 @@ FAULTS = [
     Fault(X + "quadratic_model.py", "/ (1.0 - (q**2).sum(axis=2))", "", OF_VARIANCE),
     Fault(X + "quadratic_model.py", "n * along - np.einsum(\"rnk,rn->rk\", q, errors)", "n * along", OF_VARIANCE),
     Fault(X + "quadratic_model.py", "coefficients[:, 1 : d + 1]", "coefficients[:, :d]", OF_VARIANCE),
+    Fault(X + "boundary.py", "problem.value(theta, at_limit - apart) - problem.value(theta, at_limit + apart)", "problem.value(theta, at_limit + apart) - problem.value(theta, at_limit - apart)", OF_EVENTS),
+    Fault(X + "boundary.py", "np.exp(-0.5 * limit**2)", "np.exp(-limit**2)", OF_EVENTS),
+    Fault(X + "boundary.py", "(limit - direction @ w)", "limit", OF_EVENTS),
+    Fault(X + "stochastic_derivative.py", "log_ndtr(side * limit)", "log_ndtr(-side * limit)", OF_EVENTS),
+    Fault(X + "stochastic_derivative.py", "np.maximum(0.0, -side * slope)", "np.abs(slope)", OF_EVENTS),
+    Fault(X + "stochastic_derivative.py", "(limit + side - number)", "(limit - side - number)", OF_EVENTS),
+    Fault("bench/model/scene.py", "repeat(units[:, :, None] / sigma", "repeat(normals[:, :, None] / sigma", OF_EVENTS),
+    Fault("bench/model/events.py", "limits / scale, slopes / scale", "limits, slopes", OF_EVENTS),
+    Fault("plugins/optimizers/homotopy.py", "(ahead + behind - 2 * answer.value[0]) / (2 * t)", "(ahead + behind - 2 * answer.value[0]) / (2 * t * t)", OF_EVENTS),
+    Fault("plugins/optimizers/homotopy.py", "((v**2).sum(axis=0) - d)", "(v**2).sum(axis=0)", OF_EVENTS),
     Fault(X + "sobol.py", "math.sqrt(count) * noise.mean", "noise.mean", OF_VARIANCE),
     Fault(X + "sobol.py", "change * shift / (2.0 * s * s)", "change * shift / (s * s)", OF_VARIANCE),
     Fault(X + "randomized_smoothing.py", "* direction / (2 * s)", "* direction / s", OF_ESTIMATORS),

@@ -1,0 +1,290 @@
+"""Estimators that use declared events, against closed forms and exact sums over all outcomes, and a shrinking radius."""
+
+import dataclasses
+import itertools
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from bench.plugins.backends.numpy import Numpy
+from bench.plugins.backends.torch import Torch
+from bench.plugins.contacts.impulse import Impulse
+from bench.plugins.contacts.penalty import Penalty
+from bench.plugins.estimators.boundary import Boundary
+from bench.plugins.estimators.fobg import Fobg
+from bench.plugins.estimators.reinforce import Reinforce
+from bench.plugins.estimators.stochastic_derivative import StochasticDerivative
+from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
+from bench.plugins.optimizers.homotopy import Homotopy
+from bench.plugins.scenes.coin_walk import CoinWalk
+from bench.plugins.scenes.cubic import Cubic
+from bench.plugins.scenes.heaviside import Heaviside
+from bench.plugins.scenes.ledge import Ledge
+from bench.plugins.scenes.pushing import Pushing
+from scipy import stats
+
+from bench.model import Answer, Decision, DisturbedScene, Events, EventScene, FunctionScene, compose, half_spaces
+from bench.studies.optimise.search import ScaledNoiseProblem
+
+LIMIT = 4.5
+"""Standard errors within which a mean agrees with its expectation."""
+
+
+def problem(scene):
+    return Torch().compile(compose(scene))  # exact derivatives: differences see a jump within a step of it
+
+
+def estimates(estimator, scene, repeats=1000, samples=64, seed=0):
+    p = problem(scene)
+    w = np.random.default_rng(seed).standard_normal((repeats, samples, p.program.n_noise))
+    return estimator.estimate(p, p.program.theta0, w)
+
+
+def agrees(values, truth):
+    error = values.std(axis=0) / np.sqrt(len(values))
+    return (np.abs(values.mean(axis=0) - truth) <= LIMIT * error + 1e-9).all()
+
+
+@dataclasses.dataclass(frozen=True)
+class Coin(EventScene, DisturbedScene):
+    """f = a where e < x^3, else b: one coin of probability p = Phi(x^3), so that E f has the slope p' (a - b)."""
+
+    name = "coin"
+    continuous = False
+    discrete = True
+    exogenous = 1
+
+    at: float = 0.8
+    sign: float = 1.0
+    sigma: float = 1e-9
+
+    def theta0(self):
+        return np.array([self.at])
+
+    def disturbed_cost(self, xp, x, e):
+        return xp.where(e[0] < self.sign * x[0] ** 3, 0.0 * x[0] + 5.0, 0.0 * x[0] + 2.0)
+
+    def events(self, theta, w):
+        x = theta[0] + self.sigma * w[:1]
+        return Events(np.array([[0.0, 1.0]]), self.sign * x**3, self.sign * 3 * x[None] ** 2)
+
+
+@dataclasses.dataclass(frozen=True)
+class Corner(EventScene, FunctionScene):
+    """f = 1 + x_0 x_1 in the quarter x_0 >= 0, x_1 >= 0.1: two boundaries that meet, each only beyond the other."""
+
+    name = "corner"
+    continuous = False
+
+    sigma: float = 0.3
+
+    def theta0(self):
+        return np.array([0.1, 0.2])
+
+    def cost(self, xp, x):
+        return xp.where((x[0] >= 0) & (x[1] >= 0.1), 1.0 + x[0] * x[1], 0.0 * x[0])
+
+    def events(self, theta, w):
+        return half_spaces(2.0 * np.eye(2), np.array([0.0, 0.2]), self.sigma, theta, w)
+
+    def gradient(self):
+        """E f = E[1; x_0] E[1; x_1] + E[x_0; x_0 in] E[x_1; x_1 in] factors into partial means."""
+        z = (self.theta0() - [0.0, 0.1]) / self.sigma
+        p, density, theta = stats.norm.cdf(z), stats.norm.pdf(z), self.theta0()
+        mean = theta * p + self.sigma * density
+        dp, dmean = density / self.sigma, p + theta * density / self.sigma - z * density
+        return dp * p[::-1] + dmean * mean[::-1]
+
+
+# ------------------------------------------------------------------------------------------------ boundary terms
+
+
+@pytest.mark.parametrize("theta", [-0.13, 0.0, 0.05])
+@pytest.mark.parametrize("sigma", [0.1, 0.7])
+def test_boundary_has_no_error_at_a_unit_step(theta, sigma):
+    scene = Heaviside(theta=theta, sigma=sigma)
+    values = estimates(Boundary(), scene, repeats=3, samples=5)
+    np.testing.assert_allclose(values[:, 0], stats.norm.pdf(theta / sigma) / sigma, rtol=1e-12)
+
+
+@pytest.mark.parametrize("scene", [Ledge(), Ledge(sigma=0.4, height=-2.0, edge=-0.1)], ids=str)
+def test_boundary_is_unbiased_on_an_oblique_ledge_where_first_order_lacks_its_last_term(scene):
+    truth = scene.closed_form_gradient(None, None)
+    assert agrees(estimates(Boundary(), scene), truth)
+    first = estimates(Fobg(), scene)
+    z = (np.array([0.6, 0.8]) @ scene.theta0() - scene.edge) / scene.sigma
+    assert agrees(first, [0.5, -1.0] + np.array([2.0, 1.0]) * stats.norm.cdf(z))
+    assert not agrees(first, truth)
+
+
+def test_the_boundary_term_of_a_ledge_has_the_variance_of_the_jump_along_it():
+    """The jump at n . x = edge is height + b . x: normal, with the standard deviation sigma |b . (-n_1, n_0)|."""
+    scene = Ledge()
+    p = problem(scene)
+    w = np.random.default_rng(0).standard_normal((2, 20000))
+    term = (Boundary().terms(p, scene.theta0(), w) - Fobg().terms(p, scene.theta0(), w))[0] / 0.6
+    z = (0.22 - 0.3) / scene.sigma
+    along = abs(np.array([2.0, 1.0]) @ [-0.8, 0.6])
+    assert term.std() == pytest.approx(stats.norm.pdf(z) * along, rel=LIMIT / np.sqrt(2 * 20000))
+
+
+def test_boundaries_that_end_at_each_other_are_right():
+    assert agrees(estimates(Boundary(), Corner()), Corner().gradient())
+
+
+def test_boundary_equals_first_order_without_a_jump():
+    np.testing.assert_array_equal(*(estimates(e, Cubic(), repeats=3) for e in (Boundary(), Fobg())))
+
+
+def test_boundary_follows_scaled_noise():
+    scene = Ledge(sigma=0.4)
+    scaled = ScaledNoiseProblem(problem(scene), 0.25)
+    w = np.random.default_rng(0).standard_normal((4, 16, 2))
+    plain = Boundary().estimate(problem(Ledge(sigma=0.1)), scene.theta0(), w)
+    np.testing.assert_allclose(Boundary().estimate(scaled, scene.theta0(), w), plain, rtol=1e-9)
+
+
+# --------------------------------------------------------------------------------------- stochastic derivative
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("at", [0.3, 0.8, -0.8])
+def test_one_coin_has_the_weights_of_its_source(sign, at):
+    """p' / (1 - p) for a coin that fell the other way, if p grows: the mean p' jump, the variance p'^2 jump^2 p / (1 - p)."""
+    scene = Coin(at=at, sign=sign)
+    p, slope = stats.norm.cdf(sign * at**3), stats.norm.pdf(at**3) * 3 * at**2
+    terms = StochasticDerivative().terms(problem(scene), scene.theta0(), np.array([[0.0, 0.0], [-9.0, 9.0]]))
+    happened, not_happened = (0.0, slope * 3 / (1 - p)) if sign > 0 else (-slope * 3 / p, 0.0)
+    np.testing.assert_allclose(terms[0], [happened, not_happened], rtol=1e-7)
+    boundary = Boundary().terms(problem(scene), scene.theta0(), np.zeros((2, 1)))
+    np.testing.assert_allclose(boundary[0], sign * slope * 3, rtol=1e-7)
+
+
+def walk_by_enumeration(scene, x):
+    """Return the gradient of the mean of (q - goal)^2 at x, from all 2^8 walks and the product rule."""
+    total = np.zeros(2)
+    for steps in itertools.product((1, -1), repeat=scene.exogenous):
+        places = np.cumsum([0, *steps])
+        limits = x[0] - x[1] * places[:-1]
+        up = np.array(steps) > 0
+        chances = np.where(up, stats.norm.cdf(limits), stats.norm.cdf(-limits))
+        slopes = np.where(up, 1, -1) * stats.norm.pdf(limits) * np.array([np.ones(8), -places[:-1]])
+        total += (places[-1] - scene.goal) ** 2 * chances.prod() * (slopes / chances).sum(axis=1)
+    return total
+
+
+def test_the_closed_form_of_the_walk_is_the_sum_over_all_walks():
+    scene = CoinWalk(sigma=1e-6)
+    expected = walk_by_enumeration(scene, scene.theta0())
+    expected[0] += 2 * scene.effort * scene.push
+    np.testing.assert_allclose(scene.closed_form_gradient(None, None), expected, rtol=1e-9)
+
+
+def test_the_closed_form_of_a_walk_without_pull_is_that_of_a_binomial():
+    """E f = n (1 - m^2) + (n m - goal)^2 + effort x^2 with m = 2 Phi(x) - 1, without noise on theta."""
+    scene, n = CoinWalk(pull=0.0, sigma=1e-6), 8
+    m, slope = 2 * stats.norm.cdf(scene.push) - 1, 2 * stats.norm.pdf(scene.push)
+    expected = slope * (-2 * n * m + 2 * n * (n * m - scene.goal)) + 2 * scene.effort * scene.push
+    assert scene.closed_form_gradient(None, None)[0] == pytest.approx(expected, rel=1e-8)
+
+
+@pytest.mark.parametrize("scene", [CoinWalk(), CoinWalk(pull=-0.2, sigma=0.4), CoinWalk(push=-0.5, goal=-6.0)], ids=str)
+@pytest.mark.parametrize("estimator", [StochasticDerivative(), Boundary()], ids=str)
+def test_events_in_a_row_are_unbiased(scene, estimator):
+    assert agrees(estimates(estimator, scene, repeats=3000), scene.closed_form_gradient(None, None))
+
+
+def test_both_vary_less_than_cost_times_score():
+    scene = CoinWalk()
+    plain, weighted, boundary = (
+        estimates(e, scene, seed=1).var(axis=0).sum()
+        for e in (Reinforce(baseline="leave_one_out"), StochasticDerivative(), Boundary())
+    )
+    assert 3 * weighted < plain
+    assert 1.5 * boundary < weighted
+
+
+# ------------------------------------------------------------------------------------------------- refusals
+
+
+def test_undeclared_jumps_are_refused_with_the_reason():
+    integrator = SemiImplicitEuler()
+    assert Boundary().unsupported_reason(compose(Pushing(), Penalty(), integrator)) is None
+    assert "impulse may jump" in Boundary().unsupported_reason(compose(Pushing(), Impulse(), integrator))
+    named = compose(Ledge(), decision=Decision(("height",)))
+    assert "its own theta" in Boundary().unsupported_reason(named)
+    jumping = dataclasses.make_dataclass("Jumping", [], bases=(Cubic,), frozen=True, namespace={"continuous": False})
+    assert "declares no events" in Boundary().unsupported_reason(compose(jumping()))
+    surrogate = SimpleNamespace(name="soft", continuous=True)
+    program = SimpleNamespace(scene=Heaviside(), contact=surrogate, surrogate=True)
+    assert "soft is a surrogate" in Boundary().unsupported_reason(program)
+    for scene in (Heaviside(), Cubic()):
+        assert "declares discrete events" in StochasticDerivative().unsupported_reason(compose(scene))
+    assert StochasticDerivative().unsupported_reason(compose(CoinWalk())) is None
+
+
+def test_the_plain_backend_agrees():
+    scene = CoinWalk()
+    p, w = Numpy().compile(compose(scene)), np.random.default_rng(3).standard_normal((5, 8, 10))
+    values = StochasticDerivative().estimate(p, scene.theta0(), w)
+    np.testing.assert_allclose(values, StochasticDerivative().estimate(problem(scene), scene.theta0(), w), rtol=1e-6)
+
+
+# ------------------------------------------------------------------------------------------ a shrinking radius
+
+
+def step(optimizer, cost, theta, seed=0):
+    state = optimizer.start(np.array(theta))
+    noise = np.random.default_rng(seed).standard_normal((len(theta), optimizer.draws(len(theta))))
+    points = optimizer.ask(state, noise)
+    return optimizer.tell(state, points, Answer(value=cost(points)))
+
+
+def test_homotopy_takes_the_derivatives_of_a_quadratic_by_theta_and_radius():
+    """F = theta' A theta / 2 + t^2 tr A / 2: the gradient A theta, whatever t, and dF/dt = t tr A."""
+    a, pairs, t = np.array([1.0, 3.0]), 400_000, 0.5
+    theta = np.array([2.0, -1.0])
+
+    def cost(x):
+        return 0.5 * a @ x**2
+
+    state = step(Homotopy(pairs=pairs, rate=0.1, radius=t, speed=0.1, shrink=0.99), cost, theta)
+    assert state["theta"] == pytest.approx(theta - 0.1 * a * theta, abs=0.01)
+    assert state["radius"] == pytest.approx(t - 0.1 * t * a.sum(), abs=0.005)
+    plain = step(Homotopy(pairs=4, radius=t, shrink=0.8), cost, theta)
+    assert plain["radius"] == pytest.approx(0.8 * t)
+
+
+def test_homotopy_shrinks_at_least_by_its_factor_and_not_below_its_least_radius():
+    concave = step(Homotopy(pairs=2000, speed=1.0, shrink=0.9), lambda x: -(x**2).sum(axis=0), [0.0])
+    assert concave["radius"] == pytest.approx(0.9)  # dF/dt < 0 would widen it
+    steep = step(Homotopy(pairs=2000, speed=100.0, least=0.02), lambda x: (x**2).sum(axis=0), [0.0])
+    assert steep["radius"] == 0.02
+    lost = step(Homotopy(pairs=10), lambda x: np.where(x[0] > 0.5, np.inf, x[0]), [0.5])
+    assert np.isfinite(lost["theta"]).all()
+
+
+def test_homotopy_slope_of_a_wave_falls_with_the_radius():
+    """F = exp(-k^2 t^2 / 2) cos(k theta) has the slope -k exp(-k^2 t^2 / 2) sin(k theta)."""
+    k, t = 3.0, 0.5
+    state = step(Homotopy(pairs=400_000, rate=1.0, radius=t), lambda x: np.cos(k * x[0]), [0.4])
+    assert 0.4 - state["theta"][0] == pytest.approx(-k * np.exp(-0.5 * (k * t) ** 2) * np.sin(k * 0.4), abs=0.01)
+
+
+@pytest.mark.parametrize("speed", [0.0, 1e-3])
+def test_homotopy_passes_local_minima_where_a_small_radius_stops(speed):
+    """x^2 / 2 - 2 cos(4 x) has its lowest minimum at 0 and local ones near 1.5, 3 and 4.4."""
+
+    def cost(x):
+        return 0.5 * x[0] ** 2 - 2.0 * np.cos(4.0 * x[0])
+
+    def end(optimizer):
+        state = optimizer.start(np.array([4.4]))
+        for i in range(300):
+            noise = np.random.default_rng(i).standard_normal((1, optimizer.draws(1)))
+            points = optimizer.ask(state, noise)
+            state = optimizer.tell(state, points, Answer(value=cost(points)))
+        return float(state["theta"][0])
+
+    assert abs(end(Homotopy(rate=0.02, radius=1.5, shrink=0.99, speed=speed))) < 0.1
+    assert end(Homotopy(rate=0.02, radius=0.05, shrink=0.99, speed=speed)) > 4.0
