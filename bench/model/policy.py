@@ -123,8 +123,9 @@ class PolicyScene(MechanicalScene):
     """A role: the controls are a :class:`Policy` of observations, u_t = pi(theta, o(x_t)) + sigma w_t.
 
     Theta holds the policy's parameters. Every rollout starts at a random state if ``n_start`` is not 0, and J is the
-    mean over starts too. One step of ``dt`` is a control step, made of ``substeps`` steps of the integrator. After
-    :meth:`has_ended` the state no longer moves, and :meth:`stage_cost` should be 0 there.
+    mean over starts too. One step of ``dt`` is a control step, made of ``substeps`` steps of the integrator. The cost of
+    step t counts ``discount``^t times, the terminal cost ``discount``^horizon times. After :meth:`has_ended` the state
+    no longer moves, and :meth:`stage_cost` should be 0 there.
     """
 
     n_observations: ClassVar[int]
@@ -135,6 +136,9 @@ class PolicyScene(MechanicalScene):
     noise: str = param("action", "whether noise is on the actions or on theta", choices=("action", "parameter"))
     policy: str = param("linear", "policy, as name or name[parameter=value,...]")
     substeps: int = param(1, "steps of the integrator per control step", positive=True)
+    discount: float | None = param(
+        None, "factor on the cost per control step; null: 1", positive=True, high=1.0, neutral=None
+    )
 
     def __post_init__(self) -> None:
         _ = self.plugin  # raises the error of an invalid policy
@@ -155,6 +159,12 @@ class PolicyScene(MechanicalScene):
     def theta0(self) -> np.ndarray:
         """Return the policy's initial parameters, ``(d,)``."""
         return self.plugin.initial(self.n_observations, self.n_u)
+
+    def cost_weights(self) -> np.ndarray | None:
+        """Return the powers of the discount, ``(horizon + 1,)``; None without one."""
+        if self.discount is None or self.discount == 1.0:
+            return None
+        return np.asarray(self.discount ** np.arange(self.horizon + 1.0))
 
     def feedback(self, xp: Any, theta: Array, q: Array, v: Array) -> Array:
         """Return the controls of the policy, ``(n_u, B)``."""

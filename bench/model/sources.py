@@ -14,18 +14,18 @@ from pathlib import Path
 from bench.model.parameters import remember
 
 EQUIVALENT: dict[str, str] = {
-    # bench/model/program.py: a scene may name the class of its programs
-    "9ae5b1689df59e23a97fbf2a6398fc92eb921a67d4cdd04846d258711776ae07": "537e21f7c1463cf5e114b297818ea6abf2ec7e5556f8f0da67faa3578015e5ff",
-    # bench/model/scene.py: a scene may name the class of its programs, the derivative of its feedback, and an MJCF file
-    "92f2c777d31e715efc8865cb8aba45e68f5ae954bbca5beb09361cb6edf1244e": "19a77ee56a6a214a4dc2c76e08a14257a51fb50b9c3cdad578f647101743edcb",
+    # bench/model/program.py: a scene may name the class of its programs, and the weights of its costs, which are 1 in all stored rows
+    "38908a3e3e9f33fe5a049cbe280779aa29a966cda1521a01c58547038e5fe7c7": "537e21f7c1463cf5e114b297818ea6abf2ec7e5556f8f0da67faa3578015e5ff",
+    # bench/model/scene.py: a scene may name the class of its programs, the derivative of its feedback, weights of its costs, and an MJCF file
+    "c51b327096909140184397b28282a007c242604f3405d923ce6ac9250883fc66": "19a77ee56a6a214a4dc2c76e08a14257a51fb50b9c3cdad578f647101743edcb",
     # bench/measure/reference.py: noise on the actions beside a scene's own noise, which no stored scene has
     "8e9c1980ecf41fda3cffe337a73bda5f04f968b11b11f7bd78492e9239172a70": "f4ea930fd9b4c514b92e905d9ee99b00899e60ecef16cc4e558020bce228ddd2",
     # bench/model/estimator.py: noise on the actions beside a scene's own noise, which no stored scene has; a declaration for the kit
     "27ba374e4797eaa1dadbe2347093b8293d17e4beb4fc537313212341f3eda325": "297f51107543e92425d4da900ff76f5713b7be2f7b41083c98ff121267327fdc",
     # bench/model/problem.py: noise on the actions beside a scene's own noise, which no stored scene has
     "d253d82556790fbfa9c54d8b60474b8450cdff44271a3a8e42ea6788bc5dfb93": "b537cd67e11a1065dce873c040744092aa6c8dbc2af87f4d4b4942d39197585c",
-    # bench/model/adjoint.py: uses a scene's own derivative of the feedback, which no stored scene has
-    "199f4a0dd1f16ecfe50c34223c5b4e7c1b27bcf03013f946651eccf457a8fdba": "d6d35bf0003a6041adf76a4e9ccca9ede0b96e1241a58774c8fbf795bedcd942",
+    # bench/model/adjoint.py: uses a scene's own derivative of the feedback and weights of its costs, which no stored scene has
+    "e73ab9a382a2e7ceb1ba44154ef92a482cd52aa7137c8436c3ef1c8fbfeb459c": "d6d35bf0003a6041adf76a4e9ccca9ede0b96e1241a58774c8fbf795bedcd942",
     # bench/model/manifold.py: the joints of a scene may depend on its parameters
     "c38492d867e6f03e0243c75cef3741d9cb79210f93ea28080e68b0c514e4eb05": "e8ce151ce4c198a1b8893f9f61339c4ec86bdcf2b79d517068441741c4451491",
     # plugins/mjcf.py: models from files, which no stored scene has; contacts for gradient checks and traces
@@ -56,8 +56,8 @@ EQUIVALENT: dict[str, str] = {
     "4e4e92ad12ad459268276452de9d92447609b50b51f136a670a8894f55dcde11": "fee1e09006427e51ebe8172ecbdc8ac76366922b7225e35c26a1993d121e599c",
     # bench/training/fitting.py: refuses more batches than states, which no stored row has
     "4ccf81bc6d7e8b7c66e350f09cbade82b42523e1933928d90fe9e0a773edf604": "c09fb2d21730de2566b1607dd2f5cf30cc0f2f9a6a97f395b798f3378a996fe0",
-    # bench/engines/problem.py: asks the program whether its law is open-loop, and an engine's settings for the row
-    "cffc1219dfc227492e89d6e560deebdb8b79c68d45e0ddc1116debfd49b061b9": "48ac5bce93078bdac75ea14151589c5fb68141cf5ddd768e00982181f06b8495",
+    # bench/engines/problem.py: asks the program whether its law is open-loop, an engine's settings for the row, and weights of costs, which are 1 in all stored rows
+    "c94419a9b2fa32631f0db9a20d4b0c39d150bb16ec710abf69f803b1089e5398": "48ac5bce93078bdac75ea14151589c5fb68141cf5ddd768e00982181f06b8495",
     # bench/model/optimizer.py: answers have a field that no stored row uses
     "3eade79e9325d352ff0765c87f98a09ab2b8bd083fbf5d237cb869655811b6d5": "6f4d0e199929423d63585facc347881eeffde26603a3145be3d59d374a71cc60",
     # bench/studies/optimise/batched.py: step Jacobians by differences where searches share batches, and a cell without an experiment around it, which both failed
@@ -90,10 +90,10 @@ EQUIVALENT: dict[str, str] = {
     "68ff709898b81a8338d9c6b5a7a9dffa958a5f79fe387b1d35163d59c8329710": "022e3f0543d013eba1fdcd4af5c8eaa83d6e118c9e76b19b822e78bcd7a551b0",
     # bench/measure/gradcheck/__init__.py: one more name
     "393f225cbaafb140fb5e64053a0d8756db2de946bc0aa4ab264483b416b31692": "f965dfe680d35ea51da514344bfdf1e2a7728d16485d4c8d967fee9fd5fe25e9",
-    # bench/model/policy.py: controls of a trained network's actions, which are the actions in all stored rows
-    "2a57fac59c1ebc96fbb047e5106954b3ab8e3ece5d7a5532fe053c4a1ea6b525": "c7bd75c4ea4fa863abffd86725712f9e9798a0f8a5b7c41c2c52b43c890e1c58",
-    # bench/training/environment.py: controls of a trained network's actions, which are the actions in all stored rows
-    "f5754d87028a92ed79b569d6110954964d82ba295ff14cf8f381acec6e51d2e4": "6aa866f73c01dfeda2b1d4c2a289a10da52f29ab8768c4a76018c39488fa779b",
+    # bench/model/policy.py: controls of a trained network's actions, which are the actions in all stored rows, and a discount, which none has
+    "d7a501856f21e04c93dcf10b76432cc60e807139f1a9b5dfcae78384882bcba7": "c7bd75c4ea4fa863abffd86725712f9e9798a0f8a5b7c41c2c52b43c890e1c58",
+    # bench/training/environment.py: controls of a trained network's actions, which are the actions in all stored rows; refuses a discounted scene
+    "b3e11f0d56d0ed05202d2c6352006fd153ad41b58be8690506f8b44d244c41b8": "6aa866f73c01dfeda2b1d4c2a289a10da52f29ab8768c4a76018c39488fa779b",
     # bench/training/windows.py: controls of a trained network's actions, which are the actions in all stored rows
     "42acbd247be5e409f9f5b031ccce299de23779a8d881cde645985148c3b2b05c": "b32815416608beb1d442f5a7fb2d50ee6443130c23b9f3dd3cfc7056935083f5",
     # bench/studies/train/measure.py: trains on the program that a backend runs, which is the scene's own in all stored rows
@@ -102,6 +102,8 @@ EQUIVALENT: dict[str, str] = {
     "40f5a560fa0e9fb3cea4708ff14d1a00aad69004bd9e49d4705131ded8a3da14": "f302f032f1e6e1b031801f5896df99bc0f3f8a962349db73ed6aeec772b7945c",
     # plugins/trainers/evolution.py: shares its episodes with another trainer
     "686532575ae796c4217d1d3d7d95c9b0f48ca9dbc3792a9b6dd451d0f65968bc": "604abd01749d1f0cf4c1bc84d6045238660ab504dacb683d96a39c67f8465455",
+    # bench/trace/adjoints.py: weights of the costs of steps, which are 1 in all stored rows
+    "8522ae5d2430fbced6b3a1e94e71355666ba5c1210db6d848540337568e41e5e": "7f592afa67aed65e145b0f972cdb2aafc18195565bb85fa4165aee3a8062ade9",
 }
 """Hashes of files, and of classes of studies, whose changes decide no stored number: the new hash, and the one in the keys of rows.
 

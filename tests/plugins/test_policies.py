@@ -14,6 +14,7 @@ from bench.experiment.keys import fingerprint
 from bench.measure import noise
 from bench.model import LoopOps, State, adjoint_gradient, slopes
 from bench.model.policy import policy_of, uniform
+from bench.trace.trace import trace
 
 REVERSED = 1e-9
 """Relative difference of gradients by one reverse pass and step by step: rounding over 30 steps."""
@@ -111,22 +112,74 @@ def test_the_adjoint_without_jax_takes_differences(monkeypatch):
     assert np.abs(by_differences - by_product).max() < DIFFERENCED * np.abs(by_product).max()
 
 
-def test_a_window_as_long_as_the_rollout_is_fobg():
-    exact = problem()
+@pytest.mark.parametrize("discount", [None, 0.9])
+def test_a_window_as_long_as_the_rollout_is_fobg(discount):
+    exact = problem(discount=discount)
     drawn = noise.draw(0, "policy", 2, 8, exact.program.n_noise, "test")
     whole = make("estimators", "fobg").estimate(exact, exact.program.theta0, drawn)
     windowed = make("estimators", "windowed[steps=30]").estimate(exact, exact.program.theta0, drawn)
     assert windowed == pytest.approx(whole, rel=REVERSED)
 
 
+@pytest.mark.parametrize("discount", [None, 0.7])
 @pytest.mark.parametrize("estimator", ["reinforce", "total_propagation[per=action]"])
-def test_zeroth_order_agrees_with_first_order(estimator):
-    exact = problem("linear", horizon=10)
+def test_zeroth_order_agrees_with_first_order(estimator, discount):
+    exact = problem("linear", horizon=10, discount=discount)
     theta, program = exact.program.theta0, exact.program
     first = make("estimators", "fobg").estimate(exact, theta, noise.draw(0, "a", 64, 64, program.n_noise, "test"))
     other = make("estimators", estimator).estimate(exact, theta, noise.draw(1, "b", 64, 1024, program.n_noise, "test"))
     error = np.sqrt((first.var(axis=0, ddof=1) + other.var(axis=0, ddof=1)) / 64)
     assert (np.abs(first.mean(axis=0) - other.mean(axis=0)) < 4.5 * error).all()
+
+
+@pytest.mark.parametrize("where", ["action", "parameter"])
+def test_a_discounted_cost_is_its_sum(where):
+    given = problem("linear", "numpy", noise=where, discount=0.8, horizon=5)
+    theta, w, scene = given.program.theta0, sample(given), given.program.scene
+    expected, weight = 0.0, 1.0
+    for state, u in list(given.program.steps(LoopOps(), theta[:, None], w))[:-1]:
+        expected, weight = expected + weight * scene.stage_cost(np, *state, u), 0.8 * weight
+    assert given.value(theta, w) == pytest.approx(expected, rel=1e-13)
+
+
+class Final(CartpoleSwing):
+    """A cart-pole that also pays at the end."""
+
+    def terminal_cost(self, xp, q, v):
+        return 3.0 * q[0] ** 2 + v[1] ** 2
+
+
+@pytest.mark.parametrize("where", ["action", "parameter"])
+def test_backends_agree_on_a_discounted_gradient(where):
+    scene = Final(policy="mlp[hidden=4]", horizon=12, noise=where, discount=0.7)
+    exact = compile_problem(scene, None, "semi_implicit_euler", "jax")
+    theta, w = exact.program.theta0, sample(exact)
+    gradient = exact.grad(theta, w)
+    scale = np.abs(gradient).max()
+    others = {name: REVERSED for name in ("torch", "implicit", "fused", "checkpointed")}
+    for backend, error in (others | {"numpy": DIFFERENCED, "checkpointed[keep=jacobians]": DIFFERENCED}).items():
+        other = compile_problem(scene, None, "semi_implicit_euler", backend)
+        assert other.value(theta, w) == pytest.approx(exact.value(theta, w), rel=1e-12), backend
+        assert np.abs(other.grad(theta, w) - gradient).max() < error * scale, backend
+    assert np.abs(adjoint_gradient(exact, slopes(exact, theta, w)) - gradient).max() < DIFFERENCED * scale
+    undiscounted = compile_problem(dataclasses.replace(scene, discount=1.0), None, "semi_implicit_euler", "jax")
+    assert np.abs(undiscounted.grad(theta, w) - gradient).max() > 0.1 * scale
+
+
+def test_a_trace_of_a_discounted_rollout_adds_up():
+    given = compile_problem(Final(policy="linear", horizon=12, discount=0.7), None, "semi_implicit_euler", "jax")
+    w = sample(given, 1)
+    table, error = trace(given, w)
+    total = table.cost_stage.sum() + table.cost_terminal.sum()
+    assert total == pytest.approx(given.value(given.program.theta0, w)[0], rel=1e-12)
+    assert error < REVERSED
+
+
+def test_without_a_discount_costs_and_keys_are_as_before():
+    scene = make("scenes", "cartpole_swing[horizon=30]")
+    assert scene.cost_weights() is None
+    assert dataclasses.replace(scene, discount=1.0).cost_weights() is None
+    assert fingerprint(scene) == fingerprint(make("scenes", "cartpole_swing[horizon=30,discount=null]"))
 
 
 def test_substeps_are_steps_of_the_integrator():
