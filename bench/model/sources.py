@@ -90,8 +90,8 @@ EQUIVALENT: dict[str, str] = {
     "68ff709898b81a8338d9c6b5a7a9dffa958a5f79fe387b1d35163d59c8329710": "022e3f0543d013eba1fdcd4af5c8eaa83d6e118c9e76b19b822e78bcd7a551b0",
     # bench/measure/gradcheck/__init__.py: one more name
     "393f225cbaafb140fb5e64053a0d8756db2de946bc0aa4ab264483b416b31692": "f965dfe680d35ea51da514344bfdf1e2a7728d16485d4c8d967fee9fd5fe25e9",
-    # bench/model/policy.py: controls of a trained network's actions, which are the actions in all stored rows, and a discount, which none has
-    "d7a501856f21e04c93dcf10b76432cc60e807139f1a9b5dfcae78384882bcba7": "c7bd75c4ea4fa863abffd86725712f9e9798a0f8a5b7c41c2c52b43c890e1c58",
+    # bench/model/policy.py: controls of a trained network's actions, which are the actions in all stored rows, a discount and normalised observations, which none has
+    "6c2237498d83324baabe9126743299301e6ff2d50682e6014ba81f9dcc3c19ba": "c7bd75c4ea4fa863abffd86725712f9e9798a0f8a5b7c41c2c52b43c890e1c58",
     # bench/training/environment.py: controls of a trained network's actions, which are the actions in all stored rows; refuses a discounted scene
     "b3e11f0d56d0ed05202d2c6352006fd153ad41b58be8690506f8b44d244c41b8": "6aa866f73c01dfeda2b1d4c2a289a10da52f29ab8768c4a76018c39488fa779b",
     # bench/training/windows.py: controls of a trained network's actions, which are the actions in all stored rows

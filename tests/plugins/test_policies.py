@@ -7,7 +7,7 @@ import pytest
 from bench.plugins.scenes.cartpole_swing import CartpoleSwing
 
 import bench
-from bench.errors import UserError
+from bench.errors import Unsupported, UserError
 from bench.experiment import config, grid
 from bench.experiment.by_name import compile_problem, make
 from bench.experiment.keys import fingerprint
@@ -180,6 +180,60 @@ def test_without_a_discount_costs_and_keys_are_as_before():
     assert scene.cost_weights() is None
     assert dataclasses.replace(scene, discount=1.0).cost_weights() is None
     assert fingerprint(scene) == fingerprint(make("scenes", "cartpole_swing[horizon=30,discount=null]"))
+
+
+def test_normalised_observations_are_less_their_mean_and_over_their_deviation():
+    scene = CartpoleSwing(policy="linear", horizon=3, normalise=4)
+    given = compile_problem(scene, None, "semi_implicit_euler", "numpy")
+    theta, seen = given.program.theta0, []
+    plain = compile_problem(dataclasses.replace(scene, normalise=0), None, "semi_implicit_euler", "numpy").program
+    starts = np.random.default_rng(0).standard_normal((8, 4))
+    state = scene.random_start(np, starts)
+    for _ in range(3):
+        seen.append(scene.observation(np, *state))
+        u = theta[None, :5] @ seen[-1] + theta[5]
+        state = plain.step(LoopOps(), State(*state), u)
+    seen = np.concatenate(seen, axis=1)
+    mean, deviation = seen.mean(axis=1), np.sqrt(seen.var(axis=1) + 1e-5)
+    q, v = np.array([[0.1], [2.0]]), np.array([[0.3], [-0.2]])
+    inputs = (scene.observation(np, q, v)[:, 0] - mean) / deviation
+    control = given.program.scene.feedback(np, theta[:, None], q, v)
+    assert control[0, 0] == pytest.approx(theta[:5] @ inputs + theta[5], rel=1e-12)
+    assert plain.scene.feedback(np, theta[:, None], q, v)[0, 0] != pytest.approx(control[0, 0], rel=1e-3)
+
+
+def test_backends_agree_with_normalised_observations():
+    exact = problem("mlp[hidden=4]", normalise=8, horizon=6)
+    theta, w = exact.program.theta0, sample(exact)
+    gradient = exact.grad(theta, w)
+    scale = np.abs(gradient).max()
+    for backend in ("torch", "numpy"):
+        other = problem("mlp[hidden=4]", backend, normalise=8, horizon=6)
+        assert other.value(theta, w) == pytest.approx(exact.value(theta, w), rel=1e-12)
+        assert np.abs(other.grad(theta, w) - gradient).max() < DIFFERENCED * scale
+    assert np.abs(adjoint_gradient(exact, slopes(exact, theta, w)) - gradient).max() < DIFFERENCED * scale
+    # programs with other moments share no compiled function and no derivative of the policy
+    shorter = problem("mlp[hidden=4]", normalise=4, horizon=6)
+    assert shorter.program.structure != exact.program.structure
+    by_steps = adjoint_gradient(shorter, slopes(shorter, theta, w))
+    assert np.abs(by_steps - shorter.grad(theta, w)).max() < DIFFERENCED * scale
+
+
+def test_states_after_an_end_do_not_count_in_the_moments():
+    scene = Ending(policy="linear[scale=0]", horizon=60, normalise=64)
+    mean, _ = compile_problem(scene, None, "semi_implicit_euler", "numpy").program.scene.moments
+    q, _ = scene.random_start(np, np.random.default_rng(0).standard_normal((8, 64)))
+    assert abs(q[0]).max() > 1.0  # some rollouts end at once
+    assert abs(mean[0, 0]) < abs(q[0]).max()
+    moving = np.abs(q[0]) <= 1.0
+    short = dataclasses.replace(scene, horizon=1)
+    first, _ = compile_problem(short, None, "semi_implicit_euler", "numpy").program.scene.moments
+    assert first[0, 0] == pytest.approx(q[0, moving].mean(), rel=1e-12)
+
+
+def test_normalisation_that_numpy_cannot_measure_is_refused():
+    with pytest.raises(Unsupported, match="in NumPy, which lacks root"):
+        compile_problem("cartpole_swing[normalise=8]", None, "implicit_euler", "implicit")
 
 
 def test_substeps_are_steps_of_the_integrator():
