@@ -57,7 +57,6 @@ def slopes(problem: Problem, theta: np.ndarray, w: np.ndarray) -> Slopes:
     scene, (horizon, m, count) = program.scene, path.controls.shape
     noisy = full if program.action_noise else full + scene.sigma * w[: program.dim]
     before, controls = _flatten(path.states[:-1]), _flatten(path.controls)
-    repeated = np.tile(noisy, (1, horizon))
 
     weights = scene.cost_weights()
 
@@ -70,7 +69,7 @@ def slopes(problem: Problem, theta: np.ndarray, w: np.ndarray) -> Slopes:
         return value if weights is None else weights[-1] * value
 
     def back(x: np.ndarray) -> np.ndarray | None:
-        return scene.feedback(np, repeated, *_split(program, x))
+        return scene.feedback(np, np.tile(noisy, (1, horizon)), *_split(program, x))
 
     def by_state(function: Callable[[np.ndarray], np.ndarray], x: np.ndarray) -> np.ndarray:
         if n_changes(scene) == len(x):

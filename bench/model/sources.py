@@ -24,8 +24,8 @@ EQUIVALENT: dict[str, str] = {
     "27ba374e4797eaa1dadbe2347093b8293d17e4beb4fc537313212341f3eda325": "297f51107543e92425d4da900ff76f5713b7be2f7b41083c98ff121267327fdc",
     # bench/model/problem.py: noise on the actions beside a scene's own noise, which no stored scene has
     "d253d82556790fbfa9c54d8b60474b8450cdff44271a3a8e42ea6788bc5dfb93": "b537cd67e11a1065dce873c040744092aa6c8dbc2af87f4d4b4942d39197585c",
-    # bench/model/adjoint.py: uses a scene's own derivative of the feedback and weights of its costs, which no stored scene has
-    "e73ab9a382a2e7ceb1ba44154ef92a482cd52aa7137c8436c3ef1c8fbfeb459c": "d6d35bf0003a6041adf76a4e9ccca9ede0b96e1241a58774c8fbf795bedcd942",
+    # bench/model/adjoint.py: uses a scene's own derivative of the feedback and weights of its costs, which no stored scene has, and makes no array that it does not use
+    "f289ee60c7db4889658136b05bcfc15e2ac1d357bdb99740c1023fa3843be036": "d6d35bf0003a6041adf76a4e9ccca9ede0b96e1241a58774c8fbf795bedcd942",
     # bench/model/manifold.py: the joints of a scene may depend on its parameters
     "c38492d867e6f03e0243c75cef3741d9cb79210f93ea28080e68b0c514e4eb05": "e8ce151ce4c198a1b8893f9f61339c4ec86bdcf2b79d517068441741c4451491",
     # plugins/mjcf.py: models from files, which no stored scene has; contacts for gradient checks and traces
@@ -34,8 +34,8 @@ EQUIVALENT: dict[str, str] = {
     "b392988da4aa3f807e846c0a0cbebc04c3700897b947dcb409b45f3c4da71371": "b1b262672b057e5f7cdafaf36a41d335c4543c3e9956d73e60a0d9ede57e60e2",
     # plugins/backends/mjx.py: programs with a policy and models from files, which no stored scene has; contacts for gradient checks and traces
     "552daf16d16a3031ce2de6a8eb13325db9421a8b3e45f4281e340480a8c8b6f5": "785dd047351f2bee8e0aeb5c2c6d36ef7616c3cb47fd9e7d898f13a91ae57769",
-    # plugins/backends/jax.py: its loop is a function that other backends call
-    "d4fd1ca7df941e541b95c6d2269a99997af4415110b5a73fa63bb870d4a397ff": "a46ed4d792f61433071933b66bd03d3ad33ff491c1585d8568ee77b069d5cb09",
+    # plugins/backends/jax.py: its loop is a function that other backends call, and blocks of few columns for a theta longer than in any stored row
+    "ffbf774226467927a27ec9e78971b492dcac2e2584208254123440d5d3c69b4a": "a46ed4d792f61433071933b66bd03d3ad33ff491c1585d8568ee77b069d5cb09",
     # plugins/backends/checkpointed.py: calls the loop of jax, and provides surrogate gradients, which no stored row uses
     "5576d15eeb6545cec4296d7010d7d149086dc768d2a57e2f659edca4ec8148e6": "03679d6ad1a4de8ee22b01b239b9c167376e447e916100529ce2b69e6dde1377",
     # plugins/backends/compiling.py: forgets executables, which are compiled again
@@ -104,6 +104,8 @@ EQUIVALENT: dict[str, str] = {
     "686532575ae796c4217d1d3d7d95c9b0f48ca9dbc3792a9b6dd451d0f65968bc": "604abd01749d1f0cf4c1bc84d6045238660ab504dacb683d96a39c67f8465455",
     # bench/trace/adjoints.py: weights of the costs of steps, which are 1 in all stored rows
     "8522ae5d2430fbced6b3a1e94e71355666ba5c1210db6d848540337568e41e5e": "7f592afa67aed65e145b0f972cdb2aafc18195565bb85fa4165aee3a8062ade9",
+    # bench/studies/bias_variance/estimates.py: terms of a long theta in parts, longer than in any stored row
+    "e4cd5183e4b678285e2c220414839d6f1996bc535c0554a643390c5dd2f6ccc8": "b1c11c1e927407e7722da3471963a7ae79001c2a87e3f68b85f9c41d0babec2f",
 }
 """Hashes of files, and of classes of studies, whose changes decide no stored number: the new hash, and the one in the keys of rows.
 

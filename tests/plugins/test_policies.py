@@ -1,6 +1,7 @@
 """Policies, and the scenes and programs that use them."""
 
 import dataclasses
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -234,6 +235,26 @@ def test_states_after_an_end_do_not_count_in_the_moments():
 def test_normalisation_that_numpy_cannot_measure_is_refused():
     with pytest.raises(Unsupported, match="in NumPy, which lacks root"):
         compile_problem("cartpole_swing[normalise=8]", None, "implicit_euler", "implicit")
+
+
+def test_a_long_theta_has_blocks_of_few_columns(monkeypatch):
+    usual = problem(horizon=5)
+    theta, w = usual.program.theta0, sample(usual, 11)
+    monkeypatch.setattr("bench.plugins.backends.jax.LARGE", usual.dim)
+    long = problem(horizon=5)
+    assert (long.grain, long.block) == (8, 8)
+    assert long.grad(theta, w) == pytest.approx(usual.grad(theta, w), rel=REVERSED)
+
+
+def test_the_adjoint_keeps_no_copy_of_theta_for_each_step():
+    long = problem("mlp[hidden=64x64]")
+    theta, w = long.program.theta0, sample(long)
+    slopes(long, theta, w)
+    tracemalloc.start()
+    slopes(long, theta, w)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 8 * theta.size * w.shape[1] * 30 / 2  # a copy for each of the 30 steps would be twice that
 
 
 def test_substeps_are_steps_of_the_integrator():
