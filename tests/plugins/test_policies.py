@@ -348,3 +348,20 @@ def test_policies_are_swept(tmp_path):
     )  # fmt: skip
     assert rows.status.tolist() == ["ok", "ok"]
     assert sorted(rows.dim) == [6, 57]
+
+
+@pytest.mark.slow
+def test_a_policy_with_a_hundred_thousand_coordinates_has_rows(tmp_path):
+    common = dict(
+        name="large", backends=["jax"], samples=4, repeats=4, timing=False, results_dir=tmp_path,
+        reference={"samples": 64},
+    )  # fmt: skip
+    scene = "cartpole_swing[horizon=5,policy=mlp[hidden=300x300]"
+    on_actions = ["fobg", "reinforce", "windowed[steps=2]", "total_propagation[per=action]"]
+    rows = bench.run(scenes=[f"{scene}]"], estimators=on_actions, **common)
+    assert rows.status.tolist() == ["ok"] * 4
+    smoothed = bench.run(scenes=[f"{scene},noise=parameter,sigma=0.01]"], estimators=["randomized_smoothing"], **common)
+    assert smoothed.status.tolist() == ["ok"]
+    for given in (rows, smoothed):
+        assert set(given.dim) == {92401}
+        assert given.peak_memory_mb.max() < 2048
