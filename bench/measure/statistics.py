@@ -90,7 +90,7 @@ class Sampling:
     @property
     def trace(self) -> float:
         """Trace of the covariance: the expected squared distance of the mean from its expectation."""
-        return float(np.vdot(self.rows, self.rows)) + self.equal * self.rows.shape[1]
+        return float(np.vdot(self.rows, self.rows) + self.equal * self.rows.shape[1])
 
     def over(self, unit: float) -> Sampling:
         """Return the same covariance, measured in ``unit``."""

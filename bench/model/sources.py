@@ -107,7 +107,7 @@ EQUIVALENT: dict[str, str] = {
     # bench/studies/bias_variance/estimates.py: terms of a long theta in parts, longer than in any stored row
     "e4cd5183e4b678285e2c220414839d6f1996bc535c0554a643390c5dd2f6ccc8": "b1c11c1e927407e7722da3471963a7ae79001c2a87e3f68b85f9c41d0babec2f",
     # bench/measure/statistics.py: an error without direction of more coordinates than any stored row has
-    "0d417efb992113e213acd57c2b568e8513b743955ef694c3bc41533c2567f3ac": "84ee3b297525a5a62f906f72c889b8c3ffb5ef0c706ed14afb9b5ea6e87f076b",
+    "51eb9c71012394bd872b8766ae81ec9445a2a30a43ea72d6335f036d5d833be6": "84ee3b297525a5a62f906f72c889b8c3ffb5ef0c706ed14afb9b5ea6e87f076b",
     # bench/measure/jumps.py: points of more coordinates than any stored row has, in parts
     "a6d5fb77ee965172f6c23ef8366258357121b9ecb632f2cce341b6e1ef95e677": "c9c777360e1c496fe08a44906155a28cb871bfabd77c62b774ce233a4a9ff5dd",
 }
