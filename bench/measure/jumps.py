@@ -24,7 +24,8 @@ LOUD = 100.0
 """Multiple of the cost's rounding noise below which a change counts as noise."""
 SINGLE = float(np.finfo(np.float32).eps)
 """Relative rounding of a cost computed in single precision, whose values are all single-precision numbers."""
-
+MOST_POINTS = 1 << 25
+"""Most numbers in the points of one call of the cost (256 MiB)."""
 
 REACH = 4.0
 """Distance searched on either side of theta, in standard deviations of the noise."""
@@ -64,7 +65,9 @@ def jump_under_noise(problem: Problem, theta: np.ndarray, seed: int, columns: in
     changes = cost(samples)
     changes = np.where(np.isfinite(changes), changes - np.nan_to_num(np.median(changes)), 0.0)
     chosen = np.unique(np.linspace(0, width - 1, min(width, LINES)).astype(int))
-    directions = np.concatenate([np.eye(width)[:, chosen], samples[:, :LINES], (samples @ changes)[:, None]], axis=1)
+    units = np.zeros((width, chosen.size))
+    units[chosen, np.arange(chosen.size)] = 1.0
+    directions = np.concatenate([units, samples[:, :LINES], (samples @ changes)[:, None]], axis=1)
     lengths = np.linalg.norm(directions, axis=0)
     directions = directions[:, lengths > 0.0] / lengths[lengths > 0.0]
     pairs = samples[:, : 2 * LINES], samples[:, 2 * LINES :]
@@ -94,7 +97,11 @@ def largest_jump(
     while True:
         nodes = left[:, None] + width * np.linspace(0.0, 1.0, parts + 1)
         at = np.repeat(line, parts + 1)
-        values = cost(starts[:, at] + (ends[:, at] - starts[:, at]) * nodes.ravel()).reshape(nodes.shape)
+        places, held = nodes.ravel(), max(1, MOST_POINTS // len(starts))
+        values = np.concatenate([
+            cost(starts[:, part] + (ends[:, part] - starts[:, part]) * places[i : i + held])
+            for i, part in ((i, at[i : i + held]) for i in range(0, len(at), held))
+        ]).reshape(nodes.shape)  # fmt: skip
         values = np.where(np.isfinite(values), values, np.nan)
         if not np.isfinite(values).any():
             return Jump(0.0, span)

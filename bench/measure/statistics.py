@@ -46,6 +46,8 @@ SYMMETRIC = 1e-6
 """Skewness below which its correction is rounding."""
 VAGUE = 0.1
 """Error of a reference, as a share of its norm, above which a note warns that relative columns are no more accurate."""
+LARGE = 1 << 12
+"""Coordinates from which a covariance that is equal in all directions is one number: as rows it has d x d numbers."""
 THREE = 3.0
 """Numerator of the rule of three: an event absent from n trials has a probability below 3 / n, at 95% confidence."""
 UNEXPLAINED = "tails unseen or gradient wrong"
@@ -68,6 +70,8 @@ class Sampling:
     """``(K, d)``. For a sample of K: deviations from the sample's mean, divided by sqrt(K (K - 1))."""
     degrees: float
     """Degrees of freedom: K - 1 for a sample of K, infinite for a known covariance."""
+    equal: float = 0.0
+    """A variance that is added to every coordinate, so that an error without direction needs no d rows."""
 
     @classmethod
     def of(cls, sample: np.ndarray) -> Sampling:
@@ -78,17 +82,19 @@ class Sampling:
     @classmethod
     def without_direction(cls, error: float, dim: int) -> Sampling:
         """Return the known covariance of an error of norm ``error`` whose direction is unknown."""
+        if dim > LARGE:
+            return cls(np.zeros((0, dim)), math.inf, error**2 / dim)
         rows = np.eye(dim) * (error / math.sqrt(max(dim, 1))) if error else np.zeros((0, dim))
         return cls(rows, math.inf)
 
     @property
     def trace(self) -> float:
         """Trace of the covariance: the expected squared distance of the mean from its expectation."""
-        return float(np.vdot(self.rows, self.rows))
+        return float(np.vdot(self.rows, self.rows) + self.equal * self.rows.shape[1])
 
     def over(self, unit: float) -> Sampling:
         """Return the same covariance, measured in ``unit``."""
-        return replace(self, rows=self.rows / unit)
+        return replace(self, rows=self.rows / unit, equal=self.equal / unit**2)
 
     def excess(self) -> float:
         """Return the upward bias of tr C^2 as an estimate, where C is the covariance of a sample's mean; 0 for a known C.
@@ -184,7 +190,8 @@ class Truth:
     @property
     def standard_error(self) -> float:
         """Square root of the trace of the covariance of the mean, including the error that sampling does not show."""
-        return math.hypot(_length(self.sampling.rows), self.unseen)
+        shown = math.sqrt(self.sampling.trace) if self.sampling.equal else _length(self.sampling.rows)
+        return math.hypot(shown, self.unseen)
 
     def vanishes(self) -> bool:
         """Return whether the gradient is not distinguishable from 0, so that relative quantities are undefined."""
@@ -233,12 +240,15 @@ def bias_interval(difference: np.ndarray, *errors: Sampling, level: float = 0.95
     difference = difference / unit
     rows = np.concatenate([error.rows for error in errors])
     doubt = sum(error.trace**2 / error.degrees for error in errors)  # Welch: the reciprocal of the degrees of freedom
-    square = _trace_square(rows) - sum(error.excess() for error in errors)
+    # S = rows' rows + equal I
+    equal, dim = sum(error.equal for error in errors), difference.size
+    square = _trace_square(rows) + equal * (2.0 * float(np.vdot(rows, rows)) + equal * dim)
+    square = square - sum(error.excess() for error in errors)
     square = min(max(square, 1.0 / difference.size), 1.0)
     total = float(difference @ difference)
     image = rows @ difference
-    once = float(image @ image)  # m'Sm
-    image = image @ rows
+    once = float(image @ image) + equal * total  # m'Sm
+    image = image @ rows + equal * difference
     twice = (float(image @ image) - once * doubt) / (1.0 + doubt)  # m'S^2 m, less the noise in S
     directional = min(once / total, 1.0) if total else square
     slope = min(max(twice / once if once else 0.0, directional), 1.0)

@@ -57,16 +57,19 @@ def slopes(problem: Problem, theta: np.ndarray, w: np.ndarray) -> Slopes:
     scene, (horizon, m, count) = program.scene, path.controls.shape
     noisy = full if program.action_noise else full + scene.sigma * w[: program.dim]
     before, controls = _flatten(path.states[:-1]), _flatten(path.controls)
-    repeated = np.tile(noisy, (1, horizon))
+
+    weights = scene.cost_weights()
 
     def stage(x: np.ndarray, u: np.ndarray) -> np.ndarray:
-        return np.asarray(0.0 * x[0] + scene.stage_cost(np, *_split(program, x), u))
+        value = np.asarray(0.0 * x[0] + scene.stage_cost(np, *_split(program, x), u))
+        return value if weights is None else np.repeat(weights[:-1], count) * value
 
     def end(x: np.ndarray) -> np.ndarray:
-        return np.asarray(scene.terminal_cost(np, *_split(program, x)))
+        value = np.asarray(scene.terminal_cost(np, *_split(program, x)))
+        return value if weights is None else weights[-1] * value
 
     def back(x: np.ndarray) -> np.ndarray | None:
-        return scene.feedback(np, repeated, *_split(program, x))
+        return scene.feedback(np, np.tile(noisy, (1, horizon)), *_split(program, x))
 
     def by_state(function: Callable[[np.ndarray], np.ndarray], x: np.ndarray) -> np.ndarray:
         if n_changes(scene) == len(x):

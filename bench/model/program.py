@@ -480,6 +480,7 @@ class Rollout(Program):
         theta, state, scanned = self.start(ops, theta, w)
         planned_scored = None if theta_scored is None else scene.planned_controls(xp, theta_scored)
         extra = () if planned_scored is None else (planned_scored,)
+        weights, last_weight = self._weights(xp, w)
         # a scan's carry must have a constant shape and type
         zero = xp.zeros_like(w[0, :])
 
@@ -488,13 +489,15 @@ class Rollout(Program):
             drawn = slices[: len(scanned)]
             u = self.control(ops, theta, state, drawn)
             if theta_scored is not None:
-                scored = [*slices[len(scanned) :], scene.feedback(xp, theta_scored, state.q, state.v)]
+                scored = [*slices[len(scanned) :][: len(extra)], scene.feedback(xp, theta_scored, state.q, state.v)]
                 logp = logp + sum(xp.sum(drawn[-1] * part, axis=0) for part in scored if part is not None)
-            cost = cost + scene.stage_cost(xp, state.q, state.v, u)
+            stage = scene.stage_cost(xp, state.q, state.v, u)
+            cost = cost + (slices[-1] * stage if weights else stage)
             return self.step(ops, state, u), cost, logp
 
-        state, cost, logp = ops.scan(step, (state, zero, zero), scanned + extra, scene.horizon)
-        return cost + scene.terminal_cost(xp, state.q, state.v), logp
+        state, cost, logp = ops.scan(step, (state, zero, zero), scanned + extra + weights, scene.horizon)
+        end = scene.terminal_cost(xp, state.q, state.v)
+        return cost + (last_weight * end if weights else end), logp
 
     def _replayed(self, ops: Ops, theta: Array, theta_moved: Array, w: Array) -> tuple[Array, Array]:
         """Return cost and sum_t w_t . pi(theta_moved, x_t), each ``(B,)``, along the states x_t.
@@ -504,24 +507,34 @@ class Rollout(Program):
         scene, xp = self.scene, ops.xp
         theta, first, scanned = self.start(ops, theta, w)
         theta_moved, second, scanned_moved = self.start(ops, theta_moved, w)
+        weights, last_weight = self._weights(xp, w)
         zero = xp.zeros_like(w[0, :])
 
         def step(
             carry: tuple[State, State, Array, Array], slices: tuple[Array, ...]
         ) -> tuple[State, State, Array, Array]:
             state, moved, cost, logp = carry
-            drawn, planned = slices[: len(scanned)], slices[len(scanned) :]
+            drawn, planned = slices[: len(scanned)], slices[len(scanned) :][: len(scanned_moved) - 1]
             u = self.control(ops, theta, state, drawn)
             for part in (*planned, scene.feedback(xp, theta_moved, moved.q, moved.v)):
                 if part is not None:
                     logp = logp + xp.sum(drawn[-1] * part, axis=0)
-            cost = cost + scene.stage_cost(xp, moved.q, moved.v, u)
+            stage = scene.stage_cost(xp, moved.q, moved.v, u)
+            cost = cost + (slices[-1] * stage if weights else stage)
             return self.step(ops, state, u), self.step(ops, moved, u), cost, logp
 
         # the second rollout needs only its own plan, since both have the same noise
-        inputs = scanned + scanned_moved[:-1]
+        inputs = scanned + scanned_moved[:-1] + weights
         _, last, cost, logp = ops.scan(step, (first, second, zero, zero), inputs, scene.horizon)
-        return cost + scene.terminal_cost(xp, last.q, last.v), logp
+        end = scene.terminal_cost(xp, last.q, last.v)
+        return cost + (last_weight * end if weights else end), logp
+
+    def _weights(self, xp: Any, w: Array) -> tuple[tuple[Array, ...], float]:
+        """Return the weights of the stage costs as a scan's input, empty if all are 1, and that of the terminal cost."""
+        weights = self.scene.cost_weights()
+        if weights is None:
+            return (), 1.0
+        return (xp.asarray(weights[:-1], dtype=w.dtype),), float(weights[-1])
 
 
 class _VaryingOps:

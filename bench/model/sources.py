@@ -14,18 +14,18 @@ from pathlib import Path
 from bench.model.parameters import remember
 
 EQUIVALENT: dict[str, str] = {
-    # bench/model/program.py: a scene may name the class of its programs
-    "55c7c911a32078be57451be8702e153baec58333859031b5fbd7430408e52ad3": "537e21f7c1463cf5e114b297818ea6abf2ec7e5556f8f0da67faa3578015e5ff",
-    # bench/model/scene.py: a scene may name the class of its programs, the derivative of its feedback, an MJCF file, and its events
-    "6a6212885eb95dbb5126a0a4aa4c76c68a8da7354e0e7c2e16be8773d5f523fe": "19a77ee56a6a214a4dc2c76e08a14257a51fb50b9c3cdad578f647101743edcb",
+    # bench/model/program.py: a scene may name the class of its programs, and the weights of its costs, which are 1 in all stored rows
+    "b04d8f5748b7f944c3659eddf5d99cb19406be96f501ffe3379e865a000c4211": "537e21f7c1463cf5e114b297818ea6abf2ec7e5556f8f0da67faa3578015e5ff",
+    # bench/model/scene.py: a scene may name the class of its programs, the derivative of its feedback, weights of its costs, an MJCF file, and its events
+    "f2fb257863e04aeb9706b8ab770ef996056df0e777d573a558f837b04e7fec18": "19a77ee56a6a214a4dc2c76e08a14257a51fb50b9c3cdad578f647101743edcb",
     # bench/measure/reference.py: noise on the actions beside a scene's own noise, which no stored scene has
     "8e9c1980ecf41fda3cffe337a73bda5f04f968b11b11f7bd78492e9239172a70": "f4ea930fd9b4c514b92e905d9ee99b00899e60ecef16cc4e558020bce228ddd2",
     # bench/model/estimator.py: noise on the actions beside a scene's own noise, which no stored scene has; a declaration for the kit
     "27ba374e4797eaa1dadbe2347093b8293d17e4beb4fc537313212341f3eda325": "297f51107543e92425d4da900ff76f5713b7be2f7b41083c98ff121267327fdc",
     # bench/model/problem.py: noise on the actions beside a scene's own noise, which no stored scene has
     "d253d82556790fbfa9c54d8b60474b8450cdff44271a3a8e42ea6788bc5dfb93": "b537cd67e11a1065dce873c040744092aa6c8dbc2af87f4d4b4942d39197585c",
-    # bench/model/adjoint.py: uses a scene's own derivative of the feedback, which no stored scene has
-    "199f4a0dd1f16ecfe50c34223c5b4e7c1b27bcf03013f946651eccf457a8fdba": "d6d35bf0003a6041adf76a4e9ccca9ede0b96e1241a58774c8fbf795bedcd942",
+    # bench/model/adjoint.py: uses a scene's own derivative of the feedback and weights of its costs, which no stored scene has, and makes no array that it does not use
+    "f289ee60c7db4889658136b05bcfc15e2ac1d357bdb99740c1023fa3843be036": "d6d35bf0003a6041adf76a4e9ccca9ede0b96e1241a58774c8fbf795bedcd942",
     # bench/model/manifold.py: the joints of a scene may depend on its parameters
     "c38492d867e6f03e0243c75cef3741d9cb79210f93ea28080e68b0c514e4eb05": "e8ce151ce4c198a1b8893f9f61339c4ec86bdcf2b79d517068441741c4451491",
     # plugins/mjcf.py: models from files, which no stored scene has; contacts for gradient checks and traces
@@ -34,8 +34,8 @@ EQUIVALENT: dict[str, str] = {
     "b392988da4aa3f807e846c0a0cbebc04c3700897b947dcb409b45f3c4da71371": "b1b262672b057e5f7cdafaf36a41d335c4543c3e9956d73e60a0d9ede57e60e2",
     # plugins/backends/mjx.py: programs with a policy and models from files, which no stored scene has; contacts for gradient checks and traces
     "552daf16d16a3031ce2de6a8eb13325db9421a8b3e45f4281e340480a8c8b6f5": "785dd047351f2bee8e0aeb5c2c6d36ef7616c3cb47fd9e7d898f13a91ae57769",
-    # plugins/backends/jax.py: its loop is a function that other backends call
-    "d4fd1ca7df941e541b95c6d2269a99997af4415110b5a73fa63bb870d4a397ff": "a46ed4d792f61433071933b66bd03d3ad33ff491c1585d8568ee77b069d5cb09",
+    # plugins/backends/jax.py: its loop is a function that other backends call, and blocks of few columns for a theta longer than in any stored row
+    "ffbf774226467927a27ec9e78971b492dcac2e2584208254123440d5d3c69b4a": "a46ed4d792f61433071933b66bd03d3ad33ff491c1585d8568ee77b069d5cb09",
     # plugins/backends/checkpointed.py: calls the loop of jax, and provides surrogate gradients, which no stored row uses
     "5576d15eeb6545cec4296d7010d7d149086dc768d2a57e2f659edca4ec8148e6": "03679d6ad1a4de8ee22b01b239b9c167376e447e916100529ce2b69e6dde1377",
     # plugins/backends/compiling.py: forgets executables, which are compiled again
@@ -56,8 +56,8 @@ EQUIVALENT: dict[str, str] = {
     "4e4e92ad12ad459268276452de9d92447609b50b51f136a670a8894f55dcde11": "fee1e09006427e51ebe8172ecbdc8ac76366922b7225e35c26a1993d121e599c",
     # bench/training/fitting.py: refuses more batches than states, which no stored row has
     "4ccf81bc6d7e8b7c66e350f09cbade82b42523e1933928d90fe9e0a773edf604": "c09fb2d21730de2566b1607dd2f5cf30cc0f2f9a6a97f395b798f3378a996fe0",
-    # bench/engines/problem.py: asks the program whether its law is open-loop, and an engine's settings for the row
-    "cffc1219dfc227492e89d6e560deebdb8b79c68d45e0ddc1116debfd49b061b9": "48ac5bce93078bdac75ea14151589c5fb68141cf5ddd768e00982181f06b8495",
+    # bench/engines/problem.py: asks the program whether its law is open-loop, an engine's settings for the row, and weights of costs, which are 1 in all stored rows
+    "c94419a9b2fa32631f0db9a20d4b0c39d150bb16ec710abf69f803b1089e5398": "48ac5bce93078bdac75ea14151589c5fb68141cf5ddd768e00982181f06b8495",
     # bench/model/optimizer.py: answers have a field that no stored row uses
     "3eade79e9325d352ff0765c87f98a09ab2b8bd083fbf5d237cb869655811b6d5": "6f4d0e199929423d63585facc347881eeffde26603a3145be3d59d374a71cc60",
     # bench/studies/optimise/batched.py: step Jacobians by differences where searches share batches, and a cell without an experiment around it, which both failed
@@ -90,10 +90,10 @@ EQUIVALENT: dict[str, str] = {
     "68ff709898b81a8338d9c6b5a7a9dffa958a5f79fe387b1d35163d59c8329710": "022e3f0543d013eba1fdcd4af5c8eaa83d6e118c9e76b19b822e78bcd7a551b0",
     # bench/measure/gradcheck/__init__.py: one more name
     "393f225cbaafb140fb5e64053a0d8756db2de946bc0aa4ab264483b416b31692": "f965dfe680d35ea51da514344bfdf1e2a7728d16485d4c8d967fee9fd5fe25e9",
-    # bench/model/policy.py: controls of a trained network's actions, which are the actions in all stored rows
-    "2a57fac59c1ebc96fbb047e5106954b3ab8e3ece5d7a5532fe053c4a1ea6b525": "c7bd75c4ea4fa863abffd86725712f9e9798a0f8a5b7c41c2c52b43c890e1c58",
-    # bench/training/environment.py: controls of a trained network's actions, which are the actions in all stored rows
-    "f5754d87028a92ed79b569d6110954964d82ba295ff14cf8f381acec6e51d2e4": "6aa866f73c01dfeda2b1d4c2a289a10da52f29ab8768c4a76018c39488fa779b",
+    # bench/model/policy.py: controls of a trained network's actions, which are the actions in all stored rows, a discount and normalised observations, which none has
+    "6c2237498d83324baabe9126743299301e6ff2d50682e6014ba81f9dcc3c19ba": "c7bd75c4ea4fa863abffd86725712f9e9798a0f8a5b7c41c2c52b43c890e1c58",
+    # bench/training/environment.py: controls of a trained network's actions, which are the actions in all stored rows; refuses a discounted scene
+    "b3e11f0d56d0ed05202d2c6352006fd153ad41b58be8690506f8b44d244c41b8": "6aa866f73c01dfeda2b1d4c2a289a10da52f29ab8768c4a76018c39488fa779b",
     # bench/training/windows.py: controls of a trained network's actions, which are the actions in all stored rows
     "42acbd247be5e409f9f5b031ccce299de23779a8d881cde645985148c3b2b05c": "b32815416608beb1d442f5a7fb2d50ee6443130c23b9f3dd3cfc7056935083f5",
     # bench/studies/train/measure.py: trains on the program that a backend runs, which is the scene's own in all stored rows
@@ -108,6 +108,14 @@ EQUIVALENT: dict[str, str] = {
     "2af1f4ae249ee3a458509132a1098efa3017c735b33d9ec65daffd10352337b7": "b4c6f2bd35d60a5908e9e38ac4d0d9adf001763508ae271a68e5860a738d5e56",
     # plugins/scenes/heaviside.py: declares its event, which no stored row uses
     "ce37ea8f704c52f80bdf9637ce2855b40b905e23de7825d8247dc52578c7cc7d": "62b7d378b702a48097b07a0eef7f6aac386d34c77b3028567ec40bdf3f8a570f",
+    # bench/trace/adjoints.py: weights of the costs of steps, which are 1 in all stored rows
+    "8522ae5d2430fbced6b3a1e94e71355666ba5c1210db6d848540337568e41e5e": "7f592afa67aed65e145b0f972cdb2aafc18195565bb85fa4165aee3a8062ade9",
+    # bench/studies/bias_variance/estimates.py: terms of a long theta in parts, longer than in any stored row
+    "e4cd5183e4b678285e2c220414839d6f1996bc535c0554a643390c5dd2f6ccc8": "b1c11c1e927407e7722da3471963a7ae79001c2a87e3f68b85f9c41d0babec2f",
+    # bench/measure/statistics.py: an error without direction of more coordinates than any stored row has
+    "51eb9c71012394bd872b8766ae81ec9445a2a30a43ea72d6335f036d5d833be6": "84ee3b297525a5a62f906f72c889b8c3ffb5ef0c706ed14afb9b5ea6e87f076b",
+    # bench/measure/jumps.py: points of more coordinates than any stored row has, in parts
+    "a6d5fb77ee965172f6c23ef8366258357121b9ecb632f2cce341b6e1ef95e677": "c9c777360e1c496fe08a44906155a28cb871bfabd77c62b774ce233a4a9ff5dd",
 }
 """Hashes of files, and of classes of studies, whose changes decide no stored number: the new hash, and the one in the keys of rows.
 

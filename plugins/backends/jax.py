@@ -100,6 +100,12 @@ def loop(body: Callable[[Any, Any], Any], carry: Any, xs: Any, length: int, reco
     return jax.lax.scan(lambda state, x: (one(state, x), None), carry, xs, length)[0]
 
 
+LARGE = 1 << 14
+"""Length of theta from which a column is a block's worth of work: blocks then have few columns, and hardly any padding."""
+FEW = 8
+"""Columns per block from that length on: theta, per column, and its derivative fit a core's cache."""
+
+
 def _platform() -> str:
     import jax
 
@@ -131,6 +137,8 @@ class JaxProblem(Problem):
         self.device = _platform()
         if self.device == "cpu":
             self.fit_blocks(_numbers(program) * self._dtype.itemsize)
+            if program.dim >= LARGE:
+                self.grain = self.block = self.least = FEW
 
     def _value(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         return self._call(self._cost, theta, w)

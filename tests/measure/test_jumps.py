@@ -7,7 +7,7 @@ import pytest
 import trusted
 from bench.plugins.backends.numpy import Numpy
 
-from bench.measure.jumps import jump_under_noise
+from bench.measure.jumps import jump_under_noise, largest_jump
 from bench.model import compose
 
 SEEN = {(s.family, s.label): s for s in trusted.scenes()}
@@ -56,3 +56,20 @@ def test_a_jump_within_reach_is_found(name):
     assert jump.height > 0.0
     assert math.isfinite(jump.span)
     assert 0.0 < np.abs(w).max() <= 4.0
+
+
+def test_points_with_many_coordinates_are_made_in_parts(monkeypatch):
+    starts, ends = np.full((50, 3), -1.0), np.ones((50, 3))
+    ends[0] = [1.0, 2.0, 3.0]
+    sizes = []
+
+    def cost(x):
+        sizes.append(x.size)
+        return np.where(x[0] > 1.5, 1.0, 0.0) + x.sum(axis=0) ** 2
+
+    whole = largest_jump(cost, starts, ends)
+    monkeypatch.setattr("bench.measure.jumps.MOST_POINTS", 500)
+    sizes.clear()
+    assert largest_jump(cost, starts, ends) == whole
+    assert whole.height == pytest.approx(1.0, abs=1e-3)
+    assert max(sizes) <= 500

@@ -548,3 +548,19 @@ def test_coverage_study(noise: str, capsys: pytest.CaptureFixture[str]) -> None:
     # Skewness of 6 at 16 repeats is beyond any interval built on two moments.
     assert within >= (0.6 if noise == "lognormal 1" else 0.9)
     assert min(shares) >= (0.7 if noise == "lognormal 1" else 0.85)
+
+
+def test_an_error_without_direction_needs_no_rows_for_many_coordinates(monkeypatch):
+    draw = np.random.default_rng(0)
+    sample, error = draw.standard_normal((6, 40)), 0.7
+    difference = sample.mean(axis=0) + 0.1
+    by_rows = bias_interval(difference, Sampling.of(sample), Sampling.without_direction(error, 40))
+    exact = Truth.exact(difference, error)
+    monkeypatch.setattr("bench.measure.statistics.LARGE", 39)
+    hidden = Sampling.without_direction(error, 40)
+    assert hidden.rows.shape == (0, 40)
+    assert bias_interval(difference, Sampling.of(sample), hidden) == pytest.approx(by_rows, rel=1e-12)
+    short = Truth.exact(difference, error)
+    assert short.standard_error == pytest.approx(exact.standard_error, rel=1e-12)
+    assert short.over(3.0).standard_error == pytest.approx(exact.over(3.0).standard_error, rel=1e-12)
+    assert short.vanishes() == exact.vanishes()

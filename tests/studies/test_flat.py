@@ -60,6 +60,23 @@ def test_estimates_in_parts_are_those_in_one_go(estimator, monkeypatch):
         np.testing.assert_allclose(values[0], values[1], rtol=1e-9)
 
 
+@pytest.mark.parametrize(("most", "largest"), [(20, 20), (500, 480)])
+def test_terms_of_a_long_theta_are_computed_in_parts(most, largest, monkeypatch):
+    cell, sizes = cell_of("fobg"), []
+    _, expected = made(cell)
+    terms = type(cell.estimator).terms
+
+    def counted(self, problem, theta, w):
+        sizes.append(w.shape[1] * problem.dim)
+        return terms(self, problem, theta, w)
+
+    monkeypatch.setattr(type(cell.estimator), "terms", counted)
+    monkeypatch.setattr("bench.studies.bias_variance.estimates.MOST_TERMS", most)
+    _, found = made(cell)
+    np.testing.assert_allclose(found, expected, rtol=ROUNDED)
+    assert max(sizes) == largest
+
+
 def test_variance_per_sample_is_that_of_all_terms():
     cell = cell_of("fobg", samples=400, repeats=8)
     found, _ = made(cell)

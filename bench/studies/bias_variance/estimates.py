@@ -20,6 +20,8 @@ from bench.model import Auxiliaries, Problem, SampleMean, columns, per_repeat
 
 MOST_NORMS = 100_000
 """Most norms of single terms to store for their quantiles: the first ones of each repeat, equally many per repeat."""
+MOST_TERMS = 1 << 25
+"""Most numbers in the terms of one call (256 MiB): d per sample. With more, fewer repeats or samples share a call."""
 QUANTILES = {"sample_low": 0.05, "sample_median": 0.5, "sample_high": 0.95}
 """Columns with quantiles of the norm of a single term, and the quantile of each."""
 
@@ -44,6 +46,7 @@ class Estimates:
         self._cell, self._problem, self._theta = cell, problem, theta
         self._width = problem.program.n_noise
         self._estimator = cell.estimator
+        self._columns = max(1, MOST_TERMS // problem.dim)
         fits = cell.repeats * cell.samples * self._width <= noise.HELD
         self._noise = (
             noise.shared(cell.seed, cell.scene.name, cell.repeats, cell.samples, self._width) if fits else None
@@ -54,9 +57,11 @@ class Estimates:
 
     def of(self, start: int, stop: int) -> np.ndarray:
         """Return the estimates of repeats ``start`` to ``stop - 1``, ``(stop - start, d)``."""
-        estimator = self._estimator
+        estimator, together = self._estimator, max(1, self._columns // self._cell.samples)
+        if stop - start > together:
+            return np.concatenate([self.of(r, min(r + together, stop)) for r in range(start, stop, together)])
         if isinstance(estimator, SampleMean) and estimator.separable:
-            if self._noise is not None:
+            if self._noise is not None and self._cell.samples <= self._columns:
                 return self._mean_of_batch(estimator, start, self._noise[start:stop])
             return np.stack([self._mean_of_parts(estimator, repeat) for repeat in range(start, stop)])
         if self._noise is not None:
@@ -93,7 +98,9 @@ class Estimates:
 
     def _draw_parts(self, repeat: int) -> Iterator[np.ndarray]:
         cell = self._cell
-        return noise.parts(cell.seed, cell.scene.name, repeat, cell.samples, self._width, "cells")
+        for part in noise.parts(cell.seed, cell.scene.name, repeat, cell.samples, self._width, "cells"):
+            for first in range(0, part.shape[1], self._columns):
+                yield part[:, first : first + self._columns]
 
     def _estimate_batch(self, start: int, block: np.ndarray) -> np.ndarray:
         result, self.diagnostics[start] = self._estimator.estimate_with_diagnostics(self._problem, self._theta, block)
