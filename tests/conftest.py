@@ -1,5 +1,6 @@
 """Settings and fixtures of all tests: quick compilation, and the registered backends."""
 
+import compileall
 import gc
 import itertools
 import os
@@ -18,14 +19,31 @@ QUICK = (
 """Tests compile hundreds of programs and run each for milliseconds. Without optimisation and fused loops, XLA compiles in a
 quarter of the time, and numbers are equal up to rounding. Processes that a test starts inherit the setting."""
 
+COMPILED = ("bench", "plugins", "tests/programs")
+"""Folders whose bytecode is written before the tests, also where PYTHONDONTWRITEBYTECODE is set: hundreds of processes import
+their files, and compiling these takes a third of the start of a process."""
+
 
 def pytest_configure(config):
+    if not hasattr(config, "workerinput"):
+        for folder in COMPILED:
+            compileall.compile_dir(config.rootpath / folder, quiet=2)
     os.environ["XDG_CACHE_HOME"] = str(config.rootpath / ".pytest_cache" / "home")
     os.environ["XLA_FLAGS"] = f"{QUICK} {os.environ.get('XLA_FLAGS', '')}".strip()
     config.addinivalue_line(
         "markers",
         "needs(*capabilities): what the backend fixture must provide; physics asks for engines, which else are left out",
     )
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection():
+    """Write the bytecode of test files, which pytest changes, for later sessions; files that tests edit are never written."""
+    chosen, sys.dont_write_bytecode = sys.dont_write_bytecode, False
+    try:
+        return (yield)
+    finally:
+        sys.dont_write_bytecode = chosen
 
 
 LONG = {"fused"}
