@@ -14,10 +14,12 @@ from browser import CHROMIUM, MISSING, chromium
 from bench.model import registry, trial
 
 QUICK = (
-    "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false --xla_llvm_disable_expensive_passes=true"
+    "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false --xla_llvm_disable_expensive_passes=true "
+    "--xla_cpu_parallel_codegen_split_count=1"
 )
 """Tests compile hundreds of programs and run each for milliseconds. Without optimisation and fused loops, XLA compiles in a
-quarter of the time, and numbers are equal up to rounding. Processes that a test starts inherit the setting."""
+quarter of the time, and numbers are equal up to rounding. One module per program instead of up to 32, whose threads would
+share the cores with other tests, takes 40% off that. Processes that a test starts inherit the setting."""
 
 COMPILED = ("bench", "plugins", "tests/programs")
 """Folders whose bytecode is written before the tests, also where PYTHONDONTWRITEBYTECODE is set: hundreds of processes import
