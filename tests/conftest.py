@@ -1,5 +1,6 @@
 """Settings and fixtures of all tests: quick compilation, and the registered backends."""
 
+import compileall
 import gc
 import itertools
 import os
@@ -13,19 +14,45 @@ from browser import CHROMIUM, MISSING, chromium
 from bench.model import registry, trial
 
 QUICK = (
-    "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false --xla_llvm_disable_expensive_passes=true"
+    "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false --xla_llvm_disable_expensive_passes=true "
+    "--xla_cpu_parallel_codegen_split_count=1"
 )
 """Tests compile hundreds of programs and run each for milliseconds. Without optimisation and fused loops, XLA compiles in a
-quarter of the time, and numbers are equal up to rounding. Processes that a test starts inherit the setting."""
+quarter of the time, and numbers are equal up to rounding. One module per program instead of up to 32, whose threads would
+share the cores with other tests, takes 40% off that. Processes that a test starts inherit the setting."""
+
+COMPILED = ("bench", "plugins", "tests/programs")
+"""Folders whose bytecode is written before the tests, also where PYTHONDONTWRITEBYTECODE is set: hundreds of processes import
+their files, and compiling these takes a third of the start of a process."""
 
 
 def pytest_configure(config):
+    if not hasattr(config, "workerinput"):
+        for folder in COMPILED:
+            compileall.compile_dir(config.rootpath / folder, quiet=2)
     os.environ["XDG_CACHE_HOME"] = str(config.rootpath / ".pytest_cache" / "home")
     os.environ["XLA_FLAGS"] = f"{QUICK} {os.environ.get('XLA_FLAGS', '')}".strip()
     config.addinivalue_line(
         "markers",
         "needs(*capabilities): what the backend fixture must provide; physics asks for engines, which else are left out",
     )
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection():
+    """Write the bytecode of test files for later sessions, and exempt what collection imports from garbage collection.
+
+    The bytecode of files that tests edit is never written. A full garbage collection traverses all objects of JAX, torch and
+    the tests, and took a tenth of the time of tests.
+    """
+    chosen, sys.dont_write_bytecode = sys.dont_write_bytecode, False
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        sys.dont_write_bytecode = chosen
+        gc.enable()
+        gc.freeze()
 
 
 LONG = {"fused"}

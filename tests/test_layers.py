@@ -3,6 +3,7 @@
 import ast
 import graphlib
 from collections.abc import Iterator
+from functools import cache
 from importlib.util import resolve_name
 from pathlib import Path
 
@@ -41,8 +42,13 @@ def module_of(path: Path) -> str:
     return ".".join(filter(None, [base, *(part for part in parts if part != "__init__")]))
 
 
-def imported(path: Path) -> Iterator[str]:
+@cache
+def imported(path: Path) -> list[str]:
     """Every module and name that a file imports, at its top, later, or for types only, as ``bench.experiment.cell.Cell``."""
+    return list(_imported(path))
+
+
+def _imported(path: Path) -> Iterator[str]:
     own = module_of(path)
     parent = own if path.name == "__init__.py" else own.rpartition(".")[0]
     for node in ast.walk(ast.parse(path.read_text())):

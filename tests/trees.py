@@ -17,7 +17,7 @@ class Tree:
     def __init__(self, root: Path) -> None:
         self.root, self.packages = root / "tree", root / "site"
         for part in ("bench", "plugins", "conf"):
-            shutil.copytree(ROOT / part, self.root / part, ignore=shutil.ignore_patterns("__pycache__"))
+            shutil.copytree(ROOT / part, self.root / part)  # with the bytecode, which an edit of its file makes void
         self.packages.mkdir()
 
     def add(self, path: str, text: str) -> None:

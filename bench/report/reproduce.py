@@ -102,14 +102,8 @@ class PluginBuilder:
         return self._known[text]
 
 
-def cell_settings(cell: Cell) -> list[str]:
-    """Return the settings, as command-line words, of an experiment with only this cell, which has the same key."""
-    before, after = _settings_around_counts(cell)
-    return [*before, *(f"{name}={getattr(cell, name)}" for name in COUNTS), *after]
-
-
 def _settings_around_counts(cell: Cell) -> tuple[list[str], list[str]]:
-    """Return the settings of :func:`cell_settings` before the counts and after them."""
+    """Return the settings, as command-line words, of an experiment with only this cell: before its counts and after them."""
     before = [f"study={_identity(cell.study)}", *plugin_settings(cell)]
     after = theta_settings(cell)
     if cell.budget is not None:

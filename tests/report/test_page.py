@@ -17,12 +17,10 @@ import pytest
 from helpers import experiment, row, small_rows, stiffness_rows, table
 
 from bench import cli
-from bench.experiment import config, grid
 from bench.experiment.columns import Column, Columns
 from bench.experiment.study import Study
 from bench.experiment.views import Chart, Mark, Style, Views
 from bench.model import registry
-from bench.report import reproduce
 from bench.report.draw import series_styles
 from bench.report.finish import views_of
 from bench.report.web import document
@@ -129,19 +127,6 @@ def test_names_with_html_in_them_are_text(name):
     assert text.count("</script") == 3
     assert "<img" not in text
     assert name in column(data_of(text), "scene")
-
-
-@pytest.mark.parametrize("name", config.experiments())
-def test_command_of_a_cell_makes_that_cell(name):
-    made = config.load([f"experiment={name}"])
-    every = grid.cells(made)
-    for cell in every[:: max(1, len(every) // 2)]:
-        told = shlex.split(" ".join([reproduce.HEAD, *map(shlex.quote, reproduce.cell_settings(cell))]))
-        assert told[:3] == ["python", "-m", "bench"]
-        again = config.load(told[3:])
-        assert [other.key for other in grid.cells(again)] == [cell.key]
-        if cell.budget is not None:
-            assert again.reference == made.reference
 
 
 RUN = (

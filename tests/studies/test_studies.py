@@ -472,10 +472,13 @@ def test_findings_count_in_plain_english():
 
 
 def again(given, rows, command):
-    """The keys of the cells that a command line runs."""
+    """The keys of the cells that a command line runs, with the budget of references that the rows have, if any."""
     words = shlex.split(" ".join([reproduce.HEAD, *command]))
     assert words[:3] == ["python", "-m", "bench"]
-    return [cell.key for cell in cells(config.load(words[3:]))]
+    found = config.load(words[3:])
+    every = cells(found)
+    assert all(cell.budget is None or found.reference == given.reference for cell in every)
+    return [cell.key for cell in every]
 
 
 @pytest.mark.parametrize("name", config.experiments())
