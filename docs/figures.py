@@ -488,18 +488,31 @@ def dose_runs() -> str:
     return block([*head, *lines])
 
 
+WINDOW_NAMES = {"windowed[steps=8]": "8 steps", "windowed": "16 steps", "windowed[steps=32]": "32 steps"}
+"""What each method of ``dose_response_windows`` is called in its table."""
+
+
+def windows_missed() -> str:
+    """Return on how many problems the best gradient reaches 1/100 and a window of no length does, of how many."""
+    lines = analysis.searches(rows_of("dose_response_windows")).query("target == 100")
+    medians = lines.pivot_table(index="problem", columns="method", values="median", aggfunc="first")
+    missed = np.isfinite(medians[analysis.BEST]) & np.isinf(medians[list(WINDOW_NAMES)]).all(axis=1)
+    return f"{int(missed.sum())} of {len(medians)}"
+
+
 def dose_windows() -> str:
     """Return bias and updates to 1/100 of truncated windows by problem, beside the best gradient, as a Markdown table."""
-    names = {"windowed[steps=8]": "8 steps", "windowed": "16 steps", "windowed[steps=32]": "32 steps"}
     lines = analysis.searches(rows_of("dose_response_windows")).query("target == 100")
-    head = [f"| problem | best gradient | {' | '.join(names.values())} |", f"|---|--:|{'--:|' * len(names)}"]
+    head = [
+        f"| problem | best gradient | {' | '.join(WINDOW_NAMES.values())} |",
+        f"|---|--:|{'--:|' * len(WINDOW_NAMES)}",
+    ]
     rows = []
     for problem, own in lines.groupby("problem", sort=False):
         by_method = own.drop_duplicates("method").set_index("method")
-        cells = [number(by_method.loc[analysis.BEST, "median"])]
-        for name in names:
-            median, bias = by_method.loc[name, "median"], by_method.loc[name, "bias"]
-            cells.append(f"{number(median) if np.isfinite(median) else '-'} ({number(bias)})")
+        updates = {name: number(median) if np.isfinite(median) else "-" for name, median in by_method["median"].items()}
+        cells = [updates[analysis.BEST]]
+        cells += [f"{updates[name]} ({number(by_method.loc[name, 'bias'])})" for name in WINDOW_NAMES]
         rows.append(f"| {problem} | {' | '.join(cells)} |")
     return block([*head, *rows])
 
@@ -778,6 +791,7 @@ FIGURES: dict[str, Callable[[], str]] = {
     "dose-runs": dose_runs,
     "dose-unreached": dose_unreached,
     "dose-windows": dose_windows,
+    "dose-windows-missed": windows_missed,
     "dose-fits": dose_fits,
     "dose-hash": lambda: ", ".join(sorted(set(rows_of("dose_response")["hypotheses"]) - {""})),
     "dose-verdicts": dose_verdicts,
