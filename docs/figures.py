@@ -565,11 +565,11 @@ def dose_costs() -> str:
     return block(head + lines)
 
 
-def dose_unreached() -> str:
-    """Return on how many stiff problems that count no natural method reaches 1/100, of how many."""
-    stiff = dose("problems").query("scene_class == 'stiff'")
-    counted = int((stiff["reason_100"].fillna("") == "").sum())
-    reached = dose("costs").query("target == 100 and scene_class == 'stiff'")["problems"].iloc[0]
+def dose_unreached(name: str = "dose_response", scene_class: str = "stiff") -> str:
+    """Return on how many problems of a class that count no natural method reaches 1/100, of how many."""
+    own = dose("problems", name).query("scene_class == @scene_class")
+    counted = int((own["reason_100"].isna() | (own["reason_100"] == "")).sum())
+    reached = dose("costs", name).query("target == 100 and scene_class == @scene_class")["problems"].iloc[0]
     return f"{counted - int(reached)} of {counted}"
 
 
@@ -790,6 +790,7 @@ FIGURES: dict[str, Callable[[], str]] = {
     "dose-pairs": dose_pairs,
     "dose-runs": dose_runs,
     "dose-unreached": dose_unreached,
+    "dose-policy-unreached": lambda: dose_unreached("dose_response_policy", "smooth"),
     "dose-windows": dose_windows,
     "dose-windows-missed": windows_missed,
     "dose-fits": dose_fits,

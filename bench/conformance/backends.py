@@ -257,7 +257,7 @@ def score_is_that_of_actions(backend: Backend) -> str:
         problem = backend.compile(program)
         score = problem.score(theta, w)
         if program.noise_on_theta:
-            off = distance(score, w / program.scene.sigma)
+            off = distance(score, w[: program.dim] / program.scene.sigma)
             require(off < ROUNDED, f"{describe(program)}: differs from w / sigma by {off:.1e}")
             continue
         e, h, ops = rng("direction").standard_normal(theta.shape), 1e-3, NewtonOps()

@@ -21,6 +21,7 @@ PUSH = ["scenes=[pushing]", "contacts=[penalty]", "integrators=[semi_implicit_eu
 OPTIMISE = ["study=optimise", *PUSH, "estimators=[fobg]"]
 CELLS = {
     "fobg": [*PUSH, "estimators=[fobg]"],
+    "boundary": [*PUSH, "estimators=[boundary]"],
     "windowed": [*PUSH, "estimators=[windowed]"],
     "total_propagation": [*PUSH, "estimators=[total_propagation]"],
     "callable": ["scenes=[callable]", f"scene.callable.cost={ROOT}/examples/numpy_loop.py:cost", "backends=[callable]",
@@ -35,7 +36,7 @@ CELLS = {
     "identify": ["study=identify", "scenes=[spring_record]", "integrators=[rk4]", "backends=[numpy]"],
 }  # fmt: skip
 """One cell of every kind whose keys are compared."""
-BIAS = "fobg windowed total_propagation callable"
+BIAS = "fobg boundary windowed total_propagation callable"
 REFERENCED = f"{BIAS} engines three_errors"
 ESTIMATED = f"{BIAS} engines adam cem ilqr dose_response gradient_check growth stability three_errors twins"
 MOVED = {
@@ -61,6 +62,7 @@ MOVED = {
     "measure/statistics": f"{REFERENCED} train",
     "measure/timing": f"{BIAS} backward_memory engines solver twins",
     "model/__init__": "",
+    "model/events": "boundary",
     "model/expansion": "ilqr",
     "model/adjoint": "engines windowed total_propagation ilqr",
     "model/manifold": "engines windowed total_propagation solver ilqr",

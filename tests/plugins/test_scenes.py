@@ -24,6 +24,7 @@ from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
 from bench.plugins.scenes.bounce_once import BounceOnce
 from bench.plugins.scenes.bouncing_ball import BouncingBall
 from bench.plugins.scenes.cartpole import Cartpole
+from bench.plugins.scenes.coin_walk import CoinWalk
 from bench.plugins.scenes.constant import Constant
 from bench.plugins.scenes.cubic import Cubic
 from bench.plugins.scenes.double_integrator import DoubleIntegrator
@@ -32,6 +33,7 @@ from bench.plugins.scenes.ground_wall import GroundWall
 from bench.plugins.scenes.gusty_cart import GustyCart
 from bench.plugins.scenes.heaviside import Heaviside
 from bench.plugins.scenes.hopper import Hopper
+from bench.plugins.scenes.ledge import Ledge
 from bench.plugins.scenes.linear import Linear
 from bench.plugins.scenes.mass_spring import MassSpring
 from bench.plugins.scenes.pushing import Pushing
@@ -203,6 +205,8 @@ def test_implicit_gradient_is_that_of_its_program(scene, law):
 CLOSED = [
     Heaviside(),
     Heaviside(theta=0.1),
+    Ledge(),
+    CoinWalk(),
     SoftHeaviside(),
     SoftHeaviside(theta=0.03, nu=0.2),
     Quadratic(),

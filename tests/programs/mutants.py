@@ -107,7 +107,7 @@ FAULTS = [
     Fault(S, "rmse_rel=rmse / relative,", "rmse_rel=rmse * unit / relative,", OF_STATISTICS),
     Fault(S, "return float(raw - min(max(unbiased, trace**2 / self.rows.shape[1]), trace**2))", "return 0.0", OF_STATISTICS),
     Fault(S, "scale = (square + 2.0 * along) / (1.0 + 2.0 * power)", "scale = (square + along) / (1.0 + power)", OF_STATISTICS),
-    Fault(S, "once = float(image @ image)  # m'Sm", "once = total  # m'Sm", OF_STATISTICS),
+    Fault(S, "once = float(image @ image) + equal * total  # m'Sm", "once = total  # m'Sm", OF_STATISTICS),
     Fault(S, "seen, end = max(total, 1.0), max(end, 1.0) + limit", "seen, end = total, max(end, 1.0) + limit", OF_STATISTICS),
     Fault(S, "h = 1.0 - 2.0 / 3.0 * first * third / second**2", "h = 1.0 / 3.0", OF_STATISTICS),
     Fault(S, "left = total - squares * repeats / max(repeats - 1, 1)", "left = total - squares", OF_STATISTICS),
@@ -145,7 +145,7 @@ FAULTS = [
     Fault(S, "FEW_REPEATS = 8", "FEW_REPEATS = 3", OF_STATISTICS),
     Fault(S, "THREE = 3.0", "THREE = 1.0", OF_STATISTICS),
     Fault(S, "if error > VAGUE * norm:", "if error > norm:", OF_STATISTICS),
-    Fault(S, "math.hypot(_length(self.sampling.rows), self.unseen)", "_length(self.sampling.rows)", OF_STATISTICS),
+    Fault(S, "math.hypot(shown, self.unseen)", "shown", OF_STATISTICS),
     # noise
     Fault(N, "zlib.crc32(scene.encode()), repeat]", "0, repeat]", "tests/measure/test_noise.py"),
     Fault(N, "zlib.crc32(scene.encode()), repeat]", "zlib.crc32(scene.encode()), 0]", "tests/measure/test_noise.py"),
