@@ -52,12 +52,13 @@ def results_entry(entry: Entry, folder: Path) -> str:
     chart = Path(os.path.relpath(entry.chart, folder)).as_posix() if entry.chart else ""
     command = f"`python -m bench +experiment={entry.name}`"
     data = Path(os.path.relpath(entry.folder, folder)).as_posix()
+    missing = f"its results are part of `{entry.joined}`" if entry.joined else "no stored results"
     parts = [
         f"## {entry.name}",
         f"*{escape_markdown(entry.question)}*",
         f"![{entry.name}]({chart})" if chart else "",
         "\n".join(f"- {escape_markdown(finding)}" for finding in entry.findings),
-        f"{command} · [data]({data})" if entry.findings else f"{command} (no stored results)",
+        f"{command} · [data]({data})" if entry.findings else f"{command} ({missing})",
     ]
     return "\n\n".join(filter(None, parts))
 

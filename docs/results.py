@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ import pandas as pd
 import bench
 from bench.errors import UserError
 from bench.experiment import config
+from bench.experiment.experiment import Experiment
 from bench.report.views import arrange
 from bench.studies.bias_variance import comparisons
 
@@ -31,6 +32,8 @@ class Entry:
     folder: Path
     findings: tuple[str, ...] = ()
     chart: Path | None = None
+    joined: str = ""
+    """The experiment that has this one's cells too, by its setting ``also``."""
 
     @property
     def page(self) -> str:
@@ -66,14 +69,27 @@ class Entry:
 
 def entries_of(results: Path) -> list[Entry]:
     """Return every experiment with its findings, in alphabetical order; those not run yet have none."""
-    return [entry_of(*experiment) for experiment in experiments(results)]
+    joined = joined_experiments(results)
+    return [
+        replace(entry_of(*experiment), joined=joined.get(experiment[2].name, "")) for experiment in experiments(results)
+    ]
 
 
 @cache
 def experiments(results: Path) -> list[tuple[str, str, Path]]:
     """Return the name, question and folder of every experiment."""
-    loaded = {name: config.load([f"experiment={name}", f"results_dir={results}"]) for name in config.experiments()}
-    return [(name, experiment.question, experiment.directory) for name, experiment in loaded.items()]
+    return [(name, experiment.question, experiment.directory) for name, experiment in loaded(results).items()]
+
+
+def joined_experiments(results: Path) -> dict[str, str]:
+    """Return, by an experiment's folder, the name of the one that has its cells too."""
+    return {other.directory.name: name for name, experiment in loaded(results).items() for other in experiment.also}
+
+
+@cache
+def loaded(results: Path) -> dict[str, Experiment]:
+    """Return every experiment by name."""
+    return {name: config.load([f"experiment={name}", f"results_dir={results}"]) for name in config.experiments()}
 
 
 def entry_of(name: str, question: str, folder: Path) -> Entry:
