@@ -16,6 +16,7 @@ class Homotopy(Population):
     2022, algorithm 3). With pairs of points theta +- t v, g is the mean of (f_+ - f_-) v / 2t and F_t the mean of
     (f_+ + f_- - 2 f_0) (|v|^2 - d) / 2t, where the source has one-sided differences with samples of their own. On
     theta' A theta / 2, F_t = t tr A. On a wave cos(k theta) the slope of F is exp(-k^2 t^2 / 2) times that of the wave.
+    Noise in F_t shrinks t as well, so a large speed needs many pairs.
     """
 
     name = "homotopy"
