@@ -147,9 +147,9 @@ class PolicyScene(MechanicalScene):
     """A role: the controls are a :class:`Policy` of observations, u_t = pi(theta, o(x_t)) + sigma w_t.
 
     Theta holds the policy's parameters. Every rollout starts at a random state if ``n_start`` is not 0, and J is the
-    mean over starts too. One step of ``dt`` is a control step, made of ``substeps`` steps of the integrator. The cost of
-    step t counts ``discount``^t times, the terminal cost ``discount``^horizon times. After :meth:`has_ended` the state
-    no longer moves, and :meth:`stage_cost` should be 0 there.
+    mean over starts too. One step of ``dt`` is a control step, made of ``substeps`` steps of the integrator. With the
+    discount c, the cost of step t counts c^t times and the terminal cost c^horizon times. After :meth:`has_ended` the
+    state no longer moves, and :meth:`stage_cost` should be 0 there.
 
     With ``normalise`` the inputs of the policy are (o - mean) / deviation, measured once, see :func:`observed_moments`.
     """
