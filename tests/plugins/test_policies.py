@@ -353,7 +353,7 @@ def test_policies_are_swept(tmp_path):
 @pytest.mark.slow
 def test_a_policy_with_a_hundred_thousand_coordinates_has_rows(tmp_path):
     common = dict(
-        name="large", backends=["jax"], samples=4, repeats=4, timing=False, results_dir=tmp_path,
+        name="large", backends=["jax"], samples=4, repeats=4, results_dir=tmp_path,
         reference={"samples": 256},
     )  # fmt: skip
     scene = "cartpole_swing[horizon=5,policy=mlp[hidden=300x300]"
