@@ -492,23 +492,26 @@ WINDOW_NAMES = {"windowed[steps=8]": "8 steps", "windowed": "16 steps", "windowe
 """What each method of ``dose_response_windows`` is called in its table."""
 
 
+def window_searches() -> pd.DataFrame:
+    """Return the searches of ``dose_response_windows`` to 1/100."""
+    return analysis.searches(rows_of("dose_response_windows")).query("target == 100")
+
+
 def windows_missed() -> str:
     """Return on how many problems the best gradient reaches 1/100 and a window of no length does, of how many."""
-    lines = analysis.searches(rows_of("dose_response_windows")).query("target == 100")
-    medians = lines.pivot_table(index="problem", columns="method", values="median", aggfunc="first")
+    medians = window_searches().pivot_table(index="problem", columns="method", values="median", aggfunc="first")
     missed = np.isfinite(medians[analysis.BEST]) & np.isinf(medians[list(WINDOW_NAMES)]).all(axis=1)
     return f"{int(missed.sum())} of {len(medians)}"
 
 
 def dose_windows() -> str:
     """Return bias and updates to 1/100 of truncated windows by problem, beside the best gradient, as a Markdown table."""
-    lines = analysis.searches(rows_of("dose_response_windows")).query("target == 100")
     head = [
         f"| problem | best gradient | {' | '.join(WINDOW_NAMES.values())} |",
         f"|---|--:|{'--:|' * len(WINDOW_NAMES)}",
     ]
     rows = []
-    for problem, own in lines.groupby("problem", sort=False):
+    for problem, own in window_searches().groupby("problem", sort=False):
         by_method = own.drop_duplicates("method").set_index("method")
         updates = {name: number(median) if np.isfinite(median) else "-" for name, median in by_method["median"].items()}
         cells = [updates[analysis.BEST]]
@@ -565,10 +568,14 @@ def dose_costs() -> str:
     return block(head + lines)
 
 
+def is_counted(problems: pd.DataFrame) -> pd.Series:
+    """Return whether each problem counts for the target 1/100."""
+    return problems["reason_100"].isna() | (problems["reason_100"] == "")
+
+
 def dose_unreached(name: str = "dose_response", scene_class: str = "stiff") -> str:
     """Return on how many problems of a class that count no natural method reaches 1/100, of how many."""
-    own = dose("problems", name).query("scene_class == @scene_class")
-    counted = int((own["reason_100"].isna() | (own["reason_100"] == "")).sum())
+    counted = int(is_counted(dose("problems", name).query("scene_class == @scene_class")).sum())
     reached = dose("costs", name).query("target == 100 and scene_class == @scene_class")["problems"].iloc[0]
     return f"{counted - int(reached)} of {counted}"
 
@@ -599,7 +606,7 @@ def dose_shapes() -> str:
 def dose_data() -> str:
     """Return the number of cells, problems and problems that count, by class."""
     rows, problems = rows_of("dose_response"), dose("problems")
-    counted = problems["reason_100"].isna() | (problems["reason_100"] == "")
+    counted = is_counted(problems)
     by_class = [
         f"{name} {int(part.sum())} of {len(part)}"
         for name, part in counted.groupby(problems["scene_class"], sort=False)

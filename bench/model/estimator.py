@@ -170,3 +170,11 @@ def zeroth_order(problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.n
     w = columns(noise)
     cost = problem.value(theta, w) - problem.value(theta, np.zeros((w.shape[0], 1)))
     return per_repeat(cost * problem.score(theta, w) + problem.explicit(theta, w), noise)
+
+
+def best_gradient(problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """Return the best gradient available, ``(R, d)``: without noise, or the mean of costs times scores where the cost jumps."""
+    if not problem.program.continuous:
+        return np.asarray(zeroth_order(problem, theta, noise).mean(axis=1))
+    gradient = problem.grad(theta, problem.program.noise_free).mean(axis=1, keepdims=True)
+    return np.repeat(gradient.T, len(noise), axis=0)

@@ -21,7 +21,7 @@ EQUIVALENT: dict[str, str] = {
     # bench/measure/reference.py: noise on the actions beside a scene's own noise, which no stored scene has
     "8e9c1980ecf41fda3cffe337a73bda5f04f968b11b11f7bd78492e9239172a70": "f4ea930fd9b4c514b92e905d9ee99b00899e60ecef16cc4e558020bce228ddd2",
     # bench/model/estimator.py: noise on the actions beside a scene's own noise, which no stored scene has; a declaration for the kit
-    "27ba374e4797eaa1dadbe2347093b8293d17e4beb4fc537313212341f3eda325": "297f51107543e92425d4da900ff76f5713b7be2f7b41083c98ff121267327fdc",
+    "988bb8d1a2f8f54a8859fad7be6e195bdbace1ec4a774247a41132b7ce1076b3": "297f51107543e92425d4da900ff76f5713b7be2f7b41083c98ff121267327fdc",
     # bench/model/problem.py: noise on the actions beside a scene's own noise, which no stored scene has
     "d253d82556790fbfa9c54d8b60474b8450cdff44271a3a8e42ea6788bc5dfb93": "b537cd67e11a1065dce873c040744092aa6c8dbc2af87f4d4b4942d39197585c",
     # bench/model/adjoint.py: uses a scene's own derivative of the feedback and weights of its costs, which no stored scene has, and makes no array that it does not use
@@ -103,9 +103,9 @@ EQUIVALENT: dict[str, str] = {
     # plugins/trainers/evolution.py: shares its episodes with another trainer
     "686532575ae796c4217d1d3d7d95c9b0f48ca9dbc3792a9b6dd451d0f65968bc": "604abd01749d1f0cf4c1bc84d6045238660ab504dacb683d96a39c67f8465455",
     # plugins/estimators/planted.py: the best gradient of a scene with noise of its own, which no stored row has
-    "f1df51b78d9e08c126d0d06f9489e59b9df8e17060c27db8da31a3bcb7af0e1a": "e9e0cd36e6596cd749d22fa2823919c2c7ea91c732d37d2e4486f36f769021e8",
+    "655a3572e2bbe74f4735ea7edf4e8ee2d898fc78779967c6d0da15fe8b341410": "e9e0cd36e6596cd749d22fa2823919c2c7ea91c732d37d2e4486f36f769021e8",
     # bench/studies/dose_response/ground.py: the objective of a scene with noise of its own, which no stored row has
-    "2af1f4ae249ee3a458509132a1098efa3017c735b33d9ec65daffd10352337b7": "b4c6f2bd35d60a5908e9e38ac4d0d9adf001763508ae271a68e5860a738d5e56",
+    "6b662592f6120ac2b8e79765e2788ff79f3a87c4580ab8cb37bea9fef91a5829": "b4c6f2bd35d60a5908e9e38ac4d0d9adf001763508ae271a68e5860a738d5e56",
     # plugins/scenes/heaviside.py: declares its event, which no stored row uses
     "ce37ea8f704c52f80bdf9637ce2855b40b905e23de7825d8247dc52578c7cc7d": "62b7d378b702a48097b07a0eef7f6aac386d34c77b3028567ec40bdf3f8a570f",
     # bench/trace/adjoints.py: weights of the costs of steps, which are 1 in all stored rows

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.model import Estimator, Problem, Program, columns, param, per_repeat, zeroth_order
+from bench.model import Estimator, Problem, Program, best_gradient, columns, param, per_repeat
 
 
 @dataclass(frozen=True)
@@ -76,11 +76,8 @@ class Planted(Estimator):
         return math.ceil((program.dim + (self.tails or 0)) / program.n_noise)
 
     def _base(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
-        if self._is_exact(problem.program):
-            gradient = problem.grad(theta, problem.program.noise_free).mean(axis=1, keepdims=True)
-            return np.repeat(gradient.T, len(noise), axis=0)
         if self.base == "best":
-            return np.asarray(zeroth_order(problem, theta, noise).mean(axis=1))
+            return best_gradient(problem, theta, noise)
         return np.asarray(per_repeat(problem.grad(theta, columns(noise)), noise).mean(axis=1))
 
     def _unit_errors(self, noise: np.ndarray, d: int) -> np.ndarray:

@@ -15,7 +15,7 @@ from bench.experiment.cell import Cell
 from bench.experiment.keys import fingerprint, hashed
 from bench.experiment.session import Session
 from bench.measure import noise
-from bench.model import Estimator, Optimizer, Problem, zeroth_order
+from bench.model import Estimator, Optimizer, Problem, best_gradient, zeroth_order
 from bench.run.files import make_directory, write_whole
 from bench.studies.dose_response.search import Method, Task, objective, run_searches, tune, unit_rate, with_rate
 from bench.studies.optimise.search import known_optimum
@@ -40,10 +40,7 @@ class BestGradient(Estimator):
 
     def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Return the gradient of the scored objective, ``(R, d)``."""
-        if problem.program.continuous:
-            gradient = problem.grad(theta, problem.program.noise_free).mean(axis=1, keepdims=True)
-            return np.repeat(gradient.T, len(noise), axis=0)
-        return np.asarray(zeroth_order(problem, theta, noise).mean(axis=1))
+        return best_gradient(problem, theta, noise)
 
 
 @dataclass(frozen=True)
