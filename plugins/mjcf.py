@@ -14,6 +14,9 @@ from bench.model import EngineTwin, MechanicalScene, Program, Unsupported
 
 from .contacts.penalty import Penalty
 
+REVISION = 1
+"""Raised when a stored number that this module decides moves."""
+
 MATCH = {"euler": "semi_implicit_euler", "implicitfast": "semi_implicit_euler", "rk4": "rk4"}
 """The integrator of the scene's program that each engine integrator replaces.
 

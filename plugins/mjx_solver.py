@@ -8,6 +8,9 @@ import threading
 from collections.abc import Iterator
 from typing import Any
 
+REVISION = 1
+"""Raised when a stored number that this module decides moves."""
+
 NEWTON_STEPS = 2
 """Newton steps after the solver. The last one is differentiated; the others ensure that it starts at the minimum."""
 _tracing = threading.RLock()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import time
 from collections.abc import Mapping
@@ -13,7 +12,7 @@ from typing import Any
 from bench.claims import toolkit
 from bench.claims.claim import UNDECIDED, Claim, Figure, verdict
 from bench.errors import Unsupported
-from bench.experiment.keys import module_hash, plugin_hash
+from bench.experiment.keys import code_of, hashed
 from bench.model import registry
 from bench.run.files import write_whole
 
@@ -34,7 +33,7 @@ class ClaimResult:
     """The reservation, or the reason why nothing could be measured."""
     series: Mapping[str, Any] = field(default_factory=dict)
     key: str = ""
-    """Hash of the code that the numbers depend on."""
+    """Hash of the revisions that the numbers depend on."""
     plugins: tuple[tuple[str, str], ...] = ()
     """Kind and name of the plugins used."""
 
@@ -67,11 +66,8 @@ def measure(claim: type[Claim]) -> ClaimResult:
 
 
 def key_of(claim: type[Claim], used: tuple[tuple[str, str], ...]) -> str:
-    """Return the hash of the code of the claim, the toolkit of claims, and the plugins used."""
-    digest = hashlib.sha256(module_hash(claim.__module__, toolkit.__name__).encode())
-    for kind, name in used:
-        digest.update(plugin_hash(registry.usable(kind, name)).encode())
-    return digest.hexdigest()
+    """Return the hash of the revisions of the claim, the contract of claims, and the plugins used."""
+    return hashed(code_of(claim), [code_of(registry.usable(kind, name)) for kind, name in used])
 
 
 def path_of(directory: Path, name: str) -> Path:

@@ -11,7 +11,7 @@ from bench.engines import environments, server, twin
 from bench.engines.problem import EngineProblem
 from bench.engines.process import EngineModel
 from bench.errors import Unavailable, Unsupported
-from bench.model import Backend, EngineTwin, MechanicalScene, Problem, Program, param
+from bench.model import Backend, EngineTwin, MechanicalScene, Problem, Program, adjoint, param
 from bench.model.parameters import values
 
 
@@ -22,6 +22,7 @@ class EngineBackend(Backend):
     The engine's file is in a folder ``engines``, from which the harness imports nothing.
     """
 
+    uses = (adjoint,)
     provides = frozenset({"value", "grad", "score", "physics"})
 
     file: ClassVar[str]

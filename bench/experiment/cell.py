@@ -13,8 +13,9 @@ from typing import Any, cast
 
 from bench.errors import Unsupported, UserError, failure, printable
 from bench.experiment.experiment import Budget
-from bench.experiment.keys import PROGRAM, REFERENCE, fingerprint, hash_of_text, hashed, module_hash
+from bench.experiment.keys import COMPARED, SHARED, fingerprint, hash_of_text, hashed, raised, revisions_of
 from bench.experiment.reference_backends import capable_backends
+from bench.measure import reference
 from bench.model import (
     Backend,
     ContactLaw,
@@ -125,10 +126,11 @@ class Cell:
         theta = "" if self.decision is OWN else repr(self.decision)
         given = (*parts.items(), theta, repr(self.budget), fingerprint(self.study))
         if given not in _rest:
-            reference = None if self.budget is None else [self.reference_key, module_hash(REFERENCE)]
+            own = None if self.budget is None else [self.reference_key, raised(revisions_of(COMPARED))]
             # a study may use this backend besides the cell's own
             best = fingerprint(next(iter(self.ranked_backends), None))
-            after = [reference, best, self._budget(), self._theta(), fingerprint(self.study), module_hash(PROGRAM)]
+            shared = raised(revisions_of(SHARED))
+            after = [own, best, self._budget(), self._theta(), fingerprint(self.study), shared]
             _rest[given] = (json.dumps(parts), json.dumps(after)[1:])
         before, rest = _rest[given]
         return hash_of_text(f"[{before}, {counts}, {rest}")
@@ -139,7 +141,7 @@ class Cell:
         parts = [fingerprint(part) for part in (self.scene, self.contact, self.integrator)]
         given = (*parts, repr(self.decision))
         if given not in _program_keys:
-            _program_keys[given] = hashed(parts, self._theta(), module_hash(PROGRAM))
+            _program_keys[given] = hashed(parts, self._theta(), raised(revisions_of(SHARED)))
         return _program_keys[given]
 
     @cached_property
@@ -152,13 +154,15 @@ class Cell:
         backend, estimator = fingerprint(self.reference_backends[0]), fingerprint(self.parts.get("estimator"))
         given = (self.program_key, repr(self.budget), backend, estimator)
         if given not in _reference_keys:
-            radius = []
+            radius, methods = [], dict(reference.REVISIONS)
             # a combination without meaning has no smoothing; an error shows up in the cell's own row
             with suppress(Exception):
                 smoothing = self.smoothing()
                 radius = [] if smoothing is None else [[smoothing.shape, smoothing.radius]]
+                if smoothing is None:
+                    methods = reference.revisions(self.program(), self.reference_backends[0].provides)
             budget = [self.budget.samples, self.budget.tolerance]
-            _reference_keys[given] = hashed(self.program_key, budget, backend, *radius)
+            _reference_keys[given] = hashed(self.program_key, budget, backend, *radius, raised(methods))
         return _reference_keys[given]
 
     @property

@@ -9,6 +9,9 @@ from functools import lru_cache
 
 import numpy as np
 
+REVISION = 1
+"""Raised when a stored number that this module decides moves."""
+
 HELD = 1 << 22
 """Most normal numbers that a cell stores in memory (32 MiB). A cell that needs more draws them in parts."""
 

@@ -42,6 +42,8 @@ EXTREME = 1e100
 """Size of costs above which, or below the inverse of which, their squares would leave the range of float64."""
 SIZED = 4
 """Samples that show the size of the costs."""
+REVISIONS = {"closed_form": 1, "quadrature": 1, "sampling": 1, "smoothed": 1}
+"""Revision of each method. It is raised when a stored reference of that method moves."""
 CONTRACTS = "bench.model."
 """Modules of the contracts, whose defaults are not declarations."""
 WARNED, REFUSED = 0.999, 1.0 - 1e-6
@@ -125,12 +127,26 @@ def certify(
     return replace(reference, plain=plain, physical=np.asarray(physical, dtype=np.float64))
 
 
+def revisions(program: Program, provides: frozenset[str]) -> dict[str, int]:
+    """Return the revisions of the methods that :func:`certify` may use for a program."""
+    if "physics" not in provides and program.closed_form_gradient() is not None:
+        names = ["closed_form"]
+    else:
+        names = ["sampling"] + ["quadrature"] * _can_integrate(program)
+    return {name: REVISIONS[name] for name in names}
+
+
+def _can_integrate(program: Program) -> bool:
+    """Return whether quadrature can integrate over the noise."""
+    return program.noise_on_theta and program.n_noise <= (1 if _unlisted_jumps(program) else 2)
+
+
 def _compute(
     problem: Problem, theta: np.ndarray, provides: frozenset[str], samples: int, tolerance: float
 ) -> Reference:
     program = problem.program
     quadrature = None
-    if program.noise_on_theta and program.n_noise <= (1 if _unlisted_jumps(program) else 2):
+    if _can_integrate(program):
         integral = integrate(problem, theta, min(QUADRATURE_POINTS, 64 * samples), COLUMNS)
         if integral is not None:
             method = f"quadrature[points={integral.points},spacing={integral.spacing:.2g}]"

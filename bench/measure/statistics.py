@@ -21,6 +21,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+REVISION = 1
+"""Raised when a stored number that this module decides moves."""
+
 __all__ = [
     "UNEXPLAINED",
     "Sampling",

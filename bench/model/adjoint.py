@@ -13,6 +13,9 @@ from bench.model.problem import Jacobians, Problem
 from bench.model.program import Program, Rollout, rollout
 from bench.model.scene import MechanicalScene
 
+REVISION = 1
+"""Raised when a stored number that this module decides moves."""
+
 DIFFERENCE_STEP = 1e-6
 """Step of central differences relative to max(1, |x|), for an error of about 1e-10."""
 

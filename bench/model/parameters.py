@@ -35,13 +35,11 @@ def param(
     low: float | None = None,
     high: float | None = None,
     choices: tuple[str, ...] | None = None,
-    neutral: Any = dataclasses.MISSING,
 ) -> Any:
     """Declare a plugin parameter: its default, meaning, unit and allowed values.
 
     ``positive`` requires a value above 0, ``low`` and ``high`` are inclusive bounds, and ``choices`` are the allowed
-    strings. ``neutral`` is for a parameter that a study gains: the value with which it measures what it did before. A
-    cell with that value keeps its key, and stored rows stay valid.
+    strings.
     """
     return dataclasses.field(
         default=default,
@@ -52,7 +50,6 @@ def param(
             low=low,
             high=high,
             choices=choices,
-            neutral=() if neutral is dataclasses.MISSING else (neutral,),
         ),
     )
 
@@ -65,6 +62,10 @@ class Plugin(ABC):  # noqa: B024, each kind has its own abstract methods
     """Its kind, the plural of its axis: ``scenes``, ``contacts``, ``studies``, ..., or a new one."""
     name: ClassVar[str] = ""
     """Its name on the command line and in tables, legends and caches."""
+    revision: ClassVar[int] = 1
+    """Raised by a class of this package when a stored number that it decides moves. Each class has its own."""
+    uses: ClassVar[tuple[types.ModuleType, ...]] = ()
+    """Modules whose ``REVISION`` counts too: helpers that several plugins share."""
     requires: ClassVar[tuple[str, ...]] = ()
     """Modules that must be installed for the plugin to be available, as ``module`` or ``module=distribution``."""
 
@@ -96,8 +97,6 @@ class Parameter:
     low: float | None = None
     high: float | None = None
     choices: tuple[str, ...] | None = None
-    neutral: tuple[Any, ...] = ()
-    """The value, if any, that leaves a cell's key as it was before the parameter existed."""
 
 
 def _require_annotations(plugin: type[Plugin]) -> None:
@@ -148,12 +147,6 @@ def parameters(plugin: type[Plugin]) -> dict[str, Parameter]:
 def values(plugin: Plugin) -> dict[str, Any]:
     """Return all parameters of a plugin with their values, defaults included."""
     return {name: getattr(plugin, name) for name in parameters(type(plugin))}
-
-
-def deciding(plugin: Plugin) -> dict[str, Any]:
-    """Return the parameters of a plugin that can decide its numbers: all but those at their neutral value."""
-    declared = parameters(type(plugin))
-    return {name: value for name, value in values(plugin).items() if repr((value,)) != repr(declared[name].neutral)}
 
 
 def named(plugins: Iterable[type[Plugin]], name: str) -> Parameter | None:

@@ -21,6 +21,9 @@ from bench.model.ops import Array, Ops, State
 from bench.model.parameters import Plugin, traced
 from bench.model.scene import DisturbedScene, EngineScene, FunctionScene, MechanicalScene, ProcessNoiseScene, Scene
 
+REVISION = 1
+"""Raised when a stored number that this module decides moves."""
+
 SURROGATE = "the gradient is a surrogate, not the derivative of the program"
 """The note in rows, tables and charts if :attr:`Program.surrogate` is true."""
 

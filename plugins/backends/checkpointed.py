@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.model import Array, Ops, Problem, Program, Rollout, adjoint_gradient, param, slopes
+from bench.model import Array, Ops, Problem, Program, Rollout, adjoint, adjoint_gradient, param, slopes
 
 from .jax import Jax, JaxOps, JaxProblem, loop, use_double_precision
 
@@ -28,6 +28,7 @@ class Checkpointed(Jax):
     """
 
     name = "checkpointed"
+    uses = (adjoint,)
     reference_rank = None
 
     keep: str = param("states", "what the backward pass keeps", choices=("states", "everything", "jacobians"))

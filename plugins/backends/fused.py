@@ -10,6 +10,7 @@ import numpy as np
 
 from bench.model import Array, Backend, LoopOps, Problem, Program
 
+from .. import fused
 from ..fused import emit, kernels, trace
 from ..fused.graph import Refused
 from .jax import Jax, JaxOps, JaxProblem, use_double_precision
@@ -26,6 +27,7 @@ class Fused(Backend):
     """
 
     name = "fused"
+    uses = (fused,)
     requires: ClassVar[tuple[str, ...]] = ("jax", "numba")
     # surrogate gradients are not supported
     provides = Jax.provides - {"surrogate"}

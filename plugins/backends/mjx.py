@@ -48,6 +48,7 @@ class Mjx(Jax):
     """
 
     name = "mjx"
+    uses = (mjcf, mjx_solver)
     requires: ClassVar[tuple[str, ...]] = ("jax", "mujoco", "mujoco.mjx=mujoco-mjx")
     provides = Backend.provides | {"physics"}
     reference_rank: ClassVar[int | None] = None

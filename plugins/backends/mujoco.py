@@ -48,6 +48,7 @@ class Mujoco(Backend):
     """
 
     name = "mujoco"
+    uses = (mjcf,)
     requires: ClassVar[tuple[str, ...]] = ("mujoco", "torch")
     provides = Backend.provides | {"physics"}
 

@@ -29,9 +29,7 @@ class Newton(EngineBackend):
     libraries: ClassVar[tuple[str, ...]] = ("newton", "warp-lang", "numpy")
 
     dtype: str = param("float32", "floating-point type of the simulation", choices=("float32",))
-    solver: str = param(
-        "featherstone", "Newton's solver", choices=("featherstone", "semi_implicit", "xpbd"), neutral="featherstone"
-    )
+    solver: str = param("featherstone", "Newton's solver", choices=("featherstone", "semi_implicit", "xpbd"))
 
     def __post_init__(self) -> None:
         if self.solver == "xpbd":

@@ -12,6 +12,7 @@ from bench.model import (
     Problem,
     Program,
     Rollout,
+    adjoint,
     by_actions,
     by_theta,
     columns,
@@ -42,6 +43,7 @@ class TotalPropagation(DiagnosticEstimator):
     """
 
     name = "total_propagation"
+    uses = (adjoint,)
     needs = frozenset({"value", "grad", "score"})
     includes_explicit_derivative = True
     unbiased = False

@@ -14,6 +14,7 @@ from bench.model import (
     Program,
     Rollout,
     Slopes,
+    adjoint,
     adjoint_gradient,
     columns,
     param,
@@ -38,6 +39,7 @@ class Windowed(Estimator):
     """
 
     name = "windowed"
+    uses = (adjoint,)
     needs = frozenset({"grad"})
     unbiased = False
 

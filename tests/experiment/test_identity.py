@@ -3,15 +3,12 @@
 import itertools
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
-from trees import ROOT, Tree
 
-from bench import model
 from bench.cli import main
 from bench.errors import UserError
-from bench.experiment import config, grid, keys
+from bench.experiment import config, grid
 from bench.experiment.cell import Cell
 from bench.experiment.keys import fingerprint
 from bench.run import plan, tasks
@@ -80,104 +77,6 @@ def test_sign_of_zero_is_seen():
 def test_refused_cells_have_keys():
     words = ["scenes=[pushing]", "contacts=[complementarity]", "backends=[numpy]", "integrators=[event_driven]"]
     assert all(cell.key for cell in cells(*words))
-
-
-# -------------------------------------------------------------------------------------------------- sources
-
-
-EDITED = ["scenes=[quadratic,linear]", "backends=[numpy]", "estimators=[fobg,reinforce,with_helper]", "samples=8",
-          "repeats=4", "name=mine"]  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory) -> Path:
-    """A folder of plugins with an estimator that imports another file of the folder."""
-    path = tmp_path_factory.mktemp("identity") / "mine"
-    path.mkdir()
-    fobg = (ROOT / "plugins/estimators/fobg.py").read_text()
-    imports = "from . import gain_of_helper  # noqa\nfrom bench.model import"
-    (path / "with_helper.py").write_text(
-        fobg.replace("fobg", "with_helper").replace("from bench.model import", imports)
-    )
-    (path / "gain_of_helper.py").write_text("GAIN = 1.0\n")
-    return path
-
-
-@pytest.fixture(scope="module")
-def unedited(folder) -> set[str]:
-    """The keys of the code as it is."""
-    return keys_of_edited(folder)
-
-
-def keys_of_edited(folder: Path, path: Path | None = None, text: str = "") -> set[str]:
-    """Return the keys of six cells while every read of the file at ``path`` returns ``text``."""
-
-    def forget() -> None:
-        for module in (keys, model.sources):
-            for value in vars(module).values():
-                getattr(value, "cache_clear", lambda: None)()
-        keys._fingerprints.clear()
-
-    def is_edited(file: Path) -> bool:
-        return path is not None and file.name == path.name and file.resolve() == path.resolve()
-
-    read_text, read_bytes = Path.read_text, Path.read_bytes
-    forget()
-    try:
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(
-                Path, "read_text", lambda file, *a, **k: text if is_edited(file) else read_text(file, *a, **k)
-            )
-            patch.setattr(Path, "read_bytes", lambda file: text.encode() if is_edited(file) else read_bytes(file))
-            six = {cell.key for cell in grid.cells(config.load([*EDITED, f"plugins={folder}"]))}
-    finally:
-        forget()
-    assert len(six) == 6
-    return six
-
-
-@pytest.mark.parametrize(
-    ("path", "missing"),
-    [
-        ("plugins/estimators/reinforce.py", 2),
-        ("mine/gain_of_helper.py", 2),
-        ("plugins/scenes/quadratic.py", 3),
-        ("plugins/scenes/cubic.py", 0),
-        ("plugins/backends/numpy.py", 6),
-        ("bench/model/program.py", 6),
-        ("bench/measure/statistics.py", 6),
-        ("bench/studies/bias_variance/measure.py", 6),
-        ("bench/studies/bias_variance/views.py", 0),
-        ("bench/studies/growth/measure.py", 0),
-        ("bench/report/tables.py", 0),
-        ("bench/run/runner.py", 0),
-        ("bench/run/pool.py", 0),
-        ("bench/run/store.py", 0),
-        ("bench/measure/timing.py", 6),
-        ("bench/measure/gradcheck/direction.py", 0),
-    ],
-)
-def test_editing_a_file_reruns_what_it_decides_and_only_that(folder, unedited, path, missing):
-    file = folder / Path(path).name if path.startswith("mine/") else ROOT / path
-    assert len(keys_of_edited(folder, file, file.read_text() + "\nEDITED = 1\n") - unedited) == missing
-
-
-@pytest.mark.parametrize("path", ["plugins/estimators/reinforce.py", "bench/model/program.py"])
-def test_comments_and_docstrings_rerun_nothing(folder, unedited, path):
-    text = (ROOT / path).read_text().replace('"""', '"""Edited: ', 1) + "\n# edited\n"
-    assert keys_of_edited(folder, ROOT / path, text) == unedited
-
-
-@pytest.mark.slow
-def test_plan_counts_the_cells_of_an_edited_file(tmp_path):
-    """The same through the command, with a file that was edited on disk."""
-    tree = Tree(tmp_path)
-    words = [*EDITED, "estimators=[fobg,reinforce]", "results_dir=out"]
-    done = tree.run(*words)
-    assert done.returncode == 0, done.stderr
-    path = "plugins/estimators/reinforce.py"
-    tree.add(path, (tree.root / path).read_text() + "\nEDITED = 1\n")
-    assert "4 cells, 2 stored, 2 to run" in tree.run("plan", *words).stdout
 
 
 # -------------------------------------------------------------------------------------------------- policies

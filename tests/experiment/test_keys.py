@@ -1,108 +1,83 @@
-"""Every file that can decide a number is in the keys of the cells whose numbers it can decide, and in no other."""
+"""A key changes with what decides a cell's numbers: parameters, declared revisions, and files from outside."""
 
-import ast
+import importlib
+import json
+import sys
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
+from types import ModuleType
 
+import bench.plugins.fused
 import pytest
 from trees import ROOT
 
-import bench
-import bench.model
 from bench.experiment import cell as cell_module
 from bench.experiment import config, grid, keys
 from bench.experiment.cell import Cell
-from bench.experiment.keys import HARMLESS, PROGRAM, REFERENCE, code, plugin_code
-from bench.model import registry, sources
-from bench.model.sources import file_of, is_below
+from bench.measure import noise, reference, statistics
+from bench.model import Backend, PolicyScene, Scene, adjoint, program, registry
+from bench.plugins import mjcf, mjx_solver
 
 PUSH = ["scenes=[pushing]", "contacts=[penalty]", "integrators=[semi_implicit_euler]", "backends=[numpy]"]
-OPTIMISE = ["study=optimise", *PUSH, "estimators=[fobg]"]
+MUJOCO = ["scenes=[pushing]", "contacts=[penalty]", "backends=[mujoco]"]
 CELLS = {
     "fobg": [*PUSH, "estimators=[fobg]"],
-    "boundary": [*PUSH, "estimators=[boundary]"],
+    "reinforce": [*PUSH, "estimators=[reinforce]"],
     "windowed": [*PUSH, "estimators=[windowed]"],
-    "total_propagation": [*PUSH, "estimators=[total_propagation]"],
-    "callable": ["scenes=[callable]", f"scene.callable.cost={ROOT}/examples/numpy_loop.py:cost", "backends=[callable]",
-                 "estimators=[fobg]"],
-    "adam": [*OPTIMISE, "optimizers=[adam]"],
-    "cem": [*OPTIMISE, "optimizers=[cem]"],
-    "ilqr": [*OPTIMISE, "optimizers=[ilqr]"],
-    "dose_response": ["study=dose_response", *PUSH, "estimators=[fobg]", "optimizers=[adam]"],
-    **{study: [f"study={study}", *PUSH] for study in ("backward_memory", "engines", "gradient_check", "growth", "stability", "three_errors", "twins")},
-    "solver": ["study=solver", "scenes=[pushing]", "contacts=[penalty]", "backends=[mujoco]"],
-    "train": ["study=train", "scenes=[cartpole_swing]", "integrators=[rk4]", "backends=[jax]", "trainers=[shac]"],
-    "identify": ["study=identify", "scenes=[spring_record]", "integrators=[rk4]", "backends=[numpy]"],
+    "quadratic": ["scenes=[quadratic]", "backends=[numpy]", "estimators=[fobg]"],
+    "heaviside": ["scenes=[soft_heaviside]", "backends=[jax]", "estimators=[fobg]", "scene.soft_heaviside.sigma=0.1"],
+    "billiard": ["scenes=[billiard]", "contacts=[softplus]", "backends=[numpy]", "estimators=[fobg]"],
+    "ledge": ["scenes=[ledge]", "backends=[numpy]", "estimators=[fobg]"],
+    "fused": ["scenes=[pushing]", "contacts=[penalty]", "backends=[fused]", "estimators=[fobg]"],
+    "mujoco": [*MUJOCO, "estimators=[fobg]"],
+    "mjx": ["scenes=[pushing]", "contacts=[penalty]", "backends=[mjx]", "estimators=[fobg]"],
+    "adam": ["study=optimise", *PUSH, "estimators=[fobg]", "optimizers=[adam]"],
+    "growth": ["study=growth", *PUSH],
+    "policy": ["scenes=['cartpole_swing[policy=linear]']", "integrators=[rk4]", "backends=[numpy]", "estimators=[fobg]"],
 }  # fmt: skip
-"""One cell of every kind whose keys are compared."""
-BIAS = "fobg boundary windowed total_propagation callable"
-REFERENCED = f"{BIAS} engines three_errors"
-ESTIMATED = f"{BIAS} engines adam cem ilqr dose_response gradient_check growth stability three_errors twins"
+"""One cell of each kind whose keys are compared."""
+REFERENCED = {name for name in CELLS if name not in ("adam", "growth")}
+PUSHED = {"fobg", "reinforce", "windowed", "fused", "mujoco", "mjx", "adam", "growth"}
 MOVED = {
-    "measure/__init__": "",
-    "measure/adequacy": "identify",
-    "measure/batches": f"{REFERENCED} gradient_check",
-    "measure/contacts": "gradient_check",
-    "measure/gradcheck/__init__": "gradient_check",
-    "measure/gradcheck/causes": "gradient_check",
-    "measure/gradcheck/check": "gradient_check",
-    "measure/gradcheck/direction": "gradient_check",
-    "measure/gradcheck/roughness": "gradient_check",
-    "measure/gradcheck/sampling": "gradient_check",
-    "measure/gradcheck/verdicts": "gradient_check",
-    "measure/identification": "identify",
-    "measure/jumps": f"{REFERENCED} gradient_check",
-    "measure/noise": f"{BIAS} backward_memory engines adam cem ilqr dose_response gradient_check growth solver three_errors twins identify train",
-    "measure/performance": "identify",
-    "measure/quadrature": REFERENCED,
-    "measure/reference": REFERENCED,
-    "measure/smoothed": REFERENCED,
-    "measure/solve": "adam cem ilqr dose_response",
-    "measure/statistics": f"{REFERENCED} train",
-    "measure/timing": f"{BIAS} backward_memory engines solver twins",
-    "model/__init__": "",
-    "model/events": "boundary",
-    "model/expansion": "ilqr",
-    "model/adjoint": "engines windowed total_propagation ilqr",
-    "model/manifold": "engines windowed total_propagation solver ilqr",
-    "model/estimator": ESTIMATED,
-    "model/known_solutions": "windowed adam cem ilqr dose_response identify",
-    "model/optimizer": "adam cem ilqr dose_response identify",
-    "model/policy": "train",
-    "model/trainer": "train",
-    "model/simulator/__init__": "",
-    "model/simulator/clock": "callable",
-    "model/simulator/example": "",
-    "model/simulator/imports": "callable",
-    "model/simulator/mjcf": "",
-    "model/simulator/simulator": "callable",
-    "model/simulator/tree": "callable",
-    "run/references": REFERENCED,
-    "studies/backward_memory/measure": "backward_memory",
-    "studies/bias_variance/measure": BIAS,
-    "studies/dose_response/measure": "dose_response",
-    "studies/engines/measure": "engines",
-    "studies/gradient_check/measure": "gradient_check",
-    "studies/growth/measure": "growth",
-    "studies/identify/measure": "identify",
-    "studies/optimise/measure": "adam cem ilqr",
-    "studies/solver/measure": "solver",
-    "studies/stability/measure": "stability",
-    "studies/three_errors/measure": "engines three_errors",
-    "studies/train/measure": "train",
-    "studies/twins/measure": "twins",
+    ("scenes", "pushing"): PUSHED,
+    ("scenes", "soft_heaviside"): {"heaviside"},
+    ("contacts", "penalty"): PUSHED,
+    ("estimators", "reinforce"): {"reinforce"},
+    ("backends", "fused"): {"fused"},
+    ("backends", "jax"): set(CELLS),
+    ("backends", "mjx"): {"mjx"},
+    ("optimizers", "adam"): {"adam"},
+    ("policies", "linear"): {"policy"},
+    ("studies", "growth"): {"growth"},
+    Scene: set(CELLS),
+    Backend: set(CELLS),
+    PolicyScene: {"policy"},
+    noise: set(CELLS),
+    program: set(CELLS),
+    statistics: REFERENCED,
+    adjoint: {"windowed"},
+    mjcf: {"mujoco", "mjx"},
+    mjx_solver: {"mjx"},
+    bench.plugins.fused: {"fused"},
+    "closed_form": {"quadratic", "heaviside", "ledge"},
+    "sampling": REFERENCED - {"quadratic", "heaviside", "ledge"},
+    "quadrature": {"billiard"},
 }
-"""Files, each with the cells whose keys its code is in. A file that is not listed must be in all keys, or harmless."""
-HALVES = (
-    "model",
-    "measure",
-    "run/references",
-    *(f"studies/{path.parent.name}/measure" for path in ROOT.glob("bench/studies/*/measure.py")),
-)
-FILES = sorted(path for path in (ROOT / "bench").rglob("*.py")
-               if str(path.relative_to(ROOT / "bench").with_suffix("")).startswith(HALVES))  # fmt: skip
-"""Every file of ``model`` (the user's simulator included), of ``measure``, and of each study's measuring half."""
+"""What declares a revision, with the cells whose keys change if it is raised. All references here are computed by ``jax``."""
+
+
+def forget() -> None:
+    """Forget the hashes that keys are computed from."""
+    keys.code_of.cache_clear()
+    for cache in (keys._fingerprints, cell_module._rest, cell_module._program_keys, cell_module._reference_keys):
+        cache.clear()
+
+
+@pytest.fixture(autouse=True)
+def fresh():
+    forget()
+    yield
+    forget()
 
 
 @pytest.fixture(scope="module")
@@ -110,148 +85,99 @@ def cells() -> dict[str, Cell]:
     return {name: grid.cells(config.load(words))[0] for name, words in CELLS.items()}
 
 
-files_of = cache(plugin_code)
-"""The files of a plugin's code, which are the same whatever is planted: a constant imports nothing."""
-
-
-def forget() -> None:
-    """Forget the hashes that keys are computed from."""
-    keys.module_hash.cache_clear()
-    keys.plugin_hash.cache_clear()
-    keys._fingerprints.clear()
-    cell_module._rest.clear()
-
-
 def keys_of(cells: dict[str, Cell]) -> dict[str, str]:
-    """Return the keys of cells, computed anew."""
     forget()
     return {name: replace(cell).key for name, cell in cells.items()}
 
 
-@pytest.fixture(scope="module")
-def before(cells: dict[str, Cell]) -> dict[str, str]:
-    """The keys without a planted constant."""
-    return keys_of(cells)
-
-
-def moved(cells: dict[str, Cell], before: dict[str, str], planted: Path, monkeypatch: pytest.MonkeyPatch) -> set[str]:
-    """Return the names of the cells whose keys a constant planted in a file changes."""
-    read = sources.code_hash
-    with monkeypatch.context() as patch:
-        patch.setattr(keys, "plugin_code", files_of)
-        patch.setattr(sources, "code_hash", lambda path: read(path) + ("PLANTED = 1" if path == planted else ""))
-        after = keys_of(cells)
-    forget()
-    return {name for name in cells if before[name] != after[name]}
-
-
-def module_of(path: Path) -> str:
-    return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
-
-
-@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
-def test_a_constant_planted_in_a_file_changes_the_keys_that_it_can_decide(path, cells, before, monkeypatch):
-    name = str(path.relative_to(ROOT / "bench").with_suffix(""))
-    changed = moved(cells, before, path, monkeypatch)
-    if is_below(module_of(path), HARMLESS):
-        assert not changed
-    elif name not in MOVED:
-        assert changed == set(CELLS), f"{name} changes the keys of {changed} only"
+@pytest.mark.parametrize("what", MOVED, ids=lambda what: str(getattr(what, "__name__", what)))
+def test_a_raised_revision_changes_the_keys_of_the_cells_that_use_it_and_no_other(what, cells, monkeypatch):
+    before = keys_of(cells)
+    if isinstance(what, ModuleType):
+        monkeypatch.setattr(what, "REVISION", 2)
+    elif isinstance(what, str):
+        monkeypatch.setitem(reference.REVISIONS, what, 2)
     else:
-        assert changed == set(MOVED[name].split())
+        owner = registry.usable(*what) if isinstance(what, tuple) else what
+        monkeypatch.setattr(owner, "revision", 2)
+    after = keys_of(cells)
+    assert {name for name in cells if before[name] != after[name]} == MOVED[what]
 
 
-def test_the_table_names_files_that_exist():
-    names = {str(path.relative_to(ROOT / "bench").with_suffix("")) for path in FILES}
-    assert set(MOVED) <= names
-    assert not [
-        name for name in MOVED if is_below(f"bench.{name.replace('/', '.').removesuffix('.__init__')}", HARMLESS)
-    ]
+def test_a_class_that_is_new_moved_or_renamed_changes_no_key():
+    assert keys.raised({"Scene": 1, "Pushing": 1}) == keys.raised({"Scene": 1, "Between": 1, "Pushed": 1}) == {}
+    assert keys.raised({"Scene": 2}) != keys.raised({"Scene": 3})
 
 
-def test_every_harmless_module_is_imported_by_code_that_decides_numbers(monkeypatch):
-    """The list does not outlive its reasons."""
-    reasons = dict(HARMLESS)
-    monkeypatch.setattr(keys, "HARMLESS", {})
-    plugins = [entry.plugin for table in registry.entries().values() for entry in table.values() if entry.plugin]
-    reached = {*code(PROGRAM, REFERENCE), *(name for plugin in plugins for name in plugin_code(plugin))}
-    for name, reason in reasons.items():
-        assert file_of(name) is not None, f"there is no module {name}"
-        assert any(is_below(module, [name]) for module in reached), f"nothing imports {name} any more"
-        assert reason
-
-
-def test_base_classes_of_another_package_count(tmp_path, monkeypatch):
-    base, derived = tmp_path / "some_base.py", tmp_path / "some_scene.py"
-    base.write_text("from bench.plugins.scenes.quadratic import Quadratic\n\n\nclass Base(Quadratic):\n    pass\n")
-    derived.write_text("import some_base\n\n\nclass Derived(some_base.Base):\n    name = 'derived'\n")
-    monkeypatch.syspath_prepend(tmp_path)
-    import some_scene  # type: ignore[import-not-found]
-
-    assert {"some_base", "some_scene", "bench.plugins.scenes.quadratic", "bench.model.scene"} <= set(
-        plugin_code(some_scene.Derived)
-    )
-
-
-def test_a_name_of_bench_plugin_counts_as_the_module_that_defines_it(tmp_path):
-    """A plugin does not rerun after a change of code that it does not use."""
-    file = tmp_path / "own.py"
-    names = [name for name in bench.plugin.__all__ if name in bench.model.__all__]
-
-    def imported(package: str) -> set[str]:
-        tree = ast.parse(f"from {package} import {', '.join(names)}")
-        return set(sources.imports_of_tree(tree, "own", file))
-
-    assert imported("bench.plugin") == imported("bench.model")
-    assert len(imported("bench.plugin")) > 10
-    assert not {"bench", "bench.plugin", "bench.model"} & imported("bench.plugin")
-
-
-def test_what_a_users_file_imports_from_bench_counts(tmp_path):
-    file = tmp_path / "sim.py"
-    file.write_text("from bench import Mjcf\n\n\ndef cost(theta):\n    return theta\n")
-    mjcf = file_of("bench.model.simulator.mjcf")
-    before = keys.files_hash([file])
-    with pytest.MonkeyPatch.context() as patch:
-        read = sources.code_hash
-        patch.setattr(sources, "code_hash", lambda path: read(path) + ("PLANTED" if path == mjcf else ""))
-        assert keys.files_hash([file]) != before
-    file.write_text("def cost(theta):\n    return theta\n")
-    assert mjcf not in code(*keys.code("sim")).values()
-
-
-STUDY = """
+OUTSIDE = """
 from dataclasses import dataclass
 
-from bench.plugin import Column, Columns, Study
+from bench.plugins.estimators.fobg import Fobg
 
-GAIN = {gain}
+{imports}
+
 
 @dataclass(frozen=True)
-class Small(Study):
-    name = "small"
-    axes = ("scene", "backend")
-    columns = Columns.of(Column("size", "{doc}"))
-
-    def measure(self, cell, session):
-        return {{"status": "ok", "reason": "", "size": GAIN}}
-
-    def write(self, experiment, rows):
-        return [{written}]
+class Mine(Fobg):
+    name = "{name}"
 """
 
 
-def test_a_study_of_one_file_is_known_by_all_but_what_shows_rows(tmp_path, monkeypatch):
-    def hash_after(name: str, **changes: str) -> str:
-        text = STUDY.format(**{"gain": "1.0", "doc": "size", "written": "", **changes})
-        (tmp_path / f"{name}.py").write_text(text)
-        monkeypatch.syspath_prepend(tmp_path)
-        return keys.plugin_hash(__import__(name).Small)
+@pytest.fixture
+def outside(tmp_path, monkeypatch):
+    """Return a function that gives the code of an estimator of another folder, whose files have these contents."""
+    monkeypatch.syspath_prepend(tmp_path)
 
-    plain = hash_after("small_study")
-    assert hash_after("small_reworded", doc="length") == plain
-    assert hash_after("small_shown", written="1") == plain
-    assert hash_after("small_changed", gain="2.0") != plain
+    def code(name: str, imports: str = "", **files: str) -> str:
+        (tmp_path / f"{name}.py").write_text(OUTSIDE.format(name="mine", imports=imports))
+        for helper, text in files.items():
+            path = tmp_path / f"{helper.replace('__', '/')}.py"
+            path.parent.mkdir(exist_ok=True)
+            path.write_text(text)
+        monkeypatch.delitem(sys.modules, name, raising=False)
+        return keys.code_of(importlib.import_module(name).Mine)
+
+    return code
+
+
+@pytest.mark.parametrize(
+    ("imports", "helper"),
+    [
+        ("import gain", "gain"),
+        ("from gain import GAIN", "gain"),
+        ("import parts.gain", "parts__gain"),
+        ("from parts import gain", "parts__gain"),
+        ("def late():\n    import gain", "gain"),
+    ],
+)
+def test_a_plugin_from_outside_counts_by_its_file_and_what_that_imports_from_its_folder(outside, imports, helper):
+    plain = outside("first_plugin", imports, **{helper: "GAIN = 1\n"})
+    assert outside("second_plugin", imports, **{helper: "GAIN = 1\n"}) == plain
+    assert outside("third_plugin", imports, **{helper: "GAIN = 2\n"}) != plain
+    assert outside("fourth_plugin", imports + "\nMORE = 1", **{helper: "GAIN = 1\n"}) != plain
+
+
+def test_a_plugin_from_outside_has_the_revisions_of_its_bases(outside, monkeypatch):
+    from bench.plugins.estimators.fobg import Fobg
+
+    plain = outside("plain_plugin")
+    monkeypatch.setattr(Fobg, "revision", 2)
+    assert json.loads(outside("raised_plugin"))[0] == {"Fobg": 2}
+    assert json.loads(plain)[0] == {}
+
+
+def test_a_simulator_counts_by_its_file_and_what_that_imports(tmp_path):
+    def key(gain: str) -> str:
+        (tmp_path / "physics.py").write_text(f"GAIN = {gain}\n")
+        (tmp_path / "mysim.py").write_text(
+            "import physics\n\ntheta = [1.0]\n\n\ndef cost(theta):\n    return theta[0]\n"
+        )
+        words = ["scenes=[callable]", f"scene.callable.cost={tmp_path}/mysim.py:cost", "backends=[callable]",
+                 "estimators=[fobg]"]  # fmt: skip
+        forget()
+        return grid.cells(config.load(words))[0].key
+
+    assert key("1") == key("1") != key("2")
 
 
 def test_an_estimator_whose_smoothing_fails_has_a_key_and_no_reference(cells, monkeypatch):
@@ -263,3 +189,17 @@ def test_an_estimator_whose_smoothing_fails_has_a_key_and_no_reference(cells, mo
     assert replace(cell).key
     with pytest.raises(ZeroDivisionError, match="no radius"):
         replace(cell).smoothing()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", sorted((ROOT / "conf/experiment").rglob("*.yaml")), ids=lambda path: path.stem)
+def test_stored_rows_are_those_of_the_cells_of_their_experiment(path: Path):
+    """Documents count the rows of a folder, so a row from an earlier version of the experiment would count too."""
+    import pandas as pd
+
+    experiment = config.load([f"+experiment={path.relative_to(ROOT / 'conf/experiment').with_suffix('')}"])
+    stored = ROOT / "results/standard" / experiment.name / "rows.parquet"
+    if stored.exists():
+        found = pd.read_parquet(stored, columns=["key"])["key"]
+        assert not found.duplicated().any()
+        assert set(found) <= {cell.key for cell in grid.cells(experiment)}

@@ -76,10 +76,8 @@ class Identify(Study):
     windows: int = param(8, "windows of multiple shooting and of windows", low=2)
     iterations: int = param(40, "steps of the optimizer", positive=True)
     refine: int = param(1, "the records come from a step this many times shorter", positive=True)
-    scan: int = param(
-        0, "values of each unknown at which the loss is scanned; 0: no scan", low=0, high=10_000, neutral=0
-    )
-    span: float = param(2.0, "a scan covers the truth over this to the truth times this", low=1.0, neutral=2.0)
+    scan: int = param(0, "values of each unknown at which the loss is scanned; 0: no scan", low=0, high=10_000)
+    span: float = param(2.0, "a scan covers the truth over this to the truth times this", low=1.0)
     data: str | None = param(None, "CSV file with measurements of your own, a line per step; null: made from the truth")
 
     def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
