@@ -20,7 +20,6 @@ from bench.model.parameters import Plugin, deciding, remember
 from bench.model.sources import code_of, file_of, hash_of, imports_of_tree, is_below, stored_hash
 
 HARMLESS = {
-    "bench.deprecated": "old names of the same things",
     "bench.engines.environments": "finds and installs the environments of engines, whose versions are in the row",
     "bench.engines.process": "carries arrays to an engine and back unchanged",
     "bench.errors": "statuses and the wording of messages",
