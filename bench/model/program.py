@@ -469,7 +469,6 @@ class Rollout(Program):
         theta, state, scanned = self.start(ops, theta, w)
         planned_scored = None if theta_scored is None else scene.planned_controls(xp, theta_scored)
         extra = () if planned_scored is None else (planned_scored,)
-        weights, last_weight = self._weights(xp, w)
         # a scan's carry must have a constant shape and type
         zero = xp.zeros_like(w[0, :])
 
@@ -478,22 +477,13 @@ class Rollout(Program):
             drawn = slices[: len(scanned)]
             u = self.control(ops, theta, state, drawn)
             if theta_scored is not None:
-                scored = [*slices[len(scanned) :][: len(extra)], scene.feedback(xp, theta_scored, state.q, state.v)]
+                scored = [*slices[len(scanned) :], scene.feedback(xp, theta_scored, state.q, state.v)]
                 logp = logp + sum(xp.sum(drawn[-1] * part, axis=0) for part in scored if part is not None)
-            stage = scene.stage_cost(xp, state.q, state.v, u)
-            cost = cost + (slices[-1] * stage if weights else stage)
+            cost = cost + scene.stage_cost(xp, state.q, state.v, u)
             return self.step(ops, state, u), cost, logp
 
-        state, cost, logp = ops.scan(step, (state, zero, zero), scanned + extra + weights, scene.horizon)
-        end = scene.terminal_cost(xp, state.q, state.v)
-        return cost + (last_weight * end if weights else end), logp
-
-    def _weights(self, xp: Any, w: Array) -> tuple[tuple[Array, ...], float]:
-        """Return the weights of the stage costs as a scan's input, empty if all are 1, and that of the terminal cost."""
-        weights = self.scene.cost_weights()
-        if weights is None:
-            return (), 1.0
-        return (xp.asarray(weights[:-1], dtype=w.dtype),), float(weights[-1])
+        state, cost, logp = ops.scan(step, (state, zero, zero), scanned + extra, scene.horizon)
+        return cost + scene.terminal_cost(xp, state.q, state.v), logp
 
 
 class _VaryingOps:
