@@ -9,7 +9,6 @@ once and use the array namespace ``ops.xp`` of the backend that runs them. A par
 traced value, so Python code must not branch on it. All other types are static.
 """
 
-from bench import deprecated
 from bench.errors import Unsupported, UserError, unknown
 from bench.model.adjoint import Slopes, by_actions, by_theta, slopes
 from bench.model.adjoint import gradient as adjoint_gradient
@@ -163,5 +162,3 @@ __all__ = [
     "unknown",
     "zeroth_order",
 ]
-
-__getattr__ = deprecated.lookup(__name__, globals())

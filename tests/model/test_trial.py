@@ -134,9 +134,9 @@ class Loud(Fobg):
     name = "loud"
     def __post_init__(self):
         print("made\\x1b[2J")
-    def lacks(self, *given):
+    def incompatibility(self, *given):
         print("asked\\x07")
-        return super().lacks(*given)
+        return super().incompatibility(*given)
 '''
 
 

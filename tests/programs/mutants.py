@@ -36,7 +36,7 @@ J, B, N = "bench/measure/jumps.py", "bench/measure/batches.py", "bench/measure/n
 P, E = "bench/model/program.py", "bench/model/estimator.py"
 OF_REFERENCE = "tests/measure/test_reference.py"
 OF_STATISTICS = "tests/measure/test_statistics.py tests/measure/test_unexplained.py"
-OF_SCORES = "tests/model/test_explicit.py"
+OF_SCORES = "tests/model/test_scores.py"
 OF_WEIGHTS = "tests/plugins/test_weights.py"
 T, ST = "bench/measure/timing.py", "bench/run/store.py"
 GC, GD, GK, GR, GS, GV = (
@@ -85,7 +85,7 @@ FAULTS = [
     Fault(R, "resolved = 2.0 * math.sqrt(trace)", "resolved = 2.0 * trace", OF_REFERENCE),
     Fault(R, "if program.contact is not None and not program.contact.continuous:", "if False:", OF_REFERENCE),
     Fault(R, "return not program.continuous and not any(program.breakpoints())", "return False", OF_REFERENCE),
-    Fault(R, "problem.score(theta, s) + problem.explicit(theta, s) for s", "problem.score(theta, s) for s", OF_SCORES),
+    Fault(R, "if problem.program.has_score_gradient:", "if True:", OF_SCORES),
     Fault(R, "mean = np.asarray(sum(terms) / 2)", "mean = np.asarray(sum(terms))", OF_REFERENCE),
     Fault(R, "closed = None if \"physics\" in provides else", "closed =", OF_REFERENCE),
     Fault(R, "return sampled if 0.0 < sampled", "return sampled if sampled", OF_REFERENCE),
@@ -123,12 +123,8 @@ FAULTS = [
     Fault(S, "math.isnan(relative):\n        if error == 0.0", "True:\n        if error == 0.0", OF_STATISTICS),
     Fault(S, "norm <= ROUNDING or reference.vanishes()", "norm <= ROUNDING", OF_STATISTICS),
     # scores and weights
-    Fault(P, "return self.action_noise and self._moves_start", "return False", OF_SCORES),
-    Fault(P, "self.step(ops, moved, u), cost, logp", "self.step(ops, state, u), cost, logp", OF_SCORES),
-    Fault(P, "scene.feedback(xp, theta_moved, moved.q, moved.v)):", "scene.feedback(xp, theta_moved, state.q, state.v)):", OF_SCORES),
+    Fault(P, "return not (self.action_noise and self._moves_start)", "return True", OF_SCORES),
     Fault(P, "and self._only_controls and not self._moves_start", "and self._only_controls", OF_SCORES),
-    Fault(E, "problem.score(theta, w) + problem.explicit(theta, w), noise)", "problem.score(theta, w), noise)", OF_SCORES),
-    Fault(E, "if not self.includes_explicit_derivative:", "if False:", OF_SCORES),
     Fault("plugins/estimators/inverse_variance.py", "v0 = zeroth.var(axis=1, ddof=1) / zeroth.shape[1]", "v0 = zeroth.var(axis=1, ddof=1)", OF_WEIGHTS),
     Fault("plugins/estimators/inverse_variance.py", "v1 = first.var(axis=1, ddof=1) / first.shape[1]", "v1 = first.var(axis=1) / first.shape[1]", OF_WEIGHTS),
     Fault("plugins/estimators/alpha_order.py", "first.var(axis=1, ddof=1).sum(axis=-1) / first.shape[1]", "first.var(axis=1, ddof=1).sum(axis=-1) / n", OF_WEIGHTS),
@@ -355,7 +351,7 @@ FAULTS = [
     Fault("bench/model/estimator.py", "half = noise.shape[1] // 2", "half = noise.shape[1] // 3", OF_ESTIMATORS),
     Fault("bench/model/estimator.py", "cost = problem.value(theta, w) - problem.value(theta, np.zeros((w.shape[0], 1)))", "cost = problem.value(theta, w)", OF_ESTIMATORS),
     Fault("bench/model/estimator.py", "derivative = program.continuous and not program.surrogate", "derivative = program.continuous", OF_ESTIMATORS + " tests/plugins/test_surrogate.py"),
-    Fault("bench/model/estimator.py", "if \"score\" in self.needs and program.explicit:", "if False:", OF_SCORES),
+    Fault("bench/model/estimator.py", "if \"score\" in self.needs and not program.has_score_gradient:", "if False:", OF_SCORES),
 ]  # fmt: skip
 """The planted faults. Faults that change no number are omitted, such as in code that only speeds up a search, or a quadrature
 that may stop below its least number of points: it never stops before the second level, which has that many."""
