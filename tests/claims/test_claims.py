@@ -68,10 +68,10 @@ def test_every_claim_holds_and_would_fail_with_a_wrong_figure(name):
 def test_every_plugin_has_a_planted_bug():
     for kind, planted_ in planted_claims.CLAIMS.items():
         # the errors of `planted` are its purpose, and tests/plugins/test_planted.py has their sizes. Those in no claim
-        # have planted errors in test_variance_reduction.py, test_events.py, test_surrogate.py and test_ilqr.py of tests/plugins.
+        # have planted errors in test_variance_reduction.py, test_events.py and test_surrogate.py of tests/plugins.
         unclaimed = {
             "contacts": {"surrogate_backward"},
-            "optimizers": {"homotopy", "ilqr"},
+            "optimizers": {"homotopy"},
             "estimators": {
                 "boundary",
                 "planted",
