@@ -14,7 +14,7 @@ from bench import model
 ROOT = Path(__file__).resolve().parents[1]
 BENCH = ROOT / "bench"
 LAYERS = [
-    ["errors", "interrupts", "deprecated"],
+    ["errors", "deprecated"],
     ["model"],
     ["engines"],
     ["measure", "plugins"],
