@@ -7,11 +7,6 @@
 - Plugins: :func:`list` lists them, and :mod:`bench.plugin` has the contracts that their authors import.
 """
 
-# ruff: noqa: E402
-from bench.interrupts import exit_on_interrupt
-
-exit_on_interrupt()  # before the slow imports
-
 import bench.run  # noqa: F401, before the function of the same name replaces the package here
 from bench import plugin
 from bench.api import estimate, list_plugins, load, problem, run

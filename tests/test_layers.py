@@ -14,7 +14,7 @@ from bench import model
 ROOT = Path(__file__).resolve().parents[1]
 BENCH = ROOT / "bench"
 LAYERS = [
-    ["errors", "interrupts"],
+    ["errors"],
     ["model"],
     ["engines"],
     ["measure", "plugins"],

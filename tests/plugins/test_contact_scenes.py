@@ -242,6 +242,12 @@ def test_slip_sets_in_at_the_coulomb_bound(slip_speed):
     assert np.abs(v[sliding, 0] - exact).max() < 5 * slip_speed + 0.02 * scene.pull
 
 
+def test_a_softplus_contact_pushes_at_touch():
+    """By ln 2 / beta times the stiffness, where a penalty has no force."""
+    still = np.zeros((1, 1))
+    assert Softplus(stiffness=3.0, beta=10.0).force(np, still, still) == pytest.approx(3.0 * np.log(2.0) / 10.0)
+
+
 @pytest.mark.parametrize(("law", "values"), [(Penalty, {}), (Softplus, {})], ids=["penalty", "softplus"])
 def test_friction_block_gradients_agree(law, values):
     made = program(FrictionBlock(), law, **values)

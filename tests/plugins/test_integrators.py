@@ -220,6 +220,28 @@ def test_mass_spring_gradient(integrator, damping):
     assert math.log2(errors[0] / errors[1]) == pytest.approx(integrator.order, abs=0.2)
 
 
+@pytest.mark.parametrize(
+    ("integrator", "step", "growth", "turn"),
+    [
+        (ExplicitEuler(), 0.1, lambda z: 1 + z, None),
+        (ImplicitEuler(), 0.1, lambda z: 1 / (1 - z), None),
+        (Midpoint(), 0.5, lambda z: 1 + z + z**2 / 2, None),
+        (Rk4(), 1.0, lambda z: 1 + z + z**2 / 2 + z**3 / 6 + z**4 / 24, None),
+        (ImplicitMidpoint(), 0.5, lambda z: (1 + z / 2) / (1 - z / 2), lambda h: 2 * math.atan(h / 2)),
+        (StormerVerlet(), 0.5, None, lambda h: math.acos(1 - h**2 / 2)),
+    ],
+    ids=lambda value: getattr(value, "name", ""),
+)
+def test_an_oscillator_grows_and_turns_as_the_stability_function_states(integrator, step, growth, turn):
+    """Squared ends of x'' = -x after 100 steps from (1, 0) and (0, 1) (Hairer, Lubich, Wanner 2006, I.1 and IX.1)."""
+    problem = compiled(MassSpring(stiffness=0.5, dt=step, horizon=100), integrator)
+    ends = problem.value(np.eye(2), np.zeros((problem.program.n_noise, 2)))
+    if growth is not None:
+        assert ends.sum() == pytest.approx(abs(growth(1j * step)) ** 200, rel=1e-9)
+    if turn is not None:
+        assert ends[0] == pytest.approx(math.cos(100 * turn(step)) ** 2, rel=1e-9)
+
+
 def energy_error(integrator, **values):
     """Largest relative error of the energy in the first and in the second half of the rollout."""
     scene = MassSpring(**values)

@@ -30,7 +30,6 @@ from bench.plugins.scenes.cubic import Cubic
 from bench.plugins.scenes.double_integrator import DoubleIntegrator
 from bench.plugins.scenes.friction_block import FrictionBlock
 from bench.plugins.scenes.ground_wall import GroundWall
-from bench.plugins.scenes.gusty_cart import GustyCart
 from bench.plugins.scenes.heaviside import Heaviside
 from bench.plugins.scenes.hopper import Hopper
 from bench.plugins.scenes.ledge import Ledge
@@ -216,7 +215,6 @@ CLOSED = [
     Cubic(dimension=2, sigma=0.5),
     Constant(),
     DoubleIntegrator(),
-    GustyCart(),
     StiffDecay(),
     MassSpring(),
     BounceOnce(horizon=48, dt=1 / 48),
