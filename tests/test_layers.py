@@ -106,7 +106,7 @@ def test_only_the_command_line_stands_on_the_command_line():
 
 
 def test_plugins_import_only_public_names():
-    for path, name in ((path, name) for path in PLUGINS for name in imported(path)):
+    for path, name in [(file, found) for file in PLUGINS for found in imported(file)]:
         if name.startswith("bench.plugins"):
             family = path.parent.name == "backends" or path.parent == ROOT / "plugins"
             family = family or (ROOT / "plugins" / f"{name.split('.')[2]}.py").is_file()  # a module that kinds share
