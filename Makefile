@@ -3,7 +3,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 RUN := $(BIN)/python -m bench
 
-.PHONY: run test lint slow docs site gallery examples clean
+.PHONY: run test lint slow slow-all docs site gallery examples clean
 
 run: $(VENV)/.installed
 	$(RUN) +experiment=stiffness_sweep
@@ -13,6 +13,10 @@ test: $(VENV)/.installed
 
 slow: $(VENV)/.installed
 	$(BIN)/python -m pytest -m slow --dist worksteal
+
+# The slow tests with full crossings of scenes, laws and backends instead of a design of them.
+slow-all: $(VENV)/.installed
+	$(BIN)/python -m pytest -m 'slow or full' --dist worksteal
 
 lint: $(VENV)/.installed
 	$(BIN)/ruff check .

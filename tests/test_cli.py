@@ -366,6 +366,6 @@ def test_a_thread_of_a_plugin_and_a_closed_stream_do_not_keep_a_command_waiting(
         command.command()
     """
     inherited = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, sys.path))}
-    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=inherited, capture_output=True, timeout=60)
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=inherited, capture_output=True, timeout=500)
     assert done.returncode == 3
     assert done.stdout == b"all of it\n"

@@ -22,41 +22,12 @@ from bench.measure import noise, statistics
 from bench.model import PolicyScene, Scene, program
 from bench.model.parameters import Plugin, remember, values
 
-<<<<<<< HEAD
 SHARED = (noise, program)
 """Modules that decide the numbers of all cells."""
 COMPARED = (statistics,)
 """Modules that decide the numbers of cells that are compared with a reference."""
 PACKAGE = "bench"
 """The package whose classes count by their revisions."""
-=======
-HARMLESS = {
-    "bench.engines.environments": "finds and installs the environments of engines, whose versions are in the row",
-    "bench.engines.process": "carries arrays to an engine and back unchanged",
-    "bench.errors": "statuses and the wording of messages",
-    "bench.experiment": "describes cells and rows; all that it passes on to plugins is in the key",
-    "bench.model.guard": "protects the process from plugins, and sees none of their numbers",
-    "bench.model.isolation": "detects and undoes changes of the process",
-    "bench.model.identity": "plugins as text",
-    "bench.model.parameters": "declares and checks parameters, whose values are in the key",
-    "bench.model.registry": "finds plugins, whose code is in the key",
-    "bench.model.sources": "the hashes of code themselves",
-    "bench.model.trial": "imports new plugin files in a process of their own",
-    "bench.report": "shows rows",
-    "bench.run.files": "writes files as they are given",
-    "bench.studies.bias_variance.columns": "names, units and meanings of columns",
-    "bench.studies.gradient_check.columns": "names, units and meanings of columns",
-    "bench.studies.growth.columns": "names, units and meanings of columns",
-    "bench.studies.three_errors.columns": "names, units and meanings of columns",
-}
-"""Imported modules and packages that are not hashed since they decide no number, each with the reason."""
-REFERENCE = "bench.run.references"
-"""The module that computes reference gradients."""
-PROGRAM = "bench.model.program"
-"""The module that composes scene, contact law and integrator."""
-DISPLAY = ("views", "write", "show", "page", "chart", "faults", "failure")
-"""Methods of a study that only show its rows."""
->>>>>>> rema
 
 _fingerprints: dict[int, tuple[Plugin, str]] = {}
 """Plugins and their hashes by ``id``, since equal plugins may produce different numbers: -0.0 == 0.0, False == 0."""

@@ -135,15 +135,6 @@ class PolicyScene(MechanicalScene):
     noise: str = param("action", "whether noise is on the actions or on theta", choices=("action", "parameter"))
     policy: str = param("linear", "policy, as name or name[parameter=value,...]")
     substeps: int = param(1, "steps of the integrator per control step", positive=True)
-<<<<<<< HEAD
-    discount: float | None = param(None, "factor on the cost per control step; null: 1", positive=True, high=1.0)
-    normalise: int = param(
-        0,
-        "rollouts under the initial policy whose observations give the mean and deviation that normalise its inputs; 0: none",
-        low=0,
-    )
-=======
->>>>>>> rema
 
     def __post_init__(self) -> None:
         _ = self.plugin  # raises the error of an invalid policy

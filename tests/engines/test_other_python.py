@@ -199,7 +199,7 @@ time.sleep(100)
     with subprocess.Popen([HERE, "-c", code], stdout=subprocess.PIPE, text=True) as run:
         engine = psutil.Process(int(run.stdout.readline()))
         run.kill()
-        assert engine.wait(10) is None
+        assert engine.wait(300) is None
 
 
 @pytest.mark.slow
@@ -240,7 +240,7 @@ problem.value(problem.program.theta0, noise(problem))
 left = subprocess.Popen(["sleep", "100"])
 guard.kill_children()
 assert not psutil.pid_exists(left.pid)
-left.wait(5)
+left.wait(300)
 (engine,) = process._running.values()
 assert engine.process.poll() is None
 """

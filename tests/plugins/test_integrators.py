@@ -104,10 +104,8 @@ def test_planted_fault_is_caught(plugin, fault):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("integrator", EXPLICIT, ids=named)
-@pytest.mark.parametrize(
-    "scene", [StiffDecay(), MassSpring(velocity_factor=0.9), DoublePendulum(horizon=50)], ids=named
-)
-def test_backends_agree(scene, integrator):
+def test_backends_agree(integrator):
+    scene = DoublePendulum(horizon=50)
     numpy, jax, torch = (compiled(scene, integrator, backend=backend) for backend in (Numpy(), Jax(), Torch()))
     theta, w = scene.theta0(), normal(numpy, 3)
     costs, gradients = jax.value(theta, w), jax.grad(theta, w)
@@ -254,8 +252,8 @@ def energy_error(integrator, **values):
 
 @pytest.mark.parametrize("integrator", [SemiImplicitEuler(), StormerVerlet(), EventDriven()], ids=named)
 def test_symplectic_energy_is_bounded(integrator):
-    """Over 300 periods the error is that of the first ones, of order (w dt)^order: w dt = 0.1."""
-    early, late = energy_error(integrator, horizon=20_000)
+    """Over 60 periods the error is that of the first ones, of order (w dt)^order: w dt = 0.1."""
+    early, late = energy_error(integrator, horizon=4_000)
     assert early < 1.1 * 0.1**integrator.order
     assert late == pytest.approx(early, rel=0.01)
 
