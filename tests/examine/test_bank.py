@@ -1,4 +1,4 @@
-"""Planted faults are caught, and right gradients pass; `python tests/programs/simulators.py` prints the whole table."""
+"""Planted faults are caught, and right gradients pass; `python validation/simulators.py` prints the whole table."""
 
 import pytest
 import simulators

@@ -1,4 +1,4 @@
-"""Measures the coverage of the intervals of bias and variance: `python tests/programs/intervals.py [SEEDS [STRIDE]]`.
+"""Measures the coverage of the intervals of bias and variance: `python validation/intervals.py [SEEDS [STRIDE]]`.
 
 Cells are the ridges of the bank. The bias of every estimator is known there: 0 for unbiased estimators, the slopes of the
 jumps for first order, the difference of two smoothings for another radius. The true variance is computed from a million

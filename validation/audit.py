@@ -1,4 +1,4 @@
-"""Measures intervals and references with a second implementation: `python tests/programs/audit.py [SETS [SECTION]]`.
+"""Measures intervals and references with a second implementation: `python validation/audit.py [SETS [SECTION]]`.
 
 The true values come from closed forms, or from code below that imports no statistics, scene or contact law of this package.
 Coverage is the share of SETS simulated data sets whose 95% interval contains the true value, without leaving out any set.

@@ -1,4 +1,4 @@
-"""Runs random valid and spoilt configurations: ``python tests/programs/configurations.py COUNT [SEED] [files | calls]``.
+"""Runs random valid and spoilt configurations: ``python validation/configurations.py COUNT [SEED] [files | calls]``.
 
 With ``files``, most settings of a configuration are an experiment file of the user's, some replaced on the command line,
 and its sweep is nested up to three levels, with ranges. With ``calls``, each is a call of ``bench.run``, with

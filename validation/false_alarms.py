@@ -1,6 +1,6 @@
 """Counts false alarms: how often the gradient check reports a fault in correct gradients of smooth scenes.
 
-    python tests/programs/false_alarms.py 5000 [FIRST [FILE]]
+    python validation/false_alarms.py 5000 [FIRST [FILE]]
 
 runs the checks FIRST to 4,999 at random thetas and horizons up to 3,000, and prints the counts of verdicts by horizon, every
 reported fault, and the seconds per check. A check's number determines its program and theta, so ranges can run apart or in

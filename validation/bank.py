@@ -1,4 +1,4 @@
-"""Compares certified references with known gradients, on a bank of problems: `python tests/programs/bank.py [SAMPLES]`.
+"""Compares certified references with known gradients, on a bank of problems: `python validation/bank.py [SAMPLES]`.
 
 Ridges f(x) = sum_j g_j(a_j . x) have grad J = sum_j a_j dE[g_j]/du with one-dimensional Gaussian expectations of powers,
 hinges, steps, bumps, waves and exponentials. Shipped scenes have closed forms, which are hidden from the reference.

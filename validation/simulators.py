@@ -1,8 +1,8 @@
 """Runs `bench.examine` on planted faults and correct gradients in NumPy, torch and JAX simulators, and prints a table.
 
-    python tests/programs/simulators.py [numpy] [right] [torch] [jax] [engines]
+    python validation/simulators.py [numpy] [right] [torch] [jax] [engines]
 
-    python tests/programs/simulators.py slowed [numpy] [right] [engines]
+    python validation/simulators.py slowed [numpy] [right] [engines]
 
 The first prints a line per case: the cause that `bench.examine` reports, its exit status, calls and seconds. `checkers.py` runs other
 gradient checkers on the same cases. The second compares each verdict with that of a cost that is four times slower.

@@ -1,4 +1,4 @@
-"""Kills runs at random moments of every phase, and counts losses: ``python tests/programs/kill.py COUNT [SEED]``.
+"""Kills runs at random moments of every phase, and counts losses: ``python validation/kill.py COUNT [SEED]``.
 
 A round starts in an empty folder and consists of the phases of a run (references, cells, tables, page) and a comparison with
 a sweep that was never killed. In each phase the run is killed a few times and started again. Each kill has a random victim
