@@ -4,7 +4,7 @@ import pytest
 import simulators
 
 SLOW = (
-    "contact", "missing contact term", "missing damper", "last step forgotten", "gradient elsewhere", "noise reused shifted",
+    "contact", "missing contact term", "last step forgotten", "gradient elsewhere", "noise reused shifted",
 )  # fmt: skip
 """Cases whose rollouts take long in Python; the quick tests have others of their kind."""
 UNNAMED = ("rounded",)
