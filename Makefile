@@ -22,7 +22,6 @@ lint: $(VENV)/.installed
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/python tests/programs/words.py
 
 # The generated parts of the documents: findings, columns and marked figures.
 docs: $(VENV)/.installed

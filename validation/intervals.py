@@ -1,4 +1,4 @@
-"""Measures the coverage of the intervals of bias and variance: `python tests/programs/intervals.py [SEEDS [STRIDE]]`.
+"""Measures the coverage of the intervals of bias and variance: `python validation/intervals.py [SEEDS [STRIDE]]`.
 
 Cells are the ridges of the bank. The bias of every estimator is known there: 0 for unbiased estimators, the slopes of the
 jumps for first order, the difference of two smoothings for another radius. The true variance is computed from a million
@@ -52,16 +52,6 @@ class Cell:
         kept = [(p, a) for p, a in zip(self.scene.pieces, self.scene.along, strict=True) if "step" not in p.name]
         pieces, along = zip(*kept, strict=True) if kept else ((bank.power(1, 0.0),), self.scene.along[:1])
         return bank.Ridge(pieces, along, self.scene.start, self.scene.sigma)
-
-    @property
-    def rare(self) -> bool:
-        """Whether a kink or jump is more than 2.4 standard deviations away, so that samples rarely reach it."""
-        places = [
-            p.name.split("(")[1].split(",")[0]
-            for p in self.scene.pieces
-            if p.name.startswith(("ramp", "step", "hinge"))
-        ]
-        return any(abs(float(at)) > 2.4 for at in places)
 
 
 def cells() -> list[Cell]:
@@ -167,48 +157,25 @@ def main(seeds: int = 40, stride: int = 1) -> int:
     """Print coverage and the cells with the lowest; return 1 unless coverage without remarks is within 91% to 99%."""
     total: dict[str, list[Held]] = defaultdict(list)
     worst = []
-    unbiased: list[bool] = []
-    every = cells()[::stride]
-    for cell in every:
+    for cell in cells()[::stride]:
         held = covered(cell, seeds)
         plain = [one for one in held if not one.note]
+        kind = type(cell.estimator).__name__
         # all sets, since a remark may follow from the interval itself
         total["all sets"] += held
-        total[f"all sets of {type(cell.estimator).__name__}"] += held
-        if cell.bias == 0.0:
-            unbiased += ["declared unbiased" in one.note for one in held]
+        total[f"all sets of {kind}"] += held
         total["without remark"] += plain
-        # the measured bias decides whether an unbiased estimator gets a remark, so such sets are also counted together
-        total["without remark, or declared unbiased and not found so"] += [
-            one for one in held if not one.note or one.note.startswith("declared unbiased")
-        ]
         total["of these biased" if cell.bias else "of these unbiased"] += plain
-        total[f"of these R={cell.repeats}"] += plain
-        total[f"of these {type(cell.estimator).__name__}"] += plain
-        if not cell.rare:
-            total["of these without an event rarer than 1 in 100"] += plain
-        for one in held:
-            if one.note:
-                total[f"with a remark: {one.note.split(':')[0].split(',')[0]}"].append(one)
+        total[f"of these {kind}"] += plain
         if len(plain) >= seeds / 2:
-            label = f"{type(cell.estimator).__name__} {cell.label} R={cell.repeats} N={cell.samples}"
-            worst.append((*shares(plain), label))
-    print(f"{len(every)} cells, {seeds} sets of estimates each")
-    for name in sorted(total, key=lambda name: "with a" in name):
-        if total[name]:
-            bias, variance, each = (100 * share for share in shares(total[name]))
-            print(
-                f"{name}: {len(total[name])} sets, bias covered {bias:.1f}%, variance {variance:.1f}%, per sample {each:.1f}%"
-            )
-    print(
-        f"remark that a declared unbiased estimator is not: {np.mean(unbiased):.1%} of {len(unbiased)} sets of right ones"
-    )
+            worst.append((*shares(plain), f"{kind} {cell.label} R={cell.repeats} N={cell.samples}"))
+    for name, held in sorted(total.items()):
+        bias, variance, each = (100 * share for share in shares(held))
+        print(f"{name}: {len(held)} sets, bias covered {bias:.1f}%, variance {variance:.1f}%, per sample {each:.1f}%")
     floor = LEAST - 2.5 * np.sqrt(0.95 * 0.05 / seeds)
     for place, name in enumerate(("bias", "variance", "variance per sample")):
         sound = sum(row[place] >= floor for row in worst)
-        print(
-            f"{name}: {sound} of {len(worst)} cells mostly without remarks are not below 91% by more than chance; the lowest:"
-        )
+        print(f"{name}: {sound} of {len(worst)} cells mostly without remarks are not below 91% by more than chance")
         for row in sorted(worst, key=lambda row: row[place])[:8]:
             print(f"  {100 * row[place]:.0f}%  {row[-1]}")
     return int(not all(LEAST <= share <= MOST for share in shares(total["without remark"])))

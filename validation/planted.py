@@ -1,4 +1,4 @@
-"""Prints which planted faults ``compare`` detects, by scene: ``python tests/programs/planted.py [SCENE ...]``.
+"""Prints which planted faults ``compare`` detects, by scene: ``python validation/planted.py [SCENE ...]``.
 
 Every cell runs in this process on the NumPy backend, without and with each fault. The fault is in the problem that both the
 estimates and the reference use, as if the next version of a simulator were broken.
@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 from helpers import loaded
 

@@ -1,4 +1,4 @@
-"""Counts the rule of when to trust `fobg` on scenes that were not used to find it: `python tests/programs/trusted.py`.
+"""Counts the rule of when to trust `fobg` on scenes that were not used to find it: `python validation/trusted.py`.
 
 The rule trusts a cell where one estimate spreads by less than half of its mean, the gradient check passes at theta, and
 its search along lines of the noise finds no jump. Ten families have six or more scenes each. Scenes of even number in a

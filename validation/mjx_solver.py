@@ -4,8 +4,8 @@ All mechanisms are in one model, far from each other, so that each combination o
 has its own cost, a random linear function of its final state, and the derivative is along a random change of its initial
 velocity.
 
-    python tests/programs/mjx_solver.py               # a table: 20 mechanisms, both cones, both solvers
-    python tests/programs/mjx_solver.py elliptic CG   # one combination
+    python validation/mjx_solver.py               # a table: 20 mechanisms, both cones, both solvers
+    python validation/mjx_solver.py elliptic CG   # one combination
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Plants one bug at a time in a plugin and runs claims that use it: `python tests/programs/planted_claims.py [BUG...]`.
+"""Plants one bug at a time in a plugin and runs claims that use it: `python validation/planted_claims.py [BUG...]`.
 
 Prints a table of the bugs, the claims that were run and those that fail. A bug that no claim notices ends with status 1.
 """

@@ -1,4 +1,4 @@
-"""Measures the error of the central path's gradient at ``kappa``: ``python tests/programs/relaxed.py 1e-6``.
+"""Measures the error of the central path's gradient at ``kappa``: ``python validation/relaxed.py 1e-6``.
 
 Prints, per stiffness of ``stiffness_sweep``, the relative difference between the mean gradients of ``pushing`` at ``kappa``
 and at ``kappa`` / 1000, over the same draws.

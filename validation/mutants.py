@@ -1,4 +1,4 @@
-"""Plants one-line faults in the core and reports which of them a test detects: `python tests/programs/mutants.py [WORD ...]`.
+"""Plants one-line faults in the core and reports which of them a test detects: `python validation/mutants.py [WORD ...]`.
 
 Each fault whose file or text contains a word is planted in a copy of the tree. Its tests run until one fails, in a process
 forked after the libraries are loaded. Run by hand: all faults take half an hour.
@@ -18,8 +18,8 @@ from typing import NamedTuple
 
 CPU, MEMORY = 40, 6 << 30
 """Limits for the tests of one fault: CPU seconds, and bytes of address space."""
-ROOT = Path(__file__).resolve().parents[2]
-COPIED = ("bench", "plugins", "conf", "tests", "docs", "README.md", "CONTRIBUTING.md", "pyproject.toml")
+ROOT = Path(__file__).resolve().parents[1]
+COPIED = ("bench", "plugins", "conf", "tests", "validation", "docs", "README.md", "CONTRIBUTING.md", "pyproject.toml")
 
 
 class Fault(NamedTuple):
@@ -414,7 +414,7 @@ def main(words: list[str]) -> int:
                 shutil.copytree(source, folder / part, ignore=ignored)
             else:
                 shutil.copy(source, folder / part)
-        own = (ROOT, ROOT / "tests", ROOT / "tests/programs")
+        own = (ROOT, ROOT / "tests", ROOT / "validation")
         sys.path[:] = [path for path in sys.path if Path(path or ".").resolve() not in own]
         sys.dont_write_bytecode = True
         for tests in dict.fromkeys(fault.tests for fault in chosen):

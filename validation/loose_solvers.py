@@ -1,4 +1,4 @@
-"""Counts verdicts on right implicit gradients over solvers that stop early: `python tests/programs/loose_solvers.py [COUNT]`.
+"""Counts verdicts on right implicit gradients over solvers that stop early: `python validation/loose_solvers.py [COUNT]`.
 
 x solves x = a cos x + b by a fixed-point or a damped iteration that ends at a change below 1e-6 or 1e-8. Three costs of x are
 checked at COUNT random (a, b) each. Verdicts other than right ones are false alarms.

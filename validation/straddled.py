@@ -1,4 +1,4 @@
-"""Counts MuJoCo steps whose finite difference spans a contact switch: `python tests/programs/straddled.py`.
+"""Counts MuJoCo steps whose finite difference spans a contact switch: `python validation/straddled.py`.
 
 The scene is the tossed box.
 The Jacobians of single steps from differences of 1e-6, 1e-7 and 1e-8 are compared with Jacobians from 1e-8, and the gradients

@@ -1,4 +1,4 @@
-"""Counts how often `identify` notices that its model is wrong: `python tests/programs/wrong_models.py [RECORDS]`.
+"""Counts how often `identify` notices that its model is wrong: `python validation/wrong_models.py [RECORDS]`.
 
 Records of x'' = -k x - c v + ... with terms that the model lacks, or with noise other than the model's, are fitted with
 k and c. For every wrong model the program prints the share of records that are not explained, the most that a test of one

@@ -1,15 +1,13 @@
 """Counts false alarms: how often the gradient check reports a fault in correct gradients of smooth scenes.
 
-    python tests/programs/false_alarms.py 5000 [FIRST [FILE]]
+    python validation/false_alarms.py 5000 [FIRST]
 
 runs the checks FIRST to 4,999 at random thetas and horizons up to 3,000, and prints the counts of verdicts by horizon, every
 reported fault, and the seconds per check. A check's number determines its program and theta, so ranges can run apart or in
-turn. With FILE, each check is a line of that CSV file, and checks in it are not run again. The first check of a program
-includes its compilation. Short horizons are checked more often, because a check takes as long as its horizon.
+turn. The first check of a program includes its compilation. Short horizons are checked more often, because a check takes as
+long as its horizon.
 """
 
-import csv
-import pathlib
 import sys
 import time
 from collections import Counter, defaultdict
@@ -48,17 +46,17 @@ def programs():
                 yield f"{name} {horizon} {integrator}", program, horizon or 0, weight
 
 
-def run(count, only=None, first=0, done=(), report=lambda line: None):
-    """Run the checks ``first`` to ``count - 1`` that are not in ``done``, program by program.
+def run(count, only=None, first=0):
+    """Run the checks ``first`` to ``count - 1``, program by program.
 
-    Returns lines ``(number, name, horizon, verdict, seconds, sentence)``; ``report`` is called with each.
+    Returns lines ``(number, name, horizon, verdict, seconds, sentence)``.
     """
     chosen = [entry for entry in programs() if only is None or only(entry[0])]
     cycle = [place for place, entry in enumerate(chosen) for _ in range(entry[3])]
     lines = []
     unit, search = float(np.finfo(np.float64).eps), measure.SwitchSearch(2, 16, 2.0, 1e-4)
     for place, (name, program, horizon, _) in enumerate(chosen):
-        numbers = [n for n in range(first, count) if cycle[n % len(cycle)] == place and n not in done]
+        numbers = [n for n in range(first, count) if cycle[n % len(cycle)] == place]
         problem = registry.make("backends", "jax", {}).compile(program) if numbers else None
         theta0 = program.theta0
         for number in numbers:
@@ -68,7 +66,6 @@ def run(count, only=None, first=0, done=(), report=lambda line: None):
             result = measure.start(problem, theta, unit, search, number)
             seconds = time.perf_counter() - started
             lines.append((number, name, horizon, result.cause, seconds, result.sentence()))
-            report(lines[-1])
             if result.cause in FAULTS:
                 print("blamed:", number, name, result.sentence(), flush=True)
     return lines
@@ -91,29 +88,6 @@ def summary(lines):
     return "\n".join(text)
 
 
-def main(count=100, first=0, path=None):
-    """Run checks, print the summary of all of them, and store each line in the file ``path`` as it is ready."""
-    if path is None:
-        print(summary(run(count, first=first)))
-        return
-    file = pathlib.Path(path)
-    lines = []
-    if file.exists():
-        with file.open(newline="") as stream:
-            whole = [row for row in csv.reader(stream) if len(row) == 6]  # the last may be cut
-        lines = [(int(n), name, int(h), verdict, float(s), text) for n, name, h, verdict, s, text in whole]
-    with file.open("w", newline="") as stream:
-        writer = csv.writer(stream)
-        writer.writerows(lines)
-
-        def report(line):
-            writer.writerow(line)
-            stream.flush()
-
-        done = {line[0] for line in lines}
-        lines += run(count, first=first, done=done, report=report)
-    print(summary(lines))
-
-
 if __name__ == "__main__":
-    main(*map(int, sys.argv[1:3]), *sys.argv[3:4])
+    count, first = (*map(int, sys.argv[1:3]), 0)[:2]
+    print(summary(run(count, first=first)))

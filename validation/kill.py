@@ -1,11 +1,10 @@
-"""Kills runs at random moments of every phase, and counts losses: ``python tests/programs/kill.py COUNT [SEED]``.
+"""Kills runs at random moments of every phase, and counts losses: ``python validation/kill.py COUNT [SEED]``.
 
 A round starts in an empty folder and consists of the phases of a run (references, cells, tables, page) and a comparison with
 a sweep that was never killed. In each phase the run is killed a few times and started again. Each kill has a random victim
 (the run, a child process, the process group), a random signal and a random moment within the phase; a run that outlives the
 kill of a child is killed again. A kill counts if the victim was alive, for the phase in which the run was at that moment.
-The runs of every fifth round are processes of their own from the first import on; the others are forked from a process that
-has imported the package, which takes a tenth of the time. Prints the faults and counts; the exit status is 1 for any fault.
+Prints the faults and counts; the exit status is 1 for any fault.
 """
 
 from __future__ import annotations
@@ -15,7 +14,6 @@ import itertools
 import json
 import os
 import random
-import select
 import shutil
 import signal
 import subprocess
@@ -38,8 +36,6 @@ KILLS = {"references": 4, "cells": 8, "tables": 3, "page": 3, "compare": 3}
 """Number of killed runs per phase in a round."""
 MOST = 1
 """Kills of children of one run; then the run itself is the victim. A cell that loses two workers is stored as crashed."""
-OWN = 5
-"""Each round of this number starts its runs as processes of their own."""
 CELLS = 32
 WORDS = [
     "scenes=[soft_heaviside]", "backends=[numpy]", "estimators=[fobg,reinforce]", "repeats=4", "samples=256",
@@ -82,66 +78,14 @@ def run():
 """
 """Defines ``run``, the command ``python -m bench``, which also writes the start of each phase to the file ``PHASES``."""
 START = f"{MARKS}\nrun()"
-SERVER = f"""{MARKS}
-import matplotlib.backends.backend_agg, matplotlib.figure, pandas, pyarrow.parquet, scipy.stats
-from bench.report import draw
-for line in sys.stdin:
-    folder, words, phases, errors = json.loads(line)
-    if not (pid := os.fork()):
-        os.setsid()
-        os.chdir(folder)
-        for number, path in enumerate((os.devnull, os.devnull, errors)):
-            os.dup2(os.open(path, os.O_RDONLY if number == 0 else os.O_WRONLY | os.O_CREAT | os.O_TRUNC), number)
-        os.environ["PHASES"], sys.argv = phases, ["bench", *words]
-        run()
-        sys.exit(0)
-    print(pid, flush=True)
-    print(os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]), flush=True)
-"""
-"""Runs a command per line of standard input, in a process forked from this one; prints its number, then its exit status."""
-
-
-class Server:
-    """The process from which runs are forked."""
-
-    def __init__(self) -> None:
-        self.process = subprocess.Popen(
-            [sys.executable, "-c", SERVER], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1
-        )
-
-    def __enter__(self) -> Server:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.process.kill()
-        self.process.wait()
-
-    def start(self, *what: Any) -> int:
-        """Fork a run; returns the number of its process."""
-        assert self.process.stdin is not None
-        self.process.stdin.write(json.dumps(what) + "\n")
-        self.process.stdin.flush()
-        return int(self.line())
-
-    def answers(self, seconds: float) -> bool:
-        assert self.process.stdout is not None
-        return bool(select.select([self.process.stdout], [], [], seconds)[0])
-
-    def line(self) -> str:
-        assert self.process.stdout is not None
-        return self.process.stdout.readline()
 
 
 class Run:
     """A command running in a folder, and the phases that it has started."""
 
-    def __init__(self, server: Server | None, folder: Path, *words: str) -> None:
+    def __init__(self, folder: Path, *words: str) -> None:
         self._phases, self._errors = folder.with_name("phases.txt"), folder.with_name("errors.txt")
         self._phases.write_text("")
-        self._server, self.status = server, None
-        if server is not None:
-            self.pid = server.start(str(folder), words, str(self._phases), str(self._errors))
-            return
         with self._errors.open("w") as errors:
             self._process = subprocess.Popen(
                 [sys.executable, "-c", START, *words], cwd=folder, env=os.environ | {"PHASES": str(self._phases)},
@@ -149,33 +93,30 @@ class Run:
             )  # fmt: skip
         self.pid = self._process.pid
 
-    status: int | None
+    @property
+    def status(self) -> int | None:
+        """The exit status, or None while the command runs."""
+        return self._process.poll()
 
     def phases(self) -> list[tuple[str, float]]:
         """Return the phases that the command has started, each with its time [s since 1970]."""
         lines = [line.split() for line in self._phases.read_text().splitlines()]
         return [(line[0], float(line[1])) for line in lines if len(line) == 2]
 
-    def poll(self, seconds: float = 0.0) -> int | None:
-        """Return the exit status, or None if the command still runs after ``seconds``."""
-        if self.status is None and self._server is None:
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                self.status = self._process.wait(seconds)
-        elif self.status is None and self._server is not None and self._server.answers(seconds):
-            self.status = int(self._server.line())
-        return self.status
+    def ends_within(self, seconds: float) -> bool:
+        """Wait at most ``seconds``; returns whether the command has ended."""
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(seconds)
+        return self.status is not None
 
-    def reaches(self, phase: str) -> bool:
-        """Wait until a phase starts; returns False if the command ends without it."""
-        while phase not in dict(self.phases()):
-            if self.poll() is not None:
-                return phase in dict(self.phases())
+    def wait_for(self, phase: str) -> None:
+        """Wait until a phase starts or the command ends."""
+        while phase not in dict(self.phases()) and self.status is None:
             time.sleep(0.01)
-        return True
 
     def end(self) -> str:
         """Wait until the command ends; returns its stderr."""
-        assert self.poll(600.0) is not None, "the command does not end"
+        assert self.ends_within(600.0), "the command does not end"
         return self._errors.read_text(errors="replace")
 
 
@@ -218,8 +159,7 @@ def broken(path: Path) -> bool:
 class Kills:
     """Runs rounds of kills, and counts kills and faults."""
 
-    def __init__(self, place: Path, seed: int, server: Server) -> None:
-        self._server = server
+    def __init__(self, place: Path, seed: int) -> None:
         self.whole, self.cut, self.dice = place / "whole", place / "cut", random.Random(seed)
         self.done: Counter[str] = Counter()
         self.by: Counter[str] = Counter()
@@ -229,7 +169,7 @@ class Kills:
         self.whole.mkdir()
         self._lasts: dict[str, float] = {}
         for phase in ("cells", "compare"):
-            run = Run(server, self.whole, *(["compare", "sweep", "sweep"] if phase == "compare" else WORDS))
+            run = Run(self.whole, *(["compare", "sweep", "sweep"] if phase == "compare" else WORDS))
             said = run.end()
             assert run.status == 0, said
             came = run.phases()
@@ -255,7 +195,7 @@ class Kills:
                 if self.done.total() < count:
                     self.kill(phase)
         for phase in ("cells", "compare"):  # merges files, and removes those that kills have left
-            run = self.start(phase)
+            run = Run(self.cut, *words_of(phase))
             said = run.end()
             if run.status not in (0, 1):
                 self.fault("failed", f"{phase} {run.status} {said}")
@@ -268,10 +208,6 @@ class Kills:
         shutil.rmtree(self.cut)
         self.rounds += 1
 
-    def start(self, phase: str) -> Run:
-        """Start the command that has the phase."""
-        return Run(self._server if (self.rounds + 1) % OWN else None, self.cut, *words_of(phase))
-
     def room_for(self, phase: str) -> None:
         """Remove the results of a phase that a surviving run has finished, so that the next run has the phase again."""
         if phase in ("references", "cells") and len(rows_of(self.cut)) == CELLS:
@@ -281,12 +217,12 @@ class Kills:
     def kill(self, phase: str) -> None:
         """Start the command, kill children and then the run during the phase, and count faults in the results."""
         self.room_for(phase)
-        run, kills = self.start(phase), []
-        run.reaches(phase)
+        run, kills = Run(self.cut, *words_of(phase)), []
+        run.wait_for(phase)
         before = rows_of(self.cut)
         for number in range(MOST + 1):
             lasts = 0.6 * self._lasts.get(phase, 0.5)  # the next run has less to do
-            if run.poll(self.dice.uniform(0.0, lasts)) is not None:
+            if run.ends_within(self.dice.uniform(0.0, lasts)):
                 break
             kills.append(what := self.strike(run, run.phases()[-1][0] if run.phases() else "start", number == MOST))
             if not what.endswith("child"):
@@ -338,8 +274,8 @@ class Kills:
 
 
 def main(count: int, seed: int) -> int:
-    with tempfile.TemporaryDirectory() as place, Server() as server:
-        kills = Kills(Path(place).resolve(), seed, server)
+    with tempfile.TemporaryDirectory() as place:
+        kills = Kills(Path(place).resolve(), seed)
         while kills.done.total() < count:
             kills.round(count)
             print(f"{kills.done.total()} kills", flush=True)

@@ -1,4 +1,4 @@
-"""Runs misbehaving plugins, every fault at every place: ``python tests/programs/misbehave.py COUNT [SEED]``.
+"""Runs misbehaving plugins, every fault at every place: ``python validation/misbehave.py COUNT [SEED]``.
 
 Each plugin is a file in one folder. Cases are drawn so that faults and places are equally frequent. Each plugin must be
 listed or have its own row, with a status and a reason of one line if it did harm. Cells of sound plugins must have the same

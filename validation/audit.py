@@ -1,8 +1,8 @@
-"""Measures intervals and references with a second implementation: `python tests/programs/audit.py [SETS [SECTION]]`.
+"""Measures intervals and references with a second implementation: `python validation/audit.py [SETS [SECTION]]`.
 
 The true values come from closed forms, or from code below that imports no statistics, scene or contact law of this package.
 Coverage is the share of SETS simulated data sets whose 95% interval contains the true value, without leaving out any set.
-Sections: rates, runtimes, scores, ranks, costs, cosine, tails, examine, identify, claims, references.
+Sections: runtimes, scores, costs, tails, examine, references.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 import pandas as pd
-from scipy import optimize, special, stats
+from scipy import special, stats
 
 Line = tuple[str, float, float, str]
 """What was measured, its value, the number it is compared with, and the kind: ``coverage`` or ``difference``."""
@@ -28,24 +28,6 @@ def within(interval: tuple[float, float], truth: float) -> bool:
 
 
 # ------------------------------------------------------------------------------------------- searches (optimise)
-
-
-def rates(sets: int) -> Iterator[Line]:
-    """Wilson's interval: its ends, and its exact coverage, summed over all counts, averaged over rates."""
-    from bench.measure import performance
-
-    worst = 0.0
-    for n in (1, 5, 8, 40):
-        for k in range(n + 1):
-            known = stats.binomtest(k, n).proportion_ci(0.95, "wilson")
-            worst = max(worst, *np.abs(np.subtract(performance.wilson(k, n), known)))
-    yield "success rate, ends against SciPy", worst, 1e-12, "difference"
-    grid = np.linspace(0.02, 0.98, 97)
-    for n in (8, 20):
-        ends = np.array([performance.wilson(k, n) for k in range(n + 1)])
-        inside = (ends[:, :1] <= grid) & (grid <= ends[:, 1:])
-        weights = stats.binom.pmf(np.arange(n + 1)[:, None], n, grid)
-        yield f"success rate, {n} searches", float((inside * weights).sum(axis=0).mean()), 0.95, "coverage"
 
 
 def runtimes(sets: int) -> Iterator[Line]:
@@ -90,29 +72,6 @@ def scores(sets: int) -> Iterator[Line]:
         yield f"score, {label}", share(inside), 0.95, "coverage"
         yield f"share of targets, {label}", share(reached), 0.95, "coverage"
         yield f"chance to beat the baseline, {label}", share(better), 0.95, "coverage"
-
-
-def ranks(sets: int) -> Iterator[Line]:
-    """Spearman's correlation of normal pairs: 6 / pi asin(r / 2)."""
-    from bench.measure import performance
-
-    random = np.random.default_rng(3)
-    x, y = random.integers(0, 6, (2, 30))
-    known = stats.spearmanr(x, y).statistic
-    yield (
-        "rank correlation with ties, value against SciPy",
-        abs(performance.spearman(x, y) - known),
-        1e-12,
-        "difference",
-    )
-    for n, r in ((12, 0.0), (12, 0.7), (40, 0.7)):
-        inside = []
-        truth = 6.0 / math.pi * math.asin(r / 2.0)
-        for k in range(sets // 2):
-            a = random.standard_normal(n)
-            b = r * a + math.sqrt(1 - r * r) * random.standard_normal(n)
-            inside.append(within(performance.spearman_interval([np.stack([a, b], 1)], seed=k, draws=300), truth))
-        yield f"rank correlation {truth:.2f} of {n} points", share(inside), 0.95, "coverage"
 
 
 # ---------------------------------------------------------------------------------- estimators (bias_variance)
@@ -166,30 +125,6 @@ def costs(sets: int) -> Iterator[Line]:
             label = f"factor between two costs, {how}, {tail} noise, stated in {len(ratio) / sets:.0%} of sets"
             yield label, share(ratio), 0.95, "coverage"
             yield f"relative RMSE, {tail} noise", share(errors), 0.95, "coverage"
-
-
-def cosine(sets: int) -> Iterator[Line]:
-    """Mean cosine with the reference: E cos of a normal vector around it, by quadrature over its angle."""
-    from bench.measure.statistics import Truth, summarise
-
-    worst, apart = 0.0, []
-    random = np.random.default_rng(5)
-    truth, std = np.array([3.0, -4.0]), 5.0
-    along = np.linspace(-8, 8, 2000)
-    w = np.exp(-0.5 * along**2)
-    w /= w.sum()
-    first, second = np.meshgrid(5.0 + std * along, std * along, indexing="ij")
-    mean = float(np.sum(first / np.hypot(first, second) * np.outer(w, w)))
-    for _ in range(sets):
-        estimates = truth + std * random.standard_normal((16, 2))
-        found = summarise(estimates, Truth.exact(truth), 1)
-        own = np.mean([e @ truth / np.linalg.norm(e) / 5.0 for e in estimates])
-        worst = max(worst, abs(found.cosine - own))
-        worst = max(worst, abs(found.sign_agreement - np.mean(np.sign(estimates) == np.sign(truth))))
-        apart.append(found.cosine - mean)
-    yield "cosine and signs, value", worst, 1e-12, "difference"
-    error = float(np.std(apart, ddof=1) / math.sqrt(sets))
-    yield "mean cosine, bias in standard errors", abs(float(np.mean(apart))) / error, 4.0, "difference"
 
 
 def tails(sets: int) -> Iterator[Line]:
@@ -278,96 +213,6 @@ def examine(sets: int) -> Iterator[Line]:
         )  # fmt: skip
         ratio = float(np.divide(*np.mean(gradient, axis=0)))
         yield f"gradient under noise, {label}, d = {dim}: RMS error / stated", math.sqrt(ratio), 1.2, "difference"
-
-
-# ----------------------------------------------------------------------------------------------------- identify
-
-
-def _swing(log_theta: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """Return q(t) of q'' = -k q - c q', q(0) = 3, q'(0) = 0, in closed form."""
-    k, c = np.exp(log_theta)
-    w = np.sqrt(k - c * c / 4)
-    return 3.0 * np.exp(-c * t / 2) * (np.cos(w * t) + c / (2 * w) * np.sin(w * t))
-
-
-def identify(sets: int) -> Iterator[Line]:
-    """Intervals of fitted parameters by all shooting methods, for white and for correlated noise."""
-    from bench.plugins.integrators.rk4 import Rk4
-    from bench.plugins.optimizers.gauss_newton import GaussNewton
-    from bench.plugins.scenes.mass_spring_damper import MassSpringDamper
-
-    from bench.measure import adequacy
-    from bench.model import Decision, compose
-    from bench.studies.identify import measure
-
-    names = ("stiffness", "damping")
-    scene = MassSpringDamper(damping=0.3, start=3.0)
-    model = measure.Model(compose(scene, None, Rk4(), Decision(names)), names, (0,), tuple(range(1, scene.horizon + 1)))
-    t, sigma = scene.dt * np.arange(1, scene.horizon + 1), 0.01
-    truth = np.log(model.values)
-    clean = _swing(truth, t)
-    yield (
-        "record, against the closed form, in units of the noise",
-        float(np.abs(model.record(model.values[:, None])[:, 0] - clean).max() / sigma),
-        0.01,
-        "difference",
-    )
-    for rho in (0.0, 0.5, 0.9):
-        random = np.random.default_rng([6, int(10 * rho)])
-        e = random.standard_normal((t.size, sets))
-        noise = e.copy()
-        for i in range(1, t.size):
-            noise[i] = rho * noise[i - 1] + math.sqrt(1 - rho**2) * e[i]
-        data = clean[:, None] + sigma * noise
-        start = np.repeat(1.1 * model.values[:, None], sets, axis=1)
-        if rho == 0.0:
-            first = data[:, 0]
-            own = optimize.least_squares(lambda p, y: (_swing(p, t) - y) / sigma, truth, x_scale="jac", args=(first,))
-            covariance = np.linalg.inv(own.jac.T @ own.jac)
-        for shooting in ("single", "multiple", "windows") if rho == 0.0 else ("single",):
-            unit = np.array([3.0, 3.0 * math.sqrt(model.values[0])])
-            fitting = measure.Fitting(model, shooting, 1 if shooting == "single" else 4, sigma, unit)
-            points = measure.run_fits(fitting, GaussNewton(), fitting.start(start, data), data, 20)
-            residual, jacobian = fitting.residuals(points, data), fitting.jacobians(points, data)
-            inside, wide = [], []
-            for i in range(sets):
-                slopes = measure._parameters_only(jacobian[:, :, i], 2)
-                error = np.sqrt(np.diag(np.linalg.inv(slopes.T @ slopes)))
-                inside.append(np.abs(points[:2, i] - truth) <= 1.959964 * error)
-                if shooting == "single":
-                    other = np.sqrt(np.diag(adequacy.correlated_covariance(residual[:, i], jacobian[:, :, i], 1)))
-                    wide.append(np.abs(points[:2, i] - truth) <= 1.959964 * np.maximum(error, other))
-            kind = f"noise of correlation {rho:g}"
-            yield f"{shooting} shooting, {kind}", float(np.mean(inside)), 0.95 if rho == 0.0 else math.nan, "coverage"
-            if shooting == "single":
-                yield f"intervals for correlated noise, {kind}", float(np.mean(wide)), 0.95, "coverage"
-                if rho == 0.0:
-                    apart = np.abs(points[:2, 0] - own.x).max() / np.sqrt(np.diag(covariance)).max()
-                    yield "fit against SciPy's, in standard errors", float(apart), 0.01, "difference"
-
-
-# ------------------------------------------------------------------------------------------------------- claims
-
-
-def claims(sets: int) -> Iterator[Line]:
-    """Means and variances of samples with 1.96 of their standard errors, as claims print them."""
-    from bench.claims import toolkit
-
-    laws: dict[str, tuple[Callable, float, float]] = {
-        "normal": (lambda r, size: r.standard_normal(size), 0.0, 1.0),
-        "t5": (lambda r, size: r.standard_t(5, size), 0.0, 5 / 3),
-        "exponential": (lambda r, size: r.exponential(size=size), 1.0, 1.0),
-    }
-    for name, (draw, mean, variance) in laws.items():
-        random, means, variances = np.random.default_rng([7, len(name)]), [], []
-        for _ in range(sets):
-            sample = draw(random, (2000, 2))
-            value, error = toolkit.centre(sample[:, 0])
-            means.append(abs(value - mean) <= 1.96 * error)
-            value, error = toolkit.spread(sample)
-            variances.append(abs(value - 2 * variance) <= 1.96 * error)
-        yield f"mean of 2,000 {name} numbers", share(means), 0.95, "coverage"
-        yield f"variance of 2,000 {name} numbers", share(variances), 0.95, "coverage"
 
 
 # --------------------------------------------------------------------------------------------------- references
@@ -489,7 +334,7 @@ def _compared(name: str, found, own: np.ndarray, allowed: float) -> Line:
     return label, apart / allowed, 1.0, "difference"
 
 
-SECTIONS = (rates, runtimes, scores, ranks, costs, cosine, tails, examine, identify, claims, references)
+SECTIONS = (runtimes, scores, costs, tails, examine, references)
 
 
 def main(sets: int = 200, *sections: str) -> int:
