@@ -33,7 +33,6 @@ from bench.engines.process import close_engines
 from bench.errors import Crashed, Unsupported
 from bench.experiment.keys import fingerprint
 from bench.model import LoopOps, Problem, compose, registry
-from bench.model.parameters import deciding
 
 TOYS = Path(__file__).parent / "toys"
 HERE = sys.executable
@@ -377,12 +376,6 @@ def test_a_rigid_solver_stands_for_impulses_and_has_no_gradients():
     assert (
         pickle.loads(pickle.dumps(rigid)).provides == dataclasses.replace(rigid, python=HERE).provides == rigid.provides
     )
-
-
-def test_the_default_solver_keeps_the_keys_of_rows_from_before_there_were_others():
-    newton = registry.usable("backends", "newton")
-    assert "solver" not in deciding(newton())
-    assert len({fingerprint(newton(solver=name)) for name in ("featherstone", "semi_implicit", "xpbd")}) == 3
 
 
 def test_only_an_engine_that_declares_an_error_of_its_solver_may_differ_by_it(monkeypatch):
