@@ -24,13 +24,13 @@ from typing import Any
 
 HERE = Path(__file__).resolve().parent
 ORDER = (
-    "nimble_ball", "newton_ball", "newton_cartpole", "brax_ball", "drake_ball", "genesis_ball", "taichi_ball", "warp_kernel", "mujoco_cube",
+    "nimble_ball", "newton_ball", "newton_cartpole", "brax_ball", "drake_ball", "genesis_ball", "taichi_ball", "warp_kernel",
     "gymnasium_cartpole", "jax_rollout", "torch_module", "numpy_loop", "mpc",
 )  # fmt: skip
 LIMIT = 1800
 """Seconds for one example; the examples have budgets of their own."""
 PACKAGES = {
-    "brax": "brax", "drake": "drake", "genesis": "genesis-world", "gymnasium": "gymnasium", "jax": "jax", "mujoco": "mujoco",
+    "brax": "brax", "drake": "drake", "genesis": "genesis-world", "gymnasium": "gymnasium", "jax": "jax",
     "newton": "newton", "numpy": "numpy", "pydrake": "drake", "taichi": "taichi", "torch": "torch", "warp": "warp-lang",
 }  # fmt: skip
 ELSEWHERE = {"nimble_ball": ("nimblephysics", "NIMBLE_PYTHON", ".venv-nimble/bin/python")}
@@ -104,7 +104,7 @@ def record(path: Path) -> None:
     sys.argv = [str(path)]
     runpy.run_path(str(path), run_name="__main__")
     text = path.read_text()
-    names = [name for name in imported(text) if name in PACKAGES] + ["mujoco"] * ("bench.Mjcf" in text)
+    names = [name for name in imported(text) if name in PACKAGES]
     first = sorted(names, key=lambda name: (name in ("numpy", "jax", "torch"), name))[:1]
     version = ", ".join(f"{PACKAGES[name]} {metadata.version(PACKAGES[name])}" for name in first) or foreign(path.stem)
     print(MARK + json.dumps([row(report, version, path.stem) for report in found]), flush=True)

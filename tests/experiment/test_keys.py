@@ -209,15 +209,15 @@ def test_a_name_of_bench_plugin_counts_as_the_module_that_defines_it(tmp_path):
 
 def test_what_a_users_file_imports_from_bench_counts(tmp_path):
     file = tmp_path / "sim.py"
-    file.write_text("from bench import Mjcf\n\n\ndef cost(theta):\n    return theta\n")
-    mjcf = file_of("bench.model.simulator.mjcf")
+    file.write_text("from bench import aggregate\n\n\ndef cost(theta):\n    return theta\n")
+    curves = file_of("bench.compare.curves")
     before = keys.files_hash([file])
     with pytest.MonkeyPatch.context() as patch:
         read = sources.code_hash
-        patch.setattr(sources, "code_hash", lambda path: read(path) + ("PLANTED" if path == mjcf else ""))
+        patch.setattr(sources, "code_hash", lambda path: read(path) + ("PLANTED" if path == curves else ""))
         assert keys.files_hash([file]) != before
     file.write_text("def cost(theta):\n    return theta\n")
-    assert mjcf not in code(*keys.code("sim")).values()
+    assert curves not in code(*keys.code("sim")).values()
 
 
 STUDY = """

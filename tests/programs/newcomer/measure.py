@@ -22,7 +22,6 @@ NEEDS = {
     "numpy_loop": ["-e", "."],
     "jax_function": ["-e", ".[jax]"],
     "torch_module": ["torch==2.13.0", "-e", ".[torch]"],
-    "own_mjcf": ["-e", ".[engines]"],
     "warp_kernel": ["-e", ".", "warp-lang"],
     "gym_env": ["-e", ".", "gymnasium"],
 }
