@@ -71,7 +71,7 @@ def test_every_plugin_has_a_planted_bug():
         # have planted errors in test_variance_reduction.py, test_events.py, test_surrogate.py and test_ilqr.py of tests/plugins.
         unclaimed = {
             "contacts": {"surrogate_backward"},
-            "optimizers": {"homotopy", "ilqr"},
+            "optimizers": {"ilqr"},
             "estimators": {
                 "boundary",
                 "planted",
