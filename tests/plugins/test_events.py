@@ -187,8 +187,16 @@ def test_the_closed_form_of_a_walk_without_pull_is_that_of_a_binomial():
     assert scene.closed_form_gradient(None, None)[0] == pytest.approx(expected, rel=1e-8)
 
 
-@pytest.mark.parametrize("scene", [CoinWalk(), CoinWalk(pull=-0.2, sigma=0.4), CoinWalk(push=-0.5, goal=-6.0)], ids=str)
-@pytest.mark.parametrize("estimator", [StochasticDerivative(), Boundary()], ids=str)
+@pytest.mark.parametrize(
+    ("scene", "estimator"),
+    [
+        (CoinWalk(pull=-0.2, sigma=0.4), StochasticDerivative()),
+        (CoinWalk(push=-0.5, goal=-6.0), StochasticDerivative()),
+        pytest.param(CoinWalk(pull=-0.2, sigma=0.4), Boundary(), marks=pytest.mark.slow),
+        pytest.param(CoinWalk(push=-0.5, goal=-6.0), Boundary(), marks=pytest.mark.slow),
+    ],
+    ids=str,
+)
 def test_events_in_a_row_are_unbiased(scene, estimator):
     assert agrees(estimates(estimator, scene, repeats=3000), scene.closed_form_gradient(None, None))
 
