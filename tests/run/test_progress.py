@@ -96,6 +96,16 @@ def test_refused_cells_take_no_time(monkeypatch):
     assert counted._remaining() == "about 15 s left"
 
 
+def test_a_run_says_after_5_s_which_reference_it_computes(monkeypatch, capsys):
+    clock = [100.0]
+    monkeypatch.setattr(progress.time, "monotonic", lambda: clock[0])
+    lines = progress.Lines("mine", planned(0, 12))
+    for clock[0] in (101.0, 104.9, 105.1, 106.0, 115.0, 115.2):
+        lines.working("reference of callable callable (2 of 12 references done)")
+    said = capsys.readouterr().err.splitlines()
+    assert said == ["mine: 0/12 cells; now reference of callable callable (2 of 12 references done)"] * 2
+
+
 def test_a_run_in_this_process_says_which_reference_it_is_busy_with(tmp_path, monkeypatch, capsys):
     said = threading.Event()
     compute, show = References._compute, progress.Lines.show
