@@ -255,9 +255,6 @@ def test_theta_can_be_named_parameters():
     [
         (lambda: bench.run("stiffness_swep"), "did you mean 'stiffness_sweep'"),
         (lambda: bench.run(sampels=8), "did you mean 'samples'"),
-        (lambda: bench.run(scenes=["pushin"]), "did you mean 'pushing'"),
-        (lambda: bench.run(scene={"pushing": {"mas": 1.0}}), "did you mean 'mass'"),
-        (lambda: bench.run(sweep={"stifness": [1.0]}), "did you mean 'stiffness'"),
         (lambda: bench.problem("quadratc"), "did you mean 'quadratic'"),
         (lambda: bench.problem("quadratic[sgima=1]"), "did you mean 'sigma'"),
         (lambda: bench.problem("pushing", contact="penaltie"), "did you mean 'penalty'"),

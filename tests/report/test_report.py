@@ -40,7 +40,6 @@ from bench.report.draw import draw
 from bench.report.figures import save, styled
 from bench.report.problems import split_by_problem
 from bench.report.style import PALETTE, colour, marker
-from bench.report.text import number
 from bench.run.store import Store
 from bench.studies.bias_variance import tables
 from bench.studies.bias_variance.charts import estimator_styles
@@ -159,15 +158,6 @@ def test_text_is_escaped_in_every_format(made):
     assert pd.read_csv(made.directory / "bias_variance.csv")["scene"][0] == EVIL
 
 
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [(0.0213, "0.021"), (0.996, "1.0"), (350.0, "350"), (1234.0, "1200"), (123456.0, "1.2e5"), (2e-7, "2.0e-7"),
-     (0.0, "0"), (math.nan, "-"), (math.inf, "inf")],
-)  # fmt: skip
-def test_numbers_are_short(value, text):
-    assert number(value) == text
-
-
 # -------------------------------------------------------------------------------------------------------- terminal
 
 
@@ -230,26 +220,6 @@ def drawn(rows, swept, sweep=None, **given):
 def figure_of(chart):
     with styled():
         return draw(chart)
-
-
-@pytest.mark.slow
-def test_charts_are_written_as_pictures_and_data(tmp_path):
-    made = experiment(tmp_path, formats=("png", "svg", "pdf"), sweep={"sigma": [0.1, 0.3], "stiffness": [1e2, 1e4]})
-    made.directory.mkdir()
-    rows = small_rows(sigmas=(0.1, 0.3))
-    paths = [path for path in written(made, rows) if path.stem.partition(".")[0] not in tables_names(made, rows)]
-    stems = {"bias_variance_sigma", "bias_variance_stiffness"}
-    suffixes = ("png", "svg", "pdf", "plotted.csv")
-    assert {f"{stem}.{suffix}" for stem in stems for suffix in suffixes} <= {path.name for path in paths}
-    for path in paths:
-        content = path.read_bytes()
-        starts = {".png": b"\x89PNG", ".svg": b"<?xml", ".pdf": b"%PDF"}
-        assert content.startswith(starts.get(path.suffix, b""))
-        assert len(content) > (10_000 if path.suffix in starts else 100)
-
-
-def tables_names(made, rows):
-    return {table.name for table in made.study.views(made, rows).tables} | {"findings"}
 
 
 def test_an_estimator_has_one_colour_in_all_charts():
