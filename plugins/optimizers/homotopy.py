@@ -29,15 +29,12 @@ class Homotopy(Population):
     least: float = param(1e-3, "smallest t", positive=True)
 
     def start(self, theta: np.ndarray) -> OptimizerState:
-        """Return the initial state, with the initial radius."""
         return super().start(theta) | {"radius": max(self.radius, self.least)}
 
     def draws(self, dim: int) -> int:
-        """Return the number of pairs."""
         return self.pairs
 
     def ask(self, state: OptimizerState, noise: np.ndarray) -> np.ndarray:
-        """Return theta and the pairs around it, ``(d, 1 + 2 pairs)``."""
         theta, shift = state["theta"][:, None], state["radius"] * noise
         return np.concatenate([theta, theta + shift, theta - shift], axis=1)
 
