@@ -307,7 +307,8 @@ def test_texts_come_through_as_they_are(text):
 
 def test_marks_are_a_table_with_names_of_any_kind():
     marks = {"stiffness": {"step size limit": 6400, "a: (b), [c]=1": 2}}
-    assert config.load(_override_words("marks", marks)).marks == marks
+    words = ["contacts=[penalty]", "scenes=[pushing]", "sweep.stiffness=[1e3]"]
+    assert config.load([*words, *_override_words("marks", marks)]).marks == marks
 
 
 # -------------------------------------------------------------------------------------------------- public names
