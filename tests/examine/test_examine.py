@@ -171,12 +171,6 @@ def test_gradient_that_raises_is_a_finding():
     assert "no tape" in str(report)
 
 
-def test_input_without_effect_warns_and_passes():
-    report = bench.examine(lambda x: x[0] ** 2, [1.0, 2.0], grad=lambda x: [2 * x[0], 0.0], **QUICK)
-    assert report.status == 0
-    assert "zero: theta[1]" in str(report)
-
-
 # -------------------------------------------------------------------------------------- jumps and noise
 
 
@@ -314,10 +308,6 @@ def test_jumps_of_one_height_on_every_line_are_said_to_be_so(right, second, said
 def test_a_check_under_other_noise_decides_too(right):
     report = dataclasses.replace(right, more=[dataclasses.replace(right.check, cause="missing_term")])
     assert (report.cause, report.status) == ("missing_term", 1)
-
-
-def test_smooth_line_has_no_breaks():
-    assert not scan(lambda x: np.tanh(30 * x[0]) + x[0] ** 3, np.zeros(1), np.ones(1), noise=1e-16).breaks
 
 
 def test_bias_at_a_jump_is_that_of_the_closed_form():
