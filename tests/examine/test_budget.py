@@ -76,15 +76,6 @@ def pendulum_gradients():
     yield "right", 1, lambda x, steps: mechanisms.swinging(x, steps, shared=True, slope=True)
 
 
-@pytest.fixture
-def now(monkeypatch):
-    """The time of a clock that only costs move, so that no other program counts."""
-    seconds = [0.0]
-    monkeypatch.setattr("time.perf_counter", lambda: seconds[0])
-    monkeypatch.setattr("bench.model.simulator.clock._run_delay", lambda: 0.0)
-    return seconds
-
-
 @pytest.mark.parametrize("settings", [{"calls": 400}, {"budget": 3}])
 @pytest.mark.parametrize(("fault", "steps", "slope"), [*pendulum_gradients()])
 def test_verdicts_do_not_depend_on_load(now, fault, steps, slope, settings):
