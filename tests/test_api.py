@@ -13,7 +13,6 @@ import numpy as np
 import pandas as pd
 import pytest
 import yaml
-from helpers import SPRINGY
 
 import bench
 import bench.model
@@ -91,16 +90,6 @@ def test_run_returns_its_own_rows_and_load_all_that_are_stored(rows, results):
     )
     assert len(again) == 1
     assert len(bench.load(results / "notes")) == len(rows) + 1
-
-
-def test_load_of_a_scene_parameter_named_like_one_of_the_law(tmp_path):
-    (tmp_path / "plugins").mkdir()
-    (tmp_path / "plugins" / "springy.py").write_text(SPRINGY)
-    given = {"sweep": {"springy": {"stiffness": [1, 2, 3]}}, "estimators": ["fobg"], "plugins": tmp_path / "plugins"}
-    bench.run(name="own", scenes=["springy"], results_dir=str(tmp_path / "out"), **given, **TINY)
-    found = bench.load(str(tmp_path / "out" / "own"))
-    assert list(found["springy.stiffness"]) == [1.0, 2.0, 3.0]
-    assert list(found["stiffness"]) == [1000.0] * 3
 
 
 def test_problem_and_estimate():

@@ -15,7 +15,7 @@ from helpers import approve_views
 
 import bench.report
 from bench.experiment import config
-from bench.experiment.axes import axes, table
+from bench.experiment.axes import table
 from bench.experiment.columns import COMMON
 from bench.experiment.grid import cells
 from bench.measure.gradcheck import EPS
@@ -23,9 +23,8 @@ from bench.model import registry
 from bench.report import reproduce
 from bench.report.cells import parts, readable
 from bench.report.finish import views_of
-from bench.report.problems import problem_names, problem_numbers, split_by_problem
-from bench.report.style import colour
-from bench.report.views import arrange, rows_along
+from bench.report.problems import problem_numbers
+from bench.report.views import arrange
 from bench.report.web.data import page_data
 from bench.report.writer import write
 from bench.run.files import make_directory
@@ -318,17 +317,6 @@ def test_twins_of_a_swept_scene_are_panels_of_their_own():
 # ------------------------------------------------------------------------------------------------------ swept axes
 
 
-def test_a_parameter_that_two_scenes_lend_to_their_law_keeps_every_row():
-    given, rows = made("scenes=[wall_penalty_1d,bouncing_ball]", "estimators=[fobg]", "sweep.damping=[0,1,10]")
-    shown = arrange(given, rows)
-    assert len(shown.rows) == len(rows) == 6
-    (axis,) = shown.axes
-    found = rows_along(shown, axis)
-    assert len(found) == 6
-    assert [len(family.rows) for family in split_by_problem(shown, axis)] == [3, 3]
-    assert list(shown.rows["damping"]) == [0.0, 0.0, 1.0, 1.0, 10.0, 10.0]
-
-
 def test_a_scene_with_a_stiffness_of_its_own_keeps_its_cells_apart(own):
     words = [f"plugins=['{own}']", "scenes=[sprung]", "contacts=[penalty]", "estimators=[fobg]"]
     given, rows = made(*words, "sweep.sprung.stiffness=[1,10,100]")
@@ -344,31 +332,7 @@ def test_a_scene_with_a_stiffness_of_its_own_keeps_its_cells_apart(own):
     assert len({panel.title for panel in panels}) == 3
 
 
-def test_a_swept_scene_parameter_is_a_numeric_column_and_its_default_is_named():
-    given, rows = made("scenes=[pushing]", "estimators=[fobg]", "sweep.pushing.mass=[0.1,0.2]", "sweep.horizon=[2,3]")
-    shown = arrange(given, rows)
-    assert pd.api.types.is_numeric_dtype(shown.rows["mass"])
-    assert set(shown.rows["scene"]) == {"pushing"}
-    default = registry.find("scenes", "pushing").plugin().mass
-    names = problem_names(shown, ["scene"], [axis for axis in shown.axes if axis.column == "horizon"])
-    assert set(names) == {"pushing, mass=0.1", "pushing, mass=0.2"}
-    assert default in (0.1, 0.2), "the default is one of the swept values, and left out of identity strings"
-    assert list(table(given, rows))[-3:] == ["mass", "study", "parameters"]
-
-
-def test_zipped_axes_name_each_other():
-    given, rows = made("scenes=[pushing]", "estimators=[fobg]", "sweep.zip.dt=[0.1,0.05]", "sweep.zip.horizon=[2,4]")
-    found = {axis.column: axis for axis in axes(given.sweep, rows)}
-    assert found["dt"].moves == ("horizon",)
-    assert found["horizon"].moves == ("dt",)
-    assert found["dt"].title == "dt [s], with horizon"
-
-
 # ----------------------------------------------------------------------------------------------------------- pages
-
-
-def test_colours_of_series_do_not_repeat():
-    assert len({colour(i) for i in range(24)}) == 24
 
 
 def test_a_study_without_a_page_gets_its_numbers_and_filters_by_what_varies(own):
