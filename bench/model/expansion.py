@@ -131,7 +131,7 @@ class ClosedLoop(Rollout):
         """Length of plans, reference states and gains."""
         return self._ends[-1]
 
-    @cached_property
+    @property
     def theta0(self) -> np.ndarray:
         """Return zeros."""
         return np.zeros(self.dim)
