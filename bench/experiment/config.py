@@ -56,7 +56,9 @@ def load(overrides: Sequence[str], config_dirs: Sequence[Path] = ()) -> Experime
     for override in overrides:
         key, _, value = override.lstrip("+").partition("=")
         if key == "plugins":
-            for path in _split(value):
+            for path in _split(value) or [""]:
+                if not path.strip("'\" "):
+                    raise UserError(f"{override} names no folder; the current one is plugins=.")
                 registry.add_folder(Path(path))
     for folder in config_dirs:
         if not (folder / "experiment").is_dir():
@@ -351,6 +353,10 @@ def _study(text: Any) -> Study:
 def _folder(value: Any) -> Path:
     if not isinstance(value, str | Path) or not str(value).strip():
         raise UserError(f"results_dir={value!r} must be a folder")
+    if "://" in str(value):
+        raise UserError(
+            f"results_dir={printable(value)} is an address, and results are written to a folder of this machine"
+        )
     return Path(value).expanduser()
 
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import os
+import signal
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -12,10 +14,18 @@ from bench.errors import INTERRUPTED, printable
 
 MAX_CAPTURED_CHARACTERS = 300
 """Maximum number of characters of a plugin's output that are quoted."""
-
-
+DEATH_SIGNAL = 1
+"""PR_SET_PDEATHSIG of prctl(2)."""
 SPARED: set[int] = set()
 """Ids of child processes that later cells use too, which :func:`kill_children` spares."""
+
+
+def die_with(parent: int) -> None:
+    """Make the kernel kill this process when its parent, of that id, ends (Linux)."""
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None, use_errno=True).prctl(DEATH_SIGNAL, signal.SIGKILL, 0, 0, 0)
+    if os.getppid() != parent:
+        os._exit(1)
 
 
 def exit_if_forked(pid: int) -> None:

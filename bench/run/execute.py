@@ -113,4 +113,4 @@ def _compact(store: Store, planned: Sequence[Planned]) -> None:
     try:
         store.compact([item.cell.key for item in planned])
     except StorageError as error:
-        print(f"bench: {error}; every finished cell is stored nevertheless", file=sys.stderr)
+        print(f"bench: {error}; the rows in 'pending' are merged by the next run", file=sys.stderr)

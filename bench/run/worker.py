@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import faulthandler
 import json
 import os
@@ -19,7 +18,6 @@ from typing import Any, Protocol
 
 from bench.errors import StorageError, failure
 from bench.model import guard, isolation, registry
-from bench.run.reaper import DEATH_SIGNAL
 
 LENGTH = struct.Struct(">Q")
 """The length of a message in bytes, which precedes the message."""
@@ -142,21 +140,13 @@ def first_message(make: Callable[[Any], Handler], argument: bytes, folders: tupl
 def main() -> None:
     """Handle items until the run closes the channel; ``sys.argv`` contains a descriptor and the run's process id."""
     descriptor, run = map(int, sys.argv[1:3])
-    _die_with(run)
+    guard.die_with(run)  # elsewhere than on Linux see the reaper
     # Ctrl-C reaches the run, which ends its workers
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     faulthandler.enable(all_threads=False)
     sys.argv[:] = ["bench-worker"]
     with suppress(ConnectionLost):
         _serve(Channel(socket.socket(fileno=descriptor), blocking=True))
-
-
-def _die_with(run: int) -> None:
-    """Make the kernel kill this process when its run ends, even during an item (Linux; elsewhere see the reaper)."""
-    with suppress(OSError, AttributeError):
-        ctypes.CDLL(None, use_errno=True).prctl(DEATH_SIGNAL, signal.SIGKILL, 0, 0, 0)
-    if os.getppid() != run:
-        os._exit(1)
 
 
 def _serve(channel: Channel) -> None:
@@ -166,7 +156,7 @@ def _serve(channel: Channel) -> None:
     folders, make, argument = pickle.loads(messages.pop(0))
     for folder in folders:
         registry.add_folder(folder)
-    pid = os.getpid()
+    pid, printed = os.getpid(), os.fstat(1)
     with isolation.undo_changes("a plugin, while it was imported,"):
         content = pickle.loads(argument)
     handle = make(content)
@@ -178,8 +168,9 @@ def _serve(channel: Channel) -> None:
         guard.kill_children()
         with suppress(Exception):
             sys.stdout.flush()
-        with suppress(OSError):  # a plugin may have closed it
-            os.write(1, END_OF_OUTPUT)
+        with suppress(OSError):  # a plugin may have closed it, and opened another file under its number
+            if os.path.samestat(os.fstat(1), printed):
+                os.write(1, END_OF_OUTPUT)
         channel.send(answer)
         if getattr(handle, "is_tainted", False):
             return  # the run continues in a new worker
