@@ -11,7 +11,6 @@ import traceback
 from functools import partial
 
 from bench.cli import main
-from bench.interrupts import out_of_memory
 from bench.model import guard
 from bench.run.pool import describe_exit
 
@@ -38,11 +37,11 @@ def command() -> None:
     pid = os.getpid()
     try:
         status = main()
-    except Exception as error:
-        if message := out_of_memory(error):
-            print(message, file=sys.stderr)
-        else:  # a bug of this package
-            traceback.print_exc()
+    except MemoryError:
+        print("bench: not enough memory: give the process more (4 GB suffice for most runs)", file=sys.stderr)
+        status = 1
+    except Exception:  # a bug of this package
+        traceback.print_exc()
         status = 1
     guard.exit_if_forked(pid)
     if verdict:
