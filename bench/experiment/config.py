@@ -155,7 +155,7 @@ def _to_hydra(override: str, config_dirs: Sequence[Path], values: Values) -> str
         return f"++{bare}={_quote_identities(value)}"
     if bare == "study":
         return f"study={_quote_identities(value)[1:-1]}"
-    if head in map(singular, kinds) or head in ("sweep", "marks", "ray", "slurm"):
+    if head in map(singular, kinds) or head in ("sweep", "marks", "ray"):
         return f"++{bare}={value}"
     if bare != head and (head not in ("reference", "table") or bare.count(".") > 1):
         whole = bare.rpartition(".")[0]
@@ -424,17 +424,27 @@ def _execution(config: Mapping[str, Any]) -> Execution:
         retry=tuple(_one_of("retry", status, STATUSES) for status in _as_list(config["retry"]) if status is not None),
         launcher=_one_of("launcher", config["launcher"], tuple(CLUSTERS)),
         cluster=_cluster(config, str(config["launcher"])),
+        shard=_shard(config),
     )
+
+
+def _shard(config: Mapping[str, Any]) -> tuple[int, int] | None:
+    """Return the number and the count in ``shard=3/64``, or None."""
+    if config["shard"] is None:
+        return None
+    text = str(config["shard"])
+    number, _, count = text.partition("/")
+    if not (number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count)):
+        raise UserError(f"shard={printable(text)} must be NUMBER/COUNT: of 64 shards, 1/64 to 64/64")
+    if config["ladder"]:
+        raise UserError("ladder=true needs the rows of all scenes, and shard= runs some: leave one of them out")
+    return int(number), int(count)
 
 
 CLUSTERS: dict[str, dict[str, tuple[type, bool]]] = {
     "local": {},
     "ray": {"address": (str, True), "cells": (int, False), "cpus": (float, False), "wait": (float, False)},
-    "slurm": {
-        "cluster": (str, False), **dict.fromkeys(("cells", "minutes", "cpus", "parallel"), (int, False)),
-        "wait": (float, True), **dict.fromkeys(("partition", "constraint", "account", "qos"), (str, True)),
-    },
-}  # fmt: skip
+}
 """Settings by launcher: the type of each, and whether it may be null."""
 
 
@@ -458,7 +468,6 @@ def _cluster(config: Mapping[str, Any], launcher: str) -> dict[str, Any]:
             f"ray.cpus={ray['cpus']:g} is more than the {n_cores} cores of this machine, on which a cluster is started without "
             "ray.address"
         )
-    _one_of("slurm.cluster", settings["slurm"]["cluster"], ("slurm", "local"))
     return settings[launcher]
 
 

@@ -11,7 +11,6 @@ from pathlib import Path
 import pandas as pd
 
 from bench.errors import UserError
-from bench.experiment.defaults import completed_rows
 from bench.experiment.experiment import Experiment
 from bench.experiment.study import study_of
 from bench.experiment.views import Views
@@ -22,7 +21,6 @@ from bench.report.views import newest_rows
 from bench.run.execute import Finished, store_of
 from bench.run.plan import requested_rows
 from bench.run.record import record
-from bench.run.store import sort_rows
 
 FINDINGS = 3
 """Most findings; a ladder's come first, and further ones are remarks."""
@@ -30,9 +28,7 @@ FINDINGS = 3
 
 def finish(finished: Finished, words: Sequence[str]) -> tuple[pd.DataFrame, Views, list[Path]]:
     """Write the files of a run, the record first; return the rows in the order of the cells, their views, and the files' paths."""
-    keys = finished.keys
-    rows = finished.store.load()
-    rows = completed_rows(sort_rows(rows[rows["key"].isin(keys)], keys))
+    rows = finished.rows()
     simulated = any(item.runs for item in finished.planned)
     path = record(finished.experiment, rows, list(words), finished.seconds, simulated)
     views, paths = write(finished.experiment, rows)

@@ -81,8 +81,6 @@ class Answer:
     """The last lines printed while the item was handled."""
     machine: str = ""
     """Kind of the machine that handled the item; empty for this machine."""
-    stored: bool = False
-    """Whether that machine has stored the row."""
 
 
 # ---------------------------------------------------------------------------------------------------------- a worker
