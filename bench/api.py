@@ -79,7 +79,6 @@ class Settings(TypedDict, total=False):
     columns: str | None
     rows: Names
     compile_time: bool
-    average: Names
     marks: Mapping[str, Mapping[str, float]]
 
 

@@ -532,11 +532,6 @@ VERBS = {
         _main_of("bench.report.index"), "index [DIR]", "a page over all experiments of a results folder, with the state of each",
         "DIR is results by default. Written to DIR/index.html. Nothing is simulated.\n",
     ),
-    "aggregate": Verb(
-        _main_of("bench.compare.curves"), "aggregate FILE.csv [axis=step|seconds] [better=higher|lower] [out=DIR]", "learning curves of any origin: which method is ahead over all tasks",
-        "FILE has the columns task, method, seed, return, and step or seconds. Written to out=DIR (runs/aggregate):\n"
-        "aggregate.csv and .md, curves.png and profile.png with their data.\n",
-    ),
     "history": Verb(
         _main_of("bench.compare.history"), "history DIR DIR ... [out=DIR]", "errors and failures over versions, as one small chart",
         "Directories or git revisions, the oldest first. Written to out=DIR (runs/history): history.png, .csv and .md.\n",

@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import pandas as pd
@@ -15,8 +14,7 @@ from bench.experiment.experiment import Experiment
 from bench.experiment.study import study_of
 from bench.experiment.views import Views
 from bench.model import guard
-from bench.report import averages, generic, ladder, web, writer
-from bench.report.cores import run_tasks
+from bench.report import generic, ladder, web, writer
 from bench.report.views import newest_rows
 from bench.run.execute import Finished, store_of
 from bench.run.plan import requested_rows
@@ -47,7 +45,7 @@ def report(experiment: Experiment) -> tuple[pd.DataFrame, Views, list[Path]]:
 
 
 def write(experiment: Experiment, rows: pd.DataFrame) -> tuple[Views, list[Path]]:
-    """Write tables, charts, page and averages; return the views and the files' paths. Raises :class:`UserError` without rows.
+    """Write tables, charts and page; return the views and the files' paths. Raises :class:`UserError` without rows.
 
     A study with a method ``write``, as in version 0.4, also writes files of its own.
     """
@@ -58,14 +56,10 @@ def write(experiment: Experiment, rows: pd.DataFrame) -> tuple[Views, list[Path]
         guard.protect_process(),
     ):  # building the commands that repeat cells runs code of plugins
         views = views_of(experiment, rows)
-        tasks = [
-            partial(writer.write, experiment, views),
-            partial(web.write, experiment, rows, views),
-            partial(averages.write, experiment, rows),
-        ]
+        paths = [*writer.write(experiment, views), *web.write(experiment, rows, views)]
         if own := getattr(study_of(experiment), "write", None):
-            tasks.append(partial(own, experiment, rows))
-        return views, [path for paths in run_tasks(tasks) for path in paths]
+            paths += own(experiment, rows)
+        return views, paths
 
 
 def views_of(experiment: Experiment, rows: pd.DataFrame) -> Views:
