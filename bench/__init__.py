@@ -2,7 +2,6 @@
 
 - One gradient: :func:`problem` compiles a problem, :func:`estimate` estimates its gradient.
 - Experiments: :func:`run` runs one, :func:`load` reads stored rows, :func:`compare` compares two results.
-- Learning curves of any origin: :func:`aggregate` summarises them over tasks and seeds.
 - Your own simulator: :func:`examine` reports whether its gradient is right.
 - Plugins: :func:`list` lists them, and :mod:`bench.plugin` has the contracts that their authors import.
 """
@@ -10,7 +9,7 @@
 import bench.run  # noqa: F401, before the function of the same name replaces the package here
 from bench import plugin
 from bench.api import estimate, list_plugins, load, problem, run
-from bench.compare import aggregate, compare
+from bench.compare import compare
 from bench.errors import Unsupported, UserError
 from bench.examine import examine
 
@@ -20,7 +19,6 @@ __version__ = "0.4.0"
 __all__ = [
     "Unsupported",
     "UserError",
-    "aggregate",
     "compare",
     "estimate",
     "examine",

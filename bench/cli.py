@@ -35,7 +35,7 @@ Settings:
   study=NAME sweep.AXIS=[..] theta=[mass,..] theta0=[..]
   scene.NAME.PARAMETER=..  (also contact. integrator. backend. estimator.)
   samples=N repeats=R seed=S results_dir=DIR name=FOLDER formats=[png,svg,pdf]
-  workers=N timeout=10m memory=4g on_error=stop timing=false retry=[timeout]
+  shard=3/64 workers=N timeout=10m memory=4g on_error=stop timing=false retry=[timeout]
   plugins=DIR: plugins of your own
   --config-dir DIR: experiments of your own, as DIR/experiment/NAME.yaml
   --quiet: no progress
@@ -220,7 +220,15 @@ def _load(words: Sequence[str]) -> Experiment:
 
 def _run(words: list[str]) -> int:
     finished = _execute(_load(words), words)
-    return finished if isinstance(finished, int) else _finish(finished, words)[0]
+    if isinstance(finished, int):
+        return finished
+    if finished.experiment.execution.shard is None:
+        return _finish(finished, words)[0]
+    print(
+        f"{len(finished.planned)} cells of this shard are stored in '{printable(finished.experiment.directory)}'; "
+        "when all shards have run, write tables and charts with `report` and the same words, without shard="
+    )
+    return _status(finished.rows())
 
 
 def _execute(experiment: Experiment, words: Sequence[str]) -> Finished | int:
@@ -258,6 +266,10 @@ def _show(experiment: Experiment, rows: pd.DataFrame, views: Views, paths: Seque
 
     writer.show(experiment, rows, views)
     _print_written(paths)
+    return _status(rows)
+
+
+def _status(rows: pd.DataFrame) -> int:
     return 1 if (rows["status"] == "error").any() else 0
 
 
@@ -292,10 +304,6 @@ def _plan(words: list[str]) -> int:
 
         with launcher_of(experiment):  # raises an error if the cluster does not answer, or cannot run the jobs
             pass
-    if experiment.execution.launcher == "slurm":
-        from bench.run.launchers.slurm import script
-
-        print(f"\nthe job script:\n{script(experiment)}")
     return 0
 
 
@@ -517,11 +525,6 @@ VERBS = {
     "index": Verb(
         _main_of("bench.report.index"), "index [DIR]", "a page over all experiments of a results folder, with the state of each",
         "DIR is results by default. Written to DIR/index.html. Nothing is simulated.\n",
-    ),
-    "aggregate": Verb(
-        _main_of("bench.compare.curves"), "aggregate FILE.csv [axis=step|seconds] [better=higher|lower] [out=DIR]", "learning curves of any origin: which method is ahead over all tasks",
-        "FILE has the columns task, method, seed, return, and step or seconds. Written to out=DIR (runs/aggregate):\n"
-        "aggregate.csv and .md, curves.png and profile.png with their data.\n",
     ),
     "history": Verb(
         _main_of("bench.compare.history"), "history DIR DIR ... [out=DIR]", "errors and failures over versions, as one small chart",

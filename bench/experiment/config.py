@@ -61,7 +61,9 @@ def _composed(overrides: Sequence[str], config_dirs: Sequence[Path]) -> Experime
     for override in overrides:
         key, _, value = override.lstrip("+").partition("=")
         if key == "plugins":
-            for path in _split(value):
+            for path in _split(value) or [""]:
+                if not path.strip("'\" "):
+                    raise UserError(f"{override} names no folder; the current one is plugins=.")
                 registry.add_folder(Path(path))
     for folder in config_dirs:
         if not (folder / "experiment").is_dir():
@@ -159,7 +161,7 @@ def _to_hydra(override: str, config_dirs: Sequence[Path], values: Values) -> str
         return f"++{bare}={_quote_identities(value)}"
     if bare == "study":
         return f"study={_quote_identities(value)[1:-1]}"
-    if head in map(singular, kinds) or head in ("sweep", "marks", "ray", "slurm"):
+    if head in map(singular, kinds) or head in ("sweep", "marks", "ray"):
         return f"++{bare}={value}"
     if bare != head and (head not in ("reference", "table") or bare.count(".") > 1):
         whole = bare.rpartition(".")[0]
@@ -271,7 +273,6 @@ def experiment(config: Mapping[str, Any]) -> Experiment:
         compile_time=coerce(bool, config["compile_time"], "compile_time"),
         formats=tuple(_one_of("formats", item, FORMATS) for item in _as_list(config["formats"])),
         table=_table_layout(_mapping(config, "table"), _mapping(config, "sweep")),
-        average=_average(config["average"], _mapping(config, "sweep")),
         reference=_budget(_mapping(config, "reference")),
         compile_cache=_compile_cache(config["compile_cache"]),
         plugins=registry.folders(),
@@ -290,6 +291,10 @@ def _study(text: Any) -> Study:
 def _folder(value: Any) -> Path:
     if not isinstance(value, str | Path) or not str(value).strip():
         raise UserError(f"results_dir={value!r} must be a folder")
+    if "://" in str(value):
+        raise UserError(
+            f"results_dir={printable(value)} is an address, and results are written to a folder of this machine"
+        )
     return Path(value).expanduser()
 
 
@@ -322,18 +327,6 @@ def _table_layout(settings: Mapping[str, Any], sweep: Mapping[str, Any]) -> Tabl
     if "estimator" not in rows:
         raise UserError(f"table.rows={list(rows)} must contain estimator; [estimator,backend] gives each backend a row")
     return TableLayout(columns, rows)
-
-
-def _average(names: Any, sweep: Mapping[str, Any]) -> tuple[str, ...]:
-    known = {part for name in swept(sweep) for part in (name, parameter_name(name), name.partition(".")[0])}
-    for name in _as_list(names):
-        if name not in known:
-            raise (
-                unknown("axis for average:", str(name), known)
-                if known
-                else UserError(f"average={name}: nothing is swept, so there is nothing to average over")
-            )
-    return tuple(map(str, _as_list(names)))
 
 
 def _decision(config: Mapping[str, Any]) -> Decision:
@@ -373,17 +366,27 @@ def _execution(config: Mapping[str, Any]) -> Execution:
         retry=tuple(_one_of("retry", status, STATUSES) for status in _as_list(config["retry"]) if status is not None),
         launcher=_one_of("launcher", config["launcher"], tuple(CLUSTERS)),
         cluster=_cluster(config, str(config["launcher"])),
+        shard=_shard(config),
     )
+
+
+def _shard(config: Mapping[str, Any]) -> tuple[int, int] | None:
+    """Return the number and the count in ``shard=3/64``, or None."""
+    if config["shard"] is None:
+        return None
+    text = str(config["shard"])
+    number, _, count = text.partition("/")
+    if not (number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count)):
+        raise UserError(f"shard={printable(text)} must be NUMBER/COUNT: of 64 shards, 1/64 to 64/64")
+    if config["ladder"]:
+        raise UserError("ladder=true needs the rows of all scenes, and shard= runs some: leave one of them out")
+    return int(number), int(count)
 
 
 CLUSTERS: dict[str, dict[str, tuple[type, bool]]] = {
     "local": {},
     "ray": {"address": (str, True), "cells": (int, False), "cpus": (float, False), "wait": (float, False)},
-    "slurm": {
-        "cluster": (str, False), **dict.fromkeys(("cells", "minutes", "cpus", "parallel"), (int, False)),
-        "wait": (float, True), **dict.fromkeys(("partition", "constraint", "account", "qos"), (str, True)),
-    },
-}  # fmt: skip
+}
 """Settings by launcher: the type of each, and whether it may be null."""
 
 
@@ -407,7 +410,6 @@ def _cluster(config: Mapping[str, Any], launcher: str) -> dict[str, Any]:
             f"ray.cpus={ray['cpus']:g} is more than the {n_cores} cores of this machine, on which a cluster is started without "
             "ray.address"
         )
-    _one_of("slurm.cluster", settings["slurm"]["cluster"], ("slurm", "local"))
     return settings[launcher]
 
 

@@ -17,7 +17,7 @@ LONG_LIST = re.compile(rf"\[\s*{NUMBER}(?:\s*,\s*{NUMBER}){{15,}}\s*\]")
 """A list of at least 16 numbers, which Hydra's parser would read slowly."""
 RANGE = re.compile(r"range\(([^()]*)\)")
 PLACEHOLDER = "bench_values_"
-TABLES = ("sweep", "marks", "reference", "table", "ray", "slurm")
+TABLES = ("sweep", "marks", "reference", "table", "ray")
 """Settings that are tables; the parameters of plugins are too."""
 LISTS_AS = "write key=value with lists as [a,b] and strings in quotes"
 
