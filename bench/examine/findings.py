@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bench.examine.diagnosis import NEAR, Horizon, grows, may_be_adaptive
+from bench.examine.diagnosis import Gap, Horizon, grows, may_be_adaptive
 from bench.examine.gradient import SUSPICIOUS, recaused
 from bench.examine.lines import ALIKE, LineScan
 from bench.examine.smoothing import PAIRS, TARGET_ERROR, Method, Smoothed
@@ -74,9 +74,14 @@ SEEN_ALONE = 4.0
 """Multiple of a slope's error from which the error of one number shows along most random directions."""
 DIFFERENT = 1e-6
 """Relative difference of two costs that must agree, in double precision."""
-REFINED, REFINED_FAR = 0.1, 0.3
-"""Least distance between the differences of the cost and of a refined cost, relative to the gradient's error, of a discretisation
-gap: for a small error, and for a larger one."""
+AGREES = 0.5
+"""Largest distance of a gradient that agrees with a refined cost, relative to that of the cost's own differences."""
+AS_FAR = 4.0
+"""Largest such distance over all thetas together where the steps depend on theta, so that the gradient has its own error."""
+EXCUSABLE = ("missing_term", "wrong_adjoint")
+"""Causes that a discretisation imitates: it makes no constant factor."""
+OPEN_TO_EXPECT = ("jump", "kink", "undecided", "unsettled", "unresolved", "nonfinite", "adaptive", "zero", "no_effect")
+"""Causes at theta that ``expect`` may accept; a wrong gradient stays wrong."""
 CLEAR_ORDER = 1.5
 """Order of a Taylor remainder below which it shows a wrong gradient."""
 SHOWN = 8
@@ -198,7 +203,9 @@ class Findings:
     n_failed: int
     """Number of gradient calls that raised an exception."""
     is_adaptive: bool
-    """Whether the jumps of the cost explain the error of the gradient."""
+    """Whether steps that depend on theta explain the error of the gradient, by the jumps of the cost."""
+    steps: str
+    """The place of a loop whose length depends on theta, as ``ode.py:17``; empty where none is known."""
     is_unexplained: bool
     """Whether the error is so small that adaptive steps may explain it, and the budget ended before that was known."""
     printed: Printed
@@ -211,6 +218,8 @@ class Findings:
     """Relative errors of the gradient and of the second gradient."""
     refined: Check | None = None
     """The gradient against differences of a refined cost."""
+    gaps: Sequence[Gap] = ()
+    """At theta and at others: how far gradient and cost are from the refined cost; empty without a refined cost."""
     growth: Sequence[Horizon] = ()
     """The error of the gradient by number of steps."""
     command: str = ""
@@ -329,7 +338,7 @@ class Findings:
             return "nondeterministic"
         if self.wrong_checks:
             cause = self.wrong_checks[0].cause
-            if cause in SUSPICIOUS and (self.is_adaptive if self.refined is None else self.is_discretisation_gap):
+            if cause in EXCUSABLE and self.is_discretisation_gap:
                 return "adaptive"
             if cause in (*SUSPICIOUS, "unsettled", "disconnected") and self.is_overwritten:
                 return "overwritten"
@@ -346,19 +355,20 @@ class Findings:
         return "saturated" if check.cause == "zero" else check.cause
 
     @property
-    @np.errstate(all="ignore")
     def is_discretisation_gap(self) -> bool:
-        """Whether the differences of the cost and of the refined cost are as far apart as the gradient is from the former."""
-        if self.refined is None or self.check is None:
-            return False
-        cost = {part.name: part for part in self.check.components if math.isfinite(part.error)}
-        pairs = [(cost[part.name], part) for part in self.refined.components if part.name in cost]
-        own, other, program, scale = np.array(
-            [(a.difference, b.difference, a.program, a.sample.scale) for a, b in pairs] or [(0.0, 0.0, 0.0, 1.0)]
-        ).T
-        error, apart = (float(np.linalg.norm(scale * (one - own))) for one in (program, other))
-        is_small = error <= NEAR * float(np.linalg.norm(scale * own))
-        return apart > (REFINED if is_small else REFINED_FAR) * error
+        """Whether evidence of its own says that the gradient is that of another discretisation of the same problem.
+
+        Either the gradient agrees with a refined cost where the cost's own differences do not, at every theta compared. Or
+        the steps depend on theta, and the error is of the size of the jumps that this makes, or of a refined cost's gap.
+        """
+        if not self.gaps:
+            return bool(self.steps) and self.is_adaptive
+        if all(gap.gradient <= AGREES * gap.own for gap in self.gaps):
+            return True
+        gradient, own = (
+            float(np.linalg.norm(sizes)) for sizes in zip(*((g.gradient, g.own) for g in self.gaps), strict=True)
+        )
+        return bool(self.steps) and gradient <= AS_FAR * own
 
     @property
     def is_overwritten(self) -> bool:
@@ -413,13 +423,20 @@ class Findings:
     @property
     def status(self) -> int:
         """The exit status: 0 right, 1 wrong, 3 not decided; 0 also for the expected cause, and as in the baseline."""
-        if self.is_as_before or (self.expect and self.expect == self.cause):
+        if self.is_as_before or self.is_expected:
             return 0
         if self.derivative == WRONG:
             return 1
         if self.derivative == UNSHOWN:
             return 3
         return 0 if not self.noise_cause else 3 if self.noise_cause in NOT_SHOWN else 1
+
+    @property
+    def is_expected(self) -> bool:
+        """Whether the cause is the expected one, and no wrong gradient."""
+        if not self.expect or self.expect != self.cause:
+            return False
+        return self.cause in OPEN_TO_EXPECT or self.derivative in (RIGHT, NONE)
 
     @property
     def size(self) -> float:
@@ -602,8 +619,10 @@ class Findings:
     def warnings(self) -> list[str]:
         """The warnings as sentences: findings that are not problems but deserve attention."""
         warnings = []
-        if self.expect and self.expect == self.cause:
+        if self.is_expected:
             warnings.append(f"the cause is {self.cause}, as expected")
+        elif self.expect == self.cause:
+            warnings.append(f"expect={self.expect} excuses no wrong gradient")
         elif self.expect:
             warnings.append(f"expected {self.expect}, found {self.cause}: remove expect={self.expect} if that is right")
         if self.small_errors and self.derivative == RIGHT:
