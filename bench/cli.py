@@ -412,8 +412,15 @@ def _gradcheck(words: list[str]) -> int:
     plugins = [choice.entry.plugin for choice in experiment.choices["scene"]]
     horizons = [word for word in words if _sets_horizon(word)]
     is_swept = any(word.startswith("sweep.horizon=") for word in settings)
-    if (horizons and not is_swept) or not any(plugin and "horizon" in parameters(plugin) for plugin in plugins):
+    own = {
+        int(parameters(plugin)["horizon"].default) for plugin in plugins if plugin and "horizon" in parameters(plugin)
+    }
+    if (horizons and not is_swept) or not own:
         experiment = replace(experiment, sweep={k: v for k, v in experiment.sweep.items() if k != "horizon"})
+    elif not is_swept:
+        experiment = replace(
+            experiment, sweep={**experiment.sweep, "horizon": sorted({*experiment.sweep["horizon"], *own})}
+        )
     finished = _execute(experiment, words)
     if isinstance(finished, int):
         return finished

@@ -20,7 +20,7 @@ import pytest
 from helpers import loaded
 
 from bench.cli import main
-from bench.errors import StorageError
+from bench.errors import StorageError, UserError
 from bench.model.parameters import values
 from bench.run import files, tasks
 from bench.run import store as store_module
