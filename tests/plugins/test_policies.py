@@ -111,7 +111,9 @@ def test_a_window_as_long_as_the_rollout_is_fobg(discount):
 
 
 @pytest.mark.parametrize("discount", [None, 0.7])
-@pytest.mark.parametrize("estimator", ["reinforce", "total_propagation[per=action]"])
+@pytest.mark.parametrize(
+    "estimator", ["reinforce", pytest.param("total_propagation[per=action]", marks=pytest.mark.slow)]
+)
 def test_zeroth_order_agrees_with_first_order(estimator, discount):
     exact = problem("linear", horizon=10, discount=discount)
     theta, program = exact.program.theta0, exact.program
