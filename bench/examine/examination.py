@@ -312,6 +312,7 @@ class _Examination:
             gradients=clock.gradients,
             seconds=clock.spent,
             compile_s=clock.compile_s,
+            elapsed=clock.elapsed,
             budget=clock.budget,
             calls=clock.calls,
             cost_s=clock.per_cost(),
