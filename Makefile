@@ -3,7 +3,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 RUN := $(BIN)/python -m bench
 
-.PHONY: run test lint slow docs site gallery examples clean
+.PHONY: run test lint slow slow-all docs site gallery examples clean
 
 run: $(VENV)/.installed
 	$(RUN) +experiment=stiffness_sweep
@@ -14,11 +14,14 @@ test: $(VENV)/.installed
 slow: $(VENV)/.installed
 	$(BIN)/python -m pytest -m slow --dist worksteal
 
+# The slow tests with full crossings of scenes, laws and backends instead of a design of them.
+slow-all: $(VENV)/.installed
+	$(BIN)/python -m pytest -m 'slow or full' --dist worksteal
+
 lint: $(VENV)/.installed
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/python tests/programs/words.py
 
 # The generated parts of the documents: findings, columns and marked figures.
 docs: $(VENV)/.installed
@@ -34,13 +37,13 @@ gallery: $(VENV)/.installed
 	  $(RUN) +experiment=$$name results_dir=results/standard || exit 1; done
 	$(BIN)/python -m docs.build results figures
 
-# The examples on other people's engines, in environments of their own: their pins and ours do not live together.
-examples: .venv-engines/.installed .venv-nimble/.installed
+# The examples on other people's engines, in an environment of their own: their pins and ours do not live together.
+examples: .venv-engines/.installed
 	.venv-engines/bin/python examples/table.py
 
-.venv-engines/.installed .venv-nimble/.installed: .venv-%/.installed: examples/requirements-%.txt
-	$(PYTHON) -m venv .venv-$*
-	.venv-$*/bin/python -m pip install --quiet --disable-pip-version-check -r $<
+.venv-engines/.installed: examples/requirements-engines.txt
+	$(PYTHON) -m venv .venv-engines
+	.venv-engines/bin/python -m pip install --quiet --disable-pip-version-check -r $<
 	touch $@
 
 $(VENV)/.installed: pyproject.toml constraints.txt

@@ -46,9 +46,11 @@ class Execution:
     retry: tuple[str, ...] = ()
     """Statuses of stored rows that are run again."""
     launcher: str = "local"
-    """Where cells run: ``local``, ``ray`` or ``slurm``."""
+    """Where cells run: ``local`` or ``ray``."""
     cluster: Mapping[str, Any] = field(default_factory=dict)
     """Settings of the launcher."""
+    shard: tuple[int, int] | None = None
+    """Number, from 1, and count of the parts of which this run is one; None for all cells."""
 
 
 @dataclass(frozen=True)
@@ -101,8 +103,6 @@ class Experiment:
     formats: tuple[str, ...] = ("png",)
     """File formats of the charts."""
     table: TableLayout = TableLayout()
-    average: tuple[str, ...] = ()
-    """Swept axes over which averages are written; the rows do not depend on this setting."""
     reference: Budget = Budget()
     compile_cache: Path | None = None
     """Folder in which compiled programs are cached between runs."""
@@ -136,11 +136,10 @@ class Experiment:
             "theta0": None if self.decision.at is None else list(self.decision.at),
             **{name: getattr(self, name) for name in ("samples", "repeats", "seed", "timing", "marks", "compile_time")},
             "formats": list(self.formats),
-            "average": list(self.average),
             "table": dataclasses.asdict(self.table),
             "reference": dataclasses.asdict(self.reference),
             "results_dir": str(self.results_dir),
             "compile_cache": None if self.compile_cache is None else str(self.compile_cache),
             "plugins": [str(path) for path in self.plugins],
-            "execution": dataclasses.asdict(self.execution),
+            "execution": {k: v for k, v in dataclasses.asdict(self.execution).items() if k != "shard"},
         }

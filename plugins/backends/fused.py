@@ -22,8 +22,8 @@ class Fused(Backend):
 
     JAX traces the program once for one rollout. The step and its adjoint become scalar code with an inner time loop,
     and rollouts are the lanes of vector instructions, so that states remain in registers and cache. Results equal the
-    results of ``jax`` up to rounding, also at ties. Trajectories, step Jacobians and explicit derivatives are computed
-    by ``jax``. Programs with an operation that has no scalar form are not supported.
+    results of ``jax`` up to rounding, also at ties. Trajectories and step Jacobians are computed by ``jax``. Programs
+    with an operation that has no scalar form are not supported.
     """
 
     name = "fused"
@@ -33,7 +33,6 @@ class Fused(Backend):
     provides = Jax.provides - {"surrogate"}
 
     def compile(self, program: Program) -> Problem:
-        """Return the program as a problem. A function's kernel is compiled at its first call, for all batch sizes."""
         use_double_precision()
         return FusedProblem(program, JaxOps(), self.dtype, "reverse")
 
@@ -61,7 +60,6 @@ class _PlainOps(LoopOps):
         super().__init__(jax.numpy)
 
     def scan(self, step: Any, carry: Any, xs: Any, length: int) -> Any:
-        """Return the last carry of lax.scan."""
         import jax
 
         return jax.lax.scan(lambda state, x: (step(state, x), None), carry, xs, length)[0]

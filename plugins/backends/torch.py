@@ -17,11 +17,10 @@ class Torch(Backend):
 
     name = "torch"
     requires: ClassVar[tuple[str, ...]] = ("torch",)
-    provides = Backend.provides | {"explicit", "surrogate"}
+    provides = Backend.provides | {"surrogate"}
     reference_rank: ClassVar[int | None] = 2
 
     def compile(self, program: Program) -> Problem:
-        """Return the program as a problem that runs eagerly; nothing is compiled."""
         return TorchProblem(program, self.dtype)
 
 
@@ -34,7 +33,6 @@ class TorchOps(LoopOps):
         super().__init__(array_api_compat.torch)
 
     def scan(self, step: Callable[[Any, Any], Any], carry: Any, xs: Any, length: int) -> Any:
-        """Return the last carry of a Python loop over the leading axis of ``xs``."""
         # unbind adds one graph node for all steps, while indexing would add one per step
         slices = [x.unbind(0) for x in xs]
         for t in range(length):
@@ -63,7 +61,6 @@ class TorchProblem(Problem):
         return np.asarray(cost.to(self._torch.float64).numpy())
 
     def trajectory(self, theta: np.ndarray, w: np.ndarray) -> Trajectory:
-        """Return states and controls of all steps."""
         theta = np.reshape(theta, (self.dim, -1))
         with self._torch.no_grad():
             steps = list(rollout(self.program).steps(self._ops, self._tensor(theta), self._tensor(w)))
@@ -77,10 +74,6 @@ class TorchProblem(Problem):
     def _score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         fixed = self._tensor(theta)
         return self._derivative(lambda full, w: self.program.log_probability(self._ops, fixed, full, w), theta, w)
-
-    def _explicit(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        fixed = self._tensor(theta)
-        return self._derivative(lambda full, w: self.program.explicit_cost(self._ops, fixed, full, w), theta, w)
 
     def _derivative(self, function: Callable[[Array, Array], Array], theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         """Return the derivative of column b of ``function`` by column b of theta, ``(d, B)``; 0 if it is independent.

@@ -104,10 +104,8 @@ def test_planted_fault_is_caught(plugin, fault):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("integrator", EXPLICIT, ids=named)
-@pytest.mark.parametrize(
-    "scene", [StiffDecay(), MassSpring(velocity_factor=0.9), DoublePendulum(horizon=50)], ids=named
-)
-def test_backends_agree(scene, integrator):
+def test_backends_agree(integrator):
+    scene = DoublePendulum(horizon=50)
     numpy, jax, torch = (compiled(scene, integrator, backend=backend) for backend in (Numpy(), Jax(), Torch()))
     theta, w = scene.theta0(), normal(numpy, 3)
     costs, gradients = jax.value(theta, w), jax.grad(theta, w)
@@ -196,6 +194,7 @@ def test_who_is_stable_at_any_stiffness(stiffness):
     assert radius(scene, Midpoint()) > 1
 
 
+@pytest.mark.slow
 def test_stiff_implicit_rollouts_stay_bounded():
     """At dt^2 2 k / m = 2e4, 5,000 times beyond the explicit limit."""
     scene = MassSpring(stiffness=1e8, horizon=20)
@@ -220,6 +219,28 @@ def test_mass_spring_gradient(integrator, damping):
     assert math.log2(errors[0] / errors[1]) == pytest.approx(integrator.order, abs=0.2)
 
 
+@pytest.mark.parametrize(
+    ("integrator", "step", "growth", "turn"),
+    [
+        (ExplicitEuler(), 0.1, lambda z: 1 + z, None),
+        (ImplicitEuler(), 0.1, lambda z: 1 / (1 - z), None),
+        (Midpoint(), 0.5, lambda z: 1 + z + z**2 / 2, None),
+        (Rk4(), 1.0, lambda z: 1 + z + z**2 / 2 + z**3 / 6 + z**4 / 24, None),
+        (ImplicitMidpoint(), 0.5, lambda z: (1 + z / 2) / (1 - z / 2), lambda h: 2 * math.atan(h / 2)),
+        (StormerVerlet(), 0.5, None, lambda h: math.acos(1 - h**2 / 2)),
+    ],
+    ids=lambda value: getattr(value, "name", ""),
+)
+def test_an_oscillator_grows_and_turns_as_the_stability_function_states(integrator, step, growth, turn):
+    """Squared ends of x'' = -x after 100 steps from (1, 0) and (0, 1) (Hairer, Lubich, Wanner 2006, I.1 and IX.1)."""
+    problem = compiled(MassSpring(stiffness=0.5, dt=step, horizon=100), integrator)
+    ends = problem.value(np.eye(2), np.zeros((problem.program.n_noise, 2)))
+    if growth is not None:
+        assert ends.sum() == pytest.approx(abs(growth(1j * step)) ** 200, rel=1e-9)
+    if turn is not None:
+        assert ends[0] == pytest.approx(math.cos(100 * turn(step)) ** 2, rel=1e-9)
+
+
 def energy_error(integrator, **values):
     """Largest relative error of the energy in the first and in the second half of the rollout."""
     scene = MassSpring(**values)
@@ -232,8 +253,8 @@ def energy_error(integrator, **values):
 
 @pytest.mark.parametrize("integrator", [SemiImplicitEuler(), StormerVerlet(), EventDriven()], ids=named)
 def test_symplectic_energy_is_bounded(integrator):
-    """Over 300 periods the error is that of the first ones, of order (w dt)^order: w dt = 0.1."""
-    early, late = energy_error(integrator, horizon=20_000)
+    """Over 60 periods the error is that of the first ones, of order (w dt)^order: w dt = 0.1."""
+    early, late = energy_error(integrator, horizon=4_000)
     assert early < 1.1 * 0.1**integrator.order
     assert late == pytest.approx(early, rel=0.01)
 
@@ -306,7 +327,7 @@ BOUNCES = [
     pytest.param(BouncingBall(), marks=pytest.mark.slow),
     pytest.param(BouncingBall(horizon=50, dt=0.02), marks=pytest.mark.slow),
     BouncingBall(horizon=7, dt=1 / 7),
-    BouncingBall(horizon=300, dt=0.01, velocity=1.0),
+    pytest.param(BouncingBall(horizon=300, dt=0.01, velocity=1.0), marks=pytest.mark.slow),
     pytest.param(BouncingBall(horizon=120, dt=0.01, restitution=0.7), marks=pytest.mark.slow),
     BouncingBall(horizon=120, dt=0.01, restitution=0.7, mass=3.0, velocity=-2.0),
 ]
@@ -343,7 +364,7 @@ def test_event_driven_gradients_across_noise():
     assert problem.grad(scene.theta0(), w) == pytest.approx(np.transpose(exact), rel=1e-8, abs=1e-10)
 
 
-@pytest.mark.parametrize("height", [1.0, 1.0 + 1 / 480], ids=["on_a_boundary", "within_a_step"])
+@pytest.mark.parametrize("height", [1.0, pytest.param(1.0 + 1 / 480, marks=pytest.mark.slow)])
 def test_event_driven_bounce_without_gravity(height):
     """Where the impact meets a step boundary too, which is a kink for force laws. The force of the first step acts at its middle."""
     scene = BounceOnce(height=height)
@@ -365,7 +386,7 @@ def test_event_driven_without_impacts_is_stormer_verlet():
 
 def test_event_driven_comes_to_rest():
     """After infinitely many bounces, by 1.36 s, it lies on the ground but for a sinking of less than dt^2 g / 2 a step."""
-    scene = BouncingBall(horizon=1200, restitution=0.5)
+    scene = BouncingBall(horizon=640, restitution=0.5)
     assert scene.physical_gradient() is None
     problem = compiled(scene, EventDriven(), Impulse(), Torch())
     end = scene.target - math.sqrt(problem.value(scene.theta0(), quiet(problem))[0])

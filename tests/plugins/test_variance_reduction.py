@@ -1,4 +1,4 @@
-"""Zeroth-order estimators of low variance against closed forms, and against themselves when 5% too large."""
+"""Zeroth-order estimators of low variance against closed forms."""
 
 from dataclasses import dataclass
 from types import SimpleNamespace
@@ -103,12 +103,9 @@ def test_optimal_baseline_is_computed_from_the_other_samples():
     np.testing.assert_allclose(OptimalBaseline().estimate(p, p.program.theta0, w), expected, rtol=ROUNDING)
 
 
-def known(value, score, is_explicit=False):
+def known(value, score):
     """Return a problem of one variable with a given cost and score of w."""
-    return SimpleNamespace(
-        value=lambda theta, w: value(w[0]), score=lambda theta, w: score(w), explicit=lambda theta, w: np.zeros_like(w),
-        program=SimpleNamespace(explicit=is_explicit),
-    )  # fmt: skip
+    return SimpleNamespace(value=lambda theta, w: value(w[0]), score=lambda theta, w: score(w))
 
 
 @pytest.mark.parametrize("offset", [0.0, 3.0])
@@ -125,15 +122,6 @@ def test_optimal_baseline_is_unbiased_where_the_other_samples_have_no_score(offs
     inside = 2 * (3 * (stats.norm.cdf(1.5) - 0.5) - (1.5**3 + 3 * 1.5) * stats.norm.pdf(1.5))
     assert mean == pytest.approx(3.0 - inside, rel=1e-9)
     assert 3.0 - inside == pytest.approx(2.44, abs=0.01)
-
-
-def test_optimal_baseline_with_an_explicit_derivative_needs_a_quotient_with_finite_variance():
-    """1 / s has no mean for a normal s, and s_2 / (s_2^2 + s_3^2) has no variance; with three scores both are finite."""
-    given = known(lambda w: w, lambda w: w, is_explicit=True)
-    for samples in (2, 3):
-        with pytest.raises(ValueError, match=f"at least 4 samples, got {samples}"):
-            OptimalBaseline().estimate(given, np.zeros(1), drawn(1, samples, 1))
-    assert OptimalBaseline().estimate(given, np.zeros(1), drawn(1, 4, 1)).shape == (1, 1)
 
 
 def test_a_constant_added_to_the_cost_does_not_change_the_optimal_baselines_estimate():
@@ -271,31 +259,6 @@ def test_across_an_oblique_jump_of_many_variables_quasi_random_directions_gain_l
     assert -1 - 3 / 8 - LIMIT * error < many < -1 + LIMIT * error
     one, other = slope(Sobol(), HalfSpace(dimension=1))
     assert one + LIMIT * np.hypot(error, other) < many
-
-
-UNBIASED = [OptimalBaseline(), QuadraticModel(), Sobol()]
-ORACLES = [Cubic(dimension=2, sigma=0.5), Heaviside(theta=0.05), HalfSpace(dimension=3)]
-
-
-def bias_in_standard_errors(estimator, scene):
-    values = estimates(estimator, scene, repeats=4000, samples=32)
-    bias = values.mean(axis=0) - scene.closed_form_gradient(None, None)
-    return float(np.max(np.abs(bias) / values.std(axis=0))) * np.sqrt(len(values))
-
-
-@pytest.mark.parametrize("estimator", UNBIASED, ids=str)
-@pytest.mark.parametrize("scene", ORACLES, ids=lambda scene: scene.name)
-def test_estimates_are_unbiased_and_not_if_5_percent_large(estimator, scene):
-    assert bias_in_standard_errors(estimator, scene) < LIMIT
-    method = "estimate_with_diagnostics" if isinstance(estimator, QuadraticModel) else "estimate"
-    original = getattr(type(estimator), method)
-
-    def large(self, *arguments):
-        result = original(self, *arguments)
-        return (1.05 * result[0], result[1]) if isinstance(result, tuple) else 1.05 * result
-
-    with mock.patch.object(type(estimator), method, large):
-        assert bias_in_standard_errors(estimator, scene) > LIMIT
 
 
 def test_too_few_samples_are_an_error_that_says_how_many_are_needed():
