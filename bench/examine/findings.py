@@ -508,7 +508,8 @@ class Findings:
                 return f"{text} (gradients differ by {number(100 * self.gradient_spread)}%)"
             return text
         if cause == "adaptive":
-            return f"{text} ({self._worst_size(self.wrong_checks[0])}{self._refined_text()})"
+            loop = f"; the loop at {self.steps} has another length at other thetas" if self.steps else ""
+            return f"{text} ({self._worst_size(self.wrong_checks[0])}{loop}{self._refined_text()})"
         if cause == "overwritten":
             return f"{text}{self._overwritten_text()} ({self._worst_size(self.wrong_checks[0])})"
         if cause == "zero":
