@@ -91,7 +91,7 @@ def examine(
 
     An error up to ``atol + tolerance * |derivative|`` only causes a warning; both are numbers or mappings of inputs to
     numbers. ``allow_zero`` names the inputs that may have no effect (True: all; False: none; by default they cause a
-    warning). ``expect`` is a known cause, such as ``"kink"``, with which the report passes.
+    warning). ``expect`` is a known cause, such as ``"kink"``, with which the report passes; a wrong gradient never does.
 
     ``twin`` is a second cost that must agree, and ``twin_grad`` a second gradient, such as one with a tape per step.
     ``refined`` is the cost at a tighter tolerance or finer step. ``horizons`` are numbers of steps T at which
@@ -312,6 +312,7 @@ class _Examination:
             gradients=clock.gradients,
             seconds=clock.spent,
             compile_s=clock.compile_s,
+            elapsed=clock.elapsed,
             budget=clock.budget,
             calls=clock.calls,
             cost_s=clock.per_cost(),

@@ -83,6 +83,8 @@ OPEN_TO_EXPECT = ("jump", "kink", "undecided", "unsettled", "unresolved", "nonfi
 """Causes at theta that ``expect`` may accept; a wrong gradient stays wrong."""
 CLEAR_ORDER = 1.5
 """Order of a Taylor remainder below which it shows a wrong gradient."""
+LATE = 1.2
+"""Ratio of the time on the clock to the charged time from which on both are stated."""
 SAME_FACTOR = 0.05
 """Largest relative range of ratios that are stated as one factor."""
 OVERFLOWS = 1e100
@@ -168,6 +170,8 @@ class Findings:
     """Time within the budget [s]."""
     compile_s: float
     """Time of first calls [s]."""
+    elapsed: float
+    """Time on the clock, including first calls and waiting for a processor that other programs use [s]."""
     budget: float
     calls: float
     """Limit of costs and gradients together."""
@@ -504,7 +508,8 @@ class Findings:
                 return f"{text} (gradients differ by {number(100 * self.gradient_spread)}%)"
             return text
         if cause == "adaptive":
-            return f"{text} ({self._worst_size(self.wrong_checks[0])}{self._refined_text()})"
+            loop = f"; the loop at {self.steps} has another length at other thetas" if self.steps else ""
+            return f"{text} ({self._worst_size(self.wrong_checks[0])}{loop}{self._refined_text()})"
         if cause == "overwritten":
             return f"{text}{self._overwritten_text()} ({self._worst_size(self.wrong_checks[0])})"
         if cause == "zero":
@@ -748,7 +753,7 @@ class Findings:
 
     def sentence(self, check: Check) -> str:
         """Return the verdict of a failed check as a sentence, with the numbers of the worst part."""
-        cause = EXPLANATIONS.get(check.cause, check.cause) + self._evidence(check)
+        cause = self._same_factor(check) or EXPLANATIONS.get(check.cause, check.cause) + self._evidence(check)
         if check.cause == "disconnected" and any(part.verdict in ("smooth", "nonlinear") for part in check.components):
             cause = "the gradient of some inputs is exactly 0 where the cost has a slope: they are detached"
         size = self._worst_size(check)
@@ -767,16 +772,20 @@ class Findings:
             return ", and the cost does not move at all"
         if self._is_along_theta(check):
             return "; the error is along theta itself, as of a normalisation that is left out"
-        ratios = np.array([part.ratio for part in (*wrong, *(p for p in check.draws if p.verdict == check.cause))])
-        ratios = ratios[np.isfinite(ratios)]
-        if not ratios.size:
+        ratios = ", ".join(number(part.ratio, 3) for part in wrong[:4])
+        return f" ({ratios} times the derivative, by input)" if check.cause == "wrong_factor" and len(wrong) > 1 else ""
+
+    def _same_factor(self, check: Check) -> str:
+        """Return the factor of a gradient whose ratios to the differences are nearly the same, in words; else an empty string."""
+        wrong = [part for part in (*check.components, *check.draws) if part.verdict == check.cause]
+        ratios = np.array([part.ratio for part in wrong if math.isfinite(part.ratio)])
+        if check.cause not in SUSPICIOUS or ratios.size < 2:
             return ""
-        low, high, middle = float(ratios.min()), float(ratios.max()), float(np.median(ratios))
-        if high - low <= SAME_FACTOR * abs(middle):
-            return f": {number(middle, 3)} times the derivative, here and at other thetas"
-        if check.cause == "wrong_factor":
-            return f": {', '.join(number(part.ratio, 3) for part in wrong[:4])} times the derivative, by input"
-        return f": {number(low, 3)} to {number(high, 3)} times the derivative"
+        middle = float(np.median(ratios))
+        if np.ptp(ratios) > SAME_FACTOR * abs(middle) or abs(middle - 1.0) <= SAME_FACTOR:
+            return ""
+        where = ", here and at other thetas" if any(part.component is None for part in wrong) else ""
+        return f"{number(middle, 3)} times the derivative{where}: a factor or a sign is wrong, or a term in proportion to the rest"
 
     def _where_not_a_number(self, check: Check) -> str:
         """Return at which thetas or numbers of steps a gradient is not a number, with the likely reason."""
@@ -955,7 +964,8 @@ class Findings:
                 text += f", the twin (differs by {number(100 * self.twin)}%)"
             lines.append(text)
         rest = [] if self.gradient else ["any gradient"]
-        rest += [f"{what} (budget)" for what in self.left_out]
+        limit = "calls" if math.isfinite(self.calls) and not math.isfinite(self.budget) else "budget"
+        rest += [f"{what} ({limit})" for what in self.left_out]
         if self.smoothed and self.gradient:
             rest.append(
                 f"jumps that fewer than 3 in {2 * min(one.pairs for one in self.smoothed)} draws of the noise meet"
@@ -967,7 +977,8 @@ class Findings:
             )
         is_said = any("other thetas" in what for what in self.left_out)
         if self.gradient and self.check is not None and not self.check.draws and not is_said:
-            rest.append("the gradient at other thetas around this one")
+            cut = f" ({limit})" if self.left_out or math.isfinite(self.calls) else ""
+            rest.append(f"the gradient at other thetas around this one{cut}")
         rest += (
             ["the gradient under noise on theta (no sigma)"]
             if self.gradient and not self.requested and not self.smoothed
@@ -1062,6 +1073,8 @@ class Findings:
             spent += f" and {counted(self.gradients, 'gradient')}"
         limit = f" of {duration(self.budget)}" if math.isfinite(self.budget) else ""
         spent += f" in {duration(self.seconds)}{limit}, first calls {duration(self.compile_s)}"
+        if self.elapsed > LATE * (self.seconds + self.compile_s) + 1.0:
+            spent += f" ({duration(self.elapsed)} on the clock, since other programs used the processors)"
         spent += f"; a cost takes {duration(self.cost_s)}"
         if math.isfinite(self.gradient_s):
             spent += f", a gradient {duration(self.gradient_s)}"

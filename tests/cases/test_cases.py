@@ -28,7 +28,7 @@ CASES = [
     ("c05_backward_cg:cost grad=cg", WRONG, "disconnected", ""),
     ("c05_backward_cg:cost grad=stopped", WRONG, "wrong_adjoint", ""),
     ("c05_backward_cg:cost grad=right", RIGHT, "smooth", ""),
-    ("c06_step_size:cost grad=damped", WRONG, "", "0.300 times the derivative"),
+    ("c06_step_size:cost grad=damped", WRONG, "", " times the derivative, here and at other thetas"),
     ("c07_accumulate:cost grad=doubled horizons=1,2,5,10,20", WRONG, "", "steps"),
     ("c08_lp_layer:cost grad=layer sigma=0.05,0.2", WRONG, "staircase", ""),
     ("c10_checkpoint_rng:cost grad=torch", WRONG, "", ""),
@@ -50,7 +50,7 @@ CASES = [
     ("m1_atol:cost grad=grad atol=1e-2", RIGHT, "", "small error, within the tolerance"),
     ("m1_atol:cost grad=grad", WRONG, "", ""),
     ("m1_atol:flat grad=residue sigma=0.3", WRONG, "staircase", ""),
-    ("m3_refined:cost grad=five refined=refined", WRONG, "wrong_factor", "0.960 times the derivative"),
+    ("m3_refined:cost grad=five refined=refined", WRONG, "wrong_factor", "off by 4.0%"),
     ("m3_refined:coarse grad=half refined=refined", WRONG, "wrong_factor", ""),
     ("m3_refined:coarse grad=wide refined=refined", WRONG, "wrong_factor", ""),
     ("m3_refined:coarse grad=sign refined=refined", WRONG, "wrong_factor", ""),
@@ -66,7 +66,7 @@ SCENES = [
 def test_a_public_case_gets_its_verdict(words, status, cause, said):
     place, *settings = words.split()
     file, _, name = place.partition(":")
-    report = run([f"{HERE / file}.py:{name}", *settings, "--quiet"])
+    report = run([f"{HERE / file}.py:{name}", *settings, "calls=12000", "--quiet"])
     assert report.status == status, str(report)
     assert cause in ("", report.cause), str(report)
     assert said in str(report)

@@ -266,6 +266,6 @@ def test_a_gradient_that_is_right_at_one_theta_is_said_to_be_right_there_only():
 
     few = bench.examine(lambda x: float(np.sin(x).sum()), [0.3, 0.7], grad=stale, calls=30, progress=False)
     assert "at this theta only" in few.conclusion
-    assert "other thetas around this one (budget)" in str(few)
+    assert "other thetas around this one (calls)" in str(few)
     many = bench.examine(lambda x: float(np.sin(x).sum()), [0.3, 0.7], grad=stale, progress=False)
     assert many.cause == "stale_gradient"
