@@ -293,12 +293,12 @@ def views(result: Aggregate) -> Views:
     table = Table("aggregate", result.table, COLUMNS, result.finding.rstrip("."), notes, terminal=True)
     share = replace(SHARE, label=f"share of the task's budget of {'seconds' if result.axis == 'seconds' else 'steps'}")
     charts = [
-        Chart("curves", result.finding, result.curves, [share], [IQM], series="method", labels="ends", band=True,
+        Chart("curves", result.curves, [share], [IQM], title=result.finding, series="method", labels="ends", band=True,
               subtitle=f"interquartile mean over {counted(len(result.tasks), 'task')} and all seeds, 95% intervals"),
-        Chart("profile", result.finding, result.profile, [replace(SCORE, label="score")], [ABOVE], series="method", band=True,
+        Chart("profile", result.profile, [replace(SCORE, label="score")], [ABOVE], title=result.finding, series="method", band=True,
               subtitle="score distributions: the higher curve is better, where the bands are apart"),
     ]  # fmt: skip
-    return Views([result.finding], [table], charts, remarks=result.remarks)
+    return Views([table], charts, remarks=result.remarks, headline=result.finding)
 
 
 def main(words: Sequence[str]) -> int:
@@ -316,7 +316,7 @@ def main(words: Sequence[str]) -> int:
         )
     result = aggregate_curves(names[0], settings["axis"], settings["better"])
     shown, console = views(result), terminal.open_console()
-    for sentence in (*shown.findings, *shown.remarks):
+    for sentence in (shown.headline, *shown.remarks):
         console.print(sentence)
     right = {column.heading for column in COLUMNS if column.kind == "number"}
     terminal.print_table(console, readable(shown.tables[0]), right=right)

@@ -137,7 +137,7 @@ def _frame(chart: Chart) -> pd.DataFrame:
 
 def _chart(chart: Chart) -> dict[str, Any]:
     return {
-        "title": (chart.page_title or chart.title).rstrip("."),
+        "title": chart.title or chart.name.replace("_", " ").capitalize(),
         "text": " ".join(
             filter(
                 None,
