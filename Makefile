@@ -3,7 +3,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 RUN := $(BIN)/python -m bench
 
-.PHONY: run test lint slow docs site gallery examples clean
+.PHONY: run test lint slow slow-all docs site gallery examples clean
 
 run: $(VENV)/.installed
 	$(RUN) +experiment=stiffness_sweep
@@ -14,11 +14,14 @@ test: $(VENV)/.installed
 slow: $(VENV)/.installed
 	$(BIN)/python -m pytest -m slow --dist worksteal
 
+# The slow tests with full crossings of scenes, laws and backends instead of a design of them.
+slow-all: $(VENV)/.installed
+	$(BIN)/python -m pytest -m 'slow or full' --dist worksteal
+
 lint: $(VENV)/.installed
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/python tests/programs/words.py
 
 # The generated parts of the documents: findings, columns and marked figures.
 docs: $(VENV)/.installed

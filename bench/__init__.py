@@ -7,13 +7,8 @@
 - Plugins: :func:`list` lists them, and :mod:`bench.plugin` has the contracts that their authors import.
 """
 
-# ruff: noqa: E402
-from bench.interrupts import exit_on_interrupt
-
-exit_on_interrupt()  # before the slow imports
-
 import bench.run  # noqa: F401, before the function of the same name replaces the package here
-from bench import deprecated, plugin
+from bench import plugin
 from bench.api import estimate, list_plugins, load, problem, run
 from bench.compare import aggregate, compare
 from bench.errors import Unsupported, UserError
@@ -36,9 +31,6 @@ __all__ = [
     "problem",
     "run",
 ]
-
-deprecated.install()
-__getattr__ = deprecated.lookup(__name__, globals(), dict.fromkeys(plugin.__all__, "bench.plugin") | deprecated.HOMES)
 
 
 def __dir__() -> tuple[str, ...]:

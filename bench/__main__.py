@@ -8,7 +8,6 @@ import threading
 import traceback
 
 from bench.cli import main
-from bench.interrupts import out_of_memory
 from bench.model import guard
 
 
@@ -17,11 +16,11 @@ def command() -> None:
     pid = os.getpid()
     try:
         status = main()
-    except Exception as error:
-        if message := out_of_memory(error):
-            print(message, file=sys.stderr)
-        else:  # a bug of this package
-            traceback.print_exc()
+    except MemoryError:
+        print("bench: not enough memory: give the process more (4 GB suffice for most runs)", file=sys.stderr)
+        status = 1
+    except Exception:  # a bug of this package
+        traceback.print_exc()
         status = 1
     guard.exit_if_forked(pid)
     guard.kill_children()

@@ -216,10 +216,7 @@ def _load(words: Sequence[str], notes: bool = True) -> Experiment:
         else:
             overrides.append(word)
     experiment = config.load(overrides, folders)
-    for note in [
-        *config.explain_names(overrides, folders),
-        *(config.notes(experiment, overrides, folders) if notes else ()),
-    ]:
+    for note in config.notes(experiment, overrides, folders) if notes else ():
         print(f"bench: {printable(note)}", file=sys.stderr)
     return experiment
 

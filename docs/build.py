@@ -1,4 +1,7 @@
-"""Write the generated parts of the documents: ``python -m docs.build [results|columns|figures|site|all]``.
+"""Write the generated parts of the documents: ``python -m docs.build [--check] [results|columns|figures|site|all]``.
+
+``--check`` writes nothing: it lists the documents that differ from what would be written, with the
+lines that differ, and exits with 1 if there are any.
 
 - ``results``: the part of ``docs/results.md`` between two marks, from the answers in ``results/standard``.
 - ``columns``: ``docs/columns.md``, from the columns that each study declares.
@@ -8,6 +11,7 @@
 
 from __future__ import annotations
 
+import difflib
 import os
 import re
 import sys
@@ -152,8 +156,12 @@ def figures_pages() -> list[Path]:
     return [page for page in pages if figures.MARK.search(page.read_text())]
 
 
-def main(names: Sequence[str]) -> None:
-    """Write the named parts, or all but the site if ``names`` is empty, and print their paths."""
+def main(words: Sequence[str]) -> int:
+    """Write the named parts, or all but the site without names, and print their paths; return the exit status.
+
+    With ``--check``, compare them with the documents instead, and return 1 if any differs.
+    """
+    names, is_check = [word for word in words if word != "--check"], "--check" in words
     tasks: dict[str, Callable[[], dict[Path, str]]] = {
         "results": lambda: {DOCS / "results.md": results_page(DOCS / "results.md")},
         "columns": lambda: {DOCS / "columns.md": columns_page()},
@@ -162,17 +170,31 @@ def main(names: Sequence[str]) -> None:
     allowed = [*tasks, "site", "all"]
     if unknown := [name for name in names if name not in allowed]:
         raise UserError(f"unknown part '{unknown[0]}' (allowed: {', '.join(allowed)})")
+    status = 0
     for name, task in tasks.items():
         if not names or name in names or "all" in names:
             for path, text in task().items():
-                write_whole(path, text.encode())
-                print(path.relative_to(ROOT))
-    if {"site", "all"} & set(names):
+                if not is_check:
+                    write_whole(path, text.encode())
+                    print(path.relative_to(ROOT))
+                elif path.read_text() != text:
+                    status = 1
+                    print("\n".join(difference(path, text)))
+    if {"site", "all"} & set(names) and not is_check:
         print(website.build(ROOT / "build" / "site").relative_to(ROOT))
+    return status
+
+
+def difference(path: Path, text: str) -> list[str]:
+    """Return the changed lines of a document, as a unified diff without context."""
+    name = path.relative_to(ROOT).as_posix()
+    return list(
+        difflib.unified_diff(path.read_text().splitlines(), text.splitlines(), name, "written again", n=0, lineterm="")
+    )
 
 
 if __name__ == "__main__":
     try:
-        main(sys.argv[1:])
+        sys.exit(main(sys.argv[1:]))
     except (UserError, OSError) as error:
         sys.exit(f"docs: {error}")

@@ -21,7 +21,7 @@ QUICK = (
 quarter of the time, and numbers are equal up to rounding. One module per program instead of up to 32, whose threads would
 share the cores with other tests, takes 40% off that. Processes that a test starts inherit the setting."""
 
-COMPILED = ("bench", "plugins", "tests/programs")
+COMPILED = ("bench", "plugins", "validation")
 """Folders whose bytecode is written before the tests, also where PYTHONDONTWRITEBYTECODE is set: hundreds of processes import
 their files, and compiling these takes a third of the start of a process."""
 

@@ -97,7 +97,7 @@ def test_readme_names_the_two_commands_that_set_everything_up():
     for command in commands:
         assert f"| `{command}` |" in section
         assert f"\n{command.split()[1]}: $(VENV)/.installed\n" in (ROOT / "Makefile").read_text()
-    assert "\nmake test\n" in (ROOT / ".ci" / "run").read_text()
+    assert " make test\n" in (ROOT / ".ci" / "run").read_text()
 
 
 def test_every_page_is_linked_from_the_readme():

@@ -22,8 +22,6 @@ LESSONS = {
     "The price of smoothing": "Smoothing lets a gradient see past an edge, and moves the optimum.",
     "Chaos": "Beyond the horizon of chaos derivatives are right and useless.",
     "Windows and objectives": "Shorter problems have tamer gradients, of another objective.",
-    "Steps of the optimizers": "An optimizer's rule decides how far a gradient moves theta.",
-    "Solver iterations": "A contact solver that stops early is another program, with another gradient.",
 }
 """The lessons in order, each with a summary of one sentence. Claims of other packages may add lessons."""
 

@@ -49,11 +49,6 @@ class RecordingProblem(Problem):
         """Return scores, if allowed."""
         return self._use("score", theta, w)
 
-    def explicit(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """Return explicit derivatives, which count as part of the scores."""
-        require("score" in self._allowed, "uses explicit, and score is not in needs")
-        return self._inner.explicit(theta, w)
-
     def _use(self, capability: str, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         require(capability in self._allowed, f"uses {capability}, which is not in needs")
         self.used.add(capability)

@@ -10,7 +10,7 @@ import numpy as np
 
 from bench.conformance.kit import require, verifies
 from bench.conformance.subjects import rng
-from bench.model import Answer, Expansion, Optimizer
+from bench.model import Answer, Optimizer
 from bench.model.optimizer import WANTED
 
 DIM = 4
@@ -34,23 +34,8 @@ def answer(points: np.ndarray, wanted: frozenset[str]) -> Answer:
         "gradient": SLOPES.T @ residual,
         "residual": residual,
         "jacobian": np.repeat(SLOPES[:, :, None], points.shape[1], axis=2),
-        "path": _one_step(points[:, 0]),
     }
     return Answer(**{name: known[name] for name in wanted})
-
-
-def _one_step(theta: np.ndarray) -> Expansion:
-    """Return the bowl as the stage cost of one step, whose state does not move."""
-    residual = SLOPES @ (theta - GOAL)
-    still = np.zeros((2, 1))
-
-    def follow(plans: np.ndarray, gains: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return plans, 0.5 * ((SLOPES @ (plans[0] - GOAL[:, None])) ** 2).sum(axis=0)
-
-    return Expansion(
-        theta[None], np.ones((1, 1, 1)), np.zeros((1, 1, DIM)), 0.5 * float(residual @ residual), still,
-        (SLOPES.T @ residual)[None], still[:, :, None], np.zeros((1, DIM, 1)), (SLOPES.T @ SLOPES)[None], follow,
-    )  # fmt: skip
 
 
 def search(optimizer: Optimizer, watch: Watcher | None = None, steps: int = STEPS) -> tuple[dict[str, Any], list[Any]]:

@@ -129,14 +129,11 @@ class EngineProblem(Problem):
 
     def _cost(self, states: np.ndarray, controls: np.ndarray) -> np.ndarray:
         scene = self._rolled.scene
-        n_q, weights = scene.n_q, scene.cost_weights()
+        n_q = scene.n_q
         with np.errstate(all="ignore"):
             total = np.asarray(scene.terminal_cost(np, states[-1, :n_q], states[-1, n_q:]), dtype=np.float64)
-            if weights is None:
-                weights = np.ones(scene.horizon + 1)
-            total = weights[-1] * total
-            for x, u, weight in zip(states[:-1], controls, weights, strict=False):
-                total = total + weight * scene.stage_cost(np, x[:n_q], x[n_q:], u)
+            for x, u in zip(states[:-1], controls, strict=True):
+                total = total + scene.stage_cost(np, x[:n_q], x[n_q:], u)
         return np.where(np.isfinite(states).all(axis=(0, 1)), total, np.nan)
 
     def call(self, name: str, *arrays: np.ndarray) -> list[np.ndarray]:

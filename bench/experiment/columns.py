@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import InitVar, dataclass, field
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-
-from bench import deprecated
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -60,8 +58,6 @@ class Column:
     """Whether the CSV has this column; ``rows.parquet`` always does."""
     measured: bool = False
     """Whether the value depends on the machine and its load; it is missing if cells are not timed, unless ``untimed``."""
-    judged: InitVar[ComparisonRule | None] = None
-    """The old name of ``comparison``."""
     label: str = field(default="", kw_only=True)
     """The name in headings and on axes; by default the column's name with spaces."""
     untimed: bool = field(default=False, kw_only=True)
@@ -84,11 +80,6 @@ class Column:
     """The column of words that tables append to the value, or show in place of a missing one."""
     above_one: str = field(default="", kw_only=True)
     """The meaning of values above 1; charts shade that area."""
-
-    def __post_init__(self, judged: ComparisonRule | None) -> None:
-        if judged is not None:
-            deprecated.warn("Column(judged=...)", "comparison", 4)
-            object.__setattr__(self, "comparison", judged)
 
     @property
     def heading(self) -> str:
@@ -216,11 +207,6 @@ class Columns:
         """Return the names of the columns of one kind: ``number``, ``text`` or ``list``."""
         return [column.name for column in self.all if column.kind == kind]
 
-    def named(self, kind: Kind) -> list[str]:
-        """Return :meth:`of_kind`; this is its old name."""
-        deprecated.warn("Columns.named", "Columns.of_kind")
-        return self.of_kind(kind)
-
     def blank(self) -> dict[str, Any]:
         """Return a row in which every value is missing: NaN, an empty string or an empty list."""
         return {c.name: "" if c.kind == "text" else [] if c.kind == "list" else math.nan for c in self.all}
@@ -251,6 +237,3 @@ def _numbers(listed: Any) -> Any:
     """Return a list with NaN where all its values are None, which is how Parquet stores a list of NaN."""
     is_object = isinstance(listed, np.ndarray) and listed.dtype == object and len(listed) > 0
     return np.full(len(listed), math.nan) if is_object and all(value is None for value in listed) else listed
-
-
-__getattr__ = deprecated.lookup(__name__, globals())

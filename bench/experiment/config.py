@@ -10,7 +10,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from bench import deprecated
 from bench.errors import STATUSES, UserError, printable, unknown
 from bench.experiment.experiment import Budget, Choice, Execution, Experiment, TableLayout
 from bench.experiment.grid import COUNTS, applies, is_theta_axis, parameter_name, refuse_too_many, swept
@@ -136,8 +135,7 @@ def _joined(
 def _file_of(name: str, config_dirs: Sequence[Path]) -> Path:
     """Return the file of an experiment, of the user's or of this package."""
     folders = [folder / "experiment" for folder in (*config_dirs, config_dir())]
-    paths = [folder / f"{stem}.yaml" for stem in (name, deprecated.EXPERIMENTS.get(name, name)) for folder in folders]
-    return next(path for path in paths if path.exists())
+    return next(path for folder in folders if (path := folder / f"{name}.yaml").exists())
 
 
 def _known_keys() -> frozenset[str]:
@@ -173,7 +171,10 @@ def _to_hydra(override: str, config_dirs: Sequence[Path], values: Values) -> str
             raise UserError(
                 f"'{override}': one command runs one experiment with its sweep; run one command for each experiment"
             )
-        return f"+experiment={_present_name(value, experiments(config_dirs))}"
+        names = experiments(config_dirs)
+        if value not in names:
+            raise unknown("experiment", value, names)
+        return f"+experiment={value}"
     if head.partition("/")[0] == "hydra" or key.startswith("~"):
         raise UserError(f"'{override}': Hydra's own settings cannot be changed")
     if head not in _known_keys():
@@ -189,23 +190,6 @@ def _to_hydra(override: str, config_dirs: Sequence[Path], values: Values) -> str
         whole = bare.rpartition(".")[0]
         raise UserError(f"'{bare}' is not a setting: '{whole}' has no settings of its own")
     return f"{bare}={value}"
-
-
-def _present_name(name: str, names: Sequence[str]) -> str:
-    """Return the present name of an experiment; raises :class:`UserError` if there is none."""
-    if name in names:
-        return name
-    if name not in deprecated.EXPERIMENTS:
-        raise unknown("experiment", name, names)
-    deprecated.warn(f"experiment={name}", f"experiment={deprecated.EXPERIMENTS[name]}", 5)
-    return deprecated.EXPERIMENTS[name]
-
-
-def explain_names(overrides: Sequence[str], config_dirs: Sequence[Path] = ()) -> list[str]:
-    """Return one sentence for each old name of an experiment among the overrides, with the new name."""
-    values = [value for key, _, value in (word.lstrip("+").partition("=") for word in overrides) if key == "experiment"]
-    old = [value for value in values if value in deprecated.EXPERIMENTS and value not in experiments(config_dirs)]
-    return [deprecated.sentence(f"experiment={name}", f"experiment={deprecated.EXPERIMENTS[name]}") for name in old]
 
 
 def notes(experiment: Experiment, overrides: Sequence[str], config_dirs: Sequence[Path] = ()) -> list[str]:

@@ -189,9 +189,6 @@ class _Scaled:
     def grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         return self._problem.grad(theta, w) / self._unit
 
-    def explicit(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        return self._problem.explicit(theta, w) / self._unit
-
 
 def assumes_continuity(program: Program) -> bool:
     """Return whether the scene's or the contact law's class does not declare that it is continuous.
@@ -237,7 +234,7 @@ def _sample(problem: Problem, theta: np.ndarray, provides: frozenset[str], sampl
     still = np.zeros((problem.program.n_noise, 1))
     centre = problem.value(theta, still)
     orders: dict[str, Terms] = {}
-    if not problem.program.explicit or "explicit" in provides:
+    if problem.program.has_score_gradient:
         orders["zeroth_order"] = lambda w: _antithetic(problem, theta, w, centre)
     if problem.program.continuous and "grad" in provides:
         orders["first_order"] = lambda w: problem.grad(theta, w)
@@ -245,7 +242,7 @@ def _sample(problem: Problem, theta: np.ndarray, provides: frozenset[str], sampl
     pilots = {name: terms(pilot) for name, terms in orders.items()}
     pilots = {name: terms for name, terms in pilots.items() if np.isfinite(terms).all()}
     if not pilots:
-        reason = "rollouts are not finite" if orders else "needs explicit derivatives"
+        reason = "rollouts are not finite" if orders else problem.program.no_score_gradient
         return _failed(problem, reason)
     effect = pilot @ (problem.value(theta, pilot) - centre)
     directions = _directions(effect if np.isfinite(effect).all() else still[:, 0])
@@ -505,7 +502,7 @@ def _antithetic(
     For noise on theta, ``linear (d,)`` is the gradient of a linear part of the cost. Its terms are replaced by their
     mean, ``linear``, which changes no expectation.
     """
-    terms = ((problem.value(theta, s) - centre) * problem.score(theta, s) + problem.explicit(theta, s) for s in (w, -w))
+    terms = ((problem.value(theta, s) - centre) * problem.score(theta, s) for s in (w, -w))
     mean = np.asarray(sum(terms) / 2)
     if linear is None or not linear.any():
         return mean

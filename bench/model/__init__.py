@@ -9,7 +9,6 @@ once and use the array namespace ``ops.xp`` of the backend that runs them. A par
 traced value, so Python code must not branch on it. All other types are static.
 """
 
-from bench import deprecated
 from bench.errors import Unsupported, UserError, unknown
 from bench.model.adjoint import Slopes, by_actions, by_theta, slopes
 from bench.model.adjoint import gradient as adjoint_gradient
@@ -32,12 +31,11 @@ from bench.model.estimator import (
     zeroth_order,
 )
 from bench.model.events import events_of, undeclared_jumps
-from bench.model.expansion import PathOptimizer
 from bench.model.integrator import Integrator
 from bench.model.known_solutions import Identified, KnownOptimum, KnownValue
 from bench.model.manifold import JointScene, difference, n_changes, retract, slope_by_changes
 from bench.model.ops import Array, LoopOps, Ops, State, stopped
-from bench.model.optimizer import Answer, Descent, Expansion, Optimizer, Population
+from bench.model.optimizer import Answer, Descent, Optimizer, Population
 from bench.model.optimizer import State as OptimizerState
 from bench.model.parameters import Plugin, param
 from bench.model.policy import Policy, PolicyRollout, PolicyScene, affine, uniform
@@ -95,7 +93,6 @@ __all__ = [
     "Estimator",
     "EventScene",
     "Events",
-    "Expansion",
     "ForceLaw",
     "FrictionScene",
     "FunctionProgram",
@@ -113,7 +110,6 @@ __all__ = [
     "Optimizer",
     "OptimizerState",
     "Oscillator",
-    "PathOptimizer",
     "Plugin",
     "Policy",
     "PolicyRollout",
@@ -163,5 +159,3 @@ __all__ = [
     "unknown",
     "zeroth_order",
 ]
-
-__getattr__ = deprecated.lookup(__name__, globals())

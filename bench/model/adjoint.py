@@ -61,15 +61,11 @@ def slopes(problem: Problem, theta: np.ndarray, w: np.ndarray) -> Slopes:
     noisy = full if program.action_noise else full + scene.sigma * w[: program.dim]
     before, controls = _flatten(path.states[:-1]), _flatten(path.controls)
 
-    weights = scene.cost_weights()
-
     def stage(x: np.ndarray, u: np.ndarray) -> np.ndarray:
-        value = np.asarray(0.0 * x[0] + scene.stage_cost(np, *_split(program, x), u))
-        return value if weights is None else np.repeat(weights[:-1], count) * value
+        return np.asarray(0.0 * x[0] + scene.stage_cost(np, *_split(program, x), u))
 
     def end(x: np.ndarray) -> np.ndarray:
-        value = np.asarray(scene.terminal_cost(np, *_split(program, x)))
-        return value if weights is None else weights[-1] * value
+        return np.asarray(scene.terminal_cost(np, *_split(program, x)))
 
     def back(x: np.ndarray) -> np.ndarray | None:
         return scene.feedback(np, np.tile(noisy, (1, horizon)), *_split(program, x))

@@ -10,7 +10,7 @@ from bench.model.parameters import Plugin, param
 from bench.model.problem import Problem
 from bench.model.program import Program
 
-CAPABILITIES = frozenset({"value", "grad", "score", "explicit", "surrogate", "root", "physics", "simulator"})
+CAPABILITIES = frozenset({"value", "grad", "score", "surrogate", "root", "physics", "simulator"})
 """The capabilities that a backend may provide."""
 
 
@@ -22,7 +22,6 @@ class Backend(Plugin):
     provides: ClassVar[frozenset[str]] = frozenset({"value", "grad", "score"})
     """Capabilities, a subset of :data:`CAPABILITIES`.
 
-    - ``explicit``: differentiates the cost by theta at given actions, see :meth:`Problem.explicit`.
     - ``surrogate``: computes the gradient that a contact law declares in place of the derivative.
     - ``simulator``: runs only users' own simulators, see :class:`CallableScene`.
     - ``physics``: steps a scene's :meth:`~EngineTwin.mjcf` twin with the engine's integrator and contact solver. Its

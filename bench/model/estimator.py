@@ -40,12 +40,6 @@ class Estimator(Plugin):
     """Whether the estimator is also unbiased for costs with jumps in theta."""
     diagnostics: ClassVar[tuple[str, ...]] = ()
     """Names of the arrays that :meth:`estimate_with_diagnostics` returns in addition, for example ``weight``."""
-    includes_explicit_derivative: ClassVar[bool] = False
-    """Whether the estimator adds :meth:`Problem.explicit` to cost times score.
-
-    Without this term, cost times score is biased if theta sets the initial state and noise is on the actions, so the
-    estimator is not supported for such programs.
-    """
     needs_directions: ClassVar[bool] = False
     """Whether it uses each sample's noise as a direction in theta space, which needs at least d numbers per sample."""
     couples_samples: ClassVar[bool] = False
@@ -90,12 +84,8 @@ class Estimator(Plugin):
         if "grad" in self.needs and program.surrogate and "surrogate" not in provides:
             law = program.contact.name if program.contact else ""
             return f"{self.name} needs the surrogate gradient of contact law {law}, and {backend} computes differences of costs"
-        if "score" in self.needs and program.explicit:
-            condition = f"theta sets the initial state of {program.scene.name} while noise is on the actions, so "
-            if not self.includes_explicit_derivative:
-                return f"{condition}cost times score lacks a term, which {self.name} does not add"
-            if "explicit" not in provides:
-                return f"{condition}{self.name} needs explicit, which {backend} lacks"
+        if "score" in self.needs and not program.has_score_gradient:
+            return f"{self.name} needs scores, but {program.no_score_gradient}"
         own = program.n_noise - program.exogenous
         if self.needs_directions and own < program.dim:
             return f"{self.name} needs {program.dim} normal numbers per sample, and the noise model has {own}"
@@ -151,8 +141,7 @@ def per_repeat(values: np.ndarray, noise: np.ndarray) -> np.ndarray:
 def halves(problem: Problem, theta: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return first-order terms of the first half of the samples, zeroth-order terms of the rest, each ``(R, N/2, d)``.
 
-    The zeroth-order terms are (f - f at w = 0) times the score, plus the explicit derivative. Raises ValueError for
-    fewer than 4 samples.
+    The zeroth-order terms are (f - f at w = 0) times the score. Raises ValueError for fewer than 4 samples.
     """
     half = noise.shape[1] // 2
     if half < 2:
@@ -166,10 +155,10 @@ def first_order(problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.nd
 
 
 def zeroth_order(problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
-    """Return (f - f at w = 0) times the score of each sample plus the explicit derivative, ``(R, N, d)``."""
+    """Return (f - f at w = 0) times the score of each sample, ``(R, N, d)``."""
     w = columns(noise)
     cost = problem.value(theta, w) - problem.value(theta, np.zeros((w.shape[0], 1)))
-    return per_repeat(cost * problem.score(theta, w) + problem.explicit(theta, w), noise)
+    return per_repeat(cost * problem.score(theta, w), noise)
 
 
 def best_gradient(problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:

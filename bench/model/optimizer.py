@@ -3,52 +3,15 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from bench.model.parameters import Plugin
 
-if TYPE_CHECKING:
-    from bench.model.backend import Backend
-    from bench.model.problem import Problem
-    from bench.model.program import Program
-
 State = dict[str, Any]
 """The complete state of an optimizer between two steps: arrays and numbers by name, including ``theta (d,)``."""
-
-
-class Expansion(NamedTuple):
-    """The rollout of T controls without noise, with derivatives of its steps and costs.
-
-    m is the length of a control and k of a change of the state. Second derivatives of the steps are not included.
-    """
-
-    controls: np.ndarray
-    """``(T, m)``."""
-    a: np.ndarray
-    """d next state / d state, ``(T, k, k)``."""
-    b: np.ndarray
-    """d next state / d control, ``(T, k, m)``."""
-    cost: float
-    """Sum of the stage costs and the terminal cost."""
-    cost_x: np.ndarray
-    """Derivatives of the stage costs and of the terminal cost by the state, ``(T + 1, k)``."""
-    cost_u: np.ndarray
-    """Derivatives of the stage costs by the control, ``(T, m)``."""
-    cost_xx: np.ndarray
-    """``(T + 1, k, k)``."""
-    cost_ux: np.ndarray
-    """``(T, m, k)``."""
-    cost_uu: np.ndarray
-    """``(T, m, m)``."""
-    follow: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
-    """From plans ``(T, m, B)`` and gains ``(T, m, k)``: the controls ``(T, m, B)`` and costs ``(B,)`` of B rollouts.
-
-    The controls are the plan plus the gains times the change of the state from this rollout.
-    """
 
 
 class Answer(NamedTuple):
@@ -62,8 +25,6 @@ class Answer(NamedTuple):
     """Residuals of a least-squares cost, ``(m, B)``. The cost is half the sum of their squares."""
     jacobian: np.ndarray | None = None
     """Derivatives of the residuals with respect to theta, ``(m, d, B)``."""
-    path: Expansion | None = None
-    """The noise-free rollout at the only point, with the derivatives of its steps and costs."""
 
 
 WANTED = frozenset(Answer._fields)
@@ -97,14 +58,6 @@ class Optimizer(Plugin):
     def required_fields(self, state: State) -> frozenset[str]:
         """Return the fields of the answer that the next step uses; by default :attr:`needs`."""
         return self.needs
-
-    def unsupported_reason(self, program: Program) -> str | None:
-        """Return why this optimizer's own limits exclude the program, or None."""
-        return None
-
-    def expansion(self, problem: Problem, backend: Backend, theta: np.ndarray) -> Expansion:
-        """Return the field ``path`` of the answer at ``theta (d,)``; an optimizer that needs it is a `PathOptimizer`."""
-        raise NotImplementedError(f"optimizer {self.name} needs path: derive it from PathOptimizer")
 
     @abstractmethod
     def tell(self, state: State, theta: np.ndarray, answer: Answer) -> State:

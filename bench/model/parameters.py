@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any, ClassVar, Self, TypeVar, cast
 
-from bench import deprecated
 from bench.errors import UserError, printable, unknown
 
 LARGEST = 2**53
@@ -71,7 +70,6 @@ class Plugin(ABC):  # noqa: B024, each kind has its own abstract methods
 
     def __init_subclass__(cls, **arguments: Any) -> None:
         super().__init_subclass__(**arguments)
-        deprecated.rename_members(cls)
         _require_annotations(cls)
 
     def __new__(cls, *_: Any, **__: Any) -> Self:

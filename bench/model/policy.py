@@ -2,28 +2,21 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, ClassVar, cast
 
 import numpy as np
 
 from bench.errors import Unsupported
 from bench.model import registry
-from bench.model.contact import ContactLaw
 from bench.model.identity import parse_identity
-from bench.model.integrator import Integrator
-from bench.model.ops import Array, LoopOps, Ops, State
+from bench.model.ops import Array, Ops, State
 from bench.model.parameters import Plugin, build, param, parameters, remember
-from bench.model.program import OWN, Decision, Rollout
+from bench.model.program import Rollout
 from bench.model.scene import MechanicalScene
-
-FLOOR = 1e-5
-"""Added to the variance of an observation that is normalised, so that a constant one does not divide by 0."""
 
 
 @dataclass(frozen=True)
@@ -91,23 +84,6 @@ class PolicyRollout(Rollout):
 
     scene: PolicyScene
 
-    def __init__(
-        self,
-        scene: PolicyScene,
-        contact: ContactLaw | None,
-        integrator: Integrator | None,
-        decision: Decision = OWN,
-    ) -> None:
-        super().__init__(scene, contact, integrator, decision)
-        if scene.normalise and scene.moments is None:
-            self.scene = dataclasses.replace(scene)
-            object.__setattr__(self.scene, "moments", observed_moments(scene, contact, integrator))
-
-    @cached_property
-    def structure(self) -> tuple[Any, ...]:
-        """The key of the computation graph, with the moments of the observations, which are compiled in."""
-        return (*super().structure, *(part.tobytes() for part in self.scene.moments or ()))
-
     @property
     def exogenous(self) -> int:
         """Number of normal numbers of the random start, the last rows of w."""
@@ -147,29 +123,18 @@ class PolicyScene(MechanicalScene):
     """A role: the controls are a :class:`Policy` of observations, u_t = pi(theta, o(x_t)) + sigma w_t.
 
     Theta holds the policy's parameters. Every rollout starts at a random state if ``n_start`` is not 0, and J is the
-    mean over starts too. One step of ``dt`` is a control step, made of ``substeps`` steps of the integrator. With the
-    discount c, the cost of step t counts c^t times and the terminal cost c^horizon times. After :meth:`has_ended` the
-    state no longer moves, and :meth:`stage_cost` should be 0 there.
-
-    With ``normalise`` the inputs of the policy are (o - mean) / deviation, measured once, see :func:`observed_moments`.
+    mean over starts too. One step of ``dt`` is a control step, made of ``substeps`` steps of the integrator. After
+    :meth:`has_ended` the state no longer moves, and :meth:`stage_cost` should be 0 there.
     """
 
     n_observations: ClassVar[int]
     n_start: ClassVar[int] = 0
     """Number of standard normal numbers that decide the start of one rollout."""
-    moments: ClassVar[tuple[np.ndarray, np.ndarray] | None] = None
-    """Mean and deviation of the observations, each ``(n_observations, 1)``, in a program with ``normalise``."""
     program_type: ClassVar[type[Rollout] | None] = PolicyRollout
 
     noise: str = param("action", "whether noise is on the actions or on theta", choices=("action", "parameter"))
     policy: str = param("linear", "policy, as name or name[parameter=value,...]")
     substeps: int = param(1, "steps of the integrator per control step", positive=True)
-    discount: float | None = param(None, "factor on the cost per control step; null: 1", positive=True, high=1.0)
-    normalise: int = param(
-        0,
-        "rollouts under the initial policy whose observations give the mean and deviation that normalise its inputs; 0: none",
-        low=0,
-    )
 
     def __post_init__(self) -> None:
         _ = self.plugin  # raises the error of an invalid policy
@@ -191,24 +156,9 @@ class PolicyScene(MechanicalScene):
         """Return the policy's initial parameters, ``(d,)``."""
         return self.plugin.initial(self.n_observations, self.n_u)
 
-    def cost_weights(self) -> np.ndarray | None:
-        """Return the powers of the discount, ``(horizon + 1,)``; None without one."""
-        if self.discount is None or self.discount == 1.0:
-            return None
-        return np.asarray(self.discount ** np.arange(self.horizon + 1.0))
-
     def feedback(self, xp: Any, theta: Array, q: Array, v: Array) -> Array:
         """Return the controls of the policy, ``(n_u, B)``."""
-        return self.plugin.act(xp, theta, self.normalised(xp, self.observation(xp, q, v)))
-
-    def normalised(self, xp: Any, observation: Array) -> Array:
-        """Return the inputs of the policy: the observation, less its mean and over its deviation with ``normalise``."""
-        if not self.normalise:
-            return observation
-        if self.moments is None:
-            raise Unsupported("only a program has the moments that normalise observations: use compose and its scene")
-        mean, deviation = (xp.asarray(part, dtype=observation.dtype) for part in self.moments)
-        return (observation - mean) / deviation
+        return self.plugin.act(xp, theta, self.observation(xp, q, v))
 
     def controls_of(self, xp: Any, action: Array) -> Array:
         """Return the controls of a trained network's actions ``(n_u, B)``, which have no bound: the actions themselves."""
@@ -225,36 +175,6 @@ class PolicyScene(MechanicalScene):
             return None
         total, by_state = _product(self, theta.shape, states.shape, by_theta)(theta, states, weights)
         return np.asarray(total), np.asarray(by_state)
-
-
-@remember
-def observed_moments(
-    scene: PolicyScene, contact: ContactLaw | None, integrator: Integrator | None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean and deviation of the observations along rollouts, each ``(n_observations, 1)``.
-
-    The ``normalise`` rollouts start at random and follow the initial policy without noise. They are computed in NumPy
-    from seed 0, so that all backends, thetas and estimators get the same numbers. States after an end do not count.
-    Raises :class:`Unsupported` where NumPy cannot run them.
-    """
-    plain = dataclasses.replace(scene, normalise=0, noise="action")
-    program = PolicyRollout(plain, contact, integrator)
-    if program.needs:
-        raise Unsupported(
-            f"{scene.name}.normalise measures observations along rollouts in NumPy, which lacks {', '.join(sorted(program.needs))}"
-        )
-    starts = np.random.default_rng(0).standard_normal((scene.n_start, scene.normalise))
-    w = np.concatenate([np.zeros((program.n_noise - scene.n_start, scene.normalise)), starts])
-    seen = []
-    with np.errstate(all="ignore"):
-        for state, _ in list(program.steps(LoopOps(), program.theta0[:, None], w))[:-1]:
-            ended = plain.has_ended(np, *state)
-            observation = plain.observation(np, *state)
-            seen.append(observation if ended is None else observation[:, ~ended])
-    every = np.concatenate(seen, axis=1)
-    if not np.isfinite(every).all():
-        raise Unsupported(f"{scene.name}.normalise: rollouts under the initial policy are not finite")
-    return every.mean(axis=1, keepdims=True), np.sqrt(every.var(axis=1, keepdims=True) + FLOOR)
 
 
 def uniform(xp: Any, e: Array) -> Array:
@@ -293,7 +213,7 @@ def _product(scene: PolicyScene, theta: tuple[int, ...], states: tuple[int, ...]
         return total, jnp.moveaxis(by_state, 0, 1)
 
     jax.config.update("jax_enable_x64", True)
-    key = (scene, *(part.tobytes() for part in scene.moments or ()), theta, states, by_theta)
+    key = (scene, theta, states, by_theta)
     if key not in _products:
         _products[key] = jax.jit(product)
     return _products[key]

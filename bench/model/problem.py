@@ -15,7 +15,6 @@ from bench.model import blocks
 from bench.model.program import Program
 
 NOT_DEFINED = "{0} computes no {1}: define {0}._{2}, or leave '{2}' out of the backend's `provides`"
-NO_EXPLICIT = "{} does not differentiate by theta at given actions, which the score of this program needs"
 
 
 class Trajectory(NamedTuple):
@@ -146,23 +145,15 @@ class Problem(ABC):
         raise Unsupported(f"{type(self).__name__} has one method of differentiation")
 
     def score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """Return the score d log p(actions | theta)/dtheta of each sample, ``(d, B)``: w / sigma for noise on theta."""
+        """Return the score d log p(actions | theta)/dtheta of each sample, ``(d, B)``: w / sigma for noise on theta.
+
+        Raises :class:`Unsupported` if cost times score is not the gradient, see :attr:`Program.has_score_gradient`.
+        """
         if self.noise_on_theta:
             return w[: self.dim] / self.sigma
-        if self.program.explicit and type(self)._explicit is Problem._explicit:
-            raise Unsupported(NO_EXPLICIT.format(type(self).__name__))
+        if not self.program.has_score_gradient:
+            raise Unsupported(self.program.no_score_gradient)
         return self._blocks(self._score, theta, w, (self.dim,))
-
-    def explicit(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """Return each sample's explicit derivative, ``(d, B)``: of the cost with respect to theta at given actions.
-
-        The gradient of J is the mean of cost times score plus the explicit derivative, which is 0 unless the program is
-        :attr:`~Program.explicit`. Then it counts as a gradient in :attr:`usage`.
-        """
-        if not self.program.explicit:
-            return np.zeros((self.dim, w.shape[1]))
-        self.usage.gradients += w.shape[1]
-        return self._blocks(self._explicit, theta, w, (self.dim,))
 
     def trajectory(self, theta: np.ndarray, w: np.ndarray) -> Trajectory:
         """Return states and controls along each rollout; raises :class:`Unsupported` if the backend has none."""
@@ -224,6 +215,3 @@ class Problem(ABC):
 
     def _score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         raise Unsupported(NOT_DEFINED.format(type(self).__name__, "scores", "score"))
-
-    def _explicit(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        raise Unsupported(NO_EXPLICIT.format(type(self).__name__))

@@ -146,12 +146,17 @@ class Program(ABC):
         return not self.action_noise
 
     @property
-    def explicit(self) -> bool:
-        """Whether theta affects the cost, or the states that a policy observes, other than through the mean actions.
+    def has_score_gradient(self) -> bool:
+        """Whether the mean of cost times score is the gradient: theta affects the cost through the noisy numbers only."""
+        return True
 
-        E[f score] then lacks the explicit derivative of f, see :meth:`explicit_cost`.
-        """
-        return False
+    @property
+    def no_score_gradient(self) -> str:
+        """The reason for which cost times score is not the gradient, where :attr:`has_score_gradient` is false."""
+        return (
+            f"theta sets the initial state of scene {self.scene.name} while noise is on the actions, so that cost times "
+            "score is not the gradient"
+        )
 
     @property
     def exogenous(self) -> int:
@@ -193,7 +198,6 @@ class Program(ABC):
 
     def bind(self, parameters: Any) -> Program:
         """Return a copy of this program with the values ``parameters (p,)``, possibly traced, see :meth:`parameters`."""
-        _ = self.explicit  # caches the value for the copy, in which it cannot be computed from traced values
         places = [(axis, name) for axis, plugin in self.parts.items() for name in traced(plugin)]
         return self._with(dict(zip(places, parameters, strict=False)))
 
@@ -275,14 +279,6 @@ class Program(ABC):
         """
         return ops.xp.sum(w[: self.dim] * theta_scored, axis=0) / self.scene.sigma
 
-    def explicit_cost(self, ops: Ops, theta: Array, theta_moved: Array, w: Array) -> Array:
-        """Return the cost at ``theta_moved`` under the actions of a rollout with theta and w, ``(B,)``.
-
-        With E over the actions, grad J = E[f score + d explicit_cost / d theta_moved] (Williams 1992 for the score,
-        Schulman et al. 2015, eq. 3, for both). Needed only if the program is :attr:`explicit`.
-        """
-        return self.cost(ops, theta, w)
-
     def _own_theta(self, xp: Any, theta: Array, w: Array) -> tuple[Program, Array]:
         """Return the program with parameters from noisy theta, each ``(B,)``, and the scene's own theta ``(d', B)``."""
         noisy = theta + self.scene.sigma * w
@@ -356,9 +352,9 @@ class Rollout(Program):
         return scene.feedback(np, np.zeros((self.dim, 1)), np.zeros((scene.n_q, 1)), np.zeros((n_v, 1))) is None
 
     @property
-    def explicit(self) -> bool:
-        """Whether theta sets the initial state of a program whose noise is on the actions."""
-        return self.action_noise and self._moves_start
+    def has_score_gradient(self) -> bool:
+        """Whether cost times score is the gradient: not if theta sets the initial state and noise is on the actions."""
+        return not (self.action_noise and self._moves_start)
 
     @property
     def _only_controls(self) -> bool:
@@ -396,17 +392,10 @@ class Rollout(Program):
         """Return sum_t w_t . pi(theta_scored, x_t) / sigma along the rollout's states x_t, ``(B,)``.
 
         This is the part of log p(actions) that is linear in the change of the policy pi. The rollout uses theta and w.
-        If the program is :attr:`explicit`, it starts at the initial state of ``theta_scored`` with the same actions.
         """
         # a held control is drawn once, but the sum contains it at each of its steps
         scale = self.scene.sigma * (self.scene.horizon // self.scene.controls)
-        if self.explicit:
-            return self._replayed(ops, theta, theta_scored, w)[1] / scale
         return self._rollout(ops, theta, w, theta_scored)[1] / scale
-
-    def explicit_cost(self, ops: Ops, theta: Array, theta_moved: Array, w: Array) -> Array:
-        """Return the cost from the initial state of ``theta_moved`` under the actions of theta and w, ``(B,)``."""
-        return self._replayed(ops, theta, theta_moved, w)[0]
 
     def resolved(self, ops: Ops, theta: Array, w: Array) -> tuple[Rollout, Array, Array]:
         """Return program, theta and noise with the named parameters set from theta; unchanged if none are named."""
@@ -483,7 +472,6 @@ class Rollout(Program):
         theta, state, scanned = self.start(ops, theta, w)
         planned_scored = None if theta_scored is None else scene.planned_controls(xp, theta_scored)
         extra = () if planned_scored is None else (planned_scored,)
-        weights, last_weight = self._weights(xp, w)
         # a scan's carry must have a constant shape and type
         zero = xp.zeros_like(w[0, :])
 
@@ -492,52 +480,13 @@ class Rollout(Program):
             drawn = slices[: len(scanned)]
             u = self.control(ops, theta, state, drawn)
             if theta_scored is not None:
-                scored = [*slices[len(scanned) :][: len(extra)], scene.feedback(xp, theta_scored, state.q, state.v)]
+                scored = [*slices[len(scanned) :], scene.feedback(xp, theta_scored, state.q, state.v)]
                 logp = logp + sum(xp.sum(drawn[-1] * part, axis=0) for part in scored if part is not None)
-            stage = scene.stage_cost(xp, state.q, state.v, u)
-            cost = cost + (slices[-1] * stage if weights else stage)
+            cost = cost + scene.stage_cost(xp, state.q, state.v, u)
             return self.step(ops, state, u), cost, logp
 
-        state, cost, logp = ops.scan(step, (state, zero, zero), scanned + extra + weights, scene.horizon)
-        end = scene.terminal_cost(xp, state.q, state.v)
-        return cost + (last_weight * end if weights else end), logp
-
-    def _replayed(self, ops: Ops, theta: Array, theta_moved: Array, w: Array) -> tuple[Array, Array]:
-        """Return cost and sum_t w_t . pi(theta_moved, x_t), each ``(B,)``, along the states x_t.
-
-        The states start at the initial state of ``theta_moved``, under the actions of a rollout with theta and w.
-        """
-        scene, xp = self.scene, ops.xp
-        theta, first, scanned = self.start(ops, theta, w)
-        theta_moved, second, scanned_moved = self.start(ops, theta_moved, w)
-        weights, last_weight = self._weights(xp, w)
-        zero = xp.zeros_like(w[0, :])
-
-        def step(
-            carry: tuple[State, State, Array, Array], slices: tuple[Array, ...]
-        ) -> tuple[State, State, Array, Array]:
-            state, moved, cost, logp = carry
-            drawn, planned = slices[: len(scanned)], slices[len(scanned) :][: len(scanned_moved) - 1]
-            u = self.control(ops, theta, state, drawn)
-            for part in (*planned, scene.feedback(xp, theta_moved, moved.q, moved.v)):
-                if part is not None:
-                    logp = logp + xp.sum(drawn[-1] * part, axis=0)
-            stage = scene.stage_cost(xp, moved.q, moved.v, u)
-            cost = cost + (slices[-1] * stage if weights else stage)
-            return self.step(ops, state, u), self.step(ops, moved, u), cost, logp
-
-        # the second rollout needs only its own plan, since both have the same noise
-        inputs = scanned + scanned_moved[:-1] + weights
-        _, last, cost, logp = ops.scan(step, (first, second, zero, zero), inputs, scene.horizon)
-        end = scene.terminal_cost(xp, last.q, last.v)
-        return cost + (last_weight * end if weights else end), logp
-
-    def _weights(self, xp: Any, w: Array) -> tuple[tuple[Array, ...], float]:
-        """Return the weights of the stage costs as a scan's input, empty if all are 1, and that of the terminal cost."""
-        weights = self.scene.cost_weights()
-        if weights is None:
-            return (), 1.0
-        return (xp.asarray(weights[:-1], dtype=w.dtype),), float(weights[-1])
+        state, cost, logp = ops.scan(step, (state, zero, zero), scanned + extra, scene.horizon)
+        return cost + scene.terminal_cost(xp, state.q, state.v), logp
 
 
 class _VaryingOps:

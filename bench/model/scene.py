@@ -167,10 +167,6 @@ class MechanicalScene(Scene):
         """Return the cost of one step from the state before the step, ``(B,)``."""
         return 0.0
 
-    def cost_weights(self) -> np.ndarray | None:
-        """Return the weights of the stage costs and of the terminal cost in J, ``(horizon + 1,)``; None: all are 1."""
-        return None
-
     def cost_terms(self, xp: Any, q: Array, v: Array, u: Array) -> Mapping[str, Array]:
         """Return parts of the stage cost by name, each ``(B,)``, for separate display by ``trace``; none by default."""
         return {}

@@ -3,7 +3,6 @@
 :mod:`bench.model` describes the conventions: frozen dataclasses, declared parameters, component-first arrays.
 """
 
-from bench import deprecated
 from bench.engines.backend import EngineBackend
 from bench.engines.node import StepNode
 from bench.experiment.cell import Cell
@@ -19,5 +18,3 @@ __all__ = [
     *_contracts, "COMMON", "Cell", "Chart", "Column", "Columns", "ComparisonRule", "EngineBackend", "Experiment", "Mark", "Note", "Session", "StepNode", "Study",
     "Style", "Table", "Views",
 ]  # fmt: skip
-
-__getattr__ = deprecated.lookup(__name__, globals())

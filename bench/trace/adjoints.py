@@ -50,16 +50,13 @@ def adjoints(program: Rollout, theta: np.ndarray, w: np.ndarray, path: Jacobians
         theta = jnp.broadcast_to(theta, (theta.shape[0], count))
         return bound.control(ops, theta, at(bound.scene, before, change), slices)
 
-    given = program.scene.cost_weights()
-    weights = np.ones(count + 1) if given is None else given
-
     def stage(theta: Array, change: Array, u: Array) -> Array:
         scene = program.resolved(ops, theta, w)[0].scene
-        return jnp.sum(weights[:-1] * jnp.asarray(scene.stage_cost(jnp, *at(scene, before, change), u)))
+        return jnp.sum(jnp.broadcast_to(scene.stage_cost(jnp, *at(scene, before, change), u), count))
 
     def terminal(theta: Array, change: Array) -> Array:
         scene = program.resolved(ops, theta, w)[0].scene
-        return jnp.sum(weights[-1] * scene.terminal_cost(jnp, *at(scene, end, change)))
+        return jnp.sum(scene.terminal_cost(jnp, *at(scene, end, change)))
 
     def along(e: Array) -> Array:
         return jax.jvp(lambda x: controls(column, x), (still,), (jnp.broadcast_to(e[:, None], still.shape),))[1]

@@ -152,14 +152,13 @@ def _norms(matrices: np.ndarray) -> np.ndarray:
 def _costs(scene: MechanicalScene, path: Jacobians) -> dict[str, np.ndarray]:
     """Return costs by column, each ``(T + 1,)``: stage costs and terms per step, the terminal cost at the last state."""
     states, u = path.states.T, path.controls.T
-    before, given = split(scene, states[:, :-1]), scene.cost_weights()
-    weights = np.ones(states.shape[1]) if given is None else given
+    before = split(scene, states[:, :-1])
 
     def staged(value: Any) -> np.ndarray:
-        return per_state(np.broadcast_to(weights[:-1] * value, u.shape[1]))
+        return per_state(np.broadcast_to(value, u.shape[1]))
 
     terms = {"stage": staged(scene.stage_cost(np, *before, u))}
     terms["terminal"] = np.full(states.shape[1], np.nan)
-    terms["terminal"][-1] = weights[-1] * scene.terminal_cost(np, *split(scene, states[:, -1:]))[0]
+    terms["terminal"][-1] = scene.terminal_cost(np, *split(scene, states[:, -1:]))[0]
     terms |= {name: staged(value) for name, value in scene.cost_terms(np, *before, u).items()}
     return {f"cost_{name}": values for name, values in terms.items()}

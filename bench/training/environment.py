@@ -46,8 +46,6 @@ class Environment:
             raise Unsupported(f"scene {scene.name} is not a policy problem: it has no observations and random starts")
         if getattr(ops.xp, "__name__", "") != "jax.numpy":
             raise Unsupported("training needs a backend with the operations of jax.numpy, such as jax, implicit or mjx")
-        if scene.cost_weights() is not None:
-            raise Unsupported(f"trainers have a discount of their own: {scene.name}.discount must be 1")
         self.program, self.ops, self.dtype = program, ops, dtype
 
     @property

@@ -6,17 +6,20 @@ import numpy as np
 from bench.plugins.backends.numpy import Numpy
 from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
 from bench.plugins.optimizers.cem import Cem
-from bench.plugins.optimizers.ilqr import Ilqr
 from bench.plugins.optimizers.mppi import Mppi
 from bench.plugins.scenes.pendulum_swing import PendulumSwing
 from scipy.stats import t as student
 
-from bench.plugin import Answer, LoopOps, State, compose, param
+from bench.plugin import Answer, LoopOps, State, compose, param, slopes
 
 STEPS, AHEAD = 60, 25
 """Steps of 0.1 s in a run, and at most in a plan that is made again."""
 ITERATIONS = 4
-"""Iterations of the optimizer at each step."""
+"""Iterations of a plan at each step."""
+SHARES = 0.5 ** np.arange(10)
+"""Shares of a change of all controls that iLQR tries."""
+SUFFICIENT = 1e-4
+"""Share of the predicted descent that iLQR requires."""
 SIGMAS, SEEDS = (0.3, 1.0), 20
 
 
@@ -38,47 +41,95 @@ def swing(steps, angle=0.0, rate=0.0):
     return Numpy().compile(compose(From(horizon=steps, angle=angle, rate=rate), None, SemiImplicitEuler()))
 
 
-def improved(optimizer, state, problem, rng):
-    """Return the optimizer's state after one iteration on the cost without noise."""
-    points = optimizer.ask(state, rng.standard_normal((problem.dim, optimizer.draws(problem.dim))))
-    if "path" in optimizer.needs:
-        return optimizer.tell(state, points, Answer(path=optimizer.expansion(problem, Numpy(), state["theta"])))
-    return optimizer.tell(state, points, Answer(problem.value(points, np.zeros_like(points))))
+def sampled(optimizer):
+    """Return a planner ``(problem, theta, rng) -> theta`` that improves controls by an optimizer on the cost without noise."""
+
+    def improved(problem, theta, rng):
+        state = optimizer.start(theta)
+        for _ in range(ITERATIONS):
+            points = optimizer.ask(state, rng.standard_normal((problem.dim, optimizer.draws(problem.dim))))
+            state = optimizer.tell(state, points, Answer(problem.value(points, np.zeros_like(points))))
+        return state["theta"]
+
+    return improved
+
+
+def ilqr(problem, theta, rng=None, iterations=ITERATIONS):
+    """Return controls ``(T,)`` improved by the iterative linear-quadratic regulator (Li, Todorov 2004).
+
+    Trial rollouts apply shares of the regulator's changes with the whole gains, so that they stay near the plan.
+    """
+    for _ in range(iterations):
+        path = slopes(problem, theta, np.zeros((problem.dim, 1)))
+        changes, gains, descent, curvature = regulator(problem.program.scene, path)
+        states = path.states[:, :, 0]
+        for share in SHARES:
+            controls, cost = followed(problem, theta + share * changes, gains, states)
+            if path.cost.sum() - cost > SUFFICIENT * (share * descent - 0.5 * share**2 * curvature):
+                theta = controls
+                break
+    return theta
+
+
+def regulator(scene, path):
+    """Return changes ``(T,)``, gains ``(T, 2)``, and slope and curvature of the descent along the changes.
+
+    They minimise the cost of the linearised steps. The second derivatives of this scene's cost are constants.
+    """
+    a, b, cost_x, cost_u = path.a[..., 0], path.b[:, :, 0, 0], path.cost_x[..., 0], path.cost_u[:, 0, 0]
+    changes, gains, descent, curvature = np.empty(len(b)), np.empty((len(b), 2)), 0.0, 0.0
+    value_x, value_xx = cost_x[-1], 2.0 * scene.terminal * np.eye(2)
+    for t in reversed(range(len(b))):
+        x, u = cost_x[t] + a[t].T @ value_x, cost_u[t] + b[t] @ value_x
+        xx, ux = 2.0 * np.eye(2) + a[t].T @ value_xx @ a[t], b[t] @ value_xx @ a[t]
+        uu = 2.0 * scene.effort + b[t] @ value_xx @ b[t]
+        changes[t], gains[t] = -u / uu, -ux / uu
+        descent, curvature = descent + u**2 / uu, curvature + u**2 / uu
+        value_x, value_xx = x + ux * changes[t], xx + np.outer(ux, gains[t])
+    return changes, gains, descent, curvature
+
+
+def followed(problem, plan, gains, states):
+    """Return controls ``(T,)`` and cost of the rollout under the plan plus gains times the distance from ``states (T + 1, 2)``."""
+    controls = []
+
+    def control(t, x):
+        controls.append(plan[t] + gains[t] @ (x - states[t]))
+        return controls[-1]
+
+    cost = run_cost(control, 0.0, np.zeros(len(plan)), problem.program)
+    return np.array(controls), cost
 
 
 def best_plan():
-    """Return the best controls without noise, their cost, states ``(STEPS + 1, 2)`` and gains ``(STEPS, 1, 2)``."""
-    problem, optimizer = swing(STEPS), Ilqr()
-    state = optimizer.start(problem.program.theta0)
-    for _ in range(30):
-        state = improved(optimizer, state, problem, np.random.default_rng(0))
-    path = optimizer.expansion(problem, Numpy(), state["theta"])
-    states = problem.trajectory(state["theta"], np.zeros((STEPS, 1))).states[:, :, 0]
-    return state["theta"], path.cost, states, optimizer.backward(path, 0.0)[1]
+    """Return the best controls without noise, their cost, states ``(STEPS + 1, 2)`` and gains ``(STEPS, 2)``."""
+    problem = swing(STEPS)
+    theta = ilqr(problem, problem.program.theta0, iterations=30)
+    path = slopes(problem, theta, np.zeros((STEPS, 1)))
+    return theta, float(path.cost.sum()), path.states[:, :, 0], regulator(problem.program.scene, path)[1]
 
 
-def run_cost(control, sigma, noise):
-    """Return the cost of one run under ``control(t, x)``, to which sigma times ``noise (STEPS,)`` is added."""
-    program, ops, state, total = swing(STEPS).program, LoopOps(), State(np.zeros((1, 1)), np.zeros((1, 1))), 0.0
-    for t in range(STEPS):
+def run_cost(control, sigma, noise, program=None):
+    """Return the cost of one run under ``control(t, x)``, to which sigma times ``noise (T,)`` is added."""
+    program, ops, total = program or swing(STEPS).program, LoopOps(), 0.0
+    state = program.scene.initial_state(np, np.zeros((1, 1)))
+    for t in range(len(noise)):
         u = np.full((1, 1), control(t, np.concatenate(state)[:, 0]) + sigma * noise[t])
         total += program.scene.stage_cost(np, *state, u)[0]
         state = program.step(ops, state, u)
     return float(total + program.scene.terminal_cost(np, *state)[0])
 
 
-def receding(optimizer, seed):
+def receding(planner, seed):
     """Return a law that improves a plan from the present state, applies its first control and shifts the rest."""
     plan, rng = np.full(AHEAD, 0.1), np.random.default_rng([seed, 1])
 
     def control(t, x):
         nonlocal plan
         problem = swing(min(AHEAD, STEPS - t), *x)
-        state = optimizer.start(plan[: problem.dim])
-        for _ in range(ITERATIONS):
-            state = improved(optimizer, state, problem, rng)
-        plan = np.append(state["theta"][1:], 0.0)
-        return state["theta"][0]
+        theta = planner(problem, plan[: problem.dim], rng)
+        plan = np.append(theta[1:], 0.0)
+        return theta[0]
 
     return control
 
@@ -88,10 +139,10 @@ def laws(seed):
     theta, _, states, gains = PLAN
     return {
         "plan made once": lambda t, x: theta[t],
-        "plan made once, with gains": lambda t, x: theta[t] + float(gains[t, 0] @ (x - states[t])),
-        "MPPI at each step": receding(Mppi(population=64, width=1.0, temperature=0.1), seed),
-        "CEM at each step": receding(Cem(population=64, elites=8, width=1.0), seed),
-        "iLQR at each step": receding(Ilqr(), seed),
+        "plan made once, with gains": lambda t, x: theta[t] + gains[t] @ (x - states[t]),
+        "MPPI at each step": receding(sampled(Mppi(population=64, width=1.0, temperature=0.1)), seed),
+        "CEM at each step": receding(sampled(Cem(population=64, elites=8, width=1.0)), seed),
+        "iLQR at each step": receding(ilqr, seed),
     }
 
 

@@ -22,8 +22,8 @@ class Fused(Backend):
 
     JAX traces the program once for one rollout. The step and its adjoint become scalar code with an inner time loop,
     and rollouts are the lanes of vector instructions, so that states remain in registers and cache. Results equal the
-    results of ``jax`` up to rounding, also at ties. Trajectories, step Jacobians and explicit derivatives are computed
-    by ``jax``. Programs with an operation that has no scalar form are not supported.
+    results of ``jax`` up to rounding, also at ties. Trajectories and step Jacobians are computed by ``jax``. Programs
+    with an operation that has no scalar form are not supported.
     """
 
     name = "fused"

@@ -33,7 +33,7 @@ class Jax(Backend):
 
     name = "jax"
     requires: ClassVar[tuple[str, ...]] = ("jax",)
-    provides = Backend.provides | {"explicit", "surrogate"}
+    provides = Backend.provides | {"surrogate"}
     compiles = True
     reference_rank: ClassVar[int | None] = 0
 
@@ -154,9 +154,6 @@ class JaxProblem(Problem):
     def _score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         return self._call(self._score_function, theta, w)
 
-    def _explicit(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        return self._call(self._explicit_function, theta, w)
-
     def trajectory(self, theta: np.ndarray, w: np.ndarray) -> Trajectory:
         """Return states and controls from a scan that stores them."""
         return Trajectory(*self._parts(self._trajectory, theta, w))
@@ -234,12 +231,6 @@ class JaxProblem(Problem):
             return self.program.bind(parameters).log_probability(self._ops, theta, scored, w)
 
         return self._derivative(log_probability, theta, w.shape[1])
-
-    def _explicit_function(self, parameters: Array, theta: Array, w: Array) -> Array:
-        def cost(moved: Array) -> Array:
-            return self.program.bind(parameters).explicit_cost(self._ops, theta, moved, w)
-
-        return self._derivative(cost, theta, w.shape[1])
 
     def _derivative(self, function: Callable[[Array], Array], theta: Array, batch: int) -> Array:
         """Return the derivative of column b of ``function`` by column b of theta, ``(d, B)``; NaN for nonfinite values.

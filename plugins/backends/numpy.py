@@ -16,7 +16,6 @@ class Numpy(Backend):
     """Gradients: central differences, 2 d rollouts each, error O(step^2); float64 or float32; no implicit equations."""
 
     name = "numpy"
-    provides = Backend.provides | {"explicit"}
     reference_rank: ClassVar[int | None] = 3
 
     step: float | None = param(
@@ -68,21 +67,12 @@ class NumpyProblem(Problem):
         return self._differences(lambda moved, w: self._value(moved, w), theta, w)
 
     def _score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        return self._differences_by_moved(self._bound.log_probability, theta, w)
-
-    def _explicit(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        return self._differences_by_moved(self._bound.explicit_cost, theta, w)
-
-    def _differences_by_moved(
-        self, function: Callable[..., np.ndarray], theta: np.ndarray, w: np.ndarray
-    ) -> np.ndarray:
-        """Return the derivative of ``function(ops, theta, moved, w)`` by ``moved`` at theta, ``(d, B)``."""
         self.usage.rollouts += 2 * self.dim * w.shape[1]
 
         def at(moved: np.ndarray, w: np.ndarray) -> np.ndarray:
             fixed = np.tile(theta, (1, moved.shape[1] // theta.shape[1])) if theta.shape[1] > 1 else theta
             with np.errstate(all="ignore"):
-                return np.asarray(function(self._ops, fixed, moved, w), dtype=np.float64)
+                return np.asarray(self._bound.log_probability(self._ops, fixed, moved, w), dtype=np.float64)
 
         return self._differences(at, theta, w)
 

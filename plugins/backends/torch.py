@@ -17,7 +17,7 @@ class Torch(Backend):
 
     name = "torch"
     requires: ClassVar[tuple[str, ...]] = ("torch",)
-    provides = Backend.provides | {"explicit", "surrogate"}
+    provides = Backend.provides | {"surrogate"}
     reference_rank: ClassVar[int | None] = 2
 
     def compile(self, program: Program) -> Problem:
@@ -77,10 +77,6 @@ class TorchProblem(Problem):
     def _score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         fixed = self._tensor(theta)
         return self._derivative(lambda full, w: self.program.log_probability(self._ops, fixed, full, w), theta, w)
-
-    def _explicit(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        fixed = self._tensor(theta)
-        return self._derivative(lambda full, w: self.program.explicit_cost(self._ops, fixed, full, w), theta, w)
 
     def _derivative(self, function: Callable[[Array, Array], Array], theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         """Return the derivative of column b of ``function`` by column b of theta, ``(d, B)``; 0 if it is independent.

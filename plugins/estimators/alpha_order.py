@@ -24,7 +24,6 @@ class AlphaOrder(DiagnosticEstimator):
 
     name = "alpha_order"
     needs = frozenset({"value", "grad", "score"})
-    includes_explicit_derivative = True
     unbiased = False
     diagnostics: ClassVar[tuple[str, ...]] = ("alpha", "eps")
 

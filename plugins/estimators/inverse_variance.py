@@ -19,7 +19,6 @@ class InverseVariance(DiagnosticEstimator):
 
     name = "inverse_variance"
     needs = frozenset({"value", "grad", "score"})
-    includes_explicit_derivative = True
     unbiased = False
     diagnostics: ClassVar[tuple[str, ...]] = ("weight",)
 

@@ -15,27 +15,24 @@ class OptimalBaseline(Estimator):
     Each sample's b_i is computed from the other samples, so the result is unbiased for any cost. It is the mean of their f
     where all their scores are 0. On a + g w + h w^2
     with w standard normal, the variance per sample is 2 g^2 + 6 h^2 in units of 1 / sigma^2, against 2 g^2 + 10 h^2
-    with the mean of f as baseline. If theta also sets the initial state, the explicit derivative of f is added, and b_i
-    minimises the variance of the sum. Requires costs and scores, and at least 2 samples. With the explicit derivative it
-    requires at least 4, since the quotient in b_i has no mean over one other sample, and no variance over two.
+    with the mean of f as baseline. Requires costs and scores, and at least 2 samples.
     """
 
     name = "optimal_baseline"
     needs = frozenset({"value", "score"})
-    includes_explicit_derivative = True
     unbiased_at_discontinuities = True
 
     def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Return the mean of the terms over samples, ``(R, d)``; ValueError for too few samples."""
-        count, least = noise.shape[1], 4 if problem.program.explicit else 2
-        if count < least:
-            raise ValueError(f"{self.name} needs at least {least} samples, got {count}")
+        count = noise.shape[1]
+        if count < 2:
+            raise ValueError(f"{self.name} needs at least 2 samples, got {count}")
         w = columns(noise)
         f = per_repeat(problem.value(theta, w), noise)[..., None]
         score = per_repeat(problem.score(theta, w), noise)
         # a constant added to f is removed by every baseline, and a small f has smaller rounding errors
         centred = f - f.mean(axis=1, keepdims=True)
-        terms = centred * score + per_repeat(problem.explicit(theta, w), noise)
+        terms = centred * score
         product, square = terms * score, score**2
         above, below = (sums.sum(axis=1, keepdims=True) - sums for sums in (product, square))
         # centred costs sum to 0, so this is the mean of the others: a baseline must not depend on the own sample

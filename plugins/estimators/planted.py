@@ -23,7 +23,6 @@ class Planted(Estimator):
 
     name = "planted"
     unbiased = False
-    includes_explicit_derivative = True
     needs_directions = True
 
     base: str = param("samples", "gradient to which the error is added", choices=("samples", "best"))

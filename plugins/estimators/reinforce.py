@@ -11,15 +11,12 @@ from bench.model import Problem, SampleMean, columns, param, per_repeat
 class Reinforce(SampleMean):
     """Approximates grad J_sigma with the mean of (f - b) d log p(actions)/dtheta (Williams 1992).
 
-    If theta also sets the initial state, the explicit derivative of f, at given actions, is added.
-
     Baseline b: ``none``; ``center``, f at w = 0; ``leave_one_out``, the mean cost of the other samples of the batch.
     Requires costs and scores. Unbiased for any cost, even with jumps.
     """
 
     name = "reinforce"
     needs = frozenset({"value", "score"})
-    includes_explicit_derivative = True
     unbiased_at_discontinuities = True
 
     baseline: str = param("center", "baseline subtracted from f", choices=("none", "center", "leave_one_out"))
@@ -30,11 +27,11 @@ class Reinforce(SampleMean):
         return self.baseline != "leave_one_out"
 
     def terms(self, problem: Problem, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """Return (f - b) * score plus the explicit derivative of each sample, ``(d, B)``."""
+        """Return (f - b) * score of each sample, ``(d, B)``."""
         f = problem.value(theta, w)
         if self.baseline == "center":
             f = f - problem.value(theta, np.zeros((w.shape[0], 1)))
-        return np.asarray(f * problem.score(theta, w) + problem.explicit(theta, w))
+        return np.asarray(f * problem.score(theta, w))
 
     def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Return the mean of the terms over samples, ``(R, d)``; ValueError if the baseline needs more samples."""
@@ -46,5 +43,4 @@ class Reinforce(SampleMean):
         f = per_repeat(problem.value(theta, w), noise)
         f = (f - f.mean(axis=1, keepdims=True)) * f.shape[1] / (f.shape[1] - 1)
         score = per_repeat(problem.score(theta, w), noise)
-        explicit = per_repeat(problem.explicit(theta, w), noise)
-        return np.asarray(np.einsum("rn,rnd->rd", f, score) / f.shape[1] + explicit.mean(axis=1))
+        return np.asarray(np.einsum("rn,rnd->rd", f, score) / f.shape[1])

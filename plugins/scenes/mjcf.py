@@ -100,7 +100,8 @@ class Mjcf(PolicyScene, JointScene):
         return (Path(str(self.module.__file__)), *_model_files(self.path))
 
     def model_file(self) -> Path:
-        """Return the MJCF file."""
+        """Return the MJCF file. Raises :class:`UserError` if it cannot be read."""
+        _ = self.robot
         return self.path
 
     def mjcf(self) -> str:

@@ -11,11 +11,10 @@ import pytest
 from bench import cli
 from bench.claims import Claim, Figure, Outcome, discovery, results
 from bench.claims.claim import NOT_REPRODUCED, REPRODUCED, RESERVED, UNDECIDED, last_digit, verdict
-from bench.model import registry
 
-CHEAP = ("C5", "C21", "L4")
+CHEAP = ("C5", "L4")
 """Claims that take a second or two."""
-BLIND = {"C2": 6, "C8": 1, "C10": 1, "C14": 2, "C16": 6, "C17": 12, "C20": 3, "C22": 10}
+BLIND = {"C2": 6, "C8": 1, "C10": 1, "C14": 2, "C16": 6, "C17": 12}
 """Number of figures that cannot detect an error of 5%, since the published number is less precise. It must not grow."""
 
 
@@ -63,27 +62,6 @@ def test_every_claim_holds_and_would_fail_with_a_wrong_figure(name):
     assert result.verdict in (REPRODUCED, RESERVED), (result.remark, [f for f in result.figures if not f.agrees])
     assert unnoticed(result) == []
     assert sum(not figure.is_sensitive for figure in result.figures) == BLIND.get(name, 0)
-
-
-def test_every_plugin_has_a_planted_bug():
-    for kind, planted_ in planted_claims.CLAIMS.items():
-        # the errors of `planted` are its purpose, and tests/plugins/test_planted.py has their sizes. Those in no claim
-        # have planted errors in test_variance_reduction.py, test_events.py, test_surrogate.py and test_ilqr.py of tests/plugins.
-        unclaimed = {
-            "contacts": {"surrogate_backward"},
-            "optimizers": {"homotopy", "ilqr"},
-            "estimators": {
-                "boundary",
-                "planted",
-                "optimal_baseline",
-                "quadratic_model",
-                "sobol",
-                "stochastic_derivative",
-            },
-        }
-        own = unclaimed.get(kind, set()) | ({"impulse", "complementarity"} if kind == "contacts" else set())
-        entries = {n for n, e in registry.entries()[kind].items() if e.plugin.__module__.startswith("bench.plugins")}
-        assert entries == set(planted_) | own
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""Every registered plugin passes the conformance kit, and the kit catches the faults planted here."""
+"""The conformance kit catches the faults planted here, and its checks are pytest items."""
 
 import contextlib
 import re
@@ -21,11 +21,9 @@ from bench.plugins.scenes.mass_spring import MassSpring
 from bench.plugins.scenes.pushing import Pushing
 from bench.plugins.scenes.quadratic import Quadratic
 
-from bench import cli, conformance
+from bench import cli
 from bench.conformance import Skipped, check, kit, main, parametrize, subjects
 from bench.conformance.kit import variants
-from bench.conformance.subjects import all_programs, available, distinguishing_programs, sound_scenes
-from bench.conformance.subjects import programs as programs_of
 from bench.errors import UserError
 from bench.model import (
     Array,
@@ -48,56 +46,6 @@ from bench.model import (
     per_repeat,
     registry,
 )
-
-ENTRIES = [entry for table in registry.entries().values() for entry in table.values()]
-PLUGINS = [entry.plugin for entry in ENTRIES if entry.plugin is not None]
-
-
-def _is_long(plugin: type[Plugin]) -> bool:
-    """Whether its checks take long: backends that compile each program for seconds or run it eagerly, and two more.
-
-    A rollout of ``hopper_run`` has 1,920 steps of the integrator, and ``surrogate_backward`` solves two equations each step.
-    """
-    is_slow_backend = {"physics", "root"} & set(getattr(plugin, "provides", ())) or {"torch", "numba"} & set(
-        plugin.requires
-    )
-    return bool(is_slow_backend) or plugin.name in ("hopper_run", "surrogate_backward")
-
-
-@pytest.mark.parametrize("entry", ENTRIES, ids=lambda entry: f"{entry.kind}-{entry.name}")
-def test_registered_plugin_loads(entry):
-    assert entry.plugin is not None, entry.reason
-
-
-@pytest.fixture
-def few_programs(monkeypatch):
-    """Checks of backends, scenes and contact laws run one program of each sort, or every fourth scene with contacts.
-
-    Scenes are compared on ``numpy`` and ``jax``; the slow tests compare them on all backends.
-    """
-    programs, scenes = tuple(distinguishing_programs(all_programs())), sound_scenes()
-    touching = [scene for scene in scenes if isinstance(scene, ContactScene) and scene.continuous]
-    monkeypatch.setattr(conformance.backends, "all_programs", lambda: programs)
-    monkeypatch.setattr(conformance.scenes, "programs", lambda scene: distinguishing_programs(programs_of(scene)))
-    monkeypatch.setattr(
-        conformance.scenes,
-        "available",
-        lambda kind: [p for p in available(kind) if p.name not in ("fused", "implicit", "torch")],
-    )
-    monkeypatch.setattr(conformance.contacts, "sound_scenes", lambda: touching[::4])
-
-
-@pytest.mark.usefixtures("few_programs")
-@parametrize([plugin for plugin in PLUGINS if not _is_long(plugin)])
-def test_registered_plugin_conforms(plugin, check):
-    check(plugin)
-
-
-@pytest.mark.slow
-@parametrize([p for p in PLUGINS if _is_long(p) or p.kind in ("backends", "scenes", "contacts")])
-def test_registered_plugin_conforms_on_every_program(plugin, check):
-    check(plugin)
-
 
 # ------------------------------------------------------------------------------------------- planted: estimators
 
@@ -844,7 +792,7 @@ def test_item_that_nothing_applies_fails():
 
 
 def test_plugin_of_another_kind_needs_no_checks_of_its_own():
-    study = next(plugin for plugin in PLUGINS if plugin.kind == "studies")
+    study = next(iter(registry.entries()["studies"].values())).plugin
     assert {result.outcome for result in check(study)} == {"pass"}
 
 
@@ -883,11 +831,11 @@ def test_a_check_ends_at_the_time_limit_and_the_others_run(capsys, tmp_path, mon
     with folder_of_plugins(tmp_path):
         endless = registry.usable("backends", "endless")
         monkeypatch.setattr(kit, "_CHECKS", {Plugin: kit._CHECKS[Plugin][:2], Backend: kit._CHECKS[Backend][:1]})
-        assert main(["endless"], limit=0.5) == 1
+        assert main(["endless"], limit=2.0) == 1
     lines = capsys.readouterr().out.splitlines()
     assert endless.name in lines[0]
     assert any(
-        line.startswith("fail  endless") and "not finished within 0.5 s (limit=DURATION)" in line for line in lines
+        line.startswith("fail  endless") and "not finished within 2 s (limit=DURATION)" in line for line in lines
     )
     assert any(line.startswith("pass  endless") for line in lines)
 

@@ -1,7 +1,6 @@
-"""The generated parts of the documents are up to date."""
+"""The generated parts of the documents, and their comparison with the documents as they are."""
 
 import json
-from pathlib import Path
 
 import pytest
 
@@ -9,18 +8,20 @@ from bench.errors import UserError
 from bench.experiment import config
 from docs import build
 
-DOCS = Path(__file__).resolve().parents[2] / "docs"
 
-
-def test_columns_are_up_to_date():
-    assert (DOCS / "columns.md").read_text() == build.columns_page(), "run: python -m docs.build columns"
-
-
-@pytest.mark.skipif(
-    not any(build.STANDARD.glob("*/findings.json")), reason="needs the findings that a run writes beside its rows"
-)
-def test_results_are_up_to_date():
-    assert (DOCS / "results.md").read_text() == build.results_page(DOCS / "results.md"), "run: make docs"
+def test_a_stale_document_is_listed_with_its_lines_and_not_written(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(build, "ROOT", tmp_path)
+    monkeypatch.setattr(build, "DOCS", tmp_path)
+    page = tmp_path / "columns.md"
+    page.write_text(build.columns_page())
+    assert build.main(["--check", "columns"]) == 0
+    assert not capsys.readouterr().out
+    page.write_text(page.read_text().replace("# Columns", "# Rows"))
+    assert build.main(["--check", "columns"]) == 1
+    assert capsys.readouterr().out.splitlines() == [
+        "--- columns.md", "+++ written again", "@@ -1 +1 @@", "-# Rows", "+# Columns",
+    ]  # fmt: skip
+    assert page.read_text().startswith("# Rows")
 
 
 def test_results_have_findings_and_name_experiments_without_rows(tmp_path, monkeypatch):

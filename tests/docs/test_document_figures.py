@@ -3,8 +3,6 @@
 import re
 from pathlib import Path
 
-import pytest
-
 from docs import figures, website
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -22,11 +20,6 @@ def sections(text):
     return re.split(r"^(?=#+ )", text, flags=re.MULTILINE)
 
 
-@pytest.mark.parametrize("path", [path for path, text in PAGES.items() if figures.MARK.search(text)])
-def test_marked_figures_are_those_of_the_stored_results(path):
-    assert figures.with_figures(PAGES[path]) == PAGES[path], "run: python -m docs.build figures"
-
-
 def test_every_figure_is_used():
     used = {match[1] for text in PAGES.values() for match in figures.MARK.finditer(text)}
     assert used == set(figures.FIGURES)
@@ -40,20 +33,18 @@ def test_a_wrong_figure_is_written_again():
     assert figures.without_marks(right) == f"is {figures.FIGURES['trust-cells']()} of"
 
 
-@pytest.mark.parametrize("path", [path for path in PAGES if path not in FREE])
-def test_sections_with_figures_name_their_source(path):
+def test_sections_with_figures_name_their_source():
     missing = []
-    for section in sections(PAGES[path]):
+    for path, section in [(page, part) for page in PAGES if page not in FREE for part in sections(PAGES[page])]:
         plain = figures.SOURCE.sub("", figures.MARK.sub("", section))
         numbers = [number for number in NUMBER.findall(plain) if not PLAIN.fullmatch(number)]
         if numbers and not figures.SOURCE.search(section):
-            missing.append((section.partition("\n")[0], numbers))
+            missing.append((path, section.partition("\n")[0], numbers))
     assert not missing, "add <!-- figures: COMMAND --> to these sections"
 
 
-@pytest.mark.parametrize("path", PAGES)
-def test_named_sources_exist(path):
-    for source in figures.SOURCE.findall(PAGES[path]):
+def test_named_sources_exist():
+    for source in {source for text in PAGES.values() for source in figures.SOURCE.findall(text)}:
         files = re.findall(r"[\w/]+\.py", source)
         assert files or "python -m bench" in source or source in ("given", "the commands in the table"), source
         assert all((ROOT / file).exists() for file in files), source

@@ -3,9 +3,6 @@
 ``BENCH_ENGINES=DIR`` names the folder of the environments, which ``python -m bench engines install`` makes.
 """
 
-import subprocess
-from pathlib import Path
-
 import numpy as np
 import pytest
 from bench.plugins.backends.numpy import Numpy
@@ -17,7 +14,6 @@ from bench.plugins.scenes.pushing import Pushing
 
 import bench.conformance
 from bench.conformance.subjects import law_for
-from bench.engines import environments
 from bench.experiment import by_name
 from bench.model import compose, registry
 
@@ -68,19 +64,6 @@ def test_a_bounce_of_the_xpbd_solver_is_rigid():
     own, rigid = (b.compile(of).trajectory(of.theta0, still).states for b in (backend, Numpy()))
     np.testing.assert_allclose(own[-1, 1], rigid[-1, 1], rtol=1e-6)
     assert np.abs(own[:, 0] - rigid[:, 0]).max() < abs(scene.velocity) * scene.dt
-
-
-def test_the_tape_of_an_xpbd_step_leaves_out_the_bounce():
-    """So the backend offers no gradients there."""
-    python = installed("newton").python or str(environments.python_of("newton"))
-    program = Path(__file__).resolve().parents[1] / "programs" / "xpbd_tape.py"
-    result = subprocess.run([python, str(program)], capture_output=True, text=True, check=True)
-    lines = [line.partition(": ")[2] for line in result.stdout.splitlines() if line.startswith("restitution")]
-    assert lines == [
-        "tape 0.200, a second pass over it 0.200, differences 0.200",
-        "tape 0.200, a second pass over it 0.600, differences 0.200",
-        "tape 0.200, a second pass over it 0.600, differences -1.000",
-    ]
 
 
 def test_balls_of_a_tenth_of_a_kilogram_touch_in_brax():

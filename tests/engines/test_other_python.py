@@ -63,17 +63,14 @@ def noise(problem, columns=5):
 # --------------------------------------------------------------------------------------------------------- numbers
 
 
-class Weighted(BouncingBall):
-    """A ball with costs of all steps, whose weights fall."""
+class Running(BouncingBall):
+    """A ball with costs of all steps."""
 
     def stage_cost(self, xp, q, v, u):
         return q[0] ** 2 + 0.1 * v[0] ** 2
 
-    def cost_weights(self):
-        return 0.9 ** np.arange(self.horizon + 1.0)
 
-
-@pytest.mark.parametrize("scene", [BounceOnce(), BouncingBall(), Weighted()], ids=lambda s: type(s).__name__)
+@pytest.mark.parametrize("scene", [BounceOnce(), BouncingBall(), Running()], ids=lambda s: type(s).__name__)
 def test_costs_and_gradients_equal_those_of_this_process(scene):
     ours, theirs = Numpy().compile(program(scene)), toy().compile(program(scene))
     w = noise(ours)
@@ -202,7 +199,7 @@ time.sleep(100)
     with subprocess.Popen([HERE, "-c", code], stdout=subprocess.PIPE, text=True) as run:
         engine = psutil.Process(int(run.stdout.readline()))
         run.kill()
-        assert engine.wait(10) is None
+        assert engine.wait(300) is None
 
 
 @pytest.mark.slow
@@ -243,7 +240,7 @@ problem.value(problem.program.theta0, noise(problem))
 left = subprocess.Popen(["sleep", "100"])
 guard.kill_children()
 assert not psutil.pid_exists(left.pid)
-left.wait(5)
+left.wait(300)
 (engine,) = process._running.values()
 assert engine.process.poll() is None
 """

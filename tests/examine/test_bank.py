@@ -1,10 +1,10 @@
-"""Planted faults are caught, and right gradients pass; `python tests/programs/simulators.py` prints the whole table."""
+"""Planted faults are caught, and right gradients pass; `python validation/simulators.py` prints the whole table."""
 
 import pytest
 import simulators
 
 SLOW = (
-    "contact", "missing contact term", "missing damper", "last step forgotten", "gradient elsewhere", "noise reused shifted",
+    "contact", "missing contact term", "last step forgotten", "gradient elsewhere", "noise reused shifted",
 )  # fmt: skip
 """Cases whose rollouts take long in Python; the quick tests have others of their kind."""
 UNNAMED = ("rounded",)

@@ -74,13 +74,3 @@ def test_the_page_has_the_stored_table_of_all_examples():
 def test_an_example_without_its_library_has_no_rows_and_names_it():
     table = runpy.run_path(str(ROOT / "examples" / "table.py"))
     assert table["rows"]("drake_ball") == ([], "not installed: pydrake")
-
-
-def test_the_page_has_a_row_of_each_case_of_engines():
-    import engine_cases
-
-    page = (ROOT / "docs/examine.md").read_text()
-    rows = page.partition(engine_cases.BEGIN)[2].partition(engine_cases.END)[0].splitlines()[2:]
-    cells = [[cell.strip() for cell in row.strip("|").split(" | ")] for row in rows]
-    assert [row[0] for row in cells] == list(engine_cases.CASES)
-    assert [row[2] for row in cells] == [engine_cases.said(one.expected[0]) for one in engine_cases.CASES.values()]

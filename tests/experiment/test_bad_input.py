@@ -3,12 +3,12 @@
 import os
 import subprocess
 import sys
-import time
 
 import pandas as pd
 import pytest
 
 from bench.cli import main
+from bench.experiment import grid
 from bench.experiment.axes import table
 from bench.experiment.config import load
 from bench.experiment.grid import cells
@@ -41,10 +41,9 @@ def test_odd_words_are_refused_in_one_line(tmp_path, monkeypatch, capsys, words)
     assert not list(tmp_path.iterdir())
 
 
-def test_ten_million_cells_are_refused_before_they_are_expanded(capsys):
-    started = time.monotonic()
+def test_ten_million_cells_are_refused_before_they_are_expanded(capsys, monkeypatch):
+    monkeypatch.setattr(grid, "expand", lambda *_: pytest.fail("the sweep is expanded"))
     assert main(["plan", *BASE, f"sweep.seed=[{MANY}]", f"sweep.samples=[{MANY}]", f"sweep.repeats=[{MANY}]"]) == 2
-    assert time.monotonic() - started < 10
     assert "the sweep has 10360232 cells" in capsys.readouterr().err
 
 
@@ -157,14 +156,6 @@ def test_ranges_and_long_lists_have_the_values_that_short_lists_have(word, value
     read = load([word]).sweep["seed"]
     assert read == values
     assert [type(value) for value in read] == [type(value) for value in values]
-
-
-def test_a_list_of_twenty_thousand_values_is_read_in_a_second():
-    words = [f"sweep.seed=[{','.join(map(str, range(20_000)))}]", *BASE[:-1]]
-    load(BASE[:-1])
-    started = time.process_time()
-    assert len(load(words).sweep["seed"]) == 20_000
-    assert time.process_time() - started < 1.5
 
 
 # -------------------------------------------------------------------------------------------------------------- rows

@@ -22,7 +22,6 @@ from bench.plugins.scenes.ground_wall import GroundWall
 from bench.plugins.scenes.hopper import Hopper
 from scipy import integrate
 
-from bench.conformance.subjects import SAME
 from bench.model import ContactScene, Dynamics, State, compose, param
 
 
@@ -166,21 +165,6 @@ def test_hopper_conserves_energy_in_flight():
     assert drift[0] / drift[1] == pytest.approx(2.0, rel=0.1)
 
 
-@pytest.mark.parametrize(("law", "values"), [(Penalty, {}), (Softplus, {"beta": 1e3})], ids=["penalty", "softplus"])
-def test_hopper_gradients_agree(law, values):
-    made = program(Hopper(), law, **values)
-    theta, w = made.theta0, np.random.default_rng(0).standard_normal((made.n_noise, 3))
-    jax, torch = Jax().compile(made), Torch().compile(made)
-    exact = jax.grad(theta, w)
-    assert np.all(np.isfinite(exact))
-    scale = np.abs(exact).max()
-    assert np.abs(torch.grad(theta, w) - exact).max() < 1e-8 * scale
-    eps = 1e-7
-    for i, e in enumerate(eps * np.eye(2)):
-        difference = (jax.value(theta + e, w) - jax.value(theta - e, w)) / (2 * eps)
-        assert np.abs(difference - exact[i]).max() < 1e-5 * scale
-
-
 def test_hopper_target_is_what_the_policy_regulates():
     """A higher target gives higher hops."""
     tops = [trajectory(program(Hopper(target=target), Penalty))[0][300:, 0].max() for target in (0.65, 0.7, 0.75)]
@@ -218,7 +202,7 @@ def test_friction_stays_in_the_cone():
     assert np.abs(tangential[sliding]) == pytest.approx(scene.friction * normal[sliding], rel=1e-3)  # 1 - tanh 5 = 9e-5
 
 
-@pytest.mark.parametrize("slip_speed", [1e-3, 1e-4])
+@pytest.mark.parametrize("slip_speed", [1e-3, pytest.param(1e-4, marks=pytest.mark.slow)])
 def test_slip_sets_in_at_the_coulomb_bound(slip_speed):
     """Pulled evenly, the block holds until the spring pulls with mu m g, then moves at V (1 - cos(sqrt(k/m) t)).
 
@@ -242,18 +226,10 @@ def test_slip_sets_in_at_the_coulomb_bound(slip_speed):
     assert np.abs(v[sliding, 0] - exact).max() < 5 * slip_speed + 0.02 * scene.pull
 
 
-@pytest.mark.parametrize(("law", "values"), [(Penalty, {}), (Softplus, {})], ids=["penalty", "softplus"])
-def test_friction_block_gradients_agree(law, values):
-    made = program(FrictionBlock(), law, **values)
-    theta, w = made.theta0, np.random.default_rng(0).standard_normal((2, 3))
-    jax, torch = Jax().compile(made), Torch().compile(made)
-    exact = jax.grad(theta, w)
-    scale = np.abs(exact).max()
-    assert np.abs(torch.grad(theta, w) - exact).max() < SAME * scale
-    eps = 1e-6
-    for i, e in enumerate(eps * np.eye(2)):
-        difference = (jax.value(theta + e, w) - jax.value(theta - e, w)) / (2 * eps)
-        assert np.abs(difference - exact[i]).max() < 1e-6 * scale
+def test_a_softplus_contact_pushes_at_touch():
+    """By ln 2 / beta times the stiffness, where a penalty has no force."""
+    still = np.zeros((1, 1))
+    assert Softplus(stiffness=3.0, beta=10.0).force(np, still, still) == pytest.approx(3.0 * np.log(2.0) / 10.0)
 
 
 def test_friction_makes_the_difference():

@@ -1,7 +1,9 @@
 """Estimators against closed-form biases and variances, and where two of them really differ."""
 
 import math
+from dataclasses import dataclass
 from functools import cache
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -33,7 +35,7 @@ from scipy import stats
 from bench.measure import noise
 from bench.measure.reference import certify
 from bench.measure.statistics import summarise
-from bench.model import compose
+from bench.model import FunctionScene, compose
 
 SIGMA, SAMPLES, REPEATS = 0.1, 200, 400
 
@@ -229,6 +231,51 @@ def test_zeroth_orders_on_a_linear_cost_have_their_closed_form_errors():
     assert error(Orthogonal(lengths="fixed")) < 1e-20
     assert error(Orthogonal()) < 0.5 * error(RandomizedSmoothing())
     assert error(ControlVariate()) < 1e-16  # what differences leave of the gradient at w = 0
+
+
+def test_directions_on_a_plane_have_their_closed_form_errors():
+    """The squared error d / N - 1 of N orthogonal directions (Choromanski et al. 2018), and 2 + 7 share of guided ones."""
+    problem = Numpy().compile(compose(Linear(dimension=8)))
+    truth, w = problem.program.closed_form_gradient(), noise.draw(2, "plane", 20_000, 2, 8, "cells")
+
+    def mean(estimator):
+        values = estimator.estimate(problem, problem.program.theta0, w)
+        errors = ((values - truth) ** 2).sum(axis=1) / (truth @ truth)
+        return values.mean(axis=0) @ truth / (truth @ truth), errors.mean()
+
+    assert mean(Orthogonal(lengths="fixed"))[1] == pytest.approx(3.0, rel=0.01)
+    assert mean(Guided(subspace=1, share=0.1)) == pytest.approx((1.0, 2.7), rel=0.03)  # 2.7 varies by 1%
+
+
+@dataclass(frozen=True)
+class Parabola(FunctionScene):
+    """f = x^2 / 2 at theta = 1, so that a gradient is 1 + sigma w."""
+
+    name = "parabola"
+    continuous: ClassVar[bool] = True
+    sigma: float = 1.0
+
+    def theta0(self):
+        return np.ones(1)
+
+    def cost(self, xp, x):
+        return 0.5 * x[0] * x[0]
+
+
+def test_estimators_that_change_gradients_on_a_parabola():
+    """Means where a gradient is N(1, 1): censored at 1 it is .6095 (Greene 2012, 19.3), otherwise 1."""
+    problem, random = Numpy().compile(compose(Parabola())), np.random.default_rng(24)
+    theta, (few, many) = problem.program.theta0, random.standard_normal((2, 200_000))
+    cut = Clipped(limit=1.0).estimate(problem, theta, few.reshape(-1, 1, 1))
+    assert cut.mean() == pytest.approx(0.6095, abs=0.006)  # four standard errors
+    w = many.reshape(100, 2000, 1)
+    corrected, fitted = ControlVariate().estimate_with_diagnostics(problem, theta, w)
+    assert fitted["coefficient"].mean() == pytest.approx(1.0, abs=0.005)
+    mixed, decided = TotalPropagation().estimate_with_diagnostics(problem, theta, w)
+    assert decided["weight"].mean() == pytest.approx(5.75 / 6.75, rel=0.01)
+    others = (e.estimate(problem, theta, w) for e in (AlphaOrder(), FiniteDifference()))
+    for values in (corrected, mixed, *others):
+        assert values.mean() == pytest.approx(1.0, abs=0.02)  # four standard errors of 200,000 samples, or more
 
 
 @pytest.mark.parametrize(("limit", "by"), [(2.0, "sample"), (2.0, "element")])

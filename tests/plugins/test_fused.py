@@ -2,7 +2,6 @@
 
 import math
 import re
-import time
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -120,24 +119,6 @@ def test_what_is_remembered_of_a_block_begins_at_zero_without_a_loop_over_time_t
     place = re.search(r"lane\[(\d+) \+ l\] = lane\[\1 \+ l\] if abs", text)
     assert place
     assert f"lane[{place[1]} + l] = F(0.0)" in text
-
-
-def test_a_gradient_costs_a_few_values(pushing):
-    """A loop that stored the history beside the carries was not vectorised: a gradient cost 5 values, and now 2."""
-    scene = registry.make("scenes", "pushing", {"horizon": 100})
-    fused, _ = both(compose(scene, pushing[0].program.contact, pushing[0].program.integrator))
-    w = np.random.default_rng(0).standard_normal((100, 992))
-    fused.threads = 1
-
-    def seconds(call: Any) -> float:
-        spent = []
-        for _ in range(40):
-            since = time.perf_counter()
-            call(fused.program.theta0, w)
-            spent.append(time.perf_counter() - since)
-        return min(spent[1:])
-
-    assert seconds(fused.grad) < 3.3 * seconds(fused.value)
 
 
 def test_parameters_and_horizon_compile_nothing_again(pushing):

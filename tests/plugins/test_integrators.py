@@ -104,10 +104,8 @@ def test_planted_fault_is_caught(plugin, fault):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("integrator", EXPLICIT, ids=named)
-@pytest.mark.parametrize(
-    "scene", [StiffDecay(), MassSpring(velocity_factor=0.9), DoublePendulum(horizon=50)], ids=named
-)
-def test_backends_agree(scene, integrator):
+def test_backends_agree(integrator):
+    scene = DoublePendulum(horizon=50)
     numpy, jax, torch = (compiled(scene, integrator, backend=backend) for backend in (Numpy(), Jax(), Torch()))
     theta, w = scene.theta0(), normal(numpy, 3)
     costs, gradients = jax.value(theta, w), jax.grad(theta, w)
@@ -220,6 +218,28 @@ def test_mass_spring_gradient(integrator, damping):
     assert math.log2(errors[0] / errors[1]) == pytest.approx(integrator.order, abs=0.2)
 
 
+@pytest.mark.parametrize(
+    ("integrator", "step", "growth", "turn"),
+    [
+        (ExplicitEuler(), 0.1, lambda z: 1 + z, None),
+        (ImplicitEuler(), 0.1, lambda z: 1 / (1 - z), None),
+        (Midpoint(), 0.5, lambda z: 1 + z + z**2 / 2, None),
+        (Rk4(), 1.0, lambda z: 1 + z + z**2 / 2 + z**3 / 6 + z**4 / 24, None),
+        (ImplicitMidpoint(), 0.5, lambda z: (1 + z / 2) / (1 - z / 2), lambda h: 2 * math.atan(h / 2)),
+        (StormerVerlet(), 0.5, None, lambda h: math.acos(1 - h**2 / 2)),
+    ],
+    ids=lambda value: getattr(value, "name", ""),
+)
+def test_an_oscillator_grows_and_turns_as_the_stability_function_states(integrator, step, growth, turn):
+    """Squared ends of x'' = -x after 100 steps from (1, 0) and (0, 1) (Hairer, Lubich, Wanner 2006, I.1 and IX.1)."""
+    problem = compiled(MassSpring(stiffness=0.5, dt=step, horizon=100), integrator)
+    ends = problem.value(np.eye(2), np.zeros((problem.program.n_noise, 2)))
+    if growth is not None:
+        assert ends.sum() == pytest.approx(abs(growth(1j * step)) ** 200, rel=1e-9)
+    if turn is not None:
+        assert ends[0] == pytest.approx(math.cos(100 * turn(step)) ** 2, rel=1e-9)
+
+
 def energy_error(integrator, **values):
     """Largest relative error of the energy in the first and in the second half of the rollout."""
     scene = MassSpring(**values)
@@ -232,8 +252,8 @@ def energy_error(integrator, **values):
 
 @pytest.mark.parametrize("integrator", [SemiImplicitEuler(), StormerVerlet(), EventDriven()], ids=named)
 def test_symplectic_energy_is_bounded(integrator):
-    """Over 300 periods the error is that of the first ones, of order (w dt)^order: w dt = 0.1."""
-    early, late = energy_error(integrator, horizon=20_000)
+    """Over 60 periods the error is that of the first ones, of order (w dt)^order: w dt = 0.1."""
+    early, late = energy_error(integrator, horizon=4_000)
     assert early < 1.1 * 0.1**integrator.order
     assert late == pytest.approx(early, rel=0.01)
 

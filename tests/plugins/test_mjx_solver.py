@@ -1,5 +1,6 @@
 """Gradients through MJX's converged solver agree with differences and forward mode, and dropped terms are caught."""
 
+import mjx_solver as program
 import numpy as np
 import pandas as pd
 import pytest
@@ -8,7 +9,6 @@ from bench.plugins.backends.numpy import Numpy
 from bench.plugins.contacts.penalty import Penalty
 from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
 from bench.plugins.scenes.tossed_box import TossedBox
-from programs import mjx_solver as program
 
 from bench.cli import main
 from bench.conformance.subjects import law_for

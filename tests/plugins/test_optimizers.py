@@ -258,6 +258,48 @@ def test_gauss_newton_where_only_a_ratio_is_known():
     assert state["theta"][0] / state["theta"][1] == pytest.approx(2.0)
 
 
+def steps(optimizer, cost, slope, count):
+    """Thetas from 1 on, ``(count + 1,)``. The residual of a least-squares method is the gradient, with derivative 1."""
+    state = optimizer.start(np.ones(1))
+    found = [1.0]
+    for _ in range(count):
+        x = optimizer.ask(state, np.empty((1, 0)))
+        state = optimizer.tell(state, x, Answer(cost(x[0]), slope(x), slope(x), np.ones((1, *x.shape))))
+        found.append(float(state["theta"][0]))
+    return found
+
+
+def test_a_line_search_takes_the_first_step_with_sufficient_descent():
+    """Armijo 1966: on 50 x^2 the first accepted rate is .004, and the second step has the same."""
+    assert steps(LineSearch(), lambda x: 50.0 * x**2, lambda x: 100.0 * x, 2)[2] == pytest.approx(0.6, rel=SAME)
+
+
+def test_lbfgs_steps_along_the_secant():
+    """From 1 to .9, then along the secant of the gradient x + x^2 (Nocedal, Wright 2006, chapter 6)."""
+    found = steps(Lbfgs(), lambda x: 0.5 * x**2 + x**3 / 3, lambda x: x + x**2, 4)
+    assert found[2] == pytest.approx(0.9, rel=SAME)
+    assert found[4] == pytest.approx(0.9 - 0.1 * 1.71 / (2.0 - 1.71), rel=1e-9)
+
+
+def test_a_damped_step_of_gauss_newton():
+    """Marquardt 1963: the share damping / (1 + damping) remains."""
+    found = steps(GaussNewton(damping=0.001), lambda x: 0.5 * x**2, lambda x: x, 2)
+    assert found[2] == pytest.approx(0.001 / 1.001, rel=1e-9)
+
+
+def test_three_of_six_points_move_the_mean_of_cma_es():
+    """By 1.006 step sizes on a linear cost: the weighted mean of the three lowest of six normal numbers (Hansen 2016)."""
+    optimizer, rng = CmaEs(population=6, width=1.0), np.random.default_rng(0)
+    state, moves = optimizer.start(np.zeros(2)), []
+    for _ in range(4000):
+        points = optimizer.ask(state, rng.standard_normal((2, 6)))
+        moves.append(-optimizer.tell(state, points, Answer(value=points[0]))["theta"][0])
+    drawn = np.sort(rng.standard_normal((SAMPLES, 6)), axis=1)[:, ::-1]
+    expected = drawn[:, :3].mean(axis=0) @ constants(2, 6).weights
+    assert expected == pytest.approx(1.006, abs=0.005)
+    assert np.mean(moves) == pytest.approx(expected, abs=4 * np.std(moves) / math.sqrt(len(moves)))
+
+
 def test_nothing_finite_is_no_step():
     for optimizer in (Cem(population=4, elites=2), Mppi(population=4), CmaEs(population=4), Ppo(population=4)):
         state = optimizer.start(np.zeros(2))

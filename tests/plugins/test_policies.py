@@ -8,7 +8,7 @@ import pytest
 from bench.plugins.scenes.cartpole_swing import CartpoleSwing
 
 import bench
-from bench.errors import Unsupported, UserError
+from bench.errors import UserError
 from bench.experiment import config, grid
 from bench.experiment.by_name import compile_problem, make
 from bench.experiment.keys import fingerprint
@@ -84,18 +84,6 @@ def test_two_normal_numbers_give_a_uniform_one():
 
 
 @pytest.mark.parametrize("where", ["action", "parameter"])
-@pytest.mark.parametrize("policy", ["linear", "mlp[hidden=8]"])
-def test_backends_agree_on_costs_and_gradients(policy, where):
-    exact = problem(policy, noise=where)
-    theta, w = exact.program.theta0, sample(exact)
-    for backend in ("torch", "numpy"):
-        other = problem(policy, backend, noise=where)
-        assert other.value(theta, w) == pytest.approx(exact.value(theta, w), rel=1e-12)
-        scale = np.abs(exact.grad(theta, w)).max()
-        assert np.abs(other.grad(theta, w) - exact.grad(theta, w)).max() < DIFFERENCED * scale
-
-
-@pytest.mark.parametrize("where", ["action", "parameter"])
 def test_the_adjoint_step_by_step_is_the_gradient(where):
     exact = problem(noise=where)
     theta, w = exact.program.theta0, sample(exact)
@@ -113,19 +101,17 @@ def test_the_adjoint_without_jax_takes_differences(monkeypatch):
     assert np.abs(by_differences - by_product).max() < DIFFERENCED * np.abs(by_product).max()
 
 
-@pytest.mark.parametrize("discount", [None, 0.9])
-def test_a_window_as_long_as_the_rollout_is_fobg(discount):
-    exact = problem(discount=discount)
+def test_a_window_as_long_as_the_rollout_is_fobg():
+    exact = problem()
     drawn = noise.draw(0, "policy", 2, 8, exact.program.n_noise, "test")
     whole = make("estimators", "fobg").estimate(exact, exact.program.theta0, drawn)
     windowed = make("estimators", "windowed[steps=30]").estimate(exact, exact.program.theta0, drawn)
     assert windowed == pytest.approx(whole, rel=REVERSED)
 
 
-@pytest.mark.parametrize("discount", [None, 0.7])
 @pytest.mark.parametrize("estimator", ["reinforce", "total_propagation[per=action]"])
-def test_zeroth_order_agrees_with_first_order(estimator, discount):
-    exact = problem("linear", horizon=10, discount=discount)
+def test_zeroth_order_agrees_with_first_order(estimator):
+    exact = problem("linear", horizon=10)
     theta, program = exact.program.theta0, exact.program
     first = make("estimators", "fobg").estimate(exact, theta, noise.draw(0, "a", 64, 64, program.n_noise, "test"))
     other = make("estimators", estimator).estimate(exact, theta, noise.draw(1, "b", 64, 1024, program.n_noise, "test"))
@@ -134,12 +120,12 @@ def test_zeroth_order_agrees_with_first_order(estimator, discount):
 
 
 @pytest.mark.parametrize("where", ["action", "parameter"])
-def test_a_discounted_cost_is_its_sum(where):
-    given = problem("linear", "numpy", noise=where, discount=0.8, horizon=5)
+def test_a_cost_is_its_sum(where):
+    given = problem("linear", "numpy", noise=where, horizon=5)
     theta, w, scene = given.program.theta0, sample(given), given.program.scene
-    expected, weight = 0.0, 1.0
+    expected = 0.0
     for state, u in list(given.program.steps(LoopOps(), theta[:, None], w))[:-1]:
-        expected, weight = expected + weight * scene.stage_cost(np, *state, u), 0.8 * weight
+        expected = expected + scene.stage_cost(np, *state, u)
     assert given.value(theta, w) == pytest.approx(expected, rel=1e-13)
 
 
@@ -151,8 +137,8 @@ class Final(CartpoleSwing):
 
 
 @pytest.mark.parametrize("where", ["action", "parameter"])
-def test_backends_agree_on_a_discounted_gradient(where):
-    scene = Final(policy="mlp[hidden=4]", horizon=12, noise=where, discount=0.7)
+def test_backends_agree_on_a_gradient_with_a_terminal_cost(where):
+    scene = Final(policy="mlp[hidden=4]", horizon=12, noise=where)
     exact = compile_problem(scene, None, "semi_implicit_euler", "jax")
     theta, w = exact.program.theta0, sample(exact)
     gradient = exact.grad(theta, w)
@@ -163,78 +149,15 @@ def test_backends_agree_on_a_discounted_gradient(where):
         assert other.value(theta, w) == pytest.approx(exact.value(theta, w), rel=1e-12), backend
         assert np.abs(other.grad(theta, w) - gradient).max() < error * scale, backend
     assert np.abs(adjoint_gradient(exact, slopes(exact, theta, w)) - gradient).max() < DIFFERENCED * scale
-    undiscounted = compile_problem(dataclasses.replace(scene, discount=1.0), None, "semi_implicit_euler", "jax")
-    assert np.abs(undiscounted.grad(theta, w) - gradient).max() > 0.1 * scale
 
 
-def test_a_trace_of_a_discounted_rollout_adds_up():
-    given = compile_problem(Final(policy="linear", horizon=12, discount=0.7), None, "semi_implicit_euler", "jax")
+def test_a_trace_adds_up():
+    given = compile_problem(Final(policy="linear", horizon=12), None, "semi_implicit_euler", "jax")
     w = sample(given, 1)
     table, error = trace(given, w)
     total = table.cost_stage.sum() + table.cost_terminal.sum()
     assert total == pytest.approx(given.value(given.program.theta0, w)[0], rel=1e-12)
     assert error < REVERSED
-
-
-def test_without_a_discount_costs_and_keys_are_as_before():
-    scene = make("scenes", "cartpole_swing[horizon=30]")
-    assert scene.cost_weights() is None
-    assert dataclasses.replace(scene, discount=1.0).cost_weights() is None
-    assert fingerprint(scene) == fingerprint(make("scenes", "cartpole_swing[horizon=30,discount=null]"))
-
-
-def test_normalised_observations_are_less_their_mean_and_over_their_deviation():
-    scene = CartpoleSwing(policy="linear", horizon=3, normalise=4)
-    given = compile_problem(scene, None, "semi_implicit_euler", "numpy")
-    theta, seen = given.program.theta0, []
-    plain = compile_problem(dataclasses.replace(scene, normalise=0), None, "semi_implicit_euler", "numpy").program
-    starts = np.random.default_rng(0).standard_normal((8, 4))
-    state = scene.random_start(np, starts)
-    for _ in range(3):
-        seen.append(scene.observation(np, *state))
-        u = theta[None, :5] @ seen[-1] + theta[5]
-        state = plain.step(LoopOps(), State(*state), u)
-    seen = np.concatenate(seen, axis=1)
-    mean, deviation = seen.mean(axis=1), np.sqrt(seen.var(axis=1) + 1e-5)
-    q, v = np.array([[0.1], [2.0]]), np.array([[0.3], [-0.2]])
-    inputs = (scene.observation(np, q, v)[:, 0] - mean) / deviation
-    control = given.program.scene.feedback(np, theta[:, None], q, v)
-    assert control[0, 0] == pytest.approx(theta[:5] @ inputs + theta[5], rel=1e-12)
-    assert plain.scene.feedback(np, theta[:, None], q, v)[0, 0] != pytest.approx(control[0, 0], rel=1e-3)
-
-
-def test_backends_agree_with_normalised_observations():
-    exact = problem("mlp[hidden=4]", normalise=8, horizon=6)
-    theta, w = exact.program.theta0, sample(exact)
-    gradient = exact.grad(theta, w)
-    scale = np.abs(gradient).max()
-    for backend in ("torch", "numpy"):
-        other = problem("mlp[hidden=4]", backend, normalise=8, horizon=6)
-        assert other.value(theta, w) == pytest.approx(exact.value(theta, w), rel=1e-12)
-        assert np.abs(other.grad(theta, w) - gradient).max() < DIFFERENCED * scale
-    assert np.abs(adjoint_gradient(exact, slopes(exact, theta, w)) - gradient).max() < DIFFERENCED * scale
-    # programs with other moments share no compiled function and no derivative of the policy
-    shorter = problem("mlp[hidden=4]", normalise=4, horizon=6)
-    assert shorter.program.structure != exact.program.structure
-    by_steps = adjoint_gradient(shorter, slopes(shorter, theta, w))
-    assert np.abs(by_steps - shorter.grad(theta, w)).max() < DIFFERENCED * scale
-
-
-def test_states_after_an_end_do_not_count_in_the_moments():
-    scene = Ending(policy="linear[scale=0]", horizon=60, normalise=64)
-    mean, _ = compile_problem(scene, None, "semi_implicit_euler", "numpy").program.scene.moments
-    q, _ = scene.random_start(np, np.random.default_rng(0).standard_normal((8, 64)))
-    assert abs(q[0]).max() > 1.0  # some rollouts end at once
-    assert abs(mean[0, 0]) < abs(q[0]).max()
-    moving = np.abs(q[0]) <= 1.0
-    short = dataclasses.replace(scene, horizon=1)
-    first, _ = compile_problem(short, None, "semi_implicit_euler", "numpy").program.scene.moments
-    assert first[0, 0] == pytest.approx(q[0, moving].mean(), rel=1e-12)
-
-
-def test_normalisation_that_numpy_cannot_measure_is_refused():
-    with pytest.raises(Unsupported, match="in NumPy, which lacks root"):
-        compile_problem("cartpole_swing[normalise=8]", None, "implicit_euler", "implicit")
 
 
 def test_a_long_theta_has_blocks_of_few_columns(monkeypatch):

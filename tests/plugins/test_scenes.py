@@ -2,20 +2,16 @@
 
 import dataclasses
 import functools
-import importlib
-import inspect
 import itertools
 import math
-import pkgutil
 
-import bench.plugins.contacts
-import bench.plugins.scenes
 import numpy as np
 import pytest
 from bench.plugins.backends.implicit import Implicit
 from bench.plugins.backends.jax import Jax
 from bench.plugins.backends.numpy import Numpy
 from bench.plugins.backends.torch import Torch
+from bench.plugins.contacts.complementarity import Complementarity
 from bench.plugins.contacts.impulse import Impulse
 from bench.plugins.contacts.penalty import Penalty
 from bench.plugins.contacts.softplus import Softplus
@@ -24,26 +20,20 @@ from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
 from bench.plugins.scenes.bounce_once import BounceOnce
 from bench.plugins.scenes.bouncing_ball import BouncingBall
 from bench.plugins.scenes.cartpole import Cartpole
-from bench.plugins.scenes.coin_walk import CoinWalk
 from bench.plugins.scenes.constant import Constant
 from bench.plugins.scenes.cubic import Cubic
 from bench.plugins.scenes.double_integrator import DoubleIntegrator
 from bench.plugins.scenes.friction_block import FrictionBlock
 from bench.plugins.scenes.ground_wall import GroundWall
-from bench.plugins.scenes.gusty_cart import GustyCart
 from bench.plugins.scenes.heaviside import Heaviside
 from bench.plugins.scenes.hopper import Hopper
-from bench.plugins.scenes.ledge import Ledge
-from bench.plugins.scenes.linear import Linear
-from bench.plugins.scenes.mass_spring import MassSpring
 from bench.plugins.scenes.pushing import Pushing
 from bench.plugins.scenes.quadratic import Quadratic
 from bench.plugins.scenes.soft_heaviside import SoftHeaviside
-from bench.plugins.scenes.stiff_decay import StiffDecay
 from bench.plugins.scenes.wall_penalty_1d import WallPenalty1d
+from pairwise import pairwise
 
-from bench.conformance.subjects import SAME
-from bench.model import ContactLaw, ContactScene, EngineScene, MechanicalScene, Scene, compose
+from bench.model import ContactScene, MechanicalScene, compose, registry
 
 # -------------------------------------------------------------------------------------------- used throughout
 
@@ -55,22 +45,6 @@ SOLVED = 1e-5
 """Relative error of differences of costs whose steps solve equations to 1e-12, over a step of 1e-6, and a margin of 10."""
 ROUNDED = 1e-9
 """Rounding of small costs over that step."""
-
-
-def classes(package, base):
-    """Concrete plugin classes defined in the modules of a package, by name."""
-    found = {}
-    for module in pkgutil.iter_modules(package.__path__):
-        members = vars(importlib.import_module(f"{package.__name__}.{module.name}")).values()
-        for cls in members:
-            own = isinstance(cls, type) and issubclass(cls, base) and cls.__module__.endswith(f".{module.name}")
-            if own and cls.name and not inspect.isabstract(cls):
-                found[cls.name] = cls
-    return found
-
-
-SCENES = classes(bench.plugins.scenes, Scene)
-LAWS = classes(bench.plugins.contacts, ContactLaw)
 
 
 def program(scene, law=None, integrator=None, **values):
@@ -116,123 +90,62 @@ def assert_mean(samples, expected):
     assert np.all(np.abs(samples.mean(axis=1) - expected) <= 5 * error + 1e-12 * (1 + np.abs(expected)))
 
 
-# --------------------------------------------------------------------------------- backends agree, all scenes
+# ----------------------------------------------------------------------------------------- implicit contact
 
+SHORTER = {
+    "bounce_once": BounceOnce(horizon=96, dt=1 / 96),
+    "bouncing_ball": BouncingBall(horizon=48, dt=0.01),
+    "friction_block": FrictionBlock(horizon=400),
+    "ground_wall": GroundWall(horizon=120),
+    "hopper": Hopper(horizon=400),
+    "wall_penalty_1d": WallPenalty1d(horizon=100, dt=0.02),
+}
+"""Scenes in few steps where those would be many.
 
-def combinations(root):
-    """Scene x law, for laws that solve an equation or for those that do not, in few steps where those would be many.
-
-    The implicit law is inelastic: its ball forgets where it came from once it lies still, so it is stopped at landing.
-    """
-    for name, cls in SCENES.items():
-        if issubclass(cls, EngineScene):  # it has no program of its own; tests/test_engines.py checks its twin
-            continue
-        scenes = {
-            "cartpole": [Cartpole(noise=noise) for noise in ("action", "parameter")],
-            "bounce_once": [BounceOnce(horizon=96, dt=1 / 96)],
-            "bouncing_ball": [BouncingBall(horizon=48 if root else 100, dt=0.01)],
-            "wall_penalty_1d": [WallPenalty1d(horizon=100, dt=0.02)],
-            "ground_wall": [GroundWall(horizon=120 if root else 288)],
-            "hopper": [Hopper(horizon=400)],
-            "friction_block": [FrictionBlock(horizon=400)],
-        }.get(name, [cls()])
-        for scene in scenes:
-            if scene.backends:  # it says itself where it runs
-                continue
-            contacts = getattr(scene, "n_contacts", 0)
-            laws = [law for law in LAWS.values() if law.needs_root == root] if contacts else [] if root else [None]
-            if root:  # a surrogate is not the derivative; tests/plugins/test_surrogate.py holds it
-                laws = [law for law in laws if not law.surrogate]
-            for law in laws:
-                yield pytest.param(scene, law, id=f"{name}-{law.name if law else scene.noise}")
+The implicit law is inelastic: its ball forgets where it came from once it lies still, so it is stopped at landing.
+"""
+CONTACT_SCENES = [
+    SHORTER.get(name) or entry.plugin()
+    for name, entry in registry.entries()["scenes"].items()
+    if entry.plugin.__module__.startswith("bench.plugins.") and issubclass(entry.plugin, ContactScene)
+]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("scene", "law"), list(combinations(root=False)))
-def test_backends_agree(scene, law):
-    made = program(scene, law)
-    theta, w = scene.theta0(), normal(made.n_noise, 4)
-    jax, torch, numpy = (backend.compile(made) for backend in (Jax(), Torch(), Numpy()))
-    costs = jax.value(theta, w)
-    assert np.all(np.isfinite(costs))
-    assert torch.value(theta, w) == pytest.approx(costs, rel=SAME)
-    assert numpy.value(theta, w) == pytest.approx(costs, rel=SAME)
-    gradients = jax.grad(theta, w)
-    scale = np.abs(gradients).max()
-    assert np.abs(torch.grad(theta, w) - gradients).max() <= SAME * scale
-
-
 @pytest.mark.parametrize(
-    "scene",
-    [c() for c in SCENES.values() if issubclass(c, ContactScene)],
-    ids=lambda s: s.name,
+    ("scene", "is_rigid", "kappa"), pairwise(itertools.product(CONTACT_SCENES, (True, False), (1e-2, 1e-4, 1e-6)))
 )
-def test_contact_geometry(scene):
-    """gap_rate is the time derivative of gap, and a force on a contact opens it."""
-    q, v = np.random.default_rng(0).normal(size=(2, scene.n_q, 5))
-    eps = 1e-6
-    difference = (scene.gap(np, q + eps * v) - scene.gap(np, q - eps * v)) / (2 * eps)
-    assert difference.shape == (scene.n_contacts, 5)
-    assert scene.gap_rate(np, q, v) == pytest.approx(difference, rel=DIFFERENCED, abs=ROUNDED_OVER_EPS)
-    for i in range(scene.n_contacts):
-        force = np.zeros((scene.n_contacts, 5))
-        force[i] = 1.0
-        push = scene.contact_acceleration(np, q, force)
-        assert np.all(scene.gap_rate(np, q, push)[i] > 0)
-        assert scene.contact_acceleration(np, q, 3.0 * force) == pytest.approx(3.0 * push)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("scene", "law"), list(combinations(root=True)))
-def test_implicit_gradient_is_that_of_its_program(scene, law):
+def test_implicit_gradient_is_that_of_its_program(scene, is_rigid, kappa):
     """Against central differences, in contact, on the central path and near hard contact, soft and rigid."""
     theta = scene.theta0()
     free = Jax().compile(program(scene))
     w = 0.5 * normal(free.program.n_noise, 3)
-    for stiffness in (math.inf, scene.contact_values.get("stiffness", 1e4)):
-        for kappa in (1e-2, 1e-4, 1e-6):
-            problem = Implicit().compile(program(scene, law, kappa=kappa, stiffness=stiffness))
-            assert np.all(np.abs(problem.value(theta, w) - free.value(theta, w)) > 1e-4), "the contact is not active"
-            exact = problem.grad(theta, w)
-            for i in {0, theta.size // 2}:
-                step = 1e-6 * np.eye(theta.size)[i]
-                difference = (problem.value(theta + step, w) - problem.value(theta - step, w)) / 2e-6
-                assert np.abs(exact[i] - difference).max() <= SOLVED * np.abs(exact).max() + ROUNDED
+    stiffness = math.inf if is_rigid else scene.contact_values.get("stiffness", 1e4)
+    problem = Implicit().compile(program(scene, Complementarity, kappa=kappa, stiffness=stiffness))
+    assert np.all(np.abs(problem.value(theta, w) - free.value(theta, w)) > 1e-4), "the contact is not active"
+    exact = problem.grad(theta, w)
+    for i in {0, theta.size // 2}:
+        step = 1e-6 * np.eye(theta.size)[i]
+        difference = (problem.value(theta + step, w) - problem.value(theta - step, w)) / 2e-6
+        assert np.abs(exact[i] - difference).max() <= SOLVED * np.abs(exact).max() + ROUNDED
 
 
 # --------------------------------------------------------------------------------------------- closed forms
 
 CLOSED = [
-    Heaviside(),
     Heaviside(theta=0.1),
-    Ledge(),
-    CoinWalk(),
-    SoftHeaviside(),
     SoftHeaviside(theta=0.03, nu=0.2),
-    Quadratic(),
     Quadratic(dimension=1),
-    Linear(),
-    Cubic(),
     Cubic(dimension=2, sigma=0.5),
-    Constant(),
-    DoubleIntegrator(),
-    GustyCart(),
-    StiffDecay(),
-    MassSpring(),
     BounceOnce(horizon=48, dt=1 / 48),
     BounceOnce(horizon=48, dt=1 / 48, velocity=-0.95),
     BounceOnce(horizon=48, dt=1 / 48, velocity=-0.95, restitution=0.5, mass=0.01, force=1.0),
 ]
+"""Scenes with other parameters than the kit's."""
 
 
 def closed_program(scene):
     return program(scene, Impulse if isinstance(scene, BounceOnce) else None)
-
-
-def test_all_closed_forms_are_covered():
-    covered = {scene.name for scene in CLOSED}
-    declared = {name for name, cls in SCENES.items() if cls.closed_form_gradient is not Scene.closed_form_gradient}
-    assert declared <= covered
 
 
 @pytest.mark.parametrize("scene", CLOSED, ids=lambda s: s.name)

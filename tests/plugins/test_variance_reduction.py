@@ -103,12 +103,9 @@ def test_optimal_baseline_is_computed_from_the_other_samples():
     np.testing.assert_allclose(OptimalBaseline().estimate(p, p.program.theta0, w), expected, rtol=ROUNDING)
 
 
-def known(value, score, is_explicit=False):
+def known(value, score):
     """Return a problem of one variable with a given cost and score of w."""
-    return SimpleNamespace(
-        value=lambda theta, w: value(w[0]), score=lambda theta, w: score(w), explicit=lambda theta, w: np.zeros_like(w),
-        program=SimpleNamespace(explicit=is_explicit),
-    )  # fmt: skip
+    return SimpleNamespace(value=lambda theta, w: value(w[0]), score=lambda theta, w: score(w))
 
 
 @pytest.mark.parametrize("offset", [0.0, 3.0])
@@ -125,15 +122,6 @@ def test_optimal_baseline_is_unbiased_where_the_other_samples_have_no_score(offs
     inside = 2 * (3 * (stats.norm.cdf(1.5) - 0.5) - (1.5**3 + 3 * 1.5) * stats.norm.pdf(1.5))
     assert mean == pytest.approx(3.0 - inside, rel=1e-9)
     assert 3.0 - inside == pytest.approx(2.44, abs=0.01)
-
-
-def test_optimal_baseline_with_an_explicit_derivative_needs_a_quotient_with_finite_variance():
-    """1 / s has no mean for a normal s, and s_2 / (s_2^2 + s_3^2) has no variance; with three scores both are finite."""
-    given = known(lambda w: w, lambda w: w, is_explicit=True)
-    for samples in (2, 3):
-        with pytest.raises(ValueError, match=f"at least 4 samples, got {samples}"):
-            OptimalBaseline().estimate(given, np.zeros(1), drawn(1, samples, 1))
-    assert OptimalBaseline().estimate(given, np.zeros(1), drawn(1, 4, 1)).shape == (1, 1)
 
 
 def test_a_constant_added_to_the_cost_does_not_change_the_optimal_baselines_estimate():

@@ -108,6 +108,14 @@ def test_first_gain_of_a_window_without_value(steps):
         assert plan[start] == pytest.approx(-GAINS[steps] * x[start], abs=FIXED)
 
 
+def test_a_window_keeps_the_last_part_of_the_gradient():
+    """The derivatives by the controls are proportional to 20, 19, ..., 1, and the last five remain: 55 of 2,870."""
+    problem = bench.problem("double_integrator[horizon=20]", backend="numpy")
+    still = np.zeros((1, 1, problem.program.n_noise))
+    full, window = (e.estimate(problem, problem.program.theta0, still)[0] for e in (Fobg(), Windowed(steps=5)))
+    assert window @ full / (full @ full) == pytest.approx(55 / 2870, rel=DIFFERENCED)
+
+
 def test_excess_cost_of_short_windows():
     """J(K_H)/J* - 1 with J(K) = (1 + 10 K^2) / (1 - (1 - K)^2), from gains by Riccati steps written here."""
     gain, p, costs = {}, 0.0, {}

@@ -433,7 +433,8 @@ def test_own_measurements_have_no_coverage_to_show(standard):
 
 # ------------------------------------------------------------------------------------------------- scans of the loss
 
-CHAOS = ("scenes=[logistic_map[horizon=200]]", "integrators=[explicit_euler]", "repeats=2")
+PLUGINS = Path(__file__).resolve().parents[1] / "plugins_for_tests"
+CHAOS = (f"plugins=[{PLUGINS}]", "scenes=[logistic_map[horizon=200]]", "integrators=[explicit_euler]", "repeats=2")
 SCAN = "study=identify[scan=2001,span=1.89,windows=40,measurement=1e-6,start=1.02,iterations=1]"
 
 
@@ -518,15 +519,11 @@ def test_without_a_scan_keys_are_those_of_the_study_before_it_had_one():
     assert plain.key == cell_of(*SPRING).key
 
 
-@pytest.fixture(scope="module")
-def chaos():
+def test_the_scan_is_stated_with_its_grid_and_drawn():
     given = config.load([SCAN, "backends=[numpy]", "optimizers=[gauss_newton]", "samples=1", *CHAOS])
     (cell,) = cells(given)
     rows = pd.DataFrame([cell.columns() | measure(cell, given.study) | {"experiment": "chaos"}])
-    return study_of(given).views(given, rows)
-
-
-def test_the_scan_is_stated_with_its_grid_and_drawn(chaos):
+    chaos = study_of(given).views(given, rows)
     assert chaos.findings[-1].startswith(
         "The loss on logistic_map over 2,001 values of rate from 2 to 4 1/s has 131 local minima for the whole record of 200 "
         "steps, and "

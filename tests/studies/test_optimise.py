@@ -27,7 +27,7 @@ from bench.experiment.grid import cells
 from bench.experiment.study import study_of
 from bench.measure import performance
 from bench.measure.solve import solve
-from bench.model import Problem, State, compose
+from bench.model import Problem, State, compose, slopes
 from bench.report.views import newest_rows
 from bench.run.execute import store_of
 from bench.run.plan import plan
@@ -386,6 +386,27 @@ def test_a_call_that_fails_for_one_seed_is_made_for_each_alone():
     good, bad = run_batched(problem, [search(problem.program.n_noise), search(problem.program.n_noise + 1)])
     assert isinstance(good, dict)
     assert isinstance(bad, BaseException)
+
+
+def test_step_jacobians_of_searches_that_share_batches():
+    """Without step Jacobians of the backend they are differences, in a shared problem too."""
+    problem = bench.problem("lqr[horizon=5]", backend="numpy")
+    theta, still = np.ones(5), np.zeros((5, 1))
+    (shared,) = run_batched(problem, [lambda lane: {"a": slopes(lane, theta, still).a}])
+    assert np.array_equal(shared["a"], slopes(problem, theta, still).a)
+
+
+def test_an_untimed_search_runs_in_another_process(tmp_path):
+    words = [word for word in BARE if not word.startswith("workers")] + [
+        "workers=1",
+        "timing=false",
+        "samples=2",
+        "repeats=2",
+    ]
+    assert main([*words, "study=optimise[iterations=2]", "sweep.seed=[0,1]", f"results_dir={tmp_path}"]) == 0
+    rows = bench.load(tmp_path / "none")
+    assert (rows["status"] == "ok").all()
+    assert (rows["gradients"] == 4).all()
 
 
 def test_tables_charts_and_page(finished):

@@ -180,10 +180,3 @@ def test_a_scene_without_observations_is_refused():
     assert isinstance(program, Rollout)
     with pytest.raises(Unsupported, match="no observations and random starts"):
         Environment(program, registry.make("backends", "jax").ops())
-
-
-def test_a_discounted_scene_is_refused_since_trainers_have_a_discount_of_their_own():
-    from bench.errors import Unsupported
-
-    with pytest.raises(Unsupported, match="discount must be 1"):
-        Environment(cartpole_program(discount=0.9), registry.make("backends", "jax").ops())

@@ -36,7 +36,6 @@ class BestGradient(Estimator):
     """The best gradient available: without noise for a continuous cost, else the mean of costs times scores."""
 
     name = ""  # not a plugin
-    includes_explicit_derivative = True
 
     def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Return the gradient of the scored objective, ``(R, d)``."""

@@ -104,8 +104,6 @@ class Identify(Study):
             )
         if optimizer.draws(2):
             return f"optimizer {optimizer.name} samples, and fits are compared along one path: use a deterministic one"
-        if "path" in optimizer.needs:
-            return f"optimizer {optimizer.name} plans controls, and fits have parameters: use gauss_newton"
         if self.data is not None:
             try:
                 read(self.data, scene)

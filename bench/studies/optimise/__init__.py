@@ -92,11 +92,7 @@ class Optimise(Study):
         optimizer, estimator = cell.parts["optimizer"], cell.parts["estimator"]
         assert isinstance(optimizer, Optimizer)
         assert estimator is None or isinstance(estimator, Estimator)
-        if "path" in optimizer.needs and self.scored != "plain":
-            return f"optimizer {optimizer.name} minimises the cost without noise, and scored={self.scored} is another objective"
-        if reason := optimizer.unsupported_reason(cell.program()):
-            return reason
-        available = {"value", "path"} | ({"gradient"} if estimator is not None and estimator.gives_gradient else set())
+        available = {"value"} | ({"gradient"} if estimator is not None and estimator.gives_gradient else set())
         missing = sorted(optimizer.needs - available)
         if missing:
             source = f"estimator {estimator.name}" if estimator is not None else f"scene {cell.scene.name}"

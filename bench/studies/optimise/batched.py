@@ -95,12 +95,6 @@ class Lane(Problem):
         """Return per-sample scores ``(d, B)``."""
         return self._call("score", theta, w)
 
-    def explicit(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """Return per-sample derivatives ``(d, B)`` by theta along every path except the actions."""
-        if self.program.explicit:
-            self.usage.gradients += w.shape[1]
-        return self._call("explicit", theta, w)
-
     @property
     def gives_jacobians(self) -> bool:
         """Whether the shared problem defines :meth:`jacobians`."""

@@ -117,8 +117,7 @@ class OptimizerRun:
         wanted = self.optimizer.required_fields(state)
         value = self._values(points, iteration) if "value" in wanted else None
         gradient = self._gradients(points, iteration) if "gradient" in wanted else None
-        path = self.optimizer.expansion(self.problem, self.cell.backend, points[:, 0]) if "path" in wanted else None
-        return self.optimizer.tell(state, points, Answer(value, gradient, path=path))
+        return self.optimizer.tell(state, points, Answer(value, gradient))
 
     def _noise(self, iteration: int) -> np.ndarray:
         width = self.problem.program.n_noise

@@ -1,0 +1,169 @@
+"""Every registered plugin passes the conformance kit: on few short programs, slowly on a design of crossings, or on all."""
+
+import dataclasses
+import itertools
+from functools import cache
+
+import numpy as np
+import pytest
+from pairwise import pairwise
+
+from bench import conformance
+from bench.conformance import check as results_of
+from bench.conformance import kit, parametrize
+from bench.conformance.subjects import (
+    all_programs,
+    backends,
+    can_run,
+    distinguishing_programs,
+    plain_backend,
+    samples,
+    sound_scenes,
+)
+from bench.conformance.subjects import programs as programs_of
+from bench.model import ContactScene, EngineScene, MechanicalScene, Plugin, compose, registry
+
+STEPS = 50
+"""Most steps of a rollout in the fast tests, and as in the slow ones where a scene declares to jump."""
+MOVED = 1e-9
+"""Difference of costs of about 1 that is far more than rounding."""
+ENTRIES = [entry for table in registry.entries().values() for entry in table.values()]
+PLUGINS = [entry.plugin for entry in ENTRIES if entry.plugin is not None]
+ITEMS = parametrize(PLUGINS).mark.args[1]
+GENERIC = {check.__name__ for check in kit._CHECKS[Plugin]}
+
+
+def kit_items(keep):
+    """The kit's items of registered plugins, beside those of any plugin, whose subject and name of check are to be kept."""
+    named = [(item, item.values[0], item.values[1].args[0].__name__) for item in ITEMS]
+    chosen = [item for item, subject, name in named if name not in GENERIC and keep(subject, name)]
+    return pytest.mark.parametrize(("plugin", "check"), chosen)
+
+
+def is_long(plugin, check):
+    """Whether a check takes long: of backends that compile each program for seconds or run it eagerly, and a few more.
+
+    A rollout of ``hopper_run`` has 1,920 steps of the integrator, ``surrogate_backward`` solves two equations each step, and
+    a search for jumps takes thousands of rollouts of an engine.
+    """
+    is_slow_backend = {"physics", "root"} & set(getattr(plugin, "provides", ())) or {"torch", "numba"} & set(
+        plugin.requires
+    )
+    is_search = check == "continuity_is_as_declared" and isinstance(plugin, EngineScene)
+    return bool(is_slow_backend) or is_search or plugin.name in ("hopper_run", "surrogate_backward")
+
+
+def is_repeated(plugin, check):
+    """Whether a check without noise ran on the same scene with another place of the noise."""
+    return check == "continuity_is_as_declared" and plugin.noise != type(plugin)().noise
+
+
+def explicit_programs(scene):
+    """The scene's programs without an equation to solve."""
+    return [program for program in programs_of(scene) if not program.needs_root]
+
+
+@cache
+def shortened(scene):
+    """The scene with STEPS steps, or twice as many and so on until theta and the contacts both move its cost.
+
+    Scenes that jump keep theirs, since the jump may come later, and so do those that run in engines only.
+    """
+    if not isinstance(scene, MechanicalScene) or isinstance(scene, EngineScene) or not scene.continuous:
+        return scene
+    for doublings in itertools.count():
+        horizon = STEPS << doublings
+        if horizon >= scene.horizon:
+            return scene
+        short = dataclasses.replace(scene, horizon=horizon)
+        program = explicit_programs(short)[0]
+        costs = quiet_costs(program)
+        free = quiet_costs(compose(short, None, program.integrator))
+        if np.ptp(costs) > MOVED and (program.contact is None or np.abs(costs - free).max() > MOVED):
+            return short
+
+
+def quiet_costs(program):
+    """Costs without noise at thetas near theta0, ``(B,)``."""
+    theta, w = samples(program)
+    return plain_backend().compile(program).value(theta, 0 * w)
+
+
+@pytest.fixture
+def few_programs(monkeypatch, check):
+    """Checks run one short program of each sort, or every fourth scene with contacts, and compare ``jax`` with ``numpy``."""
+    programs = distinguishing_programs(
+        compose(shortened(program.scene), program.contact, program.integrator) for program in all_programs()
+    )
+    touching = [scene for scene in sound_scenes() if isinstance(scene, ContactScene) and scene.continuous]
+    compared = check.args[0].__name__ == "backends_agree"
+
+    def few(scene):
+        programs = explicit_programs if compared else programs_of
+        return distinguishing_programs(programs(shortened(scene)))[: 1 if compared else None]
+
+    monkeypatch.setattr(conformance.backends, "all_programs", lambda: programs)
+    monkeypatch.setattr(conformance.scenes, "programs", few)
+    monkeypatch.setattr(conformance.scenes, "backends", lambda: [b for b in backends() if b.name == "jax"])
+    monkeypatch.setattr(conformance.contacts, "sound_scenes", lambda: list(map(shortened, touching[::4])))
+
+
+@pytest.mark.parametrize("entry", ENTRIES, ids=lambda entry: f"{entry.kind}-{entry.name}")
+def test_registered_plugin_loads_and_is_well_formed(entry):
+    assert entry.plugin is not None, entry.reason
+    assert [result for result in results_of(entry.plugin, GENERIC) if result.outcome != "pass"] == []
+
+
+@pytest.mark.usefixtures("few_programs")
+@kit_items(lambda plugin, check: not is_long(plugin, check) and not is_repeated(plugin, check))
+def test_registered_plugin_conforms(plugin, check):
+    check(plugin)
+
+
+# ----------------------------------------------------------------------------------------------- crossings, slow
+
+
+@cache
+def design():
+    """Scene, law and backend of programs in which each pair of these occurs, among those that ``numpy`` runs too."""
+    plain = plain_backend()
+    runs = [program for program in all_programs() if can_run(plain, program)]
+    others = [backend for backend in backends() if type(backend) is not type(plain)]
+    return set(pairwise(levels(p, backend) for p in runs for backend in others if can_run(backend, p)))
+
+
+def levels(program, backend):
+    return type(program.scene), type(program.contact), type(backend)
+
+
+@pytest.fixture
+def designed_programs(monkeypatch, plugin, check):
+    """Costs on a backend are compared on the programs of the design."""
+    if check.args[0].__name__ == "value_agrees":
+        programs = [program for program in all_programs() if levels(program, plugin) in design()]
+        monkeypatch.setattr(conformance.backends, "all_programs", lambda: programs)
+
+
+def is_wider(plugin, check):
+    """Whether a check runs more or longer programs than in the fast tests."""
+    if check in ("value_agrees", "gradient_is_that_of_value"):
+        return plugin == type(plugin)() and plugin.name != plain_backend().name
+    if check == "costs_are_finite":
+        return isinstance(plugin, ContactScene)
+    if check == "continuity_is_as_declared":
+        is_shortened = plugin.continuous and getattr(plugin, "horizon", 0) > STEPS
+        return is_shortened and not is_repeated(plugin, check)
+    return check == "continuity_in_rollouts_is_as_declared"
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("designed_programs")
+@kit_items(lambda plugin, check: check != "backends_agree" and (is_long(plugin, check) or is_wider(plugin, check)))
+def test_registered_plugin_conforms_on_more_programs(plugin, check):
+    check(plugin)
+
+
+@pytest.mark.full
+@kit_items(lambda plugin, check: plugin.kind in ("backends", "scenes", "contacts"))
+def test_registered_plugin_conforms_on_every_program(plugin, check):
+    check(plugin)

@@ -1,0 +1,156 @@
+"""Plants one bug at a time in a plugin and runs claims that use it: `python validation/planted_claims.py [BUG...]`.
+
+Prints a table of the bugs, the claims that were run and those that fail. A bug that no claim notices ends with status 1.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from typing import Any
+from unittest import mock
+
+from bench.plugins.contacts.complementarity import Complementarity
+from bench.plugins.contacts.impulse import Impulse
+from bench.plugins.estimators.inverse_variance import InverseVariance
+
+from bench.claims import discovery, results
+from bench.claims.claim import NOT_REPRODUCED
+from bench.model import DiagnosticEstimator, Problem, SampleMean, State, registry
+
+
+@contextlib.contextmanager
+def changed(owner: type, name: str, wrapper: Callable[..., Any]) -> Iterator[None]:
+    """Replace a method by ``wrapper(original, self, *arguments)``."""
+    original = getattr(owner, name)
+    with mock.patch.object(owner, name, lambda self, *a, **k: wrapper(original, self, *a, **k)):
+        yield
+
+
+def scaled(factor: float) -> Callable[..., Any]:
+    """Return a wrapper that multiplies a method's result."""
+    return lambda original, self, *a, **k: factor * original(self, *a, **k)
+
+
+def halved_kappa(original: Any, self: Any, ops: Any, contact: Any, before: Any, free: Any, dt: Any) -> Any:
+    import copy
+
+    twin = copy.copy(self)
+    object.__setattr__(twin, "kappa", self.kappa / 2)
+    return original(twin, ops, contact, before, free, dt)
+
+
+def swapped_weights(original: Any, self: Any, problem: Any, theta: Any, noise: Any) -> Any:
+    from bench.plugins.estimators import inverse_variance
+
+    plain = inverse_variance.halves
+    with mock.patch.object(inverse_variance, "halves", plain):
+        first, zeroth = plain(problem, theta, noise)
+        v1, v0 = first.var(axis=1, ddof=1), zeroth.var(axis=1, ddof=1)
+        weight = v1 / (v0 + v1)
+        return weight * first.mean(axis=1) + (1 - weight) * zeroth.mean(axis=1), {"weight": weight}
+
+
+def early_impact(original: Any, self: Any, ops: Any, contact: Any, before: Any, free: Any, dt: Any) -> Any:
+    change = original(self, ops, contact, before, free, dt)
+    return State(0.9 * change.q, change.v)
+
+
+def fast_step(original: Any, self: Any, dynamics: Any, state: Any, u: Any, dt: Any) -> Any:
+    return original(self, dynamics, state, u, 1.05 * dt)
+
+
+def with_numbers(original: Any, self: Any, problem: Any, theta: Any, noise: Any) -> Any:
+    values, numbers = original(self, problem, theta, noise)
+    return 1.05 * values, numbers
+
+
+Bug = tuple[type, str, Callable[..., Any], tuple[str, ...]]
+"""The class and method with the bug, the wrapper, and the claims that are run."""
+
+
+def of(kind: str, name: str) -> type:
+    """Return a plugin's class."""
+    plugin = registry.find(kind, name).plugin
+    assert plugin is not None
+    return plugin
+
+
+CLAIMS = {
+    "estimators": {
+        "fobg": ("C5", "C6", "C19"), "inverse_variance": ("C19",), "measure_valued": ("C6",), "randomized_smoothing": ("C7",),
+        "reinforce": ("C1", "C5", "C6"), "sphere_smoothing": ("C7",),
+    },
+    "contacts": {"penalty": ("C14", "C18"), "straight_through": ("C15",)},
+    "integrators": {"event_driven": ("C13",), "semi_implicit_euler": ("C8", "C13")},
+}  # fmt: skip
+"""The claims that use a plugin, by kind and name. `impulse` and `complementarity` have bugs of their own below."""
+
+
+def _bugs() -> Iterator[tuple[str, Bug]]:
+    yield "kappa halved", (Complementarity, "impulse", halved_kappa, ("C5",))
+    yield "time of impact .9 dt", (Impulse, "impulse", early_impact, ("C8", "C13"))
+    yield "score 5% large", (Problem, "score", scaled(1.05), ("C1", "C5", "C6"))
+    yield "weights swapped", (InverseVariance, "estimate_with_diagnostics", swapped_weights, ("C19",))
+    for name, claims in CLAIMS["estimators"].items():
+        plugin = of("estimators", name)
+        if issubclass(plugin, DiagnosticEstimator):
+            bug: Bug = (plugin, "estimate_with_diagnostics", with_numbers, claims)
+        else:
+            bug = (plugin, "terms" if issubclass(plugin, SampleMean) else "estimate", scaled(1.05), claims)
+        yield f"{name} 5% large", bug
+    for name, claims in CLAIMS["contacts"].items():
+        yield f"{name} force 5% large", (of("contacts", name), "force", scaled(1.05), claims)
+    for name, claims in CLAIMS["integrators"].items():
+        yield f"{name} step 5% long", (of("integrators", name), "step", fast_step, claims)
+
+
+BUGS: dict[str, Bug] = dict(_bugs())
+"""Bugs by name."""
+
+
+def failing(bug: str) -> tuple[list[str], list[str]]:
+    """Return the claims that are run under a bug, and those that are then not reproduced.
+
+    The bug is planted in a process of its own: a program that was compiled without the bug would run without it.
+    """
+    claims = BUGS[bug][3]
+    command = [sys.executable, __file__, "--process", bug]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    if result.returncode:
+        raise RuntimeError(f"the process with the bug '{bug}' failed: {result.stderr[-2000:]}")
+    verdicts = json.loads(result.stdout.splitlines()[-1])
+    return list(claims), [claim for claim in claims if verdicts[claim] == NOT_REPRODUCED]
+
+
+def verdicts(bug: str) -> dict[str, str]:
+    """Return the verdict of each claim that is run under a bug, or its error; nothing may have been compiled before."""
+    owner, name, wrapper, claims = BUGS[bug]
+    found = {}
+    with changed(owner, name, wrapper):
+        for claim in claims:
+            try:
+                found[claim] = results.measure(discovery.claims()[claim]).verdict
+            except Exception as error:
+                found[claim] = f"{type(error).__name__}: {error}"
+    return found
+
+
+def main(bugs: list[str]) -> int:
+    """Print a line per bug; return 1 if a bug passes every claim that is run."""
+    if bugs[:1] == ["--process"]:
+        print(json.dumps(verdicts(bugs[1])))
+        return 0
+    missed = 0
+    for bug in bugs or BUGS:
+        claims, failed = failing(bug)
+        missed += not failed
+        print(f"| {bug} | {', '.join(claims)} | {', '.join(failed) or 'none'} |", flush=True)
+    return int(missed > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

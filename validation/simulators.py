@@ -1,0 +1,358 @@
+"""Runs `bench.examine` on planted faults and correct gradients in NumPy, torch and JAX simulators, and prints a table.
+
+    python validation/simulators.py [numpy] [right] [torch] [jax]
+
+A line per case has the cause that `bench.examine` reports, its exit status, calls and seconds. Failures of engines by their
+mechanisms are in `mechanisms.py`.
+"""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Case:
+    """A cost with a gradient, and the expected result of an examination."""
+
+    name: str
+    cost: Callable[..., Any]
+    theta: Any
+    grad: Any
+    causes: tuple[str, ...] = ()
+    """Correct names of the planted fault; empty for a correct gradient."""
+    settings: dict[str, Any] = field(default_factory=dict)
+    warned: str = ""
+    """Expected start of a warning about a correct gradient."""
+
+
+# ------------------------------------------------------------------------------------------------ NumPy
+
+
+def complex_step(cost, *extra):
+    """Return a function for the gradient of an analytic cost, exact up to rounding (Squire and Trapp 1998)."""
+
+    def gradient(x, *w):
+        steps = np.array(x, dtype=complex)[None] + 1e-30j * np.eye(len(x))
+        return np.array([cost(row, *w).imag for row in steps]) / 1e-30
+
+    return gradient
+
+
+def swing(x, steps=100, dt=0.02):
+    """Return q^2 + 0.1 v^2 at the end of a damped pendulum's motion; theta is first angle, first speed and damping."""
+    q, v = x[0], x[1]
+    for _ in range(steps):
+        v = v + dt * (-9.81 * np.sin(q) - x[2] * v)
+        q = q + dt * v
+    return q * q + 0.1 * v * v
+
+
+def landing(x, has_contact=True, steps=150, dt=2e-3, slope=False):
+    """Return the cost of a ball on a damped spring floor or, with ``slope``, its derivative by height and speed.
+
+    The derivative omits all contact terms unless ``has_contact``.
+    """
+    q, v, dq, dv = x[0], x[1], np.array([1.0, 0.0]), np.array([0.0, 1.0])
+    for _ in range(steps):
+        depth = max(-q, 0.0)
+        force = -9.81 + 2e3 * depth - 50.0 * depth * v
+        dforce = float(q < 0) * has_contact * (-2e3 * dq + 50.0 * v * dq - 50.0 * depth * dv)
+        v, dv = v + dt * force, dv + dt * dforce
+        q, dq = q + dt * v, dq + dt * dv
+    return 2 * (q - 0.2) * dq if slope else (q - 0.2) ** 2
+
+
+def bisected(x, tolerance, slope=False):
+    """Return the square of the root z of z + z^3 = x0 x1, by bisection to ``tolerance``, or its implicit derivative."""
+    low, high = -10.0, 10.0
+    while high - low > tolerance:
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if middle + middle**3 < x[0] * x[1] else (low, middle)
+    z = 0.5 * (low + high)
+    return np.array([x[1], x[0]]) / (1 + 3 * z * z) * 2 * z if slope else z * z
+
+
+def fixed_point(x, tolerance=1e-7, slope=False):
+    """Return z^2 for z = cos(z) x0 x1 / 3, iterated until z moves at most ``tolerance``, or its implicit derivative."""
+    z, before, c = 0.0, 1.0, x[0] * x[1] / 3
+    while abs(z - before) > tolerance:
+        z, before = np.cos(z) * c, z
+    return 2 * z * np.cos(z) / 3 * np.array([x[1], x[0]]) / (1 + np.sin(z) * c) if slope else z * z
+
+
+MIX = np.array([[2.0, 1.0, 0.3], [0.2, 1.5, -0.4], [0.1, 0.7, 1.2]])
+START = [0.4, 0.3, 0.5]
+
+
+def mixed(x):
+    return np.sum(np.tanh(MIX @ x) ** 2)
+
+
+def transposed(x):
+    y = np.tanh(MIX @ x)
+    return MIX @ (2 * y * (1 - y * y))
+
+
+def numpy_cases():
+    right = complex_step(swing)
+    first, calls = {}, []
+
+    def stale(x):
+        return first.setdefault("gradient", right(x))
+
+    def counting(x):
+        calls.append(x)
+        return swing(x) + 1e-5 * len(calls)
+
+    def driven(x, w):
+        q, v = x[0], x[1]
+        for push in w:
+            v = v + 0.05 * (-9.81 * np.sin(q) - x[2] * v + push)
+            q = q + 0.05 * v
+        return q * q
+
+    def slope(x):
+        return bisected(x, 1e-7, slope=True)
+
+    noise, drop = {"noise": 20}, [0.1, -0.5]
+    yield Case("3% off", swing, START, lambda x: 1.03 * right(x), ("wrong_factor",))
+    yield Case("transposed matrix", mixed, START, transposed, ("missing_term",))
+    yield Case("missing contact term", landing, drop, lambda x: landing(x, False, slope=True), ("missing_term",))
+    yield Case("last step forgotten", swing, START, complex_step(lambda x: swing(x, 99)), ("missing_term",))
+    yield Case("stale cache", swing, START, stale, ("stale_gradient",))
+    yield Case("float32 inside", lambda x: swing(np.asarray(x, np.float32)).item(), START, right, warned="precision")
+    rounded = ("staircase", "precision")
+    yield Case("cast to int", lambda x: swing(np.floor(np.array(x) * 1e4) / 1e4), START, right, rounded)
+    yield Case("state outlasts a call", counting, START, right, ("nondeterministic",))
+    shifted = complex_step(lambda x, w: driven(x, w[::-1]))
+    yield Case("noise reused shifted", driven, START, shifted, ("missing_term",), noise)
+    yield Case("gradient elsewhere", swing, START, lambda x: right(np.array(x) + 0.01), ("missing_term",))
+    yield Case("jump at theta", lambda x: swing(x) + (x[0] > 0.4 - 1e-12) * 1.0, START, right, ("jump",))
+    yield Case("bisection to 1e-7", lambda x: bisected(x, 1e-7), [1.0, 2.0], slope, ("precision",))
+
+    yield Case("pendulum", swing, START, right)
+    yield Case("contact", landing, drop, lambda x: landing(x, slope=True))
+    yield Case("cost of 1e-12", lambda x: 1e-12 * swing(x), START, lambda x: 1e-12 * right(x))
+    yield Case("cost beside 1e6", lambda x: 1e6 + swing(x), START, right)
+    yield Case("solver to 1e-7", fixed_point, [1.0, 2.0], lambda x: fixed_point(x, slope=True))
+    yield Case("own noise", driven, START, complex_step(driven), settings=noise)
+
+
+def friction(x, steps=60, dt=0.01):
+    """Return the cost of a block pushed over a floor whose friction changes sign within 1 mm/s, so that it is stiff."""
+    q, v = 0.0, x[0]
+    for t in range(steps):
+        v = v + dt * (x[1] * (t < steps // 2) - np.tanh(v / 1e-3))
+        q = q + dt * v
+    return q * q
+
+
+def decay(x, steps=20, dt=0.1):
+    """Return the cost of implicit Euler steps of y' = -k (y - cos y), k = x1; each step is a Newton solve to rounding."""
+    y = x[0]
+    for _ in range(steps):
+        z = y
+        for _ in range(8):
+            z = z - (z - y + dt * x[1] * (z - np.cos(z))) / (1 + dt * x[1] * (1 + np.sin(z)))
+        y = z
+    return y * y + 1e-3 * np.sin(x[0]) * y + 1e-7 * x[1]
+
+
+def lorenz(x, steps=150, dt=0.01):
+    """Return the cost of Lorenz's equations by Euler's method; theta is the initial state."""
+    a, b, c = x[0], x[1], x[2]
+    for _ in range(steps):
+        a, b, c = a + dt * 10 * (b - a), b + dt * (a * (28 - c) - b), c + dt * (a * b - 8 / 3 * c)
+    return a * a + c
+
+
+def bounces(x):
+    """Return the final height of a ball that bounces twice, with exact times of impact.
+
+    theta is height and upward speed. The height has a kink where the number of bounces changes.
+    """
+    state, left = (x[0], x[1]), 1.0
+    while True:
+        hit = (state[1] + np.sqrt(state[1] ** 2 + 2 * 9.81 * state[0])) / 9.81
+        if hit.real > left:
+            return state[0] + state[1] * left - 9.81 / 2 * left**2
+        state, left = (0.0, 0.8 * (9.81 * hit - state[1])), left - hit
+
+
+def network(x, slope=False):
+    """Return the cost of a network of rectifiers, which has kinks near theta but not at it, or its derivative."""
+    first = np.outer(np.arange(1, 9) / 8, [1.0, -2.0, 0.7]) + np.sin(np.arange(24).reshape(8, 3))
+    inside = first @ np.array(x) + np.cos(np.arange(8))
+    out = np.maximum(inside, 0) @ np.cos(np.arange(8))
+    return 2 * out * ((inside > 0) * np.cos(np.arange(8))) @ first if slope else out**2
+
+
+def right_cases():
+    """Yield more correct gradients: stiff, chaotic, with kinks, and of very different sizes."""
+    right, spread, start = complex_step(swing), np.array([1e-6, 1e6, 1.0]), np.array(START)
+    many = np.linspace(-3, 3, 40)
+    yield Case("friction within 1 mm/s", friction, [0.8, 3.0], complex_step(friction))
+    yield Case("implicit, k = 1e6", decay, [0.4, 1e6], complex_step(decay))
+    yield Case("Lorenz", lorenz, [1.0, 2.0, 20.0], complex_step(lorenz))
+    yield Case("two bounces", bounces, [0.7, 0.4], complex_step(bounces))
+    yield Case("rectifiers", network, START, lambda x: network(x, slope=True))
+    yield Case("1e-6 beside 1e6", lambda x: swing(x / spread), start * spread, lambda x: right(x / spread) / spread)
+    yield Case("40 inputs", lambda x: np.sin(x @ many) + x @ x, many / 7, lambda x: np.cos(x @ many) * many + 2 * x)
+    yield Case(
+        "at a minimum", lambda x: np.sum((x - start) ** 4 + (x - start) ** 2), START,
+        lambda x: 4 * (x - start) ** 3 + 2 * (x - start),
+    )  # fmt: skip
+    yield Case(
+        "at the origin", lambda x: np.expm1(x[0]) - np.sin(x[1]) * 1e-6, [0.0, 0.0],
+        lambda x: [np.exp(x[0]), -np.cos(x[1]) * 1e-6],
+    )  # fmt: skip
+    yield Case("cost of 1e15", lambda x: 1e15 * swing(x), START, lambda x: 1e15 * right(x))
+    yield Case(
+        "steep wall", lambda x: np.log1p(np.exp(300 * (x[0] - x[1]))) / 300 + x[0] ** 2, [0.4, 0.38],
+        lambda x: np.array([1.0, -1.0]) / (1 + np.exp(-300 * (x[0] - x[1]))) + [2 * x[0], 0.0],
+    )  # fmt: skip
+
+
+# ------------------------------------------------------------------------------------------------ torch
+
+
+def torch_cases():
+    import torch
+
+    def fall(x, cut=lambda f: f, state=lambda q: q, steps=60):
+        q, v = x[0], x[1]
+        for _ in range(steps):
+            force = -9.81 + cut(200.0 * torch.relu(-q) - 3.0 * torch.relu(-q) * v)
+            v = v + 0.01 * force
+            q = state(q + 0.01 * v)
+        return (q - 0.2) ** 2 + 0.1 * v * v
+
+    def clamped(q):
+        q = q.clone()
+        q.data.clamp_(max=0.03)
+        return q
+
+    class Halved(torch.autograd.Function):
+        @staticmethod
+        def forward(context, x):
+            context.save_for_backward(x)
+            return x.sin()
+
+        @staticmethod
+        def backward(context, slope):
+            return 0.5 * slope * context.saved_tensors[0].cos()
+
+    grid = torch.linspace(-1, 1, 20001)
+
+    def snapped(x):
+        return fall(x) + 0.1 * torch.argmin((grid - x[0]).abs()) / 20000
+
+    def masked(x):
+        return fall(x) + torch.where(x[0] > 0.1, torch.sqrt(x[0] - 0.1), torch.zeros_like(x[0]))
+
+    def ranked(x):
+        return (x * torch.argsort(x).double()).sum() + torch.sort(x).indices.double()[0]
+
+    at, cut, off = [0.05, -0.4], ("missing_term",), ("disconnected",)
+    yield Case("detach on the force", lambda x: fall(x, lambda f: f.detach()), at, "torch", cut)
+    yield Case("item() in the loop", lambda x: fall(x, state=lambda q: q * 0 + q.item()), at, "torch", off)
+    yield Case("in-place clamp of data", lambda x: fall(x, state=clamped), at, "torch", cut)
+    yield Case("rounded", lambda x: fall((x * 1e5).long() / 1e5), at, "torch", ("staircase",))
+    yield Case("float32 inside", lambda x: fall(x.float()).double(), at, "torch", warned="precision")
+    yield Case("NaN behind where", masked, at, "torch", ("nan_gradient",))
+    yield Case("argmin of a grid", snapped, at, "torch", ("staircase",))
+    yield Case("rank by sorting", ranked, [0.3, 0.3], "torch", ("jump",))
+    yield Case("wrong backward", lambda x: Halved.apply(x).sum(), [0.3, 0.7], "torch", ("wrong_factor",))
+
+    three = [0.3, -0.7, 0.2]
+    yield Case("ball on a floor", fall, at, "torch")
+    yield Case("small network", lambda x: torch.tanh(torch.outer(x, x) @ x).sum(), three, "torch")
+    yield Case("sorted values", lambda x: (torch.sort(x).values * torch.arange(3)).sum(), three, "torch")
+
+
+# -------------------------------------------------------------------------------------------------- JAX
+
+
+def jax_cases():
+    import jax
+    import jax.numpy as jnp
+
+    jax.config.update("jax_enable_x64", True)
+
+    def push(x, cut=lambda f: f, steps=80):
+        def step(carry, _):
+            q, v = carry
+            gap = q[1] - q[0]
+            force = cut(100.0 * jax.nn.softplus(-20.0 * gap) / 20.0)
+            v = v + 0.02 * jnp.stack([-force, force])
+            return (q + 0.02 * v, v), None
+
+        (q, v), _ = jax.lax.scan(step, (jnp.array([0.0, 0.2]), x), None, length=steps)
+        return (q[1] - 1.0) ** 2 + 0.1 * v @ v
+
+    @jax.custom_vjp
+    def wrong(x):
+        return jnp.sin(x)
+
+    wrong.defvjp(lambda x: (jnp.sin(x), x), lambda x, g: (-g * jnp.cos(x),))
+
+    def norm(x):
+        return jnp.linalg.norm(x[1:]) ** 2 + x[0] ** 2
+
+    at = [1.0, 0.1]
+    yield Case("stop_gradient on contact", lambda x: push(x, jax.lax.stop_gradient), at, "jax", ("missing_term",))
+    yield Case("stop_gradient on theta", lambda x: push(jax.lax.stop_gradient(x)), at, "jax", ("disconnected",))
+    yield Case("cast to int", lambda x: push((x * 1e5).astype(int) / 1e5), at, "jax", ("staircase",))
+    yield Case("wrong custom_vjp", lambda x: wrong(x).sum(), at, "jax", ("wrong_factor",))
+    yield Case("norm at 0, squared", norm, [0.3, 0.0], "jax", ("nan_gradient",))
+    yield Case("float(x) in the loop", lambda x: push(x) + float(x[0]), at, "jax", ("raised",))
+
+    yield Case("pushing", push, at, "jax")
+    yield Case("stiff, implicit", lambda x: jnp.sum((x / 1001.0) ** 2) * 1e6 + jnp.sum(x), at, "jax")
+    yield Case("kink beside theta", lambda x: jnp.sum(jnp.abs(x - 0.1003) * x), at, "jax")
+
+
+CASES = {"numpy": numpy_cases, "right": right_cases, "torch": torch_cases, "jax": jax_cases}
+
+
+def examined(case):
+    """Return the report on a case."""
+    from bench.examine import examine
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return examine(case.cost, case.theta, grad=case.grad, progress=False, budget=60, **case.settings)
+
+
+def main(libraries):
+    print("| library | case | cause named | as planted | exit | costs | gradients | seconds |")
+    print("|---|---|---|---|---|---|---|---|")
+    caught = named = faults = right = alarms = 0
+    for library in libraries or CASES:
+        for case in CASES[library]():
+            report = examined(case)
+            fits = report.cause in case.causes if case.causes else report.status == 0
+            if case.warned:
+                fits &= any(case.warned in text for text in report.warnings)
+            if case.causes or case.warned:
+                faults, caught, named = faults + 1, caught + bool(report.status or case.warned), named + fits
+            else:
+                right, alarms = right + 1, alarms + bool(report.status)
+            print(
+                f"| {library} | {case.name} | {report.cause} | {'yes' if fits else 'NO'} | {report.status} "
+                f"| {report.costs} | {report.gradients} | {report.seconds:.2f} |",
+                flush=True,
+            )
+    print(f"\n{caught} of {faults} faults caught, {named} named as planted, {alarms} false alarms of {right}")
+    return 0 if named == faults and not alarms else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,311 @@
+"""Counts the rule of when to trust `fobg` on scenes that were not used to find it: `python validation/trusted.py`.
+
+The rule trusts a cell where one estimate spreads by less than half of its mean, the gradient check passes at theta, and
+its search along lines of the noise finds no jump. Ten families have six or more scenes each. Scenes of even number in a
+family may be looked at while the rule changes; those of odd number are only counted. A cell is one scene and one seed. It is
+wrong where the relative RMSE is 0.5 or more. The truth is a dense rule in one dimension, and 4 million pairs of costs in more.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from bench.plugins.backends.jax import Jax
+from bench.plugins.estimators.fobg import Fobg
+
+from bench.measure import gradcheck
+from bench.measure.jumps import jump_under_noise
+from bench.model import FunctionScene, compose, param
+from bench.studies.bias_variance.trust import SPREAD, WRONG
+from bench.studies.gradient_check.measure import SwitchSearch, start
+
+SAMPLES, REPEATS, SEEDS = 100, 32, (1, 2, 3)
+POINTS = 1 << 21
+"""Points of the rule that computes the truth in one dimension."""
+PAIRS, PART = 1 << 22, 1 << 16
+COLUMNS = 128
+
+
+@dataclass(frozen=True)
+class Given(FunctionScene):
+    """A scene with the given cost, a function of ``xp`` and ``x (d, B)``."""
+
+    name = "given"
+    key: str = param("", "what tells programs apart, so that none runs the code compiled for another")
+
+    def __init__(self, key: str, function: Callable[[Any, Any], Any], theta: tuple[float, ...], sigma: float) -> None:
+        for name, value in dict(key=key, function=function, start=theta, sigma=sigma, noise="parameter").items():
+            object.__setattr__(self, name, value)
+
+    def theta0(self) -> np.ndarray:
+        return np.array(self.start)
+
+    def cost(self, xp: Any, x: Any) -> Any:
+        return self.function(xp, x)
+
+
+class Scene(NamedTuple):
+    """A scene of a family, with its theta and noise."""
+
+    family: str
+    label: str
+    cost: Callable[[Any, Any], Any]
+    theta: tuple[float, ...]
+    sigma: float
+
+
+def edge(at: float, height: float, drag: float) -> Callable[[Any, Any], Any]:
+    """A puck slides with viscous drag for 1 s; beyond the edge of the table the target is another."""
+
+    def cost(xp: Any, v0: Any) -> Any:
+        x, v = 0.0 * v0[0], v0[0]
+        for _ in range(100):
+            x, v = x + 0.01 * v, v - 0.01 * drag * v
+        return xp.where(x > at, (x - 2.0) ** 2 + height, 0.1 * (x - 2.0) ** 2)
+
+    return cost
+
+
+def ledge(at: float, drop: float) -> Callable[[Any, Any], Any]:
+    """A ball thrown from 1 m lands on a floor that drops behind a ledge; the cost is the distance to 2 m."""
+
+    def cost(xp: Any, v: Any) -> Any:
+        g, up = 9.81, 1.0
+        near = (up + math.sqrt(up * up + 2 * g * 1.0)) / g
+        far = (up + math.sqrt(up * up + 2 * g * (1.0 + drop))) / g
+        x = v[0] * near
+        return (xp.where(x > at, v[0] * far, x) - 2.0) ** 2
+
+    return cost
+
+
+def gate(low: float, high: float, prize: float) -> Callable[[Any, Any], Any]:
+    """A cart passes a plane; between the posts it earns a prize."""
+
+    def cost(xp: Any, x: Any) -> Any:
+        y = x[0] + 0.3 * xp.sin(x[0])
+        return 0.5 * (y - 1.0) ** 2 - prize * xp.where((y > low) & (y < high), 1.0, 0.0)
+
+    return cost
+
+
+def latch(force: float, stiffness: float) -> Callable[[Any, Any], Any]:
+    """A mass on a spring; once it passes 1 m, a second spring catches it for good."""
+
+    def cost(xp: Any, v0: Any) -> Any:
+        x, v, caught = 0.0 * v0[0], v0[0], 0.0 * v0[0]
+        for _ in range(40):
+            caught = xp.where(x > 1.0, 1.0, caught)
+            v = v + 0.05 * (force - x - stiffness * caught * (x - 1.0))
+            x = x + 0.05 * v
+        return (x - 0.5) ** 2 + 0.1 * x
+
+    return cost
+
+
+def friction(mu: float, width: float) -> Callable[[Any, Any], Any]:
+    """A block slides until dry friction stops it (width 0), or with friction smoothed over a slip speed."""
+
+    def cost(xp: Any, v0: Any) -> Any:
+        x, v = 0.0 * v0[0], v0[0]
+        for _ in range(50):
+            if width:
+                v = v - 0.02 * mu * 9.81 * xp.tanh(v / width)
+            else:
+                change = 0.02 * mu * 9.81
+                v = xp.where(xp.abs(v) > change, v - change * xp.sign(v), 0.0 * v)
+            x = x + 0.02 * v
+        return (x - 0.3) ** 2
+
+    return cost
+
+
+def flight(target: float, wind: float) -> Callable[[Any, Any], Any]:
+    """A ball in free flight with quadratic drag."""
+
+    def cost(xp: Any, theta: Any) -> Any:
+        x, y, vx, vy = 0.0 * theta[0], 0.0 * theta[0], theta[0], theta[-1]
+        for _ in range(30):
+            speed = xp.sqrt(vx * vx + vy * vy + 1e-9)
+            vx, vy = vx - 0.02 * wind * speed * vx, vy - 0.02 * (9.81 + wind * speed * vy)
+            x, y = x + 0.02 * vx, y + 0.02 * vy
+        return (x - target) ** 2 + 0.1 * y**2
+
+    return cost
+
+
+def contact(stiffness: float, wall: float) -> Callable[[Any, Any], Any]:
+    """A ball hits a wall of stiffness k (penalty), dt = 0.01 s."""
+
+    def cost(xp: Any, v0: Any) -> Any:
+        x, v = 0.0 * v0[0], v0[0]
+        for _ in range(60):
+            v = v + 0.01 * (-stiffness * xp.maximum(x - wall, 0.0))
+            x = x + 0.01 * v
+        return (x - 0.2) ** 2
+
+    return cost
+
+
+def chaos(rate: float, steps: int) -> Callable[[Any, Any], Any]:
+    """The logistic map, whose gradient grows with the steps where it is chaotic."""
+
+    def cost(xp: Any, x: Any) -> Any:
+        y = 1.0 / (1.0 + xp.exp(-x[0]))
+        for _ in range(steps):
+            y = rate * y * (1.0 - y)
+        return y
+
+    return cost
+
+
+def saturation(limit: float, gain: float, hard: bool) -> Callable[[Any, Any], Any]:
+    """A servo with a limited actuator follows a step."""
+
+    def cost(xp: Any, k: Any) -> Any:
+        x, v = 0.0 * k[0], 0.0 * k[0]
+        for _ in range(40):
+            u = gain * k[0] * (1.0 - x) - 0.8 * v
+            u = xp.clip(u, -limit, limit) if hard else limit * xp.tanh(u / limit)
+            v = v + 0.05 * u
+            x = x + 0.05 * v
+        return (x - 1.0) ** 2 + 0.05 * v * v
+
+    return cost
+
+
+def plane(dim: int, at: float, height: float) -> Callable[[Any, Any], Any]:
+    """A smooth cost of several inputs with a jump across a slanted plane, or without for height 0."""
+    slanted = np.ones(dim) / math.sqrt(dim)
+
+    def cost(xp: Any, x: Any) -> Any:
+        along = sum(float(a) * x[i] for i, a in enumerate(slanted))
+        return x[0] + 0.3 * x[-1] ** 2 + height * xp.where(along > at, 1.0, 0.0)
+
+    return cost
+
+
+def scenes() -> Iterator[Scene]:
+    """Yield every scene, family by family."""
+    for at, height, drag in ((1.4, 1.0, 1.0), (1.2, 1.0, 1.0), (1.5, 3.0, 1.0), (1.7, 1.0, 1.0), (1.0, 0.2, 1.5), (1.3, 5.0, 0.7)):  # fmt: skip
+        yield Scene("edge", f"at {at} by {height}, drag {drag}", edge(at, height, drag), (2.0,), 0.2)
+    for at, drop, sigma in ((1.8, 0.5, 0.2), (1.2, 0.5, 0.2), (2.2, 1.0, 0.3), (1.5, 0.1, 0.1), (3.0, 2.0, 0.2), (1.7, 0.02, 0.3)):  # fmt: skip
+        yield Scene("ledge", f"at {at}, drop {drop}", ledge(at, drop), (3.0,), sigma)
+    for low, high, prize in ((0.8, 1.2, 1.0), (1.4, 1.6, 0.5), (0.2, 0.4, 2.0), (1.9, 2.5, 5.0), (-1.0, 0.1, 1.0), (0.95, 1.0, 0.2)):  # fmt: skip
+        yield Scene("gate", f"{low} to {high} for {prize}", gate(low, high, prize), (0.4,), 0.3)
+    for force, stiffness, theta in ((0.2, 5.0, 1.0), (0.2, 20.0, 0.8), (0.5, 5.0, 0.5), (0.0, 5.0, 1.4), (0.3, 50.0, 1.0), (0.0, 1.0, 0.7)):  # fmt: skip
+        yield Scene("latch", f"force {force}, k {stiffness}, v {theta}", latch(force, stiffness), (theta,), 0.2)
+    for mu, width, theta in ((0.3, 0.0, 1.0), (0.3, 0.01, 1.0), (0.5, 0.0, 3.0), (0.1, 0.001, 1.0), (0.6, 0.0, 0.4), (0.2, 0.1, 2.0)):  # fmt: skip
+        yield Scene("friction", f"mu {mu}, slip {width}, v {theta}", friction(mu, width), (theta,), 0.2)
+    for target, wind, theta in ((2.0, 0.0, (3.0, 2.0)), (2.0, 0.1, (3.0, 2.0)), (1.0, 0.3, (4.0, 1.0)), (5.0, 0.05, (2.0, 5.0)), (1.7, 0.0, (3.0, 3.0)), (0.0, 1.0, (6.0, 6.0))):  # fmt: skip
+        yield Scene("free flight", f"to {target}, drag {wind}, v {theta}", flight(target, wind), theta, 0.3)
+    for stiffness, wall, theta in ((100.0, 0.3, 1.0), (1e3, 0.3, 1.0), (1e4, 0.3, 1.0), (1e4, 0.6, 0.8), (5e4, 0.3, 1.0), (1e5, 0.75, 1.0)):  # fmt: skip
+        yield Scene("soft contact", f"k {stiffness:g}, wall {wall}, v {theta}", contact(stiffness, wall), (theta,), 0.1)
+    for rate, steps in ((3.9, 3), (3.9, 6), (3.9, 12), (3.9, 30), (3.2, 30), (3.57, 40)):
+        yield Scene("chaos", f"rate {rate}, {steps} steps", chaos(rate, steps), (0.3,), 0.1)
+    for limit, gain, hard in ((1.0, 1.0, True), (0.5, 2.0, False), (0.3, 4.0, True), (5.0, 1.0, False), (0.1, 4.0, True), (0.1, 4.0, False)):  # fmt: skip
+        yield Scene(
+            "saturation", f"limit {limit}, gain {gain}, hard {hard}", saturation(limit, gain, hard), (1.0,), 0.3
+        )
+    for dim, at, height in (
+        (2, 1.0, 1.0),
+        (3, 2.0, 3.0),
+        (5, 1.0, 0.0),
+        (5, 2.5, 10.0),
+        (10, 1.5, 2.0),
+        (10, 3.0, 22.6),
+    ):
+        yield Scene("plane", f"d {dim}, at {at} by {height}", plane(dim, at, height), (0.5,) * dim, 1.0)
+
+
+@cache
+def truth(scene: Scene) -> np.ndarray:
+    """Return the smoothed gradient ``(d,)``, from costs only, without the harness."""
+    theta, dim = np.array(scene.theta), len(scene.theta)
+    if dim == 1:
+        w = (np.arange(POINTS) + 0.5) / POINTS * 20.0 - 10.0
+        weight = np.exp(-w * w / 2) / math.sqrt(2 * math.pi) * (20.0 / POINTS)
+        f = scene.cost(np, theta[:, None] + scene.sigma * w[None, :])
+        return np.array([float(((f - f[POINTS // 2]) * w * weight).sum()) / scene.sigma])
+    random, total = np.random.default_rng(77), np.zeros(dim)
+    for _ in range(PAIRS // PART):
+        w = random.standard_normal((dim, PART))
+        up, down = (scene.cost(np, theta[:, None] + s * scene.sigma * w) for s in (1.0, -1.0))
+        total += ((up - down) * w).mean(axis=1) / (2.0 * scene.sigma)
+    return total / (PAIRS // PART)
+
+
+class Outcome(NamedTuple):
+    """What the rule says on one cell, and the relative RMSE of one estimate."""
+
+    spread: float
+    verdict: str
+    jump: float
+    rmse: float
+
+    @property
+    def trusted_without_search(self) -> bool:
+        """Whether the rule without the jump search trusts the cell."""
+        return self.spread < SPREAD
+
+    @property
+    def trusted(self) -> bool:
+        """Whether the rule trusts the cell."""
+        return self.trusted_without_search and self.verdict in gradcheck.TRUSTED and self.jump == 0.0
+
+    @property
+    def wrong(self) -> bool:
+        """Whether one estimate is wrong by half of the gradient or more."""
+        return self.rmse >= WRONG
+
+
+def outcomes(scene: Scene, seeds: tuple[int, ...] = SEEDS) -> list[Outcome]:
+    """Return the outcome of every seed of a scene."""
+    problem = Jax().compile(compose(Given(f"{scene.family} {scene.label}", scene.cost, scene.theta, scene.sigma)))
+    theta, known = np.array(scene.theta), truth(scene)
+    unit = float(np.finfo(np.float64).eps)
+    found = []
+    for seed in seeds:
+        w = np.random.default_rng(seed).standard_normal((REPEATS, SAMPLES, theta.size))
+        estimates = np.asarray(Fobg().estimate(problem, theta, w))
+        mean = np.linalg.norm(estimates.mean(axis=0))
+        deviation = math.sqrt(float(estimates.var(axis=0, ddof=1).sum()))
+        checked = start(problem, theta, unit, SwitchSearch(2, 16, 2.0, 1e-4), seed)
+        jump, _ = jump_under_noise(problem, theta, seed, COLUMNS)
+        rmse = math.sqrt(float(np.square(estimates - known).sum(axis=1).mean())) / float(np.linalg.norm(known))
+        found.append(Outcome(deviation / mean if mean else math.inf, checked.cause, jump.height, rmse))
+    return found
+
+
+def main() -> int:
+    """Print a line per scene and the counts of both halves; return 1 if the rule trusts a wrong cell of the counted half."""
+    halves: dict[bool, list[Outcome]] = {True: [], False: []}
+    number: dict[str, int] = {}
+    for scene in scenes():
+        place = number[scene.family] = number.get(scene.family, -1) + 1
+        found = outcomes(scene)
+        halves[bool(place % 2)] += found
+        print(
+            f"{scene.family:13}{scene.label:34}{'counted' if place % 2 else 'seen':8}"
+            + "  ".join(f"{o.spread:.2g} {o.verdict} {o.jump:.2g} rmse {o.rmse:.2g} {'TRUSTED' if o.trusted else '-'}{' WRONG' if o.trusted and o.wrong else ''}" for o in found),
+            flush=True,
+        )  # fmt: skip
+    for counted, name in ((False, "seen"), (True, "counted only")):
+        cells = halves[counted]
+        for rule, trusts in (("spread alone", Outcome.trusted_without_search), ("the rule", Outcome.trusted)):
+            trusted = [o for o in cells if trusts.fget(o)]
+            bad, missed = sum(o.wrong for o in trusted), sum(not o.wrong for o in cells if not trusts.fget(o))
+            print(
+                f"{name}: {rule} trusts {len(trusted)} of {len(cells)} cells, {bad} of them wrong, and leaves {missed} right ones"
+            )
+    return int(any(o.trusted and o.wrong for o in halves[True]))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
