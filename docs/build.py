@@ -101,9 +101,12 @@ Beside the files of [every run](reading-results.md#files), each study writes its
   baseline, and the share of targets reached in time. `targets.csv`: per problem, method and target (the first regret over
   10, 100 and 1,000) the successes with Wilson's interval and the average runtime in rollouts. The runtime includes failed
   searches, and is infinite where none succeeded. Methods are compared at their best tuning on each problem.
-- `train.csv`: one line per run, with the return before and after it. `windows.csv`: per length of a window the norm of its gradient
-  and the final return. `faults.csv`: what the logs show, in words.
+  `effect_of_error.csv`: per class of scenes whether gradients with a smaller error reach a tenth of the first regret `sooner`.
+- `train.csv`: one line per run, with the return before and after it. `summary.csv`: per trainer the final return with its interval
+  and a verdict: `first`, `tied`, `behind`, `open` or `no result`. `windows.csv`: the same per length of a window, with the norm of
+  its gradient. `faults.csv`: what the logs show, by code, with the numbers that show it.
 - `identify.csv`: one line per problem, with lists by method of fitting (`shooting`) and by product of powers (`invariants`).
+  `fits.csv`: one line per problem and method, with a verdict: `precise`, `narrow`, `unconverged` or `open`.
 """
 ALSO_IN_CSV = ("study", "parameters")
 """Columns that the CSV has after its table and the swept axes: see :func:`bench.experiment.axes.table`."""

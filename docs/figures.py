@@ -806,7 +806,6 @@ FIGURES: dict[str, Callable[[], str]] = {
     "dose-data": dose_data,
     "dose-shapes": dose_shapes,
     "dose-rates": dose_rates,
-    "dose-controls-answer": lambda: answer_of("dose_response/controls"),
     "dose-controls": dose_controls,
     "fobg-soft": lambda: span(pushing("fobg", stiffness=SOFT)["rmse_rel"]),
     "reinforce-soft": lambda: span(pushing("reinforce", stiffness=SOFT)["rmse_rel"]),

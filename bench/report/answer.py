@@ -1,8 +1,9 @@
 """Fills in answers: texts by a person, whose numbers are references to the tables of an experiment.
 
 A reference is ``{table | filters | column | format}``. ``{verdicts | method=fobg, at<=3000 | error < 1}`` gives
-``0.10 to 0.15``, and an error where a selected value is not below 1. Values with a comma stand in double quotes. The
-format is a key of :data:`FORMATS`, by default ``number``.
+``0.10 to 0.15``, and an error where a selected value is not below 1. Further conditions on the selected rows follow the
+column: ``error, verdict=works``. Values with a comma stand in double quotes. The format is a key of :data:`FORMATS`, by
+default ``number``.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import pandas as pd
 
 from bench.errors import UserError, unknown
 from bench.report.problems import value_text
-from bench.report.text import apart, duration, interval, listed, number, span
+from bench.report.text import duration, interval, listed, number, span
 
 REFERENCE = re.compile(r"\{([^{}]*)\}")
 CONDITION = re.compile(r'\s*([^,=<>!]+?)\s*(<=|>=|!=|=|<|>)\s*("[^"]*"|[^,]*)\s*(?:,|$)')
@@ -38,11 +39,13 @@ def value_of(reference: str, table: Callable[[str], pd.DataFrame]) -> str:
     """Return the value of one reference, without its braces, as text."""
     name, filters, column, *form = (part.strip() for part in reference.split("|"))
     rows = select(table(name), filters)
-    if condition := CONDITION.fullmatch(column):
-        column = condition[1]
+    shown, _, rest = column.partition(",")
+    column = own[1] if (own := CONDITION.fullmatch(shown)) else shown
+    for condition in filter(None, (own, *CONDITION.finditer(rest))):
         holds = _holds(rows, condition)
         if not holds.all():
-            raise LookupError(f"{{{reference}}}: {column} is {listed(map(str, rows.loc[~holds, column].unique()[:3]))}")
+            wrong = rows.loc[~holds, condition[1]].unique()[:3]
+            raise LookupError(f"{{{reference}}}: {condition[1]} is {listed(map(str, wrong))}")
     if column not in rows:
         raise unknown("column", column, rows.columns)
     chosen = (form or ["number"])[0]
@@ -85,6 +88,11 @@ def _finite(rows: pd.DataFrame, column: str) -> np.ndarray:
     return values
 
 
+def _interval(rows: pd.DataFrame, column: str) -> str:
+    value, *ends = _only(rows, column)
+    return f"{number(value, 3)} [{', '.join(number(end, 3) if np.isfinite(end) else 'no limit' for end in ends)}]"
+
+
 def _only(rows: pd.DataFrame, column: str) -> tuple[float, float, float]:
     """Return the value and the interval of the only row."""
     if len(rows) != 1:
@@ -120,8 +128,8 @@ FORMATS: dict[str, Callable[[pd.DataFrame, str], str]] = {
     "seconds": _seconds,
     "least": lambda rows, column: number(_finite(rows, column).min()),
     "most": lambda rows, column: number(_finite(rows, column).max()),
-    "above 1": lambda rows, column: apart(_finite(rows, column).min(), 1.0),
-    "interval": lambda rows, column: interval(*_only(rows, column)),
+    "interval": _interval,
+    "ratio": lambda rows, column: interval(*_only(rows, column)),
     "percent interval": _percents,
     "names": lambda rows, column: listed(dict.fromkeys(map(value_text, rows[column]))),
     "rows": lambda rows, column: f"{len(rows):,}",

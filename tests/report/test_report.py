@@ -94,7 +94,8 @@ def test_every_promised_file_is_written(full):
         "bias_variance.md",
         "bias_variance.tex",
         "speed_accuracy.csv",
-        "findings.json",
+        "answer.json",
+        "verdicts.csv",
     } <= names
     assert {path.name for path in made.directory.iterdir()} == names
 
@@ -249,7 +250,7 @@ def test_charts_are_written_as_pictures_and_data(tmp_path):
 
 
 def tables_names(made, rows):
-    return {table.name for table in made.study.views(made, rows).tables} | {"findings"}
+    return {table.name for table in made.study.views(made, rows).tables} | {"answer"}
 
 
 def test_an_estimator_has_one_colour_in_all_charts():

@@ -168,14 +168,9 @@ def grown(*words):
     return given, given.columns.typed(pd.DataFrame(lines))
 
 
-def test_findings_charts_and_tables_of_planted_rows():
+def test_charts_and_tables_of_planted_rows():
     given, rows = grown()
     shown = views.views(given, rows)
-    assert shown.findings == [
-        "Use the zeroth order on bouncing_ball from 5 s and hopper from 5 s: it varies less there.",
-        "Gradients explode on hopper (rate 1.0 [1.0, 1.0] per second).",
-        "They grow like a power of the horizon on bouncing_ball (order 2.0 [2.0, 2.0]).",
-    ]
     norms, variances, _, gains = shown.charts
     drawn = norms.plotted()
     assert set(zip(drawn["problem"], drawn["series"], strict=True)) == {
@@ -189,6 +184,8 @@ def test_findings_charts_and_tables_of_planted_rows():
     assert list(rows["horizon"][gains.frame["row"]]) == [200.0] * 4, "gains are of the longest horizon"
     answers, table = map(readable, shown.tables)
     assert list(answers["verdict"]) == ["polynomial", "exploding"]
+    assert list(answers["lower variance"]) == ["zeroth order from 5 s"] * 2
+    assert (answers["order"][0], answers["rate [1/s]"][1]) == ("2.0 [2.0, 2.0]", "1.0 [1.0, 1.0]")
     assert list(table["singular values"]) == ["10 to 0.10"] * 5 + ["1000 to < 2.2e-13"] * 5
     assert table["spectral [1/s]"][0] == "1.0 [0.50, 2.0]", "per second, at steps of 0.1 s"
 
@@ -200,19 +197,16 @@ def test_ranges_of_variances_that_overlap_and_lost_horizons_are_open():
     rows.loc[lost, ["gradient_median", "gradient_quarter"]] = math.nan
     rows.loc[lost, "status"] = "nonfinite"
     shown = views.views(given, rows)
-    assert shown.findings == [
-        "Which order has the lower variance is open at the longest horizon.",
-        "Gradients explode on no problem.",
-        "They show no clear law of growth on bouncing_ball and hopper.",
-    ]
+    assert list(shown.tables[0].frame["verdict"]) == ["open", "open"]
+    assert list(shown.tables[0].frame["lower"]) == ["open at the longest horizon"] * 2
     assert len(shown.tables[1].frame) == len(rows)
     rows["status"], rows["gradient_median"], rows["reason"] = "nonfinite", math.nan, "not finite"
     shown = views.views(given, rows)
-    assert shown.findings == ["No cell gave a result: the table has the reason of each."]
-    assert shown.remarks == ["not finite"]
+    assert not shown.charts
+    assert shown.remarks == ["10 nonfinite: not finite"]
 
 
-def test_findings_of_the_standard_experiment_computed_from_its_table():
+def test_verdicts_of_the_standard_experiment_computed_from_its_table():
     given = config.load(["+experiment=horizon_growth", f"results_dir={STANDARD}"])
     rows = Store(given.directory, COLUMNS).load()
     shown = views.views(given, rows)
@@ -235,9 +229,9 @@ def test_findings_of_the_standard_experiment_computed_from_its_table():
     assert verdicts == classes | {"hopper": "open"}, "the norms of hopper rise, then fall: the order's interval has 0"
     lower = table["zeroth_order_variance_high"] < table["first_order_variance_low"]
     assert set(table.loc[lower, "scene"]) == {"bouncing_ball", "double_pendulum"}
+    orders = dict(zip(shown.tables[0].frame["problem"], shown.tables[0].frame["lower"], strict=True))
     for scene, start in (("bouncing_ball", 1.0), ("double_pendulum", 2.5)):
         own = table[table["scene"] == scene]
         assert list(own["time_horizon"] >= start) == list(lower[own.index])
-        assert f"{scene} from {start:g} s" in shown.findings[0]
-    assert "the first order on double_integrator and pendulum at every horizon" in shown.findings[0]
-    assert shown.findings[1].startswith("Gradients explode on bouncing_ball (")
+        assert orders[scene] == f"zeroth order from {start:g} s"
+    assert {orders[scene] for scene in ("double_integrator", "pendulum")} == {"first order at every horizon"}

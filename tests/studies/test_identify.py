@@ -331,29 +331,26 @@ def standard():
     return given, rows, study_of(given).views(given, rows)
 
 
-def test_findings_are_those_of_the_stored_table(standard):
+def test_verdicts_are_those_of_the_stored_table(standard):
     """Counted again from the CSV's own lists, without the code of the views."""
     rows = pd.read_csv(STANDARD / "identify" / "identify.csv")
     listed = {
-        name: [[float(word) for word in cell.strip("[]").split()] for cell in rows[name]]
-        for name in ("converged_high", "coverage", "coverage_high", "error")
+        name: [float(word) for cell in rows[name] for word in cell.strip("[]").split()]
+        for name in ("converged_high", "coverage_high")
     }
-    lost = sum(high < 0.9 for cell in listed["converged_high"] for high in cell)
-    narrow = sum(high < 0.95 for cell in listed["coverage_high"] for high in cell)
-    lowest = min(c for cell in listed["coverage"] for c in cell if c == c)
-    errors = [cell[0] for cell, name in zip(listed["error"], rows["integrator"], strict=True) if name == "rk4"]
-    use, fails, known = standard[2].findings
-    assert use.startswith("Use rk4 and single shooting: in 5 of 5 cases")
-    assert f"(error {min(errors):.2f} to {max(errors):.1f} times the bound)" in use
-    assert f"in {lost} of 22 cases, all with semi_implicit_euler," in fails
-    assert f"too narrow in {narrow} (they contain the truth in {lowest:.0%} of the fits" in fails
-    assert known == "A record of mass_spring_damper identifies only stiffness/mass and damping/mass."
-    assert not any(";" in text for text in standard[2].findings)
+    fits = next(table for table in standard[2].tables if table.name == "fits").frame
+    counts = fits["verdict"].value_counts()
+    lost = [high < 0.9 for high in listed["converged_high"]]
+    narrow = [high < 0.95 for high in listed["coverage_high"]]
+    assert counts["unconverged"] == sum(lost)
+    assert counts["narrow"] == sum(np.array(narrow) & ~np.array(lost))
+    rk4 = fits[(fits["integrator"] == "rk4") & (fits["shooting"] == "single")]
+    assert rk4["verdict"].tolist() == ["precise"] * 5
 
 
 def test_chart_and_tables_have_the_rows(standard):
     _, rows, views = standard
-    fits, parameters = views.tables
+    fits, parameters, _ = views.tables
     assert len(fits.frame) == 22
     assert len(parameters.frame) == len(rows)
     assert {"step_note", "condition"} <= {column.name for column in parameters.columns}
@@ -369,7 +366,7 @@ def test_chart_and_tables_have_the_rows(standard):
 
 
 def planted(**columns):
-    """The findings of four cases with rk4 and four with another integrator, some columns replaced."""
+    """The verdicts on four cases with rk4 and four with another integrator, some columns replaced."""
     n = 8
     lines = pd.DataFrame({
         "row": range(n), "problem": [f"p{i}" for i in range(n)], "scene": "s", "integrator": ["rk4"] * 4 + ["euler"] * 4,
@@ -378,28 +375,18 @@ def planted(**columns):
         "coverage_high": 0.98, "hidden": 0.0,
     } | columns)  # fmt: skip
     low, high = shown.error_interval(lines["error"], lines["converged"] * lines["fits"])
-    return shown.findings(lines.assign(error_low=low, error_high=high))
+    return list(shown.verdicts(lines.assign(error_low=low, error_high=high)))
 
 
-def test_findings_need_their_intervals():
-    half = [1.0] * 4
-    tied = planted()
-    assert tied[0].startswith("Use rk4 and single shooting: in 4 of 4 cases")
-    assert tied[1] == "Neither fits nor their intervals fail in any of 8 cases."
-    assert len(tied) == 2
-    open_ = planted(coverage=[0.85] * 8, coverage_low=0.7, coverage_high=0.951)
-    assert "fail in any" in open_[1]  # below the stated level, but not by the whole interval
-    few = planted(converged=[0.85] * 8, converged_low=0.7, converged_high=0.93)
-    assert few[0] == "No fit is known to reach the Cramer-Rao bound."
-    assert "do not explain" not in few[1]
+def test_verdicts_need_their_intervals():
+    assert planted() == ["precise"] * 8
+    # below the stated level, but not by the whole interval
+    assert planted(coverage=[0.85] * 8, coverage_low=0.7, coverage_high=0.951) == ["precise"] * 8
+    assert planted(converged=[0.85] * 8, converged_low=0.7, converged_high=0.93) == ["open"] * 8
+    assert planted(converged=[0.7] * 8, converged_low=0.6, converged_high=0.8) == ["unconverged"] * 8
     unknown = planted(error=[math.nan] * 8, coverage=[math.nan] * 8, coverage_high=[math.nan] * 8)
-    assert unknown[0] == "No fit is known to reach the Cramer-Rao bound."
-    far = planted(
-        error=[*half, 3.0, 3.0, 3.0, 3.0], coverage=[0.95] * 4 + [0.3] * 4, coverage_high=[0.98] * 4 + [0.4] * 4
-    )
-    assert far[0].startswith("Use rk4")
-    assert "95% intervals are too narrow in 4 (they contain the truth in 30%" in far[1]
-    assert "report more identifiable directions" in planted(hidden=[3.0] + [0.0] * 7)[2]
+    assert unknown == ["open"] * 8
+    assert planted(error=[3.0] * 8, coverage=[0.3] * 8, coverage_high=[0.4] * 8) == ["narrow"] * 8
 
 
 def test_interval_of_the_error_covers():
@@ -414,9 +401,8 @@ def test_interval_of_the_error_covers():
 def test_rows_without_results_are_said_so(standard, status):
     given, rows, _ = standard
     views = study_of(given).views(given, rows.assign(status=status, reason="planted"))
-    assert views.findings == ["No fit gave a result: the table has the reason of each."]
     assert not views.charts
-    assert list(views.remarks) == ["planted"]
+    assert views.remarks == [f"{len(rows)} {status}: planted"]
 
 
 def test_own_measurements_have_no_coverage_to_show(standard):
@@ -427,7 +413,7 @@ def test_own_measurements_have_no_coverage_to_show(standard):
         for name in ("error", "coverage", "coverage_low", "coverage_high")
     }
     views = study_of(given).views(given, rows.assign(**gone))
-    assert views.findings[0] == "No fit is known to reach the Cramer-Rao bound."
+    assert "precise" not in set(views.tables[0].frame["verdict"])
     assert [column.name for column in views.charts[0].x] == ["converged", "condition", "step_shift"]
 
 
@@ -519,18 +505,11 @@ def test_without_a_scan_keys_are_those_of_the_study_before_it_had_one():
     assert plain.key == cell_of(*SPRING).key
 
 
-def test_the_scan_is_stated_with_its_grid_and_drawn():
+def test_the_scan_is_drawn_with_its_minima():
     given = config.load([SCAN, "backends=[numpy]", "optimizers=[gauss_newton]", "samples=1", *CHAOS])
     (cell,) = cells(given)
     rows = pd.DataFrame([cell.columns() | measure(cell, given.study) | {"experiment": "chaos"}])
     chaos = study_of(given).views(given, rows)
-    assert chaos.findings[-1].startswith(
-        "The loss on logistic_map over 2,001 values of rate from 2 to 4 1/s has 131 local minima for the whole record of 200 "
-        "steps, and "
-    )
-    assert "17 and 1 for windows of 40, 20, 10 and 5 steps (130, " in chaos.findings[-1]
-    assert "10 and 1 if the last sample of a window, at which the next starts, is not compared)" in chaos.findings[-1]
-    assert ";" not in chaos.findings[-1]
     (chart,) = [chart for chart in chaos.charts if chart.name == "scan_rate"]
     counts = chart.frame[chart.frame["part"] == "local minimum"].groupby("window", sort=False).size()
     assert counts["whole record of 200 steps: 131 minima"] == 131
@@ -544,4 +523,3 @@ def test_the_scan_is_stated_with_its_grid_and_drawn():
 
 def test_rows_without_a_scan_show_none(standard):
     assert not [chart for chart in standard[2].charts if chart.name.startswith("scan")]
-    assert not any("local minim" in text for text in standard[2].findings)

@@ -292,52 +292,37 @@ def classed(*entries):
     )
 
 
-def test_findings_lead_with_what_to_use_and_say_why_the_rest_is_wrong():
+def test_shares_are_those_of_the_cells_and_the_best_of_a_scene_comes_first():
     cells = classed(
-        ("spring", "one", "right", "", 3), ("spring", "one", "diverged", "", 1), ("spring", "two", "right", "", 3),
+        ("spring", "one", "right", "", 1), ("spring", "one", "diverged", "", 3), ("spring", "two", "right", "", 3),
         ("spring", "two", "wrong", "step", 1), ("ball", "one", "wrong", "law", 3), ("ball", "one", "wrong", "", 1),
     )  # fmt: skip
-    assert views.findings(views.shares_of(cells), cells) == [
-        "Use one and two on spring (right in 75% of 4 cells).",
-        "Of 12 cells, 5 have a finite but wrong gradient and 1 a state that diverges.",
-        "The cause of the wrong gradients is the step or its derivative in 1, the law in 3, not resolved in 1.",
-    ]
-    assert list(views.shares_of(cells)["by unknown"]) == [0.0, 0.0, 0.25]
-    lost = classed(("ball", "one", "diverged", "", 2), ("ball", "one", "open", "", 1))
-    assert views.findings(views.shares_of(lost), lost) == [
-        "No law and integrator gives a right gradient at any step size and stiffness.",
-        "Of 3 cells, 0 have a finite but wrong gradient and 1 a state that diverges.".replace(" 1 a", " 2 a"),
-    ]
+    shares = views.shares_of(cells)
+    assert list(shares["step"]) == ["two", "one", "one"]
+    assert list(shares["right"]) == [0.75, 0.25, 0.0]
+    assert list(shares["by unknown"]) == [0.0, 0.0, 0.25]
 
 
-def test_findings_of_the_standard_experiment_computed_from_its_rows():
+def test_shares_of_the_standard_experiment_computed_from_its_rows():
     given = config.load(["+experiment=stability_map", f"results_dir={STANDARD}"])
     rows = Store(given.directory, given.columns).load()
     shown = views.views(given, rows)
     ran = rows[rows["verdict"] != ""]
-    counts = ran["verdict"].value_counts()
-    n_wrong, n_lost = (counts.reindex(names).sum() for names in (maps.WRONG, maps.LOST))
-    assert shown.findings[1] == (
-        f"Of {len(ran)} cells, {n_wrong:.0f} have a finite but wrong gradient and {n_lost:.0f} a state that diverges."
-    )
     law = ran["contact"].str.partition("[")[0]
     right = (
         (ran["verdict"] == "ok")
         .groupby([ran["scene"].str.partition("[")[0], law, ran["integrator"]])
         .agg(["mean", "size"])
     )
-    spring, ball = (right.loc[scene].sort_values("mean").iloc[-1] for scene in ("mass_spring", "bouncing_ball"))
-    assert (spring.name, ball.name) == (("none", "rk4"), ("impulse", "event_driven"))
-    assert shown.findings[0] == (
-        f"Use rk4 on mass_spring (right in {spring['mean']:.0%} of {spring['size']:.0f} cells) and impulse, event_driven on "
-        f"bouncing_ball (right in {ball['mean']:.0%} of {ball['size']:.0f} cells)."
-    )
-    causes = ran["cause"].value_counts()
-    for cause, noun in (("step", "the step or its derivative"), ("law", "the law"), ("both", "both")):
-        assert f"{noun} in {causes[cause]}" in shown.findings[2]
-    assert f"not resolved in {causes['unknown']}" in shown.findings[2]
+    shares = shown.tables[0].frame.groupby("scene", sort=False).first()
+    for scene, step in (("mass_spring", "rk4"), ("bouncing_ball", "impulse, event_driven")):
+        best = right.loc[scene].sort_values("mean").iloc[-1]
+        assert ", ".join(name for name in best.name if name != "none") == shares.loc[scene, "step"] == step
+        assert shares.loc[scene, ["right", "cells"]].tolist() == [best["mean"], best["size"]]
+    wrong = shown.tables[0].frame
+    for cause in ("step", "law", "both", "unknown"):
+        assert (wrong[f"by {cause}"] * wrong["cells"]).sum() == pytest.approx((ran["cause"] == cause).sum())
     printed = shown.charts[0]
-    assert f"{(ran['verdict'] == 'ok').mean():.0%} of the cells" in printed.title
     assert len(draw(printed, 3.5).axes) == len(draw(printed).axes) == 8 * 5, "a panel per integrator and problem"
     assert [chart.name for chart in shown.charts if chart.printed] == ["stability_map"]
     whole = shown.charts[1].frame
@@ -355,7 +340,7 @@ def test_backends_that_disagree_show_the_worse_verdict_and_no_verdict_is_no_find
     assert rows["backend"][chart.loc[100.0, "row"]] == "numpy"
     rows["verdict"], rows["status"], rows["reason"] = "", "unsupported", "no step"
     nothing = views.views(given, rows)
-    assert nothing.findings == ["No cell has a verdict: the table has the reason of each."]
+    assert not nothing.charts
     assert nothing.remarks == ["4 unsupported: no step"]
 
 

@@ -1,7 +1,6 @@
 """The study of training: what it shows of made-up runs, what it refuses, and one small run of it all."""
 
 import json
-import re
 
 import numpy as np
 import pandas as pd
@@ -11,8 +10,9 @@ import bench
 from bench.errors import UserError
 from bench.experiment import config
 from bench.experiment.grid import cells
+from bench.report.cells import readable
 from bench.run.tasks import blank_row
-from bench.studies.train import aggregate, findings
+from bench.studies.train import aggregate
 from bench.studies.train.views import views
 
 BASE = ["study=train", "scenes=[cartpole_swing]", "integrators=[semi_implicit_euler]", "backends=[jax]", "samples=1"]
@@ -40,87 +40,69 @@ def made_up(final=FINAL, seeds=range(5), spread=10.0, **columns):
     return experiment, experiment.columns.typed(pd.DataFrame(rows))
 
 
-def test_the_best_trainer_is_named_with_its_interval_and_those_behind_it():
+def verdicts_of(experiment, rows):
+    """The verdict on each trainer, by the table of trainers."""
+    table = next(table for table in views(experiment, rows).tables if table.name == "summary")
+    return dict(zip(table.frame["method"], table.frame["verdict"], strict=True))
+
+
+def test_the_best_trainer_and_those_behind_it_have_verdicts():
     experiment, rows = made_up()
-    first, second, third = views(experiment, rows).findings
-    assert first.startswith("The best final return is -5")
-    assert "(shac), and shac[window=8] and ppo end lower" in first
-    assert second == "Among windows of shac, 32 steps end best, and 8 steps end lower."
-    assert third == "The logs of 15 runs show no fault."
-    assert all(text.endswith(".") and ";" not in text for text in (first, second, third))
+    assert verdicts_of(experiment, rows) == {"shac": "first", "shac[window=8]": "behind", "ppo": "behind"}
+    windows = next(table for table in views(experiment, rows).tables if table.name == "windows").frame
+    assert dict(zip(windows["window"], windows["verdict"], strict=True)) == {32: "first", 8: "behind"}
 
 
 def test_trainers_whose_intervals_overlap_are_open():
     experiment, rows = made_up({"shac": -530.0, "ppo": -535.0}, spread=40.0)
-    assert views(experiment, rows).findings[0].startswith("Which trainer is best is open: ")
+    assert set(verdicts_of(experiment, rows).values()) == {"open"}
 
 
 def test_few_seeds_give_no_interval_and_no_order():
     experiment, rows = made_up(seeds=range(4))
     shown = views(experiment, rows)
-    assert re.fullmatch(
-        r"Which trainer is best is open, since 4 seeds are too few for an interval: the highest final return is -5\d\d \(shac\)\.",
-        shown.findings[0],
-    )
+    assert set(verdicts_of(experiment, rows).values()) == {"open"}
     texts = [*(chart.subtitle for chart in shown.charts), *(note for table in shown.tables for note in table.notes)]
     told = [text for text in texts if "interquartile" in text]
     assert len(told) == 5, "the curves, the windows, and the notes of two tables"
     assert all("interquartile mean over 4 seeds, too few for an interval" in text for text in told)
 
 
-def test_windows_that_are_not_distinguishable_from_the_best_are_named():
+def test_windows_that_are_not_distinguishable_from_the_best_are_tied():
     experiment, rows = made_up({"shac": -530.0, "shac[window=16]": -531.0, "shac[window=8]": -700.0})
-    assert views(experiment, rows).findings[1] in {
-        f"Among windows of shac, {best} steps end best, not distinguishable from {other} steps, and 8 steps end lower."
-        for best, other in ((16, 32), (32, 16))
-    }
+    windows = next(table for table in views(experiment, rows).tables if table.name == "windows").frame
+    assert sorted(windows["verdict"]) == ["behind", "first", "tied"]
+    assert windows.loc[windows["verdict"] == "behind", "window"].tolist() == [8]
 
 
-def test_titles_over_several_problems_count_them_instead_of_naming_the_first():
+def test_verdicts_are_those_of_each_problem():
     runs = []
     for k, final in (("1e3", FINAL), ("1e4", dict.fromkeys(FINAL, -600.0))):
         experiment, rows = made_up(final, spread=10.0 if k == "1e3" else 100.0)
         runs.append(aggregate.runs_of(experiment, rows).assign(problem=f"stiffness={k}"))
-    every = pd.concat(runs, ignore_index=True)
-    summary, windows = aggregate.summarise(every), aggregate.windows(every)
-    assert findings.title(summary) == "Trainers end lower than the best on 1 of 2 problems"
-    assert findings.window_title(windows) == "Among windows of shac, 32 steps end best on 1 of 2 problems"
-    last = windows[windows["problem"] == "stiffness=1e4"]
-    assert findings.window_title(pd.concat([last, last.assign(problem="other")])) == (
-        "Among windows of shac, which length ends best is open"
-    )
+    summary = aggregate.summarise(pd.concat(runs, ignore_index=True))
+    verdicts = summary.assign(verdict=aggregate.ranked(summary, ["problem"])).groupby("problem")["verdict"].agg(sorted)
+    assert verdicts.to_dict() == {"stiffness=1e3": ["behind", "behind", "first"], "stiffness=1e4": ["open"] * 3}
 
 
-def test_lengths_of_windows_are_compared_by_their_returns_and_a_bias_is_named_only_where_its_interval_excludes_0():
+def test_lengths_of_windows_are_compared_by_their_returns():
     experiment, rows = made_up()
-    rows.loc[rows["trainer"] == "shac[window=8]", "window_bias_low"] = 0.0
     shown = views(experiment, rows)
     chart = next(chart for chart in shown.charts if chart.name == "windows")
     assert [column.name for column in chart.y] == ["final", "window_bias", "window_gradient"]
-    assert "bias" not in " ".join(shown.findings)
-    lines = next(table for table in shown.tables if table.name == "windows").frame.set_index("window")
-    assert lines.loc[8, "bias"] == "not distinguishable from 0 (up to 1.4)"
-    assert lines.loc[32, "bias"] == "0.31 [0.28, 0.34]"
+    lines = readable(next(table for table in shown.tables if table.name == "windows"))
+    assert "0.31 [0.28, 0.34]" in set(lines["its bias"])
 
 
 def test_a_trainer_without_a_run_that_ends_is_not_the_best_by_its_untrained_policy():
     experiment, rows = made_up()
     planted = rows["trainer"] == "ppo"
     rows.loc[planted, ["status", "first_return"]] = ["nonfinite", -100.0]
-    text = views(experiment, rows).findings[0]
-    assert "(shac), and shac[window=8] ends lower" in text
-    assert text.endswith(", and no run of ppo ends with a finite return.")
-    assert "-100" not in text
+    assert verdicts_of(experiment, rows) == {"shac": "first", "shac[window=8]": "behind", "ppo": "no result"}
     rows.loc[rows["trainer"] == "shac[window=8]", ["status", "first_return"]] = ["nonfinite", -100.0]
-    assert not any("windows" in found for found in views(experiment, rows).findings), "one window is left"
+    assert "windows" not in {table.name for table in views(experiment, rows).tables}, "one window is left"
     rows["status"] = "nonfinite"
-    assert views(experiment, rows).findings[0] == "No run ends with a finite return."
-
-
-def test_runs_that_are_not_finite_are_named_beside_a_final_return():
-    experiment, rows = made_up({"shac": -530.0})
-    rows.loc[0, "status"] = "nonfinite"
-    assert views(experiment, rows).findings[0].endswith(", 1 of 5 runs not finite.")
+    assert set(verdicts_of(experiment, rows).values()) == {"no result"}
 
 
 def test_a_run_that_is_not_finite_counts_as_its_untrained_policy():
@@ -133,14 +115,12 @@ def test_a_run_that_is_not_finite_counts_as_its_untrained_policy():
     assert aggregate.summarise(runs)["failed"].tolist() == [1]
 
 
-def test_a_fault_is_reported_in_words_with_its_run():
+def test_a_fault_is_reported_with_its_run_and_its_numbers():
     experiment, rows = made_up(verdicts=json.dumps([{"code": "not_finite", "update": 7, "quantity": "loss"}]))
-    shown = views(experiment, rows)
-    assert shown.findings[2] == (
-        "The logs of 15 of 15 runs show a fault, most often this: NaN at update 7: the loss is not finite (shac, seed 0)."
-    )
-    table = next(table for table in shown.tables if table.name == "faults")
-    assert set(table.frame["words"]) == {"NaN at update 7: the loss is not finite"}
+    table = next(table for table in views(experiment, rows).tables if table.name == "faults")
+    assert len(table.frame) == 15
+    assert (table.frame[["code", "update", "quantity"]] == ["not_finite", 7, "loss"]).all(axis=None)
+    assert "- not_finite: a quantity is not finite" in table.notes
 
 
 @pytest.mark.parametrize(("cosine_update", "count"), [([100, 300], 15), ([], 0)])
@@ -156,16 +136,7 @@ def test_a_cut_gradient_is_no_fault_of_whole_episodes_which_are_cut_by_construct
 @pytest.mark.parametrize(("contacts", "is_told"), [([2.0, 1.0], False), ([0.0, 1.0], True)])
 def test_that_peaks_have_contact_is_told_only_where_some_updates_have_none(contacts, is_told):
     fault = {"code": "explodes", "update": 9, "factor": 200.0, "peaks": 2, "with_contact": 2}
-    words = findings.describe(planted({"shac": -530.0}, fault, log_contacts=contacts)["fault"].iloc[0])
-    assert ("peaks in updates with contact" in words) == is_told
-
-
-def test_differences_that_do_not_agree_are_open_and_no_fault():
-    fault = json.dumps([{"code": "differences", "error": 0.5}])
-    experiment, rows = made_up({"shac": -530.0}, verdicts=fault)
-    assert views(experiment, rows).findings[-1] == (
-        "The logs of 5 runs show no fault, and in 5 central differences do not agree with the gradient, which is open."
-    )
+    assert ("with_contact" in planted({"shac": -530.0}, fault, log_contacts=contacts)) == is_told
 
 
 def planted(final, fault, **columns):
@@ -182,17 +153,18 @@ def test_the_chart_of_logs_has_one_axis_of_steps_for_all_quantities():
     assert chart.frame["step"].max() == 1e6
 
 
-def test_a_return_above_another_by_less_than_noise_is_not_below():
-    low, high = {"final_low": -10.0, "final_high": -8.0}, {"final_low": -8.5, "final_high": -7.0}
-    assert not findings.is_below(low, high)
-    assert findings.is_below({**low, "final_high": -9.0}, high)
+def test_a_return_above_another_by_less_than_noise_is_not_behind():
+    lines = pd.DataFrame(
+        {"final": [-9.0, -8.0], "final_low": [-10.0, -8.5], "final_high": [-8.0, -7.0], "group": "one"}
+    )
+    assert aggregate.ranked(lines, ["group"]).tolist() == ["open", "open"]
+    assert aggregate.ranked(lines.assign(final_high=[-9.0, -7.0]), ["group"]).tolist() == ["behind", "first"]
 
 
 def test_rows_without_a_run_show_their_reasons():
     experiment, rows = made_up(status="error", reason="planted", curve_return=[])
     shown = views(experiment, rows)
-    assert shown.findings == ["No run gave a result: the table has the reason of each."]
-    assert shown.remarks == ["planted"]
+    assert shown.remarks == ["15 error: planted"]
 
 
 def test_a_scene_without_observations_is_refused_with_the_reason(tmp_path):
