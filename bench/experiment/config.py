@@ -348,7 +348,6 @@ def experiment(config: Mapping[str, Any]) -> Experiment:
         compile_time=coerce(bool, config["compile_time"], "compile_time"),
         formats=tuple(_one_of("formats", item, FORMATS) for item in _as_list(config["formats"])),
         table=_table_layout(_mapping(config, "table"), _mapping(config, "sweep")),
-        average=_average(config["average"], _mapping(config, "sweep")),
         reference=_budget(_mapping(config, "reference")),
         compile_cache=_compile_cache(config["compile_cache"]),
         plugins=registry.folders(),
@@ -399,18 +398,6 @@ def _table_layout(settings: Mapping[str, Any], sweep: Mapping[str, Any]) -> Tabl
     if "estimator" not in rows:
         raise UserError(f"table.rows={list(rows)} must contain estimator; [estimator,backend] gives each backend a row")
     return TableLayout(columns, rows)
-
-
-def _average(names: Any, sweep: Mapping[str, Any]) -> tuple[str, ...]:
-    known = {part for name in swept(sweep) for part in (name, parameter_name(name), name.partition(".")[0])}
-    for name in _as_list(names):
-        if name not in known:
-            raise (
-                unknown("axis for average:", str(name), known)
-                if known
-                else UserError(f"average={name}: nothing is swept, so there is nothing to average over")
-            )
-    return tuple(map(str, _as_list(names)))
 
 
 def _decision(config: Mapping[str, Any]) -> Decision:

@@ -103,8 +103,6 @@ class Experiment:
     formats: tuple[str, ...] = ("png",)
     """File formats of the charts."""
     table: TableLayout = TableLayout()
-    average: tuple[str, ...] = ()
-    """Swept axes over which averages are written; the rows do not depend on this setting."""
     reference: Budget = Budget()
     compile_cache: Path | None = None
     """Folder in which compiled programs are cached between runs."""
@@ -138,7 +136,6 @@ class Experiment:
             "theta0": None if self.decision.at is None else list(self.decision.at),
             **{name: getattr(self, name) for name in ("samples", "repeats", "seed", "timing", "marks", "compile_time")},
             "formats": list(self.formats),
-            "average": list(self.average),
             "table": dataclasses.asdict(self.table),
             "reference": dataclasses.asdict(self.reference),
             "results_dir": str(self.results_dir),

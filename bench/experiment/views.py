@@ -45,16 +45,6 @@ class Mark:
 
 
 @dataclass(frozen=True)
-class Note:
-    """A text to the left of a point of a panel."""
-
-    text: str
-    x: float
-    y: float
-    panel: str | None = None
-
-
-@dataclass(frozen=True)
 class Chart:
     """A chart as data: which columns of a table are drawn against each other, for print and page.
 
@@ -97,7 +87,6 @@ class Chart:
     styles: Mapping[str, Style] = field(default_factory=dict)
     """The looks of series or levels; others get a colour each."""
     marks: Sequence[Mark] = ()
-    notes: Sequence[Note] = ()
     join: bool = False
     front: str = ""
     """On the page: the column within whose values points are marked that no other point beats in both x and y."""

@@ -16,7 +16,7 @@ from bench.experiment.experiment import Experiment
 from bench.experiment.study import study_of
 from bench.experiment.views import Views
 from bench.model import guard
-from bench.report import answer, averages, generic, ladder, web, writer
+from bench.report import answer, generic, ladder, web, writer
 from bench.report.cores import run_tasks
 from bench.report.views import newest_rows
 from bench.run.execute import Finished, store_of
@@ -50,7 +50,7 @@ def report(experiment: Experiment) -> tuple[pd.DataFrame, Views, list[Path]]:
 
 
 def write(experiment: Experiment, rows: pd.DataFrame) -> tuple[Views, list[Path]]:
-    """Write tables, charts, page and averages; return the views and the files' paths. Raises :class:`UserError` without rows.
+    """Write tables, charts and page; return the views and the files' paths. Raises :class:`UserError` without rows.
 
     A study with a method ``write``, as in version 0.4, also writes files of its own.
     """
@@ -64,7 +64,6 @@ def write(experiment: Experiment, rows: pd.DataFrame) -> tuple[Views, list[Path]
         tasks = [
             partial(writer.write, experiment, views),
             partial(web.write, experiment, rows, views),
-            partial(averages.write, experiment, rows),
         ]
         if own := getattr(study_of(experiment), "write", None):
             tasks.append(partial(own, experiment, rows))

@@ -161,7 +161,6 @@ def _chart(chart: Chart) -> dict[str, Any]:
         "own_scales": chart.own_scales,
         "looks": {name: _look(style) for name, style in draw.series_styles(chart).items()},
         "notes": dict(chart.panel_notes),
-        "texts": [{"text": note.text, "x": note.x, "y": note.y, "panel": note.panel} for note in chart.notes],
     }
 
 
