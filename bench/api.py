@@ -72,7 +72,7 @@ class Settings(TypedDict, total=False):
     plugins: str | Path | Sequence[str | Path]
     launcher: str
     ray: Mapping[str, Any]
-    slurm: Mapping[str, Any]
+    shard: str
     results_dir: str | Path
     formats: Names
     table: Mapping[str, Any]
@@ -104,7 +104,8 @@ def run(experiment: str | Sequence[str] = (), **settings: Unpack[Settings]) -> p
     words = [f"experiment={experiment}"] if isinstance(experiment, str) and experiment else list(experiment)
     words += [word for key, value in settings.items() for word in _override_words(key, value)]
     resolved = config.load(words)
-    rows, _, _ = finish(execute(resolved), words)
+    finished = execute(resolved)
+    rows = finish(finished, words)[0] if resolved.execution.shard is None else finished.rows()
     return with_axes(resolved, rows).reset_index(drop=True)
 
 

@@ -46,9 +46,11 @@ class Execution:
     retry: tuple[str, ...] = ()
     """Statuses of stored rows that are run again."""
     launcher: str = "local"
-    """Where cells run: ``local``, ``ray`` or ``slurm``."""
+    """Where cells run: ``local`` or ``ray``."""
     cluster: Mapping[str, Any] = field(default_factory=dict)
     """Settings of the launcher."""
+    shard: tuple[int, int] | None = None
+    """Number, from 1, and count of the parts of which this run is one; None for all cells."""
 
 
 @dataclass(frozen=True)
@@ -141,5 +143,5 @@ class Experiment:
             "results_dir": str(self.results_dir),
             "compile_cache": None if self.compile_cache is None else str(self.compile_cache),
             "plugins": [str(path) for path in self.plugins],
-            "execution": dataclasses.asdict(self.execution),
+            "execution": {k: v for k, v in dataclasses.asdict(self.execution).items() if k != "shard"},
         }

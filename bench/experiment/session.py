@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Protocol
 
+import numpy as np
+
 from bench.experiment.cell import Cell
 from bench.experiment.experiment import Experiment
 from bench.experiment.keys import fingerprint
@@ -19,19 +21,34 @@ class Problems:
 
     def __init__(self, folder: Path | None = None) -> None:
         self.compilations = Compilations(folder)
-        self._kept: dict[tuple[str, str], Problem] = {}
+        self._kept: dict[tuple[str, str], tuple[Problem, dict[str, bytes]]] = {}
+        """Problems, each with the content of its arrays when it was compiled."""
 
     def of(self, backend: Backend, cell: Cell) -> Problem:
-        """Return the problem of the cell's program on ``backend``, compiled if it is not cached."""
+        """Return the problem of the cell's program on ``backend``, compiled if it is not cached.
+
+        A problem whose arrays a cell has changed is compiled again.
+        """
         key = (fingerprint(backend), cell.program_key)
-        problem = self._kept.pop(key, None)
-        if problem is None:
+        problem, before = self._kept.pop(key, (None, {}))
+        if problem is None or before.items() - _arrays(problem).items():
             problem = backend.compile(cell.program())
             problem.compilations, problem.provides = self.compilations, backend.provides
-        self._kept[key] = problem
+            before = _arrays(problem)
+        self._kept[key] = problem, before
         if len(self._kept) > self.KEPT:
             del self._kept[next(iter(self._kept))]
         return problem
+
+
+def _arrays(problem: Problem) -> dict[str, bytes]:
+    """Return the content of the arrays, and of the lists of arrays, in the attributes of a problem and of its program."""
+    content = {}
+    for name, value in [*vars(problem).items(), *vars(problem.program).items()]:
+        parts = value if isinstance(value, list | tuple) else [value]
+        if arrays := [part.tobytes() for part in parts if isinstance(part, np.ndarray)]:
+            content[name] = b"".join(arrays)
+    return content
 
 
 class ReferenceSource(Protocol):

@@ -16,9 +16,22 @@ HELD = 1 << 22
 """Most normal numbers that a cell stores in memory (32 MiB). A cell that needs more draws them in parts."""
 
 
-@lru_cache(maxsize=2)
 def shared(seed: int, scene: str, repeats: int, samples: int, width: int) -> np.ndarray:
-    """Return the noise of cells, see :func:`draw`, cached for the next cell with the same arguments."""
+    """Return the noise of cells, see :func:`draw`, in an array of the caller's own.
+
+    Up to :data:`HELD` numbers are kept for the next cell with the same arguments, which gets a copy: read-only does not
+    bind torch, and a cell that writes into its noise changes no other cell.
+    """
+    if repeats * samples * width > HELD:
+        return draw(seed, scene, repeats, samples, width, "cells")
+    own = _kept(seed, scene, repeats, samples, width).copy(order="K")
+    own.setflags(write=False)
+    return own
+
+
+@lru_cache(maxsize=2)
+def _kept(seed: int, scene: str, repeats: int, samples: int, width: int) -> np.ndarray:
+    """Return the noise that cells get copies of."""
     return draw(seed, scene, repeats, samples, width, "cells")
 
 
@@ -32,7 +45,7 @@ def draw(seed: int, scene: str, repeats: int, samples: int, width: int, stream: 
     block = np.empty((width, repeats, samples))
     for r in range(repeats):
         block[:, r, :] = _generator(seed, scene, r, stream).standard_normal((samples, width)).T
-    # cells share the array
+    # estimators take noise, and do not change it
     block.setflags(write=False)
     return np.moveaxis(block, 0, -1)
 

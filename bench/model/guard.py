@@ -3,19 +3,31 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
+import fcntl
 import os
+import signal
 import sys
 import tempfile
 from collections.abc import Iterator
+from typing import IO
 
 from bench.errors import INTERRUPTED, printable
 
 MAX_CAPTURED_CHARACTERS = 300
 """Maximum number of characters of a plugin's output that are quoted."""
-
-
+DEATH_SIGNAL = 1
+"""PR_SET_PDEATHSIG of prctl(2)."""
 SPARED: set[int] = set()
 """Ids of child processes that later cells use too, which :func:`kill_children` spares."""
+
+
+def die_with(parent: int) -> None:
+    """Make the kernel kill this process when its parent, of that id, ends (Linux)."""
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None, use_errno=True).prctl(DEATH_SIGNAL, signal.SIGKILL, 0, 0, 0)
+    if os.getppid() != parent:
+        os._exit(1)
 
 
 def exit_if_forked(pid: int) -> None:
@@ -50,6 +62,16 @@ def raise_pending_interrupt() -> None:
         raise KeyboardInterrupt
 
 
+def temporary_file() -> IO[bytes]:
+    """Return a file without a name, to which all processes that have it open append; without a temporary folder, no file."""
+    try:
+        file = tempfile.TemporaryFile()  # noqa: SIM115, the caller closes it
+    except OSError:
+        return open(os.devnull, "w+b")
+    fcntl.fcntl(file, fcntl.F_SETFL, fcntl.fcntl(file, fcntl.F_GETFL) | os.O_APPEND)
+    return file
+
+
 @contextlib.contextmanager
 def capture_output(source: str) -> Iterator[None]:
     """Capture output printed in the block, and quote its start, without control characters, on one line of stderr.
@@ -59,10 +81,7 @@ def capture_output(source: str) -> Iterator[None]:
     """
     _flush()
     with contextlib.ExitStack() as stack:
-        try:
-            file = stack.enter_context(tempfile.TemporaryFile())
-        except OSError:  # no temporary folder
-            file = stack.enter_context(open(os.devnull, "w+b"))
+        file = stack.enter_context(temporary_file())
         for descriptor in (1, 2):
             with contextlib.suppress(OSError):  # the descriptor is closed
                 original = os.dup(descriptor)

@@ -112,9 +112,13 @@ class Program(ABC):
         """Whether the contact law replaces the derivative of the program by a surrogate gradient."""
         return self.contact is not None and self.contact.surrogate
 
-    @cached_property
+    @property
     def theta0(self) -> np.ndarray:
-        """The theta at which gradients are computed, ``(d,)``."""
+        """The theta at which gradients are computed, ``(d,)``, in an array of the caller's own: cells share the program."""
+        return self._theta0.copy()
+
+    @cached_property
+    def _theta0(self) -> np.ndarray:
         if self.decision.at is not None:
             return np.array(self.decision.at, dtype=np.float64)
         if self._named:
@@ -168,7 +172,7 @@ class Program(ABC):
         """n_w, the number of normal numbers per rollout."""
         return self.dim + self.exogenous
 
-    @cached_property
+    @property
     def noise_free(self) -> np.ndarray:
         """The noise of the cost without noise on theta or actions: ``(n_w, 1)`` zeros.
 

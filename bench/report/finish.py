@@ -11,27 +11,22 @@ from pathlib import Path
 import pandas as pd
 
 from bench.errors import UserError, printable, unknown
-from bench.experiment.defaults import completed_rows
 from bench.experiment.experiment import Experiment
 from bench.experiment.study import study_of
 from bench.experiment.views import Views
 from bench.model import guard
 from bench.report import answer, generic, ladder, web, writer
-from bench.report.cores import run_tasks
 from bench.report.views import newest_rows
 from bench.run.execute import Finished, store_of
 from bench.run.plan import requested_rows
 from bench.run.record import record
-from bench.run.store import sort_rows
 
 NO_RESULT = "No cell gave a result: the table has the reason of each."
 
 
 def finish(finished: Finished, words: Sequence[str]) -> tuple[pd.DataFrame, Views, list[Path]]:
     """Write the files of a run, the record first; return the rows in the order of the cells, their views, and the files' paths."""
-    keys = finished.keys
-    rows = finished.store.load()
-    rows = completed_rows(sort_rows(rows[rows["key"].isin(keys)], keys))
+    rows = finished.rows()
     simulated = any(item.runs for item in finished.planned)
     path = record(finished.experiment, rows, list(words), finished.seconds, simulated)
     views, paths = write(finished.experiment, rows)
@@ -61,13 +56,10 @@ def write(experiment: Experiment, rows: pd.DataFrame) -> tuple[Views, list[Path]
         guard.protect_process(),
     ):  # building the commands that repeat cells runs code of plugins
         views = views_of(experiment, rows)
-        tasks = [
-            partial(writer.write, experiment, views),
-            partial(web.write, experiment, rows, views),
-        ]
+        paths = [*writer.write(experiment, views), *web.write(experiment, rows, views)]
         if own := getattr(study_of(experiment), "write", None):
-            tasks.append(partial(own, experiment, rows))
-        return views, [path for paths in run_tasks(tasks) for path in paths]
+            paths += own(experiment, rows)
+        return views, paths
 
 
 def views_of(experiment: Experiment, rows: pd.DataFrame) -> Views:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import pandas as pd
@@ -14,7 +13,6 @@ from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Table, Views
 from bench.report import terminal
 from bench.report.cells import TableCell, parts, readable, text_rows
-from bench.report.cores import run_tasks
 from bench.report.draw import draw
 from bench.report.figures import save, styled
 from bench.report.latex import latex
@@ -28,8 +26,8 @@ ANSWER = "answer.json"
 
 def write(experiment: Experiment, views: Views) -> list[Path]:
     """Write all tables, charts and the answer of an experiment; return the files' paths."""
-    tasks = [partial(_draw, experiment, chart) for chart in views.charts if chart.printed and len(chart.drawn())]
-    charts = [path for saved in run_tasks(tasks) for path in saved]
+    drawn = [chart for chart in views.charts if chart.printed and len(chart.drawn())]
+    charts = [path for chart in drawn for path in _draw(experiment, chart)]
     paths = write_all(experiment.directory, [(ANSWER, _answer(experiment, views))])
     for name in dict.fromkeys(table.name for table in views.tables):
         tables = [table for table in views.tables if table.name == name]

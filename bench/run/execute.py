@@ -7,8 +7,10 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import TYPE_CHECKING
 
 from bench.errors import StorageError, Unsupported, UserError
+from bench.experiment.defaults import completed_rows
 from bench.experiment.experiment import Experiment
 from bench.experiment.study import study_of
 from bench.measure import timing
@@ -16,7 +18,10 @@ from bench.run import progress, runner
 from bench.run.files import remove_stale
 from bench.run.ladder import climb
 from bench.run.plan import Planned, plan
-from bench.run.store import Store
+from bench.run.store import Store, sort_rows
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 MAX_REPAIRS = 2
 """Number of times that cells whose rows are gone at the end of a run are run again."""
@@ -35,6 +40,11 @@ class Finished:
     def keys(self) -> list[str]:
         """Cell keys, in sweep order."""
         return [item.cell.key for item in self.planned]
+
+    def rows(self) -> pd.DataFrame:
+        """Return the stored rows of the cells, in sweep order, with parameters added since at their defaults."""
+        rows = self.store.load()
+        return completed_rows(sort_rows(rows[rows["key"].isin(self.keys)], self.keys))
 
 
 def store_of(experiment: Experiment) -> Store:
@@ -113,4 +123,4 @@ def _compact(store: Store, planned: Sequence[Planned]) -> None:
     try:
         store.compact([item.cell.key for item in planned])
     except StorageError as error:
-        print(f"bench: {error}; every finished cell is stored nevertheless", file=sys.stderr)
+        print(f"bench: {error}; the rows in 'pending' are merged by the next run", file=sys.stderr)

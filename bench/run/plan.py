@@ -52,14 +52,27 @@ class Planned:
 
 
 def plan(experiment: Experiment, store: Store) -> list[Planned]:
-    """Return the experiment's cells in sweep order, each with its state; raises :class:`UserError` for invalid values."""
+    """Return the experiment's cells, or those of its shard, in sweep order, each with its state.
+
+    Raises :class:`UserError` for invalid values.
+    """
     rows = store.load()
     facts = zip(rows["status"], rows["versions"], rows["machine"], strict=True)
     stored = dict(zip(rows["key"], facts, strict=True))
     with guard.capture_output("a plugin"), guard.protect_process():
         every = cells(experiment)
         older = _rows_of_older_code(experiment, rows, {cell.key for cell in every})
-        return [_planned(experiment, cell, stored, older) for cell in every]
+        mine = [cell for cell in every if _is_in_shard(cell, experiment.execution.shard)]
+        return [_planned(experiment, cell, stored, older) for cell in mine]
+
+
+def _is_in_shard(cell: Cell, shard: tuple[int, int] | None) -> bool:
+    """Return whether a cell is in the part (number, count) of a sweep: a part has all cells of a reference."""
+    if shard is None:
+        return True
+    number, count = shard
+    key = cell.program_key if cell.budget is None else cell.reference_key
+    return int(key, 16) % count == number - 1
 
 
 def _planned(

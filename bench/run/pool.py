@@ -1,8 +1,8 @@
 """Runs items in worker processes, one item at a time, with limits on the time and memory of each item.
 
 A worker is a process in its own session. It builds a handler once and then handles items as they arrive, so that imports
-and compilations happen once. It answers in JSON, and its printed output arrives through a separate pipe: nothing that a
-worker sends is executed here. (Pools of the standard library lose all their items when one worker dies.)
+and compilations happen once. It answers in JSON over a socket of its own, and what it prints goes to a file: nothing that
+a worker sends is executed here. (Pools of the standard library lose all their items when one worker dies.)
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ import json
 import math
 import os
 import pickle
-import select
 import signal
 import socket
+import struct
 import subprocess
 import time
 import uuid
@@ -21,33 +21,33 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from multiprocessing.connection import Connection, wait
 from pathlib import Path
-from typing import Any, Literal
+from typing import IO, Any, Literal
 
 import psutil
 
 from bench.errors import STATUSES, StorageError, UserError, failure
+from bench.model import guard
 from bench.run.reaper import MARK, Reaper, kill_marked_processes
-from bench.run.worker import END_OF_OUTPUT, Channel, ConnectionLost, Handler, MalformedMessage, command, first_message
+from bench.run.worker import Handler, command, first_message
 
 TICK = 0.05
 """Seconds between checks of the items' time and memory."""
 CHILDREN_S = 1.0
 """Seconds between searches for the processes that a worker has started, whose memory counts as the worker's."""
-AHEAD_S = 0.05
-"""Seconds of work sent to a worker in advance, so that it does not wait while results are written."""
-MAX_AHEAD = 16
-"""Largest number of items sent to a worker in advance."""
-MAX_UNSENT = 1 << 16
-"""Unsent bytes for a worker above which no items are sent in advance."""
+BATCH_S = 0.05
+"""Seconds for which the answers of quick items are gathered, to be stored in one file."""
 STEAL_S = 5.0
 """Seconds of queued work above which an idle worker takes half of a queue, although it has to compile again."""
 START_S = 60.0
 """Seconds allowed for starting a worker and importing an item's libraries, in addition to the item's time limit."""
-TAIL = 16000
-"""Bytes stored of the end of a worker's printed output."""
+TAIL, MOST_OUTPUT = 16000, 1 << 26
+"""Bytes that are read of the end of a worker's printed output, and bytes of a file of output that is emptied."""
 EXIT_S = 5.0
-"""Seconds allowed for a process to end after it has closed its connection."""
+"""Seconds allowed for the rest of a message to arrive, and for a process to end after it has closed its connection."""
+MAX_MESSAGE = 1 << 30
+"""Bytes of the longest valid message."""
 MAX_FAILED_STARTS = 3
 """Number of consecutive workers killed during their start after which the run ends with an error."""
 SINGLE_THREAD = {
@@ -81,43 +81,50 @@ class Answer:
     """The last lines printed while the item was handled."""
     machine: str = ""
     """Kind of the machine that handled the item; empty for this machine."""
-    stored: bool = False
-    """Whether that machine has stored the row."""
 
 
 # ---------------------------------------------------------------------------------------------------------- a worker
 
 
+class MalformedMessage(Exception):
+    """Raised when the bytes that arrived are not a message."""
+
+
 @dataclass(eq=False)
 class _Worker:
     process: subprocess.Popen[bytes]
-    channel: Channel
-    output: int
-    """Descriptor for reading the worker's printed output."""
+    connection: Connection
+    output: IO[bytes]
+    """The file of its printed output."""
     usage: psutil.Process
     mark: str
+    first_message: bytes = b""
+    """How to build its handler; sent as soon as it reads."""
     queue: deque[Any] = field(default_factory=deque)
     """Items to send to the worker."""
-    sent: deque[Any] = field(default_factory=deque)
-    """Items sent to the worker and not answered; it works on the first."""
+    item: Any = None
+    """The item that it works on."""
+    is_busy: bool = False
+    """Whether it works on an item."""
     since: float = field(default_factory=time.monotonic)
-    """Monotonic time in seconds at which the first item was sent or, once its imports are done, was started."""
+    """Monotonic time in seconds at which the item was sent or, once its imports are done, was started."""
     is_ready: bool = False
     """Whether it has built its handler."""
     is_prepared: bool = False
-    """Whether it has imported the libraries of the current item, so that the item's own time has begun."""
+    """Whether it has imported the libraries of the item, so that the item's own time has begun."""
+    checked: float = 0.0
+    """Monotonic time in seconds at which its limits were last checked."""
     children: list[psutil.Process] = field(default_factory=list)
     """The processes that it had started when they were last searched for."""
     children_since: float = 0.0
     """Monotonic time in seconds of that search."""
     pace: float = 1.0
     """Seconds that the last item took."""
-    printed: bytes = b""
     n_answered: int = 0
     is_done: bool = False
     """Whether it handles no more items, since a plugin has changed its process."""
-    fault: ConnectionLost | MalformedMessage | None = None
-    """Fault that ended the connection to the worker."""
+    fault: str = ""
+    """What is wrong with its connection or its last message."""
 
     def resident_bytes(self) -> int:
         """Return the resident memory of the worker and of the processes that it has started, such as engines."""
@@ -131,12 +138,12 @@ class _Worker:
                 total += int(child.memory_info().rss)
         return total
 
-    @property
-    def capacity(self) -> int:
-        """Number of items that may be sent to the worker now."""
-        if self.sent and self.channel.n_unsent > MAX_UNSENT:
-            return 0
-        return 1 + min(MAX_AHEAD, int(AHEAD_S / max(self.pace, 1e-6))) - len(self.sent)
+    def send(self, message: bytes) -> None:
+        """Send a message to the worker, which waits for it."""
+        try:
+            self.connection.send_bytes(message)
+        except OSError:
+            self.fault = "closed its connection"
 
     def send_next(self) -> Answer | None:
         """Send the next item of the queue; returns an answer with the failure if the item cannot be pickled."""
@@ -145,25 +152,17 @@ class _Worker:
             message = pickle.dumps(item)
         except Exception as error:
             return Answer(item, dict(failure(error)), 0.0)
-        if not self.sent:
-            self.since, self.is_prepared = time.monotonic(), False
-        self.sent.append(item)
-        with suppress(ConnectionLost):  # the next check of the worker reports its end
-            self.channel.send(message)
+        self.item, self.is_busy, self.is_prepared, self.since = item, True, False, time.monotonic()
+        self.send(message)
         return None
-
-    def read_output(self) -> None:
-        """Read the worker's new output, and store the last :data:`TAIL` bytes of all its output."""
-        with suppress(OSError):
-            while chunk := os.read(self.output, 1 << 16):
-                self.printed = (self.printed + chunk)[-TAIL:]
-                if len(chunk) < 1 << 16:
-                    return
 
     def take_output(self) -> str:
         """Return the last lines printed since the last call, or the first lines of Python's crash dump, joined by ``|``."""
-        output, end, rest = self.printed.partition(END_OF_OUTPUT)
-        self.printed = rest if end else b""
+        size = os.fstat(self.output.fileno()).st_size
+        if not size:
+            return ""
+        output = os.pread(self.output.fileno(), TAIL, max(0, size - TAIL))
+        os.ftruncate(self.output.fileno(), 0)
         _, crash, dump = output.decode(errors="replace").rpartition("(most recent call first):")
         printable = ("".join(c for c in line if c.isprintable()).strip() for line in dump.split("\n"))
         lines = [line for line in printable if line]
@@ -173,12 +172,12 @@ class _Worker:
         """Return the answers that have arrived. A fault of the connection or of a message is stored in ``fault``."""
         answers: list[Answer] = []
         try:
-            while self.fault is None and self.sent and (messages := self.channel.receive()):
-                for message in messages:
-                    answers += self._read(message)
-        except (ConnectionLost, MalformedMessage) as error:
-            self.fault = error
-        self.read_output()
+            while not self.fault and self.connection.poll():
+                answers += self._read(self.connection.recv_bytes(MAX_MESSAGE))
+        except (EOFError, ConnectionError):
+            self.fault = "closed its connection"
+        except (MalformedMessage, OSError):  # it is too long, or its rest did not arrive
+            self.fault = "sent a malformed message"
         return answers
 
     def _read(self, message: bytes) -> list[Answer]:
@@ -186,6 +185,9 @@ class _Worker:
         try:
             content = json.loads(message)
             match content["event"]:
+                case "hello":
+                    self.send(self.first_message)
+                    return []
                 case "ready":
                     self.is_ready = True
                     return []
@@ -194,19 +196,15 @@ class _Worker:
                     return []
                 case "storage":
                     raise StorageError(content["reason"])
-                case "answer":
+                case "answer" if self.is_busy:
                     result, seconds = _result_in(content)
-                    item = self.sent.popleft()
                 case _:
                     raise MalformedMessage
         except (ValueError, LookupError, TypeError, RecursionError) as error:
             raise MalformedMessage from error
-        self.read_output()
-        answer = Answer(item, result, seconds, self.take_output() if END_OF_OUTPUT in self.printed else "")
-        self.is_done = content.get("is_last") is True
-        self.pace, self.since, self.is_prepared = seconds, time.monotonic(), False
+        self.is_done, self.is_busy, self.pace = content.get("is_last") is True, False, seconds
         self.n_answered += 1
-        return [answer]
+        return [Answer(self.item, result, seconds, self.take_output())]
 
     def kill(self) -> None:
         """Kill the worker and all processes that it has started."""
@@ -215,13 +213,11 @@ class _Worker:
         self.process.kill()
         self.process.wait()
         kill_marked_processes(self.mark)
-        self.read_output()
 
     def close(self) -> None:
         """Close the descriptors of a worker that has ended."""
-        self.channel.close()
-        with suppress(OSError):
-            os.close(self.output)
+        self.connection.close()
+        self.output.close()
 
 
 # ---------------------------------------------------------------------------------------------------------- the pool
@@ -246,7 +242,6 @@ class Pool:
         self._n_workers, self._limits, self._single_thread = n_workers, limits, single_thread
         self._first_message = first_message(make, pickle.dumps(argument), tuple(folders))
         self._workers: list[_Worker] = []
-        self._unpicklable: list[Answer] = []
         self._retries: deque[deque[Any]] = deque()
         self._crashed: set[int] = set()
         self._n_failed_starts = 0
@@ -272,23 +267,31 @@ class Pool:
         """
         waiting = deque(deque(group) for group in groups if group)
         while True:
-            self._assign(waiting)
-            busy = [worker for worker in self._workers if worker.sent]
-            if not busy and not self._unpicklable:
+            until = time.monotonic() + BATCH_S
+            answers = self._assign(waiting)
+            busy = self._busy
+            while busy and (left := until - time.monotonic()) > 0:
+                wait([worker.connection for worker in busy], left)
+                answers += [answer for worker in busy for answer in self._collect(worker, waiting)]
+                answers += self._assign(waiting)
+                busy = self._busy
+            if not busy and not answers:
                 return
-            _wait(busy, 0 if self._unpicklable else TICK)
-            answers, self._unpicklable = self._unpicklable, []
-            yield answers + [answer for worker in busy for answer in self._collect(worker, waiting)]
+            yield answers
+
+    @property
+    def _busy(self) -> list[_Worker]:
+        return [worker for worker in self._workers if worker.is_busy or worker.queue]
 
     @property
     def current(self) -> list[Any]:
         """The items being worked on."""
-        return [worker.sent[0] for worker in self._workers if worker.sent]
+        return [worker.item for worker in self._workers if worker.is_busy]
 
-    def _assign(self, waiting: deque[deque[Any]]) -> None:
-        """Assign work to every idle worker, and start more workers while groups are waiting."""
+    def _assign(self, waiting: deque[deque[Any]]) -> list[Answer]:
+        """Assign work to every idle worker, and start more workers while groups are waiting; returns failures to send."""
         for worker in self._workers:
-            if not worker.queue and not worker.sent:
+            if not worker.queue and not worker.is_busy:
                 worker.queue = waiting.popleft() if waiting else self._take_half()
         # an earlier item may have caused the death of a worker, so the item it died on is retried in a new worker
         for groups in (self._retries, waiting):
@@ -298,10 +301,12 @@ class Pool:
                 self._workers.append(worker)
         if self._reaper is not None:  # it starts while the workers do
             self._reaper.wait_until_ready()
+        answers: list[Answer] = []
         for worker in self._workers:
-            while worker.queue and worker.capacity > 0:
+            while worker.queue and worker.is_ready and not worker.is_busy:
                 if (answer := worker.send_next()) is not None:
-                    self._unpicklable.append(answer)
+                    answers.append(answer)
+        return answers
 
     def _take_half(self) -> deque[Any]:
         """Remove and return the second half of the slowest queue; empty if that queue takes less than :data:`STEAL_S`."""
@@ -316,22 +321,20 @@ class Pool:
         if self._reaper is None:
             self._reaper = Reaper(self._mark)
         ours, theirs = socket.socketpair()
-        output, printed = os.pipe()
-        # reading the output must never wait
-        os.set_blocking(output, False)
-        mark = f"{self._mark}-{uuid.uuid4().hex}"
+        # a worker that has sent half a message, or reads none, is not waited for
+        for option in (socket.SO_RCVTIMEO, socket.SO_SNDTIMEO):
+            ours.setsockopt(socket.SOL_SOCKET, option, struct.pack("@ll", int(EXIT_S), 0))
+        output, mark = guard.temporary_file(), f"{self._mark}-{uuid.uuid4().hex}"
         process = subprocess.Popen(
             command(theirs.fileno()), pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL,
-            stdout=printed, stderr=printed, start_new_session=True,
+            stdout=output, stderr=output, start_new_session=True,
             env=os.environ | {MARK: mark} | (SINGLE_THREAD if self._single_thread else {}),
         )  # fmt: skip
         # a socket reports its end only when every copy of the other side is closed, including this copy
         theirs.close()
-        os.close(printed)
-        worker = _Worker(process, Channel(ours), output, psutil.Process(process.pid), mark)
-        with suppress(ConnectionLost):
-            worker.channel.send(self._first_message)
-        return worker
+        return _Worker(
+            process, Connection(ours.detach()), output, psutil.Process(process.pid), mark, self._first_message
+        )
 
     def _collect(self, worker: _Worker, waiting: deque[deque[Any]]) -> list[Answer]:
         """Return a worker's new answers. A worker that has died or exceeds a limit is removed and its items reassigned."""
@@ -344,22 +347,22 @@ class Pool:
         worker.kill()
         if kind != "done":
             answers += worker.receive()  # answers sent before it died still count
+        output = worker.take_output()
         worker.close()
         self._workers.remove(worker)
         self._n_failed_starts = 0 if worker.is_ready else self._n_failed_starts + 1
         if not worker.is_ready and (self._n_failed_starts == MAX_FAILED_STARTS or not was_killed):
-            raise UserError(f"a worker cannot start: {reason}; last output: {worker.take_output() or 'none'}")
-        if worker.sent and worker.is_ready and kind != "done":
-            item, seconds = worker.sent.popleft(), time.monotonic() - worker.since
+            raise UserError(f"a worker cannot start: {reason}; last output: {output or 'none'}")
+        rest = worker.queue  # the items behind the failed item have not run
+        if worker.is_busy and kind != "done":
+            item, seconds = worker.item, time.monotonic() - worker.since
             if self._may_retry(worker, item, kind):
                 self._crashed.add(id(item))
-                self._retries.append(deque([item, *worker.sent, *worker.queue]))
+                self._retries.append(deque([item, *rest]))
                 return answers
             twice = ", in two workers" if id(item) in self._crashed else ""
             status = "timeout" if kind == "timeout" else "crashed"
-            answers.append(Answer(item, {"status": status, "reason": reason + twice}, seconds, worker.take_output()))
-        # the items queued behind the failed item have not run
-        rest = deque([*worker.sent, *worker.queue])
+            answers.append(Answer(item, {"status": status, "reason": reason + twice}, seconds, output))
         if rest:
             waiting.appendleft(rest)
         return answers
@@ -377,19 +380,21 @@ class Pool:
         """Return why a worker has to be replaced, as a kind and a reason; None if it can continue."""
         if worker.is_done:
             return "done", "a plugin has changed its process"
-        code = worker.process.poll()
-        if code is None and isinstance(worker.fault, ConnectionLost):
+        now, is_lost = time.monotonic(), worker.fault == "closed its connection"
+        if not worker.fault and now < worker.checked + TICK:
+            return None
+        worker.checked, code = now, worker.process.poll()
+        if code is None and is_lost:
             with suppress(subprocess.TimeoutExpired):
                 code = worker.process.wait(EXIT_S)
         if code is not None:
             return "crashed", describe_exit(code)
-        if worker.fault is not None:
-            malformed = isinstance(worker.fault, MalformedMessage)
-            return "crashed", "sent a malformed message" if malformed else "closed its connection"
-        if not worker.sent:
-            return None
+        if worker.fault:
+            return "crashed", worker.fault
+        if os.fstat(worker.output.fileno()).st_size > MOST_OUTPUT:
+            os.ftruncate(worker.output.fileno(), 0)
         timeout, memory = self._limits.timeout, self._limits.memory
-        if timeout is not None and time.monotonic() - worker.since > timeout + (0 if worker.is_prepared else START_S):
+        if timeout is not None and now - worker.since > timeout + (0 if worker.is_prepared else START_S):
             return "timeout", f"no result within {timeout:g} s"
         with suppress(psutil.Error):
             if memory is not None and worker.resident_bytes() > memory:
@@ -413,16 +418,3 @@ def describe_exit(code: int) -> str:
         return f"the process ended with exit status {code}"
     name = signal.Signals(-code).name
     return f"killed by {name}" + (" (out of memory?)" if name == "SIGKILL" else "")
-
-
-def _wait(workers: Sequence[_Worker], seconds: float) -> None:
-    """Wait at most ``seconds`` until a worker sends a message, prints output or accepts unsent bytes."""
-    poll = select.poll()
-    for worker in workers:
-        poll.register(worker.channel, select.POLLIN | (select.POLLOUT if worker.channel.n_unsent else 0))
-        poll.register(worker.output, select.POLLIN)
-    poll.poll(1000 * seconds)
-    for worker in workers:
-        with suppress(ConnectionLost):
-            worker.channel.flush()
-        worker.read_output()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from contextlib import suppress
+from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 
@@ -34,7 +35,7 @@ class References:
         return self._path(cell).exists()
 
     def of(self, cell: Cell) -> Reference:
-        """Return the reference of the cell's program, from the best backend that can run it."""
+        """Return the reference of the cell's program, from the best backend that can run it, in arrays of the caller's own."""
         key = cell.reference_key
         if key not in self._references:
             result = load(self._path(cell))
@@ -42,7 +43,7 @@ class References:
                 result = self._compute(cell)
                 save(result, self._path(cell))
             self._references[key] = result
-        return self._references[key]
+        return deepcopy(self._references[key])
 
     def _compute(self, cell: Cell) -> Reference:
         """Compute the reference on the first backend that can; raises the error of the first backend if none can.

@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
 MAX_ROWS = 5_000_000
 """Largest number of rows of a file: five times the largest sweep."""
-MAX_BYTES = 1 << 33
-"""Largest size of a table in memory, as its file states it."""
+MAX_BYTES, MAX_GROWTH, ALWAYS_BYTES = 1 << 33, 1000, 1 << 29
+"""Largest size of a table in memory, as its file states it; also as a multiple of the file's size, above 512 MiB."""
 MAX_TEXT = 1_000_000
 """Length of the longest string, in characters."""
 COUNTS = {"samples": 1, "repeats": 1, "seed": 0, "horizon": 0}
@@ -63,14 +63,19 @@ def read_parquet(path: Path, columns: Sequence[str] | None = None) -> pd.DataFra
     content = io.BytesIO(path.read_bytes())
     file = pyarrow.parquet.ParquetFile(content)
     metadata = file.metadata
-    size = sum(metadata.row_group(i).total_byte_size for i in range(metadata.num_row_groups))
-    if metadata.num_rows > MAX_ROWS or size > MAX_BYTES:
+    groups = [metadata.row_group(i) for i in range(metadata.num_row_groups)]
+    n_values = sum(group.column(i).num_values for group in groups for i in range(group.num_columns))
+    size = max(sum(group.total_byte_size for group in groups), 8 * n_values)  # equal values take no room in a file
+    most = min(MAX_BYTES, max(ALWAYS_BYTES, MAX_GROWTH * content.getbuffer().nbytes))
+    if metadata.num_rows > MAX_ROWS or size > most:
         raise ValueError(f"{metadata.num_rows} rows and {size} bytes are more than a run writes")
     texts = [field.name for field in file.schema_arrow if str(field.type) in ("string", "large_string")]
     content.seek(0)
     table = pyarrow.parquet.read_table(content, columns=columns and list(columns), read_dictionary=texts)
     # a column is freed as soon as it is converted
     frame = table.to_pandas(split_blocks=True, self_destruct=True)
+    if not all(isinstance(name, str) for name in frame):
+        raise ValueError("a column has no name")
     return frame.assign(**{name: _shared(frame[name]) for name in texts if name in frame})
 
 

@@ -127,8 +127,7 @@ class _Run:
 
     def _measure(self, cells: list[Cell], launcher: Launcher) -> None:
         for answers in self._answers([Task(cell) for cell in cells], launcher):
-            for stored in (False, True):
-                self._finish([(a.item.cell, result_of(a)) for a in answers if a.stored == stored], stored)
+            self._finish([(a.item.cell, result_of(a)) for a in answers])
 
     def _answers(self, tasks: list[Task], launcher: Launcher) -> Iterator[list[Answer]]:
         with guard.capture_output("a plugin"), guard.protect_process():
@@ -148,10 +147,10 @@ class _Run:
         finally:
             self._current = ""
 
-    def _finish(self, results: list[Result], stored: bool = False) -> None:
-        """Store rows, unless the machine that measured them has, and report them; raises :class:`Stopped` if due."""
+    def _finish(self, results: list[Result]) -> None:
+        """Store rows and report them; raises :class:`Stopped` if due."""
         rows = [row_of(self._experiment, cell, result) for cell, result in results]
-        if rows and not stored:
+        if rows:
             self._store.append(*rows)
         for (cell, _), row in zip(results, rows, strict=True):
             self._on_finished(cell, row)

@@ -85,7 +85,7 @@ class Store:
 
         if not self._in_pending(claim, f"'{self._claim}' cannot be created"):
             with suppress(OSError):  # a run that has removed the claim has stored rows
-                owner = self._claim.read_text()
+                owner = self._claim.read_text(errors="replace")
                 if owner not in ("", self._study):
                     raise UserError(
                         f"a run of study {printable(owner)} has started in '{self.directory}', and this is study {self._study}: "
@@ -100,7 +100,7 @@ class Store:
 
     def _release_claim(self) -> None:
         with suppress(OSError):
-            if self._claim.read_text() == self._study:
+            if self._claim.read_text(errors="replace") == self._study:
                 self._claim.unlink()
 
     def _refuse_other_studies(self, studies: Iterable[str]) -> None:
@@ -152,7 +152,8 @@ class Store:
         files = {}
         for path in [self._table, *(self._pending / name for name in names)]:
             with suppress(FileNotFoundError, NotADirectoryError):
-                files[path] = _file_id(path)
+                if not path.is_fifo():  # which would be waited for
+                    files[path] = _file_id(path)
         return files
 
     def _read_all(self) -> tuple[pd.DataFrame, dict[Path, FileId]]:

@@ -64,6 +64,8 @@ class TaskHandler:
 
     def prepare(self, item: Task) -> None:
         """Compile the program, so that the backend imports its libraries."""
+        if _is_foreign(item.cell) and not self._ran_foreign_code:
+            registry.entries()  # imported before foreign code can change them, so that a change is seen
         with guard.protect_process():
             try:
                 self._session.problems.of(item.backend, item.cell)
@@ -78,7 +80,7 @@ class TaskHandler:
         A change of the process that would change other cells' numbers is undone and added to the reason.
         """
         if _is_foreign(item.cell) and not self._ran_foreign_code:
-            registry.entries()  # imported before foreign code can change them, so that a change is seen
+            registry.entries()  # as in prepare, which only workers call
             self._state.adopt()
             self._ran_foreign_code = True
         result = self._handle(item)

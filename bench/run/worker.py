@@ -1,119 +1,31 @@
-"""The worker process, which builds a handler once and then handles items one by one, and its message channel."""
+"""The worker process, which builds a handler once and then handles items one by one."""
 
 from __future__ import annotations
 
-import ctypes
 import faulthandler
 import json
 import os
 import pickle
 import signal
-import socket
-import struct
 import sys
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Protocol
 
 from bench.errors import StorageError, failure
 from bench.model import guard, isolation, registry
-from bench.run.reaper import DEATH_SIGNAL
 
-LENGTH = struct.Struct(">Q")
-"""The length of a message in bytes, which precedes the message."""
-CHUNK = 1 << 18
-"""Bytes read from the socket in one call."""
-MAX_MESSAGE = 1 << 30
-"""Bytes of the longest valid message."""
 PROGRAM = "import sys; sys.path[:] = sys.argv.pop().split(chr(0x1f)); from bench.run.worker import main; main()"
 """The program of a worker. It has the import path of its run, and does not import the run's main script."""
 ENCODER = json.JSONEncoder()
 """The encoder of messages, created before a plugin can replace it."""
-END_OF_OUTPUT = b"\x1ebench-end-of-output\x1e\n"
-"""What a worker prints after each item, so that its output is not taken for the next item's."""
 
 
 class ConnectionLost(Exception):
-    """Raised when the other end of a channel is closed."""
-
-
-class MalformedMessage(Exception):
-    """Raised when the bytes that arrived are not a message."""
-
-
-class Channel:
-    """One end of a socket for messages, each preceded by its length. The worker's end is ``blocking``.
-
-    The run's end never blocks. Bytes that do not fit into the socket are buffered here, so a worker that reads nothing
-    delays neither the other workers nor the checks of time limits. Output that a plugin prints does not reach the socket.
-    """
-
-    def __init__(self, connection: socket.socket, blocking: bool = False) -> None:
-        self._connection = connection
-        connection.setblocking(blocking)
-        self._received = bytearray()
-        self._unsent = bytearray()
-
-    def fileno(self) -> int:
-        """Return the socket's descriptor."""
-        return self._connection.fileno()
-
-    @property
-    def n_unsent(self) -> int:
-        """Number of buffered bytes, to be sent."""
-        return len(self._unsent)
-
-    def send(self, message: bytes) -> None:
-        """Send a message, or as much of it as fits: :meth:`flush` sends the rest."""
-        self._unsent += LENGTH.pack(len(message)) + message
-        self.flush()
-
-    def flush(self) -> None:
-        """Send the buffered bytes: all of them if the socket blocks, otherwise as many as fit."""
-        while self._unsent:
-            try:
-                n_sent = self._connection.send(self._unsent)
-            except BlockingIOError:
-                return
-            except OSError as error:
-                raise ConnectionLost from error
-            del self._unsent[:n_sent]
-
-    def receive(self) -> list[bytes]:
-        """Return the messages that have arrived: at least one if the socket blocks, otherwise possibly none.
-
-        Raises :class:`ConnectionLost` or :class:`MalformedMessage` once all messages before the fault were returned.
-        """
-        while not (messages := self._split()):
-            try:
-                chunk = self._connection.recv(CHUNK)
-            except BlockingIOError:
-                break
-            except OSError as error:
-                raise ConnectionLost from error
-            if not chunk:
-                raise ConnectionLost
-            self._received += chunk
-        return messages
-
-    def _split(self) -> list[bytes]:
-        """Remove the complete messages from the received bytes and return them."""
-        messages: list[bytes] = []
-        while len(self._received) >= LENGTH.size:
-            end = LENGTH.size + LENGTH.unpack_from(self._received)[0]
-            if end > MAX_MESSAGE and not messages:
-                raise MalformedMessage
-            if len(self._received) < end:
-                break
-            messages.append(bytes(self._received[LENGTH.size : end]))
-            del self._received[:end]
-        return messages
-
-    def close(self) -> None:
-        """Close this end."""
-        self._connection.close()
+    """Raised when the run has ended."""
 
 
 class Handler(Protocol):
@@ -142,70 +54,68 @@ def first_message(make: Callable[[Any], Handler], argument: bytes, folders: tupl
 def main() -> None:
     """Handle items until the run closes the channel; ``sys.argv`` contains a descriptor and the run's process id."""
     descriptor, run = map(int, sys.argv[1:3])
-    _die_with(run)
+    os.set_inheritable(descriptor, False)
+    guard.die_with(run)  # elsewhere than on Linux see the reaper
     # Ctrl-C reaches the run, which ends its workers
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     faulthandler.enable(all_threads=False)
     sys.argv[:] = ["bench-worker"]
     with suppress(ConnectionLost):
-        _serve(Channel(socket.socket(fileno=descriptor), blocking=True))
+        _serve(Connection(descriptor))
 
 
-def _die_with(run: int) -> None:
-    """Make the kernel kill this process when its run ends, even during an item (Linux; elsewhere see the reaper)."""
-    with suppress(OSError, AttributeError):
-        ctypes.CDLL(None, use_errno=True).prctl(DEATH_SIGNAL, signal.SIGKILL, 0, 0, 0)
-    if os.getppid() != run:
-        os._exit(1)
-
-
-def _serve(channel: Channel) -> None:
+def _serve(connection: Connection) -> None:
     """Build the handler that the first message describes, then answer all later messages."""
-    messages = channel.receive()
+    _send(connection, "hello")
     # the argument is pickled separately, since its classes may come from the folders of plugins
-    folders, make, argument = pickle.loads(messages.pop(0))
+    folders, make, argument = pickle.loads(_receive(connection))
     for folder in folders:
         registry.add_folder(folder)
     pid = os.getpid()
     with isolation.undo_changes("a plugin, while it was imported,"):
         content = pickle.loads(argument)
     handle = make(content)
-    channel.send(_encode("ready"))
-    while True:
-        messages = messages or channel.receive()
-        answer = _answer(channel, handle, messages.pop(0))
+    _send(connection, "ready")
+    while not getattr(handle, "is_tainted", False):  # the run continues in a new worker
+        event, answer = _answer(connection, handle, _receive(connection))
         guard.exit_if_forked(pid)
         guard.kill_children()
-        with suppress(Exception):
+        with suppress(Exception):  # a plugin may have closed or replaced it
             sys.stdout.flush()
-        with suppress(OSError):  # a plugin may have closed it
-            os.write(1, END_OF_OUTPUT)
-        channel.send(answer)
-        if getattr(handle, "is_tainted", False):
-            return  # the run continues in a new worker
+        _send(connection, event, **answer)
 
 
-def _encode(event: str, **content: Any) -> bytes:
-    """Return a message to the run as JSON; its event is ``ready``, ``started``, ``answer`` or ``storage``."""
-    return ENCODER.encode({"event": event, **content}).encode()
+def _receive(connection: Connection) -> bytes:
+    try:
+        return connection.recv_bytes()
+    except (EOFError, OSError) as error:
+        raise ConnectionLost from error
 
 
-def _answer(channel: Channel, handle: Handler, message: bytes) -> bytes:
-    """Handle the item in a message and return the message that answers it."""
+def _send(connection: Connection, event: str, **content: Any) -> None:
+    """Send a message as JSON; its event is ``hello``, ``ready``, ``started``, ``answer`` or ``storage``."""
+    try:
+        connection.send_bytes(ENCODER.encode({"event": event, **content}).encode())
+    except OSError as error:
+        raise ConnectionLost from error
+
+
+def _answer(connection: Connection, handle: Handler, message: bytes) -> tuple[str, dict[str, Any]]:
+    """Handle the item in a message; return the event of the answer and its content."""
     pid, started = os.getpid(), time.perf_counter()
     try:
         item = pickle.loads(message)
         handle.prepare(item)
         # the imports are done, and the item's own time begins
-        channel.send(_encode("started"))
+        _send(connection, "started")
         started = time.perf_counter()
         result = handle(item)
         seconds, is_last = time.perf_counter() - started, bool(getattr(handle, "is_tainted", False))
-        return _encode("answer", result=result, seconds=seconds, is_last=is_last)
+        return "answer", {"result": result, "seconds": seconds, "is_last": is_last}
     except ConnectionLost:
         raise
     except StorageError as error:
-        return _encode("storage", reason=str(error))
+        return "storage", {"reason": str(error)}
     except BaseException as error:
         guard.exit_if_forked(pid)
-        return _encode("answer", result=failure(error), seconds=time.perf_counter() - started)
+        return "answer", {"result": failure(error), "seconds": time.perf_counter() - started}

@@ -1,10 +1,8 @@
-"""The same tasks, the same rows: on this machine, on a Ray cluster that loses a node, and as jobs of Slurm."""
+"""The same tasks, the same rows: on this machine, in shards, and on a Ray cluster that loses a node."""
 
-import ast
 import importlib
 import importlib.util
 import os
-import signal
 import subprocess
 import sys
 import time
@@ -19,6 +17,7 @@ from bench.experiment import config
 from bench.run import record
 from bench.run.execute import execute, store_of
 from bench.run.launchers import jobs, waiting
+from bench.run.plan import plan
 from bench.run.tasks import Task
 
 WORDS = ["scenes=[heaviside]", "backends=[numpy]", "samples=16", "repeats=4", "workers=1", "--quiet"]
@@ -81,7 +80,7 @@ def bench(*words: str, **more) -> subprocess.CompletedProcess[str]:
     [
         ("launcher=rai", "did you mean 'ray'"), ("ray.cell=3", "unknown setting of ray 'cell'; did you mean 'cells'"),
         ("ray.cells=0", "ray.cells=0 must be at least 1"), ("ray.cells=x", "ray.cells='x' must be a whole number"),
-        ("slurm.cluster=moab", "slurm"), ("slurm=3", "must be a table"),
+        ("ray=3", "must be a table"),
     ],
 )  # fmt: skip
 def test_settings_of_launchers_are_checked(capsys, word, said):
@@ -135,64 +134,47 @@ def test_more_cores_than_this_machine_has_are_refused_when_planned(capsys, monke
     assert "ray.cpus=4096 is more than the" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("launcher", ["ray", "slurm"])
-def test_a_launcher_whose_library_is_absent_says_how_to_get_it(tmp_path, capsys, monkeypatch, launcher):
-    monkeypatch.setitem(sys.modules, {"ray": "ray", "slurm": "submitit"}[launcher], None)
-    words = [*WORDS, "estimators=[fobg]", f"launcher={launcher}", f"results_dir={tmp_path}"]
-    assert main(words) == 2
-    assert f"pip install 'diffsim-bench[{launcher}]'" in capsys.readouterr().err
+def test_a_launcher_whose_library_is_absent_says_how_to_get_it(tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    assert main([*WORDS, "estimators=[fobg]", "launcher=ray", f"results_dir={tmp_path}"]) == 2
+    assert "pip install 'diffsim-bench[ray]'" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("package", ["run", "run/launchers", "experiment", "plugins"])
-def test_no_module_imports_the_package_that_gathers_it(package):
-    folder = Path(config.__file__).parents[1] / package
-    name = f"bench.{package.replace('/', '.')}"
-    names = {path.stem for path in folder.glob("*.py")} | {path.name for path in folder.iterdir() if path.is_dir()}
-    for path in folder.glob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text())):
-            if path.name != "__init__.py" and isinstance(node, ast.ImportFrom) and node.module == name:
-                assert {alias.name for alias in node.names} <= names, f"{path.name} imports from {name}"
+@pytest.mark.parametrize("shard", ["0/64", "65/64", "3", "a/b", "1/0", "-1/4"])
+def test_a_shard_that_is_none_is_refused(capsys, shard):
+    assert main(["plan", *WORDS, "estimators=[fobg]", f"shard='{shard}'"]) == 2
+    assert "must be NUMBER/COUNT: of 64 shards, 1/64 to 64/64" in capsys.readouterr().err
+
+
+def test_shards_at_once_one_killed_give_the_rows_of_one_run(tmp_path, capsys):
+    """Cells that share a reference are in one shard; another count of shards runs nothing that is stored."""
+    words = [*WORDS[:-1], "estimators=[fobg,alpha_order]", "sweep.sigma=[0.1,0.2,0.3,0.4]", f"results_dir={tmp_path}"]
+    words.append("timing=false")
+    assert main([*words, "name=local"]) == 0
+    command = [sys.executable, "-m", "bench", *words, "name=parts"]
+    runs = [subprocess.Popen([*command, f"shard={part}/3"], stdout=subprocess.DEVNULL) for part in (1, 2, 3)]
+    runs[1].kill()
+    assert [run.wait(120) for run in runs][::2] == [0, 0]
+    assert not list((tmp_path / "parts").glob("*.csv"))
+    capsys.readouterr()
+    assert main([*words, "name=parts", "shard=2/3"]) == 0
+    assert "cells of this shard are stored" in capsys.readouterr().out
+    made = [config.load([*words, "name=parts", f"shard={part}/3"]) for part in (1, 2, 3)]
+    parts = [plan(one, store_of(one)) for one in made]
+    assert sum(map(len, parts)) == 8
+    assert all(item.stored for part in parts for item in part)
+    references = [{item.cell.reference_key for item in part} for part in parts]
+    assert sum(map(len, references)) == len(set.union(*references)) == 4
+    assert main(["plan", *words, "name=parts", "shard=1/5"]) == 0
+    assert " 0 to run" in capsys.readouterr().out
+    assert main(["report", *words, "name=parts"]) == 0
+    pd.testing.assert_frame_equal(rows(tmp_path / "parts"), rows(tmp_path / "local"), check_exact=True)
 
 
 def test_groups_are_cut_only_as_far_as_all_slots_get_a_part():
     assert jobs.split([list(range(10)), [1]], 100, 1) == [list(range(10)), [1]]
     assert [len(part) for part in jobs.split([list(range(10))], 100, 4)] == [3, 3, 3, 1]
     assert [len(part) for part in jobs.split([list(range(10))], 4, 1)] == [4, 4, 2]
-
-
-def test_the_job_script_asks_for_what_was_set(tmp_path, capsys):
-    if importlib.util.find_spec("submitit") is None:
-        pytest.skip("submitit is not installed")
-    words = ["slurm.partition=short", "slurm.constraint=epyc", "slurm.minutes=30", "slurm.cpus=2", "memory=2g"]
-    given = [*WORDS, "estimators=[fobg]", "launcher=slurm", *words, f"results_dir={tmp_path}"]
-    assert main(["plan", *given, "timing=true"]) == 0
-    script = capsys.readouterr().out.partition("the job script:\n")[2]
-    for line in (
-        "--partition=short",
-        "--constraint=epyc",
-        "--time=30",
-        "--cpus-per-task=2",
-        "--mem=5GB",
-        "--exclusive",
-    ):
-        assert f"#SBATCH {line}\n" in script
-    assert "-m submitit.core._submit" in script
-    assert "export PYTHONPATH=" in script
-    assert main(["plan", *given, "timing=false"]) == 0
-    assert "--exclusive" not in capsys.readouterr().out
-
-
-@pytest.mark.skipif(importlib.util.find_spec("submitit") is None, reason="submitit is not installed")
-def test_submitit_leaves_other_peoples_logging_alone(tmp_path):
-    """It sets logging up when it is imported, which closes every handler there is, and some close their streams."""
-    code = (
-        "import logging, sys\n"
-        f"handler = logging.FileHandler({str(tmp_path / 'log')!r}); handler.acquire(); stream = handler.stream\n"
-        "from bench.run.launchers import slurm\n"
-        "slurm.import_submitit()\n"
-        "sys.exit(stream.closed)"
-    )
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 def test_every_row_says_which_kind_of_machine_made_it(tmp_path):
@@ -221,7 +203,7 @@ def test_a_job_on_another_kind_of_machine_measures_nothing(tmp_path):
     from bench.experiment.grid import cells
 
     tasks = [Task(cell) for cell in cells(made)]
-    job = jobs.Job((), jobs.pack(made), pickle.dumps(tasks), True, "another kind", stores=True)
+    job = jobs.Job((), jobs.pack(made), pickle.dumps(tasks), True, "another kind")
     said = list(jobs.run_job(job))
     assert [place for place, _ in said] == [-1]
     assert store_of(made).load().empty
@@ -229,95 +211,7 @@ def test_a_job_on_another_kind_of_machine_measures_nothing(tmp_path):
         jobs.read_message(tasks[0], said[0][1], "another kind")
 
 
-FAKE = {
-    "sbatch": "echo Submitted batch job 4242",
-    "srun": "exit 1",
-    "sacct": "echo 'JobID|State|NodeList'; for i in 0 1 2 3; do echo 4242_$i'|PENDING|None assigned'; done",
-    "scancel": 'echo "$@" >> "$CANCELLED"',
-}
-"""Commands of a Slurm cluster on which no job starts."""
-
-
-def test_a_run_says_which_job_does_not_start_and_gives_up_after_the_limit(tmp_path, monkeypatch, capsys):
-    pytest.importorskip("submitit")
-    for name, text in FAKE.items():
-        path = tmp_path / "bin" / name
-        path.parent.mkdir(exist_ok=True)
-        path.write_text(f"#!/bin/sh\n{text}\n")
-        path.chmod(0o755)
-    monkeypatch.setenv("PATH", f"{tmp_path / 'bin'}:{os.environ['PATH']}")
-    monkeypatch.setenv("CANCELLED", str(tmp_path / "cancelled"))
-    monkeypatch.setattr(waiting, "SILENT_S", 0.2)
-    monkeypatch.setattr(importlib.import_module("bench.run.launchers.slurm"), "TICK", 0.1)
-    slurm = ["launcher=slurm", "slurm.wait=1", "slurm.cells=1", "timing=false", "name=never", f"results_dir={tmp_path}"]
-    assert main([*WORDS, "estimators=[fobg]", "sweep.seed=[0,1]", *slurm]) == 2
-    said = capsys.readouterr().err
-    assert "none of 2 jobs has started (job 4242_0 is pending): waiting, for at most 1 s (slurm.wait)" in said
-    assert "gave up after 1 s (slurm.wait); squeue shows the reason, and slurm.wait=null waits without a limit" in said
-    assert "Traceback" not in said
-    assert "4242" in (tmp_path / "cancelled").read_text()
-
-
-def test_a_job_may_wait_without_a_limit_but_not_for_less_than_a_second():
-    assert config.load([*WORDS[:-1], "launcher=slurm"]).execution.cluster["wait"] is None
-    with pytest.raises(UserError, match=r"slurm.wait=0 must be at least 1"):
-        config.load([*WORDS[:-1], "launcher=slurm", "slurm.wait=0"])
-
-
 # --------------------------------------------------------------------------------------------------------------- slow
-
-
-@pytest.mark.slow
-def test_jobs_of_submitit_give_the_rows_of_a_local_run(tmp_path):
-    if importlib.util.find_spec("submitit") is None:
-        pytest.skip("submitit is not installed")
-    words = [
-        *WORDS,
-        "estimators=[fobg,alpha_order]",
-        "timing=false",
-        "sweep.sigma=[0.1,0.2,0.3]",
-        f"results_dir={tmp_path}",
-    ]
-    assert main([*words, "name=local"]) == 0
-    sent = ["name=sent", "launcher=slurm", "slurm.cluster=local", "slurm.cells=4", "slurm.parallel=2"]
-    assert main([*words, "name=sent", "sweep.sigma=[0.2]"]) == 0  # one launcher begins, another goes on
-    begun = rows(tmp_path / "sent")
-    done = bench(*words, *sent)
-    assert done.returncode == 0, done.stderr
-    assert len(begun) == 2
-    table = pd.read_parquet(tmp_path / "sent" / "rows.parquet").set_index("key")
-    first = table.loc[begun["key"], "sequence"].max()
-    assert (table.drop(index=begun["key"])["sequence"] > first).all()
-    pd.testing.assert_frame_equal(rows(tmp_path / "sent"), rows(tmp_path / "local"), check_exact=True)
-    assert not (tmp_path / "sent" / "jobs").exists()
-    again = bench("plan", *words, "name=sent")
-    assert "6 cells, 6 stored" in again.stdout
-
-
-@pytest.mark.slow
-def test_an_interrupt_prints_no_traceback_of_submitit(tmp_path):
-    pytest.importorskip("submitit")
-    words = [
-        "scenes=[heaviside]",
-        "backends=[numpy]",
-        "estimators=[reinforce]",
-        "samples=20000",
-        "repeats=64",
-        "timing=false",
-    ]
-    words += ["sweep.seed=range(0,400)", "launcher=slurm", "slurm.cluster=local", "slurm.cells=100", "slurm.parallel=2"]
-    run = subprocess.Popen(
-        [sys.executable, "-m", "bench", *words, "name=cut", f"results_dir={tmp_path}", "--quiet"],
-        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, start_new_session=True,
-    )  # fmt: skip
-    until = time.monotonic() + 60
-    while not list(tmp_path.glob("cut/pending/*.json")) and run.poll() is None and time.monotonic() < until:
-        time.sleep(0.1)
-    os.killpg(run.pid, signal.SIGINT)  # as a terminal does
-    said = run.communicate(timeout=60)[1]
-    assert run.returncode == 130
-    assert "Traceback" not in said
-    assert "Continue with: python -m bench" in said
 
 
 @pytest.mark.cluster

@@ -6,7 +6,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections import deque
+from multiprocessing.connection import Connection
 
 import pandas as pd
 import psutil
@@ -15,12 +15,12 @@ from trees import hearing_signals
 
 from bench.cli import main
 from bench.errors import StorageError, UserError
+from bench.model.guard import temporary_file
 from bench.run import files
 from bench.run.files import TEMPORARY, remove_stale, temporary
-from bench.run.pool import Pool, ResourceLimits, _Worker
+from bench.run.pool import MalformedMessage, Pool, ResourceLimits, _Worker
 from bench.run.reaper import Reaper
 from bench.run.store import Store
-from bench.run.worker import LENGTH, Channel, ConnectionLost, MalformedMessage
 from bench.studies.bias_variance.columns import COLUMNS
 
 TINY = ["scenes=[heaviside]", "backends=[numpy]", "samples=8", "repeats=4", "timing=false", "workers=0", "--quiet"]
@@ -181,7 +181,7 @@ def test_the_disk_is_told_to_empty_its_cache_where_fsync_does_not(tmp_path, monk
 
 
 def framed(text: bytes) -> bytes:
-    return len(text).to_bytes(8, "big") + text
+    return len(text).to_bytes(4, "big") + text
 
 
 MALFORMED = {
@@ -279,12 +279,10 @@ def test_a_malformed_message_counts_as_a_crash_of_its_cell(content):
 
 @pytest.mark.parametrize("content", sorted(MALFORMED.keys() - {"noise", "length"}))
 def test_a_message_that_is_no_answer_is_malformed(content):
-    (length,) = LENGTH.unpack_from(MALFORMED[content])
-    worker = _Worker(None, None, -1, None, "", sent=deque(["item"]))
+    worker = _Worker(None, None, None, None, "", item="item", is_busy=True)
     with pytest.raises(MalformedMessage):
-        worker._read(MALFORMED[content][LENGTH.size :])
-    assert list(worker.sent) == ["item"]
-    assert length == len(MALFORMED[content]) - LENGTH.size
+        worker._read(MALFORMED[content][4:])
+    assert worker.is_busy
 
 
 def test_a_worker_that_a_plugin_has_changed_is_replaced_and_nothing_is_blamed():
@@ -303,26 +301,27 @@ def test_output_belongs_to_the_item_that_printed_it():
 def test_messages_before_a_malformed_one_still_count():
     import socket
 
-    one, two = socket.socketpair()
-    with one, two:
-        run, worker = Channel(one), Channel(two)
-        worker.send(b"first")
-        worker.send(b"second")
-        two.send(b"garbage" * 10)
-        assert run.receive() == [b"first", b"second"]
-        with pytest.raises(MalformedMessage):
-            run.receive()
+    ours, theirs = socket.socketpair()
+    with theirs:
+        answer = b'{"event": "answer", "result": {"status": "ok"}, "seconds": 1.0}'
+        theirs.sendall(framed(b'{"event": "started"}') + framed(answer) + b"garbage" * 10)
+        worker = _Worker(None, Connection(ours.detach()), temporary_file(), None, "", item="item", is_busy=True)
+        assert [one.item for one in worker.receive()] == ["item"]
+        assert worker.fault == "sent a malformed message"
+        worker.close()
 
 
 def test_an_open_connection_without_messages_is_not_a_fault():
     import socket
 
-    one, two = socket.socketpair()
-    with one:
-        assert Channel(one).receive() == []
-        two.close()
-        with pytest.raises(ConnectionLost):
-            Channel(one).receive()
+    ours, theirs = socket.socketpair()
+    worker = _Worker(None, Connection(ours.detach()), temporary_file(), None, "")
+    assert worker.receive() == []
+    assert not worker.fault
+    theirs.close()
+    assert worker.receive() == []
+    assert worker.fault == "closed its connection"
+    worker.close()
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="processes stop otherwise")
@@ -389,15 +388,6 @@ def test_workers_that_hold_the_interpreter_lock_end_with_their_run(tmp_path):
             return
         time.sleep(0.05)
     assert not left()
-
-
-def test_workers_that_cannot_be_made_say_why():
-    with Pool(1, _no_handler, None, ResourceLimits()) as pool, pytest.raises(UserError, match="no handler today"):
-        list(pool.run([[1]]))
-
-
-def _no_handler(argument):
-    raise RuntimeError("no handler today")
 
 
 COLLECTED = """
@@ -484,20 +474,6 @@ def test_a_backend_asked_for_references_moves_and_doubles_nothing(tmp_path, work
     assert (tmp_path / "here" / "out" / "custom" / "rows.parquet").exists()
     assert list((tmp_path / "here" / "out" / "references").glob("*.parquet"))
     assert not list((tmp_path / "elsewhere").iterdir())
-
-
-def test_two_studies_that_start_at_once_in_an_empty_folder_do_not_mix(tmp_path):
-    first, second = (Store(tmp_path / "mine", COLUMNS, study) for study in ("bias_variance", "growth"))
-    for store in (first, second):
-        assert store.load().empty
-    first.prepare()
-    with pytest.raises(UserError, match="a run of study bias_variance has started"):
-        second.prepare()
-    first.append(COLUMNS.blank() | {"key": "1", "study": "bias_variance"})
-    first.compact()
-    assert not (tmp_path / "mine" / "pending").exists()
-    with pytest.raises(UserError, match="holds rows of study bias_variance"):
-        second.prepare()
 
 
 def test_too_little_memory_is_one_line():

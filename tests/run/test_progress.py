@@ -96,11 +96,6 @@ def test_refused_cells_take_no_time(monkeypatch):
     assert counted._remaining() == "about 15 s left"
 
 
-def test_times_are_as_coarse_as_their_estimate():
-    texts = [progress._rounded(seconds) for seconds in (0.2, 23.0, 94.0, 260.0, 9000.0)]
-    assert texts == ["5 s", "25 s", "95 s", "4 min", "2.5 h"]
-
-
 def test_a_run_says_after_5_s_which_reference_it_computes(monkeypatch, capsys):
     clock = [100.0]
     monkeypatch.setattr(progress.time, "monotonic", lambda: clock[0])

@@ -5,6 +5,8 @@ import math
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from helpers import row, table
 
@@ -149,3 +151,12 @@ def test_an_odd_date_of_a_row_does_not_end_the_index(tmp_path, stored_at):
     table([row()]).assign(stored_at=stored_at).to_parquet(tmp_path / "a" / "rows.parquet")
     assert main(["index", str(tmp_path)]) == 0
     assert "<span>1 ok</span>" in (tmp_path / "index.html").read_text()
+
+
+def test_a_small_file_of_many_equal_values_is_not_read(tmp_path, monkeypatch):
+    monkeypatch.setattr(rows, "ALWAYS_BYTES", 1 << 20)
+    column = pa.array(np.zeros(100_000))
+    pq.write_table(pa.table({f"column{i}": column for i in range(40)}), tmp_path / "rows.parquet")
+    assert (tmp_path / "rows.parquet").stat().st_size < 30_000
+    with pytest.raises(ValueError, match="more than a run writes"):
+        rows.read_parquet(tmp_path / "rows.parquet")

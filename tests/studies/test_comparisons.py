@@ -6,13 +6,10 @@ import math
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 from helpers import experiment, failed, row, table
 
-from bench.experiment import config
-from bench.report.views import arrange, newest_rows
-from bench.run.execute import store_of
+from bench.report.views import arrange
 from bench.studies.bias_variance.comparisons import (
     FAILS,
     NO_RESULT,
@@ -28,15 +25,6 @@ from bench.studies.bias_variance.comparisons import (
 )
 
 STANDARD = Path(__file__).resolve().parents[2] / "results" / "standard"
-MAIN = [
-    path.parent.name for path in sorted(STANDARD.glob("*/bias_variance.csv")) if (path.parent / "rows.parquet").exists()
-]
-
-
-def shown(name):
-    """The arranged rows of a standard experiment."""
-    given = config.load([f"experiment={name}", f"results_dir={STANDARD}"])
-    return arrange(given, newest_rows(store_of(given).load()))
 
 
 def cell(error, low, high, **values):
@@ -161,34 +149,6 @@ def test_costs_of_one_rollout_per_sample_are_compared_at_each_number_of_samples(
 
 
 # ------------------------------------------------------------------------- a second way, from the committed rows
-
-
-@pytest.mark.parametrize("name", MAIN)
-def test_verdicts_and_winners_of_standard_results_follow_from_the_csv(name):
-    """Verdicts and winners, from bias and variance by plain loops."""
-    arranged = shown(name)
-    methods = method_table(arranged)
-    compared = compare_errors(methods)
-    rows = arranged.rows
-    for line in methods[methods["status"] == "ok"].to_dict("records"):
-        match = rows[(rows["rmse_rel"] == line["error"]) & (rows["status"] == "ok")]
-        if rows["seed"].nunique() > 1 or match.empty:
-            continue
-        one = match.iloc[0]
-        low = math.hypot(one["bias_low"], math.sqrt(one["variance_low"])) / one["reference_norm"]
-        high = math.hypot(one["bias_high"], math.sqrt(one["variance_high"])) / one["reference_norm"]
-        expected = FAILS if low > 1 else WORKS if high < 1 else OPEN
-        assert line["verdict"] == expected, line
-    for place in compared.to_dict("records"):
-        part = methods[(methods["problem"] == place["problem"]) & (methods["axis"] == place["axis"])]
-        part = part[part["at"].isna() if math.isnan(place["at"]) else part["at"] == place["at"]]
-        known = part[np.isfinite(part["error"]) & np.isfinite(part["error_low"])]
-        assert (place["value"] == known["error"].min()) if len(known) else place["first"] == ""
-
-
-def test_there_are_standard_results():
-    assert len(MAIN) >= 6
-    assert pd.Series(MAIN).is_unique
 
 
 def test_a_far_larger_error_does_not_share_the_first_place_of_an_error_that_is_not_sure():

@@ -1,7 +1,6 @@
 """Products of step Jacobians against closed forms, and the growth study end to end."""
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -12,7 +11,6 @@ from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
 from bench.plugins.scenes.double_integrator import DoubleIntegrator
 from bench.plugins.scenes.double_pendulum import DoublePendulum
 
-import bench
 from bench.cli import main
 from bench.experiment import config
 from bench.experiment.grid import cells
@@ -23,8 +21,6 @@ from bench.studies.growth import views
 from bench.studies.growth.columns import COLUMNS
 from bench.studies.growth.fits import fit
 from bench.studies.growth.measure import classify, products, rate
-
-STANDARD = Path(bench.__file__).parent.parent / "results" / "standard"
 
 
 def constant(matrix, horizon, batch=3):
@@ -204,34 +200,3 @@ def test_ranges_of_variances_that_overlap_and_lost_horizons_are_open():
     shown = views.views(given, rows)
     assert not shown.charts
     assert shown.remarks == ["10 nonfinite: not finite"]
-
-
-def test_verdicts_of_the_standard_experiment_computed_from_its_table():
-    given = config.load(["+experiment=horizon_growth", f"results_dir={STANDARD}"])
-    rows = Store(given.directory, COLUMNS).load()
-    shown = views.views(given, rows)
-    table = pd.read_csv(given.directory / "growth.csv")
-    classes = {}
-    for scene, part in table.groupby("scene", sort=False):
-        t, y = part["time_horizon"], np.log(part["gradient_median"])
-        left = {name: np.polyfit(x, y, 1, full=True)[1][0] for name, x in (("t", t), ("log", np.log(t)))}
-        odds = (left["log"] / left["t"]) ** (len(part) / 2)
-        classes[scene] = "exploding" if odds > 20 else "polynomial" if odds < 1 else "open"
-    assert classes == {
-        "double_integrator": "polynomial", "pendulum": "polynomial", "bouncing_ball": "exploding",
-        "hopper": "polynomial", "double_pendulum": "exploding",
-    }  # fmt: skip
-    slope, _ = np.polyfit(np.log(t := table[table["scene"] == "hopper"]["time_horizon"]), np.log(
-        table[table["scene"] == "hopper"]["gradient_median"]), 1)  # fmt: skip
-    assert 0 < slope < 1
-    assert len(t) == 5
-    verdicts = dict(zip(shown.tables[0].frame["problem"], shown.tables[0].frame["verdict"], strict=True))
-    assert verdicts == classes | {"hopper": "open"}, "the norms of hopper rise, then fall: the order's interval has 0"
-    lower = table["zeroth_order_variance_high"] < table["first_order_variance_low"]
-    assert set(table.loc[lower, "scene"]) == {"bouncing_ball", "double_pendulum"}
-    orders = dict(zip(shown.tables[0].frame["problem"], shown.tables[0].frame["lower"], strict=True))
-    for scene, start in (("bouncing_ball", 1.0), ("double_pendulum", 2.5)):
-        own = table[table["scene"] == scene]
-        assert list(own["time_horizon"] >= start) == list(lower[own.index])
-        assert orders[scene] == f"zeroth order from {start:g} s"
-    assert {orders[scene] for scene in ("double_integrator", "pendulum")} == {"first order at every horizon"}

@@ -495,16 +495,6 @@ def test_a_record_of_its_end_only_has_one_scan_without_an_open_count():
     assert math.isnan(found["minima_open"][0])
 
 
-def test_without_a_scan_keys_are_those_of_the_study_before_it_had_one():
-    """The keys of the stored rows, which have neither parameter; a scan has a key of its own."""
-    given = config.load(["experiment=identify", f"results_dir={STANDARD}"])
-    assert set(newest_rows(store_of(given).load())["key"]) == {cell.key for cell in cells(given)}
-    (plain,), (scanned,) = (cells(made(*SPRING, f"study=identify[scan={n}]")) for n in (0, 11))
-    (wide,) = cells(made(*SPRING, "study=identify[scan=11,span=3.0]"))
-    assert len({plain.key, scanned.key, wide.key}) == 3
-    assert plain.key == cell_of(*SPRING).key
-
-
 def test_the_scan_is_drawn_with_its_minima():
     given = config.load([SCAN, "backends=[numpy]", "optimizers=[gauss_newton]", "samples=1", *CHAOS])
     (cell,) = cells(given)

@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
-import bench
 from bench.experiment import config
 from bench.experiment.cell import Cell
 from bench.experiment.grid import cells
 from bench.model import MechanicalScene, State, compose, registry
 from bench.model.parameters import build
 from bench.report.cells import readable
-from bench.report.draw import draw
 from bench.run import runner, tasks
 from bench.run.plan import plan
 from bench.run.session import Session
@@ -25,7 +22,6 @@ from bench.run.store import Store
 from bench.studies.stability import Stability, maps, views
 from bench.studies.stability import measure as stability
 
-STANDARD = Path(bench.__file__).parent.parent / "results" / "standard"
 STIFFNESS = tuple(float(k) for k in np.logspace(1, 4, 13))
 HORIZON, DT = 40, 0.05
 
@@ -301,33 +297,6 @@ def test_shares_are_those_of_the_cells_and_the_best_of_a_scene_comes_first():
     assert list(shares["step"]) == ["two", "one", "one"]
     assert list(shares["right"]) == [0.75, 0.25, 0.0]
     assert list(shares["by unknown"]) == [0.0, 0.0, 0.25]
-
-
-def test_shares_of_the_standard_experiment_computed_from_its_rows():
-    given = config.load(["+experiment=stability_map", f"results_dir={STANDARD}"])
-    rows = Store(given.directory, given.columns).load()
-    shown = views.views(given, rows)
-    ran = rows[rows["verdict"] != ""]
-    law = ran["contact"].str.partition("[")[0]
-    right = (
-        (ran["verdict"] == "ok")
-        .groupby([ran["scene"].str.partition("[")[0], law, ran["integrator"]])
-        .agg(["mean", "size"])
-    )
-    shares = shown.tables[0].frame.groupby("scene", sort=False).first()
-    for scene, step in (("mass_spring", "rk4"), ("bouncing_ball", "impulse, event_driven")):
-        best = right.loc[scene].sort_values("mean").iloc[-1]
-        assert ", ".join(name for name in best.name if name != "none") == shares.loc[scene, "step"] == step
-        assert shares.loc[scene, ["right", "cells"]].tolist() == [best["mean"], best["size"]]
-    wrong = shown.tables[0].frame
-    for cause in ("step", "law", "both", "unknown"):
-        assert (wrong[f"by {cause}"] * wrong["cells"]).sum() == pytest.approx((ran["cause"] == cause).sum())
-    printed = shown.charts[0]
-    assert len(draw(printed, 3.5).axes) == len(draw(printed).axes) == 8 * 5, "a panel per integrator and problem"
-    assert [chart.name for chart in shown.charts if chart.printed] == ["stability_map"]
-    whole = shown.charts[1].frame
-    assert whole.groupby(["panel", "dt", "stiffness"]).size().max() == 1
-    assert set(whole["row"]) == set(rows.index[rows["verdict"] != ""])
 
 
 def test_backends_that_disagree_show_the_worse_verdict_and_no_verdict_is_no_finding(tmp_path):

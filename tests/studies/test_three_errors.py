@@ -1,7 +1,6 @@
 """Program, model and estimator error kept apart: the impulse without time of impact, which only the model error betrays."""
 
 import dataclasses
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -13,7 +12,6 @@ from bench.plugins.scenes.bounce_once import BounceOnce
 from bench.plugins.scenes.bouncing_ball import BouncingBall
 from bench.plugins.scenes.wall_penalty_1d import WallPenalty1d
 
-import bench
 from bench.cli import main
 from bench.experiment import config
 from bench.experiment.grid import cells
@@ -26,7 +24,6 @@ from bench.studies.three_errors.measure import difference_check
 from bench.studies.three_errors.sections import sections, traps
 from bench.studies.three_errors.views import FLOOR, OWN, TRAP, views
 
-STANDARD = Path(bench.__file__).parent.parent / "results" / "standard"
 NO_IMPACT = Impulse(time_of_impact=False)
 
 
@@ -173,21 +170,6 @@ def test_gradients_are_drawn_once_whatever_estimates_them_and_only_where_compare
     given, rows = laws(model)
     rows["status"], rows["reason"] = "unsupported", "no physics"
     assert not views(given, rows).charts
-
-
-def test_the_chart_of_the_standard_experiment_computed_from_its_table():
-    given = config.load(["+experiment=three_errors", f"results_dir={STANDARD}"])
-    found = views(given, Store(given.directory, COLUMNS).load())
-    data = pd.read_csv(given.directory / "three_errors.csv")
-    fobg = data[data["estimator"] == "fobg"]
-    smallest = fobg[fobg["dt"] == fobg.groupby("scene")["dt"].transform("min")]
-    main = found.charts[0]
-    drawn = main.frame[main.frame["series"] != OWN].set_index(["scene", "contact"])["error"]
-    known = smallest.set_index(["scene", "contact"])["model_error_rel"]
-    pd.testing.assert_series_equal(
-        drawn.sort_index(), known.clip(lower=FLOOR).sort_index(), check_names=False, check_index=True
-    )
-    assert (main.frame["series"] == TRAP).sum() == 5
 
 
 def test_rounding_has_no_sign():

@@ -12,13 +12,8 @@ def launcher_of(experiment: Experiment, timed: bool = False, kind: str = "") -> 
     Timed tasks run one at a time on an otherwise unused machine, and all machines are of the given ``kind`` or, if it is
     empty, of the first machine's kind. Other tasks run in parallel, each on one thread.
     """
-    match experiment.execution.launcher:
-        case "ray":
-            from bench.run.launchers.ray import RayLauncher
+    if experiment.execution.launcher == "ray":
+        from bench.run.launchers.ray import RayLauncher
 
-            return RayLauncher(experiment, timed, kind)
-        case "slurm":
-            from bench.run.launchers.slurm import SlurmLauncher
-
-            return SlurmLauncher(experiment, timed, kind)
+        return RayLauncher(experiment, timed, kind)
     return local_launcher(experiment, timed)

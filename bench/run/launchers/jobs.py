@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import pickle
 from collections import Counter, deque
@@ -16,8 +17,7 @@ from bench.model import registry
 from bench.run.launchers.launcher import local_launcher, without_grid
 from bench.run.pool import Answer
 from bench.run.record import kind_of_machine
-from bench.run.store import Store
-from bench.run.tasks import Task, result_of, row_of
+from bench.run.tasks import Task
 
 WRONG_KIND = "wrong_kind"
 """Key of a message from a machine of another kind than the sweep's timed rows; its value is that machine's kind."""
@@ -36,9 +36,6 @@ class Job:
     timed: bool
     kind: str
     """The kind of machine that timed tasks need; empty for any."""
-    workers: int = 1
-    stores: bool = False
-    """Whether the job stores its rows, so that they survive the end of the run that sent it."""
 
 
 def pack(experiment: Experiment) -> bytes:
@@ -64,15 +61,9 @@ def run_job(job: Job) -> Iterator[tuple[int, dict[str, Any]]]:
         yield -1, {WRONG_KIND: kind}
         return
     index = {id(task): i for i, task in enumerate(tasks)}
-    store = Store(experiment.directory, experiment.columns, experiment.study.name) if job.stores else None
-    with local_launcher(experiment, job.timed, job.workers) as launcher:
-        for answers in launcher.run([tasks]):
-            rows = [row_of(experiment, a.item.cell, result_of(a)) for a in answers if not a.item.reference]
-            if rows and store is not None:
-                store.append(*rows)
-            for a in answers:
-                message = {"result": a.result, "seconds": a.seconds, "output": a.output, "machine": kind}
-                yield index[id(a.item)], message | {"stored": store is not None and not a.item.reference}
+    with local_launcher(experiment, job.timed, n_workers=1) as launcher:
+        for a in itertools.chain.from_iterable(launcher.run([tasks])):
+            yield index[id(a.item)], {"result": a.result, "seconds": a.seconds, "output": a.output, "machine": kind}
 
 
 def read_message(task: Task, message: dict[str, Any], kind: str) -> Answer:

@@ -105,6 +105,7 @@ def follow(problem: Problem, method: Method, task: Task, seed: int, keep: bool =
         )
         needs = optimizer.required_fields(state)
         drawn = _noise(seed if method.is_random else 0, task.scene, method.samples, width, i if method.is_random else 0)
+        drawn = drawn.copy(order="K")  # methods share the noise
         value = gradient = None
         if "value" in needs:
             scored = task.scored

@@ -29,7 +29,7 @@ from bench.studies.gradient_check.points import POINTS
 KINDS: dict[str, tuple[tuple[str, ...], Style]] = {
     "X": (FAULTS, Style(PALETTE[2], letter="X", meaning="X: not the derivative of its cost")),
     "?": (UNDECIDED, Style("#bdbdbd", letter="?", meaning="?: undecided")),
-    "J": (("jump",), Style(PALETTE[4], letter="J", meaning="J: the cost jumps here")),
+    "J": (("jump", "missed_slope"), Style(PALETTE[4], letter="J", meaning="J: the cost jumps or rises steeply here")),
     "K": (("kink",), Style(PALETTE[5], letter="K", meaning="K: kink, at most a one-sided slope")),
     "ok": (TRUSTED, Style("#cfe8df", letter="ok", meaning="ok: right")),
 }
@@ -38,6 +38,8 @@ LOOKS = {
     point: Style(PALETTE[place], marker) for point, place, marker in zip(POINTS, (0, 5, 2, 3, 4), "osD^X", strict=True)
 }
 """Look of each point at which gradients are checked."""
+RESOLVED = 0.1
+"""Largest error of a right gradient that a difference shows; above it, a second method has confirmed the gradient."""
 ERROR = Column("error", label="best error")
 EPS = Column("eps", label="best eps")
 

@@ -1,0 +1,74 @@
+"""A command that judges says its verdict, or its status is 3: code that ends the process does not answer for it."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+COST = """
+import ctypes, os, signal
+theta, calls = [0.4, 0.3], []
+def cost(x):
+    calls.append(1)
+    if len(calls) == 11: {end}
+    return x[0] ** 2 * x[1]
+def grad(x): return [-2 * x[0] * x[1], x[0] ** 2]
+"""
+SCENE = '''
+"""A scene that ends the process."""
+
+import os
+from dataclasses import dataclass
+
+import numpy as np
+
+from bench.plugin import FunctionScene, param
+
+
+@dataclass(frozen=True)
+class Ends(FunctionScene):
+    """Ends the process when its cost is computed.
+
+    Approximates nothing.
+    """
+
+    name = "ends"
+    sigma: float = param(0.1, "noise")
+
+    def theta0(self):
+        return np.ones(2)
+
+    def cost(self, xp, theta):
+        os._exit(0)
+'''
+ENDS = {"exit": "os._exit(0)", "c_exit": "ctypes.CDLL(None).exit(0)", "killed": "os.kill(os.getpid(), signal.SIGKILL)"}
+
+
+def status_of(folder, *words):
+    """Return the exit status and the printed errors of a command."""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, sys.path))}
+    command = [sys.executable, "-m", "bench", *map(str, words)]
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=240)
+    return done.returncode, done.stderr
+
+
+@pytest.mark.parametrize("end", ENDS)
+def test_a_cost_that_ends_the_process_is_not_right(end, tmp_path):
+    (tmp_path / "mine.py").write_text(COST.format(end=ENDS[end]))
+    status, said = status_of(tmp_path, "examine", "mine.py:cost", "grad=grad", "--quiet")
+    assert status == 3
+    assert "before a verdict" in said
+
+
+def test_the_status_of_a_verdict_and_of_bad_input_arrives(tmp_path):
+    (tmp_path / "mine.py").write_text(COST.format(end="pass"))
+    assert status_of(tmp_path, "examine", "mine.py:cost", "grad=grad", "--quiet")[0] == 1
+    assert status_of(tmp_path, "examine", "mine.py:nothing")[0] == 2
+
+
+def test_a_scene_that_ends_the_process_is_not_right(tmp_path):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "ends.py").write_text(SCENE)
+    words = ["gradcheck", "ends", "workers=0", f"plugins={tmp_path / 'mine'}", f"results_dir={tmp_path / 'results'}"]
+    assert status_of(tmp_path, *words)[0] == 3
