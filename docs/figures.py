@@ -22,7 +22,7 @@ import pandas as pd
 from bench.experiment import config
 from bench.measure.performance import wilson
 from bench.report import answer
-from bench.report.text import apart, number
+from bench.report.text import apart, axis_value, number
 from bench.report.text import interval as text_of_interval
 from bench.report.text import span as ends_of
 from bench.studies.bias_variance import trust
@@ -383,7 +383,7 @@ def faults_table(experiment: str) -> str:
     head = ["trainer", "fault", "runs", "first in seed", *numbers]
     return block([f"| {' | '.join(head)} |", "|---|---|" + "--:|" * (len(head) - 2)] + [
         f"| `{method}` | {code.replace('_', ' ')} | {len(part)} of {seeds[method]} | {part['seed'].iloc[0]:.0f} | "
-        + " | ".join(number(part[name].iloc[0], 3) for name in numbers) + " |"
+        + " | ".join(axis_value(float(f"{part[name].iloc[0]:.3g}")) for name in numbers) + " |"
         for (method, code), part in faults.groupby(["method", "code"])
     ])  # fmt: skip
 

@@ -16,6 +16,7 @@ from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Style, Table, Views
 from bench.report.colours import estimator_colour
 from bench.report.problems import axes_of, label_columns, problem_names
+from bench.report.shown import stacked
 from bench.report.style import PALETTE
 from bench.report.text import axis_value, number
 from bench.report.views import Arranged, arrange, attempted
@@ -204,15 +205,7 @@ def _further(good: pd.DataFrame) -> list[Chart]:
     cells = good.assign(row=good.index)
     names = {order: f"{name} term" for order, name in ORDERS.items()}
     styles = {name: looks()[order] for order, name in names.items()}
-    variances = pd.concat(
-        [
-            cells.assign(
-                series=name, **{f"variance{end}": cells[f"{order}_variance{end}"] for end in ("", "_low", "_high")}
-            )
-            for order, name in names.items()
-        ],
-        ignore_index=True,
-    )
+    variances = stacked(cells, {name: f"{order}_variance" for order, name in names.items()}, "variance")
     longest = cells.sort_values("horizon", kind="stable").drop_duplicates("problem", keep="last").sort_index()
     gains = longest[["problem", "row", "lags", "gain", "gain_low", "gain_high"]].explode(
         ["lags", "gain", "gain_low", "gain_high"], ignore_index=True
