@@ -37,13 +37,13 @@ gallery: $(VENV)/.installed
 	  $(RUN) +experiment=$$name results_dir=results/standard || exit 1; done
 	$(BIN)/python -m docs.build results figures
 
-# The examples on other people's engines, in environments of their own: their pins and ours do not live together.
-examples: .venv-engines/.installed .venv-nimble/.installed
+# The examples on other people's engines, in an environment of their own: their pins and ours do not live together.
+examples: .venv-engines/.installed
 	.venv-engines/bin/python examples/table.py
 
-.venv-engines/.installed .venv-nimble/.installed: .venv-%/.installed: examples/requirements-%.txt
-	$(PYTHON) -m venv .venv-$*
-	.venv-$*/bin/python -m pip install --quiet --disable-pip-version-check -r $<
+.venv-engines/.installed: examples/requirements-engines.txt
+	$(PYTHON) -m venv .venv-engines
+	.venv-engines/bin/python -m pip install --quiet --disable-pip-version-check -r $<
 	touch $@
 
 $(VENV)/.installed: pyproject.toml constraints.txt

@@ -2,7 +2,7 @@
 
 - One gradient: :func:`problem` compiles a problem, :func:`estimate` estimates its gradient.
 - Experiments: :func:`run` runs one, :func:`load` reads stored rows, :func:`compare` compares two results.
-- Your own simulator: :func:`examine` reports whether its gradient is right; :class:`Mjcf` makes a cost of an MJCF model.
+- Your own simulator: :func:`examine` reports whether its gradient is right.
 - Plugins: :func:`list` lists them, and :mod:`bench.plugin` has the contracts that their authors import.
 """
 
@@ -12,13 +12,11 @@ from bench.api import estimate, list_plugins, load, problem, run
 from bench.compare import compare
 from bench.errors import Unsupported, UserError
 from bench.examine import examine
-from bench.model.simulator.mjcf import Mjcf
 
 list = list_plugins  # not in __all__: a star import must not replace the built-in type
 
 __version__ = "0.4.0"
 __all__ = [
-    "Mjcf",
     "Unsupported",
     "UserError",
     "compare",

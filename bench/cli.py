@@ -200,8 +200,8 @@ def _print_overview() -> None:
 # ------------------------------------------------------------------------------------------------------ run
 
 
-def _load(words: Sequence[str], notes: bool = True) -> Experiment:
-    """Return the experiment that the words describe. With ``notes``, prints on stderr how their sweeps combine."""
+def _load(words: Sequence[str]) -> Experiment:
+    """Return the experiment that the words describe."""
     from bench.experiment import config
 
     overrides, folders = [], []
@@ -215,10 +215,7 @@ def _load(words: Sequence[str], notes: bool = True) -> Experiment:
             folders.append(Path(folder).expanduser())
         else:
             overrides.append(word)
-    experiment = config.load(overrides, folders)
-    for note in config.notes(experiment, overrides, folders) if notes else ():
-        print(f"bench: {printable(note)}", file=sys.stderr)
-    return experiment
+    return config.load(overrides, folders)
 
 
 def _run(words: list[str]) -> int:
@@ -291,7 +288,7 @@ def _print_written(paths: Sequence[Path]) -> None:
 def _report(words: list[str]) -> int:
     from bench.report.finish import report
 
-    experiment = _load(words, notes=False)
+    experiment = _load(words)
     return _show(experiment, *report(experiment))
 
 
@@ -415,11 +412,15 @@ def _gradcheck(words: list[str]) -> int:
     plugins = [choice.entry.plugin for choice in experiment.choices["scene"]]
     horizons = [word for word in words if _sets_horizon(word)]
     is_swept = any(word.startswith("sweep.horizon=") for word in settings)
-    if horizons:
-        effect = f"sweep.horizon overrides {horizons[0]}" if is_swept else f"{horizons[0]} replaces the horizon sweep"
-        print(f"bench: {effect}", file=sys.stderr)
-    if (horizons and not is_swept) or not any(plugin and "horizon" in parameters(plugin) for plugin in plugins):
+    own = {
+        int(parameters(plugin)["horizon"].default) for plugin in plugins if plugin and "horizon" in parameters(plugin)
+    }
+    if (horizons and not is_swept) or not own:
         experiment = replace(experiment, sweep={k: v for k, v in experiment.sweep.items() if k != "horizon"})
+    elif not is_swept:
+        experiment = replace(
+            experiment, sweep={**experiment.sweep, "horizon": sorted({*experiment.sweep["horizon"], *own})}
+        )
     finished = _execute(experiment, words)
     if isinstance(finished, int):
         return finished
@@ -431,16 +432,16 @@ IN_ENGINES = ("backends=[mujoco]", "contacts=[penalty]")
 """What ``gradcheck`` and ``trace`` take for scenes that only engines run, unless it is given."""
 
 
-def _with_engine(words: list[str], settings: list[str], notes: bool = True) -> Experiment:
+def _with_engine(words: list[str], settings: list[str]) -> Experiment:
     """Return the experiment of words and settings, with :data:`IN_ENGINES` where only engines run its scenes."""
     from bench.model import EngineScene
 
-    experiment = _load([*words, *settings], notes=notes)
+    experiment = _load([*words, *settings])
     plugins = [choice.entry.plugin for choice in experiment.choices["scene"]]
     in_engines = [word for word in IN_ENGINES if not _is_given(word.partition("=")[0], settings)]
     if in_engines and all(plugin and issubclass(plugin, EngineScene) for plugin in plugins):
         print(f"bench: only engines run these scenes: {' '.join(in_engines)}", file=sys.stderr)
-        return _load([*words, *in_engines, *settings], notes=False)
+        return _load([*words, *in_engines, *settings])
     return experiment
 
 
@@ -453,7 +454,7 @@ def _trace(words: list[str]) -> int:
     from bench import trace
 
     scenes, settings = _split_scenes(words, "trace")
-    experiment = _with_engine(scenes, settings, notes=False)
+    experiment = _with_engine(scenes, settings)
     for rollout in trace.run(experiment, any(word.startswith("seed=") for word in settings)):
         paths = trace.write(rollout, experiment.results_dir, experiment.formats)
         print(f"\n{printable(rollout.title)}")

@@ -847,13 +847,6 @@ FIGURES: dict[str, Callable[[], str]] = {
     "eg-bounce": lambda: span(engine_gradient("rmse_rel").drop("drake")),
     "eg-bounce-drake": lambda: number(engine_gradient("rmse_rel", backend="drake").item()),
     "eg-bounce-costs": lambda: span(engine_gradient("zeroth_rmse_rel")),
-    "eg-nimble-model": lambda: percent(engine_gradient("model_error_rel", contact="impulse", backend="nimble").item()),
-    "eg-nimble-program": lambda: percent(
-        engine_gradient("program_error_rel", contact="impulse", backend="nimble").item()
-    ),
-    "eg-nimble-cartpole": lambda: percent(
-        engine_gradient("model_error_rel", "cartpole", "none", backend="nimble").item()
-    ),
     "eg-pipe-bounce": lambda: span(100 * engine_gradient("pipe_share"), suffix="%"),
     "eg-pipe-cartpole": lambda: span(100 * engine_gradient("pipe_share", "cartpole", "none"), suffix="%"),
     "three-confirmed": lambda: count(len(confirmed())),

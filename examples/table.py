@@ -13,7 +13,6 @@ import argparse
 import importlib.util
 import json
 import math
-import os
 import re
 import runpy
 import subprocess
@@ -24,17 +23,15 @@ from typing import Any
 
 HERE = Path(__file__).resolve().parent
 ORDER = (
-    "nimble_ball", "newton_ball", "newton_cartpole", "brax_ball", "drake_ball", "genesis_ball", "taichi_ball", "warp_kernel", "mujoco_cube",
+    "newton_ball", "newton_cartpole", "brax_ball", "drake_ball", "genesis_ball", "taichi_ball", "warp_kernel",
     "gymnasium_cartpole", "jax_rollout", "torch_module", "numpy_loop", "mpc",
 )  # fmt: skip
 LIMIT = 1800
 """Seconds for one example; the examples have budgets of their own."""
 PACKAGES = {
-    "brax": "brax", "drake": "drake", "genesis": "genesis-world", "gymnasium": "gymnasium", "jax": "jax", "mujoco": "mujoco",
+    "brax": "brax", "drake": "drake", "genesis": "genesis-world", "gymnasium": "gymnasium", "jax": "jax",
     "newton": "newton", "numpy": "numpy", "pydrake": "drake", "taichi": "taichi", "torch": "torch", "warp": "warp-lang",
 }  # fmt: skip
-ELSEWHERE = {"nimble_ball": ("nimblephysics", "NIMBLE_PYTHON", ".venv-nimble/bin/python")}
-"""Packages that live in a Python of their own: name, variable and default of that Python."""
 HEAD = (
     "what",
     "version",
@@ -57,14 +54,6 @@ MARK = "\x1eROWS "
 def imported(text: str) -> list[str]:
     """Return the modules that an example imports, by their first names."""
     return sorted(set(re.findall(r"^(?:import|from) (\w+)", text, re.MULTILINE)))
-
-
-def foreign(name: str) -> str:
-    """Return the package and version of an example whose engine has a Python of its own."""
-    package, variable, default = ELSEWHERE[name]
-    words = [os.environ.get(variable, default), "-m", "pip", "show", package]
-    shown = subprocess.run(words, capture_output=True, text=True, check=True).stdout
-    return f"{package} {re.search(r'^Version: (.*)$', shown, re.MULTILINE)[1]}"
 
 
 def row(report: Any, version: str, example: str) -> list[str]:
@@ -104,9 +93,9 @@ def record(path: Path) -> None:
     sys.argv = [str(path)]
     runpy.run_path(str(path), run_name="__main__")
     text = path.read_text()
-    names = [name for name in imported(text) if name in PACKAGES] + ["mujoco"] * ("bench.Mjcf" in text)
+    names = [name for name in imported(text) if name in PACKAGES]
     first = sorted(names, key=lambda name: (name in ("numpy", "jax", "torch"), name))[:1]
-    version = ", ".join(f"{PACKAGES[name]} {metadata.version(PACKAGES[name])}" for name in first) or foreign(path.stem)
+    version = ", ".join(f"{PACKAGES[name]} {metadata.version(PACKAGES[name])}" for name in first)
     print(MARK + json.dumps([row(report, version, path.stem) for report in found]), flush=True)
 
 

@@ -45,7 +45,6 @@ class Legged(EngineScene):
         """Return the body of a leg as MJCF, with motors' joints ``name_joint`` and the foot ``name``."""
 
     def mjcf(self) -> str:
-        """Return the torso with its legs, whose feet are spheres over a plane."""
         pairs = "".join(
             f'<pair geom1="ground" geom2="{leg}" condim="3" friction="{self.friction} {self.friction} 1 1 1"/>'
             for leg in self.legs

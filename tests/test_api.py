@@ -13,7 +13,6 @@ import numpy as np
 import pandas as pd
 import pytest
 import yaml
-from helpers import SPRINGY
 
 import bench
 import bench.model
@@ -91,16 +90,6 @@ def test_run_returns_its_own_rows_and_load_all_that_are_stored(rows, results):
     )
     assert len(again) == 1
     assert len(bench.load(results / "notes")) == len(rows) + 1
-
-
-def test_load_of_a_scene_parameter_named_like_one_of_the_law(tmp_path):
-    (tmp_path / "plugins").mkdir()
-    (tmp_path / "plugins" / "springy.py").write_text(SPRINGY)
-    given = {"sweep": {"springy": {"stiffness": [1, 2, 3]}}, "estimators": ["fobg"], "plugins": tmp_path / "plugins"}
-    bench.run(name="own", scenes=["springy"], results_dir=str(tmp_path / "out"), **given, **TINY)
-    found = bench.load(str(tmp_path / "out" / "own"))
-    assert list(found["springy.stiffness"]) == [1.0, 2.0, 3.0]
-    assert list(found["stiffness"]) == [1000.0] * 3
 
 
 def test_problem_and_estimate():
@@ -255,9 +244,6 @@ def test_theta_can_be_named_parameters():
     [
         (lambda: bench.run("stiffness_swep"), "did you mean 'stiffness_sweep'"),
         (lambda: bench.run(sampels=8), "did you mean 'samples'"),
-        (lambda: bench.run(scenes=["pushin"]), "did you mean 'pushing'"),
-        (lambda: bench.run(scene={"pushing": {"mas": 1.0}}), "did you mean 'mass'"),
-        (lambda: bench.run(sweep={"stifness": [1.0]}), "did you mean 'stiffness'"),
         (lambda: bench.problem("quadratc"), "did you mean 'quadratic'"),
         (lambda: bench.problem("quadratic[sgima=1]"), "did you mean 'sigma'"),
         (lambda: bench.problem("pushing", contact="penaltie"), "did you mean 'penalty'"),
@@ -310,7 +296,8 @@ def test_texts_come_through_as_they_are(text):
 
 def test_marks_are_a_table_with_names_of_any_kind():
     marks = {"stiffness": {"step size limit": 6400, "a: (b), [c]=1": 2}}
-    assert config.load(_override_words("marks", marks)).marks == marks
+    words = ["contacts=[penalty]", "scenes=[pushing]", "sweep.stiffness=[1e3]"]
+    assert config.load([*words, *_override_words("marks", marks)]).marks == marks
 
 
 # -------------------------------------------------------------------------------------------------- public names

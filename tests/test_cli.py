@@ -17,7 +17,6 @@ TINY = [
     "scenes=[heaviside]", "backends=[numpy]", "estimators=[fobg,reinforce]", "samples=8", "repeats=4", "name=tiny",
     "workers=0",
 ]  # fmt: skip
-TIMES = ["time_s", "time_iqr_s", "compile_s", "peak_memory_mb"]
 
 
 def test_run_then_report_then_plan(tmp_path, capsys):
@@ -70,19 +69,6 @@ def test_record_of_a_run_outlasts_one_that_finds_all_rows_stored(tmp_path):
     assert path.read_text() == first
     assert main([*here, "sweep.sigma=[0.1]"]) == 0
     assert json.loads(path.read_text())["counts"] == {"ok": 2}
-
-
-@pytest.mark.slow
-def test_same_seed_same_rows(tmp_path):
-    overrides = [
-        "scenes=[pushing,heaviside]", "contacts=[penalty]", "backends=[jax,torch,numpy]", "scene.pushing.horizon=5",
-        "estimators=[fobg,reinforce,alpha_order]", "samples=8", "repeats=8", "name=twice", "reference.samples=4096",
-    ]  # fmt: skip
-    tables = []
-    for run in ("a", "b"):
-        assert main([*overrides, f"results_dir={tmp_path / run}"]) == 0
-        tables.append(pd.read_csv(tmp_path / run / "twice" / "bias_variance.csv").drop(columns=TIMES))
-    pd.testing.assert_frame_equal(*tables, check_exact=True)
 
 
 def test_a_failing_cell_is_a_row_and_exit_status_1(tmp_path):
@@ -168,6 +154,13 @@ BAD = [
     (["reference.samples=1"], ["reference.samples"]),
     (["hydra.run.dir=/tmp"], ["Hydra"]),
     (["-m", "+experiment=quick,stiffness_sweep"], ["multirun"]),
+    (["theta=[mas]"], ["'mas'", "'mass'"]),
+    (["theta=[mass]", "theta0=[1,2]"], ["theta0 has 2 values", "has 1"]),
+    (["theta0=[nan]"], ["theta0"]),
+    (["plugins=nowhere_at_all"], ["nowhere_at_all", "not a folder"]),
+    (["formats=[gif]"], ["gif", "png"]),
+    (["study='stability[diverge=3]'"], ["diverge", "'diverged'"]),
+    (["--config-dir", "nowhere_at_all", "+experiment=quick"], ["nowhere_at_all", "experiment"]),
 ]
 
 
@@ -199,15 +192,6 @@ def test_report_without_rows(tmp_path, capsys):
     assert "no rows" in capsys.readouterr().err
 
 
-def test_unreadable_rows_are_not_written_over(tmp_path, capsys):
-    path = tmp_path / "tiny" / "rows.parquet"
-    path.parent.mkdir()
-    path.write_bytes(b"not parquet")
-    assert main([*TINY, f"results_dir={tmp_path}"]) == 2
-    assert "cannot be read" in capsys.readouterr().err
-    assert path.read_bytes() == b"not parquet"
-
-
 def test_help_names_the_experiments_and_fits_80_columns(capsys):
     assert main(["--help"]) == 0
     text = capsys.readouterr().out
@@ -218,14 +202,6 @@ def test_help_names_the_experiments_and_fits_80_columns(capsys):
     assert [name for name in ("check ", "gradcheck ", "examine ", "trace ", "compare ") if f"\n  {name}" in family] == [
         "check ", "gradcheck ", "examine ", "trace "
     ]  # fmt: skip
-
-
-@pytest.mark.parametrize("verb", ["check", "gradcheck", "examine"])
-def test_the_commands_that_ask_whether_something_is_right_name_each_other(verb, capsys):
-    assert main([verb, "--help"]) == 0
-    text = capsys.readouterr().out
-    for name, subject in (("check", "a plugin"), ("gradcheck", "a scene"), ("examine", "your own simulator")):
-        assert any(line.split()[:1] == [name] and subject in line for line in text.splitlines())
 
 
 @pytest.mark.parametrize(
@@ -245,9 +221,7 @@ def test_the_subject_of_another_command_is_sent_there(words, right, capsys):
 
 def test_a_swept_axis_of_the_command_line_replaces_that_of_the_file(capsys):
     assert main(["plan", "+experiment=optimise/small", "sweep.seed=[0]"]) == 0
-    shown = capsys.readouterr()
-    assert shown.out.startswith("quick_optimise: "), "the folder of its results"
-    assert "sweep: seed of the command line replaces that of" in shown.err
+    assert capsys.readouterr().out.startswith("quick_optimise: "), "the folder of its results"
 
 
 @pytest.mark.parametrize("verb", VERBS)
@@ -331,25 +305,6 @@ def test_theta_from_the_command_line(tmp_path):
     assert all(
         json.loads(text)["theta"] == {"names": ["mass", "stiffness"], "at": [0.12, 900]} for text in table["parameters"]
     )
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["theta=[mas]"], ["'mas'", "'mass'"]),
-        (["theta=[mass]", "theta0=[1,2]"], ["theta0 has 2 values", "has 1"]),
-        (["theta0=[nan]"], ["theta0"]),
-        (["plugins=nowhere_at_all"], ["nowhere_at_all", "not a folder"]),
-        (["formats=[gif]"], ["gif", "png"]),
-        (["study='stability[diverge=3]'"], ["diverge", "'diverged'"]),
-        (["--config-dir", "nowhere_at_all", "+experiment=quick"], ["nowhere_at_all", "experiment"]),
-    ],
-)
-def test_bad_new_settings(words, said, tmp_path, capsys):
-    assert main([*words, f"results_dir={tmp_path / 'out'}"]) == 2
-    message = capsys.readouterr().err
-    for part in said:
-        assert part in message
 
 
 def test_a_thread_of_a_plugin_and_a_closed_stream_do_not_keep_a_command_waiting(tmp_path):

@@ -2,7 +2,7 @@
 
 The true values come from closed forms, or from code below that imports no statistics, scene or contact law of this package.
 Coverage is the share of SETS simulated data sets whose 95% interval contains the true value, without leaving out any set.
-Sections: runtimes, scores, costs, tails, examine, references.
+Sections: costs, tails, examine, references.
 """
 
 from __future__ import annotations
@@ -25,53 +25,6 @@ def share(inside: list[bool]) -> float:
 
 def within(interval: tuple[float, float], truth: float) -> bool:
     return bool(interval[0] <= truth <= interval[1])
-
-
-# ------------------------------------------------------------------------------------------- searches (optimise)
-
-
-def runtimes(sets: int) -> Iterator[Line]:
-    """Average runtime until a target: E[spent] / p."""
-    from bench.measure import performance
-
-    for n, p in ((8, 1.0), (8, 0.6), (16, 0.6), (32, 0.6)):
-        random, inside = np.random.default_rng([1, n]), []
-        truth = (p * math.exp(0.125) + (1 - p) * 3.0) / p
-        for k in range(sets):
-            reached = random.random(n) < p
-            spent = np.where(reached, np.exp(0.5 * random.standard_normal(n)), 3.0)
-            inside.append(within(performance.runtime_interval(spent, reached, seed=k), truth))
-        yield f"average runtime, {n} searches, success {p:g}", share(inside), 0.95, "coverage"
-
-
-def scores(sets: int) -> Iterator[Line]:
-    """Interquartile mean over problems, share of targets reached, and the chance to beat the baseline."""
-    from bench.measure import performance
-    from bench.studies.optimise import aggregate
-
-    for problems, seeds in ((4, 8), (8, 8), (8, 20)):
-        random = np.random.default_rng([2, problems, seeds])
-        centres = np.linspace(0.2, 0.9, problems)
-        large = np.sort((centres + 0.1 * random.standard_normal((200_000, problems))).ravel())
-        edges = np.array([0.25, 0.75]) * large.size
-        truth = float(large[int(edges[0]) : int(edges[1])].mean())
-        inside, reached, better = [], [], []
-        chances = np.linspace(0.2, 0.95, problems)
-        for k in range(sets):
-            strata = list(centres[:, None] + 0.1 * random.standard_normal((problems, seeds)))
-            inside.append(within(performance.bootstrap(strata, aggregate._pooled_score, seed=k, draws=400), truth))
-            wins = random.binomial(seeds, chances)
-            table = pd.DataFrame({"problem": np.arange(problems), "successes": wins, "searches": seeds})
-            value, error = aggregate.share_of_targets(table.assign(rate=wins / seeds))
-            reached.append(abs(value - chances.mean()) <= 1.959964 * error)
-            mean = wins.sum() / (problems * seeds)
-            better.append(
-                within(performance.wilson(round(mean * problems * seeds), problems * seeds), float(chances.mean()))
-            )
-        label = f"{problems} problems, {seeds} seeds"
-        yield f"score, {label}", share(inside), 0.95, "coverage"
-        yield f"share of targets, {label}", share(reached), 0.95, "coverage"
-        yield f"chance to beat the baseline, {label}", share(better), 0.95, "coverage"
 
 
 # ---------------------------------------------------------------------------------- estimators (bias_variance)
@@ -334,7 +287,7 @@ def _compared(name: str, found, own: np.ndarray, allowed: float) -> Line:
     return label, apart / allowed, 1.0, "difference"
 
 
-SECTIONS = (runtimes, scores, costs, tails, examine, references)
+SECTIONS = (costs, tails, examine, references)
 
 
 def main(sets: int = 200, *sections: str) -> int:

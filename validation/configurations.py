@@ -229,7 +229,7 @@ class Interrupted:
         runner._Run._finish = self._real  # type: ignore[method-assign]
 
 
-REMARKS = (" is given twice: ", " has no effect: ", "bench: sweep: ", ", which was undone")
+REMARKS = (", which was undone",)
 """What only remarks on settings contain; a refused command may print some before its error."""
 
 

@@ -337,8 +337,6 @@ FAULTS = [
     Fault(X + "stochastic_derivative.py", "(limit + side - number)", "(limit - side - number)", OF_EVENTS),
     Fault("bench/model/scene.py", "repeat(units[:, :, None] / sigma", "repeat(normals[:, :, None] / sigma", OF_EVENTS),
     Fault("bench/model/events.py", "limits / scale, slopes / scale", "limits, slopes", OF_EVENTS),
-    Fault("plugins/optimizers/homotopy.py", "(ahead + behind - 2 * answer.value[0]) / (2 * t)", "(ahead + behind - 2 * answer.value[0]) / (2 * t * t)", OF_EVENTS),
-    Fault("plugins/optimizers/homotopy.py", "((v**2).sum(axis=0) - d)", "(v**2).sum(axis=0)", OF_EVENTS),
     Fault(X + "sobol.py", "math.sqrt(count) * noise.mean", "noise.mean", OF_VARIANCE),
     Fault(X + "sobol.py", "change * shift / (2.0 * s * s)", "change * shift / (s * s)", OF_VARIANCE),
     Fault(X + "randomized_smoothing.py", "* direction / (2 * s)", "* direction / s", OF_ESTIMATORS),

@@ -93,6 +93,26 @@ def costs_are_finite(scene: Scene) -> str:
 
 
 @verifies(Scene)
+def gradient_is_finite(scene: Scene) -> str:
+    """Verify that a library's derivative of the cost is finite at theta0, over at most :data:`SCORED_STEPS` steps."""
+    if isinstance(scene, MechanicalScene):
+        scene = dataclasses.replace(scene, horizon=min(scene.horizon, SCORED_STEPS))
+    for program in programs(scene):
+        able = [b for b in backends() if b.compiles and "grad" in b.provides and "physics" not in b.provides]
+        backend = next((b for b in able if can_run(b, program) and works(b)), None)
+        if backend is not None:
+            gradient = backend.compile(program).grad(program.theta0, np.zeros((program.n_noise, 1)))[:, 0]
+            wrong = np.flatnonzero(~np.isfinite(gradient))
+            require(
+                not wrong.size,
+                f"{describe(program)}: by {backend.name} the gradient at theta0 is not a number in component "
+                f"{', '.join(map(str, wrong[:4]))}: a sqrt, norm or division at the edge of its domain",
+            )
+            return f"{describe(program)}, {backend.name}: norm {np.linalg.norm(gradient):.4g}"
+    raise Skipped("no available backend differentiates it by a library")
+
+
+@verifies(Scene)
 def noise_is_where_declared(scene: Scene) -> str:
     """Verify that costs at (theta, w) equal costs at (theta + sigma w, 0), except for action noise under a policy."""
     program = programs(scene)[0]

@@ -6,7 +6,6 @@ import time
 
 import numpy as np
 
-from bench.engines.node import StepNode
 from bench.engines.process import EngineModel, Reply
 from bench.model import Jacobians, LoopOps, Problem, Program, State, Trajectory, adjoint_gradient, rollout, slopes
 
@@ -59,10 +58,6 @@ class EngineProblem(Problem):
     def settings(self) -> dict[str, str]:
         """The engine's settings that can change its last digits, by name; empty before the first call."""
         return self._model.settings
-
-    def step_node(self) -> StepNode:
-        """Return the engine's step with its vector-Jacobian product, for programs in NumPy, torch and JAX."""
-        return EngineStep(self)
 
     def _value(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         return self._cost(*self._rollout(theta, w)[:2])
@@ -155,24 +150,3 @@ class EngineProblem(Problem):
         self.n_calls += 1
         self.peak_memory_mb = max(self.peak_memory_mb, reply.peak_memory_mb)
         return reply
-
-
-class EngineStep(StepNode):
-    """The step of an engine in another Python. A backward pass repeats the step, under the engine's tape of that step."""
-
-    def __init__(self, problem: EngineProblem) -> None:
-        self._problem = problem
-
-    def start(self, x: np.ndarray) -> np.ndarray:
-        """Return the engine's carry at states x, ``(k, B)``; k is 0 for most engines."""
-        return next(iter(self._problem.start(x)), np.empty((0, x.shape[1])))
-
-    def step(self, x: np.ndarray, u: np.ndarray, carry: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the states and the carry after one step."""
-        after, *carried = self._problem.call("step", x, u, *[carry] * bool(len(carry)))
-        return after, next(iter(carried), carry)
-
-    def pull(self, x: np.ndarray, u: np.ndarray, carry: np.ndarray, slope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the derivatives of the sum of ``slope`` times the next states by x and by u."""
-        by_state, by_control = self._problem.call("pull", x, u, *[carry] * bool(len(carry)), slope)
-        return by_state, by_control

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from bench.examine.gradient import SUSPICIOUS, GradientStages
-from bench.examine.lines import LineScan, scan
+from bench.examine.lines import SIDES, LineScan, scan
 from bench.examine.quick import QuickCheck
+from bench.examine.steps import changed_loop, changing_loop, traced_loops
 from bench.examine.subspace import choose
 from bench.measure.gradcheck import Check
 from bench.model.simulator.simulator import Simulator
@@ -27,6 +28,16 @@ SMALL_JUMPS = 0.05
 """Largest total height of such jumps, as a share of the cost's change along the line."""
 FEWEST_JUMPS = 2
 """Fewest jumps on the lines that count as jumps of adaptive steps."""
+TRACED = 4
+"""Most jumps at which the loops of the two sides are compared."""
+SPREADS = (0.0, 0.05, 0.1, 0.2, 0.4)
+"""Distances from theta, in units of each input's scale, at which the loops of the program are compared."""
+ELSEWHERE = 2
+"""Number of other thetas at which the gradient is compared with a refined cost."""
+ALONG = 4
+"""Directions of these comparisons at each theta."""
+AROUND = 0.05
+"""Distance of these thetas, in units of each input's scale."""
 LONGER = 10.0
 """Length of the line on which more jumps are searched, in multiples of the first line."""
 THETAS = 4
@@ -88,6 +99,41 @@ def check_refined(stages: GradientStages, refined: Callable[..., Any]) -> Check 
         quick.run_round(other.width)
     outcome = quick.check([f"component {i}" for i in range(space.size)])
     return None if outcome is None else space.restore(outcome)
+
+
+@dataclass(frozen=True)
+class Gap:
+    """At one theta, the distances of the gradient and of the cost's own differences from those of a refined cost."""
+
+    gradient: float
+    own: float
+
+
+def refined_gaps(stages: GradientStages, refined: Callable[..., Any]) -> list[Gap]:
+    """Return the gaps at theta and at other thetas around it, along a few random directions each."""
+    other, scale, random = (
+        _simulator(stages, refined, None),
+        stages.scale,
+        np.random.default_rng([stages.seed, 0x676170]),
+    )
+    eps, size, gaps = float(np.cbrt(stages.simulator.unit)), stages.theta.size, []
+    for spread in (0.0, *[AROUND] * ELSEWHERE):
+        theta = stages.theta + spread * scale * random.standard_normal(size)
+        vectors = random.standard_normal((size, min(ALONG, size)))
+        vectors *= scale[:, None] / np.linalg.norm(vectors, axis=0)
+        at = np.concatenate([theta[:, None] + eps * vectors, theta[:, None] - eps * vectors], axis=1)
+        w = None if stages.w is None else np.repeat(stages.w, at.shape[1], axis=1)
+        own, exact = (np.subtract(*np.split(costs, 2)) / (2 * eps) for costs in (stages.costs(at), other.costs(at, w)))
+        slopes = stages.gradient_at(theta) @ vectors
+        gaps.append(Gap(float(np.linalg.norm(slopes - exact)), float(np.linalg.norm(own - exact))))
+    return gaps
+
+
+def changing_steps(stages: GradientStages) -> str:
+    """Return the place of a loop of the cost whose length depends on theta, as ``ode.py:17``; empty where none is known."""
+    random = np.random.default_rng([stages.seed, 0x6C6F6F70])
+    moved = np.outer(stages.scale, SPREADS) * random.standard_normal((stages.theta.size, len(SPREADS)))
+    return changing_loop(stages.simulator, stages.theta[:, None] + moved, stages.w)
 
 
 def errors_by_horizon(stages: GradientStages, horizons: Sequence[int]) -> list[Horizon]:
@@ -179,9 +225,21 @@ def is_adaptive(
         apart = abs(float((costs[1] - costs[0]) / (2 * step) - line.direction @ stages.gradient))
         rows.append((sum(jump.size for jump in line.jumps), np.abs(np.diff(line.costs)).sum(), apart * np.ptp(line.at)))
     heights, changes, errors = np.array(rows).T
-    if error <= NEAR and ((heights < SMALL_JUMPS * changes) & (errors <= EXPLAINED * heights)).any():
+    is_near = error <= NEAR and ((heights < SMALL_JUMPS * changes) & (errors <= EXPLAINED * heights)).any()
+    is_far = heights.sum() < FAR_JUMPS * changes.sum() and (errors <= heights).all()
+    return bool((is_near or is_far) and _has_steps_at_jumps(stages, lines))
+
+
+def _has_steps_at_jumps(stages: GradientStages, lines: Sequence[LineScan]) -> bool:
+    """Return whether the loops of a Python program change their lengths across most jumps; JAX programs show no lengths."""
+    if stages.simulator.library == "jax":
         return True
-    return bool(heights.sum() < FAR_JUMPS * changes.sum() and (errors <= heights).all())
+    jumps = [(line, jump) for line in lines for jump in sorted(line.jumps, key=lambda jump: -jump.size)[:TRACED]]
+    changed = []
+    for line, jump in jumps[:TRACED]:
+        sides = [stages.theta + jump.near[SIDES + i][0] * line.direction for i in (-1, 0)]
+        changed.append(bool(changed_loop([traced_loops(stages.simulator, theta, stages.w) for theta in sides])))
+    return float(np.mean(changed)) >= 0.5
 
 
 def _simulator(stages: GradientStages, cost: Callable[..., Any], grad: Any) -> Simulator:

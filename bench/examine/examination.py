@@ -91,7 +91,7 @@ def examine(
 
     An error up to ``atol + tolerance * |derivative|`` only causes a warning; both are numbers or mappings of inputs to
     numbers. ``allow_zero`` names the inputs that may have no effect (True: all; False: none; by default they cause a
-    warning). ``expect`` is a known cause, such as ``"kink"``, with which the report passes.
+    warning). ``expect`` is a known cause, such as ``"kink"``, with which the report passes; a wrong gradient never does.
 
     ``twin`` is a second cost that must agree, and ``twin_grad`` a second gradient, such as one with a tape per step.
     ``refined`` is the cost at a tighter tolerance or finer step. ``horizons`` are numbers of steps T at which
@@ -257,10 +257,13 @@ class _Examination:
         self.left_out: list[str] = []
         self.is_adaptive: bool | None = None
         """Whether adaptive steps explain the error; None before that is known."""
-        self._lines: list[LineScan] | None = None
+        self.steps: str | None = None
+        """The place of a loop whose length depends on theta, empty without one; None before that is known."""
+        self._near: list[LineScan] | None = None
+        """Lines at theta that do not depend on sigma."""
         random = np.random.default_rng([setup.seed, 0x6578616D])
         w = random.standard_normal((simulator.noise, 1)) if simulator.noise else None
-        self.stages = GradientStages(simulator, setup.scale, clock, setup.seed, w, bool(self.levels), random)
+        self.stages = GradientStages(simulator, setup.scale, clock, setup.seed, w, random)
 
     def run(self, gradient: str, twin: Any, twin_grad: Any, refined: Any) -> Report:
         """Run the checks that the budget allows, the decisive ones first, and return the report."""
@@ -277,13 +280,18 @@ class _Examination:
             )
         if refined is not None:
             other["refined"] = self._attempt("the refined cost", lambda: diagnosis.check_refined(stages, refined))
+            if checked is not None and checked.cause in SUSPICIOUS and stages.gradient is not None:
+                gaps = self._attempt(
+                    "the refined cost at other thetas", lambda: diagnosis.refined_gaps(stages, refined)
+                )
+                other["gaps"] = gaps or []
         if setup.horizons:
             growth = self._attempt("horizons", lambda: diagnosis.errors_by_horizon(stages, setup.horizons))
             other["growth"] = growth or []
         can_go_on = not (stages.gradient is None and simulator.has_gradient) and not stages.is_failed
-        self._lines = lines = self._scan_lines(checked) if can_go_on else []
         if checked is not None and checked.cause in SUSPICIOUS and can_go_on and self.is_adaptive is None:
             self.is_adaptive = self._compare_along_lines(checked)
+        lines = self._scan_lines(checked) if can_go_on else []
         smoothed = self._measure_noise(checked) if can_go_on else []
         if clock.is_terminated:
             self.left_out.append("everything after SIGTERM")
@@ -304,6 +312,7 @@ class _Examination:
             gradients=clock.gradients,
             seconds=clock.spent,
             compile_s=clock.compile_s,
+            elapsed=clock.elapsed,
             budget=clock.budget,
             calls=clock.calls,
             cost_s=clock.per_cost(),
@@ -327,6 +336,7 @@ class _Examination:
             elsewhere=simulator.gradient_error if not stages.is_failed else "",
             n_failed=simulator.n_failed_gradients,
             is_adaptive=bool(self.is_adaptive),
+            steps=self.steps or "",
             is_unexplained=self.is_adaptive is None and checked is not None and diagnosis.may_be_adaptive(checked),
             printed=simulator.printed,
             notes=[*simulator.notes, *self._exceptions()],
@@ -367,20 +377,27 @@ class _Examination:
         """Return whether adaptive steps explain the small error of a gradient, and keep the answer."""
         if not diagnosis.may_be_adaptive(checked):
             return False
-        self._lines = self._scan_lines(checked, EARLY_SHARE)
-        self.is_adaptive = self._compare_along_lines(checked)
+        self.is_adaptive = self._compare_along_lines(checked, EARLY_SHARE)
         return bool(self.is_adaptive)
 
-    def _compare_along_lines(self, checked: Check) -> bool | None:
-        """Return whether the jumps on the lines explain the gradient's error; None where the budget ends before."""
+    def _compare_along_lines(self, checked: Check, share: float = 0.0) -> bool | None:
+        """Return whether the program's steps depend on theta and its jumps explain the gradient's error.
+
+        None where the budget ends before. Nothing here depends on sigma.
+        """
+        if self.steps is None:
+            self.steps = self._attempt("the loops of the program", lambda: diagnosis.changing_steps(self.stages))
+        if not self.steps:
+            return None if self.steps is None else False
+        self._near = near = (
+            self._scan(self.scale * RELATIVE, checked, share or 0.9) if self._near is None else self._near
+        )
 
         def decide() -> bool | None:
             effort = self._effort(self.clock.affordable(0.9))
-            if effort is None or not self._lines:
-                return None
-            return diagnosis.is_adaptive(self.stages, checked, self._lines, *effort)
+            return None if effort is None else diagnosis.is_adaptive(self.stages, checked, near, *effort)
 
-        return None if self._lines == [] else self._attempt("the comparison along lines", decide)
+        return self._attempt("the comparison along lines", decide) if near else None
 
     @staticmethod
     def _effort(room: float) -> tuple[int, int, int] | None:
@@ -391,17 +408,19 @@ class _Examination:
                 return points, halvings, most
         return None
 
-    def _scan_lines(self, checked: Check | None, share: float = 0.0) -> list[LineScan]:
+    def _scan_lines(self, checked: Check | None) -> list[LineScan]:
+        """Return scans of the cost over the noise, or near theta without sigma."""
+        if not self.levels:
+            return self._scan(self.scale * RELATIVE, checked, 0.9) if self._near is None else self._near
+        return self._scan(max(self.levels, key=lambda level: level[0])[1], checked, 0.5)
+
+    def _scan(self, spread: np.ndarray, checked: Check | None, share: float) -> list[LineScan]:
         """Return scans of the cost for jumps and kinks, along random directions through theta.
 
-        They take at most ``share`` of the remaining budget, by default half of it before noise and all of it otherwise.
+        They take at most ``share`` of the remaining budget.
         """
-        if self._lines is not None:
-            return self._lines
         self.clock.start_stage("scanning lines")
-        spread = self.scale * RELATIVE if not self.levels else max(self.levels, key=lambda level: level[0])[1]
         along = directions(2, spread, self.seed)
-        share = share or (0.5 if self.levels else 0.9)
         effort = self._effort(self.clock.affordable(share) / len(along))
         if effort is None:
             self.left_out.append("jumps and kinks on lines")

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bench.examine.diagnosis import NEAR, Horizon, grows, may_be_adaptive
+from bench.examine.diagnosis import Gap, Horizon, grows, may_be_adaptive
 from bench.examine.gradient import SUSPICIOUS, recaused
 from bench.examine.lines import ALIKE, LineScan
 from bench.examine.smoothing import PAIRS, TARGET_ERROR, Method, Smoothed
@@ -23,16 +23,15 @@ if TYPE_CHECKING:
     import pandas as pd
 
 EXPLANATIONS = {
-    "nan_gradient": "the gradient is not a number where the cost is: a division, log, sqrt or norm at the edge of its domain, "
-    "or a branch that 'where' discards only in the value",
+    "nan_gradient": "the gradient is not a number where the cost is",
     "nondeterministic": "the same call returns different numbers: new noise in every call, or state that persists between calls; "
     "pass the noise as w, or fix its seed",
     "stale_gradient": "the gradient does not change when theta does: a cache that is never cleared, or a copy made too early",
     "staircase": "the cost is constant between steps: a cast to int, rounding, or a comparison inside",
     "precision": "the cost has fewer digits than its type: a shorter float inside, or a solver that stops early",
     "disconnected": "the gradient is exactly 0 where the cost has a slope: detached, or an operation that cuts gradients",
-    "wrong_factor": "the ratio is constant: a factor or a sign is wrong",
-    "missing_term": "ratio not constant: a term is missing or detached",
+    "wrong_factor": "a factor or a sign is wrong",
+    "missing_term": "part of the derivative is right: a term is missing, detached or counted twice",
     "wrong_adjoint": "the differences agree with each other, but not with the gradient",
     "nonfinite": "the cost is not a number at theta or near it",
     "unsettled": "the differences agree at no step, so the check is inconclusive: the cost is chaotic, or too noisy at every step",
@@ -74,11 +73,26 @@ SEEN_ALONE = 4.0
 """Multiple of a slope's error from which the error of one number shows along most random directions."""
 DIFFERENT = 1e-6
 """Relative difference of two costs that must agree, in double precision."""
-REFINED, REFINED_FAR = 0.1, 0.3
-"""Least distance between the differences of the cost and of a refined cost, relative to the gradient's error, of a discretisation
-gap: for a small error, and for a larger one."""
+AGREES = 0.5
+"""Largest distance of a gradient that agrees with a refined cost, relative to that of the cost's own differences."""
+AS_FAR = 4.0
+"""Largest such distance over all thetas together where the steps depend on theta, so that the gradient has its own error."""
+EXCUSABLE = ("missing_term", "wrong_adjoint")
+"""Causes that a discretisation imitates: it makes no constant factor."""
+OPEN_TO_EXPECT = ("jump", "kink", "undecided", "unsettled", "unresolved", "nonfinite", "adaptive", "zero", "no_effect")
+"""Causes at theta that ``expect`` may accept; a wrong gradient stays wrong."""
 CLEAR_ORDER = 1.5
 """Order of a Taylor remainder below which it shows a wrong gradient."""
+LATE = 1.2
+"""Ratio of the time on the clock to the charged time from which on both are stated."""
+SAME_FACTOR = 0.05
+"""Largest relative range of ratios that are stated as one factor."""
+OVERFLOWS = 1e100
+"""Size of a derivative from which on one that is not a number is an overflow."""
+ALONG_THETA = 0.9999
+"""Least cosine between theta and an error along theta."""
+RESIDUE = 1e-4
+"""Largest change of the cost by a gradient, relative to the height of a jump, that is a residue of a solver."""
 SHOWN = 8
 """Most numbers of theta in the table of breaks."""
 HEADLINE = 200
@@ -156,6 +170,8 @@ class Findings:
     """Time within the budget [s]."""
     compile_s: float
     """Time of first calls [s]."""
+    elapsed: float
+    """Time on the clock, including first calls and waiting for a processor that other programs use [s]."""
     budget: float
     calls: float
     """Limit of costs and gradients together."""
@@ -198,7 +214,9 @@ class Findings:
     n_failed: int
     """Number of gradient calls that raised an exception."""
     is_adaptive: bool
-    """Whether the jumps of the cost explain the error of the gradient."""
+    """Whether steps that depend on theta explain the error of the gradient, by the jumps of the cost."""
+    steps: str
+    """The place of a loop whose length depends on theta, as ``ode.py:17``; empty where none is known."""
     is_unexplained: bool
     """Whether the error is so small that adaptive steps may explain it, and the budget ended before that was known."""
     printed: Printed
@@ -211,6 +229,8 @@ class Findings:
     """Relative errors of the gradient and of the second gradient."""
     refined: Check | None = None
     """The gradient against differences of a refined cost."""
+    gaps: Sequence[Gap] = ()
+    """At theta and at others: how far gradient and cost are from the refined cost; empty without a refined cost."""
     growth: Sequence[Horizon] = ()
     """The error of the gradient by number of steps."""
     command: str = ""
@@ -248,7 +268,8 @@ class Findings:
         else:  # along a direction of length 1 in units of the scales
             sizes = [p.difference * p.sample.scale for p in self.check.components]
             along = max(float(np.linalg.norm(np.nan_to_num(sizes))), abs(part.difference))
-            allowed = float(self.rtol.max()) * along
+            whole = GroupSize(self.theta.size, float(np.linalg.norm(self.check.scale * self.atol)), 0.0)
+            allowed = float(self.rtol.max()) * along + whole.tolerated
         return bool(abs(part.program - part.difference) <= allowed)
 
     @property
@@ -329,7 +350,9 @@ class Findings:
             return "nondeterministic"
         if self.wrong_checks:
             cause = self.wrong_checks[0].cause
-            if cause in SUSPICIOUS and (self.is_adaptive if self.refined is None else self.is_discretisation_gap):
+            if cause in SUSPICIOUS and self._is_residue:
+                return "staircase"
+            if cause in EXCUSABLE and self.is_discretisation_gap:
                 return "adaptive"
             if cause in (*SUSPICIOUS, "unsettled", "disconnected") and self.is_overwritten:
                 return "overwritten"
@@ -339,26 +362,38 @@ class Findings:
         if self.gradient and self.unresolved:
             return "unresolved"
         is_allowed = self.allow_zero is not None and bool(self.allow_zero.all())
-        if all(part.verdict == "zero" for part in check.parts) and not is_allowed and not self.has_steps:
+        if all(part.verdict == "zero" for part in check.parts) and not is_allowed and not self.moves_around:
             return "zero"
-        if self.allow_zero is not None and self.zeros and not self.has_steps:
+        if self.allow_zero is not None and self.zeros and not self.moves_around:
             return "no_effect"
         return "saturated" if check.cause == "zero" else check.cause
 
     @property
-    @np.errstate(all="ignore")
+    def _is_residue(self) -> bool:
+        """Whether the gradient is a residue beside the jumps of a cost that is constant around theta."""
+        assert self.check is not None
+        wrong = [part for part in self.check.parts if part.verdict in SUSPICIOUS]
+        height = max((jump.size for line in self.lines for jump in line.jumps), default=0.0)
+        return all(
+            not part.sample.differences.any() and abs(part.program) * part.sample.scale <= RESIDUE * height
+            for part in wrong
+        )
+
+    @property
     def is_discretisation_gap(self) -> bool:
-        """Whether the differences of the cost and of the refined cost are as far apart as the gradient is from the former."""
-        if self.refined is None or self.check is None:
-            return False
-        cost = {part.name: part for part in self.check.components if math.isfinite(part.error)}
-        pairs = [(cost[part.name], part) for part in self.refined.components if part.name in cost]
-        own, other, program, scale = np.array(
-            [(a.difference, b.difference, a.program, a.sample.scale) for a, b in pairs] or [(0.0, 0.0, 0.0, 1.0)]
-        ).T
-        error, apart = (float(np.linalg.norm(scale * (one - own))) for one in (program, other))
-        is_small = error <= NEAR * float(np.linalg.norm(scale * own))
-        return apart > (REFINED if is_small else REFINED_FAR) * error
+        """Whether evidence of its own says that the gradient is that of another discretisation of the same problem.
+
+        Either the gradient agrees with a refined cost where the cost's own differences do not, at every theta compared. Or
+        the steps depend on theta, and the error is of the size of the jumps that this makes, or of a refined cost's gap.
+        """
+        if not self.gaps:
+            return bool(self.steps) and self.is_adaptive
+        if all(gap.gradient <= AGREES * gap.own for gap in self.gaps):
+            return True
+        gradient, own = (
+            float(np.linalg.norm(sizes)) for sizes in zip(*((g.gradient, g.own) for g in self.gaps), strict=True)
+        )
+        return bool(self.steps) and gradient <= AS_FAR * own
 
     @property
     def is_overwritten(self) -> bool:
@@ -380,10 +415,8 @@ class Findings:
 
     @cached_property
     def noise_cause(self) -> str:
-        """The cause of the first problem around theta or under noise; empty if there is none."""
-        if self.derivative not in (RIGHT, NONE):
-            return ""
-        if self.has_steps:
+        """The cause of the first problem around theta or under noise, from costs and gradients there; empty if there is none."""
+        if self.has_steps and (self.derivative in (RIGHT, NONE) or not self.is_measured):
             return "staircase"
         if self._misses_jumps:
             return "staircase" if self.tread else "jumps"
@@ -397,29 +430,42 @@ class Findings:
         return "unmeasured" if self.gradient and len(self.smoothed) < len(self.requested) else ""
 
     @property
+    def is_measured(self) -> bool:
+        """Whether the bias of the mean gradient is decided at every sigma."""
+        return len(self.smoothed) >= max(len(self.requested), 1) and all(
+            one.known and one.decided and math.isfinite(one.bias) for one in self.smoothed
+        )
+
+    @property
     def _misses_jumps(self) -> bool:
         """Whether a line shows jumps that bias the gradient, and no measured bias says more."""
-        is_measured = len(self.smoothed) >= len(self.requested) > 0 and all(
-            one.known and one.decided for one in self.smoothed
-        )
         # a part of the cost that is rounded everywhere is a fault of its own, however small
-        return self.missed > (SEEN if self.tread else TARGET_ERROR) and not is_measured
+        return self.missed > (SEEN if self.tread else TARGET_ERROR) and not self.is_measured
 
     @property
     def cause(self) -> str:
-        """The cause of the first problem, or the verdict on a right gradient: one of :data:`CAUSES`."""
+        """The cause of the first problem, that of theta before noise, or the verdict on a right gradient: one of :data:`CAUSES`."""
+        if self.derivative in (WRONG, UNSHOWN):
+            return self.derivative_cause
         return self.noise_cause or self.derivative_cause
 
     @property
     def status(self) -> int:
         """The exit status: 0 right, 1 wrong, 3 not decided; 0 also for the expected cause, and as in the baseline."""
-        if self.is_as_before or (self.expect and self.expect == self.cause):
+        if self.is_as_before or self.is_expected:
             return 0
         if self.derivative == WRONG:
             return 1
         if self.derivative == UNSHOWN:
             return 3
         return 0 if not self.noise_cause else 3 if self.noise_cause in NOT_SHOWN else 1
+
+    @property
+    def is_expected(self) -> bool:
+        """Whether the cause is the expected one, and no wrong gradient."""
+        if not self.expect or self.expect != self.cause:
+            return False
+        return self.cause in OPEN_TO_EXPECT or self.derivative in (RIGHT, NONE)
 
     @property
     def size(self) -> float:
@@ -462,7 +508,8 @@ class Findings:
                 return f"{text} (gradients differ by {number(100 * self.gradient_spread)}%)"
             return text
         if cause == "adaptive":
-            return f"{text} ({self._worst_size(self.wrong_checks[0])}{self._refined_text()})"
+            loop = f"; the loop at {self.steps} has another length at other thetas" if self.steps else ""
+            return f"{text} ({self._worst_size(self.wrong_checks[0])}{loop}{self._refined_text()})"
         if cause == "overwritten":
             return f"{text}{self._overwritten_text()} ({self._worst_size(self.wrong_checks[0])})"
         if cause == "zero":
@@ -525,9 +572,10 @@ class Findings:
                 )
             if one.biased:
                 low, high = one.bias_percent
+                why = ", though each gradient is right: it does not see the jumps" if self.derivative == RIGHT else ""
                 problems.append(
                     f"biased: at sigma {number(one.sigma)} the mean of the gradients misses "
-                    f"{span(low, high)}% of grad J, though each gradient is right: it does not see the jumps"
+                    f"{span(low, high)}% of grad J{why}"
                 )
         if self.noise_cause == "unmeasured":
             problems.append(f"unmeasured: {EXPLANATIONS['unmeasured']}")
@@ -585,25 +633,30 @@ class Findings:
         if self.noise_cause and self.noise_cause != "unmeasured":
             answer = "not shown" if self.noise_cause in NOT_SHOWN else "NOT usable"
             return f"{where}: {answer}. {self._noise_problems()[0]}"
-        if self.derivative != RIGHT:
-            answer = "not shown" if self.derivative == UNSHOWN else "not usable"
-            return f"{where}: {answer}, since the derivative at theta is {self.derivative}"
-        if not self.requested:
-            return "Under noise: not measured, since no sigma is given"
-        if self.noise_cause:
+        if not self.smoothed or self.noise_cause:
+            if self.derivative != RIGHT:
+                answer = "not shown" if self.derivative == UNSHOWN else "not usable"
+                return f"{where}: {answer}, since the derivative at theta is {self.derivative}"
+            if not self.requested:
+                return "Under noise: not measured, since no sigma is given"
             return f"{where}: not measured, since the budget ended"
+        aside = "" if self.derivative == RIGHT else f", though the derivative at theta is {self.derivative}"
         worst = max(self.smoothed, key=lambda one: one.bias_high / one.norm if one.norm > 0 else math.inf)
         if not worst.known:
-            return f"{where}: usable. Its mean is 0, as grad J"
+            return f"{where}: usable. Its mean is 0, as grad J{aside}"
+        if not all(math.isfinite(one.bias) for one in self.smoothed):
+            return f"{where}: not shown. A gradient there is not a number"
         bias = max(worst.bias_percent[1], 1e-3)
-        return f"{where}: usable. The bias of the mean gradient is below {number(bias)}%"
+        return f"{where}: usable. The bias of the mean gradient is below {number(bias)}%{aside}"
 
     @property
     def warnings(self) -> list[str]:
         """The warnings as sentences: findings that are not problems but deserve attention."""
         warnings = []
-        if self.expect and self.expect == self.cause:
+        if self.is_expected:
             warnings.append(f"the cause is {self.cause}, as expected")
+        elif self.expect == self.cause:
+            warnings.append(f"expect={self.expect} excuses no wrong gradient")
         elif self.expect:
             warnings.append(f"expected {self.expect}, found {self.cause}: remove expect={self.expect} if that is right")
         if self.small_errors and self.derivative == RIGHT:
@@ -616,6 +669,8 @@ class Findings:
             for verdict in NOTEWORTHY:
                 parts = [self.label(part) for part in self.check.components if part.verdict == verdict]
                 parts = self.zeros if verdict == "zero" else parts
+                if verdict == "zero" and len(parts) == self.theta.size and self.moves_around:
+                    continue  # they have an effect, beside theta
                 if parts and self.derivative_cause not in ("zero", "no_effect"):
                     warnings.append(
                         f"{verdict}: {', '.join(parts[:6])}{' ...' if len(parts) > 6 else ''}: {EXPLANATIONS[verdict]}"
@@ -658,6 +713,11 @@ class Findings:
         return any(line.steps for line in self.lines)
 
     @property
+    def moves_around(self) -> bool:
+        """Whether theta moves the cost beside a flat part at theta: by jumps on a line, or under noise."""
+        return any(line.jumps for line in self.lines) or any(one.known for one in self.smoothed)
+
+    @property
     def tread(self) -> float:
         """Height of the jumps, if all lines have equal, evenly spaced jumps; else 0."""
         treads = [line.tread for line in self.lines] or [0.0]
@@ -693,13 +753,74 @@ class Findings:
 
     def sentence(self, check: Check) -> str:
         """Return the verdict of a failed check as a sentence, with the numbers of the worst part."""
-        cause = EXPLANATIONS.get(check.cause, check.cause)
+        cause = self._same_factor(check) or EXPLANATIONS.get(check.cause, check.cause) + self._evidence(check)
         if check.cause == "disconnected" and any(part.verdict in ("smooth", "nonlinear") for part in check.components):
             cause = "the gradient of some inputs is exactly 0 where the cost has a slope: they are detached"
         size = self._worst_size(check)
         if not size or check.cause in ("nan_gradient", "nonfinite"):
             return f"{check.cause}: {cause}" + (f" ({size})" if size else "")
         return f"{check.cause}: {cause} ({size})"
+
+    def _evidence(self, check: Check) -> str:
+        """Return what the numbers of a failed check say beyond its cause."""
+        if check.cause == "nan_gradient":
+            return self._where_not_a_number(check)
+        if check.cause not in SUSPICIOUS:
+            return ""
+        wrong = [part for part in check.components if part.verdict == check.cause]
+        if wrong and not any(part.sample.differences.any() for part in wrong):
+            return ", and the cost does not move at all"
+        if self._is_along_theta(check):
+            return "; the error is along theta itself, as of a normalisation that is left out"
+        ratios = ", ".join(number(part.ratio, 3) for part in wrong[:4])
+        return f" ({ratios} times the derivative, by input)" if check.cause == "wrong_factor" and len(wrong) > 1 else ""
+
+    def _same_factor(self, check: Check) -> str:
+        """Return the factor of a gradient whose ratios to the differences are nearly the same, in words; else an empty string."""
+        wrong = [part for part in (*check.components, *check.draws) if part.verdict == check.cause]
+        ratios = np.array([part.ratio for part in wrong if math.isfinite(part.ratio)])
+        if check.cause not in SUSPICIOUS or ratios.size < 2:
+            return ""
+        middle = float(np.median(ratios))
+        if np.ptp(ratios) > SAME_FACTOR * abs(middle) or abs(middle - 1.0) <= SAME_FACTOR:
+            return ""
+        where = ", here and at other thetas" if any(part.component is None for part in wrong) else ""
+        return f"{number(middle, 3)} times the derivative{where}: a factor or a sign is wrong, or a term in proportion to the rest"
+
+    def _where_not_a_number(self, check: Check) -> str:
+        """Return at which thetas or numbers of steps a gradient is not a number, with the likely reason."""
+        whole = [one.steps for one in self.growth if math.isfinite(one.error)]
+        broken = [one.steps for one in self.growth if not math.isfinite(one.error)]
+        if whole and broken and max(whole) < min(broken):
+            return (
+                f": it is one after {max(whole)} steps and none from step {min(broken)} on, so look at the first steps"
+            )
+        here = not np.isfinite(check.gradient).all()
+        good = [part for part in check.draws if math.isfinite(part.program)]
+        sizes = [abs(part.program) for part in (*check.parts, *check.draws) if math.isfinite(part.program)]
+        if np.isinf(check.gradient).any() or max(sizes, default=0.0) > OVERFLOWS:
+            return ": it overflows, as in a rollout that amplifies: use fewer steps, or damp it"
+        if not here:
+            return f", at {len(check.draws) - len(good)} of {len(check.draws)} directions at other thetas, though not at theta itself"
+        where = (
+            f", at theta and at none of {len(check.draws)} directions at other thetas"
+            if check.draws and len(good) == len(check.draws)
+            else ""
+        )
+        return (
+            f"{where}: a division, log, sqrt or norm at the edge of its domain, or a branch that 'where' discards only in the "
+            "value"
+        )
+
+    def _is_along_theta(self, check: Check) -> bool:
+        """Return whether the gradient's error is a multiple of theta, in at least two components."""
+        parts = list(check.components)
+        if len(parts) < max(self.theta.size, 2) or not all(math.isfinite(part.difference) for part in parts):
+            return False
+        error = np.array([part.program - part.difference for part in parts])
+        at = self.theta[[part.component for part in parts]]
+        size = float(np.linalg.norm(error) * np.linalg.norm(at))
+        return np.count_nonzero(at) > 1 and size > 0 and abs(float(error @ at)) > ALONG_THETA * size
 
     def _named_parts(self, check: Check) -> list[Part]:
         """Return the worst parts that name an input: located groups, then components, then directions."""
@@ -712,7 +833,7 @@ class Findings:
         parts = self._named_parts(check)
         if not parts:
             return ""
-        part = max(parts, key=lambda p: np.nan_to_num(p.error, nan=math.inf))
+        part = max(parts, key=_distance)
         if check.cause == "kink":
             return f"{self.label(part)}: {number(part.left, 4)} and {number(part.right, 4)}"
         if check.cause not in FAULTS or not self.gradient:
@@ -843,7 +964,8 @@ class Findings:
                 text += f", the twin (differs by {number(100 * self.twin)}%)"
             lines.append(text)
         rest = [] if self.gradient else ["any gradient"]
-        rest += [f"{what} (budget)" for what in self.left_out]
+        limit = "calls" if math.isfinite(self.calls) and not math.isfinite(self.budget) else "budget"
+        rest += [f"{what} ({limit})" for what in self.left_out]
         if self.smoothed and self.gradient:
             rest.append(
                 f"jumps that fewer than 3 in {2 * min(one.pairs for one in self.smoothed)} draws of the noise meet"
@@ -855,7 +977,8 @@ class Findings:
             )
         is_said = any("other thetas" in what for what in self.left_out)
         if self.gradient and self.check is not None and not self.check.draws and not is_said:
-            rest.append("the gradient at other thetas around this one (budget)")
+            cut = f" ({limit})" if self.left_out or math.isfinite(self.calls) else ""
+            rest.append(f"the gradient at other thetas around this one{cut}")
         rest += (
             ["the gradient under noise on theta (no sigma)"]
             if self.gradient and not self.requested and not self.smoothed
@@ -873,20 +996,18 @@ class Findings:
             f"calls={int(2 * self.calls)}" if math.isfinite(self.calls) else f"budget={max(2 * self.budget, 60.0):.0f}s"
         )
         if cause in ("undecided", "unmeasured") or (cause == "unsettled" and self.left_out):
-            refined = (
-                ", or refined=COST, the cost at a tighter tolerance"
-                if cause == "undecided" and self.wrong_checks
-                else ""
-            )
+            is_new = cause == "undecided" and self.wrong_checks and self.refined is None
+            refined = ", or refined=COST, the cost at a tighter tolerance" if is_new else ""
             return f"{self._again(longer)}: the rest needs more calls{refined}"
         if cause in ("kink", "jump"):
             return f"choose a theta beside the {cause}, or {self._again(f'expect={cause}')} if it is known"
         if cause == "adaptive":
-            return (
-                f"{self._again('refined=COST')}, the cost at a tighter tolerance, and compare; "
-                f"or {self._again('expect=adaptive')} if it is known"
-            )
-        costs = "estimate the gradient from costs (smoothing), as the table recommends for each sigma"
+            if self.refined is not None:
+                return f"{self._again('expect=adaptive')} if the gradient is meant to be that of the refined cost"
+            return f"{self._again('refined=COST')}, the cost at a tighter tolerance, and compare"
+        costs = "estimate the gradient from costs (smoothing)"
+        if any(self.recommended(one) is not None for one in self.smoothed):
+            costs += ", as the table recommends"
         if cause == "spread" and any(one.unshown and one.pairs < PAIRS for one in self.smoothed):
             return f"{self._again(longer)}: more pairs narrow the interval; or {costs}"
         if cause in ("biased", "jumps", "spread", "staircase"):
@@ -901,13 +1022,15 @@ class Findings:
             parts = self._named_parts(self.wrong_checks[0]) if self.wrong_checks else []
             names = ", ".join(self.located.get(part.name, self.label(part)) for part in parts[:3]) or "the cost"
             has_jumps, is_near = any(line.jumps for line in self.lines), may_be_adaptive(self.wrong_checks[0])
-            adapts = "; refined=COST if its steps adapt to theta" if has_jumps else ""
-            if is_near and not has_jumps:
-                adapts = "; refined=COST if the gradient is of the equations, with a discretisation of its own"
-            return (
-                f"follow {names} through the cost: cut it into parts until the ratio is 1; "
-                f"horizons=1,2,5 if it takes steps=T{adapts}"
-            )
+            more = [] if self.growth else ["; horizons=1,2,5 if it takes steps=T"]
+            if self.refined is None and (has_jumps or is_near):
+                adapts = (
+                    "its steps adapt to theta"
+                    if has_jumps
+                    else "the gradient is of the equations, with a discretisation of its own"
+                )
+                more.append(f"; refined=COST if {adapts}")
+            return f"follow {names} through the cost: cut it into parts until the ratio is 1{''.join(more)}"
         if cause in TRUSTED and self.gradient and not self.requested:
             return f"{self._again('sigma=SIGMA')} for use under noise"
         return ""
@@ -935,7 +1058,10 @@ class Findings:
         first = [(self.names[i], self.theta[i]) for i in range(min(6, self.theta.size))]
         point = ", ".join(f"{name}={value:g}" for name, value in first)
         point += f", ... ({self.theta.size:,} numbers)" if self.theta.size > 6 else ""
-        repeats = "repeats exactly" if self.repeats else f"DOES NOT REPEAT: calls differ by {number(self.spread)}"
+        repeats = "repeats exactly"
+        if not self.repeats:
+            how = "repeats up to the last digits" if self.is_small_spread else "DOES NOT REPEAT"
+            repeats = f"{how}: calls differ by {number(self.spread)}"
         if self.repeats and self.check is not None and self.check.noise > 0:
             repeats += f", rough by {number(self.check.noise)}"
         lines = [
@@ -947,6 +1073,8 @@ class Findings:
             spent += f" and {counted(self.gradients, 'gradient')}"
         limit = f" of {duration(self.budget)}" if math.isfinite(self.budget) else ""
         spent += f" in {duration(self.seconds)}{limit}, first calls {duration(self.compile_s)}"
+        if self.elapsed > LATE * (self.seconds + self.compile_s) + 1.0:
+            spent += f" ({duration(self.elapsed)} on the clock, since other programs used the processors)"
         spent += f"; a cost takes {duration(self.cost_s)}"
         if math.isfinite(self.gradient_s):
             spent += f", a gradient {duration(self.gradient_s)}"
@@ -1037,7 +1165,9 @@ class Findings:
             rows.append(
                 [
                     number(one.sigma),
-                    f"{number(one.norm, 3)} +- {number(one.error, 1)}",
+                    f"{number(one.norm, 3)} +- {number(one.error, 1)}"
+                    if one.error or one.norm
+                    else "no draw moved the cost",
                     self._bias(one),
                     f"{number(100 * one.moved / one.norm)}%" if math.isfinite(one.moved) and one.known else "-",
                     *self._use(one),
@@ -1083,6 +1213,13 @@ class Findings:
             fewer = "use the gradient" if self.gradient_s < 2 * dim * self.cost_s else "differences are no slower"
             lines[0] += f"; the gradient {duration(self.gradient_s)}: {fewer}"
         return lines
+
+
+@np.errstate(all="ignore")
+def _distance(part: Part) -> float:
+    """Return how far a part's derivative is from its difference, relative to the difference, as headlines state it."""
+    apart = float(np.float64(abs(part.program - part.difference)) / np.float64(abs(part.difference)))
+    return math.inf if math.isnan(apart) else apart
 
 
 def shortened(text: str) -> str:

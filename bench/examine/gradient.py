@@ -46,6 +46,8 @@ SUSPICIOUS = ("wrong_factor", "missing_term", "wrong_adjoint")
 """Causes that adaptive steps and kinks imitate."""
 KINKED = 1e3
 """Ratio of the steps over which two slopes at a kink differ by a constant."""
+SHARE = 0.8
+"""Largest share of the remaining budget of a stage, whatever is measured after it."""
 STATE = 0.1
 """Largest share of the difference between histories by which a cost with equal histories differs."""
 
@@ -85,7 +87,6 @@ class GradientStages:
         clock: Clock,
         seed: int,
         w: np.ndarray | None,
-        has_sigma: bool,
         random: np.random.Generator,
     ) -> None:
         self.simulator, self.scale, self.clock, self.seed, self.w = simulator, scale, clock, seed, w
@@ -115,7 +116,6 @@ class GradientStages:
         self._repeated = False  # whether calls were repeated within the budget
         self.is_hidden_single = False
         """Whether the cost has single precision, though it returns a float64."""
-        self._share = 0.5 if has_sigma else 0.8
         self._random = random
         self._costs_store, self._gradients_store = Store(), Store()
 
@@ -183,8 +183,8 @@ class GradientStages:
         """Largest difference between equal calls of the cost that only limits the accuracy of the check."""
         return float(self.simulator.unit**SMALL * (abs(self.value) if math.isfinite(self.value) else 0.0))
 
-    def run(self, is_explained: Callable[[Check], bool] = lambda check: False) -> None:
-        """Run all stages that the budget allows, until ``is_explained`` accepts the outcome of a wrong gradient."""
+    def run(self, explain: Callable[[Check], bool] = lambda check: False) -> None:
+        """Run all stages that the budget allows; ``explain`` gets the outcome of a wrong gradient before it is named."""
         try:
             self._start()
         except OutOfTime:
@@ -209,7 +209,7 @@ class GradientStages:
             return
         if self.check is None:
             return
-        self._check_in_stages(space, is_explained)
+        self._check_in_stages(space, explain)
         self._locate(space)
         self._check_under_other_noise()
 
@@ -242,7 +242,7 @@ class GradientStages:
             for _ in ROUNDS:
                 quick.run_round(self.simulator.width)
                 steps = self._plan(space.size, True)[0][1]
-                if self.clock.can_afford(*self._cost_of(steps, space.size), share=self._share):
+                if self.clock.can_afford(*self._cost_of(steps, space.size), share=SHARE):
                     break
         finally:
             outcome = quick.check(names)
@@ -364,7 +364,7 @@ class GradientStages:
         gradients = 0 if self.gradient is None else 3 + options.draws * (3 if wrong else 1)
         return costs, gradients
 
-    def _check_in_stages(self, space: Subspace, is_explained: Callable[[Check], bool]) -> None:
+    def _check_in_stages(self, space: Subspace, explain: Callable[[Check], bool]) -> None:
         self.clock.start_stage("checking the gradient")
         assert self.check is not None
         is_done: list[str] = []
@@ -373,21 +373,20 @@ class GradientStages:
             plan = dict(self._plan(space.size, self.check.trusted))
             is_wrong = any(part.verdict in FAULTS for part in self.check.parts)
             if name == ALL_STEPS and is_wrong:
-                if is_explained(self.check):
-                    return
+                explain(self.check)
                 continue  # the ratios at other thetas name the fault, and these stages also have all steps
-            if not self.clock.can_afford(*self._cost_of(plan[name], space.size), share=self._share):
+            if not self.clock.can_afford(*self._cost_of(plan[name], space.size), share=SHARE):
                 self.left_out.append(name)
                 if name != FEW_DRAWS:
                     break
                 continue
             # a wrong gradient is named by few thetas first, so that the name does not depend on the time that is left
             is_skipped = name == FEW_DRAWS != names[-1] and not is_wrong
-            if is_skipped and self.clock.can_afford(*self._cost_of(plan[names[-1]], space.size), share=self._share):
+            if is_skipped and self.clock.can_afford(*self._cost_of(plan[names[-1]], space.size), share=SHARE):
                 continue
             options = plan[name]
             self._refresh()
-            self.clock.limit(max(self._share, 0.9))
+            self.clock.limit(max(SHARE, 0.9))
             try:
                 self._run_stage(space, options)
                 is_done.append(name)
@@ -509,7 +508,7 @@ class GradientStages:
             return
         space = choose(self.layout, self.scale, self.gradient, self.seed)
         options = replace(self._plan(space.size, True)[1][1], components=0, scanned=0, repeated=False)
-        if not self.clock.can_afford(*self._cost_of(options, 0), share=self._share):
+        if not self.clock.can_afford(*self._cost_of(options, 0), share=SHARE):
             self.left_out.append("checks under other noise")
             return
         try:

@@ -12,12 +12,12 @@ from typing import Any
 
 from bench.errors import STATUSES, UserError, printable, unknown
 from bench.experiment.experiment import Budget, Choice, Execution, Experiment, TableLayout
-from bench.experiment.grid import COUNTS, applies, is_theta_axis, parameter_name, refuse_too_many, swept
-from bench.experiment.overrides import LISTS_AS, Values, check_file, quoted, repeated
+from bench.experiment.grid import check_axes, parameter_name, refuse_too_many, swept
+from bench.experiment.overrides import LISTS_AS, Values, check_file, quoted
 from bench.experiment.study import Study
 from bench.model import Decision, MechanicalScene, Plugin, guard, registry
 from bench.model.identity import parse_identity
-from bench.model.parameters import build, coerce, parameters, remember, singular
+from bench.model.parameters import build, coerce, remember, singular
 
 SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0}
@@ -43,10 +43,16 @@ def experiments(config_dirs: Sequence[Path] = ()) -> list[str]:
 
 
 def load(overrides: Sequence[str], config_dirs: Sequence[Path] = ()) -> Experiment:
-    """Return the experiment that Hydra composes from overrides; raises :class:`UserError` if an override is invalid.
+    """Return the experiment that Hydra composes from overrides; raises :class:`UserError` if an override is invalid or not read.
 
     ``config_dirs`` are folders with the user's own experiments, as ``experiment/NAME.yaml``.
     """
+    loaded = _composed(overrides, config_dirs)
+    _refuse_unread(loaded, overrides)
+    return loaded
+
+
+def _composed(overrides: Sequence[str], config_dirs: Sequence[Path]) -> Experiment:
     from hydra import compose, initialize_config_dir
     from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.errors import HydraException
@@ -96,7 +102,7 @@ def _joined(
 ) -> Experiment:
     """Return an experiment with those that join it, which have the same settings of the command line."""
     common = [word for word in overrides if word.lstrip("+").partition("=")[0] not in ("experiment", "also")]
-    also = tuple(load([f"experiment={name}", *common, "also=[]"], config_dirs) for name in names)
+    also = tuple(_composed([f"experiment={name}", *common, "also=[]"], config_dirs) for name in names)
     for name, other in zip(names, also, strict=True):
         if other.study != main.study:
             raise UserError(f"also: {name} has another study or other settings of it than {main.name}")
@@ -163,85 +169,34 @@ def _to_hydra(override: str, config_dirs: Sequence[Path], values: Values) -> str
     return f"{bare}={value}"
 
 
-def notes(experiment: Experiment, overrides: Sequence[str], config_dirs: Sequence[Path] = ()) -> list[str]:
-    """Return sentences on settings whose effect may surprise: given twice, without effect, or combined with a file's."""
-    return [*repeated(overrides), *_without_effect(experiment, overrides), *explain_sweep(overrides, config_dirs)]
-
-
-def _without_effect(experiment: Experiment, overrides: Sequence[str]) -> list[str]:
-    """Return a sentence for each setting of the command line that changes no cell of the experiment."""
+def _refuse_unread(experiment: Experiment, overrides: Sequence[str]) -> None:
+    """Raise :class:`UserError` for a name on the command line that nothing in the experiment reads."""
+    every = (experiment, *experiment.also)
     kinds = {kind: singular(kind) for kind in registry.kinds() if kind != "studies"}
-    chosen = {axis: [choice.entry.name for choice in some] for axis, some in experiment.choices.items()}
-    plugins = _effective_plugins(experiment)
-    axes = swept(experiment.sweep)
-    sentences = []
+    used = {kind: axis for kind, axis in kinds.items() if axis in experiment.choices}
+    choices = [(axis, choice.entry) for e in every for axis, some in e.choices.items() for choice in some]
+    names = {*_settings() - {*kinds, *kinds.values()}, *LAYOUT, "experiment", *used, *used.values()}
+    names |= {f"{axis}.{entry.name}" for axis, entry in choices}
+    plugins = _in_use([entry.plugin for _, entry in choices if entry.plugin])
+    axes = {name for e in every for name in swept(e.sweep)}
     for override in overrides:
-        key = override.lstrip("+").partition("=")[0]
-        axis, _, rest = key.partition(".")
-        if kinds.get(axis, axis) in kinds.values() and kinds.get(axis, axis) not in chosen:
-            reason = f"study {experiment.study.name} has no {kinds.get(axis, axis)}"
-        elif axis in chosen and rest and rest.partition(".")[0] not in chosen[axis]:
-            reason = f"{rest.partition('.')[0]} is not among the {registry.kind_of(axis)}"
-        elif (
-            axis == "sweep"
-            and rest in axes
-            and rest not in COUNTS
-            and not is_theta_axis(rest)
-            and not any(applies(rest, plugin.kind, plugin.name, parameters(plugin)) for plugin in plugins)
-            and _is_parameter(rest)
-        ):
-            reason = "no scene of the sweep uses a plugin with that parameter"
-        elif axis == "marks" and (unswept := _unswept_marks(experiment, axes)):
-            reason = f"{', '.join(unswept)} is not swept"
-        else:
-            continue
-        sentences.append(f"{override[:200]} has no effect: {reason}")
-    return sentences
+        head, _, rest = override.lstrip("+").partition("=")[0].partition(".")
+        name = f"{head}.{rest.partition('.')[0]}" if rest and head in kinds.values() else head
+        if name not in names:
+            raise unknown("setting of this experiment", name, names)
+        if head == "sweep" and rest in axes:
+            check_axes([rest], plugins)
+        marked = {part for axis in axes for part in (axis, parameter_name(axis))}
+        if head == "marks" and (unread := experiment.marks.keys() - marked):
+            raise unknown("mark", min(unread), marked)
 
 
-def _is_parameter(axis: str) -> bool:
-    """Return whether some registered plugin has the parameter that a sweep names; others are errors, not remarks."""
-    plugins = [entry.plugin for entries in registry.entries().values() for entry in entries.values() if entry.plugin]
-    return any(applies(axis, plugin.kind, plugin.name, parameters(plugin)) for plugin in plugins)
-
-
-def _effective_plugins(experiment: Experiment) -> list[type[Plugin]]:
-    """Return the chosen plugins, without contact laws and integrators that no chosen scene uses."""
-    plugins = [choice.entry.plugin for some in experiment.choices.values() for choice in some if choice.entry.plugin]
+def _in_use(plugins: Sequence[type[Plugin]]) -> list[type[Plugin]]:
+    """Return the chosen plugins without contact laws and integrators that no chosen scene uses."""
     mechanical = [plugin for plugin in plugins if issubclass(plugin, MechanicalScene)]
     unused = {"contacts"} if not any(plugin.n_contacts != 0 for plugin in mechanical) else set()
-    unused |= set() if mechanical else {"contacts", "integrators"}
+    unused |= set() if mechanical else {"integrators"}
     return [plugin for plugin in plugins if plugin.kind not in unused]
-
-
-def _unswept_marks(experiment: Experiment, axes: Sequence[str]) -> list[str]:
-    names = {part for axis in axes for part in (axis, parameter_name(axis))}
-    return [name for name in experiment.marks if name not in names]
-
-
-def explain_sweep(overrides: Sequence[str], config_dirs: Sequence[Path] = ()) -> list[str]:
-    """Return one sentence on how the sweeps of file and command line combine; empty unless both have a sweep."""
-    from hydra.core.override_parser.overrides_parser import OverridesParser
-    from omegaconf import OmegaConf
-
-    split = [(key.lstrip("+"), value) for key, _, value in (word.partition("=") for word in overrides)]
-    chosen = [value for key, value in split if key == "experiment"]
-    axes: list[str] = []
-    for key, value in split:
-        head, _, axis = key.partition(".")
-        if head == "sweep" and axis:
-            axes.append(axis)
-        elif head == "sweep":
-            whole: Any = OverridesParser.create().parse_override(f"sweep={Values().replace_in(head, value)}").value()
-            axes.extend(map(str, whole or ()))
-    if not chosen or not axes:
-        return []
-    file: Any = OmegaConf.load(_file_of(chosen[-1], config_dirs))
-    own = file.get("sweep") or {}
-    replaced = [f"{axis} of the command line replaces that of {chosen[-1]}" for axis in axes if axis in own]
-    kept = [f"{axis} of {chosen[-1]} stays" for axis in own if axis not in axes]
-    added = [f"{axis} of the command line is multiplied with it" for axis in axes if axis not in own]
-    return [f"sweep: {'; '.join(replaced + kept + added)}"] if own else []
 
 
 def _split(value: str) -> list[str]:

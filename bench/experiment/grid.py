@@ -43,7 +43,10 @@ def parameter_name(axis: str) -> str:
 def cells(experiment: Experiment) -> list[Cell]:
     """Return the cells of an experiment and of those that join it, each once, in sweep order; raises :class:`UserError` for invalid values."""
     refuse_too_many(experiment.sweep, math.prod(len(some) for some in experiment.choices.values()))
-    _check_axes(experiment)
+    check_axes(
+        swept(experiment.sweep),
+        [c.entry.plugin for some in experiment.choices.values() for c in some if c.entry.plugin],
+    )
     unique: dict[str, Cell] = {}
     expansion = _Expansion(experiment)
     for point in expand(experiment.sweep):
@@ -217,11 +220,11 @@ def _applies(axis: str, plugin: type[Plugin]) -> str | None:
     return applies(axis, plugin.kind, plugin.name, parameters(plugin))
 
 
-def _check_axes(experiment: Experiment) -> None:
-    chosen = [c.entry.plugin for some in experiment.choices.values() for c in some if c.entry.plugin]
-    names = {name for plugin in chosen for name in parameters(plugin)} | {*COUNTS, THETA}
-    for axis in swept(experiment.sweep):
-        if axis not in COUNTS and not is_theta_axis(axis) and not any(_applies(axis, plugin) for plugin in chosen):
+def check_axes(axes: Sequence[str], plugins: Sequence[type[Plugin]]) -> None:
+    """Raise :class:`UserError` for an axis that is a parameter of none of the plugins, nor a count or theta."""
+    names = {name for plugin in plugins for name in parameters(plugin)} | {*COUNTS, THETA}
+    for axis in axes:
+        if axis not in COUNTS and not is_theta_axis(axis) and not any(_applies(axis, plugin) for plugin in plugins):
             raise unknown("sweep axis", axis, names)
 
 

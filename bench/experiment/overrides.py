@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,18 +20,6 @@ PLACEHOLDER = "bench_values_"
 TABLES = ("sweep", "marks", "reference", "table", "ray")
 """Settings that are tables; the parameters of plugins are too."""
 LISTS_AS = "write key=value with lists as [a,b] and strings in quotes"
-
-
-def repeated(overrides: Sequence[str]) -> list[str]:
-    """Return a sentence for each setting that is given more than once, since only its last value counts."""
-    given: dict[str, str] = {}
-    sentences = []
-    for override in overrides:
-        key = override.partition("=")[0].lstrip("+")
-        if key in given:
-            sentences.append(f"{key} is given twice: {override[:200]} counts, {given[key][:200]} does not")
-        given[key] = override
-    return sentences
 
 
 def quoted(value: str) -> str:

@@ -1,4 +1,4 @@
-"""Finds the largest jump of a cost along lines, by refining the intervals in which the cost bends most."""
+"""Finds what the mean of gradients misses under noise, along lines: jumps of the cost, and slopes that no sample meets."""
 
 from __future__ import annotations
 
@@ -27,10 +27,23 @@ SINGLE = float(np.finfo(np.float32).eps)
 MOST_POINTS = 1 << 25
 """Most numbers in the points of one call of the cost (256 MiB)."""
 
+ISOLATED = 0.1
+"""Largest change of the cost beside a jump, relative to the jump. Beside a root or in chaos the changes are of one size."""
+
 REACH = 4.0
 """Distance searched on either side of theta, in standard deviations of the noise."""
 LINES = 16
 """Most lines along coordinates, and along random directions; twice as many lie between two random samples."""
+FAR, NODES = 6.0, 128
+"""Distance on either side of theta, in standard deviations, and number of points, of the lines with costs and gradients."""
+MET = 3.0
+"""Distance that samples are sure to meet: one in 370 is beyond it."""
+SIGNED = 5
+"""Largest number of inputs of which all diagonals are lines."""
+MISSED = 0.25
+"""Share of the mean slope that gradients must not miss: half of the error at which an estimate counts as wrong."""
+UNRESOLVED = 0.25
+"""Largest difference between the sums over every other point, relative to the missed slope, at which the sums decide."""
 
 
 class Jump(NamedTuple):
@@ -44,6 +57,75 @@ class Jump(NamedTuple):
     """Index of the line with the jump."""
     at: float = 0.0
     """Place of the jump on its line, from 0 at the start to 1 at the end."""
+
+
+class MissedSlope(NamedTuple):
+    """The part of the mean slope along a line through the noise that sampled gradients do not have."""
+
+    share: float
+    """The missed slope over the largest mean slope of all lines; 0 where gradients miss nothing that matters."""
+    w: np.ndarray
+    """The noise ``(n_w,)`` where most of it lies."""
+
+
+def missed_slope(problem: Problem, theta: np.ndarray, seed: int, columns: int) -> MissedSlope:
+    """Return the slope of the mean cost at ``theta (d,)`` that sampled gradients miss, on lines through its noise.
+
+    On a line, the derivative of the mean cost is E[f(t) t] for a standard normal t, from costs, and E[f'(t)] from
+    gradients. Samples meet only t within :data:`MET`. The two differ where a rise is too narrow for any sample, or where
+    a far kink or a jump has a large weight. They show nothing where sums over every other point differ as well, as in
+    chaos. Only noise that acts on theta has gradients along a line; the share is 0 for other noise.
+    """
+    width, dim = problem.program.n_noise, problem.dim
+    nothing = MissedSlope(0.0, np.zeros(width))
+    if not problem.noise_on_theta or not problem.sigma > 0.0:
+        return nothing
+    directions = _lines_of_slopes(dim, np.random.default_rng([seed, 0x736C6F70]))
+    t = np.linspace(-FAR, FAR, NODES)
+    points = (directions[:, :, None] * t).reshape(dim, -1)
+
+    def along(part: np.ndarray) -> np.ndarray:
+        w = np.concatenate([part, np.zeros((width - dim, part.shape[1]))])
+        at = np.repeat(theta[:, None], part.shape[1], axis=1)
+        return np.concatenate([problem.value(at, w)[None], problem.sigma * problem.grad(at, w)])
+
+    with np.errstate(all="ignore"):
+        both = in_columns(along, points, columns).reshape(dim + 1, -1, NODES)
+        costs, slopes = both[0], np.einsum("dl,dlt->lt", directions, both[1:])
+        density = np.exp(-t * t / 2.0) / np.sqrt(2.0 * np.pi) * (t[1] - t[0])
+        by_costs = (costs - costs[:, NODES // 2, None]) * t * density
+        by_gradients = np.where(np.abs(t) <= MET, slopes, 0.0) * density
+        missed = (by_costs - by_gradients).sum(axis=1)
+        doubts = [
+            2.0 * np.abs(part[:, ::2].sum(axis=1) - part[:, 1::2].sum(axis=1)) for part in (by_costs, by_gradients)
+        ]
+        largest = max(np.nanmax(np.abs(part.sum(axis=1)), initial=0.0) for part in (by_costs, by_gradients))
+        unit = SINGLE if (costs == costs.astype(np.float32)).all() else float(np.finfo(np.float64).eps)
+        noise = LOUD * unit * np.abs(costs).max(axis=1)
+        is_shown = (np.abs(missed) > noise) & (doubts[1] <= UNRESOLVED * np.abs(missed)) & (doubts[0] <= np.abs(missed))
+        shares = np.where(is_shown, np.abs(missed) / largest, 0.0)
+    line = int(np.argmax(shares))
+    if not shares[line] > MISSED:
+        return nothing
+    rest = np.abs(np.diff(costs[line]) - (slopes[line, 1:] + slopes[line, :-1]) / 2.0 * (t[1] - t[0]))
+    rest = np.where(np.abs(t[1:]) > MET, np.abs(np.diff(costs[line])), rest) * density[1:]
+    w = np.zeros(width)
+    w[:dim] = directions[:, line] * t[int(np.argmax(rest))]
+    return MissedSlope(float(shares[line]), w)
+
+
+def _lines_of_slopes(dim: int, random: np.random.Generator) -> np.ndarray:
+    """Return unit vectors ``(d, L)``: coordinates, diagonals of pairs and of all inputs where there are few, random ones."""
+    chosen = np.unique(np.linspace(0, dim - 1, min(dim, LINES)).astype(int))
+    rows = list(np.eye(dim)[chosen])
+    if 1 < dim <= SIGNED:
+        signs = np.array(np.meshgrid(*[(-1.0, 0.0, 1.0)] * dim)).reshape(dim, -1).T
+        first = signs[np.arange(len(signs)), (signs != 0).argmax(axis=1)]
+        rows += list(signs[(first > 0) & ((signs != 0).sum(axis=1) > 1)])
+    elif dim > SIGNED:
+        rows += [*np.sign(random.standard_normal((LINES, dim))), *random.standard_normal((LINES, dim))]
+    directions = np.array(rows).T
+    return np.asarray(directions / np.linalg.norm(directions, axis=0))
 
 
 def jump_under_noise(problem: Problem, theta: np.ndarray, seed: int, columns: int) -> tuple[Jump, np.ndarray]:
@@ -117,6 +199,11 @@ def largest_jump(
         if width / parts < FINEST:
             # at this length only a jump exceeds rounding
             noise = float(np.median(bends))
+            isolated = _isolated(values, steps)
+            highest = int(np.argmax(isolated))
+            part = int(steps[highest].argmax())
+            where = int(line[highest]), float(nodes[highest, part : part + 2].mean())
+            changes[-1] = float(isolated[highest])
             break
         row, place = np.unravel_index(np.argsort(bends, axis=None)[-SUSPECTS:], bends.shape)
         line, left, width, parts = line[row], nodes[row, place], 2.0 * width / parts, CUTS
@@ -125,3 +212,16 @@ def largest_jump(
         noise = max(noise, SINGLE * size)
     stays = changes[-1] > 0.1 * changes[-2] and changes[-1] > max(NO_JUMP * span, LOUD * noise)
     return Jump(changes[-1] if stays else 0.0, span, *where)
+
+
+def _isolated(values: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """Return each row's largest change ``(L,)`` where the cost is flat on both sides of it, compared with the change; else 0.
+
+    ``values (L, P + 1)`` are costs at the points of short lines, ``steps (L, P)`` their changes.
+    """
+    row, part = np.arange(len(steps)), steps.argmax(axis=1)
+    rest = steps.copy()
+    rest[row, part] = 0.0
+    sides = np.maximum(np.abs(values[row, part] - values[:, 0]), np.abs(values[:, -1] - values[row, part + 1]))
+    allowed = ISOLATED * steps[row, part]
+    return np.where((rest.max(axis=1) <= allowed) & (np.nan_to_num(sides) <= allowed), steps[row, part], 0.0)

@@ -4,7 +4,6 @@
 """
 
 from bench.engines.backend import EngineBackend
-from bench.engines.node import StepNode
 from bench.experiment.cell import Cell
 from bench.experiment.columns import COMMON, Column, Columns, ComparisonRule
 from bench.experiment.experiment import Experiment
@@ -15,6 +14,6 @@ from bench.model import *  # noqa: F403
 from bench.model import __all__ as _contracts
 
 __all__ = [
-    *_contracts, "COMMON", "Cell", "Chart", "Column", "Columns", "ComparisonRule", "EngineBackend", "Experiment", "Mark", "Note", "Session", "StepNode", "Study",
+    *_contracts, "COMMON", "Cell", "Chart", "Column", "Columns", "ComparisonRule", "EngineBackend", "Experiment", "Mark", "Note", "Session", "Study",
     "Style", "Table", "Views",
 ]  # fmt: skip

@@ -35,16 +35,13 @@ class Checkpointed(Jax):
     levels: int = param(2, "levels of checkpoints, for keep=states", positive=True)
 
     def compile(self, program: Program) -> Problem:
-        """Return the program as jitted functions; each batch shape is compiled at its first call."""
         return _CheckpointedProblem(program, self)
 
     def ops(self) -> Ops:
-        """Return the operations for the model code."""
         use_double_precision()
         return _CheckpointedOps(self.levels if self.keep == "states" else 0)
 
     def unsupported_reason(self, program: Program) -> str | None:
-        """Return why step Jacobians do not give the gradient, or None."""
         if self.keep != "jacobians":
             return None
         if not isinstance(program, Rollout):
@@ -62,7 +59,6 @@ class _CheckpointedOps(JaxOps):
         self._levels = levels
 
     def loop(self, body: Callable[[Any, Any], Any], carry: Any, xs: Any, length: int) -> Any:
-        """Return the last carry of nested loops."""
         return _nested(body, carry, xs, length, self._levels)
 
 

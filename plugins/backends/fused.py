@@ -33,7 +33,6 @@ class Fused(Backend):
     provides = Jax.provides - {"surrogate"}
 
     def compile(self, program: Program) -> Problem:
-        """Return the program as a problem. A function's kernel is compiled at its first call, for all batch sizes."""
         use_double_precision()
         return FusedProblem(program, JaxOps(), self.dtype, "reverse")
 
@@ -61,7 +60,6 @@ class _PlainOps(LoopOps):
         super().__init__(jax.numpy)
 
     def scan(self, step: Any, carry: Any, xs: Any, length: int) -> Any:
-        """Return the last carry of lax.scan."""
         import jax
 
         return jax.lax.scan(lambda state, x: (step(state, x), None), carry, xs, length)[0]

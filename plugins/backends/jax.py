@@ -40,7 +40,6 @@ class Jax(Backend):
     mode: str = param("reverse", "direction of differentiation", choices=("reverse", "forward"))
 
     def compile(self, program: Program) -> Problem:
-        """Return the program as jitted functions; each batch shape is compiled at its first call."""
         return JaxProblem(program, self.ops(), self.dtype, self.mode)
 
     def ops(self) -> Ops:
@@ -155,7 +154,6 @@ class JaxProblem(Problem):
         return self._call(self._score_function, theta, w)
 
     def trajectory(self, theta: np.ndarray, w: np.ndarray) -> Trajectory:
-        """Return states and controls from a scan that stores them."""
         return Trajectory(*self._parts(self._trajectory, theta, w))
 
     def jacobians(self, theta: np.ndarray, w: np.ndarray) -> Jacobians:

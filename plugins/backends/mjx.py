@@ -70,7 +70,6 @@ class Mjx(Jax):
     lean: bool = param(True, "switch off all engine features that the scene does not use")
 
     def compile(self, program: Program) -> Problem:
-        """Return the twin's steps as jitted functions, compiled at the first call with each batch shape."""
         ops = self.ops()
         return MjxProblem(_stepped(rollout(program), self), ops, self.dtype, self._direction(program))
 

@@ -68,7 +68,6 @@ class Mujoco(Backend):
     lean: bool = param(True, "switch off all engine features that the scene does not use")
 
     def compile(self, program: Program) -> Problem:
-        """Return the twin's model as a problem; nothing is compiled."""
         return MujocoProblem(program, self)
 
     def unsupported_reason(self, program: Program) -> str | None:
@@ -106,7 +105,6 @@ class MujocoProblem(NumpyProblem):
         return _reverse(recorded(self._rolled, self._rollout(theta, w)[0]), theta, w, scored=True)
 
     def trajectory(self, theta: np.ndarray, w: np.ndarray) -> Trajectory:
-        """Return the engine's states and controls."""
         return Trajectory(*self._rollout(np.asarray(theta, dtype=np.float64).reshape(self.dim, -1), w))
 
     def engine_contacts(self) -> mjcf.Contacts:

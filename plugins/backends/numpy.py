@@ -23,7 +23,6 @@ class Numpy(Backend):
     )
 
     def compile(self, program: Program) -> Problem:
-        """Return the program as a problem; nothing is compiled."""
         # about the cube root of the unit roundoff, which balances rounding and truncation errors
         step = self.step or {"float64": 1e-6, "float32": 5e-3}[self.dtype]
         return NumpyProblem(program, self.dtype, step)
@@ -54,7 +53,6 @@ class NumpyProblem(Problem):
         return np.asarray(cost, dtype=np.float64)
 
     def trajectory(self, theta: np.ndarray, w: np.ndarray) -> Trajectory:
-        """Return states and controls of all steps."""
         bound = rollout(self._bound)
         theta = np.reshape(theta, (self.dim, -1)).astype(self._dtype)
         with np.errstate(all="ignore"):

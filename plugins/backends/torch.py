@@ -21,7 +21,6 @@ class Torch(Backend):
     reference_rank: ClassVar[int | None] = 2
 
     def compile(self, program: Program) -> Problem:
-        """Return the program as a problem that runs eagerly; nothing is compiled."""
         return TorchProblem(program, self.dtype)
 
 
@@ -34,7 +33,6 @@ class TorchOps(LoopOps):
         super().__init__(array_api_compat.torch)
 
     def scan(self, step: Callable[[Any, Any], Any], carry: Any, xs: Any, length: int) -> Any:
-        """Return the last carry of a Python loop over the leading axis of ``xs``."""
         # unbind adds one graph node for all steps, while indexing would add one per step
         slices = [x.unbind(0) for x in xs]
         for t in range(length):
@@ -63,7 +61,6 @@ class TorchProblem(Problem):
         return np.asarray(cost.to(self._torch.float64).numpy())
 
     def trajectory(self, theta: np.ndarray, w: np.ndarray) -> Trajectory:
-        """Return states and controls of all steps."""
         theta = np.reshape(theta, (self.dim, -1))
         with self._torch.no_grad():
             steps = list(rollout(self.program).steps(self._ops, self._tensor(theta), self._tensor(w)))

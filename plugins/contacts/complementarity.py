@@ -29,7 +29,6 @@ class Complementarity(ImpulseLaw):
         return True
 
     def impulse(self, ops: Ops, contact: Contact, before: State, free: State, dt: float) -> State:
-        """Return the velocity change over the step, without an additional position change."""
         xp = ops.xp
         opened = dt * dt * contact.response(xp, before.q)
 

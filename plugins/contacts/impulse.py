@@ -28,11 +28,9 @@ class Impulse(ImpulseLaw):
         return False
 
     def finds_time_of_impact(self) -> bool:
-        """Return whether ``time_of_impact`` is set."""
         return self.time_of_impact
 
     def impulse(self, ops: Ops, contact: Contact, before: State, free: State, dt: float) -> State:
-        """Return the velocity change, and the position change in addition to dt times the velocity change."""
         xp = ops.xp
         rate = contact.gap_rate(before.q, before.v)
         overlap = -contact.gap(before.q + dt * before.v)

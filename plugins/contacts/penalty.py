@@ -27,11 +27,9 @@ class Penalty(ForceLaw):
         return self.damping == 0.0
 
     def spring(self) -> tuple[float, float]:
-        """Return (k, c)."""
         return self.stiffness, self.damping
 
     def force(self, xp: Any, gap: Array, gap_rate: Array) -> Array:
-        """Return the normal force, zero without penetration."""
         damper = -self.damping * gap_rate
         if self.damping_mode == "approach":
             damper = xp.where(damper > 0, damper, 0.0 * damper)

@@ -31,7 +31,6 @@ class Softplus(ForceLaw):
         return self.smooths == "gap" or self.damping == 0.0
 
     def spring(self) -> tuple[float, float]:
-        """Return (k, c)."""
         return self.stiffness, self.damping
 
     def force(self, xp: Any, gap: Array, gap_rate: Array) -> Array:

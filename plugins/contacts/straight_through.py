@@ -37,11 +37,9 @@ class StraightThrough(ForceLaw):
         return self.forward == "softplus" or self.damping == 0.0
 
     def spring(self) -> tuple[float, float]:
-        """Return (k, c) of the forward law."""
         return self.stiffness, self.damping
 
     def force(self, xp: Any, gap: Array, gap_rate: Array) -> Array:
-        """Return the forward law's force, with the backward law's derivative."""
         ahead = stopped(self._law(self.forward).force(xp, gap, gap_rate))
         if self.backward == "none":
             return ahead

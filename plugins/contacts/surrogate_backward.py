@@ -27,7 +27,6 @@ class SurrogateBackward(Complementarity):
     soft_kappa: float = param(1e-2, "central-path parameter of the gradient, force times gap", "N m", positive=True)
 
     def impulse(self, ops: Ops, contact: Contact, before: State, free: State, dt: float) -> State:
-        """Return the velocity change over the step at ``kappa``, with the derivatives at ``soft_kappa``."""
         hard = super().impulse(ops, contact, before, free, dt)
         if isinstance(hard.v, np.ndarray):  # without derivatives
             return hard

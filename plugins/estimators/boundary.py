@@ -30,7 +30,6 @@ class Boundary(SampleMean):
     )
 
     def terms(self, problem: Problem, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """Return the gradient of each sample plus its boundary terms, ``(d, B)``."""
         total = problem.grad(theta, w)
         for direction, limit, slope in zip(*events_of(problem, theta, w), strict=True):
             at_limit = w + direction[:, None] * (limit - direction @ w)
@@ -40,6 +39,5 @@ class Boundary(SampleMean):
         return np.asarray(total)
 
     def unsupported_reason(self, program: Program) -> str | None:
-        """Return where the cost may jump without a declared event; else None."""
         missing = undeclared_jumps(program)
         return None if missing is None else f"{self.name} needs all jumps of the cost: {missing}"

@@ -21,7 +21,6 @@ class MeasureValued(SampleMean):
     unbiased_at_discontinuities = True
 
     def terms(self, problem: Problem, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """Return the scaled difference of both costs for every coordinate, ``(d, B)``."""
         from scipy.special import log_ndtr
 
         radius = np.sqrt(-2.0 * log_ndtr(w))

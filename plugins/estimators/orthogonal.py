@@ -37,7 +37,6 @@ class Orthogonal(Estimator):
         return program.noise_on_theta and super().declares_unbiased(program)
 
     def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
-        """Return the mean of central differences along the rotated directions, ``(R, d)``."""
         d, s = problem.dim, problem.sigma
         normal = noise[..., :d]
         v = np.concatenate([_rotated(normal[:, i : i + d]) for i in range(0, noise.shape[1], d)], axis=1)

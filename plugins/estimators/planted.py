@@ -38,7 +38,6 @@ class Planted(Estimator):
         return frozenset({"grad"}) if self.base == "samples" else frozenset({"grad", "value", "score"})
 
     def unsupported_reason(self, program: Program) -> str | None:
-        """Return the reason if theta has too few coordinates for a rotation; else None."""
         if self.angle and program.dim < 2:
             return f"{self.name}[angle={self.angle:g}] needs at least 2 coordinates, and theta has {program.dim}"
         return None

@@ -32,7 +32,6 @@ class RandomizedSmoothing(SampleMean):
     )
 
     def terms(self, problem: Problem, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """Return one finite difference per sample, times its direction, ``(d, B)``."""
         s = problem.sigma if self.radius is None else self.radius
         direction = problem.directions(w)
         centred = problem.centred(w)
@@ -50,7 +49,6 @@ class RandomizedSmoothing(SampleMean):
         return program.noise_on_theta and not is_other and super().declares_unbiased(program)
 
     def smoothing(self, program: Program) -> Smoothing | None:
-        """Return the Gaussian of the estimator's radius if it is the reference and noise is on theta; else None."""
         if self.reference == "sigma" or self.radius is None or not program.noise_on_theta:
             return None
         return Smoothing("gaussian", self.radius)

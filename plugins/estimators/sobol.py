@@ -38,7 +38,6 @@ class Sobol(Estimator):
         return program.noise_on_theta and super().declares_unbiased(program)
 
     def unsupported_reason(self, program: Program) -> str | None:
-        """Return the reason if theta has more coordinates than the sequence; else None."""
         if program.dim > MOST:
             return f"{self.name} has directions of at most {MOST:,} coordinates, and theta has {program.dim:,}"
         return None

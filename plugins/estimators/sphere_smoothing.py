@@ -30,7 +30,6 @@ class SphereSmoothing(SampleMean):
     )
 
     def terms(self, problem: Problem, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """Return one central difference per sample, times its direction, ``(d, B)``."""
         d = problem.dim
         r = self._radius(problem.program)
         normal = problem.directions(w)
@@ -43,7 +42,6 @@ class SphereSmoothing(SampleMean):
         return float(program.scene.sigma * np.sqrt(program.dim + 2.0)) if self.radius is None else self.radius
 
     def smoothing(self, program: Program) -> Smoothing | None:
-        """Return the smoothing over the ball if it is the reference, else None."""
         return Smoothing("ball", self._radius(program)) if self.reference == "own" else None
 
     def declares_unbiased(self, program: Program) -> bool:

@@ -24,7 +24,6 @@ class StochasticDerivative(SampleMean):
     unbiased_at_discontinuities = True
 
     def terms(self, problem: Problem, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """Return the gradient of each sample plus the weighted changes of its cost, ``(d, B)``."""
         from scipy.special import log_ndtr
 
         total, cost = problem.grad(theta, w), problem.value(theta, w)
@@ -39,7 +38,6 @@ class StochasticDerivative(SampleMean):
         return np.asarray(total)
 
     def unsupported_reason(self, program: Program) -> str | None:
-        """Return the reason if the scene declares no discrete events, or the cost may jump elsewhere; else None."""
         scene = program.scene
         if not (isinstance(scene, EventScene) and scene.discrete):
             return f"{self.name} needs a scene that declares discrete events, and {scene.name} does not"

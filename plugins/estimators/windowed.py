@@ -51,7 +51,6 @@ class Windowed(Estimator):
     ridge: float = param(1e-3, "ridge penalty of the fitted value, per sample", positive=True)
 
     def unsupported_reason(self, program: Program) -> str | None:
-        """Return the reason if the exact value is unknown or theta consists of named parameters; else None."""
         if self.terminal == "exact" and not isinstance(program.scene, KnownValue | FunctionScene):
             return f"{self.name}[terminal=exact] needs a scene that knows its cost-to-go, and {program.scene.name} does not"
         if program.decision.names and isinstance(program, Rollout):
@@ -59,7 +58,6 @@ class Windowed(Estimator):
         return None
 
     def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
-        """Return the mean over samples of the windowed gradient, ``(R, d)``."""
         program, w = problem.program, columns(noise)
         if not isinstance(program, Rollout) or (self.steps >= program.scene.horizon and self.cut is None):
             return np.asarray(per_repeat(problem.grad(theta, w), noise).mean(axis=1))

@@ -30,7 +30,6 @@ class EventDriven(StormerVerlet):
     takes_impulses = True
 
     def step(self, dynamics: Dynamics, state: State, u: Array, dt: float) -> State:
-        """Return the state after a step to the impact, if there is one, and then to the end of the step."""
         q, v = state.q, dynamics.carried(state.v)
         contact = dynamics.contact
         if contact is None:

@@ -18,7 +18,6 @@ class ExplicitEuler(Integrator):
     order = 1
 
     def step(self, dynamics: Dynamics, state: State, u: Array, dt: float) -> State:
-        """Return the state after one step, with all terms evaluated at its start."""
         v = dynamics.carried(state.v) + dt * dynamics.acceleration(state.q, state.v, u)
         return State(state.q + dt * state.v, v)
 
@@ -27,5 +26,4 @@ class ExplicitEuler(Integrator):
         return 1 + z
 
     def transition(self, dt: float, stiffness: float, damping: float, factor: float) -> np.ndarray:
-        """Return the matrix ``(2, 2)`` of one step, both rows evaluated at the old state."""
         return np.array([[1.0, dt], [-dt * stiffness, factor - dt * damping]])

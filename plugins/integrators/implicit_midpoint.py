@@ -24,7 +24,6 @@ class ImplicitMidpoint(Integrator):
     needs_root = True
 
     def step(self, dynamics: Dynamics, state: State, u: Array, dt: float) -> State:
-        """Return the state after one step, which solves one equation for the displacement dt m."""
 
         def residual(moved: Array, args: Any) -> Array:
             q, v, u, dt = args

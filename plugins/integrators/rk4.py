@@ -35,7 +35,6 @@ class Rk4(Integrator):
         return 1 + z * (1 + z / 2 * (1 + z / 3 * (1 + z / 4)))
 
     def transition(self, dt: float, stiffness: float, damping: float, factor: float) -> np.ndarray:
-        """Return the same series in dt times the system matrix, after the velocity factor."""
         z, one = dt * np.array([[0.0, 1.0], [-stiffness, -damping]]), np.eye(2)
         series = one + z @ (one + z / 2 @ (one + z / 3 @ (one + z / 4)))
         return series @ np.diag([1.0, factor])

@@ -19,7 +19,6 @@ class SemiImplicitEuler(Integrator):
     takes_impulses = True
 
     def step(self, dynamics: Dynamics, state: State, u: Array, dt: float) -> State:
-        """Return the state after one step, in which impulses act on the new velocity."""
         v = dynamics.carried(state.v) + dt * dynamics.acceleration(state.q, state.v, u)
         return dynamics.with_impulse(state, State(state.q + dt * v, v), dt)
 
@@ -28,6 +27,5 @@ class SemiImplicitEuler(Integrator):
         return 1 + z
 
     def transition(self, dt: float, stiffness: float, damping: float, factor: float) -> np.ndarray:
-        """Return the matrix ``(2, 2)`` of one step, which updates the velocity, then the position with the new velocity."""
         row = np.array([-dt * stiffness, factor - dt * damping])
         return np.array([[1.0, 0.0] + dt * row, row])

@@ -29,7 +29,6 @@ class StormerVerlet(Integrator):
         return 1 + z + z * z / 2
 
     def transition(self, dt: float, stiffness: float, damping: float, factor: float) -> np.ndarray:
-        """Return the matrix ``(2, 2)`` of one step, computed row by row as in :meth:`step`, after the velocity factor."""
         position, velocity = np.eye(2)
         before = -stiffness * position - damping * velocity
         moved = position + dt * velocity + 0.5 * dt**2 * before

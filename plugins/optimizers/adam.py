@@ -27,7 +27,6 @@ class Adam(Clipped):
         return super().start(theta) | {"mean": np.zeros(len(theta)), "square": np.zeros(len(theta))}
 
     def step(self, state: OptimizerState, gradient: np.ndarray) -> OptimizerState:
-        """Return the state after updating both means with the clipped gradient and taking a step."""
         i, g = state["iteration"] + 1, self.clipped(gradient)
         mean = self.beta1 * state["mean"] + (1 - self.beta1) * g
         square = self.beta2 * state["square"] + (1 - self.beta2) * g * g

@@ -29,11 +29,9 @@ class Cem(Population):
         return super().start(theta) | {"deviation": np.full(len(theta), self.width)}
 
     def draws(self, dim: int) -> int:
-        """Return the size of the population."""
         return self.population
 
     def ask(self, state: OptimizerState, noise: np.ndarray) -> np.ndarray:
-        """Return the points of one iteration, ``(d, population)``."""
         return np.asarray(state["theta"][:, None] + state["deviation"][:, None] * noise)
 
     def tell(self, state: OptimizerState, theta: np.ndarray, answer: Answer) -> OptimizerState:

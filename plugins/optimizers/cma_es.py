@@ -61,16 +61,13 @@ class CmaEs(Population):
         return super().start(theta) | paths | root | {"sigma": self.width, "iteration": 0}
 
     def draws(self, dim: int) -> int:
-        """Return the size of the population."""
         return self.population or 4 + math.floor(3 * math.log(dim))
 
     def ask(self, state: OptimizerState, noise: np.ndarray) -> np.ndarray:
-        """Return the points of one iteration, ``(d, population)``."""
         moved = state["axes"] @ (state["lengths"][:, None] * noise)
         return np.asarray(state["theta"][:, None] + state["sigma"] * moved)
 
     def tell(self, state: OptimizerState, theta: np.ndarray, answer: Answer) -> OptimizerState:
-        """Return the state with updated mean, evolution paths, covariance and step size."""
         assert answer.value is not None
         d, i = theta.shape[0], state["iteration"] + 1
         k = constants(d, theta.shape[1])

@@ -31,11 +31,9 @@ class GaussNewton(Optimizer):
         }  # fmt: skip
 
     def ask(self, state: OptimizerState, noise: np.ndarray) -> np.ndarray:
-        """Return the next point, ``(d, 1)``."""
         return np.array(state["next"][:, None])
 
     def tell(self, state: OptimizerState, theta: np.ndarray, answer: Answer) -> OptimizerState:
-        """Return the state after accepting or rejecting the point, with the next step from the best point."""
         assert answer.residual is not None
         assert answer.jacobian is not None
         residual, jacobian = answer.residual[:, 0], answer.jacobian[..., 0]

@@ -16,6 +16,5 @@ class GradientDescent(Clipped):
     name = "gradient_descent"
 
     def step(self, state: OptimizerState, gradient: np.ndarray) -> OptimizerState:
-        """Return the state after a step against the clipped gradient."""
         i = state["iteration"] + 1
         return {"theta": state["theta"] - self.rate_at(i) * self.clipped(gradient), "iteration": i}

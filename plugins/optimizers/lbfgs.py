@@ -27,11 +27,9 @@ class Lbfgs(Searching):
     first_move: float = param(0.1, "length of the first step", positive=True)
 
     def start(self, theta: np.ndarray) -> OptimizerState:
-        """Return the initial state, without pairs."""
         return super().start(theta) | {"steps": [], "changes": [], "last": None}
 
     def with_gradient(self, state: OptimizerState, gradient: np.ndarray) -> OptimizerState:
-        """Return the state with a new gradient and the pair that it completes, if any."""
         steps, changes = list(state["steps"]), list(state["changes"])
         if state["last"] is not None:
             s, y = state["theta"] - state["last"][0], gradient - state["last"][1]
@@ -42,7 +40,6 @@ class Lbfgs(Searching):
         }  # fmt: skip
 
     def direction(self, state: OptimizerState) -> np.ndarray:
-        """Return minus the approximate inverse Hessian times the gradient, ``(d,)``."""
         q = np.array(state["gradient"])
         pairs = list(zip(state["steps"], state["changes"], strict=True))
         if not pairs:

@@ -16,5 +16,4 @@ class LineSearch(Searching):
     name = "line_search"
 
     def direction(self, state: OptimizerState) -> np.ndarray:
-        """Return the negative gradient."""
         return -np.asarray(state["gradient"])

@@ -23,7 +23,6 @@ class Momentum(Clipped):
         return super().start(theta) | {"speed": np.zeros(len(theta))}
 
     def step(self, state: OptimizerState, gradient: np.ndarray) -> OptimizerState:
-        """Return the state after a step along a share of the last step plus the clipped gradient."""
         i, g = state["iteration"] + 1, self.clipped(gradient)
         speed = self.momentum * state["speed"] + g
         move = g + self.momentum * speed if self.nesterov else speed

@@ -24,11 +24,9 @@ class Mppi(Population):
     relative: bool = param(True, "whether the temperature is in units of the standard deviation of the costs")
 
     def draws(self, dim: int) -> int:
-        """Return the size of the population."""
         return self.population
 
     def ask(self, state: OptimizerState, noise: np.ndarray) -> np.ndarray:
-        """Return the samples, ``(d, population)``."""
         return np.asarray(state["theta"][:, None] + self.width * noise)
 
     def tell(self, state: OptimizerState, theta: np.ndarray, answer: Answer) -> OptimizerState:

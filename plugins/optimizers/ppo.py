@@ -35,11 +35,9 @@ class Ppo(Population):
         }  # fmt: skip
 
     def draws(self, dim: int) -> int:
-        """Return the size of the population."""
         return self.population
 
     def ask(self, state: OptimizerState, noise: np.ndarray) -> np.ndarray:
-        """Return the points of one iteration, ``(d, population)``."""
         mean, log_deviation = state["policy"]
         return np.asarray(mean[:, None] + np.exp(log_deviation)[:, None] * noise)
 

@@ -25,22 +25,18 @@ class Searching(Optimizer):
     tries: int = param(8, "number of trial steps", positive=True)
 
     def start(self, theta: np.ndarray) -> OptimizerState:
-        """Return the initial state, which requests a gradient."""
         return super().start(theta) | {"gradient": None}
 
     def required_fields(self, state: OptimizerState) -> frozenset[str]:
-        """Return ``gradient`` and ``value`` alternately."""
         return frozenset({"gradient"} if state["gradient"] is None else {"value"})
 
     def ask(self, state: OptimizerState, noise: np.ndarray) -> np.ndarray:
-        """Return theta, ``(d, 1)``, or theta and the trial points, ``(d, 1 + tries)``."""
         theta = state["theta"][:, None]
         if state["gradient"] is None:
             return np.array(theta)
         return np.asarray(theta + self.direction(state)[:, None] * np.concatenate([[0.0], self.steps(state)]))
 
     def tell(self, state: OptimizerState, theta: np.ndarray, answer: Answer) -> OptimizerState:
-        """Return the state with a new gradient, or after the longest step with sufficient descent."""
         if state["gradient"] is None:
             assert answer.gradient is not None
             return self.with_gradient(state, answer.gradient[:, 0])

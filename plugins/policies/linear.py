@@ -22,7 +22,6 @@ class Linear(Policy):
         return {"weight": (n_outputs, n_inputs), "bias": (n_outputs,)}
 
     def initial(self, n_inputs: int, n_outputs: int) -> np.ndarray:
-        """Return random weights and zero biases, ``(d,)``."""
         drawn = np.random.default_rng(self.seed).standard_normal(n_outputs * n_inputs)
         return np.concatenate([self.scale / np.sqrt(n_inputs) * drawn, np.zeros(n_outputs)])
 

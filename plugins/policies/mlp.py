@@ -43,7 +43,6 @@ class Mlp(Policy):
         return shapes
 
     def initial(self, n_inputs: int, n_outputs: int) -> np.ndarray:
-        """Return random weights and zero biases, ``(d,)``."""
         random, parts = np.random.default_rng(self.seed), []
         last = f"weight_{len(self.widths)}"
         for name, shape in self.shapes(n_inputs, n_outputs).items():
@@ -55,7 +54,6 @@ class Mlp(Policy):
         return np.concatenate(parts)
 
     def act(self, xp: Any, theta: Array, observations: Array) -> Array:
-        """Return the output of the last layer, ``(n_outputs, B)``."""
         *_, width = sizes = [observations.shape[0], *self.widths]
         before = sum((n_in + 1) * n_out for n_in, n_out in itertools.pairwise(sizes))
         arrays = self.arrays(xp, theta, observations.shape[0], (theta.shape[0] - before) // (width + 1))

@@ -40,11 +40,9 @@ class Ant(Legged):
     torque: float = param(0.5, "torque of each joint at theta; hips alternate in sign", "N m")
 
     def theta0(self) -> np.ndarray:
-        """Return hip torques of alternating sign and equal ankle torques."""
         return self.torque * np.array([1.0, 1.0, -1.0, 1.0, 1.0, 1.0, -1.0, 1.0])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """Return the stance just above the ground, falling forward."""
         zero = 0.0 * theta[0]
         height = 2 * self.link * float(np.sin(np.pi / 4)) + self.foot_radius + self.clearance
         q = [zero, zero, zero + height, *([zero] * 11)]
@@ -56,7 +54,6 @@ class Ant(Legged):
         return theta - self.stiffness * q[6:] - self.damping * v[6:]
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
-        """Return minus the forward position."""
         return -q[0]
 
     def leg(self, name: str) -> str:

@@ -35,7 +35,6 @@ class Billiard(ContactScene):
     start: float = param(1.0, "u0 at theta, the force along y in the first step", "N")
 
     def theta0(self) -> np.ndarray:
-        """Return (u0,)."""
         return np.array([self.start])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
@@ -50,26 +49,21 @@ class Billiard(ContactScene):
         return xp.concat([first, later], axis=0)
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """Return the force on the first ball over its mass."""
         return xp.concat([u / self.mass, 0.0 * u], axis=0)
 
     def gap(self, xp: Any, q: Array) -> Array:
-        """Return the distance between the surfaces."""
         return _distance(xp, q)[None] - 2.0 * self.radius
 
     def gap_rate(self, xp: Any, q: Array, v: Array) -> Array:
-        """Return the relative velocity along the line of centres."""
         apart, relative = q[2:4] - q[0:2], v[2:4] - v[0:2]
         return (xp.sum(apart * relative, axis=0) / _distance(xp, q))[None]
 
     def contact_acceleration(self, xp: Any, q: Array, force: Array) -> Array:
-        """Return accelerations that push both balls apart along the line of centres."""
         normal = (q[2:4] - q[0:2]) / _distance(xp, q)
         pushed = normal * force / self.mass
         return xp.concat([-pushed, pushed], axis=0)
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
-        """Return the squared distance of the second ball from the origin."""
         return q[2] ** 2 + q[3] ** 2
 
 

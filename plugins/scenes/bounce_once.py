@@ -39,11 +39,9 @@ class BounceOnce(EngineTwin, ContactScene):
     force: float = param(0.0, "force during the first step at theta, upwards", "N")
 
     def theta0(self) -> np.ndarray:
-        """Return (height, velocity, force)."""
         return np.array([self.height, self.velocity, self.force])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """Return the height and velocity in theta."""
         return State(theta[0:1], theta[1:2])
 
     def planned_controls(self, xp: Any, theta: Array) -> Array:
@@ -53,27 +51,21 @@ class BounceOnce(EngineTwin, ContactScene):
         return xp.concat([first, later], axis=0)
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """Return the force per mass."""
         return u / self.mass
 
     def gap(self, xp: Any, q: Array) -> Array:
-        """Return the height of the ball's lowest point."""
         return q - self.radius
 
     def gap_rate(self, xp: Any, q: Array, v: Array) -> Array:
-        """Return v."""
         return v
 
     def contact_acceleration(self, xp: Any, q: Array, force: Array) -> Array:
-        """Return the upward acceleration by the contact force."""
         return force / self.mass
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
-        """Return the final height."""
         return q[0]
 
     def mjcf(self) -> str:
-        """Return a sphere on a vertical slide, over a plane."""
         return f"""
             <worldbody>
               <geom name="ground" type="plane" size="1 1 1"/>

@@ -41,31 +41,24 @@ class BouncingBall(EngineTwin, ContactScene):
     restitution: float = param(1.0, "restitution of impulse laws and of the physical gradient", low=0.0, high=1.0)
 
     def theta0(self) -> np.ndarray:
-        """Return (height, velocity)."""
         return np.array([self.height, self.velocity])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """Return the height and velocity in theta."""
         return State(theta[0:1], theta[1:2])
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """Return gravity."""
         return 0.0 * q - self.gravity
 
     def gap(self, xp: Any, q: Array) -> Array:
-        """Return q."""
         return q
 
     def gap_rate(self, xp: Any, q: Array, v: Array) -> Array:
-        """Return v."""
         return v
 
     def contact_acceleration(self, xp: Any, q: Array, force: Array) -> Array:
-        """Return the upward acceleration by the contact force."""
         return force / self.mass
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
-        """Return the squared distance to the target."""
         return (q[0] - self.target) ** 2
 
     def mjcf(self) -> str:
@@ -82,12 +75,10 @@ class BouncingBall(EngineTwin, ContactScene):
             <contact><pair geom1="ground" geom2="ball" condim="1"/></contact>"""
 
     def physical_gradient(self) -> np.ndarray | None:
-        """Return grad f for rigid bounces with the scene's restitution, event by event; None if the ball stops."""
         final = self._rigid_end()
         return None if final is None else np.asarray(2 * (final[0] - self.target) * final[1])
 
     def physical_cost(self) -> float | None:
-        """Return f for rigid bounces with the scene's restitution; None if the ball stops."""
         final = self._rigid_end()
         return None if final is None else (final[0] - self.target) ** 2
 

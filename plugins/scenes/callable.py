@@ -30,7 +30,6 @@ class Callable(CallableScene):
         return _loaded(self.cost, self.theta, self.grad, self.batch, self.own_noise)
 
     def files(self) -> tuple[Path, ...]:
-        """Return the file that defines the cost."""
         return simulator_files(self.cost)
 
 

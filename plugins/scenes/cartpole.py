@@ -40,7 +40,6 @@ class Cartpole(EngineTwin, MechanicalScene):
         return np.array([-3.0, -40.0, -4.0, -8.0])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """Return the state at rest, with the pole leaning by ``angle``."""
         zero = 0.0 * theta[0]
         return State(xp.stack([zero, zero + self.angle]), xp.stack([zero, zero]))
 
@@ -49,14 +48,12 @@ class Cartpole(EngineTwin, MechanicalScene):
         return -(theta[0:1] * q[0:1] + theta[1:2] * q[1:2] + theta[2:3] * v[0:1] + theta[3:4] * v[1:2])
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """Return the accelerations of cart and pole under the force u on the cart."""
         sine, cosine = xp.sin(q[1]), xp.cos(q[1])
         swing = self.length * v[1] * v[1] - self.gravity * cosine
         cart = (u[0] + self.pole_mass * sine * swing) / (self.cart_mass + self.pole_mass * sine * sine)
         return xp.stack([cart, (self.gravity * sine - cart * cosine) / self.length])
 
     def mjcf(self) -> str:
-        """Return a point mass above a hinge on a cart."""
         return f"""
             <option gravity="0 0 {-self.gravity}"/>
             <worldbody>
@@ -72,9 +69,7 @@ class Cartpole(EngineTwin, MechanicalScene):
             <actuator><motor joint="track"/></actuator>"""
 
     def stage_cost(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """Return the squared distance from the origin and the effort of one step."""
         return self.dt * (q[0] ** 2 + 10.0 * q[1] ** 2 + 0.01 * u[0] ** 2)
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
-        """Return the squared distance of the last state from rest at the origin."""
         return q[0] ** 2 + 10.0 * q[1] ** 2 + 0.1 * v[0] ** 2 + 0.1 * v[1] ** 2

@@ -38,12 +38,10 @@ class CartpoleSwing(PolicyScene):
     force: float = param(10.0, "largest force on the cart", "N", positive=True)
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """Return the state at rest with the pole hanging."""
         zero = 0.0 * theta[0]
         return State(xp.stack([zero, zero - math.pi]), xp.stack([zero, zero]))
 
     def random_start(self, xp: Any, e: Array) -> State:
-        """Return the random initial states."""
         u = uniform(xp, e) - 0.5
         return State(xp.stack([math.pi * u[0], math.pi * u[1] - math.pi]), 0.5 * u[2:4])
 
@@ -52,7 +50,6 @@ class CartpoleSwing(PolicyScene):
         return xp.stack([q[0], v[0], xp.sin(q[1]), xp.cos(q[1]), v[1]])
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """Return the accelerations of cart and pole."""
         sine, cosine, mass = xp.sin(q[1]), xp.cos(q[1]), self.cart_mass + self.pole_mass
         moment = self.pole_mass * self.length
         pushed = (self.force * xp.tanh(u[0]) + moment * v[1] * v[1] * sine) / mass
@@ -62,10 +59,8 @@ class CartpoleSwing(PolicyScene):
         return xp.stack([pushed - moment * turn * cosine / mass, turn])
 
     def stage_cost(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """Return the cost of one step."""
         angle = xp.atan2(xp.sin(q[1]), xp.cos(q[1]))
         return angle**2 + 0.1 * v[1] ** 2 + 0.05 * q[0] ** 2 + 0.1 * v[0] ** 2
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
-        """Return 0."""
         return 0.0 * q[0]

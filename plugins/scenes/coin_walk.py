@@ -34,11 +34,9 @@ class CoinWalk(EventScene, DisturbedScene):
     effort: float = param(2.0, "weight of the squared push", low=0.0)
 
     def theta0(self) -> np.ndarray:
-        """Return (push, pull)."""
         return np.array([self.push, self.pull])
 
     def disturbed_cost(self, xp: Any, x: Array, e: Array) -> Array:
-        """Return the cost of each path."""
         q = 0.0 * x[0] + 0.0 * e[0]
         for t in range(self.exogenous):
             up = e[t] < x[0] - x[1] * q
@@ -46,7 +44,6 @@ class CoinWalk(EventScene, DisturbedScene):
         return (q - self.goal) ** 2 + self.effort * x[0] ** 2
 
     def events(self, theta: np.ndarray, w: np.ndarray) -> Events:
-        """Return the steps up, one event per step."""
         x = np.reshape(theta, (2, 1)) + self.sigma * w[:2]
         q = np.zeros(w.shape[1])
         limits, slopes = [], []

@@ -28,5 +28,4 @@ class Constant(FunctionScene):
         return 0.0 * xp.sum(x, axis=0) + self.value
 
     def closed_form_gradient(self, contact: ContactLaw | None, integrator: Plugin | None) -> np.ndarray:
-        """Return zero."""
         return np.zeros(self.dimension)

@@ -30,7 +30,6 @@ class DoubleIntegrator(EngineTwin, MechanicalScene):
     control: float = param(1.0, "control of every step at theta", "m/s^2")
 
     def theta0(self) -> np.ndarray:
-        """Return the same control for every step."""
         return np.full(self.horizon, self.control)
 
     def initial_state(self, xp: Any, theta: Array) -> State:
@@ -39,7 +38,6 @@ class DoubleIntegrator(EngineTwin, MechanicalScene):
         return State(zero, zero)
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """Return the control."""
         return u
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:

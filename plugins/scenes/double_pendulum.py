@@ -34,7 +34,6 @@ class DoublePendulum(MechanicalScene):
         return np.array([0.5 * np.pi, 0.0, 5.0, -5.0])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """Return the initial state, theta."""
         return State(theta[:2], theta[2:])
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
@@ -45,7 +44,6 @@ class DoublePendulum(MechanicalScene):
         return xp.stack([f1 - c * f2, 2.0 * f2 - c * f1]) / (2.0 - c * c)
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
-        """Return the height of the first mass above its lowest point, in rod lengths."""
         return 1.0 - xp.cos(q[0])
 
     def energy(self, xp: Any, q: Array, v: Array) -> Array:

@@ -51,25 +51,20 @@ class FrictionBlock(FrictionScene):
     restitution: float = param(0.0, "restitution of impulse laws", low=0.0, high=1.0)
 
     def theta0(self) -> np.ndarray:
-        """Return (V, a)."""
         return np.array([self.pull, self.jerk])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """Return the state at rest, with the spring unstretched."""
         zero = 0.0 * theta[0]
         return State(xp.stack([zero, zero - self.depth]), xp.stack([zero, zero]))
 
     def planned_controls(self, xp: Any, theta: Array) -> Array:
-        """Return p, the position of the spring's end at each step, ``(horizon, 1, B)``."""
         time = self.dt * xp.astype(xp.arange(self.horizon), theta.dtype)[:, None]
         return (theta[0] * (time - theta[1] * xp.sin(self.frequency * time) / self.frequency))[:, None, :]
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """Return the accelerations by the spring and by gravity."""
         return xp.stack([self.spring * (u[0] - q[0]) / self.mass, 0.0 * v[1] - self.gravity])
 
     def gap(self, xp: Any, q: Array) -> Array:
-        """Return z."""
         return q[1:2]
 
     def gap_rate(self, xp: Any, q: Array, v: Array) -> Array:
@@ -77,7 +72,6 @@ class FrictionBlock(FrictionScene):
         return v[1:2]
 
     def contact_acceleration(self, xp: Any, q: Array, force: Array) -> Array:
-        """Return the upward acceleration by the normal force."""
         return xp.stack([0.0 * force[0], force[0] / self.mass])
 
     def slip(self, xp: Any, q: Array, v: Array) -> Array:
@@ -85,7 +79,6 @@ class FrictionBlock(FrictionScene):
         return v[0:1]
 
     def friction_acceleration(self, xp: Any, q: Array, force: Array) -> Array:
-        """Return the acceleration along x by the friction force."""
         return xp.stack([force[0] / self.mass, 0.0 * force[0]])
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:

@@ -45,36 +45,28 @@ class GroundWall(ContactScene):
     target_y: float = param(1.5, "y of the target", "m")
 
     def theta0(self) -> np.ndarray:
-        """Return (vx, vy)."""
         return np.array([self.velocity_x, self.velocity_y])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """Return the fixed initial position, with velocity theta."""
         zero = 0.0 * theta[0]
         return State(xp.stack([zero + self.start_x, zero + self.start_y]), theta)
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """Return gravity."""
         return xp.stack([0.0 * v[0], 0.0 * v[1] - self.gravity])
 
     def gap(self, xp: Any, q: Array) -> Array:
-        """Return the distances of the ball's surface from the ground and the wall."""
         return xp.stack([q[1] - self.radius, self.wall - self.radius - q[0]])
 
     def gap_rate(self, xp: Any, q: Array, v: Array) -> Array:
-        """Return (vy, -vx)."""
         return xp.stack([v[1], -v[0]])
 
     def contact_acceleration(self, xp: Any, q: Array, force: Array) -> Array:
-        """Return the accelerations, upwards by the ground and to the left by the wall."""
         return xp.stack([-force[1], force[0]]) / self.mass
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
-        """Return the squared distance to the target."""
         return (q[0] - self.target_x) ** 2 + (q[1] - self.target_y) ** 2
 
     def physical_gradient(self) -> np.ndarray | None:
-        """Return grad f for rigid impacts with the scene's restitution, event by event; None if the ball stops."""
         final = self._rigid_end()
         if final is None:
             return None
@@ -82,7 +74,6 @@ class GroundWall(ContactScene):
         return np.array([2 * (x - self.target_x) * x_slope, 2 * (y - self.target_y) * y_slope])
 
     def physical_cost(self) -> float | None:
-        """Return f for rigid impacts with the scene's restitution; None if the ball stops."""
         final = self._rigid_end()
         return None if final is None else (final[0][0] - self.target_x) ** 2 + (final[1][0] - self.target_y) ** 2
 

@@ -23,7 +23,6 @@ class Heaviside(EventScene, FunctionScene):
     theta: float = param(0.0, "where the gradient is estimated; the jump is at 0")
 
     def theta0(self) -> np.ndarray:
-        """Return theta, ``(1,)``."""
         return np.array([self.theta])
 
     def cost(self, xp: Any, x: Array) -> Array:
@@ -36,7 +35,6 @@ class Heaviside(EventScene, FunctionScene):
         return half_spaces(np.ones((1, 1)), np.zeros(1), self.sigma, theta, w)
 
     def breakpoints(self) -> tuple[tuple[float, ...], ...]:
-        """Return the position of the jump."""
         return ((0.0,),)
 
     def closed_form_gradient(self, contact: ContactLaw | None, integrator: Plugin | None) -> np.ndarray:

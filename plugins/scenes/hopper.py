@@ -53,7 +53,6 @@ class Hopper(EngineTwin, ContactScene):
         return np.array([100.0, 400.0])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """Return the state at rest in the air, with the leg at its rest length."""
         zero = 0.0 * theta[0]
         return State(xp.stack([zero + self.drop + self.leg, zero + self.drop]), xp.stack([zero, zero]))
 
@@ -63,24 +62,19 @@ class Hopper(EngineTwin, ContactScene):
         return xp.stack([self._compression(q) * v[0] * gain])
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """Return the accelerations by gravity and the leg."""
         push = self.leg_stiffness * self._compression(q) + self.leg_damping * (v[1] - v[0]) + u[0]
         return xp.stack([push / self.body_mass - self.gravity, -push / self.foot_mass - self.gravity])
 
     def gap(self, xp: Any, q: Array) -> Array:
-        """Return the height of the foot."""
         return q[1:2]
 
     def gap_rate(self, xp: Any, q: Array, v: Array) -> Array:
-        """Return the velocity of the foot."""
         return v[1:2]
 
     def contact_acceleration(self, xp: Any, q: Array, force: Array) -> Array:
-        """Return the upward acceleration of the foot by the contact force."""
         return xp.stack([0.0 * force[0], force[0] / self.foot_mass])
 
     def mjcf(self) -> str:
-        """Return body and foot on vertical slides, a tendon as the leg between them, the foot a sphere over a plane."""
         return f"""
             <option gravity="0 0 {-self.gravity}"/>
             <worldbody>
@@ -104,11 +98,9 @@ class Hopper(EngineTwin, ContactScene):
             <actuator><motor tendon="leg"/></actuator>"""
 
     def stage_cost(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """Return the step's share of error and effort."""
         return (self.terminal_cost(xp, q, v) + self.effort * u[0] ** 2) / self.horizon
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
-        """Return the squared error of the energy height."""
         return (self._energy_height(q, v) - self.target) ** 2
 
     def _compression(self, q: Array) -> Array:

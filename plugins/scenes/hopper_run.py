@@ -71,7 +71,6 @@ class HopperRun(PolicyScene, FrictionScene):
         return State(xp.stack([zero, zero + 0.1 + self.leg, zero, zero, zero + 0.1]), xp.stack([zero] * 5))
 
     def random_start(self, xp: Any, e: Array) -> State:
-        """Return the random initial states."""
         u = uniform(xp, e)
         zero, foot, angle = 0.0 * u[0], 0.2 * u[0], 0.2 * u[1] - 0.1
         q = [zero, foot + self.leg * xp.cos(angle), 0.2 * u[2] - 0.1, self.leg * xp.sin(angle), foot]
@@ -79,14 +78,12 @@ class HopperRun(PolicyScene, FrictionScene):
         return State(xp.stack(q), xp.stack([forward, upward, zero, forward, upward]))
 
     def observation(self, xp: Any, q: Array, v: Array) -> Array:
-        """Return the heights, the leg's extension and angles, and the rates."""
         length, angle, _, (stretching, across) = self._leg(xp, q, v)
         return xp.stack([
             q[1], length - self.leg, q[4], q[2], angle - q[2], v[1], stretching, v[0], v[2], across / length - v[2],
         ])  # fmt: skip
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """Return the accelerations of body and foot by gravity, leg and hip."""
         length, angle, (x, z), (stretching, _) = self._leg(xp, q, v)
         push = self.leg_stiffness * (self.leg - length) - self.leg_damping * stretching + self.thrust * xp.tanh(u[0])
         turn = self.torque * xp.tanh(u[1]) - self.hip_stiffness * (angle - q[2])
@@ -99,29 +96,23 @@ class HopperRun(PolicyScene, FrictionScene):
         ])  # fmt: skip
 
     def gap(self, xp: Any, q: Array) -> Array:
-        """Return the height of the foot."""
         return q[4:5]
 
     def gap_rate(self, xp: Any, q: Array, v: Array) -> Array:
-        """Return the vertical velocity of the foot."""
         return v[4:5]
 
     def contact_acceleration(self, xp: Any, q: Array, force: Array) -> Array:
-        """Return the upward acceleration of the foot by the contact force."""
         zero = 0.0 * force[0]
         return xp.stack([zero, zero, zero, zero, force[0] / self.foot_mass])
 
     def slip(self, xp: Any, q: Array, v: Array) -> Array:
-        """Return the horizontal velocity of the foot."""
         return v[3:4]
 
     def friction_acceleration(self, xp: Any, q: Array, force: Array) -> Array:
-        """Return the horizontal acceleration of the foot by friction."""
         zero = 0.0 * force[0]
         return xp.stack([zero, zero, zero, force[0] / self.foot_mass, zero])
 
     def has_ended(self, xp: Any, q: Array, v: Array) -> Array:
-        """Return whether the body is too low or has tilted over."""
         return (q[1] < self.low) | (xp.abs(q[2]) > self.tilt)
 
     def stage_cost(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
@@ -133,7 +124,6 @@ class HopperRun(PolicyScene, FrictionScene):
         return xp.where(self.has_ended(xp, q, v), 0.0 * reward, -reward)
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
-        """Return 0."""
         return 0.0 * q[0]
 
     def _leg(self, xp: Any, q: Array, v: Array) -> tuple[Array, Array, tuple[Array, Array], tuple[Array, Array]]:

@@ -33,7 +33,6 @@ class Ledge(EventScene, FunctionScene):
         return np.array([0.1, 0.2])
 
     def cost(self, xp: Any, x: Array) -> Array:
-        """Return the plane with its ledge."""
         inside = _NORMAL[0] * x[0] + _NORMAL[1] * x[1] >= self.edge
         beyond = self.height + _CHANGE[0] * x[0] + _CHANGE[1] * x[1]
         return _SLOPE[0] * x[0] + _SLOPE[1] * x[1] + xp.where(inside, beyond, 0.0 * beyond)
@@ -43,7 +42,6 @@ class Ledge(EventScene, FunctionScene):
         return half_spaces(_NORMAL[None], np.array([self.edge]), self.sigma, theta, w)
 
     def closed_form_gradient(self, contact: ContactLaw | None, integrator: Plugin | None) -> np.ndarray:
-        """Return the gradient of the class description."""
         theta = self.theta0()
         z = (float(_NORMAL @ theta) - self.edge) / self.sigma
         density = math.exp(-0.5 * z * z) / math.sqrt(2 * math.pi)

@@ -27,11 +27,9 @@ class Linear(FunctionScene):
         return np.linspace(0.5, 1.5, self.dimension)
 
     def cost(self, xp: Any, x: Array) -> Array:
-        """Return a . x."""
         return self.slope * xp.sum(xp.asarray(_ramp(self.dimension)[:, None], dtype=x.dtype) * x, axis=0)
 
     def closed_form_gradient(self, contact: ContactLaw | None, integrator: Plugin | None) -> np.ndarray:
-        """Return the slopes a."""
         return np.asarray(self.slope * _ramp(self.dimension))
 
 

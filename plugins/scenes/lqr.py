@@ -38,24 +38,19 @@ class Lqr(KnownOptimum, KnownValue, MechanicalScene):
     end_speed: float = param(1.0, "weight of v^2 at the end", "s^2/m^2", low=0.0)
 
     def theta0(self) -> np.ndarray:
-        """Return the same control for every step."""
         return np.full(self.horizon, self.control)
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """Return the state at rest at ``start``."""
         zero = 0.0 * theta[:1]
         return State(zero + self.start, zero)
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """Return the control."""
         return u
 
     def stage_cost(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """Return the weighted squares of the state before the step and of the control."""
         return self.position * q[0] ** 2 + self.speed * v[0] ** 2 + self.effort * u[0] ** 2
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
-        """Return the weighted squares of the end state."""
         return self.end_position * q[0] ** 2 + self.end_speed * v[0] ** 2
 
     def optimum(self, contact: ContactLaw | None, integrator: Plugin | None) -> tuple[float, str] | None:

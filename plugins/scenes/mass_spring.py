@@ -35,19 +35,15 @@ class MassSpring(Oscillator, DampedScene):
     rate: float = param(0.0, "initial rate of the stretch at theta", "m/s")
 
     def theta0(self) -> np.ndarray:
-        """Return (stretch, rate)."""
         return np.array([self.stretch, self.rate])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """Return the stretch and rate in theta."""
         return State(theta[0:1], theta[1:2])
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """Return the acceleration by spring and damper on both masses."""
         return -2.0 / self.mass * (self.stiffness * q + self.damping * v)
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
-        """Return the squared stretch."""
         return q[0] * q[0]
 
     def energy(self, q: Array, v: Array) -> Array:

@@ -35,11 +35,9 @@ class MassSpringDamper(Identified, MechanicalScene):
     hold: float = param(0.0, "target x", "m")
 
     def theta0(self) -> np.ndarray:
-        """Return the position at the start."""
         return np.array([self.start])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """Return the state at rest at theta."""
         return State(theta[:1], 0.0 * theta[:1])
 
     def planned_controls(self, xp: Any, theta: Array) -> Array:
@@ -48,13 +46,10 @@ class MassSpringDamper(Identified, MechanicalScene):
         return (xp.sin(time) + 0.0 * theta[0])[:, None, :]
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """Return the sum of the spring, damper and external forces over the mass."""
         return (self.force * u - self.stiffness * q - self.damping * v) / self.mass
 
     def stage_cost(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """Return the step's share of the mean squared distance."""
         return (q[0] - self.hold) ** 2 / self.horizon
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
-        """Return 0."""
         return 0.0 * q[0]

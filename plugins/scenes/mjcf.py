@@ -100,7 +100,6 @@ class Mjcf(PolicyScene, JointScene):
         return (Path(str(self.module.__file__)), *_model_files(self.path))
 
     def model_file(self) -> Path:
-        """Return the MJCF file. Raises :class:`UserError` if it cannot be read."""
         _ = self.robot
         return self.path
 
@@ -144,17 +143,14 @@ class Mjcf(PolicyScene, JointScene):
     # --------------------------------------------------------------------------------------------------- physics
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """Return the start of the MJCF file."""
         zero = 0.0 * theta[:1]
         return State(*(xp.asarray(part[:, None], dtype=theta.dtype) + zero for part in self.robot[:2]))
 
     def random_start(self, xp: Any, e: Array) -> State:
-        """Return the random starts of the Python file."""
         q, v = (xp.asarray(part[:, None], dtype=e.dtype) + 0.0 * e[:1] for part in self.robot[:2])
         return State(*self._function("random_start")(xp, q, v, e))
 
     def observation(self, xp: Any, q: Array, v: Array) -> Array:
-        """Return the observation of the Python file."""
         return self.module.observation(xp, q, v)
 
     def feedback(self, xp: Any, theta: Array, q: Array, v: Array) -> Array:

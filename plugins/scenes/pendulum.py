@@ -35,16 +35,13 @@ class Pendulum(EngineTwin, MechanicalScene):
     effort: float = param(1e-3, "cost per squared torque and second", "1/(N^2 m^2 s)", low=0.0)
 
     def theta0(self) -> np.ndarray:
-        """Return the same torque for every step."""
         return np.full(self.horizon, self.torque)
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """Return the state hanging at rest."""
         zero = 0.0 * theta[:1]
         return State(zero, zero)
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """Return the torques of control, damping and gravity over the moment of inertia."""
         inertia = self.mass * self.length * self.length
         return (u - self.damping * v) / inertia - self.gravity / self.length * xp.sin(q)
 
@@ -61,7 +58,6 @@ class Pendulum(EngineTwin, MechanicalScene):
             <actuator><motor joint="pivot"/></actuator>"""
 
     def stage_cost(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """Return the effort of one step."""
         return self.effort * self.dt * u[0] * u[0]
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:

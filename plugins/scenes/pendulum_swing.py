@@ -35,11 +35,9 @@ class PendulumSwing(MechanicalScene):
     terminal: float = param(20.0, "weight of the end state", low=0.0)
 
     def theta0(self) -> np.ndarray:
-        """Return the same torque for every step."""
         return np.full(self.horizon, self.torque)
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """Return the state hanging at rest."""
         zero = 0.0 * theta[:1]
         return State(zero, zero)
 
@@ -48,11 +46,9 @@ class PendulumSwing(MechanicalScene):
         return u - xp.sin(q)
 
     def stage_cost(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """Return the squared distance from rest upright, plus the weighted squared torque."""
         return self._distance(q, v) + self.effort * u[0] ** 2
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
-        """Return the weighted squared distance from rest upright."""
         return self.terminal * self._distance(q, v)
 
     @staticmethod

@@ -41,16 +41,13 @@ class Pushing(EngineTwin, ZeroOrderHoldScene, DampedScene, ContactScene):
     restitution: float = param(0.0, "restitution of impulse laws", low=0.0, high=1.0)
 
     def theta0(self) -> np.ndarray:
-        """Return the same push for every control."""
         return np.full(self.controls, self.push)
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """Return the bodies just touching, the first moving at ``speed``."""
         zero = 0.0 * theta[0]
         return State(xp.stack([zero, zero + 1.0]), xp.stack([zero + self.speed, zero]))
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """Return the accelerations by the push on the first body."""
         return xp.stack([u[0] / self.mass, 0.0 * u[0]])
 
     def gap(self, xp: Any, q: Array) -> Array:
@@ -62,7 +59,6 @@ class Pushing(EngineTwin, ZeroOrderHoldScene, DampedScene, ContactScene):
         return v[1:2] - v[0:1]
 
     def contact_acceleration(self, xp: Any, q: Array, force: Array) -> Array:
-        """Return the accelerations by equal and opposite forces on the bodies."""
         return xp.stack([-force[0] / self.mass, force[0] / self.mass])
 
     def mjcf(self) -> str:
@@ -83,7 +79,6 @@ class Pushing(EngineTwin, ZeroOrderHoldScene, DampedScene, ContactScene):
             <actuator><motor joint="first"/></actuator>"""
 
     def stage_cost(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """Return the distance to the goal before the step, plus effort, divided by ``hold``."""
         return (self.terminal_cost(xp, q, v) + u[0] * u[0]) / self.hold
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:

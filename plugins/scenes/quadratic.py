@@ -28,12 +28,10 @@ class Quadratic(FunctionScene):
         return np.linspace(0.5, 1.5, self.dimension)
 
     def cost(self, xp: Any, x: Array) -> Array:
-        """Return the sum of the weighted squares, ``(B,)``."""
         exponents = xp.asarray(_exponents(self.dimension)[:, None], dtype=x.dtype)
         return 0.5 * xp.sum(self.condition**exponents * x * x, axis=0)
 
     def closed_form_gradient(self, contact: ContactLaw | None, integrator: Plugin | None) -> np.ndarray:
-        """Return c theta."""
         return np.asarray(self.condition ** _exponents(self.dimension) * self.theta0())
 
 

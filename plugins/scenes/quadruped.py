@@ -46,11 +46,9 @@ class Quadruped(Legged):
     target: float = param(0.1, "target forward position at the end", "m")
 
     def theta0(self) -> np.ndarray:
-        """Return the angles of a stance with bent knees."""
         return np.tile([0.0, self.bend, -2 * self.bend], 4)
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """Return the bent stance with all feet just above the ground and the torso in motion."""
         zero = 0.0 * theta[0]
         bend = zero + self.bend
         height = 2 * self.link * xp.cos(bend) + self.foot_radius + self.clearance
@@ -63,7 +61,6 @@ class Quadruped(Legged):
         return self.gain * (theta - q[6:]) - self.damping * v[6:]
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
-        """Return the squared distance to the target."""
         return (q[0] - self.target) ** 2 + q[1] ** 2
 
     def leg(self, name: str) -> str:

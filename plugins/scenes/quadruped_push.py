@@ -47,17 +47,14 @@ class QuadrupedPush(Quadruped):
     effort: float = param(1e-4, "weight of the mean squared torques", "1/(N m)^2", low=0.0)
 
     def theta0(self) -> np.ndarray:
-        """Return a plan that holds the hips at ``lean`` and the knees in the stance."""
         return np.tile([self.lean, 0.0, self.lean, 0.0], self.knots)
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """Return the bent stance with all feet just above the ground, and the block at rest."""
         q, v = super().initial_state(xp, theta)
         block = 0.0 * theta[:1]
         return State(xp.concat([q, block]), xp.concat([v, block]))
 
     def planned_controls(self, xp: Any, theta: Array) -> Array:
-        """Return gain times the planned angles, ``(horizon, 12, B)``."""
         plan = xp.reshape(theta, (self.knots, 4, theta.shape[1]))[np.arange(self.horizon) * self.knots // self.horizon]
         side = 0.0 * plan[:, 0]
         front, back = ([side, plan[:, i] + self.bend, plan[:, i + 1] - 2 * self.bend] for i in (0, 2))
@@ -68,11 +65,9 @@ class QuadrupedPush(Quadruped):
         return -self.gain * q[6:18] - self.damping * v[6:18]
 
     def stage_cost(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """Return the effort of one step."""
         return self.effort / self.horizon * xp.sum(u * u, axis=0)
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
-        """Return the weighted squared distance of the block from its target, and the tilt of the torso."""
         return self.block * (1.0 - q[18] / self.target) ** 2 + self.upright * (q[4] ** 2 + q[5] ** 2)
 
     def mjcf(self) -> str:

@@ -33,7 +33,6 @@ class SlidingBlock(Identified, MechanicalScene):
     goal: float = param(2.0, "target x at the end", "m")
 
     def theta0(self) -> np.ndarray:
-        """Return the initial speed."""
         return np.array([self.speed])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
@@ -41,10 +40,8 @@ class SlidingBlock(Identified, MechanicalScene):
         return State(0.0 * theta[:1], theta[:1])
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """Return the deceleration by friction, limited to the deceleration that stops the block within the step."""
         most, stop = self.friction * self.gravity, v / self.dt
         return -xp.where(stop < most, stop, most + 0.0 * v)
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
-        """Return the squared distance from the goal."""
         return (q[0] - self.goal) ** 2

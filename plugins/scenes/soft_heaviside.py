@@ -25,7 +25,6 @@ class SoftHeaviside(FunctionScene):
     nu: float = param(0.1, "width of the ramp", positive=True)
 
     def theta0(self) -> np.ndarray:
-        """Return theta, ``(1,)``."""
         return np.array([self.theta])
 
     def cost(self, xp: Any, x: Array) -> Array:
@@ -35,7 +34,6 @@ class SoftHeaviside(FunctionScene):
         return xp.where(z > 1, flat + 1.0, xp.where(z < -1, flat - 1.0, z))
 
     def breakpoints(self) -> tuple[tuple[float, ...], ...]:
-        """Return the positions of both ends of the ramp."""
         return ((-self.nu / 2, self.nu / 2),)
 
     def probability(self) -> float:

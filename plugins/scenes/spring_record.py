@@ -33,7 +33,6 @@ class SpringRecord(KnownOptimum, MechanicalScene):
     guess: float = param(1.3, "k at theta over that of the record", positive=True)
 
     def theta0(self) -> np.ndarray:
-        """Return the guessed stiffness and no damping."""
         return np.array([self.guess * self.stiffness, 0.0])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
@@ -42,15 +41,12 @@ class SpringRecord(KnownOptimum, MechanicalScene):
         return State(zero + 1.0, zero)
 
     def planned_controls(self, xp: Any, theta: Array) -> Array:
-        """Return theta for each step, ``(horizon, 2, B)``."""
         return xp.zeros((self.horizon, 1, 1), dtype=theta.dtype) + theta
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """Return the acceleration with theta's spring and damper, then with the record's."""
         return xp.stack([-u[0] * q[0] - u[1] * v[0], -self.stiffness * q[1] - self.damping * v[1]])
 
     def stage_cost(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """Return the step's share of the mean squared distance."""
         return (q[0] - q[1]) ** 2 / self.horizon
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:

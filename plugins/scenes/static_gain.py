@@ -51,11 +51,9 @@ class StaticGain(KnownOptimum, KnownValue, MechanicalScene):
         return State(xp.concat([zero] * self.copies), xp.concat([zero + 1.0] * self.copies))
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """Return the control."""
         return u
 
     def feedback(self, xp: Any, theta: Array, q: Array, v: Array) -> Array:
-        """Return K x."""
         gains = xp.reshape(theta, (self.copies, self.copies, theta.shape[1]))
         return xp.sum(gains * v[None], axis=1)
 
@@ -64,7 +62,6 @@ class StaticGain(KnownOptimum, KnownValue, MechanicalScene):
         return xp.sum(v * v, axis=0) + self.effort * xp.sum(u * u, axis=0)
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
-        """Return the weighted square of the end state."""
         return self.end * xp.sum(v * v, axis=0)
 
     def optimum(self, contact: ContactLaw | None, integrator: Plugin | None) -> tuple[float, str] | None:

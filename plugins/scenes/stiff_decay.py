@@ -31,7 +31,6 @@ class StiffDecay(MechanicalScene):
     start: float = param(1.0, "x_0 at theta")
 
     def theta0(self) -> np.ndarray:
-        """Return (x_0,)."""
         return np.array([self.start])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
@@ -39,11 +38,9 @@ class StiffDecay(MechanicalScene):
         return State(theta[:0], theta)
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """Return rate x."""
         return self.rate * v
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
-        """Return x_N."""
         return v[0]
 
     def closed_form_gradient(self, contact: ContactLaw | None, integrator: Plugin | None) -> np.ndarray | None:

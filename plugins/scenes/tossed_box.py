@@ -37,20 +37,16 @@ class TossedBox(EngineScene):
     target: float = param(0.5, "target horizontal position at the end", "m")
 
     def theta0(self) -> np.ndarray:
-        """Return a forward velocity with spin."""
         return np.array([self.speed, 0.0, self.spin])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        """Return the box level at ``height``, with velocity theta."""
         zero = 0.0 * theta[0]
         return State(xp.stack([zero, zero + self.height, zero]), theta)
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
-        """Return the squared distance to the target."""
         return (q[0] - self.target) ** 2
 
     def mjcf(self) -> str:
-        """Return a body with a box's inertia and a small sphere in each corner, over a plane."""
         inertia = self.mass * self.side**2 / 6
         radius, half = 0.05 * self.side, 0.45 * self.side
         corners = {f"corner{i}{j}": (i * half, j * half) for i in (-1, 1) for j in (-1, 1)}

@@ -41,7 +41,6 @@ class TwoBalls(KnownOptimum, ContactScene):
     effort: float = param(0.1, "weight of the squared force", "m^2/(N^2 s)", positive=True)
 
     def theta0(self) -> np.ndarray:
-        """Return the same force for every step."""
         return np.full(2 * self.horizon, self.force)
 
     def initial_state(self, xp: Any, theta: Array) -> State:
@@ -54,25 +53,20 @@ class TwoBalls(KnownOptimum, ContactScene):
         return xp.stack([u[0], u[1], 0.0 * u[0], 0.0 * u[0]])
 
     def gap(self, xp: Any, q: Array) -> Array:
-        """Return the distance between the surfaces."""
         return xp.sqrt((q[2:3] - q[0:1]) ** 2 + (q[3:4] - q[1:2]) ** 2) - 2.0 * self.radius
 
     def gap_rate(self, xp: Any, q: Array, v: Array) -> Array:
-        """Return the speed at which the centres separate."""
         x, y = self._normal(xp, q)
         return x * (v[2:3] - v[0:1]) + y * (v[3:4] - v[1:2])
 
     def contact_acceleration(self, xp: Any, q: Array, force: Array) -> Array:
-        """Return accelerations that push both balls apart along the line of centres."""
         x, y = self._normal(xp, q)
         return xp.concat([-x * force, -y * force, x * force, y * force])
 
     def stage_cost(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """Return the effort of one step."""
         return self.effort * self.dt * (u[0] ** 2 + u[1] ** 2)
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
-        """Return the squared distance of the second ball from the goal."""
         return q[2] ** 2 + q[3] ** 2
 
     def optimum(self, contact: ContactLaw | None, integrator: Plugin | None) -> tuple[float, str] | None:

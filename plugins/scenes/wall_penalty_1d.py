@@ -35,7 +35,6 @@ class WallPenalty1d(EngineTwin, ContactScene):
     start: float = param(0.6, "q0 at theta", "m")
 
     def theta0(self) -> np.ndarray:
-        """Return (q0,)."""
         return np.array([self.start])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
@@ -47,11 +46,9 @@ class WallPenalty1d(EngineTwin, ContactScene):
         return 0.0 * v
 
     def gap(self, xp: Any, q: Array) -> Array:
-        """Return q."""
         return q
 
     def gap_rate(self, xp: Any, q: Array, v: Array) -> Array:
-        """Return v."""
         return v
 
     def contact_acceleration(self, xp: Any, q: Array, force: Array) -> Array:

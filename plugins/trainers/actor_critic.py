@@ -22,7 +22,6 @@ class ActorCritic(Neural):
     batches: int = param(4, "batches in a pass", positive=True)
 
     def steps_per_update(self, env: Any) -> int:
-        """Return rollouts times window."""
         return self.rollouts * self.window
 
     def critic_optimizer(self, env: Any) -> Any:
@@ -30,7 +29,6 @@ class ActorCritic(Neural):
         return self.adam(self.critic_rate, self.updates(env) * self.passes * self.batches)
 
     def start(self, env: Any, seed: Any) -> Run:
-        """Return a new actor and critic, and episodes at their starts."""
         import jax
 
         from bench.training.networks import Network

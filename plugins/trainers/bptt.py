@@ -24,11 +24,9 @@ class Bptt(Neural):
     discount: float = param(1.0, "gamma, factor on the reward of the next control step", positive=True, high=1.0)
 
     def steps_per_update(self, env: Any) -> int:
-        """Return rollouts times the length of an episode."""
         return self.rollouts * int(env.length)
 
     def update(self, env: Any, state: Run) -> tuple[Run, dict[str, Any]]:
-        """Return the state after one step on whole episodes."""
         import jax
         import jax.numpy as jnp
         import optax
@@ -52,7 +50,6 @@ class Bptt(Neural):
         return Run(actor, memory, known, state.episodes, key), log
 
     def parts(self, env: Any, state: Run, actor: Any, key: Any) -> tuple[Any, Any, Any]:
-        """Return rewards, ends and log probabilities of new episodes of an actor, each ``(T, B)``."""
         from bench.training import windows
 
         window = self._window(env, state, actor, key)

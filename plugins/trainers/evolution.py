@@ -27,7 +27,6 @@ class PopulationTrainer(Trainer):
     hidden: int = param(64, "width of the two hidden layers", positive=True)
 
     def steps_per_update(self, env: Any) -> int:
-        """Return population times the length of an episode."""
         return 2 * (self.population // 2) * int(env.length)
 
     def network(self, env: Any, key: Any) -> tuple[Any, Any]:
@@ -58,7 +57,6 @@ class PopulationTrainer(Trainer):
         return jnp.where(is_running, window.reward, 0.0).sum(axis=0), window
 
     def action(self, env: Any, state: Any, observation: Any) -> Any:
-        """Return the network's output."""
         import jax
 
         from bench.training import normaliser
@@ -87,7 +85,6 @@ class Evolution(PopulationTrainer):
         return adam(self.rate, self.updates(env), self.clip, 0.9, 0.999)
 
     def start(self, env: Any, seed: Any) -> Search:
-        """Return a new network."""
         import jax
 
         from bench.training import normaliser
@@ -97,7 +94,6 @@ class Evolution(PopulationTrainer):
         return Search(theta, self._optimizer(env).init(theta), normaliser.start(env.n_observations, env.dtype), key)
 
     def update(self, env: Any, state: Search) -> tuple[Search, dict[str, Any]]:
-        """Return the state after one population."""
         import jax
         import jax.numpy as jnp
         import optax

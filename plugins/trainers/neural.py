@@ -53,7 +53,6 @@ class Neural(Trainer):
         return self.adam(self.actor_rate, self.updates(env))
 
     def start(self, env: Any, seed: Any) -> Run:
-        """Return a new actor, and episodes at their starts."""
         import jax
 
         from bench.training import normaliser
@@ -67,11 +66,9 @@ class Neural(Trainer):
         return Run(actor, self.actor_optimizer(env).init(actor), known, episodes, key)
 
     def fresh(self, env: Any, state: Any, key: Any) -> Any:
-        """Return the state with all episodes at new starts."""
         return state._replace(episodes=env.start(env.normal(key, (env.n_start, self.rollouts))))
 
     def action(self, env: Any, state: Any, observation: Any) -> Any:
-        """Return the mean of the policy's distribution."""
         from bench.training import normaliser
 
         return state.actor.mean(normaliser.normalised(state.normaliser, observation))

@@ -31,13 +31,11 @@ class Ppo(ActorCritic):
     entropy: float = param(0.0, "weight of the actions' log deviation in the objective", low=0.0)
 
     def start(self, env: Any, seed: Any) -> Run:
-        """Return a new actor and critic, and episodes at their starts."""
         from bench.training import normaliser
 
         return super().start(env, seed)._replace(returns=normaliser.start(1, env.dtype))
 
     def actor_optimizer(self, env: Any) -> Any:
-        """Return the actor's optimizer, which takes a step per pass and batch."""
         return self.adam(self.actor_rate, self.updates(env) * self.passes * self.batches)
 
     def surrogate(self, actor: Any, seen: Any, action: Any, old: Any, advantage: Any) -> Any:
@@ -52,7 +50,6 @@ class Ppo(ActorCritic):
         return -jnp.minimum(ratio * advantage, clipped * advantage).mean() - self.entropy * actor.log_deviation.sum()
 
     def update(self, env: Any, state: Run) -> tuple[Run, dict[str, Any]]:
-        """Return the state after one window and ``passes`` over its states."""
         import jax
         import jax.numpy as jnp
         import optax

@@ -40,7 +40,6 @@ class SepCmaEs(PopulationTrainer):
     name = "sep_cma_es"
 
     def start(self, env: Any, seed: Any) -> Search:
-        """Return a new network as the mean, with step size ``width`` and equal variances."""
         import jax
         import jax.numpy as jnp
 
@@ -54,7 +53,6 @@ class SepCmaEs(PopulationTrainer):
         return Search(theta, sigma, jnp.ones_like(theta), zero, zero, jnp.zeros((), jnp.int32), known, key)
 
     def update(self, env: Any, state: Search) -> tuple[Search, dict[str, Any]]:
-        """Return the state after one population."""
         import jax
         import jax.numpy as jnp
 

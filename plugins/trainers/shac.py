@@ -33,7 +33,6 @@ class Shac(ActorCritic):
     entropy: float = param(0.0, "weight of the actions' log deviation in the objective", low=0.0)
 
     def update(self, env: Any, state: Run) -> tuple[Run, dict[str, Any]]:
-        """Return the state after one window, one step of the actor and ``passes`` of the critic."""
         import jax
         import jax.numpy as jnp
         import optax
@@ -69,7 +68,6 @@ class Shac(ActorCritic):
         return Run(actor, memory, known, episodes, key, Critic(network, target, critic_memory)), log
 
     def parts(self, env: Any, state: Run, actor: Any, key: Any, every: int = 0) -> tuple[Any, Any, Any]:
-        """Return gains, cuts and log probabilities of the next window of an actor, each ``(h, B)``."""
         from bench.training import windows
 
         assert state.critic is not None

@@ -17,16 +17,13 @@ from bench.conformance.subjects import law_for
 from bench.experiment import by_name
 from bench.model import compose, registry
 
-ENGINES = ("brax", "drake", "genesis", "mujoco_warp", "newton", "nimble", "taichi")
+ENGINES = ("brax", "drake", "genesis", "mujoco_warp", "newton", "taichi")
 SPRING = (-1.56802, -1.22481, -1.22481 / 480)
 """Gradient of one bounce on an undamped spring of 1e4 N/m under semi-implicit Euler, as in the tests of MuJoCo and MJX."""
-WRONG = {
-    "nimble-gradient_is_that_of_value": "its Jacobians are of rigid contact, its costs bounce once per step boundary",
-}
 pytestmark = pytest.mark.slow
 
 
-@bench.conformance.parametrize([registry.usable("backends", name) for name in ENGINES], expected_failures=WRONG)
+@bench.conformance.parametrize([registry.usable("backends", name) for name in ENGINES])
 def test_engine_conforms(plugin, check):
     check(plugin)
 

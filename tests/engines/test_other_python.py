@@ -32,8 +32,7 @@ from bench.engines import environments, process, twin
 from bench.engines.process import close_engines
 from bench.errors import Crashed, Unsupported
 from bench.experiment.keys import fingerprint
-from bench.model import LoopOps, Problem, compose, registry
-from bench.model.parameters import deciding
+from bench.model import Problem, compose, registry
 
 TOYS = Path(__file__).parent / "toys"
 HERE = sys.executable
@@ -379,12 +378,6 @@ def test_a_rigid_solver_stands_for_impulses_and_has_no_gradients():
     )
 
 
-def test_the_default_solver_keeps_the_keys_of_rows_from_before_there_were_others():
-    newton = registry.usable("backends", "newton")
-    assert "solver" not in deciding(newton())
-    assert len({fingerprint(newton(solver=name)) for name in ("featherstone", "semi_implicit", "xpbd")}) == 3
-
-
 def test_only_an_engine_that_declares_an_error_of_its_solver_may_differ_by_it(monkeypatch):
     """And only where there are contact forces to solve for."""
     allowed = [(program(BounceOnce()), 1e-9 + 1e-6), (program(Cartpole()), 1e-9)]
@@ -393,7 +386,7 @@ def test_only_an_engine_that_declares_an_error_of_its_solver_may_differ_by_it(mo
     assert [backends._allowed(toy(), of, 1e-9) for of, _ in allowed] == pytest.approx([error for _, error in allowed])
 
 
-# ----------------------------------------------------------------------------------------------- carries and nodes
+# --------------------------------------------------------------------------------------------------------- carries
 
 
 def counted(scene, theta, w):
@@ -423,66 +416,17 @@ def test_an_engine_has_numbers_beside_the_state():
     np.testing.assert_allclose(problem.grad(theta, w), differences, atol=1e-5 * np.abs(differences).max())
 
 
-def node_case(**values):
-    problem = toy(**values).compile(program(BounceOnce(horizon=60, dt=1 / 60)))
-    start = problem.program.start(LoopOps(), problem.program.theta0[:, None], np.zeros((problem.program.n_noise, 1)))[1]
-    return problem.step_node(), np.concatenate(start)
-
-
-@pytest.mark.parametrize("counts", [False, True])
-def test_a_step_node_is_differentiated_by_torch(counts):
-    torch = pytest.importorskip("torch")
-    node, first = node_case(counts=counts)
-    step, x = node.torch(), torch.tensor(first, requires_grad=True)
-    state, carry = x, torch.tensor(node.start(first))
-    u = torch.zeros((1, 1), dtype=torch.float64, requires_grad=True)
-    for _ in range(60):
-        state, carry = step(state, u, carry)
-    state[0].sum().backward()
-    for tensor, at in ((x, 0), (u, 1)):
-        expected = final_height_slope(node, first, at)
-        np.testing.assert_allclose(tensor.grad.numpy(), expected, atol=1e-5 * np.abs(expected).max())
-
-
-def final_height_slope(node, first, at):
-    """Return central differences of the last height by the first state (at 0) or the constant control (at 1)."""
-
-    def last(x, u):
-        carry = node.start(x)
-        for _ in range(60):
-            x, carry = node.step(x, u, carry)
-        return x[0, 0]
-
-    result = []
-    for i in range(2 if at == 0 else 1):
-        h = 1e-6 * np.eye(2)[:, [i]] if at == 0 else np.full((1, 1), 1e-6)
-        sides = [last(first + s * h, np.zeros((1, 1))) if at == 0 else last(first, s * h) for s in (1, -1)]
-        result.append([(sides[0] - sides[1]) / 2e-6])
-    return np.array(result)
-
-
-def test_a_step_node_is_differentiated_by_jax_in_a_compiled_scan():
-    jax = pytest.importorskip("jax")
-    node, first = node_case(counts=True)
-    step = node.jax()
-
-    def height(x, u):
-        def advance(state, _):
-            return step(state[0], u, state[1]), None
-
-        (state, _), _ = jax.lax.scan(advance, (x, jax.numpy.asarray(node.start(first))), None, 60)
-        return state[0, 0]
-
-    with jax.enable_x64(True):
-        by_x, by_u = jax.jit(jax.grad(height, (0, 1)))(jax.numpy.asarray(first), jax.numpy.zeros((1, 1)))
-    for gradient, at in ((by_x, 0), (by_u, 1)):
-        expected = final_height_slope(node, first, at)
-        np.testing.assert_allclose(gradient, expected, atol=1e-5 * np.abs(expected).max())
+def test_a_pull_is_the_slope_times_the_step_jacobians():
+    problem, draw = toy().compile(program(BounceOnce())), np.random.default_rng(0)
+    x, u, slope = draw.standard_normal((2, 5)), draw.standard_normal((1, 5)), draw.standard_normal((2, 5))
+    jacobians, pulled = problem.call("jacobians", x, u), problem.call("pull", x, u, slope)
+    for jacobian, product in zip(jacobians, pulled, strict=True):
+        np.testing.assert_allclose(product, np.einsum("nmb,nb->mb", jacobian, slope), rtol=1e-12)
 
 
 def test_a_state_that_is_not_finite_does_not_reach_the_engine():
-    node, first = node_case()
-    after, _ = node.step(np.concatenate([first, np.nan * first], axis=1), np.zeros((1, 2)), np.empty((0, 2)))
+    problem, x = toy().compile(program(BounceOnce())), np.array([[1.0], [0.0]])
+    (after,) = problem.call("step", np.concatenate([x, np.nan * x], axis=1), np.zeros((1, 2)))
     assert np.isfinite(after[:, 0]).all()
     assert np.isnan(after[:, 1]).all()
 

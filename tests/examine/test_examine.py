@@ -171,12 +171,6 @@ def test_gradient_that_raises_is_a_finding():
     assert "no tape" in str(report)
 
 
-def test_input_without_effect_warns_and_passes():
-    report = bench.examine(lambda x: x[0] ** 2, [1.0, 2.0], grad=lambda x: [2 * x[0], 0.0], **QUICK)
-    assert report.status == 0
-    assert "zero: theta[1]" in str(report)
-
-
 # -------------------------------------------------------------------------------------- jumps and noise
 
 
@@ -316,10 +310,6 @@ def test_a_check_under_other_noise_decides_too(right):
     assert (report.cause, report.status) == ("missing_term", 1)
 
 
-def test_smooth_line_has_no_breaks():
-    assert not scan(lambda x: np.tanh(30 * x[0]) + x[0] ** 3, np.zeros(1), np.ones(1), noise=1e-16).breaks
-
-
 def test_bias_at_a_jump_is_that_of_the_closed_form():
     """f = x^2 + 1[x > 0]: grad J = 2 theta + pdf(theta / sigma) / sigma, of which each gradient sees 2 theta."""
     theta, sigma = 0.1, 0.2
@@ -393,14 +383,13 @@ def test_cost_that_cannot_be_called_is_bad_input():
         bench.examine(lambda p: p["mass"], {"weight": 1.0}, **QUICK)
 
 
-def test_budget_bounds_everything():
+def test_budget_bounds_everything(now):
     def slow(x):
-        time.sleep(0.02)
+        now[0] += 0.02
         return bowl(x)
 
-    began = time.perf_counter()
     report = bench.examine(slow, [1.0, 0.5], grad=slope, sigma=[0.01, 0.1], progress=False, budget="1s")
-    assert time.perf_counter() - began < 2.0  # a second, and room for a busy machine
+    assert 0.5 < now[0] < 1.1
     assert "not done within the budget" in str(report)
 
 
@@ -436,11 +425,11 @@ def test_alarm_of_someone_else_is_left_alone():
         signal.signal(signal.SIGALRM, signal.SIG_DFL)
 
 
-def test_batches_are_planned_by_the_time_of_a_batch():
+def test_batches_are_planned_by_the_time_of_a_batch(now):
     """A call takes 4 ms, however many thetas it has: planned as if each took that, the whole check would be left out."""
 
     def columns(x):
-        time.sleep(0.004)
+        now[0] += 0.004
         return (x**2).sum(axis=0)
 
     report = bench.examine(columns, [1.0, 2.0], batch="columns", progress=False, budget=4)

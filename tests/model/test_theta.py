@@ -139,7 +139,7 @@ SOLVING = {
 
 
 @pytest.mark.needs("root")
-@pytest.mark.parametrize("case", SOLVING)
+@pytest.mark.parametrize("case", [pytest.param(n, marks=[pytest.mark.slow] * (n != "law")) for n in SOLVING])
 def test_columns_of_a_batch_have_parameters_of_their_own_in_equations(case, backend):
     """A solver that takes columns one by one has to find each column's own parameters."""
     *parts, names = SOLVING[case]

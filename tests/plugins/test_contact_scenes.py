@@ -129,6 +129,7 @@ def test_ground_wall_has_no_physical_gradient_at_rest():
 # ------------------------------------------------------------------------------------------------------ hopper
 
 
+@pytest.mark.slow
 def test_hopper_hops():
     """Stance and flight alternate, several times, and the apexes agree between contact laws."""
     apexes = {}

@@ -1,4 +1,4 @@
-"""Estimators that use declared events, against closed forms and exact sums over all outcomes, and a shrinking radius."""
+"""Estimators that use declared events, against closed forms and exact sums over all outcomes."""
 
 import dataclasses
 import itertools
@@ -15,7 +15,6 @@ from bench.plugins.estimators.fobg import Fobg
 from bench.plugins.estimators.reinforce import Reinforce
 from bench.plugins.estimators.stochastic_derivative import StochasticDerivative
 from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
-from bench.plugins.optimizers.homotopy import Homotopy
 from bench.plugins.scenes.coin_walk import CoinWalk
 from bench.plugins.scenes.cubic import Cubic
 from bench.plugins.scenes.heaviside import Heaviside
@@ -23,7 +22,7 @@ from bench.plugins.scenes.ledge import Ledge
 from bench.plugins.scenes.pushing import Pushing
 from scipy import stats
 
-from bench.model import Answer, Decision, DisturbedScene, Events, EventScene, FunctionScene, compose, half_spaces
+from bench.model import Decision, DisturbedScene, Events, EventScene, FunctionScene, compose, half_spaces
 from bench.studies.optimise.search import ScaledNoiseProblem
 
 LIMIT = 4.5
@@ -188,8 +187,16 @@ def test_the_closed_form_of_a_walk_without_pull_is_that_of_a_binomial():
     assert scene.closed_form_gradient(None, None)[0] == pytest.approx(expected, rel=1e-8)
 
 
-@pytest.mark.parametrize("scene", [CoinWalk(), CoinWalk(pull=-0.2, sigma=0.4), CoinWalk(push=-0.5, goal=-6.0)], ids=str)
-@pytest.mark.parametrize("estimator", [StochasticDerivative(), Boundary()], ids=str)
+@pytest.mark.parametrize(
+    ("scene", "estimator"),
+    [
+        (CoinWalk(pull=-0.2, sigma=0.4), StochasticDerivative()),
+        (CoinWalk(push=-0.5, goal=-6.0), StochasticDerivative()),
+        pytest.param(CoinWalk(pull=-0.2, sigma=0.4), Boundary(), marks=pytest.mark.slow),
+        pytest.param(CoinWalk(push=-0.5, goal=-6.0), Boundary(), marks=pytest.mark.slow),
+    ],
+    ids=str,
+)
 def test_events_in_a_row_are_unbiased(scene, estimator):
     assert agrees(estimates(estimator, scene, repeats=3000), scene.closed_form_gradient(None, None))
 
@@ -228,63 +235,3 @@ def test_the_plain_backend_agrees():
     p, w = Numpy().compile(compose(scene)), np.random.default_rng(3).standard_normal((5, 8, 10))
     values = StochasticDerivative().estimate(p, scene.theta0(), w)
     np.testing.assert_allclose(values, StochasticDerivative().estimate(problem(scene), scene.theta0(), w), rtol=1e-6)
-
-
-# ------------------------------------------------------------------------------------------ a shrinking radius
-
-
-def step(optimizer, cost, theta, seed=0):
-    state = optimizer.start(np.array(theta))
-    noise = np.random.default_rng(seed).standard_normal((len(theta), optimizer.draws(len(theta))))
-    points = optimizer.ask(state, noise)
-    return optimizer.tell(state, points, Answer(value=cost(points)))
-
-
-def test_homotopy_takes_the_derivatives_of_a_quadratic_by_theta_and_radius():
-    """F = theta' A theta / 2 + t^2 tr A / 2: the gradient A theta, whatever t, and dF/dt = t tr A."""
-    a, pairs, t = np.array([1.0, 3.0]), 400_000, 0.5
-    theta = np.array([2.0, -1.0])
-
-    def cost(x):
-        return 0.5 * a @ x**2
-
-    state = step(Homotopy(pairs=pairs, rate=0.1, radius=t, speed=0.1, shrink=0.99), cost, theta)
-    assert state["theta"] == pytest.approx(theta - 0.1 * a * theta, abs=0.01)
-    assert state["radius"] == pytest.approx(t - 0.1 * t * a.sum(), abs=0.005)
-    plain = step(Homotopy(pairs=4, radius=t, shrink=0.8), cost, theta)
-    assert plain["radius"] == pytest.approx(0.8 * t)
-
-
-def test_homotopy_shrinks_at_least_by_its_factor_and_not_below_its_least_radius():
-    concave = step(Homotopy(pairs=2000, speed=1.0, shrink=0.9), lambda x: -(x**2).sum(axis=0), [0.0])
-    assert concave["radius"] == pytest.approx(0.9)  # dF/dt < 0 would widen it
-    steep = step(Homotopy(pairs=2000, speed=100.0, least=0.02), lambda x: (x**2).sum(axis=0), [0.0])
-    assert steep["radius"] == 0.02
-    lost = step(Homotopy(pairs=10), lambda x: np.where(x[0] > 0.5, np.inf, x[0]), [0.5])
-    assert np.isfinite(lost["theta"]).all()
-
-
-def test_homotopy_slope_of_a_wave_falls_with_the_radius():
-    """F = exp(-k^2 t^2 / 2) cos(k theta) has the slope -k exp(-k^2 t^2 / 2) sin(k theta)."""
-    k, t = 3.0, 0.5
-    state = step(Homotopy(pairs=400_000, rate=1.0, radius=t), lambda x: np.cos(k * x[0]), [0.4])
-    assert 0.4 - state["theta"][0] == pytest.approx(-k * np.exp(-0.5 * (k * t) ** 2) * np.sin(k * 0.4), abs=0.01)
-
-
-@pytest.mark.parametrize("speed", [0.0, 1e-3])
-def test_homotopy_passes_local_minima_where_a_small_radius_stops(speed):
-    """x^2 / 2 - 2 cos(4 x) has its lowest minimum at 0 and local ones near 1.5, 3 and 4.4."""
-
-    def cost(x):
-        return 0.5 * x[0] ** 2 - 2.0 * np.cos(4.0 * x[0])
-
-    def end(optimizer):
-        state = optimizer.start(np.array([4.4]))
-        for i in range(300):
-            noise = np.random.default_rng(i).standard_normal((1, optimizer.draws(1)))
-            points = optimizer.ask(state, noise)
-            state = optimizer.tell(state, points, Answer(value=cost(points)))
-        return float(state["theta"][0])
-
-    assert abs(end(Homotopy(rate=0.02, radius=1.5, shrink=0.99, speed=speed))) < 0.1
-    assert end(Homotopy(rate=0.02, radius=0.05, shrink=0.99, speed=speed)) > 4.0

@@ -20,7 +20,10 @@ from bench.model import FunctionScene, compose
 
 SOLVED = 1e-12
 """The root finder stops at a relative change of 1e-12, and Newton's last step on a linear equation is exact."""
-SCENES = [pytest.param(Pushing(horizon=5), id="one unknown"), pytest.param(GroundWall(horizon=5), id="two unknowns")]
+SCENES = [
+    pytest.param(Pushing(horizon=5), id="one unknown", marks=pytest.mark.slow),
+    pytest.param(GroundWall(horizon=5), id="two unknowns"),
+]
 
 
 @pytest.mark.parametrize("scene", SCENES)
@@ -36,7 +39,7 @@ def test_a_column_that_cannot_be_solved_is_the_only_one_lost(scene):
         assert np.array_equal(part[..., ~lost], whole[..., ~lost])
 
 
-@pytest.mark.parametrize("unknowns", [1, 2])
+@pytest.mark.parametrize("unknowns", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_columns_of_any_scale_are_differentiated_alike(unknowns):
     """z = 1 / a has the derivative -1 / a^2, whatever the a of other columns."""
     import jax
@@ -68,7 +71,7 @@ def test_stiff_equations_are_solved_whatever_the_size_of_their_residual(stiffnes
     assert np.isfinite(problem.grad(theta, w)).all()
 
 
-@pytest.mark.parametrize("mode", ["reverse", "forward"])
+@pytest.mark.parametrize("mode", ["reverse", pytest.param("forward", marks=pytest.mark.slow)])
 def test_a_solve_that_fails_has_no_gradient(mode):
     """z^2 + 1 = 0 has no root; what the last iteration left has a derivative all the same, of nothing."""
     import jax

@@ -109,7 +109,9 @@ def test_a_window_as_long_as_the_rollout_is_fobg():
     assert windowed == pytest.approx(whole, rel=REVERSED)
 
 
-@pytest.mark.parametrize("estimator", ["reinforce", "total_propagation[per=action]"])
+@pytest.mark.parametrize(
+    "estimator", ["reinforce", pytest.param("total_propagation[per=action]", marks=pytest.mark.slow)]
+)
 def test_zeroth_order_agrees_with_first_order(estimator):
     exact = problem("linear", horizon=10)
     theta, program = exact.program.theta0, exact.program

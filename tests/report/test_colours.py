@@ -16,7 +16,14 @@ from bench.studies.optimise import views as searches
 DEUTERANOPIA = np.array(
     [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]]
 )
+PROTANOPIA = np.array(
+    [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]]
+)
+TRITANOPIA = np.array(
+    [[1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602], [0.004733, 0.691367, 0.303900]]
+)
 """On linear RGB, at full severity (Machado, Oliveira, Fernandes 2009)."""
+EYES = {"normal": np.eye(3), "deutan": DEUTERANOPIA, "protan": PROTANOPIA, "tritan": TRITANOPIA}
 D65 = np.array(
     [[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.0721750], [0.0193339, 0.1191920, 0.9503041]]
 )
@@ -57,6 +64,21 @@ def test_red_and_green_of_equal_lightness_would_be_caught():
 def test_more_estimators_than_colours_differ_by_colour_or_marker(seen):
     for a, b in combinations(range(ESTIMATORS), 2):
         assert marker(a) != marker(b) or apart(colour(a), colour(b), seen) > DISTINCT, (a, b)
+
+
+def test_forty_estimators_have_forty_colours_each_apart_from_the_one_it_comes_from():
+    found = [colour(place) for place in range(40)]
+    assert found[: len(PALETTE)] == list(PALETTE)
+    for place in range(len(PALETTE), 40):
+        assert apart(found[place], PALETTE[place % len(PALETTE)], np.eye(3)) > 10
+    assert min(apart(a, b, np.eye(3)) for a, b in combinations(found, 2)) > 5
+
+
+@pytest.mark.parametrize("eyes", EYES)
+def test_twelve_estimators_stay_distinct_for_colour_blind_readers_too(eyes):
+    """Colours differ by 8 (just noticeable: 2.3), and by 30 where the marker is the same."""
+    for a, b in combinations(range(12), 2):
+        assert apart(colour(a), colour(b), EYES[eyes]) > (30 if marker(a) == marker(b) else 8)
 
 
 def test_an_estimator_keeps_its_colour_in_searches_and_in_errors_and_what_sees_costs_only_is_grey_and_dashed():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import itertools
 import json
 import math
 import re
@@ -28,7 +27,6 @@ from helpers import (
     stiffness_rows,
     table,
 )
-from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 from bench.cli import main
@@ -39,8 +37,6 @@ from bench.report.cells import readable
 from bench.report.draw import draw
 from bench.report.figures import save, styled
 from bench.report.problems import split_by_problem
-from bench.report.style import PALETTE, colour, marker
-from bench.report.text import number
 from bench.run.store import Store
 from bench.studies.bias_variance import tables
 from bench.studies.bias_variance.charts import estimator_styles
@@ -159,15 +155,6 @@ def test_text_is_escaped_in_every_format(made):
     assert pd.read_csv(made.directory / "bias_variance.csv")["scene"][0] == EVIL
 
 
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [(0.0213, "0.021"), (0.996, "1.0"), (350.0, "350"), (1234.0, "1200"), (123456.0, "1.2e5"), (2e-7, "2.0e-7"),
-     (0.0, "0"), (math.nan, "-"), (math.inf, "inf")],
-)  # fmt: skip
-def test_numbers_are_short(value, text):
-    assert number(value) == text
-
-
 # -------------------------------------------------------------------------------------------------------- terminal
 
 
@@ -230,26 +217,6 @@ def drawn(rows, swept, sweep=None, **given):
 def figure_of(chart):
     with styled():
         return draw(chart)
-
-
-@pytest.mark.slow
-def test_charts_are_written_as_pictures_and_data(tmp_path):
-    made = experiment(tmp_path, formats=("png", "svg", "pdf"), sweep={"sigma": [0.1, 0.3], "stiffness": [1e2, 1e4]})
-    made.directory.mkdir()
-    rows = small_rows(sigmas=(0.1, 0.3))
-    paths = [path for path in written(made, rows) if path.stem.partition(".")[0] not in tables_names(made, rows)]
-    stems = {"bias_variance_sigma", "bias_variance_stiffness"}
-    suffixes = ("png", "svg", "pdf", "plotted.csv")
-    assert {f"{stem}.{suffix}" for stem in stems for suffix in suffixes} <= {path.name for path in paths}
-    for path in paths:
-        content = path.read_bytes()
-        starts = {".png": b"\x89PNG", ".svg": b"<?xml", ".pdf": b"%PDF"}
-        assert content.startswith(starts.get(path.suffix, b""))
-        assert len(content) > (10_000 if path.suffix in starts else 100)
-
-
-def tables_names(made, rows):
-    return {table.name for table in made.study.views(made, rows).tables} | {"findings"}
 
 
 def test_an_estimator_has_one_colour_in_all_charts():
@@ -625,24 +592,6 @@ def test_charts_have_the_swept_values_of_every_estimator(values):
 # --------------------------------------------------------------------------------------------------------- colours
 
 
-def lab(text):
-    """A colour in CIELAB, where distances are those that are seen."""
-    rgb = np.array(to_rgb(text))
-    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
-    xyz = [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]] @ linear / [0.9505, 1.0, 1.089]
-    x, y, z = np.where(xyz > 0.008856, np.cbrt(xyz), 7.787 * xyz + 16 / 116)
-    return np.array([116 * y - 16, 500 * (x - y), 200 * (y - z)])
-
-
-def test_forty_estimators_have_forty_colours_each_told_from_the_one_it_comes_from():
-    found = [colour(place) for place in range(40)]
-    assert len(set(found)) == 40
-    assert found[: len(PALETTE)] == list(PALETTE)
-    for place in range(len(PALETTE), 40):
-        assert np.linalg.norm(lab(found[place]) - lab(PALETTE[place % len(PALETTE)])) > 10
-    assert min(np.linalg.norm(lab(a) - lab(b)) for a, b in itertools.combinations(found, 2)) > 5
-
-
 def test_an_estimator_keeps_its_look_whatever_else_is_drawn():
     def look(*estimators):
         rows = table([row(estimator=name, stiffness=k) for name in estimators for k in (1e2, 1e4)])
@@ -653,32 +602,3 @@ def test_an_estimator_keeps_its_look_whatever_else_is_drawn():
     for name in NAMES:
         assert look(name) == {name: every[name]}
     assert look("of_my_own", *NAMES) == every | look("of_my_own")
-
-
-BLIND = {
-    "protan": [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]],
-    "deutan": [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]],
-    "tritan": [[1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602], [0.004733, 0.691367, 0.303900]],
-}
-"""Linear RGB as seen without one kind of cone (Machado, Oliveira and Fernandes 2009, table of severity 1)."""
-
-
-def lab_of(linear):
-    """CIE L*a*b* of linear sRGB, under D65."""
-    xyz = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]) @ linear
-    f = np.array([math.cbrt(t) if t > 0.008856 else 7.787 * t + 16 / 116 for t in xyz / [0.9505, 1.0, 1.089]])
-    return np.array([116 * f[1] - 16, 500 * (f[0] - f[1]), 200 * (f[1] - f[2])])
-
-
-@pytest.mark.parametrize("eyes", ["all", *BLIND])
-def test_twelve_estimators_stay_distinct_for_colour_blind_readers_too(eyes):
-    """Colours differ by 8 (just noticeable: 2.3), and by 30 where the marker is the same."""
-    seen = np.array(BLIND.get(eyes, np.eye(3)))
-    styles = [{"color": colour(i), "marker": marker(i)} for i in range(12)]
-    linear = [
-        np.array([c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in to_rgb(s["color"])])
-        for s in styles
-    ]
-    colours = [lab_of(np.clip(seen @ rgb, 0, 1)) for rgb in linear]
-    for (a, one), (b, two) in itertools.combinations(zip(colours, styles, strict=True), 2):
-        assert np.linalg.norm(a - b) > (30 if one["marker"] == two["marker"] else 8)

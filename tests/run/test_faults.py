@@ -221,12 +221,8 @@ def test_what_plugins_print_stays_out_of_our_output(run):
     refused = rows[rows["estimator"] == "refuses"]["reason"]
     assert refused.str.contains("last output: before the storm").all()
     assert rows[rows["estimator"] == "crashes"]["reason"].str.contains("faults.py").all()
-
-
-def test_error_names_the_lines_it_came_through(run):
-    reason = run[1][run[1]["estimator"] == "refuses"]["reason"].iloc[0]
-    assert "faults.py:" in reason
-    assert " in refuses < faults.py:" in reason
+    assert refused.str.contains(" in refuses < faults.py:").all()
+    assert rows[rows["estimator"] == "bad_number"]["reason"].str.contains("repeat 0").all()
 
 
 def test_no_process_is_left(tree, run):
@@ -235,13 +231,6 @@ def test_no_process_is_left(tree, run):
             return
         time.sleep(0.1)
     assert not descendants_of(tree)
-
-
-def test_bad_number_can_be_repeated(run):
-    reason = run[1][run[1]["estimator"] == "bad_number"]["reason"].iloc[0]
-    assert "seed 0" in reason
-    assert "repeat 0" in reason
-    assert "theta [" in reason
 
 
 @pytest.mark.slow
@@ -279,19 +268,14 @@ def wait_for(condition, seconds=60.0):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("sent", "status"), [(signal.SIGINT, 130), (signal.SIGKILL, -signal.SIGKILL)])
-def test_stopping_a_run_leaves_rows_and_no_process(tree, sent, status):
-    where = f"stopped{int(sent)}"
+def test_killing_a_run_leaves_rows_and_no_process(tree):
+    where = "killed"
     words = [*BASE, "estimators=[fobg,hangs]", f"name={where}", "results_dir=out", "workers=1", "timeout=null"]
     process = start(tree, *words)
     folder: Path = tree.root / "out" / where
     wait_for(lambda: list(folder.glob("pending/*.json")))
-    process.send_signal(sent)
-    said = process.communicate(timeout=30)[1]
-    assert process.returncode == status
-    if sent == signal.SIGINT:
-        assert f"1 of 2 cells are stored in 'out/{where}'. Continue with: python -m bench" in said
-        assert "Traceback" not in said
+    process.send_signal(signal.SIGKILL)
+    process.communicate(timeout=30)
     wait_for(lambda: not descendants_of(tree), 10.0)
     done = tree.run("plan", *words)
     assert "2 cells, 1 stored, 1 to run" in done.stdout

@@ -1,6 +1,5 @@
 """The same tasks, the same rows: on this machine, in shards, and on a Ray cluster that loses a node."""
 
-import ast
 import importlib
 import importlib.util
 import os
@@ -170,17 +169,6 @@ def test_shards_at_once_one_killed_give_the_rows_of_one_run(tmp_path, capsys):
     assert " 0 to run" in capsys.readouterr().out
     assert main(["report", *words, "name=parts"]) == 0
     pd.testing.assert_frame_equal(rows(tmp_path / "parts"), rows(tmp_path / "local"), check_exact=True)
-
-
-@pytest.mark.parametrize("package", ["run", "run/launchers", "experiment", "plugins"])
-def test_no_module_imports_the_package_that_gathers_it(package):
-    folder = Path(config.__file__).parents[1] / package
-    name = f"bench.{package.replace('/', '.')}"
-    names = {path.stem for path in folder.glob("*.py")} | {path.name for path in folder.iterdir() if path.is_dir()}
-    for path in folder.glob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text())):
-            if path.name != "__init__.py" and isinstance(node, ast.ImportFrom) and node.module == name:
-                assert {alias.name for alias in node.names} <= names, f"{path.name} imports from {name}"
 
 
 def test_groups_are_cut_only_as_far_as_all_slots_get_a_part():

@@ -390,15 +390,6 @@ def test_workers_that_hold_the_interpreter_lock_end_with_their_run(tmp_path):
     assert not left()
 
 
-def test_workers_that_cannot_be_made_say_why():
-    with Pool(1, _no_handler, None, ResourceLimits()) as pool, pytest.raises(UserError, match="no handler today"):
-        list(pool.run([[1]]))
-
-
-def _no_handler(argument):
-    raise RuntimeError("no handler today")
-
-
 COLLECTED = """
 import gc, os, signal
 from bench.cli import _stop_on_signals
@@ -483,20 +474,6 @@ def test_a_backend_asked_for_references_moves_and_doubles_nothing(tmp_path, work
     assert (tmp_path / "here" / "out" / "custom" / "rows.parquet").exists()
     assert list((tmp_path / "here" / "out" / "references").glob("*.parquet"))
     assert not list((tmp_path / "elsewhere").iterdir())
-
-
-def test_two_studies_that_start_at_once_in_an_empty_folder_do_not_mix(tmp_path):
-    first, second = (Store(tmp_path / "mine", COLUMNS, study) for study in ("bias_variance", "growth"))
-    for store in (first, second):
-        assert store.load().empty
-    first.prepare()
-    with pytest.raises(UserError, match="a run of study bias_variance has started"):
-        second.prepare()
-    first.append(COLUMNS.blank() | {"key": "1", "study": "bias_variance"})
-    first.compact()
-    assert not (tmp_path / "mine" / "pending").exists()
-    with pytest.raises(UserError, match="holds rows of study bias_variance"):
-        second.prepare()
 
 
 def test_too_little_memory_is_one_line():

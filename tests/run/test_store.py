@@ -352,13 +352,6 @@ def test_without_hard_links_nothing_of_another_run_is_overwritten(tmp_path, no_h
     assert (tmp_path / "new").read_text() == "mine"
 
 
-def test_without_hard_links_one_of_two_studies_is_refused_too(tmp_path, no_hard_links):
-    first, second = (Store(tmp_path, COLUMNS, study) for study in ("bias_variance", "growth"))
-    first.prepare()
-    with pytest.raises(UserError, match="a run of study bias_variance has started"):
-        second.prepare()
-
-
 # ------------------------------------------------------------------------------------------------ commands
 
 
@@ -427,13 +420,6 @@ def test_small_disk(tmp_path):
         assert len(Store(tmp_path / "tiny", COLUMNS).load()) == 100
     finally:
         subprocess.run(["umount", str(disk)], check=True)
-
-
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
-def test_directory_without_permission(tmp_path, capsys):
-    tmp_path.chmod(0o500)
-    assert main([*TINY, "name=tiny", f"results_dir={tmp_path}"]) == 2
-    assert "Permission denied" in capsys.readouterr().err
 
 
 def test_directory_that_refuses(tmp_path, capsys, monkeypatch):

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 import pytest
+from helpers import approve_views
 
 from bench.errors import Crashed
 from bench.experiment import config
@@ -129,27 +130,30 @@ def test_orders_and_ratios_at_the_longest_horizon_are_those_of_the_memory():
     assert list(table["longer"]) == pytest.approx([math.nan, 2.0, 1.5], nan_ok=True)
 
 
-def test_findings_state_ratios_with_intervals():
-    least, fastest, same = views.views(*rows()).findings
-    assert least == (
-        "On mass_spring at T = 10,000, fused needs 100 [98, 100] times less memory than jax at 1.5 [1.2, 1.8] times its time."
-    )
-    assert fastest == "The fastest there is jax on mass_spring."
-    assert same.startswith("All 6 gradients agree with jax within 1e-6"), "those of jax itself do not count"
+MEMORY = ["memory_mb", "memory_mb_low", "memory_mb_high"]
 
 
-def test_overlapping_times_leave_the_fastest_open():
-    assert (
-        views.views(*rows(apart=0.4)).findings[1] == "The fastest there is jax or torch or fused (open) on mass_spring."
-    )
-
-
-def test_a_gradient_that_differs_is_counted():
+def changed(place=slice(None), names=MEMORY, value=None, keep=slice(None)):
+    """Rows of which some have other values, or are left out."""
     given, table = rows()
-    table.loc[4, "gradient_error_rel"] = 0.5
-    found = views.views(given, table).findings[2]
-    assert found.startswith("5 of 6 gradients agree")
-    assert "0.50 (torch, mass_spring, T = 1,000)" in found
+    if value is not None:
+        table.loc[place(table) if callable(place) else place, names] = value
+    return given, table[keep(table) if callable(keep) else keep].reset_index(drop=True)
+
+
+CASES = {
+    "three methods": lambda: rows(),
+    "times that overlap": lambda: rows(apart=0.4),
+    "a gradient that differs": lambda: changed(4, "gradient_error_rel", 0.5),
+    "no result of the first method": lambda: changed(lambda table: table["backend"] == "jax", "status", "error"),
+    "one method": lambda: changed(keep=lambda table: table["backend"] == "jax"),
+    "methods that are tied": lambda: changed(value=[10.0, 9.0, 11.0]),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_findings_state_ratios_with_intervals(case):
+    approve_views("backward_memory", case, views.views(*CASES[case]()))
 
 
 def test_memory_below_the_resolution_is_an_upper_limit_without_an_order():
@@ -160,12 +164,8 @@ def test_memory_below_the_resolution_is_an_upper_limit_without_an_order():
     line = shown.tables[0].frame.set_index("method").loc["fused"]
     assert math.isnan(line["order"])
     assert math.isnan(line["less"])
-    assert shown.findings[0] == (
-        "On mass_spring at T = 10,000, jax needs 1.0e4 [9900, 1.0e4] MiB, and less than 1 MiB is enough for fused at "
-        "1.5 [1.2, 1.8] times the time."
-    )
+    approve_views("backward_memory", "memory below the resolution", shown)
     chart = shown.charts[0]
-    assert chart.title == "fused needs less than 1 MiB at the longest horizon, where jax needs at least 9900 MiB"
     assert "Hollow: at most so much" in chart.subtitle
     drawn = chart.plotted()
     assert drawn["is_small"].sum() == 3
@@ -189,33 +189,6 @@ def test_intervals_of_memory_contain_the_error_of_the_measurement():
     line = views.views(given, table).tables[0].frame.set_index("method").loc["fused"]
     assert list(line[columns]) == pytest.approx([2.0, 1.6, 2.4])
     assert line["less_high"] == pytest.approx(10100.3 / 1.6)
-
-
-def test_without_a_result_of_the_first_method_no_other_takes_its_place():
-    given, table = rows()
-    table.loc[table["backend"] == "jax", "status"] = "error"
-    shown = views.views(given, table)
-    assert shown.findings[0] == (
-        "On mass_spring at T = 10,000, jax has no result, so that nothing is compared with it."
-    )
-    assert shown.tables[0].frame["less"].isna().all()
-    assert "jax" not in " ".join(chart.title for chart in shown.charts)
-
-
-def test_a_method_alone_is_compared_with_nothing():
-    given, table = rows()
-    shown = views.views(given, table[table["backend"] == "jax"].reset_index(drop=True))
-    assert shown.findings[0].endswith("jax needs 1.0e4 [9900, 1.0e4] MiB, and no other method has a result.")
-    assert not any("fastest" in text for text in shown.findings)
-
-
-def test_methods_that_are_not_distinguishable_save_nothing():
-    given, table = rows()
-    columns = ["memory_mb", "memory_mb_low", "memory_mb_high"]
-    table[columns] = [10.0, 9.0, 11.0]
-    shown = views.views(given, table)
-    assert "no method needs distinguishably less memory than jax" in shown.findings[0]
-    assert shown.charts[0].title == "Memory of a batch of gradients along the horizon"
 
 
 def test_backends_without_gradients_are_refused():

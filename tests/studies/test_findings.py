@@ -4,17 +4,13 @@ from __future__ import annotations
 
 import json
 import math
-import re
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
-from helpers import experiment, failed, row, table
+from helpers import approve, experiment, failed, row, table
 
-from bench.experiment import config
-from bench.report.views import arrange, newest_rows
-from bench.run.execute import store_of
+from bench.report.views import arrange
 from bench.studies.bias_variance.charts import accurate_and_fast
 from bench.studies.bias_variance.comparisons import (
     FAILS,
@@ -27,18 +23,9 @@ from bench.studies.bias_variance.comparisons import (
     verdict,
     verdicts_by_estimator,
 )
-from bench.studies.bias_variance.findings import findings, recommended
+from bench.studies.bias_variance.findings import findings
 
 STANDARD = Path(__file__).resolve().parents[2] / "results" / "standard"
-MAIN = [
-    path.parent.name for path in sorted(STANDARD.glob("*/bias_variance.csv")) if (path.parent / "rows.parquet").exists()
-]
-
-
-def shown(name):
-    """The arranged rows of a standard experiment."""
-    given = config.load([f"experiment={name}", f"results_dir={STANDARD}"])
-    return arrange(given, newest_rows(store_of(given).load()))
 
 
 def cell(error, low, high, **values):
@@ -142,20 +129,22 @@ def stiff(contact, stiffness):
     return 90.0 if contact == "penalty" and stiffness > 6400 else 0.1
 
 
-def test_the_recommendation_comes_first_then_the_failure_then_what_removes_it():
-    cells = [
+def along_stiffness():
+    """A method that fails beyond the limit under one of two laws, and one that is usable everywhere."""
+    return [
         cell(e := error(contact, k), 0.9 * e, 1.1 * e, stiffness=k, contact=contact, estimator=name)
         for name, error in (("fobg", stiff), ("randomized_smoothing", lambda *_: 0.5))
         for contact in ("penalty", "complementarity")
         for k in (10.0, 1e3, 1e4, 1e5)
     ]
-    texts = made(*cells)[2]
-    assert texts == [
-        "Use fobg up to stiffness 1000 with penalty and at every stiffness with complementarity: it has the lowest error "
-        "at equal samples, each of 1 to 2 rollouts or gradients (relative RMSE 0.10).",
-        "fobg fails beyond the limit (stiffness 6400) with penalty: its error is at least 81 times the gradient, where "
-        "randomized_smoothing is usable (0.50).",
-        "With complementarity fobg does not fail there (0.10).",
+
+
+def of_problems():
+    """A method that fails on one of three problems, and one that is usable on all."""
+    return [
+        cell(e, 0.9 * e, 1.1 * e, estimator=name, scene=scene)
+        for name, errors in (("fobg", (0.01, 0.01, 50.0)), ("reinforce", (0.3, 0.4, 0.5)))
+        for scene, e in zip(("pendulum", "cartpole", "pushing"), errors, strict=True)
     ]
 
 
@@ -181,80 +170,23 @@ def test_costs_of_several_rollouts_per_sample_are_compared_at_equal_rollouts():
     assert texts[0].startswith("Use a on pushing, penalty: it has the lowest error (relative RMSE 0.088).")
 
 
-def test_gradients_are_compared_at_equal_samples_and_the_sentence_says_so():
-    cells = [*by_samples("a", 0, 1), *by_samples("b", 2, scale=3.0)]
-    _, compared, texts = made(*cells, sweep={"samples": [64, 128]})
-    assert set(compared["basis"]) == {"relative RMSE at equal samples"}
-    assert "the lowest error at equal samples, each of 1 to 2 rollouts or gradients (" in texts[0]
+CASES = {
+    "a failure beyond the limit": (along_stiffness, {}),
+    "problems without an axis": (of_problems, {"sweep": {}}),
+    "an interval around 1": (lambda: [cell(1.3, 0.65, 2.4, stiffness=k) for k in (1e2, 1e4)], {}),
+    "gradients at equal samples": (
+        lambda: [*by_samples("a", 0, 1), *by_samples("b", 2, scale=3.0)], {"sweep": {"samples": [64, 128]}},
+    ),
+    "one rollout a sample": (
+        lambda: [*by_samples("a", 1), *by_samples("b", 1, scale=3.0)], {"sweep": {"samples": [64, 128]}},
+    ),
+}  # fmt: skip
 
 
-def test_costs_of_one_rollout_per_sample_are_compared_at_each_number_of_samples():
-    _, compared, texts = made(*by_samples("a", 1), *by_samples("b", 1, scale=3.0), sweep={"samples": [64, 128]})
-    assert compared["at"].tolist() == [64, 128]
-    assert "at equal samples" not in texts[0]
-
-
-def test_an_interval_around_1_is_no_failure():
-    texts = made(*(cell(1.3, 0.65, 2.4, stiffness=k) for k in (1e2, 1e4)))[2]
-    assert not any("fobg fails" in text or "better than zero" in text for text in texts)
-    assert texts[0].startswith("No estimator is certain to be better than the zero estimate")
-
-
-def test_without_an_axis_the_worst_case_is_ranked():
-    cells = [
-        cell(e, 0.9 * e, 1.1 * e, estimator=name, scene=scene)
-        for name, errors in (("fobg", (0.01, 0.01, 50.0)), ("reinforce", (0.3, 0.4, 0.5)))
-        for scene, e in zip(("pendulum", "cartpole", "pushing"), errors, strict=True)
-    ]
-    texts = made(*cells, sweep={})[2]
-    assert texts[0] == (
-        "reinforce has the lowest worst case on the 3 problems at equal samples, each of 1 to 2 rollouts or gradients: "
-        "0.30 to 0.50."
-    )
-    assert "fobg is best or tied on pendulum, penalty, and cartpole, penalty (0.010)" in texts[1]
-    assert "fails on pushing, penalty (at least 45 times the gradient)" in texts[1]
-    assert texts[2] == "1 of 2 estimators fails at some setting, 1 works at every setting (reinforce)."
-
-
-# ------------------------------------------------------------------------- a second way, from the committed rows
-
-
-@pytest.mark.parametrize("name", MAIN)
-def test_findings_of_standard_results_follow_from_the_csv(name):
-    """Verdicts, winners and the numbers of the first two sentences, from bias and variance by plain loops."""
-    arranged = shown(name)
-    methods = method_table(arranged)
-    compared = compare_errors(methods)
-    rows = arranged.rows
-    for line in methods[methods["status"] == "ok"].to_dict("records"):
-        match = rows[(rows["rmse_rel"] == line["error"]) & (rows["status"] == "ok")]
-        if rows["seed"].nunique() > 1 or match.empty:
-            continue
-        one = match.iloc[0]
-        low = math.hypot(one["bias_low"], math.sqrt(one["variance_low"])) / one["reference_norm"]
-        high = math.hypot(one["bias_high"], math.sqrt(one["variance_high"])) / one["reference_norm"]
-        expected = FAILS if low > 1 else WORKS if high < 1 else OPEN
-        assert line["verdict"] == expected, line
-    for place in compared.to_dict("records"):
-        part = methods[(methods["problem"] == place["problem"]) & (methods["axis"] == place["axis"])]
-        part = part[part["at"].isna() if math.isnan(place["at"]) else part["at"] == place["at"]]
-        known = part[np.isfinite(part["error"]) & np.isfinite(part["low"])]
-        assert (place["value"] == known["error"].min()) if len(known) else place["first"] == ""
-    swept = arranged.swept()
-    longest = max(swept, key=lambda axis: swept[axis], default=None)
-    texts = findings(methods, compared, arranged.marks(longest) if longest else {})
-    assert 1 <= len(texts) <= 3
-    main = recommended(methods, compared)
-    errors = methods.loc[methods["error"].notna(), "error"]
-    numbers = re.findall(r"(?:RMSE|:|\() ?(\d[\d.e-]*) to (\d[\d.e-]*)", texts[0])
-    for pair in numbers:
-        for text in pair:
-            assert np.isclose(errors, float(text.rstrip(".")), rtol=0.06).any(), (text, texts[0])
-    if f"{main} fails" in texts[1 % len(texts)]:
-        least = float(re.search(r"at least ([\d.e+]+) times", texts[1])[1])
-        failing = methods[(methods["estimator"] == main) & (methods["verdict"] == FAILS)]
-        assert failing["low"].min() == pytest.approx(least, rel=0.06)
-        assert least > 1
+@pytest.mark.parametrize("case", CASES)
+def test_the_recommendation_comes_first_then_the_failure_then_what_removes_it(case):
+    cells, given = CASES[case]
+    approve("bias_variance", case, *made(*cells(), **given)[2])
 
 
 @pytest.mark.parametrize("path", sorted(STANDARD.glob("*/findings.json")), ids=lambda path: path.parent.name)
@@ -264,11 +196,6 @@ def test_stored_findings_are_short_and_their_chart_exists(path):
     assert 1 <= len(found["findings"]) <= 3
     assert all(text.endswith(".") and ";" not in text for text in found["findings"])
     assert not found["chart"] or (path.parent / f"{found['chart']}.png").exists()
-
-
-def test_there_are_standard_results():
-    assert len(MAIN) >= 6
-    assert pd.Series(MAIN).is_unique
 
 
 def test_a_tie_is_no_win_of_the_lowest_error():

@@ -1,7 +1,6 @@
 """Estimates from noise in parts: the same numbers, in memory that does not grow with samples and repeats."""
 
 import dataclasses
-import time
 
 import numpy as np
 import pytest
@@ -103,30 +102,43 @@ def test_an_estimator_with_an_estimate_of_its_own_is_not_taken_apart():
     np.testing.assert_allclose(found, 2.0 * expected, rtol=ROUNDED)
 
 
-def test_pauses_are_no_time_of_a_call():
+@pytest.fixture
+def clock(monkeypatch):
+    """A clock of calls that only moves when it is told to: ``clock(seconds)``."""
+    now = [0.0]
+    monkeypatch.setattr(timing.time, "perf_counter", lambda: now[0])
+
+    def move(seconds):
+        now[0] += seconds
+
+    return move
+
+
+def test_pauses_are_no_time_of_a_call(clock):
     pause = timing.Pause()
 
     def call(_):
+        clock(0.003)
         with pause:
-            time.sleep(0.02)
+            clock(0.02)
         return np.zeros(1)
 
-    _, clock = timing.timed(call, 3, least_s=0.0, pause=pause)
-    assert clock.median_s < 0.01
+    _, found = timing.timed(call, 3, least_s=0.0, pause=pause)
+    assert found.median_s == pytest.approx(0.003)
 
 
-def test_times_are_repeated_until_they_are_steady():
-    waits = iter([0.0, *[0.001, 0.003] * 2, *[0.002] * 400])
+def test_times_are_repeated_until_they_are_steady(clock):
+    def timed(*first, **more):
+        waits = iter([0.0, *first * 2, *[0.002] * 400])
 
-    def call(_):
-        time.sleep(next(waits))
-        return np.zeros(1)
+        def call(_):
+            clock(next(waits))
+            return np.zeros(1)
 
-    _, short = timing.timed(call, 2, least_s=0.0, most=100)
-    assert short.calls == 3
-    waits = iter([0.0, *[0.001, 0.004] * 2, *[0.002] * 400])
-    _, settled = timing.timed(call, 2, least_s=0.0, most=100, settle_s=0.2)
-    assert settled.calls > 5
+        return timing.timed(call, 2, least_s=0.0, most=100, **more)[1]
+
+    assert timed(0.001, 0.003).calls == 3
+    assert timed(0.001, 0.004, settle_s=0.2).calls > 5
 
 
 def test_a_gradient_by_differences_counts_once():

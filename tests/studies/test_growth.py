@@ -1,7 +1,6 @@
 """Products of step Jacobians against closed forms, and the growth study end to end."""
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -11,8 +10,8 @@ from bench.plugins.integrators.rk4 import Rk4
 from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
 from bench.plugins.scenes.double_integrator import DoubleIntegrator
 from bench.plugins.scenes.double_pendulum import DoublePendulum
+from helpers import approve_views
 
-import bench
 from bench.cli import main
 from bench.experiment import config
 from bench.experiment.grid import cells
@@ -23,8 +22,6 @@ from bench.studies.growth import views
 from bench.studies.growth.columns import COLUMNS
 from bench.studies.growth.fits import fit
 from bench.studies.growth.measure import classify, products, rate
-
-STANDARD = Path(bench.__file__).parent.parent / "results" / "standard"
 
 
 def constant(matrix, horizon, batch=3):
@@ -171,11 +168,7 @@ def grown(*words):
 def test_findings_charts_and_tables_of_planted_rows():
     given, rows = grown()
     shown = views.views(given, rows)
-    assert shown.findings == [
-        "Use the zeroth order on bouncing_ball from 5 s and hopper from 5 s: it varies less there.",
-        "Gradients explode on hopper (rate 1.0 [1.0, 1.0] per second).",
-        "They grow like a power of the horizon on bouncing_ball (order 2.0 [2.0, 2.0]).",
-    ]
+    approve_views("growth", "planted rows", shown)
     norms, variances, _, gains = shown.charts
     drawn = norms.plotted()
     assert set(zip(drawn["problem"], drawn["series"], strict=True)) == {
@@ -200,44 +193,7 @@ def test_ranges_of_variances_that_overlap_and_lost_horizons_are_open():
     rows.loc[lost, ["gradient_median", "gradient_quarter"]] = math.nan
     rows.loc[lost, "status"] = "nonfinite"
     shown = views.views(given, rows)
-    assert shown.findings == [
-        "Which order has the lower variance is open at the longest horizon.",
-        "Gradients explode on no problem.",
-        "They show no clear law of growth on bouncing_ball and hopper.",
-    ]
+    approve_views("growth", "overlap and lost horizons", shown)
     assert len(shown.tables[1].frame) == len(rows)
     rows["status"], rows["gradient_median"], rows["reason"] = "nonfinite", math.nan, "not finite"
-    shown = views.views(given, rows)
-    assert shown.findings == ["No cell gave a result: the table has the reason of each."]
-    assert shown.remarks == ["not finite"]
-
-
-def test_findings_of_the_standard_experiment_computed_from_its_table():
-    given = config.load(["+experiment=horizon_growth", f"results_dir={STANDARD}"])
-    rows = Store(given.directory, COLUMNS).load()
-    shown = views.views(given, rows)
-    table = pd.read_csv(given.directory / "growth.csv")
-    classes = {}
-    for scene, part in table.groupby("scene", sort=False):
-        t, y = part["time_horizon"], np.log(part["gradient_median"])
-        left = {name: np.polyfit(x, y, 1, full=True)[1][0] for name, x in (("t", t), ("log", np.log(t)))}
-        odds = (left["log"] / left["t"]) ** (len(part) / 2)
-        classes[scene] = "exploding" if odds > 20 else "polynomial" if odds < 1 else "open"
-    assert classes == {
-        "double_integrator": "polynomial", "pendulum": "polynomial", "bouncing_ball": "exploding",
-        "hopper": "polynomial", "double_pendulum": "exploding",
-    }  # fmt: skip
-    slope, _ = np.polyfit(np.log(t := table[table["scene"] == "hopper"]["time_horizon"]), np.log(
-        table[table["scene"] == "hopper"]["gradient_median"]), 1)  # fmt: skip
-    assert 0 < slope < 1
-    assert len(t) == 5
-    verdicts = dict(zip(shown.tables[0].frame["problem"], shown.tables[0].frame["verdict"], strict=True))
-    assert verdicts == classes | {"hopper": "open"}, "the norms of hopper rise, then fall: the order's interval has 0"
-    lower = table["zeroth_order_variance_high"] < table["first_order_variance_low"]
-    assert set(table.loc[lower, "scene"]) == {"bouncing_ball", "double_pendulum"}
-    for scene, start in (("bouncing_ball", 1.0), ("double_pendulum", 2.5)):
-        own = table[table["scene"] == scene]
-        assert list(own["time_horizon"] >= start) == list(lower[own.index])
-        assert f"{scene} from {start:g} s" in shown.findings[0]
-    assert "the first order on double_integrator and pendulum at every horizon" in shown.findings[0]
-    assert shown.findings[1].startswith("Gradients explode on bouncing_ball (")
+    approve_views("growth", "no result", views.views(given, rows))

@@ -8,6 +8,7 @@ import pandas as pd
 import pytest
 import wrong_models
 from bench.plugins.optimizers.gauss_newton import GaussNewton
+from helpers import approve, approve_views
 
 import bench
 from bench.experiment import config
@@ -331,26 +332,6 @@ def standard():
     return given, rows, study_of(given).views(given, rows)
 
 
-def test_findings_are_those_of_the_stored_table(standard):
-    """Counted again from the CSV's own lists, without the code of the views."""
-    rows = pd.read_csv(STANDARD / "identify" / "identify.csv")
-    listed = {
-        name: [[float(word) for word in cell.strip("[]").split()] for cell in rows[name]]
-        for name in ("converged_high", "coverage", "coverage_high", "error")
-    }
-    lost = sum(high < 0.9 for cell in listed["converged_high"] for high in cell)
-    narrow = sum(high < 0.95 for cell in listed["coverage_high"] for high in cell)
-    lowest = min(c for cell in listed["coverage"] for c in cell if c == c)
-    errors = [cell[0] for cell, name in zip(listed["error"], rows["integrator"], strict=True) if name == "rk4"]
-    use, fails, known = standard[2].findings
-    assert use.startswith("Use rk4 and single shooting: in 5 of 5 cases")
-    assert f"(error {min(errors):.2f} to {max(errors):.1f} times the bound)" in use
-    assert f"in {lost} of 22 cases, all with semi_implicit_euler," in fails
-    assert f"too narrow in {narrow} (they contain the truth in {lowest:.0%} of the fits" in fails
-    assert known == "A record of mass_spring_damper identifies only stiffness/mass and damping/mass."
-    assert not any(";" in text for text in standard[2].findings)
-
-
 def test_chart_and_tables_have_the_rows(standard):
     _, rows, views = standard
     fits, parameters = views.tables
@@ -381,25 +362,22 @@ def planted(**columns):
     return shown.findings(lines.assign(error_low=low, error_high=high))
 
 
-def test_findings_need_their_intervals():
-    half = [1.0] * 4
-    tied = planted()
-    assert tied[0].startswith("Use rk4 and single shooting: in 4 of 4 cases")
-    assert tied[1] == "Neither fits nor their intervals fail in any of 8 cases."
-    assert len(tied) == 2
-    open_ = planted(coverage=[0.85] * 8, coverage_low=0.7, coverage_high=0.951)
-    assert "fail in any" in open_[1]  # below the stated level, but not by the whole interval
-    few = planted(converged=[0.85] * 8, converged_low=0.7, converged_high=0.93)
-    assert few[0] == "No fit is known to reach the Cramer-Rao bound."
-    assert "do not explain" not in few[1]
-    unknown = planted(error=[math.nan] * 8, coverage=[math.nan] * 8, coverage_high=[math.nan] * 8)
-    assert unknown[0] == "No fit is known to reach the Cramer-Rao bound."
-    far = planted(
-        error=[*half, 3.0, 3.0, 3.0, 3.0], coverage=[0.95] * 4 + [0.3] * 4, coverage_high=[0.98] * 4 + [0.4] * 4
-    )
-    assert far[0].startswith("Use rk4")
-    assert "95% intervals are too narrow in 4 (they contain the truth in 30%" in far[1]
-    assert "report more identifiable directions" in planted(hidden=[3.0] + [0.0] * 7)[2]
+HALF = [1.0] * 4
+FINDINGS = {
+    "all cases hold": {},
+    "coverage below the level but not by the whole interval": {"coverage": [0.85] * 8, "coverage_low": 0.7, "coverage_high": 0.951},
+    "few fits end well": {"converged": [0.85] * 8, "converged_low": 0.7, "converged_high": 0.93},
+    "unknown": {"error": [math.nan] * 8, "coverage": [math.nan] * 8, "coverage_high": [math.nan] * 8},
+    "one integrator is off": {
+        "error": [*HALF, 3.0, 3.0, 3.0, 3.0], "coverage": [0.95] * 4 + [0.3] * 4, "coverage_high": [0.98] * 4 + [0.4] * 4,
+    },
+    "fits hide the gauge": {"hidden": [3.0] + [0.0] * 7},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", FINDINGS)
+def test_findings_need_their_intervals(case):
+    approve("identify", case, *planted(**FINDINGS[case]))
 
 
 def test_interval_of_the_error_covers():
@@ -413,10 +391,7 @@ def test_interval_of_the_error_covers():
 @pytest.mark.parametrize("status", ["nonfinite", "unsupported"])
 def test_rows_without_results_are_said_so(standard, status):
     given, rows, _ = standard
-    views = study_of(given).views(given, rows.assign(status=status, reason="planted"))
-    assert views.findings == ["No fit gave a result: the table has the reason of each."]
-    assert not views.charts
-    assert list(views.remarks) == ["planted"]
+    approve_views("identify", "no result", study_of(given).views(given, rows.assign(status=status, reason="planted")))
 
 
 def test_own_measurements_have_no_coverage_to_show(standard):
@@ -509,28 +484,16 @@ def test_a_record_of_its_end_only_has_one_scan_without_an_open_count():
     assert math.isnan(found["minima_open"][0])
 
 
-def test_without_a_scan_keys_are_those_of_the_study_before_it_had_one():
-    """The keys of the stored rows, which have neither parameter; a scan has a key of its own."""
-    given = config.load(["experiment=identify", f"results_dir={STANDARD}"])
-    assert set(newest_rows(store_of(given).load())["key"]) == {cell.key for cell in cells(given)}
-    (plain,), (scanned,) = (cells(made(*SPRING, f"study=identify[scan={n}]")) for n in (0, 11))
-    (wide,) = cells(made(*SPRING, "study=identify[scan=11,span=3.0]"))
-    assert len({plain.key, scanned.key, wide.key}) == 3
-    assert plain.key == cell_of(*SPRING).key
-
-
-def test_the_scan_is_stated_with_its_grid_and_drawn():
+@pytest.fixture(scope="module")
+def chaos():
     given = config.load([SCAN, "backends=[numpy]", "optimizers=[gauss_newton]", "samples=1", *CHAOS])
     (cell,) = cells(given)
     rows = pd.DataFrame([cell.columns() | measure(cell, given.study) | {"experiment": "chaos"}])
-    chaos = study_of(given).views(given, rows)
-    assert chaos.findings[-1].startswith(
-        "The loss on logistic_map over 2,001 values of rate from 2 to 4 1/s has 131 local minima for the whole record of 200 "
-        "steps, and "
-    )
-    assert "17 and 1 for windows of 40, 20, 10 and 5 steps (130, " in chaos.findings[-1]
-    assert "10 and 1 if the last sample of a window, at which the next starts, is not compared)" in chaos.findings[-1]
-    assert ";" not in chaos.findings[-1]
+    return study_of(given).views(given, rows)
+
+
+def test_the_scan_is_stated_with_its_grid_and_drawn(chaos):
+    approve("identify", "scan of the loss", chaos.findings[-1])
     (chart,) = [chart for chart in chaos.charts if chart.name == "scan_rate"]
     counts = chart.frame[chart.frame["part"] == "local minimum"].groupby("window", sort=False).size()
     assert counts["whole record of 200 steps: 131 minima"] == 131

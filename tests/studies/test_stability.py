@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
+from helpers import approve, approve_views
 
-import bench
 from bench.experiment import config
 from bench.experiment.cell import Cell
 from bench.experiment.grid import cells
 from bench.model import MechanicalScene, State, compose, registry
 from bench.model.parameters import build
 from bench.report.cells import readable
-from bench.report.draw import draw
 from bench.run import runner, tasks
 from bench.run.plan import plan
 from bench.run.session import Session
@@ -25,7 +23,6 @@ from bench.run.store import Store
 from bench.studies.stability import Stability, maps, views
 from bench.studies.stability import measure as stability
 
-STANDARD = Path(bench.__file__).parent.parent / "results" / "standard"
 STIFFNESS = tuple(float(k) for k in np.logspace(1, 4, 13))
 HORIZON, DT = 40, 0.05
 
@@ -297,52 +294,10 @@ def test_findings_lead_with_what_to_use_and_say_why_the_rest_is_wrong():
         ("spring", "one", "right", "", 3), ("spring", "one", "diverged", "", 1), ("spring", "two", "right", "", 3),
         ("spring", "two", "wrong", "step", 1), ("ball", "one", "wrong", "law", 3), ("ball", "one", "wrong", "", 1),
     )  # fmt: skip
-    assert views.findings(views.shares_of(cells), cells) == [
-        "Use one and two on spring (right in 75% of 4 cells).",
-        "Of 12 cells, 5 have a finite but wrong gradient and 1 a state that diverges.",
-        "The cause of the wrong gradients is the step or its derivative in 1, the law in 3, not resolved in 1.",
-    ]
+    approve("stability", "two scenes", *views.findings(views.shares_of(cells), cells))
     assert list(views.shares_of(cells)["by unknown"]) == [0.0, 0.0, 0.25]
     lost = classed(("ball", "one", "diverged", "", 2), ("ball", "one", "open", "", 1))
-    assert views.findings(views.shares_of(lost), lost) == [
-        "No law and integrator gives a right gradient at any step size and stiffness.",
-        "Of 3 cells, 0 have a finite but wrong gradient and 1 a state that diverges.".replace(" 1 a", " 2 a"),
-    ]
-
-
-def test_findings_of_the_standard_experiment_computed_from_its_rows():
-    given = config.load(["+experiment=stability_map", f"results_dir={STANDARD}"])
-    rows = Store(given.directory, given.columns).load()
-    shown = views.views(given, rows)
-    ran = rows[rows["verdict"] != ""]
-    counts = ran["verdict"].value_counts()
-    n_wrong, n_lost = (counts.reindex(names).sum() for names in (maps.WRONG, maps.LOST))
-    assert shown.findings[1] == (
-        f"Of {len(ran)} cells, {n_wrong:.0f} have a finite but wrong gradient and {n_lost:.0f} a state that diverges."
-    )
-    law = ran["contact"].str.partition("[")[0]
-    right = (
-        (ran["verdict"] == "ok")
-        .groupby([ran["scene"].str.partition("[")[0], law, ran["integrator"]])
-        .agg(["mean", "size"])
-    )
-    spring, ball = (right.loc[scene].sort_values("mean").iloc[-1] for scene in ("mass_spring", "bouncing_ball"))
-    assert (spring.name, ball.name) == (("none", "rk4"), ("impulse", "event_driven"))
-    assert shown.findings[0] == (
-        f"Use rk4 on mass_spring (right in {spring['mean']:.0%} of {spring['size']:.0f} cells) and impulse, event_driven on "
-        f"bouncing_ball (right in {ball['mean']:.0%} of {ball['size']:.0f} cells)."
-    )
-    causes = ran["cause"].value_counts()
-    for cause, noun in (("step", "the step or its derivative"), ("law", "the law"), ("both", "both")):
-        assert f"{noun} in {causes[cause]}" in shown.findings[2]
-    assert f"not resolved in {causes['unknown']}" in shown.findings[2]
-    printed = shown.charts[0]
-    assert f"{(ran['verdict'] == 'ok').mean():.0%} of the cells" in printed.title
-    assert len(draw(printed, 3.5).axes) == len(draw(printed).axes) == 8 * 5, "a panel per integrator and problem"
-    assert [chart.name for chart in shown.charts if chart.printed] == ["stability_map"]
-    whole = shown.charts[1].frame
-    assert whole.groupby(["panel", "dt", "stiffness"]).size().max() == 1
-    assert set(whole["row"]) == set(rows.index[rows["verdict"] != ""])
+    approve("stability", "nothing right", *views.findings(views.shares_of(lost), lost))
 
 
 def test_backends_that_disagree_show_the_worse_verdict_and_no_verdict_is_no_finding(tmp_path):
@@ -354,9 +309,7 @@ def test_backends_that_disagree_show_the_worse_verdict_and_no_verdict_is_no_find
     assert dict(chart["level"]) == {10.0: "right", 100.0: "wrong"}
     assert rows["backend"][chart.loc[100.0, "row"]] == "numpy"
     rows["verdict"], rows["status"], rows["reason"] = "", "unsupported", "no step"
-    nothing = views.views(given, rows)
-    assert nothing.findings == ["No cell has a verdict: the table has the reason of each."]
-    assert nothing.remarks == ["4 unsupported: no step"]
+    approve_views("stability", "no verdict", views.views(given, rows))
 
 
 @pytest.mark.parametrize(

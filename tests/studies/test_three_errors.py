@@ -1,7 +1,6 @@
 """Program, model and estimator error kept apart: the impulse without time of impact, which only the model error betrays."""
 
 import dataclasses
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -12,8 +11,8 @@ from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
 from bench.plugins.scenes.bounce_once import BounceOnce
 from bench.plugins.scenes.bouncing_ball import BouncingBall
 from bench.plugins.scenes.wall_penalty_1d import WallPenalty1d
+from helpers import approve_views
 
-import bench
 from bench.cli import main
 from bench.experiment import config
 from bench.experiment.grid import cells
@@ -26,7 +25,6 @@ from bench.studies.three_errors.measure import difference_check
 from bench.studies.three_errors.sections import sections, traps
 from bench.studies.three_errors.views import FLOOR, OWN, TRAP, views
 
-STANDARD = Path(bench.__file__).parent.parent / "results" / "standard"
 NO_IMPACT = Impulse(time_of_impact=False)
 
 
@@ -163,74 +161,31 @@ def laws(model, program=(1e-12, 1e-12, 1e-12)):
     return given, COLUMNS.typed(rows)
 
 
-@pytest.mark.parametrize(
-    ("model", "first"),
-    [
-        ([[0.0, 1.0, 1.0], [0.05, 1.0, 1.0]], "impulse is within 10% of the gradient of the physics on 2 scenes of 2."),
-        (
-            [[0.0, 0.1, 1.0], [0.5, 1.0, 1.0]],
-            "No contact law is right on every scene: impulse and penalty are within 10% of the gradient of the physics on 1 "
-            "of 2 scenes, the most.",
-        ),
-        ([[0.2, 0.2, 0.2]] * 2, "No contact law is within 10% of the gradient of the physics on any scene."),
-        (
-            [[np.nan, 0.05, 1.0]] * 2,
-            "penalty is within 10% of the gradient of the physics on 2 scenes of 2.",
-        ),
-    ],
-)
-def test_the_law_nearest_to_the_physics_comes_first_ties_together_and_nan_never(model, first):
-    assert views(*laws(model)).findings[0] == first
+MODELS = {
+    "one law is right": [[0.0, 1.0, 1.0], [0.05, 1.0, 1.0]],
+    "no law is right on every scene": [[0.0, 0.1, 1.0], [0.5, 1.0, 1.0]],
+    "no law is right": [[0.2, 0.2, 0.2]] * 2,
+    "a law without a number": [[np.nan, 0.05, 1.0]] * 2,
+    "nothing compared": [[np.nan] * 3] * 2,
+}
+
+
+@pytest.mark.parametrize("case", MODELS)
+def test_the_law_nearest_to_the_physics_comes_first_ties_together_and_nan_never(case):
+    approve_views("three_errors", case, views(*laws(MODELS[case])))
 
 
 def test_gradients_are_counted_once_whatever_estimates_them_and_only_where_confirmed_and_compared():
-    model = [[0.0, 3.0, np.nan], [0.5, 0.2, 0.05]]
-    found = views(*laws(model, (1e-12, 1e-12, np.nan)))
-    assert found.findings[1] == (
-        "Of 4 gradients confirmed by differences of the program's cost, 3 are off by over 10% from the gradient of the "
-        "physics, the worst by 3.0 times its norm (bounce_once, penalty, semi_implicit_euler)."
-    )
-    assert len(found.findings) == 2, "no trap without a sweep of the time step"
+    given, rows = laws([[0.0, 3.0, np.nan], [0.5, 0.2, 0.05]], (1e-12, 1e-12, np.nan))
+    found = views(given, rows)
+    approve_views("three_errors", "confirmed and compared", found)
     drawn = found.charts[0].plotted()
     zero = drawn[drawn["error"] == FLOOR]
     assert list(zero["law"]) == ["impulse"]
     assert zero["limit"].all()
     assert drawn["error"].notna().all()
-    nothing = laws([[np.nan] * 3] * 2)
-    assert views(*nothing).findings[0].startswith("Of 0 gradients confirmed")
-    given, rows = laws(model)
     rows["status"], rows["reason"] = "unsupported", "no physics"
-    assert views(given, rows).findings == ["No cell gave a result: the table has the reason of each."]
-
-
-def test_findings_of_the_standard_experiment_computed_from_its_table():
-    given = config.load(["+experiment=three_errors", f"results_dir={STANDARD}"])
-    found = views(given, Store(given.directory, COLUMNS).load())
-    data = pd.read_csv(given.directory / "three_errors.csv")
-    fobg = data[data["estimator"] == "fobg"]
-    right = fobg[fobg["program_error_rel"] <= 1e-3]
-    wrong = right[right["model_error_rel"] > 0.1]
-    assert f"Of {len(right)} gradients" in found.findings[1]
-    assert f", {len(wrong)} are off by over 10%" in found.findings[1]
-    assert f"by {wrong['model_error_rel'].max():.2g} times".replace("7.2e+02", "720") in found.findings[1]
-    smallest = fobg[fobg["dt"] == fobg.groupby("scene")["dt"].transform("min")]
-    near = (smallest["model_error_rel"] <= 0.1).groupby(smallest["contact"]).sum()
-    assert (
-        f"{near.idxmax()} is within 10% of the gradient of the physics on {near.max()} of 4 scenes" in found.findings[0]
-    )
-    assert sorted(near)[-2] < near.max()
-    main = found.charts[0]
-    drawn = main.frame[main.frame["series"] != OWN].set_index(["scene", "contact"])["error"]
-    known = smallest.set_index(["scene", "contact"])["model_error_rel"]
-    pd.testing.assert_series_equal(
-        drawn.sort_index(), known.clip(lower=FLOOR).sort_index(), check_names=False, check_index=True
-    )
-    assert (
-        main.title
-        == f"Right for the program, wrong for the physics: {(known > 0.1).sum()} of 20 gradients, 5 of them traps"
-    )
-    assert "5 of 20 programs are traps" in found.findings[2]
-    assert (main.frame["series"] == TRAP).sum() == 5
+    approve_views("three_errors", "no result", views(given, rows))
 
 
 def test_rounding_has_no_sign():

@@ -1,11 +1,11 @@
 """The study of training: what it shows of made-up runs, what it refuses, and one small run of it all."""
 
 import json
-import re
 
 import numpy as np
 import pandas as pd
 import pytest
+from helpers import approve_views
 
 import bench
 from bench.errors import UserError
@@ -40,55 +40,36 @@ def made_up(final=FINAL, seeds=range(5), spread=10.0, **columns):
     return experiment, experiment.columns.typed(pd.DataFrame(rows))
 
 
-def test_the_best_trainer_is_named_with_its_interval_and_those_behind_it():
+OPEN_DIFFERENCES = json.dumps([{"code": "differences", "error": 0.5}])
+NOT_FINITE = json.dumps([{"code": "not_finite", "update": 7, "quantity": "loss"}])
+
+
+def with_lost(**lost):
+    """Return made-up runs of which those of some trainers are not finite, and start from a better policy than others end with."""
     experiment, rows = made_up()
-    first, second, third = views(experiment, rows).findings
-    assert first.startswith("The best final return is -5")
-    assert "(shac), and shac[window=8] and ppo end lower" in first
-    assert second == "Among windows of shac, 32 steps end best, and 8 steps end lower."
-    assert third == "The logs of 15 runs show no fault."
-    assert all(text.endswith(".") and ";" not in text for text in (first, second, third))
+    for trainer, count in lost.items():
+        places = rows.index[rows["trainer"] == trainer][:count]
+        rows.loc[places, ["status", "first_return"]] = ["nonfinite", -100.0]
+    return experiment, rows
 
 
-def test_trainers_whose_intervals_overlap_are_open():
-    experiment, rows = made_up({"shac": -530.0, "ppo": -535.0}, spread=40.0)
-    assert views(experiment, rows).findings[0].startswith("Which trainer is best is open: ")
+CASES = {
+    "three trainers": lambda: made_up(),
+    "intervals that overlap": lambda: made_up({"shac": -530.0, "ppo": -535.0}, spread=40.0),
+    "four seeds": lambda: made_up(seeds=range(4)),
+    "two windows that are tied": lambda: made_up({"shac": -530.0, "shac[window=16]": -531.0, "shac[window=8]": -700.0}),
+    "no finite run of one trainer": lambda: with_lost(ppo=5),
+    "no finite run of any trainer": lambda: with_lost(**{"shac": 5, "shac[window=8]": 5, "ppo": 5}),
+    "one run lost": lambda: with_lost(shac=1),
+    "a fault in every run": lambda: made_up(verdicts=NOT_FINITE),
+    "differences that do not agree": lambda: made_up({"shac": -530.0}, verdicts=OPEN_DIFFERENCES),
+    "no result": lambda: made_up(status="error", reason="planted", curve_return=[]),
+}
 
 
-def test_few_seeds_give_no_interval_and_no_order():
-    experiment, rows = made_up(seeds=range(4))
-    shown = views(experiment, rows)
-    assert re.fullmatch(
-        r"Which trainer is best is open, since 4 seeds are too few for an interval: the highest final return is -5\d\d \(shac\)\.",
-        shown.findings[0],
-    )
-    texts = [*(chart.subtitle for chart in shown.charts), *(note for table in shown.tables for note in table.notes)]
-    told = [text for text in texts if "interquartile" in text]
-    assert len(told) == 5, "the curves, the windows, and the notes of two tables"
-    assert all("interquartile mean over 4 seeds, too few for an interval" in text for text in told)
-
-
-def test_windows_that_are_not_distinguishable_from_the_best_are_named():
-    experiment, rows = made_up({"shac": -530.0, "shac[window=16]": -531.0, "shac[window=8]": -700.0})
-    assert views(experiment, rows).findings[1] in {
-        f"Among windows of shac, {best} steps end best, not distinguishable from {other} steps, and 8 steps end lower."
-        for best, other in ((16, 32), (32, 16))
-    }
-
-
-def test_titles_over_several_problems_count_them_instead_of_naming_the_first():
-    runs = []
-    for k, final in (("1e3", FINAL), ("1e4", dict.fromkeys(FINAL, -600.0))):
-        experiment, rows = made_up(final, spread=10.0 if k == "1e3" else 100.0)
-        runs.append(aggregate.runs_of(experiment, rows).assign(problem=f"stiffness={k}"))
-    every = pd.concat(runs, ignore_index=True)
-    summary, windows = aggregate.summarise(every), aggregate.windows(every)
-    assert findings.title(summary) == "Trainers end lower than the best on 1 of 2 problems"
-    assert findings.window_title(windows) == "Among windows of shac, 32 steps end best on 1 of 2 problems"
-    last = windows[windows["problem"] == "stiffness=1e4"]
-    assert findings.window_title(pd.concat([last, last.assign(problem="other")])) == (
-        "Among windows of shac, which length ends best is open"
-    )
+@pytest.mark.parametrize("case", CASES)
+def test_findings_and_titles_of_made_up_runs(case):
+    approve_views("train", case, views(*CASES[case]()))
 
 
 def test_lengths_of_windows_are_compared_by_their_returns_and_a_bias_is_named_only_where_its_interval_excludes_0():
@@ -103,26 +84,6 @@ def test_lengths_of_windows_are_compared_by_their_returns_and_a_bias_is_named_on
     assert lines.loc[32, "bias"] == "0.31 [0.28, 0.34]"
 
 
-def test_a_trainer_without_a_run_that_ends_is_not_the_best_by_its_untrained_policy():
-    experiment, rows = made_up()
-    planted = rows["trainer"] == "ppo"
-    rows.loc[planted, ["status", "first_return"]] = ["nonfinite", -100.0]
-    text = views(experiment, rows).findings[0]
-    assert "(shac), and shac[window=8] ends lower" in text
-    assert text.endswith(", and no run of ppo ends with a finite return.")
-    assert "-100" not in text
-    rows.loc[rows["trainer"] == "shac[window=8]", ["status", "first_return"]] = ["nonfinite", -100.0]
-    assert not any("windows" in found for found in views(experiment, rows).findings), "one window is left"
-    rows["status"] = "nonfinite"
-    assert views(experiment, rows).findings[0] == "No run ends with a finite return."
-
-
-def test_runs_that_are_not_finite_are_named_beside_a_final_return():
-    experiment, rows = made_up({"shac": -530.0})
-    rows.loc[0, "status"] = "nonfinite"
-    assert views(experiment, rows).findings[0].endswith(", 1 of 5 runs not finite.")
-
-
 def test_a_run_that_is_not_finite_counts_as_its_untrained_policy():
     experiment, rows = made_up({"shac": -530.0})
     rows.loc[0, ["status", "final_return"]] = ["nonfinite", -100.0]
@@ -134,11 +95,8 @@ def test_a_run_that_is_not_finite_counts_as_its_untrained_policy():
 
 
 def test_a_fault_is_reported_in_words_with_its_run():
-    experiment, rows = made_up(verdicts=json.dumps([{"code": "not_finite", "update": 7, "quantity": "loss"}]))
+    experiment, rows = made_up(verdicts=NOT_FINITE)
     shown = views(experiment, rows)
-    assert shown.findings[2] == (
-        "The logs of 15 of 15 runs show a fault, most often this: NaN at update 7: the loss is not finite (shac, seed 0)."
-    )
     table = next(table for table in shown.tables if table.name == "faults")
     assert set(table.frame["words"]) == {"NaN at update 7: the loss is not finite"}
 
@@ -160,14 +118,6 @@ def test_that_peaks_have_contact_is_told_only_where_some_updates_have_none(conta
     assert ("peaks in updates with contact" in words) == is_told
 
 
-def test_differences_that_do_not_agree_are_open_and_no_fault():
-    fault = json.dumps([{"code": "differences", "error": 0.5}])
-    experiment, rows = made_up({"shac": -530.0}, verdicts=fault)
-    assert views(experiment, rows).findings[-1] == (
-        "The logs of 5 runs show no fault, and in 5 central differences do not agree with the gradient, which is open."
-    )
-
-
 def planted(final, fault, **columns):
     """Return the faults of made-up runs that all have one."""
     experiment, rows = made_up(final, verdicts=json.dumps([fault]), difference_error=np.nan, **columns)
@@ -186,13 +136,6 @@ def test_a_return_above_another_by_less_than_noise_is_not_below():
     low, high = {"final_low": -10.0, "final_high": -8.0}, {"final_low": -8.5, "final_high": -7.0}
     assert not findings.is_below(low, high)
     assert findings.is_below({**low, "final_high": -9.0}, high)
-
-
-def test_rows_without_a_run_show_their_reasons():
-    experiment, rows = made_up(status="error", reason="planted", curve_return=[])
-    shown = views(experiment, rows)
-    assert shown.findings == ["No run gave a result: the table has the reason of each."]
-    assert shown.remarks == ["planted"]
 
 
 def test_a_scene_without_observations_is_refused_with_the_reason(tmp_path):

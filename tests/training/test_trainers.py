@@ -87,6 +87,7 @@ def test_the_first_step_of_sep_cma_es_is_the_diagonal_of_that_of_cma_es():
     np.testing.assert_allclose(after.variance - 1.0, change * (state.theta.size + 2) / 3, rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_windows_have_no_bias_where_actions_move_nothing_and_one_where_they_do():
     """Without dynamics every action is rewarded at once, so that neither a cut nor a wrong critic changes the gradient."""
 

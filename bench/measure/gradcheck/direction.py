@@ -157,8 +157,6 @@ def judge(sample: Sample) -> Finding:
     finite = sample.finite
     if not np.isfinite(sample.centre) or finite.sum() < MIN_STEPS:
         return Finding("nonfinite")
-    if not np.isfinite(sample.derivative):
-        return Finding("nan_gradient")
     where = np.flatnonzero(finite)
     parts = {name: getattr(sample, name)[where] for name in ("step", "minus", "plus", "crossing")}
     with np.errstate(over="ignore", invalid="ignore"):
@@ -167,6 +165,10 @@ def judge(sample: Sample) -> Finding:
 
 
 def _judge(sample: Sample) -> Finding:
+    if not np.isfinite(sample.derivative):
+        noise = sample.uncertainty
+        index, spread = plateau(sample, noise)
+        return _finding(sample, "nan_gradient", index, spread + float(noise[index]))
     still = (sample.plus == sample.centre) & (sample.minus == sample.centre)
     if sample.derivative == 0.0 and still.all():
         return Finding("zero", 0, 0.0, float(sample.uncertainty[0]), 0.0, 0.0)

@@ -11,8 +11,8 @@ FAULTS = (
 """Verdicts that the program's gradient is not the derivative of its cost."""
 UNDECIDED = ("nonfinite", "unsettled")
 """Verdicts of an inconclusive check."""
-BROKEN = ("jump", "kink")
-"""Verdicts that the cost has no derivative at this point."""
+BROKEN = ("jump", "missed_slope", "kink")
+"""Verdicts that the cost has no derivative at this point, or under noise none that sampled gradients show."""
 TRUSTED = ("saturated", "rounding", "mode_crossing", "nonlinear", "smooth", "zero")
 """Verdicts that the gradient is the derivative."""
 UNTRUSTED = (*FAULTS, *UNDECIDED, *BROKEN)
@@ -32,6 +32,7 @@ MEANING = {
     "nonfinite": "a cost is NaN or infinite",
     "unsettled": "the differences agree at no step, so the check is inconclusive",
     "jump": "the cost jumps here, so it has no derivative",
+    "missed_slope": "under noise, a steep rise or a far kink carries part of the mean slope, and no sampled gradient meets it",
     "kink": "the two sides have different slopes, and a gradient can match only one",
     "saturated": "right: exactly 0, though wider differences are not: the input is clipped or has no effect here",
     "rounding": "right; small steps have larger errors than the arithmetic explains, as with a loose solver tolerance",

@@ -85,20 +85,20 @@ def by_point(rows: pd.DataFrame) -> pd.DataFrame:
     return table.drop_duplicates(["row", "point"]).sort_index()
 
 
-JUMP_UNDER_NOISE = ("noise", "jump")
-"""Point and verdict of a jump that only noise reaches: the gradient itself can be right."""
+UNDER_NOISE = "noise"
+"""Point of a jump or a missed slope that only noise reaches: the gradient itself can be right."""
 
 
 def not_right(rows: pd.DataFrame) -> str:
     """Return which checks show a gradient that is wrong or open, by verdict, in words; empty without any.
 
-    A jump that only noise reaches does not count as a fault of the gradient.
+    What only noise reaches does not count as a fault of the gradient.
     """
     points: dict[str, list[str]] = {}
     cells = set()
     for row, i, verdict in checks(rows):
         point = row["point"][i]
-        if not is_trusted(point, verdict) and (point, verdict) != JUMP_UNDER_NOISE:
+        if not is_trusted(point, verdict) and point != UNDER_NOISE:
             points.setdefault(verdict, []).append(point)
             cells.add(row["key"])
     verdicts = listed(f"{verdict} ({', '.join(dict.fromkeys(at))})" for verdict, at in points.items()) if points else ""

@@ -16,7 +16,7 @@ from bench.experiment.session import Session
 from bench.measure import gradcheck, noise
 from bench.measure.batches import in_columns
 from bench.measure.contacts import active_contacts, contact_names, engine_contacts
-from bench.measure.jumps import jump_under_noise
+from bench.measure.jumps import MissedSlope, jump_under_noise, missed_slope
 from bench.model import SURROGATE, ContactScene, EngineScene, ForceLaw, LoopOps, Problem, Rollout, Unsupported
 from bench.studies.gradient_check.points import is_trusted
 
@@ -66,9 +66,15 @@ def measure(cell: Cell, session: Session, search: SwitchSearch) -> dict[str, Any
     directions = noise.draw(cell.seed, cell.scene.name, 1, search.drawn, theta.size, "directions")[0]
     whole = start(problem, theta, unit, search, cell.seed)
     jump, at_jump = jump_under_noise(problem, theta, cell.seed, COLUMNS_AT_ONCE)
-    jumps = [Place("noise", theta, directions[0] / np.linalg.norm(directions[0]), at_jump, 0, 1)] if jump.height else []
-    places, samples = examine(problem, theta, drawn, directions, unit, search, jumps)
-    checked = [_checked(place, *both) for place, both in zip(places, samples, strict=True)]
+    # a jump is a fault of its own, and the slope that it carries is no other one
+    missed = MissedSlope(0.0, at_jump) if jump.height else missed_slope(problem, theta, cell.seed, COLUMNS_AT_ONCE)
+    under_noise = "jump" if jump.height else "missed_slope" if missed.share else ""
+    at = at_jump if jump.height else missed.w
+    places, samples = examine(
+        problem, theta, drawn, directions, unit, search,
+        [Place("noise", theta, directions[0] / np.linalg.norm(directions[0]), at, 0, 1)] if under_noise else [],
+    )  # fmt: skip
+    checked = [_checked(place, *both, under_noise) for place, both in zip(places, samples, strict=True)]
     points = [
         *at_start(whole),
         *(_settled(problem, unit, point, place) for point, place in zip(checked, places, strict=True)),
@@ -86,6 +92,11 @@ def measure(cell: Cell, session: Session, search: SwitchSearch) -> dict[str, Any
         remarks.append(
             f"the cost jumps by {jump.height:.3g}, {jump.height / jump.span:.2g} of its range, under noise of "
             f"{distance:.2g} standard deviations: the mean of gradients misses jumps"
+        )
+    if missed.share:
+        remarks.append(
+            f"sampled gradients miss {missed.share:.2g} of the mean slope along a line through the noise, most of it near "
+            f"{float(np.linalg.norm(missed.w)):.2g} standard deviations: a steep rise, or a far kink"
         )
     return {
         "status": "nonfinite" if lost else "ok",
@@ -228,9 +239,9 @@ def _number(part: gradcheck.Part) -> int:
     return -1 - part.component if part.component is not None else int(part.name.rpartition(" ")[2])
 
 
-def _checked(place: Place, sample: gradcheck.Sample, sides: Sequence[tuple[str, str]]) -> Point:
+def _checked(place: Place, sample: gradcheck.Sample, sides: Sequence[tuple[str, str]], under_noise: str) -> Point:
     minus, plus = zip(*sides, strict=True)
-    verdict = "jump" if place.point == "noise" else gradcheck.diagnose(sample)
+    verdict = under_noise if place.point == "noise" else gradcheck.diagnose(sample)
     return Point(place.point, place.sample, place.number, verdict, sample, minus, plus, place.switch)
 
 

@@ -18,8 +18,8 @@ from bench.report.style import PALETTE
 from bench.report.text import counted, listed, number
 from bench.report.views import Arranged, arrange
 from bench.studies.gradient_check.lines import (
-    JUMP_UNDER_NOISE,
     PROBLEM,
+    UNDER_NOISE,
     by_point,
     component_table,
     long_table,
@@ -30,7 +30,7 @@ from bench.studies.gradient_check.points import POINTS
 KINDS: dict[str, tuple[tuple[str, ...], Style]] = {
     "X": (FAULTS, Style(PALETTE[2], letter="X", meaning="X: not the derivative of its cost")),
     "?": (UNDECIDED, Style("#bdbdbd", letter="?", meaning="?: undecided")),
-    "J": (("jump",), Style(PALETTE[4], letter="J", meaning="J: the cost jumps here")),
+    "J": (("jump", "missed_slope"), Style(PALETTE[4], letter="J", meaning="J: the cost jumps or rises steeply here")),
     "K": (("kink",), Style(PALETTE[5], letter="K", meaning="K: kink, at most a one-sided slope")),
     "ok": (TRUSTED, Style("#cfe8df", letter="ok", meaning="ok: right")),
 }
@@ -39,6 +39,8 @@ LOOKS = {
     point: Style(PALETTE[place], marker) for point, place, marker in zip(POINTS, (0, 5, 2, 3, 4), "osD^X", strict=True)
 }
 """Look of each point at which gradients are checked."""
+RESOLVED = 0.1
+"""Largest error of a right gradient that a difference shows; above it, a second method has confirmed the gradient."""
 ERROR = Column("error", label="best error")
 EPS = Column("eps", label="best eps")
 
@@ -75,26 +77,31 @@ def findings(points: pd.DataFrame) -> list[str]:
     if points.empty:
         return ["No gradient could be checked: the table has the reason of each cell."]
     faults = untrusted(points)
-    under_noise = (faults[["point", "verdict"]] == list(JUMP_UNDER_NOISE)).all(axis=1)
+    under_noise = faults["point"] == UNDER_NOISE
     wrong, jumps = faults[~under_noise], faults[under_noise]
+    reached = "a jump of the cost" if (jumps["verdict"] == "jump").all() else "a rise that sampled gradients miss"
     if wrong.empty:
         first = f"No wrong gradient at {counted(len(points), 'checked point')}"
-        first += (
-            f", but noise reaches a jump of the cost at {len(jumps)} of them, on {_places(jumps)}" if len(jumps) else ""
-        )
+        first += f", but noise reaches {reached} at {len(jumps)} of them, on {_places(jumps)}" if len(jumps) else ""
     else:
         first = (
             f"{len(wrong)} of {counted(len(points), 'checked point')} {'has' if len(wrong) == 1 else 'have'} a gradient "
             f"that cannot be trusted ({', '.join(wrong['verdict'].unique())}), on {_places(wrong)}"
         )
-        first += f", and noise reaches a jump of the cost at {counted(len(jumps), 'other')}" if len(jumps) else ""
+        first += f", and noise reaches {reached} at {counted(len(jumps), 'other')}" if len(jumps) else ""
     broken = points["verdict"].isin(UNTRUSTED)
     errors = points.loc[~broken, "error"].dropna()
+    n_unresolved, errors = int((errors > RESOLVED).sum()), errors[errors <= RESOLVED]
     largest = (
         [f"The largest error of a right gradient is {number(errors.max())} ({points.loc[errors.idxmax(), 'name']})."]
         if len(errors)
         else []
     )
+    if n_unresolved:
+        largest.append(
+            f"At {counted(n_unresolved, 'point')} no difference resolves the gradient, and finer steps or a second method "
+            "confirm it."
+        )
     edges = points[points["verdict"].isin(BROKEN) & (points["point"] == "at")]
     one_sided = (
         [f"{counted(len(edges), 'point')} on a contact switch {'has' if len(edges) == 1 else 'have'} a kink or a jump, "

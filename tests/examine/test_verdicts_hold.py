@@ -1,0 +1,121 @@
+"""No hint softens a verdict about theta: every planted fault, with and without refined=, sigma=, noise= and expect=."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+import bench
+from bench.examine.findings import CAUSES
+
+START = np.array([0.5, -1.0, 8.0])
+RANK = {"right": 0, "not shown": 1, "wrong": 2}
+DAMPING = 0.4
+
+
+def ball(x, w=None, steps=40, damping=DAMPING, held=None):
+    """A ball falls on a soft floor: explicit steps of fixed length; theta is height, speed and root of the stiffness.
+
+    ``held`` are damper forces that a detached damper takes from another run.
+    """
+    q, v, dt, forces = x[0], x[1] + (0.0 if w is None else 0.05 * w[0]), 0.8 / steps, []
+    for i in range(steps):
+        depth = -q if q.real < 0 else 0.0
+        force = 0.0 if q.real >= 0 else damping * v if held is None else held[i]
+        forces.append(force)
+        v = v + dt * (-9.81 + x[2] * x[2] * depth - force)
+        q = q + dt * v
+    return (q - 0.3) ** 2 + 0.1 * v * v, forces
+
+
+def cost(x, w=None):
+    return ball(x, w)[0]
+
+
+def refined(x, w=None):
+    return ball(x, w, steps=400)[0]
+
+
+def slope(x, w=None, is_detached=False):
+    held = [force.real for force in ball(x, w)[1]] if is_detached else None
+    return np.array([ball(row, w, held=held)[0].imag for row in np.asarray(x) + 1e-30j * np.eye(3)]) / 1e-30
+
+
+def towards_refined(x, w=None):
+    """A factor that makes the gradient more like that of the refined cost, of which it is no derivative either."""
+    return 0.9 * slope(x, w)
+
+
+FAULTS = {
+    "a factor of .96": lambda x, w=None: 0.96 * slope(x, w),
+    "a factor of 1.04": lambda x, w=None: 1.04 * slope(x, w),
+    "a factor of .9": towards_refined,
+    "a sign": lambda x, w=None: -slope(x, w),
+    "one component": lambda x, w=None: slope(x, w) * [1.0, 1.03, 1.0],
+    "a detached damper": lambda x, w=None: slope(x, w, is_detached=True),
+    "zeros": lambda x, w=None: 0.0 * slope(x, w),
+    "no number": lambda x, w=None: np.nan * slope(x, w),
+    "another theta": lambda x, w=None: slope(START, w),
+    "no normalisation": lambda x, w=None: slope(x, w) + 0.05 * np.asarray(x),
+}
+HINTS = {
+    "refined": {"refined": refined},
+    "small sigma": {"sigma": [0.01]},
+    "two sigmas": {"sigma": [0.01, 0.1]},
+    "noise": {"noise": 1},
+    **{f"expect={cause}": {"expect": cause} for cause in ("adaptive", "kink", "wrong_factor", "missing_term")},
+    "everything": {"refined": refined, "sigma": [0.01, 0.1], "noise": 1, "expect": "adaptive"},
+}
+
+
+def examined(fault, **hints):
+    return bench.examine(cost, START, grad=FAULTS[fault], calls=2500, progress=False, **hints)
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_no_hint_softens_a_verdict(fault):
+    plain = examined(fault)
+    assert (plain.status, plain.derivative) == (1, "wrong"), str(plain)
+    for name, hints in HINTS.items():
+        report = examined(fault, **hints)
+        assert RANK[report.derivative] >= RANK[plain.derivative], f"{name}\n{report}"
+        assert report.status == 1, f"{name}\n{report}"
+        assert report.cause != "adaptive"
+
+
+def test_the_right_gradient_of_the_same_program_passes_with_every_hint():
+    FAULTS["none"] = slope
+    try:
+        for name, hints in {"none": {}, **HINTS}.items():
+            report = examined("none", **hints)
+            assert report.derivative == "right", f"{name}\n{report}"
+    finally:
+        del FAULTS["none"]
+
+
+def test_expect_accepts_what_is_open_and_never_a_wrong_gradient():
+    for fault, cause in itertools.product(("a factor of .96", "zeros"), CAUSES):
+        assert bench.examine(cost, START, grad=FAULTS[fault], calls=200, progress=False, expect=cause).status == 1
+
+
+def rounded(x, w=None):
+    return np.sum(np.round(8.0 * np.asarray(x)) / 8.0)
+
+
+def test_a_straight_through_estimator_is_wrong_at_theta_and_usable_under_noise():
+    report = bench.examine(rounded, [0.3, 0.7], grad=lambda x: np.ones(2), sigma=0.5, calls=12_000, progress=False)
+    assert report.derivative == "wrong"
+    assert "usable. The bias" in report.noise_answer
+    assert (report.status, report.noise_cause) == (1, "")
+
+
+def test_a_rounded_latent_moves_the_cost_under_noise():
+    """For each draw the cost is flat, and the mean over draws is not."""
+
+    def latent(x, w):
+        return float(np.mean(np.round(x[0] + w)) ** 2)
+
+    report = bench.examine(latent, [0.3], grad=lambda x, w: [0.0], sigma=0.3, noise=20, calls=8000, progress=False)
+    assert "does theta reach the simulator" not in str(report)
+    assert (report.status, report.noise_cause) == (1, "staircase"), str(report)
+    assert any(text.startswith("biased") for text in report.problems)
