@@ -514,9 +514,6 @@ VERBS = {
         _trace, "trace SCENE ... [key=value ...]", "one rollout: do gradient spikes coincide with contact switches?",
         f"Without noise, or with seed=S the first sample of that seed.\n{SETTINGS}", "Is it right?",
     ),
-    "bench-self": Verb(
-        _main_of("bench.benchself"), "bench-self [quick=true] [results_dir=DIR]", "speed of the harness, compared with a NumPy loop and native code", group="This package",
-    ),
     "claims": Verb(
         _main_of("bench.claims"), "claims [NAME ...] [--list] [--quick] [--again] [results_dir=DIR]", "published results run again, each with a verdict",
         "Results stored under results_dir/claims are measured again only if their code has changed, or with --again.\n"

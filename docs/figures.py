@@ -390,7 +390,7 @@ def faults_table(experiment: str) -> str:
 
 @cache
 def speeds() -> dict[str, float]:
-    """Return the lines of the stored run of ``bench-self`` by name."""
+    """Return the lines of the stored run of ``bench_self`` by name."""
     lines = json.loads((STANDARD / "bench_self" / "bench_self.json").read_text())["lines"]
     return {line["what"]: line["value"] for line in lines if line["value"] is not None}
 
@@ -399,7 +399,7 @@ BATCHES = ("1000", "10000", "100000", "1e+06")
 
 
 def speed(name: str) -> list[float]:
-    """Return the values of ``bench-self`` whose name, without the number of rollouts, is ``name``; ``*`` for the number."""
+    """Return the values of ``bench_self`` whose name, without the number of rollouts, is ``name``; ``*`` for the number."""
     return [speeds()[key] for batch in BATCHES if (key := name.replace("*", batch)) in speeds()]
 
 

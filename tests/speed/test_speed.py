@@ -5,6 +5,7 @@ import json
 import threading
 import time
 
+import bench_self
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,6 +20,7 @@ from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
 from bench.plugins.scenes.pushing import Pushing
 
 from bench import cli
+from bench.errors import UserError
 from bench.experiment import config
 from bench.measure import timing
 from bench.model import Compilations, blocks, compose, registry
@@ -246,11 +248,11 @@ def test_unsteady_times_are_marked():
     assert not unsteady({"time_s": float("nan"), "time_iqr_s": float("nan")})
 
 
-# -------------------------------------------------------------------------------------------------------- bench-self
+# -------------------------------------------------------------------------------------------------------- bench_self
 
 
 def test_numpy_loop_and_native_kernel_give_the_gradient():
-    from bench.benchself import loop, native
+    from speed import loop, native
 
     problem = Jax().compile(pushing(40))
     scene, w = problem.program.scene, np.random.default_rng(0).standard_normal((40, 64))
@@ -264,20 +266,20 @@ def test_numpy_loop_and_native_kernel_give_the_gradient():
 
 
 def test_no_compiler_is_a_line_and_no_failure(monkeypatch):
-    from bench.benchself import native
+    from speed import native
 
     monkeypatch.setattr("shutil.which", lambda name: None)
     with pytest.raises(native.Unavailable, match="no C compiler"):
         native.gradient(Pushing(), 1e3)
 
 
-def test_bench_self_refuses_what_it_does_not_know(capsys):
-    assert cli.main(["bench-self", "quik=true"]) == 2
-    assert "did you mean 'quick'" in capsys.readouterr().err
+def test_bench_self_refuses_what_it_does_not_know():
+    with pytest.raises(UserError, match="did you mean 'quick'"):
+        bench_self.main(["quik=true"])
 
 
 def test_bench_self_resumes_what_it_stored(tmp_path):
-    from bench.benchself import harness
+    from speed import harness
 
     words = [*harness.SMALL, "sweep.seed=[0,1,2]", "name=many", f"results_dir={tmp_path}"]
     harness.store_all(config.load(words))
@@ -287,7 +289,7 @@ def test_bench_self_resumes_what_it_stored(tmp_path):
 
 @pytest.mark.slow
 def test_bench_self_writes_its_table(tmp_path):
-    assert cli.main(["bench-self", "quick=true", f"results_dir={tmp_path}"]) == 0
+    assert bench_self.main(["quick=true", f"results_dir={tmp_path}"]) == 0
     lines = json.loads((tmp_path / "bench_self" / "bench_self.json").read_text())["lines"]
     found = {line["what"]: line for line in lines}
     counted = next(line for what, line in found.items() if what.startswith("compilations"))

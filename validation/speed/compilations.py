@@ -6,9 +6,9 @@ import itertools
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from bench.benchself.rollouts import batch, problem
-from bench.benchself.speed_rows import SpeedRow
 from bench.model import Compilations
+from speed.rollouts import batch, problem
+from speed.speed_rows import SpeedRow
 
 FACTORS = (0.5, 1.0, 2.0)
 """Factors by which each parameter is multiplied."""

@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from bench.benchself import loop, native
-from bench.benchself.speed_rows import SpeedRow
 from bench.experiment.by_name import compile_problem
 from bench.measure import noise, timing
 from bench.model import Problem, blocks, registry
+from speed import loop, native
+from speed.speed_rows import SpeedRow
 
 SIZES = (1_000, 10_000, 100_000, 1_000_000)
 QUICK_SIZES = (64, 512)

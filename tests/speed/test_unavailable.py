@@ -1,10 +1,10 @@
-"""bench-self on a machine that lacks a library: a line that says so, and no failure."""
+"""bench_self on a machine that lacks a library: a line that says so, and no failure."""
 
 import dataclasses
 
 import yaml
+from speed import rollouts
 
-from bench.benchself import rollouts
 from bench.experiment.config import config_dir
 from bench.model import registry
 

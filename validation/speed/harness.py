@@ -9,13 +9,13 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from bench.benchself.speed_rows import SpeedRow
 from bench.experiment import config
 from bench.experiment.experiment import Experiment
 from bench.experiment.grid import cells
 from bench.run.execute import store_of
 from bench.run.plan import plan
 from bench.run.tasks import blank_row
+from speed.speed_rows import SpeedRow
 
 SIDE, QUICK_SIDE = 100, 5
 """Number of values on each of the two axes of the planned sweep."""

@@ -1,4 +1,8 @@
-"""``python -m bench bench-self``: measures the speed of the harness, compared with a NumPy loop and native code."""
+"""Measures the speed of the harness, compared with a NumPy loop and native code.
+
+``python validation/bench_self.py [quick=true] [results_dir=DIR]`` writes ``results_dir/bench_self/``; quick=true runs small
+sizes.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +11,8 @@ import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from bench.benchself import compilations, harness, rollouts, speed_rows
+from speed import compilations, harness, rollouts, speed_rows
+
 from bench.errors import UserError
 from bench.experiment.config import config_dir
 from bench.experiment.words import parse_flag, parse_words
@@ -15,9 +20,9 @@ from bench.experiment.words import parse_flag, parse_words
 
 def main(words: Sequence[str]) -> int:
     """Measure speeds, write files and print the table. Returns 0. ``quick=true`` runs small sizes."""
-    names, settings, _ = parse_words(words, "bench-self", {"quick": "false", "results_dir": "results"})
+    names, settings, _ = parse_words(words, "bench_self", {"quick": "false", "results_dir": "results"})
     if names:
-        raise UserError(f"bench-self takes quick=true|false and results_dir=FOLDER, not '{names[0]}'")
+        raise UserError(f"bench_self takes quick=true|false and results_dir=FOLDER, not '{names[0]}'")
     load_before = list(os.getloadavg()) if hasattr(os, "getloadavg") else None
     rows = []
     for row in measure(parse_flag(settings, "quick")):
@@ -40,3 +45,10 @@ def measure(quick: bool) -> Iterator[speed_rows.SpeedRow]:
     yield from rollouts.compare_backends(settings, quick)
     yield from compilations.count_compilations(settings)
     yield from harness.measure_commands(quick)
+
+
+if __name__ == "__main__":
+    try:
+        sys.exit(main(sys.argv[1:]))
+    except UserError as error:
+        sys.exit(f"bench_self: {error}")
