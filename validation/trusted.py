@@ -347,16 +347,17 @@ class Counted(FunctionScene):
 '''
 
 
-@cache
-def refused(seed: int, indices: tuple[int, ...]) -> dict[int, str]:
-    """Return the verdicts with which the command `gradcheck` refuses scenes, by their number; empty for those it does not."""
+def refused(seed: int, indices: tuple[int, ...], folder: str) -> dict[int, str]:
+    """Return the verdicts with which the command `gradcheck` refuses scenes, by their number; empty for those it does not.
+
+    ``folder`` has the plugin.
+    """
     every = list(scenes())
-    with tempfile.TemporaryDirectory() as folder:
-        (Path(folder) / "counted.py").write_text(PLUGIN)
+    with tempfile.TemporaryDirectory() as results:
         names = [f"counted[index={i},sigma={every[i].sigma}]" for i in indices]
-        settings = ["backends=[jax]", "workers=0", f"seed={seed}", f"plugins={folder}", f"results_dir={folder}/results"]
+        settings = ["backends=[jax]", "workers=0", f"seed={seed}", f"plugins={folder}", f"results_dir={results}"]
         command(["gradcheck", *names, *settings, "--quiet"])
-        rows = pd.read_parquet(Path(folder) / "results" / "gradcheck" / "rows.parquet")
+        rows = pd.read_parquet(Path(results) / "gradcheck" / "rows.parquet")
     verdicts = {}
     for row in rows.to_dict("records"):
         pairs = zip(row["point"], row["check_verdict"], strict=True)
@@ -433,7 +434,10 @@ def main() -> int:
         part = "new" if scene.family in NEW else "counted only" if place % 2 else "seen"
         if part in (sys.argv[1:] or parts):
             chosen.append((index, scene, part))
-    verdicts = {seed: refused(seed, tuple(index for index, _, _ in chosen)) for seed in SEEDS}
+    with tempfile.TemporaryDirectory() as folder:
+        (Path(folder) / "counted.py").write_text(PLUGIN)
+        indices = tuple(index for index, _, _ in chosen)
+        verdicts = {seed: refused(seed, indices, folder) for seed in SEEDS}
     trusted_scenes: dict[str, set[int]] = {part: set() for part in parts}
     for index, scene, part in chosen:
         found = outcomes(index, scene, verdicts)

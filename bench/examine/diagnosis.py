@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from bench.examine.gradient import SUSPICIOUS, GradientStages
-from bench.examine.lines import SIDES, LineScan, scan
+from bench.examine.lines import LineScan, scan
 from bench.examine.quick import QuickCheck
-from bench.examine.steps import changed_loop, changing_loop, traced_loops
+from bench.examine.steps import changing_loop
 from bench.examine.subspace import choose
 from bench.measure.gradcheck import Check
 from bench.model.simulator.simulator import Simulator
@@ -28,8 +28,6 @@ SMALL_JUMPS = 0.05
 """Largest total height of such jumps, as a share of the cost's change along the line."""
 FEWEST_JUMPS = 2
 """Fewest jumps on the lines that count as jumps of adaptive steps."""
-TRACED = 4
-"""Most jumps at which the loops of the two sides are compared."""
 SPREADS = (0.0, 0.05, 0.1, 0.2, 0.4)
 """Distances from theta, in units of each input's scale, at which the loops of the program are compared."""
 ELSEWHERE = 2
@@ -227,19 +225,7 @@ def is_adaptive(
     heights, changes, errors = np.array(rows).T
     is_near = error <= NEAR and ((heights < SMALL_JUMPS * changes) & (errors <= EXPLAINED * heights)).any()
     is_far = heights.sum() < FAR_JUMPS * changes.sum() and (errors <= heights).all()
-    return bool((is_near or is_far) and _has_steps_at_jumps(stages, lines))
-
-
-def _has_steps_at_jumps(stages: GradientStages, lines: Sequence[LineScan]) -> bool:
-    """Return whether the loops of a Python program change their lengths across most jumps; JAX programs show no lengths."""
-    if stages.simulator.library == "jax":
-        return True
-    jumps = [(line, jump) for line in lines for jump in sorted(line.jumps, key=lambda jump: -jump.size)[:TRACED]]
-    changed = []
-    for line, jump in jumps[:TRACED]:
-        sides = [stages.theta + jump.near[SIDES + i][0] * line.direction for i in (-1, 0)]
-        changed.append(bool(changed_loop([traced_loops(stages.simulator, theta, stages.w) for theta in sides])))
-    return float(np.mean(changed)) >= 0.5
+    return bool(is_near or is_far)
 
 
 def _simulator(stages: GradientStages, cost: Callable[..., Any], grad: Any) -> Simulator:

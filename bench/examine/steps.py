@@ -23,9 +23,9 @@ SKIPPED = tuple(f"/{name}/" for name in ("jax", "jaxlib", "torch", "numpy", "ben
 
 
 def changing_loop(simulator: Simulator, thetas: np.ndarray, w: np.ndarray | None) -> str:
-    """Return the place of a loop whose length depends on theta, as ``ode.py:17``; empty where none is known.
+    """Return the place of a while loop whose length depends on theta, as ``ode.py:17``; empty where none is known.
 
-    A JAX program is read: a while loop whose condition depends on theta. Other Python code runs under a trace at
+    A JAX program is read: a loop whose condition depends on theta. Other Python code runs under a trace at
     ``thetas (d, n)``. Loops of compiled code are not seen.
     """
     place = _loop_of_jax(simulator, thetas[:, 0], w)
@@ -88,16 +88,21 @@ def traced_loops(simulator: Simulator, theta: np.ndarray, w: np.ndarray | None) 
 
 
 def _loop_lines(code: CodeType) -> dict[int, int]:
-    """Return the last line of each loop of a function by its first line."""
+    """Return the last line of each while loop of a function by its first line.
+
+    A for loop runs over a list, whose length is often the number of contacts rather than of steps.
+    """
     lines: dict[int, int] = {}
+    names: dict[int, str] = {}
     line = code.co_firstlineno
     spans: dict[int, int] = {}
     for instruction in dis.get_instructions(code):
         line = (instruction.positions and instruction.positions.lineno) or line
-        lines[instruction.offset] = line
-        if "JUMP_BACKWARD" in instruction.opname and instruction.argval in lines:
-            first = min(lines[instruction.argval], line)
-            last = max(one for offset, one in lines.items() if offset >= instruction.argval)
+        lines[instruction.offset], names[instruction.offset] = line, instruction.opname
+        target = instruction.argval
+        if "JUMP_BACKWARD" in instruction.opname and names.get(target, "FOR_ITER") != "FOR_ITER":
+            first = min(lines[target], line)
+            last = max(one for offset, one in lines.items() if offset >= target)
             spans[first] = max(spans.get(first, first), last)
     return spans
 
@@ -167,6 +172,10 @@ def _programs(equation: Any) -> list[Any]:
 
 
 def _place(equation: Any) -> str:
-    from jax._src import source_info_util
+    """Return the place of an equation in the user's code, as JAX summarises it."""
+    try:
+        from jax._src import source_info_util
 
-    return Path(source_info_util.summarize(equation.source_info).split(" ")[0]).name
+        return Path(source_info_util.summarize(equation.source_info).split(" ")[0]).name
+    except (ImportError, AttributeError):  # no public function names it
+        return "a while loop"
