@@ -35,7 +35,8 @@ Settings:
   study=NAME sweep.AXIS=[..] theta=[mass,..] theta0=[..]
   scene.NAME.PARAMETER=..  (also contact. integrator. backend. estimator.)
   samples=N repeats=R seed=S results_dir=DIR name=FOLDER formats=[png,svg,pdf]
-  shard=3/64 workers=N timeout=10m memory=4g on_error=stop timing=false retry=[timeout]
+  workers=N timeout=10m memory=4g on_error=stop timing=false retry=[timeout]
+  shard=3/64: the third of 64 parts of the sweep
   plugins=DIR: plugins of your own
   --config-dir DIR: experiments of your own, as DIR/experiment/NAME.yaml
   --quiet: no progress

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -47,9 +48,14 @@ class Task:
 
     @property
     def outside(self) -> frozenset[str]:
-        """The modules from outside this package whose code the task runs."""
+        """The modules and files from outside this package whose code the task runs."""
         parts = [*self.cell.parts.values(), self.cell.study, self.backend]
-        return frozenset(type(part).__module__ for part in parts if part is not None and is_foreign(part))
+        foreign = [part for part in parts if part is not None and is_foreign(part)]
+        names = {type(part).__module__ for part in foreign}
+        for part in foreign:
+            with suppress(Exception):  # the error is reported when the cell is measured
+                names |= set(map(str, getattr(part, "files", tuple)()))
+        return frozenset(names)
 
 
 class TaskHandler:
