@@ -268,8 +268,10 @@ class Findings:
         else:  # along a direction of length 1 in units of the scales
             sizes = [p.difference * p.sample.scale for p in self.check.components]
             along = max(float(np.linalg.norm(np.nan_to_num(sizes))), abs(part.difference))
-            whole = GroupSize(self.theta.size, float(np.linalg.norm(self.check.scale * self.atol)), 0.0)
-            allowed = float(self.rtol.max()) * along + whole.tolerated
+            parts = [p.sample.scale * self.atol[p.component] for p in self.check.components if p.component is not None]
+            parts += [group.allowed for group in self.groups.values()] if self.atol.any() else []
+            absolute = GroupSize(max(len(parts), 1), float(np.linalg.norm(parts)), 0.0).tolerated
+            allowed = float(self.rtol.max()) * along + absolute
         return bool(abs(part.program - part.difference) <= allowed)
 
     @property
@@ -818,9 +820,9 @@ class Findings:
         if len(parts) < max(self.theta.size, 2) or not all(math.isfinite(part.difference) for part in parts):
             return False
         error = np.array([part.program - part.difference for part in parts])
-        at = self.theta[[part.component for part in parts]]
+        at = np.array([self.theta[part.component or 0] for part in parts])
         size = float(np.linalg.norm(error) * np.linalg.norm(at))
-        return np.count_nonzero(at) > 1 and size > 0 and abs(float(error @ at)) > ALONG_THETA * size
+        return bool(np.count_nonzero(at) > 1 and size > 0 and abs(float(error @ at)) > ALONG_THETA * size)
 
     def _named_parts(self, check: Check) -> list[Part]:
         """Return the worst parts that name an input: located groups, then components, then directions."""
