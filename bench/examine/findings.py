@@ -22,8 +22,7 @@ from bench.report.text import counted, duration, number, span
 if TYPE_CHECKING:
     import pandas as pd
 
-EXPLANATIONS = {
-    "nan_gradient": "the gradient is not a number where the cost is",
+EXPLANATIONS = MEANING | {
     "nondeterministic": "the same call returns different numbers: new noise in every call, or state that persists between calls; "
     "pass the noise as w, or fix its seed",
     "stale_gradient": "the gradient does not change when theta does: a cache that is never cleared, or a copy made too early",
@@ -32,7 +31,6 @@ EXPLANATIONS = {
     "disconnected": "the gradient is exactly 0 where the cost has a slope: detached, or an operation that cuts gradients",
     "wrong_factor": "a factor or a sign is wrong",
     "missing_term": "part of the derivative is right: a term is missing, detached or counted twice",
-    "wrong_adjoint": "the differences agree with each other, but not with the gradient",
     "nonfinite": "the cost is not a number at theta or near it",
     "unsettled": "the differences agree at no step, so the check is inconclusive: the cost is chaotic, or too noisy at every step",
     "unresolved": "the cost's rounding or noise hides its slope at every step, so the check can show neither a right nor a wrong value",
@@ -494,7 +492,7 @@ class Findings:
 
     def _derivative_problem(self) -> str:
         cause = self.derivative_cause
-        text = f"{cause}: {EXPLANATIONS.get(cause, MEANING.get(cause, ''))}"
+        text = f"{cause}: {EXPLANATIONS[cause]}"
         if cause == "raised":
             return f"{text}: {shortened(self.error)}"
         if cause == "twin":
@@ -755,7 +753,7 @@ class Findings:
 
     def sentence(self, check: Check) -> str:
         """Return the verdict of a failed check as a sentence, with the numbers of the worst part."""
-        cause = self._same_factor(check) or EXPLANATIONS.get(check.cause, check.cause) + self._evidence(check)
+        cause = self._same_factor(check) or EXPLANATIONS[check.cause] + self._evidence(check)
         if check.cause == "disconnected" and any(part.verdict in ("smooth", "nonlinear") for part in check.components):
             cause = "the gradient of some inputs is exactly 0 where the cost has a slope: they are detached"
         size = self._worst_size(check)
