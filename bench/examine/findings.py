@@ -22,8 +22,7 @@ from bench.report.text import counted, duration, number, span
 if TYPE_CHECKING:
     import pandas as pd
 
-EXPLANATIONS = {
-    "nan_gradient": "the gradient is not a number where the cost is",
+EXPLANATIONS = MEANING | {
     "nondeterministic": "the same call returns different numbers: new noise in every call, or state that persists between calls; "
     "pass the noise as w, or fix its seed",
     "stale_gradient": "the gradient does not change when theta does: a cache that is never cleared, or a copy made too early",
@@ -32,7 +31,6 @@ EXPLANATIONS = {
     "disconnected": "the gradient is exactly 0 where the cost has a slope: detached, or an operation that cuts gradients",
     "wrong_factor": "a factor or a sign is wrong",
     "missing_term": "part of the derivative is right: a term is missing, detached or counted twice",
-    "wrong_adjoint": "the differences agree with each other, but not with the gradient",
     "nonfinite": "the cost is not a number at theta or near it",
     "unsettled": "the differences agree at no step, so the check is inconclusive: the cost is chaotic, or too noisy at every step",
     "unresolved": "the cost's rounding or noise hides its slope at every step, so the check can show neither a right nor a wrong value",
@@ -268,8 +266,10 @@ class Findings:
         else:  # along a direction of length 1 in units of the scales
             sizes = [p.difference * p.sample.scale for p in self.check.components]
             along = max(float(np.linalg.norm(np.nan_to_num(sizes))), abs(part.difference))
-            whole = GroupSize(self.theta.size, float(np.linalg.norm(self.check.scale * self.atol)), 0.0)
-            allowed = float(self.rtol.max()) * along + whole.tolerated
+            parts = [p.sample.scale * self.atol[p.component] for p in self.check.components if p.component is not None]
+            parts += [group.allowed for group in self.groups.values()] if self.atol.any() else []
+            absolute = GroupSize(max(len(parts), 1), float(np.linalg.norm(parts)), 0.0).tolerated
+            allowed = float(self.rtol.max()) * along + absolute
         return bool(abs(part.program - part.difference) <= allowed)
 
     @property
@@ -492,7 +492,7 @@ class Findings:
 
     def _derivative_problem(self) -> str:
         cause = self.derivative_cause
-        text = f"{cause}: {EXPLANATIONS.get(cause, MEANING.get(cause, ''))}"
+        text = f"{cause}: {EXPLANATIONS[cause]}"
         if cause == "raised":
             return f"{text}: {shortened(self.error)}"
         if cause == "twin":
@@ -753,7 +753,7 @@ class Findings:
 
     def sentence(self, check: Check) -> str:
         """Return the verdict of a failed check as a sentence, with the numbers of the worst part."""
-        cause = self._same_factor(check) or EXPLANATIONS.get(check.cause, check.cause) + self._evidence(check)
+        cause = self._same_factor(check) or EXPLANATIONS[check.cause] + self._evidence(check)
         if check.cause == "disconnected" and any(part.verdict in ("smooth", "nonlinear") for part in check.components):
             cause = "the gradient of some inputs is exactly 0 where the cost has a slope: they are detached"
         size = self._worst_size(check)
@@ -818,9 +818,9 @@ class Findings:
         if len(parts) < max(self.theta.size, 2) or not all(math.isfinite(part.difference) for part in parts):
             return False
         error = np.array([part.program - part.difference for part in parts])
-        at = self.theta[[part.component for part in parts]]
+        at = np.array([self.theta[part.component or 0] for part in parts])
         size = float(np.linalg.norm(error) * np.linalg.norm(at))
-        return np.count_nonzero(at) > 1 and size > 0 and abs(float(error @ at)) > ALONG_THETA * size
+        return bool(np.count_nonzero(at) > 1 and size > 0 and abs(float(error @ at)) > ALONG_THETA * size)
 
     def _named_parts(self, check: Check) -> list[Part]:
         """Return the worst parts that name an input: located groups, then components, then directions."""

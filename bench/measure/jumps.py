@@ -200,10 +200,10 @@ def largest_jump(
             # at this length only a jump exceeds rounding
             noise = float(np.median(bends))
             isolated = _isolated(values, steps)
-            highest = int(np.argmax(isolated))
-            part = int(steps[highest].argmax())
-            where = int(line[highest]), float(nodes[highest, part : part + 2].mean())
-            changes[-1] = float(isolated[highest])
+            best = int(np.argmax(isolated))
+            at_jump = int(steps[best].argmax())
+            where = int(line[best]), float(nodes[best, at_jump : at_jump + 2].mean())
+            changes[-1] = float(isolated[best])
             break
         row, place = np.unravel_index(np.argsort(bends, axis=None)[-SUSPECTS:], bends.shape)
         line, left, width, parts = line[row], nodes[row, place], 2.0 * width / parts, CUTS
