@@ -37,6 +37,7 @@ class Settings(TypedDict, total=False):
 
     name: str
     question: str
+    answer: str
     study: str
     scenes: Names
     contacts: Names

@@ -299,7 +299,8 @@ def test_bench_has_a_dozen_names_and_every_contract_is_in_bench_plugin():
     for name in bench.model.__all__:
         assert getattr(bench.plugin, name) is getattr(bench.model, name)
     public = {name for name, value in vars(bench.model).items() if not name.startswith("_") and getattr(value, "__module__", "") != "bench.model" and not hasattr(value, "__path__") and type(value).__name__ != "module"}  # fmt: skip
-    assert public == set(bench.model.__all__)
+    shared_by_plugins = {"adjoint"}  # a module whose revision plugins name in `uses`
+    assert public | shared_by_plugins == set(bench.model.__all__)
 
 
 def test_a_star_import_replaces_no_builtin():

@@ -165,7 +165,7 @@ def planned(words):
     if verb in ("gradcheck", "trace"):
         scenes = [w for w in rest if "=" not in w.partition("[")[0]]
         chosen = ["experiment=gradient_check"] * (verb == "gradcheck")
-        rest = [*chosen, f"scenes=[{','.join(scenes)}]", *rest[len(scenes) :]]
+        rest = [*chosen, *[f"scenes=[{','.join(scenes)}]"][: len(scenes)], *rest[len(scenes) :]]
     if verb in ("run", "report", "plan", "gradcheck", "trace"):
         return ["plan", *rest]
     return ["list", *rest] if verb in ("list", "check") else [verb, "--help"]

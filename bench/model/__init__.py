@@ -10,6 +10,7 @@ traced value, so Python code must not branch on it. All other types are static.
 """
 
 from bench.errors import Unsupported, UserError, unknown
+from bench.model import adjoint
 from bench.model.adjoint import Slopes, by_actions, by_theta, slopes
 from bench.model.adjoint import gradient as adjoint_gradient
 from bench.model.backend import Backend
@@ -130,6 +131,7 @@ __all__ = [
     "Usage",
     "UserError",
     "ZeroOrderHoldScene",
+    "adjoint",
     "adjoint_gradient",
     "affine",
     "best_gradient",
