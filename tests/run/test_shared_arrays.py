@@ -71,6 +71,7 @@ def rows(folder, names, workers):
     return table.loc[["fobg", "reinforce"]], table.loc[names]
 
 
+@pytest.mark.filterwarnings("ignore:The given NumPy array is not writable")
 @pytest.mark.parametrize("workers", [0, 1])
 def test_writing_in_place_changes_no_other_cell(tmp_path, workers):
     plain, _ = rows(tmp_path / "plain", [], workers)
