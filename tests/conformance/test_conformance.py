@@ -21,9 +21,10 @@ from bench.plugins.scenes.mass_spring import MassSpring
 from bench.plugins.scenes.pushing import Pushing
 from bench.plugins.scenes.quadratic import Quadratic
 
-from bench import cli
+from bench import cli, conformance
 from bench.conformance import Skipped, check, kit, main, parametrize, subjects
 from bench.conformance.kit import variants
+from bench.conformance.subjects import all_programs, distinguishing_programs, sound_scenes
 from bench.errors import UserError
 from bench.model import (
     Array,
@@ -636,6 +637,17 @@ PLANTED = {
 }
 
 
+@pytest.fixture
+def few_programs(monkeypatch):
+    """Checks of backends and contact laws run one program of each sort and one with a surrogate, and every fourth scene with contacts."""
+    programs = distinguishing_programs(all_programs())
+    programs.append(next(program for program in all_programs() if program.surrogate and not program.needs_root))
+    touching = [scene for scene in sound_scenes() if isinstance(scene, ContactScene) and scene.continuous]
+    monkeypatch.setattr(conformance.backends, "all_programs", lambda: programs)
+    monkeypatch.setattr(conformance.contacts, "sound_scenes", lambda: touching[::4])
+
+
+@pytest.mark.usefixtures("few_programs")
 @pytest.mark.parametrize("plugin", PLANTED, ids=lambda plugin: plugin.name)
 def test_planted_fault_is_caught(plugin):
     failed = {result.check: result.detail for result in check(plugin, PLANTED[plugin]) if result.outcome == "fail"}
@@ -853,7 +865,7 @@ def test_a_limit_that_is_no_duration_is_refused():
         cli._check(["linear", "limit=soon"])
 
 
-@pytest.mark.parametrize("provides", ["{'physics'}", "set()"])
+@pytest.mark.parametrize("provides", ["{'physics'}", pytest.param("set()", marks=pytest.mark.slow)])
 def test_a_broken_backend_does_not_fail_the_checks_of_a_scene(tmp_path, provides):
     (tmp_path / "a_broken.py").write_text(BROKEN_BACKEND.replace("PROVIDES", provides))
     for cached in (subjects.plain_backend, subjects.all_programs, subjects.sound_laws):

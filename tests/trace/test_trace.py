@@ -54,7 +54,7 @@ PROBLEMS = {
     "bounce_once": (BounceOnce(), Penalty(stiffness=1e4)),
     "bounce_once, impulse": (BounceOnce(), Impulse()),
 }
-ALIKE = {"cartpole", "pushing, softplus", "pushing, impulse"}
+ALIKE = {"double_integrator", "pendulum", "cartpole", "pushing, softplus", "pushing, impulse", "bounce_once"}
 """Problems whose scene and sort of law other problems have too."""
 
 
