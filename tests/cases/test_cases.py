@@ -39,7 +39,7 @@ CASES = [
     ("c13_second_step_nan:cost grad=grad horizons=1,2,3", WRONG, "nan_gradient", "from step 2 on"),
     ("c14_five_percent:cost grad=adjoint", WRONG, "", "32%"),
     ("c15_buffer:cost grad=grad", RIGHT, "", ""),
-    ("c15_buffer:double grad=grad", WRONG, "wrong_factor", ""),
+    ("c15_buffer:cost grad=double", WRONG, "wrong_factor", ""),
     ("c15_buffer:work grad=work_grad", RIGHT, "", ""),
     ("c16_exploding:cost grad=jax sigma=0.003", 3, "spread", ""),
     ("c21_argmax:cost grad=last sigma=0.1", WRONG, "", ""),
