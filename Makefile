@@ -23,7 +23,7 @@ lint: $(VENV)/.installed
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-# The generated parts of the documents: findings, columns and marked figures.
+# The generated parts of the documents: answers, columns and marked figures.
 docs: $(VENV)/.installed
 	$(BIN)/python -m docs.build
 
@@ -31,7 +31,7 @@ docs: $(VENV)/.installed
 site: $(VENV)/.installed
 	$(BIN)/python -m docs.build site
 
-# Run the missing cells of all experiments into results/standard, then write findings and figures into the documents.
+# Run the missing cells of all experiments into results/standard, then write answers and figures into the documents.
 gallery: $(VENV)/.installed
 	for name in $$(cd conf/experiment && find * -name '*.yaml' | sed 's/\.yaml$$//' | sort); do \
 	  $(RUN) +experiment=$$name results_dir=results/standard || exit 1; done

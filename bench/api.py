@@ -242,7 +242,7 @@ def problem(
 
     ``problem.value(theta, w)``, ``.grad`` and ``.score`` take ``theta (d,)`` or ``(d, B)`` and noise ``w (n_w,)`` or
     ``(n_w, B)``, as arrays or lists. By default they use ``problem.program.theta0``, the point at which gradients are
-    taken, and no noise. ``problem.plot()`` draws the cost, and ``problem.to_frame()`` has the parameters. ``theta``
+    taken, and no noise. ``problem.to_frame()`` has the parameters. ``theta``
     names float parameters of the scene and the contact law as the decision variable in place of the scene's own. Raises
     :class:`bench.UserError` for an invalid name or value, and :class:`bench.Unsupported` if the combination cannot run
     or a library is not installed.

@@ -35,7 +35,8 @@ Settings:
   study=NAME sweep.AXIS=[..] theta=[mass,..] theta0=[..]
   scene.NAME.PARAMETER=..  (also contact. integrator. backend. estimator.)
   samples=N repeats=R seed=S results_dir=DIR name=FOLDER formats=[png,svg,pdf]
-  shard=3/64 workers=N timeout=10m memory=4g on_error=stop timing=false retry=[timeout]
+  workers=N timeout=10m memory=4g on_error=stop timing=false retry=[timeout]
+  shard=3/64: the third of 64 parts of the sweep
   plugins=DIR: plugins of your own
   --config-dir DIR: experiments of your own, as DIR/experiment/NAME.yaml
   --quiet: no progress
@@ -513,9 +514,6 @@ VERBS = {
     "trace": Verb(
         _trace, "trace SCENE ... [key=value ...]", "one rollout: do gradient spikes coincide with contact switches?",
         f"Without noise, or with seed=S the first sample of that seed.\n{SETTINGS}", "Is it right?",
-    ),
-    "bench-self": Verb(
-        _main_of("bench.benchself"), "bench-self [quick=true] [results_dir=DIR]", "speed of the harness, compared with a NumPy loop and native code", group="This package",
     ),
     "claims": Verb(
         _main_of("bench.claims"), "claims [NAME ...] [--list] [--quick] [--again] [results_dir=DIR]", "published results run again, each with a verdict",

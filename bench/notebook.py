@@ -1,4 +1,4 @@
-"""Problems and estimates as a notebook shows them: a line of text, a table, a chart."""
+"""Problems and estimates as a notebook shows them: a line of text, and a table."""
 
 from __future__ import annotations
 
@@ -18,16 +18,8 @@ from bench.model.parameters import parameters
 
 if TYPE_CHECKING:
     import pandas as pd
-    from matplotlib.figure import Figure
 
     from bench.measure.statistics import Summary
-
-POINTS = 201
-"""Number of costs on the line that :meth:`NotebookProblem.plot` draws."""
-REACH = 3.0
-"""Length of the line on each side of theta, in units of sigma."""
-SHOWN = 12
-"""Most components of theta that a chart shows: those with the largest reference."""
 
 
 class NotebookProblem(Problem):
@@ -95,11 +87,6 @@ class NotebookProblem(Problem):
         facts = self._facts()
         return f"Problem: {self.title}; theta = {facts['theta']}; noise: {facts['noise']}"
 
-    def _repr_html_(self) -> str:
-        from bench.report.displays import html_table
-
-        return html_table("Problem", self._facts())
-
     def to_frame(self) -> pd.DataFrame:
         """Return all parameters of scene, contact law and integrator: part, plugin, name, value, unit and meaning."""
         import pandas as pd
@@ -111,42 +98,6 @@ class NotebookProblem(Problem):
             for name, parameter in parameters(type(part)).items()
         ]
         return pd.DataFrame(rows, columns=["part", "plugin", "parameter", "value", "unit", "meaning"])
-
-    def plot(self, component: int = 0, reach: float | None = None) -> Figure:
-        """Return a chart of the cost without noise along one component of theta, with the gradient's tangent.
-
-        The line extends by ``reach`` on each side of ``theta0``, by default three sigma.
-        """
-        from bench.report.displays import add_legend, new_chart
-        from bench.report.figures import styled
-        from bench.report.style import GREY, PALETTE
-
-        if not 0 <= component < self.dim:
-            raise UserError(f"component={component} is not a component of theta: give 0 to {self.dim - 1}")
-        reach = REACH * self.sigma if reach is None else reach
-        if not 0 < reach < math.inf:
-            raise UserError(f"reach={reach} must be a finite number greater than 0")
-        theta0 = self.program.theta0
-        shift = np.linspace(-reach, reach, POINTS)
-        theta = np.repeat(theta0[:, None], POINTS, axis=1)
-        theta[component] += shift
-        costs = self.value(theta)
-        name = component_names(self)[component]
-        with styled():
-            figure, axes = new_chart(self.title)
-            axes.plot(theta[component], costs, color=PALETTE[0], label="cost without noise")
-            if "grad" in self.provides:
-                tangent = costs[POINTS // 2] + self.grad()[component] * shift
-                low, high = np.nanmin(costs), np.nanmax(costs)
-                margin = 0.1 * (high - low)
-                is_near = (tangent >= low - margin) & (tangent <= high + margin)
-                line = np.where(is_near, tangent, np.nan)
-                axes.plot(theta[component], line, "--", color=PALETTE[2], label="slope by the gradient")
-            axes.axvline(theta0[component], color=GREY, linewidth=0.6, linestyle=":")
-            axes.set_xlabel(name)
-            axes.set_ylabel("cost f")
-            add_legend(figure)
-        return figure
 
 
 @cache
@@ -224,11 +175,6 @@ class Estimates:
 
     __repr__ = __str__
 
-    def _repr_html_(self) -> str:
-        from bench.report.displays import html_table
-
-        return html_table(self._title(), self._facts())
-
     def as_dict(self) -> dict[str, Any]:
         """Return the statistics by the names of the main table's columns."""
         return asdict(self.summary)
@@ -244,30 +190,3 @@ class Estimates:
         std = self.values.std(axis=0, ddof=1) if repeats > 1 else np.full(self.reference.size, math.nan)
         columns = {"reference": self.reference, "mean": self.values.mean(axis=0), "se": std / math.sqrt(repeats)}
         return pd.DataFrame(columns | {"std": std}, index=pd.Index(component_names(self.problem), name="component"))
-
-    def plot(self) -> Figure:
-        """Return a chart of the estimates and the reference per component; of the 12 largest components if d is larger."""
-        from bench.report.displays import add_legend, new_chart
-        from bench.report.figures import styled
-        from bench.report.style import PALETTE
-
-        order = np.sort(np.argsort(-np.abs(self.reference), kind="stable")[:SHOWN])
-        names = [component_names(self.problem)[index] for index in order]
-        place = np.arange(order.size)
-        # the estimates of a component are spread over a third of its place, in order, without chance
-        offset = np.linspace(-1 / 6, 1 / 6, len(self.values)) if len(self.values) > 1 else np.zeros(1)
-        with styled():
-            figure, axes = new_chart(self._title())
-            across = (place[None, :] + offset[:, None]).ravel()
-            axes.plot(across, self.values[:, order].ravel(), ".", color=PALETTE[6], markersize=4, label="one estimate")
-            axes.plot(place, self.values[:, order].mean(axis=0), "o", color=PALETTE[0], label="mean of the estimates")
-            axes.hlines(
-                self.reference[order], place - 0.3, place + 0.3, color=PALETTE[2], linewidth=1.5, label="reference"
-            )
-            axes.set_xticks(place, names, rotation=45 if order.size > 6 else 0)
-            axes.set_xlim(-0.6, order.size - 0.4)
-            axes.set_ylabel("gradient")
-            if order.size < self.reference.size:
-                axes.set_xlabel(f"the {order.size} of {self.reference.size} components with the largest reference")
-            add_legend(figure)
-        return figure

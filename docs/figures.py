@@ -1,6 +1,7 @@
 """Figures in the documents: each stands between two marks, and is written again from the stored results.
 
-A document has ``<!--=name-->231<!--/-->``, where ``name`` is a key of :data:`FIGURES`. Renderers hide the marks.
+A document has ``<!--=name-->231<!--/-->``, where ``name`` is a key of :data:`FIGURES`, or a reference to a stored table,
+``train/windows | verdict=first | window | integer``: see :mod:`bench.report.answer`. Renderers hide the marks.
 ``python -m docs.build figures`` writes the present values, and a test fails where a document has another one.
 
 A section whose figures come from a command that takes long has ``<!-- figures: COMMAND -->``; one whose numbers are
@@ -20,17 +21,18 @@ import pandas as pd
 
 from bench.experiment import config
 from bench.measure.performance import wilson
-from bench.report.text import apart, number
+from bench.report import answer
+from bench.report.text import apart, axis_value, number
 from bench.report.text import interval as text_of_interval
 from bench.report.text import span as ends_of
 from bench.studies.bias_variance import trust
 from bench.studies.dose_response import analysis
 from bench.studies.gradient_check.points import is_trusted
 from bench.studies.growth import views as growth
-from bench.studies.train import aggregate, findings
-from docs.results import STANDARD, comparison, rmse_interval, rows_of, select
+from bench.studies.train import aggregate
+from docs.results import STANDARD, answer_of, comparison, rmse_interval, rows_of, select, table_of
 
-MARK = re.compile(r"<!--=([\w.-]+)-->(.*?)<!--/-->", re.DOTALL)
+MARK = re.compile(r"<!--=([\w.-]+|[^>\n]+\|.*?)-->(.*?)<!--/-->", re.DOTALL)
 SOURCE = re.compile(r"<!-- figures: (.*?) -->\n?")
 FOUR = ("fobg", "reinforce", "randomized_smoothing", "inverse_variance")
 SOFT, STIFF = (0.0, 3000.0), (1e4, 1e6)
@@ -320,6 +322,12 @@ def trained_in_range(low: float, high: float) -> str:
     return f"{((low <= final) & (final <= high)).sum()} of {len(final)}"
 
 
+def window_bias(line: dict[str, Any]) -> str:
+    """Return the bias of windows with its interval, or the upper end of an interval that reaches 0."""
+    low, high = number(line["window_bias_low"]), number(line["window_bias_high"])
+    return f"{number(line['window_bias'])} [{low}, {high}]" if line["window_bias_low"] > 0 else f"0 (< {high})"
+
+
 def final_return(line: dict[str, Any]) -> str:
     """Return a final return with its interval, or without one where there are too few seeds."""
     ends = f" [{number(line['final_low'], 3)}, {number(line['final_high'], 3)}]"
@@ -343,7 +351,7 @@ def windows_table(experiment: str = "train") -> str:
     """Return gradient, its bias and final return by the length of a window as a Markdown table."""
     head = ["| window [steps] | norm of the gradient | its bias | final return |", "|--:" * 4 + "|"]
     return block(head + [
-        f"| {line['window']:.0f} | {number(line['window_gradient'])} | {findings.bias_words(line)} | {final_return(line)} |"
+        f"| {line['window']:.0f} | {number(line['window_gradient'])} | {window_bias(line)} | {final_return(line)} |"
         for line in aggregate.windows(trained(experiment)).to_dict("records")
     ])  # fmt: skip
 
@@ -355,7 +363,7 @@ def stiffness_table() -> str:
         "|--:" * 5 + "|",
     ]
     return block(head + [
-        f"| {count(stiffness)} | {line['window']:.0f} | {number(line['window_gradient'])} | {findings.bias_words(line)} | {final_return(line)} |"
+        f"| {count(stiffness)} | {line['window']:.0f} | {number(line['window_gradient'])} | {window_bias(line)} | {final_return(line)} |"
         for stiffness, part in trained("train/stiffness").groupby("stiffness")
         for line in aggregate.windows(part).to_dict("records")
     ])  # fmt: skip
@@ -367,26 +375,22 @@ def gradient_norms(experiment: str, window: int) -> str:
     return span(runs.loc[runs["trainer"].str.contains(f"window={window}]", regex=False), "gradient_typical"])
 
 
-def windows_finding(experiment: str = "train") -> str:
-    """Return which window ends best, which are not distinguishable from it, and which end lower."""
-    return findings.window(aggregate.windows(trained(experiment)))
-
-
 def faults_table(experiment: str) -> str:
-    """Return per trainer and fault the number of runs whose log shows it, with the words of the first, as Markdown."""
+    """Return per trainer and fault the number of runs whose log shows it, and the numbers of the first, as Markdown."""
     runs = trained(experiment)
     seeds = runs.groupby("method")["seed"].nunique()
-    named = aggregate.faults(runs).assign(code=lambda frame: [fault["code"] for fault in frame["fault"]])
-    return block(["| trainer | runs | the log of the first one |", "|---|--:|---|"] + [
-        f"| `{method}` | {len(part)} of {seeds[method]} | "
-        f"seed {part['seed'].iloc[0]:.0f}: {findings.describe(part['fault'].iloc[0])} |"
-        for (method, _), part in named.groupby(["method", "code"])
+    numbers = [name for name in ("update", "factor", "error") if name in (faults := aggregate.faults(runs))]
+    head = ["trainer", "fault", "runs", "first in seed", *numbers]
+    return block([f"| {' | '.join(head)} |", "|---|---|" + "--:|" * (len(head) - 2)] + [
+        f"| `{method}` | {code.replace('_', ' ')} | {len(part)} of {seeds[method]} | {part['seed'].iloc[0]:.0f} | "
+        + " | ".join(axis_value(float(f"{part[name].iloc[0]:.3g}")) for name in numbers) + " |"
+        for (method, code), part in faults.groupby(["method", "code"])
     ])  # fmt: skip
 
 
 @cache
 def speeds() -> dict[str, float]:
-    """Return the lines of the stored run of ``bench-self`` by name."""
+    """Return the lines of the stored run of ``bench_self`` by name."""
     lines = json.loads((STANDARD / "bench_self" / "bench_self.json").read_text())["lines"]
     return {line["what"]: line["value"] for line in lines if line["value"] is not None}
 
@@ -395,7 +399,7 @@ BATCHES = ("1000", "10000", "100000", "1e+06")
 
 
 def speed(name: str) -> list[float]:
-    """Return the values of ``bench-self`` whose name, without the number of rollouts, is ``name``; ``*`` for the number."""
+    """Return the values of ``bench_self`` whose name, without the number of rollouts, is ``name``; ``*`` for the number."""
     return [speeds()[key] for batch in BATCHES if (key := name.replace("*", batch)) in speeds()]
 
 
@@ -526,12 +530,6 @@ def with_interval(row: Any, name: str) -> str:
     if not np.isfinite(value):
         return "-"
     return text_of_interval(value, low, high)
-
-
-def dose_answer(name: str = "dose_response") -> str:
-    """Return the findings of an experiment, a line each."""
-    found = json.loads((STANDARD / name / "findings.json").read_text())
-    return block([f"- {sentence}" for sentence in (found["findings"] if isinstance(found, dict) else found)])
 
 
 def dose_fits() -> str:
@@ -793,7 +791,7 @@ FIGURES: dict[str, Callable[[], str]] = {
     "push-on-lbfgs": lambda: span(select(rows_of("push_on"), optimizer="lbfgs")["final_cost"], digits=3),
     "push-on-adam": lambda: span(select(rows_of("push_on"), optimizer="adam[rate=0.03]")["final_cost"], digits=3),
     "push-on-cem": lambda: push_costs("apart, noise 0.02", "cem"),
-    "dose-answer": dose_answer,
+    "dose-answer": lambda: answer_of("dose_response"),
     "dose-pairs": dose_pairs,
     "dose-runs": dose_runs,
     "dose-unreached": dose_unreached,
@@ -808,7 +806,6 @@ FIGURES: dict[str, Callable[[], str]] = {
     "dose-data": dose_data,
     "dose-shapes": dose_shapes,
     "dose-rates": dose_rates,
-    "dose-controls-answer": lambda: dose_answer("dose_response_controls"),
     "dose-controls": dose_controls,
     "fobg-soft": lambda: span(pushing("fobg", stiffness=SOFT)["rmse_rel"]),
     "reinforce-soft": lambda: span(pushing("reinforce", stiffness=SOFT)["rmse_rel"]),
@@ -880,18 +877,16 @@ FIGURES: dict[str, Callable[[], str]] = {
     "rate-effect": lambda: span((rates := learning_rates())["score"] - rates["median_score"]),
     "rate-methods": lambda: number(float(np.ptp(learning_rates()["score"]))),
     "rate-diverged": lambda: diverged("learning_rates"),
-    "train-finding": lambda: findings.recommendation(aggregate.summarise(trained())),
+    "train-answer": lambda: answer_of("train"),
     "train-range": lambda: trained_in_range(-560.0, -480.0),
     "train-table": trained_table,
     "train-windows": windows_table,
-    "train-windows-finding": windows_finding,
-    "hopper-finding": lambda: findings.recommendation(aggregate.summarise(trained("train/hopper"))),
+    "hopper-answer": lambda: answer_of("train/hopper"),
     "hopper-table": lambda: trained_table("train/hopper"),
     "hopper-stiffness": stiffness_table,
     "hopper-windows": lambda: windows_table("train/hopper"),
-    "hopper-windows-finding": lambda: windows_finding("train/hopper"),
     "hopper-faults": lambda: faults_table("train/hopper"),
-    "cheetah-finding": lambda: findings.recommendation(aggregate.summarise(trained("train/half_cheetah"))),
+    "cheetah-answer": lambda: answer_of("train/half_cheetah"),
     "cheetah-table": lambda: trained_table("train/half_cheetah"),
     "cheetah-norms-8": lambda: gradient_norms("train/half_cheetah", 8),
     "cheetah-norms-16": lambda: gradient_norms("train/half_cheetah", 16),
@@ -926,7 +921,12 @@ FIGURES: dict[str, Callable[[], str]] = {
 
 def with_figures(text: str) -> str:
     """Return a document with the present value of each marked figure; raises KeyError for an unknown name."""
-    return MARK.sub(lambda match: f"<!--={match[1]}-->{FIGURES[match[1]]()}<!--/-->", text)
+    return MARK.sub(lambda match: f"<!--={match[1]}-->{figure(match[1])}<!--/-->", text)
+
+
+def figure(name: str) -> str:
+    """Return the present value of a figure, by its name or as a reference to a stored table."""
+    return answer.value_of(name, table_of) if "|" in name else FIGURES[name]()
 
 
 def without_marks(text: str) -> str:

@@ -1,4 +1,4 @@
-"""Standard results as the documents need them: findings, files, and errors compared between estimators."""
+"""Standard results as the documents need them: answers, tables, files, and errors compared between estimators."""
 
 from __future__ import annotations
 
@@ -16,7 +16,9 @@ import bench
 from bench.errors import UserError
 from bench.experiment import config
 from bench.experiment.experiment import Experiment
+from bench.report import answer
 from bench.report.views import arrange
+from bench.report.writer import ANSWER
 from bench.studies.bias_variance import comparisons
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -25,12 +27,12 @@ STANDARD = ROOT / "results" / "standard"
 
 @dataclass(frozen=True)
 class Entry:
-    """One experiment: its question, and its findings and files where it has been run."""
+    """One experiment: its question, and its answer and files where it has been run."""
 
     name: str
     question: str
     folder: Path
-    findings: tuple[str, ...] = ()
+    answer: str = ""
     chart: Path | None = None
     joined: str = ""
     """The experiment that has this one's cells too, by its setting ``also``."""
@@ -39,6 +41,11 @@ class Entry:
     def page(self) -> str:
         """The name of the experiment's page on the site, that of its folder."""
         return f"experiment/{self.folder.name}"
+
+    @property
+    def has_results(self) -> bool:
+        """Whether the experiment has been run."""
+        return (self.folder / ANSWER).exists()
 
     @property
     def charts(self) -> list[Path]:
@@ -63,12 +70,12 @@ class Entry:
         words = {".csv": "table, every digit", ".parquet": "all rows with all columns", ".md": "readable table"}
         words |= {".tex": "table for a paper", ".json": "settings, versions, machine and counts"}
         for path in sorted(self.folder.iterdir()):
-            if path.suffix in words and not path.name.endswith(".plotted.csv") and path.name != "findings.json":
+            if path.suffix in words and not path.name.endswith(".plotted.csv") and path.name != ANSWER:
                 yield path, words[path.suffix]
 
 
 def entries_of(results: Path) -> list[Entry]:
-    """Return every experiment with its findings, in alphabetical order; those not run yet have none."""
+    """Return every experiment with its answer, in alphabetical order; those not run yet have none."""
     joined = joined_experiments(results)
     return [
         replace(entry_of(*experiment), joined=joined.get(experiment[2].name, "")) for experiment in experiments(results)
@@ -93,19 +100,32 @@ def loaded(results: Path) -> dict[str, Experiment]:
 
 
 def entry_of(name: str, question: str, folder: Path) -> Entry:
-    """Return an experiment with the content of its ``findings.json``; raises :class:`UserError` if that is malformed."""
-    path = folder / "findings.json"
+    """Return an experiment with the content of its ``answer.json``; raises :class:`UserError` if that is malformed."""
+    path = folder / ANSWER
     if not path.exists():
         return Entry(name, question, folder)
     record = json.loads(path.read_text())
     record = record if isinstance(record, dict) else {}
-    findings, chart = record.get("findings"), record.get("chart") or ""
-    if not (isinstance(findings, list) and all(isinstance(text, str) for text in findings) and isinstance(chart, str)):
-        raise UserError(
-            f"'{path}' is not a record of findings: it needs a list of strings 'findings' and a string 'chart'"
-        )
+    text, chart = record.get("answer"), record.get("chart")
+    if not (isinstance(text, str) and isinstance(chart, str)):
+        raise UserError(f"'{path}' is not an answer: it needs the strings 'answer' and 'chart'")
     picture = folder / f"{Path(chart).name}.png"
-    return Entry(name, question, folder, tuple(findings), picture if picture.exists() else None)
+    return Entry(name, question, folder, text, picture if picture.exists() else None)
+
+
+@cache
+def table_of(name: str, results: Path = STANDARD) -> pd.DataFrame:
+    """Return a stored table, ``train/windows``: the folder of an experiment, and the name of its CSV."""
+    path = results / f"{name}.csv"
+    if not path.exists():
+        raise UserError(f"'{path}' does not exist")
+    return pd.read_csv(path)
+
+
+def answer_of(experiment: str, results: Path = STANDARD) -> str:
+    """Return an experiment's answer with its numbers; raises LookupError if the stored tables do not carry it."""
+    own = loaded(results)[experiment]
+    return answer.fill(own.answer, lambda name: table_of(f"{own.name}/{name}", results))
 
 
 @cache
@@ -138,7 +158,7 @@ def rmse_interval(rows: pd.DataFrame) -> tuple[pd.Series, pd.Series]:
 def comparison(experiment: str, results: Path = STANDARD) -> pd.DataFrame:
     """Return the relative RMSE of each setting of an estimator on each problem, with its 95% interval and verdict.
 
-    Verdicts are those of :mod:`bench.studies.bias_variance.comparisons`, as in the experiment's findings. ``best``: lowest,
+    Verdicts are those of :mod:`bench.studies.bias_variance.comparisons`. ``best``: lowest,
     or not distinguishable from the lowest. ``biased``: more than half of the squared error is bias.
     """
     loaded = config.load([f"experiment={experiment}", f"results_dir={results}"])
@@ -146,7 +166,7 @@ def comparison(experiment: str, results: Path = STANDARD) -> pd.DataFrame:
     settings = comparisons.compare_errors(methods).to_dict("records")
     best = {(row["problem"], name) for row in settings for name in (row["first"], *row["tied"])}
     parts = methods["estimator"].str.partition("[")
-    return methods.rename(columns={"error": "rmse_rel"}).assign(
+    return methods.rename(columns={"error": "rmse_rel", "error_low": "low", "error_high": "high"}).assign(
         estimator=parts[0],
         estimator_params=parts[2].str.removesuffix("]"),
         best=[pair in best for pair in zip(methods["problem"], methods["method"], strict=True)],

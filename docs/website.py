@@ -78,7 +78,7 @@ def build(out: Path, results: Path = STANDARD) -> Path:
 
 def sources(results: Path = STANDARD) -> dict[str, str]:
     """Return the Markdown text of every page of the site, by its name without suffix."""
-    found = [entry for entry in entries_of(results) if entry.findings]
+    found = [entry for entry in entries_of(results) if entry.has_results]
     pages = {name: localise(without_marks((ROOT / path).read_text()), Path(path)) for name, path in PAGES.items()}
     pages |= {entry.page: experiment_page(entry) for entry in found}
     pages |= {f"estimator/{name}": text for name, text in estimator_pages(results).items()}
@@ -146,7 +146,7 @@ def download(label: str, file: str) -> str:
 
 
 def home_page(found: Sequence[Entry]) -> str:
-    """Return the first page: what the package answers, the five entries and one finding of each experiment."""
+    """Return the first page: what the package answers, the five entries and the answer of each experiment."""
     readme = without_marks((ROOT / PAGES["start"]).read_text())
     opening = readme.partition("\n## ")[0].strip()
     lines = [
@@ -156,20 +156,20 @@ def home_page(found: Sequence[Entry]) -> str:
         "- [Extend](extending.md): add an estimator, a scene, a backend or a study",
         "- [Reference](reference.md): commands, columns, Python interface, validation",
     ]
-    findings = [f"- [{entry.name}]({entry.page}.md): {escape_markdown(entry.findings[0])}" for entry in found]
-    return "\n".join([localise(opening, Path("README.md")), "", *lines, "", "## Findings", "", *findings, ""])
+    answers = [
+        f"- [{entry.name}]({entry.page}.md): {escape_markdown(entry.answer or entry.question)}" for entry in found
+    ]
+    return "\n".join([localise(opening, Path("README.md")), "", *lines, "", "## Experiments", "", *answers, ""])
 
 
 def experiment_page(entry: Entry) -> str:
-    """Return the page of one experiment: question, findings, chart, command, tables and links to its data."""
+    """Return the page of one experiment: question, answer, chart, command, tables and links to its data."""
     folder = f"/data/{entry.folder.name}"
-    anchor = entry.folder.name.replace("_", "-")
-    parts = [f"# {entry.name}", escape_markdown(entry.question), "## Findings"]
-    for count, finding in enumerate(entry.findings, 1):
-        name = f"{anchor}-{count}"
-        parts.append(f"({name})=\n{{.finding}}\n{escape_markdown(finding)} [¶](#{name})")
+    parts = [f"# {entry.name}", escape_markdown(entry.question)]
+    if entry.answer:
+        parts.append(f"{{.finding}}\n{escape_markdown(entry.answer)}")
     if entry.chart:
-        parts.append(f"![{escape_markdown(entry.findings[0])}]({folder}/{entry.chart.name})")
+        parts.append(f"![{escape_markdown(entry.question)}]({folder}/{entry.chart.name})")
     parts += ["## Run it", f"    python -m bench +experiment={entry.name}", "Or write its page from the stored rows:"]
     parts += [f"    python -m bench report +experiment={entry.name} results_dir=results/standard", entry.made]
     for path in entry.tables:

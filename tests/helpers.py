@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import json
 import math
-import os
 import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -19,7 +18,6 @@ from bench.experiment.cell import Cell
 from bench.experiment.columns import IDENTITY
 from bench.experiment.experiment import Experiment, TableLayout
 from bench.experiment.grid import cells
-from bench.experiment.views import Views
 from bench.model import registry
 from bench.model.identity import parse_identity
 from bench.model.parameters import parameters
@@ -35,29 +33,6 @@ VIEWS = {"scene": ("horizon", "dt", "sigma", "noise"), "contact": ("stiffness",)
 """The columns that show a parameter of the plugin on an axis."""
 WHO = (*IDENTITY, "experiment", "dim", "key", "study", "parameters")
 """The columns that are also filled in rows of failed cells."""
-
-
-APPROVED = Path(__file__).with_name("approved")
-"""Folder of the texts that people have read and approved, a file per study."""
-
-
-def approve(study: str, case: str, *texts: str) -> None:
-    """Compare texts with those approved for a case of a study. With APPROVE=1 in the environment, store them as approved."""
-    path = APPROVED / f"{study}.txt"
-    sections = path.read_text().split("## ")[1:] if path.exists() else []
-    approved = dict(section.split("\n", 1) for section in sections)
-    found = "".join(f"{text}\n" for text in texts)
-    if os.environ.get("APPROVE"):
-        approved[case] = found
-        path.parent.mkdir(exist_ok=True)
-        path.write_text("".join(f"## {name}\n{text}" for name, text in sorted(approved.items())))
-    assert found == approved.get(case), f"{case} of {path} differs; APPROVE=1 stores the text if it is right"
-
-
-def approve_views(study: str, case: str, shown: Views) -> None:
-    """Compare findings, remarks and the titles of charts that are not findings with the approved texts of a case."""
-    titles = [chart.title for chart in shown.charts if f"{chart.title}." not in shown.findings]
-    approve(study, case, *shown.findings, *dict.fromkeys(titles), *shown.remarks)
 
 
 # ------------------------------------------------------------------------------------------------ made-up results

@@ -21,7 +21,7 @@ LAYERS = [
     ["run"],
     ["report"],
     ["studies", "trace"],
-    ["compare", "benchself", "examine", "claims"],
+    ["compare", "examine", "claims"],
     ["notebook", "plugin"],
     ["api"],
     ["__init__"],

@@ -271,7 +271,7 @@ class Ledger:
 
         config.load = loaded
         if not charts:
-            finish.write = lambda *_: (Views(()), [])
+            finish.write = lambda *_: (Views(), [])
         try:
             with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
                 return main(["run", *words, f"results_dir={folder}"]), err.getvalue().strip()

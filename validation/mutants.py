@@ -44,7 +44,7 @@ GC, GD, GK, GR, GS, GV = (
     for name in ("check", "direction", "causes", "roughness", "sampling", "verdicts")
 )
 X = "plugins/estimators/"
-OF_TIMING = "tests/studies/test_flat.py tests/benchself/test_speed.py::test_timing_repeats_fast_calls_and_keeps_the_results_asked_for tests/benchself/test_speed.py::test_slow_calls_are_made_once_each tests/measure/test_timing.py"
+OF_TIMING = "tests/studies/test_flat.py tests/speed/test_speed.py::test_timing_repeats_fast_calls_and_keeps_the_results_asked_for tests/speed/test_speed.py::test_slow_calls_are_made_once_each tests/measure/test_timing.py"
 OF_STORE = "-m not\\ slow tests/run/test_store.py tests/run/test_nothing_lost.py"
 OF_CHECKS = "tests/measure/test_direction.py tests/measure/test_check.py"
 EL, EF, EX, ES, EG, EQ = (

@@ -14,6 +14,7 @@ from bench.claims.tables import Results
 from bench.report.tables import csv
 from bench.report.text import counted, duration
 from bench.report.web import shell
+from bench.report.writer import ANSWER
 from bench.run.files import write_all
 
 TITLE = "Published claims, run again"
@@ -34,11 +35,11 @@ def write(directory: Path, results: Results) -> list[Path]:
             "claims.csv": csv(tables.figures_table(results)),
             "claims.tex": tables.latex(results),
             "claims.html": page(results, charts),
-            "findings.json": json.dumps(
+            ANSWER: json.dumps(
                 {
                     "experiment": "claims",
                     "question": QUESTION,
-                    "findings": [f"{counted(len(results), 'published claim')}: {tables.count_verdicts(results)}."],
+                    "answer": f"{counted(len(results), 'published claim')}: {tables.count_verdicts(results)}.",
                     "chart": next(iter(charts), ""),
                 },
                 indent=1,

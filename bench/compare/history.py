@@ -154,7 +154,7 @@ def views(history: History) -> Views:
     subtitle = "geometric mean of the ratios to the errors of the first result"
     subtitle += f", {len(names)} of {len(moved)} changed series" if len(moved) > len(names) else ""
     chart = Chart(
-        "history", finding, frame, [text("result", label="")], [ERROR], panel="line", panel_notes=failures, height=1.2,
+        "history", frame, [text("result", label="")], [ERROR], title=finding, panel="line", panel_notes=failures, height=1.2,
         marks=[Mark("", 1.0, axis="y")], subtitle=subtitle,
     )  # fmt: skip
     columns = [
@@ -175,7 +175,7 @@ def views(history: History) -> Views:
             "gradient moved: largest distance of a cell's gradient from that of the first result, relative to its norm."
         )
     every = Table("history", table, columns, finding.rstrip("."), notes, data=history.table)
-    return Views([finding], [every], [chart])
+    return Views([every], [chart], headline=finding)
 
 
 def _changes(table: pd.DataFrame) -> pd.Series:

@@ -201,7 +201,7 @@ def page_views(comparison: Comparison) -> Views:
         for when in ("before", "after")
     ]  # fmt: skip
     return Views(
-        findings=[summary(table)],
+        headline=summary(table),
         tables=[views.Table("rules", rules, [text("remark")], "How cells are judged", files=[], page=True)],
         charts=[
             _before_after(before, after, rows)
@@ -221,6 +221,6 @@ def _before_after(before: Column, after: Column, rows: pd.DataFrame) -> Chart:
     title = after.heading.replace(" after", "").capitalize()
     frame = rows[["outcome", "experiment", before.name, after.name]].assign(row=range(len(rows)))
     return Chart(
-        after.name, title, frame, [before], [after], "points", series="outcome", panel="experiment", styles=STYLES,
+        after.name, frame, [before], [after], "points", title, series="outcome", panel="experiment", styles=STYLES,
         printed=False, text="Points above the diagonal are larger after.",
     )  # fmt: skip

@@ -94,7 +94,38 @@ def _composed(overrides: Sequence[str], config_dirs: Sequence[Path]) -> Experime
         raise UserError(printable(": ".join(lines)).replace("override ++", "")[:1000]) from None
     assert isinstance(plain, dict)
     settings = {str(k): values.restore(v) for k, v in plain.items()}
-    return _joined(experiment(settings), _as_list(settings["also"]), overrides, config_dirs)
+    joined = _joined(experiment(settings), _as_list(settings["also"]), overrides, config_dirs)
+    return replace(joined, answer=_answer(joined, overrides, config_dirs))
+
+
+APPEARANCE = (
+    "name",
+    "also",
+    "results_dir",
+    "answer",
+    "formats",
+    "table",
+    "compile_time",
+    "compile_cache",
+    "plugins",
+    "execution",
+)
+"""Fields of an experiment that may differ from those of its file where its answer holds; of ``also`` the number may not."""
+
+
+def _answer(found: Experiment, overrides: Sequence[str], config_dirs: Sequence[Path]) -> str:
+    """Return the answer in an experiment's own file; empty if the file has none or other settings."""
+    from omegaconf import OmegaConf
+
+    split = (override.lstrip("+").partition("=") for override in overrides)
+    name = next((value for key, _, value in split if key == "experiment"), None)
+    file: Any = OmegaConf.load(_file_of(name, config_dirs)) if name else {}
+    answer = str(file.get("answer") or "")
+    if answer and len(overrides) > 1:
+        own = load([f"experiment={name}"], config_dirs)
+        alike = replace(found, **{field: getattr(own, field) for field in APPEARANCE})
+        return answer if alike == own and len(found.also) == len(own.also) else ""
+    return answer
 
 
 def _joined(
@@ -269,6 +300,7 @@ def experiment(config: Mapping[str, Any]) -> Experiment:
         decision=_decision(config),
         results_dir=_folder(config["results_dir"]),
         question=str(config["question"] or ""),
+        answer=str(config["answer"] or ""),
         marks=_mapping(config, "marks"),
         compile_time=coerce(bool, config["compile_time"], "compile_time"),
         formats=tuple(_one_of("formats", item, FORMATS) for item in _as_list(config["formats"])),

@@ -96,6 +96,8 @@ class Experiment:
     seed: int = 0
     results_dir: Path = Path("results")
     question: str = ""
+    answer: str = ""
+    """What a person concludes, with references to tables (:mod:`bench.report.answer`); empty if its settings were changed."""
     marks: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     """Named values by axis, drawn as lines in the charts."""
     compile_time: bool = False

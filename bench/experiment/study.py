@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Study(Plugin):
-    """Measures each cell, and says what to show of the rows: findings, tables and charts, as data.
+    """Measures each cell, and says what to show of the rows: tables and charts, as data.
 
     A study is registered like any plugin: as a folder under ``bench/studies``, in a plugin folder of the user, or by an
     entry point.

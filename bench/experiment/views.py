@@ -1,4 +1,4 @@
-"""What a study shows of its rows, as data: findings, tables and charts. :mod:`bench.report` writes and draws them."""
+"""What a study shows of its rows, as data: tables and charts. :mod:`bench.report` writes and draws them."""
 
 from __future__ import annotations
 
@@ -45,16 +45,6 @@ class Mark:
 
 
 @dataclass(frozen=True)
-class Note:
-    """A text to the left of a point of a panel."""
-
-    text: str
-    x: float
-    y: float
-    panel: str | None = None
-
-
-@dataclass(frozen=True)
 class Chart:
     """A chart as data: which columns of a table are drawn against each other, for print and page.
 
@@ -67,14 +57,14 @@ class Chart:
 
     name: str
     """The stem of the files' names."""
-    title: str
-    """The finding that print shows."""
     frame: pd.DataFrame
     """A line per point. Its column ``row``, if any, is the position of the cell in ``Views.rows``."""
     x: Sequence[Column]
     """The horizontal quantities: print draws the first, a reader of the page chooses."""
     y: Sequence[Column]
     kind: ChartKind = "lines"
+    title: str = ""
+    """By default the experiment's question, and on the page the name."""
     series: str = ""
     """The column whose values have a colour and a marker each."""
     line: str = ""
@@ -90,16 +80,13 @@ class Chart:
     """How to read the chart, for the page."""
     subtitle: str = ""
     """Conditions that all panels share, for print."""
-    page_title: str = ""
-    """The finding of all of the table, for the page; by default ``title``."""
     value_range: tuple[float, float] | None = None
     """The numbers ``value`` of the lightest and the darkest cell; by default the smallest and the largest."""
     panel_notes: Mapping[str, str] = field(default_factory=dict)
-    """A sentence below the title of a panel, by panel."""
+    """Words below the title of a panel, such as a verdict, by panel."""
     styles: Mapping[str, Style] = field(default_factory=dict)
     """The looks of series or levels; others get a colour each."""
     marks: Sequence[Mark] = ()
-    notes: Sequence[Note] = ()
     join: bool = False
     front: str = ""
     """On the page: the column within whose values points are marked that no other point beats in both x and y."""
@@ -177,8 +164,6 @@ class Table:
 class Views:
     """All that a study shows of its rows."""
 
-    findings: Sequence[str]
-    """At most three sentences: the recommendation first, then what fails."""
     tables: Sequence[Table] = ()
     charts: Sequence[Chart] = ()
     """The main chart first."""
@@ -188,3 +173,5 @@ class Views:
     """The result columns of the page's table of cells; empty: all of the study's numbers and verdicts."""
     remarks: Sequence[str] = ()
     """Lines that the terminal adds, such as the reasons of cells without results."""
+    headline: str = ""
+    """What stands first and last: the experiment's answer, which :mod:`bench.report` fills in. Studies leave it empty."""

@@ -493,12 +493,6 @@ def _draw_marks(chart: Chart, panel: Axes, name: str, part: pd.DataFrame) -> Non
                         0.005, mark.at, plain(mark.name), transform=panel.get_yaxis_transform(), va="bottom",
                         fontsize=SIZE - 1, color="#404040",
                     )  # fmt: skip
-    for note in chart.notes:
-        if note.panel in (None, name):
-            panel.annotate(
-                plain_lines(note.text), (note.x, note.y), (-6, 4), textcoords="offset points", fontsize=SIZE - 0.5,
-                va="top", ha="right",
-            )  # fmt: skip
 
 
 def _free_height(panel: Axes, start: float, end: float, height: float) -> float:

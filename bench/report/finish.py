@@ -5,23 +5,23 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pandas as pd
 
-from bench.errors import UserError
+from bench.errors import UserError, printable, unknown
 from bench.experiment.experiment import Experiment
 from bench.experiment.study import study_of
 from bench.experiment.views import Views
 from bench.model import guard
-from bench.report import generic, ladder, web, writer
+from bench.report import answer, generic, ladder, web, writer
 from bench.report.views import newest_rows
 from bench.run.execute import Finished, store_of
 from bench.run.plan import requested_rows
 from bench.run.record import record
 
-FINDINGS = 3
-"""Most findings; a ladder's come first, and further ones are remarks."""
+NO_RESULT = "No cell gave a result: the table has the reason of each."
 
 
 def finish(finished: Finished, words: Sequence[str]) -> tuple[pd.DataFrame, Views, list[Path]]:
@@ -66,7 +66,19 @@ def views_of(experiment: Experiment, rows: pd.DataFrame) -> Views:
     """Return what the study shows of its rows, or else a table of its numbers and a chart of any two of them."""
     rows = rows.reset_index(drop=True)
     views = study_of(experiment).views(experiment, rows) or generic.views(experiment, rows)
-    if not experiment.execution.ladder:
-        return views
-    every = [*ladder.findings(experiment, rows), *views.findings]
-    return replace(views, findings=every[:FINDINGS], remarks=[*every[FINDINGS:], *views.remarks])
+    if experiment.execution.ladder:
+        views = replace(views, tables=[ladder.table(experiment, rows), *views.tables])
+    if not (rows["status"] == "ok").any() and not any(len(chart.frame) for chart in views.charts):
+        return replace(views, headline=NO_RESULT)
+    try:
+        return replace(views, headline=answer.fill(experiment.answer, partial(_table, views)))
+    except LookupError as error:
+        return replace(views, remarks=[*views.remarks, f"The rows no longer carry the answer: {printable(error)}"])
+
+
+def _table(views: Views, name: str) -> pd.DataFrame:
+    """Return the content of a table's CSV by its name."""
+    named = {table.name: table for table in reversed(views.tables) if "csv" in table.files}
+    if name not in named:
+        raise unknown("table", name, named)
+    return named[name].frame if named[name].data is None else named[name].data

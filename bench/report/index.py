@@ -1,4 +1,4 @@
-"""Writes ``index.html``: a grid with a chart, the finding and the state of every experiment in a results folder.
+"""Writes ``index.html``: a grid with a chart, the answer and the state of every experiment in a results folder.
 
 All texts come from stored files, which may be foreign: they are shown literally, and nothing is read from other pages.
 """
@@ -24,7 +24,7 @@ YEAR_3000 = 32503680000.0
 """Seconds since 1970 that no run has stored."""
 GOOD = ("ok", "unsupported", "unavailable", "waiting")
 """Statuses that do not count as failures: the cell has a result, or was refused with a reason."""
-MARKERS = ("rows.parquet", "run.json", "findings.json")
+MARKERS = ("rows.parquet", "run.json", "answer.json")
 """Files whose folder is listed."""
 LISTED = (".html", ".md", ".csv", ".tex", ".png", ".svg", ".pdf")
 """Suffixes of the files that a card lists."""
@@ -54,20 +54,18 @@ def write(folder: Path) -> Path:
 
 
 def _card(folder: Path, place: Path) -> str:
-    """Return the HTML of one experiment: chart, question, finding, state, one button, and its files folded away."""
-    record, stored = read_object(place / "run.json"), read_object(place / "findings.json")
+    """Return the HTML of one experiment: chart, question, answer, state, one button, and its files folded away."""
+    record, stored = read_object(place / "run.json"), read_object(place / "answer.json")
     name = _text(stored, "experiment") or _text(record, "experiment") or place.name
     question = _text(stored, "question") or _text(record, "question")
-    findings = stored.get("findings")
-    finding = next(iter(findings), "") if isinstance(findings, list) else ""
     chart = _chart(place, _text(stored, "chart"))
     state, when = _state(place / "rows.parquet", record)
     notes = [when, _text(record, "git_commit") and f"commit {_text(record, 'git_commit')[:12]}"]
     parts = [_thumbnail(folder, chart, name), f"<h2>{escape(name)}</h2>"]
     if question:
         parts.append(f'<p class="hint">{escape(question)}</p>')
-    if isinstance(finding, str) and finding:
-        parts.append(f'<p class="finding-line">{escape(finding)}</p>')
+    if answer := _text(stored, "answer"):
+        parts.append(f'<p class="answer">{escape(answer)}</p>')
     parts += [f'<p class="state">{state}</p>' if state else "", _button(folder, place, chart, name)]
     files = sorted(p for p in place.iterdir() if p.suffix in LISTED and ".plotted" not in p.name)
     links = "".join(f'<li><a href="{_link(folder, path)}">{escape(path.name)}</a></li>' for path in files)

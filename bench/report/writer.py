@@ -1,4 +1,4 @@
-"""Writes what a study shows, given as data: tables as CSV, Markdown and LaTeX, charts as files, findings as JSON."""
+"""Writes what a study shows, given as data: tables as CSV, Markdown and LaTeX, charts as files, the answer as JSON."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from bench.report.tables import csv_blocks, escape_markdown
 from bench.report.text import counted, one_line
 from bench.run.files import write_all
 
-FINDINGS = "findings.json"
-"""The file with an experiment's question, findings and main chart."""
+ANSWER = "answer.json"
+"""The file with an experiment's question, answer and main chart."""
 
 
 def write(experiment: Experiment, views: Views) -> list[Path]:
-    """Write all tables, charts and findings of an experiment; return the files' paths."""
+    """Write all tables, charts and the answer of an experiment; return the files' paths."""
     drawn = [chart for chart in views.charts if chart.printed and len(chart.drawn())]
     charts = [path for chart in drawn for path in _draw(experiment, chart)]
-    paths = write_all(experiment.directory, [(FINDINGS, _findings(experiment, views))])
+    paths = write_all(experiment.directory, [(ANSWER, _answer(experiment, views))])
     for name in dict.fromkeys(table.name for table in views.tables):
         tables = [table for table in views.tables if table.name == name]
         paths += write_all(experiment.directory, table_files(tables, experiment.name))
@@ -37,13 +37,14 @@ def write(experiment: Experiment, views: Views) -> list[Path]:
 
 def _draw(experiment: Experiment, chart: Chart) -> list[Path]:
     with styled():
-        return save(draw(chart), experiment.directory / chart.name, experiment.formats, chart.plotted())
+        titled = replace(chart, title=chart.title or experiment.question)
+        return save(draw(titled), experiment.directory / chart.name, experiment.formats, chart.plotted())
 
 
-def _findings(experiment: Experiment, views: Views) -> str:
+def _answer(experiment: Experiment, views: Views) -> str:
     main = next((chart.name for chart in views.charts if chart.printed and len(chart.drawn())), "")
     content = {
-        "experiment": experiment.name, "question": experiment.question, "findings": list(views.findings), "chart": main
+        "experiment": experiment.name, "question": experiment.question, "answer": views.headline, "chart": main
     }  # fmt: skip
     return json.dumps(content, indent=1, ensure_ascii=False) + "\n"
 
@@ -90,13 +91,14 @@ def _in_markdown(one: TableCell) -> str:
 
 
 def show(experiment: Experiment, rows: pd.DataFrame, views: Views) -> None:
-    """Print the counts of cells, the findings, and the tables that are meant for the terminal."""
+    """Print the counts of cells, the headline, the tables that are meant for the terminal, and the headline again."""
     console = terminal.open_console()
     console.print(f"\n{experiment.name}: {experiment.question}" if experiment.question else f"\n{experiment.name}")
     counts = rows["status"].value_counts()
     console.print(f"{counted(len(rows), 'cell')}: " + ", ".join(f"{n} {status}" for status, n in counts.items()))
-    for text in map(one_line, views.findings):
-        console.print(text)
+    headline = one_line(views.headline)
+    if headline:
+        console.print(headline)
     for table in views.tables:
         if table.terminal:
             right = {column.heading for column in table.columns if column.kind == "number"}
@@ -107,6 +109,8 @@ def show(experiment: Experiment, rows: pd.DataFrame, views: Views) -> None:
                 console.print(one_line(note))
     for text in map(one_line, views.remarks):
         console.print(text, soft_wrap="python -m bench" in text)  # a command stays one line, so that it can be copied
+    if headline:
+        console.print(f"\n{headline}")
 
 
 def _terminal_text(table: Table, width: int) -> pd.DataFrame:
@@ -119,6 +123,12 @@ def _terminal_text(table: Table, width: int) -> pd.DataFrame:
     return readable(replace(table, columns=[replace(column, low="", high="") for column in columns]))
 
 
-def reasons(rows: pd.DataFrame) -> Sequence[str]:
-    """Return each distinct reason in the rows once."""
-    return list(rows.loc[rows["reason"] != "", "reason"].unique())
+def reasons(rows: pd.DataFrame) -> list[str]:
+    """Return why cells failed, were refused or have remarks; reasons that differ only in numbers are counted together."""
+    given = rows[rows["reason"] != ""]
+    kinds = given["reason"].str.replace(r"\d+(\.\d+)?(e[+-]?\d+)?", "#", regex=True)
+    groups = sorted(given.groupby(["status", kinds]), key=lambda item: -len(item[1]))
+    return [
+        f"{len(part)} {status}: {part['reason'].iloc[0]}" + ("" if part["reason"].nunique() == 1 else " (for example)")
+        for (status, _), part in groups
+    ]

@@ -121,6 +121,8 @@ class _Worker:
     pace: float = 1.0
     """Seconds that the last item took."""
     n_answered: int = 0
+    outside: frozenset[str] = frozenset()
+    """The modules from outside whose code it has run."""
     is_done: bool = False
     """Whether it handles no more items, since a plugin has changed its process."""
     fault: str = ""
@@ -227,7 +229,8 @@ class Pool:
     """Workers that share groups of items: a context manager that ends all its processes on exit.
 
     ``make(argument)`` builds the handler in each worker, with the plugins in ``folders`` available. With
-    ``single_thread``, numerical libraries use one thread.
+    ``single_thread``, numerical libraries use one thread. ``outside(item)`` are the modules from outside whose code an
+    item runs, the same for all items of a group: a worker that has run such code only runs items with the same ones.
     """
 
     def __init__(
@@ -238,9 +241,11 @@ class Pool:
         limits: ResourceLimits,
         single_thread: bool = True,
         folders: Sequence[Path] = (),
+        outside: Callable[[Any], frozenset[str]] = lambda _: frozenset(),
     ) -> None:
         self._n_workers, self._limits, self._single_thread = n_workers, limits, single_thread
         self._first_message = first_message(make, pickle.dumps(argument), tuple(folders))
+        self._outside = outside
         self._workers: list[_Worker] = []
         self._retries: deque[deque[Any]] = deque()
         self._crashed: set[int] = set()
@@ -253,9 +258,7 @@ class Pool:
 
     def __exit__(self, *_: object) -> None:
         while self._workers:
-            worker = self._workers.pop()
-            worker.kill()
-            worker.close()
+            self._remove(self._workers[-1])
         if self._reaper is not None:
             self._reaper.close()
             self._reaper = None
@@ -290,9 +293,15 @@ class Pool:
 
     def _assign(self, waiting: deque[deque[Any]]) -> list[Answer]:
         """Assign work to every idle worker, and start more workers while groups are waiting; returns failures to send."""
-        for worker in self._workers:
-            if not worker.queue and not worker.is_busy:
-                worker.queue = waiting.popleft() if waiting else self._take_half()
+        for worker in [worker for worker in self._workers if not worker.queue and not worker.is_busy]:
+            place = next((i for i, group in enumerate(waiting) if self._may_run(worker, group)), None)
+            if place is not None:
+                worker.queue = waiting[place]
+                del waiting[place]
+            elif waiting:  # a new worker runs them
+                self._remove(worker)
+            else:
+                worker.queue = self._take_half(worker)
         # an earlier item may have caused the death of a worker, so the item it died on is retried in a new worker
         for groups in (self._retries, waiting):
             while groups and len(self._workers) < self._n_workers:
@@ -304,14 +313,20 @@ class Pool:
         answers: list[Answer] = []
         for worker in self._workers:
             while worker.queue and worker.is_ready and not worker.is_busy:
+                worker.outside = worker.outside or self._outside(worker.queue[0])
                 if (answer := worker.send_next()) is not None:
                     answers.append(answer)
         return answers
 
-    def _take_half(self) -> deque[Any]:
+    def _may_run(self, worker: _Worker, group: Sequence[Any]) -> bool:
+        return not worker.outside or worker.outside == self._outside(group[0])
+
+    def _take_half(self, idle: _Worker) -> deque[Any]:
         """Remove and return the second half of the slowest queue; empty if that queue takes less than :data:`STEAL_S`."""
         longest = max(self._workers, key=lambda worker: len(worker.queue) * worker.pace)
         half: deque[Any] = deque()
+        if longest.queue and not self._may_run(idle, longest.queue):
+            return half
         if len(longest.queue) * longest.pace > STEAL_S:
             for _ in range(len(longest.queue) // 2):
                 half.appendleft(longest.queue.pop())
@@ -348,8 +363,7 @@ class Pool:
         if kind != "done":
             answers += worker.receive()  # answers sent before it died still count
         output = worker.take_output()
-        worker.close()
-        self._workers.remove(worker)
+        self._remove(worker)
         self._n_failed_starts = 0 if worker.is_ready else self._n_failed_starts + 1
         if not worker.is_ready and (self._n_failed_starts == MAX_FAILED_STARTS or not was_killed):
             raise UserError(f"a worker cannot start: {reason}; last output: {output or 'none'}")
@@ -366,6 +380,11 @@ class Pool:
         if rest:
             waiting.appendleft(rest)
         return answers
+
+    def _remove(self, worker: _Worker) -> None:
+        worker.kill()
+        worker.close()
+        self._workers.remove(worker)
 
     def _may_retry(self, worker: _Worker, item: Any, kind: str) -> bool:
         """Return whether to retry an item in a new worker before the worker's death counts as the item's result.

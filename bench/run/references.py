@@ -29,6 +29,8 @@ class References:
         self._directory = experiment.results_dir.absolute() / "references"
         self._budget = experiment.reference
         self._references: dict[str, Reference] = {}
+        self.stores = True
+        """Whether computed references are stored for other cells."""
 
     def stored(self, cell: Cell) -> bool:
         """Return whether the reference of the cell's program is on disk."""
@@ -41,7 +43,8 @@ class References:
             result = load(self._path(cell))
             if result is None:
                 result = self._compute(cell)
-                save(result, self._path(cell))
+                if self.stores:
+                    save(result, self._path(cell))
             self._references[key] = result
         return deepcopy(self._references[key])
 

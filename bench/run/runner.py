@@ -10,7 +10,7 @@ from typing import Any
 
 from bench.experiment.cell import Cell
 from bench.experiment.experiment import Experiment
-from bench.model import guard
+from bench.model import Estimator, guard
 from bench.run.launchers import launcher_of
 from bench.run.launchers.launcher import Launcher
 from bench.run.plan import Planned
@@ -115,7 +115,7 @@ class _Run:
 
     def _compute_references(self, cells: list[Cell], references: list[Cell], launcher: Launcher) -> list[Cell]:
         """Compute references and return the cells to measure; cells whose reference failed are stored with its status."""
-        tasks = [Task(cell, reference=True) for cell in references]
+        tasks = [Task(_for_reference(cell), reference=True) for cell in references]
         failed: dict[str, dict[str, Any]] = {}
         for answer in itertools.chain.from_iterable(self._answers(tasks, launcher)):
             if answer.result["status"] != "ok":
@@ -167,6 +167,14 @@ class Stopped(Exception):
 def _stopped_by(row: dict[str, Any]) -> Stopped:
     names = " ".join(str(row[name]) for name in ("scene", "backend", "estimator") if row.get(name))
     return Stopped(f"after a failed cell ({names}: {row['status']}, {row['reason']})")
+
+
+def _for_reference(cell: Cell) -> Cell:
+    """Return the cell without its estimator, whose code the reference does not need, unless the estimator smooths J."""
+    with suppress(Exception):  # the error is reported when the cell is measured
+        if isinstance(cell.parts.get("estimator"), Estimator) and cell.smoothing() is None:
+            return cell.with_part("estimator", None)
+    return cell
 
 
 def _has_closed_form(cell: Cell) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -45,6 +46,17 @@ class Task:
         """The backend that runs the task."""
         return self.cell.reference_backends[0] if self.reference else self.cell.backend
 
+    @property
+    def outside(self) -> frozenset[str]:
+        """The modules and files from outside this package whose code the task runs."""
+        parts = [*self.cell.parts.values(), self.cell.study, self.backend]
+        foreign = [part for part in parts if part is not None and is_foreign(part)]
+        names = {type(part).__module__ for part in foreign}
+        for part in foreign:
+            with suppress(Exception):  # the error is reported when the cell is measured
+                names |= set(map(str, getattr(part, "files", tuple)()))
+        return frozenset(names)
+
 
 class TaskHandler:
     """Handles the tasks of one experiment, in a worker or in this process."""
@@ -64,7 +76,7 @@ class TaskHandler:
 
     def prepare(self, item: Task) -> None:
         """Compile the program, so that the backend imports its libraries."""
-        if _is_foreign(item.cell) and not self._ran_foreign_code:
+        if item.outside and not self._ran_foreign_code:
             registry.entries()  # imported before foreign code can change them, so that a change is seen
         with guard.protect_process():
             try:
@@ -79,7 +91,7 @@ class TaskHandler:
 
         A change of the process that would change other cells' numbers is undone and added to the reason.
         """
-        if _is_foreign(item.cell) and not self._ran_foreign_code:
+        if item.outside and not self._ran_foreign_code:
             registry.entries()  # as in prepare, which only workers call
             self._state.adopt()
             self._ran_foreign_code = True
@@ -101,6 +113,10 @@ class TaskHandler:
         return result | {"reason": "; ".join(part for part in (result.get("reason", ""), remark) if part)}
 
     def _handle(self, item: Task) -> dict[str, Any]:
+        program = (item.cell.parts.get(axis) for axis in ("scene", "contact", "integrator", "backend"))
+        is_built_in = not any(part is not None and is_foreign(part) for part in program)
+        # foreign code may have changed what computes it
+        self._session.references.stores = item.reference or not (item.outside and is_built_in)
         with guard.protect_process():
             if not item.reference:
                 return measure_cell(item.cell, self._session, self._study)
@@ -113,14 +129,9 @@ class TaskHandler:
             return {"status": "ok"}
 
 
-def _is_foreign(cell: Cell) -> bool:
-    """Return whether a cell runs code from outside this package."""
-    parts: list[Plugin | None] = [*cell.parts.values(), cell.study]
-    return any(
-        part is not None
-        and (not type(part).__module__.startswith("bench.") or (isinstance(part, Scene) and hasattr(part, "files")))
-        for part in parts
-    )
+def is_foreign(part: Plugin) -> bool:
+    """Return whether a plugin's code is from outside this package."""
+    return not type(part).__module__.startswith("bench.") or (isinstance(part, Scene) and hasattr(part, "files"))
 
 
 def _uses_jax(backend: Backend) -> bool:
@@ -182,11 +193,11 @@ def _fault_of(result: dict[str, Any], study: Study) -> str:
 
 
 def group_by_program(tasks: list[Task]) -> list[list[Task]]:
-    """Return groups of tasks that share a compilation, in the order of their first tasks."""
+    """Return groups of tasks that share a compilation and run the same code from outside; those that run none come first."""
     groups: dict[Any, list[Task]] = defaultdict(list)
     for task in tasks:
-        groups[fingerprint(task.backend), repr(task.cell.program().structure)].append(task)
-    return list(groups.values())
+        groups[fingerprint(task.backend), repr(task.cell.program().structure), task.outside].append(task)
+    return sorted(groups.values(), key=lambda group: sorted(group[0].outside))
 
 
 def result_of(answer: Answer, prefix: str = "") -> dict[str, Any]:

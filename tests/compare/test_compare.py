@@ -594,14 +594,14 @@ def test_history_draws_what_changed():
     made = history.views(history.History(pd.DataFrame(lines, columns=names), ["a", "b", "c"]))
     what = "changed in error by more than 1%, in gradient or in failed cells"
     blind = "1 series cannot be compared: no cell has an error in all results."
-    assert made.findings == [f"4 of 6 series {what}, most some: much. {blind}"]
+    assert made.headline == f"4 of 6 series {what}, most some: much. {blind}"
     (chart,) = made.charts
     assert list(dict.fromkeys(chart.frame["line"])) == ["some: much", "some: lost", "some: little", "some: moved"]
     assert chart.panel_notes == {"some: lost": "failed: 1, 1, 2 of 4"}
     still = history.views(history.History(pd.DataFrame(lines[:3], columns=names), ["a", "b", "c"]))
-    assert still.findings == [f"None of 1 series {what}."]
+    assert still.headline == f"None of 1 series {what}."
     unknown = history.views(history.History(pd.DataFrame(lines[-3:], columns=names), ["a", "b", "c"]))
-    assert unknown.findings == [blind]
+    assert unknown.headline == blind
 
 
 def test_a_gradient_that_a_release_of_an_engine_changes_is_told(tmp_path):
@@ -638,7 +638,7 @@ def test_the_page_has_all_cells_and_numbers_of_the_comparison():
     after.loc[good(rows), ["bias", "bias_low", "bias_high"]] = [9.0, 8.0, 10.0]
     table = compared(rows, after).assign(experiment="some")
     made = report.page_views(report.Comparison("t", table, ["a remark"], COLUMNS.compared, "bias_variance"))
-    assert made.findings == [report.summary(table)]
+    assert made.headline == report.summary(table)
     assert made.rows["outcome"].iloc[0] == "worse"
     assert len(made.rows) == len(table)
     (chart,) = [chart for chart in made.charts if chart.name == "bias_after"]

@@ -24,11 +24,11 @@ def test_a_stale_document_is_listed_with_its_lines_and_not_written(tmp_path, mon
     assert page.read_text().startswith("# Rows")
 
 
-def test_results_have_findings_and_name_experiments_without_rows(tmp_path, monkeypatch):
+def test_results_have_answers_and_name_experiments_without_rows(tmp_path, monkeypatch):
     (tmp_path / "quick").mkdir()
     (tmp_path / "quick" / "chart.png").write_bytes(b"")
-    record = {"question": "Why?", "findings": ["First <b>.", "Second."], "chart": "chart"}
-    (tmp_path / "quick" / "findings.json").write_text(json.dumps(record))
+    record = {"question": "Why?", "answer": "First <b>. Second.", "chart": "chart"}
+    (tmp_path / "quick" / "answer.json").write_text(json.dumps(record))
     monkeypatch.setattr(config, "experiments", lambda *_: ["twins", "quick"])
     page = tmp_path / "page.md"
     page.write_text(f"before {build.MARKS[0]}old{build.MARKS[1]} after")
@@ -38,7 +38,7 @@ def test_results_have_findings_and_name_experiments_without_rows(tmp_path, monke
     assert "old" not in text
     assert "`python -m bench +experiment=twins` (no stored results)" in text
     assert (
-        "## quick\n\n*Does the whole path work on this machine?*\n\n![quick](quick/chart.png)\n\n- First &lt;b&gt;.\n- Second.\n\n"
+        "## quick\n\n*Does the whole path work on this machine?*\n\n![quick](quick/chart.png)\n\nFirst &lt;b&gt;. Second.\n\n"
         in text
     )
     page.write_text(text)
@@ -48,7 +48,7 @@ def test_results_have_findings_and_name_experiments_without_rows(tmp_path, monke
 def test_results_need_their_marks(tmp_path):
     page = tmp_path / "results.md"
     page.write_text("no marks")
-    with pytest.raises(UserError, match="has no place for the findings"):
+    with pytest.raises(UserError, match="has no place for the answers"):
         build.results_page(page, tmp_path)
 
 

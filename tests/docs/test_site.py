@@ -36,9 +36,9 @@ def test_site_has_five_entries(pages):
     assert len(re.findall(r"^[A-Z].* <|^[a-z]+$", block, re.MULTILINE)) == len(website.SECTIONS) == 5
 
 
-def test_every_experiment_with_findings_has_a_page(pages):
+def test_every_experiment_with_results_has_a_page(pages):
     for entry in results.entries_of(results.STANDARD):
-        assert (entry.page in pages) == bool(entry.findings)
+        assert (entry.page in pages) == entry.has_results
 
 
 def test_every_claim_with_a_result_has_a_page(pages):
@@ -77,12 +77,12 @@ def test_verdicts_are_those_of_the_rows():
         assert not part[part["best"]]["low"].gt(part["high"].min()).any(), "intervals that are apart are no tie"
 
 
-def entry(folder, finding):
-    (folder / "findings.json").write_text(json.dumps({"question": finding, "findings": [finding], "chart": "../x"}))
-    return results.entry_of("quick", finding, folder)
+def entry(folder, text):
+    (folder / "answer.json").write_text(json.dumps({"question": text, "answer": text, "chart": "../x"}))
+    return results.entry_of("quick", text, folder)
 
 
-def test_findings_are_text(tmp_path):
+def test_answers_are_text(tmp_path):
     from markdown_it import MarkdownIt
 
     page = website.experiment_page(entry(tmp_path, HOSTILE))
@@ -93,17 +93,31 @@ def test_findings_are_text(tmp_path):
     assert "<em>" not in html
 
 
-@pytest.mark.parametrize("record", [[], {"findings": "text"}, {"findings": [1]}, {"findings": ["a"], "chart": 3}])
-def test_malformed_findings_are_refused(tmp_path, record):
-    (tmp_path / "findings.json").write_text(json.dumps(record))
-    with pytest.raises(UserError, match="is not a record of findings"):
+@pytest.mark.parametrize("record", [[], {"answer": "text"}, {"answer": [1], "chart": "a"}, {"answer": "a", "chart": 3}])
+def test_malformed_answers_are_refused(tmp_path, record):
+    (tmp_path / "answer.json").write_text(json.dumps(record))
+    with pytest.raises(UserError, match="is not an answer"):
         results.entry_of("quick", "Why?", tmp_path)
 
 
-def test_an_experiment_without_findings_has_its_question(tmp_path):
+def test_an_experiment_without_results_has_its_question(tmp_path):
     found = results.entry_of("quick", "Why?", tmp_path)
     assert found.question == "Why?"
-    assert not found.findings
+    assert not found.answer
+    assert not found.has_results
+
+
+def test_answers_are_carried_by_the_stored_tables():
+    """Conditions in an answer hold, and the stored text is that of today's tables; an answer has two sentences at most."""
+    for name, experiment in results.loaded(results.STANDARD).items():
+        stored = experiment.directory / "answer.json"
+        if experiment.answer:
+            text = results.answer_of(name)
+            assert json.loads(stored.read_text())["answer"] == text, name
+            assert len(re.findall(r"\.(?: [A-Z]|$)", text)) <= 2, name
+            assert ";" not in text
+        elif stored.exists():
+            assert not json.loads(stored.read_text())["answer"], name
 
 
 def test_long_tables_are_shortened():
@@ -149,16 +163,6 @@ def dom(page, query=""):
 def test_site_needs_no_network(site):
     for page in site.rglob("*.html"):
         assert not re.search(r"<(?:script|link|img)[^>]*(?:src|href)=\"(?:https?:)?//", page.read_text()), page
-
-
-@pytest.mark.slow
-def test_every_finding_has_a_link_of_its_own(site):
-    for found in results.entries_of(results.STANDARD):
-        for count in range(1, len(found.findings) + 1):
-            name = f"{found.folder.name.replace('_', '-')}-{count}"
-            text = (site / f"{found.page}.html").read_text()
-            assert f'id="{name}"' in text
-            assert f'href="#{name}"' in text
 
 
 @pytest.mark.slow

@@ -55,7 +55,7 @@ def test_one_value_on_a_logarithmic_axis_has_its_label():
 
 def test_a_title_without_spaces_breaks_after_commas_and_slashes():
     name = "mjcf[action_scale=1,file=gymnasium:envs/mujoco/assets/half_cheetah.xml,substeps=5]"
-    chart = Chart("c", "t", pd.DataFrame(), [], [])
+    chart = Chart("c", pd.DataFrame(), [], [])
     lines = draw._panel_title(chart, name, 2.0).split("\n")
     assert "".join(lines) == name
     assert all(width_in_inches(line) <= 2.0 for line in lines)

@@ -18,7 +18,7 @@ BANNER = '<b style="position:fixed;inset:0">banner</b><meta http-equiv="refresh"
 
 @pytest.fixture
 def folder(tmp_path):
-    """Four experiments: with page, findings, a chart and a failure; without rows; with broken rows; only findings."""
+    """Four experiments: with page, answer, a chart and a failure; without rows; with broken rows; only an answer."""
     rows = table([row(), failed("error", "it broke", seed=1), failed("unsupported", "cannot work", seed=2)])
     for name in ("good", "nested/bare", "broken", "published#1"):
         (tmp_path / name).mkdir(parents=True)
@@ -27,13 +27,8 @@ def folder(tmp_path):
     (tmp_path / "published#1" / "run.json").unlink()
     rows.to_parquet(tmp_path / "good" / "rows.parquet")
     for name in ("good", "published#1"):
-        findings = {
-            "experiment": name,
-            "question": "why?",
-            "findings": ["use fobg < 3 & more", "second"],
-            "chart": "second",
-        }
-        (tmp_path / name / "findings.json").write_text(json.dumps(findings))
+        answer = {"experiment": name, "question": "why?", "answer": "use fobg < 3 & more", "chart": "second"}
+        (tmp_path / name / "answer.json").write_text(json.dumps(answer))
         for stem in ("first", "second"):
             Image.new("RGB", (40, 30), "red").save(tmp_path / name / f"{stem}.png")
     (tmp_path / "good" / "report.html").write_text(f'<p class="finding" id="finding">{BANNER}</p>')
@@ -46,14 +41,13 @@ def card(text, name):
     return next(part for part in text.split("<article>") if f"<h2>{name}</h2>" in part)
 
 
-def test_every_experiment_is_there_with_its_state_and_finding(folder):
+def test_every_experiment_is_there_with_its_state_and_answer(folder):
     assert cli.main(["index", str(folder)]) == 0
     text = (folder / "index.html").read_text()
     assert text.count("<article>") == 4
     good = card(text, "good")
     assert 'href="good/report.html"' in good
     assert "use fobg &lt; 3 &amp; more</p>" in good
-    assert "second</p>" not in good, "one finding on a card"
     assert 'src="good/second.png"' in good
     assert '<span class="bad">1 error</span>' in good
     assert "<span>1 unsupported</span>" in good
@@ -62,7 +56,7 @@ def test_every_experiment_is_there_with_its_state_and_finding(folder):
     assert HOSTILE not in text
 
 
-def test_findings_are_shown_without_a_page_and_its_chart_is_one_click_away(folder):
+def test_an_answer_is_shown_without_a_page_and_its_chart_is_one_click_away(folder):
     """As in a fresh clone, where no page has been written."""
     (folder / "good" / "report.html").unlink()
     text = index.write(folder).read_text()
@@ -78,23 +72,23 @@ def test_findings_are_shown_without_a_page_and_its_chart_is_one_click_away(folde
 @pytest.mark.parametrize(
     "content",
     [
-        "[]", "nonsense", "null", "[" * 100_000, '{"findings": "text"}', '{"findings": [{"a": 1}]}', '{"findings": []}',
-        '{"experiment": 3, "question": [], "findings": [3], "chart": {}}', '{"chart": "../../secret"}',
+        "[]", "nonsense", "null", "[" * 100_000, '{"answer": ["text"]}', '{"answer": ""}',
+        '{"experiment": 3, "question": [], "answer": [3], "chart": {}}', '{"chart": "../../secret"}',
     ],
 )  # fmt: skip
-def test_findings_of_other_types_are_left_out(content, folder):
-    (folder / "good" / "findings.json").write_text(content)
+def test_answers_of_other_types_are_left_out(content, folder):
+    (folder / "good" / "answer.json").write_text(content)
     text = index.write(folder).read_text()
     good = card(text, "good")
     assert 'src="good/first.png"' in good, "the first chart"
-    assert "finding-line" not in good
+    assert 'class="answer"' not in good
     assert "secret" not in text
     assert HOSTILE not in text
 
 
-def test_every_text_of_findings_and_record_is_literal(folder, browser):
-    for name in ("run", "findings"):
-        texts = {"experiment": BANNER, "question": BANNER, "findings": [BANNER], "chart": BANNER, "finished": BANNER}
+def test_every_text_of_answer_and_record_is_literal(folder, browser):
+    for name in ("run", "answer"):
+        texts = {"experiment": BANNER, "question": BANNER, "answer": BANNER, "chart": BANNER, "finished": BANNER}
         record = texts | {"git_commit": BANNER, "counts": {BANNER: BANNER}}
         (folder / "nested" / "bare" / f"{name}.json").write_text(json.dumps(record))
     (folder / "nested" / "bare" / f"{BANNER.replace('/', '')}.csv").write_text("a")

@@ -90,7 +90,8 @@ def test_every_promised_file_is_written(full):
         "bias_variance.md",
         "bias_variance.tex",
         "speed_accuracy.csv",
-        "findings.json",
+        "answer.json",
+        "verdicts.csv",
     } <= names
     assert {path.name for path in made.directory.iterdir()} == names
 

@@ -10,7 +10,6 @@ from bench.plugins.integrators.rk4 import Rk4
 from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
 from bench.plugins.scenes.double_integrator import DoubleIntegrator
 from bench.plugins.scenes.double_pendulum import DoublePendulum
-from helpers import approve_views
 
 from bench.cli import main
 from bench.experiment import config
@@ -165,10 +164,9 @@ def grown(*words):
     return given, given.columns.typed(pd.DataFrame(lines))
 
 
-def test_findings_charts_and_tables_of_planted_rows():
+def test_charts_and_tables_of_planted_rows():
     given, rows = grown()
     shown = views.views(given, rows)
-    approve_views("growth", "planted rows", shown)
     norms, variances, _, gains = shown.charts
     drawn = norms.plotted()
     assert set(zip(drawn["problem"], drawn["series"], strict=True)) == {
@@ -182,6 +180,8 @@ def test_findings_charts_and_tables_of_planted_rows():
     assert list(rows["horizon"][gains.frame["row"]]) == [200.0] * 4, "gains are of the longest horizon"
     answers, table = map(readable, shown.tables)
     assert list(answers["verdict"]) == ["polynomial", "exploding"]
+    assert list(answers["lower variance"]) == ["zeroth order from 5 s"] * 2
+    assert (answers["order"][0], answers["rate [1/s]"][1]) == ("2.0 [2.0, 2.0]", "1.0 [1.0, 1.0]")
     assert list(table["singular values"]) == ["10 to 0.10"] * 5 + ["1000 to < 2.2e-13"] * 5
     assert table["spectral [1/s]"][0] == "1.0 [0.50, 2.0]", "per second, at steps of 0.1 s"
 
@@ -193,7 +193,10 @@ def test_ranges_of_variances_that_overlap_and_lost_horizons_are_open():
     rows.loc[lost, ["gradient_median", "gradient_quarter"]] = math.nan
     rows.loc[lost, "status"] = "nonfinite"
     shown = views.views(given, rows)
-    approve_views("growth", "overlap and lost horizons", shown)
+    assert list(shown.tables[0].frame["verdict"]) == ["open", "open"]
+    assert list(shown.tables[0].frame["lower"]) == ["open at the longest horizon"] * 2
     assert len(shown.tables[1].frame) == len(rows)
     rows["status"], rows["gradient_median"], rows["reason"] = "nonfinite", math.nan, "not finite"
-    approve_views("growth", "no result", views.views(given, rows))
+    shown = views.views(given, rows)
+    assert not shown.charts
+    assert shown.remarks == ["10 nonfinite: not finite"]

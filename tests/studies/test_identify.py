@@ -8,7 +8,6 @@ import pandas as pd
 import pytest
 import wrong_models
 from bench.plugins.optimizers.gauss_newton import GaussNewton
-from helpers import approve, approve_views
 
 import bench
 from bench.experiment import config
@@ -332,9 +331,26 @@ def standard():
     return given, rows, study_of(given).views(given, rows)
 
 
+def test_verdicts_are_those_of_the_stored_table(standard):
+    """Counted again from the CSV's own lists, without the code of the views."""
+    rows = pd.read_csv(STANDARD / "identify" / "identify.csv")
+    listed = {
+        name: [float(word) for cell in rows[name] for word in cell.strip("[]").split()]
+        for name in ("converged_high", "coverage_high")
+    }
+    fits = next(table for table in standard[2].tables if table.name == "fits").frame
+    counts = fits["verdict"].value_counts()
+    lost = [high < 0.9 for high in listed["converged_high"]]
+    narrow = [high < 0.95 for high in listed["coverage_high"]]
+    assert counts["unconverged"] == sum(lost)
+    assert counts["narrow"] == sum(np.array(narrow) & ~np.array(lost))
+    rk4 = fits[(fits["integrator"] == "rk4") & (fits["shooting"] == "single")]
+    assert rk4["verdict"].tolist() == ["precise"] * 5
+
+
 def test_chart_and_tables_have_the_rows(standard):
     _, rows, views = standard
-    fits, parameters = views.tables
+    fits, parameters, _ = views.tables
     assert len(fits.frame) == 22
     assert len(parameters.frame) == len(rows)
     assert {"step_note", "condition"} <= {column.name for column in parameters.columns}
@@ -350,7 +366,7 @@ def test_chart_and_tables_have_the_rows(standard):
 
 
 def planted(**columns):
-    """The findings of four cases with rk4 and four with another integrator, some columns replaced."""
+    """The verdicts on four cases with rk4 and four with another integrator, some columns replaced."""
     n = 8
     lines = pd.DataFrame({
         "row": range(n), "problem": [f"p{i}" for i in range(n)], "scene": "s", "integrator": ["rk4"] * 4 + ["euler"] * 4,
@@ -359,25 +375,18 @@ def planted(**columns):
         "coverage_high": 0.98, "hidden": 0.0,
     } | columns)  # fmt: skip
     low, high = shown.error_interval(lines["error"], lines["converged"] * lines["fits"])
-    return shown.findings(lines.assign(error_low=low, error_high=high))
+    return list(shown.verdicts(lines.assign(error_low=low, error_high=high)))
 
 
-HALF = [1.0] * 4
-FINDINGS = {
-    "all cases hold": {},
-    "coverage below the level but not by the whole interval": {"coverage": [0.85] * 8, "coverage_low": 0.7, "coverage_high": 0.951},
-    "few fits end well": {"converged": [0.85] * 8, "converged_low": 0.7, "converged_high": 0.93},
-    "unknown": {"error": [math.nan] * 8, "coverage": [math.nan] * 8, "coverage_high": [math.nan] * 8},
-    "one integrator is off": {
-        "error": [*HALF, 3.0, 3.0, 3.0, 3.0], "coverage": [0.95] * 4 + [0.3] * 4, "coverage_high": [0.98] * 4 + [0.4] * 4,
-    },
-    "fits hide the gauge": {"hidden": [3.0] + [0.0] * 7},
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("case", FINDINGS)
-def test_findings_need_their_intervals(case):
-    approve("identify", case, *planted(**FINDINGS[case]))
+def test_verdicts_need_their_intervals():
+    assert planted() == ["precise"] * 8
+    # below the stated level, but not by the whole interval
+    assert planted(coverage=[0.85] * 8, coverage_low=0.7, coverage_high=0.951) == ["precise"] * 8
+    assert planted(converged=[0.85] * 8, converged_low=0.7, converged_high=0.93) == ["open"] * 8
+    assert planted(converged=[0.7] * 8, converged_low=0.6, converged_high=0.8) == ["unconverged"] * 8
+    unknown = planted(error=[math.nan] * 8, coverage=[math.nan] * 8, coverage_high=[math.nan] * 8)
+    assert unknown == ["open"] * 8
+    assert planted(error=[3.0] * 8, coverage=[0.3] * 8, coverage_high=[0.4] * 8) == ["narrow"] * 8
 
 
 def test_interval_of_the_error_covers():
@@ -391,7 +400,9 @@ def test_interval_of_the_error_covers():
 @pytest.mark.parametrize("status", ["nonfinite", "unsupported"])
 def test_rows_without_results_are_said_so(standard, status):
     given, rows, _ = standard
-    approve_views("identify", "no result", study_of(given).views(given, rows.assign(status=status, reason="planted")))
+    views = study_of(given).views(given, rows.assign(status=status, reason="planted"))
+    assert not views.charts
+    assert views.remarks == [f"{len(rows)} {status}: planted"]
 
 
 def test_own_measurements_have_no_coverage_to_show(standard):
@@ -402,7 +413,7 @@ def test_own_measurements_have_no_coverage_to_show(standard):
         for name in ("error", "coverage", "coverage_low", "coverage_high")
     }
     views = study_of(given).views(given, rows.assign(**gone))
-    assert views.findings[0] == "No fit is known to reach the Cramer-Rao bound."
+    assert "precise" not in set(views.tables[0].frame["verdict"])
     assert [column.name for column in views.charts[0].x] == ["converged", "condition", "step_shift"]
 
 
@@ -484,16 +495,11 @@ def test_a_record_of_its_end_only_has_one_scan_without_an_open_count():
     assert math.isnan(found["minima_open"][0])
 
 
-@pytest.fixture(scope="module")
-def chaos():
+def test_the_scan_is_drawn_with_its_minima():
     given = config.load([SCAN, "backends=[numpy]", "optimizers=[gauss_newton]", "samples=1", *CHAOS])
     (cell,) = cells(given)
     rows = pd.DataFrame([cell.columns() | measure(cell, given.study) | {"experiment": "chaos"}])
-    return study_of(given).views(given, rows)
-
-
-def test_the_scan_is_stated_with_its_grid_and_drawn(chaos):
-    approve("identify", "scan of the loss", chaos.findings[-1])
+    chaos = study_of(given).views(given, rows)
     (chart,) = [chart for chart in chaos.charts if chart.name == "scan_rate"]
     counts = chart.frame[chart.frame["part"] == "local minimum"].groupby("window", sort=False).size()
     assert counts["whole record of 200 steps: 131 minima"] == 131
@@ -507,4 +513,3 @@ def test_the_scan_is_stated_with_its_grid_and_drawn(chaos):
 
 def test_rows_without_a_scan_show_none(standard):
     assert not [chart for chart in standard[2].charts if chart.name.startswith("scan")]
-    assert not any("local minim" in text for text in standard[2].findings)

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pandas as pd
 import pytest
-from helpers import approve, approve_views
 
 from bench.experiment import config
 from bench.experiment.cell import Cell
@@ -289,15 +288,15 @@ def classed(*entries):
     )
 
 
-def test_findings_lead_with_what_to_use_and_say_why_the_rest_is_wrong():
+def test_shares_are_those_of_the_cells_and_the_best_of_a_scene_comes_first():
     cells = classed(
-        ("spring", "one", "right", "", 3), ("spring", "one", "diverged", "", 1), ("spring", "two", "right", "", 3),
+        ("spring", "one", "right", "", 1), ("spring", "one", "diverged", "", 3), ("spring", "two", "right", "", 3),
         ("spring", "two", "wrong", "step", 1), ("ball", "one", "wrong", "law", 3), ("ball", "one", "wrong", "", 1),
     )  # fmt: skip
-    approve("stability", "two scenes", *views.findings(views.shares_of(cells), cells))
-    assert list(views.shares_of(cells)["by unknown"]) == [0.0, 0.0, 0.25]
-    lost = classed(("ball", "one", "diverged", "", 2), ("ball", "one", "open", "", 1))
-    approve("stability", "nothing right", *views.findings(views.shares_of(lost), lost))
+    shares = views.shares_of(cells)
+    assert list(shares["step"]) == ["two", "one", "one"]
+    assert list(shares["right"]) == [0.75, 0.25, 0.0]
+    assert list(shares["by unknown"]) == [0.0, 0.0, 0.25]
 
 
 def test_backends_that_disagree_show_the_worse_verdict_and_no_verdict_is_no_finding(tmp_path):
@@ -309,7 +308,9 @@ def test_backends_that_disagree_show_the_worse_verdict_and_no_verdict_is_no_find
     assert dict(chart["level"]) == {10.0: "right", 100.0: "wrong"}
     assert rows["backend"][chart.loc[100.0, "row"]] == "numpy"
     rows["verdict"], rows["status"], rows["reason"] = "", "unsupported", "no step"
-    approve_views("stability", "no verdict", views.views(given, rows))
+    nothing = views.views(given, rows)
+    assert not nothing.charts
+    assert nothing.remarks == ["4 unsupported: no step"]
 
 
 @pytest.mark.parametrize(

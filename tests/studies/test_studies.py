@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from helpers import approve_views
 
 import bench.report
 from bench.experiment import config
@@ -148,15 +147,17 @@ def test_untrusted_undecided_and_missing_gradients_come_first_and_are_never_righ
     rows.at[0, "check_verdict"], rows.at[0, "check_error"] = ["wrong_factor"], [0.5]
     rows.at[1, "check_verdict"], rows.at[1, "check_error"] = ["nonfinite"], [np.nan]
     shown = gradient_check.views(given, rows)
-    approve_views("gradient_check", "two that cannot be trusted", shown)
+    verdicts = shown.tables[0].frame.set_index("verdict")
+    assert verdicts.loc[["wrong_factor", "nonfinite"], "trusted"].tolist() == ["no", "no"]
     assert list(shown.charts[0].frame["letter"]) == ["X", "ok"], "the worse verdict of the backends"
     assert "      python -m bench gradcheck 0" in shown.tables[1].notes
     rows.at[1, "check_verdict"], rows.at[1, "point"] = ["jump"], ["noise"]
-    approve_views("gradient_check", "one that cannot be trusted and a jump", gradient_check.views(given, rows))
     for name in ("check_verdict", "point", "check_error", "check_eps"):
         rows[name] = [[]] * len(rows)
     rows["status"], rows["reason"] = "unsupported", "no root finder"
-    approve_views("gradient_check", "nothing checked", gradient_check.views(given, rows))
+    nothing = gradient_check.views(given, rows)
+    assert not nothing.charts
+    assert nothing.remarks == ["\n4 cells: unsupported: no root finder"]
 
 
 # ---------------------------------------------------------------------------------------------------- three_errors
@@ -306,8 +307,6 @@ def test_twins_of_a_swept_scene_are_panels_of_their_own():
     assert list(dict.fromkeys(drawn["problem"])) == ["pendulum, horizon=2", "pendulum, horizon=3"], "the worst is first"
     assert list(drawn["gradient_difference_rel"]) == [twins.FLOOR, 2e-3, 1e-3, 1e-3], "0 is at the lower edge"
     assert list(drawn["gradient_difference_rel_limit"]) == [True, False, False, False]
-    assert "on 0 of 2 problems" in shown.findings[0]
-    assert "on pendulum, horizon=2" in shown.findings[1]
     assert list(readable(lines)["horizon [steps]"]) == ["2", "2", "3", "3"]
     table_ = table(given, rows)
     assert "own_path" not in table_
@@ -340,7 +339,6 @@ def test_a_study_without_a_page_gets_its_numbers_and_filters_by_what_varies(own)
     given, rows = made(*words)
     rows = rows.assign(weight=[1.0, 2.0, 30.0], outcome=["good", "bad", "good"])
     views = views_of(given, rows)
-    assert views.findings == ["3 of 3 cells gave a result."]
     data = page_data(given, rows, views, [[]] * 3)
     assert [axis["label"] for axis in data["charts"][0]["y"]] == ["weight [kg]"]
     assert data["charts"][0]["x"][0]["column"] == "mass"
@@ -436,7 +434,7 @@ def test_a_row_of_a_plugin_that_is_not_installed_has_no_command():
     given, rows = made("scenes=[pushing]")
     rows["parameters"] = rows["parameters"].str.replace('"name":"pushing"', '"name":"gone"')
     assert reproduce.commands(given, rows) == [[]] * len(rows)
-    assert views_of(given, rows).findings
+    assert views_of(given, rows).tables
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,6 @@ from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
 from bench.plugins.scenes.bounce_once import BounceOnce
 from bench.plugins.scenes.bouncing_ball import BouncingBall
 from bench.plugins.scenes.wall_penalty_1d import WallPenalty1d
-from helpers import approve_views
 
 from bench.cli import main
 from bench.experiment import config
@@ -145,7 +144,6 @@ def test_a_trap_is_exact_convergent_and_turned_away_or_no_nearer_at_every_step(c
     shown = arrange(given, COLUMNS.typed(rows.assign(**(values | change))))
     assert len(traps(shown, sections(shown))) == trapped
     found = views(given, shown.rows)
-    assert ("1 of 1 program is a trap" in " ".join(found.findings)) == trapped
     assert (set(found.charts[0].frame["series"]) == {OWN, TRAP}) == trapped
 
 
@@ -161,31 +159,17 @@ def laws(model, program=(1e-12, 1e-12, 1e-12)):
     return given, COLUMNS.typed(rows)
 
 
-MODELS = {
-    "one law is right": [[0.0, 1.0, 1.0], [0.05, 1.0, 1.0]],
-    "no law is right on every scene": [[0.0, 0.1, 1.0], [0.5, 1.0, 1.0]],
-    "no law is right": [[0.2, 0.2, 0.2]] * 2,
-    "a law without a number": [[np.nan, 0.05, 1.0]] * 2,
-    "nothing compared": [[np.nan] * 3] * 2,
-}
-
-
-@pytest.mark.parametrize("case", MODELS)
-def test_the_law_nearest_to_the_physics_comes_first_ties_together_and_nan_never(case):
-    approve_views("three_errors", case, views(*laws(MODELS[case])))
-
-
-def test_gradients_are_counted_once_whatever_estimates_them_and_only_where_confirmed_and_compared():
-    given, rows = laws([[0.0, 3.0, np.nan], [0.5, 0.2, 0.05]], (1e-12, 1e-12, np.nan))
-    found = views(given, rows)
-    approve_views("three_errors", "confirmed and compared", found)
+def test_gradients_are_drawn_once_whatever_estimates_them_and_only_where_compared():
+    model = [[0.0, 3.0, np.nan], [0.5, 0.2, 0.05]]
+    found = views(*laws(model, (1e-12, 1e-12, np.nan)))
     drawn = found.charts[0].plotted()
     zero = drawn[drawn["error"] == FLOOR]
     assert list(zero["law"]) == ["impulse"]
     assert zero["limit"].all()
     assert drawn["error"].notna().all()
+    given, rows = laws(model)
     rows["status"], rows["reason"] = "unsupported", "no physics"
-    approve_views("three_errors", "no result", views(given, rows))
+    assert not views(given, rows).charts
 
 
 def test_rounding_has_no_sign():

@@ -5,14 +5,14 @@ import json
 import numpy as np
 import pandas as pd
 import pytest
-from helpers import approve_views
 
 import bench
 from bench.errors import UserError
 from bench.experiment import config
 from bench.experiment.grid import cells
+from bench.report.cells import readable
 from bench.run.tasks import blank_row
-from bench.studies.train import aggregate, findings
+from bench.studies.train import aggregate
 from bench.studies.train.views import views
 
 BASE = ["study=train", "scenes=[cartpole_swing]", "integrators=[semi_implicit_euler]", "backends=[jax]", "samples=1"]
@@ -40,48 +40,69 @@ def made_up(final=FINAL, seeds=range(5), spread=10.0, **columns):
     return experiment, experiment.columns.typed(pd.DataFrame(rows))
 
 
-OPEN_DIFFERENCES = json.dumps([{"code": "differences", "error": 0.5}])
-NOT_FINITE = json.dumps([{"code": "not_finite", "update": 7, "quantity": "loss"}])
+def verdicts_of(experiment, rows):
+    """The verdict on each trainer, by the table of trainers."""
+    table = next(table for table in views(experiment, rows).tables if table.name == "summary")
+    return dict(zip(table.frame["method"], table.frame["verdict"], strict=True))
 
 
-def with_lost(**lost):
-    """Return made-up runs of which those of some trainers are not finite, and start from a better policy than others end with."""
+def test_the_best_trainer_and_those_behind_it_have_verdicts():
     experiment, rows = made_up()
-    for trainer, count in lost.items():
-        places = rows.index[rows["trainer"] == trainer][:count]
-        rows.loc[places, ["status", "first_return"]] = ["nonfinite", -100.0]
-    return experiment, rows
+    assert verdicts_of(experiment, rows) == {"shac": "first", "shac[window=8]": "behind", "ppo": "behind"}
+    windows = next(table for table in views(experiment, rows).tables if table.name == "windows").frame
+    assert dict(zip(windows["window"], windows["verdict"], strict=True)) == {32: "first", 8: "behind"}
 
 
-CASES = {
-    "three trainers": lambda: made_up(),
-    "intervals that overlap": lambda: made_up({"shac": -530.0, "ppo": -535.0}, spread=40.0),
-    "four seeds": lambda: made_up(seeds=range(4)),
-    "two windows that are tied": lambda: made_up({"shac": -530.0, "shac[window=16]": -531.0, "shac[window=8]": -700.0}),
-    "no finite run of one trainer": lambda: with_lost(ppo=5),
-    "no finite run of any trainer": lambda: with_lost(**{"shac": 5, "shac[window=8]": 5, "ppo": 5}),
-    "one run lost": lambda: with_lost(shac=1),
-    "a fault in every run": lambda: made_up(verdicts=NOT_FINITE),
-    "differences that do not agree": lambda: made_up({"shac": -530.0}, verdicts=OPEN_DIFFERENCES),
-    "no result": lambda: made_up(status="error", reason="planted", curve_return=[]),
-}
+def test_trainers_whose_intervals_overlap_are_open():
+    experiment, rows = made_up({"shac": -530.0, "ppo": -535.0}, spread=40.0)
+    assert set(verdicts_of(experiment, rows).values()) == {"open"}
 
 
-@pytest.mark.parametrize("case", CASES)
-def test_findings_and_titles_of_made_up_runs(case):
-    approve_views("train", case, views(*CASES[case]()))
+def test_few_seeds_give_no_interval_and_no_order():
+    experiment, rows = made_up(seeds=range(4))
+    shown = views(experiment, rows)
+    assert set(verdicts_of(experiment, rows).values()) == {"open"}
+    texts = [*(chart.subtitle for chart in shown.charts), *(note for table in shown.tables for note in table.notes)]
+    told = [text for text in texts if "interquartile" in text]
+    assert len(told) == 5, "the curves, the windows, and the notes of two tables"
+    assert all("interquartile mean over 4 seeds, too few for an interval" in text for text in told)
 
 
-def test_lengths_of_windows_are_compared_by_their_returns_and_a_bias_is_named_only_where_its_interval_excludes_0():
+def test_windows_that_are_not_distinguishable_from_the_best_are_tied():
+    experiment, rows = made_up({"shac": -530.0, "shac[window=16]": -531.0, "shac[window=8]": -700.0})
+    windows = next(table for table in views(experiment, rows).tables if table.name == "windows").frame
+    assert sorted(windows["verdict"]) == ["behind", "first", "tied"]
+    assert windows.loc[windows["verdict"] == "behind", "window"].tolist() == [8]
+
+
+def test_verdicts_are_those_of_each_problem():
+    runs = []
+    for k, final in (("1e3", FINAL), ("1e4", dict.fromkeys(FINAL, -600.0))):
+        experiment, rows = made_up(final, spread=10.0 if k == "1e3" else 100.0)
+        runs.append(aggregate.runs_of(experiment, rows).assign(problem=f"stiffness={k}"))
+    summary = aggregate.summarise(pd.concat(runs, ignore_index=True))
+    verdicts = summary.assign(verdict=aggregate.ranked(summary, ["problem"])).groupby("problem")["verdict"].agg(sorted)
+    assert verdicts.to_dict() == {"stiffness=1e3": ["behind", "behind", "first"], "stiffness=1e4": ["open"] * 3}
+
+
+def test_lengths_of_windows_are_compared_by_their_returns():
     experiment, rows = made_up()
-    rows.loc[rows["trainer"] == "shac[window=8]", "window_bias_low"] = 0.0
     shown = views(experiment, rows)
     chart = next(chart for chart in shown.charts if chart.name == "windows")
     assert [column.name for column in chart.y] == ["final", "window_bias", "window_gradient"]
-    assert "bias" not in " ".join(shown.findings)
-    lines = next(table for table in shown.tables if table.name == "windows").frame.set_index("window")
-    assert lines.loc[8, "bias"] == "not distinguishable from 0 (up to 1.4)"
-    assert lines.loc[32, "bias"] == "0.31 [0.28, 0.34]"
+    lines = readable(next(table for table in shown.tables if table.name == "windows"))
+    assert "0.31 [0.28, 0.34]" in set(lines["its bias"])
+
+
+def test_a_trainer_without_a_run_that_ends_is_not_the_best_by_its_untrained_policy():
+    experiment, rows = made_up()
+    planted = rows["trainer"] == "ppo"
+    rows.loc[planted, ["status", "first_return"]] = ["nonfinite", -100.0]
+    assert verdicts_of(experiment, rows) == {"shac": "first", "shac[window=8]": "behind", "ppo": "no result"}
+    rows.loc[rows["trainer"] == "shac[window=8]", ["status", "first_return"]] = ["nonfinite", -100.0]
+    assert "windows" not in {table.name for table in views(experiment, rows).tables}, "one window is left"
+    rows["status"] = "nonfinite"
+    assert set(verdicts_of(experiment, rows).values()) == {"no result"}
 
 
 def test_a_run_that_is_not_finite_counts_as_its_untrained_policy():
@@ -94,11 +115,12 @@ def test_a_run_that_is_not_finite_counts_as_its_untrained_policy():
     assert aggregate.summarise(runs)["failed"].tolist() == [1]
 
 
-def test_a_fault_is_reported_in_words_with_its_run():
-    experiment, rows = made_up(verdicts=NOT_FINITE)
-    shown = views(experiment, rows)
-    table = next(table for table in shown.tables if table.name == "faults")
-    assert set(table.frame["words"]) == {"NaN at update 7: the loss is not finite"}
+def test_a_fault_is_reported_with_its_run_and_its_numbers():
+    experiment, rows = made_up(verdicts=json.dumps([{"code": "not_finite", "update": 7, "quantity": "loss"}]))
+    table = next(table for table in views(experiment, rows).tables if table.name == "faults")
+    assert len(table.frame) == 15
+    assert (table.frame[["code", "update", "quantity"]] == ["not_finite", 7, "loss"]).all(axis=None)
+    assert "- not_finite: a quantity is not finite" in table.notes
 
 
 @pytest.mark.parametrize(("cosine_update", "count"), [([100, 300], 15), ([], 0)])
@@ -114,8 +136,7 @@ def test_a_cut_gradient_is_no_fault_of_whole_episodes_which_are_cut_by_construct
 @pytest.mark.parametrize(("contacts", "is_told"), [([2.0, 1.0], False), ([0.0, 1.0], True)])
 def test_that_peaks_have_contact_is_told_only_where_some_updates_have_none(contacts, is_told):
     fault = {"code": "explodes", "update": 9, "factor": 200.0, "peaks": 2, "with_contact": 2}
-    words = findings.describe(planted({"shac": -530.0}, fault, log_contacts=contacts)["fault"].iloc[0])
-    assert ("peaks in updates with contact" in words) == is_told
+    assert ("with_contact" in planted({"shac": -530.0}, fault, log_contacts=contacts)) == is_told
 
 
 def planted(final, fault, **columns):
@@ -132,10 +153,18 @@ def test_the_chart_of_logs_has_one_axis_of_steps_for_all_quantities():
     assert chart.frame["step"].max() == 1e6
 
 
-def test_a_return_above_another_by_less_than_noise_is_not_below():
-    low, high = {"final_low": -10.0, "final_high": -8.0}, {"final_low": -8.5, "final_high": -7.0}
-    assert not findings.is_below(low, high)
-    assert findings.is_below({**low, "final_high": -9.0}, high)
+def test_a_return_above_another_by_less_than_noise_is_not_behind():
+    lines = pd.DataFrame(
+        {"final": [-9.0, -8.0], "final_low": [-10.0, -8.5], "final_high": [-8.0, -7.0], "group": "one"}
+    )
+    assert aggregate.ranked(lines, ["group"]).tolist() == ["open", "open"]
+    assert aggregate.ranked(lines.assign(final_high=[-9.0, -7.0]), ["group"]).tolist() == ["behind", "first"]
+
+
+def test_rows_without_a_run_show_their_reasons():
+    experiment, rows = made_up(status="error", reason="planted", curve_return=[])
+    shown = views(experiment, rows)
+    assert shown.remarks == ["15 error: planted"]
 
 
 def test_a_scene_without_observations_is_refused_with_the_reason(tmp_path):

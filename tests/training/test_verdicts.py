@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from bench.studies.train.findings import WORDS, describe
 from bench.studies.train.verdicts import Log, judge
 
 N = 100
@@ -29,9 +28,10 @@ def verdicts(returns=RETURNS, cosines=COSINES, probe=None, **planted):
     return judge(log, EVALUATED, np.asarray(returns), cosines, probe or {"difference_error": 1e-4})
 
 
-def words(found):
-    assert len(found) == 1, found
-    return describe(found[0])
+def fault(found, code):
+    """The only fault found, which has a code."""
+    assert [one["code"] for one in found] == [code]
+    return found[0]
 
 
 def with_value(name, where, value):
@@ -48,34 +48,36 @@ def test_a_gradient_that_explodes_after_the_contact_starts():
     found = verdicts(
         gradient_norm=with_value("gradient_norm", 42, 500.0), contacts=with_value("contacts", slice(40, None), 0.5)
     )
-    assert words(found).startswith("the gradient explodes 2 updates after the contact starts (update 43), to 4")
+    one = fault(found, "explodes")
+    assert (one["update"], one["contact"]) == (43, 41)
+    assert 400 < one["factor"] < 500
 
 
 def test_a_gradient_that_explodes_without_contact_names_none():
     found = verdicts(gradient_norm=with_value("gradient_norm", [30, 60, 61], 1e4))
-    assert "contact" not in words(found)
-    assert words(found).startswith("the gradient explodes at update 31, to ")
-    assert words(found).endswith("and 2 more times")
+    one = fault(found, "explodes")
+    assert "contact" not in one
+    assert (one["update"], one["peaks"]) == (31, 3)
 
 
 def test_a_contact_long_before_the_explosion_is_not_named():
     found = verdicts(
         gradient_norm=with_value("gradient_norm", 80, 1e4), contacts=with_value("contacts", slice(10, None), 1.0)
     )
-    assert words(found).startswith("the gradient explodes at update 81")
+    one = fault(found, "explodes")
+    assert one["update"] == 81
+    assert "contact" not in one
 
 
 def test_a_gradient_that_returns_to_its_usual_size_does_not_explode():
-    text = words(verdicts(gradient_norm=with_value("gradient_norm", slice(5, 40), 1e-4)))
-    assert text.startswith("the gradient nearly vanishes before update 41 and then grows 1")
-    assert text.endswith("to its usual size")
+    assert fault(verdicts(gradient_norm=with_value("gradient_norm", slice(5, 40), 1e-4)), "returns")["update"] == 41
 
 
 def test_a_gradient_that_explodes_and_stays_large():
     norm = HEALTHY["gradient_norm"] * np.where(np.arange(N) < 30, 1.0, 1e4)
-    text = words(verdicts(gradient_norm=norm, contacts=with_value("contacts", slice(29, None), 1.0)))
-    assert text.startswith("the gradient explodes 1 update after the contact starts (update 31), to ")
-    assert text.endswith("times its median before, and stays at about 1.0e4 times")
+    one = fault(verdicts(gradient_norm=norm, contacts=with_value("contacts", slice(29, None), 1.0)), "explodes")
+    assert (one["update"], one["contact"]) == (31, 30)
+    assert one["lasting"] == pytest.approx(1e4, rel=0.05)
 
 
 def test_a_gradient_that_grows_step_by_step():
@@ -83,9 +85,9 @@ def test_a_gradient_that_grows_step_by_step():
 
     The medians of the first and last 10 updates are 90 updates apart: 1.12^90 = 2.7e4.
     """
-    text = words(verdicts(gradient_norm=1.12 ** np.arange(N)))
-    assert text.startswith("the gradient grows step by step, 2.7e4 times in all")
-    assert text.endswith("above 100 times its first size from update 47 on")
+    one = fault(verdicts(gradient_norm=1.12 ** np.arange(N)), "grows")
+    assert one["factor"] == pytest.approx(2.7e4, rel=0.02)
+    assert one["update"] == 47
 
 
 RISING_NO_MORE = [*RETURNS[:2], [-60, -62, -58], [-61, -63, -59], [-60, -62, -58]]
@@ -93,9 +95,9 @@ RISING_NO_MORE = [*RETURNS[:2], [-60, -62, -58], [-61, -63, -59], [-60, -62, -58
 
 def test_a_gradient_that_vanishes_while_the_return_rises_no_more():
     vanishing = HEALTHY["gradient_norm"] * np.where(np.arange(N) < 40, 1.0, 1e-4)
-    text = words(verdicts(gradient_norm=vanishing, returns=RISING_NO_MORE[:1] + [RISING_NO_MORE[2]] * 4))
-    assert text.startswith("the gradient nearly vanishes from update 41 on, 9900 times below its size before")
-    assert text.endswith("converged or is stuck")
+    one = fault(verdicts(gradient_norm=vanishing, returns=RISING_NO_MORE[:1] + [RISING_NO_MORE[2]] * 4), "vanishes")
+    assert one["update"] == 41
+    assert one["factor"] == pytest.approx(9900, rel=0.01)
 
 
 def test_a_gradient_that_becomes_small_while_the_return_rises_is_no_fault():
@@ -104,29 +106,30 @@ def test_a_gradient_that_becomes_small_while_the_return_rises_is_no_fault():
 
 def test_a_gradient_that_vanishes_and_returns_is_named_by_its_return_only():
     """Also where it was small for most of the run: what counts is its size before."""
-    text = words(verdicts(gradient_norm=with_value("gradient_norm", slice(20, 80), 1e-4), returns=RISING_NO_MORE))
-    assert text.startswith("the gradient nearly vanishes before update 81")
+    found = verdicts(gradient_norm=with_value("gradient_norm", slice(20, 80), 1e-4), returns=RISING_NO_MORE)
+    assert fault(found, "returns")["update"] == 81
 
 
 def test_a_gradient_of_all_zeros():
-    assert words(verdicts(gradient_norm=np.zeros(N))) == "the gradient is exactly zero in all 100 updates"
+    one = fault(verdicts(gradient_norm=np.zeros(N)), "zero")
+    assert (one["update"], one["zero"], one["updates"]) == (1, 100, 100)
 
 
 def test_a_gradient_that_becomes_zero():
     found = verdicts(gradient_norm=with_value("gradient_norm", slice(70, None), 0.0))
-    assert words(found) == "the gradient is exactly zero from update 71 on, in 30 of 100 updates"
+    one = fault(found, "zero")
+    assert (one["update"], one["zero"], one["updates"]) == (71, 30, 100)
 
 
 def test_a_nan_names_its_update_and_quantity():
     found = verdicts(gradient_norm=with_value("gradient_norm", slice(12, None), np.nan))
-    assert words(found) == "NaN at update 13: the gradient norm is not finite"
+    assert found == [{"code": "not_finite", "update": 13, "quantity": "gradient norm"}]
 
 
 def test_a_return_that_rises_while_penetration_doubles():
     depth = np.linspace(1e-3, 4e-3, N) + 1e-5 * RNG.standard_normal(N)
     found = verdicts(penetration=depth, contacts=np.full(N, 1.0))
-    assert "penetration grows 3.4 times" in words(found)
-    assert words(found).endswith("the policy uses the soft contact")
+    assert fault(found, "soft_contact")["factor"] == pytest.approx(3.4, abs=0.05)
 
 
 def test_a_penetration_that_doubles_while_the_reward_stays_is_not_that_fault():
@@ -137,9 +140,9 @@ def test_a_loss_that_falls_while_the_return_worsens():
     worse = np.array(RETURNS)
     worse[-1] = [-90, -92, -88]
     worse[1] = [-40, -42, -38]
-    text = words(verdicts(returns=worse))
-    assert text.startswith("the loss falls (")
-    assert text.endswith("while the return worsens from -40.0 at update 25 to -90.0")
+    one = fault(verdicts(returns=worse), "worse")
+    assert (one["update"], one["best"], one["last"]) == (25, -40.0, -90.0)
+    assert one["loss_after"] < one["loss_before"]
 
 
 def test_a_return_that_worsens_within_its_interval_is_open():
@@ -149,27 +152,22 @@ def test_a_return_that_worsens_within_its_interval_is_open():
 
 
 def test_parameters_that_leave_their_scale():
-    assert "parameters are unphysical: the largest is 300" in words(
-        verdicts(parameter_largest=with_value("parameter_largest", slice(60, None), 300.0))
-    )
+    found = verdicts(parameter_largest=with_value("parameter_largest", slice(60, None), 300.0))
+    assert fault(found, "parameters")["value"] == 300.0
 
 
 def test_a_deviation_that_collapses():
-    assert words(verdicts(deviation=with_value("deviation", slice(60, None), 1e-5))).startswith(
-        "the actions' deviation is unphysical: 1.0e-5 at update 61"
-    )
+    one = fault(verdicts(deviation=with_value("deviation", slice(60, None), 1e-5)), "deviation")
+    assert (one["update"], one["value"]) == (61, 1e-5)
 
 
 def test_a_gradient_that_differences_contradict():
-    assert (
-        "open: central differences at the steps tried do not agree with the gradient (relative error of at least 0.50)"
-        in words(verdicts(probe={"difference_error": 0.5}))
-    )
+    assert verdicts(probe={"difference_error": 0.5}) == [{"code": "differences", "error": 0.5}]
 
 
 def test_a_first_order_gradient_that_points_away():
     opposed = np.array([[10.0, -0.5, -0.6], [50.0, -0.4, -0.6], [90.0, -0.45, -0.6]])
-    assert "points away from the zeroth-order one: cosine -0.45" in words(verdicts(cosines=opposed))
+    assert fault(verdicts(cosines=opposed), "opposed")["cosine"] == pytest.approx(-0.45)
 
 
 def test_two_comparisons_give_no_verdict():
@@ -178,16 +176,4 @@ def test_two_comparisons_give_no_verdict():
 
 
 def test_windows_that_are_always_cut():
-    assert words(verdicts(cut=np.ones(N))).startswith("the gradient is cut in 100% of windows")
-
-
-@pytest.mark.parametrize("code", WORDS)
-def test_every_code_has_words_without_a_full_stop_or_semicolon(code):
-    numbers = {"update": 3, "quantity": "loss", "zero": 10, "updates": 20, "factor": 4.0, "peaks": 2, "error": 0.5,
-               "cosine": -0.5, "low": -0.6, "high": -0.4, "best": 1.0, "last": 0.0, "loss_before": 2.0, "loss_after": 1.0,
-               "before": 0.1, "after": 0.4, "reward_before": 0.0, "reward_after": 1.0, "first": 1.0, "value": 200.0,
-               "share": 0.95, "lasting": 500.0}  # fmt: skip
-    text = describe({"code": code, **numbers})
-    assert text
-    assert ";" not in text
-    assert not text.endswith(".")
+    assert fault(verdicts(cut=np.ones(N)), "cut")["share"] == 1.0

@@ -137,7 +137,7 @@ def _frame(chart: Chart) -> pd.DataFrame:
 
 def _chart(chart: Chart) -> dict[str, Any]:
     return {
-        "title": (chart.page_title or chart.title).rstrip("."),
+        "title": chart.title or chart.name.replace("_", " ").capitalize(),
         "text": " ".join(
             filter(
                 None,
@@ -161,7 +161,6 @@ def _chart(chart: Chart) -> dict[str, Any]:
         "own_scales": chart.own_scales,
         "looks": {name: _look(style) for name, style in draw.series_styles(chart).items()},
         "notes": dict(chart.panel_notes),
-        "texts": [{"text": note.text, "x": note.x, "y": note.y, "panel": note.panel} for note in chart.notes],
     }
 
 

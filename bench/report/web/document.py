@@ -45,11 +45,10 @@ def blocks(
     counts = (rows if views.rows is None else views.rows)["status"].value_counts()
     statuses = "".join(f'<li class="{escape(str(s))}"><b>{n}</b> {escape(str(s))}</li>' for s, n in counts.items())
     data = page_data(experiment, rows, views, commands)
-    first, *rest = (escape(finding) for finding in (*views.findings, "")[: max(1, len(views.findings))])
     parts = {
         "title": escape(experiment.name),
         "question": escape(experiment.question),
-        "finding": first + "".join(f"<span>{finding}</span>" for finding in rest),
+        "headline": escape(views.headline),
         "counts": f"<li><b>{counts.sum()}</b> cells</li>{statuses}",
         "answers": _answers(views),
         "made": _made(record),

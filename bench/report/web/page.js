@@ -481,13 +481,6 @@ function pointFigure(chart, name, panel, range) {
   for (const [axis, marks] of [["x", chart.marks], ["y", chart.y_marks]]) {
     for (const [label, value] of Object.entries(marks)) mark(chart, axis, label, value, range, shapes, annotations);
   }
-  const scaled = (value, axis) => (axis.log ? Math.log10(value) : value);
-  for (const { text, x, y, panel: only } of chart.xAxis === chart.x[0] && chart.yAxis === chart.y[0] ? chart.texts : []) {
-    if (only === null || only === name) {
-      annotations.push({ x: scaled(x, chart.xAxis), y: scaled(y, chart.yAxis), xanchor: "right", xshift: -6, showarrow: false,
-        align: "right", text: plotted(text).replace(/\n/g, "<br>"), font: { size: SMALL } });
-    }
-  }
   annotations.push(...backendNames(chart, panel, joined, range));
   return [traces, { ...frame(chart, panel, range), shapes, annotations }];
 }

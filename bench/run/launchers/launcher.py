@@ -84,7 +84,7 @@ def local_launcher(experiment: Experiment, timed: bool = False, n_workers: int |
     limits = ResourceLimits(rules.timeout, rules.memory)
     return Pool(
         1 if timed else workers, TaskHandler, without_grid(experiment), limits,
-        single_thread=not timed, folders=experiment.plugins,
+        single_thread=not timed, folders=experiment.plugins, outside=lambda task: task.outside,
     )  # fmt: skip
 
 

@@ -57,7 +57,7 @@ class BackwardMemory(Study):
         return None if "grad" in cell.backend.provides else f"backend {cell.backend.name} computes no gradients"
 
     def views(self, experiment: Experiment, rows: pd.DataFrame) -> Views:
-        """Return the findings, the tables of growth and of cells, and the charts of memory and time along the horizon."""
+        """Return the tables of growth and of cells, and the charts of memory and time along the horizon."""
         from bench.studies.backward_memory.views import views
 
         return views(experiment, rows)

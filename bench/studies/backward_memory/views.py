@@ -12,19 +12,14 @@ from bench.experiment import grid
 from bench.experiment.columns import Column, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Style, Table, Views
-from bench.report.generic import engine_table
-from bench.report.problems import axes_of, problem_names
+from bench.report.shown import Shown
 from bench.report.style import colour, marker
-from bench.report.text import listed, number
-from bench.report.views import arrange
 from bench.report.writer import reasons
 
 FLOOR = 0.3
 """Error of a measured memory in MiB: the kernel counts resident pages late, so that peaks are 0.1 to 0.25 MiB too low."""
 SMALL = 1.0
 """Memory in MiB, about three floors, below which a memory is an upper limit without ratios and orders."""
-AGREES = 1e-6
-"""Relative difference up to which gradients agree: rounding, and central differences of costs in a pass over Jacobians."""
 SHOWN = ("memory_mb", "gradient_s", "process_mb", "gradient_error_rel")
 LINES = (
     text("problem"),
@@ -57,39 +52,27 @@ class Ratio(NamedTuple):
     low: float
     high: float
 
-    def __str__(self) -> str:
-        return f"{number(self.value)} [{number(self.low)}, {number(self.high)}]"
-
 
 UNKNOWN = Ratio(math.nan, math.nan, math.nan)
 
 
 def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
-    """Return the findings, the tables of the longest horizon and of all cells, and the charts of memory and time."""
-    shown = arrange(experiment, rows)
-    shown = replace(shown, rows=with_error(shown.rows))
-    own = [replace(experiment.columns.by_name[name], digits=3) for name in SHOWN]
+    """Return the tables of the longest horizon and of all cells, and the charts of memory and time."""
+    shown = Shown(experiment, rows, along=["horizon"])
+    tried = with_error(shown.rows)
+    own = [shown.column(name, digits=3) for name in SHOWN]
     own[0] = replace(own[0], limit="is_small")
-    cells = engine_table(
-        experiment, rows, shown, own, "memory and time of a backward pass", [CELLS_NOTE], always=("scene", "backend", "horizon")
-    )  # fmt: skip
-    cells = replace(cells, terminal=False)
-    tried = shown.rows
+    title, always = "memory and time of a backward pass", ("scene", "backend", "horizon")
+    cells = shown.cells(own, title, [CELLS_NOTE], always, tried, terminal=False)
     if not _has_result(tried).any():
-        return Views(["No cell gave a result: the table has the reason of each."], [cells], remarks=reasons(rows))
+        return Views([cells], remarks=reasons(rows))
     # the first method is the experiment's first, in whatever order rows were stored
     places = {cell.key: place for place, cell in enumerate(grid.cells(experiment))}
     tried = tried.iloc[tried["key"].map(places).fillna(len(places)).to_numpy().argsort(kind="stable")]
-    over = axes_of(shown, "horizon")
-    tried = tried.assign(
-        problem=problem_names(shown, ["scene", "contact", "integrator"], over, always=["scene"], rows=tried),
-        method=problem_names(shown, ["backend"], over, always=["backend"], rows=tried),
-    )
     first, good = str(tried["method"].iloc[0]), tried[_has_result(tried)]
     lines = longest(good, first)
     table = Table("backward_memory_methods", lines, LINES, "Memory and time of a backward pass", [NOTE], terminal=True, page=True)  # fmt: skip
-    charts = _charts(experiment, good, lines, first)
-    return Views(findings(good, lines, first), [table, cells], charts, remarks=reasons(rows))
+    return Views([table, cells], _charts(experiment, good), remarks=reasons(rows))
 
 
 def with_error(rows: pd.DataFrame) -> pd.DataFrame:
@@ -150,126 +133,27 @@ def _order(earlier: pd.Series, later: pd.Series) -> Ratio:
     return Ratio(*(math.log(value) / steps for value in ratio(later, earlier, "memory_mb")))
 
 
-def findings(good: pd.DataFrame, lines: pd.DataFrame, first: str) -> list[str]:
-    """Return what the methods with the least memory save at the longest horizon, the fastest one, and whether gradients agree."""
-    parts = [
-        f"On {problem} at T = {int(part['horizon'].max()):,}, {_least(part, first)}."
-        for problem, part in lines.groupby("problem", sort=False)
-    ]
-    texts = [" ".join(parts), fastest(lines), agreement(good)]
-    return [text for text in texts if text]
-
-
-def _least(part: pd.DataFrame, first: str) -> str:
-    """Return what the method with the least memory on one problem saves, compared with the method ``first``."""
-    base, others = part[part["method"] == first], part[part["method"] != first]
-    if base.empty:
-        return f"{first} has no result, so that nothing is compared with it"
-    own = base.iloc[0]
-    if others.empty:
-        return f"{first} needs {_memory(own)}, and no other method has a result"
-    small = others[others["is_small"]]
-    if own["is_small"] or not len(small):
-        least = others.loc[others["memory_mb"].idxmin()]
-        less = _ratio(least, "less")
-        if not less.low > 1.0:
-            return f"no method needs distinguishably less memory than {first} ({_memory(own)})"
-        return (
-            f"{least['method']} needs {less} times less memory than {first} at {_ratio(least, 'longer')} times its time"
-        )
-    times = [f"{row['method']} at {_ratio(row, 'longer')} times the time" for _, row in small.iterrows()]
-    return f"{first} needs {_memory(own)}, and {_limit(small)} is enough for {listed(times)}"
-
-
-def _ratio(line: pd.Series, name: str) -> Ratio:
-    return Ratio(*(line[f"{name}{end}"] for end in ("", "_low", "_high")))
-
-
-def _memory(line: pd.Series) -> str:
-    value = Ratio(*(line[f"memory_mb{end}"] for end in ("", "_low", "_high")))
-    return _limit(line.to_frame().T) if line["is_small"] else f"{value} MiB"
-
-
-def _limit(small: pd.DataFrame) -> str:
-    return f"less than {float(small['memory_mb_high'].max()):.3g} MiB"
-
-
-def fastest(lines: pd.DataFrame) -> str:
-    """Return the fastest of several methods on each problem at the longest horizon, or those whose intervals overlap."""
-    names: dict[str, list[str]] = {}
-    for problem, part in lines.groupby("problem", sort=False):
-        if len(part) < 2:
-            continue
-        limit = part.loc[part["gradient_s"].idxmin(), "gradient_s_high"]
-        close = part[part["gradient_s_low"] <= limit]["method"]
-        names.setdefault(" or ".join(close) + (" (open)" if len(close) > 1 else ""), []).append(str(problem))
-    if not names:
-        return ""
-    return f"The fastest there is {', '.join(f'{name} on {listed(problems)}' for name, problems in names.items())}."
-
-
-def agreement(good: pd.DataFrame) -> str:
-    """Return in how many cells the gradient agrees with that of another backend, and the largest difference."""
-    known = good[good["gradient_error_rel"].notna() & (good["backend"] != good["compared_with"])]
-    if known.empty:
-        return "No gradient was compared with another one."
-    same = int((known["gradient_error_rel"] <= AGREES).sum())
-    worst = known.loc[known["gradient_error_rel"].idxmax()]
-    return (
-        f"{'All' if same == len(known) else f'{same} of'} {len(known)} gradients agree with {listed(known['compared_with'].unique())} "
-        f"within {number(AGREES, 1)}, and the largest relative difference is {number(worst['gradient_error_rel'])} "
-        f"({worst['method']}, {worst['problem']}, T = {int(worst['horizon']):,})."
-    )
-
-
-def _charts(experiment: Experiment, good: pd.DataFrame, lines: pd.DataFrame, first: str) -> list[Chart]:
+def _charts(experiment: Experiment, good: pd.DataFrame) -> list[Chart]:
     """Return the charts of memory and of time along the horizon, a panel per problem and a line per method."""
     own = experiment.columns.by_name
-    frame = good.assign(row=good.index)
-    methods = list(dict.fromkeys(good["method"]))
+    methods = dict.fromkeys(good["method"])
     styles = {method: Style(colour(i), marker(i)) for i, method in enumerate(methods)}
     horizon = replace(own["horizon"], label="horizon T", log=True)
     memory = replace(own["memory_mb"], limit="is_small", log=True)
     seconds = replace(own["gradient_s"], label="time of a batch of gradients", log=True)
     samples = " or ".join(f"{count:g}" for count in good["samples"].unique())
     conditions = f"Batches of {samples} rollouts on one thread, a process per point"
-    limits = (
-        f". Hollow: at most so much, since little is known below {SMALL:.0f} MiB" if frame["is_small"].any() else ""
-    )
+    limits = f". Hollow: at most so much, since little is known below {SMALL:.0f} MiB" if good["is_small"].any() else ""
     shared: dict[str, Any] = dict(
         series="method", panel="problem", styles=styles, across=2,
     )  # fmt: skip
     return [
         Chart(
-            "backward_memory", _memory_title(lines, first), frame, [horizon], [memory],
+            "backward_memory", good, [horizon], [memory],
             text="Peak of the resident memory beyond the memory before the gradients.", subtitle=conditions + limits, **shared,
         ),
         Chart(
-            "backward_time", _time_title(lines, first), frame, [horizon], [seconds],
+            "backward_time", good, [horizon], [seconds],
             text="Median and range of the measured calls.", subtitle=conditions, **shared,
         ),
     ]  # fmt: skip
-
-
-def _memory_title(lines: pd.DataFrame, first: str) -> str:
-    """Return the title of the chart of memory: which methods need much less than the first, as far as intervals show it."""
-    base = lines[(lines["method"] == first) & ~lines["is_small"]]
-    small = lines[lines["is_small"] & lines["problem"].isin(base["problem"])]
-    if len(small):
-        methods = small["method"].unique()
-        needs = "needs" if len(methods) == 1 else "need"
-        return f"{listed(methods)} {needs} {_limit(small)} at the longest horizon, where {first} needs at least {number(base['memory_mb_low'].min())} MiB"
-    saving = lines[lines["less_low"] > 1.0]
-    if saving.empty:
-        return "Memory of a batch of gradients along the horizon"
-    least = saving.loc[saving["less"].idxmax()]
-    return f"{least['method']} needs up to {number(least['less'])} times less memory than {first}"
-
-
-def _time_title(lines: pd.DataFrame, first: str) -> str:
-    """Return the title of the chart of time: the method that saves most time, if its interval shows that it saves some."""
-    faster = lines[lines["longer_high"] < 1.0]
-    if faster.empty:
-        return "Time of a batch of gradients along the horizon"
-    quick = faster.loc[faster["longer"].idxmin()]
-    return f"{quick['method']} is up to {number(1.0 / quick['longer'])} times as fast as {first}"

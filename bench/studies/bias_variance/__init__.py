@@ -42,7 +42,7 @@ class BiasVariance(Study):
         return measure(cell, session, self.timed_calls, self.settle_s)
 
     def views(self, experiment: Experiment, rows: pd.DataFrame) -> Views:
-        """Return the findings, the comparisons behind them, all tables, and the charts."""
+        """Return the tables, comparisons among them, and the charts."""
         from bench.studies.bias_variance.views import views
 
         return views(experiment, rows)

@@ -15,7 +15,7 @@ import pandas as pd
 from bench.experiment.axes import Axis
 from bench.experiment.columns import Column, text
 from bench.experiment.parameters import number_problems
-from bench.experiment.views import Chart, Mark, Note, Style
+from bench.experiment.views import Chart, Mark, Style
 from bench.model import SURROGATE, registry
 from bench.report.colours import estimator_order
 from bench.report.problems import ProblemRows, named_values, split_by_problem, titled
@@ -33,9 +33,8 @@ from bench.report.views import (
 )
 from bench.studies.bias_variance import time_to_accuracy
 from bench.studies.bias_variance.columns import COLUMNS
-from bench.studies.bias_variance.comparisons import FAILS, NO_RESULT, leaders
+from bench.studies.bias_variance.comparisons import FAILS, NO_RESULT, most_often_first
 from bench.studies.bias_variance.costs import ROLLOUTS, TIME, Cost
-from bench.studies.bias_variance.findings import findings, recommended
 from bench.studies.bias_variance.time_to_accuracy import SAMPLES, TARGETS
 
 FLOOR = 1e-4
@@ -72,7 +71,6 @@ def charts(
     methods: pd.DataFrame,
     comparisons: pd.DataFrame,
     best: pd.DataFrame,
-    texts: Sequence[str],
 ) -> list[Chart]:
     """Return all charts, the main one first."""
     labelled = replace(shown, rows=with_plotted_columns(shown.rows))
@@ -84,19 +82,19 @@ def charts(
     for axis in sorted(swept, key=lambda a: (-swept[a], a.column != "stiffness")):
         if axis.column == "samples" and not best.empty:
             continue
-        chart = _along(labelled, axis, methods, comparisons, styles, subtitle, texts)
+        chart = _along(labelled, axis, methods, comparisons, styles, subtitle)
         main += [chart] if chart is not None else []
     if not best.empty:
         first = [_speed_accuracy(labelled, best, styles, subtitle), _costs_matrix(labelled, best)]
         main = [chart for chart in first if chart is not None] + main
     elif shown.rows["backend"].nunique() > 1:
-        main += [_error_and_cost(labelled, styles, subtitle, accurate_and_fast(methods, comparisons))]
+        main += [_error_and_cost(labelled, styles, subtitle)]
     if not swept and methods["problem"].nunique() > 1:
-        main = [_estimators(methods, texts), *main]
+        main = [_estimators(methods), *main]
     everything = labelled.rows
     page_only.append(
         Chart(
-            "error_against_time", "Error against time", everything, TIMES, [RMSE, BIAS], "points", series="series",
+            "error_against_time", everything, TIMES, [RMSE, BIAS], "points", series="series",
             panel="problem_", front="setting_", styles=styles, printed=False,
             text="Each point is one cell. Lower left is better; above 1 an estimate is worse than the zero estimate. Points with "
             "a ring are not beaten in both by any point shown of the same problem.",
@@ -104,7 +102,7 @@ def charts(
     )  # fmt: skip
     page_only.append(
         Chart(
-            "bias_against_spread", "Bias against spread", everything, [SPREAD], [BIAS], "points", series="series",
+            "bias_against_spread", everything, [SPREAD], [BIAS], "points", series="series",
             panel="problem_", styles=styles, printed=False,
             text="Towards the left more samples do not help; towards the top the error is bias.",
         )
@@ -182,17 +180,11 @@ def _along(
     comparisons: pd.DataFrame,
     styles: Mapping[str, Style],
     subtitle: str,
-    whole: Sequence[str],
 ) -> Chart | None:
     """Return the chart of errors along an axis: print draws the main estimators on the main problems, the page all."""
-    every = split_by_problem(shown, axis)
-    problems = [p for p in every if attempted(p.rows)["x"].nunique() > 1]
+    problems = [p for p in split_by_problem(shown, axis) if attempted(p.rows)["x"].nunique() > 1]
     if not problems:
         return None
-    own, compared = (table[table["axis"] == axis.column] for table in (methods, comparisons))
-    title = whole[0]
-    if 0 < len(compared) < len(comparisons):
-        title = f"Along {axis.column}: {findings(own, compared, shown.marks(axis))[0]}"
     frame = pd.concat([_lines(problem) for problem in problems], ignore_index=True)
     if shown.rows["seed"].nunique() > 1:
         frame = frame.drop(columns="row")  # a median over seeds is not a cell
@@ -200,17 +192,12 @@ def _along(
     names = _main_series(frame, methods, comparisons)
     total = frame["series"].nunique()
     panels = [problem.title() for problem in drawn]
-    named = split_by_problem(shown, axis, ("scene", "contact"))  # as the table of methods names the same problems
-    titles = {p.title(): name.title() for p, name in zip(every, named, strict=True)}
-    ours, of_ours = (table[table["problem"].isin([titles[panel] for panel in panels])] for table in (own, compared))
-    printed = findings(ours, of_ours, shown.marks(axis))[0] if 0 < len(of_ours) < len(compared) else title
     shares = [f"{len(names)} of {total} estimators"] if len(names) < total else []
-    marks, remarks = _unstable(shown, axis, frame[frame["panel"].isin(panels) & frame["first"]], names)
+    marks = _unstable(shown, axis, frame[frame["panel"].isin(panels) & frame["first"]], names)
     x = Column("x", label=axis.title, format="setting")
     return Chart(
-        "bias_variance_" + re.sub(r"\W", "_", axis.column), printed, frame, [x], [RMSE, BIAS, SPREAD], series="series",
-        page_title=title,
-        line="line", panel="panel", styles=styles, marks=marks, notes=remarks, failed="failed", across=len(drawn),
+        "bias_variance_" + re.sub(r"\W", "_", axis.column), frame, [x], [RMSE, BIAS, SPREAD], series="series",
+        line="line", panel="panel", styles=styles, marks=marks, failed="failed", across=len(drawn),
         labels="ends" if len(drawn) <= 2 else "legend", height=2.7 if len(drawn) <= 2 else 2.1,
         subtitle=", ".join(filter(None, [subtitle, *notes, *shares])), chosen=(("first", [True]), ("series", names), ("panel", panels)),
         text="Bars are 95% intervals. A hollow marker is the upper limit of a bias that is not distinguishable from 0.",
@@ -229,7 +216,7 @@ def _lines(problem: ProblemRows) -> pd.DataFrame:
 
 def _main_series(frame: pd.DataFrame, methods: pd.DataFrame, comparisons: pd.DataFrame) -> list[str]:
     """Return the estimators to print: the recommended one, then those that are first elsewhere, then distinct ones."""
-    main = recommended(methods, comparisons)
+    main = most_often_first(methods, comparisons)
     estimator = dict(zip(methods["method"], methods["estimator"], strict=True))
     wins = Counter(estimator[name] for name in comparisons["first"] if name)
     present = list(dict.fromkeys(frame["series"]))
@@ -250,25 +237,20 @@ def _distance(frame: pd.DataFrame, one: str, other: str) -> float:
     return float(np.exp(apart.median())) if len(apart) else math.inf
 
 
-def _unstable(shown: Arranged, axis: Axis, frame: pd.DataFrame, names: Sequence[str]) -> tuple[list[Mark], list[Note]]:
+def _unstable(shown: Arranged, axis: Axis, frame: pd.DataFrame, names: Sequence[str]) -> list[Mark]:
     """Return the marks of an axis: a band where an estimator fails beyond a named value, else a line at that value.
 
     The band is drawn in the panels where the first estimator's whole interval is above 1 at every value beyond the mark
-    and at none before it. Its largest error is written beside its point.
+    and at none before it.
     """
-    marks, notes = [], []
+    marks = []
     for name, value in shown.marks(axis).items():
         for panel, part in frame[frame["series"].isin(names[:1])].groupby("panel", sort=False):
             bad = (part["rmse_low"] > 1) | part["failed"]
             beyond = part["x"] > value
             if beyond.any() and bad[beyond].all() and not bad[~beyond].any():
                 marks.append(Mark(f"beyond the {name}", value, math.inf, panel=str(panel)))
-                worst = part.loc[part["rmse_rel"].where(part["failed"] == 0).idxmax()]
-                text_ = f"at least\n{number(worst['rmse_low'])} times\nthe gradient"
-                notes.append(Note(text_, worst["x"], worst["rmse_rel"], str(panel)))
-    if not marks:
-        marks = [Mark(name, value) for name, value in shown.marks(axis).items()]
-    return marks, notes
+    return marks or [Mark(name, value) for name, value in shown.marks(axis).items()]
 
 
 def choose_problems(problems: Sequence[ProblemRows], room: int) -> tuple[list[ProblemRows], list[str]]:
@@ -297,13 +279,11 @@ def _speed_accuracy(shown: Arranged, best: pd.DataFrame, styles: Mapping[str, St
     """Return error against cost where samples were swept: of each estimator the best backends' front, per problem."""
     timed = bool((best["by"] == "time").any())
     cost, x = (TIME, TIMES[0]) if timed else (ROLLOUTS, TIMES[2])
-    parts, notes = [], {}
+    parts = []
     for problem in split_by_problem(shown, SAMPLES, ("scene",)):
         rows = cost.known(problem.rows)
         if rows["x"].nunique() < 2:
             continue
-        entries = best[(best["problem"] == problem.title()) & (best["by"] == ("time" if timed else "rollouts"))]
-        notes[problem.title()] = "\n".join(map(time_to_accuracy.sentence, entries.to_dict("records")))
         for _, every in rows.groupby("series", sort=False):
             part = _on_fastest(every, cost)
             front = part[pareto(cost.of(part), part["rmse_rel"])]
@@ -313,8 +293,8 @@ def _speed_accuracy(shown: Arranged, best: pd.DataFrame, styles: Mapping[str, St
     marks = [Mark(f"{target:.0%}", target, axis="y") for target in TARGETS]
     frame = pd.concat(parts, ignore_index=True)
     return Chart(
-        "speed_accuracy" if timed else "rollouts_accuracy", time_to_accuracy.finding(best), frame, [x], [RMSE], series="series",
-        panel="panel", panel_notes=notes, styles=styles, marks=marks, across=3, height=2.0,
+        "speed_accuracy" if timed else "rollouts_accuracy", frame, [x], [RMSE], series="series",
+        panel="panel", styles=styles, marks=marks, across=3, height=2.0,
         subtitle=", ".join(filter(None, [subtitle, "each estimator on its fastest backend"])),
         text="Only estimates that no other of the same estimator beats in both error and cost are drawn.",
     )  # fmt: skip
@@ -350,8 +330,8 @@ def _costs_matrix(shown: Arranged, best: pd.DataFrame) -> Chart | None:
                 })  # fmt: skip
     what = "Time" if timed else "Rollouts"
     return Chart(
-        "summary_matrix", f"{what} to reach an error, relative to the lowest known of each column", pd.DataFrame(lines),
-        [text("problem", label="")], [ESTIMATOR], "grid", panel="panel", value="factor", cell="cell", across=1, height=0.24,
+        "summary_matrix", pd.DataFrame(lines), [text("problem", label="")], [ESTIMATOR], "grid",
+        f"{what} to reach an error, relative to the lowest known of each column", panel="panel", value="factor", cell="cell", across=1, height=0.24,
         subtitle="costs over the lowest, -: never reached, as the bias is larger, ?: not known, ≥ and ≤: limits, as the fewest "
         "samples suffice",
     )  # fmt: skip
@@ -366,7 +346,7 @@ def _factor_cell(way: time_to_accuracy.RequiredCost, first: time_to_accuracy.Req
     return "?" if way is not first and all(limits) else sign + number(factor)
 
 
-def _error_and_cost(shown: Arranged, styles: Mapping[str, Style], subtitle: str, title: str) -> Chart:
+def _error_and_cost(shown: Arranged, styles: Mapping[str, Style], subtitle: str) -> Chart:
     """Return error against time where samples were not swept: a dot per estimator and backend, by problem."""
     rows = TIME.known(shown.rows)
     problems = list(dict.fromkeys(rows["problem_"]))
@@ -374,30 +354,16 @@ def _error_and_cost(shown: Arranged, styles: Mapping[str, Style], subtitle: str,
     chosen = problems[::step]
     shares = [f"{len(chosen)} of {counted(len(problems), 'problem')}"] if len(chosen) < len(problems) else []
     return Chart(
-        "speed_accuracy", title, rows, TIMES[:1], [RMSE], "points", series="series", shape="backend", panel="problem_",
+        "speed_accuracy", rows, TIMES[:1], [RMSE], "points", series="series", shape="backend", panel="problem_",
         styles=styles, across=3, height=1.9, subtitle=", ".join(filter(None, [subtitle, *shares])),
         chosen=(("problem_", chosen),), on_page=False,
     )  # fmt: skip
 
 
-def accurate_and_fast(methods: pd.DataFrame, comparisons: pd.DataFrame) -> str:
-    """Format which estimator is most often first or tied in error, and which most often takes the least median time."""
-    wins = Counter(name for names in leaders(comparisons, methods).values() for name in names)
-    times = methods[methods["time_s"] > 0]
-    if times.empty or not wins:
-        return "No estimate was timed" if times.empty else "No error could be compared"
-    fast = Counter(times.loc[times.groupby("setting")["time_s"].idxmin(), "estimator"])
-    (accurate, n_accurate), (fastest, n_fastest) = wins.most_common(1)[0], fast.most_common(1)[0]
-    total = counted(methods["setting"].nunique(), "setting")
-    takes = f"takes the least median time at {n_fastest}"
-    who = f", and {takes}" if accurate == fastest else f"; {fastest} {takes}"
-    return f"{accurate} has the lowest error or ties at {n_accurate} of {total}{who}"
-
-
 # --------------------------------------------------------------------------------------------------- estimators
 
 
-def _estimators(methods: pd.DataFrame, texts: Sequence[str]) -> Chart:
+def _estimators(methods: pd.DataFrame) -> Chart:
     """Return the heat table of errors: estimators by their worst case, in families, against problems."""
     known = methods.assign(worst=methods["error"].where(methods["status"] == "ok", math.inf))
     order = known.groupby("estimator", sort=False)["worst"].max().sort_values(kind="stable").index
@@ -413,7 +379,7 @@ def _estimators(methods: pd.DataFrame, texts: Sequence[str]) -> Chart:
             })  # fmt: skip
     frame = pd.DataFrame(lines)
     return Chart(
-        "estimators", texts[0], frame, [text("problem", label="")], [ESTIMATOR], "grid", panel="panel", value="value",
+        "estimators", frame, [text("problem", label="")], [ESTIMATOR], "grid", panel="panel", value="value",
         cell="cell", across=1, height=0.2, value_range=(1e-2, 1e2),
         subtitle="relative RMSE of one estimate, sorted by the worst case; above 1 the zero estimate is better",
     )  # fmt: skip

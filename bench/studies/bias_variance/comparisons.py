@@ -1,4 +1,4 @@
-"""Compares estimators at each setting, with intervals: the one table behind findings, ranking, charts and page.
+"""Compares estimators at each setting, with intervals: the one table behind ranking, charts and page.
 
 A setting is a problem at one value of its swept axis. A method is an estimator, on the backends that agree.
 """
@@ -6,7 +6,8 @@ A setting is a problem at one value of its swept axis. A method is an estimator,
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -88,7 +89,7 @@ def method_table(shown: Arranged) -> pd.DataFrame:
                 lines.append({
                     "setting": f"{problem.title()}; {axis.column} {x!r}" if axis else problem.title(),
                     "problem": problem.title(), **kinds, "axis": axis.column if axis else "", "at": x if axis else math.nan,
-                    "method": name, "estimator": curve.label, "error": error, "low": low, "high": high,
+                    "method": name, "estimator": curve.label, "error": error, "error_low": low, "error_high": high,
                     "verdict": verdict(row["status"], error, low, high), "status": row["status"],
                     "remark": row["reason"], "bias_share": (row["bias_low"] / row["rmse"]) ** 2 if error > 0 else math.nan,
                     "evaluations": (row["rollouts"] + row["gradients"]) / (x if along_samples else row["samples"]),
@@ -149,7 +150,7 @@ def compare_errors(methods: pd.DataFrame) -> pd.DataFrame:
     """
     lines = []
     for _, part in methods.groupby("setting", sort=False):
-        good = part[np.isfinite(part["error"]) & np.isfinite(part["low"])].sort_values("error", kind="stable")
+        good = part[np.isfinite(part["error"]) & np.isfinite(part["error_low"])].sort_values("error", kind="stable")
         line: dict[str, Any] = part.iloc[0][["setting", "problem", "axis", "at"]].to_dict() | {
             "basis": EQUAL_ROLLOUTS if part["axis"].iloc[0] == ROLLOUTS.column else EQUAL_SAMPLES, "first": "", "value": math.nan, "value_low": math.nan,
             "value_high": math.nan, "second": "", "factor": math.nan, "factor_low": math.nan, "factor_high": math.nan,
@@ -172,28 +173,28 @@ def compare_errors(methods: pd.DataFrame) -> pd.DataFrame:
 
 
 def _interval(row: Any) -> tuple[float, float, float]:
-    return float(row["error"]), float(row["low"]), float(row["high"])
+    return float(row["error"]), float(row["error_low"]), float(row["error_high"])
 
 
 def leaders(comparisons: pd.DataFrame, methods: pd.DataFrame) -> dict[str, list[str]]:
     """Return, per setting, the estimators that are first, or tied and near the first; empty if no error is known."""
-    return _first_and_tied(comparisons, methods, NEAR)
-
-
-def not_excluded(comparisons: pd.DataFrame, methods: pd.DataFrame) -> dict[str, list[str]]:
-    """Return, per setting, the estimators that are first or tied with the first, however large their errors are."""
-    return _first_and_tied(comparisons, methods, math.inf)
-
-
-def _first_and_tied(comparisons: pd.DataFrame, methods: pd.DataFrame, most: float) -> dict[str, list[str]]:
     places = zip(methods["setting"], methods["method"], strict=True)
     known = dict(zip(places, zip(methods["estimator"], methods["error"], strict=True), strict=True))
     result = {}
     for row in comparisons[["setting", "first", "value", "tied"]].to_dict("records"):
         lines = [known[row["setting"], name] for name in (row["first"], *row["tied"]) if name]
-        near = [estimator for estimator, error in lines if not error > most * row["value"]]
+        near = [estimator for estimator, error in lines if not error > NEAR * row["value"]]
         result[row["setting"]] = list(dict.fromkeys(near))
     return result
+
+
+def most_often_first(methods: pd.DataFrame, comparisons: pd.DataFrame) -> str:
+    """Return the estimator that is most often first or tied with the first and certain to be better than zero there."""
+    working = set(methods.loc[methods["verdict"] == WORKS, ["estimator", "setting"]].itertuples(index=False, name=None))
+    wins = Counter(
+        (name, (name, place) in working) for place, names in leaders(comparisons, methods).items() for name in names
+    )
+    return max(map(str, methods["estimator"].unique()), key=lambda name: (wins[name, True], wins[name, False]))
 
 
 def verdicts_by_estimator(methods: pd.DataFrame) -> pd.DataFrame:
@@ -203,13 +204,3 @@ def verdicts_by_estimator(methods: pd.DataFrame) -> pd.DataFrame:
     worst = ranks.groupby(["estimator", "setting"], sort=False)["rank"].max()
     counts = worst.groupby(level="estimator", sort=False).value_counts().unstack(fill_value=0)
     return counts.rename(columns=dict(enumerate(order))).reindex(columns=order, fill_value=0)
-
-
-def estimators(methods: pd.DataFrame) -> list[str]:
-    """Return the estimators in order of appearance."""
-    return list(dict.fromkeys(methods["estimator"]))
-
-
-def known(values: Iterable[float]) -> list[float]:
-    """Return the finite values."""
-    return [value for value in values if math.isfinite(value)]

@@ -19,7 +19,7 @@ from bench.experiment.parameters import number_problems
 from bench.experiment.views import Table
 from bench.measure.statistics import is_unexplained
 from bench.report.problems import ProblemRows, split_by_problem
-from bench.report.text import axis_value
+from bench.report.text import axis_value, span
 from bench.report.views import (
     UNSTEADY,
     Arranged,
@@ -41,7 +41,6 @@ from bench.studies.bias_variance.comparisons import (
     problems_by_axis,
     verdicts_by_estimator,
 )
-from bench.studies.bias_variance.findings import span, value_range, work_of_a_sample
 from bench.studies.bias_variance.time_to_accuracy import limits
 
 FAILURES = {
@@ -76,6 +75,7 @@ def tables(
         result.append(ranking(methods))
     errors = comparisons[comparisons["basis"].isin((EQUAL_SAMPLES, EQUAL_ROLLOUTS))]
     result.append(recommendations(methods, errors))
+    result.append(Table("verdicts", methods.drop(columns="setting"), [], files=["csv"]))
     joined = comparisons.drop(columns="setting").assign(tied=[", ".join(names) for names in comparisons["tied"]])
     noted = joined.assign(factor_note=limits(joined))
     columns = [replace(c, note="factor_note") if c.name == "factor" else c for c in COMPARED]
@@ -86,7 +86,7 @@ def tables(
 
 COMPARISON_NOTES = (
     "Factor: the second over the first, with its 95% interval. Tied: not distinguishable from the first, since the interval "
-    "of the factor reaches 1 or is not known. All findings, the ranking and the charts' titles are computed from this table.",
+    "of the factor reaches 1 or is not known.",
 )
 
 
@@ -237,7 +237,7 @@ def ranking(methods: pd.DataFrame) -> Table:
                 work = f"({row['evaluations']:.0f}x)" if row["evaluations"] > MANY else ""
                 share = "biased" if row["bias_share"] > 0.5 else ""
                 note = row["status"] if row["status"] != "ok" else ", ".join(filter(None, (row["verdict"], share)))
-                line |= {f"p{i}": row["error"], f"p{i}_low": row["low"], f"p{i}_high": row["high"]}
+                line |= {f"p{i}": row["error"], f"p{i}_low": row["error_low"], f"p{i}_high": row["error_high"]}
                 line[f"p{i}_note"] = " ".join(filter(None, (note, work)))
         finite = [line[f"p{i}"] for i in range(len(problems))]
         line["worst"] = max(finite) if all(map(math.isfinite, finite)) else math.nan
@@ -266,6 +266,11 @@ def _basis(methods: pd.DataFrame) -> str:
     return "samples or rollouts" if len(along) > 1 else ROLLOUTS.column if along == {True} else "samples"
 
 
+def _values(axis: str, at: pd.Series) -> str:
+    """Return the values of an axis, ``stiffness 10, 100``; empty without an axis."""
+    return f"{axis} {', '.join(map(axis_value, sorted(at.unique())))}" if axis else ""
+
+
 def recommendations(methods: pd.DataFrame, comparisons: pd.DataFrame) -> Table:
     """Return what to use where: a line per problem and range of its axis with the same first and tied estimators."""
     named = leaders(comparisons, methods)
@@ -274,29 +279,14 @@ def recommendations(methods: pd.DataFrame, comparisons: pd.DataFrame) -> Table:
         uses = part["setting"].map(named).map(tuple)
         for use in filter(None, uses.unique()):
             inside = part[uses == use]
-            at = dict(zip(part["at"], uses == use, strict=True)) if axis else {}
             errors = inside.loc[inside["estimator"].isin(use[:1]), "error"]
             failing = dict.fromkeys(inside.loc[inside["verdict"].isin((FAILS, NO_RESULT)), "estimator"])
             lines.append({
-                "problem": problem, "where": span(at, axis) if axis else "", "use": " or ".join(use),
-                "error": value_range(errors), "fails": ", ".join(failing) or "none",
+                "problem": problem, "where": _values(axis, inside["at"]), "use": " or ".join(use),
+                "error": span(errors.min(), errors.max()), "fails": ", ".join(failing) or "none",
             })  # fmt: skip
     columns = [
         text("problem"), text("where"), text("use"), text("error", label="relative RMSE"), text("fails", label="fails there"),
     ]  # fmt: skip
-    equal = work_of_a_sample(methods) or f" at equal {_basis(methods)}"
-    notes = [f"Errors are compared{equal}."]
+    notes = [f"Errors are compared at equal {_basis(methods)}."]
     return Table("recommendations", pd.DataFrame(lines), columns, "What to use where", notes, files=(), page=True)
-
-
-def remarks(rows: pd.DataFrame) -> list[str]:
-    """Return why cells failed, were refused or have remarks; reasons that differ only in numbers are counted together."""
-    remarked = rows[rows["reason"] != ""]
-    if remarked.empty:
-        return []
-    kinds = remarked["reason"].str.replace(r"\d+(\.\d+)?(e[+-]?\d+)?", "#", regex=True)
-    groups = sorted(remarked.groupby(["status", kinds]), key=lambda item: -len(item[1]))
-    return [
-        f"{len(part)} {status}: {part['reason'].iloc[0]}" + ("" if part["reason"].nunique() == 1 else " (for example)")
-        for (status, _), part in groups
-    ]

@@ -9,7 +9,6 @@ for independent samples above v / N without bias: an order is stated where that 
 from __future__ import annotations
 
 import math
-from collections import Counter
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -22,15 +21,13 @@ from bench.experiment.views import Table
 from bench.measure.statistics import is_unexplained
 from bench.model import registry
 from bench.report.problems import ProblemRows, split_by_problem
-from bench.report.text import counted, number
+from bench.report.text import number
 from bench.report.views import Arranged, Curve, estimator_curves
 from bench.studies.bias_variance.costs import ROLLOUTS, TIME, Cost
 
 SAMPLES = Axis("samples", ("samples",))
 TARGETS = (0.1, 0.01)
 """Target relative errors."""
-NAMED = 2
-"""Most methods, besides the first, that an open line names."""
 NOTES = (
     "cost: of the cheapest estimate that reaches the error, in seconds without compilation, or in rollouts, where a "
     "gradient counts as the rollouts that take as long (as measured at the most samples; as one where it was not). how: "
@@ -292,75 +289,3 @@ def comparisons(best: pd.DataFrame) -> pd.DataFrame:
         "factor": best["factor"], "factor_low": best["factor_low"], "factor_high": best["factor_high"],
         "tied": best["tied"],
     })  # fmt: skip
-
-
-def sentence(entry: Any) -> str:
-    """Format a line of the table in a few words: ``10%: fobg on jax, 3.8 times ahead [2.7, 5.2]``, or why it is open."""
-    what = f"{entry['relative error']:.0%}: "
-    if entry["fastest"] == "-":
-        return what + ("none, all have a larger bias" if entry["how"] == "never" else "not known")
-    if entry["next"] == "-":
-        return f"{what}only {entry['fastest']}"
-    if not _is_clearly_first(entry):
-        return f"{what}open, {_candidates(entry)}"
-    low, high = number(entry["factor_low"]), number(entry["factor_high"])
-    if _is_limit(entry["factor"], entry["factor_high"]):
-        return f"{what}{estimator_of(entry['fastest'])}, at least {low} times ahead"
-    return f"{what}{estimator_of(entry['fastest'])}, {number(entry['factor'])} times ahead [{low}, {high}]"
-
-
-def _candidates(entry: Any) -> str:
-    """Format the methods that may be first: of known cost, and how many are not known."""
-    first, tied = entry["fastest"], list(entry["tied"]) or [entry["next"]]
-    if any(estimator_of(name) != estimator_of(first) for name in tied):
-        first, tied = estimator_of(first), list(dict.fromkeys(map(estimator_of, tied)))
-    unknown = {estimator_of(name) for name in str(entry["unknown"]).split(", ")} & set(tied)
-    known = [name for name in tied if name not in unknown]
-    others = "" if not unknown else ", others not known" if len(unknown) > 1 else f", {unknown.pop()} not known"
-    named = known if len(known) <= NAMED else [f"{len(known)} others"]
-    return " or ".join([first, *named]) + others
-
-
-def _is_clearly_first(entry: Any) -> bool:
-    """Return whether the first estimator's lead is certain: no other reaches the error, or all intervals lie above 1."""
-    if entry["fastest"] == "-":
-        return False
-    alone = entry["next"] == "-" or estimator_of(entry["next"]) == estimator_of(entry["fastest"])
-    return alone or (len(entry["tied"]) == 0 and bool(entry["factor_low"] > 1.0))
-
-
-def finding(best: pd.DataFrame) -> str:
-    """Return which estimator is certainly first to each error most often, and on how many problems that is open."""
-    kind = "time" if (best["by"] == "time").any() else "rollouts"
-    clauses: list[str] = []
-    before = ""
-    entries = best[best["by"] == kind].to_dict("records")
-    for target in TARGETS:
-        asked = [entry for entry in entries if entry["relative error"] == target]
-        clear = [e["fastest"] for e in asked if _is_clearly_first(e)]
-        if not clear:
-            clauses.append(f"nobody is certainly first to {target:.0%}")
-            continue
-        leader, count = Counter(map(estimator_of, clear)).most_common(1)[0]
-        ways = {method for method in clear if estimator_of(method) == leader}
-        name = ways.pop() if len(ways) == 1 else leader
-        ahead = _ahead([e for e in asked if estimator_of(e["fastest"]) == leader and _is_clearly_first(e)])
-        who = "" if name == before else f"{name} is first "
-        before = name
-        clauses.append(f"{who}to {target:.0%} error on {count} of {counted(len(asked), 'problem')}{ahead}")
-    text = ", and ".join(clauses)
-    return f"{text[0].upper() if text.startswith('nobody') else text[0]}{text[1:]}."
-
-
-def _ahead(entries: list[Any]) -> str:
-    """Format the range of factors of some lines: ``, 2.0 to 3.1 times ahead``, or ``, at least 2.4 times ahead``."""
-    factors = [e["factor"] for e in entries if math.isfinite(e["factor"])]
-    lows = [e["factor_low"] for e in entries if _is_limit(e["factor"], e["factor_high"])]
-    if lows:
-        return f", at least {number(min(factors + lows))} times ahead"
-    return f", {_range(factors)} times ahead" if factors else ""
-
-
-def _range(values: list[float]) -> str:
-    low, high = number(min(values)), number(max(values))
-    return low if low == high else f"{low} to {high}"

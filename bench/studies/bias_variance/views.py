@@ -1,4 +1,4 @@
-"""What the main study shows of its rows: comparisons with intervals, and the findings, tables and charts from them."""
+"""What the main study shows of its rows: comparisons with intervals, and the tables and charts from them."""
 
 from __future__ import annotations
 
@@ -9,37 +9,29 @@ import pandas as pd
 from bench.experiment.experiment import Experiment
 from bench.experiment.views import Views
 from bench.report.views import arrange
+from bench.report.writer import reasons
 from bench.studies.bias_variance import charts, reported, tables, time_to_accuracy
 from bench.studies.bias_variance.columns import COLUMNS
 from bench.studies.bias_variance.comparisons import compare_errors, method_table
 from bench.studies.bias_variance.costs import with_gradient_cost
-from bench.studies.bias_variance.findings import findings
 
 RESULTS = ("variance", "cosine", "rollouts", "gradients", "reference_method")
 
 
 def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
-    """Return findings, tables and charts of the rows."""
+    """Return the tables and charts of the rows."""
     shown = arrange(experiment, with_gradient_cost(rows))
     methods = method_table(shown)
     if methods.empty:
-        text = "No cell was run: the table has the reason of each."
-        return Views(
-            [text], [replace(tables.every_cell(experiment, rows), files=["csv", "md"])], remarks=tables.remarks(rows)
-        )
-    swept = shown.swept()
-    longest = max(swept, key=lambda axis: swept[axis], default=None)
+        return Views([replace(tables.every_cell(experiment, rows), files=["csv", "md"])], remarks=reasons(rows))
     errors = compare_errors(methods)
     best = time_to_accuracy.table(shown)
     comparisons = errors if best.empty else pd.concat([errors, time_to_accuracy.comparisons(best)], ignore_index=True)
-    texts = findings(methods, errors, shown.marks(longest) if longest else {})
-    texts = texts if best.empty else [time_to_accuracy.finding(best), *texts][:3]
     all_tables = tables.tables(experiment, rows, shown, methods, comparisons)
     all_tables += [] if best.empty else [time_to_accuracy.accuracy_table(best)]
     return Views(
-        texts,
         all_tables,
-        charts.charts(shown, methods, errors, best, texts),
+        charts.charts(shown, methods, errors, best),
         rows=charts.with_plotted_columns(with_gradient_cost(rows)),
         columns=[
             *(replace(c, label=label) for c, label in ((charts.RMSE, "rel. RMSE"), (charts.BIAS, "rel. bias"))),
@@ -47,7 +39,7 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
             *(COLUMNS.by_name[name] for name in RESULTS),
         ],
         remarks=[
-            *tables.remarks(rows),
+            *reasons(rows),
             *reported.loose_references(rows, experiment.reference.tolerance),
             *reported.sentences(rows),
         ],

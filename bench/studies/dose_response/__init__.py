@@ -93,7 +93,7 @@ class DoseResponse(Study):
         return None
 
     def views(self, experiment: Experiment, rows: pd.DataFrame) -> Views:
-        """Return the cost of an error by class, with the natural methods on it, tables and findings."""
+        """Return the cost of an error by class, with the natural methods on it, and the tables."""
         from bench.studies.dose_response.views import views
 
         return views(experiment, rows)

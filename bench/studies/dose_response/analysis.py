@@ -30,7 +30,7 @@ from bench.studies.dose_response.search import TARGETS
 CLASSES = ("smooth", "stiff", "discontinuous", "chaotic", "identification")
 """The classes of problems, in the order in which they are shown."""
 MAIN = 100.0
-"""The target of the main chart and findings."""
+"""The target of the main chart."""
 SHOWN = (10.0, 100.0, 1000.0)
 LEAST_UPDATES = 5
 """Fewest updates of the best gradient at which a problem counts for a target."""

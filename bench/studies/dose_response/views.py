@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -17,8 +16,8 @@ from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Style, Table, Views
 from bench.measure.performance import wilson
 from bench.report.style import PALETTE, VARIANTS
-from bench.report.text import counted, listed, number
 from bench.report.text import interval as text_of_interval
+from bench.report.text import listed, number
 from bench.report.writer import reasons
 from bench.studies.dose_response import analysis, controls
 from bench.studies.dose_response.analysis import BEST, BIAS, FIXED, MAIN, RANDOM, ROTATION, SHOWN, TAILS, ClassFit
@@ -63,7 +62,7 @@ FIT_NOTES = (
 
 
 def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
-    """Return the findings, tables and charts."""
+    """Return the tables and charts."""
     # in small problems, several threads of linear algebra wait for each other most of the time
     with threadpool_limits(limits=1):
         return _views(experiment, rows)
@@ -75,11 +74,7 @@ def _views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     if table.empty or (table["kind"] == BEST).sum() == 0:
         lines = _method_lines(table) if len(table) else pd.DataFrame()
         shown = [Table("dose_response", lines, METHODS, "Methods", terminal=True, data=data)] if len(lines) else []
-        return Views(
-            ["No problem has searches with the best gradient, so nothing can be compared."],
-            shown,
-            remarks=reasons(rows),
-        )
+        return Views(shown, remarks=reasons(rows))
     lines, beside = analysis.counted(table), controls.lines(table)
     fits = list(analysis.class_fits(lines))
     costs, rates, smallest = analysis.costs(lines), analysis.wrong_rates(lines), analysis.cheapest_samples(lines)
@@ -115,81 +110,17 @@ def _views(experiment: Experiment, rows: pd.DataFrame) -> Views:
                                   Column("below", label="a tenth of it")], "The best gradient with a wrong rate", RATE_NOTES),
     ]  # fmt: skip
     charts = [_chart(lines, fits, pairs, target) for target in (MAIN, 10.0, 1000.0)]
-    sentences = findings(pairs, costs)
     if len(beside):  # then the question is what such methods take, and there are no planted errors
         if pairs.empty:
-            sentences, tables = [], [table for table in tables if table.name in ("methods", "problems", "controls")]
-        sentences = controls.findings(beside) + sentences
+            tables = [table for table in tables if table.name in ("methods", "problems", "controls")]
         tables = [*controls.tables(beside), *(replace(table, terminal=False) for table in tables)]
         charts.insert(0, controls.chart(beside))
     cells = rows.assign(problem=[analysis.problem_name(row) for _, row in rows.iterrows()])
     return Views(
-        sentences, tables, [chart for chart in charts if chart is not None], rows=cells,
+        tables, [chart for chart in charts if chart is not None], rows=cells,
         columns=[experiment.columns.by_name[name] for name in ("scene_class", "error", "bias", "spread", "cosine", "lowest")],
         remarks=reasons(rows),
     )  # fmt: skip
-
-
-# ------------------------------------------------------------------------------------------------------ findings
-
-
-def findings(pairs: pd.DataFrame, costs: pd.DataFrame) -> list[str]:
-    """Return what ten times more error, an error as large as the gradient, and a bias of that size cost; and which order is cheaper."""
-    main = {(row.scene_class, row.comparison): row for row in pairs[pairs["target"] == MAIN].itertuples()}
-    tenfold = main.get((analysis.ALL, analysis.TENFOLD))
-    if tenfold is None:
-        return ["What an error costs is not known: no problem that counts has planted errors of both sizes."]
-    goal = f"{_regret(MAIN)} of the first regret"
-    result = [
-        f"Ten times as much random error (3 times the gradient instead of 0.3) takes {_interval(tenfold)} times the updates to "
-        f"{goal}, over {counted(tenfold.problems, 'problem')}. {_sides(main, analysis.TENFOLD)}."
-    ]
-    sizes = [(name, main.get((analysis.ALL, name))) for name in (analysis.RANDOM_ONE, analysis.BIAS_BELOW_ONE)]
-    words = {
-        analysis.RANDOM_ONE: "a random error as large as the gradient",
-        analysis.BIAS_BELOW_ONE: "a bias of 0.9 of it",
-    }
-    known = [f"{words[name]} takes {_interval(row)}" for name, row in sizes if row is not None]
-    if known:
-        both = main.get((analysis.ALL, analysis.BIAS_OVER_RANDOM))
-        result.append(
-            f"Against the updates of the best gradient, {listed(known)} times as many."
-            + (f" That bias takes {_interval(both)} times the updates of that random error. {_sides(main, analysis.BIAS_OVER_RANDOM)}."
-               if both is not None else "")
-        )  # fmt: skip
-    return [*result, *([cost_sentence(costs)] if (costs["target"] == MAIN).any() else [])]
-
-
-def _sides(main: Mapping[tuple[str, str], Any], comparison: str) -> str:
-    """Return on which classes a ratio is above 1, below 1 and open."""
-    names: dict[str, list[str]] = {"above 1": [], "below 1": [], "open": []}
-    for (scene_class, name), row in main.items():
-        if name == comparison:
-            names["above 1" if row.ratio_low > 1 else "below 1" if row.ratio_high < 1 else "open"].append(
-                "all together" if scene_class == analysis.ALL else scene_class
-            )
-    return f"This is {', and '.join(f'{side} on {listed(classes)}' for side, classes in names.items() if classes)}"
-
-
-def _interval(row: Any) -> str:
-    return _text(Estimate(row.ratio, row.ratio_low, row.ratio_high, row.problems))
-
-
-def cost_sentence(costs: pd.DataFrame, target: float = MAIN) -> str:
-    """Return where the first order is cheaper at every ratio of costs, and where this is not known."""
-    part = costs[costs["target"] == target]
-    known: dict[str, list[str]] = {"first order": [], "zeroth order": [], "not known": []}
-    for name, own in part.groupby("scene_class", sort=False):
-        verdicts = set(own["verdict"])
-        known[verdicts.pop() if len(verdicts) == 1 else "not known"].append(str(name))
-    parts = [
-        f"the {order} needs fewer on {listed(known[order])}"
-        for order in ("first order", "zeroth order")
-        if known[order]
-    ]
-    if known["not known"]:
-        parts.append(f"this is not known on {listed(known['not known'])}")
-    return f"In rollouts to {_regret(target)}, with a gradient charged as 1, 2, 4 or the measured number: {', and '.join(parts)}."
 
 
 def _text(quantity: Estimate, boundary: float = 1.0) -> str:
@@ -418,16 +349,8 @@ def _chart(lines: pd.DataFrame, fits: Sequence[ClassFit], pairs: pd.DataFrame, t
     points = points.assign(place=points["scene_class"].map(panels.index)).sort_values(
         ["place", "method"], kind="stable"
     )
-    tenfold = pairs[
-        (pairs["target"] == target) & (pairs["comparison"] == analysis.TENFOLD) & (pairs["scene_class"] == analysis.ALL)
-    ]
-    known = [_interval(row) for row in tenfold.itertuples() if row.ratio_low > 1 or row.ratio_high < 1]
-    title = (
-        f"Ten times as much random error takes {known[0]} times the updates" if known
-        else "What ten times as much random error costs is open"
-    )  # fmt: skip
     return Chart(
-        "cost_of_error" if target == MAIN else f"cost_of_error_{target:g}", title, points,
+        "cost_of_error" if target == MAIN else f"cost_of_error_{target:g}", points,
         [Column("error", label="relative error", log=True)],
         [Column("time", label="updates / best gradient's", low="time_low", high="time_high", log=True)],
         kind="lines", series="method", panel="scene_class", styles=STYLES | looks, failed="is_missed", across=3, height=2.0,

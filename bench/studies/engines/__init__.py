@@ -70,7 +70,7 @@ class Engines(Study):
         return measure(cell, session, self.batch, self.timed_calls)
 
     def views(self, experiment: Experiment, rows: pd.DataFrame) -> Views:
-        """Return the findings, the table with a line per engine and scene, and the grid of usable gradients."""
+        """Return the table with a line per engine and scene, and the grid of usable gradients."""
         from bench.studies.engines.views import views
 
         return views(experiment, rows)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -12,11 +11,9 @@ from scipy.special import chdtri
 from bench.experiment.columns import text
 from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Style, Views
-from bench.report.generic import engine_table
-from bench.report.problems import problem_names
+from bench.report.shown import Shown
 from bench.report.style import PALETTE
-from bench.report.text import duration, number
-from bench.report.views import arrange
+from bench.report.text import number
 from bench.report.writer import reasons
 
 ACCURATE = 0.02
@@ -24,8 +21,6 @@ ACCURATE = 0.02
 have two digits."""
 SAME = 0.1
 """Relative model error up to which a gradient counts as the gradient of the model."""
-NAMED = 2
-"""Most engines without a usable gradient that the title names."""
 USELESS = 1.0
 """Relative RMSE from which on an estimate is no better than the zero estimate."""
 SHOWN = (
@@ -57,24 +52,21 @@ NOTES = (
 
 
 def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
-    """Return the findings, the table with a line per scene and engine, and the grid of usable gradients."""
-    arranged = arrange(experiment, rows)
-    arranged = replace(arranged, rows=with_limits(arranged.rows))
-    columns = experiment.columns.by_name
-    columns = columns | {"rmse_rel": replace(columns["rmse_rel"], limit="rmse_is_limit")}
+    """Return the table with a line per scene and engine, and the grid of usable gradients."""
+    shown = Shown(experiment, rows)
+    cells = with_limits(shown.rows)
+    measured = cells["status"].isin(("ok", "nonfinite"))
+    levels = [
+        level(row) if is_measured else "" for (_, row), is_measured in zip(cells.iterrows(), measured, strict=True)
+    ]
+    cells = cells.assign(level=levels)
+    columns = experiment.columns.by_name | {"rmse_rel": shown.column("rmse_rel", limit="rmse_is_limit")}
     own, details = ([columns[name] for name in names] for names in (SHOWN, DETAILS))
-    lines = engine_table(experiment, rows, arranged, own, "gradients of physics engines", NOTES)
-    measured = arranged.rows[arranged.rows["status"].isin(("ok", "nonfinite"))]
-    if measured.empty:
-        return Views(["No cell gave a result: the table has the reason of each."], [lines], remarks=reasons(rows))
-    measured = measured.assign(
-        engine=problem_names(arranged, ["backend"], always=["backend"], rows=measured),
-        level=[level(row) for _, row in measured.iterrows()],
+    table = shown.cells([text("level", label="gradient"), *own], "gradients of physics engines", NOTES, rows=cells)
+    charts = [_chart(cells[measured])] if measured.any() else []
+    return Views(
+        [table], charts, rows=with_limits(shown.arranged.rows), columns=[*own, *details], remarks=reasons(rows)
     )
-    findings = [usable(measured), models(measured), costs(measured)]
-    findings = [finding for finding in findings if finding]
-    charts = [_chart(measured, headline(measured))]
-    return Views(findings, [lines], charts, rows=arranged.rows, columns=[*own, *details], remarks=reasons(rows))
 
 
 def level(row: pd.Series) -> str:
@@ -117,68 +109,7 @@ def with_limits(rows: pd.DataFrame) -> pd.DataFrame:
     return shown
 
 
-def usable(measured: pd.DataFrame) -> str:
-    """Return on how many scenes each engine's gradient is the derivative of its program and better than 0 on average."""
-    return (
-        "Cells in which a gradient is the derivative of its engine's program, and averages of it are better than 0 (95% "
-        f"interval): {_counts(measured)}."
-    )
-
-
-def _counts(measured: pd.DataFrame) -> str:
-    """Return the counts of usable and of open gradients, with the engines that have them."""
-    engines: dict[str, list[str]] = {}
-    for engine, part in measured.groupby("engine", sort=False):
-        good, undecided = int(part["level"].isin(("right", "own")).sum()), int((part["level"] == "open").sum())
-        count = f"{good} of {len(part)}" + (f" and {undecided} open" if undecided else "")
-        engines.setdefault(count, []).append(str(engine))
-    return ", ".join(f"{count} ({', '.join(names)})" for count, names in engines.items())
-
-
-def headline(measured: pd.DataFrame) -> str:
-    """Return the title of the chart: the engines with usable gradients."""
-    good = measured[measured["level"].isin(("right", "own"))]
-    counts = [
-        f"{engine} {len(part)} of {int((measured['engine'] == engine).sum())}"
-        for engine, part in good.groupby("engine", sort=False)
-    ]
-    rest = [str(engine) for engine in measured["engine"].unique() if engine not in set(good["engine"])]
-    names = ", ".join(rest) if len(rest) <= NAMED else f"the other {len(rest)}"
-    others = f"; none known for {names}" if rest and counts else ""
-    return f"Gradients that can be used: {', '.join(counts) or 'none'}{others}"
-
-
-def models(measured: pd.DataFrame) -> str:
-    """Return the gradients that match rigid contact where it has a closed form, and the largest distance."""
-    rigid = measured[(measured["model"] == "rigid contact") & measured["model_error_rel"].notna()]
-    if rigid.empty:
-        return ""
-    near = rigid[rigid["model_error_rel"] <= SAME]
-    worst = rigid.loc[rigid["model_error_rel"].idxmax()]
-    names = ", ".join(f"{row['engine']} on {row['scene']}" for _, row in near.iterrows()) or "none"
-    return (
-        f"Gradients within {number(SAME, 1)} of rigid contact's: {names}. The largest relative distance is "
-        f"{number(worst['model_error_rel'])} ({worst['engine']} on {worst['scene']})."
-    )
-
-
-def costs(measured: pd.DataFrame) -> str:
-    """Return the times of a batch of gradients by engine, and the largest share of the pipe."""
-    timed = measured[measured["gradient_s"].notna()]
-    if timed.empty:
-        return ""
-    texts = [f"{engine} {_range(part['gradient_s'])}" for engine, part in timed.groupby("engine", sort=False)]
-    pipe = timed["pipe_share"].max()
-    share = f" Pipes take up to {number(100 * pipe)}% of a gradient." if pipe == pipe else ""
-    return f"64 gradients take: {', '.join(texts)}.{share}"
-
-
-def _range(seconds: pd.Series) -> str:
-    """Return the shortest and longest duration, or one if they are the same text."""
-    return " to ".join(dict.fromkeys(duration(value) for value in (seconds.min(), seconds.max())))
-
-
-def _chart(measured: pd.DataFrame, title: str) -> Chart:
+def _chart(measured: pd.DataFrame) -> Chart:
     """Return the grid of engines and scenes, coloured by level, with the model error of each gradient."""
     several = measured["contact"].nunique() > 1
     places = [
@@ -186,7 +117,6 @@ def _chart(measured: pd.DataFrame, title: str) -> Chart:
         for _, row in measured.iterrows()
     ]
     frame = measured.assign(
-        row=measured.index,
         place=places,
         cell=[
             f"{LEVELS[row['level']].letter} {number(row['model_error_rel'])}" if row["level"] != "none" else "-"
@@ -194,7 +124,7 @@ def _chart(measured: pd.DataFrame, title: str) -> Chart:
         ],
     )
     return Chart(
-        "engines", title, frame, [text("place", label="")], [text("engine", label="")], "grid",
+        "engines", frame, [text("place", label="")], [text("method", label="")], "grid",
         level="level", cell="cell", styles=LEVELS, height=0.3, across=1,
         subtitle="Number: model error, the relative distance from the model's gradient.",
         text="A cell per engine and scene (rigid: with the law impulse). An empty cell: the engine does not run it.",

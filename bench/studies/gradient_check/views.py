@@ -12,14 +12,13 @@ from bench.experiment.columns import COMMON, Column, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.parameters import parse
 from bench.experiment.views import Chart, Style, Table, Views
-from bench.measure.gradcheck import BROKEN, FAULTS, MEANING, TRUSTED, UNDECIDED, UNTRUSTED, VERDICTS
+from bench.measure.gradcheck import FAULTS, MEANING, TRUSTED, UNDECIDED, VERDICTS
 from bench.report.problems import axes_of, label_columns, problem_names, titled
 from bench.report.style import PALETTE
-from bench.report.text import counted, listed, number
+from bench.report.text import counted, listed
 from bench.report.views import Arranged, arrange
 from bench.studies.gradient_check.lines import (
     PROBLEM,
-    UNDER_NOISE,
     by_point,
     component_table,
     long_table,
@@ -56,65 +55,16 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
               title="gradients against differences of the cost", notes=_notes(rows, untrusted(points))),
         Table("gradient_components", component_table(rows), [], files=["csv"]),
     ]  # fmt: skip
-    charts = [] if points.empty else [_grid(points, findings(points)[0]), _errors(shown)]
+    charts = [] if points.empty else [_grid(points), _errors(shown)]
     answers = Table("gradient_verdicts", *_verdicts(points), title="Verdicts", files=[], page=True)
     shown_columns = [experiment.columns.by_name[name] for name in ("verdict", "best_error", "best_eps")]
     return Views(
-        findings(points),
         [answers, *tables],
         charts,
         shown.rows,
         shown_columns,
         [*_tally(points), *_remarks(rows, points)],
     )
-
-
-# ------------------------------------------------------------------------------------------------------ findings
-
-
-def findings(points: pd.DataFrame) -> list[str]:
-    """Return which gradients cannot be trusted, the largest error of the others, and where only one-sided ones exist."""
-    if points.empty:
-        return ["No gradient could be checked: the table has the reason of each cell."]
-    faults = untrusted(points)
-    under_noise = faults["point"] == UNDER_NOISE
-    wrong, jumps = faults[~under_noise], faults[under_noise]
-    reached = "a jump of the cost" if (jumps["verdict"] == "jump").all() else "a rise that sampled gradients miss"
-    if wrong.empty:
-        first = f"No wrong gradient at {counted(len(points), 'checked point')}"
-        first += f", but noise reaches {reached} at {len(jumps)} of them, on {_places(jumps)}" if len(jumps) else ""
-    else:
-        first = (
-            f"{len(wrong)} of {counted(len(points), 'checked point')} {'has' if len(wrong) == 1 else 'have'} a gradient "
-            f"that cannot be trusted ({', '.join(wrong['verdict'].unique())}), on {_places(wrong)}"
-        )
-        first += f", and noise reaches {reached} at {counted(len(jumps), 'other')}" if len(jumps) else ""
-    broken = points["verdict"].isin(UNTRUSTED)
-    errors = points.loc[~broken, "error"].dropna()
-    n_unresolved, errors = int((errors > RESOLVED).sum()), errors[errors <= RESOLVED]
-    largest = (
-        [f"The largest error of a right gradient is {number(errors.max())} ({points.loc[errors.idxmax(), 'name']})."]
-        if len(errors)
-        else []
-    )
-    if n_unresolved:
-        largest.append(
-            f"At {counted(n_unresolved, 'point')} no difference resolves the gradient, and finer steps or a second method "
-            "confirm it."
-        )
-    edges = points[points["verdict"].isin(BROKEN) & (points["point"] == "at")]
-    one_sided = (
-        [f"{counted(len(edges), 'point')} on a contact switch {'has' if len(edges) == 1 else 'have'} a kink or a jump, "
-         f"where only one-sided gradients exist ({listed(dict.fromkeys(edges['scene']))})."]
-        if len(edges) else []
-    )  # fmt: skip
-    return [f"{first}.", *largest, *one_sided]
-
-
-def _places(points: pd.DataFrame) -> str:
-    """Return the scenes of points, each with its contact law if it has one."""
-    names = points["scene"].where(points["contact"] == "none", points["scene"] + " with " + points["contact"])
-    return listed(dict.fromkeys(names))
 
 
 # ------------------------------------------------------------------------------------------------------- tables
@@ -233,7 +183,7 @@ def _count_reasons(rows: pd.DataFrame, of_checked: bool = False) -> Sequence[tup
 # ------------------------------------------------------------------------------------------------------- charts
 
 
-def _grid(points: pd.DataFrame, title: str) -> Chart:
+def _grid(points: pd.DataFrame) -> Chart:
     """Return the main chart: the worst verdict of each problem at each horizon and point, over backends and checks."""
     letters = {verdict: letter for letter, (verdicts, _) in KINDS.items() for verdict in verdicts}
     names = {name: place for place, name in enumerate(dict.fromkeys(points["name"]))}
@@ -246,7 +196,7 @@ def _grid(points: pd.DataFrame, title: str) -> Chart:
     )
     switches = "Blank: no switch of contact was found." if frame["point"].nunique() > 1 else ""
     return Chart(
-        "gradient_check", title, frame, [text("point", label="")], [text("name", label="")], "grid",
+        "gradient_check", frame, [text("point", label="")], [text("name", label="")], "grid",
         panel="steps", level="letter", cell="letter", styles={letter: style for letter, (_, style) in KINDS.items()},
         height=0.17, subtitle=switches,
         text="The worst verdict over backends and checks: at the start, and before, at and after a switch of contact mode.",
@@ -266,7 +216,7 @@ def _errors(shown: Arranged) -> Chart:
     frame = long.assign(check=titled(long, ["point", "sample", "direction", "cell"]), row=long["row"].astype(int))
     frame = frame.astype({"eps": float, "relative_error": float})
     return Chart(
-        "gradient_errors", "The error of a right gradient falls with eps^2 until rounding dominates", frame,
+        "gradient_errors", frame,
         [Column("eps", label="eps, in units of the natural scale", log=True)],
         [Column("relative_error", log=True, above_one="larger than the gradient")], series="point", line="check", panel="problem",
         styles=LOOKS, printed=False, text="That of a wrong gradient stays constant.",

@@ -37,7 +37,7 @@ class Growth(Study):
         return measure(cell, session, self.rollouts, self.lags)
 
     def views(self, experiment: Experiment, rows: pd.DataFrame) -> Views:
-        """Return how the norm grows on each problem, where the zeroth order varies less, the tables and the charts."""
+        """Return the tables of verdicts and cells, and the charts."""
         from bench.studies.growth.views import views
 
         return views(experiment, rows)

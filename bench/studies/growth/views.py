@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -16,8 +16,9 @@ from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Style, Table, Views
 from bench.report.colours import estimator_colour
 from bench.report.problems import axes_of, label_columns, problem_names
+from bench.report.shown import stacked
 from bench.report.style import PALETTE
-from bench.report.text import axis_value, listed, number
+from bench.report.text import axis_value, number
 from bench.report.views import Arranged, arrange, attempted
 from bench.report.writer import reasons
 from bench.studies.growth.columns import COLUMNS, ORDERS
@@ -64,7 +65,7 @@ NOTE = (
 
 
 def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
-    """Return the findings, a table with a line per problem and one with a line per cell, and the charts."""
+    """Return a table with a line per problem and one with a line per cell, and the charts."""
     shown = arrange(experiment, rows)
     cells = Table(
         "growth",
@@ -77,7 +78,7 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     good = attempted(named)
     good = good[np.isfinite(good["gradient_median"]) & (good["gradient_median"] > 0)]
     if good.empty:
-        return Views(["No cell gave a result: the table has the reason of each."], [cells], remarks=reasons(rows))
+        return Views([cells], remarks=reasons(rows))
     lines = verdicts(good)
     answers = Table(
         "growth_verdicts",
@@ -89,8 +90,7 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
         terminal=True,
         page=True,
     )
-    findings = sentences(lines)
-    return Views(findings, [answers, cells], [_norms(good, lines), *_further(good)], named, remarks=reasons(rows))
+    return Views([answers, cells], [_norms(good, lines), *_further(good)], named, remarks=reasons(rows))
 
 
 def problem_of(shown: Arranged, rows: pd.DataFrame | None = None) -> pd.Series:
@@ -132,45 +132,6 @@ def _variances(part: pd.DataFrame) -> dict[str, Any]:
     if start < len(times):
         return {"lower": f"zeroth order from {axis_value(times[start])} s", "zeroth_from": times[start]}
     return {"lower": FIRST if first.all() else "open at the longest horizon", "zeroth_from": math.nan}
-
-
-def sentences(lines: pd.DataFrame) -> list[str]:
-    """Return which order to use where, where gradients explode, and how they grow elsewhere."""
-    entries = lines.to_dict("records")
-    first = [line["problem"] for line in entries if line["lower"] == FIRST]
-    zeroth = [
-        f"{line['problem']} from {axis_value(line['zeroth_from'])} s" for line in entries if line["zeroth_from"] >= 0
-    ]
-    use = [f"the first order on {listed(first)} at every horizon"] if first else []
-    use += [f"the zeroth order on {listed(zeroth)}"] if zeroth else []
-    growth = _growth(entries, _named)
-    return [
-        f"Use {', and '.join(use)}: it varies less there."
-        if use
-        else "Which order has the lower variance is open at the longest horizon.",
-        f"Gradients {growth[0]}.",
-        *([f"They {listed(growth[1:])}."] if growth[1:] else []),
-    ]
-
-
-def _growth(entries: Sequence[dict[Any, Any]], name: Callable[[dict[Any, Any]], str]) -> list[str]:
-    """Return on which problems gradients explode, and then how they grow on the others."""
-    verbs = {
-        "exploding": "explode on", "polynomial": "grow like a power of the horizon on", "vanishing": "vanish on",
-        "open": "show no clear law of growth on",
-    }  # fmt: skip
-    names = {verdict: [name(line) for line in entries if line["verdict"] == verdict] for verdict in verbs}
-    others = [f"{verbs[verdict]} {listed(given)}" for verdict, given in names.items() if given]
-    return others if names["exploding"] else ["explode on no problem", *others]
-
-
-def _named(line: dict[Any, Any]) -> str:
-    """Return a problem with the order or rate of its curve."""
-    name, unit = {"exploding": ("rate", " per second"), "polynomial": ("order", "")}.get(line["verdict"], ("", ""))
-    if not name:
-        return str(line["problem"])
-    value, low, high = (number(line[f"{name}{end}"]) for end in ("", "_low", "_high"))
-    return f"{line['problem']} ({name} {value} [{low}, {high}]{unit})"
 
 
 # ------------------------------------------------------------------------------------------------------- table
@@ -219,24 +180,14 @@ def _norms(good: pd.DataFrame, lines: pd.DataFrame) -> Chart:
                 "problem": line["problem"], "series": CURVES[line["verdict"]], "time_horizon": times,
                 "gradient_median": line["fit"].at(times), "row": part.index[-1],
             }))  # fmt: skip
-    entries = lines.to_dict("records")
-    title = f"Gradients {' and '.join(_growth(entries, lambda line: str(line['problem']))[:2])}"
     horizon, norm = (COLUMNS.by_name[name] for name in ("time_horizon", "gradient_median"))
     return Chart(
-        "growth", title, pd.concat(parts, ignore_index=True), [replace(horizon, log=True)], [replace(norm, log=True)],
+        "growth", pd.concat(parts, ignore_index=True), [replace(horizon, log=True)], [replace(norm, log=True)],
         series="series", panel="problem", styles=STYLES, across=5, height=1.9, band=True,
-        panel_notes={line["problem"]: _note(line) for line in entries},
+        panel_notes=dict(zip(lines["problem"], lines["verdict"], strict=True)),
         text="Median over noise samples, and 5% to 95% of them. On these axes a power law is straight and an exponential "
         "bends upwards. Where it is open which one the norms follow, no curve is drawn.",
     )  # fmt: skip
-
-
-def _note(line: dict[Any, Any]) -> str:
-    notes = {
-        "exploding": f"explodes, e^({number(line['rate'])} t)",
-        "polynomial": f"grows like t^{number(line['order'])}",
-    }
-    return notes.get(line["verdict"], str(line["verdict"]))
 
 
 def looks() -> dict[str, Style]:
@@ -254,15 +205,7 @@ def _further(good: pd.DataFrame) -> list[Chart]:
     cells = good.assign(row=good.index)
     names = {order: f"{name} term" for order, name in ORDERS.items()}
     styles = {name: looks()[order] for order, name in names.items()}
-    variances = pd.concat(
-        [
-            cells.assign(
-                series=name, **{f"variance{end}": cells[f"{order}_variance{end}"] for end in ("", "_low", "_high")}
-            )
-            for order, name in names.items()
-        ],
-        ignore_index=True,
-    )
+    variances = stacked(cells, {name: f"{order}_variance" for order, name in names.items()}, "variance")
     longest = cells.sort_values("horizon", kind="stable").drop_duplicates("problem", keep="last").sort_index()
     gains = longest[["problem", "row", "lags", "gain", "gain_low", "gain_high"]].explode(
         ["lags", "gain", "gain_low", "gain_high"], ignore_index=True
@@ -272,17 +215,17 @@ def _further(good: pd.DataFrame) -> list[Chart]:
                        high="variance_high", log=True)  # fmt: skip
     return [
         Chart(
-            "growth_variances", "Beyond the crossing of the lines the zeroth order has the lower variance", variances,
+            "growth_variances", variances,
             horizon, [variance], series="series", panel="problem", styles=styles, printed=False,
             text="Median over repeats, and 5% to 95% of them.",
         ),
         Chart(
-            "growth_rates", "Growth of the gradient and of the Jacobian product", cells, horizon,
+            "growth_rates", cells, horizon,
             [own["gradient_median"], replace(own["spectral_rate"], unit="per step"), replace(own["stretch_rate"], unit="per step")],
             series="problem", printed=False, text="Means over noise samples with 95% intervals, per step.",
         ),
         Chart(
-            "growth_gains", "How far back a gradient reaches", gains,
+            "growth_gains", gains,
             [replace(own["lags"], kind="number", label="lag")],
             [replace(own["gain"], kind="number", low="gain_low", high="gain_high", log=True)],
             series="problem", printed=False,

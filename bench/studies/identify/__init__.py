@@ -112,7 +112,7 @@ class Identify(Study):
         return None
 
     def views(self, experiment: Experiment, rows: pd.DataFrame) -> Views:
-        """Return the findings, the tables of fits and of identifiable parameters, and the charts of their precision."""
+        """Return the tables of fits and of identifiable parameters, and the charts of their precision."""
         from bench.studies.identify.views import views
 
         return views(experiment, rows)

@@ -19,7 +19,7 @@ from bench.model import registry
 from bench.model.parameters import named
 from bench.report.problems import problem_names
 from bench.report.style import PALETTE
-from bench.report.text import axis_value, counted, listed, number
+from bench.report.text import number
 from bench.report.views import Arranged, arrange, attempted
 from bench.report.writer import reasons
 from bench.studies.identify.measure import is_minimum
@@ -35,7 +35,8 @@ PROBLEM, SHOOTING = text("problem"), text("shooting")
 NOTES = (
     "converged: fits whose residuals are consistent with the noise. error: root mean square error of converged fits in "
     "units of the Cramer-Rao bound, at best 1. coverage: share of their 95% intervals that contain the truth. hidden: fits "
-    "with more identifiable directions than the record has. single: one rollout. multiple: windows whose ends must meet. "
+    "with more identifiable directions than the record has. verdict: unconverged, fewer than 90% converge; narrow, intervals "
+    "contain the truth less often than stated; precise, neither, and errors reach the bound. single: one rollout. multiple: windows whose ends must meet. "
     "windows: independent windows.",
 )
 SCANNED = (
@@ -49,7 +50,7 @@ CURVE, MINIMUM, FIT = "loss", "local minimum", "fit"
 
 
 def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
-    """Return the findings, the tables of fits and of identifiable parameters, and the charts of the fits' precision."""
+    """Return the tables of fits and of identifiable parameters, and the charts of the fits' precision."""
     shown = arrange(experiment, rows)
     lines = flatten(shown)
     by_name = {
@@ -59,7 +60,7 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     fits = [replace(by_name[name], digits=digits) for name, digits in (("converged", 2), ("error", 2), ("coverage", 2))]
     tables = [
         Table(
-            "identify", lines, [PROBLEM, SHOOTING, *fits, by_name["hidden"], by_name["fits"]],
+            "identify", lines, [PROBLEM, SHOOTING, text("verdict"), *fits, by_name["hidden"], by_name["fits"]],
             "fits of parameters to records of the motion", NOTES, terminal=True, page=True, data=table(experiment, rows),
         ),
         Table(
@@ -69,6 +70,7 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
             ["identifiable: products of powers of the parameters. bound: Cramer-Rao bound of their relative standard deviations. explained: records that no test of the residuals contradicts."],
             terminal=True, details=["step_note"],
         ),
+        Table("fits", lines.drop(columns="row"), [], files=["csv"]),
     ]  # fmt: skip
     scans = scanned(shown)
     if len(scans):
@@ -96,12 +98,8 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
             )
         )
     if lines.empty:
-        return Views(["No fit gave a result: the table has the reason of each."], tables[:1], remarks=reasons(rows))
-    texts = findings(lines)
-    return Views(
-        [*texts[:2], landscape(scans)] if len(scans) else texts, tables,
-        [*charts(lines, fits, by_name, texts[0]), *scan_charts(scans)], remarks=reasons(rows),
-    )  # fmt: skip
+        return Views(tables[:1], remarks=reasons(rows))
+    return Views(tables, [*charts(lines, fits, by_name), *scan_charts(scans)], remarks=reasons(rows))
 
 
 def flatten(shown: Arranged) -> pd.DataFrame:
@@ -134,7 +132,8 @@ def flatten(shown: Arranged) -> pd.DataFrame:
     ]
     table_ = pd.DataFrame(lines) if lines else pd.DataFrame(columns=names_)
     low, high = error_interval(table_["error"], table_["converged"] * table_["fits"])
-    return table_.assign(error_low=low, error_high=high)
+    table_ = table_.assign(error_low=low, error_high=high)
+    return table_.assign(verdict=verdicts(table_))
 
 
 def error_interval(error: pd.Series, count: pd.Series) -> tuple[pd.Series, pd.Series]:
@@ -147,91 +146,15 @@ def error_interval(error: pd.Series, count: pd.Series) -> tuple[pd.Series, pd.Se
     return low, high
 
 
-# ------------------------------------------------------------------------------------------------------- findings
-
-
-def unconverged(lines: pd.DataFrame) -> pd.Series:
-    """Return a mask of the lines where fewer than 90% of the fits converge, with 95% confidence."""
-    return lines["converged_high"] < CONVERGED
-
-
-def narrow(lines: pd.DataFrame) -> pd.Series:
-    """Return a mask of the lines whose intervals contain the truth less often than stated, with 95% confidence."""
-    return lines["coverage_high"] < LEVEL
-
-
-def precise(lines: pd.DataFrame) -> pd.Series:
-    """Return a mask of the lines where at least 90% converge, and errors and coverage agree with the bound, by intervals."""
-    reaches = (lines["error_low"] <= 1.0) & (lines["error_high"] < 2.0)
-    return (lines["converged_low"] >= CONVERGED) & reaches & (lines["coverage_high"] >= LEVEL)
-
-
-def findings(lines: pd.DataFrame) -> list[str]:
-    """Return which integrator and shooting method to use, where fits or their intervals fail, and what is hidden."""
-    lines = lines.assign(precise=precise(lines))
-    keys = ["integrator", "shooting"] if lines["integrator"].nunique() > 1 else ["shooting"]
-    record = lines.groupby(keys, sort=False)["precise"].agg(["sum", "size"])
-    record = record.assign(share=record["sum"] / record["size"])
-    best = record.sort_values(["share", "size"], ascending=False, kind="stable").iloc[0]
-    texts = []
-    if best["sum"]:
-        name = best.name if isinstance(best.name, tuple) else (best.name,)
-        mine = lines[(lines[keys] == list(name)).all(axis=1) & lines["precise"]]
-        means = " and ".join([*name[:-1], f"{name[-1]} shooting"])
-        texts.append(
-            f"Use {means}: in {best['sum']:.0f} of {counted(int(best['size']), 'case')} fits converge and reach the "
-            f"Cramer-Rao bound (error {_range(mine['error'])} times the bound)."
-        )
-    else:
-        texts.append("No fit is known to reach the Cramer-Rao bound.")
-    return [*texts, *filter(None, (_failures(lines), _hidden(lines)))]
-
-
-def _failures(lines: pd.DataFrame) -> str:
-    """Return where fits do not explain the records, and where intervals are too narrow."""
-    lost, wrong = lines[unconverged(lines)], lines[narrow(lines)]
-    parts = []
-    if len(lost):
-        parts.append(
-            f"fits do not explain the record in {len(lost)} of {counted(len(lines), 'case')}{_all_with(lost, lines)}"
-        )
-    if len(wrong):
-        worst = wrong.loc[wrong["coverage"].idxmin()]
-        parts.append(
-            f"95% intervals are too narrow in {len(wrong)} (they contain the truth in {worst['coverage']:.0%} of the fits of "
-            f"{worst['problem']}, {worst['shooting']} shooting)"
-        )
-    if not parts:
-        return f"Neither fits nor their intervals fail in any of {counted(len(lines), 'case')}."
-    texts = " and ".join(parts) if len(lost) else f"{parts[0]} of {counted(len(lines), 'case')}"
-    return f"{texts[:1].upper()}{texts[1:]}."
-
-
-def _all_with(part: pd.DataFrame, lines: pd.DataFrame) -> str:
-    """Return ``, all with NAME`` if only one of several integrators is concerned."""
-    names = part["integrator"].unique()
-    return f", all with {names[0]}," if len(names) == 1 < lines["integrator"].nunique() else ""
-
-
-def _hidden(lines: pd.DataFrame) -> str:
-    """Return the problems whose parameters are not all identifiable, and fits that report more than the record has."""
-    few = lines[lines["rank"] < lines["n_unknowns"]].drop_duplicates("scene")
-    parts = [
-        f"{row['scene']} identifies only {' and '.join(row['identifiable'].rsplit(', ', 1)) or 'no parameter'}"
-        for row in few.to_dict("records")
-    ]
-    count = int(lines["hidden"].sum())
-    if count:
-        parts.append(
-            f"{count} of {int(lines['fits'].sum())} fits report more identifiable directions than the record has"
-        )
-    text_ = " and ".join(parts)
-    return f"A record of {text_}." if few.size else f"{text_}." if text_ else ""
-
-
-def _range(values: pd.Series) -> str:
-    low, high = number(values.min()), number(values.max())
-    return low if low == high else f"{low} to {high}"
+def verdicts(lines: pd.DataFrame) -> np.ndarray:
+    """Return a verdict per line, by intervals of 95%: see :data:`NOTES`."""
+    is_precise = (lines["converged_low"] >= CONVERGED) & (lines["error_low"] <= 1.0) & (lines["error_high"] < 2.0)
+    kinds = {
+        "unconverged": lines["converged_high"] < CONVERGED,
+        "narrow": lines["coverage_high"] < LEVEL,
+        "precise": is_precise & (lines["coverage_high"] >= LEVEL),
+    }
+    return np.select(list(kinds.values()), list(kinds), "open")
 
 
 # ---------------------------------------------------------------------------------------------------------- scans
@@ -282,39 +205,9 @@ def unit_of(name: str, given: Mapping[str, Any]) -> str:
     return declared.unit if declared is not None else ""
 
 
-def landscape(scans: pd.DataFrame) -> str:
-    """Return how many local minima the loss has by window, over which values, along the unknown with most."""
-    every = _each(scans)
-    worst = max(every, key=lambda scan: scan["minima"].iloc[0])
-    several = f" of {len(every)} scans of the loss this has most" if len(every) > 1 else ""
-    opened = ""
-    if worst["minima_open"].notna().all():
-        opened = f" ({_counts(worst, 'minima_open')} if the last sample of a window, at which the next starts, is not compared)"
-    return f"{_counted_minima(worst)}{opened}{',' if several else ''}{several}."
-
-
 def _each(scans: pd.DataFrame) -> list[pd.DataFrame]:
     """Return the lines of each scan, the whole record first."""
     return [scan for _, scan in scans.groupby(["problem", "unknown"], sort=False)]
-
-
-def _counts(scan: pd.DataFrame, name: str = "minima") -> str:
-    return listed(scan[name].astype(float).map("{:.0f}".format))
-
-
-def _counted_minima(scan: pd.DataFrame) -> str:
-    """Return the counts of one scan, and the values that they hold for."""
-    one, windows = scan.iloc[0], scan.iloc[1:]
-    unit = f" {one['unit']}" if one["unit"] else ""
-    values = (
-        f"{one['values']:,} values of {one['unknown']} from {axis_value(one['from'])} to {axis_value(one['to'])}{unit}"
-    )
-    whole = (
-        f"{counted(int(one['minima']), 'local minimum', 'local minima')} for the whole record of {one['steps']} steps"
-    )
-    lengths = listed(map(str, windows["steps"])) if len(windows) else ""
-    rest = f", and {_counts(windows)} for windows of {lengths} steps" if lengths else ""
-    return f"The loss on {one['problem']} over {values} has {whole}{rest}"
 
 
 def scan_charts(scans: pd.DataFrame) -> list[Chart]:
@@ -340,7 +233,7 @@ def _scan_chart(scan: pd.DataFrame, name: str) -> Chart:
         if line["from"] <= line["fit"] <= line["to"]:
             parts.append(curve[:1].assign(value=line["fit"], loss=np.interp(line["fit"], values, loss), part=FIT))
     return Chart(
-        name, f"{_counted_minima(scan)}.", pd.concat(parts, ignore_index=True),
+        name, pd.concat(parts, ignore_index=True),
         [Column("value", label=str(one["unknown"]), unit=str(one["unit"]), log=False)],
         [Column("loss", label="mean square of residual / noise", log=True)],
         "lines", series="part", panel="window", across=3, height=1.9, labels="legend",
@@ -354,12 +247,12 @@ def _scan_chart(scan: pd.DataFrame, name: str) -> Chart:
 # --------------------------------------------------------------------------------------------------------- charts
 
 
-def charts(lines: pd.DataFrame, fits: Sequence[Column], by_name: dict[str, Column], title: str) -> list[Chart]:
+def charts(lines: pd.DataFrame, fits: Sequence[Column], by_name: dict[str, Column]) -> list[Chart]:
     """Return the chart of errors and coverage for print, and the chart of any two numbers for the page."""
     styles = {
         name: Style(PALETTE[i], "osD"[i % 3]) for i, name in enumerate(dict.fromkeys(lines["shooting"]))
     }  # fmt: skip
-    order = lines.assign(precise=precise(lines)).groupby("integrator")["precise"].mean()
+    order = (lines["verdict"] == "precise").groupby(lines["integrator"]).mean()
     lines = lines.iloc[(-lines["integrator"].map(order)).argsort(kind="stable")]
     parts, marks = [], []
     for column, ideal, name in ((fits[1], 1.0, "bound"), (fits[2], LEVEL, "")):
@@ -370,7 +263,7 @@ def charts(lines: pd.DataFrame, fits: Sequence[Column], by_name: dict[str, Colum
     x = Column("value", label=" ", low="low", high="high")
     drawn = [] if not parts else [
         Chart(
-            "identify", title, pd.concat(parts, ignore_index=True), [x], [text("problem", label="")], "dots", series="shooting",
+            "identify", pd.concat(parts, ignore_index=True), [x], [text("problem", label="")], "dots", series="shooting",
             panel="panel", styles=styles, marks=marks, failed="failed", own_scales=True, across=2, height=0.34, on_page=False,
             subtitle="a cross: no fit converges",
         )
@@ -381,7 +274,7 @@ def charts(lines: pd.DataFrame, fits: Sequence[Column], by_name: dict[str, Colum
     return [
         *drawn,
         Chart(
-            "fits", title, frame, known, [text("problem", label="")], "dots", series="shooting", styles=styles, printed=False,
+            "fits", frame, known, [text("problem", label="")], "dots", series="shooting", styles=styles, printed=False,
             text="One dot per problem and shooting method. Choose the quantity.",
         ),
     ]  # fmt: skip

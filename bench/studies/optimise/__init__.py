@@ -104,7 +104,7 @@ class Optimise(Study):
         return None
 
     def views(self, experiment: Experiment, rows: pd.DataFrame) -> Views:
-        """Return the findings, tables and charts: targets reached by method, regret, errors of gradients, tuning."""
+        """Return the tables and charts: targets reached by method, regret, errors of gradients, tuning."""
         from bench.studies.optimise.views import views
 
         return views(experiment, rows)

@@ -332,8 +332,31 @@ def quality_and_runtime(runs: RunSet, default: float, factor: float = TARGETS[0]
 
 @remember
 def effects_of_error(runs: RunSet, default: float) -> pd.DataFrame:
-    """Return :func:`rank_correlations` of the errors and runtimes of :func:`quality_and_runtime`."""
-    return rank_correlations(quality_and_runtime(runs, default))
+    """Return :func:`rank_correlations` of the errors and runtimes of :func:`quality_and_runtime`, with a verdict.
+
+    Gradients with smaller errors reach the target ``sooner`` or ``later`` where the whole interval is on one side of 0, and
+    a random order is seldom as good; else it is ``open``.
+    """
+    rho = rank_correlations(quality_and_runtime(runs, default))
+    is_known = (rho["points"] >= FEWEST_POINTS) & (rho["chance"] <= CHANCE)
+    sides = {"sooner": is_known & (rho["rho_low"] > 0), "later": is_known & (rho["rho_high"] < 0)}
+    return rho.assign(verdict=np.select(list(sides.values()), list(sides), "open"))
+
+
+CHANCE = 0.05
+"""An order counts as random if a random order is at least as good with more than this probability."""
+
+
+def is_tied(summary: pd.DataFrame) -> pd.Series:
+    """Return a mask of the methods that reach most targets, or that are not distinguishable from the first.
+
+    Methods that were not run on all problems are not compared.
+    """
+    full = summary[summary["problems"] == summary["problems"].max()]
+    best = full.loc[full["reached"].idxmax()]
+    error = np.sqrt(best["reached_se"] ** 2 + full["reached_se"] ** 2)
+    tied = (best["reached"] - full["reached"] < performance.Z * error) | (full.index == best.name)
+    return tied.reindex(summary.index, fill_value=False)
 
 
 def rank_correlations(points: pd.DataFrame) -> pd.DataFrame:

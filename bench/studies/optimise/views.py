@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -17,9 +16,8 @@ from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Mark, Style, Table, Views
 from bench.report.colours import estimator_colour, estimator_marker
 from bench.report.style import DEVIANT, MARKERS, VARIANTS
-from bench.report.text import counted, number
 from bench.report.writer import reasons
-from bench.studies.optimise import aggregate, findings
+from bench.studies.optimise import aggregate
 from bench.studies.optimise.aggregate import TARGETS, RunSet
 
 CONTEXT = tuple(zip(("#666666", "#8c8c8c", "#4d4d4d", "#767676"), (*VARIANTS[1:], *DEVIANT[:2]), strict=True))
@@ -52,7 +50,15 @@ NOTES = (
     "target reached, where a gradient counts as many rollouts as take its time: the rollouts of all searches over the number "
     "of searches that reached the target, inf if none did. Each method is shown at its best tuning on each problem, chosen by "
     "median final cost of {seeds}, next to the number of tunings and the median score over all of them. Methods without "
-    "an estimator (dashed in charts) are context and do not enter findings about its gradients.",
+    "an estimator (dashed in charts) are context.",
+)
+EFFECT = (
+    text("scene_class", label="class"), text("verdict"), Column("rho", low="rho_low", high="rho_high", log=False),
+    Column("points", format="setting"), Column("chance", label="chance of a random order"),
+)  # fmt: skip
+EFFECT_NOTES = (
+    "rho: rank correlation of the error of gradients at the start and the average runtime, ranked within each problem. sooner or "
+    "later: the whole 95% interval is on one side of 0, and a random order is at least as good with a probability of 5% at most.",
 )
 PAGE = (
     "stopped", "scene_class", "final_cost", "best_known", "score", "rollouts", "gradients", "search_s", "quality_rmse_rel",
@@ -61,20 +67,19 @@ PAGE = (
 
 
 def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
-    """Return findings, tables and charts of the searches."""
+    """Return the tables and charts of the searches."""
     runs, default = aggregate.collect_runs(experiment, rows), default_ratio(experiment)
     if not len(runs.rows):
         every = Table(
             "optimise", rows, [text("scene"), text("optimizer"), text("status")], data=table(experiment, rows)
         )
-        return Views(["No search gave a result: the table has the reason of each."], [every], remarks=reasons(rows))
+        return Views([every], remarks=reasons(rows))
     name = short_names(runs.methods)
-    texts = findings.sentences(runs, default, name)
     cells = rows.assign(**{c: runs.rows[c] for c in ("problem", "method", "tuning", "best_known", "score")})
     cells = cells.fillna({"problem": "", "method": "", "tuning": ""}).astype({"score": float, "best_known": float})
     by_name = experiment.columns.by_name | {"best_known": Column("best_known", label="J*")}
     return Views(
-        texts, tables(experiment, rows, runs, default, name), charts(runs, default, name, texts), rows=cells,
+        tables(experiment, rows, runs, default, name), charts(runs, default, name), rows=cells,
         columns=[METHOD, *(by_name[column] for column in PAGE)], remarks=reasons(rows),
     )  # fmt: skip
 
@@ -105,11 +110,13 @@ def tables(
         name=methods["method"].map(name),
     )
     key = "; ".join(f"{name(method)}: {method}" for method in runs.methods if name(method) != method)
+    methods["verdict"] = np.where(aggregate.is_tied(methods), "first or tied", "")
     first = runs.rows.drop_duplicates("problem")
+    effects = aggregate.effects_of_error(runs, default)
     return [
         Table(
             "optimise", methods,
-            [text("name", label="method"), REACHED, SCORE, BETTER, PROFILE, Column("tunings", format="setting"), MEDIAN, text("diverged_of", label="diverged")],
+            [text("name", label="method"), REACHED, text("verdict"), SCORE, BETTER, PROFILE, Column("tunings", format="setting"), MEDIAN, text("diverged_of", label="diverged")],
             "methods by the share of targets they reach", [*notes(runs), *([f"{key}."] if key else [])], terminal=True, page=True,
             data=table(experiment, rows),
         ),
@@ -124,6 +131,8 @@ def tables(
              Column("best_known", label="J*", digits=8), text("best_known_status", label="source of J*")],
             "Lowest costs", terminal=True,
         ),
+        *([Table("effect_of_error", effects, EFFECT, "Does a smaller error reach a tenth of the first regret sooner?", EFFECT_NOTES)]
+          if len(effects) else []),
         Table("targets", reached, [], files=["csv"]),
         Table("summary", summary, [], files=["csv"]),
     ]  # fmt: skip
@@ -144,7 +153,7 @@ def styles(methods: Sequence[str], name: Callable[[str], str] = str) -> dict[str
     looks: dict[str, Style] = {}
     uses: Counter[str] = Counter()
     for method in methods:
-        estimator = re.split(r"[\[,]", method)[0] if findings.has_estimator(method) else ""
+        estimator = re.split(r"[\[,]", method)[0] if ", " in method else ""  # "estimator, optimizer"
         turn = uses[estimator]
         uses[estimator] += 1
         grey, dashes = CONTEXT[turn % len(CONTEXT)]
@@ -156,16 +165,16 @@ def styles(methods: Sequence[str], name: Callable[[str], str] = str) -> dict[str
     return looks
 
 
-def charts(runs: RunSet, default: float, name: Callable[[str], str], texts: Sequence[str]) -> list[Chart]:
+def charts(runs: RunSet, default: float, name: Callable[[str], str]) -> list[Chart]:
     """Return the charts, the shares of targets reached first."""
     looks = styles(runs.methods, name)
     charts_ = [
-        _targets(runs, default, texts[0]),
+        _targets(runs, default),
         _progress(runs, default),
         _quality(runs, default),
         *_paths(runs, default),
     ]
-    charts_ += [*_tunings(runs, name), _path_quality(runs)]
+    charts_ += [*_tunings(runs), _path_quality(runs)]
     out = []
     for chart in charts_:
         if chart is not None and len(chart.frame):
@@ -181,11 +190,11 @@ def charts(runs: RunSet, default: float, name: Callable[[str], str], texts: Sequ
     return out
 
 
-def _targets(runs: RunSet, default: float, title: str) -> Chart:
+def _targets(runs: RunSet, default: float) -> Chart:
     """Return the share of targets that each method reaches, the largest first."""
     frame = aggregate.summarise(runs, default).sort_values("reached", ascending=False, kind="stable")
     return Chart(
-        "targets", title, frame, [REACHED, SCORE, PROFILE, MEDIAN], [METHOD], "dots", height=0.24,
+        "targets", frame, [REACHED, SCORE, PROFILE, MEDIAN], [METHOD], "dots", height=0.24,
         subtitle=_where(runs, "targets: a tenth, a hundredth and a thousandth of the first regret"),
         text="Bars are 95% intervals over seeds. Choose the score or the profile to rank by them.",
     )  # fmt: skip
@@ -207,23 +216,9 @@ def _progress(runs: RunSet, default: float) -> Chart | None:
         for method, part in times.groupby("method", sort=False)
         for x in grid
     ]
-    ends = {
-        str(method): float(part["weight"][np.isfinite(part["runtime"])].sum())
-        for method, part in times.groupby("method")
-    }
-    half = {
-        str(method): float(part.sort_values("runtime")["runtime"][part.sort_values("runtime")["weight"].cumsum() >= 0.5].min())
-        for method, part in times.groupby("method", sort=False)
-        if ends[str(method)] >= 0.5
-    }  # fmt: skip
     share = Column("share", label="share of targets reached", format="percent", log=False)
-    short = short_names(runs.methods)
-    title = "No method reaches half of the targets"
-    if half:
-        first = min(half, key=lambda method: half[method])
-        title = f"{short(first)} is first to half of the targets, after {number(half[first])} rollouts"
     return Chart(
-        "runtimes", title, pd.DataFrame(lines), [SPENT], [share], labels="ends", height=2.6, panel="",
+        "runtimes", pd.DataFrame(lines), [SPENT], [share], labels="ends", height=2.6, panel="",
         subtitle=_where(runs, "single searches, a gradient counts as its time in rollouts"),
         text="Where a line ends is the share of targets reached in the whole budget.",
     )  # fmt: skip
@@ -235,21 +230,13 @@ def _quality(runs: RunSet, default: float) -> Chart | None:
     if points.empty:
         return None
     rho = aggregate.effects_of_error(runs, default)
-    title = findings.effect_of_error(rho, figures=False)
-    rho = rho.set_index("scene_class")
-    remarks = {}
-    for kind in points["scene_class"].unique():
-        row = rho.loc[kind].to_dict()
-        verdict = findings.verdict(row)
-        few = f"{row['points']:.0f} comparable points" if math.isnan(row["rho"]) else findings.correlation(row)
-        remarks[str(kind)] = few if verdict != "open" else f"open: {few}"
     missed = ~np.isfinite(points["art"])
     scenes = points["problem"].str.split(r"[,\[]").str[0]
     frame = points.assign(art=points["art"].mask(missed), missed=missed, scene=scenes)
     others = [Column("bias_share", label="share of bias in the error", log=False), Column("cosine", log=False)]
     return Chart(
-        "quality_runtime", title, frame, [ERROR, *others], [replace(RUNTIME, low="", high="")], "points", panel="scene_class",
-        shape="scene", panel_notes=remarks, failed="missed", across=2, height=1.9, own_scales=False,
+        "quality_runtime", frame, [ERROR, *others], [replace(RUNTIME, low="", high="")], "points", panel="scene_class",
+        shape="scene", panel_notes=dict(zip(rho["scene_class"], rho["verdict"], strict=True)), failed="missed", across=2, height=1.9, own_scales=False,
         subtitle="average runtime: expected rollouts per search that reaches a tenth of the first regret; a cross: never reached",
         text="A point per problem and method. Methods that never reach the target have no point.",
     )  # fmt: skip
@@ -257,12 +244,11 @@ def _quality(runs: RunSet, default: float) -> Chart | None:
 
 def _paths(runs: RunSet, default: float) -> list[Chart]:
     """Return the regret along the paths against rollouts, and for the page against time."""
-    ended: Counter[str] = Counter()
     charts_ = []
     for unit in ("rollouts", "seconds"):
         lines = []
         for problem in runs.problems:
-            ratio, ends = runs.gradient_ratio(problem, default), {}
+            ratio = runs.gradient_ratio(problem, default)
             for method, part in runs.best_runs[runs.best_runs["problem"] == problem].groupby("method", sort=False):
                 places = [
                     aggregate.rollouts_spent(row, ratio)
@@ -278,37 +264,27 @@ def _paths(runs: RunSet, default: float) -> list[Chart]:
                 )
                 first = max(part["start_cost"].iloc[0] - part["best_known"].iloc[0], 1e-300)
                 low, middle, high = np.clip(aggregate.regret_quantiles(part, places, grid) / first, DEPTH, None)
-                ends[str(method)] = middle[-1]
                 lines += [(problem, method, *values) for values in zip(grid, middle, low, high, strict=True)]
-            if unit == "rollouts" and ends:
-                best = min(ends.values())
-                ended.update([method for method, value in ends.items() if value == best])
         frame = pd.DataFrame(lines, columns=["problem", "method", "spent", "regret", "low", "high"]).replace(
             np.inf, np.nan
         )
         charts_.append(Chart(
-            "anytime" if unit == "rollouts" else "anytime_seconds", "", frame, [SPENT if unit == "rollouts" else SECONDS], [REGRET],
+            "anytime" if unit == "rollouts" else "anytime_seconds", frame, [SPENT if unit == "rollouts" else SECONDS], [REGRET],
             panel="problem", band=True, height=1.55, printed=unit == "rollouts",
             marks=[Mark("", 1 / target, axis="y") for target in TARGETS],
             subtitle=f"medians and 20% to 80% of the seeds, each method at its best tuning; lines: the targets; cut at {DEPTH:g}",
         ))  # fmt: skip
-    if not ended:
-        return []
-    method, count = ended.most_common(1)[0]
-    title = f"No method ends with the lowest median regret on most of the {len(runs.problems)} problems"
-    if 2 * count > len(runs.problems):
-        title = f"{short_names(runs.methods)(method)} ends with the lowest median regret on {count} of {counted(len(runs.problems), 'problem')}"
-    return [replace(chart, title=title) for chart in charts_]
+    return charts_
 
 
-def _tunings(runs: RunSet, name: Callable[[str], str]) -> list[Chart]:
+def _tunings(runs: RunSet) -> list[Chart]:
     """Return the score against each tuned parameter, by problem."""
     lines = aggregate.scores_by_tuning(runs)
     lines = lines[lines.groupby(["problem", "method", "axis"])["value"].transform("nunique") > 1]
     several = lines["axis"].nunique() > 1
     return [
         Chart(
-            f"learning_rates_{axis}" if several else "learning_rates", findings.tuning_title(part, name), part,
+            f"learning_rates_{axis}" if several else "learning_rates", part,
             [Column("value", label=str(axis), format="setting")], [Column("score", low="low", high="high", log=False)], panel="problem",
             band=True, height=1.45, subtitle="median over seeds, and 20% to 80% of them",
         )
@@ -326,13 +302,8 @@ def _path_quality(runs: RunSet) -> Chart | None:
         lines.loc[lines["quantity"] == "cosine", ["value", "low", "high"]].add_prefix("cosine_").reset_index(drop=True)
     )
     frame = errors.join(cosines)
-    change = frame.groupby(["problem", "method"], sort=False)["value"].agg(["first", "last"])
-    factor = (change["last"] / change["first"]).replace(np.inf, np.nan)
-    title = "The error of gradients along the path"
-    if factor.notna().any():
-        title = f"Along the path the relative error of gradients changes by up to a factor of {number(max(factor.max(), 1 / factor.min()))}"
     return Chart(
-        "path_quality", title, frame, [Column("iteration", log=False)],
+        "path_quality", frame, [Column("iteration", log=False)],
         [Column("value", label="relative error of a gradient", low="low", high="high", log=True),
          Column("cosine_value", label="cosine with the reference", low="cosine_low", high="cosine_high", log=False)],
         panel="problem", band=True, subtitle="medians and 20% to 80% of the seeds",

@@ -56,7 +56,7 @@ class Solver(Study):
         return f"backend {cell.backend.name} has no parameter iterations, the iterations of a constraint solver"
 
     def views(self, experiment: Experiment, rows: pd.DataFrame) -> Views:
-        """Return the findings, the table of errors and times, and the chart of errors along the iterations."""
+        """Return the table of errors and times, and the chart of errors along the iterations."""
         from bench.studies.solver.views import views
 
         return views(experiment, rows)

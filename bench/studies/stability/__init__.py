@@ -69,7 +69,7 @@ class Stability(Study):
         return measure(cell, session, limits)
 
     def views(self, experiment: Experiment, rows: pd.DataFrame) -> Views:
-        """Return where the gradient is right most often and why it is wrong, the tables of shares, and the maps."""
+        """Return the tables of shares and limits, and the maps."""
         from bench.studies.stability.views import views
 
         return views(experiment, rows)

@@ -14,8 +14,8 @@ from bench.experiment.columns import COMMON, Column, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Style, Table, Views
 from bench.report.problems import axes_of
-from bench.report.text import counted, listed
 from bench.report.views import attempted
+from bench.report.writer import reasons
 from bench.studies.stability.maps import (
     LOST,
     PLACES,
@@ -50,23 +50,16 @@ RESULTS = (
 
 
 def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
-    """Return where the gradient is right most often and why it is wrong, the tables of shares, and the maps."""
+    """Return the tables of shares and of stability limits, and the maps."""
     shown = arrange_maps(experiment, rows)
     maps = panels(shown)
     whole = Table(
         "stability_map", *_maps(maps, label_columns_of(shown, axes_of(shown, *PLACES))), data=table(experiment, rows),
         title="shares of verdicts and stability limits", notes=notes(shown.rows),
     )  # fmt: skip
-    remarks = [
-        f"{count} {status}: {reason}"
-        for (status, reason), count in rows[rows["status"].isin(("unsupported", "unavailable", "error"))]
-        .groupby(["status", "reason"])
-        .size()
-        .items()
-    ]
     cells = _cells(maps)
     if cells.empty:
-        return Views(["No cell has a verdict: the table has the reason of each."], [whole], remarks=remarks)
+        return Views([whole], remarks=reasons(rows))
     shares = shares_of(cells)
     answers = Table(
         "stability_shares", shares,
@@ -77,8 +70,8 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
         page=True,
     )  # fmt: skip
     return Views(
-        findings(shares, cells), [answers, whole], charts(cells, shown.rows), shown.rows,
-        [experiment.columns.by_name[name] for name in RESULTS], remarks,
+        [answers, whole], charts(cells, shown.rows), shown.rows,
+        [experiment.columns.by_name[name] for name in RESULTS], reasons(rows),
     )  # fmt: skip
 
 
@@ -156,38 +149,6 @@ def shares_of(cells: pd.DataFrame) -> pd.DataFrame:
     )
 
 
-def findings(shares: pd.DataFrame, cells: pd.DataFrame) -> list[str]:
-    """Return what to use on each scene, how often the gradient is wrong or lost, and why."""
-    best = []
-    for scene, part in shares.groupby("scene", sort=False):
-        most = part[part["right"] == part["right"].max()]
-        if most["right"].max() > 0:
-            names = listed(most["step"]) if len(most) < 4 else f"{len(most)} of {len(part)} laws and steps"
-            best.append(f"{names} on {scene} (right in {_shares_of_cells(most)})")
-    n_wrong, n_lost = (int((cells["level"] == name).sum()) for name in ("wrong", "diverged"))
-    causes = cells.loc[cells["level"] == "wrong", "cause"]
-    nouns = {"step": "the step or its derivative", "law": "the law", "both": "both"}
-    causes_of = [f"{nouns[cause]} in {(causes == cause).sum()}" for cause in nouns if (causes == cause).any()]
-    rest = int((~causes.isin(list(nouns))).sum())
-    causes_of += [f"not resolved in {rest}"] if rest else []
-    use = (
-        f"Use {listed(best)}."
-        if best
-        else "No law and integrator gives a right gradient at any step size and stiffness."
-    )
-    return [
-        use,
-        f"Of {counted(len(cells), 'cell')}, {n_wrong} have a finite but wrong gradient and {n_lost} a state that diverges.",
-        *([f"The cause of the wrong gradients is {', '.join(causes_of)}."] if n_wrong else []),
-    ]
-
-
-def _shares_of_cells(best: pd.DataFrame) -> str:
-    """Format the shares of right gradients of one scene's best laws and steps: ``46% of 90 cells``."""
-    pairs = dict.fromkeys(zip(best["right"], best["cells"], strict=True))
-    return " and ".join(f"{share:.0%} of {counted(count, 'cell')}" for share, count in pairs)
-
-
 # ------------------------------------------------------------------------------------------------------- charts
 
 
@@ -198,8 +159,6 @@ def charts(cells: pd.DataFrame, rows: pd.DataFrame) -> list[Chart]:
     frame = frame.sort_values("level", key=lambda names: names.map(worst), kind="stable")
     frame = frame.drop_duplicates(["integrator", "title", *PLACES]).sort_index()
     first = frame.groupby(["integrator", "problem"], sort=False)["variant"].transform("first")
-    right = cells["level"] == "right"
-    stable = right[cells["level"] != "diverged"].mean() if (cells["level"] != "diverged").any() else 0.0
     styles = {
         name: Style(COLOURS[name], meaning=_meaning(name, rows)) for name in CLASSES if name in set(frame["level"])
     }
@@ -208,15 +167,14 @@ def charts(cells: pd.DataFrame, rows: pd.DataFrame) -> list[Chart]:
     variants = list(dict.fromkeys(frame.loc[frame["variant"] == first, "variant"]))
     more = " The other values are on the page." if frame["variant"].nunique() > len(variants) else ""
     printed = Chart(
-        "stability_map", f"The gradient is right in {right.mean():.0%} of the cells, and in {stable:.0%} of those that do not diverge",
-        frame[frame["variant"] == first], [dt], [stiffness], panel="problem", panel_row="integrator", cell="mark",
+        "stability_map", frame[frame["variant"] == first], [dt], [stiffness], panel="problem", panel_row="integrator", cell="mark",
         height=0.085, subtitle=f"{BEYOND} beyond the stability limit in theory. Blank: not supported."
         + (f" At {' and '.join(filter(None, variants))}.{more}" if any(variants) else ""),
         text="The worse verdict where backends disagree. Verdicts and causes can be chosen in the filters.", **shared,
     )  # fmt: skip
     frame = frame.assign(panel=frame["title"] + ", " + frame["integrator"])
     every = Chart(
-        "stability_maps", "Every map", frame, [dt], [stiffness], panel="panel", printed=False,
+        "stability_maps", frame, [dt], [stiffness], panel="panel", printed=False,
         text="Verdicts and causes can be chosen in the filters.", **shared,
     )  # fmt: skip
     return [printed, *([every] if frame["variant"].nunique() > 1 else []), _share_chart(cells)]
@@ -243,7 +201,7 @@ def _share_chart(cells: pd.DataFrame) -> Chart:
     right = (cells["level"] == "right").groupby([cells["problem"], cells["integrator"]], sort=False).mean()
     frame = right.rename("share").reset_index()
     return Chart(
-        "stability_shares", "How often is the gradient right?", frame.assign(cell=[f"{v:.0%}" for v in frame["share"]]),
+        "stability_shares", frame.assign(cell=[f"{v:.0%}" for v in frame["share"]]),
         [COMMON["integrator"]], [text("problem")], "grid", value="share", cell="cell", printed=False,
         text="Share of step sizes and stiffnesses, over all values of the other parameters.",
     )  # fmt: skip

@@ -31,7 +31,7 @@ class ThreeErrors(Study):
         return measure(cell, session)
 
     def views(self, experiment: Experiment, rows: pd.DataFrame) -> Views:
-        """Return the law to use, the misleading gradients and traps, the tables and the charts of the errors."""
+        """Return the tables and the charts of the errors."""
         from bench.studies.three_errors.views import views
 
         return views(experiment, rows)

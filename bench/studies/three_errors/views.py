@@ -14,7 +14,7 @@ from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Style, Table, Views
 from bench.report.problems import label_columns, problem_names, problem_numbers
 from bench.report.style import PALETTE
-from bench.report.text import counted, listed, number
+from bench.report.text import number
 from bench.report.views import Arranged, arrange, attempted
 from bench.report.writer import reasons
 from bench.studies.three_errors.columns import COLUMNS
@@ -59,9 +59,8 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
         notes=[*map(str, trapped), NOTE], terminal=True, split="section",
     )  # fmt: skip
     if not (attempted(rows)["status"] == "ok").any():
-        return Views(["No cell gave a result: the table has the reason of each."], [lines], remarks=reasons(rows))
+        return Views([lines], remarks=reasons(rows))
     compared = _compared(shown, parts, trapped)
-    findings = [*recommended(compared), misleading(shown), *caught(compared, trapped)]
     named = shown.rows.assign(
         law=problem_names(shown, ["contact", "integrator"], shown.axes, ("contact", "integrator")),
         problem=problem_names(shown, ["scene"], shown.axes),
@@ -70,10 +69,7 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
         "three_errors_wrong", *_wrong(named), title="Right for the program, wrong for the physics", files=[], page=True
     )
     charts = [_dumbbells(compared, parts, trapped), *_further(shown, named)]
-    return Views(findings, [lines, worst], charts, named, remarks=reasons(rows))
-
-
-# ------------------------------------------------------------------------------------------------------ findings
+    return Views([lines, worst], charts, named, remarks=reasons(rows))
 
 
 def _compared(shown: Arranged, parts: Sequence[Section], trapped: Sequence[Trap]) -> pd.DataFrame:
@@ -91,52 +87,6 @@ def _compared(shown: Arranged, parts: Sequence[Section], trapped: Sequence[Trap]
         trap=programs_of(shown, part).isin([trap.name for trap in trapped]) & part.is_along_steps,
     )
     return rows.sort_values("x", kind="stable").drop_duplicates(["panel", "law"]).sort_index()
-
-
-def recommended(compared: pd.DataFrame) -> list[str]:
-    """Return the laws that are near the physics on most scenes; nothing where the physics has no gradient."""
-    known = compared[compared["model_error_rel"].notna()]
-    if known.empty:
-        return []
-    right = (known["model_error_rel"] <= WRONG).groupby(known["law"], sort=False).agg(["sum", "size"])
-    best = right[right["sum"] == right["sum"].max()]
-    if not best["sum"].max():
-        return [f"No contact law is within {WRONG:.0%} of the gradient of the physics on any scene."]
-    n_scenes, most = known["panel"].nunique(), int(best["sum"].max())
-    be = (
-        f"{listed(best.index)} {'is' if len(best) == 1 else 'are'} within {WRONG:.0%} of the gradient of the physics on"
-    )
-    if most == n_scenes:
-        return [f"{be} {counted(n_scenes, 'scene')} of {n_scenes}."]
-    return [f"No contact law is right on every scene: {be} {most} of {counted(n_scenes, 'scene')}, the most."]
-
-
-def misleading(shown: Arranged) -> str:
-    """Return how many gradients are right for their program but wrong for the physics, and the worst of them."""
-    programs = shown.rows[~problem_numbers(shown.rows, PROGRAM).duplicated()]
-    known = programs[programs["model_error_rel"].notna() & (programs["program_error_rel"] <= AGREES)]
-    wrong = known[known["model_error_rel"] > WRONG]
-    text = (
-        f"Of {counted(len(known), 'gradient')} confirmed by differences of the program's cost, {len(wrong)} "
-        f"{'is' if len(wrong) == 1 else 'are'} off by over {WRONG:.0%} from the gradient of the physics"
-    )
-    if wrong.empty:
-        return text + "."
-    worst = wrong.loc[wrong["model_error_rel"].idxmax()]
-    name = ", ".join(part for part in (worst["scene"], worst["contact"], worst["integrator"]) if part != "none")
-    return f"{text}, the worst by {number(worst['model_error_rel'])} times its norm ({name})."
-
-
-def caught(compared: pd.DataFrame, trapped: Sequence[Trap]) -> list[str]:
-    """Return how many programs are traps, if the time step was swept."""
-    if not trapped:
-        return []
-    worst = max(trapped, key=lambda trap: trap.model[1])
-    be = f"is a trap ({worst.name})" if len(trapped) == 1 else f"are traps (the worst: {worst.name})"
-    return [
-        f"{len(trapped)} of {counted(len(compared), 'program')} {be}: as the time step falls, the cost converges to the "
-        "physics and the gradient does not."
-    ]
 
 
 # ------------------------------------------------------------------------------------------------------- tables
@@ -204,10 +154,8 @@ def _dumbbells(compared: pd.DataFrame, parts: Sequence[Section], trapped: Sequen
     errors["series"] = errors["series"].mask(errors["trap"] & (errors["series"] == PHYSICS), TRAP)
     errors = errors.assign(limit=errors["error"] < FLOOR, error=errors["error"].clip(lower=FLOOR))
     steps = any(part.is_along_steps for part in parts)
-    wrong = int((compared["model_error_rel"] > WRONG).sum())
-    title = f"Right for the program, wrong for the physics: {wrong} of {counted(len(compared), 'gradient')}"
     return Chart(
-        "three_errors", title + (f", {len(trapped)} of them traps" if trapped else ""), errors,
+        "three_errors", errors,
         [replace(COLUMNS.by_name["model_error_rel"], name="error", label="relative error", limit="limit", log=True,
                  above_one="larger than the gradient")],
         [text("law", label="")], "dots", series="series", panel="panel", styles=STYLES, join=True, across=2, height=0.2,
@@ -222,11 +170,11 @@ def _further(shown: Arranged, named: pd.DataFrame) -> list[Chart]:
     model, *others = (replace(COLUMNS.by_name[name], log=True, above_one="larger than the gradient") for name in ERRORS)
     swept = [Column(axis.column, label=axis.title, format="setting") for axis in shown.swept()]
     along = Chart(
-        "three_errors_swept", "A model error that does not shrink with the step is due to the contact model", frame, swept,
+        "three_errors_swept", frame, swept,
         [model, *others], "points", series="law", panel="problem", printed=False,
     )  # fmt: skip
     against = Chart(
-        "three_errors_pairs", "Traps are at the upper left: right for the program, wrong for the physics", frame, others,
+        "three_errors_pairs", frame, others,
         [model], "points", series="law", panel="problem", printed=False,
     )  # fmt: skip
     return [*([along] if swept else []), against]

@@ -93,7 +93,7 @@ class Train(Study):
         return None
 
     def views(self, experiment: Experiment, rows: pd.DataFrame) -> Views:
-        """Return the findings, the table of returns, the table of windows, and charts of returns and logs."""
+        """Return the table of returns, the table of windows, and charts of returns and logs."""
         from bench.studies.train.views import views
 
         return views(experiment, rows)

@@ -63,6 +63,24 @@ def summarise(runs: pd.DataFrame) -> pd.DataFrame:
     return frame.sort_values(["problem", "final"], ascending=[True, False], kind="stable").reset_index(drop=True)
 
 
+def ranked(lines: pd.DataFrame, by: Sequence[str]) -> pd.Series:
+    """Return a verdict on the final return of each line of :func:`summarise` or :func:`windows`, within groups ``by``.
+
+    ``first``: the highest; ``tied``: its interval over seeds reaches the first one's; ``behind``: it does not; ``open``:
+    none of the group is behind; ``no result``: no run ended with a finite return.
+    """
+    verdicts = pd.Series("no result", lines.index, dtype=object)
+    has_ended = np.isfinite(lines["final"]) & (lines["failed"] < lines["seeds"] if "failed" in lines else True)
+    for _, part in lines[has_ended].groupby(list(by), sort=False):
+        best = part.loc[part["final"].idxmax()]
+        behind = part["final_high"] < best["final_low"]
+        verdicts[part.index] = np.where(behind, "behind", "tied")
+        verdicts[best.name] = "first"
+        if len(part) > 1 and not behind.any():
+            verdicts[part.index] = "open"
+    return verdicts
+
+
 MIN_SEEDS = 5
 """Fewest seeds for an interval: a resample cannot leave the range of its values, which covers too little for fewer."""
 
@@ -139,7 +157,7 @@ def windows(runs: pd.DataFrame) -> pd.DataFrame:
 
 
 def faults(runs: pd.DataFrame) -> pd.DataFrame:
-    """Return a line per run and fault: problem, method, seed and the fault's numbers in ``fault``.
+    """Return a line per run and fault: problem, method, seed, the fault's ``code`` and the numbers that show it.
 
     A gradient that is cut at the ends of episodes is a fault only of trainers that differentiate windows shorter than an
     episode: whole episodes are cut at their end by construction. Where every update has contact, that a peak has it says
@@ -155,8 +173,8 @@ def faults(runs: pd.DataFrame) -> pd.DataFrame:
                 continue
             if always_contact:
                 fault.pop("with_contact", None)
-            lines.append({"problem": row["problem"], "method": row["method"], "seed": row["seed"], "fault": fault})
-    return pd.DataFrame(lines, columns=["problem", "method", "seed", "fault"])
+            lines.append({"problem": row["problem"], "method": row["method"], "seed": row["seed"], **fault})
+    return pd.DataFrame(lines, columns=None if lines else ["problem", "method", "seed", "code"])
 
 
 def logs(runs: pd.DataFrame, quantities: Sequence[str]) -> pd.DataFrame:

@@ -12,14 +12,13 @@ from bench.experiment.columns import Column, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Style, Table, Views
 from bench.report.style import DEVIANT, VARIANTS, colour, marker
-from bench.report.text import number
 from bench.report.writer import reasons
-from bench.studies.train import aggregate, findings
+from bench.studies.train import aggregate
 
-PROBLEM, METHOD = text("problem"), text("method", label="trainer")
+PROBLEM, METHOD, VERDICT = text("problem"), text("method", label="trainer"), text("verdict")
 FINAL = Column("final", label="final return", low="final_low", high="final_high", digits=3, log=False)
 SUMMARY = (
-    PROBLEM, METHOD, FINAL, Column("worst", label="worst seed", digits=3), Column("seeds", format="setting"),
+    PROBLEM, METHOD, FINAL, VERDICT, Column("worst", label="worst seed", digits=3), Column("seeds", format="setting"),
     Column("failed", label="not finite", format="setting"), Column("steps", unit="steps", label="control steps", digits=3),
     Column("train_s", label="training", format="seconds"), Column("compile_s", label="compilation", format="seconds"),
     Column("gradient_typical", label="gradient norm"), Column("gradient_peak", label="largest gradient"),
@@ -32,10 +31,16 @@ WINDOW_BIAS = Column(
 )
 WINDOWS = (
     PROBLEM, text("family", label="trainer"), WINDOW,
-    WINDOW_GRADIENT, text("bias", label="its bias"),
-    Column("gradient_typical", label="gradient norm in training"), FINAL,
+    WINDOW_GRADIENT, replace(WINDOW_BIAS, label="its bias"),
+    Column("gradient_typical", label="gradient norm in training"), FINAL, VERDICT,
 )  # fmt: skip
-FAULTS = (PROBLEM, METHOD, Column("seed", format="setting"), text("words", label="the log shows"))
+FAULTS = (
+    PROBLEM,
+    METHOD,
+    Column("seed", format="setting"),
+    text("code", label="the log shows"),
+    Column("update", format="setting"),
+)
 COST = Column("cost", label="cost of an episode", low="cost_low", high="cost_high")
 STEP, SECONDS = (
     Column("step", label="control steps", log=False),
@@ -69,46 +74,62 @@ WINDOW_NOTE = (
     "policy and critic halfway through the run, median over runs. bias: the distance from the gradient without cuts, relative "
     "to it, with its 95% interval, each the median over runs. The policies differ between windows. final return: {seeds}."
 )
+FAULT_CODES = {
+    "not_finite": "a quantity is not finite",
+    "zero": "the gradient is exactly 0",
+    "explodes": "the gradient is more than 100 times its median before",
+    "returns": "the gradient nearly vanishes, and then returns to its usual size",
+    "vanishes": "the gradient stays below 1/100 of its size, and the return rises no more",
+    "grows": "the gradient grows step by step, to more than 100 times its first size",
+    "differences": "central differences do not agree with the gradient, which is open where the cost has jumps",
+    "opposed": "the first-order gradient points away from the zeroth-order one",
+    "worse": "the loss falls while the return worsens",
+    "soft_contact": "the reward rises with the penetration: the policy uses the soft contact",
+    "parameters": "the largest parameter of the policy is more than 100 times its first value",
+    "deviation": "the deviation of the actions is unphysical",
+    "cut": "the gradient is cut in most windows, so that it seldom reaches their ends",
+}
+"""What each code of a fault means."""
+FAULT_NOTE = "update: where it starts. factor: on the value before. peaks: updates with an explosion, with_contact: those with contact."
+VERDICTS = (
+    "verdict: first, tied (not distinguishable), behind (the intervals do not overlap), or open where none is behind."
+)
 PAGE = ("final_return", "first_return", "final_median", "updates", "steps", "train_s", "compile_s", "gradient_typical",
         "gradient_peak", "window_gradient", "window_bias", "difference_error")  # fmt: skip
 
 
 def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
-    """Return findings, tables and charts of the runs."""
+    """Return the tables and charts of the runs."""
     runs = aggregate.runs_of(experiment, rows)
     data = table(experiment, rows)
     if runs.empty:
         every = Table("train", rows, [text("scene"), text("trainer"), text("status")], data=data)
-        return Views(["No run gave a result: the table has the reason of each."], [every], remarks=reasons(rows))
+        return Views([every], remarks=reasons(rows))
     summary, windows, faults = aggregate.summarise(runs), aggregate.windows(runs), aggregate.faults(runs)
-    texts = findings.sentences(summary, windows, faults, len(runs))
+    summary = summary.assign(verdict=aggregate.ranked(summary, ["problem"]))
     seeds = aggregate.interval_words(runs)
     tables = [
-        Table("train", summary, SUMMARY, "final return by trainer", [NOTE.format(seeds=seeds)], terminal=True, page=True, data=data,
+        Table("train", summary, SUMMARY, "final return by trainer", [NOTE.format(seeds=seeds), VERDICTS], terminal=True, page=True, data=data,
               details=["compile_s", "gradient_typical", "gradient_peak"]),
+        Table("summary", summary, [], files=["csv"]),
     ]  # fmt: skip
     if len(windows):
         note = WINDOW_NOTE.format(seeds=seeds)
-        lines = windows.assign(bias=[findings.bias_words(line) for line in windows.to_dict("records")])
+        lines = windows.assign(verdict=aggregate.ranked(windows, ["problem", "family"]))
         tables.append(
-            Table(
-                "windows",
-                lines,
-                WINDOWS,
-                "Windows",
-                [note],
-                terminal=True,
-                page=True,
-                details=["gradient_typical"],
-            )
+            Table("windows", lines, WINDOWS, "Windows", [note], terminal=True, page=True, details=["gradient_typical"])
         )
-    worded = faults.assign(words=[findings.describe(fault) for fault in faults["fault"]]).drop(columns="fault")
-    if len(worded):
-        tables.append(Table("faults", worded, FAULTS, "Faults in the logs", terminal=True, page=True))
+    if len(faults):
+        columns = [*FAULTS, *(Column(name) for name in faults if name not in {column.name for column in FAULTS})]
+        tables.append(Table("faults", faults, columns, "Faults in the logs", _fault_notes(faults), page=True))
     cells = rows.assign(problem=runs["problem"], method=runs["method"]).fillna({"problem": "", "method": ""})
     by_name = experiment.columns.by_name
-    return Views(texts, tables, _charts(runs, summary, windows, seeds), cells,
+    return Views(tables, _charts(runs, summary, windows, seeds), cells,
                  [METHOD, *(by_name[name] for name in PAGE)], reasons(rows))  # fmt: skip
+
+
+def _fault_notes(faults: pd.DataFrame) -> list[str]:
+    return [FAULT_NOTE, *(f"- {code}: {FAULT_CODES[code]}" for code in faults["code"].unique())]
 
 
 def _styles(summary: pd.DataFrame) -> dict[str, Style]:
@@ -126,7 +147,7 @@ def _charts(runs: pd.DataFrame, summary: pd.DataFrame, windows: pd.DataFrame, se
     cost = replace(COST, log=bool((frame["cost"] > 0).all()))
     curves = [
         Chart(
-            name, findings.title(summary), frame, [x], [cost], series="method", panel="problem", styles=looks, band=True,
+            name, frame, [x], [cost], series="method", panel="problem", styles=looks, band=True,
             subtitle=f"cost: minus the return; {seeds}", text="A line per trainer, at its evaluations.",
         )
         for name, x in (("train", STEP), ("train_seconds", SECONDS))
@@ -140,7 +161,7 @@ def _charts(runs: pd.DataFrame, summary: pd.DataFrame, windows: pd.DataFrame, se
 
 def _windows(windows: pd.DataFrame, seeds: str) -> Chart:
     return Chart(
-        "windows", findings.window_title(windows), windows, [replace(WINDOW, log=True)], [FINAL, WINDOW_BIAS, WINDOW_GRADIENT], series="family", panel="problem",
+        "windows", windows, [replace(WINDOW, log=True)], [FINAL, WINDOW_BIAS, WINDOW_GRADIENT], series="family", panel="problem",
         subtitle=f"final return: {seeds}", text="A point per length of window. Choose the quantity.",
     )  # fmt: skip
 
@@ -166,32 +187,10 @@ def _logs(runs: pd.DataFrame, summary: pd.DataFrame, looks: dict[str, Style]) ->
         own = summary[summary["problem"] == problem]
         methods = list(own.drop_duplicates("family")["method"])[:MAX_LOGS]
         charts.append(Chart(
-            "train_log" if i == 0 else f"train_log_{i + 1}", _log_title(part, methods), frame, [STEP],
+            "train_log" if i == 0 else f"train_log_{i + 1}", frame, [STEP],
             [Column("value", label=" ")], series="method", panel="quantity", styles={m: replace(s, marker="") for m, s in looks.items()},
             chosen=[("method", methods)], own_scales=True, across=1, height=1.1,
             subtitle=f"{problem}, first seed; an entry is the mean or largest value of its updates",
             text="All quantities have the same axis of control steps, so that spikes can be compared.",
         ))  # fmt: skip
     return charts
-
-
-def _log_title(runs: pd.DataFrame, methods: list[str]) -> str:
-    """Return the title of a chart of logs: a fault of a drawn run, or the largest spike of a gradient."""
-    drawn = runs[runs["method"].isin(methods)]
-    faults = findings.certain(aggregate.faults(drawn[drawn["seed"] == drawn["seed"].min()]))
-    if len(faults):
-        first = faults.iloc[0]
-        words = findings.describe(first["fault"]).partition(",")[0].partition(" (")[0]
-        return f"{first['method']}: {words}{_place(drawn, first)}"
-    ratio = drawn["gradient_peak"] / drawn["gradient_typical"]
-    worst = drawn.loc[ratio.idxmax()] if ratio.notna().any() else None
-    if worst is None:
-        return "Logs of the trainings"
-    return f"The largest gradient is {number(ratio.max())} times the median of its run ({worst['method']})"
-
-
-def _place(runs: pd.DataFrame, line: pd.Series) -> str:
-    """Return where a fault starts on the axis of control steps, in words."""
-    run = runs[(runs["method"] == line["method"]) & (runs["seed"] == line["seed"])].iloc[0]
-    update = line["fault"].get("update")
-    return f" ({update * run['steps'] / run['updates']:,.0f} control steps)" if update else ""

@@ -57,7 +57,7 @@ class Twins(Study):
         return measure(cell, session, self.timed_calls)
 
     def views(self, experiment: Experiment, rows: pd.DataFrame) -> Views:
-        """Return the finding, the table of differences and times, and the chart of differences."""
+        """Return the table of differences and times, and the chart of differences."""
         from bench.studies.twins.views import views
 
         return views(experiment, rows)

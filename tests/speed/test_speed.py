@@ -1,0 +1,299 @@
+"""Blocks, row-wise evaluation, compilations and timings: what makes runs fast must change no number."""
+
+import itertools
+import json
+import threading
+import time
+
+import bench_self
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from bench.plugins.backends import rows
+from bench.plugins.backends.implicit import Implicit
+from bench.plugins.backends.jax import Jax
+from bench.plugins.contacts.complementarity import Complementarity
+from bench.plugins.contacts.penalty import Penalty
+from bench.plugins.contacts.softplus import Softplus
+from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
+from bench.plugins.scenes.pushing import Pushing
+
+from bench import cli
+from bench.errors import UserError
+from bench.experiment import config
+from bench.measure import timing
+from bench.model import Compilations, blocks, compose, registry
+from bench.run.execute import store_of
+from bench.run.plan import plan
+
+# ------------------------------------------------------------------------------------------------------------ blocks
+
+
+@pytest.mark.parametrize(("most", "grain", "threads"), [(1024, 128, 2), (640, 128, 1), (8192, 1, 1), (100, 1, 3)])
+def test_blocks_are_alike_and_few(most, grain, threads):
+    for count in (1, 127, 128, 129, 1000, 1024, 1025, 5000, 100_000, 1_000_003):
+        size = blocks.block_size(count, most, grain, threads)
+        parts = -(-count // size)
+        assert size % grain == 0
+        assert size <= -(-most // grain) * grain
+        assert parts * size - count < parts * grain + size
+        assert parts == 1 or parts >= -(-count // most)
+
+
+def test_few_shapes_serve_all_batches():
+    shapes = {blocks.block_size(count, 1024, 128, 2) for count in range(1, 20_000, 7)}
+    assert len(shapes) <= 1024 // 128
+
+
+@pytest.mark.parametrize("threads", [1, 2, 5])
+@pytest.mark.parametrize("own_theta", [False, True])
+def test_blocks_cover_each_column_once(threads, own_theta):
+    rng = np.random.default_rng(0)
+    w, theta = rng.standard_normal((3, 101)), rng.standard_normal((2, 101 if own_theta else 1))
+    seen = []
+
+    def function(theta, w):
+        seen.append(w.shape[1])
+        return w[:2] * theta
+
+    found = blocks.evaluate(function, theta, w, 16, threads, (2,))
+    np.testing.assert_array_equal(found, w[:2] * theta)
+    assert seen == [16] * 7
+
+
+def test_failure_in_a_block_is_raised():
+    def fails(theta, w):
+        raise ValueError("no")
+
+    with pytest.raises(ValueError, match="no"):
+        blocks.evaluate(fails, np.zeros((1, 1)), np.zeros((1, 50)), 10, 2, (1,))
+
+
+def test_failure_in_another_thread_is_raised():
+    here, failed = threading.get_ident(), threading.Event()
+
+    def fails(theta, w):
+        if threading.get_ident() == here:
+            failed.wait(60)
+            return w
+        failed.set()
+        raise ValueError("no")
+
+    with pytest.raises(ValueError, match="no"):
+        blocks.evaluate(fails, np.zeros((1, 1)), np.zeros((1, 50)), 10, 2, (1,))
+
+
+def test_small_batches_are_not_shared():
+    assert [blocks.n_threads(count, 4, 512) for count in (0, 1, 700, 1000, 1500, 2048, 10**6)] == [1, 1, 1, 2, 3, 4, 4]
+
+
+def test_threads_obey_the_environment(monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    assert blocks.cores() == 1
+
+
+def pushing(horizon=8, contact=None, **values):
+    return compose(Pushing(horizon=horizon, **values), contact or Penalty(), SemiImplicitEuler())
+
+
+@pytest.mark.parametrize("name", ["jax", "torch", "numpy"])
+def test_padding_and_sharing_change_no_result(name):
+    problem = registry.make("backends", name).compile(pushing())
+    w = np.random.default_rng(0).standard_normal((8, 130))
+    theta = problem.program.theta0
+    whole, costs = problem.grad(theta, w), problem.value(theta, w)
+    np.testing.assert_allclose(problem.grad(theta, w[:, :57]), whole[:, :57], rtol=1e-12, atol=1e-12)
+    problem.block, problem.grain, problem.threads = 32, 16, 2
+    np.testing.assert_allclose(problem.grad(theta, w), whole, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(problem.value(theta, w), costs, rtol=1e-12)
+
+
+# -------------------------------------------------------------------------------------------------------------- rows
+
+
+def whole_and_by_rows(function, *arguments):
+    traced = jax.make_jaxpr(function)(*arguments)
+    found = rows.evaluate(traced.jaxpr, traced.consts, [rows.split(a) for a in arguments])
+    return jax.tree.leaves(function(*arguments)), [rows.join(part) for part in found]
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda q, v: jnp.stack([v[0] - 2.0, q[1] * q[0]]) / (1.0 + q**2),
+        lambda q, v: jnp.concatenate([q[1:2], v, jnp.ones((1, 5))])[::-1],
+        lambda q, v: jnp.where(q > 0, q, jnp.zeros_like(q)) + jnp.sum(v, axis=0, keepdims=True),
+        lambda q, v: q / jnp.sqrt(v[0:1] ** 2 + 1.0) + jnp.min(v, axis=0),
+        lambda q, v: jnp.logaddexp(q, 0.0) @ jnp.ones((5, 5)) + jax.nn.softplus(v),
+        lambda q, v: jnp.reshape(q, (-1,))[:5] + v[1] + jnp.broadcast_to(q[0], (5,)),
+        lambda q, v: jax.lax.fori_loop(0, 3, lambda i, x: 0.5 * x + v, q),
+        lambda q, v: jnp.zeros((0, 5)) * v[:0],
+    ],
+)
+def test_row_wise_evaluation_gives_the_same_numbers(function):
+    q, v = jnp.asarray(np.random.default_rng(0).standard_normal((2, 2, 5)))
+    for whole, split in zip(*whole_and_by_rows(function, q, v), strict=True):
+        assert whole.shape == split.shape
+        np.testing.assert_allclose(split, whole, rtol=1e-15)
+
+
+def test_row_wise_steps_hold_no_stack():
+    """The point of it: nothing in the step of a scene has to be put together again."""
+    problem = Jax().compile(pushing())
+    text = str(jax.make_jaxpr(problem._cost)(problem._parameters, jnp.zeros((8, 4)), jnp.zeros((8, 4))))
+    scan = text[text.index("scan[") :]
+    assert "stack" not in scan[: scan.index("length")]
+    assert "concatenate" not in scan[: scan.index("length")]
+
+
+# ------------------------------------------------------------------------------------------------------ compilations
+
+
+def test_a_sweep_compiles_each_shape_once():
+    compilations = Compilations()
+    for stiffness, sigma, beta in itertools.product((1e2, 1e3), (0.1, 0.3), (5.0, 20.0)):
+        problem = Jax().compile(pushing(9, Softplus(stiffness=stiffness, beta=beta), sigma=sigma))
+        problem.compilations = compilations
+        theta, w = problem.program.theta0, np.ones((9, 20))
+        problem.value(theta, w)
+        problem.grad(theta, w)
+        problem.grad(theta, w[:, :7])
+    assert compilations.made == len(compilations.shapes) == 2
+
+
+def test_what_libraries_compile_while_a_program_is_traced_is_no_program():
+    compilations = Compilations()
+    for stiffness in (1e2, 1e3):
+        problem = Implicit().compile(pushing(8, Complementarity(stiffness=stiffness, kappa=1e-6)))
+        problem.compilations = compilations
+        problem.grad(problem.program.theta0, np.ones((8, 20)))
+    assert compilations.made == len(compilations.shapes) == 1
+
+
+@pytest.mark.slow
+def test_mjx_compiles_once_along_stiffness():
+    pytest.importorskip("mujoco.mjx")
+    from bench.plugins.backends.mjx import Mjx
+
+    compilations = Compilations()
+    for stiffness in (1e2, 1e3):
+        problem = Mjx().compile(pushing(8, Penalty(stiffness=stiffness, damping=0.0)))
+        problem.compilations = compilations
+        problem.grad(problem.program.theta0, np.ones((8, 20)))
+    assert compilations.made == len(compilations.shapes) == 1
+
+
+@pytest.mark.slow
+def test_run_counts_compilations_and_keeps_compiled_programs(tmp_path):
+    words = [
+        "scenes=[pushing]", "contacts=[softplus]", "estimators=[fobg]", "sweep.stiffness=[100,1000]",
+        "sweep.sigma=[0.1,0.2]", "sweep.beta=[5,20]", "scene.pushing.horizon=7", "samples=8", "repeats=4",
+        "reference.samples=4096", "reference.tolerance=1", f"compile_cache={tmp_path}/kept",
+    ]  # fmt: skip
+    assert cli.main([*words, f"results_dir={tmp_path}"]) == 0
+    record = json.loads((tmp_path / "custom" / "run.json").read_text())
+    assert record["compilations"] == record["distinct_shapes"] > 0
+    assert record["machine"]["affinity"]
+    assert record["machine"]["threads"]["blocks"] >= 1
+    assert list((tmp_path / "kept").iterdir())
+
+
+def test_measured_compilation_is_not_taken_from_the_folder(tmp_path):
+    from bench.plugins.backends import compiling
+
+    theta, w = np.zeros(6), np.zeros((6, 3))
+    made = []
+    for measured in (False, False, True):
+        compiling._known.clear()
+        jax.clear_caches()
+        compilations = Compilations(tmp_path)
+        problem = Jax().compile(pushing(6))
+        problem.compilations = compilations
+        if measured:
+            problem.reset_usage()
+        problem.value(theta, w)
+        made.append(compilations.made)
+    assert made == [1, 0, 1]
+
+
+# ------------------------------------------------------------------------------------------------------------ timing
+
+
+def test_timing_repeats_fast_calls_and_keeps_the_results_asked_for():
+    called = []
+
+    def call(index):
+        called.append(index)
+        return np.array([index])
+
+    results, clock = timing.timed(call, 3, least_s=1.0, most=4)
+    assert [int(r[0]) for r in results] == [0, 1, 2]
+    assert len(called) == clock.calls == 1 + 3 * 4
+    assert called[:7] == [0, 0, 1, 2, 0, 1, 2]
+
+
+def test_slow_calls_are_made_once_each():
+
+    results, clock = timing.timed(lambda index: time.sleep(0.01) or np.zeros(1), 3, least_s=0.001)
+    assert (len(results), clock.calls) == (3, 4)
+    assert clock.median_s > 0.01
+
+
+def test_unsteady_times_are_marked():
+    from bench.report.views import unsteady
+
+    assert unsteady({"time_s": 1.0, "time_iqr_s": 0.21})
+    assert not unsteady({"time_s": 1.0, "time_iqr_s": 0.19})
+    assert not unsteady({"time_s": float("nan"), "time_iqr_s": float("nan")})
+
+
+# -------------------------------------------------------------------------------------------------------- bench_self
+
+
+def test_numpy_loop_and_native_kernel_give_the_gradient():
+    from speed import loop, native
+
+    problem = Jax().compile(pushing(40))
+    scene, w = problem.program.scene, np.random.default_rng(0).standard_normal((40, 64))
+    wanted = problem.grad(scene.theta0(), w)
+    np.testing.assert_allclose(loop.gradient(scene, 1e3, scene.theta0(), w), wanted, rtol=1e-9)
+    try:
+        kernel = native.gradient(scene, 1e3)
+    except native.Unavailable as error:
+        pytest.skip(str(error))
+    np.testing.assert_allclose(kernel(scene.theta0(), w), wanted, rtol=1e-9)
+
+
+def test_no_compiler_is_a_line_and_no_failure(monkeypatch):
+    from speed import native
+
+    monkeypatch.setattr("shutil.which", lambda name: None)
+    with pytest.raises(native.Unavailable, match="no C compiler"):
+        native.gradient(Pushing(), 1e3)
+
+
+def test_bench_self_refuses_what_it_does_not_know():
+    with pytest.raises(UserError, match="did you mean 'quick'"):
+        bench_self.main(["quik=true"])
+
+
+def test_bench_self_resumes_what_it_stored(tmp_path):
+    from speed import harness
+
+    words = [*harness.SMALL, "sweep.seed=[0,1,2]", "name=many", f"results_dir={tmp_path}"]
+    harness.store_all(config.load(words))
+    planned = plan(config.load(words), store_of(config.load(words)))
+    assert [item.stored for item in planned] == [True] * 3
+
+
+@pytest.mark.slow
+def test_bench_self_writes_its_table(tmp_path):
+    assert bench_self.main(["quick=true", f"results_dir={tmp_path}"]) == 0
+    lines = json.loads((tmp_path / "bench_self" / "bench_self.json").read_text())["lines"]
+    found = {line["what"]: line for line in lines}
+    counted = next(line for what, line in found.items() if what.startswith("compilations"))
+    assert counted["value"] == counted["target"]
+    assert any(what.startswith("native C kernel") for what in found)
+    assert found["fused over jax, pushing, 64 rollouts"]["value"] > 0
+    assert (tmp_path / "bench_self" / "bench_self.csv").exists()

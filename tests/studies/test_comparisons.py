@@ -1,0 +1,164 @@
+"""Comparisons of the main study: computed a second way from the committed tables, and on planted rows."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers import experiment, failed, row, table
+
+from bench.report.views import arrange
+from bench.studies.bias_variance.comparisons import (
+    FAILS,
+    NO_RESULT,
+    OPEN,
+    WORKS,
+    compare_errors,
+    leaders,
+    method_table,
+    most_often_first,
+    ratio,
+    verdict,
+    verdicts_by_estimator,
+)
+
+STANDARD = Path(__file__).resolve().parents[2] / "results" / "standard"
+
+
+def cell(error, low, high, **values):
+    """A row whose relative RMSE has exactly this interval, with bias 0."""
+    norm = 4.0
+    made = row(**values)
+    return made | {
+        "bias": 0.0, "bias_low": 0.0, "bias_high": 0.0, "rmse_rel": error, "rmse": norm * error, "variance": (norm * error) ** 2,
+        "variance_low": (norm * low) ** 2, "variance_high": (norm * high) ** 2,
+    }  # fmt: skip
+
+
+def made(*cells, **given):
+    """Methods and comparisons of cells along the stiffness."""
+    rows = table(list(cells))
+    found = arrange(
+        experiment(**({"sweep": {"stiffness": sorted(map(float, rows["stiffness"].unique()))}} | given)), rows
+    )
+    methods = method_table(found)
+    return methods, compare_errors(methods)
+
+
+# ------------------------------------------------------------------------------------ verdicts and comparisons
+
+
+@pytest.mark.parametrize(
+    ("status", "error", "low", "high", "expected"),
+    [
+        ("ok", 0.5, 0.4, 0.6, WORKS), ("ok", 1.3, 0.65, 2.4, OPEN), ("ok", 0.71, 0.42, 4.0, OPEN), ("ok", 2.0, 1.5, 3.0, FAILS),
+        ("ok", math.nan, math.nan, math.nan, OPEN), ("ok", 0.5, math.nan, math.nan, OPEN), ("ok", 2.0, 1.5, math.inf, FAILS),
+        ("ok", 0.5, 0.1, math.inf, OPEN), ("nonfinite", math.nan, math.nan, math.nan, NO_RESULT),
+    ],
+)  # fmt: skip
+def test_a_verdict_needs_the_whole_interval(status, error, low, high, expected):
+    assert verdict(status, error, low, high) == expected
+
+
+def test_the_interval_of_a_factor_covers():
+    """Two errors with lognormal noise: the interval of their ratio contains the truth in at least 95% of draws."""
+    generator = np.random.default_rng(0)
+    widths, hits = (0.2, 0.05), 0
+    for _ in range(2000):
+        a, b = (m * math.exp(w * z) for m, w, z in zip((1.0, 3.0), widths, generator.standard_normal(2), strict=True))
+        ends = [(v, v * math.exp(-1.96 * w), v * math.exp(1.96 * w)) for v, w in zip((a, b), widths, strict=True)]
+        _, low, high = ratio(*ends)
+        hits += low <= 3.0 <= high
+    assert 0.94 <= hits / 2000 <= 0.96
+
+
+def test_methods_are_tied_unless_the_interval_of_their_factor_is_above_1():
+    _, compared = made(
+        *(cell(e, 0.9 * e, 1.1 * e, stiffness=k, estimator=n) for k in (1e2, 1e4)
+          for n, e in (("fobg", 0.10), ("reinforce", 0.105), ("finite_difference", 0.4)))
+    )  # fmt: skip
+    assert list(compared["first"]) == ["fobg", "fobg"]
+    assert list(compared["tied"]) == [("reinforce",)] * 2
+    assert (compared["factor_low"] < 1).all()
+
+
+def test_a_missing_interval_cannot_be_first_and_an_unresolved_reference_is_open():
+    methods, compared = made(
+        *(cell(0.05, math.nan, math.nan, stiffness=k, estimator="fobg") for k in (1e2, 1e4)),
+        *(cell(0.3, 0.2, 0.4, stiffness=k, estimator="reinforce") for k in (1e2, 1e4)),
+    )
+    assert set(methods.loc[methods["estimator"] == "fobg", "verdict"]) == {OPEN}
+    assert list(compared["first"]) == ["reinforce", "reinforce"]
+    assert most_often_first(methods, compared) == "reinforce"
+
+
+def test_nan_errors_are_never_a_pass():
+    """An unresolved reference leaves no error: nothing may be said to be better than zero."""
+    methods, compared = made(
+        *(row(stiffness=k) | {"rmse_rel": math.nan, "reference_norm": 0.0} for k in (1e2, 1e4)),
+    )
+    assert set(methods["verdict"]) == {OPEN}
+    assert (compared["first"] == "").all()
+
+
+def test_a_failed_cell_fails_its_estimator_and_a_refused_one_does_not():
+    methods, _ = made(
+        *(cell(0.1, 0.09, 0.11, stiffness=k) for k in (1e2, 1e4)),
+        cell(0.3, 0.2, 0.4, stiffness=1e2, estimator="reinforce"),
+        failed("nonfinite", "1 of 32 estimates are not finite", stiffness=1e4, estimator="reinforce"),
+        failed("unsupported", "it cannot", stiffness=1e2, estimator="finite_difference"),
+    )
+    counts = verdicts_by_estimator(methods)
+    assert counts.loc["reinforce", NO_RESULT] == 1
+    assert counts.loc["fobg", WORKS] == 2
+    assert "finite_difference" not in counts.index
+
+
+def by_samples(estimator, rollouts, gradients=0.0, scale=1.0):
+    """Cells whose error is ``scale`` over the root of N, with some rollouts and gradients per sample."""
+    return [
+        cell(
+            e := scale / math.sqrt(n), 0.99 * e, 1.01 * e, estimator=estimator, samples=n, rollouts=rollouts * n + 0.01,
+            gradients=gradients * n,
+        )
+        for n in (64, 128)
+    ]  # fmt: skip
+
+
+def test_costs_of_several_rollouts_per_sample_are_compared_at_equal_rollouts():
+    """At equal samples `b` has 1 / 1.2 of the error of `a`, at equal rollouts 1.18 times."""
+    cells = [*by_samples("a", 1), *by_samples("b", 2, scale=1 / 1.2)]
+    _, compared = made(*cells, sweep={"samples": [64, 128]})
+    assert compared[["axis", "at", "basis", "first", "second"]].values.tolist() == [
+        ["rollouts", 128.0, "relative RMSE at equal rollouts", "a", "b"]
+    ]
+    assert compared["factor"].iloc[0] == pytest.approx(math.sqrt(2) / 1.2)
+
+
+def test_gradients_are_compared_at_equal_samples():
+    cells = [*by_samples("a", 0, 1), *by_samples("b", 2, scale=3.0)]
+    _, compared = made(*cells, sweep={"samples": [64, 128]})
+    assert set(compared["basis"]) == {"relative RMSE at equal samples"}
+
+
+def test_costs_of_one_rollout_per_sample_are_compared_at_each_number_of_samples():
+    _, compared = made(*by_samples("a", 1), *by_samples("b", 1, scale=3.0), sweep={"samples": [64, 128]})
+    assert compared["at"].tolist() == [64, 128]
+
+
+# ------------------------------------------------------------------------- a second way, from the committed rows
+
+
+def test_a_far_larger_error_does_not_share_the_first_place_of_an_error_that_is_not_sure():
+    """fobg 0.90 [0.87, 0.92] is tied with smoothing 0.17 [0.10, 1.7], whose interval is wide: fobg is no leader there."""
+    exact = {"reference_norm": 1.0, "variance_low": 0.0, "variance_high": 0.0}
+    biased = exact | {"rmse_rel": 0.9, "bias": 0.9, "bias_low": 0.87, "bias_high": 0.92}
+    wide = exact | {"rmse_rel": 0.17, "bias": 0.17, "bias_low": 0.1, "bias_high": 1.7}
+    good = exact | {"rmse_rel": 0.14, "bias": 0.14, "bias_low": 0.13, "bias_high": 0.15}
+    methods, compared = made(
+        row(stiffness=1.0, estimator="fobg", **good), row(stiffness=1.0, estimator="smooth", **wide),
+        row(stiffness=2.0, estimator="fobg", **biased), row(stiffness=2.0, estimator="smooth", **wide),
+    )  # fmt: skip
+    assert list(leaders(compared, methods).values()) == [["fobg", "smooth"], ["smooth"]]

@@ -1,0 +1,54 @@
+"""Measures the speed of the harness, compared with a NumPy loop and native code.
+
+``python validation/bench_self.py [quick=true] [results_dir=DIR]`` writes ``results_dir/bench_self/``; quick=true runs small
+sizes.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from speed import compilations, harness, rollouts, speed_rows
+
+from bench.errors import UserError
+from bench.experiment.config import config_dir
+from bench.experiment.words import parse_flag, parse_words
+
+
+def main(words: Sequence[str]) -> int:
+    """Measure speeds, write files and print the table. Returns 0. ``quick=true`` runs small sizes."""
+    names, settings, _ = parse_words(words, "bench_self", {"quick": "false", "results_dir": "results"})
+    if names:
+        raise UserError(f"bench_self takes quick=true|false and results_dir=FOLDER, not '{names[0]}'")
+    load_before = list(os.getloadavg()) if hasattr(os, "getloadavg") else None
+    rows = []
+    for row in measure(parse_flag(settings, "quick")):
+        print(f"{row.what}: {row.value:.3g} {row.unit}", file=sys.stderr, flush=True)
+        rows.append(row)
+    paths = speed_rows.write(rows, Path(settings["results_dir"]).expanduser() / "bench_self", load_before)
+    speed_rows.show(rows)
+    for path in paths:
+        print(f"  {path}")
+    return 0
+
+
+def measure(quick: bool) -> Iterator[speed_rows.SpeedRow]:
+    """Measure and yield every row of the table."""
+    import yaml
+
+    settings = yaml.safe_load((config_dir() / "bench_self.yaml").read_text())
+    yield from rollouts.measure_backends(settings, quick)
+    yield from rollouts.measure_baselines(settings, quick)
+    yield from rollouts.compare_backends(settings, quick)
+    yield from compilations.count_compilations(settings)
+    yield from harness.measure_commands(quick)
+
+
+if __name__ == "__main__":
+    try:
+        sys.exit(main(sys.argv[1:]))
+    except UserError as error:
+        sys.exit(f"bench_self: {error}")
