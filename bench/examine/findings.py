@@ -827,7 +827,7 @@ class Findings:
         located = [part for part in check.parts if part.name in self.located]
         inside = [part for part in check.worst_parts if part.component is not None]
         exact = [part for part in inside if self.label(part) in self.located.values()]
-        return exact or located or inside or list(check.worst_parts)
+        return exact or [*located, *inside] or list(check.worst_parts)
 
     def _worst_size(self, check: Check) -> str:
         parts = self._named_parts(check)

@@ -39,12 +39,13 @@ CASES = [
     ("c13_second_step_nan:cost grad=grad horizons=1,2,3", WRONG, "nan_gradient", "from step 2 on"),
     ("c14_five_percent:cost grad=adjoint", WRONG, "", "32%"),
     ("c15_buffer:cost grad=grad", RIGHT, "", ""),
-    ("c15_buffer:double grad=grad", WRONG, "wrong_factor", ""),
+    ("c15_buffer:cost grad=double", WRONG, "wrong_factor", ""),
     ("c15_buffer:work grad=work_grad", RIGHT, "", ""),
     ("c16_exploding:cost grad=jax sigma=0.003", 3, "spread", ""),
     ("c21_argmax:cost grad=last sigma=0.1", WRONG, "", ""),
-    ("c22_own_noise_jump:cost grad=pathwise noise=1", WRONG, "biased", ""),
-    ("c22_own_noise_jump:many grad=pathwise noise=20", WRONG, "biased", ""),
+    # 4,096 pairs do not resolve grad J here: not shown, though it is biased
+    ("c22_own_noise_jump:cost grad=pathwise noise=1", 3, "spread", ""),
+    ("c22_own_noise_jump:many grad=pathwise noise=20 calls=40000", WRONG, "biased", ""),
     ("c23_batch_mixing:cost grad=grad sigma=0.01", RIGHT, "smooth", ""),
     ("c24_guarded_acos:cost grad=torch sigma=0.001", RIGHT, "", "warning"),
     ("m1_atol:cost grad=grad atol=1e-2", RIGHT, "", "small error, within the tolerance"),
@@ -67,7 +68,7 @@ def test_a_public_case_gets_its_verdict(words, status, cause, said):
     place, *settings = words.split()
     file, _, name = place.partition(":")
     calls = 12_000 if "sigma" in words or "noise" in words else 2_000
-    report = run([f"{HERE / file}.py:{name}", *settings, f"calls={calls}", "--quiet"])
+    report = run([f"{HERE / file}.py:{name}", f"calls={calls}", *settings, "--quiet"])
     assert report.status == status, str(report)
     assert cause in ("", report.cause), str(report)
     assert said in str(report)
