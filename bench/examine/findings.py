@@ -374,7 +374,7 @@ class Findings:
         assert self.check is not None
         wrong = [part for part in self.check.parts if part.verdict in SUSPICIOUS]
         height = max((jump.size for line in self.lines for jump in line.jumps), default=0.0)
-        return all(
+        return bool(wrong) and all(
             not part.sample.differences.any() and abs(part.program) * part.sample.scale <= RESIDUE * height
             for part in wrong
         )
