@@ -171,6 +171,7 @@ def planned(words):
     return ["list", *rest] if verb in ("list", "check") else [verb, "--help"]
 
 
+@pytest.mark.slow
 def test_commands_can_be_planned(folder, monkeypatch):
     """A cell of several commands is tried once."""
     reasons = {}
