@@ -21,6 +21,8 @@ from bench.run.execute import Finished, store_of
 from bench.run.plan import requested_rows
 from bench.run.record import record
 
+RESULTS = ("ok", "diverged", "nonfinite")
+"""Statuses of cells that ran: where a method fails is a result too."""
 NO_RESULT = "No cell gave a result: the table has the reason of each."
 
 
@@ -68,7 +70,7 @@ def views_of(experiment: Experiment, rows: pd.DataFrame) -> Views:
     views = study_of(experiment).views(experiment, rows) or generic.views(experiment, rows)
     if experiment.execution.ladder:
         views = replace(views, tables=[ladder.table(experiment, rows), *views.tables])
-    if not (rows["status"] == "ok").any() and not any(len(chart.frame) for chart in views.charts):
+    if not rows["status"].isin(RESULTS).any():
         return replace(views, headline=NO_RESULT)
     try:
         return replace(views, headline=answer.fill(experiment.answer, partial(_table, views)))

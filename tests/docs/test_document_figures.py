@@ -22,7 +22,8 @@ def sections(text):
 
 def test_every_figure_is_used():
     used = {match[1] for text in PAGES.values() for match in figures.MARK.finditer(text)}
-    assert used == set(figures.FIGURES)
+    references = {name for name in used if "|" in name}
+    assert used - references == set(figures.FIGURES)
 
 
 def test_a_wrong_figure_is_written_again():
