@@ -53,7 +53,11 @@ UNCOMPARED = frozenset(
 @cache
 def experiment_of(line: str) -> tuple[Experiment, dict[str, Cell]]:
     """Return the experiment of a line of the table, and its cells by line and identity strings."""
-    experiment = config.load([*TABLE["common"].split(), *LINES[line].split()])
+    words = LINES[line].split()
+    study = next((word.partition("=")[2] for word in words if word.startswith("study=")), "bias_variance")
+    axes = registry.usable("studies", parse_identity(study)[0]).axes  # type: ignore[attr-defined]
+    common = [word for word in TABLE["common"].split() if "estimator" in axes or not word.startswith("estimators=")]
+    experiment = config.load([*common, *words])
     return experiment, {f"{line}: {name_of(cell)}": cell for cell in grid.cells(experiment)}
 
 

@@ -21,13 +21,6 @@ from bench.engines.backend import EngineBackend
 from bench.model import registry
 
 STORED = json.loads(NUMBERS.read_text())
-LEAVING = {
-    "homotopy",
-    "ilqr",
-    "logistic_map",
-    "gusty_cart",
-    "nimble",
-}  # MERGER: delete, these plugins are being removed
 TOGETHER = {"scenes callable", "backends callable"}
 """Plugins that only run with each other, so that no cell tells them apart."""
 
@@ -63,7 +56,7 @@ def test_every_built_in_plugin_is_in_a_golden_cell_and_named_when_its_numbers_mo
     for kind, entries in registry.entries().items():
         for name, entry in entries.items():
             plugin = entry.plugin
-            if name in LEAVING or not plugin.__module__.startswith("bench.") or issubclass(plugin, EngineBackend):
+            if not plugin.__module__.startswith("bench.") or issubclass(plugin, EngineBackend):
                 continue
             moved = {cell for cell, classes in plugins.items() if plugin in classes}
             assert moved, f"add a line for {name} of {kind} to tests/golden/cells.yaml and write its numbers"

@@ -21,7 +21,7 @@ QUICK_S = 1.0
 MOST = 6
 """Most rows of an experiment."""
 AXES = ("scene", "contact", "integrator", "backend", "estimator", "optimizer", "trainer")
-FAST = {"quick", "windows", "stiffness_sweep", "engines"}
+FAST = {"quick", "windows", "stiffness_sweep"}
 STORED = sorted(path.parent.name for path in ROOT.glob("results/standard/*/rows.parquet"))
 CASES = [pytest.param(name, False, id=name, marks=[pytest.mark.slow] * (name not in FAST)) for name in STORED]
 CASES += [pytest.param("engines", True, id="engines-mjx", marks=pytest.mark.slow)]  # which compiles for a minute
