@@ -22,6 +22,7 @@ lint: $(VENV)/.installed
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/python validation/size.py
 
 # The generated parts of the documents: answers, columns and marked figures.
 docs: $(VENV)/.installed

@@ -55,6 +55,18 @@ def pytest_collection():
         gc.freeze()
 
 
+DRAWN = {"test_charts_are_drawn_and_a_filter_takes_points_away", "test_hostile_names_are_shown_as_they_are_and_do_nothing"}
+"""Tests in Chromium that belong to the fast set; the others, which take a third of its time, are slow."""
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items):
+    """Mark the tests that draw pages in Chromium as slow, except those of :data:`DRAWN`."""
+    for item in items:
+        if "browser" in getattr(item, "fixturenames", ()) and item.originalname not in DRAWN:
+            item.add_marker(pytest.mark.slow)
+
+
 LONG = {"fused"}
 """Backends that take seconds to compile any program."""
 BACKENDS = [pytest.param(name, marks=[pytest.mark.slow] * (name in LONG)) for name in registry.entries()["backends"]]

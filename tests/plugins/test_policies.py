@@ -137,7 +137,7 @@ class Final(CartpoleSwing):
         return 3.0 * q[0] ** 2 + v[1] ** 2
 
 
-@pytest.mark.parametrize("where", ["action", "parameter"])
+@pytest.mark.parametrize("where", ["action", pytest.param("parameter", marks=pytest.mark.slow)])
 def test_backends_agree_on_a_gradient_with_a_terminal_cost(where):
     scene = Final(policy="mlp[hidden=4]", horizon=12, noise=where)
     exact = compile_problem(scene, None, "semi_implicit_euler", "jax")

@@ -72,7 +72,7 @@ def rows(folder, names, workers):
 
 
 @pytest.mark.filterwarnings("ignore:The given NumPy array is not writable")
-@pytest.mark.parametrize("workers", [0, 1])
+@pytest.mark.parametrize("workers", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_writing_in_place_changes_no_other_cell(tmp_path, workers):
     plain, _ = rows(tmp_path / "plain", [], workers)
     (tmp_path / "hostile" / "mine").mkdir(parents=True)
