@@ -55,7 +55,10 @@ def pytest_collection():
         gc.freeze()
 
 
-DRAWN = {"test_charts_are_drawn_and_a_filter_takes_points_away", "test_hostile_names_are_shown_as_they_are_and_do_nothing"}
+DRAWN = {
+    "test_charts_are_drawn_and_a_filter_takes_points_away",
+    "test_hostile_names_are_shown_as_they_are_and_do_nothing",
+}
 """Tests in Chromium that belong to the fast set; the others, which take a third of its time, are slow."""
 
 

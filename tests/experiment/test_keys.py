@@ -69,7 +69,8 @@ MOVED = {
 def forget() -> None:
     """Forget the hashes that keys are computed from."""
     keys.code_of.cache_clear()
-    for cache in (keys._fingerprints, cell_module._rest, cell_module._program_keys, cell_module._reference_keys):
+    own = (cell_module._ranked, cell_module._rest, cell_module._program_keys, cell_module._reference_keys)
+    for cache in (keys._fingerprints, *own):
         cache.clear()
 
 

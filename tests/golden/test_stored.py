@@ -56,7 +56,7 @@ def sampled(rows: pd.DataFrame) -> pd.DataFrame:
     axes = [axis for axis in AXES if axis in rows]
     is_engine = rows.backend.map(
         lambda name: issubclass(registry.find("backends", name.partition("[")[0]).plugin, EngineBackend)
-    )
+    ).astype(bool)
     quick = rows[(rows.wall_s < QUICK_S) & ~is_engine].groupby(axes).head(1)
     engines = rows[is_engine].sort_values("wall_s").groupby("backend").head(1)
     return pd.concat([quick.iloc[:: max(1, -(-len(quick) // MOST))], engines])

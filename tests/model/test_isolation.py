@@ -127,7 +127,8 @@ def test_a_change_of_any_kind_reaches_no_other_cell_of_a_worker(tmp_path, backen
         (tmp_path / name).mkdir()
     clean = rows_of_run(tmp_path / "clean", backend, [], 1)
     rows = rows_of_run(tmp_path / "dirty", backend, kinds, 1)
-    check_rows(rows, kinds, clean)
+    # a worker that has run code from outside runs nothing else, so a setting of a library that is not in use may go unnamed
+    check_rows(rows, [kind for kind in kinds if kind != "x64" or backend == "jax"], clean)
     assert rows["dtype"].eq("float32").sum() == (backend == "jax")
 
 
