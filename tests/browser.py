@@ -86,6 +86,8 @@ def chromium() -> Iterator[Page]:
         flags = ["--disable-dev-shm-usage", "--disable-gpu", "--disable-component-update"]
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=flags)
         try:
-            yield Page(browser.new_context(offline=True).new_page())
+            context = browser.new_context(offline=True)
+            context.set_default_timeout(300_000)  # [ms]; a loaded machine is no fault of a page
+            yield Page(context.new_page())
         finally:
             browser.close()
