@@ -297,7 +297,8 @@ class State:
 
     def _add_new(self) -> None:
         """Add the settings and names of libraries and modules that are not recorded yet."""
-        if self._double_precision and reduced_precision():
+        is_new = not any(item.library == "jax" for item in self._settings)  # an import after a change may not undo it unnamed
+        if self._double_precision and is_new and reduced_precision():
             _jax().config.update("jax_enable_x64", True)
         for item in SETTINGS:
             if item not in self._settings and (not item.library or _is_imported(sys.modules.get(item.library))):

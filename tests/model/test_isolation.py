@@ -153,6 +153,7 @@ import jax
 assert jax.config.jax_enable_x64
 assert state.changes() == [], state.changes()
 jax.config.update("jax_enable_x64", False)
+import scipy.stats  # an import after the change may not undo it unnamed
 assert state.changes() == ["JAX's configuration (jax_enable_x64)"]
 state.restore()
 assert jax.config.jax_enable_x64
