@@ -287,12 +287,6 @@ def block(lines: list[str]) -> str:
     return "\n" + "\n".join(lines) + "\n"
 
 
-def diverged(experiment: str) -> str:
-    """Return how many of an experiment's searches diverged."""
-    rows = rows_of(experiment)
-    return f"{(rows['status'] == 'diverged').sum()} of {count(len(rows))}"
-
-
 def fits(column: str, integrator: str, methods: tuple[int, ...], scene: str = "mass_spring_damper") -> np.ndarray:
     """Return a number of each case of ``identify`` for methods of shooting: 0 single, 1 multiple, 2 windows."""
     rows = rows_of("identify")
@@ -774,22 +768,11 @@ FIGURES: dict[str, Callable[[], str]] = {
     "quadruped-engines": engines_agree,
     "quadruped-order": quadruped_order,
     "push-still": lambda: share_touched("apart, noise 0.02", "fobg, adam", "fobg, lbfgs"),
-    "push-still-cost": lambda: push_costs("apart, noise 0.02", "fobg, adam", "fobg, lbfgs", digits=5),
-    "push-still-smoothed": lambda: share_touched(
-        "apart, noise 0.02", "randomized_smoothing, adam", "randomized_smoothing, lbfgs"
-    ),
     "push-noisy": lambda: share_touched("apart, noise 0.2", "fobg, adam", "randomized_smoothing, adam"),
-    "push-line": lambda: share_touched("apart, noise 0.2", "fobg, lbfgs"),
-    "push-line-smoothed": lambda: share_touched("apart, noise 0.2", "randomized_smoothing, lbfgs"),
     "push-search": lambda: share_touched("apart, noise 0.02", "cma_es", "cem"),
     "push-near": lambda: share_touched("in contact, noise 0.02", "fobg, adam", "fobg, lbfgs", pushed=True),
-    "push-near-lbfgs": lambda: push_costs("in contact, noise 0.02", "fobg, lbfgs"),
-    "push-near-cem": lambda: push_costs("in contact, noise 0.02", "cem"),
-    "push-near-cma": lambda: push_costs("in contact, noise 0.02", "cma_es"),
     "push-table": push_table,
-    "push-on-start": lambda: span(rows_of("push_on")["start_cost"], digits=3),
     "push-on-lbfgs": lambda: span(select(rows_of("push_on"), optimizer="lbfgs")["final_cost"], digits=3),
-    "push-on-adam": lambda: span(select(rows_of("push_on"), optimizer="adam[rate=0.03]")["final_cost"], digits=3),
     "push-on-cem": lambda: push_costs("apart, noise 0.02", "cem"),
     "dose-answer": lambda: answer_of("dose_response"),
     "dose-pairs": dose_pairs,
@@ -869,14 +852,11 @@ FIGURES: dict[str, Callable[[], str]] = {
     "backward-memory-finding": backward_memory_finding,
     "measure-samples": lambda: count(estimators("measure_valued", column="best").sum()),
     "window-bias": lambda: number(short_windows()["bias_rel"].min()),
-    "window-hopper": lambda: number(windows("steps=100", "hopper")["bias_rel"].max()),
     "window-learned": lambda: f"{(windows('learned')['bias_low'] == 0).sum()} of {len(windows('learned'))}",
-    "window-exact": lambda: span(windows("exact", "lqr")["bias_rel"]),
     "window-lqr": window_lqr,
     "learning-rates": learning_rates_table,
     "rate-effect": lambda: span((rates := learning_rates())["score"] - rates["median_score"]),
     "rate-methods": lambda: number(float(np.ptp(learning_rates()["score"]))),
-    "rate-diverged": lambda: diverged("learning_rates"),
     "train-answer": lambda: answer_of("train"),
     "train-range": lambda: trained_in_range(-560.0, -480.0),
     "train-table": trained_table,
