@@ -234,18 +234,6 @@ def backward_memory_of(row: pd.Series) -> str:
     return f"< {number(row['memory_mb_high'])}" if row["is_small"] else with_ends(row, "memory_mb")
 
 
-def backward_memory_finding() -> str:
-    """Return what two levels of checkpoints save on the first scene."""
-    lines = backward_memory().drop_duplicates(["problem", "method"]).set_index(["problem", "method"])
-    scene = lines.index[0][0]
-    plain, two = (lines.loc[(scene, name)] for name in ("checkpointed[keep=everything]", "checkpointed"))
-    return (
-        f"At T = {count(two['horizon'])}, two levels of checkpoints take {backward_memory_of(two)} MiB and "
-        f"{number(two['gradient_s'])} s for 256 gradients of `{scene}`, where plain reverse mode takes "
-        f"{backward_memory_of(plain)} MiB and {number(plain['gradient_s'])} s."
-    )
-
-
 def windows(params: str, scene: str = "") -> pd.DataFrame:
     """Return the supported rows of ``windows`` whose windows are shorter than the horizon, with some terminal value."""
     rows = rows_of("windows")
@@ -847,7 +835,6 @@ FIGURES: dict[str, Callable[[], str]] = {
     "equal-rollouts": equal_rollouts_table,
     "equal-rollouts-reference": equal_rollouts_reference,
     "backward-memory": backward_memory_table,
-    "backward-memory-finding": backward_memory_finding,
     "measure-samples": lambda: count(estimators("measure_valued", column="best").sum()),
     "window-bias": lambda: number(short_windows()["bias_rel"].min()),
     "window-learned": lambda: f"{(windows('learned')['bias_low'] == 0).sum()} of {len(windows('learned'))}",
