@@ -160,15 +160,6 @@ class Truth:
         return cls(mean, Sampling.without_direction(error, mean.size))
 
     @classmethod
-    def from_covariance(cls, mean: np.ndarray, covariance: np.ndarray, degrees: float = math.inf) -> Truth:
-        """Return a truth from a mean ``(d,)`` and the covariance ``(d, d)`` of that mean, not of one sample."""
-        mean, covariance = np.asarray(mean, dtype=np.float64), np.asarray(covariance, dtype=np.float64)
-        if covariance.shape != (mean.size, mean.size):
-            raise ValueError(f"the covariance of a mean {mean.shape} is {(mean.size,) * 2}; given {covariance.shape}")
-        values, vectors = np.linalg.eigh(covariance)
-        return cls(mean, Sampling((vectors * np.sqrt(np.maximum(values, 0.0))).T, degrees))
-
-    @classmethod
     def from_batches(cls, batches: np.ndarray, unseen: float = 0.0) -> Truth:
         """Return a truth from K > 1 independent means ``(K, d)`` of equally large batches, whose spread is its error.
 
