@@ -326,6 +326,23 @@ def test_heavy_tails_are_remarked_on_and_ordinary_ones_are_not() -> None:
     assert "along the bias" in summarise(along + np.array([0.0, 0.0, 50.0]), truth, 1).note
 
 
+@pytest.mark.parametrize(("share", "least", "most"), [(0.5, 0.5, 0.9), (0.3, 0.0, 0.0)])
+def test_terms_of_two_values_at_equal_distances_are_a_remark(share: float, least: float, most: float) -> None:
+    """The variance p (1 - p) is largest at p = 1/2, so that it hardly depends on the number of each value there."""
+    rng, missed, remarks = np.random.default_rng(3), [], 0
+    for _ in range(200):
+        terms = (rng.random((16, 16, 1)) < share) - 0.5
+        sums = terms.sum(axis=1), (terms**2).sum(axis=(1, 2))
+        summary = summarise(terms.mean(axis=1), Truth.exact(np.ones(1)), 16, sums)
+        low, high = summary.variance_per_sample_low, summary.variance_per_sample_high
+        if "equally far" in summary.note:
+            remarks += 1
+        else:
+            missed.append(not low <= share * (1.0 - share) <= high)
+    assert least <= remarks / 200 <= most
+    assert np.mean(missed) < 0.1
+
+
 def test_one_repeat_that_differs_bounds_no_variance() -> None:
     estimates = np.zeros((64, 2))
     estimates[5] = 3.0
