@@ -38,6 +38,7 @@ def fatal(folder, names, patience=60.0):
     return trial.find_fatal_modules([f"{package}.{name}" for name in names], {package: folder}, patience)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("error")
 def test_listed_with_what_happened_and_the_others_are_listed_too(folder):
     for name, (text, _) in FATAL.items():
@@ -114,6 +115,7 @@ class Loud(Fobg):
 '''
 
 
+@pytest.mark.slow
 def test_what_plugins_print_reaches_no_terminal_raw(tmp_path):
     (tmp_path / "loud.py").write_text(LOUD)
     place = f"plugins={tmp_path}"
