@@ -198,6 +198,7 @@ def test_derivatives_of_the_likelihood_agree_with_differences():
             np.testing.assert_allclose(slope, differences, rtol=1e-4, atol=1e-4 * abs(value) / x.size)
 
 
+@pytest.mark.slow
 def test_left_out_problems_prefer_the_form_that_made_them():
     data = simulated(3, problems=8)
     only_random = data.errors[:, 1] == 0
@@ -272,6 +273,7 @@ def run(tmp_path_factory):
     return bench.run(words)
 
 
+@pytest.mark.slow
 def test_every_cell_of_a_run_has_a_row_with_the_hash_of_the_hypotheses(run):
     assert set(run["status"]) == {"ok"}
     assert set(run["hypotheses"]) == {hypotheses_hash()}

@@ -143,6 +143,7 @@ def test_single_shooting_is_lost_beyond_its_basin_and_windows_are_not():
             assert (abs(found - 4.0) < 1e-3) == (converges or shooting == "windows"), (off, shooting)
 
 
+@pytest.mark.slow
 def test_a_row_in_all_ways():
     row = measure(
         cell_of("scenes=[mass_spring_damper[horizon=80]]", "integrators=[rk4]", "repeats=12"),
@@ -344,12 +345,14 @@ def own_record(tmp_path, name):
     return measure(cell, experiment.study)
 
 
+@pytest.mark.slow
 def test_a_record_with_another_drag_is_not_explained(tmp_path):
     row = own_record(tmp_path, "0.004 v|v|")
     assert row["explained"] == 0.0
     assert "in v|v|" in row["contradictions"]
 
 
+@pytest.mark.slow
 def test_a_record_of_the_model_is_explained(tmp_path):
     row = own_record(tmp_path, "right")
     assert row["explained"] == 1.0
@@ -414,12 +417,15 @@ NOISES = {
 }
 
 
-@pytest.mark.parametrize("name", NOISES)
+@pytest.mark.parametrize(
+    "name", ["laplace", *(pytest.param(n, marks=pytest.mark.slow) for n in NOISES if n != "laplace")]
+)
 def test_right_models_are_explained_whatever_the_noise_looks_like(name):
     # 5% by design for normal noise; the tails of 150 numbers are known roughly only
     assert judged(NOISES[name])[0] >= 0.8
 
 
+@pytest.mark.slow
 def test_noise_of_another_size_is_noticed_on_both_sides_and_only_if_one_is_stated():
     for factor in (0.5, 1.5):
         other = lambda rng, size, factor=factor: factor * rng.standard_normal(size)  # noqa: E731
@@ -443,6 +449,7 @@ def test_printed_intervals_follow_a_test_of_correlation(rho, least):
     assert (kinds.count("correlated") <= 12) if rho == 0.0 else set(kinds) == {"correlated"}
 
 
+@pytest.mark.slow
 def test_a_missing_term_of_the_stated_reach_is_noticed_at_the_stated_power():
     from bench.measure import adequacy
 
