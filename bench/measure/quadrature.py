@@ -88,7 +88,8 @@ def integrate(problem: Problem, theta: np.ndarray, points: int, columns: int) ->
     centre = problem.value(theta, np.zeros((width, 1)))[0]
 
     def cost(nodes: np.ndarray) -> np.ndarray:
-        return in_columns(lambda w: problem.value(theta, w), nodes, columns)
+        values: np.ndarray = in_columns(lambda w: problem.value(theta, w), nodes, columns)
+        return values
 
     def excess(nodes: np.ndarray) -> np.ndarray:
         return cost(nodes) - centre
