@@ -88,11 +88,11 @@ def integrate(problem: Problem, theta: np.ndarray, points: int, columns: int) ->
     centre = problem.value(theta, np.zeros((width, 1)))[0]
 
     def cost(nodes: np.ndarray) -> np.ndarray:
-        values: np.ndarray = in_columns(lambda w: problem.value(theta, w), nodes, columns)
-        return values
+        return in_columns(lambda w: problem.value(theta, w), nodes, columns)
 
     def excess(nodes: np.ndarray) -> np.ndarray:
-        return cost(nodes) - centre
+        difference: np.ndarray = cost(nodes) - centre
+        return difference
 
     low, high, beyond, note = _limits(excess, width)
     beyond /= problem.sigma
