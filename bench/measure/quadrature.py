@@ -91,7 +91,8 @@ def integrate(problem: Problem, theta: np.ndarray, points: int, columns: int) ->
         return in_columns(lambda w: problem.value(theta, w), nodes, columns)
 
     def excess(nodes: np.ndarray) -> np.ndarray:
-        return cost(nodes) - centre
+        difference: np.ndarray = cost(nodes) - centre
+        return difference
 
     low, high, beyond, note = _limits(excess, width)
     beyond /= problem.sigma
