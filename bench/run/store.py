@@ -166,21 +166,22 @@ class Store:
         except OSError as error:
             raise StorageError(f"'{self._pending}' cannot be read: {error.strerror}") from None
         files = {}
-        for path in [self._table, *(self._pending / name for name in names)]:
+        # the table last: rows that are merged meanwhile are in it
+        for path in [*(self._pending / name for name in names), self._table]:
             with suppress(FileNotFoundError, NotADirectoryError):
                 if not path.is_fifo():  # which would be waited for
                     files[path] = _file_id(path)
         return files
 
     def _read_all(self) -> tuple[pd.DataFrame, dict[Path, FileId]]:
-        """Return all rows and the files that contain them; reads again if another run merges files meanwhile."""
+        """Return all rows and the files that contain them; reads again if another run merges files meanwhile.
+
+        A merge replaces the table before it deletes a small file, so files that can be read after they were listed are all rows.
+        """
         for _ in _attempts():
             files = self._list_files()
-            try:
+            with suppress(FileNotFoundError):
                 frames = self._read(files)
-            except FileNotFoundError:
-                continue
-            if files.items() <= self._list_files().items():  # no file was removed or replaced meanwhile
                 self._files_read = dict(files)
                 return self._merge(frames), files
         raise StorageError(f"'{self.directory}' changes faster than it can be read: too many runs write to it")

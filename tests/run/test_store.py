@@ -286,6 +286,23 @@ def test_a_merge_waits_for_that_of_another_run(tmp_path, monkeypatch):
     assert [path.name for path in tmp_path.iterdir()] == ["rows.parquet"]
 
 
+def test_rows_that_are_merged_while_files_are_listed_are_read(tmp_path, monkeypatch):
+    """There is no table yet when it is searched for, and the small file is gone right after."""
+    store, real = Store(tmp_path, COLUMNS), store_module._file_id
+    store.append(row(1))
+    overtake = once(Store(tmp_path, COLUMNS).compact)
+
+    def file_id(path):
+        try:
+            return real(path)
+        finally:
+            if path.name == "rows.parquet":
+                overtake()
+
+    monkeypatch.setattr(store_module, "_file_id", file_id)
+    assert keys(store) == [1]
+
+
 def test_a_folder_that_may_not_be_read_is_not_taken_for_an_empty_one(tmp_path, monkeypatch):
     def refuse(path):
         raise PermissionError(errno.EACCES, "Permission denied")
