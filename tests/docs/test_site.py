@@ -25,6 +25,7 @@ def pages():
     return website.sources()
 
 
+@pytest.mark.slow
 def test_every_page_is_in_the_navigation_once(pages):
     listed = [name for text in pages.values() for block in re.findall(r"```{toctree}\n(.*?)```", text, re.DOTALL)
               for name in re.findall(r"^(?:.* <)?([\w/-]+)>?$", block.replace(":hidden:", ""), re.MULTILINE)]  # fmt: skip

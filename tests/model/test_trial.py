@@ -47,6 +47,7 @@ def fatal(folder, names, patience=60.0):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("error")
 def test_listed_with_what_happened_and_the_others_are_listed_too(folder):
     for name, (text, _) in FATAL.items():
@@ -140,6 +141,7 @@ class Loud(Fobg):
 '''
 
 
+@pytest.mark.slow
 def test_what_plugins_print_reaches_no_terminal_raw(tmp_path):
     (tmp_path / "loud.py").write_text(LOUD)
     place = f"plugins={tmp_path}"

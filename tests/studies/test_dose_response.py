@@ -161,6 +161,7 @@ def run(tmp_path_factory):
     return bench.run(words)
 
 
+@pytest.mark.slow
 def test_every_cell_of_a_run_has_a_row_with_the_hash_of_the_hypotheses(run):
     assert set(run["status"]) == {"ok"}
     assert set(run["hypotheses"]) == {hypotheses_hash()}

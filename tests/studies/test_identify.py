@@ -145,6 +145,7 @@ def test_single_shooting_is_lost_beyond_its_basin_and_windows_are_not():
             assert (abs(found - 4.0) < 1e-3) == (converges or shooting == "windows"), (off, shooting)
 
 
+@pytest.mark.slow
 def test_a_row_in_all_ways():
     row = measure(
         cell_of("scenes=[mass_spring_damper[horizon=80]]", "integrators=[rk4]", "repeats=12"),
@@ -238,6 +239,7 @@ def own_record(tmp_path, name):
     return measure(cell, experiment.study)
 
 
+@pytest.mark.slow
 def test_a_record_with_another_drag_is_not_explained(tmp_path):
     row = own_record(tmp_path, "0.004 v|v|")
     assert row["explained"] == 0.0
@@ -245,6 +247,7 @@ def test_a_record_with_another_drag_is_not_explained(tmp_path):
     assert "The intervals do not hold" in row["reason"]
 
 
+@pytest.mark.slow
 def test_a_record_of_the_model_is_explained(tmp_path):
     row = own_record(tmp_path, "right")
     assert row["explained"] == 1.0
@@ -298,6 +301,7 @@ def test_small_terms_are_noticed_in_many_records_together():
     assert noticed < 0.373 < 0.75 <= together
 
 
+@pytest.mark.slow
 def test_records_of_the_model_are_explained_together():
     experiment = made(*SPRING, "theta=[stiffness,damping]", "scene.mass_spring_damper.damping=0.3", "repeats=8")
     (cell,) = cells(experiment)
