@@ -233,18 +233,6 @@ def backward_memory_of(row: pd.Series) -> str:
     return f"< {number(row['memory_mb_high'])}" if row["is_small"] else with_ends(row, "memory_mb")
 
 
-def backward_memory_finding() -> str:
-    """Return what two levels of checkpoints save on the first scene."""
-    lines = backward_memory().drop_duplicates(["problem", "method"]).set_index(["problem", "method"])
-    scene = lines.index[0][0]
-    plain, two = (lines.loc[(scene, name)] for name in ("checkpointed[keep=everything]", "checkpointed"))
-    return (
-        f"At T = {count(two['horizon'])}, two levels of checkpoints take {backward_memory_of(two)} MiB and "
-        f"{number(two['gradient_s'])} s for 256 gradients of `{scene}`, where plain reverse mode takes "
-        f"{backward_memory_of(plain)} MiB and {number(plain['gradient_s'])} s."
-    )
-
-
 def windows(params: str, scene: str = "") -> pd.DataFrame:
     """Return the supported rows of ``windows`` whose windows are shorter than the horizon, with some terminal value."""
     rows = rows_of("windows")
@@ -284,12 +272,6 @@ def learning_rates_table() -> str:
 def block(lines: list[str]) -> str:
     """Return lines as a block that stands between its marks on lines of their own."""
     return "\n" + "\n".join(lines) + "\n"
-
-
-def diverged(experiment: str) -> str:
-    """Return how many of an experiment's searches diverged."""
-    rows = rows_of(experiment)
-    return f"{(rows['status'] == 'diverged').sum()} of {count(len(rows))}"
 
 
 def fits(column: str, integrator: str, methods: tuple[int, ...], scene: str = "mass_spring_damper") -> np.ndarray:
@@ -678,22 +660,11 @@ FIGURES: dict[str, Callable[[], str]] = {
     "quadruped-norm-100": lambda: quadruped_growth(100),
     "quadruped-engines": engines_agree,
     "push-still": lambda: share_touched("apart, noise 0.02", "fobg, adam", "fobg, lbfgs"),
-    "push-still-cost": lambda: push_costs("apart, noise 0.02", "fobg, adam", "fobg, lbfgs", digits=5),
-    "push-still-smoothed": lambda: share_touched(
-        "apart, noise 0.02", "randomized_smoothing, adam", "randomized_smoothing, lbfgs"
-    ),
     "push-noisy": lambda: share_touched("apart, noise 0.2", "fobg, adam", "randomized_smoothing, adam"),
-    "push-line": lambda: share_touched("apart, noise 0.2", "fobg, lbfgs"),
-    "push-line-smoothed": lambda: share_touched("apart, noise 0.2", "randomized_smoothing, lbfgs"),
     "push-search": lambda: share_touched("apart, noise 0.02", "cma_es", "cem"),
     "push-near": lambda: share_touched("in contact, noise 0.02", "fobg, adam", "fobg, lbfgs", pushed=True),
-    "push-near-lbfgs": lambda: push_costs("in contact, noise 0.02", "fobg, lbfgs"),
-    "push-near-cem": lambda: push_costs("in contact, noise 0.02", "cem"),
-    "push-near-cma": lambda: push_costs("in contact, noise 0.02", "cma_es"),
     "push-table": push_table,
-    "push-on-start": lambda: span(rows_of("push_on")["start_cost"], digits=3),
     "push-on-lbfgs": lambda: span(select(rows_of("push_on"), optimizer="lbfgs")["final_cost"], digits=3),
-    "push-on-adam": lambda: span(select(rows_of("push_on"), optimizer="adam[rate=0.03]")["final_cost"], digits=3),
     "push-on-cem": lambda: push_costs("apart, noise 0.02", "cem"),
     "dose-answer": lambda: answer_of("dose_response"),
     "dose-pairs": lambda: dose_classes({name: name for name in UPDATES}),
@@ -709,10 +680,8 @@ FIGURES: dict[str, Callable[[], str]] = {
     "fobg-soft": lambda: span(pushing("fobg", stiffness=SOFT)["rmse_rel"]),
     "reinforce-soft": lambda: span(pushing("reinforce", stiffness=SOFT)["rmse_rel"]),
     "fobg-stiff": lambda: interval(pushing("fobg", stiffness=1e4)),
-    "fobg-stiff-numpy": lambda: interval(pushing("fobg", stiffness=1e4, backend="numpy")),
     "smoothing-stiff": lambda: span(pushing("randomized_smoothing", stiffness=STIFF)["rmse_rel"]),
     "fobg-implicit-stiff": lambda: span(pushing("fobg", "complementarity", stiffness=STIFF)["rmse_rel"]),
-    "fobg-implicit-0.3": lambda: span(pushing("fobg", "complementarity", sigma=0.3)["rmse_rel"]),
     "implicit-time": lambda: span(implicit_time()),
     "trust-cells": lambda: count(trusted("fobg")["cells"]),
     "trust-trusted": lambda: count(trusted("fobg")["trusted"]),
@@ -765,17 +734,13 @@ FIGURES: dict[str, Callable[[], str]] = {
     "equal-rollouts": equal_rollouts_table,
     "equal-rollouts-reference": equal_rollouts_reference,
     "backward-memory": backward_memory_table,
-    "backward-memory-finding": backward_memory_finding,
     "measure-samples": lambda: count(estimators("measure_valued", column="best").sum()),
     "window-bias": lambda: number(short_windows()["bias_rel"].min()),
-    "window-hopper": lambda: number(windows("steps=100", "hopper")["bias_rel"].max()),
     "window-learned": lambda: f"{(windows('learned')['bias_low'] == 0).sum()} of {len(windows('learned'))}",
-    "window-exact": lambda: span(windows("exact", "lqr")["bias_rel"]),
     "window-lqr": window_lqr,
     "learning-rates": learning_rates_table,
     "rate-effect": lambda: span((rates := learning_rates())["score"] - rates["median_score"]),
     "rate-methods": lambda: number(float(np.ptp(learning_rates()["score"]))),
-    "rate-diverged": lambda: diverged("learning_rates"),
     "train-answer": lambda: answer_of("train"),
     "train-range": lambda: trained_in_range(-560.0, -480.0),
     "train-table": trained_table,
