@@ -165,7 +165,7 @@ def test_gradients_are_drawn_once_whatever_estimates_them_and_only_where_compare
     drawn = found.charts[0].plotted()
     zero = drawn[drawn["error"] == FLOOR]
     assert list(zero["law"]) == ["impulse"]
-    assert zero["limit"].all()
+    assert zero["error_limit"].all()
     assert drawn["error"].notna().all()
     given, rows = laws(model)
     rows["status"], rows["reason"] = "unsupported", "no physics"
