@@ -12,7 +12,7 @@ test: $(VENV)/.installed
 	$(BIN)/python -m pytest
 
 slow: $(VENV)/.installed
-	$(BIN)/python -m pytest -m slow --dist worksteal
+	$(BIN)/python -m pytest -m 'slow and not full' --dist worksteal
 
 # The slow tests with full crossings of scenes, laws and backends instead of a design of them.
 slow-all: $(VENV)/.installed

@@ -196,7 +196,7 @@ def matching_plugins(names: Sequence[str]) -> registry.Table:
     known = {name for entries in table.values() for name in entries}
     for name in names:
         if name not in known and name not in kinds:
-            raise unknown("plugin or kind", name, {*known, *table})
+            raise unknown("plugin or kind", name, {*known, *table}, "list")
     selected = {kinds[name] for name in names if name in kinds}
     return {
         kind: {name: e for name, e in entries.items() if not names or kind in selected or name in names}

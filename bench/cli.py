@@ -172,6 +172,12 @@ def _dispatch(words: list[str]) -> int:
     if words[:1] in (["-m"], ["--multirun"]):
         raise UserError("one run is one experiment, and bench expands its grid: leave out --multirun")
     if verb not in VERBS:
+        from bench.experiment import config
+
+        if verb in config.experiments():
+            raise UserError(
+                f"'{verb}' is an experiment: {shlex.join(['python', '-m', 'bench', f'+experiment={verb}', *words])}"
+            )
         raise unknown("command", verb, VERBS)
     if any(word in ("-h", "--help") for word in words):
         command = VERBS[verb]
@@ -368,7 +374,7 @@ def _check(words: list[str]) -> int:
     plugins = {name for table in registry.entries().values() for name in table}
     for name in names:
         if name not in plugins:
-            raise unknown("plugin", name, plugins)
+            raise unknown("plugin", name, plugins, "list")
     return conformance.main(names, limit)
 
 
@@ -388,10 +394,9 @@ def _split_scenes(words: Sequence[str], verb: str) -> tuple[list[str], list[str]
     scenes = list(itertools.takewhile(lambda word: "=" not in word.partition("[")[0] and word[0] != "-", words))
     settings = list(words[len(scenes) :])
     if not scenes and not any(word.lstrip("+").startswith("scenes=") for word in settings):
-        from bench.model import registry
-
-        names = ", ".join(registry.entries()["scenes"])
-        raise UserError(f"name a scene: python -m bench {verb} SCENE ... [key=value ...]; scenes are {names}")
+        raise UserError(
+            f"name a scene: python -m bench {verb} SCENE ... [key=value ...]; all: python -m bench list scenes"
+        )
     return ([f"scenes=[{','.join(scenes)}]"] if scenes else []), settings
 
 

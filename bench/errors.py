@@ -17,6 +17,8 @@ if sys.platform == "win32":
 
 Status = Literal["ok", "nonfinite", "diverged", "timeout", "crashed", "unsupported", "unavailable", "error", "waiting"]
 STATUSES: tuple[str, ...] = get_args(Status)
+MAX_LISTED = 80
+"""Number of characters of a list of names that is not cut."""
 INTERRUPTED = threading.Event()
 """Set while a KeyboardInterrupt is pending, since plugin code may swallow the exception before it is handled."""
 
@@ -58,13 +60,18 @@ def printable(text: object) -> str:
     return " ".join(line.split())
 
 
-def unknown(what: str, given: object, allowed: Iterable[str]) -> UserError:
-    """Return the error for an unknown name, with the nearest valid name and all valid names."""
+def unknown(what: str, given: object, allowed: Iterable[str], see: str = "") -> UserError:
+    """Return the error for an unknown name, with the nearest valid name and all valid names.
+
+    ``see`` is the command that lists all: with it, names longer than a line are cut.
+    """
     names = sorted(allowed)
-    text = str(given)
-    near = get_close_matches(text.lower(), [n.lower() for n in names], n=1, cutoff=0.4)
+    text, listed = str(given), ", ".join(names) or "none"
+    near = get_close_matches(text.lower(), [n.lower() for n in names], n=1)
     hint = f"; did you mean '{next(n for n in names if n.lower() == near[0])}'?" if near else ""
-    return UserError(f"unknown {what} '{text}'{hint} (allowed: {', '.join(names) or 'none'})")
+    if see and len(listed) > MAX_LISTED:
+        listed = f"{listed[:MAX_LISTED].rpartition(', ')[0]}, ...; all {len(names)}: python -m bench {see}"
+    return UserError(f"unknown {what} '{text}'{hint} (allowed: {listed})")
 
 
 def failure(error: BaseException) -> dict[str, str]:

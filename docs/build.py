@@ -110,7 +110,9 @@ Beside the files of [every run](reading-results.md#files), each study writes its
   and a verdict: `first`, `tied`, `behind`, `open` or `no result`. `windows.csv`: the same per length of a window, with the norm of
   its gradient. `faults.csv`: what the logs show, by code, with the numbers that show it.
 - `identify.csv`: one line per problem, with lists by method of fitting (`shooting`) and by product of powers (`invariants`).
-  `fits.csv`: one line per problem and method, with a verdict: `precise`, `narrow`, `unconverged` or `open`.
+  `estimates.csv`: one line per problem and product or parameter: estimate, interval, unit, start and doubts. `unnoticed.csv`: the
+  largest bias by each term that the model lacks. `fits.csv`: one line per problem and method, with a verdict: `precise`, `narrow`,
+  `unconverged` or `open`.
 """
 ALSO_IN_CSV = ("study", "parameters")
 """Columns that the CSV has after its table and the swept axes: see :func:`bench.experiment.axes.table`."""

@@ -22,13 +22,12 @@ import pandas as pd
 from bench.experiment import config
 from bench.measure.performance import wilson
 from bench.report import answer
-from bench.report.text import apart, axis_value, number
+from bench.report.text import axis_value, number
 from bench.report.text import interval as text_of_interval
 from bench.report.text import span as ends_of
 from bench.studies.bias_variance import trust
 from bench.studies.dose_response import analysis
 from bench.studies.gradient_check.points import is_trusted
-from bench.studies.growth import views as growth
 from bench.studies.train import aggregate
 from docs.results import STANDARD, answer_of, comparison, rmse_interval, rows_of, select, table_of
 
@@ -234,18 +233,6 @@ def backward_memory_of(row: pd.Series) -> str:
     return f"< {number(row['memory_mb_high'])}" if row["is_small"] else with_ends(row, "memory_mb")
 
 
-def backward_memory_finding() -> str:
-    """Return what two levels of checkpoints save on the first scene."""
-    lines = backward_memory().drop_duplicates(["problem", "method"]).set_index(["problem", "method"])
-    scene = lines.index[0][0]
-    plain, two = (lines.loc[(scene, name)] for name in ("checkpointed[keep=everything]", "checkpointed"))
-    return (
-        f"At T = {count(two['horizon'])}, two levels of checkpoints take {backward_memory_of(two)} MiB and "
-        f"{number(two['gradient_s'])} s for 256 gradients of `{scene}`, where plain reverse mode takes "
-        f"{backward_memory_of(plain)} MiB and {number(plain['gradient_s'])} s."
-    )
-
-
 def windows(params: str, scene: str = "") -> pd.DataFrame:
     """Return the supported rows of ``windows`` whose windows are shorter than the horizon, with some terminal value."""
     rows = rows_of("windows")
@@ -285,12 +272,6 @@ def learning_rates_table() -> str:
 def block(lines: list[str]) -> str:
     """Return lines as a block that stands between its marks on lines of their own."""
     return "\n" + "\n".join(lines) + "\n"
-
-
-def diverged(experiment: str) -> str:
-    """Return how many of an experiment's searches diverged."""
-    rows = rows_of(experiment)
-    return f"{(rows['status'] == 'diverged').sum()} of {count(len(rows))}"
 
 
 def fits(column: str, integrator: str, methods: tuple[int, ...], scene: str = "mass_spring_damper") -> np.ndarray:
@@ -439,27 +420,32 @@ def dose(table: str, name: str = "dose_response") -> pd.DataFrame:
     return pd.read_csv(STANDARD / name / f"{table}.csv", keep_default_na=True)
 
 
-LEAST_RATIOS = 6
-"""Fewest problems at which the median of a ratio has a finite interval."""
+UPDATES = (
+    "random error 0.3", "random error 1", "random error 3", "random error 3 / 0.3", "bias 0.6", "bias 0.9", "bias 0.9 / random error 1",
+)  # fmt: skip
+ROLLOUTS = "first order / zeroth order, gradient "
 
 
-def ratio(row: Any) -> str:
-    """Return a ratio of updates with its interval."""
-    low, high = apart(row.ratio_low, 1.0), apart(row.ratio_high, 1.0)
-    return f"{number(row.ratio)} [{low}, {high}]"
+def dose_ratios(head: str, parts: dict[str, pd.DataFrame], names: dict[str, str]) -> str:
+    """Return ratios to 1/100 as a Markdown table: a line per part, and a column per comparison, by its heading."""
+    lines = [f"| {head} | problems | scenes | {' | '.join(names)} |", f"|---|--:|--:|{'--:|' * len(names)}"]
+    for label, part in parts.items():
+        rows = part.query("target == 100").set_index("comparison").reindex(list(names.values()))
+        cells = [
+            "-" if np.isnan(row.ratio) else number(row.ratio) if row.scenes < LEAST_SCENES else
+            text_of_interval(row.ratio, row.ratio_low, row.ratio_high, 1.0) for row in rows.itertuples()
+        ]  # fmt: skip
+        lines.append(f"| {label} | {rows['problems'].max():.0f} | {rows['scenes'].max():.0f} | {' | '.join(cells)} |")
+    return block(lines)
 
 
-def dose_pairs(name: str = "dose_response") -> str:
-    """Return the ratios of updates to 1/100 by class and comparison as a Markdown table."""
-    rows = dose("pairs", name).query("target == 100")
-    names = list(dict.fromkeys(rows["comparison"]))
-    head = [f"| class | problems | {' | '.join(names)} |", f"|---|--:|{'--:|' * len(names)}"]
-    lines = []
-    for scene_class, own in rows.groupby("scene_class", sort=False):
-        shown = own["problems"].max() >= LEAST_RATIOS
-        cells = [ratio(row) if shown else number(row.ratio) for row in own.itertuples()]
-        lines.append(f"| {scene_class} | {own['problems'].max()} | {' | '.join(cells)} |")
-    return block([*head, *lines])
+LEAST_SCENES = 6
+"""Fewest scenes at which the median of a ratio has an interval."""
+
+
+def dose_classes(names: dict[str, str]) -> str:
+    """Return ratios of ``dose_response`` by class as a Markdown table."""
+    return dose_ratios("class", dict(list(dose("pairs").groupby("scene_class", sort=False))), names)
 
 
 DOSE_RUNS = {
@@ -474,22 +460,9 @@ DOSE_RUNS = {
 
 
 def dose_runs() -> str:
-    """Return the ratios of updates to 1/100 over all problems of each experiment with planted errors as a Markdown table."""
-    names = (
-        "random error 0.3",
-        "random error 1",
-        "random error 3",
-        "random error 3 / 0.3",
-        "bias 0.9",
-        "bias 0.9 / random error 1",
-    )
-    head = [f"| searches | problems | {' | '.join(names)} |", f"|---|--:|{'--:|' * len(names)}"]
-    lines = []
-    for label, name in DOSE_RUNS.items():
-        rows = dose("pairs", name).query("target == 100 and scene_class == 'all classes'").set_index("comparison")
-        cells = [ratio(rows.loc[comparison]) for comparison in names]
-        lines.append(f"| {label} | {int(rows['problems'].max())} | {' | '.join(cells)} |")
-    return block([*head, *lines])
+    """Return the ratios over all problems of each experiment with planted errors as a Markdown table."""
+    parts = {label: dose("pairs", name).query("scene_class == 'all classes'") for label, name in DOSE_RUNS.items()}
+    return dose_ratios("searches", parts, {name: name for name in UPDATES if name != "bias 0.6"})
 
 
 WINDOW_NAMES = {"windowed[steps=8]": "8 steps", "windowed": "16 steps", "windowed[steps=32]": "32 steps"}
@@ -524,48 +497,6 @@ def dose_windows() -> str:
     return block([*head, *rows])
 
 
-def with_interval(row: Any, name: str) -> str:
-    """Return a quantity of a row with its interval, or a dash where it is unknown."""
-    value, low, high = (float(getattr(row, f"{name}{end}")) for end in ("", "_low", "_high"))
-    if not np.isfinite(value):
-        return "-"
-    return text_of_interval(value, low, high)
-
-
-def dose_fits() -> str:
-    """Return what an error costs by class and target as a Markdown table."""
-    head = [
-        "| class | regret | problems | random error 1 / 0.1 | bias 0.5 / 0.05 | c_b / c_s |",
-        "|---|---|--:|--:|--:|--:|",
-    ]
-    names = ("tenfold", "tenfold_bias", "bias_over_spread")
-    return block(head + [
-        f"| {row.scene_class} | {row.target_name} | {row.problems} | " + " | ".join(with_interval(row, name) for name in names) + " |"
-        for row in dose("fits").itertuples()
-    ])  # fmt: skip
-
-
-def dose_verdicts() -> str:
-    """Return the number of verdicts by hypothesis as a Markdown table."""
-    rows = dose("hypotheses").replace({"verdict": {"not known": "open"}})
-    counts = rows[rows["hypothesis"] != "all"].groupby("hypothesis")["verdict"].value_counts().unstack(fill_value=0)
-    counts = counts.reindex(columns=["confirmed", "refuted", "open"], fill_value=0)
-    lines = [f"| {name} | {row.confirmed} | {row.refuted} | {row.open} |" for name, row in counts.iterrows()]
-    return block(["| hypothesis | confirmed | refuted | open |", "|---|--:|--:|--:|", *lines])
-
-
-def dose_costs() -> str:
-    """Return the share of problems on which the first order is cheaper as a Markdown table."""
-    rows = dose("costs").query("target == 100")
-    head = ["| class | " + " | ".join(["1", "2", "4", "measured"]) + " | cheaper |", "|---|--:|--:|--:|--:|---|"]
-    lines = []
-    for name, part in rows.groupby("scene_class", sort=False):
-        shares = [f"{line.wins} of {line.problems}" for line in part.itertuples()]
-        verdicts = set(part["verdict"])
-        lines.append(f"| {name} | {' | '.join(shares)} | {verdicts.pop() if len(verdicts) == 1 else 'not known'} |")
-    return block(head + lines)
-
-
 def is_counted(problems: pd.DataFrame) -> pd.Series:
     """Return whether each problem counts for the target 1/100."""
     return problems["reason_100"].isna() | (problems["reason_100"] == "")
@@ -574,31 +505,9 @@ def is_counted(problems: pd.DataFrame) -> pd.Series:
 def dose_unreached(name: str = "dose_response", scene_class: str = "stiff") -> str:
     """Return on how many problems of a class that count no natural method reaches 1/100, of how many."""
     counted = int(is_counted(dose("problems", name).query("scene_class == @scene_class")).sum())
-    reached = dose("costs", name).query("target == 100 and scene_class == @scene_class")["problems"].iloc[0]
+    rows = dose("pairs", name).query("target == 100 and scene_class == @scene_class").set_index("comparison")
+    reached = rows["problems"].get(f"{ROLLOUTS}1", 0)
     return f"{counted - int(reached)} of {counted}"
-
-
-def dose_second() -> str:
-    """Return the second analysis of ``dose_response`` as a Markdown table."""
-    head = ["| class | analysis | problems | random error 1 / 0.1 | c_b / c_s |", "|---|---|--:|--:|--:|"]
-    rows = dose("second_analysis").sort_values("scene_class", kind="stable")
-    return block(head + [
-        f"| {row.scene_class} | {row.analysis} | {row.problems} | {with_interval(row, 'tenfold')} | "
-        f"{with_interval(row, 'bias_over_spread')} |" for row in rows.itertuples()
-    ])  # fmt: skip
-
-
-def dose_shapes() -> str:
-    """Return the comparison of noise of fixed and relative size as a Markdown table."""
-    head = [
-        "| class | regret | problems | fixed size / relative | first order / fixed size | zeroth order / fixed size |",
-        "|---|---|--:|--:|--:|--:|",
-    ]
-    names = ("fixed_over_relative", "first_over_fixed", "zeroth_over_fixed")
-    return block(head + [
-        f"| {row.scene_class} | 1/{row.target:g} | {row.problems} | " + " | ".join(with_interval(row, name) for name in names) + " |"
-        for row in dose("shapes").itertuples()
-    ])  # fmt: skip
 
 
 def dose_data() -> str:
@@ -646,14 +555,6 @@ def quadruped_growth(horizon: float) -> str:
     row = select(rows_of("quadruped_growth"), horizon=horizon).iloc[0]
     low, median, high = (number(row[f"gradient_{name}"]) for name in ("low", "median", "high"))
     return f"{median} [{low}, {high}]"
-
-
-def quadruped_order() -> str:
-    """Return the order of the power law that fits the norm of the quadruped's gradient, with its interval."""
-    given = config.load(["experiment=quadruped_growth", f"results_dir={STANDARD}"])
-    (table,) = (t for t in growth.views(given, rows_of("quadruped_growth")).tables if t.name == "growth_verdicts")
-    row = table.frame.iloc[0]
-    return f"{number(row['order'])} [{number(row['order_low'])}, {number(row['order_high'])}]"
 
 
 def switch_verdicts(point: str, folder: str = "quadruped_check") -> list[str]:
@@ -749,20 +650,6 @@ def push_costs(problem: str, *methods: str, digits: int = 3) -> str:
     return span(rows.loc[(rows["problem"] == problem) & rows["method"].isin(methods), "final_cost"], digits)
 
 
-def dose_rates() -> str:
-    """Return what a wrong rate costs the best gradient."""
-    rows = dose("controls")
-    texts = []
-    for name, label in (("above", "ten times its best rate"), ("below", "a tenth of it")):
-        tried = rows[name].dropna()
-        middle = float(tried.median())
-        much = f"{number(middle)} times the updates" if np.isfinite(middle) else "no arrival"
-        texts.append(
-            f"at {label} {much} ({int((tried > 2).sum())} of {len(tried)} problems need more than twice as many, or miss)"
-        )
-    return block([f"A right gradient with a wrong rate, to 1/100, median over problems: {' and '.join(texts)}."])
-
-
 FIGURES: dict[str, Callable[[], str]] = {
     "mjx-solver-compile": mjx_solver_compile,
     "mjx-solver-error": mjx_solver_error,
@@ -772,48 +659,29 @@ FIGURES: dict[str, Callable[[], str]] = {
     "quadruped-norm-10": lambda: quadruped_growth(10),
     "quadruped-norm-100": lambda: quadruped_growth(100),
     "quadruped-engines": engines_agree,
-    "quadruped-order": quadruped_order,
     "push-still": lambda: share_touched("apart, noise 0.02", "fobg, adam", "fobg, lbfgs"),
-    "push-still-cost": lambda: push_costs("apart, noise 0.02", "fobg, adam", "fobg, lbfgs", digits=5),
-    "push-still-smoothed": lambda: share_touched(
-        "apart, noise 0.02", "randomized_smoothing, adam", "randomized_smoothing, lbfgs"
-    ),
     "push-noisy": lambda: share_touched("apart, noise 0.2", "fobg, adam", "randomized_smoothing, adam"),
-    "push-line": lambda: share_touched("apart, noise 0.2", "fobg, lbfgs"),
-    "push-line-smoothed": lambda: share_touched("apart, noise 0.2", "randomized_smoothing, lbfgs"),
     "push-search": lambda: share_touched("apart, noise 0.02", "cma_es", "cem"),
     "push-near": lambda: share_touched("in contact, noise 0.02", "fobg, adam", "fobg, lbfgs", pushed=True),
-    "push-near-lbfgs": lambda: push_costs("in contact, noise 0.02", "fobg, lbfgs"),
-    "push-near-cem": lambda: push_costs("in contact, noise 0.02", "cem"),
-    "push-near-cma": lambda: push_costs("in contact, noise 0.02", "cma_es"),
     "push-table": push_table,
-    "push-on-start": lambda: span(rows_of("push_on")["start_cost"], digits=3),
     "push-on-lbfgs": lambda: span(select(rows_of("push_on"), optimizer="lbfgs")["final_cost"], digits=3),
-    "push-on-adam": lambda: span(select(rows_of("push_on"), optimizer="adam[rate=0.03]")["final_cost"], digits=3),
     "push-on-cem": lambda: push_costs("apart, noise 0.02", "cem"),
     "dose-answer": lambda: answer_of("dose_response"),
-    "dose-pairs": dose_pairs,
+    "dose-pairs": lambda: dose_classes({name: name for name in UPDATES}),
     "dose-runs": dose_runs,
     "dose-unreached": dose_unreached,
     "dose-policy-unreached": lambda: dose_unreached("dose_response_policy", "smooth"),
     "dose-windows": dose_windows,
     "dose-windows-missed": windows_missed,
-    "dose-fits": dose_fits,
     "dose-hash": lambda: ", ".join(sorted(set(rows_of("dose_response")["hypotheses"]) - {""})),
-    "dose-verdicts": dose_verdicts,
-    "dose-costs": dose_costs,
-    "dose-second": dose_second,
+    "dose-costs": lambda: dose_classes({cost: f"{ROLLOUTS}{cost}" for cost in ("1", "2", "4", "measured")}),
     "dose-data": dose_data,
-    "dose-shapes": dose_shapes,
-    "dose-rates": dose_rates,
     "dose-controls": dose_controls,
     "fobg-soft": lambda: span(pushing("fobg", stiffness=SOFT)["rmse_rel"]),
     "reinforce-soft": lambda: span(pushing("reinforce", stiffness=SOFT)["rmse_rel"]),
     "fobg-stiff": lambda: interval(pushing("fobg", stiffness=1e4)),
-    "fobg-stiff-numpy": lambda: interval(pushing("fobg", stiffness=1e4, backend="numpy")),
     "smoothing-stiff": lambda: span(pushing("randomized_smoothing", stiffness=STIFF)["rmse_rel"]),
     "fobg-implicit-stiff": lambda: span(pushing("fobg", "complementarity", stiffness=STIFF)["rmse_rel"]),
-    "fobg-implicit-0.3": lambda: span(pushing("fobg", "complementarity", sigma=0.3)["rmse_rel"]),
     "implicit-time": lambda: span(implicit_time()),
     "trust-cells": lambda: count(trusted("fobg")["cells"]),
     "trust-trusted": lambda: count(trusted("fobg")["trusted"]),
@@ -866,17 +734,13 @@ FIGURES: dict[str, Callable[[], str]] = {
     "equal-rollouts": equal_rollouts_table,
     "equal-rollouts-reference": equal_rollouts_reference,
     "backward-memory": backward_memory_table,
-    "backward-memory-finding": backward_memory_finding,
     "measure-samples": lambda: count(estimators("measure_valued", column="best").sum()),
     "window-bias": lambda: number(short_windows()["bias_rel"].min()),
-    "window-hopper": lambda: number(windows("steps=100", "hopper")["bias_rel"].max()),
     "window-learned": lambda: f"{(windows('learned')['bias_low'] == 0).sum()} of {len(windows('learned'))}",
-    "window-exact": lambda: span(windows("exact", "lqr")["bias_rel"]),
     "window-lqr": window_lqr,
     "learning-rates": learning_rates_table,
     "rate-effect": lambda: span((rates := learning_rates())["score"] - rates["median_score"]),
     "rate-methods": lambda: number(float(np.ptp(learning_rates()["score"]))),
-    "rate-diverged": lambda: diverged("learning_rates"),
     "train-answer": lambda: answer_of("train"),
     "train-range": lambda: trained_in_range(-560.0, -480.0),
     "train-table": trained_table,

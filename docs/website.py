@@ -38,7 +38,7 @@ PAGES: Mapping[str, str] = {
 """The site's page of each document, and its path in the repository."""
 SECTIONS: Mapping[str, Sequence[str]] = {
     "start": ("reading-results", "python"),
-    "trust": ("gradcheck", "examine", "stability"),
+    "trust": ("gradcheck", "examine"),
     "results": ("experiment/*", "estimators", "claims", "controller", "dose-response", "training", "engines", "speed"),
     "extending": ("architecture", "contributing"),
     "reference": (
@@ -86,7 +86,7 @@ def sources(results: Path = STANDARD) -> dict[str, str]:
     pages["estimators"] = estimators_page(results)
     pages["api"] = api_page()
     pages["reference"] = "# Reference\n"
-    pages["index"] = home_page(found)
+    pages["index"] = home_page()
     for parent, children in SECTIONS.items():
         names = [name for child in children for name in expand(child, pages)]
         pages[parent] += toctree(names, hidden=parent != "reference")
@@ -145,8 +145,8 @@ def download(label: str, file: str) -> str:
 # ------------------------------------------------------------------------------------------------------------ pages
 
 
-def home_page(found: Sequence[Entry]) -> str:
-    """Return the first page: what the package answers, the five entries and the answer of each experiment."""
+def home_page() -> str:
+    """Return the first page: the opening of the README, the five entries, and the results by question."""
     readme = without_marks((ROOT / PAGES["start"]).read_text())
     opening = readme.partition("\n## ")[0].strip()
     lines = [
@@ -156,10 +156,11 @@ def home_page(found: Sequence[Entry]) -> str:
         "- [Extend](extending.md): add an estimator, a scene, a backend or a study",
         "- [Reference](reference.md): commands, columns, Python interface, validation",
     ]
-    answers = [
-        f"- [{entry.name}]({entry.page}.md): {escape_markdown(entry.answer or entry.question)}" for entry in found
-    ]
-    return "\n".join([localise(opening, Path("README.md")), "", *lines, "", "## Experiments", "", *answers, ""])
+    index = (ROOT / PAGES["results"]).read_text().partition("\n## ")[0].replace("](#", "](results.md#")
+    questions = [line for line in index.splitlines() if line.startswith("|")]
+    return "\n".join(
+        [localise(opening, Path("README.md")), "", *lines, "", "## Results by question", "", *questions, ""]
+    )
 
 
 def experiment_page(entry: Entry) -> str:

@@ -60,6 +60,7 @@ def test_only_missing_cells_run_and_rows_are_kept(tmp_path, monkeypatch):
     assert len(pd.read_csv(tmp_path / "tiny" / "bias_variance.csv")) == 2
 
 
+@pytest.mark.slow
 def test_record_of_a_run_outlasts_one_that_finds_all_rows_stored(tmp_path):
     here = [*TINY, f"results_dir={tmp_path}", "formats=[]"]
     path = tmp_path / "tiny" / "run.json"

@@ -61,12 +61,14 @@ def test_a_cost_that_ends_the_process_is_not_right(end, tmp_path):
     assert "before a verdict" in said
 
 
+@pytest.mark.slow
 def test_the_status_of_a_verdict_and_of_bad_input_arrives(tmp_path):
     (tmp_path / "mine.py").write_text(COST.format(end="pass"))
     assert status_of(tmp_path, "examine", "mine.py:cost", "grad=grad", "--quiet")[0] == 1
     assert status_of(tmp_path, "examine", "mine.py:nothing")[0] == 2
 
 
+@pytest.mark.slow
 def test_a_scene_that_ends_the_process_is_not_right(tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "ends.py").write_text(SCENE)

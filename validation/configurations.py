@@ -229,7 +229,7 @@ class Interrupted:
         runner._Run._finish = self._real  # type: ignore[method-assign]
 
 
-REMARKS = (", which was undone",)
+REMARKS = (", while it was imported, changed",)
 """What only remarks on settings contain; a refused command may print some before its error."""
 
 

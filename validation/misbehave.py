@@ -147,7 +147,9 @@ def bank() -> list[Case]:
     for kind, (*_, work, planned) in KINDS.items():
         loud = ENDS | RAISES | HARMLESS
         cases += [Case(kind, "declared", fault) for fault in DECLARES]
-        cases += [Case(kind, place, fault) for place in ("import", "construction", *work, *planned) for fault in loud]
+        cases += [Case(kind, place, fault) for place in ("import", *work) for fault in loud]
+        # a plugin is built and planned by the command itself, which it may end
+        cases += [Case(kind, place, fault) for place in ("construction", *planned) for fault in RAISES | HARMLESS]
         cases += [Case(kind, place, fault) for place in (*work, *planned) for fault in LIES]
     return cases
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from bench.errors import STATUSES, UserError, printable, unknown
 from bench.experiment.experiment import Budget, Choice, Execution, Experiment, TableLayout
-from bench.experiment.grid import check_axes, parameter_name, refuse_too_many, swept
+from bench.experiment.grid import COUNTS, check_axes, parameter_name, refuse_too_many, swept
 from bench.experiment.overrides import LISTS_AS, Values, check_file, quoted
 from bench.experiment.study import Study
 from bench.model import Decision, MechanicalScene, Plugin, guard, registry
@@ -20,6 +20,8 @@ from bench.model.identity import parse_identity
 from bench.model.parameters import build, coerce, remember, singular
 
 SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
+RESERVED = ("references", "standard")
+"""Names of folders under ``results_dir`` that are not experiments."""
 SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0}
 BYTES = {"k": 2.0**10, "m": 2.0**20, "g": 2.0**30}
 
@@ -58,18 +60,21 @@ def _composed(overrides: Sequence[str], config_dirs: Sequence[Path]) -> Experime
     from hydra.errors import HydraException
     from omegaconf import OmegaConf
 
-    for override in overrides:
-        key, _, value = override.lstrip("+").partition("=")
+    for key, _, value in _split_words(overrides):
         if key == "plugins":
             for path in _split(value) or [""]:
                 if not path.strip("'\" "):
-                    raise UserError(f"{override} names no folder; the current one is plugins=.")
+                    raise UserError(f"plugins={value} names no folder; the current one is plugins=.")
                 registry.add_folder(Path(path))
     for folder in config_dirs:
         if not (folder / "experiment").is_dir():
             raise UserError(
                 f"'{folder}' has no experiments: put them into its folder experiment, as experiment/NAME.yaml"
             )
+    named = [name for key, _, value in _split_words(overrides) if key == "experiment" for name in _split(value)]
+    if len(named) > 1:
+        commands = " && ".join(f"python -m bench +experiment={name}" for name in named)
+        raise UserError(f"one command runs one experiment with its sweep: {commands}")
     parser, values = OverridesParser.create(), Values()
     prepared = []
     for override in overrides:
@@ -79,9 +84,8 @@ def _composed(overrides: Sequence[str], config_dirs: Sequence[Path]) -> Experime
         except (HydraException, ValueError, RecursionError):  # ValueError: a number of 5000 digits
             raise UserError(f"'{override[:200]}' cannot be read: {LISTS_AS}") from None
         prepared.append(hydra_override)
-    for key, _, name in (override.lstrip("+").partition("=") for override in overrides):
-        if key == "experiment":
-            check_file(_file_of(name, config_dirs))
+    for name in named:
+        check_file(_file_of(name, config_dirs))
     if config_dirs:
         search_path = ",".join(f"'file://{folder.expanduser().absolute()}'" for folder in config_dirs)
         prepared.insert(0, f"hydra.searchpath=[{search_path}]")
@@ -117,8 +121,7 @@ def _answer(found: Experiment, overrides: Sequence[str], config_dirs: Sequence[P
     """Return the answer in an experiment's own file; empty if the file has none or other settings."""
     from omegaconf import OmegaConf
 
-    split = (override.lstrip("+").partition("=") for override in overrides)
-    name = next((value for key, _, value in split if key == "experiment"), None)
+    name = next((value for key, _, value in _split_words(overrides) if key == "experiment"), None)
     file: Any = OmegaConf.load(_file_of(name, config_dirs)) if name else {}
     answer = str(file.get("answer") or "")
     if answer and len(overrides) > 1:
@@ -165,6 +168,8 @@ def _settings() -> frozenset[str]:
 def _to_hydra(override: str, config_dirs: Sequence[Path], values: Values) -> str:
     """Return an override in Hydra's syntax; experiments and plugin parameters need no ``+``."""
     if "=" not in override:
+        if override in experiments(config_dirs):
+            raise UserError(f"'{override}' is an experiment: write +experiment={override}")
         raise UserError(f"'{override}' is not an override: write key=value (commands come first: see --help)")
     if "${" in override:
         raise UserError(f"'{override}': interpolations are not supported, give the value itself")
@@ -175,18 +180,14 @@ def _to_hydra(override: str, config_dirs: Sequence[Path], values: Values) -> str
         bare = f"table.{bare}"
     head = bare.partition(".")[0]
     if head == "experiment":
-        if "," in value:
-            raise UserError(
-                f"'{override}': one command runs one experiment with its sweep; run one command for each experiment"
-            )
         names = experiments(config_dirs)
         if value not in names:
-            raise unknown("experiment", value, names)
+            raise unknown("experiment", value, names, "--help")
         return f"+experiment={value}"
     if head.partition("/")[0] == "hydra" or key.startswith("~"):
         raise UserError(f"'{override}': Hydra's own settings cannot be changed")
     if head not in _known_keys():
-        raise unknown("setting", bare, {*_known_keys(), *LAYOUT, "experiment"})
+        raise unknown("setting", bare, {*_known_keys(), *LAYOUT, "experiment"}, "--help")
     kinds = registry.kinds()
     if bare in kinds:
         return f"++{bare}={_quote_identities(value)}"
@@ -214,7 +215,7 @@ def _refuse_unread(experiment: Experiment, overrides: Sequence[str]) -> None:
         head, _, rest = override.lstrip("+").partition("=")[0].partition(".")
         name = f"{head}.{rest.partition('.')[0]}" if rest and head in kinds.values() else head
         if name not in names:
-            raise unknown("setting of this experiment", name, names)
+            raise unknown("setting of this experiment", name, names, "--help")
         if head == "sweep" and rest in axes:
             check_axes([rest], plugins)
         marked = {part for axis in axes for part in (axis, parameter_name(axis))}
@@ -228,6 +229,11 @@ def _in_use(plugins: Sequence[type[Plugin]]) -> list[type[Plugin]]:
     unused = {"contacts"} if not any(plugin.n_contacts != 0 for plugin in mechanical) else set()
     unused |= set() if mechanical else {"integrators"}
     return [plugin for plugin in plugins if plugin.kind not in unused]
+
+
+def _split_words(overrides: Sequence[str]) -> list[tuple[str, str, str]]:
+    """Return key, ``=`` and value of each override."""
+    return [override.lstrip("+").partition("=") for override in overrides]
 
 
 def _split(value: str) -> list[str]:
@@ -261,10 +267,12 @@ def experiment(config: Mapping[str, Any]) -> Experiment:
     """Return the experiment of a composed configuration; raises :class:`UserError` if a setting is invalid."""
     extra = set(config) - _known_keys()
     if extra:
-        raise unknown("setting", sorted(extra)[0], _known_keys())
+        raise unknown("setting", sorted(extra)[0], _known_keys(), "--help")
     name = "" if config["name"] is None else str(config["name"])
     if not SAFE_NAME.fullmatch(name) or ".." in name:
         raise UserError(f"name={name!r} must consist of letters, digits, '.', '_' and '-', since it names a folder")
+    if name in RESERVED:
+        raise UserError(f"name={name} is reserved for a folder of results_dir that is not an experiment")
     for folder in _as_list(config["plugins"]):
         registry.add_folder(Path(str(folder)))
     study = _study(config["study"])
@@ -304,12 +312,20 @@ def experiment(config: Mapping[str, Any]) -> Experiment:
         marks=_mapping(config, "marks"),
         compile_time=coerce(bool, config["compile_time"], "compile_time"),
         formats=tuple(_one_of("formats", item, FORMATS) for item in _as_list(config["formats"])),
-        table=_table_layout(_mapping(config, "table"), _mapping(config, "sweep")),
-        reference=_budget(_mapping(config, "reference")),
+        table=_table_layout(_mapping(config, "table", LAYOUT), _mapping(config, "sweep")),
+        reference=_budget(_mapping(config, "reference", BUDGET)),
         compile_cache=_compile_cache(config["compile_cache"]),
         plugins=registry.folders(),
-        **{key: coerce(int, config[key], key) for key in ("samples", "repeats", "seed")},
+        **{key: _count(config, key) for key in COUNTS},
     )
+
+
+def _count(config: Mapping[str, Any], key: str) -> Any:
+    if isinstance(config[key], list):
+        raise UserError(
+            f"{key} is one number, and {config[key]} are several: write sweep.{key}=[...] to sweep over them"
+        )
+    return coerce(int, config[key], key)
 
 
 def _study(text: Any) -> Study:
@@ -330,11 +346,11 @@ def _folder(value: Any) -> Path:
     return Path(value).expanduser()
 
 
+BUDGET = ("samples", "tolerance")
+
+
 def _budget(settings: Mapping[str, Any]) -> Budget:
-    for key in settings:
-        if key not in ("samples", "tolerance"):
-            raise unknown("setting of reference", key, ("samples", "tolerance"))
-    for key in ("samples", "tolerance"):
+    for key in BUDGET:
         if key not in settings:
             raise UserError(f"reference has no {key}: write reference.{key}=... to change only one of its settings")
     samples = coerce(int, settings["samples"], "reference.samples")
@@ -348,9 +364,6 @@ ROWS = ("estimator", "backend")
 
 
 def _table_layout(settings: Mapping[str, Any], sweep: Mapping[str, Any]) -> TableLayout:
-    for key in settings:
-        if key not in LAYOUT:
-            raise unknown("setting of table", key, LAYOUT)
     columns = "" if settings["columns"] is None else str(settings["columns"])
     names = {part for name in swept(sweep) for part in (name, name.rpartition(".")[2])}
     if columns and columns not in names:
@@ -426,10 +439,7 @@ def _cluster(config: Mapping[str, Any], launcher: str) -> dict[str, Any]:
     """Return the settings of the chosen launcher, after validating the settings of all launchers."""
     settings: dict[str, dict[str, Any]] = {name: {} for name in CLUSTERS}
     for name, types in CLUSTERS.items():
-        given = _mapping(config, name) if types else {}
-        for key in given:
-            if key not in types:
-                raise unknown(f"setting of {name}", key, types)
+        given = _mapping(config, name, types) if types else {}
         for key, (kind, may_be_null) in types.items():
             value = given.get(key)
             settings[name][key] = None if value is None and may_be_null else coerce(kind, value, f"{name}.{key}")
@@ -466,10 +476,13 @@ def _amount(key: str, value: Any, units: Mapping[str, float], example: str) -> f
     return amount
 
 
-def _mapping(config: Mapping[str, Any], key: str) -> dict[str, Any]:
+def _mapping(config: Mapping[str, Any], key: str, allowed: Collection[str] = ()) -> dict[str, Any]:
     value = {} if config.get(key) is None else config[key]
     if not isinstance(value, Mapping):
         raise UserError(f"{key}={value!r} must be a table: write {key}.name=value")
+    for name in value:
+        if allowed and name not in allowed:
+            raise unknown(f"setting of {key}", name, allowed)
     return {str(k): v for k, v in value.items()}
 
 
@@ -477,7 +490,7 @@ def _at_least_one(config: Mapping[str, Any], kind: str) -> list[Any]:
     value = config.get(kind)
     items = value if isinstance(value, list) else [value]
     if not items or value is None:
-        raise UserError(f"{kind} is empty: give at least one of {', '.join(sorted(registry.entries()[kind]))}")
+        raise UserError(f"{kind} is empty: give at least one: python -m bench list {kind}")
     return items
 
 

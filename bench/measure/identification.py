@@ -85,22 +85,15 @@ class Information:
         """The invariants as products: ``stiffness/mass``."""
         return [product(self.names, row) for row in self.invariants]
 
-    @property
-    def words(self) -> str:
-        """A sentence on which parameters or products are identifiable, and which changes do not affect the data."""
-        if self.rank == len(self.names):
-            return f"{_listed(self.names)} {'are' if len(self.names) > 1 else 'is'} identifiable"
-        hidden = [_direction(self.names, row) for row in self.gauge]
-        if not self.rank:
-            return f"nothing is identifiable: the data do not depend on {_listed(self.names)}"
-        return f"only {', '.join(self.labels)}: {'; '.join(hidden)} does not change the data"
+    def along(self, jacobian: np.ndarray) -> np.ndarray:
+        """Return a Jacobian ``(m, p)`` by logarithms of the parameters as one by logarithms of the invariants, ``(m, rank)``."""
+        return np.asarray(jacobian @ np.linalg.pinv(self.invariants))
 
-    def covariance(self) -> np.ndarray:
-        """Return the Cramer-Rao bound on the covariance of the invariants' logarithms, ``(rank, rank)``."""
-        values, rows = self._svd
-        kept = rows[: self.rank]
-        inverse = (kept.T / values[: self.rank] ** 2) @ kept
-        return np.asarray(self.invariants @ inverse @ self.invariants.T)
+    @property
+    def bound(self) -> np.ndarray:
+        """The Cramer-Rao bound on the standard deviations of the invariants' logarithms, ``(rank,)``."""
+        slopes = self.along(self.jacobian)
+        return np.asarray(np.sqrt(np.diag(np.linalg.inv(slopes.T @ slopes))))
 
 
 def product(names: tuple[str, ...], exponents: np.ndarray) -> str:
@@ -119,20 +112,3 @@ def _power(exponent: float) -> str:
     if abs(float(near) - exponent) > 1e-3:
         return f"^{exponent:.3g}"
     return "" if near == 1 else f"^{near}" if near.denominator == 1 else f"^({near})"
-
-
-def _direction(names: tuple[str, ...], row: np.ndarray) -> str:
-    is_moving = np.abs(row) > 1e-4 * np.abs(row).max()
-    moving = [name for name, moves in zip(names, is_moving, strict=True) if moves]
-    if len(moving) == 1:
-        return f"{moving[0]}"
-    powers = row[is_moving] / row[is_moving][np.argmax(np.abs(row[is_moving]))]
-    if np.allclose(powers, 1.0, atol=1e-3):
-        return f"scaling {_listed(moving)} together"
-    return "scaling " + " with ".join(
-        f"{name}{_power(abs(p)) if p > 0 else f'^{p:.3g}'}" for name, p in zip(moving, powers, strict=True)
-    )
-
-
-def _listed(names: tuple[str, ...] | list[str]) -> str:
-    return " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))

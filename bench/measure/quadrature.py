@@ -29,8 +29,6 @@ UNSETTLED = 1e-3
 """Share of the integral of absolute values at the last finite point of a ray above which the integral may not exist."""
 MARGIN = 1.0
 """Distance of a moved limit from the last point with a share of the integral, in standard deviations."""
-ZOOMS, PARTS = 10, 32
-"""Number of enlargements around the largest cost, and intervals of each, that distinguish a pole from a peak."""
 POLE = 0.95
 """Least power p of a pole, where the cost grows as 1 / distance^p. From p = 1 on, its integral over a line diverges."""
 SHIFTS = {1: ((0.0, 0.5, 0.25, 0.75),), 2: ((0.0, 0.5, 0.25, 0.75), (0.0, 0.25, 0.75, 0.5))}
@@ -44,6 +42,12 @@ SAFETY = 2.0
 """Stated error, as a multiple of the largest distance of a rule from the mean of all rules."""
 SETTLED = 1e-10
 """Relative error at which refinement stops."""
+TOLERANCE = 1e-3
+"""Relative error above which a rule with equal panels is not accepted."""
+HALVINGS, MOST, AROUND = 32, 1 << 14, 256
+"""Most halvings of a panel, most panels that are halved together, and panels around the largest cost."""
+SEARCHED, SEARCH = 5.0, (1 << 11, 1 << 13)
+"""Distance searched for narrow features on lines through w = 0, and panels of the coarse and the fine rule on a line."""
 SOLVED = 1e-11
 """Relative error of costs of programs whose steps solve an equation to 1e-12."""
 ROUNDED = 64.0
@@ -86,7 +90,11 @@ def integrate(problem: Problem, theta: np.ndarray, points: int, columns: int) ->
     def cost(nodes: np.ndarray) -> np.ndarray:
         return in_columns(lambda w: problem.value(theta, w), nodes, columns)
 
-    low, high, beyond, note = _limits(lambda w: cost(w) - centre, width)
+    def excess(nodes: np.ndarray) -> np.ndarray:
+        difference: np.ndarray = cost(nodes) - centre
+        return difference
+
+    low, high, beyond, note = _limits(excess, width)
     beyond /= problem.sigma
     if math.isnan(beyond):
         return Integral(np.full(dim, math.nan), math.nan, 0, 0.0, note)
@@ -133,13 +141,35 @@ def integrate(problem: Problem, theta: np.ndarray, points: int, columns: int) ->
     if previous is None or used < LEAST[width] or not math.isfinite(error + rounding):
         return None
     spacing = float(np.prod(high - low)) ** (1.0 / width) / used ** (1.0 / width)
-    if error > SETTLED * np.linalg.norm(previous) and _power(lambda w: cost(w) - centre, peak, spacing) > POLE:
+    settled = SETTLED * float(np.linalg.norm(previous))
+    power = 0.0
+    missed = _missed(excess, edges) / problem.sigma if width > 1 or error <= settled + rounding else 0.0
+    is_narrow = missed > error + settled + rounding + SOLVED * size
+    if width == 1 and (is_narrow or error > TOLERANCE * np.linalg.norm(previous)):
+        value, error, used, power = _bisected(
+            lambda t: t * excess(t[None, :]) / problem.sigma,
+            np.unique([*edges[0], *np.linspace(low[0], high[0], 2 * SEARCH[1])]),
+        )
+        previous, spacing, is_narrow = np.array([value]), float(high[0] - low[0]) / used, False
+    elif error > settled:
+        # along each axis, the power with which the cost grows near its largest value
+        lines = [lambda t, axis=axis: excess(peak[:, None] + np.outer(axis, t)) for axis in np.eye(width)]
+        power = max(_bisected(line, np.linspace(-1.0, 1.0, AROUND))[3] for line in lines)
+    if power > POLE:
         place = ", ".join(f"{x:.6g}" for x in theta[:width] + problem.sigma * peak)
         exists = "does not exist" if width == 1 else "may not exist"
         note = f"the cost is infinite near theta = ({place}), a pole, so its mean {exists}"
         return Integral(np.full(dim, math.nan), math.nan, used, spacing, note)
+    # the error falls as spacing^(1 - p), so a halving shows only a part of it
+    error /= 2.0 ** (1.0 - power) - 1.0
+    doubts = [note] if note else []
+    if is_narrow:
+        error += missed
+        doubts.append("the cost has a feature narrower than the spacing of the points")
+    if width > 1 and power >= 0.5:
+        doubts.append(f"the cost grows as 1 / distance^{power:.2g}, so samples have no variance")
     error += beyond + rounding + (SOLVED if problem.program.needs_root else ROUNDED * np.finfo(float).eps) * size
-    return Integral(previous, error, used, spacing, note)
+    return Integral(previous, error, used, spacing, "; ".join(doubts))
 
 
 def _limits(excess: Callable[[np.ndarray], np.ndarray], width: int) -> tuple[np.ndarray, np.ndarray, float, str]:
@@ -194,30 +224,56 @@ def _limits(excess: Callable[[np.ndarray], np.ndarray], width: int) -> tuple[np.
     return low, high, 2.0 * (beyond + float(unseen.sum())), note
 
 
-def _power(excess: Callable[[np.ndarray], np.ndarray], peak: np.ndarray, spacing: float) -> float:
-    """Return the power p with which a cost grows as 1 / distance^p at its largest value near ``peak (width,)``.
+def _missed(excess: Callable[[np.ndarray], np.ndarray], edges: list[np.ndarray]) -> float:
+    """Return the largest change, from coarse to fine panels, of E[f(w) w] along an axis or a diagonal through w = 0.
 
-    Intervals around the largest value are enlarged :data:`ZOOMS` times, along the first axis of noise and then along
-    the others. The power is 0 at a bounded peak or jump.
+    The lines show what may lie between the points of a rule, such as a narrow ridge. ``edges`` are those of each axis.
     """
-    width, sizes = spacing, []
-    at = peak.copy()
-    for _ in range(ZOOMS):
-        best = 0.0
-        for axis in range(at.size):
-            line = np.repeat(at[:, None], PARTS + 1, axis=1)
-            # not symmetric about the present point, which may lie beside the pole
-            line[axis] += width * (np.arange(PARTS + 1) / PARTS - 0.487)
-            with np.errstate(all="ignore"):
-                f = np.nan_to_num(np.abs(excess(line)), nan=0.0, posinf=0.0)
-            if f.max() > best:
-                best, at = float(f.max()), line[:, int(f.argmax())]
-        sizes.append(best)
-        width *= 4.0 / PARTS
-    if min(sizes) <= 0.0:
-        return 0.0
-    slopes = np.diff(np.log(sizes)) / math.log(PARTS / 4.0)
-    return float(np.median(slopes[-5:]))
+    half, changes = math.sqrt(0.5), []
+    for line in [(1.0,)] if len(edges) == 1 else [(1.0, 0.0), (0.0, 1.0), (half, half), (half, -half)]:
+        crossed = np.concatenate([each / part for each, part in zip(edges, line, strict=True) if part])
+        ends = np.unique([-SEARCHED, *crossed[np.abs(crossed) < SEARCHED], SEARCHED])
+        rules = [_panels(ends, panels, 0.0) for panels in SEARCH]
+        coarse, fine = (float(weights * t @ excess(np.outer(line, t))) for t, weights in rules)
+        changes.append(abs(fine - coarse))
+    return max(changes)
+
+
+def _bisected(integrand: Callable[[np.ndarray], np.ndarray], ends: np.ndarray) -> tuple[float, float, int, float]:
+    """Return the mean of ``integrand (B,) -> (B,)`` under the normal density, its last change, the points used, and a power.
+
+    Panels between ``ends`` that change when they are halved are halved again, so that spikes, jumps and poles are
+    resolved. At a pole 1 / distance^p, the changes of successive halvings fall by the ratio 2^(p - 1), which shows the
+    power p. It is 0 where all changes vanish.
+    """
+    x, w = np.polynomial.legendre.leggauss(NODES)
+
+    def panels(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        half = (high - low)[:, None] / 2.0
+        t = (low[:, None] + half) + half * x
+        weights = half * w * np.exp(-(t**2) / 2.0) / math.sqrt(2.0 * math.pi)
+        return np.asarray((weights * integrand(t.ravel()).reshape(t.shape)).sum(axis=1))
+
+    low, high = ends[:-1], ends[1:]
+    whole, total, used, changes = panels(low, high), 0.0, low.size * NODES, []
+    limit, closed = SOLVED * float(np.abs(whole).sum()), 0.0
+    while True:
+        middle = (low + high) / 2.0
+        parts = np.stack([panels(low, middle), panels(middle, high)])
+        used += 2 * low.size * NODES
+        change = np.abs(parts.sum(axis=0) - whole)
+        changes.append(float(change.sum()))
+        is_open = change > limit
+        if len(changes) == HALVINGS or is_open.sum() > MOST:
+            is_open[:] = False
+        total += float(parts[:, ~is_open].sum())
+        closed += float(change[~is_open].sum())
+        if not is_open.any():
+            break
+        low, high = np.concatenate([low[is_open], middle[is_open]]), np.concatenate([middle[is_open], high[is_open]])
+        whole = parts[:, is_open].ravel()
+    power = 1.0 + math.log2(changes[-1] / changes[-11]) / 10.0 if len(changes) == HALVINGS else 0.0
+    return total, closed, used, max(power, 0.0)
 
 
 def _panels(edges: np.ndarray, count: int, shift: float) -> tuple[np.ndarray, np.ndarray]:

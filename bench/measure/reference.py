@@ -12,8 +12,8 @@ import numpy as np
 from bench.measure import noise
 from bench.measure.batches import in_columns
 from bench.measure.jumps import largest_jump
-from bench.measure.quadrature import integrate
-from bench.measure.statistics import Sampling, Truth, bias_interval, heavy_tails
+from bench.measure.quadrature import TOLERANCE, integrate
+from bench.measure.statistics import THREE, Sampling, Truth, bias_interval, heavy_tails
 from bench.model import Problem, Program
 
 BATCHES = 64
@@ -24,8 +24,8 @@ small. The pilot, which selects the estimator of a sampled reference, is one bat
 LEAST_SAMPLES = 16384
 """Minimum samples of a sampled reference, unless the limit is lower: a small spread of few samples proves nothing."""
 QUADRATURE_POINTS = 1 << 20
-QUADRATURE_TOLERANCE = 1e-3
-"""Relative error above which quadrature is accepted only where sampling does no better."""
+SURE = 3.0
+"""Stated errors of quadrature and sampling together beyond which they disagree."""
 TAIL_EVENTS = 10.0
 """Expected samples in the tails. Their contribution is estimated separately, as a spread may not show so few samples."""
 DEEPER = 0.2
@@ -153,7 +153,7 @@ def _compute(
             quadrature = Reference(integral.gradient[None, :], method, integral.error, note=integral.note)
             if math.isnan(integral.error):
                 return replace(quadrature, method="quadrature[failed: the mean cost may not exist]")
-            if integral.error <= QUADRATURE_TOLERANCE * np.linalg.norm(integral.gradient):
+            if integral.error <= TOLERANCE * np.linalg.norm(integral.gradient):
                 return quadrature
     sampled = _sample(problem, theta, provides, samples, tolerance)
     if quadrature is None:
@@ -161,8 +161,13 @@ def _compute(
     # a gradient near zero has no relative accuracy: there the method with the smaller error is used
     if not sampled.is_finite:
         return quadrature
-    sampled = replace(sampled, note="; ".join(part for part in (sampled.note, quadrature.note) if part))
-    return sampled if 0.0 < sampled.known().standard_error < quadrature.error else quadrature
+    apart, error = float(np.linalg.norm(sampled.gradient - quadrature.gradient)), sampled.known().standard_error
+    if apart > SURE * math.hypot(error, quadrature.error):
+        note = f"quadrature and sampling disagree by {apart:.2g}, which is the stated error"
+        return _with_note(replace(quadrature, error=max(apart, quadrature.error)), note)
+    # doubts about the samples are doubts about their error
+    outdone = not sampled.note and 0.0 < error < quadrature.error
+    return _with_note(sampled, quadrature.note) if outdone else quadrature
 
 
 def _unit(problem: Problem, theta: np.ndarray) -> float:
@@ -327,8 +332,10 @@ def _batches(
         return _failed(problem, "noise rarer than any sample dominates the mean, which may not exist")
     if not note and heavy_tails(batches - batches.mean(axis=0)):
         note = "the reference's batches have heavy tails, so its standard error is uncertain"
-    elif not note and not np.ptp(pilot) and not pilot.any():
-        note = f"every sample of the reference has gradient 0: events rarer than {3.0 / (count * BATCHES):.1g} are not seen"
+    elif np.ptp(batches, axis=0).max() <= ROUNDING * np.abs(batches).max():
+        rare = THREE / (count * BATCHES)
+        unseen = math.hypot(unseen, rare * float(np.linalg.norm(batches[0])))
+        note = note or f"all samples of the reference have the same gradient: events rarer than {rare:.1g} are not seen"
     # the spread does not show an error that all samples share, such as that of a backend's differences
     unseen = math.hypot(unseen, SHARED * math.sqrt(float(np.square(pilot).sum(axis=0).mean())))
     return Reference(batches, f"sampling[{order},n={count * BATCHES}]", unseen, note=note)

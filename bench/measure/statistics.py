@@ -51,6 +51,8 @@ VAGUE = 0.1
 """Error of a reference, as a share of its norm, above which a note warns that relative columns are no more accurate."""
 LARGE = 1 << 12
 """Coordinates from which a covariance that is equal in all directions is one number: as rows it has d x d numbers."""
+NARROW = 10.0
+"""Width of the interval of the log variance of terms, times their number, below which it ignores the error of their mean."""
 THREE = 3.0
 """Numerator of the rule of three: an event absent from n trials has a probability below 3 / n, at 95% confidence."""
 UNEXPLAINED = "tails unseen or gradient wrong"
@@ -158,15 +160,6 @@ class Truth:
         """Return a truth from a closed form or quadrature ``(d,)``; its error has norm ``error`` and unknown direction."""
         mean = np.asarray(mean, dtype=np.float64)
         return cls(mean, Sampling.without_direction(error, mean.size))
-
-    @classmethod
-    def from_covariance(cls, mean: np.ndarray, covariance: np.ndarray, degrees: float = math.inf) -> Truth:
-        """Return a truth from a mean ``(d,)`` and the covariance ``(d, d)`` of that mean, not of one sample."""
-        mean, covariance = np.asarray(mean, dtype=np.float64), np.asarray(covariance, dtype=np.float64)
-        if covariance.shape != (mean.size, mean.size):
-            raise ValueError(f"the covariance of a mean {mean.shape} is {(mean.size,) * 2}; given {covariance.shape}")
-        values, vectors = np.linalg.eigh(covariance)
-        return cls(mean, Sampling((vectors * np.sqrt(np.maximum(values, 0.0))).T, degrees))
 
     @classmethod
     def from_batches(cls, batches: np.ndarray, unseen: float = 0.0) -> Truth:
@@ -499,6 +492,8 @@ def summarise(
     scaled = tuple(value * unit * unit for value in per_sample)
     if terms is not None:
         scaled = variance_per_sample(*terms, samples)
+        if scaled[1] > 0.0 and math.log(scaled[2] / scaled[1]) < NARROW / (repeats * samples):
+            notes.append("all terms are equally far from their mean: the interval of their variance is too narrow")
     return Summary(
         grad_norm=float(np.linalg.norm(mean)) * unit,
         reference_norm=norm * unit,

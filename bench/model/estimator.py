@@ -68,6 +68,10 @@ class Estimator(Plugin):
         derivative = program.continuous and not program.surrogate
         return self.unbiased and self.target == "smoothed" and (derivative or self.unbiased_at_discontinuities)
 
+    def remark(self, diagnostics: Mapping[str, Mapping[str, float]]) -> str:
+        """Return a doubt about intervals, from mean, quantiles and share of zeros of each diagnostic; empty if none."""
+        return ""
+
     def smoothing(self, program: Program) -> Smoothing | None:
         """Return the smoothing whose gradient is the reference for this estimator's rows; None: J_sigma."""
         return None

@@ -32,7 +32,7 @@ from bench.model import guard, isolation, trial
 from bench.model.parameters import Plugin, build, parameters, remember, singular
 
 CORE = "bench.studies"
-"""The package of the built-in studies, which are imported without a trial in a separate process."""
+"""The package of the built-in studies."""
 BUILT_IN = ("bench.plugins", CORE)
 KINDS = (
     "scenes", "contacts", "integrators", "backends", "estimators", "optimizers", "policies", "trainers", "studies",
@@ -65,6 +65,8 @@ class Entry:
 
 Table = dict[str, dict[str, Entry]]
 _folders: list[Path] = []
+_only: frozenset[str] | None = None
+"""The only modules from outside that are loaded; None for all."""
 
 
 def add_folder(path: Path) -> None:
@@ -85,6 +87,19 @@ def folders() -> tuple[Path, ...]:
     return tuple(_folders)
 
 
+def restrict(modules: frozenset[str] | None) -> None:
+    """Load, of the modules from outside, only ``modules``, until another name is searched for; None to load all."""
+    global _only
+    if modules != _only:
+        _only = modules
+        entries.cache_clear()  # type: ignore[attr-defined]
+
+
+def is_restricted() -> bool:
+    """Return whether some modules from outside may not have been loaded."""
+    return _only is not None
+
+
 def _package(path: Path) -> str:
     """Return the folder's package name, which is unique and the same in every process, so that plugins can be pickled."""
     return f"bench_folder_{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"
@@ -94,12 +109,14 @@ def _package(path: Path) -> str:
 def entries() -> Table:
     """Return all plugins by kind and name."""
     table: Table = {kind: {} for kind in KINDS}
-    packages = (*BUILT_IN, *map(_package, _folders))
-    modules = [module for name in packages for module in _modules(importlib.import_module(name))]
+    packages = {_package(path): path for path in _folders if _only is None or _is_needed(_package(path))}
+    modules = [module for name in (*BUILT_IN, *packages) for module in _modules(importlib.import_module(name))]
     points = sorted(entry_points(group=ENTRY_POINT_GROUP), key=lambda p: p.name)
-    hashes = {module: trial.file_hash(module) for _, module in modules if not module.startswith(CORE)}
-    hashes |= {point.module: point.dist.version if point.dist else "" for point in points}
-    fatal = trial.find_fatal_modules(hashes, {_package(path): path for path in _folders})
+    if _only is not None:
+        modules = [part for part in modules if part[1].startswith(BUILT_IN) or part[1] in _only]
+        points = [point for point in points if point.module in _only]
+    outside = [*(name for _, name in modules if not name.startswith(BUILT_IN)), *(point.module for point in points)]
+    fatal = trial.find_fatal_modules(outside, packages) if _only is None else {}
     for kind, module in modules:
         with _protected(module):
             _load_module(table, kind, module, fatal.get(module, ""))
@@ -122,14 +139,18 @@ def entries() -> Table:
 
 @contextmanager
 def _protected(module: str) -> Iterator[None]:
-    """Undo what the import of a module changes in this process, and quote what it prints."""
+    """Name what the import of a module changes in this process, and quote what it prints."""
     source = f"{module}, while it was imported,"
     with ExitStack() as stack:
         if not module.startswith("bench."):
-            stack.enter_context(isolation.undo_changes(source))
+            stack.enter_context(isolation.named_changes(source))
         stack.enter_context(guard.capture_output(source))
         stack.enter_context(guard.protect_process())
         yield
+
+
+def _is_needed(package: str) -> bool:
+    return any(name.startswith(f"{package}.") for name in _only or ())
 
 
 def entries_with(kind: str, package: str) -> dict[str, Entry]:
@@ -290,9 +311,11 @@ def installed(module: str) -> bool:
 
 def find(kind: str, name: str) -> Entry:
     """Return the entry of a plugin; raises :class:`UserError` with the nearest name if there is none."""
+    if name not in entries().get(kind, {}):
+        restrict(None)  # a parameter of another plugin may name it
     table = entries().get(kind, {})
     if name not in table:
-        raise unknown(singular(kind), name, table)
+        raise unknown(singular(kind), name, table, f"list {kind}")
     return table[name]
 
 

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict
+from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 from bench.errors import STATUSES, StorageError, failure, printable
 from bench.experiment.cell import Cell
 from bench.experiment.experiment import Experiment
 from bench.experiment.keys import fingerprint
+from bench.experiment.parameters import PROBLEM
 from bench.experiment.study import Study, study_of
 from bench.measure import noise
-from bench.model import Backend, Plugin, Scene, guard, registry
-from bench.model.isolation import State, reduced_precision
+from bench.model import Backend, Plugin, Scene, guard, isolation, registry
 from bench.run.plan import versions
 from bench.run.pool import Answer
 from bench.run.record import kind_of_machine
@@ -27,6 +29,9 @@ FAILED = ("error", "crashed", "timeout")
 """Statuses of cells that failed."""
 CONVERGED = {"float64": 1e-8, "float32": 1e-4}
 """Largest relative residual of a constraint solver that has converged, by type of the simulation."""
+
+RAN: set[str] = set()
+"""The modules and files from outside whose code this process has run."""
 
 
 @dataclass(frozen=True)
@@ -46,77 +51,71 @@ class Task:
         """The backend that runs the task."""
         return self.cell.reference_backends[0] if self.reference else self.cell.backend
 
-    @property
+    @cached_property
     def outside(self) -> frozenset[str]:
-        """The modules and files from outside this package whose code the task runs."""
-        parts = [*self.cell.parts.values(), self.cell.study, self.backend]
-        foreign = [part for part in parts if part is not None and is_foreign(part)]
-        names = {type(part).__module__ for part in foreign}
-        for part in foreign:
-            with suppress(Exception):  # the error is reported when the cell is measured
-                names |= set(map(str, getattr(part, "files", tuple)()))
-        return frozenset(names)
+        """The modules and files from outside this package whose code the task runs; known wherever the task is sent."""
+        cell = self.cell
+        return outside_of([*cell.parts.values(), cell.study, self.backend, *cell.ranked_backends])
+
+    @property
+    def outside_of_reference(self) -> frozenset[str]:
+        """The part of :attr:`outside` that decides the reference gradient."""
+        program = (self.cell.parts.get(axis) for axis in PROBLEM)
+        return self.outside if self.reference else outside_of([*program, *self.cell.reference_backends])
 
 
 class TaskHandler:
     """Handles the tasks of one experiment, in a worker or in this process."""
 
     def __init__(self, experiment: Experiment, single_thread: bool = False) -> None:
-        self._experiment = experiment
         self._session = Session(experiment)
         self._study = study_of(experiment)
-        self._state = State(double_precision=True, single_thread=single_thread)
-        self._ran_foreign_code = False
+        self._state = isolation.State(double_precision=True, single_thread=single_thread)
         self.is_tainted = False
-        """Whether a plugin has changed the process, so that later items need a new one."""
+        """Whether later items need a new process."""
 
     def close(self) -> None:
-        """Stop following the state of the process."""
+        """Restore the numbers of threads."""
         self._state.close()
 
     def prepare(self, item: Task) -> None:
-        """Compile the program, so that the backend imports its libraries."""
-        if item.outside and not self._ran_foreign_code:
-            registry.entries()  # imported before foreign code can change them, so that a change is seen
+        """Load the item's plugins and compile the program, so that the backend imports its libraries."""
+        if registry.is_restricted():
+            registry.restrict(item.outside)
         with guard.protect_process():
             try:
                 self._session.problems.of(item.backend, item.cell)
             except KeyboardInterrupt:
                 raise
             except BaseException:  # the error is reported when the cell is measured
-                return
+                pass
+        self._state.follow()
 
     def __call__(self, item: Task) -> dict[str, Any]:
         """Return the results of the cell, or the status and reason of its failure.
 
-        A change of the process that would change other cells' numbers is undone and added to the reason.
+        The reason names changed settings of the process, and code from outside that the process has run for other cells.
         """
-        if item.outside and not self._ran_foreign_code:
-            registry.entries()  # as in prepare, which only workers call
-            self._state.adopt()
-            self._ran_foreign_code = True
+        RAN.update(item.outside)
         result = self._handle(item)
-        changes = self._state.changes(functions=self._ran_foreign_code)
-        if not changes:
-            return result
-        if (
-            result.get("dtype", item.cell.backend.dtype) == "float64"
-            and reduced_precision()
-            and _uses_jax(item.backend)
-        ):
-            result["dtype"] = "float32"
-        self._state.restore()
-        self._state.adopt()
-        self._session = Session(self._experiment)
-        self.is_tainted = True
-        remark = f"a plugin of this cell changed {printable('; '.join(changes))}, which was undone before the next cell"
-        return result | {"reason": "; ".join(part for part in (result.get("reason", ""), remark) if part)}
+        remarks = []
+        if changes := [*isolation.BY_IMPORTS, *self._state.changes()]:
+            remarks.append(f"settings changed in this process: {printable('; '.join(changes))}")
+            if (
+                result.get("dtype", item.cell.backend.dtype) == "float64"
+                and isolation.reduced_precision()
+                and _uses_jax(item.backend)
+            ):
+                result["dtype"] = "float32"
+        if others := RAN - item.outside:
+            remarks.append(f"this process has also run code of {printable(', '.join(sorted(others)))}")
+        self.is_tainted = bool(changes) or not registry.is_restricted()
+        return result | {"reason": "; ".join(filter(None, (result.get("reason", ""), *remarks)))} if remarks else result
 
     def _handle(self, item: Task) -> dict[str, Any]:
-        program = (item.cell.parts.get(axis) for axis in ("scene", "contact", "integrator", "backend"))
-        is_built_in = not any(part is not None and is_foreign(part) for part in program)
-        # foreign code may have changed what computes it
-        self._session.references.stores = item.reference or not (item.outside and is_built_in)
+        self._session.references.stores = (
+            item.outside_of_reference >= RAN
+        )  # other code may have changed what computes it
         with guard.protect_process():
             if not item.reference:
                 return measure_cell(item.cell, self._session, self._study)
@@ -127,6 +126,16 @@ class TaskHandler:
             except BaseException as error:
                 return dict(failure(error))
             return {"status": "ok"}
+
+
+def outside_of(parts: Iterable[Plugin | None]) -> frozenset[str]:
+    """Return the modules and files from outside this package that decide what plugins do."""
+    foreign = [part for part in parts if part is not None and is_foreign(part)]
+    names = {type(part).__module__ for part in foreign}
+    for part in foreign:
+        with suppress(Exception):  # the error is reported when the cell is measured
+            names |= set(map(str, getattr(part, "files", tuple)()))
+    return frozenset(names)
 
 
 def is_foreign(part: Plugin) -> bool:

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from bench.errors import StorageError, failure
-from bench.model import guard, isolation, registry
+from bench.model import guard, registry
 
 PROGRAM = "import sys; sys.path[:] = sys.argv.pop().split(chr(0x1f)); from bench.run.worker import main; main()"
 """The program of a worker. It has the import path of its run, and does not import the run's main script."""
@@ -32,7 +32,7 @@ class Handler(Protocol):
     """Handles items in a worker."""
 
     def prepare(self, item: Any) -> None:
-        """Import the libraries that the item needs; this time does not count as the item's."""
+        """Import what the item needs; this time does not count as the item's."""
 
     def __call__(self, item: Any) -> dict[str, Any]:
         """Return the item's result, to be sent as JSON.
@@ -69,12 +69,11 @@ def _serve(connection: Connection) -> None:
     _send(connection, "hello")
     # the argument is pickled separately, since its classes may come from the folders of plugins
     folders, make, argument = pickle.loads(_receive(connection))
+    registry.restrict(frozenset())
     for folder in folders:
         registry.add_folder(folder)
     pid = os.getpid()
-    with isolation.undo_changes("a plugin, while it was imported,"):
-        content = pickle.loads(argument)
-    handle = make(content)
+    handle = make(pickle.loads(argument))
     _send(connection, "ready")
     while not getattr(handle, "is_tainted", False):  # the run continues in a new worker
         event, answer = _answer(connection, handle, _receive(connection))

@@ -1,11 +1,17 @@
 """Interpolation between first and zeroth order with a confidence test."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
 from bench.model import Auxiliaries, DiagnosticEstimator, Problem, first_order, halves, param, zeroth_order
+
+RARE = 2.0
+"""gamma / eps from which hardly any estimate of a smooth cost reaches the cap."""
+PRECISE = 0.9
+"""Weight above which the first order's variance is below a ninth of the zeroth order's."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +42,13 @@ class AlphaOrder(DiagnosticEstimator):
     sharing: str = param("split", "whether both orders use the same samples", choices=("split", "shared"))
     delta: float = param(0.05, "failure probability of the confidence radius", positive=True, high=1.0)
     bound: float | None = param(None, "L, bound on |zeroth-order term|; null: the largest in the batch", positive=True)
+
+    def remark(self, diagnostics: Mapping[str, Mapping[str, float]]) -> str:
+        """Return a doubt where few estimates reach the cap, and differ from the others by much more than these vary."""
+        ratio = self.ratio if self.gamma is None else self.gamma / max(diagnostics["eps"]["median"], 1e-300)
+        if 1.0 < ratio < RARE and diagnostics["alpha"]["median"] > PRECISE:
+            return "rare estimates, in which gamma - eps limits alpha, hold most of the variance: its intervals are too narrow"
+        return ""
 
     def estimate_with_diagnostics(
         self, problem: Problem, theta: np.ndarray, noise: np.ndarray

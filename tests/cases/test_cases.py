@@ -63,7 +63,14 @@ SCENES = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("words", "status", "cause", "said"), CASES, ids=[case[0] for case in CASES])
+LONG = ("sigma", "noise", "torch", "jax", "refined")
+"""Words of cases that take longer: with noise, with an import of a library, or with a second program."""
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "cause", "said"),
+    [pytest.param(*case, id=case[0], marks=[pytest.mark.slow] * any(w in case[0] for w in LONG)) for case in CASES],
+)
 def test_a_public_case_gets_its_verdict(words, status, cause, said):
     place, *settings = words.split()
     file, _, name = place.partition(":")

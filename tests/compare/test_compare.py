@@ -531,7 +531,7 @@ def test_a_table_with_several_lines_per_cell_has_the_worst_verdict_of_each(tmp_p
 
 
 @pytest.mark.parametrize("study", list(registry.entries()["studies"]))
-@pytest.mark.parametrize("parquet", [True, False])
+@pytest.mark.parametrize("parquet", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_results_of_every_study_are_compared(study, parquet, tmp_path):
     """One of them gave no result: rows of every kind of column, from Parquet and from the committed table."""
     columns, rows = of_study(study, "scenes=[pushing,quadratic]")

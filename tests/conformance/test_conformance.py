@@ -838,6 +838,7 @@ class ABroken(Backend):
 """
 
 
+@pytest.mark.slow
 def test_a_check_ends_at_the_time_limit_and_the_others_run(capsys, tmp_path, monkeypatch):
     (tmp_path / "endless.py").write_text(SLOW_BACKEND)
     with folder_of_plugins(tmp_path):
@@ -865,6 +866,7 @@ def test_a_limit_that_is_no_duration_is_refused():
         cli._check(["linear", "limit=soon"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("provides", ["{'physics'}", pytest.param("set()", marks=pytest.mark.slow)])
 def test_a_broken_backend_does_not_fail_the_checks_of_a_scene(tmp_path, provides):
     (tmp_path / "a_broken.py").write_text(BROKEN_BACKEND.replace("PROVIDES", provides))

@@ -21,10 +21,12 @@ from bench.conformance.subjects import (
     sound_scenes,
 )
 from bench.conformance.subjects import programs as programs_of
-from bench.model import ContactScene, EngineScene, MechanicalScene, Plugin, compose, registry
+from bench.model import Backend, ContactScene, EngineScene, MechanicalScene, Plugin, compose, registry
 
 STEPS = 50
 """Most steps of a rollout in the fast tests, and as in the slow ones where a scene declares to jump."""
+SHORT = 100
+"""Most steps of a rollout in the slow tests of backends that compile for seconds or run eagerly."""
 MOVED = 1e-9
 """Difference of costs of about 1 that is far more than rounding."""
 ENTRIES = [entry for table in registry.entries().values() for entry in table.values()]
@@ -51,6 +53,11 @@ def is_long(plugin, check):
     )
     is_search = check == "continuity_is_as_declared" and isinstance(plugin, EngineScene)
     return bool(is_slow_backend) or is_search or plugin.name in ("hopper_run", "surrogate_backward")
+
+
+def is_varied(plugin):
+    """Whether a plugin has other parameters than the defaults."""
+    return not isinstance(plugin, type) and plugin != type(plugin)()
 
 
 def is_repeated(plugin, check):
@@ -114,9 +121,21 @@ def test_registered_plugin_loads_and_is_well_formed(entry):
     assert [result for result in results_of(entry.plugin, GENERIC) if result.outcome != "pass"] == []
 
 
+def is_short(plugin, check):
+    """Whether a check runs on few short programs without taking long."""
+    return not is_long(plugin, check) and not is_repeated(plugin, check)
+
+
 @pytest.mark.usefixtures("few_programs")
-@kit_items(lambda plugin, check: not is_long(plugin, check) and not is_repeated(plugin, check))
+@kit_items(lambda plugin, check: is_short(plugin, check) and not is_varied(plugin))
 def test_registered_plugin_conforms(plugin, check):
+    check(plugin)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("few_programs")
+@kit_items(lambda plugin, check: is_short(plugin, check) and is_varied(plugin))
+def test_registered_plugin_with_other_parameters_conforms(plugin, check):
     check(plugin)
 
 
@@ -138,10 +157,14 @@ def levels(program, backend):
 
 @pytest.fixture
 def designed_programs(monkeypatch, plugin, check):
-    """Costs on a backend are compared on the programs of the design."""
+    """Costs on a backend are compared on the programs of the design; a backend that takes long runs few and short ones."""
+    programs = all_programs()
+    if is_long(plugin, check):
+        programs = [program for program in programs if program.scene.horizon <= SHORT]
+        monkeypatch.setattr(conformance.backends, "representative_programs", distinguishing_programs)
     if check.args[0].__name__ == "value_agrees":
-        programs = [program for program in all_programs() if levels(program, plugin) in design()]
-        monkeypatch.setattr(conformance.backends, "all_programs", lambda: programs)
+        programs = [program for program in programs if levels(program, plugin) in design()]
+    monkeypatch.setattr(conformance.backends, "all_programs", lambda: programs)
 
 
 def is_wider(plugin, check):
@@ -156,9 +179,18 @@ def is_wider(plugin, check):
     return check == "continuity_in_rollouts_is_as_declared"
 
 
+def is_designed(plugin, check):
+    """Whether the slow set has a check: of plugins that take long, other parameters than the defaults have gradients only."""
+    if check == "backends_agree":
+        return False
+    if not is_long(plugin, check):
+        return is_wider(plugin, check)
+    return not is_varied(plugin) or (isinstance(plugin, Backend) and check == "gradient_is_that_of_value")
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("designed_programs")
-@kit_items(lambda plugin, check: check != "backends_agree" and (is_long(plugin, check) or is_wider(plugin, check)))
+@kit_items(is_designed)
 def test_registered_plugin_conforms_on_more_programs(plugin, check):
     check(plugin)
 

@@ -25,6 +25,7 @@ def pages():
     return website.sources()
 
 
+@pytest.mark.slow
 def test_every_page_is_in_the_navigation_once(pages):
     listed = [name for text in pages.values() for block in re.findall(r"```{toctree}\n(.*?)```", text, re.DOTALL)
               for name in re.findall(r"^(?:.* <)?([\w/-]+)>?$", block.replace(":hidden:", ""), re.MULTILINE)]  # fmt: skip
@@ -167,8 +168,6 @@ def test_site_needs_no_network(site):
 
 @pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
-@pytest.mark.parametrize(
-    ("word", "page"), [("leave_one_out", "estimator/reinforce.html"), ("stiffness", "stability.html")]
-)
+@pytest.mark.parametrize(("word", "page"), [("leave_one_out", "estimator/reinforce.html"), ("stiffness", "trust.html")])
 def test_search_works_from_disk(site, word, page):
     assert f'href="{page}' in dom(site / "search.html", f"?q={word}")

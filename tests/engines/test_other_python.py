@@ -169,6 +169,7 @@ def test_an_error_in_an_engine_names_its_file_and_line_and_the_engine_goes_on():
     assert len(process._running) == 1
 
 
+@pytest.mark.slow
 def test_an_engine_killed_in_mid_sweep_loses_nothing(tmp_path):
     """Rows are those of a sweep in which the engine lives."""
     results = []
@@ -182,6 +183,7 @@ def test_an_engine_killed_in_mid_sweep_loses_nothing(tmp_path):
     assert [list(x) for x in killed["mean_estimate"]] == [list(x) for x in alive["mean_estimate"]]
 
 
+@pytest.mark.slow
 def test_an_engine_ends_with_its_run_even_if_it_hangs():
     code = f"""
 import sys, threading, time

@@ -443,6 +443,7 @@ def test_budget_is_read_with_its_unit():
 # ----------------------------------------------------------------------------------- files, command, pytest
 
 
+@pytest.mark.slow
 def test_page_has_text_tables_and_charts(tmp_path):
     report = bench.examine(bowl, [1.0, 0.5], grad=slope, sigma=[0.003, 0.1], **QUICK)
     names = {path.name for path in report.save(tmp_path / "out")}
@@ -652,6 +653,7 @@ def test_costs_that_are_no_numbers_beside_theta_leave_no_mean():
     assert "ValueError: out of domain" in str(report)
 
 
+@pytest.mark.slow
 def test_python_number_from_torch_is_disconnected_in_double_precision():
     pytest.importorskip("torch")
     report = bench.examine(lambda x: (x**2).sum().item(), [1.0, 2.0], grad="torch", **QUICK)

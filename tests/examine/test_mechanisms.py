@@ -79,6 +79,7 @@ def test_the_error_of_a_separately_solved_adjoint_shrinks_with_the_tolerance():
     assert sizes[0] > 5 * sizes[1] > 25 * sizes[2] > 0
 
 
+@pytest.mark.slow
 def test_an_adjoint_equation_without_a_term_is_wrong_beside_adaptive_steps():
     for settings in ({}, {"refined": mechanisms.refined}):
         report = separate(1e-4, forgotten=0.03, **settings)
@@ -538,6 +539,7 @@ def test_errors_of_10_000_numbers_within_the_tolerance_are_right(errors):
     assert any("within the tolerance" in text for text in report.warnings)
 
 
+@pytest.mark.slow
 def test_the_error_of_one_number_that_its_group_may_hide_is_stated():
     report = examined(1.0)
     assert report.derivative == "right"

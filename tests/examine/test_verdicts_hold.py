@@ -71,7 +71,9 @@ def examined(fault, **hints):
     return bench.examine(cost, START, grad=FAULTS[fault], calls=1500, progress=False, **hints)
 
 
-@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize(
+    "fault", [pytest.param(f, marks=[pytest.mark.slow] * (i % 4 > 0)) for i, f in enumerate(FAULTS)]
+)
 def test_no_hint_softens_a_verdict(fault):
     plain = examined(fault)
     assert (plain.status, plain.derivative) == (1, "wrong"), str(plain)

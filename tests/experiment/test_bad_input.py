@@ -144,6 +144,25 @@ def test_a_name_that_is_read_is_not_refused(capsys, word):
     assert capsys.readouterr().err == ""
 
 
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["plan", "+experiment=quick", "+experiment=twins"], "python -m bench +experiment=quick && python -m bench +experiment=twins"),
+        (["plan", "+experiment=quick,twins"], "python -m bench +experiment=quick && python -m bench +experiment=twins"),
+        (["stiffness_sweep", "samples=8"], "python -m bench +experiment=stiffness_sweep samples=8"),
+        (["plan", "stiffness_sweep"], "write +experiment=stiffness_sweep"), (["plan", *BASE, "samples=[16,32]"], "write sweep.samples=[...]"),
+        (["plan", *BASE, "name=standard"], "name=standard is reserved"), (["plan", *BASE, "name=references"], "is reserved"),
+        (["plan", *BASE, "scenes=[zzz]"], "python -m bench list scenes)"), (["check", "zzz"], "python -m bench list)"),
+    ],
+)  # fmt: skip
+def test_a_message_names_the_fix(capsys, words, said):
+    assert main(words) == 2
+    line = capsys.readouterr().err
+    assert said in line
+    assert not ("zzz" in line and "did you mean" in line)
+    assert len(line) < 400
+
+
 def test_a_folder_with_an_accent_needs_no_quotes():
     assert load(["results_dir=résultats/é"]).results_dir.name == "é"
     assert load(["results_dir='résultats/é'"]).results_dir.name == "é"

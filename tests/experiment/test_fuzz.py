@@ -81,6 +81,7 @@ def no_reports(monkeypatch):
     monkeypatch.setattr("bench.report.writer.show", lambda experiment, rows, views: None)
 
 
+@pytest.mark.slow
 @settings(max_examples=12, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
 @given(words=st.lists(word, min_size=1, max_size=4).filter(affordable), verb=st.sampled_from(["run", "plan"]))
 @example(words=["name=../../x"], verb="run")
@@ -93,7 +94,7 @@ def test_a_few_configurations(words, verb, capsys):
     check(words, verb, capsys)
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @settings(max_examples=1000, deadline=None, suppress_health_check=list(HealthCheck))
 @given(words=st.lists(word, min_size=1, max_size=4).filter(affordable), verb=st.sampled_from(["run", "plan"]))
 def test_a_thousand_configurations(words, verb, capsys):

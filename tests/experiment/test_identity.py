@@ -92,6 +92,7 @@ TINY = [
 ]
 
 
+@pytest.mark.slow
 def test_other_versions_are_reported_and_rerun_when_asked(tmp_path, capsys, monkeypatch):
     words = [*TINY, f"results_dir={tmp_path}"]
     assert main(words) == 0

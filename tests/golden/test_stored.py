@@ -21,10 +21,10 @@ QUICK_S = 1.0
 MOST = 6
 """Most rows of an experiment."""
 AXES = ("scene", "contact", "integrator", "backend", "estimator", "optimizer", "trainer")
-FAST = {"quick", "windows", "stiffness_sweep"}
+FAST = {"quick"}
 STORED = sorted(path.parent.name for path in ROOT.glob("results/standard/*/rows.parquet"))
 CASES = [pytest.param(name, False, id=name, marks=[pytest.mark.slow] * (name not in FAST)) for name in STORED]
-CASES += [pytest.param("engines", True, id="engines-mjx", marks=pytest.mark.slow)]  # which compiles for a minute
+CASES += [pytest.param("engines", True, id="engines-mjx", marks=pytest.mark.full)]  # which compiles for a minute
 ALLOWED = {"float64": 10.0, "float32": 1e6}
 """Tolerances of golden cells that stored rows may move by, since these are longer: 1e-7 as the double pendulum multiplies
 rounding by 1e7; and 1% where the simulation has seven digits."""

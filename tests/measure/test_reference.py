@@ -14,7 +14,7 @@ from bench.plugins.scenes.heaviside import Heaviside
 from bench.measure import noise, reference
 from bench.measure.batches import in_columns
 from bench.measure.jumps import largest_jump
-from bench.measure.quadrature import Integral
+from bench.measure.quadrature import NODES, SEARCH, Integral
 from bench.measure.reference import BATCHES, certify
 from bench.model import compose
 from bench.model.problem import Problem
@@ -77,6 +77,28 @@ def test_narrow_event_is_seen():
     case = ridge(bank.power(1), bank.bump(1.0, 0.001, 700.0), dim=1)
     assert abs(case.truth[0] - 2.0) > 0.1
     assert bank.excess(case, bank.certified(case, 1 << 18)) <= 1.0
+
+
+@pytest.mark.parametrize(("width", "at"), [(1.8e-4, 2.82), (3e-5, 2.0)])
+def test_spike_that_no_sample_meets_is_resolved(width, at):
+    """Samples have the gradient .2 with no spread, and a rule with equal panels is off by up to the spike."""
+    case = ridge(bank.power(1, 0.2), bank.bump(at, width, 3.0 / width), dim=1, sigma=1.0)
+    found = bank.certified(case, SAMPLES)
+    assert bank.excess(case, found) <= 1.0
+    assert found.error < LISTED * abs(case.truth[0])
+
+
+def test_ridge_between_the_points_of_a_plane_is_a_remark():
+    case = ridge(bank.power(1, 0.2), bank.bump(2.0, 1e-4, 3e4), dim=2, sigma=1.0)
+    found = bank.certified(case, SAMPLES)
+    assert "narrower than the spacing" in found.note
+    assert bank.excess(case, found) <= 1.0
+
+
+def test_slow_convergence_at_a_pole_is_in_the_error():
+    """d/du E|u + w - .5|^-.9 = 3.2071; two halvings of equal panels differ by a fourteenth of the error."""
+    case = ridge(bank.Piece("pole", lambda u: np.abs(u - 0.5) ** -0.9, lambda u, s: 3.2071), dim=1, sigma=1.0)
+    assert bank.excess(case, bank.certified(case, SAMPLES)) <= 1.0
 
 
 @pytest.mark.parametrize(("dim", "least"), [(1, 1 << 15), (2, 1 << 17)])
@@ -264,7 +286,8 @@ def test_points_of_a_quadrature_are_those_it_evaluates(monkeypatch):
     monkeypatch.setattr(Problem, "value", lambda self, theta, w: seen.append(w.copy()) or plain(self, theta, w))
     found = bank.certified(ridge(bank.power(3), dim=1), 1 << 18)
     points = np.unique(np.concatenate([w[0] for w in seen]))
-    levels = found_at(found, "points") * 1.5  # and those of the level before
+    # with those of the level before and of the search on a line
+    levels = found_at(found, "points") * 1.5 + NODES * sum(SEARCH)
     assert points.size == pytest.approx(levels, rel=0.02)
     assert found_at(found, "spacing") == pytest.approx(18 / found_at(found, "points"), rel=0.02)
 
@@ -398,6 +421,15 @@ def test_samples_without_any_spread_do_not_outdo_a_rule(monkeypatch, spread, cho
     monkeypatch.setattr(reference, "_sample", lambda *_: reference.Reference(batches, "sampling[n=64]", 0.0))
     monkeypatch.setattr(reference, "integrate", lambda *_: Integral(np.array([1.0]), 0.5, 1, 1.0))
     assert bank.certified(ridge(bank.power(1), dim=1), SAMPLES).method.startswith(chosen)
+
+
+def test_methods_that_disagree_state_the_disagreement_as_the_error(monkeypatch):
+    batches = 3.0 + 0.01 * np.linspace(-1.0, 1.0, BATCHES)[:, None]
+    monkeypatch.setattr(reference, "_sample", lambda *_: reference.Reference(batches, "sampling[n=64]", 0.0))
+    monkeypatch.setattr(reference, "integrate", lambda *_: Integral(np.array([1.0]), 0.5, 1, 1.0))
+    found = bank.certified(ridge(bank.power(1), dim=1), SAMPLES)
+    assert found.error == pytest.approx(2.0)
+    assert "disagree" in found.note
 
 
 def test_a_ramp_that_is_steep_and_resolved_is_no_jump():

@@ -1,8 +1,7 @@
-"""A change of the process by a plugin is named and undone, and reaches no other cell."""
+"""A setting of the process that a plugin changes is named, and what a plugin changes reaches no other cell of a worker."""
 
-import decimal
 import importlib
-import os
+import random
 import subprocess
 import sys
 from contextlib import contextmanager
@@ -15,66 +14,40 @@ from changes import CHANGES, plugin
 from threadpoolctl import ThreadpoolController, threadpool_limits
 
 from bench.experiment.config import load
-from bench.model import registry
+from bench.model import isolation, registry
 from bench.model.isolation import State
 from bench.run import tasks
 from bench.run.execute import execute
 
-LIBRARIES = (
-    "jax.numpy", "scipy.fft", "scipy.linalg", "scipy.optimize", "scipy.special", "torch", "bench.measure.statistics",
-    "bench.plugins.estimators.fobg", "bench.plugins.estimators.reinforce",
-)  # fmt: skip
-
 
 @contextmanager
-def followed():
-    """Follow the state of the process, with the libraries imported that the changes need."""
-    for name in LIBRARIES:
-        importlib.import_module(name)
-    state = State(double_precision=True)
-    try:
-        yield state
-    finally:
-        state.restore()
-        state.close()
+def unchanged():
+    """Restore the settings that :data:`CHANGES` changes."""
+    torch, special = (importlib.import_module(name) for name in ("torch", "scipy.special"))
+    seeds = random.getstate(), np.random.get_state(), torch.random.get_rng_state()  # noqa: NPY002
+    kind, threads, errors = torch.get_default_dtype(), torch.get_num_threads(), special.geterr()
+    with np.errstate(), torch.enable_grad(), threadpool_limits():
+        yield
+    random.setstate(seeds[0])
+    np.random.set_state(seeds[1])  # noqa: NPY002
+    torch.random.set_rng_state(seeds[2])
+    torch.set_default_dtype(kind)
+    torch.set_num_threads(threads)
+    special.seterr(**errors)
+    jax.config.update("jax_enable_x64", True)
 
 
-ONCE = ("fft_workers",)
-"""Changes that cannot be undone in this process."""
-
-
-SLOW = ("deterministic",)
-"""Changes that import much."""
-KINDS = [pytest.param(kind, marks=[pytest.mark.slow] * (kind in SLOW)) for kind in CHANGES if kind not in ONCE]
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_change_of_the_process_is_named_and_undone(kind):
+@pytest.mark.parametrize("kind", CHANGES)
+def test_a_changed_setting_is_named(kind):
     code, words = CHANGES[kind]
-    if kind == "cores" and len(os.sched_getaffinity(0)) == 1:
-        pytest.skip("there is one core")
-    with followed() as state:
+    with unchanged():
+        state = State(double_precision=True)
         assert state.changes() == []
-        exec(code, {"np": np, "os": os})
+        exec(code, {"np": np})
         changes = state.changes()
-        state.restore()
-        assert words in "; ".join(changes)
-        assert len(changes) <= 2
-        assert state.changes() == []
-
-
-def test_decimal_arithmetic_before_and_after_is_no_change_and_settings_come_back():
-    """Arithmetic sets flags of the context: with them in the comparison, settings that were restored still looked changed."""
-    with decimal.localcontext() as own:
-        own.prec, own.flags[decimal.Inexact] = 31, True
-        with followed() as state:
-            decimal.Decimal(2).sqrt()
-            assert state.changes() == []
-            decimal.getcontext().prec = 5
-            assert "the decimal context" in "; ".join(state.changes())
-            state.restore()
-            assert state.changes() == []
-            assert decimal.getcontext().prec == 31
+        state.close()
+    assert words in "; ".join(changes)
+    assert len(changes) <= 2
 
 
 # ------------------------------------------------------------------------------------------------------------- runs
@@ -84,7 +57,7 @@ WORDS = ["scenes=[quadratic]", "samples=8", "repeats=4", "timing=false", "refere
 
 def rows_of_run(folder, backend, kinds, workers):
     """Return the rows of a run of ``fobg``, changing estimators and ``reinforce``, by estimator."""
-    (folder / "mine").mkdir()
+    (folder / "mine").mkdir(parents=True)
     for kind in kinds:
         (folder / "mine" / f"{kind}.py").write_text(plugin(kind))
     names = ",".join(["fobg", *(f"changes_{kind}" for kind in kinds), "reinforce"])
@@ -94,111 +67,82 @@ def rows_of_run(folder, backend, kinds, workers):
 
 
 def check_rows(rows, kinds, clean):
-    """Assert that changes are named, and that they change no number of the cells after them."""
+    """Assert that changes of settings are named, and that they change no number of the built-in cells."""
     for name in ("fobg", "reinforce"):
         assert rows["mean_estimate"][name].tobytes() == clean["mean_estimate"][name].tobytes()
         assert rows["reason"][name] == clean["reason"][name]
-    for kind in kinds:
-        row = rows.loc[f"changes_{kind}"]
-        assert "a plugin of this cell changed" in row["reason"], kind
-        assert CHANGES[kind][1] in row["reason"]
-        assert row["status"] in ("ok", "error")
-        if row["status"] == "ok" and kind not in OWN_SUMS:  # its gradients precede its change
-            assert row["mean_estimate"].tobytes() == clean["mean_estimate"]["fobg"].tobytes()
+    for kind in set(kinds) & CHANGES.keys():
+        assert CHANGES[kind][1] in rows["reason"][f"changes_{kind}"]
+        assert rows["status"][f"changes_{kind}"] in ("ok", "error")
 
 
-OWN_SUMS = ("rounding",)
-"""Changes that reach the means and norms of the cell itself, which follow its gradients."""
-QUICK = ["norm", "seterr", "environment", "json", "own_method", "np_draw", "sqrt", "builtin"]
+def test_a_change_reaches_no_other_cell_of_a_worker(tmp_path):
+    kinds = ["x64", "seterr", "np_draw", "norm", "own_method"]
+    clean = rows_of_run(tmp_path / "clean", "jax", [], 1)
+    rows = rows_of_run(tmp_path / "dirty", "jax", kinds, 1)
+    check_rows(rows, kinds, clean)
+    assert rows["dtype"].eq("float32").sum() == 1
+    assert not rows["reason"].str.contains("also run").any()
 
 
-def test_a_change_reaches_no_other_cell_of_a_run_in_this_process(tmp_path):
-    for name in ("clean", "dirty"):
-        (tmp_path / name).mkdir()
-    clean = rows_of_run(tmp_path / "clean", "numpy", [], 0)
-    check_rows(rows_of_run(tmp_path / "dirty", "numpy", QUICK, 0), QUICK, clean)
+def test_in_this_process_cells_after_other_code_say_so(tmp_path):
+    """Cells of this package come first, so that each later cell names the code that ran before it."""
+    kinds = ["seed", "sqrt"]
+    root, root_of_numpy = random.getstate(), np.sqrt
+    try:
+        clean = rows_of_run(tmp_path / "clean", "numpy", [], 0)
+        rows = rows_of_run(tmp_path / "dirty", "numpy", kinds, 0)
+    finally:
+        random.setstate(root)
+        np.sqrt = root_of_numpy
+    check_rows(rows, kinds, clean)
+    assert "also run code of" not in rows["reason"]["changes_seed"]
+    later = rows["reason"]["changes_sqrt"]
+    assert "this process has also run code of bench_folder_" in later
+    assert "the seed of random" in later
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("backend", ["numpy", "jax"])
-def test_a_change_of_any_kind_reaches_no_other_cell_of_a_worker(tmp_path, backend):
-    kinds = [kind for kind in CHANGES if kind != "cores" or len(os.sched_getaffinity(0)) > 1]
-    for name in ("clean", "dirty"):
-        (tmp_path / name).mkdir()
-    clean = rows_of_run(tmp_path / "clean", backend, [], 1)
-    rows = rows_of_run(tmp_path / "dirty", backend, kinds, 1)
-    # a worker that has run code from outside runs nothing else, so a setting of a library that is not in use may go unnamed
-    check_rows(rows, [kind for kind in kinds if kind != "x64" or backend == "jax"], clean)
-    assert rows["dtype"].eq("float32").sum() == (backend == "jax")
+IMPORTED = "import numpy as np\nnp.seterr(all='raise')\n"
 
 
-IMPORTED = "import numpy as np\nnp.seterr(all='raise')\nnp.linalg.norm = None\n"
-
-
-def test_a_change_by_an_import_is_undone_and_named(tmp_path, capfd):
+def test_a_change_by_an_import_is_named(tmp_path, capfd):
     (tmp_path / "imported.py").write_text(IMPORTED)
-    before, norm = np.geterr(), np.linalg.norm
     registry.add_folder(tmp_path)
-    registry.entries()
-    assert np.geterr() == before
-    assert np.linalg.norm is norm
+    with np.errstate():
+        registry.entries()
     assert "imported, while it was imported, changed NumPy's error state" in capfd.readouterr().err
+    assert "NumPy's error state" in isolation.BY_IMPORTS[0]
+
+
+def test_a_worker_loads_no_file_that_its_cells_do_not_need(tmp_path):
+    """The change by the import of another plugin is in no row."""
+    mine = tmp_path / "run" / "mine"
+    rows_of_run(tmp_path / "run", "numpy", ["seed"], 0)
+    (mine / "imported.py").write_text(IMPORTED)
+    words = [*WORDS, "backends=[numpy]", "estimators=[fobg,changes_seed]", "workers=1", f"results_dir={tmp_path}"]
+    with np.errstate():
+        execute(load([*words, f"plugins=[{mine}]"]))
+    rows = pd.read_parquet(tmp_path / "changed" / "rows.parquet").set_index("estimator")
+    assert "settings changed" not in rows["reason"]["fobg"]
+    assert "error state" not in rows["reason"]["changes_seed"]
 
 
 FRESH = """
-import sys
 from bench.model.isolation import State
 state = State(double_precision=True)
 import jax
 assert jax.config.jax_enable_x64
+state.follow()
 assert state.changes() == [], state.changes()
 jax.config.update("jax_enable_x64", False)
-import scipy.stats  # an import after the change may not undo it unnamed
+import scipy.stats  # an import after the change does not undo it unnamed
+state.follow()
 assert state.changes() == ["JAX's configuration (jax_enable_x64)"]
-state.restore()
-assert jax.config.jax_enable_x64
 """
 
 
 def test_the_settings_of_a_library_are_followed_from_its_import_on():
     subprocess.run([sys.executable, "-c", FRESH], check=True)
-
-
-def test_an_import_of_an_installed_library_is_no_change(tmp_path, monkeypatch):
-    library = tmp_path / "site-packages" / "sets_things.py"
-    library.parent.mkdir()
-    library.write_text("import os\nos.environ['SETS_THINGS'] = '1'\n")
-    (tmp_path / "own_things.py").write_text("import os\nos.environ['OWN_THINGS'] = '1'\n")
-    monkeypatch.setenv("SETS_THINGS", "0")
-    monkeypatch.setenv("OWN_THINGS", "0")
-    for folder in (library.parent, tmp_path):
-        monkeypatch.syspath_prepend(folder)
-    with followed() as state:
-        np.seterr(over="raise")
-        importlib.import_module("sets_things")
-        assert state.changes() == ["NumPy's error state (over)"]  # what a plugin changed before the import is known
-        importlib.import_module("own_things")
-        assert "environment variables (OWN_THINGS)" in state.changes()
-
-
-@pytest.mark.parametrize(
-    "block",
-    [lambda: np.errstate(over="ignore", invalid="ignore"), lambda: jax.enable_x64(not jax.config.jax_enable_x64)],
-    ids=["numpy", "jax"],
-)
-def test_an_import_within_a_block_that_changes_a_setting_is_no_change(tmp_path, monkeypatch, block):
-    """The setting is as before when the block ends."""
-    monkeypatch.delitem(sys.modules, "set_inside", raising=False)
-    library = tmp_path / "site-packages" / "set_inside.py"
-    library.parent.mkdir()
-    library.write_text("INSIDE = 1\n")
-    monkeypatch.syspath_prepend(library.parent)
-    with followed() as state:
-        with block():
-            importlib.import_module("set_inside")
-        assert state.changes() == []
-        np.seterr(under="raise")
-        assert state.changes() == ["NumPy's error state (under)"]
 
 
 def test_cells_in_this_process_use_one_thread_and_its_own_number_comes_back():
@@ -224,5 +168,5 @@ def test_a_run_in_this_process_has_one_thread_in_its_cells(tmp_path, monkeypatch
 
     monkeypatch.setattr(tasks, "measure_cell", measure)
     with threadpool_limits(2):
-        rows_of_run(tmp_path, "numpy", [], 0)
+        rows_of_run(tmp_path / "run", "numpy", [], 0)
     assert seen == [{1}] * 2

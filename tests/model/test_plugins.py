@@ -109,6 +109,7 @@ def test_added_plugin_is_listed_with_its_parameters(listing, name):
     assert "UNAVAILABLE" not in described
 
 
+@pytest.mark.slow
 def test_added_plugins_run_and_take_parameters_from_the_command_line(rows):
     assert rows.loc[["fobg", "half_step", "third_name"], "status"].tolist() == ["ok"] * 3
     assert rows.loc["half_step", "estimator_params"] == "factor=0.5"

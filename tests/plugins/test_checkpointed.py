@@ -39,6 +39,7 @@ def gradient(one):
     return one.grad(one.program.theta0, w)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("horizon", [pytest.param(1, marks=pytest.mark.slow), 7])
 def test_the_gradient_is_that_of_jax_whatever_is_kept(horizon):
     expected = gradient(problem(horizon, "jax"))

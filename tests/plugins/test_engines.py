@@ -255,6 +255,7 @@ def test_twins_study_measures_writes_and_draws(tmp_path):
         assert row["gradient_s"] > 0
 
 
+@pytest.mark.slow
 def test_scene_for_engines_is_traced_by_engines_only(tmp_path, capsys):
     assert main(["trace", "tossed_box", f"results_dir={tmp_path}"]) == 0
     printed = capsys.readouterr()
@@ -298,6 +299,7 @@ def test_force_of_unscaled_edges_fails_the_kit(monkeypatch):
         backends.frictional_contact_has_the_force_of_its_law(Mujoco())
 
 
+@pytest.mark.slow
 def test_rollout_that_stops_with_a_number_fails_the_kit(monkeypatch):
     """MuJoCo stops at the first bad number: were that the end of the rollout, its cost would be a number."""
     rolled = mujoco.Engine.rollout

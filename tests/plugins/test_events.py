@@ -187,6 +187,7 @@ def test_the_closed_form_of_a_walk_without_pull_is_that_of_a_binomial():
     assert scene.closed_form_gradient(None, None)[0] == pytest.approx(expected, rel=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("scene", "estimator"),
     [

@@ -72,6 +72,7 @@ def pushing():
     return list(both(compose(scene, law, integrator)))
 
 
+@pytest.mark.slow
 def test_ties_and_nan_are_those_of_jax(kinks):
     fused, jax = kinks
     theta = np.array([[0.0, 0.5, 0.25], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, -2.0, 40.0]])

@@ -152,6 +152,7 @@ def test_one_solver_iteration_of_mjx_is_refused():
         problem(backend="mjx")
 
 
+@pytest.mark.slow
 def test_scenes_from_files_run_in_sweeps(pendulum, tmp_path):
     rows = bench.run(
         name="robot", scenes=[f"mjcf[file={pendulum},horizon=10]"], backends=["mujoco", "jax"],

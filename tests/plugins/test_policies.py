@@ -137,6 +137,7 @@ class Final(CartpoleSwing):
         return 3.0 * q[0] ** 2 + v[1] ** 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("where", ["action", pytest.param("parameter", marks=pytest.mark.slow)])
 def test_backends_agree_on_a_gradient_with_a_terminal_cost(where):
     scene = Final(policy="mlp[hidden=4]", horizon=12, noise=where)
@@ -152,6 +153,7 @@ def test_backends_agree_on_a_gradient_with_a_terminal_cost(where):
     assert np.abs(adjoint_gradient(exact, slopes(exact, theta, w)) - gradient).max() < DIFFERENCED * scale
 
 
+@pytest.mark.slow
 def test_a_trace_adds_up():
     given = compile_problem(Final(policy="linear", horizon=12), None, "semi_implicit_euler", "jax")
     w = sample(given, 1)
@@ -255,6 +257,7 @@ def test_the_policy_is_in_the_key_of_a_cell():
     assert len({key("linear"), key("mlp"), key("mlp[hidden=8]")}) == 3
 
 
+@pytest.mark.slow
 def test_policies_are_swept(tmp_path):
     rows = bench.run(
         name="policies", scenes=["cartpole_swing[horizon=20]"], backends=["jax"], estimators=["fobg"],

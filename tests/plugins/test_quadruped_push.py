@@ -62,6 +62,7 @@ def test_in_contact_the_gradient_moves_the_block():
     assert pushing.value(moved, STILL)[0] < pushing.value(theta, STILL)[0] - 0.02
 
 
+@pytest.mark.slow
 def test_both_sides_of_the_touch_have_the_right_gradient():
     """Along the lean of all hips: before the touch it is 0, after it that of the differences; the contact is named."""
     pushing = problem(lean=0.13, **DOWN)

@@ -87,6 +87,7 @@ def ball(law, horizon=1):
     return Implicit().compile(compose(BounceOnce(horizon=horizon), law, SemiImplicitEuler()))
 
 
+@pytest.mark.slow
 def test_a_rigid_motion_is_that_of_its_kappa_and_one_step_has_the_derivative_of_the_softer_kappa():
     """After one step the cost is linear in the state, so its gradient is the step's derivative."""
     law, still = SurrogateBackward(kappa=1e-7, soft_kappa=0.1), np.zeros((3, 3))
@@ -127,6 +128,7 @@ def test_control_variate_stays_unbiased_with_a_surrogate_gradient():
     assert (np.abs(error.mean(axis=1)) > 4.5 * standard_error).any()  # the surrogate itself is biased
 
 
+@pytest.mark.slow
 def test_rows_tables_and_charts_say_it_in_words(tmp_path):
     rows = bench.run(
         scenes=["billiard"], contacts=["penalty", "straight_through"], backends=["torch"], estimators=["fobg", "reinforce"],

@@ -145,6 +145,7 @@ def test_command_in_the_page_gives_the_same_numbers_of_that_cell_alone(ran, tmp_
         assert alone[name].iloc[0] == before[name]
 
 
+@pytest.mark.slow
 def test_report_writes_the_page_again_with_machine_and_versions(ran):
     path = ran / "mine" / "report.html"
     path.unlink()

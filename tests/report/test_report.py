@@ -220,6 +220,7 @@ def figure_of(chart):
         return draw(chart)
 
 
+@pytest.mark.slow
 def test_an_estimator_has_one_colour_in_all_charts():
     found = drawn(stiffness_rows(), ["sigma", "stiffness"])
     assert {"bias_variance_stiffness", "bias_variance_sigma", "speed_accuracy"} <= set(found)

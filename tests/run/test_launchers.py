@@ -146,6 +146,7 @@ def test_a_shard_that_is_none_is_refused(capsys, shard):
     assert "must be NUMBER/COUNT: of 64 shards, 1/64 to 64/64" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_shards_at_once_one_killed_give_the_rows_of_one_run(tmp_path, capsys):
     """Cells that share a reference are in one shard; another count of shards runs nothing that is stored."""
     words = [*WORDS[:-1], "estimators=[fobg,alpha_order]", "sweep.sigma=[0.1,0.2,0.3,0.4]", f"results_dir={tmp_path}"]

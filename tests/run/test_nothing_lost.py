@@ -258,6 +258,7 @@ def test_a_cell_that_dies_twice_is_blamed_and_its_neighbours_are_not():
     assert results["sound"]["status"] == results["other"]["status"] == "ok"
 
 
+@pytest.mark.slow
 def test_large_items_behind_a_hanging_one_do_not_hold_up_the_clock():
     big = "x" * 600_000
     started = time.monotonic()
@@ -269,7 +270,7 @@ def test_large_items_behind_a_hanging_one_do_not_hold_up_the_clock():
     assert len(found) == 8
 
 
-@pytest.mark.parametrize("content", ["noise", "length"])
+@pytest.mark.parametrize("content", ["noise", pytest.param("length", marks=pytest.mark.slow)])
 def test_a_malformed_message_counts_as_a_crash_of_its_cell(content):
     results, _ = answers([("sound",), ("malformed", content), ("other",)])
     assert results["malformed"]["status"] == "crashed"

@@ -95,6 +95,7 @@ REPLACES = {
 """Changes that no comparison of states finds."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", REPLACES)
 def test_what_a_plugin_changes_unseen_stays_in_its_own_worker(tmp_path, kind):
     plain, _ = rows(tmp_path / "plain", [], 1)

@@ -1,4 +1,4 @@
-"""The study of errors: closed forms of descent, the fit on simulated searches, exclusions, controls, and a whole run."""
+"""The study of errors: closed forms of descent, exclusions, ratios with their test over scenes, and a whole run."""
 
 import dataclasses
 import math
@@ -16,14 +16,14 @@ from matplotlib.collections import LineCollection
 import bench
 from bench.experiment import config
 from bench.experiment.columns import Column
-from bench.experiment.views import Chart
+from bench.experiment.views import Chart, Table
 from bench.report.cells import readable
 from bench.report.draw import draw
-from bench.studies.dose_response import analysis, controls, model, views
+from bench.studies.dose_response import analysis, views
 from bench.studies.dose_response.ground import BestGradient, scored_noise
 from bench.studies.dose_response.measure import compare, hypotheses_hash
-from bench.studies.dose_response.model import Data, Estimate, bootstrap, estimate, fit
-from bench.studies.dose_response.search import TARGETS, Method, Task, follow, objective, run_searches, tune, unit_rate
+from bench.studies.dose_response.search import TARGETS, Method, Task, follow, run_searches, tune, unit_rate
+from bench.studies.optimise.search import objective
 
 D = 8
 DIFFERENCED = 1e-6
@@ -143,117 +143,6 @@ def test_an_unknown_gradient_gives_no_error_instead_of_a_small_one():
     assert all(math.isnan(value) for value in found.values())
 
 
-# -------------------------------------------------------------------------------------------------------- the fit
-
-TRUE_C, TRUE_P, TRUE_SCATTER = (1.0, 6.0), 2.0, 0.4
-
-
-def simulated(seed, problems=8, methods=30, budget=250.0):
-    """Searches of the model itself: random errors and biases on problems of different difficulty, censored at a budget."""
-    rng = np.random.default_rng(seed)
-    n = problems * methods
-    problem = np.repeat(np.arange(problems), methods)
-    floor = math.log(30) + 0.5 * rng.standard_normal(problems)
-    is_random = rng.random(n) < 0.6
-    spread = np.where(is_random, np.exp(rng.uniform(math.log(0.1), math.log(5), n)), 0.0)
-    bias = np.where(is_random, 0.0, rng.uniform(0, 1.2, n))
-    growth = 1 + TRUE_C[0] * spread**TRUE_P + TRUE_C[1] * bias**TRUE_P
-    time = floor[problem] + np.log(growth) + TRUE_SCATTER * rng.standard_normal(n)
-    is_missed = time > math.log(budget)
-    return Data(
-        problem, np.minimum(time, math.log(budget)), is_missed, np.c_[spread, bias], np.ones(n), np.zeros((n, 0))
-    )
-
-
-def test_fit_recovers_planted_coefficients_from_censored_searches():
-    data = simulated(0, problems=40)
-    assert 0.1 < data.is_missed.mean() < 0.4
-    found = fit(data)
-    assert found.power == pytest.approx(TRUE_P, rel=0.2)
-    np.testing.assert_allclose(np.exp(found.log_c), TRUE_C, rtol=0.25)
-    assert math.exp(found.log_scatter) == pytest.approx(TRUE_SCATTER, rel=0.1)
-
-
-def test_dropping_missed_searches_is_noticed():
-    """The planted fault: without the missed searches, a large bias looks harmless; with them it is found."""
-    data = simulated(0, problems=40, budget=100.0)
-    kept = np.flatnonzero(~data.is_missed)
-    naive = Data(*(getattr(data, f.name)[kept] for f in dataclasses.fields(Data)))
-    truth = 1 + TRUE_C[1]
-    assert fit(data).growth(0.0, 1.0) == pytest.approx(truth, rel=0.2)
-    assert fit(naive).growth(0.0, 1.0) < 0.75 * truth
-
-
-def test_derivatives_of_the_likelihood_agree_with_differences():
-    data = simulated(1, problems=4)
-    x = np.r_[np.full(4, 3.0), 0.3, 0.5, 1.3, -0.2]
-    for form in ("floor", "power", "none"):
-        for scatter in ("normal", "extreme"):
-            value, slope = model._negative(x, data, form, scatter)
-            steps = 1e-6 * np.eye(x.size)
-            differences = [
-                (model._negative(x + s, data, form, scatter)[0] - model._negative(x - s, data, form, scatter)[0]) / 2e-6
-                for s in steps
-            ]
-            np.testing.assert_allclose(slope, differences, rtol=1e-4, atol=1e-4 * abs(value) / x.size)
-
-
-def test_left_out_problems_prefer_the_form_that_made_them():
-    data = simulated(3, problems=8)
-    only_random = data.errors[:, 1] == 0
-    part = Data(*(getattr(data, f.name)[only_random] for f in dataclasses.fields(Data)))
-    part = dataclasses.replace(part, errors=part.errors[:, :1])
-    own, power, none = (np.nanmean(model.left_out_likelihoods(part, form)) for form in ("floor", "power", "none"))
-    assert own > power > none
-
-
-def test_a_fit_without_a_reached_target_is_an_error():
-    data = simulated(0)
-    missed = dataclasses.replace(data, is_missed=np.ones_like(data.is_missed))
-    with pytest.raises(ValueError, match="no search reached its target"):
-        fit(missed)
-
-
-def test_a_power_at_its_bound_is_not_identified():
-    """Without an effect of the error's size, only of its presence, the power goes to its lower bound."""
-    data = simulated(0)
-    present = data.errors.sum(axis=1) > 0.3
-    errors = np.where(present[:, None], data.errors, 0.0)
-    log_time = 3.0 + 1.0 * present + 0.1 * np.random.default_rng(0).standard_normal(len(present))
-    jump = dataclasses.replace(data, errors=errors, log_time=log_time, is_missed=np.zeros(len(present), dtype=bool))
-    assert not fit(jump).is_identified
-    assert fit(data).is_identified
-
-
-def test_interval_of_too_few_problems_is_open():
-    assert estimate(2.0, [1.9, 2.0, 2.1] * 10, n=2).verdict(0.5, 1.5) == "open"
-    assert Estimate(3.0, 2.0, 4.5, 8).verdict(0.5, 1.5) == "above"
-    assert Estimate(1.0, 0.9, 1.1, 8).verdict(0.5, 1.5) == "inside"
-
-
-@pytest.mark.slow
-def test_intervals_of_a_factor_of_ten_cover():
-    """Coverage of the 95% interval over 8 problems, in 120 simulations: 3 standard errors below 95% is 89%."""
-    truth = (1 + TRUE_C[0]) / (1 + TRUE_C[0] * 0.1**TRUE_P)
-
-    def tenfold(found):
-        return found.growth(1.0, 0.0) / found.growth(0.1, 0.0)
-
-    hits = 0
-    for seed in range(120):
-        data = simulated(100 + seed)
-        found = fit(data)
-        interval = estimate(tenfold(found), [tenfold(draw) for draw in bootstrap(data, found, 40, seed)], 8)
-        hits += interval.low <= truth <= interval.high
-    assert hits >= 0.89 * 120
-
-
-def test_needed_problems_grow_as_the_effect_shrinks():
-    far, near = Estimate(3.0, 1.0, 9.0, 8), Estimate(1.5, 0.5, 4.5, 8)
-    assert far.problems_needed(1.0) < near.problems_needed(1.0)
-    assert math.isnan(Estimate(2.0, 0.0, math.inf, 2).problems_needed(1.0))
-
-
 # ------------------------------------------------------------------------------------------------------- a whole run
 
 
@@ -272,6 +161,7 @@ def run(tmp_path_factory):
     return bench.run(words)
 
 
+@pytest.mark.slow
 def test_every_cell_of_a_run_has_a_row_with_the_hash_of_the_hypotheses(run):
     assert set(run["status"]) == {"ok"}
     assert set(run["hypotheses"]) == {hypotheses_hash()}
@@ -330,17 +220,17 @@ def test_methods_that_use_only_costs_stand_beside_the_best_gradient():
             "fobg": ("first order", 0, 64, LOST),
         })
     )  # fmt: skip
-    known = controls.lines(table)
+    known = analysis.reached(table)
     cem = known[(known["method"] == "cem") & (known["problem"] == "easy")].iloc[0]
-    assert (cem["fewest"], cem["evaluations"], cem["most"], cem["reached"]) == (80.0, 120.0, 200.0, "3 of 3")
-    wide = controls.tables(known)[0].frame.set_index("problem")
+    assert (cem["fewest"], cem["evaluations"], cem["most"], cem["hits"], cem["runs"]) == (80.0, 120.0, 200.0, 3, 3)
+    wide = views._reached(known).frame.set_index("problem")
     assert wide.loc["easy", "cem"] == 120.0
     assert np.isnan(wide.loc["hard", "cem"])
     assert np.isnan(wide.loc["hard", "fobg"])
 
 
 def test_without_methods_that_use_only_costs_nothing_is_compared():
-    assert controls.lines(pd.DataFrame(searches_of("p", fobg=("first order", 0, 1, LOST)))).empty
+    assert analysis.reached(pd.DataFrame(searches_of("p", fobg=("first order", 0, 1, LOST)))).empty
 
 
 # ------------------------------------------------------------------------------------------------ without a model
@@ -360,26 +250,62 @@ def test_interval_of_a_median_covers_and_fewer_than_six_values_leave_it_open():
     assert np.mean([low <= 1.0 <= high for _, low, high in intervals]) >= 0.95
 
 
-def planted(problem, kind, dose, updates):
-    return {"problem": problem, "scene_class": "smooth", "kind": kind, "dose": dose, "target": 100.0, "median": updates}
+def planted(scene, kind, dose, updates, problem=""):
+    return {"problem": f"{scene}{problem}", "scene": scene, "scene_class": "smooth", "kind": kind, "dose": dose, "target": 100.0,
+            "median": updates}  # fmt: skip
+
+
+def compared(lines, comparison, scene_class="smooth"):
+    found = analysis.by_scene(analysis.ratios(pd.DataFrame(lines)))
+    return found.set_index(["scene_class", "comparison"]).loc[(scene_class, comparison)]
 
 
 def test_ratios_are_those_of_the_same_problem_and_missed_targets_count():
-    lines = pd.DataFrame(
-        [planted(f"p{i}", analysis.BEST, 0.0, 10.0 * i) for i in range(1, 8)]
-        + [planted(f"p{i}", analysis.RANDOM, 0.3, 10.0 * i) for i in range(1, 8)]
+    lines = (
+        [planted(f"p{i}", analysis.RANDOM, 0.3, 10.0 * i) for i in range(1, 8)]
         + [planted(f"p{i}", analysis.RANDOM, 3.0, 40.0 * i if i < 6 else math.inf) for i in range(1, 8)]
         + [planted(f"p{i}", analysis.RANDOM, 1.0, math.inf if i == 7 else 20.0 * i) for i in range(1, 8)]
         + [planted(f"p{i}", analysis.BIAS, 0.9, math.inf if i == 7 else 60.0 * i) for i in range(1, 8)]
     )
-    found = analysis.paired(lines).set_index(["scene_class", "comparison"])
-    assert set(found.loc["smooth"].index) == {"random error 0.3", "random error 1", "random error 3", "random error 3 / 0.3",
-                                              "bias 0.9", "bias 0.9 / random error 1"}  # fmt: skip
-    tenfold = found.loc[("smooth", analysis.TENFOLD)]
+    tenfold = compared(lines, "random error 3 / 0.3")
     assert (tenfold["ratio"], tenfold["ratio_low"], tenfold["ratio_high"]) == (4.0, 4.0, math.inf)
-    both = found.loc[("smooth", analysis.BIAS_OVER_RANDOM)]
+    both = compared(lines, "bias 0.9 / random error 1")
     assert (both["problems"], both["ratio"], both["ratio_low"], both["ratio_high"]) == (6, 3.0, 3.0, 3.0)
-    assert found.loc["all classes"].equals(found.loc["smooth"])
+    assert both.equals(compared(lines, "bias 0.9 / random error 1", analysis.ALL))
+
+
+@pytest.mark.parametrize(("scenes", "verdict"), [(6, "above 1"), (5, "not known")])
+def test_a_verdict_counts_scenes_and_not_problems(scenes, verdict):
+    """Forty problems with the same outcome are no evidence if they are of five scenes: a fair coin gives that in one of 16."""
+    lines = [planted(f"s{i % scenes}", kind, dose, updates, f", T={i}") for i in range(40)
+             for kind, dose, updates in ((analysis.RANDOM, 0.3, 10.0), (analysis.RANDOM, 3.0, 20.0 + i))]  # fmt: skip
+    line = compared(lines, "random error 3 / 0.3")
+    assert (line["problems"], line["scenes"], line["above"], line["verdict"]) == (40, scenes, scenes, verdict)
+
+
+def test_verdicts_without_an_effect_are_wrong_in_at_most_5_percent():
+    rng = np.random.default_rng(0)
+    known = pd.concat([
+        pd.DataFrame({"scene_class": "smooth", "target": float(draw), "comparison": "c", "scene": scenes,
+                      "ratio": np.exp(rng.standard_normal(22))[scenes] * np.exp(0.1 * rng.standard_normal(41))})
+        for draw in range(400) for scenes in [rng.integers(0, 22, 41)]
+    ])  # fmt: skip
+    wrong = analysis.by_scene(known).query("scene_class == 'smooth'")["verdict"].ne("not known").mean()
+    assert wrong <= 0.05 + 3 * math.sqrt(0.05 * 0.95 / 400)
+
+
+def test_orders_are_compared_at_their_cheapest_number_of_samples():
+    times = {"rollout_s": 1.0, "gradient_s": 3.0}
+    lines = pd.DataFrame([
+        planted("s", kind, math.nan, updates) | times | {"method": method, "samples": n, "rollouts_per_update": n * (kind != "first order"),
+                                                         "gradients_per_update": n * (kind == "first order")}
+        for kind, method, n, updates in (("first order", "fobg", 4, 30.0), ("first order", "fobg", 16, 10.0),
+                                         ("zeroth order", "reinforce", 4, math.inf), ("zeroth order", "reinforce", 64, 5.0))
+    ])  # fmt: skip
+    found = analysis.ratios(lines).set_index("comparison")["ratio"]
+    assert found["first order / zeroth order, gradient 1"] == 120 / 320
+    assert found["first order / zeroth order, gradient measured"] == 360 / 320
+    assert found["fewest samples / others, first order"] == 120 / 160
 
 
 def test_an_interval_above_1_is_not_printed_as_if_it_held_1():
@@ -387,9 +313,9 @@ def test_an_interval_above_1_is_not_printed_as_if_it_held_1():
     ratios = (1.03, 2.0, 2.0, 2.5, 2.5, 3.0, 3.0, 6.94)
     lines = [planted(f"p{i}", kind, dose, updates) for i, ratio in enumerate(ratios)
              for kind, dose, updates in ((analysis.RANDOM, 0.3, 100.0), (analysis.RANDOM, 3.0, 100.0 * ratio))]  # fmt: skip
-    pairs = analysis.paired(pd.DataFrame(lines))
-    (line, *_) = readable(views._pair_table(pairs)).to_dict("records")
-    assert line["random error 3 / 0.3"] == "2.5 [1.03, 6.9]"
+    pairs = analysis.by_scene(analysis.ratios(pd.DataFrame(lines)))
+    (line, *_) = readable(Table("pairs", pairs, views.PAIRS)).to_dict("records")
+    assert line["ratio"] == "2.5 [1.03, 6.9]"
 
 
 def test_a_ratio_beyond_the_budget_has_only_a_lower_end_in_its_chart():
@@ -397,9 +323,9 @@ def test_a_ratio_beyond_the_budget_has_only_a_lower_end_in_its_chart():
     missed = [planted(f"p{i}", analysis.RANDOM, 3.0, math.inf if i < 5 else 20.0 + i) for i in range(8)]
     small = [planted(f"p{i}", analysis.RANDOM, 0.3, math.inf if i < 2 else 10.0 + i) for i in range(8)]
     lines = pd.DataFrame(small + missed)
-    points = analysis.relative_times(
-        lines.assign(method="", samples=256, error=lines["dose"], floor=10.0), 100.0
-    ).set_index("size")
+    points = analysis.relative_times(lines.assign(method="", samples=256, error=lines["dose"], floor=10.0)).set_index(
+        "size"
+    )
     assert (points.loc[0.3, "time_high"], points.loc[3.0, "is_missed"]) == (math.inf, True)
     chart = Chart("x", pd.DataFrame({"a": [1.0], "b": [2.0], "low": [1.0], "high": [math.inf]}), [Column("a")],
                   [Column("b", low="low", high="high", log=True)])  # fmt: skip
@@ -414,4 +340,5 @@ def test_planted_errors_alone_have_a_report_that_compares_no_orders(run):
     experiment = config.load(["experiment=dose_response/quick"])
     for rows in (run[run["estimator"] == "planted"], run[run["estimator_params"] == "base=best"]):
         shown = views.views(experiment, rows.reset_index(drop=True))
-        assert next(table for table in shown.tables if table.name == "costs").frame.empty
+        (pairs,) = [table for table in shown.tables if table.name in ("pairs", "problems")][:1]
+        assert "first order" not in pairs.frame.to_csv()

@@ -119,10 +119,6 @@ QUIET = np.full(5, 1e-3)
 def test_verdicts_of_planted_norms(norms, verdict):
     found = fit(TIMES, norms, QUIET)
     assert found.verdict == verdict
-    if verdict == "open":
-        assert np.isnan(found.at(TIMES)).all()
-    elif norms[1] != math.exp(2.0):  # all but the one that is neither
-        assert found.at(TIMES) == pytest.approx(norms, rel=1e-6)
 
 
 def test_few_horizons_and_uncertain_norms_are_open():
@@ -168,13 +164,8 @@ def test_charts_and_tables_of_planted_rows():
     given, rows = grown()
     shown = views.views(given, rows)
     norms, variances, _, gains = shown.charts
-    drawn = norms.plotted()
-    assert set(zip(drawn["problem"], drawn["series"], strict=True)) == {
-        ("bouncing_ball", views.NORM), ("bouncing_ball", "power law"), ("hopper", views.NORM), ("hopper", "exponential")
-    }  # fmt: skip
-    curve = drawn[drawn["series"] == "exponential"]
-    assert curve["gradient_median"].to_numpy() == pytest.approx(np.exp(curve["time_horizon"].to_numpy()), rel=1e-3)
-    assert list(norms.frame.loc[norms.frame["series"] == views.NORM, "row"]) == list(range(10))
+    assert norms.panel_notes == {"bouncing_ball": "polynomial", "hopper": "exploding"}
+    assert list(norms.frame["row"]) == list(range(10))
     assert len(variances.frame) == 2 * len(rows)
     assert list(gains.frame["gain"]) == [1.0, 5.0] * 2
     assert list(rows["horizon"][gains.frame["row"]]) == [200.0] * 4, "gains are of the longest horizon"
@@ -182,7 +173,6 @@ def test_charts_and_tables_of_planted_rows():
     assert list(answers["verdict"]) == ["polynomial", "exploding"]
     assert list(answers["lower variance"]) == ["zeroth order from 5 s"] * 2
     assert (answers["order"][0], answers["rate [1/s]"][1]) == ("2.0 [2.0, 2.0]", "1.0 [1.0, 1.0]")
-    assert list(table["singular values"]) == ["10 to 0.10"] * 5 + ["1000 to < 2.2e-13"] * 5
     assert table["spectral [1/s]"][0] == "1.0 [0.50, 2.0]", "per second, at steps of 0.1 s"
 
 

@@ -1,6 +1,7 @@
 """Fits of parameters: what a record tells in closed form, the Cramer-Rao bound, coverage, basins and time steps."""
 
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import wrong_models
 from bench.plugins.optimizers.gauss_newton import GaussNewton
 
 import bench
+from bench.errors import Unsupported
 from bench.experiment import config
 from bench.experiment.grid import cells
 from bench.experiment.study import study_of
@@ -79,12 +81,9 @@ def test_information_is_that_of_the_closed_form():
 def test_only_ratios_without_a_force():
     model = model_of(cell_of(*SPRING))
     found = information(model, model.values, 0.01)
-    assert (
-        found.words
-        == "only stiffness/mass, damping/mass: scaling mass, stiffness and damping together does not change the data"
-    )
+    assert found.labels == ["stiffness/mass", "damping/mass"]
     assert np.abs(found.jacobian @ np.ones(3)).max() < 1e-7 * np.abs(found.jacobian).max()
-    bound = np.sqrt(np.diag(found.covariance()))
+    bound = found.bound
     assert bound == pytest.approx([0.00261307 / 4, 0.00128568 / 0.4], rel=STEPPED)
 
 
@@ -103,9 +102,8 @@ def test_words_of_products():
     assert product(names, np.array([1.0, -0.5, 0.0])) == "a/b^(1/2)"
     square = Information(names, np.array([[2.0, 1.0, 0.0], [0.0, 0.0, 1.0]]))  # a^2 b and c
     assert square.labels == ["a*b^(1/2)", "c"]
-    assert Information(names, np.zeros((2, 3))).words.startswith("nothing is identifiable")
-    alone = Information(names, np.diag([1.0, 1.0, 0.0])[:2])
-    assert alone.words == "only a, b: c does not change the data"
+    assert Information(names, np.zeros((2, 3))).labels == []
+    assert Information(names, np.diag([1.0, 1.0, 0.0])[:2]).labels == ["a", "b"]  # c moves nothing
 
 
 def test_friction_fitted_with_a_step_holds_for_that_step():
@@ -115,7 +113,7 @@ def test_friction_fitted_with_a_step_holds_for_that_step():
     assert -exact / 0.3 == pytest.approx(-5.096840, rel=1e-6)
     fitting = Fitting(model, "single", 1, 0.01, np.ones(2))
     start = np.log(np.array([[0.25]]))
-    found = np.exp(run_fits(fitting, GaussNewton(), start, np.array([[exact]]), 40))[0, 0]
+    found = np.exp(run_fits(fitting, GaussNewton(), start, np.array([[exact]]), 40)[0])[0, 0]
     # the stop within a step leaves a second-order rest
     assert found / 0.3 == pytest.approx(1 - 0.02 * 0.3 * 9.81 / 3.0, abs=2e-3)
     fine = model_of(cell_of("scenes=[sliding_block[dt=0.0005,horizon=2400]]"))
@@ -141,10 +139,11 @@ def test_single_shooting_is_lost_beyond_its_basin_and_windows_are_not():
         start = np.full((1, 1), (2.0 + off) ** 2)
         for shooting, count in (("single", 1), ("windows", 5)):
             fitting = Fitting(model, shooting, count, 0.01, np.array([1.0, 2.0]))
-            found = np.exp(run_fits(fitting, GaussNewton(), fitting.start(start, data), data, 20)[0, 0])
+            found = np.exp(run_fits(fitting, GaussNewton(), fitting.start(start, data), data, 20)[0][0, 0])
             assert (abs(found - 4.0) < 1e-3) == (converges or shooting == "windows"), (off, shooting)
 
 
+@pytest.mark.slow
 def test_a_row_in_all_ways():
     row = measure(
         cell_of("scenes=[mass_spring_damper[horizon=80]]", "integrators=[rk4]", "repeats=12"),
@@ -156,12 +155,12 @@ def test_a_row_in_all_ways():
     assert row["error"][0] == pytest.approx(row["error"][1], rel=0.05)  # windows that meet are one rollout
     assert row["error"][0] < row["error"][2]  # windows on their own know less
     assert all(low <= 0.95 <= high for low, high in zip(row["coverage_low"], row["coverage_high"], strict=True))
-    assert "holds for other steps too" in row["step_note"]
+    assert row["step_shift_bound"] < shown.MAX_STEP_SHIFT
 
 
 def test_model_of_a_coarse_step_says_so():
     row = measure(cell_of("scenes=[sliding_block]", "repeats=16"), made("study=identify[refine=16]").study)
-    assert row["step_note"].startswith("holds for this time step only")
+    assert row["step_shift_bound"] > shown.MAX_STEP_SHIFT
     assert row["coverage_high"][0] < 0.95
 
 
@@ -190,11 +189,32 @@ def test_refusals(tmp_path):
         bench.UserError, match=r"unknown parameter in theta of scene pendulum: 'mas'; did you mean 'mass'"
     ):
         refused("scenes=[pendulum]", "theta=[mas]")
-    path = tmp_path / "short.csv"
-    path.write_text("1.0\n0.9\n")
-    said = refused("scenes=[mass_spring_damper]", f"study=identify[data={path}]")
-    assert f"data={path} has 2 lines of 1 numbers" in said
-    assert "is measured 200 times in 1 positions" in said
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "No columns to parse"),
+        ("1.0\n0.9\n", r"has 2 lines, scene mass_spring_damper is measured 200 times, up to step 200: set horizon"),
+        ("x\n1.0\nnan\n0.8\n", r"line 3: \['nan'\] are not finite numbers"),
+        ("1,0\n0,9\n", r"has 2 columns, .* is measured in 1 positions: name them, .*; numbers need decimal points"),
+        ("1.0\n" * 200, "column 0 is constant"),
+        ("1.0\n0.9,0.8\n", "Expected 1 fields in line 2, saw 2"),
+        (
+            "t,x\n0.05,1\n0.1,2\n0.1,3\n",
+            r"line 4: its time is not a later multiple of scene mass_spring_damper's dt=0.05",
+        ),
+        ("t,x\n0.05,1\n0.12,2\n", r"line 3: its time is not a later multiple of scene mass_spring_damper's dt=0.05"),
+        ("s,x\n0.05,1\n0.1,2\n", "has no column t; its columns are s, x"),
+    ],
+)
+def test_unusable_records_are_refused_in_a_line(tmp_path, text, message):
+    path = tmp_path / "own.csv"
+    path.write_text(text)
+    time = ",time=t" if "x\n0" in text else ""
+    reason = refused("scenes=[mass_spring_damper]", f"study=identify[data={path}{time}]")
+    assert re.search(message, reason)
+    assert reason.count("\n") == 0
 
 
 def test_own_measurements_are_fitted(tmp_path):
@@ -205,7 +225,94 @@ def test_own_measurements_are_fitted(tmp_path):
     row = measure(cell, experiment.study)
     assert row["fits"] == 1
     assert math.isnan(row["coverage"][0])  # no truth is known
+    assert all(map(math.isnan, row["truth"]))
     assert row["estimate"][:2] == pytest.approx([4.4, 0.5], rel=STEPPED)
+
+
+def test_a_table_with_times_may_lack_lines_and_its_noise_is_estimated(tmp_path):
+    """Laplace noise of .02 that is not stated, a line per step with the start, every seventh one missing."""
+    t = 0.05 * np.arange(201)
+    x = displacement(4.4, 0.5, t) + 0.02 / math.sqrt(2) * np.random.default_rng(1).laplace(size=201)
+    table = pd.DataFrame({"t": t, "other": 1.0 + t, "x": x})
+    table[np.arange(201) % 7 != 3].to_csv(tmp_path / "own.csv", index=False)
+    experiment = made(*SPRING, f"study=identify[data={tmp_path / 'own.csv'},time=t,measured=x]")
+    (cell,) = cells(experiment)
+    row = measure(cell, experiment.study)
+    assert row["explained"] == 1.0
+    assert row["noise_size"] == pytest.approx(0.02, rel=0.2)  # three standard errors of Laplace noise
+    assert row["intervals"] == ["own size"]
+    low, high = np.array(row["estimate_low"]), np.array(row["estimate_high"])
+    assert ((low < [4.4, 0.5]) & (high > [4.4, 0.5])).all()
+
+
+def test_as_many_measurements_as_unknowns_need_a_stated_noise(tmp_path):
+    (tmp_path / "two.csv").write_text("0.99\n0.97\n")
+    short = ("scenes=[mass_spring_damper[horizon=2]]", "integrators=[rk4]", "theta=[stiffness,damping]")
+    experiment = made(*short, f"study=identify[data={tmp_path / 'two.csv'}]")
+    (cell,) = cells(experiment)
+    with pytest.raises(Unsupported, match="2 measurements for 2 unknowns: state the noise"):
+        measure(cell, experiment.study)
+    experiment = made(*short, f"study=identify[data={tmp_path / 'two.csv'},measurement=0.01]")
+    row = measure(next(iter(cells(experiment))), experiment.study)
+    assert math.isnan(row["explained"])  # too few to test
+
+
+def table_of(experiment, row):
+    """The table of estimates by parameter, and that of biases that go unnoticed."""
+    (cell,) = cells(experiment)
+    rows = experiment.columns.typed(pd.DataFrame([cell.columns() | row | {"experiment": "own"}]))
+    views = study_of(experiment).views(experiment, rows)
+    return views.tables[0].frame.set_index("parameter"), views.tables[1]
+
+
+def test_estimates_come_first_and_only_what_is_identifiable_has_one(tmp_path):
+    t = 0.05 * np.arange(1, 201)
+    noise = 0.01 * np.random.default_rng(2).standard_normal(200)
+    np.savetxt(tmp_path / "own.csv", displacement(4.4, 0.5, t) + noise)
+    experiment = made(*SPRING, f"study=identify[data={tmp_path / 'own.csv'}]")
+    row = measure(next(iter(cells(experiment))), experiment.study)
+    estimates, unnoticed = table_of(experiment, row)
+    assert list(estimates.index) == ["stiffness/mass", "damping/mass", "mass", "stiffness", "damping"]
+    assert estimates["unit"].tolist() == ["(N/m)/kg", "(N s/m)/kg", "kg", "N/m", "N s/m"]
+    assert estimates["identifiable"].tolist() == [
+        "yes", "yes", "only stiffness/mass, damping/mass", "only stiffness/mass", "only damping/mass"
+    ]  # fmt: skip
+    assert estimates["estimate"].isna().tolist() == [False] * 2 + [True] * 3
+    assert estimates.loc["damping/mass", "low"] < 0.5 < estimates.loc["damping/mass", "high"]
+    assert estimates["start"].tolist() == pytest.approx([4.0, 0.4, 1.2, 4.8, 0.48])
+    assert estimates["doubt"].tolist() == [""] * 5
+    # dry friction can hide behind the damping
+    terms = unnoticed.frame[unnoticed.frame["parameter"] == "damping/mass"].set_index("term")
+    assert terms.loc["friction of coordinate 0 in the sign of v", "errors"] > 1.0
+    assert estimates.loc["damping/mass", "bias"] >= terms["bias"].max()
+
+
+def test_a_parameter_that_moves_nothing_has_no_interval():
+    experiment = made(*SPRING, "theta=[stiffness,damping,hold]", "scene.mass_spring_damper.hold=1", "repeats=2")
+    row = measure(next(iter(cells(experiment))), experiment.study)
+    estimates, _ = table_of(experiment, row)
+    assert estimates.loc["hold", "identifiable"] == "no"
+    assert estimates.loc["hold", ["estimate", "low", "high"]].isna().all()
+    assert estimates.loc["stiffness", "identifiable"] == "yes"
+
+
+def test_fits_stop_where_they_have_converged():
+    model = model_of(cell_of(*SPRING, "theta=[stiffness,damping]"))
+    data = model.record(model.values[:, None]) + 0.01 * np.random.default_rng(3).standard_normal((200, 1))
+    fitting, calls = Fitting(model, "single", 1, 0.01, np.ones(2)), []
+
+    class Counting(GaussNewton):
+        def ask(self, state, noise):
+            calls.append(1)
+            return super().ask(state, noise)
+
+    start = fitting.start(1.2 * model.values[:, None], data)
+    found, has_converged = run_fits(fitting, Counting(), start, data, 40)
+    assert has_converged.all()
+    assert len(calls) < 15
+    exact, _ = run_fits(fitting, GaussNewton(), found, data, 40)
+    errors = information(model, model.values, 0.01).bound
+    assert (np.abs(found - exact)[:, 0] < 1e-3 * errors).all()
 
 
 def test_fits_take_gauss_newton_unless_another_optimizer_is_named():
@@ -238,17 +345,18 @@ def own_record(tmp_path, name):
     return measure(cell, experiment.study)
 
 
+@pytest.mark.slow
 def test_a_record_with_another_drag_is_not_explained(tmp_path):
     row = own_record(tmp_path, "0.004 v|v|")
     assert row["explained"] == 0.0
-    assert "the model does not explain the record" in row["reason"]
-    assert "The intervals do not hold" in row["reason"]
+    assert "in v|v|" in row["contradictions"]
 
 
+@pytest.mark.slow
 def test_a_record_of_the_model_is_explained(tmp_path):
     row = own_record(tmp_path, "right")
     assert row["explained"] == 1.0
-    assert row["reason"] == ""
+    assert row["contradictions"] == ""
 
 
 @pytest.mark.parametrize(
@@ -263,11 +371,10 @@ def test_a_record_of_the_model_is_explained(tmp_path):
 )
 def test_wrong_models_are_noticed_and_the_right_one_is_not_blamed(name, least, most):
     clean, noise = next((record, noise) for label, record, noise in wrong_models.cases() if label == name)
-    noticed, together, inside, wide = wrong_models.run(clean, noise, 64)
+    noticed, inside, printed = wrong_models.run(clean, noise, 64)
     assert least <= noticed <= most
-    assert together <= 0.5 if name == "right" else together == 1.0 or "noise" in name
     if "noise" in name:
-        assert inside < 0.6 < 0.8 < wide
+        assert inside < 0.6 < 0.8 < printed
 
 
 def test_one_outlier_is_noticed():
@@ -276,34 +383,86 @@ def test_one_outlier_is_noticed():
     residual = np.random.default_rng(0).standard_normal(200)
     line = np.linspace(-1.0, 1.0, 200)[:, None]
     residual -= line[:, 0] * (line[:, 0] @ residual) / (line[:, 0] @ line[:, 0])
-    assert adequacy.judge(residual, line, 1).is_explained
+    assert adequacy.judge(residual, line, 1, {}).is_explained
     residual[100] = 6.0
-    verdict = adequacy.judge(residual, line, 1)
+    verdict = adequacy.judge(residual, line, 1, {})
     assert not verdict.is_explained
-    assert "the largest residual is 6 times the stated noise" in verdict.sentence()
+    assert "largest residual" in verdict.contradictions
 
 
 @pytest.mark.slow
 def test_faults_of_a_sensor_are_named(tmp_path):
-    for fault, word in (("gain 0.99", "a gain of sensor 0"), ("drift 2 sigma", "a drift of sensor 0")):
-        assert word in own_record(tmp_path, fault)["reason"]
+    for fault, word in (("gain 0.99", "gain of sensor 0"), ("drift 2 sigma", "drift of sensor 0")):
+        assert word in own_record(tmp_path, fault)["contradictions"]
+
+
+def judged(noise, records=40, **settings):
+    """The share of records of 150 measurements and a line that are explained, and that noise of unit size is."""
+    from bench.measure import adequacy
+
+    rng, line = np.random.default_rng(0), np.linspace(-1.0, 1.0, 150)[:, None]
+    residuals = noise(rng, (150, records))
+    residuals -= line @ np.linalg.lstsq(line, residuals, rcond=None)[0]
+    verdicts = [adequacy.judge(residuals[:, i], line, 1, {}, i, **settings) for i in range(records)]
+    return np.mean([one.is_explained for one in verdicts]), np.mean(
+        ["noise" not in one.contradictions for one in verdicts]
+    )
+
+
+NOISES = {
+    "normal": lambda rng, size: rng.standard_normal(size),
+    "laplace": lambda rng, size: rng.laplace(size=size) / math.sqrt(2),
+    "t5": lambda rng, size: rng.standard_t(5, size) / math.sqrt(5 / 3),
+    "skewed": lambda rng, size: rng.exponential(size=size) - 1.0,
+}
+
+
+@pytest.mark.parametrize(
+    "name", ["laplace", *(pytest.param(n, marks=pytest.mark.slow) for n in NOISES if n != "laplace")]
+)
+def test_right_models_are_explained_whatever_the_noise_looks_like(name):
+    # 5% by design for normal noise; the tails of 150 numbers are known roughly only
+    assert judged(NOISES[name])[0] >= 0.8
 
 
 @pytest.mark.slow
-def test_small_terms_are_noticed_in_many_records_together():
-    """A drag of .001 v|v|: a test of one record that knows the term would notice it in 37%."""
-    clean, noise = next((record, noise) for label, record, noise in wrong_models.cases() if label == "0.001 v|v|")
-    assert wrong_models.limit(clean) == pytest.approx(0.373, abs=0.01)
-    noticed, together, *_ = wrong_models.run(clean, noise, 64)
-    assert noticed < 0.373 < 0.75 <= together
+def test_noise_of_another_size_is_noticed_on_both_sides_and_only_if_one_is_stated():
+    for factor in (0.5, 1.5):
+        other = lambda rng, size, factor=factor: factor * rng.standard_normal(size)  # noqa: E731
+        assert judged(other, 20) == (0.0, 0.0)
+        assert judged(other, 20, is_size_known=False)[0] >= 0.8
 
 
-def test_records_of_the_model_are_explained_together():
-    experiment = made(*SPRING, "theta=[stiffness,damping]", "scene.mass_spring_damper.damping=0.3", "repeats=8")
-    (cell,) = cells(experiment)
-    row = measure(cell, experiment.study)
-    assert row["misfit_together"] > 0.05
-    assert row["reason"] == ""
+@pytest.mark.parametrize(("rho", "least"), [(0.0, 0.9), (0.5, 0.85), (0.9, 0.8)])
+def test_printed_intervals_follow_a_test_of_correlation(rho, least):
+    from bench.measure import adequacy
+
+    line = np.cos(np.linspace(0.0, 20.0, 300))[:, None]
+    inside, kinds = 0, []
+    for seed in range(100):
+        residual = wrong_models.autoregressive(np.random.default_rng(seed), (300, 1), rho)
+        estimate = np.linalg.lstsq(line, residual, rcond=None)[0]
+        variance, kind, quantile = adequacy.variances((residual - line @ estimate)[:, 0], line, 1)
+        inside += abs(estimate[0, 0]) <= quantile * math.sqrt(variance[0])
+        kinds.append(kind)
+    assert inside / 100 >= least
+    assert (kinds.count("correlated") <= 12) if rho == 0.0 else set(kinds) == {"correlated"}
+
+
+@pytest.mark.slow
+def test_a_missing_term_of_the_stated_reach_is_noticed_at_the_stated_power():
+    from bench.measure import adequacy
+
+    line, rng = np.linspace(-1.0, 1.0, 150)[:, None], np.random.default_rng(5)
+    term = {"cubic": line[:, 0] ** 3}
+    noise = rng.standard_normal((150, 40))
+    first = adequacy.judge(
+        noise[:, 0] - line[:, 0] * (line[:, 0] @ noise[:, 0]) / (line[:, 0] @ line[:, 0]), line, 1, term
+    )
+    data = noise + first.reach["cubic"] * term["cubic"][:, None]
+    data -= line @ np.linalg.lstsq(line, data, rcond=None)[0]
+    noticed = np.mean([not adequacy.judge(data[:, i], line, 1, term, i).is_explained for i in range(40)])
+    assert noticed >= adequacy.POWER - 0.1  # three standard errors
 
 
 def test_levenberg_marquardt_needs_as_few_evaluations_as_minpack_on_rosenbrock():
@@ -350,19 +509,13 @@ def test_verdicts_are_those_of_the_stored_table(standard):
 
 def test_chart_and_tables_have_the_rows(standard):
     _, rows, views = standard
-    fits, parameters, _ = views.tables
+    estimates, _, parameters, fits, *_ = views.tables
+    assert estimates.title == "Estimates"
     assert len(fits.frame) == 22
     assert len(parameters.frame) == len(rows)
-    assert {"step_note", "condition"} <= {column.name for column in parameters.columns}
     printed = next(chart for chart in views.charts if chart.printed)
     assert len(printed.frame) == 44
     assert printed.frame["failed"].sum() == 2 * (fits.frame["converged"] == 0).sum() > 0
-    page = next(chart for chart in views.charts if not chart.printed)
-    for line in page.frame.to_dict("records"):
-        row = rows.iloc[line["row"]]
-        assert line["error"] == pytest.approx(
-            list(row["error"])[list(row["shooting"]).index(line["shooting"])], nan_ok=True
-        )
 
 
 def planted(**columns):
@@ -413,8 +566,8 @@ def test_own_measurements_have_no_coverage_to_show(standard):
         for name in ("error", "coverage", "coverage_low", "coverage_high")
     }
     views = study_of(given).views(given, rows.assign(**gone))
-    assert "precise" not in set(views.tables[0].frame["verdict"])
-    assert [column.name for column in views.charts[0].x] == ["converged", "condition", "step_shift"]
+    assert "precise" not in set(views.tables[3].frame["verdict"])
+    assert not views.charts
 
 
 # ------------------------------------------------------------------------------------------------- scans of the loss
@@ -449,7 +602,7 @@ def test_local_minima_of_the_logistic_map_depend_on_the_window_and_on_its_last_s
     assert minima_of_the_map(window, False) == without
     cell = cell_of(*CHAOS)
     model, settings = model_of(cell), made(SCAN).study
-    found = scan(model, 40, model.record(model.values[:, None]), settings)
+    found = scan(model, 40, model.record(model.values[:, None]), 1e-6, settings)
     place = found["scan_steps"].index(window)
     assert (found["scan_low"], found["scan_high"]) == ([2.0], [4.0])
     assert (found["minima"][place], found["minima_open"][place]) == (with_last, without)
@@ -475,7 +628,7 @@ def test_scanned_loss_of_an_undamped_spring_is_the_closed_form():
     model = model_of(cell_of("scenes=[mass_spring_damper[damping=1e-12]]", "integrators=[rk4]", "theta=[stiffness]"))
     settings = made("study=identify[scan=301,span=2.5,measurement=1.0]").study
     t = 0.05 * np.arange(1, 201)
-    found = scan(model, 4, np.cos(2 * t)[:, None], settings)
+    found = scan(model, 4, np.cos(2 * t)[:, None], 1.0, settings)
     assert found["scan_steps"] == [200, 100, 50]
     rates = np.sqrt(np.linspace(1.6, 10.0, 301))
     expected = ((np.cos(np.outer(rates, t)) - np.cos(2 * t)) ** 2).mean(axis=1)
@@ -489,7 +642,7 @@ def test_scanned_loss_of_an_undamped_spring_is_the_closed_form():
 
 def test_a_record_of_its_end_only_has_one_scan_without_an_open_count():
     model = model_of(cell_of("scenes=[sliding_block]"))
-    found = scan(model, 1, model.record(model.values[:, None]), made("study=identify[scan=11]").study)
+    found = scan(model, 1, model.record(model.values[:, None]), 0.01, made("study=identify[scan=11]").study)
     assert found["scan_steps"] == [60]
     assert len(found["scan_loss"]) == 11
     assert math.isnan(found["minima_open"][0])

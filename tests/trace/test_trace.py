@@ -57,6 +57,7 @@ ALIKE = {"double_integrator", "pendulum", "cartpole", "pushing, softplus", "push
 """Problems whose scene and sort of law other problems have too."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (n in ALIKE)) for n in PROBLEMS])
 def test_adjoints_give_the_programs_gradient(name):
     problem = compiled(*PROBLEMS[name])
@@ -350,6 +351,7 @@ def test_changes_and_spikes():
 # --------------------------------------------------------------------------------------------------------- command
 
 
+@pytest.mark.slow
 def test_command_writes_table_and_chart(tmp_path, capsys):
     words = [
         "trace", "pushing", "double_integrator", "contacts=[penalty]", "contact.penalty.stiffness=1e4",

@@ -22,6 +22,7 @@ def test_contacts_penetration_and_force_of_a_state():
     np.testing.assert_allclose(force, [20.0, 0.0])
 
 
+@pytest.mark.slow
 def test_the_log_has_the_contact_of_a_window_and_softer_ground_is_entered_deeper():
     depth = {}
     for stiffness in (1e3, 1e4):

@@ -69,6 +69,7 @@ def test_seeds_give_different_runs_from_one_compilation():
     assert run.compile_s == seconds
 
 
+@pytest.mark.slow
 def test_the_first_step_of_sep_cma_es_is_the_diagonal_of_that_of_cma_es():
     """From equal variances both draw the same points; learning rates of the variances differ by (d + 2) / 3."""
     run = training("sep_cma_es", population=6)
@@ -132,6 +133,7 @@ def test_a_planted_first_order_gradient_of_the_wrong_sign_is_seen_in_the_cosine(
     assert float(cosine(parts(-1), theta, key, 64)["cosine"]) == pytest.approx(-1.0)
 
 
+@pytest.mark.slow
 def test_the_first_step_of_ppo_is_the_policy_gradient_of_a_one_step_problem():
     """For actions a ~ N(m, s^2), reward -(a - c)^2 and a linear policy of a constant, all in closed form.
 

@@ -35,6 +35,7 @@ def actor():
     return Actor(jax.random.PRNGKey(1), [5, 8, 1], "float64")
 
 
+@pytest.mark.slow
 def test_the_gradient_of_a_window_agrees_with_central_differences(actor):
     env, key = environment(), jax.random.PRNGKey(2)
     objective = jax.jit(lambda a: window_return(env, a, 5, key)[0])
@@ -46,6 +47,7 @@ def test_the_gradient_of_a_window_agrees_with_central_differences(actor):
     assert float(ends[0] - ends[1]) / (2 * step) == pytest.approx(float(along), rel=DIFFERENCE)
 
 
+@pytest.mark.slow
 def test_the_gradient_of_a_window_is_that_of_fobg_on_the_whole_program():
     """Without discount and value, a window as long as the horizon has the cost of the sweep's own program."""
     steps, count, sigma = 5, 6, 0.3
@@ -117,6 +119,7 @@ def test_a_cut_stops_the_gradient_where_the_jacobian_is_too_large(actor):
     np.testing.assert_array_equal(free.reward, always.reward)
 
 
+@pytest.mark.slow
 def test_the_gradient_of_an_episode_in_windows_is_the_sum_of_theirs(actor):
     """By a loop over windows whose first states are constants: rewards and the last value, times gamma^steps before."""
     env, key, length, every, discount = environment(), jax.random.PRNGKey(2), 10, 4, 0.9

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from scipy.optimize import brentq
@@ -13,9 +13,6 @@ from bench.claims.claim import Claim, Figure, Outcome
 from bench.claims.colours import GREY, estimator_colour
 from bench.claims.toolkit import centre, estimator, expectation, problem, rule, stochastic_descent
 from bench.model import Array, FunctionScene, Problem, param
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 GRAVITY, WALL, HEIGHT, SIGMA = 9.81, 0.06, 0.02, 0.1
 JUMPS = (0.69320, 1.19935)
@@ -60,6 +57,8 @@ class ThrownBall(Claim):
         "the samples can resolve turns alpha-order into the zeroth order."
     )
     labels = ("angle [rad]", "gradient of the smoothed cost")
+    curves = {"truth": ("true", "-", GREY), "first": ("first-order mean", "-", "fobg")}
+    marks = (("y", 0.0, ""),)
     quick = False
 
     def measure(self) -> Outcome:
@@ -146,11 +145,9 @@ class ThrownBall(Claim):
         share.append((float(np.mean(decided == 0)), 0.0))
         return ends, share, spread, path[::20, 0]
 
-    def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
+    def draw(self, axes: Any, series: Mapping[str, Any]) -> None:
         """Draw both gradients and the ends of the descents."""
-        axes.plot(series["x"], series["truth"], color=GREY, label="true")
-        axes.plot(series["x"], series["first"], color=estimator_colour("fobg"), label="first-order mean")
-        axes.axhline(0.0, color=GREY, linewidth=0.6)
+        super().draw(axes, series)
         axes.plot([series["first_end"]], [0], "o", color=estimator_colour("fobg"), label="first order ends")
         axes.plot([series["zeroth_end"]], [0], "s", color=estimator_colour("reinforce"), label="zeroth order ends")
 

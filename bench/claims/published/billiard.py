@@ -2,17 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
-
 import numpy as np
 
 from bench.claims.claim import Claim, Figure, Outcome
 from bench.claims.colours import GREY
 from bench.claims.toolkit import problem
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 SIGMA = 0.3
 
@@ -31,6 +25,7 @@ class Missed(Claim):
         "A surrogate gradient sees what was missed and keeps the motion, but it is not the derivative of the program."
     )
     labels = ("force across u0 [N]", "df / du0")
+    curves = {"truth": ("true", "-", GREY), "plain": ("plain", "--"), "surrogate": ("surrogate", "-")}
     quick = False
 
     def measure(self) -> Outcome:
@@ -85,12 +80,6 @@ class Missed(Claim):
                 "surrogate": means["surrogate"][::8].tolist(),
             },
         )
-
-    def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
-        """Draw the smoothed gradients."""
-        axes.plot(series["u"], series["truth"], color=GREY, label="true")
-        axes.plot(series["u"], series["plain"], "--", label="plain")
-        axes.plot(series["u"], series["surrogate"], label="surrogate")
 
 
 def _root_mean_square(values: np.ndarray) -> float:

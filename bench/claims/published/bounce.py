@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
-
 import numpy as np
 
 from bench.claims.claim import Claim, Figure, Outcome
 from bench.claims.toolkit import problem
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 SOURCE = "Zhong, Han, Brikis 2022, arXiv 2207.05060, task 1"
 NAMES = ("df/dy0", "df/dvy0", "df/du0")
@@ -31,6 +25,7 @@ class TimeOfImpact(Claim):
         "A motion that is right to first order can have a derivative of the wrong sign, and refining does not help."
     )
     labels = ("initial height [m]", "final height [m]")
+    curves = {"with": ("with time of impact: slope -1", "-"), "without": ("without: slope +1 on every tooth", "-")}
 
     def measure(self) -> Outcome:
         """Differentiate both programs away from the boundary between steps, and around the source's start."""
@@ -58,11 +53,6 @@ class TimeOfImpact(Claim):
             series=series,
         )
 
-    def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
-        """Draw the final height against the initial one."""
-        axes.plot(series["height"], series["with"], label="with time of impact: slope -1")
-        axes.plot(series["height"], series["without"], label="without: slope +1 on every tooth")
-
 
 class PenaltyPhase(Claim):
     """A penalty bounce over all phases of the step."""
@@ -73,6 +63,8 @@ class PenaltyPhase(Claim):
     source = f"{SOURCE}; recomputed over 256 phases"
     learned = "What counts is stiffness times squared step: how many steps a contact lasts."
     labels = ("stiffness [N/m]", "RMS of df/dy0 + 1")
+    logarithmic = "xy"
+    curves = {"480": ("dt = 1/480 s", "o-"), "48000": ("dt = 1/48000 s", "s-")}
     quick = False
 
     def measure(self) -> Outcome:
@@ -91,8 +83,3 @@ class PenaltyPhase(Claim):
                 figures.append(Figure(f"k = {k:g}, dt = 1/{parts}", text, errors[-1]))
             series[str(parts)] = errors
         return Outcome(figures, series=series)
-
-    def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
-        """Draw both errors against the stiffness."""
-        axes.loglog(series["k"], series["480"], "o-", label="dt = 1/480 s")
-        axes.loglog(series["k"], series["48000"], "s-", label="dt = 1/48000 s")

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -13,10 +12,6 @@ from scipy.special import ndtr
 from bench.claims.claim import Claim, Figure, Outcome
 from bench.claims.toolkit import estimator, moments, problem
 from bench.model import Array, ContactScene, FunctionScene, State, param
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
 
 KAPPA = 0.25
 """Central-path parameter of the contact [N m]."""
@@ -85,6 +80,7 @@ class CentralPath(Claim):
     source = "Suh, Pang, Tedrake 2022; Pang et al. 2023"
     learned = "Analytic smoothing and smoothing by noise are the same thing; only the analytic one has no variance."
     labels = ("gap without force / sqrt(c)", "derivative of the gap after it")
+    curves = {"relaxed": ("central path = t(2) noise", "-"), "gauss": ("closest Gaussian", "--")}
 
     def measure(self) -> Outcome:
         """Compare the relaxed derivative with the chance under that noise, and the kink's variances."""
@@ -111,11 +107,6 @@ class CentralPath(Claim):
             figures,
             series={"a": a[::8].tolist(), "relaxed": relaxed[::8].tolist(), "gauss": ndtr(a / closest.x)[::8].tolist()},
         )
-
-    def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
-        """Draw the relaxed derivative and its Gaussian neighbour."""
-        axes.plot(series["a"], series["relaxed"], label="central path = t(2) noise")
-        axes.plot(series["a"], series["gauss"], "--", label="closest Gaussian")
 
 
 def _chance(a: np.ndarray) -> np.ndarray:

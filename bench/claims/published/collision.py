@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from bench.claims.claim import Claim, Figure, Outcome
-from bench.claims.colours import GREY
 from bench.claims.toolkit import descend, native
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
     from bench.model import Problem
 
 
@@ -37,6 +33,8 @@ class Collision(Claim):
     source = "Zhong, Han, Brikis 2022, arXiv 2207.05060, task 3"
     learned = "With the wrong sign at the impact the optimiser learns not to touch: it gives up."
     labels = ("iteration", "cost")
+    curves = {name: (label, "-") for name, label in LABELS.items()}
+    marks = (("y", 2.0, "doing nothing"),)
     quick = False
 
     def measure(self) -> Outcome:
@@ -65,12 +63,6 @@ class Collision(Claim):
             ),
             series=series | {"stiffness": list(tried), "end": list(tried.values())},
         )
-
-    def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
-        """Draw the costs."""
-        for name in LABELS:
-            axes.plot(series["iteration"], series[name], label=LABELS[name])
-        axes.axhline(2.0, color=GREY, linewidth=0.6, label="doing nothing")
 
 
 def _costs(at: Problem) -> np.ndarray:

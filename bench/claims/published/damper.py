@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
-
 import numpy as np
 
 from bench.claims.claim import Claim, Figure, Outcome
 from bench.claims.toolkit import estimator, native, terms
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 SAMPLES = 80_000
 STIFFNESSES = (1e4, 2e4, 3e4, 5e4, 1e5, 2e5)
@@ -36,6 +30,8 @@ class Damper(Claim):
     source = "Zhong, Han, Brikis 2022, task 2; distances by an independent program"
     learned = "A stiff contact does not bias the first order; a force that jumps does, at any step."
     labels = ("stiffness", "distance of first from zeroth order")
+    logarithmic = "xy"
+    curves = {str(steps): (f"{steps} steps", "o-") for steps in DISTANCES}
 
     def measure(self) -> Outcome:
         """Estimate both means with the same samples."""
@@ -53,11 +49,6 @@ class Damper(Claim):
         finer = _distance(1e4, 10.0, 2880)
         figures.append(Figure("a damper of 10, steps ten times finer", "3.36", *finer, spread=SPREAD * 3.36))
         return Outcome(figures, series=series)
-
-    def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
-        """Draw the distances."""
-        for steps in DISTANCES:
-            axes.loglog(series["stiffness"], series[str(steps)], "o-", label=f"{steps} steps")
 
 
 def _distance(stiffness: float, damping: float, steps: int) -> tuple[float, float]:

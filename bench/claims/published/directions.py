@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from bench.claims.claim import Claim, Figure, Outcome
-from bench.claims.colours import bars, estimator_colour
 from bench.claims.toolkit import centre, estimator, problem
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 D, REPEATS = 20, {20: 16_000, 100: 16_000, 400: 4000}
 """Number of variables, and of estimates per number of samples."""
@@ -32,6 +27,12 @@ class Directions(Claim):
     source = "Nesterov, Spokoiny 2017; Berahas et al. 2022"
     learned = "Zeroth order pays for dimension: it needs as many samples as variables to be 100% off."
     labels = ("samples N", "relative squared error")
+    logarithmic = "xy"
+    has_ticks = True
+    curves = {
+        "gauss": ("Gaussian: (n + 1)/N", "o-", "randomized_smoothing"),
+        "sphere": ("sphere: (n - 1)/N", "s--", "sphere_smoothing"),
+    }
     quick = False
 
     def measure(self) -> Outcome:
@@ -60,24 +61,3 @@ class Directions(Claim):
         truth = at.program.closed_form_gradient()
         values = np.concatenate([method.estimate(at, at.program.theta0, part) for part in noise])
         return centre(((values - truth) ** 2).sum(axis=1) / (truth**2).sum())
-
-    def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
-        """Draw both errors against the number of samples."""
-        axes.set(xscale="log", yscale="log")
-        bars(
-            axes,
-            series["n"],
-            series["gauss"],
-            fmt="o-",
-            color=estimator_colour("randomized_smoothing"),
-            label="Gaussian: (n + 1)/N",
-        )
-        bars(
-            axes,
-            series["n"],
-            series["sphere"],
-            fmt="s--",
-            color=estimator_colour("sphere_smoothing"),
-            label="sphere: (n - 1)/N",
-        )
-        axes.set_xticks(series["n"], [f"{n:g}" for n in series["n"]])

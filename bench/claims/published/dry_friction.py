@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy.special import ndtr
@@ -12,9 +12,6 @@ from scipy.special import ndtr
 from bench.claims.claim import Claim, Figure, Outcome
 from bench.claims.toolkit import estimator, moments, problem
 from bench.model import Array, FunctionScene, param
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 
 @dataclass(frozen=True)
@@ -46,6 +43,7 @@ class Sticking(Claim):
     source = "Le Lidec et al. 2023"
     learned = "An exact zero can be right and still of no use to an optimiser; noise looks past the edge of the cone."
     labels = ("push F", "derivative of the acceleration")
+    curves = {"smooth": ("smoothed, s = mu", "-")}
 
     def measure(self) -> Outcome:
         """Compute the exact derivative, and integrate both orders over the noise."""
@@ -72,7 +70,7 @@ class Sticking(Claim):
             series={"force": forces.tolist(), "smooth": smooth},
         )
 
-    def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
+    def draw(self, axes: Any, series: Mapping[str, Any]) -> None:
         """Draw the exact and the smoothed derivative."""
         axes.plot([-4, -1, -1, 1, 1, 4], [1, 1, 0, 0, 1, 1], label="exact")
-        axes.plot(series["force"], series["smooth"], label="smoothed, s = mu")
+        super().draw(axes, series)

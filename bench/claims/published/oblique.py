@@ -9,14 +9,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bench.claims.claim import Claim, Figure, Outcome
-from bench.claims.colours import GREY
 from bench.claims.toolkit import descend, plugin, problem
 from bench.errors import Unsupported
 from bench.model import Array, MechanicalScene, State
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
     from bench.model import Problem
 
 STEPS, RATE, ITERATIONS = 480, 200.0, 500
@@ -65,6 +62,8 @@ class ObliqueCollision(Claim):
     source = "Zhong, Han, Brikis 2023, arXiv 2305.00092"
     learned = "Where the normal turns with the place of impact, the right position with a wrong velocity is worse than neither."
     labels = ("iteration", "cost")
+    curves = {name: (label, "-") for name, label in LABELS.items()}
+    marks = (("y", OPTIMUM, "optimum"),)
     quick = False
 
     def measure(self) -> Outcome:
@@ -94,11 +93,9 @@ class ObliqueCollision(Claim):
             series=series,
         )
 
-    def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
-        """Draw the costs."""
-        for name, label in LABELS.items():
-            axes.plot(series["iteration"], series[name], label=label)
-        axes.axhline(OPTIMUM, color=GREY, linewidth=0.6, label="optimum")
+    def draw(self, axes: Any, series: Mapping[str, Any]) -> None:
+        """Draw the costs near the optimum."""
+        super().draw(axes, series)
         axes.set_ylim(0.25, 0.6)
 
 

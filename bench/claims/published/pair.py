@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
 from bench.claims.claim import Claim, Figure, Outcome
 from bench.claims.toolkit import problem
 from bench.model import Array, ContactScene, State, param
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 NAMES = ("x1", "x2", "v1", "v2")
 
@@ -70,6 +66,7 @@ class ElasticPair(Claim):
     source = "nimblephysics, issue 97"
     learned = "A program can end at the right place with the derivatives of the wrong ball."
     labels = ("variable", "derivative of the second ball's end")
+    curves = {name: (name, "o-") for name in ("with time of impact", "without", "event driven")}
 
     def measure(self) -> Outcome:
         """Differentiate the end under the impulse law with and without the time of impact, and under event-driven steps."""
@@ -92,9 +89,3 @@ class ElasticPair(Claim):
                 figures.append(Figure(f"place at the end, {label}", "1.200", end, spread=1e-9))
             series[label] = slopes.tolist()
         return Outcome(figures, series=series)
-
-    def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
-        """Draw the derivatives."""
-        for label, values in series.items():
-            if label != "names":
-                axes.plot(series["names"], values, "o-", label=label)

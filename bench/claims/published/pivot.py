@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
 from bench.claims.claim import Claim, Figure, Outcome
-from bench.claims.colours import GREY, estimator_colour
+from bench.claims.colours import GREY
 from bench.claims.toolkit import centre, expectation, problem, stochastic_descent
 from bench.model import Array, FunctionScene, param
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 SIGMA = 0.02
 
@@ -47,6 +43,8 @@ class FallingPivot(Claim):
     source = "Suh et al. 2022, ICML"
     learned = "Near the edge the first-order gradient misses exactly the part that warns: the jump times its density."
     labels = ("angle [rad]", "mean gradient")
+    curves = {"truth": ("true", "-", GREY), "first": ("first-order mean", "-", "fobg")}
+    marks = (("x", math.pi / 4, "edge"),)
 
     def measure(self) -> Outcome:
         """Integrate the missing part, and descend."""
@@ -78,9 +76,3 @@ class FallingPivot(Claim):
             figures,
             series={"x": grid.tolist(), "first": [a[0] for a, _ in both], "truth": [b[0] for _, b in both]},
         )
-
-    def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
-        """Draw both gradients around the edge."""
-        axes.plot(series["x"], series["truth"], color=GREY, label="true")
-        axes.plot(series["x"], series["first"], color=estimator_colour("fobg"), label="first-order mean")
-        axes.axvline(math.pi / 4, color=GREY, linestyle=":", linewidth=0.8, label="edge")

@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from bench.claims.claim import Claim, Figure, Outcome
-from bench.claims.colours import bars, estimator_colour
 from bench.claims.toolkit import estimator, problem, spread, terms
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
     from bench.model import Problem
 
 
@@ -53,6 +49,8 @@ class SmoothedPush(Claim):
     source = "Suh et al. 2022, ICML"
     learned = "Smooth contact until its width is that of a sample's motion: then the first order is far better."
     labels = ("sharpness beta [1/m]", "variance of one sample")
+    logarithmic = "xy"
+    curves = {"first": ("first order", "o-", "fobg"), "zeroth": ("zeroth order", "s-", "reinforce")}
     quick = False
 
     def measure(self) -> Outcome:
@@ -92,14 +90,6 @@ class SmoothedPush(Claim):
             series=series,
         )
 
-    def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
-        """Draw both variances against the sharpness."""
-        axes.set(xscale="log", yscale="log")
-        bars(axes, series["beta"], series["first"], fmt="o-", color=estimator_colour("fobg"), label="first order")
-        bars(
-            axes, series["beta"], series["zeroth"], fmt="s-", color=estimator_colour("reinforce"), label="zeroth order"
-        )
-
 
 class StiffPush(Claim):
     """Pushing at several stiffnesses and two steps."""
@@ -113,6 +103,12 @@ class StiffPush(Claim):
     source = "Suh et al. 2022, ICML; recomputed with a finer step"
     learned = "Two to three of the decades at k = 1000 are the step's, not the contact's: refine before you smooth."
     labels = ("stiffness [N/m]", "variance of one sample")
+    logarithmic = "xy"
+    curves = {
+        "coarse": ("first order, step 5 ms", "o-", "fobg"),
+        "fine": ("first order, step 0.25 ms", "o--", "fobg"),
+        "zeroth": ("zeroth order", "s-", "reinforce"),
+    }
     quick = False
 
     def measure(self) -> Outcome:
@@ -146,27 +142,6 @@ class StiffPush(Claim):
             ),
             series=series,
         )
-
-    def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
-        """Draw the variances against the stiffness."""
-        axes.set(xscale="log", yscale="log")
-        bars(
-            axes,
-            series["k"],
-            series["coarse"],
-            fmt="o-",
-            color=estimator_colour("fobg"),
-            label="first order, step 5 ms",
-        )
-        bars(
-            axes,
-            series["k"],
-            series["fine"],
-            fmt="o--",
-            color=estimator_colour("fobg"),
-            label="first order, step 0.25 ms",
-        )
-        bars(axes, series["k"], series["zeroth"], fmt="s-", color=estimator_colour("reinforce"), label="zeroth order")
 
 
 def _heavy(what: str, text: str, measured: float, error: float, count: int) -> Figure:

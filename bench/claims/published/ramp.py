@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from bench.claims.claim import Claim, Figure, Outcome
-from bench.claims.colours import GREY, estimator_colour
 from bench.claims.toolkit import centre, estimator, moments, problem
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 SIGMA, NU = 0.1, 0.005
 
@@ -29,6 +24,9 @@ class Ramp(Claim):
     source = "Suh et al. 2022, ICML"
     learned = "An unbiased gradient can be useless: in finite samples a steep ramp is a jump."
     labels = ("width of the ramp / sigma", "variance of one sample")
+    logarithmic = "xy"
+    curves = {"first": ("first order", "-", "fobg"), "zeroth": ("zeroth order", "-", "reinforce")}
+    marks = (("x", 1.517, "published crossing"),)
     quick = False
 
     def measure(self) -> Outcome:
@@ -91,9 +89,3 @@ class Ramp(Claim):
                 Figure(f"{name}-order mean absolute error, {count} samples", published, mean, error, 2 * once)
             )
         return figures
-
-    def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
-        """Draw both variances against the width."""
-        axes.loglog(series["width"], series["first"], color=estimator_colour("fobg"), label="first order")
-        axes.loglog(series["width"], series["zeroth"], color=estimator_colour("reinforce"), label="zeroth order")
-        axes.axvline(1.517, color=GREY, linewidth=0.6, label="published crossing")

@@ -2,17 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
-
 import numpy as np
 
 from bench.claims.claim import Claim, Figure, Outcome
-from bench.claims.colours import GREY
 from bench.claims.toolkit import native
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 PUBLISHED = {0.1: "1.26", 0.05: "0.61", 0.02: "0.145", 0.01: "0.149", 1e-3: "0.012", 1e-4: "4.5e-4"}
 STARTS = 40_000
@@ -34,6 +27,9 @@ class SoftWall(Claim):
     source = "Paulus et al. 2025, arXiv 2506.14186, toy example"
     learned = "Before blaming contact, halve the time step and look again."
     labels = ("time step [s]", "mean error of df/dq0")
+    logarithmic = "xy"
+    curves = {"error": ("penalty program", "o-")}
+    marks = (("y", SPEED, "size of the gradient"),)
 
     def measure(self) -> Outcome:
         """Average the error over starts that are more than 0.05 away from the exact solution's kink."""
@@ -63,11 +59,6 @@ class SoftWall(Claim):
             ),
             series={"dt": list(PUBLISHED), "error": errors},
         )
-
-    def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
-        """Draw the error against the step."""
-        axes.loglog(series["dt"], series["error"], "o-", label="penalty program")
-        axes.axhline(SPEED, color=GREY, linewidth=0.6, label="size of the gradient")
 
 
 def _mean_error(dt: float, shares: np.ndarray) -> float:

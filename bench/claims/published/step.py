@@ -2,17 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
-
 import numpy as np
 
 from bench.claims.claim import Claim, Figure, Outcome
-from bench.claims.colours import estimator_colour
 from bench.claims.toolkit import estimator, moments, problem
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 
 class Step(Claim):
@@ -26,6 +19,10 @@ class Step(Claim):
     source = "Suh et al. 2022, ICML"
     learned = "A gradient that repeats itself perfectly can be wholly wrong."
     labels = ("theta", "mean gradient")
+    curves = {
+        "zeroth": ("zeroth order: the slope", "-", "reinforce"),
+        "first": ("first order: 0 everywhere", "-", "fobg"),
+    }
 
     def measure(self) -> Outcome:
         """Integrate both estimators over the noise."""
@@ -52,10 +49,3 @@ class Step(Claim):
                 "zeroth": [moments(at, zeroth, x, 4000)[0][0] for x in thetas],
             },
         )
-
-    def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
-        """Draw both means along theta."""
-        axes.plot(
-            series["theta"], series["zeroth"], color=estimator_colour("reinforce"), label="zeroth order: the slope"
-        )
-        axes.plot(series["theta"], series["first"], color=estimator_colour("fobg"), label="first order: 0 everywhere")

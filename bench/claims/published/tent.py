@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from bench.claims.claim import Claim, Figure, Outcome
-from bench.claims.colours import bars, estimator_colour
 from bench.claims.toolkit import estimator, problem, spread, terms
 from bench.model import Array, FunctionScene, param
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 SAMPLES = 400_000
 AT_GAIN = 8 * SAMPLES
@@ -55,6 +50,8 @@ class Chaos(Claim):
     source = "Metz et al. 2021; Parmas et al. 2018; figures for the tent map in closed form"
     learned = "Beyond the horizon of chaos derivatives are right and useless; sampling does not care."
     labels = ("steps T", "variance of one sample")
+    logarithmic = "y"
+    curves = {"first": ("first order: 4^T", "o-", "fobg"), "zeroth": ("zeroth order", "s-", "reinforce")}
 
     def measure(self) -> Outcome:
         """Sample both orders at several horizons."""
@@ -107,12 +104,4 @@ class Chaos(Claim):
                 "first": [v[0] for v in found.values()],
                 "zeroth": [v[1] for v in found.values()],
             },
-        )
-
-    def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
-        """Draw both variances against the horizon."""
-        axes.set_yscale("log")
-        bars(axes, series["steps"], series["first"], fmt="o-", color=estimator_colour("fobg"), label="first order: 4^T")
-        bars(
-            axes, series["steps"], series["zeroth"], fmt="s-", color=estimator_colour("reinforce"), label="zeroth order"
         )

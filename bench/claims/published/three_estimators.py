@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from bench.claims.claim import Claim, Figure, Outcome
-from bench.claims.colours import bars, estimator_colour
 from bench.claims.toolkit import estimator, hermite, moments, problem, spread, terms
 from bench.model import Array, FunctionScene, param
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 
 @dataclass(frozen=True)
@@ -62,6 +57,13 @@ class ThreeEstimators(Claim):
     source = "Mohamed et al. 2020, JMLR"
     learned = "No estimator is best: roughness costs the first order, dimension the score."
     labels = ("frequency k of cos(k x)", "variance of one sample")
+    logarithmic = "xy"
+    has_ticks = True
+    curves = {
+        "pathwise": ("pathwise", "o-", "fobg"),
+        "score": ("score", "o-", "reinforce"),
+        "measure-valued": ("measure-valued", "o-", "measure_valued"),
+    }
 
     def measure(self) -> Outcome:
         """Integrate exactly on polynomials, by a fine rule on waves, and sample in more dimensions."""
@@ -121,13 +123,6 @@ class ThreeEstimators(Claim):
         return Figure(
             f"score with the best constant baseline, k = {k:g}", {-3.0: "134.0", 1.0: "6.00"}[k], variance, 1e-9
         )
-
-    def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
-        """Draw the variances against the frequency."""
-        axes.set(xscale="log", yscale="log")
-        for name, method in (("pathwise", "fobg"), ("score", "reinforce"), ("measure-valued", "measure_valued")):
-            bars(axes, series["k"], series[name], fmt="o-", color=estimator_colour(method), label=name)
-        axes.set_xticks(series["k"], [f"{k:g}" for k in series["k"]])
 
 
 def _exact(text: str) -> str:

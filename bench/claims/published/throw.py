@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,8 +12,6 @@ from bench.claims.claim import Claim, Figure, Outcome
 from bench.claims.toolkit import descend, native
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
     from bench.model import Problem
 
 
@@ -37,6 +34,8 @@ class Throw(Claim):
         "A wrong gradient can still find a way, another one and a worse one; the forward law decides what is reachable."
     )
     labels = ("iteration", "squared distance to the target [m^2]")
+    logarithmic = "y"
+    curves = {name: (label, "-") for name, label in LABELS.items()}
     quick = False
 
     def measure(self) -> Outcome:
@@ -58,11 +57,6 @@ class Throw(Claim):
                 )
             series[name] = values.tolist()
         return Outcome(figures, series=series)
-
-    def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
-        """Draw the losses."""
-        for name in ("with", "without", "penalty"):
-            axes.semilogy(series["iteration"], series[name], label=LABELS[name])
 
 
 def _slope(at: Problem, theta: np.ndarray, _: int) -> np.ndarray:

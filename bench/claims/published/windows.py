@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from bench.claims.claim import Claim, Figure, Outcome
 from bench.claims.toolkit import problem
 from bench.model import Array, FunctionScene, param
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 EFFORT, VALUE, GAIN = 10.0, 3.701562, 0.270156
 
@@ -51,6 +48,8 @@ class Windows(Claim):
     source = "Xu et al. 2022 (idea); closed form by Riccati steps"
     learned = "Cutting a rollout is cheap only if its end is worth something."
     labels = ("window H", "excess cost")
+    logarithmic = "y"
+    curves = {"excess": ("no value at the end", "o-")}
 
     def measure(self) -> Outcome:
         """Compute the optimum of each window from its gradient, which is linear in the controls."""
@@ -70,10 +69,6 @@ class Windows(Claim):
             valued = _first_gain(Window(steps=steps, value=VALUE))
             figures.append(Figure(f"gain of a window of {steps} with the value", "0.270156", valued, 1e-7))
         return Outcome(figures, series=series)
-
-    def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
-        """Draw the excess cost."""
-        axes.semilogy(series["window"], series["excess"], "o-", label="no value at the end")
 
 
 def _first_gain(scene: Window) -> float:
@@ -120,7 +115,7 @@ class OtherObjective(Claim):
             series={"given": given, "scored": scored[:8]},
         )
 
-    def draw(self, axes: Axes, series: Mapping[str, Any]) -> None:
+    def draw(self, axes: Any, series: Mapping[str, Any]) -> None:
         """Draw both curves above the optimum."""
         for name, label in (("given", "given weights 1/2 and 20"), ("scored", "given weights 1 and 1")):
             axes.semilogy(np.array(series[name]) - 349.490454, "o-", label=label)

@@ -31,7 +31,6 @@ from bench.report.views import (
     pareto,
     rmse_interval,
 )
-from bench.studies.bias_variance import time_to_accuracy
 from bench.studies.bias_variance.columns import COLUMNS
 from bench.studies.bias_variance.comparisons import FAILS, NO_RESULT, most_often_first
 from bench.studies.bias_variance.costs import ROLLOUTS, TIME, Cost
@@ -85,8 +84,8 @@ def charts(
         chart = _along(labelled, axis, methods, comparisons, styles, subtitle)
         main += [chart] if chart is not None else []
     if not best.empty:
-        first = [_speed_accuracy(labelled, best, styles, subtitle), _costs_matrix(labelled, best)]
-        main = [chart for chart in first if chart is not None] + main
+        first = _speed_accuracy(labelled, best, styles, subtitle)
+        main = [*([first] if first is not None else []), *main]
     elif shown.rows["backend"].nunique() > 1:
         main += [_error_and_cost(labelled, styles, subtitle)]
     if not swept and methods["problem"].nunique() > 1:
@@ -306,44 +305,6 @@ def _on_fastest(rows: pd.DataFrame, cost: Cost) -> pd.DataFrame:
     shared = rows[rows.groupby("x")["line"].transform("nunique") == lines.nunique()]
     rows_of = shared if len(shared) else rows
     return rows[lines == cost.of(rows_of).groupby(rows_of["line"]).median().idxmin()]
-
-
-def _costs_matrix(shown: Arranged, best: pd.DataFrame) -> Chart | None:
-    """Return the matrix of the cost of each estimator to reach each error, relative to the cheapest of its column."""
-    timed = bool((best["by"] == "time").any())
-    cost: Cost = TIME if timed else ROLLOUTS
-    lines = []
-    for problem in split_by_problem(shown, SAMPLES, ("scene",)):
-        if problem.rows["x"].nunique() < 2:
-            continue
-        for target in TARGETS:
-            needed: dict[str, time_to_accuracy.RequiredCost] = {}
-            for method, way in time_to_accuracy.methods(problem, target, cost).items():
-                name = time_to_accuracy.estimator_of(method)
-                needed[name] = min(way, needed.get(name, way), key=time_to_accuracy.order)
-            first = min(needed.values(), key=time_to_accuracy.order, default=None)
-            for name, way in needed.items():
-                factor = way.cost / first.cost if first else math.nan
-                lines.append({
-                    "panel": f"to {target:.0%} error", "series": name, "problem": problem.title(), "factor": factor,
-                    "cell": _factor_cell(way, first, factor),
-                })  # fmt: skip
-    what = "Time" if timed else "Rollouts"
-    return Chart(
-        "summary_matrix", pd.DataFrame(lines), [text("problem", label="")], [ESTIMATOR], "grid",
-        f"{what} to reach an error, relative to the lowest known of each column", panel="panel", value="factor", cell="cell", across=1, height=0.24,
-        subtitle="costs over the lowest, -: never reached, as the bias is larger, ?: not known, ≥ and ≤: limits, as the fewest "
-        "samples suffice",
-    )  # fmt: skip
-
-
-def _factor_cell(way: time_to_accuracy.RequiredCost, first: time_to_accuracy.RequiredCost | None, factor: float) -> str:
-    """Format a cost over the lowest: a limit where one of them suffices with the fewest samples, as fewer may do."""
-    if not math.isfinite(factor) or first is None:
-        return "-" if way.how == "never" else "?"
-    limits = [end.is_at_fewest and end.down > 0 for end in (way, first)]
-    sign = "" if way is first or limits[0] == limits[1] else "≤ " if limits[0] else "≥ "
-    return "?" if way is not first and all(limits) else sign + number(factor)
 
 
 def _error_and_cost(shown: Arranged, styles: Mapping[str, Style], subtitle: str) -> Chart:

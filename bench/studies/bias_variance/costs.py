@@ -14,16 +14,10 @@ from bench.report.text import axis_value, duration
 
 @dataclass(frozen=True)
 class Cost:
-    """A measure of the cost of one estimate, with its labels."""
+    """A measure of the cost of one estimate."""
 
-    name: str
-    """Name of the cost in a chart's subtitle: the words after ``relative RMSE of one estimate against``."""
-    label: str
-    """Axis label."""
     of: Callable[[pd.DataFrame], pd.Series]
     """Computes the cost of each row."""
-    spread: Callable[[pd.DataFrame], pd.Series]
-    """Computes half the interquartile range of each row's cost."""
     text: Callable[[float], str]
     """Formats a cost."""
 
@@ -39,18 +33,7 @@ def _seconds(value: float) -> str:
     return duration(value).replace("us", "µs").replace(".0 ", " ")
 
 
-def _half_range(rows: pd.DataFrame) -> pd.Series:
-    return rows["time_iqr_s"].fillna(0.0) / 2
-
-
-TIME = Cost("the time it takes", "time of one estimate", lambda rows: rows["time_s"], _half_range, _seconds)
-TIME_COMPILED = Cost(
-    "the time it takes, compilation included",
-    "time with compilation",
-    lambda rows: rows["time_s"] + rows["compile_s"].fillna(0.0),
-    _half_range,
-    _seconds,
-)
+TIME = Cost(lambda rows: rows["time_s"], _seconds)
 RATIO = "gradient_cost"
 """Column with the number of rollouts that take as long as one gradient; 1 where it is missing."""
 PROGRAM = (
@@ -84,10 +67,5 @@ def _rollouts(rows: pd.DataFrame) -> pd.Series:
     return rows["rollouts"] + ratio * rows["gradients"]
 
 
-ROLLOUTS = Cost(
-    "its rollouts",
-    "rollouts, a gradient at its measured cost",
-    _rollouts,
-    lambda rows: 0.0 * rows["rollouts"],
-    axis_value,
-)
+ROLLOUTS = Cost(_rollouts, axis_value)
+"""Rollouts, with a gradient at its measured cost."""

@@ -75,7 +75,9 @@ def measure(cell: Cell, session: Session, timed_calls: int, settle_s: float) -> 
     unbiased = cell.estimator.declares_unbiased(program)
     summary = asdict(statistics.summarise(values, truth.known(), cell.samples, estimates.sums, unbiased=unbiased))
     surrogate = SURROGATE if program.surrogate and "grad" in cell.estimator.needs else ""
-    result |= {"reason": "; ".join(part for part in (surrogate, summary.pop("note"), truth.note) if part), **summary}
+    doubt = cell.estimator.remark(json.loads(result["auxiliaries"])) if result["auxiliaries"] else ""
+    remarks = (surrogate, summary.pop("note"), doubt, truth.note)
+    result |= {"reason": "; ".join(part for part in remarks if part), **summary}
     bad = ~np.isfinite(values).all(axis=1)
     if bad.any():
         result["status"] = "nonfinite"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-import time
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,6 @@ from bench.model import Estimator, Optimizer, Problem
 from bench.studies.dose_response.ground import Ground, ground_of, scored_noise
 from bench.studies.dose_response.search import (
     MOST_NUMBERS,
-    TARGETS,
     Method,
     Search,
     Task,
@@ -27,7 +25,7 @@ from bench.studies.dose_response.search import (
     unit_rate,
     with_rate,
 )
-from bench.studies.optimise.search import scene_class
+from bench.studies.optimise.search import fastest, scene_class
 
 HYPOTHESES = config_dir() / "hypotheses" / "dose_response.md"
 """The hypotheses that were written before the first run."""
@@ -152,21 +150,9 @@ def compare(estimates: np.ndarray, gradient: np.ndarray, variance: float) -> dic
     return dict(zip(names, [*values, float(cosines.mean()), float(signs)], strict=True))
 
 
-def _times(cell: Cell, problem: Problem, calls: int = 5) -> dict[str, float]:
+def _times(cell: Cell, problem: Problem) -> dict[str, float]:
     """Return the seconds of a rollout and of a gradient in a batch, each from the fastest of some calls."""
     theta = problem.program.theta0
     w = noise.draw(0, cell.scene.name, 1, TIMED, problem.program.n_noise, "dose_response: times")[0].T
-    seconds = {}
     functions = {"rollout_s": problem.value} | ({"gradient_s": problem.grad} if "grad" in cell.backend.provides else {})
-    for name, function in functions.items():
-        function(theta, w)
-        times = []
-        for _ in range(calls):
-            started = time.perf_counter()
-            function(theta, w)
-            times.append(time.perf_counter() - started)
-        seconds[name] = min(times) / TIMED
-    return seconds
-
-
-__all__ = ["TARGETS", "compare", "errors_on_path", "hypotheses_hash", "measure"]
+    return {name: fastest(function, theta, w) / TIMED for name, function in functions.items()}

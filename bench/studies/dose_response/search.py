@@ -6,7 +6,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from bench.measure import noise
 from bench.model import Answer, Estimator, Optimizer, Problem
 from bench.model.parameters import parameters
 from bench.studies.optimise.batched import run_batched
+from bench.studies.optimise.search import advance, estimates, mean_costs, objective
 
 TARGETS = (10.0, 30.0, 100.0, 300.0, 1000.0)
 """Factors by which the regret of a search has to fall."""
@@ -73,14 +74,6 @@ def _noise(seed: int, scene: str, samples: int, width: int, iteration: int) -> n
     return noise.draw(seed, scene, 1, samples, width, f"dose_response: samples {iteration}")
 
 
-def objective(problem: Problem, theta: np.ndarray, scored: np.ndarray) -> float:
-    """Return the scored objective at ``theta (d,)``. Its rollouts are not counted."""
-    before = problem.usage.rollouts
-    cost = float(problem.value(theta, scored).mean())
-    problem.usage.rollouts = before
-    return cost
-
-
 def follow(problem: Problem, method: Method, task: Task, seed: int, keep: bool = False) -> Search:
     """Search until the last target, divergence or the number of updates; ``keep`` returns theta at every update."""
     optimizer, width = method.optimizer, problem.program.n_noise
@@ -100,21 +93,13 @@ def follow(problem: Problem, method: Method, task: Task, seed: int, keep: bool =
             break
         i += 1
         draws = optimizer.draws(problem.dim)
-        points = optimizer.ask(
-            state, noise.draw(seed, task.scene, 1, draws, problem.dim, f"dose_response: points {i}")[0].T
-        )
-        needs = optimizer.required_fields(state)
-        drawn = _noise(seed if method.is_random else 0, task.scene, method.samples, width, i if method.is_random else 0)
-        drawn = drawn.copy(order="K")  # methods share the noise
-        value = gradient = None
-        if "value" in needs:
-            scored = task.scored
-            costs = problem.value(np.repeat(points, scored.shape[1], axis=1), np.tile(scored, (1, points.shape[1])))
-            value = costs.reshape(points.shape[1], -1).mean(axis=1)
-        if "gradient" in needs:
-            assert method.estimator is not None
-            gradient = np.stack([method.estimator.estimate(problem, point, drawn)[0] for point in points.T], axis=1)
-        state = optimizer.tell(state, points, Answer(value, gradient))
+        normal = noise.draw(seed, task.scene, 1, draws, problem.dim, f"dose_response: points {i}")[0].T
+        place = (seed, i) if method.is_random else (0, 0)
+        drawn = _noise(place[0], task.scene, method.samples, width, place[1]).copy(order="K")  # methods share the noise
+        state = advance(
+            optimizer, state, normal, partial(mean_costs, problem, w=task.scored),
+            partial(estimates, problem, method.estimator, w=drawn),
+        )  # fmt: skip
     share = 1.0 / max(i, 1)
     return Search(updates, problem.usage.rollouts * share, problem.usage.gradients * share, lowest, i, thetas)
 

@@ -46,7 +46,7 @@ NOTES = (
     "Program error: distance of the gradient from differences of the engine's own cost. Model error: distance from rigid "
     "contact's gradient where it has a closed form, otherwise from the gradient of the scene's own program. RMSE: of "
     "`samples` averaged gradients, or costs with scores, relative to the engine's own grad J_sigma; where that is not "
-    "known well enough, the upper end of the interval. Times are of a batch of 64 rollouts. Pipe: share of the gradients' "
+    "known well enough, the upper end of the interval. Times are of `batch` rollouts. Pipe: share of the gradients' "
     "time that is spent outside the engine's process.",
 )
 

@@ -16,15 +16,13 @@ FEWEST = 5
 
 
 @dataclass(frozen=True)
-class Curve:
-    """A curve ``exp(start + slope * place)`` through norms, where ``place`` is the horizon or its logarithm."""
+class Slope:
+    """The slope of a line through logarithms of norms: the order of a power law, or the rate of an exponential."""
 
-    start: float
-    slope: float
-    """The order of the power law, or the rate of the exponential per unit of the horizon."""
+    value: float
     low: float
     high: float
-    """The 95% interval of the slope (Student's t)."""
+    """The 95% interval (Student's t)."""
     residual: float
     """Sum of squared residuals of the logarithms, and of the norms' own errors."""
 
@@ -35,24 +33,10 @@ class Fit:
 
     verdict: str
     """exploding, polynomial, vanishing or open."""
-    power: Curve
-    exponential: Curve
+    power: Slope
+    exponential: Slope
     odds: float
     """Likelihood of the exponential relative to the power law: above 1 the exponential is nearer to the norms."""
-
-    @property
-    def curve(self) -> Curve | None:
-        """The curve that the norms follow; None where that is open."""
-        if self.verdict == "open":
-            return None
-        return self.exponential if self.verdict in ("exploding", "vanishing") and self.odds >= 1 else self.power
-
-    def at(self, horizons: np.ndarray) -> np.ndarray:
-        """Return the curve's norms at some horizons; NaN where it is open which curve the norms follow."""
-        curve = self.curve
-        if curve is None:
-            return np.full(len(horizons), math.nan)
-        return np.exp(curve.start + curve.slope * (horizons if curve is self.exponential else np.log(horizons)))
 
 
 def fit(horizons: np.ndarray, norms: np.ndarray, errors: np.ndarray, bounded: bool = False) -> Fit:
@@ -63,32 +47,28 @@ def fit(horizons: np.ndarray, norms: np.ndarray, errors: np.ndarray, bounded: bo
     with equally many parameters is (residual_1 / residual_2)^(n/2).
     """
     errors = np.maximum(errors, ROUNDING)
-    power = _curve(np.log(horizons), np.log(norms), errors)
-    exponential = _curve(horizons, np.log(norms), errors)
+    power, exponential = (_slope(places, np.log(norms), errors) for places in (np.log(horizons), horizons))
     odds = (power.residual / exponential.residual) ** (len(norms) / 2) if len(norms) >= FEWEST else math.nan
-    return Fit(_verdict(power, exponential, odds, bounded), power, exponential, odds)
-
-
-def _verdict(power: Curve, exponential: Curve, odds: float, bounded: bool) -> str:
+    verdict = "open"
     if odds >= STRONG and exponential.low > 0:
-        return "exploding"
-    if (odds >= STRONG and exponential.high < 0) or (odds <= 1 / STRONG and power.high < 0):
-        return "vanishing"
-    if power.low > 0 and (odds <= 1 / STRONG or (odds <= 1 and bounded)):
-        return "polynomial"
-    return "open"
+        verdict = "exploding"
+    elif (odds >= STRONG and exponential.high < 0) or (odds <= 1 / STRONG and power.high < 0):
+        verdict = "vanishing"
+    elif power.low > 0 and (odds <= 1 / STRONG or (odds <= 1 and bounded)):
+        verdict = "polynomial"
+    return Fit(verdict, power, exponential, odds)
 
 
-def _curve(places: np.ndarray, logarithms: np.ndarray, errors: np.ndarray) -> Curve:
+def _slope(places: np.ndarray, logarithms: np.ndarray, errors: np.ndarray) -> Slope:
     from scipy.special import stdtrit
 
     count = len(places)
     if count < 3 or np.ptp(places) == 0:
-        return Curve(*[math.nan] * 5)
+        return Slope(*[math.nan] * 4)
     away = places - places.mean()
     slope = float(away @ logarithms / (away @ away))
     start = float(logarithms.mean() - slope * places.mean())
     left = logarithms - start - slope * places
     residual = float(left @ left + errors @ errors)
     reach = float(stdtrit(count - 2, 0.975)) * math.sqrt(residual / (count - 2) / float(away @ away))
-    return Curve(start, slope, slope - reach, slope + reach, residual)
+    return Slope(slope, slope - reach, slope + reach, residual)

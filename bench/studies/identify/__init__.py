@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from bench.errors import Unsupported
 from bench.experiment.cell import Cell
 from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, text
 from bench.experiment.experiment import Experiment
@@ -27,26 +28,30 @@ class Identify(Study):
     default_plugins: ClassVar[Mapping[str, Sequence[str]]] = {"optimizers": ("gauss_newton",)}
     columns: ClassVar[Columns] = Columns.of(
         text("optimizer", "identity string of the optimizer"),
-        text("words", "what the record can and cannot tell"),
         Column("rank", "directions of the parameters that the record sees"),
         Column("condition", "largest singular value of the information over the smallest that is seen",
                comparison=ComparisonRule("exact", "condition number")),
         Column("fits", "records that were fitted"),
         Column("step_shift", "largest relative change of an estimate when the model's step is halved, without noise"),
-        text("step_note", "whether the estimate holds for its time step only"),
+        Column("step_shift_bound", "the same in units of the Cramer-Rao bound"),
         Column("explained", "share of records that no test of the residuals contradicts, at 5% false alarms",
                label="explained", format="percent"),
         Column("misfit", "share of records of a right model that contradict it as much as the first record"),
-        Column("misfit_together", "the same for all records together; a small effect adds up, and noise does not"),
-        numbers("wide_low", "by unknown, lower end of the 95% interval of the first fit under correlated noise"),
-        numbers("wide_high", "by unknown, its upper end"),
+        text("contradictions", "tests that the first record's fit fails, each with its statistic in units of its edge"),
+        Column("noise_size", "standard deviation of the residuals of the first record", "m"),
+        numbers("terms", "terms that the model lacks, whose effect on the record is tested"),
+        numbers("unnoticed", "by invariant and term, the largest relative bias of an estimate that a term causes while 5% of "
+                "records do not show it"),
         numbers("unknowns", "names of the parameters"),
-        numbers("truth", "true values of the parameters"),
+        numbers("units", "units of the parameters", table=False),
+        numbers("truth", "true values of the parameters; nan: a record of your own"),
         numbers("start", "values of the parameters where fits start"),
         numbers("invariants", "identifiable products of powers of the parameters"),
+        numbers("exponents", "by invariant and unknown, its exponent", table=False),
         numbers("bound", "Cramer-Rao bound of the relative standard deviation of each invariant"),
         numbers("fisher", "Fisher information of the logarithms, row by row", table=False),
         numbers("shooting", "the shooting methods: single, multiple, windows"),
+        numbers("optimum", "by shooting method, share of fits whose optimizer has reached an optimum"),
         numbers("converged", "by shooting method, share of fits whose residuals are consistent with the noise",
                 label="share of fits that converge", low="converged_low", high="converged_high"),
         numbers("converged_low", "lower end of its 95% interval"),
@@ -58,10 +63,11 @@ class Identify(Study):
         numbers("coverage_low", "lower end of its 95% interval over records"),
         numbers("coverage_high", "upper end of its 95% interval over records"),
         numbers("hidden", "by shooting method, fits with more identifiable directions than the record has"),
-        numbers("estimate", "by shooting method and invariant, the median estimate"),
-        numbers("estimate_low", "by shooting method and invariant, lower end of the 95% interval of the first fit"),
+        numbers("estimate", "by shooting method and invariant, the estimate of the first record"),
+        numbers("estimate_low", "by shooting method and invariant, lower end of its 95% interval"),
         numbers("estimate_high", "by shooting method and invariant, its upper end"),
-        numbers("first", "by shooting method and invariant, the estimate of the first record"),
+        numbers("intervals", "by shooting method, the noise of these intervals: of stated size, own size (that of the residuals), "
+                "or correlated; empty: stated"),
         numbers("scan_steps", "steps of the windows of each scan of the loss, the whole record first"),
         numbers("scan_low", "by unknown, the first value of the scan"),
         numbers("scan_high", "by unknown, its last value"),
@@ -71,7 +77,14 @@ class Identify(Study):
                 table=False),
     )  # fmt: skip
 
-    measurement: float = param(0.01, "standard deviation of the noise on each measurement", "m", positive=True)
+    revision: ClassVar[int] = 2
+
+    measurement: float | None = param(
+        None,
+        "standard deviation of the noise on each measurement; null: 0.01, and for a record of your own estimated",
+        "m",
+        positive=True,
+    )
     start: float = param(1.2, "fits start at this many times the truth, every second one at its inverse", positive=True)
     windows: int = param(8, "windows of multiple shooting and of windows", low=2)
     iterations: int = param(40, "steps of the optimizer", positive=True)
@@ -79,6 +92,8 @@ class Identify(Study):
     scan: int = param(0, "values of each unknown at which the loss is scanned; 0: no scan", low=0, high=10_000)
     span: float = param(2.0, "a scan covers the truth over this to the truth times this", low=1.0)
     data: str | None = param(None, "CSV file with measurements of your own, a line per step; null: made from the truth")
+    measured: str | None = param(None, "names of its measured columns, a+b; null: all")
+    time: str | None = param(None, "name of its column of times in s, from which lines may be missing; null: all steps")
 
     def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
         """Return one cell's results by column: fits of all records by each shooting method, and the Cramer-Rao bound."""
@@ -88,7 +103,7 @@ class Identify(Study):
 
     def unsupported_reason(self, cell: Cell) -> str | None:
         """Return why a cell cannot be fitted (no motion, no unknowns, no NumPy steps, sampling, unusable data), or None."""
-        from bench.studies.identify.measure import read
+        from bench.studies.identify.measure import model_of, read
 
         scene, optimizer = cell.scene, cell.parts["optimizer"]
         assert isinstance(optimizer, Optimizer)
@@ -106,9 +121,9 @@ class Identify(Study):
             return f"optimizer {optimizer.name} samples, and fits are compared along one path: use a deterministic one"
         if self.data is not None:
             try:
-                read(self.data, scene)
-            except (OSError, ValueError) as error:
-                return str(error)
+                read(self, model_of(cell))
+            except (OSError, ValueError, Unsupported) as error:
+                return str(error).strip()
         return None
 
     def views(self, experiment: Experiment, rows: pd.DataFrame) -> Views:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 import itertools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from scipy.special import chdtri
 
 from bench.errors import Unsupported
@@ -17,7 +18,7 @@ from bench.experiment.cell import Cell
 from bench.measure import adequacy, noise, performance
 from bench.measure.identification import Information
 from bench.model import Answer, Decision, Identified, LoopOps, MechanicalScene, Optimizer, Rollout, State, compose
-from bench.model.parameters import named
+from bench.model.parameters import Parameter, named
 
 STEP = 1e-5
 """Step of central differences in the logarithms of parameters. Its relative error is about 1e-10."""
@@ -25,22 +26,24 @@ SHOOTING = ("single", "multiple", "windows")
 """Shooting methods: one rollout, consecutive windows joined by a penalty on gaps, and independent windows."""
 GAP_WEIGHT = 100.0
 """Weight of a gap between windows of multiple shooting, relative to the weight of a measurement."""
-MAX_STEP_SHIFT = 0.5
-"""Largest change of an estimate at half the step, in Cramer-Rao bounds, that counts as independent of the step.
-
-To first order in the step, the error of the estimate is twice this change: one bound. With a bias of one bound, 17% of
-the 95% intervals miss the truth instead of 5%.
-"""
-
+NOISE = 0.01
+"""Noise of records that are made from the truth, if none is stated."""
+CONVERGED = 1e-3
+"""Remaining step of a converged fit, in standard errors by its residuals, and its square by the noise."""
 TESTED = 64
 """Most records whose residuals are tested."""
 UNEXPLAINED = 1e-3
 """Share of fits to a right model whose residuals are larger than those that count as consistent with the noise."""
-APART = 0.01
-"""Share of records of a right model whose fits by single shooting and by windows count as different."""
 
+Push = Callable[[np.ndarray, np.ndarray], Any]
+"""An acceleration as a function of q and v."""
 Settings = Any
 """An ``Identify`` study: its parameters are the settings. Its module imports this module, so its type cannot be named."""
+
+
+def still(q: np.ndarray, v: np.ndarray) -> float:
+    """Return no acceleration."""
+    return 0.0
 
 
 @dataclass(frozen=True)
@@ -59,6 +62,12 @@ class Model:
         """The scene's own values of the parameters, ``(p,)``."""
         return self.program.theta0
 
+    @property
+    def parameters(self) -> list[Parameter]:
+        """The declarations of the parameters."""
+        found = [named(map(type, self.program.parts.values()), name) for name in self.names]
+        return [parameter for parameter in found if parameter is not None]
+
     def _start(self, theta: np.ndarray) -> tuple[Rollout, np.ndarray, State, tuple[np.ndarray, ...]]:
         w = np.zeros((self.program.n_noise, theta.shape[1]))
         program, own, w = self.program.resolved(LoopOps(), theta, w)
@@ -69,23 +78,30 @@ class Model:
         """Return the initial states ``(n, B)`` for ``theta (p, B)``."""
         return np.concatenate(self._start(theta)[2])
 
-    def simulate(self, theta: np.ndarray, x: np.ndarray, begin: np.ndarray, steps: int) -> np.ndarray:
-        """Return the states ``(steps, n, B)`` after each step, from ``x (n, B)`` before the steps ``begin (B,)``."""
+    def simulate(
+        self, theta: np.ndarray, x: np.ndarray, begin: np.ndarray, steps: int, push: Push = still
+    ) -> np.ndarray:
+        """Return the states ``(steps, n, B)`` after each step, from ``x (n, B)`` before the steps ``begin (B,)``.
+
+        ``push`` is an additional acceleration ``(n_v, B)`` of a state, half a step before and after each step.
+        """
         program, own, state, scanned = self._start(theta)
+        half = 0.5 * program.scene.dt
         n_q, columns = len(state.q), np.arange(theta.shape[1])
         now, states = State(x[:n_q], x[n_q:]), []
         with np.errstate(all="ignore"):
             for s in range(steps):
                 at = np.minimum(begin + s, program.scene.horizon - 1)
                 u = program.control(LoopOps(), own, now, tuple(part[at, :, columns].T for part in scanned))
-                now = program.step(LoopOps(), now, u)
+                now = program.step(LoopOps(), State(now.q, now.v + half * push(*now)), u)
+                now = State(now.q, now.v + half * push(*now))
                 states.append(np.concatenate(now))
         return np.stack(states)
 
-    def record(self, theta: np.ndarray) -> np.ndarray:
-        """Return the measurements ``(m, B)`` along whole rollouts of ``theta (p, B)``."""
-        begin = np.zeros(theta.shape[1], dtype=int)
-        return self.measurements(self.simulate(theta, self.initial_states(theta), begin, self.program.scene.horizon))
+    def record(self, theta: np.ndarray, push: Push = still, shift: Any = 0.0) -> np.ndarray:
+        """Return the measurements ``(m, B)`` along whole rollouts of ``theta (p, B)`` from a start moved by ``shift``."""
+        begin, origin = np.zeros(theta.shape[1], dtype=int), self.initial_states(theta) + shift
+        return self.measurements(self.simulate(theta, origin, begin, self.program.scene.horizon, push))
 
     def measurements(self, states: np.ndarray) -> np.ndarray:
         """Return the measurements ``(m, B)`` of the states ``(horizon, n, B)`` after each step."""
@@ -93,48 +109,70 @@ class Model:
         return measured.reshape(-1, states.shape[2])
 
 
-def model_of(cell: Cell, scene: MechanicalScene | None = None, refinement: int = 1) -> Model:
-    """Return the cell's model. ``scene`` may be the cell's scene with a step ``refinement`` times shorter.
+def model_of(cell: Cell, refinement: int = 1) -> Model:
+    """Return the cell's model, with a time step ``refinement`` times shorter and the same measurements.
 
     Raises :class:`Unsupported` if an unknown is not positive.
     """
     own = cell.scene
     assert isinstance(own, MechanicalScene)
-    scene = scene or own
-    names = cell.decision.names or (own.unknowns if isinstance(own, Identified) else ())
+    scene = dataclasses.replace(own, dt=own.dt / refinement, horizon=own.horizon * refinement)
+    role = own if isinstance(own, Identified) else None
+    names = cell.decision.names or (role.unknowns if role else ())
     program = compose(scene, cell.contact, cell.integrator, Decision(tuple(names)))
     assert isinstance(program, Rollout)
     if (program.theta0 <= 0).any():
         raise Unsupported(f"unknowns {list(names)} are {program.theta0.tolist()}: relative errors need positive values")
-    measured = own.measured if isinstance(own, Identified) else None
-    coordinates = tuple(range(scene.n_q)) if measured is None else measured
-    last = own.horizon
-    steps = (last,) if isinstance(own, Identified) and own.end_only else tuple(range(1, last + 1))
-    return Model(program, tuple(names), coordinates, tuple(refinement * step for step in steps))
+    measured = (role and role.measured) or tuple(range(scene.n_q))
+    first = own.horizon if role and role.end_only else 1
+    steps = range(first * refinement, scene.horizon + 1, refinement)
+    return Model(program, tuple(names), measured, tuple(steps))
 
 
-def refine(scene: MechanicalScene, times: int) -> MechanicalScene:
-    """Return the scene with the same duration and a time step ``times`` times shorter."""
-    return dataclasses.replace(scene, dt=scene.dt / times, horizon=scene.horizon * times)
+def read(settings: Settings, model: Model) -> tuple[np.ndarray, tuple[int, ...]]:
+    """Return the measurements ``(m, 1)`` of the study's CSV file and the steps, from 1, after which they were made.
 
-
-def read(path: str, scene: MechanicalScene) -> np.ndarray:
-    """Return the measurements ``(m,)`` of a CSV file with a line per measured step.
-
-    Raises ValueError if the number of lines or columns does not match the scene, or a number is not finite.
+    With a column of time, lines may be missing, and lines before the first step are left out. Raises ValueError with the
+    number of the first line that cannot be used.
     """
-    data = np.genfromtxt(path, delimiter=",", ndmin=2)
-    if np.isnan(data[0]).all():
-        data = data[1:]  # a header
-    measured = scene.measured if isinstance(scene, Identified) else None
-    width = scene.n_q if measured is None else len(measured)
-    length = 1 if isinstance(scene, Identified) and scene.end_only else scene.horizon
-    if data.shape != (length, width) or not np.isfinite(data).all():
+    path, scene = settings.data, model.program.scene
+    words = pd.read_csv(
+        path, header=None, dtype=str, keep_default_na=False, skip_blank_lines=False, skipinitialspace=True
+    )
+    table = words.apply(pd.to_numeric, errors="coerce")
+    if table.iloc[0].isna().all():
+        table = table[1:].set_axis(words.iloc[0], axis=1)
+    names = settings.measured.split("+") if settings.measured else [c for c in table if c != settings.time]
+    if lost := {*names, settings.time or names[0]} - {*table}:
+        raise ValueError(f"{path} has no column {min(lost)}; its columns are {', '.join(map(str, table))}")
+    wrong = ~np.isfinite(table[[settings.time or names[0], *names]]).all(axis=1)
+    if wrong.any():
+        line = wrong.idxmax()
+        raise ValueError(f"{path}, line {line + 1}: {words.loc[line].tolist()} are not finite numbers")
+    if len(names) != len(model.measured):
         raise ValueError(
-            f"data={path} has {data.shape[0]} lines of {data.shape[1]} numbers, scene {scene.name} with horizon="
-            f"{scene.horizon} is measured {length} times in {width} positions, each a finite number"
+            f"{path} has {len(names)} columns, scene {scene.name} is measured in {len(model.measured)} positions: name them, "
+            "measured=a+b; numbers need decimal points"
         )
-    return data.ravel()
+    values, steps = table[names].to_numpy(), np.array(model.steps)
+    if settings.time:
+        times = table[settings.time].to_numpy() / scene.dt
+        steps = np.rint(times).astype(int)
+        wrong = (np.abs(times - steps) > 0.01) | (np.diff(steps, prepend=steps[:1] - 1) < 1)
+        if wrong.any():
+            raise ValueError(
+                f"{path}, line {table.index[wrong][0] + 1}: its time is not a later multiple of scene {scene.name}'s dt={scene.dt:g}"
+            )
+        values, steps = values[steps > 0], steps[steps > 0]
+    if len(values) != len(steps) or not values.size or not {*steps} <= {*model.steps}:
+        raise ValueError(
+            f"{path} has {len(values)} lines{f' up to step {max(steps, default=0)}' * bool(settings.time)}, scene {scene.name} is "
+            f"measured {len(model.steps)} times, up to step {model.steps[-1]}: set horizon"
+        )
+    for name, column in zip(names, values.T, strict=True):
+        if len(column) > 1 and np.ptp(column) == 0.0:
+            raise ValueError(f"{path}: column {name} is constant")
+    return values.reshape(-1, 1), tuple(steps.tolist())
 
 
 # ----------------------------------------------------------------------------------------------- shooting methods
@@ -221,28 +259,35 @@ class Fitting:
 
 def run_fits(
     fitting: Fitting, optimizer: Optimizer, start: np.ndarray, data: np.ndarray, iterations: int
-) -> np.ndarray:
-    """Return the unknowns ``(dim, B)`` after ``iterations`` of an optimizer from ``start (dim, B)``, as one batch."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the unknowns ``(dim, B)`` from ``start (dim, B)`` by an optimizer, and which fits have converged, ``(B,)``.
+
+    A fit has converged, and stops, where its Gauss-Newton step is below :data:`CONVERGED` standard errors. All stop after
+    ``iterations``.
+    """
     states = [optimizer.start(column) for column in start.T]
-    no_draws = np.empty((fitting.dim, 0))
+    no_draws, has_converged = np.empty((fitting.dim, 0)), np.zeros(len(states), dtype=bool)
     for _ in range(iterations):
-        queries = [optimizer.ask(state, no_draws) for state in states]
+        active = np.flatnonzero(~has_converged)
+        if not active.size:
+            break
+        queries = [optimizer.ask(states[i], no_draws) for i in active]
         counts = [points.shape[1] for points in queries]
-        points, many = np.concatenate(queries, axis=1), np.repeat(data, counts, axis=1)
-        wanted = frozenset().union(*(optimizer.required_fields(state) for state in states))
-        residual = fitting.residuals(points, many)
-        jacobian = fitting.jacobians(points, many) if wanted & {"gradient", "jacobian"} else None
+        points, many = np.concatenate(queries, axis=1), np.repeat(data[:, active], counts, axis=1)
+        residual, jacobian = fitting.residuals(points, many), fitting.jacobians(points, many)
         ends = np.cumsum([0, *counts])
-        for i, (low, high) in enumerate(itertools.pairwise(ends)):
+        for i, query, (low, high) in zip(active, queries, itertools.pairwise(ends), strict=True):
             own = residual[:, low:high]
-            slope = None if jacobian is None else jacobian[:, :, low:high]
-            known = {
-                "value": 0.5 * (own**2).sum(axis=0), "residual": own, "jacobian": slope,
-                "gradient": None if slope is None else np.einsum("mdb,mb->db", slope, own),
-            }  # fmt: skip
-            answer = Answer(**{name: known[name] for name in optimizer.required_fields(states[i])})
-            states[i] = optimizer.tell(states[i], queries[i], answer)
-    return np.stack([state["theta"] for state in states], axis=1)
+            slope = jacobian[:, :, low:high]
+            gradient = np.einsum("mdb,mb->db", slope, own)
+            answer = Answer(value=0.5 * (own**2).sum(axis=0), residual=own, jacobian=slope, gradient=gradient)
+            states[i] = optimizer.tell(states[i], query, answer)
+            is_finite = np.isfinite(own).all() and np.isfinite(slope).all()
+            if is_finite and np.array_equal(states[i]["theta"], query[:, 0]):
+                step = slope[:, :, 0] @ np.linalg.lstsq(slope[:, :, 0], own[:, 0], rcond=1e-8)[0]
+                size = float(np.linalg.norm(own[:, 0])) / math.sqrt(len(own))
+                has_converged[i] = np.linalg.norm(step) <= CONVERGED * max(size, CONVERGED)
+    return np.stack([state["theta"] for state in states], axis=1), has_converged
 
 
 def count_windows(horizon: int, most: int) -> int:
@@ -251,39 +296,94 @@ def count_windows(horizon: int, most: int) -> int:
 
 
 def measure(cell: Cell, settings: Settings) -> dict[str, Any]:
-    """Return one cell's results by column: fits of all records by each shooting method, and the Cramer-Rao bound."""
-    optimizer, scene = cell.parts["optimizer"], cell.scene
+    """Return one cell's results by column: fits of all records by each shooting method, and the Cramer-Rao bound.
+
+    Raises :class:`Unsupported` if a record without a stated noise has no more measurements than parameters.
+    """
+    optimizer = cell.parts["optimizer"]
     assert isinstance(optimizer, Optimizer)
-    assert isinstance(scene, MechanicalScene)
-    model = model_of(cell)
-    truth = model.values
-    known = information(model, truth, settings.measurement)
-    data = records(cell, model, settings)
+    model, is_own = model_of(cell), settings.data is not None
+    if is_own:
+        data, steps = read(settings, model)
+        model = dataclasses.replace(model, steps=steps)
+    else:
+        data = records(cell, settings)
     factor = np.where(np.arange(data.shape[1]) % 2 == 0, settings.start, 1.0 / settings.start)
-    start = truth[:, None] * factor[None, :]
+    start = model.values[:, None] * factor[None, :]
     if cell.decision.at is not None:
         start = np.repeat(np.array(cell.decision.at)[:, None], data.shape[1], axis=1)
+    horizon = model.program.scene.horizon
+    n_windows = count_windows(horizon, settings.windows)
+    has_windows = len(model.steps) == horizon and n_windows > 1
+
+    def fit(shooting: str, sigma: float) -> Fit:
+        count = 1 if shooting == "single" else n_windows
+        fitting = Fitting(model, shooting, count, sigma, _unit(model))
+        solution, has_converged = run_fits(fitting, optimizer, fitting.start(start, data), data, settings.iterations)
+        return Fit(
+            fitting, solution, has_converged, fitting.residuals(solution, data), fitting.jacobians(solution, data)
+        )
+
+    is_noise_known = settings.measurement is not None or not is_own
+    sigma = settings.measurement or (float(np.std(data)) or 1.0 if is_own else NOISE)
+    single = fit("single", sigma)
+    if not is_noise_known:
+        free = len(data) - len(model.names)
+        if free < 1:
+            raise Unsupported(
+                f"{settings.data} has {len(data)} measurements for {len(model.names)} unknowns: state the noise, measurement=.."
+            )
+        sigma *= float(np.linalg.norm(single.residual)) / math.sqrt(free) or 1.0
+        single = fit("single", sigma)
+    theta = np.exp(single.solution[:, 0]) if is_own else model.values
+    known = information(model, theta, sigma)
     result: dict[str, Any] = {
-        "status": "ok", "reason": "", "words": known.words, "rank": known.rank, "condition": known.condition,
-        "fits": data.shape[1], "unknowns": list(model.names), "truth": truth.tolist(), "start": start[:, 0].tolist(),
-        "invariants": known.labels, "bound": np.sqrt(np.diag(known.covariance())).tolist() if known.rank else [],
-        "fisher": known.fisher.ravel().tolist(), **step_dependence(cell, model, known, settings),
+        "status": "ok", "reason": "", "rank": known.rank, "condition": known.condition, "fits": data.shape[1],
+        "unknowns": list(model.names), "units": [parameter.unit for parameter in model.parameters],
+        "truth": [math.nan] * len(theta) if is_own else theta.tolist(), "start": start[:, 0].tolist(),
+        "invariants": known.labels, "exponents": known.invariants.ravel().tolist(),
+        "bound": known.bound.tolist(), "fisher": known.fisher.ravel().tolist(),
+        **step_dependence(cell, model, theta, known, sigma), **_explanation(model, single, known, is_noise_known),
     }  # fmt: skip
-    result |= _explanation(cell, model, optimizer, start, data, settings)
-    lines: dict[str, list[Any]] = {name: [] for name in LISTS}
-    n_windows = count_windows(scene.horizon, settings.windows)
-    has_windows = len(model.steps) == scene.horizon and n_windows > 1
-    for shooting in SHOOTING if has_windows else SHOOTING[:1]:
-        for name, value in _fit_statistics(model, shooting, n_windows, optimizer, start, data, known, settings).items():
-            lines[name].extend(value if isinstance(value, list) else [value])
-    if has_windows and (apart := _difference_of_fits(lines, known)):
-        result["reason"] = "; ".join(part for part in (result["reason"], apart) if part)
+    fits = [single, *(fit(shooting, sigma) for shooting in SHOOTING[1:] if has_windows)]
+    found = [_fit_statistics(one, known, is_own, is_noise_known) for one in fits]
+    lines = {name: np.concatenate([np.atleast_1d(one[name]) for one in found]).tolist() for name in found[0]}
     if settings.scan:
-        lines |= scan(model, n_windows if has_windows else 1, data[:, :1], settings)
+        lines |= scan(model, n_windows if has_windows else 1, data[:, :1], sigma, settings)
     return result | lines
 
 
-def scan(model: Model, n_windows: int, data: np.ndarray, settings: Settings) -> dict[str, list[Any]]:
+@dataclass(frozen=True)
+class Fit:
+    """Fits of all records by one shooting method."""
+
+    fitting: Fitting
+    solution: np.ndarray
+    """The unknowns, ``(dim, B)``."""
+    has_converged: np.ndarray
+    """Whether the optimizer has reached an optimum, ``(B,)``."""
+    residual: np.ndarray
+    jacobian: np.ndarray
+
+    @property
+    def is_finite(self) -> np.ndarray:
+        """Whether residuals and derivatives are finite, ``(B,)``."""
+        return np.asarray(np.isfinite(self.jacobian).all(axis=(0, 1)) & np.isfinite(self.residual).all(axis=0))
+
+    def slopes(self, i: int) -> np.ndarray:
+        """Return the Jacobian ``(m, p)`` of fit ``i`` by the parameters, with the windows' initial states projected out."""
+        own, later = np.split(self.jacobian[:, :, i], [len(self.fitting.model.names)], axis=1)
+        return np.asarray(own - later @ (np.linalg.pinv(later) @ own))
+
+
+def _unit(model: Model) -> np.ndarray:
+    """Return the largest size of each entry of the state along the scene's own motion, ``(n,)``."""
+    theta = model.values[:, None]
+    states = model.simulate(theta, model.initial_states(theta), np.zeros(1, dtype=int), model.program.scene.horizon)
+    return np.asarray(np.maximum(np.abs(states).max(axis=(0, 2)), 1e-6))
+
+
+def scan(model: Model, n_windows: int, data: np.ndarray, sigma: float, settings: Settings) -> dict[str, list[Any]]:
     """Return the loss of one record ``data (m, 1)`` along each unknown, and how many local minima it has.
 
     ``scan`` equally spaced values from the truth over ``span`` to the truth times ``span``, within the parameter's
@@ -301,14 +401,16 @@ def scan(model: Model, n_windows: int, data: np.ndarray, settings: Settings) -> 
         "scan_steps": [horizon // count for count in counts], "scan_low": [], "scan_high": [],
         "minima": [], "minima_open": [], "scan_loss": [],
     }  # fmt: skip
-    for i, (low, high) in enumerate(_ranges(model, settings.span)):
+    for i, (value, parameter) in enumerate(zip(model.values, model.parameters, strict=True)):
+        ends = np.clip([value / settings.span, value * settings.span], parameter.low, parameter.high)
+        low, high = ends.tolist()
         theta = np.repeat(model.values[:, None], settings.scan, axis=1)
         theta[i] = np.linspace(low, high, settings.scan)
         result["scan_low"].append(low)
         result["scan_high"].append(high)
         for count in counts:
             unit = np.ones(len(model.initial_states(theta[:, :1])))
-            fitting = Fitting(model, "windows", count, settings.measurement, unit)
+            fitting = Fitting(model, "windows", count, sigma, unit)
             start = fitting.start(model.values[:, None], data)[len(theta) :]
             with np.errstate(all="ignore"):
                 square = np.square(fitting.residuals_at(theta, np.repeat(start, settings.scan, axis=1), data))
@@ -330,82 +432,38 @@ def is_minimum(values: np.ndarray) -> np.ndarray:
     return np.concatenate([[False], (inner < values[:-2]) & (inner < values[2:]), [False]])
 
 
-def _ranges(model: Model, span: float) -> list[tuple[float, float]]:
-    """Return the ends of the scan of each unknown: the truth over and times ``span``, within the declared bounds."""
-    ranges = []
-    for name, value in zip(model.names, model.values.tolist(), strict=True):
-        declared = named(map(type, model.program.parts.values()), name)
-        assert declared is not None
-        low = value / span if declared.low is None else max(value / span, declared.low)
-        high = value * span if declared.high is None else min(value * span, declared.high)
-        ranges.append((low, high))
-    return ranges
+def _explanation(model: Model, fit: Fit, known: Information, is_noise_known: bool) -> dict[str, Any]:
+    """Return whether the fits by single shooting explain the records, and the biases that tests of them can miss.
 
-
-def _explanation(
-    cell: Cell, model: Model, optimizer: Optimizer, start: np.ndarray, data: np.ndarray, settings: Settings
-) -> dict[str, Any]:
-    """Return whether the fits by single shooting explain the records, and intervals that allow for correlated noise.
-
-    ``explained`` is the share of records that no test contradicts. ``reason`` states the contradictions of the first
-    record. The intervals belong to the first record's parameters.
+    ``explained`` is the share of records that no test contradicts. The other columns belong to the first record.
     """
-    unit = np.ones(len(model.initial_states(start[:, :1])))
-    fitting = Fitting(model, "single", 1, settings.measurement, unit)
-    solution = run_fits(fitting, optimizer, fitting.start(start, data), data, settings.iterations)
-    residual, p = fitting.residuals(solution, data), len(model.names)
-    jacobian = fitting.jacobians(solution, data)
-    channels = len(model.measured)
-    is_finite = np.isfinite(jacobian).all(axis=(0, 1)) & np.isfinite(residual).all(axis=0)
+    residual, sigma = fit.residual, fit.fitting.noise
+    finite = np.flatnonzero(fit.is_finite)[:TESTED].tolist()
+    if not finite or finite[0] or not known.rank:
+        return {"terms": [], "unnoticed": []}
     # the effects of missing terms at one fit serve all records, which have the same truth
-    fitted = np.exp(solution[:, int(np.argmax(is_finite))])
-    terms = missing_terms(cell, model, fitted, settings.measurement) if is_finite.any() else {}
+    terms = missing_terms(model, np.exp(fit.solution[:, 0]), sigma)
     verdicts = [
-        adequacy.judge(residual[:, i], jacobian[:, :, i], channels, terms, seed=i)
-        for i in np.flatnonzero(is_finite)[:TESTED]
+        adequacy.judge(residual[:, i], known.along(fit.slopes(i)), len(model.measured), terms, i, is_noise_known)
+        for i in finite
     ]
-    together = _together(residual[:, is_finite], jacobian[:, :, is_finite], channels, terms, len(residual) - p)
-    wide_low, wide_high = [math.nan] * p, [math.nan] * p
-    if is_finite[0]:
-        independent = np.linalg.pinv(jacobian[:, :, 0].T @ jacobian[:, :, 0], rcond=1e-11, hermitian=True)
-        correlated = adequacy.correlated_covariance(residual[:, 0], jacobian[:, :, 0], channels)
-        half = performance.Z * np.sqrt(np.maximum(np.diag(independent), np.diag(correlated)))
-        wide_low, wide_high = (np.exp(solution[:, 0] + side * half).tolist() for side in (-1.0, 1.0))
-    share = float(np.mean([one.is_explained for one in verdicts])) if verdicts else math.nan
-    first = verdicts[0].sentence() if is_finite[0] else "the fit of the first record is not finite"
-    if first and is_finite[0]:
-        intervals = ", ".join(
-            f"{name} {low:.4g} to {high:.4g}" for name, low, high in zip(model.names, wide_low, wide_high, strict=True)
-        )
-        first += f"; under correlated noise they would be {intervals}"
-    elif together and not together.is_explained:
-        first = f"all records together: {together.sentence()}"
+    first, free = verdicts[0], max(len(residual) - known.rank, 1)
+    effects = np.array([terms[name] for name in first.reach]).reshape(-1, len(residual))
+    biases = np.abs(np.linalg.pinv(known.along(fit.slopes(0))) @ effects.T) * np.array(list(first.reach.values()))
     return {
-        "explained": share, "reason": first, "wide_low": wide_low, "wide_high": wide_high,
-        "misfit": verdicts[0].probability if verdicts else math.nan,
-        "misfit_together": together.probability if together else math.nan,
+        "explained": float(np.mean([one.is_explained for one in verdicts])) + 0.0 * first.probability,  # nan: untested
+        "contradictions": ", ".join(f"{name} ({value:.2g})" for name, value in first.contradictions.items()),
+        "noise_size": sigma * float(np.linalg.norm(residual[:, 0])) / math.sqrt(free), "misfit": first.probability,
+        "terms": list(first.reach), "unnoticed": biases.ravel().tolist(),
     }  # fmt: skip
 
 
-def _together(
-    residual: np.ndarray, jacobian: np.ndarray, channels: int, terms: dict[str, np.ndarray], free: int
-) -> adequacy.Adequacy | None:
-    """Return whether the model explains all records together, or None for fewer than two.
-
-    A fit that ended elsewhere, with residuals far above the noise, is left out if at least half of the fits did not.
-    """
-    is_small = np.square(residual).sum(axis=0) <= chdtri(max(free, 1), UNEXPLAINED)
-    chosen = is_small if is_small.mean() >= 0.5 else np.ones_like(is_small)
-    if chosen.sum() < 2:
-        return None
-    return adequacy.judge(*adequacy.pool(residual[:, chosen], jacobian[:, :, chosen]), channels, terms)
-
-
-def missing_terms(cell: Cell, model: Model, theta: np.ndarray, sigma: float) -> dict[str, np.ndarray]:
+def missing_terms(model: Model, theta: np.ndarray, sigma: float) -> dict[str, np.ndarray]:
     """Return the change of the standardised record ``(m,)`` per unit of effects that the model lacks, by name.
 
-    The effects are an offset, gain, drift and delay of each sensor, and accelerations of each coordinate: constant, and
-    quadratic, cubic and signed in its velocity and position. They are computed at ``theta (p,)`` by central differences.
+    The effects are an offset, gain, drift and delay of each sensor, the start of each entry of the state, and accelerations
+    of each coordinate: constant, quadratic, cubic and signed in its velocity and position, and linear in other positions.
+    They are computed at ``theta (p,)`` by central differences.
     """
     scene = model.program.scene
     channels, columns = len(model.measured), theta[:, None]
@@ -413,160 +471,95 @@ def missing_terms(cell: Cell, model: Model, theta: np.ndarray, sigma: float) -> 
     terms = {}
     times = np.array(model.steps, dtype=float)
     table = plain.reshape(-1, channels)
-    faults = {"an offset": np.ones_like(table), "a gain": table}
+    faults = {"offset": np.ones_like(table), "gain": table}
     if len(times) > 1:
-        faults["a drift"] = np.repeat((2.0 * times / times[-1] - 1.0)[:, None], channels, axis=1)
-        faults["a delay"] = -np.gradient(table, times, axis=0)
+        faults["drift"] = np.repeat((2.0 * times / times[-1] - 1.0)[:, None], channels, axis=1)
+        faults["delay"] = -np.gradient(table, times, axis=0)
     for c, coordinate in enumerate(model.measured):
         for name, effect in faults.items():
             terms[f"{name} of sensor {coordinate}"] = (effect * np.eye(channels)[c]).ravel() / sigma
-    states = model.simulate(columns, model.initial_states(columns), np.zeros(1, dtype=int), scene.horizon)[:, :, 0]
-    size = max(float(np.abs(np.diff(states[:, scene.n_q :], axis=0)).max()) / scene.dt, 1e-12)
-    for i in range(scene.n_q if len(states[0]) == 2 * scene.n_q else 0):
-        x, v = (max(float(np.abs(states[:, j]).max()), 1e-12) for j in (i, scene.n_q + i))
-        for name, effect in _effects(i, x, v).items():
-            record = []
-            for side in (1.0, -1.0):
-                twin = _with_acceleration(scene, i, side * RELATIVE * size, effect)
-                program = dataclasses.replace(model, program=_recomposed(cell, model, twin))
-                record.append(program.record(columns)[:, 0])
-            change = (record[0] - record[1]) / (2.0 * RELATIVE * sigma)
-            if np.isfinite(change).all():
-                terms[name] = change
-    return terms
+    begin = np.zeros(1, dtype=int)
+    states = model.simulate(columns, model.initial_states(columns), begin, scene.horizon)[:, :, 0]
+    largest, n_q = np.maximum(np.abs(states).max(axis=0), 1e-12), scene.n_q
+
+    def moved(by: float, shift: Any, force: Any, effect: Push) -> np.ndarray:
+        return model.record(columns, lambda q, v: by * force * effect(q, v), by * shift)[:, 0]
+
+    def change(*by: Any) -> np.ndarray:
+        return np.asarray((moved(RELATIVE, *by) - moved(-RELATIVE, *by)) / (2.0 * RELATIVE * sigma))
+
+    for j, unit in enumerate(np.diag(largest)[:, :, None]):
+        terms[f"start of {'v' if j >= n_q else 'q'}{j % max(n_q, 1)}"] = change(unit, 0.0, still)
+    size = max(float(np.abs(np.diff(states[:, n_q:], axis=0)).max(initial=0.0)) / scene.dt, 1e-12)
+    for i in range(n_q if len(largest) == 2 * n_q else 0):
+        force = size * np.eye(n_q)[:, i : i + 1]
+        terms |= {
+            name: change(0.0, force, effect) for name, effect in _effects(i, largest[:n_q], largest[n_q + i]).items()
+        }
+    return {name: effect for name, effect in terms.items() if np.isfinite(effect).all() and effect.any()}
 
 
 RELATIVE = 1e-4
 """Size of a missing acceleration whose effect is computed, relative to the largest acceleration of the motion."""
 
 
-def _effects(i: int, x: float, v: float) -> dict[str, Any]:
-    """Return accelerations of coordinate ``i`` as functions of q and v, scaled by their largest values x and v."""
+def _effects(i: int, x: np.ndarray, v: float) -> dict[str, Any]:
+    """Return accelerations of coordinate ``i`` as functions of q and v, scaled by the largest positions ``x`` and velocity v."""
     of = f"of coordinate {i}"
     return {
-        f"a constant force {of}": lambda q, r: 1.0 + 0.0 * q[i],
+        f"constant force {of}": lambda q, r: 1.0 + 0.0 * q[i],
         f"drag {of} in v|v|": lambda q, r: r[i] * np.abs(r[i]) / v**2,
         f"drag {of} in v^3": lambda q, r: (r[i] / v) ** 3,
         f"friction {of} in the sign of v": lambda q, r: np.tanh(100.0 * r[i] / v),
-        f"a spring {of} in q^2": lambda q, r: (q[i] / x) ** 2,
-        f"a spring {of} in q^3": lambda q, r: (q[i] / x) ** 3,
-    }
+        f"spring {of} in q^2": lambda q, r: (q[i] / x[i]) ** 2,
+        f"spring {of} in q^3": lambda q, r: (q[i] / x[i]) ** 3,
+    } | {
+        f"coupling {of} with {j}": lambda q, r, j=j: q[j] / x[j] for j in range(len(x)) if j != i
+    }  # fmt: skip
 
 
-def _with_acceleration(scene: MechanicalScene, i: int, size: float, effect: Any) -> MechanicalScene:
-    """Return a copy of a scene with an additional acceleration of coordinate ``i``."""
-    base = type(scene)
-
-    def acceleration(self: Any, xp: Any, q: Any, v: Any, u: Any) -> Any:
-        more = np.zeros((scene.n_q, 1))
-        more[i] = size
-        return base.acceleration(self, xp, q, v, u) + more * effect(q, v)
-
-    twin = copy.copy(scene)
-    object.__setattr__(twin, "__class__", type(base.__name__, (base,), {"acceleration": acceleration}))
-    return twin
-
-
-def _recomposed(cell: Cell, model: Model, scene: MechanicalScene) -> Rollout:
-    program = compose(scene, cell.contact, cell.integrator, model.program.decision)
-    assert isinstance(program, Rollout)
-    return program
-
-
-def _difference_of_fits(lines: dict[str, list[Any]], known: Information) -> str:
-    """Return a remark if the first record's fits by single shooting and by independent windows differ, else "".
-
-    The windows use less of the record, so that the variance of the difference is at least that of the windows' estimate
-    minus that of single shooting (Hausman 1978).
-    """
-    count = known.rank
-    single, windows = 0, SHOOTING.index("windows")
-    if not count or len(lines["shooting"]) <= windows:
-        return ""
-    from scipy.special import ndtri
-
-    logs = {k: np.log(np.array(lines["first"][k * count : (k + 1) * count], dtype=float)) for k in (single, windows)}
-    halves = {
-        k: (np.log(np.array(lines["estimate_high"][k * count : (k + 1) * count], dtype=float)) - logs[k])
-        / performance.Z
-        for k in (single, windows)
-    }
-    variance = halves[windows] ** 2 - halves[single] ** 2
-    with np.errstate(invalid="ignore", divide="ignore"):
-        z = np.abs(logs[windows] - logs[single]) / np.sqrt(variance)
-    z = np.where(variance > 0.01 * halves[windows] ** 2, z, 0.0)
-    worst = int(np.argmax(np.nan_to_num(z)))
-    if np.nan_to_num(z[worst]) <= -ndtri(APART / (2.0 * count)):
-        return ""
-    values = [math.exp(logs[k][worst]) for k in (single, windows)]
-    return (
-        f"fits of the whole record and of its windows differ by {z[worst]:.1f} standard errors ({known.labels[worst]} "
-        f"{values[0]:.4g} and {values[1]:.4g}): the model does not explain the record, or a fit ended elsewhere"
-    )
-
-
-LISTS = (
-    "shooting", "converged", "converged_low", "converged_high", "error", "coverage", "coverage_low", "coverage_high",
-    "hidden", "estimate", "estimate_low", "estimate_high", "first",
-)  # fmt: skip
-
-
-def _fit_statistics(
-    model: Model, shooting: str, n_windows: int, optimizer: Optimizer, start: np.ndarray, data: np.ndarray,
-    known: Information, settings: Settings,
-) -> dict[str, Any]:  # fmt: skip
-    """Return the entries of one shooting method in the columns :data:`LISTS`."""
-    theta, begin = model.values[:, None], np.zeros(1, dtype=int)
-    states = model.simulate(theta, model.initial_states(theta), begin, model.program.scene.horizon)
-    unit = np.maximum(np.abs(states).max(axis=(0, 2)), 1e-6)
-    fitting = Fitting(model, shooting, 1 if shooting == "single" else n_windows, settings.measurement, unit)
-    solution = run_fits(fitting, optimizer, fitting.start(start, data), data, settings.iterations)
-    residual = fitting.residuals(solution, data)
-    p, measured = len(model.names), len(data)
-    square = (residual[:measured] ** 2).sum(axis=0)
+def _fit_statistics(fit: Fit, known: Information, is_own: bool, is_noise_known: bool) -> dict[str, Any]:
+    """Return the entries of one shooting method in columns of lists."""
+    p, n_fits, shooting = len(known.names), fit.solution.shape[1], fit.fitting.shooting
+    measured = len(fit.fitting.model.steps) * len(fit.fitting.model.measured)
+    square = (fit.residual[:measured] ** 2).sum(axis=0)
     # gaps of multiple shooting tie its initial states to the parameters
-    free = max(measured - (fitting.dim if shooting == "windows" else p), 1)
+    free = max(measured - (fit.fitting.dim if shooting == "windows" else p), 1)
     has_converged = np.isfinite(square) & (square <= chdtri(free, UNEXPLAINED))
-    jacobian = fitting.jacobians(solution, data)
-    logs, target = known.invariants @ solution[:p], known.invariants @ np.log(model.values)
-    bound = np.sqrt(np.diag(known.covariance()))
-    errors, inside, hidden, halves = [], [], 0, []
-    for i in range(data.shape[1]):
-        slopes = _parameters_only(jacobian[:, :, i], p)
-        if not np.isfinite(slopes).all():
-            halves.append(np.full(known.rank, np.nan))
-            continue
-        fit = Information(model.names, slopes)
-        hidden += fit.rank > known.rank
-        inverse = np.linalg.pinv(fit.fisher, rcond=1e-11, hermitian=True)
-        halves.append(performance.Z * np.sqrt(np.diag(known.invariants @ inverse @ known.invariants.T)))
-        if has_converged[i] and settings.data is None:
-            errors.append((logs[:, i] - target) / bound)
-            inside.append(np.abs(logs[:, i] - target) <= halves[-1])
-    n_converged, n_fits = int(has_converged.sum()), data.shape[1]
+    logs = known.invariants @ fit.solution[:p]
+    halves, noises, hidden = np.full_like(logs, np.nan), [""] * n_fits, 0
+    for i in np.flatnonzero(fit.is_finite).tolist():
+        rank = Information(known.names, fit.slopes(i)).rank
+        hidden += rank > known.rank
+        slopes, channels = known.along(fit.slopes(i)), len(fit.fitting.model.measured)
+        if rank < known.rank:
+            halves[:, i] = np.inf
+        elif shooting == "single":
+            variance, noises[i], quantile = adequacy.variances(fit.residual[:, i], slopes, channels, is_noise_known)
+            halves[:, i] = quantile * np.sqrt(variance)
+        else:
+            halves[:, i] = performance.Z * np.sqrt(np.diag(np.linalg.inv(slopes.T @ slopes)))
+    chosen = has_converged & np.isfinite(halves).all(axis=0) & (not is_own)
+    apart = logs - (known.invariants @ np.log(fit.fitting.model.values))[:, None]
+    errors = (apart / known.bound[:, None])[:, chosen]
+    is_covered = (np.abs(apart) <= halves)[:, chosen]
+    n_converged = int(has_converged.sum())
     low, high = performance.wilson(n_converged, n_fits)
-    is_covered = np.array(inside, dtype=float)
     coverage = float(is_covered.mean()) if is_covered.size else math.nan
     # the sample size of this interval is the number of records: invariants of one record are dependent
     interval = (
         performance.wilson(round(coverage * n_converged), n_converged) if is_covered.size else (math.nan, math.nan)
     )
-    middle = np.median(logs[:, has_converged], axis=1) if n_converged else np.full(known.rank, np.nan)
+    with np.errstate(over="ignore"):
+        ends = [np.exp(logs[:, 0] + side * halves[:, 0]).tolist() for side in (-1.0, 1.0)]
     return {
-        "shooting": shooting, "converged": n_converged / n_fits, "converged_low": low, "converged_high": high,
-        "error": float(np.sqrt(np.mean(np.square(errors)))) if errors else math.nan,
+        "shooting": shooting, "optimum": float(fit.has_converged.mean()),
+        "converged": n_converged / n_fits, "converged_low": low, "converged_high": high,
+        "error": float(np.sqrt(np.mean(np.square(errors)))) if errors.size else math.nan,
         "coverage": coverage, "coverage_low": interval[0], "coverage_high": interval[1], "hidden": hidden,
-        "estimate": np.exp(middle).tolist(), "estimate_low": np.exp(logs[:, 0] - halves[0]).tolist(),
-        "estimate_high": np.exp(logs[:, 0] + halves[0]).tolist(), "first": np.exp(logs[:, 0]).tolist(),
+        "estimate": np.exp(logs[:, 0]).tolist(), "estimate_low": ends[0], "estimate_high": ends[1],
+        "intervals": noises[0],
     }  # fmt: skip
-
-
-def _parameters_only(jacobian: np.ndarray, p: int) -> np.ndarray:
-    """Return the Jacobian ``(m, p)`` with respect to the parameters, with the windows' initial states projected out."""
-    if jacobian.shape[1] == p or not np.isfinite(jacobian).all():
-        return jacobian[:, :p]
-    basis, _ = np.linalg.qr(jacobian[:, p:])
-    return np.asarray(jacobian[:, :p] - basis @ (basis.T @ jacobian[:, :p]))
 
 
 def information(model: Model, theta: np.ndarray, sigma: float) -> Information:
@@ -574,40 +567,30 @@ def information(model: Model, theta: np.ndarray, sigma: float) -> Information:
 
     ``sigma`` is the standard deviation of a measurement's noise.
     """
-    p = len(theta)
-    shifts = STEP * np.concatenate([np.eye(p), -np.eye(p)], axis=1)
-    record = model.record(np.exp(np.log(theta)[:, None] + shifts))
-    return Information(model.names, (record[:, :p] - record[:, p:]) / (2 * STEP * sigma))
+    points = np.log(theta)[:, None]
+    fitting = Fitting(model, "single", 1, sigma, np.ones(len(model.initial_states(theta[:, None]))))
+    return Information(model.names, fitting.jacobians(points, model.record(theta[:, None]))[:, :, 0])
 
 
-def records(cell: Cell, model: Model, settings: Settings) -> np.ndarray:
-    """Return the records ``(m, B)`` to fit: the user's single record, or ``repeats`` noisy records of the true motion."""
-    assert isinstance(cell.scene, MechanicalScene)
-    if settings.data is not None:
-        return read(settings.data, cell.scene)[:, None]
-    source = model if settings.refine == 1 else model_of(cell, refine(cell.scene, settings.refine), settings.refine)
+def records(cell: Cell, settings: Settings) -> np.ndarray:
+    """Return ``repeats`` noisy records ``(m, B)`` of the true motion."""
+    source = model_of(cell, settings.refine)
     clean = source.record(source.values[:, None])
     drawn = noise.draw(cell.seed, cell.scene.name, cell.repeats, 1, len(clean), "identify: measurements")[:, 0].T
-    return np.asarray(clean + settings.measurement * drawn)
+    return np.asarray(clean + (settings.measurement or NOISE) * drawn)
 
 
-def step_dependence(cell: Cell, model: Model, known: Information, settings: Settings) -> dict[str, Any]:
-    """Return the columns ``step_shift`` and ``step_note``: how a noiseless fit changes when the model's step is halved.
+def step_dependence(cell: Cell, model: Model, theta: np.ndarray, known: Information, sigma: float) -> dict[str, float]:
+    """Return the largest change of a noiseless fit when the model's step is halved: relative, and in units of its bound.
 
     To first order, it is the least-squares change of the parameters that compensates the change of the record.
     """
-    assert isinstance(cell.scene, MechanicalScene)
-    half = model_of(cell, refine(cell.scene, 2), 2)
-    theta = model.values[:, None]
-    change = (half.record(theta) - model.record(theta))[:, 0] / settings.measurement
+    half = dataclasses.replace(model_of(cell, 2), steps=tuple(2 * step for step in model.steps))
+    change = (half.record(theta[:, None]) - model.record(theta[:, None]))[:, 0] / sigma
     if not known.rank or not np.isfinite(change).all():
-        return {"step_shift": math.nan, "step_note": "not distinguishable"}
-    shift = np.abs(known.invariants @ np.linalg.lstsq(known.jacobian, change, rcond=1e-8)[0])
-    bound = np.sqrt(np.diag(known.covariance()))
-    worst = int(np.argmax(shift / bound))
-    validity = "this time step only" if shift[worst] > MAX_STEP_SHIFT * bound[worst] else "other steps too"
-    note = (
-        f"holds for {validity}: halving the step changes {known.labels[worst]} by {shift[worst]:.2g} of its value, "
-        f"{shift[worst] / bound[worst]:.2g} times the bound of its error"
-    )
-    return {"step_shift": float(shift.max()), "step_note": note}
+        return {"step_shift": math.nan, "step_shift_bound": math.nan}
+    shift = np.abs(np.linalg.pinv(known.along(known.jacobian)) @ change)
+    return {
+        "step_shift": float(shift.max()),
+        "step_shift_bound": float((shift / known.bound).max()),
+    }

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -13,14 +12,12 @@ from scipy.stats import chi2
 from bench.experiment.axes import table
 from bench.experiment.columns import Column, text
 from bench.experiment.experiment import Experiment
-from bench.experiment.parameters import parse
 from bench.experiment.views import Chart, Mark, Style, Table, Views
-from bench.model import registry
-from bench.model.parameters import named
+from bench.measure.identification import product
+from bench.measure.performance import Z
 from bench.report.problems import problem_names
 from bench.report.style import PALETTE
-from bench.report.text import number
-from bench.report.views import Arranged, arrange, attempted
+from bench.report.views import arrange, attempted
 from bench.report.writer import reasons
 from bench.studies.identify.measure import is_minimum
 
@@ -31,7 +28,31 @@ STATISTICS = (
 """Columns with one value per shooting method."""
 LEVEL, CONVERGED = 0.95, 0.9
 """Stated coverage of the intervals, and the least share of fits that have to converge."""
-PROBLEM, SHOOTING = text("problem"), text("shooting")
+MAX_STEP_SHIFT = 0.5
+"""Largest change of an estimate at half the step, in Cramer-Rao bounds, that counts as independent of the step.
+
+To first order in the step, the error of the estimate is twice this change: one bound. With a bias of one bound, 17% of
+the 95% intervals miss the truth instead of 5%.
+"""
+DIGITS = 4
+"""Significant digits of estimates."""
+PROBLEM, SHOOTING, PARAMETER = text("problem"), text("shooting"), text("parameter")
+BIAS = Column("bias", label="unnoticed bias")
+ESTIMATES = (
+    "estimate: of the first record, by one rollout. low, high: its 95% interval. identifiable: a parameter that is not has no estimate; "
+    "only the products named are. unnoticed bias: the largest that a term of the next table can cause, to first order, while 5% of "
+    "records do not show it. doubt: unfinished, no optimum was reached; not explained, the residuals contradict the model; untested, too "
+    "few measurements for a test; time step, halving it moves the estimate by more than half its standard error.",
+)
+UNNOTICED = (
+    "Terms that the model lacks, and the largest bias that each causes while 5% of records do not show it; above one standard "
+    "error only. inf: no record of this motion shows the term.",
+)
+RECORDS = (
+    "explained: records that no test of the residuals contradicts. intervals: noise that they allow for, by tests of the "
+    "residuals: of the stated size, of the residuals' own size, or correlated from step to step. step shift bound: change of an "
+    "estimate when the step is halved, in units of its Cramer-Rao bound. contradictions: of the first record, with their sizes.",
+)
 NOTES = (
     "converged: fits whose residuals are consistent with the noise. error: root mean square error of converged fits in "
     "units of the Cramer-Rao bound, at best 1. coverage: share of their 95% intervals that contain the truth. hidden: fits "
@@ -40,100 +61,123 @@ NOTES = (
     "windows: independent windows.",
 )
 SCANNED = (
-    "local minima: values of the scan at which the loss is below that at both neighbours; all other unknowns have their own "
+    "steps: length of a window. minima: values of the scan at which the loss is below that at both neighbours; all other unknowns have their own "
     "values, and windows start at the measurements. A count holds for its values: others, and for a chaotic record another "
     "rounding, give another.",
-    "A window is compared with all samples after its start, its last one included, at which the next window starts. without "
-    "the last sample: the same windows if that sample is not compared.",
+    "A window is compared with all samples after its start, its last one included, at which the next window starts. minima "
+    "open: the same windows if that sample is not compared.",
 )
-CURVE, MINIMUM, FIT = "loss", "local minimum", "fit"
+CURVE, MINIMUM = "loss", "local minimum"
 
 
 def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
-    """Return the tables of fits and of identifiable parameters, and the charts of the fits' precision."""
+    """Return the tables of estimates, of what records cannot show and of fits, and the charts of the fits' precision."""
     shown = arrange(experiment, rows)
-    lines = flatten(shown)
-    by_name = {
-        column.name: replace(column, kind="number") if column.name in STATISTICS else column
-        for column in experiment.columns.all
-    }
-    fits = [replace(by_name[name], digits=digits) for name, digits in (("converged", 2), ("error", 2), ("coverage", 2))]
+    given = attempted(shown.rows)
+    # rows of older versions lack the columns
+    given = given[(given["status"] == "ok") & (given["units"].map(np.ndim) > 0)]
+    names = problem_names(shown, PARTS, rows=given)
+    given = given.assign(
+        row=given.index, scan=names, intervals=[values[0] for values in given["intervals"]],
+        problem=names + (", " + given["optimizer"] if given["optimizer"].nunique() > 1 else ""),
+    )  # fmt: skip
+    by_name = {c.name: replace(c, kind="number") if c.name in STATISTICS else c for c in experiment.columns.all}
+    fits = [by_name[name] for name in ("converged", "error", "coverage")]
+    lines, found, hidden = fits_of(given), estimates(given), unnoticed(given)
+    split = "problem" if len(given) > 1 else ""
     tables = [
         Table(
-            "identify", lines, [PROBLEM, SHOOTING, text("verdict"), *fits, by_name["hidden"], by_name["fits"]],
-            "fits of parameters to records of the motion", NOTES, terminal=True, page=True, data=table(experiment, rows),
+            "identify", found,
+            [PARAMETER, *(Column(name, digits=DIGITS) for name in ("estimate", "low", "high")), BIAS, text("doubt"), text("unit"),
+             text("identifiable"), Column("start", format="setting")],
+            "Estimates", ESTIMATES, terminal=True, page=True, split=split, data=table(experiment, rows),
         ),
         Table(
-            "identify", lines.drop_duplicates("problem"),
-            [PROBLEM, text("identifiable"), replace(by_name["bound"], kind="text"), replace(by_name["condition"], digits=3), by_name["explained"], by_name["step_note"]],
-            "Parameters that a record identifies",
-            ["identifiable: products of powers of the parameters. bound: Cramer-Rao bound of their relative standard deviations. explained: records that no test of the residuals contradicts."],
-            terminal=True, details=["step_note"],
+            "identify", hidden[hidden["errors"] > 1.0],
+            [PARAMETER, text("term"), BIAS, Column("errors", label="in standard errors")],
+            "What a record cannot show", UNNOTICED, terminal=not split, page=True, split=split,
         ),
+        Table(
+            "identify", given,
+            [PROBLEM, by_name["explained"], text("intervals"), by_name["noise_size"],
+             by_name["step_shift_bound"], by_name["condition"], by_name["contradictions"]],
+            "Records", RECORDS, terminal=True, page=True,
+        ),
+        Table(
+            "identify", lines, [PROBLEM, SHOOTING, text("verdict"), *fits, by_name["hidden"], by_name["fits"]],
+            "Fits", NOTES, terminal=True, page=True,
+        ),
+        Table("estimates", found, [], files=["csv"]),
+        Table("unnoticed", hidden, [], files=["csv"]),
         Table("fits", lines.drop(columns="row"), [], files=["csv"]),
     ]  # fmt: skip
-    scans = scanned(shown)
+    scans = scanned(given)
     if len(scans):
-        one = by_name["scan_steps"]
+        settings = ("values", "from", "to", "steps", "minima", "minima_open")
+        columns = [PROBLEM, text("unknown"), *(Column(name, format="setting") for name in settings)]
         tables.append(
             Table(
-                "identify",
-                scans.drop(columns=["loss", "unit"]),
-                [
-                    PROBLEM,
-                    text("unknown"),
-                    Column("values", "values of the scan", format="setting"),
-                    Column("from", format="setting"),
-                    Column("to", format="setting"),
-                    replace(one, name="steps", kind="number", label="window", unit="steps", format="setting"),
-                    *(
-                        replace(by_name[name], kind="number", format="setting", label=label)
-                        for name, label in (("minima", "local minima"), ("minima_open", "without the last sample"))
-                    ),
-                ],
-                "Local minima of the loss along each unknown",
-                SCANNED,
-                terminal=True,
-                page=True,
+                "identify", scans.drop(columns=["loss", "unit"]), columns, "Local minima of the loss along each unknown",
+                SCANNED, terminal=True, page=True,
             )
-        )
+        )  # fmt: skip
     if lines.empty:
         return Views(tables[:1], remarks=reasons(rows))
-    return Views(tables, [*charts(lines, fits, by_name), *scan_charts(scans)], remarks=reasons(rows))
+    return Views(tables, [*charts(lines, fits), *scan_charts(scans)], remarks=reasons(rows))
 
 
-def flatten(shown: Arranged) -> pd.DataFrame:
+def fits_of(rows: pd.DataFrame) -> pd.DataFrame:
     """Return one line per problem, optimizer, seed and shooting method; ``row`` is the position of the cell."""
-    rows = attempted(shown.rows)
-    rows = rows[rows["status"] == "ok"]
-    names = problem_names(shown, PARTS, rows=rows)
-    names = names + (", " + rows["optimizer"] if rows["optimizer"].nunique() > 1 else "")
+    kept = ["row", "problem", "scene", "integrator", "rank", "condition", "fits", "explained"]
+    lines = rows[[*kept, "shooting", *STATISTICS]].explode(["shooting", *STATISTICS], ignore_index=True)
+    lines = lines.astype(dict.fromkeys(STATISTICS, float))
+    low, high = error_interval(lines["error"], lines["converged"] * lines["fits"])
+    lines = lines.assign(error_low=low, error_high=high)
+    return lines.assign(verdict=verdicts(lines))
+
+
+def estimates(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return one line per problem and identifiable product, and one per parameter that is not identifiable."""
     lines = []
-    for index, name, row in zip(rows.index, names, rows.to_dict("records"), strict=True):
-        for i, shooting in enumerate(row["shooting"]):
+    for row in rows.to_dict("records"):
+        unknowns, invariants = list(row["unknowns"]), list(row["invariants"])
+        doubts = {
+            "unfinished": row["optimum"][0] < 1.0, "not explained": row["contradictions"] != "",
+            "untested": np.isnan(row["misfit"]), "time step": row["step_shift_bound"] > MAX_STEP_SHIFT,
+        }  # fmt: skip
+        exponents = np.reshape(row["exponents"], (-1, len(unknowns)))
+        units = tuple(f"({unit})" if " " in unit or "/" in unit else unit or "1" for unit in row["units"])
+        for k, name in enumerate(dict.fromkeys([*invariants, *unknowns])):
+            is_known = k < len(invariants)
+            powers = exponents[k] if is_known else np.eye(len(unknowns))[unknowns.index(name)]
+            products = [one for one, power in zip(invariants, exponents @ powers, strict=True) if abs(power) > 1e-4]
+            ends = [row[column][k] if is_known else np.nan for column in ("estimate", "estimate_low", "estimate_high")]
+            biases = np.reshape(row["unnoticed"], (len(invariants) or 1, -1))[k] if is_known else np.array(())
             lines.append({
-                "row": index, "problem": name, "scene": row["scene"], "integrator": row["integrator"], "shooting": shooting,
-                "identifiable": ", ".join(row["invariants"]), "rank": row["rank"], "n_unknowns": len(row["unknowns"]),
-                "bound": ", ".join(number(b) for b in row["bound"]), "condition": row["condition"], "fits": row["fits"],
-                "step_note": row["step_note"], "explained": row["explained"], "step_shift": row["step_shift"],
-                **{column: float(row[column][i]) for column in STATISTICS},
+                "problem": row["problem"], "parameter": name, **dict(zip(("estimate", "low", "high"), ends, strict=True)),
+                "unit": row["units"][unknowns.index(name)] if name in unknowns else product(units, powers),
+                "identifiable": "yes" if is_known else "only " + ", ".join(products) if products else "no",
+                "start": np.prod(np.power(row["start"], powers)),
+                "bias": ends[0] * biases.max() if biases.size else np.nan,
+                "doubt": ", ".join(doubt for doubt, holds in doubts.items() if holds),
             })  # fmt: skip
-    names_ = [
-        "row",
-        "problem",
-        "shooting",
-        "identifiable",
-        "bound",
-        "condition",
-        "fits",
-        "step_note",
-        "explained",
-        *STATISTICS,
-    ]
-    table_ = pd.DataFrame(lines) if lines else pd.DataFrame(columns=names_)
-    low, high = error_interval(table_["error"], table_["converged"] * table_["fits"])
-    table_ = table_.assign(error_low=low, error_high=high)
-    return table_.assign(verdict=verdicts(table_))
+    return pd.DataFrame(lines)
+
+
+def unnoticed(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return one line per problem, identifiable product and missing term, those of the largest biases first."""
+    lines = []
+    for row in rows.to_dict("records"):
+        biases = np.reshape(row["unnoticed"], (-1, len(row["terms"]) or 1))
+        for k, j in np.ndindex(biases.shape) if biases.size else ():
+            with np.errstate(divide="ignore"):
+                width = np.diff(np.log([row["estimate_low"][k], row["estimate_high"][k]]))[0]
+            lines.append({
+                "problem": row["problem"], "parameter": row["invariants"][k], "term": row["terms"][j],
+                "bias": row["estimate"][k] * biases[k, j], "errors": biases[k, j] * 2.0 * Z / width,
+            })  # fmt: skip
+    table_ = pd.DataFrame(lines, columns=["problem", "parameter", "term", "bias", "errors"])
+    return table_.sort_values("errors", ascending=False, ignore_index=True)
 
 
 def error_interval(error: pd.Series, count: pd.Series) -> tuple[pd.Series, pd.Series]:
@@ -160,65 +204,34 @@ def verdicts(lines: pd.DataFrame) -> np.ndarray:
 # ---------------------------------------------------------------------------------------------------------- scans
 
 
-def scanned(shown: Arranged) -> pd.DataFrame:
+def scanned(rows: pd.DataFrame) -> pd.DataFrame:
     """Return one line per problem, unknown and window of a scan; ``loss`` has a number per value of the unknown.
 
     Rows that differ by optimizer or seed only have one scan each: the first is shown.
     """
-    rows = attempted(shown.rows)
-    rows = rows[rows["status"] == "ok"]
-    if rows.empty or "scan_steps" not in rows:
-        return pd.DataFrame()
-    rows = rows[[isinstance(steps, list | np.ndarray) and len(steps) > 0 for steps in rows["scan_steps"]]]
-    rows = rows.assign(problem=problem_names(shown, PARTS, rows=rows)).drop_duplicates("problem")
+    rows = rows[[np.ndim(steps) * np.size(steps) > 0 for steps in rows["scan_steps"]]].drop_duplicates("scan")
     lines = []
-    for index, row, given in zip(rows.index, rows.to_dict("records"), parse(rows), strict=True):
+    for row in rows.to_dict("records"):
         steps, names = list(row["scan_steps"]), list(row["unknowns"])
         losses = np.array(row["scan_loss"], dtype=float).reshape(len(names), len(steps), -1)
-        for i, name in enumerate(names):
-            for j, window in enumerate(steps):
-                lines.append({
-                    "row": index, "problem": row["problem"], "unknown": name, "unit": unit_of(name, given),
-                    "values": losses.shape[2], "from": row["scan_low"][i], "to": row["scan_high"][i], "steps": window,
-                    "minima": row["minima"][i * len(steps) + j], "minima_open": row["minima_open"][i * len(steps) + j],
-                    "truth": row["truth"][i], "fit": fitted(row, name, {len(steps) - 1: "windows", 0: "single"}.get(j, "")),
-                    "is_own": bool((given.get("study") or {}).get("data")), "loss": losses[i, j],
-                })  # fmt: skip
+        for i, j in np.ndindex(losses.shape[:2]):
+            lines.append({
+                "row": row["row"], "problem": row["scan"], "unknown": names[i], "unit": row["units"][i],
+                "values": losses.shape[2], "from": row["scan_low"][i], "to": row["scan_high"][i], "steps": steps[j],
+                "minima": row["minima"][i * len(steps) + j], "minima_open": row["minima_open"][i * len(steps) + j],
+                "truth": row["truth"][i],
+                "loss": losses[i, j],
+            })  # fmt: skip
     return pd.DataFrame(lines)
 
 
-def fitted(row: Mapping[str, Any], unknown: str, shooting: str) -> float:
-    """Return the value that a shooting method gave an unknown in the first record; NaN if only a product with it is identifiable."""
-    methods, invariants = list(row["shooting"]), list(row["invariants"])
-    if shooting not in methods or unknown not in invariants:
-        return np.nan
-    return float(row["first"][methods.index(shooting) * len(invariants) + invariants.index(unknown)])
-
-
-def unit_of(name: str, given: Mapping[str, Any]) -> str:
-    """Return the unit of an unknown, from the plugins of its row; empty if they are not installed."""
-    entries = [
-        registry.entries().get(kind, {}).get(str((given.get(axis) or {}).get("name")))
-        for axis, kind in (("scene", "scenes"), ("contact", "contacts"))
-    ]
-    declared = named([entry.plugin for entry in entries if entry is not None and entry.plugin is not None], name)
-    return declared.unit if declared is not None else ""
-
-
-def _each(scans: pd.DataFrame) -> list[pd.DataFrame]:
-    """Return the lines of each scan, the whole record first."""
-    return [scan for _, scan in scans.groupby(["problem", "unknown"], sort=False)]
-
-
 def scan_charts(scans: pd.DataFrame) -> list[Chart]:
-    """Return a chart of the loss along each unknown: a panel per window, with its local minima, the truth and the fit."""
-    names: dict[str, int] = {}
-    drawn = []
-    for scan in _each(scans) if len(scans) else ():
-        unknown = scan["unknown"].iloc[0]
-        names[unknown] = names.get(unknown, 0) + 1
-        drawn.append(_scan_chart(scan, f"scan_{unknown}" + (f"_{names[unknown]}" if names[unknown] > 1 else "")))
-    return drawn
+    """Return a chart of the loss along each unknown: a panel per window, with its local minima and the truth."""
+    if scans.empty:
+        return []
+    numbers = pd.Series(scans["problem"].factorize()[0] + 1, scans.index).astype(str)
+    names = "scan_" + scans["unknown"] + ("_" + numbers).where(numbers != "1", "")
+    return [_scan_chart(scan, str(name)) for name, scan in scans.groupby(names, sort=False)]
 
 
 def _scan_chart(scan: pd.DataFrame, name: str) -> Chart:
@@ -230,16 +243,14 @@ def _scan_chart(scan: pd.DataFrame, name: str) -> Chart:
         panel = f"{'whole record' if whole else 'windows'} of {line['steps']} steps: {line['minima']:.0f} {'minimum' if line['minima'] == 1 else 'minima'}"
         curve = pd.DataFrame({"value": values, "loss": loss, "part": CURVE, "window": panel, "row": line["row"]})
         parts += [curve, curve[is_minimum(loss)].assign(part=MINIMUM)]
-        if line["from"] <= line["fit"] <= line["to"]:
-            parts.append(curve[:1].assign(value=line["fit"], loss=np.interp(line["fit"], values, loss), part=FIT))
     return Chart(
         name, pd.concat(parts, ignore_index=True),
         [Column("value", label=str(one["unknown"]), unit=str(one["unit"]), log=False)],
         [Column("loss", label="mean square of residual / noise", log=True)],
         "lines", series="part", panel="window", across=3, height=1.9, labels="legend",
-        styles={CURVE: Style(PALETTE[0], "", width=0.8), MINIMUM: Style(PALETTE[1], ".", line="none"), FIT: Style(PALETTE[2], "D", line="none")},
-        marks=[Mark("scene" if one["is_own"] else "truth", one["truth"]), Mark("", 1.0, axis="y")],
-        subtitle="grey line: 1, the noise of a sample; fit: of the first record",
+        styles={CURVE: Style(PALETTE[0], "", width=0.8), MINIMUM: Style(PALETTE[1], ".", line="none")},
+        marks=[*([Mark("truth", one["truth"])] if np.isfinite(one["truth"]) else []), Mark("", 1.0, axis="y")],
+        subtitle="grey line: 1, the noise of a sample",
         text="The loss along one unknown, all others at their own values. Windows start at the measurements.",
     )  # fmt: skip
 
@@ -247,34 +258,20 @@ def _scan_chart(scan: pd.DataFrame, name: str) -> Chart:
 # --------------------------------------------------------------------------------------------------------- charts
 
 
-def charts(lines: pd.DataFrame, fits: Sequence[Column], by_name: dict[str, Column]) -> list[Chart]:
-    """Return the chart of errors and coverage for print, and the chart of any two numbers for the page."""
-    styles = {
-        name: Style(PALETTE[i], "osD"[i % 3]) for i, name in enumerate(dict.fromkeys(lines["shooting"]))
-    }  # fmt: skip
-    order = (lines["verdict"] == "precise").groupby(lines["integrator"]).mean()
-    lines = lines.iloc[(-lines["integrator"].map(order)).argsort(kind="stable")]
+def charts(lines: pd.DataFrame, fits: Sequence[Column]) -> list[Chart]:
+    """Return the chart of errors and coverage, or none if no truth is known."""
     parts, marks = [], []
     for column, ideal, name in ((fits[1], 1.0, "bound"), (fits[2], LEVEL, "")):
         if lines[column.name].notna().any():
             values = {end: lines[c] for end, c in (("value", column.name), ("low", column.low), ("high", column.high))}
             parts.append(lines.assign(**values, panel=column.heading, failed=lines["converged"] == 0))
             marks.append(Mark(name, ideal, panel=column.heading))
-    x = Column("value", label=" ", low="low", high="high")
-    drawn = [] if not parts else [
-        Chart(
-            "identify", pd.concat(parts, ignore_index=True), [x], [text("problem", label="")], "dots", series="shooting",
-            panel="panel", styles=styles, marks=marks, failed="failed", own_scales=True, across=2, height=0.34, on_page=False,
-            subtitle="a cross: no fit converges",
-        )
-    ]  # fmt: skip
-    quantities = [fits[1], fits[0], fits[2], by_name["condition"], by_name["step_shift"]]
-    known = [column for column in quantities if lines[column.name].notna().any()]
-    frame = lines.drop_duplicates(["row", "shooting"])
+    if not parts:
+        return []
     return [
-        *drawn,
         Chart(
-            "fits", frame, known, [text("problem", label="")], "dots", series="shooting", styles=styles, printed=False,
-            text="One dot per problem and shooting method. Choose the quantity.",
-        ),
+            "identify", pd.concat(parts, ignore_index=True), [Column("value", label=" ", low="low", high="high")],
+            [text("problem", label="")], "dots", series="shooting", panel="panel", marks=marks, failed="failed",
+            own_scales=True, across=2, height=0.34, subtitle="a cross: no fit converges",
+        )
     ]  # fmt: skip

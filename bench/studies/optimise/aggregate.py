@@ -16,9 +16,9 @@ from bench.experiment.experiment import Experiment
 from bench.experiment.parameters import flatten, swept_columns
 from bench.measure import performance
 from bench.model.parameters import remember
-from bench.report.problems import problem_names
+from bench.report.problems import problem_names, titled
 from bench.report.text import axis_value
-from bench.report.views import arrange, attempted
+from bench.report.views import arrange, attempted, estimator_labels
 
 PARTS = ("scene", "contact", "integrator", "backend")
 TARGETS = (10.0, 100.0, 1000.0)
@@ -96,26 +96,15 @@ class RunSet:
         return float(ratios.median()) if len(ratios) else default
 
 
-_latest: dict[tuple[int, int], tuple[Experiment, pd.DataFrame, RunSet]] = {}
-"""The last run set, by the ids of experiment and rows. Both are referenced here, so that no other object has their ids."""
-
-
 def collect_runs(experiment: Experiment, rows: pd.DataFrame) -> RunSet:
-    """Return the searches that ran, with names of problem, method and tuning, and scores. The last result is cached."""
-    key = (id(experiment), id(rows))
-    if key not in _latest:
-        _latest.clear()
-        _latest[key] = (experiment, rows, _collect(experiment, rows))
-    return _latest[key][2]
-
-
-def _collect(experiment: Experiment, rows: pd.DataFrame) -> RunSet:
+    """Return the searches that ran, with names of problem, method and tuning, and scores."""
     shown = arrange(experiment, rows)
     runs = attempted(shown.rows)
     runs = runs[np.isfinite(runs["start_cost"])]
     tuned_axes = tuple(axis for axis in shown.axes if _is_tuned(axis, runs))
     names = problem_names(shown, PARTS, tuned_axes, rows=runs).astype(str)
-    runs = runs.assign(problem=names, method=_method_names(runs), tuning=_tuning_labels(runs, tuned_axes))
+    runs = runs.assign(problem=names, estimator_label=estimator_labels(runs), tuning=_tuning_labels(runs, tuned_axes))
+    runs = runs.assign(method=titled(runs, ["estimator_label", "optimizer"]))
     best_known, status = _best_known_cost(runs)
     start, final = runs["start_cost"], runs["final_cost"]
     achievable = (start - best_known).where(start > best_known)
@@ -131,15 +120,6 @@ def _is_tuned(axis: Axis, rows: pd.DataFrame) -> bool:
         for name in axis.names
         for column, mask in swept_columns(name, table).items()
     )
-
-
-def _method_names(rows: pd.DataFrame) -> pd.Series:
-    """Return each row's method: estimator and optimizer, ``fobg, adam``, or only the optimizer without an estimator."""
-    names = []
-    for estimator, params, optimizer in rows[["estimator", "estimator_params", "optimizer"]].to_numpy():
-        label = f"{estimator}[{params}]" if params else estimator
-        names.append(", ".join(filter(None, (label, optimizer))))
-    return pd.Series(names, index=rows.index, dtype=object)
 
 
 def _tuning_labels(rows: pd.DataFrame, axes: Sequence[Axis]) -> pd.Series:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -102,10 +103,7 @@ class OptimizerRun:
 
     def objective(self, theta: np.ndarray) -> float:
         """Return the objective at ``theta (d,)``, with noise that no iteration uses. Its rollouts are not counted."""
-        before = self.problem.usage.rollouts
-        cost = float(self.problem.value(theta, self._scored).mean())
-        self.problem.usage.rollouts = before
-        return cost
+        return objective(self.problem, theta, self._scored)
 
     def step(self, state: dict[str, Any], iteration: int) -> dict[str, Any]:
         """Return the optimizer's state after one more iteration, whose number is ``iteration``, from 1."""
@@ -113,11 +111,10 @@ class OptimizerRun:
         normal = noise.draw(
             self.cell.seed, self.cell.scene.name, 1, self.optimizer.draws(dim), dim, f"optimise: points {iteration}"
         )[0].T
-        points = self.optimizer.ask(state, normal)
-        wanted = self.optimizer.required_fields(state)
-        value = self._values(points, iteration) if "value" in wanted else None
-        gradient = self._gradients(points, iteration) if "gradient" in wanted else None
-        return self.optimizer.tell(state, points, Answer(value, gradient))
+        return advance(
+            self.optimizer, state, normal, lambda points: self._values(points, iteration),
+            lambda points: self._gradients(points, iteration),
+        )  # fmt: skip
 
     def _noise(self, iteration: int) -> np.ndarray:
         width = self.problem.program.n_noise
@@ -127,21 +124,50 @@ class OptimizerRun:
 
     def _values(self, points: np.ndarray, iteration: int) -> np.ndarray:
         """Return the costs ``(B,)`` of points ``(d, B)``: at w = 0, or means over samples for a smoothed objective."""
-        count = points.shape[1]
-        if self.settings.scored == "plain":
-            return self.problem.value(points, np.repeat(self._still, count, axis=1))
-        w = self._noise(iteration)[0].T
-        spread = np.repeat(points, w.shape[1], axis=1)
-        costs = self.problem.value(spread, np.tile(w, (1, count)))
-        return np.asarray(costs.reshape(count, -1).mean(axis=1))
+        w = self._still if self.settings.scored == "plain" else self._noise(iteration)[0].T
+        return mean_costs(self.problem, points, w)
 
     def _gradients(self, points: np.ndarray, iteration: int) -> np.ndarray:
-        assert self.estimator is not None
         problem = self.problem
         if self.settings.sigma_decay:
             problem = ScaledNoiseProblem(problem, iteration**-self.settings.sigma_decay)
-        drawn = self._noise(iteration)
-        return np.stack([self.estimator.estimate(problem, point, drawn)[0] for point in points.T], axis=1)
+        return estimates(problem, self.estimator, points, self._noise(iteration))
+
+
+def objective(problem: Problem, theta: np.ndarray, scored: np.ndarray) -> float:
+    """Return the mean cost at ``theta (d,)`` over some noise ``(n_w, M)``. Its rollouts are not counted."""
+    before = problem.usage.rollouts
+    cost = float(problem.value(theta, scored).mean())
+    problem.usage.rollouts = before
+    return cost
+
+
+def mean_costs(problem: Problem, points: np.ndarray, w: np.ndarray) -> np.ndarray:
+    """Return the mean costs ``(B,)`` of points ``(d, B)`` over the same noise ``(n_w, M)``."""
+    count = points.shape[1]
+    costs = problem.value(np.repeat(points, w.shape[1], axis=1), np.tile(w, (1, count)))
+    return np.asarray(costs.reshape(count, -1).mean(axis=1))
+
+
+def estimates(problem: Problem, estimator: Estimator | None, points: np.ndarray, w: np.ndarray) -> np.ndarray:
+    """Return an estimator's gradients ``(d, B)`` at points, all from the same noise ``(1, N, n_w)``."""
+    assert estimator is not None
+    return np.stack([estimator.estimate(problem, point, w)[0] for point in points.T], axis=1)
+
+
+def advance(
+    optimizer: Optimizer,
+    state: dict[str, Any],
+    normal: np.ndarray,
+    costs: Callable[[np.ndarray], np.ndarray],
+    gradients: Callable[[np.ndarray], np.ndarray],
+) -> dict[str, Any]:
+    """Return the optimizer's state after one more iteration: the points it asks for, and what it requires there."""
+    points = optimizer.ask(state, normal)
+    required = optimizer.required_fields(state)
+    value = costs(points) if "value" in required else None
+    gradient = gradients(points) if "gradient" in required else None
+    return optimizer.tell(state, points, Answer(value, gradient))
 
 
 def run_search(cell: Cell, session: Session, settings: Settings) -> dict[str, Any]:
@@ -294,22 +320,26 @@ def scene_class(cell: Cell, problem: Problem) -> str:
 _ratios: dict[tuple[str, str], float] = {}
 
 
-def gradient_ratio(problem: Problem, cell: Cell, calls: int = 5) -> float:
-    """Return the time of a batch of gradients over the time of a batch of costs, each the fastest of ``calls`` calls."""
+def gradient_ratio(problem: Problem, cell: Cell) -> float:
+    """Return the time of a batch of gradients over the time of a batch of costs, each the fastest of some calls."""
     key = (cell.program_key, cell.backend.name)
     if key not in _ratios:
         theta, w = problem.program.theta0, noise.draw(0, "ratio", 1, 128, problem.program.n_noise, "optimise: ratio")
-        seconds = []
-        for function in (problem.value, problem.grad):
-            function(theta, w[0].T)
-            times = []
-            for _ in range(calls):
-                started = time.perf_counter()
-                function(theta, w[0].T)
-                times.append(time.perf_counter() - started)
-            seconds.append(min(times))
-        _ratios[key] = seconds[1] / seconds[0]
+        _ratios[key] = fastest(problem.grad, theta, w[0].T) / fastest(problem.value, theta, w[0].T)
     return _ratios[key]
+
+
+def fastest(
+    function: Callable[[np.ndarray, np.ndarray], Any], theta: np.ndarray, w: np.ndarray, calls: int = 5
+) -> float:
+    """Return the least time [s] of some calls after a first one that compiles."""
+    function(theta, w)
+    times = []
+    for _ in range(calls):
+        started = time.perf_counter()
+        function(theta, w)
+        times.append(time.perf_counter() - started)
+    return min(times)
 
 
 # ---------------------------------------------------------------------------------------------- gradient quality
