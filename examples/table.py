@@ -65,7 +65,10 @@ def row(report: Any, version: str, example: str) -> list[str]:
     judged = "not checked" if not report.gradient else "right" if report.check and report.check.trusted else "wrong"
     if report.gradient and (report.derivative == "not shown" or report.cause == "nondeterministic"):
         judged = "unknown"
-    biases = [_bias(one) if report.gradient and math.isfinite(one.bias) else "-" for one in report.smoothed]
+    biases = [
+        f"{number(100 * one.bias / one.norm)}% [{', '.join(map(number, one.bias_percent))}]" if one.known else "unknown"
+        for one in report.smoothed
+    ]
     biases += ["-"] * (2 - len(biases))
     spent = report.spent
     jumps = sum(len(line.jumps) for line in report.lines)
@@ -75,16 +78,6 @@ def row(report: Any, version: str, example: str) -> list[str]:
         f"{example}: {report.name}" if bare else report.name, version, f"{judged} ({report.cause})", off, said, *biases[:2], duration(spent.cost_s),
         duration(spent.gradient_s) if math.isfinite(spent.gradient_s) else "-", duration(spent.seconds),
     ]  # fmt: skip
-
-
-def _bias(one: Any) -> str:
-    """Return the bias of the mean gradient in percent of grad J, with its 95% interval."""
-    from bench.report.text import number
-
-    if not one.known or (one.bias_high > one.norm and not one.biased):
-        return "unknown"
-    low, high = map(number, one.bias_percent)
-    return f"{number(100 * one.bias / one.norm)}% [{low}, {high}]" if one.bias_low > 0 else f"none seen, below {high}%"
 
 
 def record(path: Path) -> None:
