@@ -126,7 +126,10 @@ def test_a_refined_cost_is_recommended_where_it_bears_on_the_cause():
     def examined(grad):
         return bench.examine(lambda x: swing(x) + (x[0] > 0.701), START, grad=grad, **QUICK)
 
-    halved, bent = examined(lambda x: 0.5 * slope(x)), examined(lambda x: slope(x) * [1.0, 1.0 + 0.2 * np.sin(9 * x[0])])
+    halved, bent = (
+        examined(lambda x: 0.5 * slope(x)),
+        examined(lambda x: slope(x) * [1.0, 1.0 + 0.2 * np.sin(9 * x[0])]),
+    )
     assert (halved.cause, "refined=COST" in halved.advice) == ("wrong_factor", False)
     assert (bent.cause, "refined=COST" in bent.advice) == ("missing_term", True)
 
