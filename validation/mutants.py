@@ -88,7 +88,7 @@ FAULTS = [
     Fault(R, "if problem.program.has_score_gradient:", "if True:", OF_SCORES),
     Fault(R, "mean = np.asarray(sum(terms) / 2)", "mean = np.asarray(sum(terms))", OF_REFERENCE),
     Fault(R, "closed = None if \"physics\" in provides else", "closed =", OF_REFERENCE),
-    Fault(R, "return sampled if 0.0 < sampled", "return sampled if sampled", OF_REFERENCE),
+    Fault(R, "if not sampled.note and 0.0 < error < quadrature.error:", "if 0.0 < error < quadrature.error:", OF_REFERENCE),
     Fault(R, "return Truth.from_batches(self.batches, self.error)", "return Truth.from_batches(self.batches)", OF_REFERENCE),
     Fault(R, "chosen, doubt = min(spread", "chosen, doubt = max(spread", OF_REFERENCE),
     Fault(R, "reshape(problem.dim, BATCHES, size).mean(axis=2).T", "reshape(problem.dim, size, BATCHES).mean(axis=1).T", OF_REFERENCE),
