@@ -95,7 +95,7 @@ FAULT_CODES = {
 """What each code of a fault means."""
 FAULT_NOTE = "update: where it starts. factor: on the value before. peaks: updates with an explosion, with_contact: those with contact."
 VERDICTS = (
-    "verdict: first, tied (not distinguishable), behind (the intervals do not overlap), or open where none is behind."
+    "verdict: first, tied (not distinguishable), behind (by a Mann-Whitney test at 5%), or open where none is behind."
 )
 PAGE = ("final_return", "first_return", "final_median", "updates", "steps", "train_s", "compile_s", "gradient_typical",
         "gradient_peak", "window_gradient", "window_bias", "difference_error")  # fmt: skip
@@ -109,14 +109,14 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
         every = Table("train", rows, [text("scene"), text("trainer"), text("status")], data=data)
         return Views([every], remarks=reasons(rows))
     summary, windows, faults = aggregate.summarise(runs), aggregate.windows(runs), aggregate.faults(runs)
-    summary = summary.assign(verdict=aggregate.ranked(summary, ["problem"]))
+    summary = summary.assign(verdict=aggregate.ranked(summary, ["problem"])).drop(columns="returns")
     tables = [
         Table("train", summary, SUMMARY, "final return by trainer", [NOTE, VERDICTS], terminal=True, page=True, data=data,
               details=["compile_s", "gradient_typical", "gradient_peak"]),
         Table("summary", summary, [], files=["csv"]),
     ]  # fmt: skip
     if len(windows):
-        lines = windows.assign(verdict=aggregate.ranked(windows, ["problem", "family"]))
+        lines = windows.assign(verdict=aggregate.ranked(windows, ["problem", "family"])).drop(columns="returns")
         tables.append(
             Table(
                 "windows",
