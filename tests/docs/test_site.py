@@ -168,6 +168,5 @@ def test_site_needs_no_network(site):
 
 @pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
-@pytest.mark.parametrize(("word", "page"), [("leave_one_out", "estimator/reinforce.html"), ("stiffness", "trust.html")])
-def test_search_works_from_disk(site, word, page):
-    assert f'href="{page}' in dom(site / "search.html", f"?q={word}")
+def test_search_works_from_disk(site):
+    assert 'href="estimator/reinforce.html' in dom(site / "search.html", "?q=leave_one_out")

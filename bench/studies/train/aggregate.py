@@ -14,7 +14,6 @@ from bench.experiment.experiment import Experiment
 from bench.experiment.parameters import flatten
 from bench.measure.performance import bootstrap, bootstrap_along, interquartile_mean
 from bench.report.problems import problem_names
-from bench.report.text import counted
 from bench.report.views import arrange, attempted
 
 PARTS = ("scene", "contact", "integrator", "backend")
@@ -90,18 +89,6 @@ LEVEL = 0.05
 """Level of the test of a difference between two groups of runs."""
 MIN_SEEDS = 5
 """Fewest seeds for an interval: a resample cannot leave the range of its values, which covers too little for fewer."""
-
-
-def interval_words(runs: pd.DataFrame) -> str:
-    """Return what a mean over the seeds of runs is, and whether it has an interval, in words."""
-    counts = runs.groupby(["problem", "method"]).size()
-    least, most = int(counts.min()), int(counts.max())
-    seeds = counted(most, "seed") if least == most else f"{least} to {most} seeds"
-    if least >= MIN_SEEDS:
-        return f"interquartile mean over {seeds} with its 95% bootstrap interval"
-    if most < MIN_SEEDS:
-        return f"interquartile mean over {seeds}, too few for an interval"
-    return f"interquartile mean over {seeds}, with its 95% bootstrap interval where there are {MIN_SEEDS} or more"
 
 
 def interval(values: np.ndarray) -> tuple[float, float]:
