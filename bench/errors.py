@@ -67,8 +67,10 @@ def unknown(what: str, given: object, allowed: Iterable[str], see: str = "") -> 
     """
     names = sorted(allowed)
     text, listed = str(given), ", ".join(names) or "none"
-    near = get_close_matches(text.lower(), [n.lower() for n in names], n=1)
-    hint = f"; did you mean '{next(n for n in names if n.lower() == near[0])}'?" if near else ""
+    lower = {name.lower(): name for name in names}
+    begun = [name for name in lower if text and name.startswith(text.lower())]
+    near = begun[:1] or get_close_matches(text.lower(), list(lower), n=1)
+    hint = f"; did you mean '{lower[near[0]]}'?" if near else ""
     if see and len(listed) > MAX_LISTED:
         listed = f"{listed[:MAX_LISTED].rpartition(', ')[0]}, ...; all {len(names)}: python -m bench {see}"
     return UserError(f"unknown {what} '{text}'{hint} (allowed: {listed})")

@@ -1,4 +1,4 @@
-"""Write the generated parts of the documents: ``python -m docs.build [--check] [results|columns|figures|site|all]``.
+"""Write the generated parts of the documents: ``python -m docs.build [--check] [results|columns|figures|verdicts|site|all]``.
 
 ``--check`` writes nothing: it lists the documents that differ from what would be written, with the
 lines that differ, and exits with 1 if there are any.
@@ -6,6 +6,7 @@ lines that differ, and exits with 1 if there are any.
 - ``results``: the part of ``docs/results.md`` between two marks, from the answers in ``results/standard``.
 - ``columns``: ``docs/columns.md``, from the columns that each study declares.
 - ``figures``: the marked figures of all documents, from the rows in ``results/standard``: see :mod:`docs.figures`.
+- ``verdicts``: the tables of verdicts and causes of the checks of gradients, from their rules.
 - ``site``: the whole site as HTML, in ``build/site/html``. Only on request, since it needs Sphinx.
 """
 
@@ -15,13 +16,15 @@ import difflib
 import os
 import re
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import cast
 
 from bench.errors import UserError
+from bench.examine import rules
 from bench.experiment.columns import COMMON, Column
 from bench.experiment.study import Study
+from bench.measure.gradcheck import verdicts
 from bench.model import registry
 from bench.report.tables import escape_markdown
 from bench.run.files import write_whole
@@ -88,7 +91,8 @@ Beside the files of [every run](reading-results.md#files), each study writes its
   differences of its cost at a far finer step: `step` (the law's own gradient is right, the step or its derivative is wrong),
   `law` (as wrong at any step size), `both`, or `unknown` where the law's gradient has not converged. `stability_map.png`
   shows where the gradient is right, wrong or lost, and `stability_shares.csv` the share of each by integrator and law.
-- `three_errors.csv`: forward, program, model and estimator error, absolute and relative.
+- `three_errors.csv`: forward, program, model and estimator error, absolute and relative. `three_errors_traps.csv`: programs with an exact
+  gradient and a converging cost whose gradient does not converge to that of the physics, with their errors at the largest and the smallest step.
 - `growth.csv`: gradient norms, singular values and growth rates with their intervals. `growth_verdicts.csv`: per problem the
   order of the best power law, the rate of the best exponential, both with their intervals, and the verdict. `exploding` needs
   at least five horizons, an exponential that is 20 times as likely as the power law, and a rate above 0.
@@ -152,6 +156,29 @@ def cell_text(text: str) -> str:
     return " ".join(text.split()).replace("|", "\\|")
 
 
+# ------------------------------------------------------------------------------------------------------ verdicts
+
+RULE_MARKS = "<!-- verdicts -->\n", "<!-- end of verdicts -->"
+
+
+def rule_pages() -> dict[Path, str]:
+    """Return the documents with tables of verdicts and causes, written again."""
+    own = {cause: rule for cause, rule in rules.RULES.items() if verdicts.RULES.get(cause) != rule}
+    return {DOCS / f"{name}.md": with_rules(DOCS / f"{name}.md", table)
+            for name, table in (("gradcheck", verdicts.RULES), ("examine", own))}  # fmt: skip
+
+
+def with_rules(page: Path, table: Mapping[str, verdicts.Rule]) -> str:
+    """Return a document with a table of rules between :data:`RULE_MARKS`."""
+    before, _, rest = page.read_text().partition(RULE_MARKS[0])
+    lines = ["| verdict | kind | meaning | next | settings |", "|---|---|---|---|---|"]
+    for name, rule in table.items():
+        settings = ", ".join(f"`{setting.replace('{more}', 'budget').partition('=')[0]}`" for setting in rule.settings)
+        advice = rule.advice.format(names="the named inputs")
+        lines.append(f"| `{name}` | {rule.kind} | {cell_text(rule.meaning)} | {cell_text(advice)} | {settings} |")
+    return before + RULE_MARKS[0] + "\n".join(lines) + "\n" + RULE_MARKS[1] + rest.partition(RULE_MARKS[1])[2]
+
+
 # ------------------------------------------------------------------------------------------------------- command
 
 
@@ -170,6 +197,7 @@ def main(words: Sequence[str]) -> int:
     tasks: dict[str, Callable[[], dict[Path, str]]] = {
         "results": lambda: {DOCS / "results.md": results_page(DOCS / "results.md")},
         "columns": lambda: {DOCS / "columns.md": columns_page()},
+        "verdicts": rule_pages,
         "figures": lambda: {page: figures.with_figures(page.read_text()) for page in figures_pages()},
     }
     allowed = [*tasks, "site", "all"]

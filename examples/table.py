@@ -65,16 +65,18 @@ def row(report: Any, version: str, example: str) -> list[str]:
     judged = "not checked" if not report.gradient else "right" if report.check and report.check.trusted else "wrong"
     if report.gradient and (report.derivative == "not shown" or report.cause == "nondeterministic"):
         judged = "unknown"
-    biases = []
-    for one in report.smoothed:
-        biases.append(report._bias(one).replace("the gradient ", "") if report.gradient else "-")
+    biases = [
+        f"{number(100 * one.bias / one.norm)}% [{', '.join(map(number, one.bias_percent))}]" if one.known else "unknown"
+        for one in report.smoothed
+    ]
     biases += ["-"] * (2 - len(biases))
+    spent = report.spent
     jumps = sum(len(line.jumps) for line in report.lines)
     said = f"{jumps} on {counted(len(report.lines), 'line')}" if report.lines else "not looked for"
     bare = report.name.isidentifier() and report.name not in version
     return [
-        f"{example}: {report.name}" if bare else report.name, version, f"{judged} ({report.cause})", off, said, *biases[:2], duration(report.cost_s),
-        duration(report.gradient_s) if math.isfinite(report.gradient_s) else "-", duration(report.seconds),
+        f"{example}: {report.name}" if bare else report.name, version, f"{judged} ({report.cause})", off, said, *biases[:2], duration(spent.cost_s),
+        duration(spent.gradient_s) if math.isfinite(spent.gradient_s) else "-", duration(spent.seconds),
     ]  # fmt: skip
 
 

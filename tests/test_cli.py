@@ -250,7 +250,7 @@ def test_a_scene_has_to_be_named(verb, capsys):
     assert main([verb]) == 2
     message = capsys.readouterr().err
     assert "name a scene" in message
-    assert "pushing" in message
+    assert "python -m bench list scenes" in message
 
 
 @pytest.mark.slow

@@ -347,7 +347,7 @@ def main(libraries):
                 right, alarms = right + 1, alarms + bool(report.status)
             print(
                 f"| {library} | {case.name} | {report.cause} | {'yes' if fits else 'NO'} | {report.status} "
-                f"| {report.costs} | {report.gradients} | {report.seconds:.2f} |",
+                f"| {report.spent.costs} | {report.spent.gradients} | {report.spent.seconds:.2f} |",
                 flush=True,
             )
     print(f"\n{caught} of {faults} faults caught, {named} named as planted, {alarms} false alarms of {right}")

@@ -6,12 +6,15 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree
 
 from bench.errors import StorageError, UserError
-from bench.examine.findings import Findings
+from bench.examine.text import table
 from bench.report.text import counted, duration, number
+
+if TYPE_CHECKING:
+    from bench.examine.report import Report
 
 GREW = 2.0
 """Ratio of the sizes of an error, or of numbers of calls, above which a change is reported."""
@@ -21,7 +24,7 @@ COLUMNS = ("cost", "result", "cause", "off by", "under noise", "costs", "gradien
 """Columns of the summary."""
 
 
-def summary(report: Findings) -> dict[str, Any]:
+def summary(report: Report) -> dict[str, Any]:
     """Return what a baseline stores of a report: its verdicts, the size of its error, and its calls."""
     size = report.size
     return {
@@ -30,8 +33,8 @@ def summary(report: Findings) -> dict[str, Any]:
         "derivative": report.derivative,
         "cause": report.cause,
         "size": size if math.isfinite(size) else None,
-        "costs": report.costs,
-        "gradients": report.gradients,
+        "costs": report.spent.costs,
+        "gradients": report.spent.gradients,
     }
 
 
@@ -49,7 +52,7 @@ def read_baseline(path: Path) -> dict[str, Any] | None:
     return dict(stored)
 
 
-def write_baseline(path: Path, report: Findings) -> None:
+def write_baseline(path: Path, report: Report) -> None:
     """Write the baseline of a report. Raises :class:`StorageError` if that fails."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -58,7 +61,7 @@ def write_baseline(path: Path, report: Findings) -> None:
         raise StorageError(f"baseline={path} cannot be written: {error}") from None
 
 
-def differences(before: Mapping[str, Any], report: Findings) -> tuple[list[str], bool]:
+def differences(before: Mapping[str, Any], report: Report) -> tuple[list[str], bool]:
     """Return what changed since a baseline, as sentences, and whether something is worse.
 
     Worse is a problem that was not there before, or the same one with an error more than twice as large.
@@ -80,25 +83,30 @@ def differences(before: Mapping[str, Any], report: Findings) -> tuple[list[str],
     return changes, is_worse
 
 
-def row(report: Findings) -> list[str]:
+def row(report: Report) -> dict[str, str]:
     """Return a report as a row of the summary."""
-    off = number(100 * report.size) + "%" if report.gradient and math.isfinite(report.size) else "-"
-    noise = report.noise_answer.partition(": ")[2].partition(".")[0].partition(",")[0] or "-"
-    result = RESULTS[report.status]
-    if report.status == 0 and report.derivative == "none given":
-        result = "no gradient"
-    if report.status == 0 and report.problems:
-        result = "as expected" if report.expect else "as before"
-    seconds = duration(report.seconds + report.compile_s)
-    return [report.name, result, report.cause, off, noise, str(report.costs), str(report.gradients), seconds]
+    spent, result = report.spent, RESULTS[report.status]
+    if report.status == 0 and (report.derivative == "none given" or report.problems):
+        result = "no gradient" if not report.problems else "as expected" if report.expect else "as before"
+    return {
+        "cost": report.name, "result": result, "cause": report.cause,
+        "off by": number(100 * report.size) + "%" if report.gradient and math.isfinite(report.size) else "-",
+        "under noise": report.use if report.gradient else "-", "costs": str(spent.costs), "gradients": str(spent.gradients),
+        "seconds": duration(spent.seconds + spent.compile_s),
+    }  # fmt: skip
 
 
-def as_markdown(reports: Sequence[Findings], refused: Mapping[str, str] | None = None) -> str:
+def _rows(reports: Sequence[Report], refused: Mapping[str, str]) -> list[dict[str, str]]:
+    """Return the rows of the summary, those of bad input last."""
+    bad = [dict.fromkeys(COLUMNS, "-") | {"cost": name, "result": RESULTS[2]} for name in refused]
+    return [*map(row, reports), *bad]
+
+
+def as_markdown(reports: Sequence[Report], refused: Mapping[str, str] | None = None) -> str:
     """Return a summary in Markdown: a table with a row per report, then the problems and changes of each."""
     refused = refused or {}
-    rows = [row(report) for report in reports] + [[name, RESULTS[2], *["-"] * (len(COLUMNS) - 2)] for name in refused]
     lines = ["| " + " | ".join(COLUMNS) + " |", "|" + "---|" * len(COLUMNS)]
-    lines += ["| " + " | ".join(_cell(text) for text in cells) + " |" for cells in rows]
+    lines += ["| " + " | ".join(map(_cell, cells.values())) + " |" for cells in _rows(reports, refused)]
     for report in reports:
         texts = [*report.problems, *(f"since the baseline: {text}" for text in report.changes)]
         if texts or report.advice:
@@ -109,17 +117,13 @@ def as_markdown(reports: Sequence[Findings], refused: Mapping[str, str] | None =
     return "\n".join(lines) + "\n"
 
 
-def as_text(reports: Sequence[Findings], refused: Mapping[str, str] | None = None) -> str:
+def as_text(reports: Sequence[Report], refused: Mapping[str, str] | None = None) -> str:
     """Return the summary's table with aligned columns."""
-    rows = [list(COLUMNS), *(row(report) for report in reports)]
-    rows += [[name, RESULTS[2], *["-"] * (len(COLUMNS) - 2)] for name in refused or {}]
-    widths = [max(len(cells[i]) for cells in rows) for i in range(len(COLUMNS))]
-    lines = ["  ".join(cell.ljust(width) for cell, width in zip(cells, widths, strict=True)).rstrip() for cells in rows]
-    lines += [f"{name}: {text}" for name, text in (refused or {}).items()]
-    return "\n".join(lines)
+    refused = refused or {}
+    return "\n".join([*table("", _rows(reports, refused))[1:], *(f"{name}: {text}" for name, text in refused.items())])
 
 
-def as_junit(reports: Sequence[Findings], refused: Mapping[str, str] | None = None) -> str:
+def as_junit(reports: Sequence[Report], refused: Mapping[str, str] | None = None) -> str:
     """Return JUnit XML with a test case per report: wrong is a failure, not decided and bad input are errors."""
     refused = refused or {}
     failures = sum(report.status == 1 for report in reports)
@@ -130,7 +134,7 @@ def as_junit(reports: Sequence[Findings], refused: Mapping[str, str] | None = No
     for report in reports:
         case = ElementTree.SubElement(
             suite, "testcase", classname="examine", name=_xml_safe(report.name),
-            time=f"{report.seconds + report.compile_s:.3f}",
+            time=f"{report.spent.seconds + report.spent.compile_s:.3f}",
         )  # fmt: skip
         if report.status:
             kind = "failure" if report.status == 1 else "error"
@@ -145,14 +149,14 @@ def as_junit(reports: Sequence[Findings], refused: Mapping[str, str] | None = No
     return ElementTree.tostring(root, encoding="unicode", xml_declaration=True) + "\n"
 
 
-def as_line(reports: Sequence[Findings], refused: Mapping[str, str] | None = None) -> str:
+def as_line(reports: Sequence[Report], refused: Mapping[str, str] | None = None) -> str:
     """Return the counts of results in one line."""
     results = [RESULTS[report.status] for report in reports] + [RESULTS[2]] * len(refused or {})
     kinds = [f"{results.count(kind)} {kind}" for kind in RESULTS.values() if kind in results]
     return f"{counted(len(results), 'cost')}: {', '.join(kinds)}"
 
 
-def status(reports: Sequence[Findings], refused: Mapping[str, str] | None = None) -> int:
+def status(reports: Sequence[Report], refused: Mapping[str, str] | None = None) -> int:
     """Return the exit status of several reports: 1 if one is wrong, else 2 for bad input, else 3 if one is not decided."""
     statuses = {report.status for report in reports} | ({2} if refused else set())
     return next((one for one in (1, 2, 3) if one in statuses), 0)

@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from bench.examine.gradient import SUSPICIOUS, GradientStages
+from bench.examine.gradient import GradientStages
 from bench.examine.lines import LineScan, scan
 from bench.examine.quick import QuickCheck
+from bench.examine.rules import SUSPICIOUS
 from bench.examine.steps import changing_loop
 from bench.examine.subspace import choose
 from bench.measure.gradcheck import Check
@@ -105,6 +106,28 @@ class Gap:
 
     gradient: float
     own: float
+
+
+@dataclass
+class Explanation:
+    """What comparisons say about a wrong gradient."""
+
+    is_adaptive: bool | None = None
+    """Whether steps that depend on theta explain the error, by the jumps of the cost; None: not compared."""
+    steps: str | None = None
+    """The place of a loop whose length depends on theta, as ``ode.py:17``; empty without one, None: not searched."""
+    is_unexplained: bool = False
+    """Whether the error is so small that adaptive steps may explain it, and the budget ended before that was known."""
+    twin: float | None = None
+    """Largest relative difference between the cost and its twin."""
+    twin_error: tuple[float, float] | None = None
+    """Relative errors of the gradient and of the second gradient."""
+    refined: Check | None = None
+    """The gradient against differences of a refined cost."""
+    gaps: Sequence[Gap] = ()
+    """At theta and at others: how far gradient and cost are from the refined cost; empty without a refined cost."""
+    growth: Sequence[Horizon] = ()
+    """The error of the gradient by number of steps."""
 
 
 def refined_gaps(stages: GradientStages, refined: Callable[..., Any]) -> list[Gap]:
@@ -210,7 +233,7 @@ def is_adaptive(
         return stages.costs(stages.theta[:, None] + line.direction[:, None] * t)
 
     if sum(len(line.jumps) for line in lines) < FEWEST_JUMPS and error <= NEAR:
-        first, noise = lines[0], max(outcome.noise, stages.spread)
+        first, noise = lines[0], max(outcome.noise, stages.repeats.spread)
         reach, unit = LONGER * float(first.at[-1]), stages.simulator.unit
         longer = scan(lambda t: along(first, t[0]), np.zeros(1), np.ones(1), noise, reach, points, halvings, most, unit)
         lines = [replace(longer, direction=first.direction)]
@@ -246,4 +269,4 @@ def _quick(stages: GradientStages, other: Simulator, space: Any, slope: np.ndarr
     if slope is None and stages.gradient is not None:
         slope = space.project(stages.gradient)
     centre = float(cost(space.origin()[:, None])[0])
-    return QuickCheck(cost, space.origin(), space.scale, slope, centre, stages.simulator.unit, stages.spread)
+    return QuickCheck(cost, space.origin(), space.scale, slope, centre, stages.simulator.unit, stages.repeats.spread)

@@ -5,29 +5,28 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial, wraps
 from typing import Any
 
 import numpy as np
 
-from bench.errors import UserError
+from bench.errors import UserError, unknown
 from bench.examine import diagnosis
 from bench.examine.clock import ExaminationClock
-from bench.examine.findings import GroupSize
-from bench.examine.gradient import SUSPICIOUS, GradientStages
+from bench.examine.findings import RELATIVE, GroupSize, Setup, Spent
+from bench.examine.gradient import GradientStages
 from bench.examine.lines import HALVINGS, PLACES, POINTS, LineScan, scan
 from bench.examine.report import Report
+from bench.examine.rules import RULES, SUSPICIOUS
 from bench.examine.smoothing import FEWEST, PAIRS, Smoothed, directions, measure_smoothed
-from bench.measure.gradcheck import FAULTS, Check
+from bench.measure.gradcheck import Check
 from bench.model.simulator.clock import Clock, OutOfTime, end_on_sigterm, parse_duration
 from bench.model.simulator.simulator import Simulator
 from bench.model.simulator.tree import ParameterTree
 
 GENERATED_SUFFIX = re.compile(r"_[0-9a-f]{8}$")
 """Suffix of the generated name of a module that is loaded from a file."""
-RELATIVE = 0.01
-"""Default sigma of the line scans, and of a cost with its own noise, in units of each input's scale."""
 TOLERANCE = 1e-4
 """Default relative error of a derivative below which it only causes a warning."""
 COMPILE_S = 300.0
@@ -117,12 +116,12 @@ def examine(
         rtol=_tolerance(layout, tolerance, "tolerance", TOLERANCE),
         atol=_tolerance(layout, atol, "atol", 0.0),
         allow_zero=_allowed(layout, allow_zero),
-        expect=_expected(expect),
         seed=seed,
-        name=name or _function_name(cost),
         horizons=tuple(int(steps) for steps in horizons),
     )
-    source = _function_name(grad)
+    if expect and expect not in RULES:
+        raise unknown("expect", expect, RULES)
+    named = {"name": name or _function_name(cost), "gradient": _function_name(grad), "expect": expect}
     cost, grad, twin, twin_grad, refined = map(_with_own_warnings, (cost, grad, twin, twin_grad, refined))
     clock.start_stage("first call")
     # a cost of huge or infinite numbers overflows in the differences too, where a warning would tell nothing
@@ -135,26 +134,9 @@ def examine(
             raise UserError(f"{took}: give a larger compile_budget or a shorter rollout") from None
         examination = _Examination(simulator, setup, clock)
         try:
-            return examination.run(source, twin, twin_grad, refined)
+            return examination.run(named, twin, twin_grad, refined)
         finally:
             clock.clear_progress()
-
-
-@dataclass(frozen=True)
-class Setup:
-    """The settings of an examination, per entry of theta where they are arrays ``(d,)``."""
-
-    levels: Sequence[tuple[float, np.ndarray]]
-    """Each sigma as a number for tables, its largest entry, and as an array."""
-    scale: np.ndarray
-    rtol: np.ndarray
-    atol: np.ndarray
-    allow_zero: np.ndarray | None
-    """Whether each input may have no effect; None: such inputs cause a warning."""
-    expect: str
-    seed: int
-    name: str
-    horizons: tuple[int, ...]
 
 
 def _time_limit(budget: float | str | None, calls: int | None) -> float:
@@ -212,15 +194,6 @@ def _allowed(layout: ParameterTree, given: bool | str | Sequence[str] | None) ->
     return allowed
 
 
-def _expected(cause: str) -> str:
-    from bench.errors import unknown
-    from bench.examine.findings import CAUSES
-
-    if cause and cause not in CAUSES:
-        raise unknown("expect", cause, CAUSES)
-    return cause
-
-
 def _with_own_warnings(function: Any) -> Any:
     """Return a user's function that warns of its own arithmetic as it does outside of an examination."""
     if not callable(function):
@@ -255,94 +228,77 @@ class _Examination:
         self.scale, self.levels, self.seed = setup.scale, setup.levels, setup.seed
         self.theta = self.layout.vector
         self.left_out: list[str] = []
-        self.is_adaptive: bool | None = None
-        """Whether adaptive steps explain the error; None before that is known."""
-        self.steps: str | None = None
-        """The place of a loop whose length depends on theta, empty without one; None before that is known."""
+        self.explained = diagnosis.Explanation()
         self._near: list[LineScan] | None = None
         """Lines at theta that do not depend on sigma."""
         random = np.random.default_rng([setup.seed, 0x6578616D])
         w = random.standard_normal((simulator.noise, 1)) if simulator.noise else None
         self.stages = GradientStages(simulator, setup.scale, clock, setup.seed, w, random)
 
-    def run(self, gradient: str, twin: Any, twin_grad: Any, refined: Any) -> Report:
+    def run(self, named: Mapping[str, str], twin: Any, twin_grad: Any, refined: Any) -> Report:
         """Run the checks that the budget allows, the decisive ones first, and return the report."""
-        simulator, clock, stages, setup = self.simulator, self.clock, self.stages, self.setup
+        simulator, clock, stages, setup, explained = self.simulator, self.clock, self.stages, self.setup, self.explained
         stages.run(self._is_adaptive)
         self.left_out += stages.left_out
         checked = stages.check
-        other: dict[str, Any] = {}
+        is_wrong = checked is not None and checked.cause in SUSPICIOUS
         if twin is not None:
-            other["twin"] = self._attempt("comparison with the twin", lambda: diagnosis.compare_costs(stages, twin))
+            self._explain("twin", "comparison with the twin", lambda: diagnosis.compare_costs(stages, twin))
         if twin_grad is not None and stages.gradient is not None:
-            other["twin_error"] = self._attempt(
-                "comparison with the twin's gradient", lambda: diagnosis.compare_gradients(stages, twin_grad)
+            self._explain(
+                "twin_error",
+                "comparison with the twin's gradient",
+                lambda: diagnosis.compare_gradients(stages, twin_grad),
             )
         if refined is not None:
-            other["refined"] = self._attempt("the refined cost", lambda: diagnosis.check_refined(stages, refined))
-            if checked is not None and checked.cause in SUSPICIOUS and stages.gradient is not None:
-                gaps = self._attempt(
-                    "the refined cost at other thetas", lambda: diagnosis.refined_gaps(stages, refined)
+            self._explain("refined", "the refined cost", lambda: diagnosis.check_refined(stages, refined))
+            if is_wrong and stages.gradient is not None:
+                self._explain(
+                    "gaps", "the refined cost at other thetas", lambda: diagnosis.refined_gaps(stages, refined)
                 )
-                other["gaps"] = gaps or []
         if setup.horizons:
-            growth = self._attempt("horizons", lambda: diagnosis.errors_by_horizon(stages, setup.horizons))
-            other["growth"] = growth or []
+            self._explain("growth", "horizons", lambda: diagnosis.errors_by_horizon(stages, setup.horizons))
         can_go_on = not (stages.gradient is None and simulator.has_gradient) and not stages.is_failed
-        if checked is not None and checked.cause in SUSPICIOUS and can_go_on and self.is_adaptive is None:
-            self.is_adaptive = self._compare_along_lines(checked)
+        if checked is not None and is_wrong and can_go_on and explained.is_adaptive is None:
+            explained.is_adaptive = self._compare_along_lines(checked)
+        explained.is_unexplained = (
+            explained.is_adaptive is None and checked is not None and diagnosis.may_be_adaptive(checked)
+        )
         lines = self._scan_lines(checked) if can_go_on else []
         smoothed = self._measure_noise(checked) if can_go_on else []
         if clock.is_terminated:
             self.left_out.append("everything after SIGTERM")
+        gradient_s = clock.per_gradient() if simulator.has_gradient else math.nan
         return Report(
-            name=setup.name,
-            gradient=gradient,
+            **named,
             names=self.layout.names,
             theta=self.theta,
             cost=stages.value,
             precision=simulator.precision,
             is_hidden_single=stages.is_hidden_single,
-            spread=stages.spread,
-            gradient_spread=stages.gradient_spread,
-            is_small_spread=stages.is_small_spread,
-            has_state=stages.has_state,
             batch=simulator.batch + (f":{simulator.fixed}" if simulator.fixed else ""),
-            costs=clock.costs,
-            gradients=clock.gradients,
-            seconds=clock.spent,
-            compile_s=clock.compile_s,
-            elapsed=clock.elapsed,
-            budget=clock.budget,
-            calls=clock.calls,
-            cost_s=clock.per_cost(),
-            gradient_s=clock.per_gradient() if simulator.has_gradient else math.nan,
+            repeats=stages.repeats,
+            setup=setup,
+            spent=Spent(
+                clock.costs, clock.gradients, clock.spent, clock.compile_s, clock.elapsed, clock.per_cost(), gradient_s,
+                clock.budget, clock.calls,
+            ),
             check=checked,
             is_quick=stages.is_quick,
             is_complete=stages.is_complete,
             located=stages.located,
             groups=self._group_sizes(),
             more=stages.more,
-            rtol=setup.rtol,
-            atol=setup.atol,
-            allow_zero=setup.allow_zero,
-            expect=setup.expect,
+            explained=explained,
             lines=lines,
-            reach=max((level for level, _ in self.levels), default=RELATIVE),
-            relative=not self.levels,
-            requested=tuple(level for level, _ in self.levels),
             smoothed=smoothed,
             error=simulator.gradient_error if stages.is_failed else "",
             elsewhere=simulator.gradient_error if not stages.is_failed else "",
             n_failed=simulator.n_failed_gradients,
-            is_adaptive=bool(self.is_adaptive),
-            steps=self.steps or "",
-            is_unexplained=self.is_adaptive is None and checked is not None and diagnosis.may_be_adaptive(checked),
             printed=simulator.printed,
             notes=[*simulator.notes, *self._exceptions()],
             left_out=self.left_out,
-            **other,
-        )
+        )  # fmt: skip
 
     def _group_sizes(self) -> dict[str, GroupSize]:
         """Return, by name of a group of numbers, what errors of its numbers do to the slope along its direction."""
@@ -371,24 +327,30 @@ class _Examination:
             self.left_out.append(what)
             return None
 
+    def _explain(self, name: str, what: str, function: Callable[[], Any]) -> None:
+        """Keep the result of a comparison, unless the budget ends before."""
+        result = self._attempt(what, function)
+        if result is not None:
+            setattr(self.explained, name, result)
+
     # ------------------------------------------------------------------------------------------------ lines
 
     def _is_adaptive(self, checked: Check) -> bool:
         """Return whether adaptive steps explain the small error of a gradient, and keep the answer."""
         if not diagnosis.may_be_adaptive(checked):
             return False
-        self.is_adaptive = self._compare_along_lines(checked, EARLY_SHARE)
-        return bool(self.is_adaptive)
+        self.explained.is_adaptive = self._compare_along_lines(checked, EARLY_SHARE)
+        return bool(self.explained.is_adaptive)
 
     def _compare_along_lines(self, checked: Check, share: float = 0.0) -> bool | None:
         """Return whether the program's steps depend on theta and its jumps explain the gradient's error.
 
         None where the budget ends before. Nothing here depends on sigma.
         """
-        if self.steps is None:
-            self.steps = self._attempt("the loops of the program", lambda: diagnosis.changing_steps(self.stages))
-        if not self.steps:
-            return None if self.steps is None else False
+        if self.explained.steps is None:
+            self._explain("steps", "the loops of the program", lambda: diagnosis.changing_steps(self.stages))
+        if not self.explained.steps:
+            return None if self.explained.steps is None else False
         self._near = near = (
             self._scan(self.scale * RELATIVE, checked, share or 0.9) if self._near is None else self._near
         )
@@ -435,7 +397,7 @@ class _Examination:
             for direction in along:
                 size = abs(self.stages.value)
                 rounding = max(
-                    measured, self.stages.spread, self.simulator.unit * (size if math.isfinite(size) else 0.0)
+                    measured, self.stages.repeats.spread, self.simulator.unit * (size if math.isfinite(size) else 0.0)
                 )
                 cost = partial(self._costs_along, direction)
                 line = scan(cost, np.zeros(1), np.ones(1), rounding, 3.0, points, halvings, most, self.simulator.unit)
@@ -504,6 +466,3 @@ class _Examination:
             else:
                 results.append(one)
         return results
-
-
-__all__ = ["FAULTS", "Setup", "examine"]

@@ -10,15 +10,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
 from bench.examine.quick import ROUNDS, QuickCheck, is_nothing
 from bench.examine.subspace import Group, Subspace, choose, locate
-from bench.measure.gradcheck import EPS, FAULTS, TRUSTED, Check, Options, Part, Sample, check, most_severe
-from bench.measure.gradcheck.direction import ALIKE
+from bench.measure.gradcheck import EPS, FAULTS, TRUSTED, Check, Options, Part, check, most_severe
 from bench.model.simulator.clock import Clock, OutOfTime
 from bench.model.simulator.simulator import Simulator
 
@@ -42,14 +41,30 @@ IN_CELL = 0.4
 """Distance from a float32 number, in units of its last place, that float32 rounds away."""
 CELLS, DISTINCT_CELLS = 9, 6
 """Number of neighbouring float32 thetas at which costs are compared, and fewest different costs of a cost in float32."""
-SUSPICIOUS = ("wrong_factor", "missing_term", "wrong_adjoint")
-"""Causes that adaptive steps and kinks imitate."""
-KINKED = 1e3
-"""Ratio of the steps over which two slopes at a kink differ by a constant."""
 SHARE = 0.8
 """Largest share of the remaining budget of a stage, whatever is measured after it."""
 STATE = 0.1
 """Largest share of the difference between histories by which a cost with equal histories differs."""
+
+
+@dataclass
+class Repeats:
+    """How far equal calls differ."""
+
+    spread: float = 0.0
+    """Largest difference between equal calls of the cost."""
+    of_gradient: float = 0.0
+    """Largest difference between equal calls of the gradient, relative to its norm."""
+    has_state: bool = False
+    """Whether the cost depends on the call before it, in a repeatable way."""
+    floor: float = 0.0
+    """Largest spread that only limits the accuracy of the check."""
+    floor_of_gradient: float = 0.0
+
+    @property
+    def is_small(self) -> bool:
+        """Whether these differences only limit the accuracy of the check."""
+        return self.spread <= self.floor and self.of_gradient <= self.floor_of_gradient
 
 
 class Store:
@@ -109,10 +124,7 @@ class GradientStages:
         self.groups: list[Group] = []
         """The groups of a large theta that are checked along one direction each."""
         self.left_out: list[str] = []
-        self.spread = self.gradient_spread = 0.0
-        """Largest difference between equal calls, of the cost, and of the gradient relative to its norm."""
-        self.has_state = False
-        """Whether the cost depends on the call before it, in a repeatable way."""
+        self.repeats = Repeats(floor_of_gradient=simulator.unit**SMALL)
         self._repeated = False  # whether calls were repeated within the budget
         self.is_hidden_single = False
         """Whether the cost has single precision, though it returns a float64."""
@@ -173,16 +185,6 @@ class GradientStages:
 
     # ------------------------------------------------------------------------------------------------ stages
 
-    @property
-    def is_small_spread(self) -> bool:
-        """Whether differences between equal calls are so small that they only limit the accuracy of the check."""
-        return self.spread <= self._floor and self.gradient_spread <= self.simulator.unit**SMALL
-
-    @property
-    def _floor(self) -> float:
-        """Largest difference between equal calls of the cost that only limits the accuracy of the check."""
-        return float(self.simulator.unit**SMALL * (abs(self.value) if math.isfinite(self.value) else 0.0))
-
     def run(self, explain: Callable[[Check], bool] = lambda check: False) -> None:
         """Run all stages that the budget allows; ``explain`` gets the outcome of a wrong gradient before it is named."""
         try:
@@ -220,6 +222,7 @@ class GradientStages:
         self.value = simulator.first_value
         if simulator.noise or simulator.batch != "loop" or math.isnan(self.value):
             self.value = float(self.costs(self.theta[:, None])[0])
+        self.repeats.floor = simulator.unit**SMALL * (abs(self.value) if math.isfinite(self.value) else 0.0)
         if not simulator.has_gradient:
             return
         clock.start_stage("first gradient")
@@ -236,7 +239,9 @@ class GradientStages:
         def cost(z: np.ndarray) -> np.ndarray:
             return self._stored_costs(space, z)
 
-        quick = QuickCheck(cost, space.origin(), space.scale, slope, self.value, self.simulator.unit, self.spread)
+        quick = QuickCheck(
+            cost, space.origin(), space.scale, slope, self.value, self.simulator.unit, self.repeats.spread
+        )
         names = [f"component {i}" for i in range(space.size)]
         try:
             for _ in ROUNDS:
@@ -274,13 +279,13 @@ class GradientStages:
         for values in ([*after["theta"], *after["other"], self.value], others):
             if len(values) > 1 and np.isfinite(values).all():
                 spreads.append(float(np.ptp(values)))
-        self.spread = max([self._costs_store.spread, *spreads])
+        self.repeats.spread = max([self._costs_store.spread, *spreads])
         last = after["other"][1:]  # the first of them followed the differences, so other thetas
-        if self.spread > 0 and len(after["theta"]) > 1 and len(last) > 1:
+        if self.repeats.spread > 0 and len(after["theta"]) > 1 and len(last) > 1:
             apart = abs(after["theta"][-1] - last[-1])
             is_alike = max(np.ptp(after["theta"]), np.ptp(last)) <= STATE * apart
             # last digits that vary at random are alike by chance
-            self.has_state = bool(is_alike and self.spread > self._floor)
+            self.repeats.has_state = bool(is_alike and self.repeats.spread > self.repeats.floor)
 
     def _repeat_gradient(self, other: np.ndarray) -> None:
         """Compare the gradient with that of an equal call after one at ``other (d,)``."""
@@ -294,7 +299,7 @@ class GradientStages:
             return
         size = float(np.linalg.norm(self.gradient))
         if size and np.isfinite(again).all():
-            self.gradient_spread = float(np.linalg.norm(again - self.gradient)) / size
+            self.repeats.of_gradient = float(np.linalg.norm(again - self.gradient)) / size
 
     def _has_hidden_single(self) -> bool:
         """Return whether a cost that returns float64 computes in float32: its values have single precision, or it reads
@@ -303,7 +308,7 @@ class GradientStages:
         A cost that reads theta as float32 is constant within one rounding cell of float32, and changes from each cell to
         the next, unlike a staircase with wider treads.
         """
-        if self.simulator.unit > float(np.finfo(np.float64).eps) or self.spread > 0.0:
+        if self.simulator.unit > float(np.finfo(np.float64).eps) or self.repeats.spread > 0.0:
             return False
         if self.simulator.has_single_precision:
             return True
@@ -333,7 +338,7 @@ class GradientStages:
         base = Options(
             components=size, directions=0, draws=0, eps=few, unit=unit, scanned=0, repeated=False, seed=self.seed,
         )  # fmt: skip
-        repeated = self.spread == 0.0
+        repeated = self.repeats.spread == 0.0
         # a wrong gradient is named by its ratios at other thetas first, and then searched for staircases
         scanned = 4 if is_right else 0
         stages = [
@@ -400,9 +405,9 @@ class GradientStages:
 
     def _run_stage(self, space: Subspace, options: Options) -> None:
         outcome = self._check_once(space, options)
-        self.spread = max(self.spread, self._costs_store.spread)
-        self.gradient_spread = max(self.gradient_spread, self._spread_of_gradients(space))
-        if outcome.cause == "nondeterministic" and self.is_small_spread and self.spread > 0.0:
+        self.repeats.spread = max(self.repeats.spread, self._costs_store.spread)
+        self.repeats.of_gradient = max(self.repeats.of_gradient, self._spread_of_gradients(space))
+        if outcome.cause == "nondeterministic" and self.repeats.is_small and self.repeats.spread > 0.0:
             self._refresh()
             outcome = self._check_once(space, replace(options, repeated=False))
         self.check, self.is_quick = space.restore(outcome), False
@@ -426,7 +431,7 @@ class GradientStages:
             outcome = recaused(
                 replace(outcome, draws=tuple(part for part in outcome.draws if np.isfinite(part.program)))
             )
-        return self._with_roughness(self._without_small_spread(space, _with_kinks(_with_zeros(outcome))))
+        return self._with_roughness(self._without_small_spread(space, _with_zeros(outcome)))
 
     def _spread_of_gradients(self, space: Subspace) -> float:
         """Return the largest difference between equal calls of the gradient, relative to its norm."""
@@ -494,7 +499,9 @@ class GradientStages:
             return self.costs(thetas)
 
         one, unit = [index], self.simulator.unit
-        quick = QuickCheck(cost, self.theta[one], self.scale[one], self.gradient[one], self.value, unit, self.spread)
+        quick = QuickCheck(
+            cost, self.theta[one], self.scale[one], self.gradient[one], self.value, unit, self.repeats.spread
+        )
         for _ in ROUNDS:
             quick.run_round()
         outcome = quick.check([f"component {index}"])
@@ -529,31 +536,6 @@ def _with_zeros(outcome: Check) -> Check:
     if all(part.verdict == "zero" for part in zeros):
         return outcome
     return recaused(outcome, lambda part: replace(part, verdict="zero") if any(part is p for p in zeros) else part)
-
-
-def _with_kinks(outcome: Check) -> Check:
-    """Return a check with the verdict ``kink`` on faults that a change of slope at theta explains."""
-    kinks = [p for p in outcome.parts if p.verdict in SUSPICIOUS and is_between_slopes(p.sample)]
-    if not kinks:
-        return outcome
-    return recaused(outcome, lambda part: replace(part, verdict="kink") if any(part is p for p in kinks) else part)
-
-
-def is_between_slopes(sample: Sample) -> bool:
-    """Return whether the two one-sided slopes differ by a constant over :data:`KINKED` of step, and hold the derivative.
-
-    At a smooth point the slopes approach each other in proportion to the step, and at a jump they part.
-    """
-    bend, noise = sample.right - sample.left, sample.uncertainty
-    for i, step in enumerate(sample.step):
-        inside = (sample.step <= step) & (sample.step >= step / KINKED) & (np.abs(bend) > 10.0 * noise)
-        if sample.step[inside].size < 3 or sample.step[inside].min() > 1.5 * step / KINKED:
-            continue
-        allowed = ALIKE * abs(bend[i])
-        low, high = sorted((float(sample.left[inside][-1]), float(sample.right[inside][-1])))
-        if np.ptp(bend[inside]) <= allowed and low - allowed <= sample.derivative <= high + allowed:
-            return True
-    return False
 
 
 def recaused(outcome: Check, replaced: Callable[[Part], Part] = lambda part: part) -> Check:

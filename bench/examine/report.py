@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
 from bench.errors import UserError, unknown
-from bench.examine import ci
+from bench.examine import ci, text
 from bench.examine.findings import Findings
 
 if TYPE_CHECKING:
@@ -23,6 +23,13 @@ class Report(Findings):
     ``derivative`` and ``noise_answer`` are the two answers, ``frame``, ``sigmas`` and ``breaks`` are tables,
     ``problems`` and ``warnings`` are sentences, and ``status`` is the exit status: 0 right, 1 wrong, 3 not decided.
     """
+
+    conclusion = property(text.conclusion)
+    noise_answer = property(text.noise_answer)
+    problems = property(text.problems)
+    warnings = property(text.warnings)
+    advice = property(text.advice)
+    __str__ = text.write
 
     def __repr__(self) -> str:
         return str(self)
@@ -41,15 +48,16 @@ class Report(Findings):
         """
         from bench.examine import page
         from bench.report.displays import displayable
+        from bench.report.draw import draw
         from bench.report.figures import styled
 
-        with styled():
-            figures = page.charts(self)
+        figures = {one.name: one for one in page.charts(self)}
         if not figures:
             raise UserError("this examination has no data for a chart: give a gradient, sigma or a larger budget")
         if chart and chart not in figures:
             raise unknown("chart", chart, figures)
-        return displayable(figures[chart or next(iter(figures))][1])
+        with styled():
+            return displayable(draw(figures[chart or next(iter(figures))]))
 
     def assert_right(self) -> None:
         """Raise AssertionError with the full report unless the status is 0."""

@@ -144,7 +144,7 @@ def integrate(problem: Problem, theta: np.ndarray, points: int, columns: int) ->
     settled = SETTLED * float(np.linalg.norm(previous))
     power = 0.0
     missed = _missed(excess, edges) / problem.sigma if width > 1 or error <= settled + rounding else 0.0
-    is_narrow = missed > error + settled + rounding + SOLVED * size
+    is_narrow = missed > min(error, TOLERANCE * float(np.linalg.norm(previous))) + settled + rounding + SOLVED * size
     if width == 1 and (is_narrow or error > TOLERANCE * np.linalg.norm(previous)):
         value, error, used, power = _bisected(
             lambda t: t * excess(t[None, :]) / problem.sigma,

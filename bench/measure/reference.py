@@ -166,8 +166,9 @@ def _compute(
         note = f"quadrature and sampling disagree by {apart:.2g}, which is the stated error"
         return _with_note(replace(quadrature, error=max(apart, quadrature.error)), note)
     # doubts about the samples are doubts about their error
-    outdone = not sampled.note and 0.0 < error < quadrature.error
-    return _with_note(sampled, quadrature.note) if outdone else quadrature
+    if not sampled.note and 0.0 < error < quadrature.error:
+        return _with_note(sampled, quadrature.note)
+    return _with_note(quadrature, sampled.note)
 
 
 def _unit(problem: Problem, theta: np.ndarray) -> float:

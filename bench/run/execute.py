@@ -123,4 +123,4 @@ def _compact(store: Store, planned: Sequence[Planned]) -> None:
     try:
         store.compact([item.cell.key for item in planned])
     except StorageError as error:
-        print(f"bench: {error}; the rows in 'pending' are merged by the next run", file=sys.stderr)
+        print(f"bench: {error}; no row is lost: those in 'pending' are read from there", file=sys.stderr)

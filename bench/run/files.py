@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
-import errno
 import fcntl
 import hashlib
 import os
@@ -22,10 +20,6 @@ from bench.model.parameters import remember
 
 STALE_S = 3600.0
 """Age in seconds after which a half-written file of another machine is removed."""
-AT_FDCWD, RENAME_NOREPLACE = -100, 1
-"""Constants of renameat2(2), Linux: paths are relative to the working folder, and nothing is overwritten."""
-RENAME_EXCL = 4
-"""Constant of renamex_np(2), macOS: nothing is overwritten."""
 TEMPORARY = re.compile(r"\..+-bench-([0-9a-f]{8})-(\d+)-[0-9a-f]{32}")
 """Names of files being written, with machine, process id and a random number."""
 
@@ -103,35 +97,6 @@ def replace_file(path: Path, content: bytes | Iterable[bytes]) -> None:
     except BaseException:  # of code that makes the content
         part.unlink(missing_ok=True)
         raise
-
-
-def link_exclusively(path: Path, name: Path) -> None:
-    """Link or rename a file to ``name``; raises FileExistsError, and changes nothing, if ``name`` exists.
-
-    On file systems with hard links, ``path`` remains a name of the file.
-    """
-    try:
-        os.link(path, name)
-    except FileExistsError:
-        raise
-    except OSError:  # a file system without hard links
-        _rename_exclusively(path, name)
-
-
-def _rename_exclusively(path: Path, name: Path) -> None:
-    """Rename a file unless the new name exists, atomically if the system can. ``os.rename`` would overwrite."""
-    system, names = ctypes.CDLL(None, use_errno=True), (os.fsencode(path), os.fsencode(name))
-    failed = errno.ENOSYS
-    if hasattr(system, "renameat2"):
-        failed = ctypes.get_errno() if system.renameat2(AT_FDCWD, names[0], AT_FDCWD, names[1], RENAME_NOREPLACE) else 0
-    elif hasattr(system, "renamex_np"):
-        failed = ctypes.get_errno() if system.renamex_np(*names, RENAME_EXCL) else 0
-    if failed in (errno.ENOSYS, errno.EINVAL, errno.ENOTSUP):  # not supported here: check first, then rename
-        failed = errno.EEXIST if os.path.lexists(name) else 0
-        if not failed:
-            os.rename(path, name)
-    if failed:
-        raise OSError(failed, os.strerror(failed), str(path), None, str(name))
 
 
 def sync_directory(directory: Path) -> None:

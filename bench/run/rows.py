@@ -11,7 +11,7 @@ import io
 import json
 import math
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,7 +21,6 @@ from bench.experiment.columns import Columns
 from bench.experiment.grid import expand, refuse_too_many
 
 if TYPE_CHECKING:
-    import numpy as np
     import pandas as pd
 
 MAX_ROWS = 5_000_000
@@ -46,6 +45,8 @@ NOT_NEGATIVE = (
     "compile_s",
 )
 """Columns whose numbers are at least 0."""
+CHECKED_TEXTS = ("status", "parameters")
+"""Columns of strings with rules of their own."""
 TABLES = ("machine", "versions", "config", "counts")
 """Entries of ``run.json`` that are tables."""
 LARGEST = 2.0**53
@@ -96,10 +97,19 @@ def valid_rows(table: pd.DataFrame, columns: Columns, path: Path) -> pd.DataFram
     import numpy as np
 
     reasons: dict[int, str] = {}
-    for name, check in _checks(columns, table).items():
-        for place in np.flatnonzero(~check(table[name])):
-            value = printable(repr(table[name].iloc[place]))[:60]
-            reasons.setdefault(int(place), f"{name}={value} {_rule(name, columns)}")
+    for column in columns.all:
+        if (name := column.name) not in table:
+            continue
+        values, (holds, rule) = table[name], _rule(name, columns)
+        if column.kind == "number":  # a column of another type is refused as a whole
+            is_valid: Any = _is_in_range(name, values.to_numpy(dtype=float)) if values.dtype.kind in "fiu" else True
+        elif column.kind == "text" and str(values.dtype) == "str" and name not in CHECKED_TEXTS:
+            is_valid = ~(values.str.len() > MAX_TEXT).to_numpy(dtype=bool, na_value=False)
+        else:
+            is_valid = np.fromiter(map(holds, values), dtype=bool)
+        for place in np.flatnonzero(~np.broadcast_to(is_valid, len(table))):
+            value = printable(repr(values.iloc[place]))[:60]
+            reasons.setdefault(int(place), f"{name}={value} {rule}")
     if "parameters" in table:
         is_described = ~table["parameters"].isin(["", "{}", None])
         for name in NEEDED:
@@ -135,89 +145,42 @@ def _report(path: Path, reasons: Mapping[int, str], n_rows: int) -> None:
 def _fault(row: dict[str, Any], columns: Columns) -> str:
     """Return why a row of a small file is not a row, or an empty string."""
     for name, value in row.items():
-        column = columns.by_name.get(name)
-        if column is None:
-            fault = "" if _is_scalar(value) or _is_list(value) else "is neither a number nor a string nor a list"
-        elif column.kind == "number":
-            fault = (
-                "is not a number" if not _is_missing(value) and not _is_number(value) else _fault_of_number(name, value)
-            )
-        elif name == "status":
-            fault = "" if value in ("", *STATUSES) else _rule(name, columns)
-        else:
-            check = _is_parameters if name == "parameters" else _is_text if column.kind == "text" else _is_list
-            check = _is_vector if name in columns.vectors else check
-            fault = "" if check(value) else _rule(name, columns)
-        if fault:
-            return f"{printable(name)[:60]}={printable(repr(value))[:60]} {fault}"
+        holds, rule = _rule(name, columns)
+        if not holds(value):
+            return f"{printable(name)[:60]}={printable(repr(value))[:60]} {rule}"
     if row.get("parameters") in (None, "", "{}"):
         return ""
     return next((f"{name} is missing" for name in NEEDED if _is_missing(row.get(name)) or row[name] == ""), "")
 
 
-def _fault_of_number(name: str, value: float | None) -> str:
-    if value is None or value != value:
-        return ""
-    if name in COUNTS and not (COUNTS[name] <= value <= LARGEST and value % 1 == 0):
-        return f"is not a whole number of at least {COUNTS[name]}"
-    return "is negative" if name in NOT_NEGATIVE and value < 0 else ""
-
-
-def _checks(columns: Columns, table: pd.DataFrame) -> dict[str, Callable[[pd.Series], np.ndarray]]:
-    """Return a check of each column of the table, which returns whether each of its values is right."""
-    checks: dict[str, Callable[[pd.Series], np.ndarray]] = {}
-    for column in columns.all:
-        if column.name not in table:
-            continue
-        values = table[column.name]
-        if column.name == "status":
-            checks["status"] = lambda values: _each(values, lambda value: value in ("", *STATUSES))
-        elif column.name == "parameters":
-            checks["parameters"] = lambda values: _each(values, _is_parameters)
-        elif column.kind == "text" and str(values.dtype) == "str":
-            checks[column.name] = lambda values: ~(values.str.len() > MAX_TEXT).to_numpy(dtype=bool, na_value=False)
-        elif column.kind == "text":
-            checks[column.name] = lambda values: _each(values, _is_text)
-        elif column.kind == "list":
-            is_list = _is_vector if column.name in columns.vectors else _is_list
-            checks[column.name] = lambda values, is_list=is_list: _each(values, is_list)  # type: ignore[misc]
-        elif column.kind == "number" and values.dtype.kind in "fiu":
-            if column.name in COUNTS:
-                checks[column.name] = lambda values, low=COUNTS[column.name]: _is_count(values, low)  # type: ignore[misc]
-            elif column.name in NOT_NEGATIVE:
-                checks[column.name] = lambda values: ~(values.to_numpy() < 0)
-    return checks
-
-
-def _rule(name: str, columns: Columns) -> str:
+def _rule(name: str, columns: Columns) -> tuple[Callable[[Any], bool], str]:
+    """Return the check of a value of a column, and what is wrong with a value that fails it."""
+    column = columns.by_name.get(name)
+    if column is None:
+        return lambda value: _is_scalar(value) or _is_list(value), "is neither a number nor a string nor a list"
     if name == "status":
-        return f"is not one of {', '.join(STATUSES)}"
+        return lambda value: value in ("", *STATUSES), f"is not one of {', '.join(STATUSES)}"
     if name == "parameters":
-        return "is not an object of plugins and their values"
-    if name in COUNTS:
-        return f"is not a whole number of at least {COUNTS[name]}"
+        return _is_parameters, "is not an object of plugins and their values"
+    if column.kind == "number":
+        words = f"is not a whole number of at least {COUNTS[name]}" if name in COUNTS else "is not a number"
+        words = "is negative, or is not a number" if name in NOT_NEGATIVE else words
+        return lambda value: _is_missing(value) or (_is_number(value) and _is_in_range(name, value)), words
+    if column.kind == "text":
+        return _is_text, f"is not a string of at most {MAX_TEXT:,} characters"
     if name in columns.vectors:
-        return "is not a list of numbers"
-    kind = columns.by_name[name].kind
-    if kind == "text":
-        return f"is not a string of at most {MAX_TEXT:,} characters"
-    return "is negative" if kind == "number" else "is not a list of numbers or strings"
+        return _is_vector, "is not a list of numbers"
+    return _is_list, "is not a list of numbers or strings"
 
 
-def _each(values: Iterable[Any], check: Callable[[Any], bool]) -> np.ndarray:
+def _is_in_range(name: str, value: Any) -> Any:
+    """Return whether a number, or each number of an array, is in the range of a column; missing numbers are."""
     import numpy as np
 
-    return np.fromiter((check(value) for value in values), dtype=bool)
-
-
-def _is_count(values: pd.Series, low: int) -> np.ndarray:
-    """Return whether values are whole numbers of at least ``low``; a missing count is valid."""
-    import numpy as np
-
-    numbers = values.to_numpy(dtype=float)
-    with np.errstate(invalid="ignore"):
-        valid: np.ndarray = np.isnan(numbers) | ((numbers >= low) & (numbers <= LARGEST) & (numbers % 1 == 0))
-    return valid
+    if name in COUNTS:
+        with np.errstate(invalid="ignore"):
+            return (value != value) | ((value >= COUNTS[name]) & (value <= LARGEST) & (value % 1 == 0))
+    return (value != value) | (value >= 0) if name in NOT_NEGATIVE else True
 
 
 def _is_text(value: Any) -> bool:

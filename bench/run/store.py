@@ -1,15 +1,17 @@
 """Stores rows on disk.
 
 Rows that finish together are one small JSON file under ``pending/``. At the end of a run the small files are merged
-into ``rows.parquet``. Every file is written completely under a unique name and then renamed into place, and is deleted only
-by a run that has read it and written its rows into another file. So nothing is locked, a run can be killed at any
-moment, and several runs can write to one directory: the stored rows are the newest row of each key in all files. The newest
-row has the largest ``sequence``, a counter that only grows. Clocks are not used, since they differ between machines and may
-be wrong for an hour.
+into ``rows.parquet``, by one run at a time, which holds a lock (``flock``). Every file is written completely under a unique
+name and then renamed into place, and a small file is deleted only after its rows are in the table. So a run can be killed at
+any moment, and several runs can write to one directory: the stored rows are the newest row of each key in all files. The
+newest row has the largest ``sequence``, a counter that only grows. Clocks are not used, since they differ between machines
+and may be wrong for an hour. Reading and adding rows need no lock. Where the file system has none, small files stay.
 """
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import io
 import json
 import os
@@ -17,14 +19,14 @@ import random
 import sys
 import time
 import uuid
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any
 
 from bench.errors import StorageError, UserError, printable
 from bench.experiment.columns import Columns
-from bench.run.files import link_exclusively, remove_stale, replace_file, sync_directory, temporary
+from bench.run.files import remove_stale, replace_file, temporary, write_whole
 from bench.run.rows import read_parquet, valid_rows, valid_small_rows
 
 if TYPE_CHECKING:
@@ -69,34 +71,45 @@ class Store:
     def _claim_directory(self) -> None:
         """Reserve the directory for this study before it has rows; raises :class:`UserError` if another study has it.
 
-        The claim is a file that is created atomically. It is removed once rows are stored, since rows name their study.
+        The claim is removed once rows are stored, since rows name their study.
         """
-        part = temporary(self._pending / "study")
-
-        def claim() -> bool:
-            try:
-                part.write_text(self._study)
-                link_exclusively(part, self._claim)
-                return True
-            except FileExistsError:
-                return False
-            finally:
-                part.unlink(missing_ok=True)
-
-        if not self._in_pending(claim, f"'{self._claim}' cannot be created"):
-            with suppress(OSError):  # a run that has removed the claim has stored rows
-                owner = self._claim.read_text(errors="replace")
-                if owner not in ("", self._study):
-                    raise UserError(
-                        f"a run of study {printable(owner)} has started in '{self.directory}', and this is study {self._study}: "
-                        "choose another folder with name=..., or remove that one"
-                    )
-        if self._list_files() != self._files_read:
-            try:
+        with self._locked():
+            owner = self._claim.read_text(errors="replace") if self._claim.exists() else ""
+            if owner not in ("", self._study):
+                raise UserError(
+                    f"a run of study {printable(owner)} has started in '{self.directory}', and this is study {self._study}: "
+                    "choose another folder with name=..., or remove that one"
+                )
+            if self._list_files() != self._files_read:
                 self.load()  # another run has stored rows since the files were read
-            except UserError:
-                self._release_claim()
+            self._in_pending(lambda: self._claim.write_text(self._study), f"'{self._claim}' cannot be created")
+
+    @contextmanager
+    def _locked(self) -> Iterator[bool]:
+        """Hold the lock of the directory; False if its file system has no locks."""
+        path, is_locked = self._pending / ".lock", True
+
+        def lock() -> IO[bytes]:
+            nonlocal is_locked
+            file = path.open("ab")
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                file.close()
                 raise
+            except OSError:
+                is_locked = False
+            with suppress(FileNotFoundError):
+                if os.path.samestat(os.fstat(file.fileno()), path.stat()):
+                    return file
+            file.close()  # another run has removed the file
+            raise BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN))
+
+        with self._in_pending(lock, f"'{path}' cannot be locked"):
+            try:
+                yield is_locked
+            finally:
+                path.unlink(missing_ok=True)
 
     def _release_claim(self) -> None:
         with suppress(OSError):
@@ -119,7 +132,8 @@ class Store:
         assert self._sequence is not None
         self._sequence += 1
         stamped = [row | {"stored_at": time.time(), "sequence": self._sequence} for row in rows]
-        self._write_pending("json", json.dumps(stamped).encode())
+        path, content = self._pending / f"{uuid.uuid4().hex}.json", json.dumps(stamped).encode()
+        self._in_pending(lambda: replace_file(path, content), f"'{self._pending}' cannot be created")
 
     def load(self) -> pd.DataFrame:
         """Return the newest stored row of each key; rows of ``rows.parquet`` come first."""
@@ -127,14 +141,16 @@ class Store:
 
     def compact(self, order: Sequence[str] = ()) -> None:
         """Merge the small files into ``rows.parquet``; rows of the keys in ``order`` come last, in that order."""
-        for _ in _attempts():
+        with self._locked() as is_locked:
             table, files = self._read_all()
-            table_id = files.pop(self._table, None)
-            if not files or self._fold(sort_rows(table, order), list(files), table_id):
-                break
-        remove_stale(self._pending)
-        if self._table.exists():
-            self._release_claim()
+            files.pop(self._table, None)
+            if files and not is_locked:
+                raise StorageError(f"the file system of '{self.directory}' has no locks, so no files are merged there")
+            if files:
+                self._fold(sort_rows(table, order), list(files))
+            remove_stale(self._pending)
+            if self._table.exists():
+                self._release_claim()
         with suppress(OSError):  # the folder is not empty
             self._pending.rmdir()
 
@@ -150,21 +166,22 @@ class Store:
         except OSError as error:
             raise StorageError(f"'{self._pending}' cannot be read: {error.strerror}") from None
         files = {}
-        for path in [self._table, *(self._pending / name for name in names)]:
+        # the table last: rows that are merged meanwhile are in it
+        for path in [*(self._pending / name for name in names), self._table]:
             with suppress(FileNotFoundError, NotADirectoryError):
                 if not path.is_fifo():  # which would be waited for
                     files[path] = _file_id(path)
         return files
 
     def _read_all(self) -> tuple[pd.DataFrame, dict[Path, FileId]]:
-        """Return all rows and the files that contain them; reads again if another run merges files meanwhile."""
+        """Return all rows and the files that contain them; reads again if another run merges files meanwhile.
+
+        A merge replaces the table before it deletes a small file, so files that can be read after they were listed are all rows.
+        """
         for _ in _attempts():
             files = self._list_files()
-            try:
+            with suppress(FileNotFoundError):
                 frames = self._read(files)
-            except FileNotFoundError:
-                continue
-            if _is_complete(files, self._list_files()):
                 self._files_read = dict(files)
                 return self._merge(frames), files
         raise StorageError(f"'{self.directory}' changes faster than it can be read: too many runs write to it")
@@ -211,61 +228,32 @@ class Store:
 
     # ------------------------------------------------------------------------------------------- writing
 
-    def _write_pending(self, suffix: str, content: bytes) -> Path:
-        path = self._pending / f"{uuid.uuid4().hex}.{suffix}"
-        self._in_pending(lambda: replace_file(path, content), f"'{self._pending}' cannot be created")
-        return path
-
     def _in_pending(self, write: Callable[[], Any], failed: str) -> Any:
-        """Return ``write()``, which writes in ``pending/``; tries again if another run removes the folder meanwhile."""
+        """Return ``write()``, which writes in ``pending/``; tries again if another run removes the folder or has the lock."""
         for is_last in _attempts():
             try:
                 self._pending.mkdir(parents=True, exist_ok=True)
                 return write()
             except OSError as error:
-                if is_last or not _was_removed(error, self._pending):
+                if is_last or not (isinstance(error, BlockingIOError) or _was_removed(error, self._pending)):
                     raise StorageError(f"{failed}: {error.strerror}") from None
 
-    def _fold(self, table: pd.DataFrame, read: list[Path], table_id: FileId | None) -> bool:
-        """Replace ``rows.parquet`` by ``table``, and delete the small files that were read.
+    def _fold(self, table: pd.DataFrame, read: list[Path]) -> None:
+        """Replace ``rows.parquet`` by ``table``, then delete the small files that were read.
 
-        Returns False if another run has replaced ``rows.parquet`` meanwhile, so that its rows have to be read first.
+        A file of which some rows were left out is kept under another name.
         """
         buffer = io.BytesIO()
         table.to_parquet(buffer, index=False, compression="zstd")
-        # the rows are in one new file before the old files are deleted, so a kill at any moment loses none
-        part = self._write_pending("parquet", buffer.getvalue())
+        for path in [self._table, *read]:
+            if path in self._spoilt:
+                other = self.directory / f"left_out-{uuid.uuid4().hex[:8]}{path.suffix}"
+                write_whole(other, path.read_bytes())
+                print(f"bench: '{path}' is kept as '{other}', since some of its rows are left out", file=sys.stderr)
+        write_whole(self._table, buffer.getvalue())
         for path in read:
-            self._discard(path, path)
-        aside = self._pending / f"{uuid.uuid4().hex}.parquet"
-        try:
-            with suppress(FileNotFoundError):
-                # moved aside first: only then is it certain which file is being replaced
-                os.rename(self._table, aside)
-                if _file_id(aside) != table_id:
-                    return False
-            link_exclusively(part, self._table)
-            sync_directory(self.directory)
-        except (FileExistsError, FileNotFoundError):
-            return False  # another run was faster, or has merged this file into its own
-        except OSError as error:
-            raise StorageError(
-                f"'{self._table}' cannot be written: {error.strerror}; its rows are in '{part}'"
-            ) from None
-        part.unlink(missing_ok=True)
-        self._discard(self._table, aside)
-        return True
-
-    def _discard(self, path: Path, place: Path) -> None:
-        """Delete a merged file, which is at ``place`` now. If some of its rows were left out, it is kept under another name."""
-        if path not in self._spoilt:
-            place.unlink(missing_ok=True)
-            return
-        other = self.directory / f"left_out-{uuid.uuid4().hex[:8]}{path.suffix}"
-        with suppress(FileNotFoundError):
-            os.rename(place, other)
-            print(f"bench: '{path}' is kept as '{other}', since some of its rows are left out", file=sys.stderr)
-        self._spoilt.discard(path)
+            path.unlink(missing_ok=True)
+        self._spoilt.clear()
 
 
 def sort_rows(table: pd.DataFrame, keys: Sequence[str]) -> pd.DataFrame:
@@ -292,16 +280,6 @@ def _was_removed(error: OSError, folder: Path) -> bool:
     """
     gone = isinstance(error, FileNotFoundError) or (isinstance(error, FileExistsError) and not os.path.lexists(folder))
     return gone and folder.parent.is_dir()
-
-
-def _is_complete(before: Mapping[Path, FileId], after: Mapping[Path, FileId]) -> bool:
-    """Return whether the files listed before reading contained all rows, given the files listed after reading.
-
-    A listing is not a snapshot: rows merged while reading may be missing from both the small files and the table. In that
-    case a file was removed or replaced, or there is a new Parquet file. New JSON files only contain rows stored since.
-    """
-    added = after.keys() - before.keys()
-    return before.items() <= after.items() and not any(path.suffix == ".parquet" for path in added)
 
 
 def _file_id(path: Path) -> FileId:

@@ -11,11 +11,6 @@ import jax.numpy as jnp
 
 from bench.model.ops import Array
 
-Activation = Any
-ACTIVATIONS = {"elu": jax.nn.elu, "tanh": jnp.tanh, "relu": jax.nn.relu, "silu": jax.nn.silu}
-"""Activation functions by name."""
-
-
 SMALLEST_VARIANCE = 1e-5
 """Added to the variance of a hidden layer, so that equal outputs do not divide by 0."""
 
@@ -29,26 +24,21 @@ class Network(eqx.Module):
 
     weights: list[Array]
     biases: list[Array]
-    activation: str = eqx.field(static=True)
 
-    def __init__(
-        self, key: Array, sizes: Sequence[int], dtype: Any, activation: str = "elu", last_gain: float = 1.0
-    ) -> None:
-        """Draw orthogonal weights with gain sqrt(2), ``last_gain`` in the last layer; biases are 0."""
+    def __init__(self, key: Array, sizes: Sequence[int], dtype: Any) -> None:
+        """Draw orthogonal weights with gain sqrt(2), 1 in the last layer; biases are 0."""
         keys = jax.random.split(key, len(sizes) - 1)
-        gains = [2.0**0.5] * (len(sizes) - 2) + [last_gain]
+        gains = [2.0**0.5] * (len(sizes) - 2) + [1.0]
         self.weights = [
             jax.nn.initializers.orthogonal(gain)(k, (n_out, n_in), dtype)
             for k, gain, n_in, n_out in zip(keys, gains, sizes[:-1], sizes[1:], strict=True)
         ]
         self.biases = [jnp.zeros((n, 1), dtype) for n in sizes[1:]]
-        self.activation = activation
 
     def __call__(self, x: Array) -> Array:
         """Return the outputs ``(n_out, B)`` of ``x (n_in, B)``."""
-        function = ACTIVATIONS[self.activation]
         for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
-            x = function(weight @ x + bias)
+            x = jax.nn.elu(weight @ x + bias)
             x = (x - x.mean(axis=0)) / jnp.sqrt(x.var(axis=0) + SMALLEST_VARIANCE)
         return self.weights[-1] @ x + self.biases[-1]
 
@@ -60,10 +50,8 @@ class Actor(eqx.Module):
     log_deviation: Array
     """``(n_u, 1)``, the same for all observations."""
 
-    def __init__(
-        self, key: Array, sizes: Sequence[int], dtype: Any, activation: str = "elu", log_deviation: float = -1.0
-    ) -> None:
-        self.mean = Network(key, sizes, dtype, activation)
+    def __init__(self, key: Array, sizes: Sequence[int], dtype: Any, log_deviation: float = -1.0) -> None:
+        self.mean = Network(key, sizes, dtype)
         self.log_deviation = jnp.full((sizes[-1], 1), log_deviation, dtype)
 
     def sample(self, observation: Array, noise: Array) -> Array:

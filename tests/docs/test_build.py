@@ -53,5 +53,7 @@ def test_results_need_their_marks(tmp_path):
 
 
 def test_unknown_part_is_refused():
-    with pytest.raises(UserError, match="unknown part 'pages' \\(allowed: results, columns, figures, site, all\\)"):
+    with pytest.raises(
+        UserError, match="unknown part 'pages' \\(allowed: results, columns, verdicts, figures, site, all\\)"
+    ):
         build.main(["pages"])

@@ -3,6 +3,7 @@
 import collections
 import decimal
 import math
+import re
 import subprocess
 import sys
 
@@ -119,10 +120,18 @@ def test_adaptive_steps_are_considered_before_a_small_error_is_named():
     assert adaptive(calls=700).cause == "adaptive"
 
 
-def test_a_jump_beside_a_wrong_gradient_recommends_a_refined_cost():
-    report = bench.examine(lambda x: swing(x) + (x[0] > 0.701), START, grad=lambda x: 0.5 * slope(x), **QUICK)
-    assert report.status == 1
-    assert "refined=COST" in report.advice
+def test_a_refined_cost_is_recommended_where_it_bears_on_the_cause():
+    """A discretisation makes no constant factor."""
+
+    def examined(grad):
+        return bench.examine(lambda x: swing(x) + (x[0] > 0.701), START, grad=grad, **QUICK)
+
+    halved, bent = (
+        examined(lambda x: 0.5 * slope(x)),
+        examined(lambda x: slope(x) * [1.0, 1.0 + 0.2 * np.sin(9 * x[0])]),
+    )
+    assert (halved.cause, "refined=COST" in halved.advice) == ("wrong_factor", False)
+    assert (bent.cause, "refined=COST" in bent.advice) == ("missing_term", True)
 
 
 def test_refined_cost_shows_a_discretisation_gap_and_a_missing_term():
@@ -134,8 +143,9 @@ def test_refined_cost_shows_a_discretisation_gap_and_a_missing_term():
 def test_memory_overwritten_between_forward_and_backward_is_named_by_growth_or_by_a_second_gradient():
     grown = bench.examine(swing, START, grad=shared, horizons=[1, 2, 5, 20], **QUICK)
     assert (grown.status, grown.cause) == (1, "overwritten")
-    assert [one.steps for one in grown.growth] == [1, 2, 5, 20]
-    assert grown.growth[0].error < 1e-6 < grown.growth[1].error < grown.growth[-1].error
+    assert [one.steps for one in grown.explained.growth] == [1, 2, 5, 20]
+    errors = [one.error for one in grown.explained.growth]
+    assert errors[0] < 1e-6 < errors[1] < errors[-1]
     beside = bench.examine(swing, START, grad=shared, twin_grad=slope, **QUICK)
     assert (beside.status, beside.cause) == (1, "overwritten")
     assert "the second gradient is right" in beside.conclusion
@@ -179,7 +189,7 @@ def test_last_digits_that_vary_are_never_a_state():
             return np.nextafter(value, value + random.integers(-1, 2))
 
         report = bench.examine(cost, START, grad=slope, progress=False, calls=30)
-        assert (report.status, report.has_state) == (0, False), seed
+        assert (report.status, report.repeats.has_state) == (0, False), seed
 
 
 def test_noise_above_the_last_digits_is_a_fault_that_does_not_hide_another():
@@ -245,7 +255,7 @@ def test_errors_within_the_tolerance_are_warnings_with_their_size():
 
     strict = bench.examine(swing, START, grad=off, **QUICK)
     assert strict.status == 1
-    assert "theta[1] off by 0.1" in strict.conclusion
+    assert re.search(r"theta\[1\]: .* off by 0\.1", strict.conclusion)
     assert strict.size == pytest.approx(1e-3, rel=0.01)
     for tolerance in (2e-3, {"theta[1]": 2e-3}):
         report = bench.examine(swing, START, grad=off, tolerance=tolerance, **QUICK)
@@ -305,7 +315,7 @@ def test_an_exception_at_other_thetas_does_not_hide_an_error_at_theta():
     report = bench.examine(swing, START, grad=grad, **QUICK)
     assert report.status == 1
     assert report.cause in ("wrong_factor", "wrong_adjoint")
-    assert "7.53e4 times too large" in report.conclusion
+    assert "off by 7.5e6%" in report.conclusion
     assert "raised an exception" in str(report)
     assert all(len(text) < 400 for text in (*report.problems, *report.warnings))
 
@@ -375,7 +385,7 @@ def test_what_the_cost_prints_is_kept_and_counted(capsys):
 
     report = bench.examine(cost, START, grad=slope, progress=False, calls=20)
     assert capsys.readouterr().out == ""
-    assert report.printed.count == report.costs
+    assert report.printed.count == report.spent.costs
     assert "printed" in str(report)
 
 
@@ -407,7 +417,7 @@ def test_roughness_has_no_breaks():
 def test_breaks_have_their_place_in_theta():
     report = bench.examine(lambda x: x[0] + (x[0] > 0.701), START, grad=lambda x: [1.0, 0.0], **QUICK)
     np.testing.assert_allclose(report.breaks["theta[0]"], 0.701, atol=1e-6)
-    assert "theta = 0.701" in str(report)
+    assert "  0.701" in str(report)
 
 
 def test_the_table_and_the_text_recommend_the_same_method():
@@ -537,7 +547,7 @@ def test_the_error_of_one_number_that_its_group_may_hide_is_stated():
     report = examined(1.0)
     assert report.derivative == "right"
     assert 0 < report.hidden < 0.1
-    assert f"an error of one number below {number(100 * report.hidden)}%" in str(report)
+    assert f"an error of one number in a group below {number(100 * report.hidden)}%" in str(report)
     # a number of the first group that is a thousandth of the root mean square, and not one that hardly moves
     moves = np.abs(groups_of(ParameterTree(PLACES), np.abs(PLACES), 0)[0].vector / PLACES[:2500])
     slopes = np.abs(SIZES * np.cos(PLACES) * PLACES)[:2500]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import bench
-from bench.examine.findings import CAUSES
+from bench.examine.rules import RULES
 
 START = np.array([0.5, -1.0, 8.0])
 RANK = {"right": 0, "not shown": 1, "wrong": 2}
@@ -77,7 +77,7 @@ def examined(fault, **hints):
 def test_no_hint_softens_a_verdict(fault):
     plain = examined(fault)
     assert (plain.status, plain.derivative) == (1, "wrong"), str(plain)
-    assert {dataclasses.replace(plain, expect=cause).status for cause in CAUSES} == {1}
+    assert {dataclasses.replace(plain, expect=cause).status for cause in RULES} == {1}
     for name, hints in HINTS.items():
         report = examined(fault, **hints)
         assert RANK[report.derivative] >= RANK[plain.derivative], f"{name}\n{report}"

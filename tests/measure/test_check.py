@@ -1,14 +1,11 @@
 """The check of a gradient: each planted fault gets the name of its cause, and right gradients of hard costs get none."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-from bench.measure.gradcheck import EPS, TRUSTED, UNTRUSTED, VERDICTS, Options, check, judge, most_severe, roughness
+from bench.measure.gradcheck import EPS, TRUSTED, VERDICTS, Options, check, judge, most_severe, roughness
 from bench.measure.gradcheck.sampling import points, samples
 
-DOCUMENT = (Path(__file__).parents[2] / "docs" / "validation.md").read_text()
 THETA = np.array([0.3, 1.2, -0.7])
 UNIT = float(np.finfo(np.float64).eps)
 EXACT = 1e-7
@@ -99,13 +96,6 @@ def test_planted_fault_is_named_by_its_cause(name):
     found = check(planted, program, THETA)
     assert found.cause == cause, found.sentence()
     assert found.trusted == (cause in TRUSTED)
-
-
-def test_the_planted_faults_are_those_that_the_documents_list():
-    listed = (line.split("|")[1:3] for line in DOCUMENT.splitlines() if line.startswith("| `"))
-    planted = {cause.strip(" `"): names.strip() for cause, names in listed if cause.strip(" `") in VERDICTS}
-    for cause in {cause for cause, *_ in FAULTS.values()}:
-        assert planted[cause] == ", ".join(name for name, fault in FAULTS.items() if fault[0] == cause)
 
 
 def test_a_factor_is_one_though_rounding_spoils_its_ratios_and_a_few_roundings_are_no_staircase():
@@ -248,8 +238,7 @@ def test_cost_is_judged_without_a_gradient():
 
 
 def test_every_verdict_is_trusted_or_not():
-    assert set(TRUSTED) | set(UNTRUSTED) == set(VERDICTS)
-    assert not set(TRUSTED) & set(UNTRUSTED)
+    assert VERDICTS[-len(TRUSTED) :] == TRUSTED
     assert most_severe(["zero", "smooth", "kink"]) == "kink"
     assert most_severe(["zero", "smooth"]) == "smooth"
 

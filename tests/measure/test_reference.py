@@ -72,13 +72,6 @@ def test_stated_error_of_quadrature_counts_rounding():
     assert abs(found.gradient[0] - case.truth[0]) < found.error
 
 
-def test_narrow_event_is_seen():
-    """A bump .001 wide, which a rule of 256 points misses: reference 1, truth 1.4."""
-    case = ridge(bank.power(1), bank.bump(1.0, 0.001, 700.0), dim=1)
-    assert abs(case.truth[0] - 2.0) > 0.1
-    assert bank.excess(case, bank.certified(case, 1 << 18)) <= 1.0
-
-
 @pytest.mark.parametrize(("width", "at"), [(1.8e-4, 2.82), (3e-5, 2.0)])
 def test_spike_that_no_sample_meets_is_resolved(width, at):
     """Samples have the gradient .2 with no spread, and a rule with equal panels is off by up to the spike."""

@@ -136,7 +136,7 @@ def test_a_row_says_which_study_made_it_and_every_parameter_of_its_cell(study):
         assert set(told) == {"study", *cell.parts, "theta", "reference"}
 
 
-@pytest.mark.parametrize("step", range(1, 14))
+@pytest.mark.parametrize("step", range(1, 8))
 def test_compaction_cut_short_at_any_step_loses_nothing(tmp_path, monkeypatch, step):
     """Every change of the directory is a step; after ``step`` of them the process is gone."""
 
@@ -159,7 +159,7 @@ def test_compaction_cut_short_at_any_step_loses_nothing(tmp_path, monkeypatch, s
 
         return call
 
-    for name in ("rename", "link", "replace", "fsync"):
+    for name in ("replace", "fsync"):
         monkeypatch.setattr(store_module.os, name, cut(getattr(os, name)))
     monkeypatch.setattr(store_module.Path, "unlink", cut(store_module.Path.unlink))
     try:
@@ -167,30 +167,12 @@ def test_compaction_cut_short_at_any_step_loses_nothing(tmp_path, monkeypatch, s
     except Gone:
         pass
     else:
-        assert step >= 10, "so many steps are cut short"
+        assert step >= 6, "so many steps are cut short"
     monkeypatch.undo()
     assert keys(store) == [1, 2, 3, 4]
     store.compact()
     assert keys(store) == [1, 2, 3, 4]
     assert len(pd.read_parquet(tmp_path / "rows.parquet")) == 4
-
-
-def test_a_table_that_another_run_has_put_there_meanwhile_is_read_before_it_is_replaced(tmp_path, monkeypatch):
-    store, real = Store(tmp_path, COLUMNS), os.rename
-    store.append(row(1))
-    store.compact()
-    store.append(row(2))
-
-    def fold():
-        """Fold what the other run had read before the part with row 2 was there."""
-        table = pd.read_parquet(tmp_path / "rows.parquet")
-        pd.concat([table, table.assign(key=row(3)["key"])]).to_parquet(tmp_path / "other")
-        os.replace(tmp_path / "other", tmp_path / "rows.parquet")
-
-    overtake = once(fold)
-    monkeypatch.setattr(os, "rename", lambda path, to: (path.name == "rows.parquet" and overtake(), real(path, to))[1])
-    store.compact()
-    assert keys(store) == [1, 2, 3]
 
 
 def test_two_columns_of_one_name_are_refused(tmp_path):
@@ -284,26 +266,40 @@ def test_the_folder_of_small_files_may_go_while_a_file_is_added(tmp_path, monkey
     assert (tmp_path / "pending").is_dir()
 
 
-def test_a_file_folded_by_another_run_before_it_is_in_place_is_no_fault(tmp_path, monkeypatch):
-    """Both fold: the one that is slow finds its own file gone, into that of the other."""
-    store, other, real = Store(tmp_path, COLUMNS), Store(tmp_path, COLUMNS), os.link
+def test_a_merge_waits_for_that_of_another_run(tmp_path, monkeypatch):
+    """The other one merges when this one has made its table, and has to wait until it is in place."""
+    store, other, real = Store(tmp_path, COLUMNS), Store(tmp_path, COLUMNS), os.replace
     store.append(row(1))
-    overtake = once(other.compact)
-    monkeypatch.setattr(os, "link", lambda *words: (overtake(), real(*words))[1])
+    monkeypatch.setattr(store_module, "PATIENCE_S", 0.2)
+    refused = []
+
+    def overtake():
+        with pytest.raises(StorageError, match="cannot be locked"):
+            other.compact()
+        refused.append(True)
+
+    overtake = once(overtake)
+    monkeypatch.setattr(os, "replace", lambda *words: (overtake(), real(*words))[1])
     store.compact()
+    assert refused
     assert keys(store) == [1]
     assert [path.name for path in tmp_path.iterdir()] == ["rows.parquet"]
 
 
-def test_rows_that_a_listing_has_missed_in_both_places_are_read_again(tmp_path, monkeypatch):
-    """A folder is listed while it changes: an old file may be gone already, and the new one not be there yet."""
-    store, real = Store(tmp_path, COLUMNS), os.listdir
+def test_rows_that_are_merged_while_files_are_listed_are_read(tmp_path, monkeypatch):
+    """There is no table yet when it is searched for, and the small file is gone right after."""
+    store, real = Store(tmp_path, COLUMNS), store_module._file_id
     store.append(row(1))
-    old = [path.name for path in (tmp_path / "pending").iterdir()]
-    store._write_pending("parquet", pd.DataFrame(store.load()).to_parquet(index=False))
-    (tmp_path / "pending" / old[0]).unlink()
-    first = [[]]
-    monkeypatch.setattr(os, "listdir", lambda path: first.pop() if first else real(path))
+    overtake = once(Store(tmp_path, COLUMNS).compact)
+
+    def file_id(path):
+        try:
+            return real(path)
+        finally:
+            if path.name == "rows.parquet":
+                overtake()
+
+    monkeypatch.setattr(store_module, "_file_id", file_id)
     assert keys(store) == [1]
 
 
@@ -318,38 +314,20 @@ def test_a_folder_that_may_not_be_read_is_not_taken_for_an_empty_one(tmp_path, m
         Store(tmp_path, COLUMNS).load()
 
 
-@pytest.fixture(params=["with exclusive renames", "without"])
-def no_hard_links(request, monkeypatch):
-    """A file system that has no hard links, and perhaps no renames that refuse to overwrite."""
-
+def test_a_file_system_without_locks_keeps_the_small_files(tmp_path, monkeypatch):
     def refuse(*_):
-        raise OSError(errno.EPERM, "not permitted")
+        raise OSError(errno.ENOLCK, "No locks available")
 
-    monkeypatch.setattr(os, "link", refuse)
-    if request.param == "without":
-        monkeypatch.setattr(files.ctypes, "CDLL", lambda *_, **more: object())
-
-
-def test_a_file_system_without_hard_links(tmp_path, no_hard_links):
-    store = Store(tmp_path, COLUMNS)
-    store.append(row(1))
+    monkeypatch.setattr(store_module.fcntl, "flock", refuse)
+    store = Store(tmp_path, COLUMNS, "mine")
+    store.prepare()
+    store.append(row(1, study="mine"))
+    with pytest.raises(StorageError, match="has no locks"):
+        store.compact()
+    assert keys(store) == [1]
+    monkeypatch.undo()
     store.compact()
-    store.append(row(2))
-    store.compact()
-    assert len(pd.read_parquet(tmp_path / "rows.parquet")) == 2
-
-
-def test_without_hard_links_nothing_of_another_run_is_overwritten(tmp_path, no_hard_links):
-    mine, other = tmp_path / "part", tmp_path / "rows.parquet"
-    mine.write_text("mine")
-    other.write_text("other")
-    with pytest.raises(FileExistsError, match="File exists"):
-        files.link_exclusively(mine, other)
-    assert (mine.read_text(), other.read_text()) == ("mine", "other")
-    with pytest.raises(FileNotFoundError):
-        files.link_exclusively(tmp_path / "gone", tmp_path / "new")
-    files.link_exclusively(mine, tmp_path / "new")
-    assert (tmp_path / "new").read_text() == "mine"
+    assert [path.name for path in tmp_path.iterdir()] == ["rows.parquet"]
 
 
 # ------------------------------------------------------------------------------------------------ commands

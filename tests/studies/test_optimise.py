@@ -649,10 +649,9 @@ def test_quality_along_the_path_is_summed_up_over_seeds():
         path_quality_cosine=[[1.0, 0.9, 0.5]] * 3,
     )
     lines = aggregate.path_quality(aggregate.RunSet(rows, ()))
-    error = lines[lines["quantity"] == "rmse_rel"]
-    assert error["iteration"].tolist() == [0, 10, 20]
-    assert error["value"].tolist() == pytest.approx([0.1, 0.3, 0.6])
-    assert error["low"].iloc[2] == pytest.approx(np.quantile([0.4, 0.8, 0.6], 0.2))
+    assert lines["iteration"].tolist() == [0, 10, 20]
+    assert lines["value"].tolist() == pytest.approx([0.1, 0.3, 0.6])
+    assert lines["low"].iloc[2] == pytest.approx(np.quantile([0.4, 0.8, 0.6], 0.2))
     chart = shown._path_quality(aggregate.RunSet(rows, ()))
     assert chart.frame["value"].tolist() == pytest.approx([0.1, 0.3, 0.6])
     assert chart.frame["cosine_value"].tolist() == pytest.approx([1.0, 0.9, 0.5])

@@ -84,9 +84,7 @@ def cell(tmp_path, *words):
     return cells(experiment(tmp_path, *words))[0]
 
 
-LIMITS = stability.StabilityLimits(
-    **{name: getattr(Stability(), name) for name in stability.StabilityLimits.__annotations__}
-)
+LIMITS = Stability()
 
 
 def measured(found: Cell, given):

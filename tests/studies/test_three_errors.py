@@ -16,13 +16,12 @@ from bench.cli import main
 from bench.experiment import config
 from bench.experiment.grid import cells
 from bench.model import compose
-from bench.report.views import arrange
+from bench.report.shown import Shown
 from bench.run.store import Store
 from bench.studies.three_errors import measure
 from bench.studies.three_errors.columns import COLUMNS
 from bench.studies.three_errors.measure import difference_check
-from bench.studies.three_errors.sections import sections, traps
-from bench.studies.three_errors.views import FLOOR, OWN, TRAP, views
+from bench.studies.three_errors.views import FLOOR, OWN, PROGRAM, TRAP, traps, views
 
 NO_IMPACT = Impulse(time_of_impact=False)
 
@@ -103,8 +102,9 @@ def test_from_the_command_line(tmp_path, capsys):
         assert (tmp_path / "small" / f"three_errors.{name}").stat().st_size > 0
     printed = capsys.readouterr().out
     assert "right signs" in printed
-    assert printed.count("Trap: ") == 1
-    assert "Trap: bounce_once, impulse[time_of_impact=false]" in printed
+    assert "Traps" in printed
+    trapped = pd.read_csv(tmp_path / "small" / "three_errors_traps.csv")
+    assert set(trapped["problem"]) == {"bounce_once, impulse[time_of_impact=false]"}
     rows = Store(tmp_path / "small", COLUMNS).load()
     trap = rows[rows["contact"].str.contains("false")]
     assert (trap["program_error_rel"] < 1e-9).all()
@@ -141,9 +141,9 @@ def test_a_trap_is_exact_convergent_and_turned_away_or_no_nearer_at_every_step(c
     rows = pd.DataFrame([COLUMNS.blank() | cell.columns() for cell in cells(given)]).assign(status="ok", reason="")
     values = {"program_error_rel": [1e-12, 1e-13], "model_cosine": [-0.5, -0.4], "forward_error_rel": [0.4, 0.1]}
     values |= {"model_error_rel": [1.5, 0.5]}
-    shown = arrange(given, COLUMNS.typed(rows.assign(**(values | change))))
-    assert len(traps(shown, sections(shown))) == trapped
-    found = views(given, shown.rows)
+    typed = COLUMNS.typed(rows.assign(**(values | change)))
+    assert len(traps(Shown(given, typed, ["dt"], ["estimator"], PROGRAM))) == 3 * trapped
+    found = views(given, typed)
     assert (set(found.charts[0].frame["series"]) == {OWN, TRAP}) == trapped
 
 
@@ -165,7 +165,7 @@ def test_gradients_are_drawn_once_whatever_estimates_them_and_only_where_compare
     drawn = found.charts[0].plotted()
     zero = drawn[drawn["error"] == FLOOR]
     assert list(zero["law"]) == ["impulse"]
-    assert zero["limit"].all()
+    assert zero["error_limit"].all()
     assert drawn["error"].notna().all()
     given, rows = laws(model)
     rows["status"], rows["reason"] = "unsupported", "no physics"

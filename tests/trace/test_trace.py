@@ -1,6 +1,5 @@
 """The trace of one rollout: adjoints, contacts, solver, the verdict on spikes, and the command."""
 
-import re
 from dataclasses import dataclass
 
 import numpy as np
@@ -200,7 +199,7 @@ def test_the_feet_of_an_engines_robot_are_named_and_carry_its_weight(scene, tmp_
     assert result.gradient_error < 1e-5
     said = " ".join(result.report())
     assert first in said
-    assert "Contact switches, by step" in said
+    assert "switches, by step" in said
     labels = [text.get_text() for ax in chart(result).axes for text in ax.get_yticklabels()]
     assert {name.removeprefix("touches_") for name in feet if table[name].any()} <= set(labels)
 
@@ -210,7 +209,7 @@ def test_a_spike_is_listed_with_the_switch_beside_it():
     table, error = trace(compiled(scene, Penalty(stiffness=2e3)), np.zeros((3, 1)))
     said = " ".join(report(table, error))
     (at,) = (k for k in np.flatnonzero(table["switch"]) if "touches" in table["switched"][k])
-    assert re.search(rf"at steps? {at} \([0-9.]+x, contact touches", said)
+    assert f"step {at}: contact touches" in said
 
 
 @pytest.mark.slow
@@ -310,31 +309,24 @@ def test_spikes_at_switches_line_up():
     # two of two draws from the 6 near steps out of 100
     assert found.p_value == pytest.approx(6 * 5 / (100 * 99))
     said = verdict(table)
-    assert "no spike" in said[0]
-    assert said[1].endswith("Spikes line up with contact switches.")
+    assert "no spikes" in said[0]
+    assert ": spikes line up with contact switches (" in said[1]
 
 
 def test_spikes_away_from_switches_do_not():
     table = planted(spike_at=(10, 80), switch_at=(30, 60))
     found = align(table["adjoint_norm"], table["switch"])
     assert (found.spikes, found.near, found.p_value) == (2, 0, 1.0)
-    assert verdict(table)[1].endswith("No spike lines up with a contact switch.")
+    assert "spikes do not line up" in verdict(table)[1]
 
 
 def test_one_spike_among_many_switches_is_left_open():
     said = verdict(planted(spike_at=(30,), switch_at=range(10, 90, 5)))
-    assert said[1].endswith("chance could explain that.")
+    assert "chance could explain it" in said[1]
 
 
-def test_no_contact_and_no_switch_are_said():
-    (said,) = verdict(planted(spike_at=(30,)))
-    assert said.startswith("No contact in this rollout")
-    table = planted(spike_at=(30,))
-    table["contacts"] = 1
-    (said,) = verdict(table)
-    assert said.startswith("Contact never switches")
-    table = planted().assign(force=2.0)
-    assert "forces of up to 2 N act from a distance" in verdict(table)[0]
+def test_no_switch_is_said():
+    assert all("no contact switches" in line for line in verdict(planted(spike_at=(30,))))
 
 
 def test_by_chance_the_p_value_is_honest():
@@ -367,7 +359,7 @@ def test_command_writes_table_and_chart(tmp_path, capsys):
     ]  # fmt: skip
     assert main(words) == 0
     printed = capsys.readouterr().out
-    assert "Spikes line up with contact switches." in printed
+    assert ": spikes line up with contact switches (" in printed
     for scene, steps in (("pushing", 60), ("double_integrator", 20)):
         directory = tmp_path / "trace" / scene
         assert sorted(path.name for path in directory.iterdir()) == [

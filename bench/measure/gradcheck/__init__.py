@@ -1,23 +1,19 @@
 """Gradient checks: pure functions of a cost and a gradient, independent of problems."""
 
-from .check import AGREES, Check, Options, Part, check
-from .direction import EPS, FINE, SHORT_WINDOW, WINDOW, Finding, Sample, best, diagnose, judge
+from .check import Check, Options, Part, check, settle
+from .direction import EPS, FINE, Finding, Sample, best, diagnose, judge
 from .sampling import order, points, repeats, samples
-from .verdicts import BROKEN, FAULTS, MEANING, TRUSTED, UNDECIDED, UNTRUSTED, VERDICTS, most_severe
+from .verdicts import BROKEN, FAULTS, MEANING, TRUSTED, UNDECIDED, VERDICTS, most_severe
 
 __all__ = [
-    "AGREES",
     "BROKEN",
     "EPS",
     "FAULTS",
     "FINE",
     "MEANING",
-    "SHORT_WINDOW",
     "TRUSTED",
     "UNDECIDED",
-    "UNTRUSTED",
     "VERDICTS",
-    "WINDOW",
     "Check",
     "Finding",
     "Options",
@@ -32,4 +28,5 @@ __all__ = [
     "points",
     "repeats",
     "samples",
+    "settle",
 ]  # fmt: skip

@@ -150,16 +150,12 @@ class Check:
     def sentence(self) -> str:
         """Return the verdict in one sentence, with the numbers of the worst part."""
         text = f"{self.cause}: {MEANING[self.cause]}"
-        if not self.worst_parts:
+        if self.trusted or not self.worst_parts:
             return text
         part = max(self.worst_parts, key=lambda p: (p.component is not None, np.nan_to_num(p.error, nan=np.inf)))
-        if self.cause == "kink":
-            return f"{text}; {part.name}: slopes {part.left:.6g} and {part.right:.6g}, the program's {part.program:.6g}"
-        if self.trusted:
-            return text
         return (
-            f"{text}; {part.name}: the program's {part.program:.6g}, differences {part.difference:.6g} "
-            f"+- {part.uncertainty:.1g} at a step of {part.step:.1g} (ratio {part.ratio:.6g})"
+            f"{text}; {part.name}: the program's {part.program:.6g}, differences {part.difference:.6g} +- {part.uncertainty:.1g} "
+            f"at a step of {part.step:.1g} (ratio {part.ratio:.6g}), slopes {part.left:.6g} and {part.right:.6g}"
         )
 
 
@@ -189,6 +185,30 @@ def check(
     Raises :class:`TypeError` for complex costs or gradients and :class:`ValueError` for wrong shapes.
     """
     return _Checker(cost, gradient, np.array(theta, dtype=np.float64), options or Options(), modes, tangent).run()
+
+
+def settle(
+    cost: Cost,
+    theta: np.ndarray,
+    vector: np.ndarray,
+    length: float,
+    sample: Sample,
+    finding: Finding,
+    tangent: Tangent | None,
+) -> tuple[Finding, float]:
+    """Return the finding on an unsettled direction from smaller steps or from the tangent, and the step it is from."""
+    values = cost(points(theta[:, None], vector[:, None], sample.unit, FINE)).reshape(1, -1)
+    (fine,) = samples(
+        values, np.array([length]), np.array([sample.derivative]), sample.unit, FINE, doubts=np.array([sample.doubt])
+    )
+    better = judge(fine)
+    if better.verdict != "unsettled":
+        return replace(better, index=min(better.index, sample.step.size - 1)), float(fine.step[better.index])
+    step = float(sample.step[finding.index])
+    slope = float("nan") if tangent is None else tangent(theta, vector) / length
+    if abs(slope - sample.derivative) <= AGREES * abs(slope):
+        return replace(finding, verdict="nonlinear", difference=slope, uncertainty=AGREES * abs(slope)), step
+    return finding, step
 
 
 class _Checker:
@@ -359,8 +379,9 @@ class _Checker:
             findings = self._with_staircases(thetas, vectors, measured, findings)
             for m, finding in enumerate(findings):
                 if finding.verdict == "unsettled" and self._gradient is not None:
-                    findings[m], steps[m] = self._settle(
-                        thetas[:, m], vectors[:, m], float(lengths[m]), measured[m], finding
+                    place = thetas[:, m], vectors[:, m]
+                    findings[m], steps[m] = settle(
+                        self.cost, *place, float(lengths[m]), measured[m], finding, self._tangent
                     )
         for m, finding in enumerate(findings):
             apart = abs(finding.difference - measured[m].derivative) * float(lengths[m])
@@ -372,25 +393,6 @@ class _Checker:
             replace(_part(names[m], components[m], sample, finding, modes[m]), step=steps[m])
             for m, (sample, finding) in enumerate(zip(measured, findings, strict=True))
         ]
-
-    def _settle(
-        self, theta: np.ndarray, vector: np.ndarray, length: float, sample: Sample, finding: Finding
-    ) -> tuple[Finding, float]:
-        """Return the finding on an unsettled direction from smaller steps or from the tangent, and the step it is from."""
-        at = points(theta[:, None], vector[:, None], self.unit, FINE)
-        values = self.cost(at).reshape(1, -1)
-        (fine,) = samples(
-            values, np.array([length]), np.array([sample.derivative]), self.unit, FINE, doubts=np.array([sample.doubt])
-        )
-        better = judge(fine)
-        if better.verdict != "unsettled":
-            return replace(better, index=min(better.index, sample.step.size - 1)), float(fine.step[better.index])
-        step = float(sample.step[finding.index])
-        if self._tangent is not None:
-            slope = self._tangent(theta, vector) / length
-            if abs(slope - sample.derivative) <= AGREES * abs(slope):
-                return replace(finding, verdict="nonlinear", difference=slope, uncertainty=AGREES * abs(slope)), step
-        return finding, step
 
     def _has_loose_solver(self, theta: np.ndarray, gradient: np.ndarray, apart: float) -> bool:
         """Return whether small jumps of the cost explain an error ``apart`` of a slope in units of the inputs' scales.

@@ -25,8 +25,8 @@ MEASURED = 8.0
 """Allowed error of a cost whose noise is measured, in standard deviations of the noise and in unit roundoffs."""
 RISE = 0.01
 """Relative error above which the difference at a large step counts as inaccurate."""
-WINDOW = 7
-"""Neighbouring steps (three decades) over which the change of slope at a kink must be constant."""
+DECADES = 3.0
+"""Decades of steps over which the change of slope at a kink must be constant."""
 SHORT_WINDOW = 4
 """Neighbouring steps over which a slope must be constant in an exploding rollout, and a jump at the smallest steps."""
 ALIKE = 0.1
@@ -176,7 +176,7 @@ def _judge(sample: Sample) -> Finding:
     if _has_jump(sample, noise):
         return _finding(sample, "jump", sample.step.size - 1, float("nan"))
     bend = sample.right - sample.left
-    kink = _last_stable_index(bend, 2.0 * noise)
+    kink = _last_stable_index(sample.step, bend, 2.0 * noise)
     if kink is not None:
         return _finding(
             sample, "kink" if _is_between_slopes(sample, noise) else _classify_wrong(sample), kink, float(noise[kink])
@@ -323,21 +323,22 @@ def _has_jump(sample: Sample, noise: np.ndarray) -> bool:
     return False
 
 
-def _last_stable_index(values: np.ndarray, noise: np.ndarray) -> int | None:
+def _last_stable_index(step: np.ndarray, values: np.ndarray, noise: np.ndarray) -> int | None:
     """Return the last index of the last window of values that is constant to within ``ALIKE`` and exceeds the noise.
 
-    None without such a window. A window does not count where values at smaller steps contradict it by more than their
-    own noise.
+    A window is :data:`DECADES` of steps long. None without such a window. A window does not count where values at smaller
+    steps contradict it by more than their own noise.
     """
-    windows, noises = _windows(values, WINDOW), _windows(noise, WINDOW).max(axis=1)
+    size = min(1 + round(DECADES / float(np.log10(step[0] / step[1]))), values.size)
+    windows, noises = _windows(values, size), _windows(noise, size).max(axis=1)
     middles = np.median(windows, axis=1)
     for start in range(len(windows) - 1, -1, -1):
         middle = float(middles[start])
         if np.ptp(windows[start]) > ALIKE * abs(middle) or abs(middle) <= noises[start]:
             continue
-        after = slice(start + WINDOW, None)
+        after = slice(start + size, None)
         if (np.abs(values[after] - middle) <= ALIKE * abs(middle) + 2.0 * noise[after]).all():
-            return start + WINDOW - 1
+            return start + size - 1
     return None
 
 

@@ -70,19 +70,19 @@ def component_table(rows: pd.DataFrame) -> pd.DataFrame:
 def by_point(rows: pd.DataFrame) -> pd.DataFrame:
     """Return one line per cell and point: its worst verdict, and the largest error among its checks, with the eps.
 
-    The error of a check is the smallest over all eps. ``row`` is the position of the cell in ``rows``. ``problem`` is a
-    number, the same for cells with equal parameters of scene, contact law and integrator.
+    The error of a check is the smallest over all eps. ``row`` is the position of the cell in ``rows``, whose other columns
+    follow. ``problem`` is a number, the same for cells with equal parameters of scene, contact law and integrator.
     """
-    lines = []
-    shown = ("scene", "contact", "integrator", "backend", "horizon", "dtype", "key", "command")
-    for row, i, verdict in checks(rows.assign(row=range(len(rows)), problem=problem_numbers(rows, PROBLEM))):
-        cell = {name: row[name] for name in (*shown, "row", "problem")}
-        result = {"verdict": verdict, "error": row["check_error"][i], "eps": row["check_eps"][i]}
-        lines.append(cell | {"point": row["point"][i], "rank": VERDICTS.index(verdict)} | result)
-    names = [*shown, "row", "problem", "point", "verdict", "error", "eps", "rank"]
-    table = pd.DataFrame(lines, columns=names)
+    cells = rows.reset_index(drop=True).assign(problem=problem_numbers(rows, PROBLEM).to_numpy())
+    lines = [
+        {"row": row["row"], "point": row["point"][i], "verdict": verdict, "rank": VERDICTS.index(verdict),
+         "error": row["check_error"][i], "eps": row["check_eps"][i]}
+        for row, i, verdict in checks(cells.assign(row=cells.index))
+    ]  # fmt: skip
+    table = pd.DataFrame(lines, columns=["row", "point", "verdict", "rank", "error", "eps"])
     table = table.sort_values(["rank", "error"], ascending=[True, False], kind="stable")
-    return table.drop_duplicates(["row", "point"]).sort_index()
+    table = table.drop_duplicates(["row", "point"]).sort_index()
+    return table.join(cells.drop(columns=table.columns, errors="ignore"), on="row")
 
 
 UNDER_NOISE = "noise"

@@ -77,7 +77,7 @@ def measure(cell: Cell, session: Session, search: SwitchSearch) -> dict[str, Any
     checked = [_checked(place, *both, under_noise) for place, both in zip(places, samples, strict=True)]
     points = [
         *at_start(whole),
-        *(_settled(problem, unit, point, place) for point, place in zip(checked, places, strict=True)),
+        *(_settled(problem, point, place) for point, place in zip(checked, places, strict=True)),
     ]
     verdicts = [point.verdict for point in points]
     best = [gradcheck.best(point.sample) for point in points]
@@ -245,25 +245,21 @@ def _checked(place: Place, sample: gradcheck.Sample, sides: Sequence[tuple[str, 
     return Point(place.point, place.sample, place.number, verdict, sample, minus, plus, place.switch)
 
 
-def _settled(problem: Problem, unit: float, point: Point, place: Place) -> Point:
+def _settled(problem: Problem, point: Point, place: Place) -> Point:
     """Return the point with the verdict from smaller steps or a complex step, if the usual steps leave it unsettled."""
     if point.verdict != "unsettled":
         return point
     scale = scale_of(problem.program.theta0)
-    at = gradcheck.points(place.theta[:, None], scale * place.direction[:, None], unit, gradcheck.FINE)
-    w = np.repeat(place.w[:, None], at.shape[1], axis=1)
-    values = in_columns(
-        lambda both: problem.value(both[: at.shape[0]], both[at.shape[0] :]), np.concatenate([at, w]), COLUMNS_AT_ONCE
-    )
-    (fine,) = gradcheck.samples(
-        values.reshape(1, -1), np.array([scale]), np.array([point.sample.derivative]), unit, gradcheck.FINE
-    )
-    verdict = gradcheck.diagnose(fine)
-    if verdict == "unsettled":
-        slope = tangent(problem, place.theta, place.direction, place.w)
-        if abs(slope - point.sample.derivative) <= gradcheck.AGREES * abs(slope):
-            verdict = "nonlinear"
-    return replace(point, verdict=verdict)
+
+    def cost(at: np.ndarray) -> np.ndarray:
+        both = np.concatenate([at, np.repeat(place.w[:, None], at.shape[1], axis=1)])
+        return in_columns(lambda part: problem.value(part[: len(at)], part[len(at) :]), both, COLUMNS_AT_ONCE)
+
+    finding, _ = gradcheck.settle(
+        cost, place.theta, scale * place.direction, scale, point.sample, gradcheck.Finding("unsettled"),
+        lambda theta, vector: tangent(problem, theta, vector, place.w),
+    )  # fmt: skip
+    return replace(point, verdict=finding.verdict)
 
 
 def beyond_stability(cell: Cell) -> list[str]:

@@ -128,7 +128,7 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
 
 def fits_of(rows: pd.DataFrame) -> pd.DataFrame:
     """Return one line per problem, optimizer, seed and shooting method; ``row`` is the position of the cell."""
-    kept = ["row", "problem", "scene", "integrator", "rank", "condition", "fits", "explained"]
+    kept = ["row", "problem", "scene", "integrator", "condition", "fits", "explained"]
     lines = rows[[*kept, "shooting", *STATISTICS]].explode(["shooting", *STATISTICS], ignore_index=True)
     lines = lines.astype(dict.fromkeys(STATISTICS, float))
     low, high = error_interval(lines["error"], lines["converged"] * lines["fits"])

@@ -369,22 +369,21 @@ def rank_correlations(points: pd.DataFrame) -> pd.DataFrame:
 def path_quality(runs: RunSet) -> pd.DataFrame:
     """Return the median, 20% and 80% quantile over seeds of the gradient's relative error and cosine along the path.
 
-    There is one line per problem, method, quantity and point of the path, and none if quality was measured only at the
-    start.
+    There is one line per problem, method and point of the path, and none if quality was measured only at the start.
     """
-    lines: list[tuple[Any, ...]] = []
+    parts = []
     for problem, method, part in runs.by_method():
-        paths = [row for _, row in part.iterrows() if len(_as_list(row["path_quality_iteration"])) > 1]
-        places = max((len(_as_list(row["path_quality_iteration"])) for row in paths), default=0)
-        whole = [row for row in paths if len(_as_list(row["path_quality_iteration"])) == places]
-        for quantity in ("rmse_rel", "cosine") if whole else ():
-            values = np.array([_as_list(row[f"path_quality_{quantity}"]) for row in whole], dtype=float)
-            moments = np.median(
-                np.array([_as_list(row["path_quality_iteration"]) for row in whole], dtype=float), axis=0
-            )
-            low, middle, high = np.quantile(values, [0.2, 0.5, 0.8], axis=0)
-            lines += [(problem, method, quantity, *values) for values in zip(moments, middle, low, high, strict=True)]
-    return pd.DataFrame(lines, columns=["problem", "method", "quantity", "iteration", "value", "low", "high"])
+        counts = part["path_quality_iteration"].map(lambda places: len(_as_list(places)))
+        if not counts.max() > 1:
+            continue
+        whole = part[counts == counts.max()]
+        line: dict[str, Any] = {"problem": problem, "method": method}
+        line["iteration"] = np.median(np.stack(whole["path_quality_iteration"]), axis=0)
+        for prefix, quantity in (("", "rmse_rel"), ("cosine_", "cosine")):
+            ends = np.quantile(np.stack(whole[f"path_quality_{quantity}"]), [0.2, 0.5, 0.8], axis=0)
+            line |= dict(zip((f"{prefix}low", f"{prefix}value", f"{prefix}high"), ends, strict=True))
+        parts.append(pd.DataFrame(line))
+    return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame()
 
 
 def _as_list(value: object) -> list[float]:

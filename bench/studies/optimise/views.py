@@ -294,14 +294,9 @@ def _tunings(runs: RunSet) -> list[Chart]:
 
 def _path_quality(runs: RunSet) -> Chart | None:
     """Return the gradient's error along the path; None if it was measured only at the start."""
-    lines = aggregate.path_quality(runs)
-    if lines.empty:
+    frame = aggregate.path_quality(runs)
+    if frame.empty:
         return None
-    errors = lines[lines["quantity"] == "rmse_rel"].drop(columns="quantity").reset_index(drop=True)
-    cosines = (
-        lines.loc[lines["quantity"] == "cosine", ["value", "low", "high"]].add_prefix("cosine_").reset_index(drop=True)
-    )
-    frame = errors.join(cosines)
     return Chart(
         "path_quality", frame, [Column("iteration", log=False)],
         [Column("value", label="relative error of a gradient", low="low", high="high", log=True),

@@ -63,10 +63,9 @@ class Stability(Study):
 
     def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
         """Return one cell's results by column: the verdict on its gradient, its errors and their cause."""
-        from bench.studies.stability.measure import StabilityLimits, measure
+        from bench.studies.stability.measure import measure
 
-        limits = StabilityLimits(self.diverged, self.grown, self.inaccurate, self.fine_steps, self.finer)
-        return measure(cell, session, limits)
+        return measure(cell, session, self)
 
     def views(self, experiment: Experiment, rows: pd.DataFrame) -> Views:
         """Return the tables of shares and limits, and the maps."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -41,18 +41,11 @@ REACH = np.logspace(-3, 4, 141)
 """Values of dt^2 stiffness that the search for the stability limit tries."""
 
 
-@dataclass(frozen=True)
-class StabilityLimits:
-    """Limits for diverged rollouts and wrong gradients, and steps of the refined truth: parameters of ``Stability``."""
-
-    diverged: float
-    grown: float
-    inaccurate: float
-    fine_steps: int
-    finer: int
+Settings = Any
+"""A ``Stability`` study: its parameters are the settings. Its module imports this module, so its type cannot be named."""
 
 
-def measure(cell: Cell, session: Session, limits: StabilityLimits) -> dict[str, Any]:
+def measure(cell: Cell, session: Session, limits: Settings) -> dict[str, Any]:
     """Return one cell's results by column, verdict included.
 
     Raises :class:`Unsupported` if the program has no time steps, step states or truth.
@@ -62,7 +55,7 @@ def measure(cell: Cell, session: Session, limits: StabilityLimits) -> dict[str, 
         return _measured(cell, program, session, limits)
 
 
-def _measured(cell: Cell, program: Rollout, session: Session, limits: StabilityLimits) -> dict[str, Any]:
+def _measured(cell: Cell, program: Rollout, session: Session, limits: Settings) -> dict[str, Any]:
     problem, scene = session.problem(cell), program.scene
     theta, still = program.theta0, np.zeros((problem.program.n_noise, 1))
     gradient = problem.grad(theta, still)[:, 0]
@@ -92,7 +85,7 @@ def _measured(cell: Cell, program: Rollout, session: Session, limits: StabilityL
 
 
 def first_bad_step(
-    states: np.ndarray, largest: np.ndarray, growth: float, limits: StabilityLimits
+    states: np.ndarray, largest: np.ndarray, growth: float, limits: Settings
 ) -> tuple[int, str, str] | None:
     """Return the first bad step of ``states (T + 1, n)`` with its verdict and a description, or None without a bad step.
 
@@ -152,7 +145,7 @@ def bounds(program: Rollout, trajectory: Trajectory, factor: float) -> np.ndarra
 # ---------------------------------------------------------------------------------------------------- truth
 
 
-def compute_truth(cell: Cell, limits: StabilityLimits) -> tuple[str, np.ndarray, float]:
+def compute_truth(cell: Cell, limits: Settings) -> tuple[str, np.ndarray, float]:
     """Return the kind of truth (``physical`` or ``refined``), the true gradient ``(d,)``, and its relative error."""
     program = rollout(cell.program())
     physical = program.physical_gradient()
@@ -237,9 +230,7 @@ step.
 """
 
 
-def cause_of(
-    cell: Cell, truth_kind: str, gradient: np.ndarray, truth: np.ndarray, limits: StabilityLimits
-) -> dict[str, Any]:
+def cause_of(cell: Cell, truth_kind: str, gradient: np.ndarray, truth: np.ndarray, limits: Settings) -> dict[str, Any]:
     """Return why a gradient is wrong: ``cause``, and ``step_error`` and ``law_error`` in units of the truth's norm.
 
     The law's own gradient is the gradient of the same law and integrator at a far smaller step. The step error is the
@@ -262,7 +253,7 @@ def cause_of(
     return {"cause": "both" if len(causes) == 2 else causes[0] if causes else "step" if step >= law else "law"} | errors
 
 
-def law_gradient(cell: Cell, limits: StabilityLimits) -> tuple[np.ndarray, np.ndarray]:
+def law_gradient(cell: Cell, limits: Settings) -> tuple[np.ndarray, np.ndarray]:
     """Return the gradient ``(d,)`` of the cell's law at a far smaller step, and the gradient with half as many steps.
 
     Both are central differences of the cost over :data:`SPAN` (twice that for the second). A derivative through a

@@ -14,7 +14,6 @@ from bench.experiment.experiment import Experiment
 from bench.experiment.parameters import flatten
 from bench.measure.performance import bootstrap, bootstrap_along, interquartile_mean
 from bench.report.problems import problem_names
-from bench.report.text import counted
 from bench.report.views import arrange, attempted
 
 PARTS = ("scene", "contact", "integrator", "backend")
@@ -52,7 +51,7 @@ def summarise(runs: pd.DataFrame) -> pd.DataFrame:
         cosines = np.concatenate([np.asarray(c, float) for c in part["cosine"]]) if len(part) else np.empty(0)
         lines.append({
             "problem": problem, "method": method, "family": part["family"].iloc[0], "seeds": len(part),
-            "failed": int((part["status"] != "ok").sum()), "final": interquartile_mean(final), "final_low": low,
+            "failed": int((part["status"] != "ok").sum()), "returns": final, "final": interquartile_mean(final), "final_low": low,
             "final_high": high, "worst": float(final.min()), "steps": float(part["steps"].max()),
             "train_s": float(part["train_s"].median()), "compile_s": float(part["compile_s"].max()),
             "gradient_typical": float(part["gradient_typical"].median()),
@@ -66,14 +65,19 @@ def summarise(runs: pd.DataFrame) -> pd.DataFrame:
 def ranked(lines: pd.DataFrame, by: Sequence[str]) -> pd.Series:
     """Return a verdict on the final return of each line of :func:`summarise` or :func:`windows`, within groups ``by``.
 
-    ``first``: the highest; ``tied``: its interval over seeds reaches the first one's; ``behind``: it does not; ``open``:
-    none of the group is behind; ``no result``: no run ended with a finite return.
+    ``first``: the highest; ``behind``: its runs end lower than those of the first, by the test of Mann and Whitney (1947)
+    at 5%; ``tied``: the test finds no difference; ``open``: none of the group is behind; ``no result``: no run ended with a
+    finite return.
     """
+    from scipy.stats import mannwhitneyu
+
     verdicts = pd.Series("no result", lines.index, dtype=object)
     has_ended = np.isfinite(lines["final"]) & (lines["failed"] < lines["seeds"] if "failed" in lines else True)
     for _, part in lines[has_ended].groupby(list(by), sort=False):
         best = part.loc[part["final"].idxmax()]
-        behind = part["final_high"] < best["final_low"]
+        behind = np.array([
+            len(one) >= MIN_SEEDS and mannwhitneyu(best["returns"], one).pvalue < LEVEL for one in part["returns"]
+        ])  # fmt: skip
         verdicts[part.index] = np.where(behind, "behind", "tied")
         verdicts[best.name] = "first"
         if len(part) > 1 and not behind.any():
@@ -81,20 +85,10 @@ def ranked(lines: pd.DataFrame, by: Sequence[str]) -> pd.Series:
     return verdicts
 
 
+LEVEL = 0.05
+"""Level of the test of a difference between two groups of runs."""
 MIN_SEEDS = 5
 """Fewest seeds for an interval: a resample cannot leave the range of its values, which covers too little for fewer."""
-
-
-def interval_words(runs: pd.DataFrame) -> str:
-    """Return what a mean over the seeds of runs is, and whether it has an interval, in words."""
-    counts = runs.groupby(["problem", "method"]).size()
-    least, most = int(counts.min()), int(counts.max())
-    seeds = counted(most, "seed") if least == most else f"{least} to {most} seeds"
-    if least >= MIN_SEEDS:
-        return f"interquartile mean over {seeds} with its 95% bootstrap interval"
-    if most < MIN_SEEDS:
-        return f"interquartile mean over {seeds}, too few for an interval"
-    return f"interquartile mean over {seeds}, with its 95% bootstrap interval where there are {MIN_SEEDS} or more"
 
 
 def interval(values: np.ndarray) -> tuple[float, float]:
@@ -145,7 +139,7 @@ def windows(runs: pd.DataFrame) -> pd.DataFrame:
         final = final_returns(part)
         low, high = interval(final)
         lines.append({
-            "problem": problem, "family": family, "window": window, "seeds": len(part),
+            "problem": problem, "family": family, "window": window, "seeds": len(part), "returns": final,
             **{name: float(part[name].median()) for name in ("window_bias", "window_bias_low", "window_bias_high")},
             "window_gradient": float(part["window_gradient"].median()), "gradient_typical": float(part["gradient_typical"].median()),
             "final": interquartile_mean(final), "final_low": low, "final_high": high,

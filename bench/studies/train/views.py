@@ -63,8 +63,10 @@ LOGARITHMIC = ("gradient_norm", "gradient_largest")
 MAX_LOGS = 4
 """Most trainers in the printed chart of logs, the best of each family; the page has all."""
 LINES = (*VARIANTS, *DEVIANT)
+SEEDS = f"interquartile mean over seeds, with its 95% bootstrap interval from {aggregate.MIN_SEEDS} seeds on"
 NOTE = (
-    "final return: the mean undiscounted return of the deterministic policy from the same starts, {seeds}. A run that is not finite counts as its untrained policy. training: "
+    f"final return: the mean undiscounted return of the deterministic policy from the same starts, {SEEDS}. A run that is not "
+    "finite counts as its untrained policy. training: "
     "median over seeds, without compilation and evaluations. gradient norm: median over updates before clipping, of the "
     "trainer's own objective, so compare it within a trainer only. cosine: between first- and zeroth-order gradients of the "
     "same objective along the runs, mean; noise in either lowers it."
@@ -72,7 +74,8 @@ NOTE = (
 WINDOW_NOTE = (
     "norm of the windows' gradient: of whole episodes from new starts, cut into windows that end in the critic's value, with the "
     "policy and critic halfway through the run, median over runs. bias: the distance from the gradient without cuts, relative "
-    "to it, with its 95% interval, each the median over runs. The policies differ between windows. final return: {seeds}."
+    "to it, with its 95% interval, each the median over runs. The policies differ between windows. "
+    f"final return: {SEEDS}."
 )
 FAULT_CODES = {
     "not_finite": "a quantity is not finite",
@@ -92,7 +95,7 @@ FAULT_CODES = {
 """What each code of a fault means."""
 FAULT_NOTE = "update: where it starts. factor: on the value before. peaks: updates with an explosion, with_contact: those with contact."
 VERDICTS = (
-    "verdict: first, tied (not distinguishable), behind (the intervals do not overlap), or open where none is behind."
+    "verdict: first, tied (not distinguishable), behind (by a Mann-Whitney test at 5%), or open where none is behind."
 )
 PAGE = ("final_return", "first_return", "final_median", "updates", "steps", "train_s", "compile_s", "gradient_typical",
         "gradient_peak", "window_gradient", "window_bias", "difference_error")  # fmt: skip
@@ -106,25 +109,32 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
         every = Table("train", rows, [text("scene"), text("trainer"), text("status")], data=data)
         return Views([every], remarks=reasons(rows))
     summary, windows, faults = aggregate.summarise(runs), aggregate.windows(runs), aggregate.faults(runs)
-    summary = summary.assign(verdict=aggregate.ranked(summary, ["problem"]))
-    seeds = aggregate.interval_words(runs)
+    summary = summary.assign(verdict=aggregate.ranked(summary, ["problem"])).drop(columns="returns")
     tables = [
-        Table("train", summary, SUMMARY, "final return by trainer", [NOTE.format(seeds=seeds), VERDICTS], terminal=True, page=True, data=data,
+        Table("train", summary, SUMMARY, "final return by trainer", [NOTE, VERDICTS], terminal=True, page=True, data=data,
               details=["compile_s", "gradient_typical", "gradient_peak"]),
         Table("summary", summary, [], files=["csv"]),
     ]  # fmt: skip
     if len(windows):
-        note = WINDOW_NOTE.format(seeds=seeds)
-        lines = windows.assign(verdict=aggregate.ranked(windows, ["problem", "family"]))
+        lines = windows.assign(verdict=aggregate.ranked(windows, ["problem", "family"])).drop(columns="returns")
         tables.append(
-            Table("windows", lines, WINDOWS, "Windows", [note], terminal=True, page=True, details=["gradient_typical"])
+            Table(
+                "windows",
+                lines,
+                WINDOWS,
+                "Windows",
+                [WINDOW_NOTE],
+                terminal=True,
+                page=True,
+                details=["gradient_typical"],
+            )
         )
     if len(faults):
         columns = [*FAULTS, *(Column(name) for name in faults if name not in {column.name for column in FAULTS})]
         tables.append(Table("faults", faults, columns, "Faults in the logs", _fault_notes(faults), page=True))
     cells = rows.assign(problem=runs["problem"], method=runs["method"]).fillna({"problem": "", "method": ""})
     by_name = experiment.columns.by_name
-    return Views(tables, _charts(runs, summary, windows, seeds), cells,
+    return Views(tables, _charts(runs, summary, windows), cells,
                  [METHOD, *(by_name[name] for name in PAGE)], reasons(rows))  # fmt: skip
 
 
@@ -141,28 +151,28 @@ def _styles(summary: pd.DataFrame) -> dict[str, Style]:
     }
 
 
-def _charts(runs: pd.DataFrame, summary: pd.DataFrame, windows: pd.DataFrame, seeds: str) -> list[Chart]:
+def _charts(runs: pd.DataFrame, summary: pd.DataFrame, windows: pd.DataFrame) -> list[Chart]:
     looks = _styles(summary)
     frame = aggregate.curves(runs)
     cost = replace(COST, log=bool((frame["cost"] > 0).all()))
     curves = [
         Chart(
             name, frame, [x], [cost], series="method", panel="problem", styles=looks, band=True,
-            subtitle=f"cost: minus the return; {seeds}", text="A line per trainer, at its evaluations.",
+            subtitle=f"cost: minus the return; {SEEDS}", text="A line per trainer, at its evaluations.",
         )
         for name, x in (("train", STEP), ("train_seconds", SECONDS))
     ]  # fmt: skip
     curves = [curves[0], *(chart for chart in curves[1:] if np.isfinite(frame["seconds"]).any())]
     charts = [*curves, *_logs(runs, summary, looks)]
     if len(windows):
-        charts.append(_windows(windows, seeds))
+        charts.append(_windows(windows))
     return charts
 
 
-def _windows(windows: pd.DataFrame, seeds: str) -> Chart:
+def _windows(windows: pd.DataFrame) -> Chart:
     return Chart(
         "windows", windows, [replace(WINDOW, log=True)], [FINAL, WINDOW_BIAS, WINDOW_GRADIENT], series="family", panel="problem",
-        subtitle=f"final return: {seeds}", text="A point per length of window. Choose the quantity.",
+        subtitle=f"final return: {SEEDS}", text="A point per length of window. Choose the quantity.",
     )  # fmt: skip
 
 
