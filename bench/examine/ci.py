@@ -6,15 +6,13 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from xml.etree import ElementTree
 
 from bench.errors import StorageError, UserError
-from bench.examine.text import table
+from bench.examine.findings import Findings
+from bench.examine.text import advice, conclusion, problems, table
 from bench.report.text import counted, duration, number
-
-if TYPE_CHECKING:
-    from bench.examine.report import Report
 
 GREW = 2.0
 """Ratio of the sizes of an error, or of numbers of calls, above which a change is reported."""
@@ -24,7 +22,7 @@ COLUMNS = ("cost", "result", "cause", "off by", "under noise", "costs", "gradien
 """Columns of the summary."""
 
 
-def summary(report: Report) -> dict[str, Any]:
+def summary(report: Findings) -> dict[str, Any]:
     """Return what a baseline stores of a report: its verdicts, the size of its error, and its calls."""
     size = report.size
     return {
@@ -52,7 +50,7 @@ def read_baseline(path: Path) -> dict[str, Any] | None:
     return dict(stored)
 
 
-def write_baseline(path: Path, report: Report) -> None:
+def write_baseline(path: Path, report: Findings) -> None:
     """Write the baseline of a report. Raises :class:`StorageError` if that fails."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -61,7 +59,7 @@ def write_baseline(path: Path, report: Report) -> None:
         raise StorageError(f"baseline={path} cannot be written: {error}") from None
 
 
-def differences(before: Mapping[str, Any], report: Report) -> tuple[list[str], bool]:
+def differences(before: Mapping[str, Any], report: Findings) -> tuple[list[str], bool]:
     """Return what changed since a baseline, as sentences, and whether something is worse.
 
     Worse is a problem that was not there before, or the same one with an error more than twice as large.
@@ -83,11 +81,11 @@ def differences(before: Mapping[str, Any], report: Report) -> tuple[list[str], b
     return changes, is_worse
 
 
-def row(report: Report) -> dict[str, str]:
+def row(report: Findings) -> dict[str, str]:
     """Return a report as a row of the summary."""
     spent, result = report.spent, RESULTS[report.status]
-    if report.status == 0 and (report.derivative == "none given" or report.problems):
-        result = "no gradient" if not report.problems else "as expected" if report.expect else "as before"
+    if report.status == 0 and (report.derivative == "none given" or problems(report)):
+        result = "no gradient" if not problems(report) else "as expected" if report.expect else "as before"
     return {
         "cost": report.name, "result": result, "cause": report.cause,
         "off by": number(100 * report.size) + "%" if report.gradient and math.isfinite(report.size) else "-",
@@ -96,34 +94,34 @@ def row(report: Report) -> dict[str, str]:
     }  # fmt: skip
 
 
-def _rows(reports: Sequence[Report], refused: Mapping[str, str]) -> list[dict[str, str]]:
+def _rows(reports: Sequence[Findings], refused: Mapping[str, str]) -> list[dict[str, str]]:
     """Return the rows of the summary, those of bad input last."""
     bad = [dict.fromkeys(COLUMNS, "-") | {"cost": name, "result": RESULTS[2]} for name in refused]
     return [*map(row, reports), *bad]
 
 
-def as_markdown(reports: Sequence[Report], refused: Mapping[str, str] | None = None) -> str:
+def as_markdown(reports: Sequence[Findings], refused: Mapping[str, str] | None = None) -> str:
     """Return a summary in Markdown: a table with a row per report, then the problems and changes of each."""
     refused = refused or {}
     lines = ["| " + " | ".join(COLUMNS) + " |", "|" + "---|" * len(COLUMNS)]
     lines += ["| " + " | ".join(map(_cell, cells.values())) + " |" for cells in _rows(reports, refused)]
     for report in reports:
-        texts = [*report.problems, *(f"since the baseline: {text}" for text in report.changes)]
-        if texts or report.advice:
+        texts = [*problems(report), *(f"since the baseline: {text}" for text in report.changes)]
+        if texts or advice(report):
             lines += ["", f"**{_cell(report.name)}**", ""]
             lines += [f"- {_cell(text)}" for text in texts]
-            lines += [f"- next: {_cell(report.advice)}"] if report.advice and report.status else []
+            lines += [f"- next: {_cell(advice(report))}"] if advice(report) and report.status else []
     lines += [f"\n**{_cell(name)}**\n\n- bad input: {_cell(text)}" for name, text in refused.items()]
     return "\n".join(lines) + "\n"
 
 
-def as_text(reports: Sequence[Report], refused: Mapping[str, str] | None = None) -> str:
+def as_text(reports: Sequence[Findings], refused: Mapping[str, str] | None = None) -> str:
     """Return the summary's table with aligned columns."""
     refused = refused or {}
     return "\n".join([*table("", _rows(reports, refused))[1:], *(f"{name}: {text}" for name, text in refused.items())])
 
 
-def as_junit(reports: Sequence[Report], refused: Mapping[str, str] | None = None) -> str:
+def as_junit(reports: Sequence[Findings], refused: Mapping[str, str] | None = None) -> str:
     """Return JUnit XML with a test case per report: wrong is a failure, not decided and bad input are errors."""
     refused = refused or {}
     failures = sum(report.status == 1 for report in reports)
@@ -138,7 +136,7 @@ def as_junit(reports: Sequence[Report], refused: Mapping[str, str] | None = None
         )  # fmt: skip
         if report.status:
             kind = "failure" if report.status == 1 else "error"
-            message = _xml_safe(report.problems[0] if report.problems else report.conclusion)
+            message = _xml_safe(problems(report)[0] if problems(report) else conclusion(report))
             ElementTree.SubElement(case, kind, type=report.cause, message=message).text = _xml_safe(str(report))
         else:
             ElementTree.SubElement(case, "system-out").text = _xml_safe(str(report))
@@ -149,14 +147,14 @@ def as_junit(reports: Sequence[Report], refused: Mapping[str, str] | None = None
     return ElementTree.tostring(root, encoding="unicode", xml_declaration=True) + "\n"
 
 
-def as_line(reports: Sequence[Report], refused: Mapping[str, str] | None = None) -> str:
+def as_line(reports: Sequence[Findings], refused: Mapping[str, str] | None = None) -> str:
     """Return the counts of results in one line."""
     results = [RESULTS[report.status] for report in reports] + [RESULTS[2]] * len(refused or {})
     kinds = [f"{results.count(kind)} {kind}" for kind in RESULTS.values() if kind in results]
     return f"{counted(len(results), 'cost')}: {', '.join(kinds)}"
 
 
-def status(reports: Sequence[Report], refused: Mapping[str, str] | None = None) -> int:
+def status(reports: Sequence[Findings], refused: Mapping[str, str] | None = None) -> int:
     """Return the exit status of several reports: 1 if one is wrong, else 2 for bad input, else 3 if one is not decided."""
     statuses = {report.status for report in reports} | ({2} if refused else set())
     return next((one for one in (1, 2, 3) if one in statuses), 0)

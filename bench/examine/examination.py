@@ -235,7 +235,7 @@ class _Examination:
         w = random.standard_normal((simulator.noise, 1)) if simulator.noise else None
         self.stages = GradientStages(simulator, setup.scale, clock, setup.seed, w, random)
 
-    def run(self, named: Mapping[str, str], twin: Any, twin_grad: Any, refined: Any) -> Report:
+    def run(self, named: Mapping[str, Any], twin: Any, twin_grad: Any, refined: Any) -> Report:
         """Run the checks that the budget allows, the decisive ones first, and return the report."""
         simulator, clock, stages, setup, explained = self.simulator, self.clock, self.stages, self.setup, self.explained
         stages.run(self._is_adaptive)

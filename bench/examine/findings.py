@@ -454,7 +454,8 @@ class Findings:
     @property
     def resolution(self) -> float:
         """The smallest relative error that the differences detect: at least u^(2/3), as for central differences."""
-        return max([self.unit ** (2 / 3), *(part.uncertainty / abs(part.difference) for part in self.resolved_parts)])
+        errors = [part.uncertainty / abs(part.difference) for part in self.resolved_parts]
+        return float(max([self.unit ** (2 / 3), *errors]))
 
     def recommended(self, one: Smoothed) -> Method | None:
         """Return the fastest usable method at a sigma; None if none is known."""

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
 
 from bench.examine.ci import as_junit, as_markdown
+from bench.examine.findings import Findings
 from bench.examine.smoothing import TARGET_ERROR
+from bench.examine.text import advice, conclusion, noise_answer
 from bench.experiment.columns import Column
 from bench.experiment.views import Chart, Mark
 from bench.report.draw import draw
@@ -18,9 +19,6 @@ from bench.report.figures import save, styled
 from bench.report.text import number
 from bench.report.web import shell
 from bench.run.files import make_directory, write_all, write_whole
-
-if TYPE_CHECKING:
-    from bench.examine.report import Report
 
 SHOWN = 8
 """Most components drawn: those with the largest errors."""
@@ -37,7 +35,7 @@ BODY = """<header>
 </main>"""
 
 
-def write(report: Report, directory: Path) -> list[Path]:
+def write(report: Findings, directory: Path) -> list[Path]:
     """Write the text, the tables, the charts and ``report.html`` into ``directory``, and return their paths.
 
     The files are ``report.txt``, ``summary.md``, ``junit.xml``, ``derivatives.csv``, ``sigmas.csv``, ``breaks.csv``, the
@@ -60,7 +58,9 @@ def write(report: Report, directory: Path) -> list[Path]:
     body = BODY.format(
         title=escape(title),
         state="bad" if report.status else "good",
-        verdict="<br>".join(escape(text) for text in (report.conclusion, report.noise_answer, report.advice) if text),
+        verdict="<br>".join(
+            escape(text) for text in (conclusion(report), noise_answer(report), advice(report)) if text
+        ),
         charts="\n".join(pictures),
         text=_wrapping(str(report)),
         table=report.frame.to_html(index=False, float_format=lambda x: number(x, 5), border=0),
@@ -75,7 +75,7 @@ def _wrapping(text: str) -> str:
     return "\n".join(line if row else f'<span class="sentence">{line}</span>' for line, row in lines)
 
 
-def charts(report: Report) -> list[Chart]:
+def charts(report: Findings) -> list[Chart]:
     """Return the charts for which the report has data: steps, lines and sigmas."""
     found = []
     if report.check is not None and report.gradient:

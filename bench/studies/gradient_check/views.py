@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from typing import Any
+
 import pandas as pd
 
 from bench.experiment.axes import with_axes
@@ -63,7 +66,8 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     ]  # fmt: skip
     charts = [] if points.empty else [_grid(points), _errors(shown)]
     columns = [experiment.columns.by_name[name] for name in ("verdict", "best_error", "best_eps")]
-    return Views(tables, charts, shown.rows, columns, [*faults, *reasons(rows)])
+    switches = dict.fromkeys(f"contact switch: {name}" for names in rows["contact_switch"] for name in _switches(names))
+    return Views(tables, charts, shown.rows, columns, [*switches, *faults, *reasons(rows)])
 
 
 # ------------------------------------------------------------------------------------------------------- tables
@@ -75,20 +79,23 @@ def _tally(points: pd.DataFrame) -> str:
     return ", ".join(f"{verdict} ({', '.join(dict.fromkeys(names))})" for verdict, names in at)
 
 
+def _switches(names: Any) -> list[str]:
+    """Return the contact switches of a cell's checks, each once; NaN, in an older row, has none."""
+    return [] if isinstance(names, float) else list(dict.fromkeys(filter(None, names)))
+
+
 def _lines(shown: Arranged, points: pd.DataFrame) -> tuple[pd.DataFrame, list[Column]]:
     """Return a line per problem, horizon, point and verdict with the worst error over backends and checks; the columns."""
     always = (*PROBLEM, "horizon")
     labels = [*always, *(name for name in label_columns(shown, PROBLEM, always=always) if name not in always)]
     line = ["problem", "point", "verdict"]
-    switches = [
-        ", ".join(dict.fromkeys(filter(None, names))) if isinstance(names, list) else ""
-        for names in points["contact_switch"]
-    ]
     frame = points.assign(
         backends=points.groupby(line, sort=False)["backend"].transform(lambda names: ", ".join(dict.fromkeys(names))),
-        switch=pd.Series(switches, points.index, dtype=object).where(points["point"] == "at", ""),
+        switch=[", ".join(_switches(names)) for names in points["contact_switch"].where(points["point"] == "at", math.nan)],
+        place=points["point"].map(POINTS.index),
     )  # fmt: skip
-    frame = frame.sort_values("error", ascending=False, kind="stable").drop_duplicates(line).sort_index()
+    frame = frame.sort_values("error", ascending=False, kind="stable").drop_duplicates(line)
+    frame = frame.sort_values(["problem", "place", "rank"], kind="stable")
     heads = [COMMON.get(name, Column(name, format="setting")) for name in labels]
     return frame, [*heads, *map(text, ("point", "backends", "verdict")), ERROR, EPS, text("switch")]
 
