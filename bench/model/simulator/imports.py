@@ -70,7 +70,10 @@ def load_module(place: str) -> ModuleType:
     path = Path(place).expanduser().resolve()
     if not path.is_file():
         raise UserError(f"there is no file '{place}'")
-    name = f"{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"
+    folder = str(path.parent)
+    if folder not in sys.path:
+        sys.path.append(folder)
+    name = _module_name(path)
     if name in sys.modules:
         return sys.modules[name]
     spec = importlib.util.spec_from_file_location(name, path)
@@ -78,9 +81,6 @@ def load_module(place: str) -> ModuleType:
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
-    folder = str(path.parent)
-    if folder not in sys.path:
-        sys.path.append(folder)
     try:
         spec.loader.exec_module(module)
     except SystemExit:
@@ -92,6 +92,18 @@ def load_module(place: str) -> ModuleType:
         del sys.modules[name]
         raise UserError(f"'{place}' cannot be imported: {failure(error)['reason']}") from None
     return module
+
+
+def _module_name(path: Path) -> str:
+    """Return the file's own name, by which processes that it starts can import it, or another if another module has that."""
+    invented = f"{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"
+    if invented in sys.modules or not path.stem.isidentifier():
+        return invented
+    try:
+        found = importlib.util.find_spec(path.stem)
+    except ValueError:  # a module without a file, such as __main__
+        return invented
+    return path.stem if found is not None and found.origin == str(path) else invented
 
 
 def load_simulator(cost: str, theta: str = "theta", grad: str = "", batch: str = "", noise: int = 0) -> Simulator:

@@ -101,7 +101,11 @@ class ParameterTree:
         self.leaves: list[Leaf] = []
         values = []
         start = 0
-        for path, value in _traverse(theta, ""):
+        try:
+            arrays = list(_traverse(theta, ""))
+        except RecursionError:
+            raise UserError("theta is nested too deeply, or contains itself") from None
+        for path, value in arrays:
             array = as_numpy(value)
             if array.dtype.kind not in "fiu":
                 raise UserError(f"{path or 'theta'} is of type {array.dtype}: theta consists of real numbers")
