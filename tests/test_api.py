@@ -252,6 +252,7 @@ def test_what_cannot_work_is_unsupported():
 # ------------------------------------------------------------------------------------------------------ keywords
 
 
+@pytest.mark.slow
 def test_keywords_are_the_override_words_of_the_command_line():
     same = [
         (["samples=8", "sweep.stiffness=[100,1e4]"], {"samples": np.int64(8), "sweep": {"stiffness": np.array([100, 1e4])}}),
@@ -310,6 +311,7 @@ def test_a_star_import_replaces_no_builtin():
     assert not set(names) & set(dir(builtins)) - {"__builtins__"}
 
 
+@pytest.mark.slow
 def test_functions_stay_functions_after_all_commands_are_imported():
     code = "import bench.cli, bench.compare.command, bench.compare.history, bench.examine.command, bench; assert all(map(callable, (bench.run, bench.compare, bench.examine)))"
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -189,6 +189,7 @@ def test_commands_can_be_planned(folder, monkeypatch):
         assert cli.main(list(words)) == 0, words
 
 
+@pytest.mark.slow
 def test_readme_example_runs(folder, monkeypatch, capsys):
     (example,) = python_blocks(README)
     assert len(example.strip().splitlines()) <= 8

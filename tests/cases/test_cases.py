@@ -97,6 +97,7 @@ def test_gradcheck_refuses_what_sampled_gradients_miss(scene, verdict, tmp_path,
     assert verdict in np.concatenate(rows["check_verdict"].to_numpy())
 
 
+@pytest.mark.slow
 def test_gradcheck_checks_the_horizon_of_the_scene(tmp_path):
     main(["gradcheck", "table_edge", "backends=[jax]", "workers=0", PLUGINS, f"results_dir={tmp_path}", "--quiet"])
     rows = pd.read_parquet(tmp_path / "gradcheck" / "rows.parquet")

@@ -409,6 +409,7 @@ def test_committed_tables_are_enough(tmp_path):
     assert run(old, new, out=tmp_path / "out") == 1
 
 
+@pytest.mark.slow
 def test_times_are_compared_only_when_asked(tmp_path, capsys):
     before, after, *_ = runs(2, spread=0.02)
     after.loc[0, "time_s"] *= 9
@@ -449,6 +450,7 @@ def test_json_and_junit_say_what_the_exit_status_says(tmp_path):
     assert "<badly>" in suites.find(".//failure").get("message")
 
 
+@pytest.mark.slow
 def test_git_revisions_are_compared(tmp_path, monkeypatch, capsys):
     def git(*words):
         who = ["-c", "user.name=a", "-c", "user.email=a@b"]

@@ -160,7 +160,7 @@ def designed_programs(monkeypatch, plugin, check):
     """Costs on a backend are compared on the programs of the design; a backend that takes long runs few and short ones."""
     programs = all_programs()
     if is_long(plugin, check):
-        programs = [program for program in programs if program.scene.horizon <= SHORT]
+        programs = [program for program in programs if getattr(program.scene, "horizon", 0) <= SHORT]
         monkeypatch.setattr(conformance.backends, "representative_programs", distinguishing_programs)
     if check.args[0].__name__ == "value_agrees":
         programs = [program for program in programs if levels(program, plugin) in design()]

@@ -32,6 +32,7 @@ def test_every_page_is_in_the_navigation_once(pages):
     assert sorted(listed) == sorted(set(pages) - {"index"})
 
 
+@pytest.mark.slow
 def test_site_has_five_entries(pages):
     block = pages["index"].partition("```{toctree}")[2]
     assert len(re.findall(r"^[A-Z].* <|^[a-z]+$", block, re.MULTILINE)) == len(website.SECTIONS) == 5

@@ -227,6 +227,7 @@ def test_limits_of_a_cell_count_its_engine(tmp_path, fault, limit, status, reaso
     ]
 
 
+@pytest.mark.slow
 def test_children_that_plugins_leave_are_killed_and_engines_are_not():
     """In a process of its own, since all other children end too, such as the browser of other tests."""
     code = f"""
@@ -280,6 +281,7 @@ def test_a_missing_library_is_named(monkeypatch):
     assert "has no no_such_library; make its environment" in toy().unavailable_reason()
 
 
+@pytest.mark.slow
 def test_versions_of_the_other_python_are_in_the_row(tmp_path):
     words = ["name=versions", *SETTINGS, f"backends=['toy[python={HERE}]']", "estimators=[fobg]", "workers=0"]
     assert main([*words, f"results_dir={tmp_path}"]) == 0

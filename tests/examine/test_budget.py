@@ -205,6 +205,7 @@ print(report.status, len(traced))
 """
 
 
+@pytest.mark.slow
 def test_jax_compiles_the_cost_twice_and_the_gradient_once_for_a_check():
     """Alone, in a batch, and the gradient; in a process of its own, since other tests change JAX's configuration."""
     pytest.importorskip("jax")

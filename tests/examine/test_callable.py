@@ -29,6 +29,7 @@ def scene(**values):
     return registry.make("scenes", "callable", values)
 
 
+@pytest.mark.slow
 def test_a_file_is_a_problem(file):
     problem = bench.problem(f"callable[cost={file}:cost,sigma=0.1]", backend="callable")
     assert problem.program.theta0.tolist() == [2.0, 0.5]

@@ -225,6 +225,7 @@ def test_treads_that_a_gradient_misses_are_named_though_they_are_small():
     assert "at even distances" in report.noise_answer
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("inputs", [1, 2])
 @pytest.mark.parametrize(("step", "start"), [(1e-4, 1.0123456789), (1e-2, 1.0123456789), (1e-2, 0.7531)])
 def test_a_staircase_beside_a_smooth_part_has_a_right_derivative_between_its_jumps(inputs, step, start):
@@ -250,6 +251,7 @@ def test_a_staircase_beside_a_smooth_part_has_a_right_derivative_between_its_jum
     )  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("treads", "start", "sigma"), [(20, 1.01, 0.1), (2, 1.2, 0.3)])
 @pytest.mark.parametrize("allowed", [None, False])
 def test_a_gradient_of_0_on_a_wide_tread_is_right_and_not_usable(treads, start, sigma, allowed):
@@ -325,6 +327,7 @@ def test_bias_at_a_jump_is_that_of_the_closed_form():
     assert found.best.name == "smoothing"
 
 
+@pytest.mark.slow
 def test_own_noise_is_the_same_in_costs_that_are_compared():
     """f = (x + w)^2: without common random numbers no difference would settle."""
     report = bench.examine(
@@ -335,6 +338,7 @@ def test_own_noise_is_the_same_in_costs_that_are_compared():
     assert found.norm == pytest.approx(2.0, abs=0.2)  # E 2 (x + w) = 2, from at least 1,024 pairs
 
 
+@pytest.mark.slow
 def test_gradient_under_other_noise_is_caught():
     """A gradient that draws noise of its own is right about no cost."""
     report = bench.examine(
@@ -614,6 +618,7 @@ def test_cost_that_is_constant_between_jumps_is_no_right_gradient():
     assert "staircase: the cost is constant between" in str(report)
 
 
+@pytest.mark.slow
 def test_gradients_that_spread_too_widely_are_not_called_right():
     """f = theta + 1e-4 sin(1e7 theta): each gradient is right, and their mean is noise of 1e3 beside grad J = 1."""
     report = bench.examine(
@@ -642,6 +647,7 @@ def test_jumps_off_the_grid_of_steps_are_seen_by_the_integral():
     assert report.status == 1
 
 
+@pytest.mark.slow
 def test_costs_that_are_no_numbers_beside_theta_leave_no_mean():
     def bounded(x):
         if x[0] > 1.05:

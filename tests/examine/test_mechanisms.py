@@ -48,6 +48,7 @@ def adaptive(calls=1500, **settings):
     return bench.examine(cost, [1.0, 1.0, 0.5], grad=grad, progress=False, calls=calls, **settings)
 
 
+@pytest.mark.slow
 def test_adaptive_steps_are_no_missing_term():
     report = adaptive()
     assert (report.status, report.cause, report.derivative) == (3, "adaptive", "not shown")
@@ -134,6 +135,7 @@ def test_a_refined_cost_is_recommended_where_it_bears_on_the_cause():
     assert (bent.cause, "refined=COST" in bent.advice) == ("missing_term", True)
 
 
+@pytest.mark.slow
 def test_refined_cost_shows_a_discretisation_gap_and_a_missing_term():
     assert "from the refined cost 0.6" in adaptive(refined=mechanisms.refined).conclusion
     report = bench.examine(swing, START, grad=lambda x: slope(x) * [1, 1.2], refined=swing, **QUICK)
@@ -326,6 +328,7 @@ def test_nan_is_printed_as_nan():
     assert "NaN" in str(report)
 
 
+@pytest.mark.slow
 def test_a_kink_is_known_where_it_is_expected():
     settings = {"grad": lambda x: np.sign(x - 1.0), **QUICK}
     assert bench.examine(lambda x: abs(x[0] - 1.0), [1.0], **settings).status == 1
@@ -471,6 +474,7 @@ def test_changes_in_the_last_digits_are_no_jumps(size):
 Planted = collections.namedtuple("Planted", "name change said")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "planted",
     [

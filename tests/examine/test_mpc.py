@@ -60,6 +60,7 @@ def test_forces_solve_the_quadratic_program():
         np.testing.assert_allclose(forces, expected, atol=SAME)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("side", [-1, 1])
 def test_the_derivative_is_that_of_the_forces_on_both_sides_of_a_switch(switch, side):
     theta = switch + side * BESIDE * np.array([0.0, 1.0, 0.0, 0.0])
@@ -86,6 +87,7 @@ def test_the_switch_is_a_kink(switch):
     assert report.cause == "kink", str(report)
 
 
+@pytest.mark.slow
 def test_descent_recovers_the_weights_of_the_expert_and_not_with_the_planted_fault():
     def descent(gradient):
         return minimize(lambda theta: (float(value(theta)), np.asarray(gradient(theta))), np.zeros(4), jac=True)

@@ -86,6 +86,7 @@ def test_few_calls_at_a_kink_never_blame_a_slope_of_one_side(given, distance):
     assert report.status != 1 or report.cause == "kink", str(report)
 
 
+@pytest.mark.slow
 def test_the_measured_bias_decides_over_what_a_line_misses():
     """A jump at 2 sigma: a bias of 5%, while single lines miss more than 10% of the cost's change."""
     sigma = 0.1

@@ -85,6 +85,7 @@ def test_no_hint_softens_a_verdict(fault):
         assert report.cause != "adaptive"
 
 
+@pytest.mark.slow
 def test_the_right_gradient_of_the_same_program_passes_with_every_hint():
     FAULTS["none"] = slope
     try:
@@ -99,6 +100,7 @@ def rounded(x, w=None):
     return np.sum(np.round(8.0 * np.asarray(x)) / 8.0)
 
 
+@pytest.mark.slow
 def test_a_straight_through_estimator_is_wrong_at_theta_and_usable_under_noise():
     report = bench.examine(rounded, [0.3, 0.7], grad=lambda x: np.ones(2), sigma=0.5, calls=12_000, progress=False)
     assert report.derivative == "wrong"

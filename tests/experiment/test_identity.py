@@ -22,6 +22,7 @@ def cells(*words: str) -> list[Cell]:
     return grid.cells(config.load([*PLAIN, *words]))
 
 
+@pytest.mark.slow
 def test_ten_thousand_near_equal_configurations_have_as_many_keys():
     """Floats a bit apart, numbers of all sizes, and seeds."""
     near = list(itertools.accumulate(range(999), lambda x, _: math.nextafter(x, math.inf), initial=1000.0))

@@ -51,6 +51,7 @@ def test_golden_numbers_come_out_again(line):
         pytest.fail(explain(list(TABLE["fast"] if line in TABLE["fast"] else LINES)))
 
 
+@pytest.mark.slow
 def test_every_built_in_plugin_is_in_a_golden_cell_and_named_when_its_numbers_move():
     plugins = {name: plugins_of(cell) for line in LINES for name, cell in experiment_of(line)[1].items()}
     for kind, entries in registry.entries().items():

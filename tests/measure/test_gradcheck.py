@@ -302,6 +302,7 @@ def test_scene_without_steps_is_checked(tmp_path):
     assert set(table["verdict"]) == {"smooth"}
 
 
+@pytest.mark.slow
 def test_fault_is_exit_status_1_and_its_line_repeats_it(tmp_path, monkeypatch, capsys):
     from bench.plugins.backends.numpy import NumpyProblem
 
@@ -361,6 +362,7 @@ def test_the_foot_that_switches_is_named_and_both_sides_are_checked(tmp_path, ca
     assert is_trusted("after", verdicts["after"])
 
 
+@pytest.mark.slow
 def test_horizon_set_for_a_scene_is_checked(tmp_path):
     words = ["backends=[numpy]", f"results_dir={tmp_path}", "formats=[]", "workers=0"]
     assert main(["gradcheck", "pendulum", "scene.pendulum.horizon=3", *words]) == 0
@@ -369,6 +371,7 @@ def test_horizon_set_for_a_scene_is_checked(tmp_path):
     assert set(pd.read_csv(tmp_path / "gradcheck" / "gradient_check.csv")["horizon"]) == {2}
 
 
+@pytest.mark.slow
 def test_step_beyond_the_stability_limit_is_said(tmp_path, capsys):
     words = ["contacts=[penalty]", "backends=[numpy]", "sweep.horizon=[2]", "workers=0", "formats=[]"]
     main(["gradcheck", "pushing", *words, "contact.penalty.stiffness=1e4", f"results_dir={tmp_path}"])

@@ -141,6 +141,7 @@ assert state.changes() == ["JAX's configuration (jax_enable_x64)"]
 """
 
 
+@pytest.mark.slow
 def test_the_settings_of_a_library_are_followed_from_its_import_on():
     subprocess.run([sys.executable, "-c", FRESH], check=True)
 

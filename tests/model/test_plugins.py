@@ -188,6 +188,7 @@ def test_cells_of_an_unavailable_plugin_become_rows(rows):
     assert "pip install some-dist" in rows.loc["absent", "reason"]
 
 
+@pytest.mark.slow
 def test_kit_names_the_reason_of_an_unavailable_plugin(tree):
     done = tree.run("check", "absent")
     assert done.returncode == 1

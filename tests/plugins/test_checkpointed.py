@@ -68,6 +68,7 @@ def test_memory_grows_with_the_horizon_as_the_levels_promise(levels):
     assert math.log(long / short) / math.log(64) == pytest.approx(ORDERS[levels], abs=ROUNDED)
 
 
+@pytest.mark.slow
 def test_backends_that_keep_something_else_share_no_executable():
     counts = []
     for values in ({"levels": 1}, {"levels": 2}, {"keep": "everything"}):

@@ -36,6 +36,7 @@ def test_the_executables_used_last_are_kept():
     assert count.made == 5
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not MAPS.exists(), reason="this system does not list memory mappings")
 def test_many_programs_do_not_use_up_memory_mappings():
     """LLVM ends a process that gets no more of them, so a sweep of some hundred programs would end its worker."""

@@ -202,6 +202,7 @@ def test_events_in_a_row_are_unbiased(scene, estimator):
     assert agrees(estimates(estimator, scene, repeats=3000), scene.closed_form_gradient(None, None))
 
 
+@pytest.mark.slow
 def test_both_vary_less_than_cost_times_score():
     scene = CoinWalk()
     plain, weighted, boundary = (

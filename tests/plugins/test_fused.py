@@ -84,6 +84,7 @@ def test_ties_and_nan_are_those_of_jax(kinks):
     assert fused.value(theta, np.zeros((4, 1)))[0] == pytest.approx(3.0 + 2.0 * math.sin(1e9 + 0.5), rel=SAME)
 
 
+@pytest.mark.slow
 def test_rollouts_are_those_of_jax_for_every_batch_and_thread(pushing):
     fused, jax = pushing
     rng = np.random.default_rng(0)

@@ -160,6 +160,7 @@ def slopes(program, count):
     return np.asarray(derivative), np.asarray(high - low) / (2 * DIFFERENCE), np.asarray(gaps)
 
 
+@pytest.mark.slow
 def test_the_gradient_equals_differences_before_in_and_after_the_step_of_touch_down():
     derivative, difference, gap = slopes(program_of(substeps=2), STEPS)
     touch_down = int(np.flatnonzero(gap < 0)[0])

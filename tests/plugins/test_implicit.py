@@ -26,6 +26,7 @@ SCENES = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scene", SCENES)
 def test_a_column_that_cannot_be_solved_is_the_only_one_lost(scene):
     """Noise of 1e160 squares to infinity in the law's equation."""

@@ -384,6 +384,7 @@ def test_event_driven_without_impacts_is_stormer_verlet():
         assert np.array_equal(event.value(scene.theta0(), w), plain.value(scene.theta0(), w))
 
 
+@pytest.mark.slow
 def test_event_driven_comes_to_rest():
     """After infinitely many bounces, by 1.36 s, it lies on the ground but for a sinking of less than dt^2 g / 2 a step."""
     scene = BouncingBall(horizon=640, restitution=0.5)
@@ -418,6 +419,7 @@ def test_implicit_gradient_is_that_of_its_program(scene, law, integrator):
     assert np.abs(exact[0] - difference).max() <= 1e-5 * np.abs(exact).max() + 1e-9
 
 
+@pytest.mark.slow
 def test_stiff_penalty_is_stable_under_implicit_euler():
     """k = 1e7 in the pushing scene, dt^2 2 k / m = 5,000: the explicit step's gradient is off by orders, the implicit one bounded."""
     scene = Pushing()

@@ -78,6 +78,7 @@ def test_gradients_are_differences_of_the_cost(values):
     assert along @ given.grad(theta, w) == pytest.approx(differences, rel=100 * DIFFERENCED)
 
 
+@pytest.mark.slow
 def test_windows_follow_the_tangents_of_a_free_joint():
     given = problem()
     sample = noise.draw(0, "mjcf", 1, 3, given.program.n_noise, "test")

@@ -182,6 +182,7 @@ def test_elliptic_cone_in_reverse_agrees_with_differences_of_the_backends_own_co
     assert problem.solver_residual(w) < 1e-8
 
 
+@pytest.mark.slow
 def test_study_of_the_solver_finds_the_wrong_sign_of_one_iteration(tmp_path):
     words = ["study=solver", "scenes=[ant]", "backends=[mujoco,jax]", "backend.mujoco.impedance=0.9", "name=mine"]
     words += ["sweep.iterations=[1,100]", "samples=1", "workers=0", "timing=false"]

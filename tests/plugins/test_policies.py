@@ -82,6 +82,7 @@ def test_two_normal_numbers_give_a_uniform_one():
     assert ((counts - 1e4) ** 2 / 1e4).sum() < 43.8  # 99.9% quantile of chi-square with 19 degrees of freedom
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("where", ["action", "parameter"])
 def test_the_adjoint_step_by_step_is_the_gradient(where):
     exact = problem(noise=where)
@@ -163,6 +164,7 @@ def test_a_trace_adds_up():
     assert error < REVERSED
 
 
+@pytest.mark.slow
 def test_a_long_theta_has_blocks_of_few_columns(monkeypatch):
     usual = problem(horizon=5)
     theta, w = usual.program.theta0, sample(usual, 11)

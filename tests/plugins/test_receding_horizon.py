@@ -40,6 +40,7 @@ def test_a_run_of_fixed_controls_is_a_rollout_of_the_program():
     assert ours == pytest.approx(problem.value(THETA, w[:, None])[0], rel=SAME)
 
 
+@pytest.mark.slow
 def test_the_plan_made_once_is_the_optimum():
     least = solve(bench.problem("pendulum_swing[dt=0.1,horizon=60]", backend="numpy"))
     assert least.certified
@@ -79,6 +80,7 @@ def test_the_first_control_is_that_of_the_best_plan_from_the_present_state(plann
     assert abs(first) > 3 * error
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("optimizer", [Mppi(population=64, width=1.0, temperature=0.1), Cem(population=64, elites=8)])
 def test_plans_from_the_present_state_cost_less_than_one_plan_and_than_plans_from_another_state(optimizer):
     planner = EXAMPLE["sampled"](optimizer)

@@ -346,6 +346,7 @@ def test_bouncing_ball_at_rest_has_no_physical_gradient():
     assert BouncingBall(restitution=0.5, horizon=4000).physical_gradient() is None
 
 
+@pytest.mark.slow
 def test_bouncing_ball_impulse_derivative_is_wrong_under_gravity():
     """Time of impact or not, and at any dt; the smoothed gradient is that of the physics, jumps and all."""
     for refine in (1, 10):
@@ -469,6 +470,7 @@ def test_wall_impulse_with_time_of_impact_has_the_right_sign():
 # ------------------------------------------------------------------------------------------------- pushing
 
 
+@pytest.mark.slow
 def test_pushing_published_gradient_norm():
     """Norm of the mean of 1,000 gradients, the same on all backends for the same noise."""
     scene = Pushing(horizon=100, velocity_factor=0.1, push=1.0, speed=0.1)

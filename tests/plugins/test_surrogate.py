@@ -65,6 +65,7 @@ def test_one_force_has_the_forward_value_and_the_backward_slope(gap):
     assert slope[0, 0] < 0
 
 
+@pytest.mark.slow
 def test_a_surrogate_gradient_certifies_nothing_and_is_never_declared_unbiased(problems):
     program = problems["surrogate"].program
     assert program.surrogate

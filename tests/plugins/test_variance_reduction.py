@@ -162,6 +162,7 @@ def test_quadratic_model_is_fitted_without_the_sample_it_is_subtracted_from(samp
     np.testing.assert_allclose(values, expected, rtol=ROUNDING)
 
 
+@pytest.mark.slow
 def test_quadratic_model_leaves_only_the_third_hermite_polynomial_of_a_cubic_cost():
     """f = sigma^3 w^3 / 3 + lower powers: E[(w^3 - 3 w)^2 w^2] = 105 - 90 + 27 = 42."""
     scene = Cubic(dimension=1, sigma=2.0)

@@ -104,6 +104,7 @@ def test_a_bias_that_cannot_be_told_from_0_is_drawn_as_its_upper_limit():
     assert column(found, "bias_shown") == pytest.approx([0.2, 0.2])
 
 
+@pytest.mark.slow
 def test_page_holds_plotly_once_asks_for_nothing_and_stays_small():
     text = page(small_rows())
     assert len(text) < 6e6

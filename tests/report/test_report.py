@@ -96,6 +96,7 @@ def test_every_promised_file_is_written(full):
     assert {path.name for path in made.directory.iterdir()} == names
 
 
+@pytest.mark.slow
 def test_pareto_is_what_brute_force_finds(made):
     generator = np.random.default_rng(0)
     rows = small_rows()
@@ -159,6 +160,7 @@ def test_text_is_escaped_in_every_format(made):
 # -------------------------------------------------------------------------------------------------------- terminal
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rows", [stiffness_rows(), small_rows(backends=("jax",))])
 def test_terminal_output_says_what_matters(rows, capsys, monkeypatch):
     monkeypatch.delenv("COLUMNS", raising=False)
@@ -229,6 +231,7 @@ def test_an_estimator_has_one_colour_in_all_charts():
     assert len({style.colour for style in styles[0].values()}) == len(NAMES)
 
 
+@pytest.mark.slow
 def test_colours_do_not_depend_on_which_estimators_ran():
     few, every = (
         drawn(small_rows(estimators=names), ["stiffness"])["bias_variance_stiffness"].styles
@@ -246,6 +249,7 @@ def test_backends_that_differ_are_lines_of_their_own_on_the_page_and_one_in_prin
     assert not chart.drawn().duplicated(["panel", "series", "x"]).any()
 
 
+@pytest.mark.slow
 def test_failed_cells_are_crosses():
     rows = stiffness_rows(sigmas=(0.1,))
     chart = drawn(rows, ["stiffness"])["bias_variance_stiffness"]
@@ -256,6 +260,7 @@ def test_failed_cells_are_crosses():
     assert sum(len(line.get_xdata()) for line in crosses) == len(lost)
 
 
+@pytest.mark.slow
 def test_a_named_value_is_a_line_or_the_start_of_the_range_beyond_which_the_first_estimator_fails():
     plain = drawn(small_rows(), ["stiffness"])["bias_variance_stiffness"]
     assert [(mark.name, mark.at, mark.to) for mark in plain.marks] == [("step size limit", 6400.0, None)]
@@ -372,6 +377,7 @@ def test_every_bias_and_interval_of_the_rows_is_in_the_data_of_the_chart(tmp_pat
         assert (found["series"][near] == cell["estimator"]).any()
 
 
+@pytest.mark.slow
 def test_equal_figures_are_equal_files_with_their_fonts_inside(tmp_path):
     for name in ("first", "second"):
         with styled():
@@ -438,6 +444,7 @@ def test_widths_are_those_of_tex_or_a_little_more(text, size, points):
     assert points <= latex._set(text, size) <= 1.2 * points
 
 
+@pytest.mark.slow
 def test_columns_and_rows_of_the_papers_table_can_be_chosen(tmp_path, capsys):
     words = ["sweep.sigma=[0.1,0.3]", "sweep.stiffness=[10,100,1000]", "estimators=[fobg]", "backends=[jax,torch]"]
     for more, across, names in (
@@ -483,6 +490,7 @@ def test_table_compiles_in_latex(count, made):
 FEW = ("estimators=[fobg]", "backends=[numpy]")
 
 
+@pytest.mark.slow
 def test_no_cell_is_lost_where_a_swept_value_is_the_default_of_one_scene(capsys, made):
     """Damping 1 is what wall_penalty_1d asks of its law, and 0 what bouncing_ball leaves it: no identity string shows either."""
     swept, cells = loaded(*FEW, "scenes=[wall_penalty_1d,bouncing_ball]", "sweep.damping=[0,1,10]")
@@ -515,6 +523,7 @@ def test_a_law_parameter_that_happens_to_equal_another_keeps_its_problem():
     assert found.iloc[:, :2].to_numpy().tolist() == [["10", "1"], ["10", "10"], ["100", "1"], ["100", "10"]]
 
 
+@pytest.mark.slow
 def test_cells_that_differ_in_a_scene_parameter_named_like_one_of_the_law_are_all_reported(tmp_path, capsys):
     (tmp_path / "springy.py").write_text(SPRINGY)
     words = [
@@ -543,6 +552,7 @@ def test_rows_of_a_version_that_stored_no_parameters_are_told_apart_and_make_way
     assert len(views.merge_seeds(pd.concat([old, old.assign(seed=1.0)], ignore_index=True))) == 3
 
 
+@pytest.mark.slow
 def test_a_swept_scene_parameter_is_a_number_in_every_table_and_title_at_its_default_too(tmp_path):
     words = [*FEW, "scenes=[pushing]", "sweep.mass=[0.1,0.2]", "sweep.stiffness=[100,1000]", f"results_dir={tmp_path}"]
     swept, cells = loaded(*words)
@@ -563,6 +573,7 @@ def test_a_swept_scene_parameter_is_a_number_in_every_table_and_title_at_its_def
     assert [panel.get_title(loc="left") for panel in figure_of(chart).axes] == ["mass=0.1", "mass=0.2"]
 
 
+@pytest.mark.slow
 def test_the_axis_of_zipped_parameters_names_all_of_them():
     sweep = {"zip": {"stiffness": [1e2, 1e4], "dt": [0.01, 0.001]}}
     rows = table([row(stiffness=k, dt=h) for k, h in ((1e2, 0.01), (1e4, 0.001))])

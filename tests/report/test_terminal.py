@@ -101,6 +101,7 @@ def test_columns_of_the_environment_count_in_a_pipe(monkeypatch):
     assert "[red]" in out.getvalue() or "[red" in out.getvalue()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["quick", "twins", "three_errors", "horizon_growth", "identify", "stability_map"])
 def test_what_a_command_prints_of_standard_results_fits(name, monkeypatch, capsys):
     experiment = config.load([f"experiment={name}", "results_dir=results/standard"])

@@ -295,6 +295,7 @@ def nothing_starts(argument):
     raise RuntimeError("no handler today")
 
 
+@pytest.mark.slow
 def test_workers_that_cannot_start_end_the_run_at_once():
     with Pool(2, nothing_starts, None, ResourceLimits()) as pool, pytest.raises(UserError, match="no handler today"):
         list(pool.run([[1, 2], [3]]))

@@ -74,6 +74,7 @@ def statuses(experiment, backend) -> dict[str, str]:
     return dict(zip(rows["scene"], rows["status"], strict=True))
 
 
+@pytest.mark.slow
 def test_a_fault_on_a_rung_stops_the_climb_of_its_backend_there(climbed):
     _, experiment = climbed
     waiting = {"double_integrator": "ok", "pendulum": "ok", "cartpole": "waiting", "mass_spring": "waiting"}
@@ -94,6 +95,7 @@ def test_the_report_says_which_rung_was_reached_and_what_was_not_started(climbed
     assert ((table["reason"] != "") == (table["verdict"] == "failed")).all()
 
 
+@pytest.mark.slow
 def test_a_second_run_starts_no_rung_above_the_fault(climbed, capsys):
     words, experiment = climbed
     before = store_of(experiment).load()
@@ -105,12 +107,14 @@ def test_a_second_run_starts_no_rung_above_the_fault(climbed, capsys):
     assert (after["status"] == "waiting").sum() == 2
 
 
+@pytest.mark.slow
 def test_without_the_ladder_the_waiting_cells_run(climbed):
     words, experiment = climbed
     assert main([*words, "ladder=false", "scenes=[mass_spring]", "backends=[forgetful_climber]"]) == 0
     assert statuses(experiment, "forgetful_climber")["mass_spring"] == "ok"
 
 
+@pytest.mark.slow
 def test_a_rung_that_its_backend_cannot_run_stops_the_climb(tmp_path):
     words = [*WORDS, "scenes=[pendulum,quadruped,double_integrator]", "backends=[numpy]", f"results_dir={tmp_path}"]
     assert main(words) == 0

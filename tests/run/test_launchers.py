@@ -187,6 +187,7 @@ def test_every_row_says_which_kind_of_machine_made_it(tmp_path):
     assert os.uname().nodename not in record.kind_of_machine()
 
 
+@pytest.mark.slow
 def test_times_of_another_kind_of_machine_are_announced(tmp_path, capsys, monkeypatch):
     words = [*WORDS[:-2], "estimators=[fobg]", "workers=0", f"results_dir={tmp_path}", "--quiet"]
     assert main(words) == 0

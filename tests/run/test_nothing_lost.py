@@ -245,12 +245,14 @@ def answers(items, limits=None, **more):
     return {str(answer.item[0]): answer.result for answer in found}, found
 
 
+@pytest.mark.slow
 def test_a_late_death_is_not_blamed_on_the_next_cell():
     results, found = answers([("dies late",), ("slow",), ("sound",)])
     assert len(found) == 3
     assert {result["status"] for result in results.values()} == {"ok"}
 
 
+@pytest.mark.slow
 def test_a_cell_that_dies_twice_is_blamed_and_its_neighbours_are_not():
     results, _ = answers([("sound",), ("dies",), ("other",)])
     assert results["dies"]["status"] == "crashed"
@@ -286,6 +288,7 @@ def test_a_message_that_is_no_answer_is_malformed(content):
     assert worker.is_busy
 
 
+@pytest.mark.slow
 def test_a_worker_that_a_plugin_has_changed_is_replaced_and_nothing_is_blamed():
     results, found = answers([("sound",), ("taints",), ("other",), ("more",), ("taints", 2), ("last",)])
     assert len(found) == 6

@@ -43,6 +43,7 @@ def planned_after(rows: list[dict], *words: str):
     return plan(experiment, store)
 
 
+@pytest.mark.slow
 def test_cells_that_older_code_has_stored_run_again_and_are_counted(tmp_path, stored, capsys):
     items = planned_after(older(stored), f"results_dir={tmp_path}")
     assert [(item.stored, item.by_older_code, item.added) for item in items] == [(False, True, ())] * 2
@@ -70,6 +71,7 @@ def test_other_counts_and_times_are_other_cells(tmp_path, stored, word):
     assert not any(item.by_older_code for item in items)
 
 
+@pytest.mark.slow
 def test_a_stored_cell_is_not_called_old_beside_its_older_row(tmp_path, stored, capsys):
     experiment = config.load([*WORDS, f"results_dir={tmp_path}"])
     execute(experiment)

@@ -108,6 +108,7 @@ def test_what_a_plugin_changes_unseen_stays_in_its_own_worker(tmp_path, kind):
     assert (after["status"] == "ok").all(), after["reason"].tolist()
 
 
+@pytest.mark.slow
 def test_a_worker_that_ran_foreign_code_gets_no_other_group():
     """Items are numbers: tens run the same code from outside, and 0 to 9 run none."""
     groups = [[10, 11], [1, 2], [20], [12], [3]]

@@ -351,6 +351,7 @@ def test_unreadable_file_is_named_and_left_alone(tmp_path, capsys, place, conten
     assert path.read_bytes() == content
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("after", [0, 1, 2])
 def test_disk_that_fills(tmp_path, capsys, monkeypatch, after):
     """The disk is full after so many files of rows: exit status 2, what was stored stays, and the run goes on later."""

@@ -162,6 +162,7 @@ def test_a_sweep_compiles_each_shape_once():
     assert compilations.made == len(compilations.shapes) == 2
 
 
+@pytest.mark.slow
 def test_what_libraries_compile_while_a_program_is_traced_is_no_program():
     compilations = Compilations()
     for stiffness in (1e2, 1e3):
@@ -199,6 +200,7 @@ def test_run_counts_compilations_and_keeps_compiled_programs(tmp_path):
     assert list((tmp_path / "kept").iterdir())
 
 
+@pytest.mark.slow
 def test_measured_compilation_is_not_taken_from_the_folder(tmp_path):
     from bench.plugins.backends import compiling
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import pytest
 import yaml
 from speed import rollouts
 
@@ -9,6 +10,7 @@ from bench.experiment.config import config_dir
 from bench.model import registry
 
 
+@pytest.mark.slow
 def test_an_absent_library_is_a_line_with_the_command_that_installs_it(monkeypatch):
     settings = yaml.safe_load((config_dir() / "bench_self.yaml").read_text())
     settings["subjects"] = [one for one in settings["subjects"] if one["backend"] == "fused"]

@@ -168,6 +168,7 @@ def test_every_cell_of_a_run_has_a_row_with_the_hash_of_the_hypotheses(run):
     assert len(hypotheses_hash()) == 12
 
 
+@pytest.mark.slow
 def test_times_are_kept_in_a_run_without_timing_since_the_cost_of_a_gradient_is_their_ratio(run):
     assert run["gradient_s"].gt(0).all()
     assert run["rollout_s"].gt(0).all()

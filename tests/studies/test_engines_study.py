@@ -34,6 +34,7 @@ def results(tmp_path_factory):
     return folder / "own"
 
 
+@pytest.mark.slow
 def test_an_engine_has_the_errors_of_the_same_program_in_this_process(results):
     rows = bench.load(results)
     assert list(rows["status"]) == ["ok", "ok"]

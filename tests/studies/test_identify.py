@@ -130,6 +130,7 @@ def test_restitution_from_heights(bounces, expected):
     assert 1 / math.sqrt(slopes @ slopes) == pytest.approx(expected, rel=2e-4)
 
 
+@pytest.mark.slow
 def test_single_shooting_is_lost_beyond_its_basin_and_windows_are_not():
     """Over T = 10 s single shooting converges from within 4.4934/10 of the frequency, windows of 2 s from within 2.25."""
     model = model_of(cell_of("scenes=[mass_spring_damper[damping=1e-9]]", "integrators=[rk4]", "theta=[stiffness]"))
@@ -217,6 +218,7 @@ def test_unusable_records_are_refused_in_a_line(tmp_path, text, message):
     assert reason.count("\n") == 0
 
 
+@pytest.mark.slow
 def test_own_measurements_are_fitted(tmp_path):
     t = 0.05 * np.arange(1, 201)
     np.savetxt(tmp_path / "own.csv", displacement(4.4, 0.5, t)[:, None], delimiter=",", header="x", comments="")

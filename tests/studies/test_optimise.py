@@ -198,6 +198,7 @@ class Placed(TwoBalls):
         return None
 
 
+@pytest.mark.slow
 def test_slopes_of_the_stroke():
     """Of the end cost in x and its velocity of the first and the second ball.
 
@@ -292,6 +293,7 @@ def finished(tmp_path_factory):
     return folder / "small", config.load([*WORDS, f"results_dir={folder}"])
 
 
+@pytest.mark.slow
 def test_a_search_looking_at_costs_only_is_run_once_for_all_estimators(finished):
     rows = bench.load(finished[0])
     counts = rows.groupby(["estimator", "optimizer"]).size()
@@ -394,6 +396,7 @@ def test_step_jacobians_of_searches_that_share_batches():
     assert np.array_equal(shared["a"], slopes(problem, theta, still).a)
 
 
+@pytest.mark.slow
 def test_an_untimed_search_runs_in_another_process(tmp_path):
     words = [word for word in BARE if not word.startswith("workers")] + [
         "workers=1",
@@ -712,6 +715,7 @@ def test_who_reaches_most_targets_needs_an_interval():
     assert aggregate.is_tied(partial).tolist() == [False, True]
 
 
+@pytest.mark.slow
 def test_interval_of_the_share_of_targets_covers():
     """Seeds drawn anew, the three targets of a problem reached by the same seeds: few searches, rates at both ends."""
     rng = np.random.default_rng(0)

@@ -211,6 +211,7 @@ def test_a_truth_of_zero_is_no_disconnection():
     assert stability.compare(np.array([1.0, 0.0]), np.array([1.0, 0.0]), LIMITS.inaccurate)["verdict"] == "ok"
 
 
+@pytest.mark.slow
 def test_impulse_without_time_of_impact_has_the_wrong_sign(tmp_path):
     """The trap of bounce_once, here on the ball under gravity, where only resolved impacts are right."""
     verdicts = {}
@@ -362,6 +363,7 @@ def test_rigid_impacts_are_not_blamed_on_the_law(tmp_path):
     assert row["law_error"] < 0.05
 
 
+@pytest.mark.slow
 def test_without_a_law_the_step_is_wrong(tmp_path):
     spring = cell(tmp_path, "scenes=[mass_spring]", "integrators=[implicit_euler]", "scene.mass_spring.horizon=20")
     row = measured(spring, experiment(tmp_path))

@@ -167,6 +167,7 @@ def erring(*words):
     return given, rows.assign(**numbers, bias=0.1, bias_rel=0.1, bias_low=0.05, bias_high=0.2, reference_norm=1.0)
 
 
+@pytest.mark.slow
 def test_three_errors_of_two_integrators_are_twice_as_many_lines():
     words = ["scenes=[bounce_once]", "contacts=[impulse,penalty]", "integrators=[semi_implicit_euler,event_driven]"]
     given, rows = erring(*words, "sweep.dt=[0.1,0.05,0.02]")
@@ -181,6 +182,7 @@ def test_three_errors_of_two_integrators_are_twice_as_many_lines():
     assert len(drawn) == 2 * 4, "both errors at the smallest step"
 
 
+@pytest.mark.slow
 def test_three_errors_without_a_swept_axis_have_a_table_and_a_chart(tmp_path):
     given, rows = erring("scenes=[bounce_once]", "contacts=[impulse,penalty]", f"results_dir={tmp_path}", "formats=[]")
     make_directory(given.directory)

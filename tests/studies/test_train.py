@@ -46,6 +46,7 @@ def verdicts_of(experiment, rows):
     return dict(zip(table.frame["method"], table.frame["verdict"], strict=True))
 
 
+@pytest.mark.slow
 def test_the_best_trainer_and_those_behind_it_have_verdicts():
     experiment, rows = made_up()
     assert verdicts_of(experiment, rows) == {"shac": "first", "shac[window=8]": "behind", "ppo": "behind"}
@@ -96,6 +97,7 @@ def test_lengths_of_windows_are_compared_by_their_returns():
     assert "0.31 [0.28, 0.34]" in set(lines["its bias"])
 
 
+@pytest.mark.slow
 def test_a_trainer_without_a_run_that_ends_is_not_the_best_by_its_untrained_policy():
     experiment, rows = made_up()
     planted = rows["trainer"] == "ppo"

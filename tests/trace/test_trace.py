@@ -73,6 +73,7 @@ def test_adjoints_give_the_programs_gradient_through_solved_steps():
     assert trace(problem, drawn(problem))[1] < 1e-9
 
 
+@pytest.mark.slow
 def test_adjoint_of_every_state_is_the_slope_of_the_cost_to_go():
     problem = compiled(Cartpole())
     w = drawn(problem)
@@ -98,6 +99,7 @@ def test_adjoint_of_every_state_is_the_slope_of_the_cost_to_go():
         np.testing.assert_allclose(adjoint[k], slope, rtol=1e-7, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_adjoints_give_the_gradient_with_respect_to_named_parameters():
     names = ("mass", "penalty.stiffness", "dt")
     program = compose(Pushing(sigma=1e-3), Penalty(stiffness=1e3), SemiImplicitEuler(), Decision(names))
@@ -108,6 +110,7 @@ def test_adjoints_give_the_gradient_with_respect_to_named_parameters():
     assert table["time"].iloc[1] == pytest.approx(program.theta0[2] + 1e-3 * w[2, 0], rel=1e-14)
 
 
+@pytest.mark.slow
 def test_named_parameters_of_solved_steps_are_refused():
     program = compose(Pushing(), Complementarity(stiffness=1e3), SemiImplicitEuler(), Decision(("mass",)))
     problem = Implicit().compile(program)
@@ -132,6 +135,7 @@ def test_a_contact_mode_is_predicted_or_measured():
     assert active_contacts(soft, states, controls).tolist() == [[[True, False, False]]]
 
 
+@pytest.mark.slow
 def test_contacts_under_a_penalty_by_hand():
     """Four states of a very soft bounce, worked out on paper."""
     scene = BounceOnce(horizon=3, dt=0.5, height=0.6, velocity=-2.0)
@@ -150,6 +154,7 @@ def test_contacts_under_a_penalty_by_hand():
     assert table["solver_residual"].isna().all()
 
 
+@pytest.mark.slow
 def test_the_impulse_of_a_bounce_is_read_from_the_velocity_jump():
     scene = BounceOnce()
     table, _ = trace(compiled(scene, Impulse()), np.zeros((3, 1)))
@@ -379,6 +384,7 @@ def test_the_seed_draws_the_first_sample_of_the_runs(tmp_path):
     np.testing.assert_allclose(still["u1"].dropna(), 0.1, rtol=1e-14)
 
 
+@pytest.mark.slow
 def test_a_diverging_rollout_is_drawn_and_told():
     problem = compiled(Pushing(horizon=150, velocity_factor=1e3), Penalty(stiffness=1e3))
     table, error = trace(problem, drawn(problem))

@@ -35,6 +35,7 @@ def test_the_log_has_the_contact_of_a_window_and_softer_ground_is_entered_deeper
     assert depth[1e3] > depth[1e4]
 
 
+@pytest.mark.slow
 def test_parameter_values_share_a_compilation():
     runs = [
         Training(

@@ -106,6 +106,7 @@ def test_windows_have_no_bias_where_actions_move_nothing_and_one_where_they_do()
     assert np.linalg.norm(cut - whole) > 1e-3 * np.linalg.norm(whole)
 
 
+@pytest.mark.slow
 def test_first_and_zeroth_order_gradients_of_a_window_agree():
     """Both estimate the derivative of the same objective: with enough rollouts their cosine is 1."""
     run = training("shac", "float32")
@@ -154,6 +155,7 @@ def test_the_first_step_of_ppo_is_the_policy_gradient_of_a_one_step_problem():
     assert float(gradient.mean.biases[0][0, 0]) == pytest.approx(expected, abs=0.04)  # six standard errors
 
 
+@pytest.mark.slow
 def test_the_objective_of_ppo_is_flat_where_its_ratio_is_clipped():
     """A better action whose probability has already grown by more than the range moves the policy no further."""
     trainer = registry.make("trainers", "ppo", {"range": 0.2})
@@ -189,6 +191,7 @@ def test_shac_swings_the_cartpole_up():
     assert run.returns(state, numbers).mean() > -800
 
 
+@pytest.mark.slow
 def test_training_leaves_a_failed_solve_of_the_implicit_backend_in_its_column():
     code = "import os, bench.training.networks; print(os.environ['EQX_ON_ERROR'])"
     environ = {name: value for name, value in os.environ.items() if name != "EQX_ON_ERROR"}

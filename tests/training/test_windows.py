@@ -72,6 +72,7 @@ def test_the_gradient_of_a_window_is_that_of_fobg_on_the_whole_program():
     np.testing.assert_allclose(gradient, fobg, rtol=ROUNDING, atol=ROUNDING * np.abs(fobg).max())
 
 
+@pytest.mark.slow
 def test_no_gradient_crosses_the_end_of_an_episode(actor):
     """With an end after step 2, the derivative of all later rewards by the state at the window's start is zero."""
     env = environment(horizon=2)
@@ -109,6 +110,7 @@ def test_the_return_of_a_window_restarts_at_an_end_with_the_value_of_the_state_b
     assert not np.allclose(window.reached[2], window.observation[3])
 
 
+@pytest.mark.slow
 def test_a_cut_stops_the_gradient_where_the_jacobian_is_too_large(actor):
     env, key = environment(), jax.random.PRNGKey(2)
     free = window_return(env, actor, 8, key)[1]
@@ -152,6 +154,7 @@ def test_the_gradient_of_an_episode_in_windows_is_the_sum_of_theirs(actor):
     assert not np.allclose(jax.tree.leaves(found)[0], jax.tree.leaves(free)[0], rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_the_norm_of_a_jacobian_agrees_with_differences():
     env = environment()
     state = env.start(jnp.asarray(np.random.default_rng(0).standard_normal((8, 2)))).state
