@@ -129,7 +129,7 @@ def is_wrong():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("solver", ["Newton", "CG"])
+@pytest.mark.parametrize("solver", ["Newton", pytest.param("CG", marks=pytest.mark.full)])
 @pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])
 def test_derivatives_of_twenty_mechanisms_agree_with_differences_and_forward_mode(cone, solver):
     table = program.agreement(cone, solver)

@@ -270,7 +270,7 @@ def test_policies_are_swept(tmp_path):
     assert sorted(rows.dim) == [6, 57]
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_a_policy_with_a_hundred_thousand_coordinates_has_rows(tmp_path):
     common = dict(
         name="large", backends=["jax"], samples=4, repeats=4, results_dir=tmp_path,
