@@ -211,8 +211,8 @@ def _refuse_unread(experiment: Experiment, overrides: Sequence[str]) -> None:
     names |= {f"{axis}.{entry.name}" for axis, entry in choices}
     plugins = _in_use([entry.plugin for _, entry in choices if entry.plugin])
     axes = {name for e in every for name in swept(e.sweep)}
-    for override in overrides:
-        head, _, rest = override.lstrip("+").partition("=")[0].partition(".")
+    for key, _, _ in _split_words(overrides):
+        head, _, rest = key.partition(".")
         name = f"{head}.{rest.partition('.')[0]}" if rest and head in kinds.values() else head
         if name not in names:
             raise unknown("setting of this experiment", name, names, "--help")

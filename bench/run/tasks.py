@@ -113,9 +113,8 @@ class TaskHandler:
         return result | {"reason": "; ".join(filter(None, (result.get("reason", ""), *remarks)))} if remarks else result
 
     def _handle(self, item: Task) -> dict[str, Any]:
-        self._session.references.stores = (
-            item.outside_of_reference >= RAN
-        )  # other code may have changed what computes it
+        # other code may have changed what computes it
+        self._session.references.stores = item.outside_of_reference >= RAN
         with guard.protect_process():
             if not item.reference:
                 return measure_cell(item.cell, self._session, self._study)

@@ -101,11 +101,7 @@ class ParameterTree:
         self.leaves: list[Leaf] = []
         values = []
         start = 0
-        try:
-            arrays = list(_traverse(theta, ""))
-        except RecursionError:
-            raise UserError("theta is nested too deeply, or contains itself") from None
-        for path, value in arrays:
+        for path, value in _arrays(theta):
             array = as_numpy(value)
             if array.dtype.kind not in "fiu":
                 raise UserError(f"{path or 'theta'} is of type {array.dtype}: theta consists of real numbers")
@@ -199,7 +195,7 @@ class ParameterTree:
         Raises :class:`UserError` if it has another structure or size.
         """
         try:
-            leaves = [(path, as_numpy(part)) for path, part in _traverse(value, "")]
+            leaves = [(path, as_numpy(part)) for path, part in _arrays(value)]
         except UserError:
             leaves = []
         parts = self._reorder(value, leaves)
@@ -275,6 +271,14 @@ def _is_structure(value: Any) -> bool:
     if not isinstance(value, list | tuple):
         return False
     return not all(isinstance(part, int | float) for part in value)
+
+
+def _arrays(value: Any) -> list[tuple[str, Any]]:
+    """Return the path and value of each array in a structure; raises :class:`UserError` if the structure has no end."""
+    try:
+        return list(_traverse(value, ""))
+    except RecursionError:
+        raise UserError("a structure is nested too deeply, or contains itself") from None
 
 
 def _traverse(value: Any, path: str) -> Iterator[tuple[str, Any]]:

@@ -75,8 +75,10 @@ def ranked(lines: pd.DataFrame, by: Sequence[str]) -> pd.Series:
     has_ended = np.isfinite(lines["final"]) & (lines["failed"] < lines["seeds"] if "failed" in lines else True)
     for _, part in lines[has_ended].groupby(list(by), sort=False):
         best = part.loc[part["final"].idxmax()]
+        tests = [mannwhitneyu(best["returns"], returns) for returns in part["returns"]]
         behind = np.array([
-            len(one) >= MIN_SEEDS and mannwhitneyu(best["returns"], one).pvalue < LEVEL for one in part["returns"]
+            len(returns) >= MIN_SEEDS and test.pvalue < LEVEL and test.statistic > len(returns) * len(best["returns"]) / 2
+            for returns, test in zip(part["returns"], tests, strict=True)
         ])  # fmt: skip
         verdicts[part.index] = np.where(behind, "behind", "tied")
         verdicts[best.name] = "first"
