@@ -169,6 +169,16 @@ def test_the_objective_of_ppo_is_flat_where_its_ratio_is_clipped():
         assert (size == 0.0) == is_flat, (change, advantage)
 
 
+def test_the_critic_of_ppo_stays_within_the_returns_that_rewards_allow():
+    """Its unit comes from rewards alone: one that also depends on its values grows with them."""
+    run = training("ppo", "float32", rollouts=8, window=64, batches=8, passes=10, critic_rate=1e-2)
+    state, largest = run.start(0), 0.0
+    for _ in range(run.trainer.updates(run.env)):
+        state, log = run.update(state)
+        largest = max(largest, -float(log["reward"]))
+    assert float(log["value_loss"]) < (largest / (1 - run.trainer.discount)) ** 2
+
+
 @pytest.mark.slow
 def test_shac_swings_the_cartpole_up():
     """Half of the published steps, from about -2,000 for hanging still to above -800; results/standard/train has all."""
