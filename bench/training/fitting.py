@@ -46,4 +46,4 @@ def fit(
 
 def squared_error(network: Any, states: Array, targets: Array) -> Array:
     """Return the mean squared error of a critic's values of normalised ``states (n, N)``."""
-    return ((network(states)[0] - targets) ** 2).mean()  # type: ignore[no-any-return]
+    return ((network(states)[0] - targets) ** 2).mean()
