@@ -354,6 +354,12 @@ def gradient_norms(experiment: str, window: int) -> str:
     return span(runs.loc[runs["trainer"].str.contains(f"window={window}]", regex=False), "gradient_typical"])
 
 
+def used_steps(experiment: str) -> str:
+    """Return the range over runs of the share of control steps that trainers use which ignore others, over a whole run."""
+    shares = pd.Series([np.mean(log) for log in trained(experiment)["log_used"] if np.size(log) > 1])
+    return f"{shares.min():.0%} to {shares.max():.0%}"
+
+
 def faults_table(experiment: str) -> str:
     """Return per trainer and fault the number of runs whose log shows it, and the numbers of the first, as Markdown."""
     runs = trained(experiment)
@@ -746,6 +752,7 @@ FIGURES: dict[str, Callable[[], str]] = {
     "hopper-answer": lambda: answer_of("train/hopper"),
     "hopper-table": lambda: trained_table("train/hopper"),
     "hopper-stiffness": stiffness_table,
+    "hopper-used": lambda: used_steps("train/hopper"),
     "hopper-windows": lambda: windows_table("train/hopper"),
     "hopper-faults": lambda: faults_table("train/hopper"),
     "cheetah-answer": lambda: answer_of("train/half_cheetah"),

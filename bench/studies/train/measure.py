@@ -21,7 +21,7 @@ from bench.training.run import Training
 
 Settings = Any
 """A ``Train`` study: its parameters are the settings. Its module imports this module, so its type cannot be named."""
-MEANS = frozenset({"loss", "reward", "value_loss", "cut", "contacts", "step_length", "deviation"})
+MEANS = frozenset({"loss", "reward", "value_loss", "cut", "used", "contacts", "step_length", "deviation"})
 """Quantities whose mean an entry of a stored log has; it has the largest value of the others, so that no peak is lost."""
 Z = 1.959963984540054
 """The 0.975 quantile of the standard normal distribution."""

@@ -87,7 +87,8 @@ def judge(run: Mapping[str, Any]) -> list[Verdict]:
         check("vanishes", has_vanished, late / early if early else math.nan, small)
     check("unmoved", run["unmoved"] > 0, run["unmoved"])
     # one length may agree by chance, and curvature spoils long ones, rounding short ones: the second best decides
-    errors = sorted(error for error in np.asarray(run["difference_errors"], dtype=float) if math.isfinite(error))
+    errors = np.atleast_1d(np.asarray(run["difference_errors"], dtype=float))
+    errors = np.sort(errors[np.isfinite(errors)])
     error = errors[1] if len(errors) > 1 else run["difference_error"]
     check("differences", error > DISAGREES, error)
     cosines = np.asarray(run["cosine"], dtype=float)
