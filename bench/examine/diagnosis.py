@@ -11,11 +11,10 @@ import numpy as np
 
 from bench.examine.gradient import GradientStages
 from bench.examine.lines import LineScan, scan
-from bench.examine.quick import QuickCheck
 from bench.examine.rules import SUSPICIOUS
 from bench.examine.steps import changing_loop
 from bench.examine.subspace import choose
-from bench.measure.gradcheck import Check
+from bench.measure.gradcheck import Check, FewSteps
 from bench.model.simulator.simulator import Simulator
 
 NEAR = 0.05
@@ -96,7 +95,7 @@ def check_refined(stages: GradientStages, refined: Callable[..., Any]) -> Check 
     quick = _quick(stages, other, space)
     for _ in range(2):
         quick.run_round(other.width)
-    outcome = quick.check([f"component {i}" for i in range(space.size)])
+    outcome = quick.check()
     return None if outcome is None else space.restore(outcome)
 
 
@@ -168,7 +167,7 @@ def errors_by_horizon(stages: GradientStages, horizons: Sequence[int]) -> list[H
         space = choose(stages.layout, stages.scale, gradient, stages.seed, most=4)
         quick = _quick(stages, other, space, space.project(gradient))
         quick.run_round(other.width)
-        outcome = quick.check([f"component {i}" for i in range(space.size)])
+        outcome = quick.check()
         if outcome is None:
             continue
         program = np.array([part.program for part in outcome.parts]) * space.scale
@@ -257,7 +256,7 @@ def _simulator(stages: GradientStages, cost: Callable[..., Any], grad: Any) -> S
     return Simulator(cost, stages.layout, grad, own.noise, batch, stages.clock, own.library)
 
 
-def _quick(stages: GradientStages, other: Simulator, space: Any, slope: np.ndarray | None = None) -> QuickCheck:
+def _quick(stages: GradientStages, other: Simulator, space: Any, slope: np.ndarray | None = None) -> FewSteps:
     """Return a quick check of another cost in the coordinates of a space, with the given or theta's gradient."""
 
     def cost(z: np.ndarray) -> np.ndarray:
@@ -269,4 +268,4 @@ def _quick(stages: GradientStages, other: Simulator, space: Any, slope: np.ndarr
     if slope is None and stages.gradient is not None:
         slope = space.project(stages.gradient)
     centre = float(cost(space.origin()[:, None])[0])
-    return QuickCheck(cost, space.origin(), space.scale, slope, centre, stages.simulator.unit, stages.repeats.spread)
+    return FewSteps(cost, space.origin(), space.scale, slope, centre, stages.simulator.unit, stages.repeats.spread)

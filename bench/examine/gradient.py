@@ -15,9 +15,20 @@ from functools import partial
 
 import numpy as np
 
-from bench.examine.quick import ROUNDS, QuickCheck, is_nothing
 from bench.examine.subspace import Group, Subspace, choose, locate
-from bench.measure.gradcheck import EPS, FAULTS, TRUSTED, Check, Options, Part, check, most_severe
+from bench.measure.gradcheck import (
+    EPS,
+    FAULTS,
+    ROUNDS,
+    TRUSTED,
+    Check,
+    FewSteps,
+    Options,
+    Part,
+    check,
+    is_nothing,
+    most_severe,
+)  # fmt: skip
 from bench.model.simulator.clock import Clock, OutOfTime
 from bench.model.simulator.simulator import Simulator
 
@@ -235,14 +246,10 @@ class GradientStages:
         """Compare the gradient with two costs per coordinate, and with more where the full steps do not fit."""
         self.clock.start_stage("one step per component")
         slope = None if self.gradient is None else space.project(self.gradient)
-
-        def cost(z: np.ndarray) -> np.ndarray:
-            return self._stored_costs(space, z)
-
-        quick = QuickCheck(
-            cost, space.origin(), space.scale, slope, self.value, self.simulator.unit, self.repeats.spread
-        )
-        names = [f"component {i}" for i in range(space.size)]
+        quick = FewSteps(
+            partial(self._stored_costs, space), space.origin(), space.scale, slope, self.value, self.simulator.unit,
+            self.repeats.spread,
+        )  # fmt: skip
         try:
             for _ in ROUNDS:
                 quick.run_round(self.simulator.width)
@@ -250,7 +257,7 @@ class GradientStages:
                 if self.clock.can_afford(*self._cost_of(steps, space.size), share=SHARE):
                     break
         finally:
-            outcome = quick.check(names)
+            outcome = quick.check()
             if outcome is not None:
                 self.check, self.is_quick = space.restore(outcome), True
                 self.is_complete = len(outcome.parts) == space.size
@@ -458,8 +465,7 @@ class GradientStages:
         for part in outcome.parts:
             sample, finite = part.sample, part.sample.finite
             change = np.abs(sample.plus - sample.minus)[finite].max(initial=0.0)
-            noise = sample.noise or 0.0
-            rough.append(noise > ROUGH * change and noise > 1e6 * sample.unit * abs(sample.centre))
+            rough.append(sample.noise > ROUGH * change and sample.noise > 1e6 * sample.unit * abs(sample.centre))
         parts = tuple(
             replace(part, verdict="unsettled") if is_rough else part
             for part, is_rough in zip(outcome.parts, rough, strict=True)
@@ -499,12 +505,12 @@ class GradientStages:
             return self.costs(thetas)
 
         one, unit = [index], self.simulator.unit
-        quick = QuickCheck(
+        quick = FewSteps(
             cost, self.theta[one], self.scale[one], self.gradient[one], self.value, unit, self.repeats.spread
         )
         for _ in ROUNDS:
             quick.run_round()
-        outcome = quick.check([f"component {index}"])
+        outcome = quick.check()
         if outcome is not None and outcome.cause in FAULTS:
             added = replace(outcome.parts[0], component=index, verdict=verdict)
             self.check = replace(self.check, parts=(added, *self.check.parts))
