@@ -13,7 +13,6 @@ import numpy as np
 
 from bench.errors import UserError, unknown
 from bench.examine import diagnosis
-from bench.examine.clock import ExaminationClock
 from bench.examine.findings import RELATIVE, GroupSize, Setup, Spent
 from bench.examine.gradient import GradientStages
 from bench.examine.lines import HALVINGS, PLACES, POINTS, LineScan, scan
@@ -102,7 +101,7 @@ def examine(
     >>> report.status, report.cause
     (0, 'smooth')
     """
-    clock = ExaminationClock(
+    clock = Clock(
         _time_limit(budget, calls), progress, _call_limit(calls), parse_duration(compile_budget, "compile_budget")
     )
     if not isinstance(noise, int | np.integer) or noise < 0:
@@ -130,7 +129,7 @@ def examine(
             simulator = Simulator(cost, layout, grad, int(noise), batch, clock)
         except OutOfTime:
             limit = "compile_budget" if not clock.is_terminated else "the time until SIGTERM"
-            took = f"the first call of the cost took longer than {limit}={clock.compile_limit:g} seconds"
+            took = f"the first call of the cost took longer than {limit}={clock.compile_budget:g} seconds"
             raise UserError(f"{took}: give a larger compile_budget or a shorter rollout") from None
         examination = _Examination(simulator, setup, clock)
         try:
