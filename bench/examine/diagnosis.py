@@ -62,8 +62,7 @@ def compare_costs(stages: GradientStages, twin: Callable[..., Any]) -> float:
     thetas = stages.theta[:, None] + 1e-2 * stages.scale[:, None] * np.c_[
         np.zeros(stages.theta.size), random.standard_normal((stages.theta.size, THETAS))
     ]  # fmt: skip
-    w = None if stages.w is None else np.repeat(stages.w, thetas.shape[1], axis=1)
-    a, b = stages.costs(thetas), other.costs(thetas, w)
+    a, b = stages.costs(thetas), other.costs(thetas, stages.same_noise(thetas.shape[1]))
     size = np.maximum(np.abs(a), np.abs(b)).max()
     return float(np.abs(a - b).max() / size) if size > 0 else 0.0
 
@@ -142,7 +141,7 @@ def refined_gaps(stages: GradientStages, refined: Callable[..., Any]) -> list[Ga
         vectors = random.standard_normal((size, min(ALONG, size)))
         vectors *= scale[:, None] / np.linalg.norm(vectors, axis=0)
         at = np.concatenate([theta[:, None] + eps * vectors, theta[:, None] - eps * vectors], axis=1)
-        w = None if stages.w is None else np.repeat(stages.w, at.shape[1], axis=1)
+        w = stages.same_noise(at.shape[1])
         own, exact = (np.subtract(*np.split(costs, 2)) / (2 * eps) for costs in (stages.costs(at), other.costs(at, w)))
         slopes = stages.gradient_at(theta) @ vectors
         gaps.append(Gap(float(np.linalg.norm(slopes - exact)), float(np.linalg.norm(own - exact))))
@@ -228,20 +227,27 @@ def is_adaptive(
     if stages.gradient is None or not lines or error > FAR:
         return False
 
-    def along(line: LineScan, t: np.ndarray) -> np.ndarray:
-        return stages.costs(stages.theta[:, None] + line.direction[:, None] * t)
-
     if sum(len(line.jumps) for line in lines) < FEWEST_JUMPS and error <= NEAR:
         first, noise = lines[0], max(outcome.noise, stages.repeats.spread)
         reach, unit = LONGER * float(first.at[-1]), stages.simulator.unit
-        longer = scan(lambda t: along(first, t[0]), np.zeros(1), np.ones(1), noise, reach, points, halvings, most, unit)
+        longer = scan(
+            partial(stages.costs_along, first.direction),
+            np.zeros(1),
+            np.ones(1),
+            noise,
+            reach,
+            points,
+            halvings,
+            most,
+            unit,
+        )
         lines = [replace(longer, direction=first.direction)]
     if sum(len(line.jumps) for line in lines) < FEWEST_JUMPS:
         return False
     rows = []
     for line in lines:
         step = 1e-3 * float(line.at[1] - line.at[0])
-        costs = along(line, np.array([-step, step]))
+        costs = stages.costs_along(line.direction, np.array([-step, step]))
         apart = abs(float((costs[1] - costs[0]) / (2 * step) - line.direction @ stages.gradient))
         rows.append((sum(jump.size for jump in line.jumps), np.abs(np.diff(line.costs)).sum(), apart * np.ptp(line.at)))
     heights, changes, errors = np.array(rows).T
@@ -261,7 +267,7 @@ def _quick(stages: GradientStages, other: Simulator, space: Any, slope: np.ndarr
 
     def cost(z: np.ndarray) -> np.ndarray:
         def costs(thetas: np.ndarray) -> np.ndarray:
-            return other.costs(thetas, None if stages.w is None else np.repeat(stages.w, thetas.shape[1], axis=1))
+            return other.costs(thetas, stages.same_noise(thetas.shape[1]))
 
         return np.asarray(space.costs(costs, z, other.width))
 

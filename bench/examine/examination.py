@@ -398,7 +398,7 @@ class _Examination:
                 rounding = max(
                     measured, self.stages.repeats.spread, self.simulator.unit * (size if math.isfinite(size) else 0.0)
                 )
-                cost = partial(self._costs_along, direction)
+                cost = partial(self.stages.costs_along, direction)
                 line = scan(cost, np.zeros(1), np.ones(1), rounding, 3.0, points, halvings, most, self.simulator.unit)
                 line = replace(line, direction=direction)
                 lines.append(replace(line, missed=self._missed_share(line, checked)))
@@ -406,12 +406,6 @@ class _Examination:
             self.left_out.append("jumps and kinks on lines")
         self.clock.limit(1.0)
         return lines
-
-    def _costs_along(self, direction: np.ndarray, t: np.ndarray) -> np.ndarray:
-        """Return the costs ``(B,)`` at theta + t * direction for ``t (1, B)``."""
-        width = max(self.simulator.width, 1)
-        parts = [t[0, i : i + width] for i in range(0, t.shape[1], width)]
-        return np.concatenate([self.stages.costs(self.theta[:, None] + direction[:, None] * part) for part in parts])
 
     def _missed_share(self, line: LineScan, checked: Check | None) -> float:
         """Return the share of the cost's change along a line that its gradient does not explain.

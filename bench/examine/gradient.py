@@ -9,7 +9,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -146,8 +146,22 @@ class GradientStages:
 
     def costs(self, thetas: np.ndarray, w: np.ndarray | None = None) -> np.ndarray:
         """Return the costs ``(B,)`` of ``thetas (d, B)``, all under the same draw of the simulator's own noise."""
+        return self.simulator.costs(thetas, self.same_noise(thetas.shape[1], w))
+
+    def same_noise(self, count: int, w: np.ndarray | None = None) -> np.ndarray | None:
+        """Return one draw of the simulator's own noise for each of ``count`` thetas, ``(n, count)``; None without noise."""
         w = self.w if w is None else w
-        return self.simulator.costs(thetas, None if w is None else np.repeat(w, thetas.shape[1], axis=1))
+        return None if w is None else np.repeat(w, count, axis=1)
+
+    def thetas_along(self, direction: np.ndarray, t: np.ndarray) -> Iterator[np.ndarray]:
+        """Yield the thetas at theta + t * direction for ``t (n,)``, a batch at a time, since memory holds few large ones."""
+        width = max(self.simulator.width, 1)
+        for first in range(0, t.size, width):
+            yield self.theta[:, None] + direction[:, None] * t[first : first + width]
+
+    def costs_along(self, direction: np.ndarray, t: np.ndarray) -> np.ndarray:
+        """Return the costs ``(n,)`` at theta + t * direction for t of n numbers."""
+        return np.concatenate([self.costs(thetas) for thetas in self.thetas_along(direction, t.ravel())])
 
     def gradient_at(self, theta: np.ndarray, w: np.ndarray | None = None) -> np.ndarray:
         """Return the simulator's gradient at ``theta (d,)``."""
@@ -186,12 +200,10 @@ class GradientStages:
         edges = np.linspace(start, end, panels + 1)
         half = np.diff(edges)[:, None] / 2
         t, weights = ((edges[:-1, None] + half) + half * x).ravel(), (half * weight).ravel()
-        slopes = []
-        for first in range(0, t.size, max(self.simulator.width, 1)):
-            part = t[first : first + max(self.simulator.width, 1)]
-            at = self.theta[:, None] + direction[:, None] * part
-            w = None if self.w is None else np.repeat(self.w, part.size, axis=1)
-            slopes.append(direction @ self.simulator.gradients(at, w))
+        slopes = [
+            direction @ self.simulator.gradients(thetas, self.same_noise(thetas.shape[1]))
+            for thetas in self.thetas_along(direction, t)
+        ]
         return float(weights @ np.concatenate(slopes))
 
     # ------------------------------------------------------------------------------------------------ stages
@@ -265,32 +277,25 @@ class GradientStages:
     def _repeat(self) -> None:
         """Repeat calls, after equal and after other thetas, and compare the results."""
         self.clock.start_stage("repeating a call")
-        other = self.theta + 1e-3 * self.scale
-        after: dict[str, list[float]] = {"theta": [], "other": []}
-        others: list[float] = []
+        theta, other = self.theta, self.theta + 1e-3 * self.scale
+        calls, values = (theta, other, theta, theta, other, theta, theta), []  # the first one follows other thetas
         try:
-            for before, at in (
-                ("other", self.theta), ("theta", other), ("other", self.theta), ("theta", self.theta), ("theta", other),
-                ("other", self.theta), ("theta", self.theta),
-            ):  # fmt: skip
-                value = float(self.costs(at[:, None])[0])
-                if at is other:
-                    others.append(value)
-                else:
-                    after[before].append(value)
-            self._repeated = True
+            for at in calls:
+                values.append(float(self.costs(at[:, None])[0]))
         except OutOfTime:
             self.left_out.append("repeating a call")
         self._repeat_gradient(other)
-        spreads = []
-        for values in ([*after["theta"], *after["other"], self.value], others):
-            if len(values) > 1 and np.isfinite(values).all():
-                spreads.append(float(np.ptp(values)))
-        self.repeats.spread = max([self._costs_store.spread, *spreads])
-        last = after["other"][1:]  # the first of them followed the differences, so other thetas
-        if self.repeats.spread > 0 and len(after["theta"]) > 1 and len(last) > 1:
-            apart = abs(after["theta"][-1] - last[-1])
-            is_alike = max(np.ptp(after["theta"]), np.ptp(last)) <= STATE * apart
+        self.repeats.spread = self._costs_store.spread
+        for at in (theta, other):
+            same = [value for value, each in zip(values, calls, strict=False) if each is at] + [self.value] * (
+                at is theta
+            )
+            if len(same) > 1 and np.isfinite(same).all():
+                self.repeats.spread = max(self.repeats.spread, float(np.ptp(same)))
+        self._repeated = len(values) == len(calls)
+        if self._repeated and self.repeats.spread > 0:
+            after_theta, after_other = values[3::3], values[2::3]
+            is_alike = max(np.ptp(after_theta), np.ptp(after_other)) <= STATE * abs(after_theta[-1] - after_other[-1])
             # last digits that vary at random are alike by chance
             self.repeats.has_state = bool(is_alike and self.repeats.spread > self.repeats.floor)
 
