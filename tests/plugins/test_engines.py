@@ -155,7 +155,7 @@ def test_lean_changes_no_number():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("mode", ["forward", "reverse"])
+@pytest.mark.parametrize("mode", [pytest.param("forward", marks=pytest.mark.full), "reverse"])
 def test_stiffness_and_mass_compile_nothing_anew(mode, monkeypatch):
     monkeypatch.setattr(compiling, "_known", {})  # it keeps a limited number, of which earlier tests have filled all
     compiled = []
@@ -320,7 +320,7 @@ def test_gradient_of_a_failed_rollout_that_is_a_number_fails_the_kit(monkeypatch
 @pytest.mark.parametrize("engine", [Mujoco(), Mjx()], ids=repr)
 def test_references_of_an_engine_miss_the_gradient_by_the_error_they_state(engine, monkeypatch):
     """Twenty references from draws of their own, on a scene whose gradient is known: errors over stated errors are about 1."""
-    of = program(DoubleIntegrator(horizon=10))
+    of = program(DoubleIntegrator(horizon=3))
     problem, truth, ratios = engine.compile(of), of.closed_form_gradient(), []
     drawn = noise.draw
     for seed in range(20):

@@ -99,7 +99,7 @@ def test_the_plan_fills_every_horizon(horizon):
     np.testing.assert_allclose(plan[-1, 7:9], theta.reshape(3, 4, 2)[(horizon - 1) * 3 // horizon, 2:], atol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.parametrize("values", [{"lean": 0.0}, {"lean": 0.2}])
 def test_the_converged_solver_of_mjx_gives_the_same_gradient(values):
     if not registry.find("backends", "mjx").available:
