@@ -12,7 +12,7 @@ from bench import run
 from bench.cli import main
 from bench.experiment.columns import IDENTITY
 from bench.measure import noise
-from bench.measure.gradcheck import EPS, FAULTS, VERDICTS, Sample, diagnose
+from bench.measure.gradcheck import EPS, FAULTS, VERDICTS, Sample, judge
 from bench.model import Problem, compose, registry
 from bench.run import store
 from bench.studies.gradient_check import GradientCheck, measure
@@ -60,7 +60,7 @@ def verdicts(problem, unit=FLOAT64):
     places, found = measure.examine(problem, problem.program.theta0, drawn, directions, unit, SEARCH)
     told = {}
     for place, (sample, _) in zip(places, found, strict=True):
-        told.setdefault(place.point, []).append(diagnose(sample))
+        told.setdefault(place.point, []).append(judge(sample).verdict)
     return {point: set(names) for point, names in told.items()}
 
 
@@ -208,7 +208,7 @@ def test_sources_initial_state_of_the_bounce_is_a_kink():
             step, costs[: step.size], costs[step.size], costs[step.size + 1 :],
             float(direction @ problem.grad(theta, np.zeros((3, 1)))[:, 0]), np.zeros(step.size, bool), scale=2.24,
         )  # fmt: skip
-        told.append(diagnose(sample))
+        told.append(judge(sample).verdict)
     assert told[0] == "kink"
     assert told[1] not in ("kink", *FAULTS)
 
@@ -216,23 +216,23 @@ def test_sources_initial_state_of_the_bounce_is_a_kink():
 def test_kink_with_a_derivative_outside_its_slopes_is_a_wrong_adjoint():
     step = np.ones(1) * EPS
     inside, outside = (
-        Sample(step, 1.0 + step, 1.0, 1.0 + 2.0 * step, derivative, np.ones(step.size, bool), slope=abs(derivative))
+        Sample(step, 1.0 + step, 1.0, 1.0 + 2.0 * step, derivative, np.ones(step.size, bool))
         for derivative in (2.0, 2.1)
     )
-    assert diagnose(inside) == "kink"
-    assert diagnose(outside) == "wrong_adjoint"
+    assert judge(inside).verdict == "kink"
+    assert judge(outside).verdict == "wrong_adjoint"
 
 
 def test_differences_that_never_settle_tell_nothing():
     generator = np.random.default_rng(1)
     costs = generator.standard_normal((2, EPS.size))
     sample = Sample(EPS, costs[0], 0.0, costs[1], 1.0, np.zeros(EPS.size, bool))
-    assert diagnose(sample) == "unsettled"
+    assert judge(sample).verdict == "unsettled"
 
 
 def test_cost_that_is_no_number():
     bad = np.full(EPS.size, np.nan)
-    assert diagnose(Sample(EPS, bad, 0.0, bad, 1.0, np.zeros(EPS.size, bool))) == "nonfinite"
+    assert judge(Sample(EPS, bad, 0.0, bad, 1.0, np.zeros(EPS.size, bool))).verdict == "nonfinite"
 
 
 # ------------------------------------------------------------------------------------------------- contact modes
