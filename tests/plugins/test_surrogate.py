@@ -102,15 +102,6 @@ def test_a_rigid_motion_is_that_of_its_kappa_and_one_step_has_the_derivative_of_
 
 
 @pytest.mark.slow
-def test_a_rigid_law_with_equal_kappas_has_the_derivative_of_its_motion():
-    theta, still = np.array([[0.15, 0.3], [-2.0, -1.0], [0.0, 0.0]]), np.zeros((3, 2))
-    equal, plain = (
-        ball(law, 60) for law in (SurrogateBackward(kappa=1e-4, soft_kappa=1e-4), Complementarity(kappa=1e-4))
-    )
-    np.testing.assert_allclose(equal.grad(theta, still), plain.grad(theta, still), rtol=1e-9, atol=1e-12)
-
-
-@pytest.mark.slow
 def test_control_variate_stays_unbiased_with_a_surrogate_gradient():
     surrogate = ball(SurrogateBackward(soft_kappa=0.1), 60)
     assert surrogate.program.surrogate
@@ -146,12 +137,3 @@ def test_rows_tables_and_charts_say_it_in_words(tmp_path):
     charts = [chart for chart in given.study.views(given, rows).charts if chart.printed]
     assert charts
     assert all(SURROGATE in chart.subtitle for chart in charts)
-
-
-@pytest.mark.slow
-def test_gradcheck_says_it_in_words(tmp_path, capsys):
-    words = ["gradcheck", "billiard", "contacts=[straight_through]", "backends=[jax]", "sweep.horizon=[60]"]
-    from bench import cli
-
-    assert cli.main([*words, f"results_dir={tmp_path}"]) == 1
-    assert SURROGATE in capsys.readouterr().out
