@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from bench.plugins.backends import compiling, mujoco
+from bench.plugins.backends import mujoco
 from bench.plugins.backends.jax import Jax
 from bench.plugins.backends.mjx import Mjx
 from bench.plugins.backends.mujoco import Mujoco
@@ -115,20 +115,6 @@ def test_lean_changes_no_number():
     theta, w = samples(of)
     lean, full = (Mujoco(lean=flag).compile(of).value(theta, w) for flag in (True, False))
     np.testing.assert_array_equal(lean, full)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("mode", ["forward", "reverse"])
-def test_stiffness_and_mass_compile_nothing_anew(mode, monkeypatch):
-    monkeypatch.setattr(compiling, "_known", {})  # it keeps a limited number, of which earlier tests have filled all
-    compiled = []
-    for stiffness, mass, dt in ((1e3, 0.1, 0.005), (1e4, 0.1, 0.005), (1e5, 0.3, 0.004)):
-        of = program(Pushing(horizon=4, mass=mass, dt=dt), stiffness=stiffness)
-        known = len(compiling._known)
-        found = gradients(Mjx(mode=mode), of)
-        compiled.append(len(compiling._known) - known)
-        assert distance(found, gradients(Jax(), of)) < 1e-2
-    assert compiled == [1, 0, 0]
 
 
 # --------------------------------------------------------------------------------------------------- refusals

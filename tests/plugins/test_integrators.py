@@ -145,16 +145,9 @@ def test_explicit_stability_limit(integrator, limit):
 @pytest.mark.parametrize("damping", [0.0, 1.0, 10.0, 15.0], ids=["undamped", "damped", "critical", "overdamped"])
 @pytest.mark.parametrize("integrator", EXPLICIT, ids=named)
 def test_mass_spring_gradient(integrator, damping):
-    """The closed form of the program, and that of the physics up to the integrator's order."""
     scene = MassSpring(damping=damping)
     problem = compiled(scene, integrator, backend=Torch())
     assert gradient(problem) == pytest.approx(scene.closed_form_gradient(None, integrator), rel=1e-9)
-    errors = []
-    for halvings in (3, 4):
-        fine = dataclasses.replace(scene, dt=scene.dt / 2**halvings, horizon=scene.horizon * 2**halvings)
-        closed = fine.closed_form_gradient(None, integrator)
-        errors.append(np.linalg.norm(closed - scene.physical_gradient()))
-    assert math.log2(errors[0] / errors[1]) == pytest.approx(integrator.order, abs=0.2)
 
 
 @pytest.mark.parametrize(
