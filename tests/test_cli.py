@@ -266,6 +266,13 @@ class Escaping(SampleMean):
 '''
 
 
+NAMED = """
+theta = {"\\x1b[31mred": 0.3}
+cost = lambda x: x["\\x1b[31mred"] ** 2
+grad = lambda x: {"\\x1b[31mred": 5.0}
+"""
+
+
 def test_nothing_raw_reaches_the_terminal(tmp_path, capsys):
     folder = tmp_path / "own"
     folder.mkdir()
@@ -273,6 +280,8 @@ def test_nothing_raw_reaches_the_terminal(tmp_path, capsys):
     assert main(["list", "escaping", f"plugins={folder}"]) == 0
     words = ["scenes=[heaviside]", "backends=[numpy]", "estimators=[escaping]", "samples=8", "repeats=4", "name=raw"]
     assert main([*words, "workers=0", f"plugins={folder}", f"results_dir={tmp_path}"]) == 1
+    (folder / "cost.py").write_text(NAMED)
+    assert main(["examine", f"{folder}/cost.py:cost", "theta=theta", "grad=grad", "calls=300"]) == 1
     answer = capsys.readouterr()
     assert "alert" in answer.out
     for letter in ("\x1b", "\x07"):

@@ -222,7 +222,7 @@ def right_cases():
 def torch_cases():
     import torch
 
-    def fall(x, cut=lambda f: f, state=lambda q: q, steps=60):
+    def fall(x, cut=lambda f: f, state=lambda q: q, steps=35):
         q, v = x[0], x[1]
         for _ in range(steps):
             force = -9.81 + cut(200.0 * torch.relu(-q) - 3.0 * torch.relu(-q) * v)

@@ -408,15 +408,15 @@ def test_two_runs_of_one_experiment_at_once(tmp_path):
     assert [path.name for path in (tmp_path / "sweep").glob("*pending*")] == []
 
 
-@pytest.mark.slow
-def test_killed_at_twenty_moments(tmp_path):
-    """A 200-cell sweep is killed 20 times: no finished row is lost, and the table is that of an uninterrupted run."""
-    words = sweep(200)
+@pytest.mark.parametrize("kills", [pytest.param(5, marks=pytest.mark.slow), pytest.param(20, marks=pytest.mark.full)])
+def test_killed_again_and_again(tmp_path, kills):
+    """A sweep is killed while it runs: no finished row is lost, and the table is that of an uninterrupted run."""
+    words = sweep(10 * kills)
     assert bench(*words, f"results_dir={tmp_path / 'whole'}").returncode == 0
     store = Store(tmp_path / "cut" / "sweep", COLUMNS)
     dice = random.Random(0)
     had: set[str] = set()
-    for _ in range(20):
+    for _ in range(kills):
         run = start(*words, f"results_dir={tmp_path / 'cut'}")
         had_at_start = len(had)
         deadline = time.monotonic() + 30

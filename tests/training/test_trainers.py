@@ -169,7 +169,7 @@ def test_the_objective_of_ppo_is_flat_where_its_ratio_is_clipped():
         assert (size == 0.0) == is_flat, (change, advantage)
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_shac_swings_the_cartpole_up():
     """Half of the published steps, from about -2,000 for hanging still to above -800; results/standard/train has all."""
     run = training(
