@@ -28,7 +28,6 @@ from bench.report.writer import write
 from bench.run.files import make_directory
 from bench.studies.gradient_check import views as gradient_check
 from bench.studies.gradient_check.lines import PER_COMPONENT
-from bench.studies.growth import views as growth
 from bench.studies.stability import views as stability
 from bench.studies.three_errors import views as three_errors
 from bench.studies.twins import views as twins
@@ -256,7 +255,7 @@ def test_growth_keeps_noises_apart_and_joins_what_steps_with_the_horizon():
     words = ["study=growth", "scenes=[double_integrator]", "estimators=[fobg]", "sweep.sigma=[0.1,0.2]"]
     given, rows = made(*words, "sweep.zip.horizon=[10,20]", "sweep.zip.dt=[0.1,0.05]")
     rows = rows.assign(gradient_median=1.0, time_horizon=rows["horizon"] * rows["dt"])
-    shown = growth.views(given, rows)
+    shown = given.study.views(given, rows)
     assert dict(shown.rows["problem"].value_counts()) == {
         "double_integrator, sigma=0.1": 2, "double_integrator, sigma=0.2": 2
     }  # fmt: skip
