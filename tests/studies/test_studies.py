@@ -28,7 +28,6 @@ from bench.report.writer import write
 from bench.run.files import make_directory
 from bench.studies.gradient_check import views as gradient_check
 from bench.studies.gradient_check.lines import PER_COMPONENT
-from bench.studies.stability import views as stability
 from bench.studies.three_errors import views as three_errors
 from bench.studies.twins import views as twins
 
@@ -223,7 +222,7 @@ def test_maps_are_apart_by_parameters_and_their_titles_say_defaults():
         "scenes=[mass_spring]", "sweep.stiffness=[10,100]", "sweep.zip.dt=[0.1,0.05]", "sweep.zip.horizon=[10,20]",
         "sweep.mass_spring.damping=[0,1,10]",
     )  # fmt: skip
-    first, every = stability.views(given, rows).charts
+    first, every = given.study.views(given, rows).charts
     assert dict(every.frame["problem"].value_counts()) == {f"mass_spring, damping={d}": 4 for d in (0, 1, 10)}
     assert list(first.frame["problem"]) == ["mass_spring, damping=0"] * 4
 
@@ -232,19 +231,19 @@ def test_maps_of_scenes_that_no_label_tells_apart_are_apart():
     """sigma has a column of its own, and so is in no identity string."""
     given, rows = mapped("scenes=['mass_spring[sigma=0.1]','mass_spring[sigma=0.2]']", "sweep.stiffness=[10,100]")
     assert rows["scene"].nunique() == 1
-    every = stability.views(given, rows).charts[1].frame
+    every = given.study.views(given, rows).charts[1].frame
     assert list(dict.fromkeys(every["problem"])) == ["mass_spring, sigma=0.1", "mass_spring, sigma=0.2"]
 
 
 def test_a_stiffness_that_equals_another_swept_number_stays_on_its_map():
     given, rows = mapped("scenes=[mass_spring]", "sweep.stiffness=[10,100]", "sweep.mass_spring.damping=[10,100]")
-    for _, part in stability.views(given, rows).charts[1].frame.groupby("problem"):
+    for _, part in given.study.views(given, rows).charts[1].frame.groupby("problem"):
         assert list(part["stiffness"]) == [10.0, 100.0]
 
 
 def test_a_share_is_not_named_after_a_parameter_that_varies_in_it():
     given, rows = mapped("scenes=[mass_spring]", "sweep.stiffness=[10,100]", "sweep.mass_spring.damping=[0,1]")
-    (line,) = stability.views(given, rows).tables[0].frame.to_dict("records")
+    (line,) = given.study.views(given, rows).tables[0].frame.to_dict("records")
     assert (line["scene"], line["step"]) == ("mass_spring", "semi_implicit_euler")
 
 
@@ -295,7 +294,7 @@ def test_a_scene_with_a_stiffness_of_its_own_keeps_its_cells_apart(own):
     assert axis.unit == "N/m"
     assert rows["stiffness"].nunique() == 1  # that of the law
     given, rows = mapped(*words, "sweep.sprung.stiffness=[1,10,100]", "sweep.penalty.stiffness=[1,10]")
-    maps = stability.views(given, rows).charts[1].frame.groupby("problem")
+    maps = given.study.views(given, rows).charts[1].frame.groupby("problem")
     assert [list(cells["stiffness"]) for _, cells in maps] == [[1.0, 10.0]] * 3
 
 
