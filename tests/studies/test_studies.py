@@ -28,7 +28,6 @@ from bench.report.writer import write
 from bench.run.files import make_directory
 from bench.studies.gradient_check import views as gradient_check
 from bench.studies.gradient_check.lines import PER_COMPONENT
-from bench.studies.three_errors import views as three_errors
 from bench.studies.twins import views as twins
 
 SPRUNG = '''
@@ -169,7 +168,7 @@ def erring(*words):
 def test_three_errors_of_two_integrators_are_twice_as_many_lines():
     words = ["scenes=[bounce_once]", "contacts=[impulse,penalty]", "integrators=[semi_implicit_euler,event_driven]"]
     given, rows = erring(*words, "sweep.dt=[0.1,0.05,0.02]")
-    found = three_errors.views(given, rows)
+    found = given.study.views(given, rows)
     lines = readable(found.tables[0])
     assert len(lines) == 2 * 2 * 3 * 2, "a line per cell, of two estimators"
     assert lines.groupby(["contact", "integrator"], sort=False).ngroups == 4
@@ -184,10 +183,10 @@ def test_three_errors_of_two_integrators_are_twice_as_many_lines():
 def test_three_errors_without_a_swept_axis_have_a_table_and_a_chart(tmp_path):
     given, rows = erring("scenes=[bounce_once]", "contacts=[impulse,penalty]", f"results_dir={tmp_path}", "formats=[]")
     make_directory(given.directory)
-    write(given, three_errors.views(given, rows))
+    write(given, given.study.views(given, rows))
     assert "| bounce_once | penalty | fobg |" in (given.directory / "three_errors.md").read_text()
     assert list(pd.read_csv(given.directory / "three_errors.csv")["estimator"]) == ["fobg", "reinforce"] * 2
-    assert list(three_errors.views(given, rows).charts[0].frame["law"]) == ["impulse"] * 2 + ["penalty"] * 2
+    assert list(given.study.views(given, rows).charts[0].frame["law"]) == ["impulse"] * 2 + ["penalty"] * 2
 
 
 def test_the_main_chart_of_three_errors_is_along_the_time_step_where_it_is_swept():
@@ -195,17 +194,17 @@ def test_the_main_chart_of_three_errors_is_along_the_time_step_where_it_is_swept
     words = ["scenes=[bounce_once]", "contacts=[penalty,softplus]", "bounce_once.dt=0.05", "bounce_once.horizon=20"]
     sweep = "sweep.union=[{zip:{horizon:[10,20,40],dt:[0.1,0.05,0.025]}},{penalty.stiffness:[50,1000,10000]},{beta:[100,1000]}]"
     given, rows = erring(*(f"scene.{word}" if word.startswith("bounce") else word for word in words), sweep)
-    drawn = three_errors.views(given, rows).charts[0].frame
+    drawn = given.study.views(given, rows).charts[0].frame
     assert set(drawn["dt"]) == {0.025}
     assert len(set(drawn["law"])) == 2
     given, rows = erring("scenes=[bounce_once]", "contacts=[impulse,softplus]", "sweep.beta=[100,1000]")
-    drawn = three_errors.views(given, rows).charts[0].frame
+    drawn = given.study.views(given, rows).charts[0].frame
     assert len(set(drawn["law"])) == 3, "every cell without a sweep of the step"
 
 
 def test_the_page_of_three_errors_draws_along_every_swept_parameter():
     given, rows = erring("scenes=[bounce_once]", "contacts=[softplus]", "sweep.beta=[100,1000]", "sweep.dt=[0.1,0.05]")
-    chart = three_errors.views(given, rows).charts[1]
+    chart = given.study.views(given, rows).charts[1]
     assert [column.heading for column in chart.x] == ["beta [1/m]", "dt [s]"]
 
 
