@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, text
 from bench.model import param
@@ -13,6 +13,7 @@ QUANTILES = {"low": 0.05, "quarter": 0.25, "median": 0.5, "three_quarters": 0.75
 """Quantiles over noise samples, stored for heavy-tailed quantities."""
 ORDERS = {"first_order": "first-order", "zeroth_order": "zeroth-order"}
 RATES = {"stretch": "largest singular value", "spectral": "spectral radius"}
+MEDIAN: dict[str, Any] = {"label": "norm of one gradient", "low": "gradient_low", "high": "gradient_high"}
 INTERVAL = {"low": "lower end of its 95% interval", "high": "upper end of its 95% interval"}
 
 
@@ -25,7 +26,7 @@ class Growth(StudyPackage):
         Column("time_horizon", "duration of the rollout", "s", label="horizon", format="setting"),
         *(
             Column(f"gradient_{name}", f"norm of one sample's gradient, {q:.0%} quantile",
-                   **({"label": "norm of one gradient", "low": "gradient_low", "high": "gradient_high"} if q == 0.5 else {}))
+                   **(MEDIAN if q == 0.5 else {}))
             for name, q in QUANTILES.items()
         ),
         Column("gradient_mean", "norm of the mean gradient"),
@@ -42,7 +43,8 @@ class Growth(StudyPackage):
         ),
         *(
             Column(f"{order}_variance{end}", f"variance of one {name} term, {what}",
-                   **({} if end else {"label": f"variance, {name}", "low": f"{order}_variance_low", "high": f"{order}_variance_high"}))
+                   label="" if end else f"variance, {name}", low="" if end else f"{order}_variance_low",
+                   high="" if end else f"{order}_variance_high")
             for order, name in ORDERS.items()
             for end, what in (("", "median over repeats"), ("_low", "5% quantile"), ("_high", "95% quantile"))
         ),
