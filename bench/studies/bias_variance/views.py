@@ -9,8 +9,7 @@ import pandas as pd
 from bench.experiment.experiment import Experiment
 from bench.experiment.views import Views
 from bench.report.views import arrange
-from bench.report.writer import reasons
-from bench.studies.bias_variance import charts, reported, tables, time_to_accuracy
+from bench.studies.bias_variance import charts, tables, time_to_accuracy
 from bench.studies.bias_variance.columns import COLUMNS
 from bench.studies.bias_variance.comparisons import compare_errors, method_table
 from bench.studies.bias_variance.costs import with_gradient_cost
@@ -23,7 +22,7 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     shown = arrange(experiment, with_gradient_cost(rows))
     methods = method_table(shown)
     if methods.empty:
-        return Views([replace(tables.every_cell(experiment, rows), files=["csv", "md"])], remarks=reasons(rows))
+        return Views([replace(tables.every_cell(experiment, rows), files=["csv", "md"])])
     errors = compare_errors(methods)
     best = time_to_accuracy.table(shown)
     comparisons = errors if best.empty else pd.concat([errors, time_to_accuracy.comparisons(best)], ignore_index=True)
@@ -37,10 +36,5 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
             *(replace(c, label=label) for c, label in ((charts.RMSE, "rel. RMSE"), (charts.BIAS, "rel. bias"))),
             replace(COLUMNS.by_name["time_s"], label="time"),
             *(COLUMNS.by_name[name] for name in RESULTS),
-        ],
-        remarks=[
-            *reasons(rows),
-            *reported.loose_references(rows, experiment.reference.tolerance),
-            *reported.sentences(rows),
         ],
     )
