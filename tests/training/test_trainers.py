@@ -186,8 +186,9 @@ SWING_UP = {
 }
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", SWING_UP)
+@pytest.mark.parametrize(
+    "name", [pytest.param("shac", marks=pytest.mark.full), pytest.param("ppo", marks=pytest.mark.slow)]
+)
 def test_a_trainer_swings_the_cartpole_up(name):
     """From about -2,000 for hanging still."""
     parameters, level = SWING_UP[name]
