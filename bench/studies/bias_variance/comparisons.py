@@ -195,3 +195,12 @@ def most_often_first(methods: pd.DataFrame, comparisons: pd.DataFrame) -> str:
         (name, (name, place) in working) for place, names in leaders(comparisons, methods).items() for name in names
     )
     return max(map(str, methods["estimator"].unique()), key=lambda name: (wins[name, True], wins[name, False]))
+
+
+def verdicts_by_estimator(methods: pd.DataFrame) -> pd.DataFrame:
+    """Return the number of settings per estimator and verdict; an estimator with several methods has the worst of them."""
+    order = [WORKS, OPEN, FAILS, NO_RESULT]
+    ranks = methods.assign(rank=methods["verdict"].map(order.index))
+    worst = ranks.groupby(["estimator", "setting"], sort=False)["rank"].max()
+    counts = worst.groupby(level="estimator", sort=False).value_counts().unstack(fill_value=0)
+    return counts.rename(columns=dict(enumerate(order))).reindex(columns=order, fill_value=0)

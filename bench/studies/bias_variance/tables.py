@@ -15,6 +15,7 @@ from bench.experiment import axes
 from bench.experiment.axes import Axis
 from bench.experiment.columns import COMMON, IDENTITY, Column, text
 from bench.experiment.experiment import Experiment
+from bench.experiment.parameters import number_problems
 from bench.experiment.views import Table
 from bench.measure.statistics import is_unexplained
 from bench.report.problems import ProblemRows, split_by_problem
@@ -23,6 +24,7 @@ from bench.report.views import (
     UNSTEADY,
     Arranged,
     estimator_curves,
+    pareto,
     rmse_interval,
     unsteady,
 )
@@ -37,6 +39,7 @@ from bench.studies.bias_variance.comparisons import (
     leaders,
     method_names,
     problems_by_axis,
+    verdicts_by_estimator,
 )
 from bench.studies.bias_variance.time_to_accuracy import limits
 
@@ -53,6 +56,10 @@ FAILURES = {
 """Sign and meaning of each status other than ``ok``."""
 REMARKED = "?"
 """Mark of a cell whose row has a remark."""
+LEAST = 3
+"""Fewest estimators for which the ranking is written; the main table is enough for fewer."""
+MANY = 2.5
+"""The number of evaluations per sample is shown above this value."""
 ESTIMATOR = text("method", label="estimator")
 
 
@@ -62,6 +69,10 @@ def tables(
     """Return all tables but those of the cost to reach an error."""
     result = [*pivots(experiment, shown), every_cell(experiment, rows)]
     result[0] = replace(result[0], data=axes.table(experiment, rows))
+    columns = [COLUMNS.by_name[name] for name in ("scene", "contact", "backend", "estimator", "rmse_rel", "time_s")]
+    result.append(Table("speed_accuracy", speed_accuracy(rows), columns, files=["csv"]))
+    if methods["estimator"].nunique() >= LEAST and methods["problem"].nunique() > 1:
+        result.append(ranking(methods))
     errors = comparisons[comparisons["basis"].isin((EQUAL_SAMPLES, EQUAL_ROLLOUTS))]
     result.append(recommendations(methods, errors))
     result.append(Table("verdicts", methods.drop(columns="setting"), [], files=["csv"]))
@@ -194,7 +205,59 @@ def every_cell(experiment: Experiment, rows: pd.DataFrame) -> Table:
     return Table("bias_variance", frame, columns, "Every cell", notes, files=["md"])
 
 
-# ------------------------------------------------------------------------------------------- what to use where
+def speed_accuracy(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return errors and costs; ``pareto`` is True where no other ok row of the problem is both faster and more accurate."""
+    results = ["rmse_rel", "bias_rel", "time_s", "time_iqr_s", "compile_s", "rollouts", "gradients"]
+    table = rows[["experiment", *IDENTITY, "status", *results]].assign(pareto=False)
+    good = table[(table["status"] == "ok") & np.isfinite(table["rmse_rel"]) & np.isfinite(table["time_s"])]
+    for _, part in good.groupby(number_problems(rows).loc[good.index]):
+        table.loc[part.index[pareto(part["time_s"], part["rmse_rel"])], "pareto"] = True
+    return table
+
+
+# --------------------------------------------------------------------------------------------------- ranking
+
+
+def ranking(methods: pd.DataFrame) -> Table:
+    """Return the ranking: a line per estimator with the number of settings by verdict, and its errors by problem.
+
+    Where a problem was swept, its error is the largest along the axis: the worst case.
+    """
+    counts = verdicts_by_estimator(methods)
+    worst = methods.assign(known=methods["error"].fillna(math.inf)).sort_values("known", kind="stable")
+    worst = worst.groupby(["estimator", "problem"], sort=False).tail(1).set_index(["estimator", "problem"])
+    problems = list(dict.fromkeys(methods["problem"]))
+    lines = []
+    for name, verdicts in counts.iterrows():
+        line: dict[str, Any] = {"method": name, **verdicts.to_dict()}
+        for i, problem in enumerate(problems):
+            row = worst.loc[(name, problem)] if (name, problem) in worst.index else None
+            line |= {f"p{i}": math.nan, f"p{i}_low": math.nan, f"p{i}_high": math.nan, f"p{i}_note": ""}
+            if row is not None:
+                work = f"({row['evaluations']:.0f}x)" if row["evaluations"] > MANY else ""
+                share = "biased" if row["bias_share"] > 0.5 else ""
+                note = row["status"] if row["status"] != "ok" else ", ".join(filter(None, (row["verdict"], share)))
+                line |= {f"p{i}": row["error"], f"p{i}_low": row["error_low"], f"p{i}_high": row["error_high"]}
+                line[f"p{i}_note"] = " ".join(filter(None, (note, work)))
+        finite = [line[f"p{i}"] for i in range(len(problems))]
+        line["worst"] = max(finite) if all(map(math.isfinite, finite)) else math.nan
+        lines.append(line)
+    frame = pd.DataFrame(lines).sort_values("worst", kind="stable", na_position="last")
+    columns = [
+        ESTIMATOR,
+        *(Column(str(name), format="setting") for name in counts),
+        *(
+            Column(f"p{i}", label=problem, low=f"p{i}_low", high=f"p{i}_high", note=f"p{i}_note")
+            for i, problem in enumerate(problems)
+        ),
+    ]
+    notes = (
+        f"Sorted by the worst case. Relative RMSE [95% interval] at equal {_basis(methods)}; where a problem was swept, the largest along "
+        "the axis. works: the whole interval is below 1; fails: it is above 1; open: it contains 1 or is not known. biased: more "
+        "than half of the squared error is bias. (40x): it evaluates 40 costs and gradients per sample, where others take "
+        "one or two.",
+    )
+    return Table("ranking", frame, columns, "estimators by their worst case", notes)
 
 
 def _basis(methods: pd.DataFrame) -> str:

@@ -8,6 +8,7 @@ import pandas as pd
 
 from bench.experiment.experiment import Experiment
 from bench.experiment.views import Views
+from bench.report.text import counted
 from bench.report.views import arrange
 from bench.studies.bias_variance import charts, tables, time_to_accuracy
 from bench.studies.bias_variance.columns import COLUMNS
@@ -37,4 +38,18 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
             replace(COLUMNS.by_name["time_s"], label="time"),
             *(COLUMNS.by_name[name] for name in RESULTS),
         ],
+        remarks=loose_references(rows, experiment.reference.tolerance),
     )
+
+
+def loose_references(rows: pd.DataFrame, tolerance: float) -> list[str]:
+    """Return in how many cells the reference's relative standard error is above the experiment's ``tolerance``, and the largest."""
+    good = rows[(rows["status"] == "ok") & (rows["reference_norm"] > 0)]
+    error = good["reference_se"] / good["reference_norm"]
+    loose = error[error > tolerance]
+    if loose.empty:
+        return []
+    return [
+        f"the standard error of the reference is above its tolerance of {100 * tolerance:g}% in {counted(len(loose), 'cell')}, up to "
+        f"{100 * loose.max():.2g}% ({good.loc[loose.idxmax(), 'scene']}): more reference.samples make it smaller"
+    ]
