@@ -26,7 +26,6 @@ from bench.studies.identify.measure import (
     count_windows,
     information,
     is_minimum,
-    measure,
     model_of,
     run_fits,
     scan,
@@ -146,10 +145,8 @@ def test_single_shooting_is_lost_beyond_its_basin_and_windows_are_not():
 
 @pytest.mark.slow
 def test_a_row_in_all_ways():
-    row = measure(
-        cell_of("scenes=[mass_spring_damper[horizon=80]]", "integrators=[rk4]", "repeats=12"),
-        made("scenes=[mass_spring_damper]").study,
-    )
+    cell = cell_of("scenes=[mass_spring_damper[horizon=80]]", "integrators=[rk4]", "repeats=12")
+    row = cell.study.measure(cell, None)
     assert row["shooting"] == ["single", "multiple", "windows"]
     assert row["hidden"] == [0, 0, 0]
     assert min(row["converged"]) == 1.0
@@ -160,7 +157,7 @@ def test_a_row_in_all_ways():
 
 
 def test_model_of_a_coarse_step_says_so():
-    row = measure(cell_of("scenes=[sliding_block]", "repeats=16"), made("study=identify[refine=16]").study)
+    row = made("study=identify[refine=16]").study.measure(cell_of("scenes=[sliding_block]", "repeats=16"), None)
     assert row["step_shift_bound"] > shown.MAX_STEP_SHIFT
     assert row["coverage_high"][0] < 0.95
 
@@ -168,7 +165,7 @@ def test_model_of_a_coarse_step_says_so():
 @pytest.mark.slow
 def test_cramer_rao_is_reached_over_500_records_and_none_hides_the_gauge():
     cell = cell_of(*SPRING, "repeats=500")
-    row = measure(cell, made("study=identify[windows=2]").study)
+    row = made("study=identify[windows=2]").study.measure(cell, None)
     assert row["hidden"][0] == 0
     # the relative error of a standard deviation from 500 draws of two numbers
     assert abs(row["error"][0] - 1.0) < 4 / math.sqrt(2 * 1000)
@@ -224,7 +221,7 @@ def test_own_measurements_are_fitted(tmp_path):
     np.savetxt(tmp_path / "own.csv", displacement(4.4, 0.5, t)[:, None], delimiter=",", header="x", comments="")
     experiment = made(*SPRING, f"study=identify[data={tmp_path / 'own.csv'},start=1.05,iterations=8]")
     (cell,) = cells(experiment)
-    row = measure(cell, experiment.study)
+    row = experiment.study.measure(cell, None)
     assert row["fits"] == 1
     assert math.isnan(row["coverage"][0])  # no truth is known
     assert all(map(math.isnan, row["truth"]))
@@ -239,7 +236,7 @@ def test_a_table_with_times_may_lack_lines_and_its_noise_is_estimated(tmp_path):
     table[np.arange(201) % 7 != 3].to_csv(tmp_path / "own.csv", index=False)
     experiment = made(*SPRING, f"study=identify[data={tmp_path / 'own.csv'},time=t,measured=x]")
     (cell,) = cells(experiment)
-    row = measure(cell, experiment.study)
+    row = experiment.study.measure(cell, None)
     assert row["explained"] == 1.0
     assert row["noise_size"] == pytest.approx(0.02, rel=0.2)  # three standard errors of Laplace noise
     assert row["intervals"] == ["own size"]
@@ -253,9 +250,9 @@ def test_as_many_measurements_as_unknowns_need_a_stated_noise(tmp_path):
     experiment = made(*short, f"study=identify[data={tmp_path / 'two.csv'}]")
     (cell,) = cells(experiment)
     with pytest.raises(Unsupported, match="2 measurements for 2 unknowns: state the noise"):
-        measure(cell, experiment.study)
+        experiment.study.measure(cell, None)
     experiment = made(*short, f"study=identify[data={tmp_path / 'two.csv'},measurement=0.01]")
-    row = measure(next(iter(cells(experiment))), experiment.study)
+    row = experiment.study.measure(next(iter(cells(experiment))), None)
     assert math.isnan(row["explained"])  # too few to test
 
 
@@ -272,7 +269,7 @@ def test_estimates_come_first_and_only_what_is_identifiable_has_one(tmp_path):
     noise = 0.01 * np.random.default_rng(2).standard_normal(200)
     np.savetxt(tmp_path / "own.csv", displacement(4.4, 0.5, t) + noise)
     experiment = made(*SPRING, f"study=identify[data={tmp_path / 'own.csv'}]")
-    row = measure(next(iter(cells(experiment))), experiment.study)
+    row = experiment.study.measure(next(iter(cells(experiment))), None)
     estimates, unnoticed = table_of(experiment, row)
     assert list(estimates.index) == ["stiffness/mass", "damping/mass", "mass", "stiffness", "damping"]
     assert estimates["unit"].tolist() == ["(N/m)/kg", "(N s/m)/kg", "kg", "N/m", "N s/m"]
@@ -291,7 +288,7 @@ def test_estimates_come_first_and_only_what_is_identifiable_has_one(tmp_path):
 
 def test_a_parameter_that_moves_nothing_has_no_interval():
     experiment = made(*SPRING, "theta=[stiffness,damping,hold]", "scene.mass_spring_damper.hold=1", "repeats=2")
-    row = measure(next(iter(cells(experiment))), experiment.study)
+    row = experiment.study.measure(next(iter(cells(experiment))), None)
     estimates, _ = table_of(experiment, row)
     assert estimates.loc["hold", "identifiable"] == "no"
     assert estimates.loc["hold", ["estimate", "low", "high"]].isna().all()
@@ -344,7 +341,7 @@ def own_record(tmp_path, name):
     own = ("scene.mass_spring_damper.damping=0.3", "scene.mass_spring_damper.start=3.0")
     experiment = made(*SPRING, "theta=[stiffness,damping]", *own, f"study=identify[data={path}]")
     (cell,) = cells(experiment)
-    return measure(cell, experiment.study)
+    return experiment.study.measure(cell, None)
 
 
 @pytest.mark.slow
@@ -653,12 +650,12 @@ def test_a_record_of_its_end_only_has_one_scan_without_an_open_count():
 def test_the_scan_is_drawn_with_its_minima():
     given = config.load([SCAN, "backends=[numpy]", "optimizers=[gauss_newton]", "samples=1", *CHAOS])
     (cell,) = cells(given)
-    rows = pd.DataFrame([cell.columns() | measure(cell, given.study) | {"experiment": "chaos"}])
+    rows = pd.DataFrame([cell.columns() | given.study.measure(cell, None) | {"experiment": "chaos"}])
     chaos = study_of(given).views(given, rows)
     (chart,) = [chart for chart in chaos.charts if chart.name == "scan_rate"]
     counts = chart.frame[chart.frame["part"] == "local minimum"].groupby("window", sort=False).size()
-    assert counts["whole record of 200 steps: 131 minima"] == 131
-    assert counts["windows of 10 steps: 17 minima"] == 17
+    assert counts["whole record of 200 steps, local minima: 131"] == 131
+    assert counts["windows of 10 steps, local minima: 17"] == 17
     assert chart.x[0].heading == "rate [1/s]"
     assert [mark.at for mark in chart.marks if mark.name == "truth"] == [3.78]
     table = chaos.tables[-1].frame.set_index("steps")
