@@ -62,14 +62,6 @@ def closed_form_fisher():
     return rows @ rows.T
 
 
-def test_checked_information_of_the_spring():
-    fisher = closed_form_fisher()
-    assert fisher == pytest.approx(np.array([[153173.26, -65209.88], [-65209.88, 632731.78]]), rel=1e-5)
-    bound = np.linalg.inv(fisher)
-    assert np.sqrt(np.diag(bound)) == pytest.approx([0.00261307, 0.00128568], rel=1e-5)
-    assert bound[0, 1] / math.sqrt(bound[0, 0] * bound[1, 1]) == pytest.approx(0.209465, rel=1e-5)
-
-
 def test_information_is_that_of_the_closed_form():
     model = model_of(cell_of(*SPRING, "theta=[stiffness,damping]"))
     found = information(model, model.values, 0.01)
@@ -119,28 +111,6 @@ def test_friction_fitted_with_a_step_holds_for_that_step():
     assert (fine.record(np.array([[0.3 * 1.001, 0.3 * 0.999]])) @ [1, -1]) / 0.0006 == pytest.approx(
         [-5.09684], rel=0.01
     )
-
-
-@pytest.mark.parametrize(("bounces", "expected"), [(1, 0.00625), (4, 0.002728)])
-def test_restitution_from_heights(bounces, expected):
-    """h_n = e^(2n) with 1 cm noise at e = .8: sd(e) from the first height, and from four."""
-    n = np.arange(1, bounces + 1)
-    slopes = 2 * n * 0.8 ** (2 * n - 1) / 0.01
-    assert 1 / math.sqrt(slopes @ slopes) == pytest.approx(expected, rel=2e-4)
-
-
-@pytest.mark.slow
-def test_single_shooting_is_lost_beyond_its_basin_and_windows_are_not():
-    """Over T = 10 s single shooting converges from within 4.4934/10 of the frequency, windows of 2 s from within 2.25."""
-    model = model_of(cell_of("scenes=[mass_spring_damper[damping=1e-9]]", "integrators=[rk4]", "theta=[stiffness]"))
-    truth = model.values  # 4: frequency 2
-    data = model.record(truth[:, None])
-    for off, converges in ((0.3, True), (0.8, False)):
-        start = np.full((1, 1), (2.0 + off) ** 2)
-        for shooting, count in (("single", 1), ("windows", 5)):
-            fitting = Fitting(model, shooting, count, 0.01, np.array([1.0, 2.0]))
-            found = np.exp(run_fits(fitting, GaussNewton(), fitting.start(start, data), data, 20)[0][0, 0])
-            assert (abs(found - 4.0) < 1e-3) == (converges or shooting == "windows"), (off, shooting)
 
 
 @pytest.mark.slow
@@ -213,19 +183,6 @@ def test_unusable_records_are_refused_in_a_line(tmp_path, text, message):
     reason = refused("scenes=[mass_spring_damper]", f"study=identify[data={path}{time}]")
     assert re.search(message, reason)
     assert reason.count("\n") == 0
-
-
-@pytest.mark.slow
-def test_own_measurements_are_fitted(tmp_path):
-    t = 0.05 * np.arange(1, 201)
-    np.savetxt(tmp_path / "own.csv", displacement(4.4, 0.5, t)[:, None], delimiter=",", header="x", comments="")
-    experiment = made(*SPRING, f"study=identify[data={tmp_path / 'own.csv'},start=1.05,iterations=8]")
-    (cell,) = cells(experiment)
-    row = experiment.study.measure(cell, None)
-    assert row["fits"] == 1
-    assert math.isnan(row["coverage"][0])  # no truth is known
-    assert all(map(math.isnan, row["truth"]))
-    assert row["estimate"][:2] == pytest.approx([4.4, 0.5], rel=STEPPED)
 
 
 def test_a_table_with_times_may_lack_lines_and_its_noise_is_estimated(tmp_path):
@@ -351,13 +308,6 @@ def test_a_record_with_another_drag_is_not_explained(tmp_path):
     assert "in v|v|" in row["contradictions"]
 
 
-@pytest.mark.slow
-def test_a_record_of_the_model_is_explained(tmp_path):
-    row = own_record(tmp_path, "right")
-    assert row["explained"] == 1.0
-    assert row["contradictions"] == ""
-
-
 @pytest.mark.parametrize(
     ("name", "least", "most"),
     [
@@ -389,12 +339,6 @@ def test_one_outlier_is_noticed():
     assert "largest residual" in verdict.contradictions
 
 
-@pytest.mark.slow
-def test_faults_of_a_sensor_are_named(tmp_path):
-    for fault, word in (("gain 0.99", "gain of sensor 0"), ("drift 2 sigma", "drift of sensor 0")):
-        assert word in own_record(tmp_path, fault)["contradictions"]
-
-
 def judged(noise, records=40, **settings):
     """The share of records of 150 measurements and a line that are explained, and that noise of unit size is."""
     from bench.measure import adequacy
@@ -422,14 +366,6 @@ NOISES = {
 def test_right_models_are_explained_whatever_the_noise_looks_like(name):
     # 5% by design for normal noise; the tails of 150 numbers are known roughly only
     assert judged(NOISES[name])[0] >= 0.8
-
-
-@pytest.mark.slow
-def test_noise_of_another_size_is_noticed_on_both_sides_and_only_if_one_is_stated():
-    for factor in (0.5, 1.5):
-        other = lambda rng, size, factor=factor: factor * rng.standard_normal(size)  # noqa: E731
-        assert judged(other, 20) == (0.0, 0.0)
-        assert judged(other, 20, is_size_known=False)[0] >= 0.8
 
 
 @pytest.mark.parametrize(("rho", "least"), [(0.0, 0.9), (0.5, 0.85), (0.9, 0.8)])
@@ -489,23 +425,6 @@ def standard():
     return given, rows, study_of(given).views(given, rows)
 
 
-def test_verdicts_are_those_of_the_stored_table(standard):
-    """Counted again from the CSV's own lists, without the code of the views."""
-    rows = pd.read_csv(STANDARD / "identify" / "identify.csv")
-    listed = {
-        name: [float(word) for cell in rows[name] for word in cell.strip("[]").split()]
-        for name in ("converged_high", "coverage_high")
-    }
-    fits = next(table for table in standard[2].tables if table.name == "fits").frame
-    counts = fits["verdict"].value_counts()
-    lost = [high < 0.9 for high in listed["converged_high"]]
-    narrow = [high < 0.95 for high in listed["coverage_high"]]
-    assert counts["unconverged"] == sum(lost)
-    assert counts["narrow"] == sum(np.array(narrow) & ~np.array(lost))
-    rk4 = fits[(fits["integrator"] == "rk4") & (fits["shooting"] == "single")]
-    assert rk4["verdict"].tolist() == ["precise"] * 5
-
-
 def test_chart_and_tables_have_the_rows(standard):
     _, rows, views = standard
     estimates, _, parameters, fits, *_ = views.tables
@@ -547,14 +466,6 @@ def test_interval_of_the_error_covers():
     low, high = shown.error_interval(errors, pd.Series(np.full(4000, 20.0)))
     # 4,000 draws of a share of 0.95: three standard errors
     assert np.mean((low <= 1.0) & (high >= 1.0)) == pytest.approx(0.95, abs=0.0104)
-
-
-@pytest.mark.parametrize("status", ["nonfinite", "unsupported"])
-def test_rows_without_results_are_said_so(standard, status):
-    given, rows, _ = standard
-    views = study_of(given).views(given, rows.assign(status=status, reason="planted"))
-    assert not views.charts
-    assert views.remarks == [f"{len(rows)} {status}: planted"]
 
 
 def test_own_measurements_have_no_coverage_to_show(standard):
@@ -607,13 +518,6 @@ def test_local_minima_of_the_logistic_map_depend_on_the_window_and_on_its_last_s
     assert (found["minima"][place], found["minima_open"][place]) == (with_last, without)
 
 
-def test_a_count_of_local_minima_holds_for_its_grid_and_rounding():
-    """As docs/controller.md states it."""
-    otherwise = [minima_of_the_map(window, False, step_of=lambda r, x: r * x - r * x**2) for window in (200, 10, 5)]
-    assert otherwise == [139, 14, 1]
-    assert 1.9 < minima_of_the_map(200, False, 4001) / minima_of_the_map(200, False) < 2.3
-
-
 def test_a_map_step_is_exact():
     model = model_of(cell_of(*CHAOS))
     x, record = 0.5, model.record(model.values[:, None])[:, 0]
@@ -661,7 +565,3 @@ def test_the_scan_is_drawn_with_its_minima():
     table = chaos.tables[-1].frame.set_index("steps")
     assert table.loc[[200, 10, 5], "minima"].tolist() == [131, 17, 1]
     assert table.loc[[200, 10, 5], "minima_open"].tolist() == [130, 10, 1]
-
-
-def test_rows_without_a_scan_show_none(standard):
-    assert not [chart for chart in standard[2].charts if chart.name.startswith("scan")]
