@@ -60,7 +60,7 @@ class Chart:
     frame: pd.DataFrame
     """A line per point. Its column ``row``, if any, is the position of the cell in ``Views.rows``."""
     x: Sequence[Column]
-    """The horizontal quantities: print draws the first, a reader of the page chooses."""
+    """The horizontal quantities: the first is drawn, ``*.plotted.csv`` has all."""
     y: Sequence[Column]
     kind: ChartKind = "lines"
     title: str = ""

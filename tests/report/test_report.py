@@ -54,7 +54,8 @@ def made(tmp_path):
 
 def written(made, rows):
     """The paths of all files of rows, tables and charts."""
-    return writer.write(made, made.study.views(made, rows))
+    shown = made.study.views(made, rows)
+    return writer.write(made, shown, writer.drawings(made, shown))
 
 
 @pytest.fixture(scope="module")

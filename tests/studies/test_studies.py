@@ -309,10 +309,9 @@ def test_a_study_without_a_page_gets_its_numbers_and_filters_by_what_varies(own)
     rows = rows.assign(weight=[1.0, 2.0, 30.0], outcome=["good", "bad", "good"])
     views = views_of(given, rows)
     data = page_data(given, rows, views, [[]] * 3)
-    assert [axis["label"] for axis in data["charts"][0]["y"]] == ["weight [kg]"]
-    assert data["charts"][0]["x"][0]["column"] == "mass"
+    assert [(chart.x[0].name, chart.y[0].heading) for chart in views.charts] == [("mass", "weight [kg]")]
     assert data["filters"] == ["mass", "outcome"]
-    assert data["tables"]["rows"]["mass"]() == [1, 2, 3]
+    assert data["cells"]["mass"]() == [1, 2, 3]
 
 
 def test_verdicts_and_what_was_swept_can_be_filtered_by():
