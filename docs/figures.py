@@ -298,7 +298,7 @@ def trained(experiment: str = "train") -> pd.DataFrame:
 
 
 def trained_in_range(low: float, high: float) -> str:
-    """Return how many runs of ``shac`` with its published settings end with a mean return in a range, of how many."""
+    """Return how many runs of ``shac`` with the public settings end with a mean return in a range, of how many."""
     final = trained().query("method == 'shac'")["final_return"]
     return f"{((low <= final) & (final <= high)).sum()} of {len(final)}"
 
@@ -329,22 +329,20 @@ def trained_table(experiment: str = "train") -> str:
 
 
 def windows_table(experiment: str = "train") -> str:
-    """Return gradient, its bias and final return by the length of a window as a Markdown table."""
-    head = ["| window [steps] | norm of the gradient | its bias | final return |", "|--:" * 4 + "|"]
-    return block(head + [
-        f"| {line['window']:.0f} | {number(line['window_gradient'])} | {window_bias(line)} | {final_return(line)} |"
+    """Return gradient and final return by the length of a window as a Markdown table; on the cart-pole also the bias."""
+    has_bias = experiment == "train"
+    head = f"| window [steps] | norm of the gradient |{' its bias |' * has_bias} final return |"
+    return block([head, "|--:" * (3 + has_bias) + "|"] + [
+        f"| {line['window']:.0f} | {number(line['window_gradient'])} |{f' {window_bias(line)} |' * has_bias} {final_return(line)} |"
         for line in aggregate.windows(trained(experiment)).to_dict("records")
     ])  # fmt: skip
 
 
 def stiffness_table() -> str:
-    """Return gradient, its bias and final return by the stiffness of the ground and the length of a window, as Markdown."""
-    head = [
-        "| stiffness [N/m] | window [steps] | norm of the gradient | its bias | final return |",
-        "|--:" * 5 + "|",
-    ]
+    """Return gradient and final return by the stiffness of the ground and the length of a window, as Markdown."""
+    head = ["| stiffness [N/m] | window [steps] | norm of the gradient | final return |", "|--:" * 4 + "|"]
     return block(head + [
-        f"| {count(stiffness)} | {line['window']:.0f} | {number(line['window_gradient'])} | {window_bias(line)} | {final_return(line)} |"
+        f"| {count(stiffness)} | {line['window']:.0f} | {number(line['window_gradient'])} | {final_return(line)} |"
         for stiffness, part in trained("train/stiffness").groupby("stiffness")
         for line in aggregate.windows(part).to_dict("records")
     ])  # fmt: skip
@@ -356,11 +354,17 @@ def gradient_norms(experiment: str, window: int) -> str:
     return span(runs.loc[runs["trainer"].str.contains(f"window={window}]", regex=False), "gradient_typical"])
 
 
+def used_steps(experiment: str) -> str:
+    """Return the range over runs of the share of control steps that trainers use which ignore others, over a whole run."""
+    shares = pd.Series([np.mean(log) for log in trained(experiment)["log_used"] if np.size(log) > 1])
+    return f"{shares.min():.0%} to {shares.max():.0%}"
+
+
 def faults_table(experiment: str) -> str:
     """Return per trainer and fault the number of runs whose log shows it, and the numbers of the first, as Markdown."""
     runs = trained(experiment)
     seeds = runs.groupby("method")["seed"].nunique()
-    numbers = [name for name in ("update", "factor", "error") if name in (faults := aggregate.faults(runs))]
+    faults, numbers = aggregate.faults(runs), ["update", "value"]
     head = ["trainer", "fault", "runs", "first in seed", *numbers]
     return block([f"| {' | '.join(head)} |", "|---|---|" + "--:|" * (len(head) - 2)] + [
         f"| `{method}` | {code.replace('_', ' ')} | {len(part)} of {seeds[method]} | {part['seed'].iloc[0]:.0f} | "
@@ -465,36 +469,12 @@ def dose_runs() -> str:
     return dose_ratios("searches", parts, {name: name for name in UPDATES if name != "bias 0.6"})
 
 
-WINDOW_NAMES = {"windowed[steps=8]": "8 steps", "windowed": "16 steps", "windowed[steps=32]": "32 steps"}
-"""What each method of ``dose_response_windows`` is called in its table."""
-
-
-def window_searches() -> pd.DataFrame:
-    """Return the searches of ``dose_response_windows`` to 1/100."""
-    return analysis.searches(rows_of("dose_response_windows")).query("target == 100")
-
-
 def windows_missed() -> str:
     """Return on how many problems the best gradient reaches 1/100 and a window of no length does, of how many."""
-    medians = window_searches().pivot_table(index="problem", columns="method", values="median", aggfunc="first")
-    missed = np.isfinite(medians[analysis.BEST]) & np.isinf(medians[list(WINDOW_NAMES)]).all(axis=1)
+    searches = analysis.searches(rows_of("dose_response_windows")).query("target == 100")
+    medians = searches.pivot_table(index="problem", columns="method", values="median", aggfunc="first")
+    missed = np.isfinite(medians[analysis.BEST]) & np.isinf(medians.filter(like="windowed")).all(axis=1)
     return f"{int(missed.sum())} of {len(medians)}"
-
-
-def dose_windows() -> str:
-    """Return bias and updates to 1/100 of truncated windows by problem, beside the best gradient, as a Markdown table."""
-    head = [
-        f"| problem | best gradient | {' | '.join(WINDOW_NAMES.values())} |",
-        f"|---|--:|{'--:|' * len(WINDOW_NAMES)}",
-    ]
-    rows = []
-    for problem, own in window_searches().groupby("problem", sort=False):
-        by_method = own.drop_duplicates("method").set_index("method")
-        updates = {name: number(median) if np.isfinite(median) else "-" for name, median in by_method["median"].items()}
-        cells = [updates[analysis.BEST]]
-        cells += [f"{updates[name]} ({number(by_method.loc[name, 'bias'])})" for name in WINDOW_NAMES]
-        rows.append(f"| {problem} | {' | '.join(cells)} |")
-    return block([*head, *rows])
 
 
 def is_counted(problems: pd.DataFrame) -> pd.Series:
@@ -502,28 +482,12 @@ def is_counted(problems: pd.DataFrame) -> pd.Series:
     return problems["reason_100"].isna() | (problems["reason_100"] == "")
 
 
-def dose_unreached(name: str = "dose_response", scene_class: str = "stiff") -> str:
-    """Return on how many problems of a class that count no natural method reaches 1/100, of how many."""
-    counted = int(is_counted(dose("problems", name).query("scene_class == @scene_class")).sum())
-    rows = dose("pairs", name).query("target == 100 and scene_class == @scene_class").set_index("comparison")
+def dose_unreached() -> str:
+    """Return on how many stiff problems that count no natural method reaches 1/100, of how many."""
+    counted = int(is_counted(dose("problems").query("scene_class == 'stiff'")).sum())
+    rows = dose("pairs").query("target == 100 and scene_class == 'stiff'").set_index("comparison")
     reached = rows["problems"].get(f"{ROLLOUTS}1", 0)
     return f"{counted - int(reached)} of {counted}"
-
-
-def dose_data() -> str:
-    """Return the number of cells, problems and problems that count, by class."""
-    rows, problems = rows_of("dose_response"), dose("problems")
-    counted = is_counted(problems)
-    by_class = [
-        f"{name} {int(part.sum())} of {len(part)}"
-        for name, part in counted.groupby(problems["scene_class"], sort=False)
-    ]
-    dims = rows["dim"].dropna()
-    ok = f"{count((rows['status'] == 'ok').sum())} of {count(len(rows))} cells gave a result"
-    return block([
-        f"{ok}, on {len(problems)} problems of {int(dims.min())} to {int(dims.max())} coordinates. Problems that count for the target 1/100: "
-        f"{', '.join(by_class)}."
-    ])  # fmt: skip
 
 
 def mjx_solver(column: str) -> pd.Series:
@@ -543,11 +507,6 @@ def mjx_solver_error() -> str:
     """Return the largest error of MJX's gradients with 2 iterations or more, relative to the converged program's."""
     errors = mjx_solver("gradient_error_rel")
     return number(errors[errors.index > 1].max())
-
-
-def dose_controls() -> str:
-    """Return what methods that use only costs take, by problem, as a Markdown table."""
-    return block((STANDARD / "dose_response_controls" / "reached.md").read_text().split("\n\n")[1].splitlines())
 
 
 def quadruped_growth(horizon: float) -> str:
@@ -670,13 +629,9 @@ FIGURES: dict[str, Callable[[], str]] = {
     "dose-pairs": lambda: dose_classes({name: name for name in UPDATES}),
     "dose-runs": dose_runs,
     "dose-unreached": dose_unreached,
-    "dose-policy-unreached": lambda: dose_unreached("dose_response_policy", "smooth"),
-    "dose-windows": dose_windows,
     "dose-windows-missed": windows_missed,
     "dose-hash": lambda: ", ".join(sorted(set(rows_of("dose_response")["hypotheses"]) - {""})),
     "dose-costs": lambda: dose_classes({cost: f"{ROLLOUTS}{cost}" for cost in ("1", "2", "4", "measured")}),
-    "dose-data": dose_data,
-    "dose-controls": dose_controls,
     "fobg-soft": lambda: span(pushing("fobg", stiffness=SOFT)["rmse_rel"]),
     "reinforce-soft": lambda: span(pushing("reinforce", stiffness=SOFT)["rmse_rel"]),
     "fobg-stiff": lambda: interval(pushing("fobg", stiffness=1e4)),
@@ -748,6 +703,7 @@ FIGURES: dict[str, Callable[[], str]] = {
     "hopper-answer": lambda: answer_of("train/hopper"),
     "hopper-table": lambda: trained_table("train/hopper"),
     "hopper-stiffness": stiffness_table,
+    "hopper-used": lambda: used_steps("train/hopper"),
     "hopper-windows": lambda: windows_table("train/hopper"),
     "hopper-faults": lambda: faults_table("train/hopper"),
     "cheetah-answer": lambda: answer_of("train/half_cheetah"),

@@ -71,8 +71,9 @@ def test_complex_step_is_the_derivative_of_the_program():
     assert complex_step(problem, theta, along) == pytest.approx(slope, rel=1e-10)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("horizon", [2000, 3000])
+@pytest.mark.parametrize(
+    "horizon", [pytest.param(2000, marks=pytest.mark.slow), pytest.param(3000, marks=pytest.mark.full)]
+)
 def test_long_chaotic_rollout_is_settled_and_its_faults_are_named(horizon, monkeypatch):
     problem = pendulum(horizon)
     theta = problem.program.theta0

@@ -134,7 +134,7 @@ def test_windows_and_traces_work_on_a_manifold():
     assert {"q12", "v10"} <= set(table.columns)
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_mjx_gives_the_same_jacobians_and_gradients():
     pytest.importorskip("mujoco.mjx")
     c, x = problem(Tumbling(horizon=6)), problem(Tumbling(horizon=6), "mjx", impedance=1e-4)

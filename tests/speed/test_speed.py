@@ -289,7 +289,7 @@ def test_bench_self_resumes_what_it_stored(tmp_path):
     assert [item.stored for item in planned] == [True] * 3
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_bench_self_writes_its_table(tmp_path):
     assert bench_self.main(["quick=true", f"results_dir={tmp_path}"]) == 0
     lines = json.loads((tmp_path / "bench_self" / "bench_self.json").read_text())["lines"]

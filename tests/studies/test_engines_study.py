@@ -16,7 +16,7 @@ from bench.report.views import newest_rows
 from bench.report.web.data import page_data
 from bench.run.execute import store_of
 from bench.run.plan import requested_rows
-from bench.studies.engines.views import LEVELS, level, with_limits
+from bench.studies.engines.views import LEVELS, levels, with_limits
 
 TOYS = Path(__file__).resolve().parents[1] / "engines" / "toys"
 
@@ -88,7 +88,7 @@ def test_levels_of_a_gradient(expected, changes):
         "status": "ok", "gradient": [1.0], "program_error_rel": 1e-6, "model_error_rel": 0.01, "rmse_rel": 0.2,
         "bias_low": 0.0, "bias_high": 0.05, "variance": 0.04, "nan_share": 0.0, "repeats": 8, "reference_se": 0.02, "reference_norm": 1.0,
     }  # fmt: skip
-    assert level(pd.Series(good | changes)) == expected
+    assert levels(pd.DataFrame([good | changes])) == [expected]
     assert expected in LEVELS
 
 

@@ -28,9 +28,6 @@ from bench.report.writer import write
 from bench.run.files import make_directory
 from bench.studies.gradient_check import views as gradient_check
 from bench.studies.gradient_check.lines import PER_COMPONENT
-from bench.studies.growth import views as growth
-from bench.studies.stability import views as stability
-from bench.studies.three_errors import views as three_errors
 from bench.studies.twins import views as twins
 
 SPRUNG = '''
@@ -171,7 +168,7 @@ def erring(*words):
 def test_three_errors_of_two_integrators_are_twice_as_many_lines():
     words = ["scenes=[bounce_once]", "contacts=[impulse,penalty]", "integrators=[semi_implicit_euler,event_driven]"]
     given, rows = erring(*words, "sweep.dt=[0.1,0.05,0.02]")
-    found = three_errors.views(given, rows)
+    found = given.study.views(given, rows)
     lines = readable(found.tables[0])
     assert len(lines) == 2 * 2 * 3 * 2, "a line per cell, of two estimators"
     assert lines.groupby(["contact", "integrator"], sort=False).ngroups == 4
@@ -186,10 +183,10 @@ def test_three_errors_of_two_integrators_are_twice_as_many_lines():
 def test_three_errors_without_a_swept_axis_have_a_table_and_a_chart(tmp_path):
     given, rows = erring("scenes=[bounce_once]", "contacts=[impulse,penalty]", f"results_dir={tmp_path}", "formats=[]")
     make_directory(given.directory)
-    write(given, three_errors.views(given, rows))
+    write(given, given.study.views(given, rows))
     assert "| bounce_once | penalty | fobg |" in (given.directory / "three_errors.md").read_text()
     assert list(pd.read_csv(given.directory / "three_errors.csv")["estimator"]) == ["fobg", "reinforce"] * 2
-    assert list(three_errors.views(given, rows).charts[0].frame["law"]) == ["impulse"] * 2 + ["penalty"] * 2
+    assert list(given.study.views(given, rows).charts[0].frame["law"]) == ["impulse"] * 2 + ["penalty"] * 2
 
 
 def test_the_main_chart_of_three_errors_is_along_the_time_step_where_it_is_swept():
@@ -197,17 +194,17 @@ def test_the_main_chart_of_three_errors_is_along_the_time_step_where_it_is_swept
     words = ["scenes=[bounce_once]", "contacts=[penalty,softplus]", "bounce_once.dt=0.05", "bounce_once.horizon=20"]
     sweep = "sweep.union=[{zip:{horizon:[10,20,40],dt:[0.1,0.05,0.025]}},{penalty.stiffness:[50,1000,10000]},{beta:[100,1000]}]"
     given, rows = erring(*(f"scene.{word}" if word.startswith("bounce") else word for word in words), sweep)
-    drawn = three_errors.views(given, rows).charts[0].frame
+    drawn = given.study.views(given, rows).charts[0].frame
     assert set(drawn["dt"]) == {0.025}
     assert len(set(drawn["law"])) == 2
     given, rows = erring("scenes=[bounce_once]", "contacts=[impulse,softplus]", "sweep.beta=[100,1000]")
-    drawn = three_errors.views(given, rows).charts[0].frame
+    drawn = given.study.views(given, rows).charts[0].frame
     assert len(set(drawn["law"])) == 3, "every cell without a sweep of the step"
 
 
 def test_the_page_of_three_errors_draws_along_every_swept_parameter():
     given, rows = erring("scenes=[bounce_once]", "contacts=[softplus]", "sweep.beta=[100,1000]", "sweep.dt=[0.1,0.05]")
-    chart = three_errors.views(given, rows).charts[1]
+    chart = given.study.views(given, rows).charts[1]
     assert [column.heading for column in chart.x] == ["beta [1/m]", "dt [s]"]
 
 
@@ -224,7 +221,7 @@ def test_maps_are_apart_by_parameters_and_their_titles_say_defaults():
         "scenes=[mass_spring]", "sweep.stiffness=[10,100]", "sweep.zip.dt=[0.1,0.05]", "sweep.zip.horizon=[10,20]",
         "sweep.mass_spring.damping=[0,1,10]",
     )  # fmt: skip
-    first, every = stability.views(given, rows).charts
+    first, every = given.study.views(given, rows).charts
     assert dict(every.frame["problem"].value_counts()) == {f"mass_spring, damping={d}": 4 for d in (0, 1, 10)}
     assert list(first.frame["problem"]) == ["mass_spring, damping=0"] * 4
 
@@ -233,19 +230,19 @@ def test_maps_of_scenes_that_no_label_tells_apart_are_apart():
     """sigma has a column of its own, and so is in no identity string."""
     given, rows = mapped("scenes=['mass_spring[sigma=0.1]','mass_spring[sigma=0.2]']", "sweep.stiffness=[10,100]")
     assert rows["scene"].nunique() == 1
-    every = stability.views(given, rows).charts[1].frame
+    every = given.study.views(given, rows).charts[1].frame
     assert list(dict.fromkeys(every["problem"])) == ["mass_spring, sigma=0.1", "mass_spring, sigma=0.2"]
 
 
 def test_a_stiffness_that_equals_another_swept_number_stays_on_its_map():
     given, rows = mapped("scenes=[mass_spring]", "sweep.stiffness=[10,100]", "sweep.mass_spring.damping=[10,100]")
-    for _, part in stability.views(given, rows).charts[1].frame.groupby("problem"):
+    for _, part in given.study.views(given, rows).charts[1].frame.groupby("problem"):
         assert list(part["stiffness"]) == [10.0, 100.0]
 
 
 def test_a_share_is_not_named_after_a_parameter_that_varies_in_it():
     given, rows = mapped("scenes=[mass_spring]", "sweep.stiffness=[10,100]", "sweep.mass_spring.damping=[0,1]")
-    (line,) = stability.views(given, rows).tables[0].frame.to_dict("records")
+    (line,) = given.study.views(given, rows).tables[0].frame.to_dict("records")
     assert (line["scene"], line["step"]) == ("mass_spring", "semi_implicit_euler")
 
 
@@ -256,7 +253,7 @@ def test_growth_keeps_noises_apart_and_joins_what_steps_with_the_horizon():
     words = ["study=growth", "scenes=[double_integrator]", "estimators=[fobg]", "sweep.sigma=[0.1,0.2]"]
     given, rows = made(*words, "sweep.zip.horizon=[10,20]", "sweep.zip.dt=[0.1,0.05]")
     rows = rows.assign(gradient_median=1.0, time_horizon=rows["horizon"] * rows["dt"])
-    shown = growth.views(given, rows)
+    shown = given.study.views(given, rows)
     assert dict(shown.rows["problem"].value_counts()) == {
         "double_integrator, sigma=0.1": 2, "double_integrator, sigma=0.2": 2
     }  # fmt: skip
@@ -296,7 +293,7 @@ def test_a_scene_with_a_stiffness_of_its_own_keeps_its_cells_apart(own):
     assert axis.unit == "N/m"
     assert rows["stiffness"].nunique() == 1  # that of the law
     given, rows = mapped(*words, "sweep.sprung.stiffness=[1,10,100]", "sweep.penalty.stiffness=[1,10]")
-    maps = stability.views(given, rows).charts[1].frame.groupby("problem")
+    maps = given.study.views(given, rows).charts[1].frame.groupby("problem")
     assert [list(cells["stiffness"]) for _, cells in maps] == [[1.0, 10.0]] * 3
 
 

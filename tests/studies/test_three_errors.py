@@ -18,11 +18,11 @@ from bench.experiment.grid import cells
 from bench.model import compose
 from bench.report.shown import Shown
 from bench.run.store import Store
-from bench.studies.three_errors import measure
-from bench.studies.three_errors.columns import COLUMNS
+from bench.studies.three_errors import ThreeErrors, measure
 from bench.studies.three_errors.measure import difference_check
 from bench.studies.three_errors.views import FLOOR, OWN, PROGRAM, TRAP, traps, views
 
+COLUMNS = ThreeErrors.columns
 NO_IMPACT = Impulse(time_of_impact=False)
 
 

@@ -13,7 +13,7 @@ from typing import Any, overload
 
 import numpy as np
 
-from bench.errors import UserError, unknown
+from bench.errors import UserError, printable, unknown
 
 ROUNDING = 1e-14
 """Size relative to the array's root mean square up to which a number counts as 0 with rounding errors."""
@@ -43,8 +43,8 @@ class Leaf:
 
     @property
     def name(self) -> str:
-        """Name of the whole array: its path, or ``theta``."""
-        return self.path or "theta"
+        """Name of the whole array: its path without control characters, or ``theta``."""
+        return printable(self.path) or "theta"
 
     def entry(self, index: int) -> str:
         """Return the name of one entry, such as ``gains[3]``."""

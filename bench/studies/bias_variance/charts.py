@@ -7,7 +7,6 @@ import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -75,38 +74,25 @@ def charts(
     labelled = replace(shown, rows=with_plotted_columns(shown.rows))
     styles = estimator_styles(shown.rows)
     subtitle = _conditions(shown)
-    main: list[Chart] = []
-    page_only: list[Chart] = []
     swept = shown.swept()
-    for axis in sorted(swept, key=lambda a: (-swept[a], a.column != "stiffness")):
-        if axis.column == "samples" and not best.empty:
-            continue
-        chart = _along(labelled, axis, methods, comparisons, styles, subtitle)
-        main += [chart] if chart is not None else []
+    along = [
+        _along(labelled, axis, methods, comparisons, styles, subtitle)
+        for axis in sorted(swept, key=lambda a: (-swept[a], a.column != "stiffness"))
+        if axis.column != "samples" or best.empty
+    ]
     if not best.empty:
-        first = _speed_accuracy(labelled, best, styles, subtitle)
-        main = [*([first] if first is not None else []), *main]
+        along = [_speed_accuracy(labelled, best, styles, subtitle), *along]
     elif shown.rows["backend"].nunique() > 1:
-        main += [_error_and_cost(labelled, styles, subtitle)]
+        along += [_error_and_cost(labelled, styles, subtitle)]
     if not swept and methods["problem"].nunique() > 1:
-        main = [_estimators(methods), *main]
-    everything = labelled.rows
-    page_only.append(
-        Chart(
-            "error_against_time", everything, TIMES, [RMSE, BIAS], "points", series="series",
-            panel="problem_", front="setting_", styles=styles, printed=False,
-            text="Each point is one cell. Lower left is better; above 1 an estimate is worse than the zero estimate. Points with "
-            "a ring are not beaten in both by any point shown of the same problem.",
-        )
+        along = [_estimators(methods), *along]
+    cloud = Chart(
+        "error_against_time", labelled.rows, [*TIMES, SPREAD], [RMSE, BIAS], "points", series="series",
+        panel="problem_", front="setting_", styles=styles, printed=False,
+        text="Each point is one cell. Lower left is better; above 1 an estimate is worse than the zero estimate. Points with "
+        "a ring are not beaten in both by any point shown of the same problem.",
     )  # fmt: skip
-    page_only.append(
-        Chart(
-            "bias_against_spread", everything, [SPREAD], [BIAS], "points", series="series",
-            panel="problem_", styles=styles, printed=False,
-            text="Towards the left more samples do not help; towards the top the error is bias.",
-        )
-    )  # fmt: skip
-    return [*main, *(chart for chart in page_only if len(chart.frame))]
+    return [chart for chart in (*along, cloud) if chart is not None and len(chart.frame)]
 
 
 # ------------------------------------------------------------------------------------------------------- frames
@@ -326,21 +312,18 @@ def _error_and_cost(shown: Arranged, styles: Mapping[str, Style], subtitle: str)
 
 def _estimators(methods: pd.DataFrame) -> Chart:
     """Return the heat table of errors: estimators by their worst case, in families, against problems."""
-    known = methods.assign(worst=methods["error"].where(methods["status"] == "ok", math.inf))
-    order = known.groupby("estimator", sort=False)["worst"].max().sort_values(kind="stable").index
-    families = {name: _family(name.partition("[")[0]) for name in order}
-    lines: list[dict[str, Any]] = []
-    for name in sorted(order, key=lambda n: list(dict.fromkeys(families.values())).index(families[n])):
-        for row in methods[methods["estimator"] == name].to_dict("records"):
-            mark = {FAILS: " fails", NO_RESULT: row["status"]}.get(row["verdict"], "")
-            lines.append({
-                "panel": families[name], "series": name, "problem": row["problem"],
-                "value": min(max(row["error"], 1e-3), 1e3) if math.isfinite(row["error"]) else math.nan,
-                "error": row["error"], "cell": number(row["error"]) if math.isfinite(row["error"]) else mark,
-            })  # fmt: skip
-    frame = pd.DataFrame(lines)
+    worst = methods["error"].where(methods["status"] == "ok", math.inf)
+    names = worst.groupby(methods["estimator"], sort=False).max().sort_values(kind="stable").index
+    families = {name: _family(name.partition("[")[0]) for name in names}
+    order = sorted(names, key=lambda name: list(dict.fromkeys(families.values())).index(families[name]))
+    frame = methods.iloc[methods["estimator"].map(order.index).argsort(kind="stable")]
+    error, known = frame["error"], np.isfinite(frame["error"])
+    marks = frame["status"].where(frame["verdict"] == NO_RESULT, "").mask(frame["verdict"] == FAILS, " fails")
     return Chart(
-        "estimators", frame, [text("problem", label="")], [ESTIMATOR], "grid", panel="panel", value="value",
+        "estimators",
+        frame.assign(panel=frame["estimator"].map(families), series=frame["estimator"], value=error.clip(1e-3, 1e3).where(known),
+                     cell=error.map(number).where(known, marks)),
+        [text("problem", label="")], [ESTIMATOR], "grid", panel="panel", value="value",
         cell="cell", across=1, height=0.2, value_range=(1e-2, 1e2),
         subtitle="relative RMSE of one estimate, sorted by the worst case; above 1 the zero estimate is better",
     )  # fmt: skip

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -132,7 +131,7 @@ def _gradients(problem: Problem, scene: str, thetas: np.ndarray) -> tuple[np.nda
 def _optimum(cell: Cell, problem: Problem, session: Session, scored: np.ndarray) -> tuple[float, str]:
     """Return the lowest cost of the scored objective and its source."""
     if problem.program.continuous and not problem.program.exogenous:
-        optimum, how = known_optimum(cell, problem, session, SimpleNamespace(scored="plain"))
+        optimum, how = known_optimum(cell, problem, session)
         if np.isfinite(optimum):
             return optimum, how
     theta0 = np.array(problem.program.theta0, dtype=np.float64)

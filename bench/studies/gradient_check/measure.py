@@ -241,7 +241,7 @@ def _number(part: gradcheck.Part) -> int:
 
 def _checked(place: Place, sample: gradcheck.Sample, sides: Sequence[tuple[str, str]], under_noise: str) -> Point:
     minus, plus = zip(*sides, strict=True)
-    verdict = under_noise if place.point == "noise" else gradcheck.diagnose(sample)
+    verdict = under_noise if place.point == "noise" else gradcheck.judge(sample).verdict
     return Point(place.point, place.sample, place.number, verdict, sample, minus, plus, place.switch)
 
 
@@ -255,11 +255,11 @@ def _settled(problem: Problem, point: Point, place: Place) -> Point:
         both = np.concatenate([at, np.repeat(place.w[:, None], at.shape[1], axis=1)])
         return in_columns(lambda part: problem.value(part[: len(at)], part[len(at) :]), both, COLUMNS_AT_ONCE)
 
-    finding, _ = gradcheck.settle(
-        cost, place.theta, scale * place.direction, scale, point.sample, gradcheck.Finding("unsettled"),
+    finding = gradcheck.settle(
+        cost, place.theta, scale * place.direction, scale, point.sample,
         lambda theta, vector: tangent(problem, theta, vector, place.w),
     )  # fmt: skip
-    return replace(point, verdict=finding.verdict)
+    return point if finding is None else replace(point, verdict=finding.verdict)
 
 
 def beyond_stability(cell: Cell) -> list[str]:

@@ -15,7 +15,6 @@ from bench.experiment.views import Chart, Style, Table, Views
 from bench.report.problems import axes_of, problem_names, titled
 from bench.report.shown import PROBLEM
 from bench.report.views import arrange, attempted
-from bench.report.writer import reasons
 
 LEVEL = {"ok": "right", "inaccurate": "wrong", "wrong_sign": "wrong", "zero": "wrong", "diverged": "diverged",
          "nonfinite": "diverged", "unresolved": "open"}  # fmt: skip
@@ -60,11 +59,11 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     lines = limits(cells)
     whole = Table("stability_map", lines, LIMITS, "stability limits [N/m]", LIMIT_NOTES, data=table(experiment, rows))
     if cells.empty:
-        return Views([whole], remarks=reasons(rows))
+        return Views([whole])
     shares = Table("stability_shares", shares_of(cells), SHARES, "How often each contact law and step gives the right gradient",
                    SHARE_NOTES, terminal=True, page=True)  # fmt: skip
     columns = [experiment.columns.by_name[name] for name in RESULTS]
-    return Views([shares, whole], charts(cells), arrange(experiment, rows).rows, columns, reasons(rows))
+    return Views([shares, whole], charts(cells), arrange(experiment, rows).rows, columns)
 
 
 def cells_of(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:
