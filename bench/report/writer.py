@@ -46,7 +46,7 @@ def drawings(experiment: Experiment, views: Views) -> list[tuple[Chart, Figure]]
         return [
             (chart, draw(replace(chart, title=chart.title or experiment.question)))
             for chart in views.charts
-            if chart.printed and _is_telling(chart)
+            if _is_telling(chart)
         ]
 
 
@@ -106,7 +106,10 @@ def _in_markdown(one: TableCell) -> str:
 
 
 def show(experiment: Experiment, rows: pd.DataFrame, views: Views) -> None:
-    """Print the counts of cells, the headline, the tables that are meant for the terminal, and the headline again."""
+    """Print the counts of cells, the headline, the tables that are meant for the terminal, and the headline again.
+
+    Notes of a table that are in its Markdown file are not repeated.
+    """
     console = terminal.open_console()
     console.print(f"\n{experiment.name}: {experiment.question}" if experiment.question else f"\n{experiment.name}")
     counts = rows["status"].value_counts()
@@ -120,7 +123,7 @@ def show(experiment: Experiment, rows: pd.DataFrame, views: Views) -> None:
             for place, (heading, part) in enumerate(parts(table)):
                 texts = _terminal_text(replace(table, frame=part), console.width)
                 terminal.print_table(console, texts, heading or (table.title if place == 0 else ""), right=right)
-            for note in table.notes:
+            for note in table.notes if "md" not in table.files else ():
                 console.print(one_line(note))
     for text in map(one_line, views.remarks):
         console.print(text, soft_wrap="python -m bench" in text)  # a command stays one line, so that it can be copied
@@ -139,9 +142,13 @@ def _terminal_text(table: Table, width: int) -> pd.DataFrame:
 
 
 def reasons(rows: pd.DataFrame) -> list[str]:
-    """Return why cells failed, were refused or have remarks; reasons that differ only in numbers are counted together."""
+    """Return why cells failed, were refused or have remarks; counted together where reasons differ only in numbers.
+
+    All that are unsupported are one line.
+    """
     given = rows[rows["reason"] != ""]
     kinds = given["reason"].str.replace(r"\d+(\.\d+)?(e[+-]?\d+)?", "#", regex=True)
+    kinds = kinds.mask(given["status"] == "unsupported", "")
     groups = sorted(given.groupby(["status", kinds]), key=lambda item: -len(item[1]))
     return [
         f"{len(part)} {status}: {part['reason'].iloc[0]}" + ("" if part["reason"].nunique() == 1 else " (for example)")

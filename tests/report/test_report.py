@@ -202,7 +202,7 @@ def drawn(rows, swept, sweep=None, **given):
     if sweep is None:
         sweep = {name: sorted(map(float, rows[name].unique())) for name in swept}
     made = experiment(sweep=sweep, **given)
-    return {chart.name: chart for chart in made.study.views(made, rows).charts if chart.printed}
+    return {chart.name: chart for chart in made.study.views(made, rows).charts}
 
 
 def figure_of(chart):
