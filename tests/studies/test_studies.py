@@ -28,6 +28,7 @@ from bench.report.writer import write
 from bench.run.files import make_directory
 from bench.studies.gradient_check import views as gradient_check
 from bench.studies.gradient_check.lines import PER_COMPONENT
+from bench.studies.stability.views import cells_of
 from bench.studies.twins import views as twins
 
 SPRUNG = '''
@@ -146,13 +147,6 @@ def test_untrusted_undecided_and_missing_gradients_come_first_and_are_never_righ
     assert verdicts.loc[["wrong_factor", "nonfinite"], "trusted"].tolist() == ["no", "no"]
     assert list(shown.charts[0].frame["letter"]) == ["X", "ok"], "the worse verdict of the backends"
     assert "      python -m bench gradcheck 0" in shown.tables[1].notes
-    rows.at[1, "check_verdict"], rows.at[1, "point"] = ["jump"], ["noise"]
-    for name in ("check_verdict", "point", "check_error", "check_eps"):
-        rows[name] = [[]] * len(rows)
-    rows["status"], rows["reason"] = "unsupported", "no root finder"
-    nothing = gradient_check.views(given, rows)
-    assert not nothing.charts
-    assert nothing.remarks == ["4 unsupported: no root finder"]
 
 
 # ---------------------------------------------------------------------------------------------------- three_errors
@@ -162,31 +156,6 @@ def erring(*words):
     given, rows = made("study=three_errors", "backends=[jax]", "estimators=[fobg,reinforce]", *words)
     numbers = {name: 0.5 for name in ("forward_error_rel", "program_error_rel", "model_error_rel", "model_cosine")}
     return given, rows.assign(**numbers, bias=0.1, bias_rel=0.1, bias_low=0.05, bias_high=0.2, reference_norm=1.0)
-
-
-@pytest.mark.slow
-def test_three_errors_of_two_integrators_are_twice_as_many_lines():
-    words = ["scenes=[bounce_once]", "contacts=[impulse,penalty]", "integrators=[semi_implicit_euler,event_driven]"]
-    given, rows = erring(*words, "sweep.dt=[0.1,0.05,0.02]")
-    found = given.study.views(given, rows)
-    lines = readable(found.tables[0])
-    assert len(lines) == 2 * 2 * 3 * 2, "a line per cell, of two estimators"
-    assert lines.groupby(["contact", "integrator"], sort=False).ngroups == 4
-    drawn = found.charts[0].plotted()
-    assert list(dict.fromkeys(drawn["law"])) == [
-        f"{law}, {step}" for law in ("impulse", "penalty") for step in ("semi_implicit_euler", "event_driven")
-    ]
-    assert len(drawn) == 2 * 4, "both errors at the smallest step"
-
-
-@pytest.mark.slow
-def test_three_errors_without_a_swept_axis_have_a_table_and_a_chart(tmp_path):
-    given, rows = erring("scenes=[bounce_once]", "contacts=[impulse,penalty]", f"results_dir={tmp_path}", "formats=[]")
-    make_directory(given.directory)
-    write(given, given.study.views(given, rows))
-    assert "| bounce_once | penalty | fobg |" in (given.directory / "three_errors.md").read_text()
-    assert list(pd.read_csv(given.directory / "three_errors.csv")["estimator"]) == ["fobg", "reinforce"] * 2
-    assert list(given.study.views(given, rows).charts[0].frame["law"]) == ["impulse"] * 2 + ["penalty"] * 2
 
 
 def test_the_main_chart_of_three_errors_is_along_the_time_step_where_it_is_swept():
@@ -202,12 +171,6 @@ def test_the_main_chart_of_three_errors_is_along_the_time_step_where_it_is_swept
     assert len(set(drawn["law"])) == 3, "every cell without a sweep of the step"
 
 
-def test_the_page_of_three_errors_draws_along_every_swept_parameter():
-    given, rows = erring("scenes=[bounce_once]", "contacts=[softplus]", "sweep.beta=[100,1000]", "sweep.dt=[0.1,0.05]")
-    chart = given.study.views(given, rows).charts[1]
-    assert [column.heading for column in chart.x] == ["beta [1/m]", "dt [s]"]
-
-
 # ------------------------------------------------------------------------------------------------------- stability
 
 
@@ -221,8 +184,8 @@ def test_maps_are_apart_by_parameters_and_their_titles_say_defaults():
         "scenes=[mass_spring]", "sweep.stiffness=[10,100]", "sweep.zip.dt=[0.1,0.05]", "sweep.zip.horizon=[10,20]",
         "sweep.mass_spring.damping=[0,1,10]",
     )  # fmt: skip
-    first, every = given.study.views(given, rows).charts
-    assert dict(every.frame["problem"].value_counts()) == {f"mass_spring, damping={d}": 4 for d in (0, 1, 10)}
+    [first] = given.study.views(given, rows).charts
+    assert dict(cells_of(given, rows)["problem"].value_counts()) == {f"mass_spring, damping={d}": 4 for d in (0, 1, 10)}
     assert list(first.frame["problem"]) == ["mass_spring, damping=0"] * 4
 
 
@@ -230,13 +193,13 @@ def test_maps_of_scenes_that_no_label_tells_apart_are_apart():
     """sigma has a column of its own, and so is in no identity string."""
     given, rows = mapped("scenes=['mass_spring[sigma=0.1]','mass_spring[sigma=0.2]']", "sweep.stiffness=[10,100]")
     assert rows["scene"].nunique() == 1
-    every = given.study.views(given, rows).charts[1].frame
+    every = cells_of(given, rows)
     assert list(dict.fromkeys(every["problem"])) == ["mass_spring, sigma=0.1", "mass_spring, sigma=0.2"]
 
 
 def test_a_stiffness_that_equals_another_swept_number_stays_on_its_map():
     given, rows = mapped("scenes=[mass_spring]", "sweep.stiffness=[10,100]", "sweep.mass_spring.damping=[10,100]")
-    for _, part in given.study.views(given, rows).charts[1].frame.groupby("problem"):
+    for _, part in cells_of(given, rows).groupby("problem"):
         assert list(part["stiffness"]) == [10.0, 100.0]
 
 
@@ -293,7 +256,7 @@ def test_a_scene_with_a_stiffness_of_its_own_keeps_its_cells_apart(own):
     assert axis.unit == "N/m"
     assert rows["stiffness"].nunique() == 1  # that of the law
     given, rows = mapped(*words, "sweep.sprung.stiffness=[1,10,100]", "sweep.penalty.stiffness=[1,10]")
-    maps = given.study.views(given, rows).charts[1].frame.groupby("problem")
+    maps = cells_of(given, rows).groupby("problem")
     assert [list(cells["stiffness"]) for _, cells in maps] == [[1.0, 10.0]] * 3
 
 
@@ -306,10 +269,9 @@ def test_a_study_without_a_page_gets_its_numbers_and_filters_by_what_varies(own)
     rows = rows.assign(weight=[1.0, 2.0, 30.0], outcome=["good", "bad", "good"])
     views = views_of(given, rows)
     data = page_data(given, rows, views, [[]] * 3)
-    assert [axis["label"] for axis in data["charts"][0]["y"]] == ["weight [kg]"]
-    assert data["charts"][0]["x"][0]["column"] == "mass"
+    assert [(chart.x[0].name, chart.y[0].heading) for chart in views.charts] == [("mass", "weight [kg]")]
     assert data["filters"] == ["mass", "outcome"]
-    assert data["tables"]["rows"]["mass"]() == [1, 2, 3]
+    assert data["cells"]["mass"]() == [1, 2, 3]
 
 
 def test_verdicts_and_what_was_swept_can_be_filtered_by():
@@ -424,6 +386,14 @@ def test_the_command_of_a_gradient_check_repeats_its_cell(words):
 def test_the_command_of_a_gradient_check_without_time_steps_has_no_horizon():
     (cell,) = cells(config.load(["study=gradient_check", "scenes=[quadratic]", "estimators=[fobg]"]))
     assert reproduce.check_of(cell) == "python -m bench gradcheck quadratic 'backends=[jax]' seed=0"
+
+
+@pytest.mark.parametrize("name", one_a_study())
+def test_cells_without_results_are_said_so(name):
+    given, rows = made(f"experiment={name}")
+    shown = given.study.views(given, rows.assign(status="unsupported", reason="planted"))
+    assert not shown.charts
+    assert shown.remarks == [f"{len(rows)} unsupported: planted"]
 
 
 @pytest.mark.parametrize("name", sorted(registry.entries()["studies"]))
