@@ -64,12 +64,6 @@ class Subspace:
         """Number of coordinates m."""
         return len(self.components) + len(self.groups)
 
-    @property
-    def names(self) -> list[str]:
-        """The name of each coordinate."""
-        names = self.layout.names
-        return [names[i] for i in self.components] + [group.name for group in self.groups]
-
     def origin(self) -> np.ndarray:
         """Return the coordinates of theta, ``(m,)``: theta itself where every component is a coordinate, else 0."""
         return self.theta.copy() if self.is_whole else np.zeros(self.size)

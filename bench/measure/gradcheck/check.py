@@ -114,9 +114,7 @@ class Check:
 
     cause: str
     """The worst verdict, one of :data:`.verdicts.VERDICTS`."""
-    theta: np.ndarray
     gradient: np.ndarray
-    scale: np.ndarray
     parts: tuple[Part, ...]
     """Components and random directions at theta."""
     draws: tuple[Part, ...]
@@ -306,14 +304,7 @@ class _Checker:
             causes.append("nan_gradient")
         elif not repeats(first, again, self.unit).all():
             causes.append("nondeterministic")
-        return Check(
-            cause=most_severe(causes),
-            theta=theta,
-            gradient=first,
-            scale=self.scale,
-            parts=tuple(parts),
-            draws=tuple(draws),
-        )
+        return Check(cause=most_severe(causes), gradient=first, parts=tuple(parts), draws=tuple(draws))
 
     def _components(self, gradient: np.ndarray) -> list[int]:
         """Return the indices of the components to check one by one."""
