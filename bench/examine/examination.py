@@ -419,13 +419,11 @@ class _Examination:
         if not self.clock.can_afford(0, 4 * sum(PANELS)):
             self.left_out.append("the integral of the gradient along a line")
             return math.nan
-        integrals = [self._integral(line, panels) for panels in PANELS]
+        ends = float(line.at[0]), float(line.at[-1])
+        integrals = [self.stages.integrate(line.direction, *ends, panels) for panels in PANELS]
         missed = abs(line.costs[-1] - line.costs[0] - integrals[-1]) / changes
         doubt = abs(integrals[-1] - integrals[0]) / changes
         return float(missed) if doubt < max(0.1 * missed, LEAST_MISSED) else math.nan
-
-    def _integral(self, line: LineScan, panels: int) -> float:
-        return self.stages.integrate(line.direction, float(line.at[0]), float(line.at[-1]), panels)
 
     # ------------------------------------------------------------------------------------------------ noise
 

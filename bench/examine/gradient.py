@@ -443,7 +443,7 @@ class GradientStages:
             outcome = recaused(
                 replace(outcome, draws=tuple(part for part in outcome.draws if np.isfinite(part.program)))
             )
-        return self._with_roughness(self._without_small_spread(space, _with_zeros(outcome)))
+        return _with_roughness(self._without_small_spread(space, _with_zeros(outcome)))
 
     def _spread_of_gradients(self, space: Subspace) -> float:
         """Return the largest difference between equal calls of the gradient, relative to its norm."""
@@ -461,21 +461,6 @@ class GradientStages:
         ):
             return outcome
         return recaused(outcome)
-
-    def _with_roughness(self, outcome: Check) -> Check:
-        """Return a check with the cause ``rough`` where the cost varies as much between neighbours as over a wide step."""
-        if outcome.cause != "unsettled":
-            return outcome
-        rough = []
-        for part in outcome.parts:
-            sample, finite = part.sample, part.sample.finite
-            change = np.abs(sample.plus - sample.minus)[finite].max(initial=0.0)
-            rough.append(sample.noise > ROUGH * change and sample.noise > 1e6 * sample.unit * abs(sample.centre))
-        parts = tuple(
-            replace(part, verdict="unsettled") if is_rough else part
-            for part, is_rough in zip(outcome.parts, rough, strict=True)
-        )
-        return replace(outcome, parts=parts, cause="rough" if any(rough) else outcome.cause)
 
     def _locate(self, space: Subspace) -> None:
         """Find the numbers that cause the error of each wrong group."""
@@ -547,6 +532,17 @@ def _with_zeros(outcome: Check) -> Check:
     if all(part.verdict == "zero" for part in zeros):
         return outcome
     return recaused(outcome, lambda part: replace(part, verdict="zero") if any(part is p for p in zeros) else part)
+
+
+def _with_roughness(outcome: Check) -> Check:
+    """Return a check with the cause ``rough`` where the cost varies as much between neighbours as over a wide step."""
+    samples = [part.sample for part in outcome.parts if outcome.cause == "unsettled"]
+    changes = [np.abs(sample.plus - sample.minus)[sample.finite].max(initial=0.0) for sample in samples]
+    is_rough = any(
+        sample.noise > ROUGH * change and sample.noise > 1e6 * sample.unit * abs(sample.centre)
+        for sample, change in zip(samples, changes, strict=True)
+    )
+    return replace(outcome, cause="rough") if is_rough else outcome
 
 
 def recaused(outcome: Check, replaced: Callable[[Part], Part] = lambda part: part) -> Check:
