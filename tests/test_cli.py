@@ -121,36 +121,24 @@ BAD = [
     (["+experiment=optimise/smal"], ["optimise/smal", "'optimise/small'"]),
     (["scenes=[pushng]"], ["pushng", "'pushing'"]),
     (["contacts=[penality]"], ["penality", "'penalty'"]),
-    (["integrators=[eular]"], ["eular", "explicit_euler"]),
-    (["backends=[jaxx]"], ["jaxx", "'jax'"]),
-    (["estimators=[fobgg]"], ["fobgg", "'fobg'"]),
     (["scenes=[]"], ["scenes is empty"]),
     (["sweep.stifness=[1e3]"], ["stifness", "'stiffness'"]),
     (["sweep.stiffness=[]"], ["sweep.stiffness is empty"]),
     (["sweep.stiffness=[abc]"], ["stiffness", "must be a number"]),
     (["sweep.stiffness=[-1]"], ["penalty.stiffness=-1", "greater than 0"]),
-    (["sweep.sigma=[-1]"], ["pushing.sigma=-1", "greater than 0"]),
-    (["sweep.horizon=[0]"], ["pushing.horizon=0", "greater than 0"]),
-    (["sweep.horizon=[2.5]"], ["horizon=2.5", "whole number"]),
     (["samples=0"], ["samples=0", "at least 1"]),
-    (["sweep.samples=[8,0]"], ["samples=0", "at least 1"]),
     (["repeats=1"], ["repeats=1", "at least 2"]),
-    (["samples=many"], ["samples='many'", "whole number"]),
-    (["study=bias"], ["bias", "'bias_variance'"]),
     (["sample=3"], ["sample", "'samples'"]),
     (["scene.pushing.mas=0.2"], ["mas", "'mass'"]),
     (["scene.pushing.mass=heavy"], ["pushing.mass='heavy'", "a number"]),
-    (["scene.pushing.mass=true"], ["pushing.mass=True", "a number"]),
     (["scene.pushing=3"], ["scene.pushing=3", "parameter"]),
     (["estimator.alpha_ordr.gamma=1"], ["alpha_ordr", "'alpha_order'"]),
     (["estimators=[reinforce[baseline=center]"], ["reinforce"]),
     (["estimators=['reinforce[baseline=centre]']"], ["centre", "'center'"]),
     (["name=../up"], ["name='../up'"]),
-    (["scenes=["], ["scenes"]),
     (["nonsense=1"], ["nonsense", "allowed"]),
     (["rum"], ["rum", "'run'"]),
     (["list", "fbog"], ["fbog", "'fobg'"]),
-    (["check", "fbog"], ["fbog", "'fobg'"]),
     (["sweep={zip: {sigma: [0.1], horizon: [3, 4]}}"], ["equally long"]),
     (["reference.samples=1"], ["reference.samples"]),
     (["hydra.run.dir=/tmp"], ["Hydra"]),
@@ -299,22 +287,6 @@ def test_nothing_raw_reaches_the_terminal(tmp_path, capsys):
     for letter in ("\x1b", "\x07"):
         assert letter not in answer.out
         assert letter not in answer.err
-
-
-@pytest.mark.slow
-def test_theta_from_the_command_line(tmp_path):
-    words = [
-        "scenes=[pushing]", "backends=[numpy]", "estimators=[fobg,reinforce]", "scene.pushing.horizon=5", "samples=8",
-        "repeats=4", "reference.samples=4096", "sweep.sigma=[0.001]", "theta=[mass,stiffness]", "theta0=[0.12,900]",
-        "name=theta", f"results_dir={tmp_path}",
-    ]  # fmt: skip
-    assert main(words) == 0
-    table = pd.read_csv(tmp_path / "theta" / "bias_variance.csv")
-    assert (table["dim"] == 2).all()
-    assert (table["noise"] == "parameter").all()
-    assert all(
-        json.loads(text)["theta"] == {"names": ["mass", "stiffness"], "at": [0.12, 900]} for text in table["parameters"]
-    )
 
 
 def test_a_thread_of_a_plugin_and_a_closed_stream_do_not_keep_a_command_waiting(tmp_path):

@@ -2,7 +2,7 @@
 
 The true values come from closed forms, or from code below that imports no statistics, scene or contact law of this package.
 Coverage is the share of SETS simulated data sets whose 95% interval contains the true value, without leaving out any set.
-Sections: costs, tails, examine, references.
+Sections: tails, references.
 """
 
 from __future__ import annotations
@@ -11,18 +11,13 @@ import json
 import math
 import sys
 from collections.abc import Callable, Iterator
-from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy import special, stats
+from scipy import special
 
-Line = tuple[str, float, float, str]
-"""What was measured, its value, the number it is compared with, and the kind: ``coverage`` or ``difference``."""
-
-
-def share(inside: Any) -> float:
-    return float(np.mean(inside))
+Line = tuple[str, bool]
+"""What was measured with its value, and whether that is wrong."""
 
 
 def within(interval: tuple[float, float], truth: float) -> bool:
@@ -30,56 +25,6 @@ def within(interval: tuple[float, float], truth: float) -> bool:
 
 
 # ---------------------------------------------------------------------------------- estimators (bias_variance)
-
-
-def _rows(random: np.random.Generator, sizes: tuple[int, ...], repeats: int, std: float, bias: float, heavy: bool):
-    """Return rows of a study of 3-d estimates with the standard deviation ``std`` of one term, for a gradient of norm 1."""
-    from bench.measure.statistics import Truth, summarise
-
-    truth = np.array([1.0, 0.0, 0.0])
-    lines = []
-    for n in sizes:
-        terms = (
-            random.standard_t(5, (repeats, n, 3)) * math.sqrt(0.6) if heavy else random.standard_normal((repeats, n, 3))
-        )
-        estimates = truth + np.array([0.0, bias, 0.0]) + std / math.sqrt(3.0) * terms.mean(axis=1)
-        row = summarise(estimates, Truth.exact(truth), n).__dict__
-        lines.append(
-            row | {"samples": n, "time_s": 1e-3 * n, "time_iqr_s": 0.0, "rollouts": n, "gradients": 0.0, "status": "ok"}
-        )
-    return pd.DataFrame(lines).set_index("samples")
-
-
-def costs(sets: int) -> Iterator[Line]:
-    """Cost to reach an error of 10%: bias^2 + v / N, its ratio between two methods, and the relative RMSE."""
-    from bench.report.views import Curve, rmse_interval
-    from bench.studies.bias_variance.costs import TIME
-    from bench.studies.bias_variance.time_to_accuracy import lead, required_cost
-
-    for heavy in (False, True):
-        for sizes, how in (((16, 64, 256, 1024), "measured"), ((16, 128), "extrapolated")):
-            random = np.random.default_rng([4, len(sizes), heavy])
-            single, ratio, errors = [], [], []
-            for _ in range(sets):
-                way = []
-                for std in (1.5, 2.5):
-                    rows = _rows(random, sizes, 16, std, 0.0, heavy)
-                    way.append(required_cost(Curve("e", "", {"b": True}, rows, {"b": 1.0}, frozenset(), 0), 0.1, TIME))
-                    low, high = rmse_interval(rows.iloc[0])
-                    errors.append(within((float(low), float(high)), std / math.sqrt(sizes[0])))
-                # no statement is made where the bias is not known to be below the error asked for
-                cost = way[0].cost
-                if math.isfinite(cost):
-                    single.append(within((cost * math.exp(-way[0].down), cost * math.exp(way[0].up)), 1e-3 * 225))
-                factor = lead(*way)
-                if math.isfinite(factor[0]):
-                    ratio.append(within(factor[1:], (2.5 / 1.5) ** 2))
-            tail = "t5" if heavy else "normal"
-            label = f"cost of an error of 10%, {how}, {tail} noise, stated in {len(single) / sets:.0%} of sets"
-            yield label, share(single), 0.95, "coverage"
-            label = f"factor between two costs, {how}, {tail} noise, stated in {len(ratio) / sets:.0%} of sets"
-            yield label, share(ratio), 0.95, "coverage"
-            yield f"relative RMSE, {tail} noise", share(errors), 0.95, "coverage"
 
 
 def tails(sets: int) -> Iterator[Line]:
@@ -147,49 +92,7 @@ def tails(sets: int) -> Iterator[Line]:
                 kind = f"{label}, {', '.join([name, *values.values()])}, R = {repeats}, {1 - len(plain) / sets:.0%} with a remark"
                 for place, what in enumerate(("bias", "variance", "variance per sample", "RMSE")):
                     without = f", without {plain[:, place].mean():.1%}" if len(plain) else ""
-                    yield f"{what}, {kind}{without}", share(held[:, place]), math.nan, "coverage"
-
-
-# ------------------------------------------------------------------------------------------------------ examine
-
-
-def examine(sets: int) -> Iterator[Line]:
-    """Bias of the gradient under noise on theta: a jump of height h at c loses h phi(c / s) / s, a smooth cost nothing."""
-    from bench.examine.smoothing import measure_smoothed
-    from bench.model.simulator.clock import Clock
-
-    class Cost:
-        noise, has_gradient = 0, True
-
-        def __init__(self, height: float, at: float) -> None:
-            self.height, self.at = height, at
-
-        def costs(self, theta, w=None):
-            return theta[0] + np.sin(theta).sum(axis=0) + self.height * (theta[0] > self.at)
-
-        def gradients(self, theta, w=None):
-            slope = np.cos(theta)
-            slope[0] += 1.0
-            return slope
-
-    for dim, height, at in ((1, 0.0, 0.0), (4, 0.0, 0.0), (1, 0.5, 0.3), (4, 0.5, 0.3), (4, 0.5, 0.6), (4, 2.0, 1.0)):
-        sigma, inside, gradient, pairs, remarks = 0.3, [], [], [], []
-        bias = height * stats.norm.pdf(at / sigma) / sigma
-        truth = np.full(dim, math.exp(-(sigma**2) / 2))
-        truth[0] += 1.0 + bias
-        for k in range(sets):
-            found = measure_smoothed(Cost(height, at), np.zeros(dim), sigma, np.ones(dim), None, Clock(math.inf), k)
-            inside.append(within((found.bias_low, found.bias_high), bias))
-            gradient.append((float(np.sum((found.gradient - truth) ** 2)), found.error**2))
-            pairs.append(found.pairs)
-            remarks.append(bool(found.remark))
-        label = f"jump {height:g} at {at / sigma:.0f} sigma" if height else "smooth cost"
-        yield (
-            f"bias under noise, {label}, d = {dim}, {np.mean(pairs):.0f} pairs, {np.mean(remarks):.0%} with a remark",
-            share(inside), 0.95 if height < 2.0 else math.nan, "coverage",
-        )  # fmt: skip
-        ratio = float(np.divide(*np.mean(gradient, axis=0)))
-        yield f"gradient under noise, {label}, d = {dim}: RMS error / stated", math.sqrt(ratio), 1.2, "difference"
+                    yield f"{what}, {kind}{without}: {held[:, place].mean():.1%}", False
 
 
 # --------------------------------------------------------------------------------------------------- references
@@ -306,30 +209,24 @@ def _compared(name: str, found, own: np.ndarray, allowed: float) -> Line:
     stated = found.known().standard_error
     label = (
         f"{name} ({found.method}): error {apart / size:.1e} of the norm, stated {stated / size:.1e}, allowed "
-        f"{allowed / size:.1e}; error / allowed"
+        f"{allowed / size:.1e}"
     )
-    return label, apart / allowed, 1.0, "difference"
+    return label, not apart <= allowed
 
 
-SECTIONS = (costs, tails, examine, references)
+SECTIONS = (tails, references)
 
 
 def main(sets: int = 200, *sections: str) -> int:
-    """Print a line per figure; return 1 if a difference is too large or a coverage is below 90%."""
-    failed = 0
+    """Print a line per figure; return 1 if a difference is too large."""
+    failed = False
     for section in SECTIONS:
         if sections and section.__name__ not in sections:
             continue
-        for name, value, other, kind in section(sets):
-            is_wrong = (
-                value < 0.90
-                if kind == "coverage" and math.isfinite(other)
-                else kind == "difference" and not value <= other
-            )
-            failed += bool(is_wrong)
-            number = f"{value:.1%}" if kind == "coverage" else f"{value:.2g} (at most {other:g})"
-            print(f"{section.__name__:10} {name}: {number}{'  <-- wrong' if is_wrong else ''}", flush=True)
-    return int(failed > 0)
+        for line, is_wrong in section(sets):
+            failed |= is_wrong
+            print(f"{section.__name__:10} {line}{'  <-- wrong' if is_wrong else ''}", flush=True)
+    return int(failed)
 
 
 if __name__ == "__main__":

@@ -3,16 +3,10 @@
 All mechanisms are in one model, far from each other, so that each combination of cone and solver compiles one program. Each
 has its own cost, a random linear function of its final state, and the derivative is along a random change of its initial
 velocity.
-
-    python validation/mjx_solver.py               # a table: 20 mechanisms, both cones, both solvers
-    python validation/mjx_solver.py elliptic CG   # one combination
 """
 
 from __future__ import annotations
 
-import os
-import sys
-import time
 from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any
@@ -209,25 +203,3 @@ def agreement(
         mechanism.name: (float(reversed_[i]), float(forward[i]), float(differences[closest[i], i]))
         for i, mechanism in enumerate(mechanisms)
     }
-
-
-def main(words: list[str]) -> None:
-    """Print the table: derivative, and relative differences of forward mode and differences from it."""
-    # programs that run for milliseconds compile in a quarter of the time
-    os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true")
-    for cone in ("pyramidal", "elliptic"):
-        for solver in ("Newton", "CG"):
-            if words and words != [cone, solver]:
-                continue
-            started = time.perf_counter()
-            table = agreement(cone, solver)
-            print(f"\n{cone}, {solver} ({time.perf_counter() - started:.0f} s)")
-            for name, (reverse, forward, difference) in table.items():
-                print(
-                    f"{name:36} {reverse: .10e}  forward {abs(forward / reverse - 1):.0e}  "
-                    f"differences {abs(difference / reverse - 1):.0e}"
-                )
-
-
-if __name__ == "__main__":
-    main(sys.argv[1:])

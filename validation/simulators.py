@@ -1,14 +1,10 @@
-"""Runs `bench.examine` on planted faults and correct gradients in NumPy, torch and JAX simulators, and prints a table.
+"""Planted faults and correct gradients in NumPy, torch and JAX simulators, which `tests/examine/test_bank.py` examines.
 
-    python validation/simulators.py [numpy] [right] [torch] [jax]
-
-A line per case has the cause that `bench.examine` reports, its exit status, calls and seconds. Failures of engines by their
-mechanisms are in `mechanisms.py`.
+Failures of engines by their mechanisms are in `mechanisms.py`.
 """
 
 from __future__ import annotations
 
-import sys
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -329,30 +325,3 @@ def examined(case):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return examine(case.cost, case.theta, grad=case.grad, progress=False, budget=60, **case.settings)
-
-
-def main(libraries):
-    print("| library | case | cause named | as planted | exit | costs | gradients | seconds |")
-    print("|---|---|---|---|---|---|---|---|")
-    caught = named = faults = right = alarms = 0
-    for library in libraries or CASES:
-        for case in CASES[library]():
-            report = examined(case)
-            fits = report.cause in case.causes if case.causes else report.status == 0
-            if case.warned:
-                fits &= any(case.warned in text for text in report.warnings)
-            if case.causes or case.warned:
-                faults, caught, named = faults + 1, caught + bool(report.status or case.warned), named + fits
-            else:
-                right, alarms = right + 1, alarms + bool(report.status)
-            print(
-                f"| {library} | {case.name} | {report.cause} | {'yes' if fits else 'NO'} | {report.status} "
-                f"| {report.spent.costs} | {report.spent.gradients} | {report.spent.seconds:.2f} |",
-                flush=True,
-            )
-    print(f"\n{caught} of {faults} faults caught, {named} named as planted, {alarms} false alarms of {right}")
-    return 0 if named == faults and not alarms else 1
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))

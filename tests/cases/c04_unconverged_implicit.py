@@ -1,7 +1,7 @@
 """vmex PR #367: implicit derivative of an inner solver that stops after four iterations.
 
 Inner: minimise (z - x0)^2/2 + x1 (1 - cos z) by four steps of gradient descent from 0. Cost = (z - 0.3)^2.
-RIGHT: complex step through the four iterations (``right``). ``implicit`` differentiates the optimality condition at the
+RIGHT: complex step through the four iterations. ``implicit`` differentiates the optimality condition at the
 point reached. ``converged`` is the cost after 400 iterations, for which ``implicit`` at its own point would be right.
 """
 
@@ -25,18 +25,10 @@ def converged(x):
     return (inner(x, 400) - 0.3) ** 2
 
 
-def right(x):
-    return np.array([cost(np.array(x) + 1e-30j * row).imag for row in np.eye(2)]) / 1e-30
-
-
 def implicit(x, n=4):
     z = inner(x, n)
     by_x = np.array([1.0, -np.sin(z)]) / (1 + x[1] * np.cos(z))
     return 2 * (z - 0.3) * by_x
-
-
-def implicit_converged(x):
-    return implicit(x, 400)
 
 
 def broken(x):
@@ -47,9 +39,3 @@ def broken(x):
 
 def short(x):
     return 0.7 * implicit(x)
-
-
-if __name__ == "__main__":
-    t = np.array(theta)
-    conv = np.array([converged(t + 1e-30j * r).imag for r in np.eye(2)]) / 1e-30
-    print("right", right(t), "converged", conv, "implicit", implicit(t), "broken", broken(t), "short", short(t))

@@ -2,7 +2,7 @@
 
 z = tanh(M z + x) by iteration to rounding; cost = |z - 0.2|^2. ``cg`` solves (I - D M)^T a = dc/dz by plain CG and gives up
 to the initial zero vector if the residual has not fallen after 20 iterations, as in the report. ``stopped`` returns what
-5 iterations of CG left. RIGHT: ``right`` solves it directly; checked against complex step.
+5 iterations of CG left. ``right`` solves it directly, and agrees with a complex step.
 """
 
 import numpy as np

@@ -1,7 +1,7 @@
 """theseus #39: implicit backward through one last optimiser step that is damped by a step size of 0.3.
 
 Curve fit y = a exp(b t) by Gauss-Newton with step 0.3 to convergence; theta scales two data points; cost = (a - 1)^2 + b^2.
-RIGHT: derivative of the converged fit (complex step, ``right``). ``damped`` is exactly 0.3 times it: a wrong factor.
+RIGHT: derivative of the converged fit (complex step). ``damped`` is exactly 0.3 times it: a wrong factor.
 """
 
 import numpy as np
@@ -28,10 +28,6 @@ def fit(x):
 def cost(x):
     p = fit(np.asarray(x, dtype=None))
     return (p[0] - 1) ** 2 + p[1] ** 2
-
-
-def right(x):
-    return np.array([cost(np.array(x) + 1e-30j * r).imag for r in np.eye(2)]) / 1e-30
 
 
 def damped(x):

@@ -1,7 +1,7 @@
 """drake #10654, Genesis PR #2842: the derivative of a rotated point by a quaternion leaves out the normalisation.
 
 cost = (R(q / |q|) p - target)^2. ``unit`` differentiates R(q) p as a polynomial in q, as if |q| stayed 1.
-RIGHT: complex step of the cost (``right``). At |q| = 1 the difference is the radial part only.
+RIGHT: complex step of the cost. At |q| = 1 the difference is the radial part only.
 """
 
 import numpy as np
@@ -28,10 +28,6 @@ def unnormalised(q):
 
 def slope(f, q):
     return np.array([f(np.array(q) + 1e-30j * row).imag for row in np.eye(4)]) / 1e-30
-
-
-def right(q):
-    return slope(cost, q)
 
 
 def unit(q):

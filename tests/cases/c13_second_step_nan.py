@@ -1,8 +1,8 @@
 """jax-gcm #558: reverse mode is finite for one step and NaN from the second; forward and differences are finite.
 
 Shear of a column at rest: one step gives a nonzero wind only after the first, and the mixing length uses
-where(shear > 0, sqrt(shear), 0). RIGHT: ``safe`` is the same cost with the double
-where, whose gradient is finite at every T. Use with horizons=1,2,3.
+where(shear > 0, sqrt(shear), 0). RIGHT: the same cost with the double where,
+whose gradient is finite at every T. Use with horizons=1,2,3.
 """
 
 import jax
@@ -28,17 +28,9 @@ def plain(s):
     return jnp.where(s > 0, jnp.sqrt(s), 0.0)
 
 
-def double(s):
-    return jnp.where(s > 0, jnp.sqrt(jnp.where(s > 0, s, 1.0)), 0.0)
-
-
 def cost(x, steps=3):
     return model(x, steps, plain)
 
 
 def grad(x, steps=3):
     return jax.grad(lambda y: cost(y, steps))(jnp.asarray(x, float))
-
-
-def safe(x, steps=3):
-    return model(x, steps, double)

@@ -8,7 +8,6 @@ import numpy as np
 
 A = np.array([1.0, -0.5, 2.0, 0.3])
 theta = 0.7
-pair = [0.7, 0.2]
 named = {"mass": 0.7, "gain": 0.2}
 
 

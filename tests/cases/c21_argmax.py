@@ -1,7 +1,7 @@
 """warp #1552: the adjoint of a reduction takes the last candidate that was visited instead of the largest.
 
 cost = sum over three probes of max_j (c_j x_i + d_j); ``last`` uses the slope of the last visited j.
-RIGHT: slope of the winning j (``right``); at theta no tie.
+RIGHT: slope of the winning j; at theta no tie.
 """
 
 import numpy as np
@@ -12,11 +12,6 @@ theta = [0.4, 1.2, -0.8]
 
 def cost(x):
     return np.sum(np.max(np.outer(x, C) + D, axis=1) ** 2)
-
-
-def right(x):
-    values = np.outer(x, C) + D
-    return 2 * values.max(1) * C[values.argmax(1)]
 
 
 def last(x):

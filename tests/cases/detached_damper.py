@@ -1,11 +1,7 @@
-"""Is a detached damper of a fixed-step ball named, whatever its size and whatever sigma? python detached_damper.py"""
-
-import itertools
+"""Is a detached damper of a fixed-step ball named, whatever its size and whatever sigma?"""
 
 import jax
 import jax.numpy as jnp
-
-import bench
 
 jax.config.update("jax_enable_x64", True)
 DT, STEPS, MASS = 2e-3, 400, 0.2
@@ -28,10 +24,3 @@ def ball(damping, detach):
 
 
 theta = {"height": 0.5, "speed": -1.0, "stiffness": 800.0}
-for damping, sigma in itertools.product((0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0), ((), (0.01,), (0.01, 0.1))):
-    r = bench.examine(ball(damping, True), theta, grad="jax", sigma=list(sigma), budget=60)
-    head = str(r).split(". ", 1)
-    print(
-        f"damping {damping:<5} sigma {sigma!s:<12} {head[0]:<24} {str(head[1]).split(':')[0]:<14} {str(head[1]).split('(')[1].split(':')[0] if '(' in head[1] else ''}",
-        flush=True,
-    )

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from detached_damper import ball, theta
 
 import bench
 from bench.cli import main
@@ -113,9 +114,5 @@ def test_the_kit_refuses_a_plugin_with_a_fault(plugin):
 @pytest.mark.parametrize("damping", [0.02, pytest.param(0.5, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("sigma", [(), pytest.param((0.01, 0.1), marks=pytest.mark.slow)])
 def test_a_detached_damper_is_wrong_at_every_sigma(damping, sigma):
-    namespace = {}
-    exec((HERE / "detached_damper.py").read_text().partition("theta = {")[0], namespace)  # the rest runs all 21
-    theta = {"height": 0.5, "speed": -1.0, "stiffness": 800.0}
-    ball = namespace["ball"]
     report = bench.examine(ball(damping, True), theta, grad="jax", sigma=list(sigma), calls=3000, progress=False)
     assert (report.status, report.cause) == (1, "missing_term"), str(report)

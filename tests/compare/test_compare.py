@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
@@ -20,7 +18,6 @@ from helpers import experiment, loaded, small_rows
 
 from bench import cli
 from bench.compare import cells, command, history, judging, report, sources, timings
-from bench.errors import UserError
 from bench.experiment import axes
 from bench.experiment.columns import Columns
 from bench.model import registry
@@ -28,7 +25,6 @@ from bench.report.tables import csv
 from bench.run.tasks import blank_row
 from bench.studies.bias_variance.columns import COLUMNS
 
-INHERITED = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, sys.path))}
 MACHINE = {"processor": "a chip", "cores": 2, "system": "Linux", "load_average": [0.1, 0.1, 0.1]}
 
 
@@ -155,37 +151,12 @@ def without(rows, *names):
     return rows.assign(parameters=rows["parameters"].map(remove))
 
 
-def test_a_parameter_that_a_stored_row_lacks_is_its_present_default():
-    columns, rows = of_study("bias_variance", "scenes=[pushing]", "contacts=[penalty]")
-    stored = without(rows, "scene.mass", "study.timed_calls", "reference.tolerance")
-    for before, after in ((stored, rows), (rows, stored)):
-        assert list(compared(before, after, False, columns)["outcome"]) == ["same"]
-    _, heavy = of_study("bias_variance", "scenes=[pushing]", "contacts=[penalty]", "scene.pushing.mass=9")
-    changes = compared(stored, heavy, False, columns)["change"]
-    assert changes[0].startswith("gone, it was ok; the nearest cell after has pushing.mass=9.0 instead of ")
-    assert "," not in changes[0].partition(";")[2], "no other parameter differs"
-
-
 def test_a_missing_parameter_is_named_in_a_remark(tmp_path, capsys):
     _, rows = of_study("bias_variance", "scenes=[pushing]", "contacts=[penalty]")
     rows = rows.assign(experiment="some")
     old, new = save(without(rows, "scene.mass"), tmp_path / "old", "some"), save(rows, tmp_path / "new", "some")
     assert run(old, new, out=tmp_path / "out") == 0
     assert "some: rows before do not store pushing.mass=" in capsys.readouterr().out
-
-
-def test_the_summary_counts_cells_by_what_got_worse(tmp_path):
-    rows = given()
-    gone = compared(rows, rows.iloc[:0], False)
-    n_ok, n = (rows["status"] == "ok").sum(), len(rows)
-    assert report.summary(gone) == (
-        f"Of {n} cells, {n_ok} got worse ({n_ok} gone), 0 got better, 0 are the same within the uncertainty."
-    )
-    after = rows.copy()
-    after.loc[good(rows), ["bias", "bias_low", "bias_high"]] = [9.0, 8.0, 10.0]
-    assert ", 1 got worse (1 in bias), 0 got better," in report.summary(compared(rows, after))
-    same = report.summary(compared(rows, rows))
-    assert same == f"Of {n} cells, 0 got worse, 0 got better, {n} are the same within the uncertainty."
 
 
 def test_cells_that_the_identity_columns_do_not_distinguish_are_named_by_their_parameters():
@@ -196,44 +167,6 @@ def test_cells_that_the_identity_columns_do_not_distinguish_are_named_by_their_p
     table = compared(rows, rows.assign(status="error"), False, columns).assign(experiment="some")
     names = report.cell_names(table)
     assert [name.rpartition(", ")[2] for name in names] == [f"bias_variance.timed_calls={count}" for count in (3, 7)]
-
-
-SCENE = """
-from dataclasses import dataclass
-import numpy as np
-from bench.model import FunctionScene, param
-
-@dataclass(frozen=True)
-class Bowl(FunctionScene):
-    \"\"\"A bowl.\"\"\"
-    name = "bowl"
-    def theta0(self):
-        return np.array([1.0])
-    def cost(self, xp, x):
-        return x[0] * x[0]
-"""
-
-
-@pytest.mark.slow
-def test_a_scene_with_one_parameter_more_compares_as_the_same(tmp_path):
-    """From its file to the exit status, each version in a process of its own."""
-    (tmp_path / "own").mkdir()
-    words = ["scenes=[bowl]", "backends=[numpy]", "estimators=[fobg]", "samples=8", "repeats=4", "timing=false"]
-    words += ["name=bowls", "workers=0", "plugins=own"]
-
-    def bench(*words):
-        command = [sys.executable, "-m", "bench", *words]
-        return subprocess.run(command, cwd=tmp_path, env=INHERITED, capture_output=True, text=True)
-
-    more = '    friction: float = param(0.5, "not used yet")\n'
-    for folder, text in (("old", SCENE), ("new", SCENE.replace("    def theta0", f"{more}    def theta0"))):
-        (tmp_path / "own" / "bowl.py").write_text(text)
-        done = bench(*words, f"results_dir={folder}")
-        assert done.returncode == 0, done.stderr
-    done = bench("compare", "old", "new", "plugins=own")
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "Of 1 cell, 0 got worse, 0 got better, 1 are the same" in done.stdout
-    assert "rows before do not store bowl.friction=0.5: the present default is assumed" in " ".join(done.stdout.split())
 
 
 @pytest.mark.parametrize(("factor", "outcome"), [(10.0, "worse"), (0.1, "better")])
@@ -400,15 +333,6 @@ def test_exit_status_files_and_table(tmp_path, capsys):
     assert "it broke" in (tmp_path / "out" / "compare.html").read_text()
 
 
-def test_committed_tables_are_enough(tmp_path):
-    before, after = given(), given()
-    place = good(after)
-    after.loc[place, ["bias", "bias_low", "bias_high"]] = [9.0, 8.0, 10.0]
-    old, new = (save(rows, tmp_path / name, parquet=False) for rows, name in ((before, "old"), (after, "new")))
-    assert run(old, old, out=tmp_path / "out") == 0
-    assert run(old, new, out=tmp_path / "out") == 1
-
-
 @pytest.mark.slow
 def test_times_are_compared_only_when_asked(tmp_path, capsys):
     before, after, *_ = runs(2, spread=0.02)
@@ -492,11 +416,6 @@ def test_bad_input_is_refused(words, said, tmp_path, monkeypatch, capsys):
     assert said in capsys.readouterr().err
 
 
-def test_a_name_that_starts_with_a_dash_is_no_option_of_git():
-    with pytest.raises(UserError, match="neither a directory nor a git revision"), sources.open_results("--output=/x"):
-        pass
-
-
 def test_results_kept_in_git_are_found_in_their_own_folder(tmp_path):
     before, after = given(), given()
     after.loc[good(after), ["bias", "bias_low", "bias_high"]] = [9.0, 8.0, 10.0]
@@ -552,16 +471,6 @@ def test_results_without_a_common_experiment_are_refused(tmp_path, capsys):
     new = save(given().assign(experiment="two"), tmp_path / "new", "two")
     assert run(old, new, out=tmp_path / "out") == 2
     assert "no experiment in common" in capsys.readouterr().err
-
-
-def test_stored_rows_without_single_calls_stay_readable_beside_new_ones(tmp_path):
-    rows = given()
-    old = COLUMNS.typed(rows.drop(columns="time_samples"))
-    both = pd.concat([old, COLUMNS.typed(rows.assign(key=rows["key"] + "2"))])
-    both.to_parquet(tmp_path / "rows.parquet", index=False)
-    again = pd.read_parquet(tmp_path / "rows.parquet")
-    assert again["time_samples"].isna().sum() == len(rows)
-    assert report.summary(compared(again, again, True)).startswith("Of ")
 
 
 # ----------------------------------------------------------------------------------------------------- history
@@ -633,20 +542,6 @@ def test_results_are_named_by_what_differs():
         (["HEAD:results", "results"], ["HEAD:results", "results"]),
     ):
         assert list(history._short_names(names).values()) == short
-
-
-def test_the_page_has_all_cells_and_numbers_of_the_comparison():
-    rows = given()
-    after = rows.copy()
-    after.loc[good(rows), ["bias", "bias_low", "bias_high"]] = [9.0, 8.0, 10.0]
-    table = compared(rows, after).assign(experiment="some")
-    made = report.page_views(report.Comparison("t", table, ["a remark"], COLUMNS.compared, "bias_variance"))
-    assert made.headline == report.summary(table)
-    assert made.rows["outcome"].iloc[0] == "worse"
-    assert len(made.rows) == len(table)
-    (chart,) = [chart for chart in made.charts if chart.name == "bias_after"]
-    assert chart.frame.loc[0, "bias_after"] == 9.0
-    assert made.tables[0].frame["remark"].iloc[0] == "a remark"
 
 
 @pytest.mark.parametrize(

@@ -137,14 +137,6 @@ def test_a_name_that_nothing_reads_is_refused_with_the_nearest_one(capsys, word,
 
 
 @pytest.mark.parametrize(
-    "word", ["scene.heaviside.sigma=0.3", "sweep.sigma=[0.1]", "sweep.heaviside.sigma=[0.1]", "samples=5"]
-)
-def test_a_name_that_is_read_is_not_refused(capsys, word):
-    assert main(["plan", *BASE, word]) == 0
-    assert capsys.readouterr().err == ""
-
-
-@pytest.mark.parametrize(
     ("words", "said"),
     [
         (["plan", "+experiment=quick", "+experiment=twins"], "python -m bench +experiment=quick && python -m bench +experiment=twins"),

@@ -3,7 +3,6 @@
 import tempfile
 from pathlib import Path
 
-import configurations
 import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
@@ -66,7 +65,9 @@ def check(words: list[str], verb: str, capsys: pytest.CaptureFixture[str]) -> No
         assert status in (0, 1, 2)
         assert "Traceback" not in said
         if status == 2:
-            assert configurations.is_refusal(said)
+            assert said.startswith("bench: ")
+            assert len(said.splitlines()) == 1
+            assert "\x1b" not in said
         elif verb == "run":
             stores = [path for path in where.iterdir() if path.name != "references"]
             assert len(stores) == 1
@@ -99,13 +100,3 @@ def test_a_few_configurations(words, verb, capsys):
 @given(words=st.lists(word, min_size=1, max_size=4).filter(affordable), verb=st.sampled_from(["run", "plan"]))
 def test_a_thousand_configurations(words, verb, capsys):
     check(words, verb, capsys)
-
-
-@pytest.mark.slow
-def test_configurations_that_mean_something_lose_and_change_nothing(monkeypatch):
-    """The same search at size: ``configurations.py 1000 SEED``."""
-    monkeypatch.setattr(configurations, "WRITTEN", 0.0)
-    ledger = configurations.search(60, 7)
-    assert not ledger.faults
-    assert ledger.statuses[0] + ledger.statuses[1] >= 30  # half of them are valid, or little was tried
-    assert ledger.rows["ok"] > 30

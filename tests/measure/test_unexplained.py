@@ -13,14 +13,11 @@ from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
 from bench.plugins.scenes.cartpole import Cartpole
 from bench.plugins.scenes.heaviside import Heaviside
 from bench.plugins.scenes.quadratic import Quadratic
-from helpers import experiment, small_rows
+from helpers import small_rows
 
 from bench.compare import judging
 from bench.measure.statistics import UNEXPLAINED, Truth, is_unexplained, summarise, variance_per_sample
 from bench.model import compose
-from bench.report.cells import readable
-from bench.report.writer import markdown, show
-from bench.studies.bias_variance import tables
 from bench.studies.bias_variance.columns import COLUMNS
 
 
@@ -73,18 +70,6 @@ def doubted(rows):
     changed.loc[mine, ["bias", "bias_low", "bias_high", "bias_rel", "rmse"]] = [4.0, 3.0, 5.0, 1.0, 4.1]
     changed.loc[mine, "reason"] = f"declared unbiased, and its interval excludes 0: {UNEXPLAINED}"
     return changed
-
-
-def test_tables_and_the_terminal_say_so(capsys):
-    rows = doubted(small_rows(backends=("jax",), estimators=("fobg", "reinforce")))
-    rows = rows[rows["status"] == "ok"]
-    table = tables.every_cell(experiment(), rows)
-    marked = [text for text in readable(table)["bias"] if text.endswith(tables.REMARKED)]
-    assert len(marked) == ((rows["estimator"] == "fobg") & (rows["status"] == "ok")).sum() > 0
-    assert UNEXPLAINED in markdown([table], "made_up")
-    show(experiment(), rows, experiment().study.views(experiment(), rows))
-    shown = " ".join(capsys.readouterr().out.split())
-    assert f"declared unbiased, and its interval excludes 0: {UNEXPLAINED}" in shown
 
 
 def test_comparison_says_so():

@@ -1,8 +1,5 @@
 """Plugins are found by being there, and neither a broken nor an absent one disturbs the rest."""
 
-import subprocess
-import sys
-
 import pandas as pd
 import pytest
 from trees import Tree
@@ -33,29 +30,6 @@ class Dropped(SampleMean):
         return self.factor * problem.grad(theta, w)
 '''
 
-FAILING_SCENE = '''
-"""A plugin for a test."""
-
-from dataclasses import dataclass
-
-from bench.plugin import FunctionScene
-
-
-@dataclass(frozen=True)
-class Failing(FunctionScene):
-    """A scene that fails when it is used."""
-
-    name = "failing"
-
-    def theta0(self):
-        """Nothing."""
-        raise ValueError("no theta today")
-
-    def cost(self, xp, x):
-        """The first component."""
-        return x[0]
-'''
-
 
 @pytest.fixture(scope="module")
 def tree(tmp_path_factory) -> Tree:
@@ -63,7 +37,6 @@ def tree(tmp_path_factory) -> Tree:
     made.add("plugins/estimators/half_step.py", ESTIMATOR.format(name="half_step", requires=""))
     made.add("plugins/estimators/broken.py", "import no_such_module_at_all\n")
     made.add("plugins/scenes/unfinished.py", "from bench.plugin import Scene\n\nclass Unfinished(Scene:\n")
-    made.add("plugins/scenes/failing.py", FAILING_SCENE)
     absent = ESTIMATOR.format(name="absent", requires='"no_such_module=some-dist",')
     made.add("plugins/estimators/absent.py", absent)
     made.install(
@@ -117,50 +90,6 @@ def test_added_plugins_run_and_take_parameters_from_the_command_line(rows):
     assert rows.loc["third_name", "grad_norm"] == rows.loc["fobg", "grad_norm"]
 
 
-def test_parameter_is_checked(tree):
-    done = tree.run("plan", "estimators=[half_step]", "estimator.half_step.facter=0.5")
-    assert done.returncode == 2
-    assert "did you mean 'factor'" in done.stderr
-
-
-@pytest.mark.slow
-def test_failing_plugin_fails_the_kit_for_itself_alone(tree):
-    done = tree.run("check", "failing", "linear")
-    assert done.returncode == 1
-    failed = [line for line in done.stdout.splitlines() if line.startswith("fail")]
-    assert {line.split()[1] for line in failed} == {"failing"}
-    assert all("no theta today" in line for line in failed)
-
-
-@pytest.mark.slow
-def test_added_plugins_conform_and_survive_a_spawned_process(tree):
-    done = tree.run("check", "half_step", "third_name")
-    assert done.returncode == 0, done.stdout + done.stderr
-    passed = [line.split()[1:3] for line in done.stdout.splitlines() if line.startswith("pass")]
-    assert ["half_step", "survives_spawned_process"] in passed
-    assert ["third_name", "survives_spawned_process"] in passed
-
-
-def test_added_plugin_crosses_a_worker_pool(tree):
-    script = (
-        "from concurrent.futures import ProcessPoolExecutor\n"
-        "from multiprocessing import get_context\n"
-        "from bench.plugins.estimators.half_step import Dropped\n"
-        "if __name__ == '__main__':\n"
-        "    with ProcessPoolExecutor(1, mp_context=get_context('spawn')) as pool:\n"
-        "        print(pool.submit(repr, Dropped(factor=3.0)).result())\n"
-    )
-    tree.add("crosses.py", script)
-    done = subprocess.run([sys.executable, "crosses.py"], cwd=tree.root, capture_output=True, text=True)
-    assert done.stdout.strip() == "Dropped(factor=3.0)", done.stderr
-
-
-def test_only_the_named_third_party_plugin_is_listed(tree):
-    done = tree.run("list", "third_name")
-    assert done.returncode == 0
-    assert [line.split()[0] for line in done.stdout.splitlines() if line[:3].strip()] == ["estimators", "third_name"]
-
-
 @pytest.mark.parametrize(
     ("name", "reason"),
     [
@@ -176,20 +105,6 @@ def test_unusable_plugin_is_listed_with_its_reason(listing, name, reason):
     assert reason in described
 
 
-def test_plugin_that_fails_to_import_is_refused_by_name_only(tree, rows):
-    done = tree.run("plan", "scenes=[quadratic]", "backends=[numpy]", "estimators=[broken]")
-    assert done.returncode == 2
-    assert "no_such_module_at_all" in done.stderr
-    assert (rows["status"] != "error").all()
-
-
 def test_cells_of_an_unavailable_plugin_become_rows(rows):
     assert rows.loc["absent", "status"] == "unavailable"
     assert "pip install some-dist" in rows.loc["absent", "reason"]
-
-
-@pytest.mark.slow
-def test_kit_names_the_reason_of_an_unavailable_plugin(tree):
-    done = tree.run("check", "absent")
-    assert done.returncode == 1
-    assert "pip install some-dist" in done.stdout

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from bench.plugins.backends import compiling, mujoco
+from bench.plugins.backends import mujoco
 from bench.plugins.backends.jax import Jax
 from bench.plugins.backends.mjx import Mjx
 from bench.plugins.backends.mujoco import Mujoco
@@ -20,8 +20,6 @@ from bench.plugins.integrators.rk4 import Rk4
 from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
 from bench.plugins.scenes.bounce_once import BounceOnce
 from bench.plugins.scenes.bouncing_ball import BouncingBall
-from bench.plugins.scenes.cartpole import Cartpole
-from bench.plugins.scenes.double_integrator import DoubleIntegrator
 from bench.plugins.scenes.double_pendulum import DoublePendulum
 from bench.plugins.scenes.hopper import Hopper
 from bench.plugins.scenes.pendulum import Pendulum
@@ -36,9 +34,7 @@ from bench.conformance.kit import Failed
 from bench.conformance.subjects import distance, law_for, samples
 from bench.experiment.cell import Cell
 from bench.experiment.experiment import Budget
-from bench.measure import noise
-from bench.measure.reference import certify
-from bench.model import EngineScene, EngineTwin, Unsupported, compose, registry
+from bench.model import Unsupported, compose, registry
 from bench.plugins import mjcf
 from bench.studies.bias_variance import BiasVariance
 
@@ -54,8 +50,6 @@ SPRING = (-1.56802, -1.22481, -1.22481 / 480)
 A force in the first step is a first velocity dt / m higher: -0.002552 to the digits that were kept.
 """
 ENGINES = [Mujoco(), pytest.param(Mjx(), marks=pytest.mark.slow)]
-EXACT = 1e-6
-"""Relative difference of gradients allowed where integrator and forces are the same."""
 
 
 def program(scene, **law):
@@ -85,30 +79,6 @@ def test_gradient_of_one_bounce_is_that_of_the_spring(engine):
     np.testing.assert_allclose(found, SPRING, rtol=1e-4)
 
 
-TWINS = {
-    Pendulum(damping=0.05, horizon=20): EXACT,
-    Cartpole(horizon=20): EXACT,
-    Cartpole(horizon=20, noise="parameter"): EXACT,
-    BounceOnce(): EXACT,
-    Pushing(): 1e-3,
-    Hopper(horizon=100): 1e-3,
-    WallPenalty1d(start=0.5): 1e-2,
-}
-
-
-@pytest.mark.parametrize(("scene", "allowed"), TWINS.items(), ids=lambda value: getattr(value, "name", ""))
-def test_gradients_of_twins_are_those_of_the_scene(scene, allowed):
-    of = program(scene)
-    assert distance(gradients(Mujoco(), of), gradients(Jax(), of)) < allowed
-
-
-@pytest.mark.parametrize("scene", [Cartpole(horizon=20), Hopper(horizon=50)], ids=lambda s: s.name)
-def test_scores_under_feedback_are_those_of_the_scene(scene):
-    of = program(scene)
-    theta, w = samples(of)
-    assert distance(Mujoco().compile(of).score(theta, w), Jax().compile(of).score(theta, w)) < 1e-3
-
-
 @pytest.mark.parametrize("changed", [{"mass": 0.5}, {"gravity": 3.0}, {"dt": 0.001}, {"height": 0.4}], ids=str)
 def test_twin_takes_its_numbers_from_the_scene(changed):
     of = program(BouncingBall(horizon=300, **changed), stiffness=2e3, damping=3.0)
@@ -125,13 +95,6 @@ def test_chained_jacobians_agree_with_differences_of_whole_rollouts():
         Mujoco(gradient=kind, impedance=0.9).compile(of).grad(scene.theta0(), still) for kind in ("chain", "rollouts")
     )
     assert distance(chain, rollouts) < 1e-5
-
-
-def test_impedance_near_one_is_another_contact_than_the_spring():
-    of = program(BouncingBall(), stiffness=1e4)
-    theta, w = samples(of)
-    off = distance(Mujoco(impedance=0.9).compile(of).value(theta, w), Numpy().compile(of).value(theta, w))
-    assert off > BouncingBall.twin_difference
 
 
 @pytest.mark.parametrize("engine", ENGINES, ids=repr)
@@ -152,20 +115,6 @@ def test_lean_changes_no_number():
     theta, w = samples(of)
     lean, full = (Mujoco(lean=flag).compile(of).value(theta, w) for flag in (True, False))
     np.testing.assert_array_equal(lean, full)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("mode", [pytest.param("forward", marks=pytest.mark.full), "reverse"])
-def test_stiffness_and_mass_compile_nothing_anew(mode, monkeypatch):
-    monkeypatch.setattr(compiling, "_known", {})  # it keeps a limited number, of which earlier tests have filled all
-    compiled = []
-    for stiffness, mass, dt in ((1e3, 0.1, 0.005), (1e4, 0.1, 0.005), (1e5, 0.3, 0.004)):
-        of = program(Pushing(horizon=4, mass=mass, dt=dt), stiffness=stiffness)
-        known = len(compiling._known)
-        found = gradients(Mjx(mode=mode), of)
-        compiled.append(len(compiling._known) - known)
-        assert distance(found, gradients(Jax(), of)) < 1e-2
-    assert compiled == [1, 0, 0]
 
 
 # --------------------------------------------------------------------------------------------------- refusals
@@ -214,28 +163,7 @@ def test_reference_of_an_engine_is_its_own():
     assert len({one.reference_key for one in (own, engine, other)}) == 3
 
 
-def test_every_twin_is_listed_with_its_difference():
-    for entry in registry.entries()["scenes"].values():
-        scene = entry.plugin()
-        if isinstance(scene, EngineTwin):
-            assert 0 < scene.twin_difference <= 1e-3 or isinstance(scene, EngineScene)
-            assert Mujoco().unsupported_reason(program(scene)) is None
-
-
 # --------------------------------------------------------------------------------------------------- commands
-
-
-@pytest.mark.slow
-def test_engine_runs_through_the_command_line(tmp_path):
-    words = ["scenes=[double_integrator]", "backends=[jax,mujoco]", "estimators=[fobg]", "samples=8", "repeats=4"]
-    words += ["scene.double_integrator.horizon=5", "reference.samples=256", "name=mine", f"results_dir={tmp_path}"]
-    assert main(words) == 0
-    rows = pd.read_parquet(tmp_path / "mine" / "rows.parquet").set_index("backend")
-    assert (rows["status"] == "ok").all()
-    assert rows.loc["jax", "reference_method"] == "closed_form"
-    assert rows.loc["mujoco", "reference_method"].startswith("sampling")
-    assert rows.loc["mujoco", "model_error"] < 1e-8
-    assert "mujoco=" in rows.loc["mujoco", "versions"]
 
 
 @pytest.mark.slow
@@ -265,10 +193,6 @@ def test_scene_for_engines_is_traced_by_engines_only(tmp_path, capsys):
     assert "runs only in physics engines" in capsys.readouterr().err
 
 
-def test_study_is_found():
-    assert registry.find("studies", "twins").available
-
-
 @pytest.mark.slow
 def test_without_the_library_everything_else_is_listed_and_runs(tmp_path):
     words = ["scenes=[double_integrator]", "backends=[numpy,mujoco,mjx]", "estimators=[fobg]", "samples=4", "repeats=2",
@@ -284,13 +208,6 @@ def test_without_the_library_everything_else_is_listed_and_runs(tmp_path):
     rows = pd.read_parquet(tmp_path / "mine" / "rows.parquet").set_index("backend")
     assert rows["status"].to_dict() == {"numpy": "ok", "mujoco": "unavailable", "mjx": "unavailable"}
     assert "pip install mujoco" in rows.loc["mjx", "reason"]
-
-
-@pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])
-def test_contact_with_friction_has_the_force_of_its_law(cone):
-    """A pyramid is four edges, each a spring: unscaled, they push with 64 N where the law says 10 N."""
-    report = backends.frictional_contact_has_the_force_of_its_law(Mujoco(cone=cone))
-    assert "sliding at 1 m/s it pushes with " + {"pyramidal": "1.4", "elliptic": "2.8"}[cone] in report
 
 
 def test_force_of_unscaled_edges_fails_the_kit(monkeypatch):
@@ -314,22 +231,6 @@ def test_gradient_of_a_failed_rollout_that_is_a_number_fails_the_kit(monkeypatch
     monkeypatch.setattr(backends, "all_programs", lambda: [program(Pendulum(horizon=20))])
     with pytest.raises(Failed, match="has a finite gradient"):
         backends.failed_rollouts_have_no_gradient(Mujoco())
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("engine", [Mujoco(), Mjx()], ids=repr)
-def test_references_of_an_engine_miss_the_gradient_by_the_error_they_state(engine, monkeypatch):
-    """Twenty references from draws of their own, on a scene whose gradient is known: errors over stated errors are about 1."""
-    of = program(DoubleIntegrator(horizon=3))
-    problem, truth, ratios = engine.compile(of), of.closed_form_gradient(), []
-    drawn = noise.draw
-    for seed in range(20):
-        monkeypatch.setattr(noise, "draw", lambda block, *rest, seed=seed: drawn(block + 10**6 * seed, *rest))
-        found = certify(problem, engine.provides, 4096, 0.0)
-        assert found.method.startswith("sampling")
-        ratios.append(np.linalg.norm(found.gradient - truth) / found.known().standard_error)
-    assert 0.5 < np.mean(np.square(ratios)) < 1.7, ratios
-    assert max(ratios) < 4.0
 
 
 def test_differences_that_straddle_a_switch_of_contact_are_taken_again():

@@ -6,13 +6,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from bench.plugins.backends.numpy import Numpy
 from bench.plugins.backends.torch import Torch
 from bench.plugins.contacts.impulse import Impulse
 from bench.plugins.contacts.penalty import Penalty
 from bench.plugins.estimators.boundary import Boundary
 from bench.plugins.estimators.fobg import Fobg
-from bench.plugins.estimators.reinforce import Reinforce
 from bench.plugins.estimators.stochastic_derivative import StochasticDerivative
 from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
 from bench.plugins.scenes.coin_walk import CoinWalk
@@ -116,17 +114,6 @@ def test_boundary_is_unbiased_on_an_oblique_ledge_where_first_order_lacks_its_la
     assert not agrees(first, truth)
 
 
-def test_the_boundary_term_of_a_ledge_has_the_variance_of_the_jump_along_it():
-    """The jump at n . x = edge is height + b . x: normal, with the standard deviation sigma |b . (-n_1, n_0)|."""
-    scene = Ledge()
-    p = problem(scene)
-    w = np.random.default_rng(0).standard_normal((2, 20000))
-    term = (Boundary().terms(p, scene.theta0(), w) - Fobg().terms(p, scene.theta0(), w))[0] / 0.6
-    z = (0.22 - 0.3) / scene.sigma
-    along = abs(np.array([2.0, 1.0]) @ [-0.8, 0.6])
-    assert term.std() == pytest.approx(stats.norm.pdf(z) * along, rel=LIMIT / np.sqrt(2 * 20000))
-
-
 def test_boundaries_that_end_at_each_other_are_right():
     assert agrees(estimates(Boundary(), Corner()), Corner().gradient())
 
@@ -179,14 +166,6 @@ def test_the_closed_form_of_the_walk_is_the_sum_over_all_walks():
     np.testing.assert_allclose(scene.closed_form_gradient(None, None), expected, rtol=1e-9)
 
 
-def test_the_closed_form_of_a_walk_without_pull_is_that_of_a_binomial():
-    """E f = n (1 - m^2) + (n m - goal)^2 + effort x^2 with m = 2 Phi(x) - 1, without noise on theta."""
-    scene, n = CoinWalk(pull=0.0, sigma=1e-6), 8
-    m, slope = 2 * stats.norm.cdf(scene.push) - 1, 2 * stats.norm.pdf(scene.push)
-    expected = slope * (-2 * n * m + 2 * n * (n * m - scene.goal)) + 2 * scene.effort * scene.push
-    assert scene.closed_form_gradient(None, None)[0] == pytest.approx(expected, rel=1e-8)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("scene", "estimator"),
@@ -200,17 +179,6 @@ def test_the_closed_form_of_a_walk_without_pull_is_that_of_a_binomial():
 )
 def test_events_in_a_row_are_unbiased(scene, estimator):
     assert agrees(estimates(estimator, scene, repeats=3000), scene.closed_form_gradient(None, None))
-
-
-@pytest.mark.slow
-def test_both_vary_less_than_cost_times_score():
-    scene = CoinWalk()
-    plain, weighted, boundary = (
-        estimates(e, scene, seed=1).var(axis=0).sum()
-        for e in (Reinforce(baseline="leave_one_out"), StochasticDerivative(), Boundary())
-    )
-    assert 3 * weighted < plain
-    assert 1.5 * boundary < weighted
 
 
 # ------------------------------------------------------------------------------------------------- refusals
@@ -230,10 +198,3 @@ def test_undeclared_jumps_are_refused_with_the_reason():
     for scene in (Heaviside(), Cubic()):
         assert "declares discrete events" in StochasticDerivative().unsupported_reason(compose(scene))
     assert StochasticDerivative().unsupported_reason(compose(CoinWalk())) is None
-
-
-def test_the_plain_backend_agrees():
-    scene = CoinWalk()
-    p, w = Numpy().compile(compose(scene)), np.random.default_rng(3).standard_normal((5, 8, 10))
-    values = StochasticDerivative().estimate(p, scene.theta0(), w)
-    np.testing.assert_allclose(values, StochasticDerivative().estimate(problem(scene), scene.theta0(), w), rtol=1e-6)

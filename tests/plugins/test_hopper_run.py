@@ -3,7 +3,6 @@
 from functools import partial
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from bench.plugins.scenes.hopper_run import HopperRun
@@ -15,13 +14,6 @@ jax.config.update("jax_enable_x64", True)
 
 EXACT = 1e-12
 """Relative rounding error of a few hundred steps in float64."""
-DIFFERENCE = 1e-7
-"""Length of the change in central differences: truncation and rounding are both below :data:`AGREES`."""
-AGREES = 1e-4
-"""Relative error of central differences of a cost whose second derivative jumps at touch-down."""
-
-STEPS = 24
-"""Control steps that contain a touch-down and a lift-off."""
 
 
 def program_of(contact="penalty", law=None, **parameters):
@@ -133,44 +125,3 @@ def test_random_starts_are_in_the_air_and_inside_their_ranges():
     assert np.abs(state.q[2]).max() <= 0.1
     assert np.abs(state.v).max() <= 0.5
     assert not HopperRun().has_ended(np, state.q, state.v).any()
-
-
-def slopes(program, count):
-    """Return derivative and central difference of a cost after each of ``count`` steps by the height of the start."""
-    ops = registry.make("backends", "jax").ops()
-    first = start_of(foot=0.02, fall=0.6, speed=0.4, angle=0.1, pitch=0.05)
-    lifted = jnp.array([0.0, 1.0, 0.0, 0.0, 1.0])[:, None]
-    weights = jnp.array([0.3, 1.0, -0.5, 0.2, 0.7])[:, None]
-
-    @jax.jit
-    def step(state, u):
-        return program.step(ops, state, u)
-
-    def costs(height):
-        state = State(first.q + height * lifted, jnp.asarray(first.v))
-        values, gaps = [], []
-        for t in range(count):
-            state = step(state, jnp.array([[0.5 * np.sin(t)], [0.3]]))
-            values.append((weights * state.q).sum() + (0.1 * weights * state.v).sum())
-            gaps.append(state.q[4, 0])
-        return jnp.array(values), jnp.array(gaps)
-
-    (_, gaps), (derivative, _) = jax.jvp(costs, (0.0,), (1.0,))
-    high, low = costs(DIFFERENCE)[0], costs(-DIFFERENCE)[0]
-    return np.asarray(derivative), np.asarray(high - low) / (2 * DIFFERENCE), np.asarray(gaps)
-
-
-@pytest.mark.slow
-def test_the_gradient_equals_differences_before_in_and_after_the_step_of_touch_down():
-    derivative, difference, gap = slopes(program_of(substeps=2), STEPS)
-    touch_down = int(np.flatnonzero(gap < 0)[0])
-    lift_off = touch_down + int(np.flatnonzero(gap[touch_down:] > 0)[0])
-    assert 0 < touch_down < lift_off < STEPS - 1
-    np.testing.assert_allclose(derivative, difference, rtol=AGREES)
-
-
-def test_a_gradient_without_the_contact_force_is_caught():
-    derivative, difference, gap = slopes(program_of("straight_through", {"backward": "none"}, substeps=2), STEPS)
-    touch_down = int(np.flatnonzero(gap < 0)[0])
-    np.testing.assert_allclose(derivative[:touch_down], difference[:touch_down], rtol=AGREES)
-    assert abs(derivative[-1] / difference[-1] - 1) > 100 * AGREES

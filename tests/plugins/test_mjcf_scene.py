@@ -154,18 +154,6 @@ def test_one_solver_iteration_of_mjx_is_refused():
 
 
 @pytest.mark.slow
-def test_scenes_from_files_run_in_sweeps(pendulum, tmp_path):
-    rows = bench.run(
-        name="robot", scenes=[f"mjcf[file={pendulum},horizon=10]"], backends=["mujoco", "jax"],
-        estimators=["fobg", "reinforce"], samples=8, repeats=8, timing=False, results_dir=tmp_path,
-        reference={"samples": 2048},
-    )  # fmt: skip
-    assert rows.status.tolist().count("ok") == 2
-    assert rows[rows.backend == "jax"].status.eq("unsupported").all()
-    assert (rows[rows.status == "ok"].bias_low == 0).all()
-
-
-@pytest.mark.slow
 def test_mjx_and_mujoco_agree(pendulum):
     by_c, by_xla = problem(pendulum), problem(pendulum, "mjx[iterations=20]")
     theta, w = by_c.program.theta0, drawn(by_c)

@@ -1,7 +1,5 @@
 """Optimizers against their closed forms, torch.optim and the constants of cma."""
 
-import math
-
 import numpy as np
 import pytest
 from bench.plugins.optimizers.adam import Adam
@@ -101,15 +99,6 @@ def test_mppi_on_a_bowl():
     assert after["theta"] == pytest.approx([2 * 0.473684], abs=LIMIT)
 
 
-def test_mppi_at_a_high_temperature_is_a_gradient_step():
-    optimizer = Mppi(population=SAMPLES, width=0.3, temperature=100.0, relative=False)
-    state = optimizer.start(np.array([1.0]))
-    points = optimizer.ask(state, np.random.default_rng(0).standard_normal((1, SAMPLES)))
-    after = optimizer.tell(state, points, Answer(value=5.0 * points[0] ** 2))
-    # S / lambda times the gradient 10; the error is that of the mean of the samples
-    assert after["theta"] == pytest.approx([1.0 - 0.09 / 100 * 10.0], abs=6 * 0.3 / math.sqrt(SAMPLES))
-
-
 def test_slope_of_ppo_is_that_of_its_loss():
     """The clipped surrogate as written in the paper, differentiated by torch at a policy that has moved from the old one."""
     torch = pytest.importorskip("torch")
@@ -127,39 +116,6 @@ def test_slope_of_ppo_is_that_of_its_loss():
     assert (abs(ratio - 1) > 0.2).any()
     assert (abs(ratio - 1) < 0.2).any()
     assert Ppo().slope(moved, old, points, advantage) == pytest.approx(policy.grad.numpy(), rel=1e-10)
-
-
-def test_first_step_of_ppo_follows_the_zeroth_order_gradient():
-    """Nothing is clipped at the old policy: the slope by the mean is that of the mean cost, over its standard deviation."""
-    optimizer = Ppo(population=SAMPLES, width=0.3)
-    policy = optimizer.start(np.array([1.0, -2.0]))["policy"]
-    points = policy[0][:, None] + 0.3 * np.random.default_rng(0).standard_normal((2, SAMPLES))
-    slope = optimizer.slope(policy, policy, points, -(np.array([3.0, 1.0]) @ points))
-    # six standard errors of the mean of A z / deviation
-    assert slope[0] == pytest.approx([-3.0, -1.0], abs=6 * 4.0 / 0.3 / math.sqrt(SAMPLES))
-
-
-def test_noise_floor_of_gradient_descent():
-    """E J - J* = a v / (2 (2 - a k)) on k theta^2 / 2 with gradient variance v: variance too sets the final cost."""
-    rate, k, v, rng = 0.3, 2.0, 0.5, np.random.default_rng(3)
-    paths = 4000
-    optimizer = GradientDescent(rate=rate)
-    state = optimizer.start(np.zeros(paths))  # paths that do not touch, side by side
-    costs = []
-    for i in range(300):
-        noisy = k * state["theta"] + math.sqrt(v) * rng.standard_normal(paths)
-        state = optimizer.tell(state, state["theta"][:, None], Answer(gradient=noisy[:, None]))
-        if i >= 100 and i % 20 == 0:  # (1 - a k)^20: nothing is left of the last one
-            costs.append(0.5 * k * state["theta"] ** 2)
-    found = np.concatenate(costs)
-    error = found.std() / math.sqrt(found.size)
-    assert abs(found.mean() - rate * v / (2 * (2 - rate * k))) < 4 * error
-
-
-def test_clipping_each_step_keeps_the_sign_only():
-    """A soft step of slope 2/nu on a share p: clipped at c, the expected gradient is c p."""
-    optimizer = GradientDescent(rate=1.0, clip=0.1)
-    assert path(optimizer, np.array([[50.0], [0.0], [-50.0], [50.0]])) == pytest.approx([1.0 - 0.1])
 
 
 def test_decay_of_the_rate():
@@ -257,19 +213,6 @@ def test_a_damped_step_of_gauss_newton():
     """Marquardt 1963: the share damping / (1 + damping) remains."""
     found = steps(GaussNewton(damping=0.001), lambda x: 0.5 * x**2, lambda x: x, 2)
     assert found[2] == pytest.approx(0.001 / 1.001, rel=1e-9)
-
-
-def test_three_of_six_points_move_the_mean_of_cma_es():
-    """By 1.006 step sizes on a linear cost: the weighted mean of the three lowest of six normal numbers (Hansen 2016)."""
-    optimizer, rng = CmaEs(population=6, width=1.0), np.random.default_rng(0)
-    state, moves = optimizer.start(np.zeros(2)), []
-    for _ in range(4000):
-        points = optimizer.ask(state, rng.standard_normal((2, 6)))
-        moves.append(-optimizer.tell(state, points, Answer(value=points[0]))["theta"][0])
-    drawn = np.sort(rng.standard_normal((SAMPLES, 6)), axis=1)[:, ::-1]
-    expected = drawn[:, :3].mean(axis=0) @ constants(2, 6).weights
-    assert expected == pytest.approx(1.006, abs=0.005)
-    assert np.mean(moves) == pytest.approx(expected, abs=4 * np.std(moves) / math.sqrt(len(moves)))
 
 
 def test_nothing_finite_is_no_step():

@@ -9,12 +9,10 @@ from bench.plugins.scenes.cartpole_swing import CartpoleSwing
 
 import bench
 from bench.errors import UserError
-from bench.experiment import config, grid
 from bench.experiment.by_name import compile_problem, make
 from bench.measure import noise
 from bench.model import LoopOps, State, adjoint_gradient, slopes
 from bench.model.policy import policy_of, uniform
-from bench.trace.trace import trace
 
 REVERSED = 1e-9
 """Relative difference of gradients by one reverse pass and step by step: rounding over 30 steps."""
@@ -82,16 +80,6 @@ def test_two_normal_numbers_give_a_uniform_one():
     assert ((counts - 1e4) ** 2 / 1e4).sum() < 43.8  # 99.9% quantile of chi-square with 19 degrees of freedom
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("where", ["action", "parameter"])
-def test_the_adjoint_step_by_step_is_the_gradient(where):
-    exact = problem(noise=where)
-    theta, w = exact.program.theta0, sample(exact)
-    path = slopes(exact, theta, w)
-    scale = np.abs(exact.grad(theta, w)).max()
-    assert np.abs(adjoint_gradient(exact, path) - exact.grad(theta, w)).max() < REVERSED * scale
-
-
 def test_the_adjoint_without_jax_takes_differences(monkeypatch):
     exact = problem()
     theta, w = exact.program.theta0, sample(exact)
@@ -99,36 +87,6 @@ def test_the_adjoint_without_jax_takes_differences(monkeypatch):
     monkeypatch.setattr(CartpoleSwing, "pullback", lambda *_, **__: None)
     by_differences = adjoint_gradient(exact, slopes(exact, theta, w))
     assert np.abs(by_differences - by_product).max() < DIFFERENCED * np.abs(by_product).max()
-
-
-def test_a_window_as_long_as_the_rollout_is_fobg():
-    exact = problem()
-    drawn = noise.draw(0, "policy", 2, 8, exact.program.n_noise, "test")
-    whole = make("estimators", "fobg").estimate(exact, exact.program.theta0, drawn)
-    windowed = make("estimators", "windowed[steps=30]").estimate(exact, exact.program.theta0, drawn)
-    assert windowed == pytest.approx(whole, rel=REVERSED)
-
-
-@pytest.mark.parametrize(
-    "estimator", ["reinforce", pytest.param("total_propagation[per=action]", marks=pytest.mark.slow)]
-)
-def test_zeroth_order_agrees_with_first_order(estimator):
-    exact = problem("linear", horizon=10)
-    theta, program = exact.program.theta0, exact.program
-    first = make("estimators", "fobg").estimate(exact, theta, noise.draw(0, "a", 64, 64, program.n_noise, "test"))
-    other = make("estimators", estimator).estimate(exact, theta, noise.draw(1, "b", 64, 1024, program.n_noise, "test"))
-    error = np.sqrt((first.var(axis=0, ddof=1) + other.var(axis=0, ddof=1)) / 64)
-    assert (np.abs(first.mean(axis=0) - other.mean(axis=0)) < 4.5 * error).all()
-
-
-@pytest.mark.parametrize("where", ["action", "parameter"])
-def test_a_cost_is_its_sum(where):
-    given = problem("linear", "numpy", noise=where, horizon=5)
-    theta, w, scene = given.program.theta0, sample(given), given.program.scene
-    expected = 0.0
-    for state, u in list(given.program.steps(LoopOps(), theta[:, None], w))[:-1]:
-        expected = expected + scene.stage_cost(np, *state, u)
-    assert given.value(theta, w) == pytest.approx(expected, rel=1e-13)
 
 
 class Final(CartpoleSwing):
@@ -152,16 +110,6 @@ def test_backends_agree_on_a_gradient_with_a_terminal_cost(where):
         assert other.value(theta, w) == pytest.approx(exact.value(theta, w), rel=1e-12), backend
         assert np.abs(other.grad(theta, w) - gradient).max() < error * scale, backend
     assert np.abs(adjoint_gradient(exact, slopes(exact, theta, w)) - gradient).max() < DIFFERENCED * scale
-
-
-@pytest.mark.slow
-def test_a_trace_adds_up():
-    given = compile_problem(Final(policy="linear", horizon=12), None, "semi_implicit_euler", "jax")
-    w = sample(given, 1)
-    table, error = trace(given, w)
-    total = table.cost_stage.sum() + table.cost_terminal.sum()
-    assert total == pytest.approx(given.value(given.program.theta0, w)[0], rel=1e-12)
-    assert error < REVERSED
 
 
 @pytest.mark.slow
@@ -224,15 +172,6 @@ def test_a_rollout_that_has_ended_stays_and_costs_nothing():
     assert longer.value(theta, more) == pytest.approx(given.value(theta, w[:, column]), rel=1e-13)
 
 
-def test_the_start_is_near_hanging():
-    scene = CartpoleSwing()
-    q, v = scene.random_start(np, np.random.default_rng(0).standard_normal((8, 4000)))
-    assert np.abs(q[0]).max() < np.pi / 2
-    assert np.abs(q[1] + np.pi).max() < np.pi / 2
-    assert np.abs(v).max() < 0.25
-    assert q.std(axis=1) == pytest.approx([np.pi / np.sqrt(12)] * 2, rel=0.05)
-
-
 def test_energy_is_kept_without_force():
     scene = CartpoleSwing()
     program = compile_problem("cartpole_swing[substeps=400]", None, "semi_implicit_euler", "numpy").program
@@ -251,14 +190,6 @@ def test_energy_is_kept_without_force():
     assert energy(*state) == pytest.approx(before, rel=1e-4)  # 24,000 steps of first order
 
 
-def test_the_policy_is_in_the_key_of_a_cell():
-    def key(policy):
-        given = ["scenes=['cartpole_swing[policy=" + policy + "]']", "backends=[jax]", "estimators=[fobg]"]
-        return grid.cells(config.load(["name=keys", *given]))[0].key
-
-    assert len({key("linear"), key("mlp"), key("mlp[hidden=8]")}) == 3
-
-
 @pytest.mark.slow
 def test_policies_are_swept(tmp_path):
     rows = bench.run(
@@ -268,20 +199,3 @@ def test_policies_are_swept(tmp_path):
     )  # fmt: skip
     assert rows.status.tolist() == ["ok", "ok"]
     assert sorted(rows.dim) == [6, 57]
-
-
-@pytest.mark.full
-def test_a_policy_with_a_hundred_thousand_coordinates_has_rows(tmp_path):
-    common = dict(
-        name="large", backends=["jax"], samples=4, repeats=4, results_dir=tmp_path,
-        reference={"samples": 256},
-    )  # fmt: skip
-    scene = "cartpole_swing[horizon=5,policy=mlp[hidden=300x300]"
-    on_actions = ["fobg", "reinforce", "windowed[steps=2]", "total_propagation[per=action]"]
-    rows = bench.run(scenes=[f"{scene}]"], estimators=on_actions, **common)
-    assert rows.status.tolist() == ["ok"] * 4
-    smoothed = bench.run(scenes=[f"{scene},noise=parameter,sigma=0.01]"], estimators=["randomized_smoothing"], **common)
-    assert smoothed.status.tolist() == ["ok"]
-    for given in (rows, smoothed):
-        assert set(given.dim) == {92401}
-        assert given.peak_memory_mb.max() < 2048

@@ -1,17 +1,13 @@
 """The robot that pushes a block: without contact the block's term has no gradient, and in contact a right one."""
 
-import re
-
 import numpy as np
 import pytest
-from bench.plugins.backends.mjx import Mjx
 from bench.plugins.backends.mujoco import Mujoco
 from bench.plugins.contacts.penalty import Penalty
 from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
 from bench.plugins.scenes.quadruped_push import QuadrupedPush
 
 from bench.model import compose, registry
-from bench.studies.gradient_check.measure import ContactModes, SwitchSearch, boundary
 
 if not registry.find("backends", "mujoco").available:
     pytest.skip("MuJoCo is not installed", allow_module_level=True)
@@ -62,32 +58,6 @@ def test_in_contact_the_gradient_moves_the_block():
     assert pushing.value(moved, STILL)[0] < pushing.value(theta, STILL)[0] - 0.02
 
 
-@pytest.mark.slow
-def test_both_sides_of_the_touch_have_the_right_gradient():
-    """Along the lean of all hips: before the touch it is 0, after it that of the differences; the contact is named."""
-    pushing = problem(lean=0.13, **DOWN)
-    theta = pushing.program.theta0
-    contacts = pushing.engine_contacts()
-    (block,) = (i for i, name in enumerate(contacts.names) if name == "torso-block")
-
-    def touching(at, w):
-        at = np.broadcast_to(at, (12, w.shape[1]))
-        return contacts.touching(pushing.trajectory(at, w).states[:-1])[:, block : block + 1]
-
-    along = np.tile([1.0, 0.0, 1.0, 0.0], 3) / np.sqrt(6)
-    search = SwitchSearch(directions=1, drawn=1, reach=0.01, aside=1e-5)
-    places = boundary(ContactModes(touching, ("torso-block",)), theta, along, STILL[:, 0], 0, search)
-    assert [place.point for place in places] == ["before", "at", "after"]
-    assert re.fullmatch(r"torso-block in step 5\d \(apart before, touching after\)", places[1].switch)
-    before, _, after = (place.theta for place in places)
-    np.testing.assert_array_equal(pushing.grad(before, STILL), 0.0)
-    gradient = pushing.grad(after, STILL)
-    assert float(along @ gradient[:, 0]) < -1e-3
-    np.testing.assert_allclose(
-        gradient, differences(pushing, after, 1e-7), rtol=0, atol=1e-4 * np.linalg.norm(gradient)
-    )
-
-
 @pytest.mark.parametrize("horizon", [1, 2, 50])
 def test_the_plan_fills_every_horizon(horizon):
     """Left and right legs have the same targets, and each part of the plan its own."""
@@ -97,16 +67,3 @@ def test_the_plan_fills_every_horizon(horizon):
     assert plan.shape == (horizon, 12, 2)
     np.testing.assert_allclose(plan[:, :3], plan[:, 3:6], rtol=0, atol=1e-12)
     np.testing.assert_allclose(plan[-1, 7:9], theta.reshape(3, 4, 2)[(horizon - 1) * 3 // horizon, 2:], atol=1e-12)
-
-
-@pytest.mark.full
-@pytest.mark.parametrize("values", [{"lean": 0.0}, {"lean": 0.2}])
-def test_the_converged_solver_of_mjx_gives_the_same_gradient(values):
-    if not registry.find("backends", "mjx").available:
-        pytest.skip("MJX is not installed")
-    theta = QuadrupedPush(**values).theta0()
-    mjx = problem(Mjx(impedance=0.9, iterations=20, mode="reverse"), **values)
-    c = problem(Mujoco(impedance=0.9), **values)
-    assert mjx.value(theta, STILL)[0] == pytest.approx(c.value(theta, STILL)[0], rel=1e-8)
-    expected = c.grad(theta, STILL)
-    np.testing.assert_allclose(mjx.grad(theta, STILL), expected, rtol=0, atol=1e-5 * np.linalg.norm(expected))

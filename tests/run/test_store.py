@@ -1,7 +1,6 @@
 """Rows outlast kills, full disks and runs side by side."""
 
 import errno
-import json
 import math
 import os
 import random
@@ -17,12 +16,10 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from helpers import loaded
 
 from bench.cli import main
 from bench.errors import StorageError, UserError
-from bench.model.parameters import values
-from bench.run import files, tasks
+from bench.run import files
 from bench.run import store as store_module
 from bench.run.launchers import launcher
 from bench.run.store import Store
@@ -92,17 +89,6 @@ def test_rows_stay_in_the_order_of_their_file_whenever_they_were_stored(tmp_path
     assert list(pd.read_parquet(tmp_path / "rows.parquet")["key"]) == [*keys, row(4)["key"]]
 
 
-def test_rows_of_an_older_store_are_read(tmp_path):
-    (tmp_path / "pending").mkdir()
-    old = {k: v for k, v in row(1).items() if k not in ("wall_s", "stored_at")}
-    (tmp_path / "pending" / "abc.json").write_text(json.dumps(old))
-    pd.DataFrame([old | {"key": "b" * 32}]).to_parquet(tmp_path / "rows.parquet")
-    store = Store(tmp_path, COLUMNS)
-    assert len(store.load()) == 2
-    store.compact()
-    assert len(pd.read_parquet(tmp_path / "rows.parquet")) == 2
-
-
 def test_columns_that_are_not_known_are_kept(tmp_path):
     """A newer version, or a study of one's own, has stored more than this one knows."""
     store = Store(tmp_path, COLUMNS)
@@ -119,21 +105,6 @@ def test_columns_that_are_not_known_are_kept(tmp_path):
     table = pd.read_parquet(tmp_path / "rows.parquet").set_index("key").sort_index()
     assert table["heat"].tolist()[0] == 0.5
     assert table["colour"].tolist()[1] == "blue"
-
-
-@pytest.mark.parametrize("study", ["bias_variance", "growth", "stability"])
-def test_a_row_says_which_study_made_it_and_every_parameter_of_its_cell(study):
-    made, cells = loaded(
-        f"study={study}", "scenes=[pushing]", "backends=[numpy]", "estimators=[fobg]", "sweep.mass=[0.1,0.3]"
-    )
-    for cell, mass in zip(cells, (0.1, 0.3), strict=True):
-        stored = tasks.blank_row(made, cell)
-        assert stored["study"] == study
-        told = json.loads(stored["parameters"])
-        assert told["study"]["name"] == study
-        assert told["scene"] == {"name": "pushing"} | values(cell.scene)
-        assert told["scene"]["mass"] == mass
-        assert set(told) == {"study", *cell.parts, "theta", "reference"}
 
 
 @pytest.mark.parametrize("step", range(1, 8))
@@ -378,29 +349,6 @@ def test_disk_that_fills(tmp_path, capsys, monkeypatch, after):
     assert len(pd.read_parquet(tmp_path / "tiny" / "rows.parquet")) == 4
 
 
-@pytest.mark.slow
-@pytest.mark.skipif(os.geteuid() != 0, reason="only root can mount")
-def test_small_disk(tmp_path):
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=96k", "tmpfs", str(disk)], capture_output=True).returncode:
-        pytest.skip("no mount here")
-    try:
-        words = [*TINY, f"sweep.sigma=[{','.join(str(s / 100) for s in range(1, 101))}]", "name=tiny", "--quiet"]
-        done = bench(*words, f"results_dir={disk}")
-        assert done.returncode == 2
-        assert "Traceback" not in done.stderr
-        assert "No space left on device" in done.stderr
-        stored = Store(disk / "tiny", COLUMNS).load()
-        assert 0 < len(stored) <= 100
-        shutil.copytree(disk / "tiny", tmp_path / "tiny")
-        again = bench(*words, f"results_dir={tmp_path}")
-        assert again.returncode == 0
-        assert len(Store(tmp_path / "tiny", COLUMNS).load()) == 100
-    finally:
-        subprocess.run(["umount", str(disk)], check=True)
-
-
 def test_directory_that_refuses(tmp_path, capsys, monkeypatch):
     def refuse(*_, **__):
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
@@ -519,14 +467,3 @@ def test_a_pipe_and_a_claim_in_other_characters_are_left_alone(tmp_path):
     (tmp_path / "pending" / ".study").write_bytes(b"\xff\xfe")
     with pytest.raises(UserError, match="has started"):
         store.prepare()
-
-
-def test_a_table_with_a_column_without_a_name_is_not_read(tmp_path):
-    names = [{"name": name, "field_name": field, "pandas_type": "unicode", "numpy_type": "object", "metadata": None}
-             for name, field in ((None, "5"), ("key", "key"))]  # fmt: skip
-    pandas = {"index_columns": [], "columns": names, "pandas_version": "2.0"}
-    pandas["column_indexes"] = [names[0] | {"field_name": None, "pandas_type": "mixed-integer"}]
-    table = pa.table({"5": ["a"], "key": ["k"]}).replace_schema_metadata({"pandas": json.dumps(pandas)})
-    pq.write_table(table, tmp_path / "rows.parquet")
-    with pytest.raises(StorageError, match="a column has no name"):
-        Store(tmp_path, COLUMNS).load()
