@@ -355,8 +355,7 @@ class Findings:
         elif self.misses_jumps:
             found.append(("staircase" if self.tread else "jumps", None))
         for one in self.smoothed:
-            kinds = {"nonfinite": not one.defined, "biased": one.biased, "spread": one.unshown or one.hidden}
-            found += [(cause, one) for cause, is_found in kinds.items() if is_found]
+            found += [(one.cause, one)] if one.cause else []
         if self.gradient and len(self.smoothed) < len(self.setup.sigmas):
             found.append(("unmeasured", None))
         return sorted(found, key=lambda each: NOISE_CAUSES.index(each[0]))

@@ -188,6 +188,14 @@ def check(
     return _Checker(cost, gradient, np.array(theta, dtype=np.float64), options or Options(), modes, tangent).run()
 
 
+def extremes(weights: np.ndarray, most: int) -> list[int]:
+    """Return the indices of at most ``most`` numbers: half of them the largest in size, half the smallest."""
+    if weights.size <= most:
+        return list(range(weights.size))
+    order = np.argsort(np.nan_to_num(np.abs(weights), nan=np.inf), kind="stable")
+    return sorted(int(i) for i in np.r_[order[: most // 2], order[order.size - (most - most // 2) :]])
+
+
 def settle(
     cost: Cost, theta: np.ndarray, vector: np.ndarray, length: float, sample: Sample, tangent: Tangent | None
 ) -> Finding | None:
@@ -275,7 +283,7 @@ class _Checker:
     def run(self) -> Check:
         theta, options = self.theta, self.options
         first = self.gradient(theta)
-        chosen = self._components(first)
+        chosen = extremes(first * self.scale, options.components)
         around = theta[:, None] + options.reach * self.scale[:, None] * self.random.standard_normal(
             (theta.size, options.draws)
         )
@@ -305,14 +313,6 @@ class _Checker:
         elif not repeats(first, again, self.unit).all():
             causes.append("nondeterministic")
         return Check(cause=most_severe(causes), gradient=first, parts=tuple(parts), draws=tuple(draws))
-
-    def _components(self, gradient: np.ndarray) -> list[int]:
-        """Return the indices of the components to check one by one."""
-        dim, most = gradient.size, self.options.components
-        if dim <= most:
-            return list(range(dim))
-        share = np.argsort(np.nan_to_num(np.abs(gradient * self.scale), nan=np.inf), kind="stable")
-        return sorted(int(i) for i in np.r_[share[: most // 2], share[dim - (most - most // 2) :]])
 
     def _along(self, component: int) -> np.ndarray:
         """Return the vector ``(d,)`` of a component, of the length of its scale."""
