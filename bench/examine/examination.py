@@ -245,8 +245,7 @@ class _Examination:
         comparisons: tuple[tuple[str, str, Any, Any], ...] = (
             ("twin", "comparison with the twin", diagnosis.compare_costs, twin),
             ("twin_error", "comparison with the twin's gradient", diagnosis.compare_gradients, twin_grad if has_gradient else None),
-            ("refined", "the refined cost", diagnosis.check_refined, refined),
-            ("gaps", "the refined cost at other thetas", diagnosis.refined_gaps, refined if is_wrong and has_gradient else None),
+            ("gaps", "the refined cost", diagnosis.refined_gaps, refined if is_wrong and has_gradient else None),
             ("growth", "horizons", diagnosis.errors_by_horizon, setup.horizons or None),
         )  # fmt: skip
         for name, what, function, given in comparisons:

@@ -290,7 +290,7 @@ class Findings:
                 return "adaptive"
             if cause in (*SUSPICIOUS, "unsettled", "disconnected") and self.is_overwritten:
                 return "overwritten"
-            is_open = cause in SUSPICIOUS and explained.is_unexplained and explained.refined is None
+            is_open = cause in SUSPICIOUS and explained.is_unexplained and not explained.gaps
             return "undecided" if is_open else cause
         if not check.components or not self.is_complete:
             return "undecided"
