@@ -298,7 +298,7 @@ def trained(experiment: str = "train") -> pd.DataFrame:
 
 
 def trained_in_range(low: float, high: float) -> str:
-    """Return how many runs of ``shac`` with its published settings end with a mean return in a range, of how many."""
+    """Return how many runs of ``shac`` with the public settings end with a mean return in a range, of how many."""
     final = trained().query("method == 'shac'")["final_return"]
     return f"{((low <= final) & (final <= high)).sum()} of {len(final)}"
 
@@ -329,22 +329,20 @@ def trained_table(experiment: str = "train") -> str:
 
 
 def windows_table(experiment: str = "train") -> str:
-    """Return gradient, its bias and final return by the length of a window as a Markdown table."""
-    head = ["| window [steps] | norm of the gradient | its bias | final return |", "|--:" * 4 + "|"]
-    return block(head + [
-        f"| {line['window']:.0f} | {number(line['window_gradient'])} | {window_bias(line)} | {final_return(line)} |"
+    """Return gradient and final return by the length of a window as a Markdown table; on the cart-pole also the bias."""
+    has_bias = experiment == "train"
+    head = f"| window [steps] | norm of the gradient |{' its bias |' * has_bias} final return |"
+    return block([head, "|--:" * (3 + has_bias) + "|"] + [
+        f"| {line['window']:.0f} | {number(line['window_gradient'])} |{f' {window_bias(line)} |' * has_bias} {final_return(line)} |"
         for line in aggregate.windows(trained(experiment)).to_dict("records")
     ])  # fmt: skip
 
 
 def stiffness_table() -> str:
-    """Return gradient, its bias and final return by the stiffness of the ground and the length of a window, as Markdown."""
-    head = [
-        "| stiffness [N/m] | window [steps] | norm of the gradient | its bias | final return |",
-        "|--:" * 5 + "|",
-    ]
+    """Return gradient and final return by the stiffness of the ground and the length of a window, as Markdown."""
+    head = ["| stiffness [N/m] | window [steps] | norm of the gradient | final return |", "|--:" * 4 + "|"]
     return block(head + [
-        f"| {count(stiffness)} | {line['window']:.0f} | {number(line['window_gradient'])} | {window_bias(line)} | {final_return(line)} |"
+        f"| {count(stiffness)} | {line['window']:.0f} | {number(line['window_gradient'])} | {final_return(line)} |"
         for stiffness, part in trained("train/stiffness").groupby("stiffness")
         for line in aggregate.windows(part).to_dict("records")
     ])  # fmt: skip
@@ -356,11 +354,17 @@ def gradient_norms(experiment: str, window: int) -> str:
     return span(runs.loc[runs["trainer"].str.contains(f"window={window}]", regex=False), "gradient_typical"])
 
 
+def used_steps(experiment: str) -> str:
+    """Return the range over runs of the share of control steps that trainers use which ignore others, over a whole run."""
+    shares = pd.Series([np.mean(log) for log in trained(experiment)["log_used"] if np.size(log) > 1])
+    return f"{shares.min():.0%} to {shares.max():.0%}"
+
+
 def faults_table(experiment: str) -> str:
     """Return per trainer and fault the number of runs whose log shows it, and the numbers of the first, as Markdown."""
     runs = trained(experiment)
     seeds = runs.groupby("method")["seed"].nunique()
-    numbers = [name for name in ("update", "factor", "error") if name in (faults := aggregate.faults(runs))]
+    faults, numbers = aggregate.faults(runs), ["update", "value"]
     head = ["trainer", "fault", "runs", "first in seed", *numbers]
     return block([f"| {' | '.join(head)} |", "|---|---|" + "--:|" * (len(head) - 2)] + [
         f"| `{method}` | {code.replace('_', ' ')} | {len(part)} of {seeds[method]} | {part['seed'].iloc[0]:.0f} | "
@@ -699,6 +703,7 @@ FIGURES: dict[str, Callable[[], str]] = {
     "hopper-answer": lambda: answer_of("train/hopper"),
     "hopper-table": lambda: trained_table("train/hopper"),
     "hopper-stiffness": stiffness_table,
+    "hopper-used": lambda: used_steps("train/hopper"),
     "hopper-windows": lambda: windows_table("train/hopper"),
     "hopper-faults": lambda: faults_table("train/hopper"),
     "cheetah-answer": lambda: answer_of("train/half_cheetah"),

@@ -7,7 +7,7 @@ import shutil
 import sys
 import textwrap
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,8 @@ SETTINGS = (
     "allow_zero", "expect", "twin", "twin_grad", "refined", "horizons", "baseline", "save",
 )  # fmt: skip
 """Settings of one cost."""
+FILES = ("baseline", "save")
+"""Files of one cost."""
 OUTPUTS = ("markdown", "junit")
 """Files of a whole command."""
 QUIET, MATRIX = "--quiet", "--matrix"
@@ -93,34 +95,13 @@ def _examined(cost: str, settings: Mapping[str, Any], progress: bool) -> Report:
     """Return the report on a cost ``FILE:NAME`` with settings as on the command line, or as in a TOML file."""
     function = imports.load_attribute(cost)
     module = imports.load_module(cost.rpartition(":")[0])
-
-    def other(key: str) -> Any:
-        return imports.load_attribute(str(settings[key]), module, key) if settings.get(key) else None
-
-    report = examine(
-        function,
-        _theta(settings.get("theta", "theta"), module, "theta" in settings),
-        grad=_gradient(settings.get("grad"), module),
-        sigma=_by_input(settings["sigma"], "sigma", True) if "sigma" in settings else (),
-        noise=_count(settings, "noise") or 0,
-        budget=settings.get("budget"),
-        batch=settings.get("batch"),
-        scale=_theta(settings["scale"], module, True) if "scale" in settings else None,
-        seed=_count(settings, "seed") or 0,
-        name=cost,
-        progress=progress,
-        calls=_count(settings, "calls"),
-        **{key: _by_input(settings[key], key, False) for key in ("tolerance", "atol") if key in settings},
-        **({"compile_budget": settings["compile_budget"]} if "compile_budget" in settings else {}),
-        allow_zero=_names(settings["allow_zero"]) if "allow_zero" in settings else None,
-        expect=str(settings.get("expect", "")),
-        twin=other("twin"),
-        twin_grad=_gradient(settings.get("twin_grad"), module),
-        refined=other("refined"),
-        horizons=[int(one) for one in _numbers(settings["horizons"], "horizons")] if "horizons" in settings else (),
-    )
-    given = " ".join(f"{key}={value}" for key, value in settings.items() if key != "expect")
-    report = replace(report, command=f"python -m bench examine {cost} {given}".strip())
+    if "theta" not in settings and not hasattr(module, "theta"):
+        raise UserError("theta is missing: give theta=1,0 or define theta in the file")
+    given = {key: value for key, value in {"theta": "theta", **settings}.items() if key not in FILES}
+    values = {key: PARSERS.get(key, _as_it_is)(value, key, module) for key, value in given.items()}
+    report = examine(function, name=cost, progress=progress, **values)
+    words = " ".join(f"{key}={value}" for key, value in settings.items() if key != "expect")
+    report = replace(report, command=f"python -m bench examine {cost} {words}".strip())
     return report.compared(settings["baseline"]) if "baseline" in settings else report
 
 
@@ -192,9 +173,7 @@ def read_matrix(path: Path) -> list[tuple[str, str, dict[str, Any]]]:
         place, _, function = cost.rpartition(":")
         if place.endswith(".py"):
             cost = f"{path.parent / Path(place).expanduser()}:{function}"
-        for key in ("baseline", "save"):
-            if key in settings:
-                settings[key] = str(path.parent / str(settings[key]))
+        settings |= {key: str(path.parent / str(settings[key])) for key in FILES if key in settings}
         rows.append((name, cost, settings))
     return rows
 
@@ -214,66 +193,71 @@ def _write(outputs: Mapping[str, str], reports: Sequence[Report], refused: Mappi
 # ---------------------------------------------------------------------------------------------- values
 
 
-def _numbers(given: Any, what: str) -> list[float]:
+def _as_it_is(given: Any, key: str, module: Any) -> Any:
+    return given
+
+
+def _numbers(given: Any, key: str) -> list[float]:
     try:
         parts = given.strip("[]() ").split(",") if isinstance(given, str) else np.ravel(given)
         return [float(part) for part in parts if str(part).strip()]
     except (TypeError, ValueError):
-        raise UserError(f"{what}={given} is not a list of numbers: write {what}=1,0.5") from None
+        raise UserError(f"{key}={given} is not a list of numbers: write {key}=1,0.5") from None
 
 
-def _count(settings: Mapping[str, Any], key: str) -> int | None:
-    if key not in settings:
-        return None
-    text = str(settings[key])
-    if not re.fullmatch(r"\d+", text):
-        raise UserError(f"{key}={text} is not a whole number")
-    return int(text)
+def _count(given: Any, key: str, module: Any) -> int:
+    if not re.fullmatch(r"\d+", str(given)):
+        raise UserError(f"{key}={given} is not a whole number")
+    return int(given)
 
 
-def _pairs(text: str) -> dict[str, float] | None:
-    """Return the numbers of ``name:number,name:number``; None for another text."""
-    pairs = re.findall(r"([A-Za-z_][\w.\[\]]*):([^,]+)", text)
-    if pairs and len(pairs) == text.count(",") + 1:
-        return {name: _numbers(value, name)[0] for name, value in pairs}
-    return None
+def _counts(given: Any, key: str, module: Any) -> list[int]:
+    return [int(one) for one in _numbers(given, key)]
 
 
-def _by_input(given: Any, what: str, is_list: bool) -> Any:
-    """Return one number per input as a mapping, or a number, or a list of numbers."""
+def _by_input(given: Any, key: str, module: Any) -> Any:
+    """Return numbers, or a mapping of inputs to numbers, from ``name:number,name:number``."""
     if isinstance(given, Mapping):
         return dict(given)
-    if isinstance(given, str) and (pairs := _pairs(given)) is not None:
-        return pairs
-    values = _numbers(given, what)
-    if is_list:
-        return values
-    if len(values) != 1:
-        raise UserError(f"{what}={given} is not valid: write one number, or {what}=mass:1e-3,gain:1e-2")
-    return values[0]
+    pairs = re.findall(r"([A-Za-z_][\w.\[\]]*):([^,]+)", given) if isinstance(given, str) else []
+    if pairs and len(pairs) == given.count(",") + 1:
+        return {name: _numbers(value, name)[0] for name, value in pairs}
+    return np.array(_numbers(given, key)) if isinstance(given, str) else np.array(given, dtype=np.float64)
 
 
-def _names(given: Any) -> Any:
-    if isinstance(given, bool):
-        return given
-    words = {"true": True, "false": False}
+def _one_by_input(given: Any, key: str, module: Any) -> Any:
+    values = _by_input(given, key, module)
+    if not isinstance(values, dict) and values.size != 1:
+        raise UserError(f"{key}={given} is not valid: write one number, or {key}=mass:1e-3,gain:1e-2")
+    return values if isinstance(values, dict) else float(values.ravel()[0])
+
+
+def _names(given: Any, key: str, module: Any) -> Any:
     if isinstance(given, str):
+        words = {"true": True, "false": False}
         return words.get(given.lower(), [name.strip() for name in given.split(",") if name.strip()])
-    return [str(name) for name in given]
+    return given if isinstance(given, bool) else [str(name) for name in given]
 
 
-def _theta(given: Any, module: Any, is_given: bool) -> Any:
+def _theta(given: Any, key: str, module: Any) -> Any:
     """Return theta from numbers, ``name:number`` pairs, or a name in the file, called if it is a function."""
-    if not isinstance(given, str):
-        return dict(given) if isinstance(given, Mapping) else np.array(given, dtype=np.float64)
-    if re.fullmatch(r"[A-Za-z_][\w.]*", given):
-        if not is_given and not hasattr(module, given):
-            raise UserError("theta is missing: give theta=1,0 or define theta in the file")
-        theta = imports.load_attribute(given, module, "theta")
-        return theta() if callable(theta) else theta
-    pairs = _pairs(given)
-    return pairs if pairs is not None else np.array(_numbers(given, "theta"))
+    if not (isinstance(given, str) and re.fullmatch(r"[A-Za-z_][\w.]*", given)):
+        return _by_input(given, key, module)
+    theta = imports.load_attribute(given, module, "theta")
+    return theta() if callable(theta) else theta
 
 
-def _gradient(text: Any, module: Any) -> Any:
-    return text if text is None or text in LIBRARIES else imports.load_attribute(str(text), module, "grad", LIBRARIES)
+def _function(given: Any, key: str, module: Any) -> Any:
+    return imports.load_attribute(str(given), module, key)
+
+
+def _gradient(given: Any, key: str, module: Any) -> Any:
+    return given if given in LIBRARIES else imports.load_attribute(str(given), module, "grad", LIBRARIES)
+
+
+PARSERS: dict[str, Callable[[Any, str, Any], Any]] = {
+    "theta": _theta, "scale": _theta, "grad": _gradient, "twin_grad": _gradient, "twin": _function, "refined": _function,
+    "sigma": _by_input, "tolerance": _one_by_input, "atol": _one_by_input, "allow_zero": _names, "horizons": _counts,
+    "noise": _count, "seed": _count, "calls": _count,
+}  # fmt: skip
+"""How the settings are read whose values are not taken as they are."""

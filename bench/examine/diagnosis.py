@@ -11,11 +11,10 @@ import numpy as np
 
 from bench.examine.gradient import GradientStages
 from bench.examine.lines import LineScan, scan
-from bench.examine.quick import QuickCheck
 from bench.examine.rules import SUSPICIOUS
 from bench.examine.steps import changing_loop
 from bench.examine.subspace import choose
-from bench.measure.gradcheck import Check
+from bench.measure.gradcheck import Check, FewSteps
 from bench.model.simulator.simulator import Simulator
 
 NEAR = 0.05
@@ -63,8 +62,7 @@ def compare_costs(stages: GradientStages, twin: Callable[..., Any]) -> float:
     thetas = stages.theta[:, None] + 1e-2 * stages.scale[:, None] * np.c_[
         np.zeros(stages.theta.size), random.standard_normal((stages.theta.size, THETAS))
     ]  # fmt: skip
-    w = None if stages.w is None else np.repeat(stages.w, thetas.shape[1], axis=1)
-    a, b = stages.costs(thetas), other.costs(thetas, w)
+    a, b = stages.costs(thetas), other.costs(thetas, stages.same_noise(thetas.shape[1]))
     size = np.maximum(np.abs(a), np.abs(b)).max()
     return float(np.abs(a - b).max() / size) if size > 0 else 0.0
 
@@ -96,7 +94,7 @@ def check_refined(stages: GradientStages, refined: Callable[..., Any]) -> Check 
     quick = _quick(stages, other, space)
     for _ in range(2):
         quick.run_round(other.width)
-    outcome = quick.check([f"component {i}" for i in range(space.size)])
+    outcome = quick.check()
     return None if outcome is None else space.restore(outcome)
 
 
@@ -143,7 +141,7 @@ def refined_gaps(stages: GradientStages, refined: Callable[..., Any]) -> list[Ga
         vectors = random.standard_normal((size, min(ALONG, size)))
         vectors *= scale[:, None] / np.linalg.norm(vectors, axis=0)
         at = np.concatenate([theta[:, None] + eps * vectors, theta[:, None] - eps * vectors], axis=1)
-        w = None if stages.w is None else np.repeat(stages.w, at.shape[1], axis=1)
+        w = stages.same_noise(at.shape[1])
         own, exact = (np.subtract(*np.split(costs, 2)) / (2 * eps) for costs in (stages.costs(at), other.costs(at, w)))
         slopes = stages.gradient_at(theta) @ vectors
         gaps.append(Gap(float(np.linalg.norm(slopes - exact)), float(np.linalg.norm(own - exact))))
@@ -168,7 +166,7 @@ def errors_by_horizon(stages: GradientStages, horizons: Sequence[int]) -> list[H
         space = choose(stages.layout, stages.scale, gradient, stages.seed, most=4)
         quick = _quick(stages, other, space, space.project(gradient))
         quick.run_round(other.width)
-        outcome = quick.check([f"component {i}" for i in range(space.size)])
+        outcome = quick.check()
         if outcome is None:
             continue
         program = np.array([part.program for part in outcome.parts]) * space.scale
@@ -229,20 +227,27 @@ def is_adaptive(
     if stages.gradient is None or not lines or error > FAR:
         return False
 
-    def along(line: LineScan, t: np.ndarray) -> np.ndarray:
-        return stages.costs(stages.theta[:, None] + line.direction[:, None] * t)
-
     if sum(len(line.jumps) for line in lines) < FEWEST_JUMPS and error <= NEAR:
         first, noise = lines[0], max(outcome.noise, stages.repeats.spread)
         reach, unit = LONGER * float(first.at[-1]), stages.simulator.unit
-        longer = scan(lambda t: along(first, t[0]), np.zeros(1), np.ones(1), noise, reach, points, halvings, most, unit)
+        longer = scan(
+            partial(stages.costs_along, first.direction),
+            np.zeros(1),
+            np.ones(1),
+            noise,
+            reach,
+            points,
+            halvings,
+            most,
+            unit,
+        )
         lines = [replace(longer, direction=first.direction)]
     if sum(len(line.jumps) for line in lines) < FEWEST_JUMPS:
         return False
     rows = []
     for line in lines:
         step = 1e-3 * float(line.at[1] - line.at[0])
-        costs = along(line, np.array([-step, step]))
+        costs = stages.costs_along(line.direction, np.array([-step, step]))
         apart = abs(float((costs[1] - costs[0]) / (2 * step) - line.direction @ stages.gradient))
         rows.append((sum(jump.size for jump in line.jumps), np.abs(np.diff(line.costs)).sum(), apart * np.ptp(line.at)))
     heights, changes, errors = np.array(rows).T
@@ -257,16 +262,16 @@ def _simulator(stages: GradientStages, cost: Callable[..., Any], grad: Any) -> S
     return Simulator(cost, stages.layout, grad, own.noise, batch, stages.clock, own.library)
 
 
-def _quick(stages: GradientStages, other: Simulator, space: Any, slope: np.ndarray | None = None) -> QuickCheck:
+def _quick(stages: GradientStages, other: Simulator, space: Any, slope: np.ndarray | None = None) -> FewSteps:
     """Return a quick check of another cost in the coordinates of a space, with the given or theta's gradient."""
 
     def cost(z: np.ndarray) -> np.ndarray:
         def costs(thetas: np.ndarray) -> np.ndarray:
-            return other.costs(thetas, None if stages.w is None else np.repeat(stages.w, thetas.shape[1], axis=1))
+            return other.costs(thetas, stages.same_noise(thetas.shape[1]))
 
         return np.asarray(space.costs(costs, z, other.width))
 
     if slope is None and stages.gradient is not None:
         slope = space.project(stages.gradient)
     centre = float(cost(space.origin()[:, None])[0])
-    return QuickCheck(cost, space.origin(), space.scale, slope, centre, stages.simulator.unit, stages.repeats.spread)
+    return FewSteps(cost, space.origin(), space.scale, slope, centre, stages.simulator.unit, stages.repeats.spread)

@@ -13,7 +13,6 @@ import numpy as np
 
 from bench.errors import UserError, unknown
 from bench.examine import diagnosis
-from bench.examine.clock import ExaminationClock
 from bench.examine.findings import RELATIVE, GroupSize, Setup, Spent
 from bench.examine.gradient import GradientStages
 from bench.examine.lines import HALVINGS, PLACES, POINTS, LineScan, scan
@@ -102,7 +101,7 @@ def examine(
     >>> report.status, report.cause
     (0, 'smooth')
     """
-    clock = ExaminationClock(
+    clock = Clock(
         _time_limit(budget, calls), progress, _call_limit(calls), parse_duration(compile_budget, "compile_budget")
     )
     if not isinstance(noise, int | np.integer) or noise < 0:
@@ -130,7 +129,7 @@ def examine(
             simulator = Simulator(cost, layout, grad, int(noise), batch, clock)
         except OutOfTime:
             limit = "compile_budget" if not clock.is_terminated else "the time until SIGTERM"
-            took = f"the first call of the cost took longer than {limit}={clock.compile_limit:g} seconds"
+            took = f"the first call of the cost took longer than {limit}={clock.compile_budget:g} seconds"
             raise UserError(f"{took}: give a larger compile_budget or a shorter rollout") from None
         examination = _Examination(simulator, setup, clock)
         try:
@@ -399,7 +398,7 @@ class _Examination:
                 rounding = max(
                     measured, self.stages.repeats.spread, self.simulator.unit * (size if math.isfinite(size) else 0.0)
                 )
-                cost = partial(self._costs_along, direction)
+                cost = partial(self.stages.costs_along, direction)
                 line = scan(cost, np.zeros(1), np.ones(1), rounding, 3.0, points, halvings, most, self.simulator.unit)
                 line = replace(line, direction=direction)
                 lines.append(replace(line, missed=self._missed_share(line, checked)))
@@ -407,12 +406,6 @@ class _Examination:
             self.left_out.append("jumps and kinks on lines")
         self.clock.limit(1.0)
         return lines
-
-    def _costs_along(self, direction: np.ndarray, t: np.ndarray) -> np.ndarray:
-        """Return the costs ``(B,)`` at theta + t * direction for ``t (1, B)``."""
-        width = max(self.simulator.width, 1)
-        parts = [t[0, i : i + width] for i in range(0, t.shape[1], width)]
-        return np.concatenate([self.stages.costs(self.theta[:, None] + direction[:, None] * part) for part in parts])
 
     def _missed_share(self, line: LineScan, checked: Check | None) -> float:
         """Return the share of the cost's change along a line that its gradient does not explain.

@@ -407,7 +407,7 @@ class Findings:
             return "not shown" if RULES[self.noise_cause].kind == "open" else "NOT usable"
         if self.noise_cause or not self.smoothed:
             return {RIGHT: "not measured", UNSHOWN: "not shown"}.get(self.derivative, "not usable")
-        return "usable" if all(math.isfinite(one.bias) or not one.known for one in self.smoothed) else "not shown"
+        return "usable" if all(math.isfinite(one.bias) and one.known for one in self.smoothed) else "not shown"
 
     # ----------------------------------------------------------------------------------------------------- both
 

@@ -9,15 +9,26 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
-from bench.examine.quick import ROUNDS, QuickCheck, is_nothing
 from bench.examine.subspace import Group, Subspace, choose, locate
-from bench.measure.gradcheck import EPS, FAULTS, TRUSTED, Check, Options, Part, check, most_severe
+from bench.measure.gradcheck import (
+    EPS,
+    FAULTS,
+    ROUNDS,
+    TRUSTED,
+    Check,
+    FewSteps,
+    Options,
+    Part,
+    check,
+    is_nothing,
+    most_severe,
+)  # fmt: skip
 from bench.model.simulator.clock import Clock, OutOfTime
 from bench.model.simulator.simulator import Simulator
 
@@ -135,8 +146,22 @@ class GradientStages:
 
     def costs(self, thetas: np.ndarray, w: np.ndarray | None = None) -> np.ndarray:
         """Return the costs ``(B,)`` of ``thetas (d, B)``, all under the same draw of the simulator's own noise."""
+        return self.simulator.costs(thetas, self.same_noise(thetas.shape[1], w))
+
+    def same_noise(self, count: int, w: np.ndarray | None = None) -> np.ndarray | None:
+        """Return one draw of the simulator's own noise for each of ``count`` thetas, ``(n, count)``; None without noise."""
         w = self.w if w is None else w
-        return self.simulator.costs(thetas, None if w is None else np.repeat(w, thetas.shape[1], axis=1))
+        return None if w is None else np.repeat(w, count, axis=1)
+
+    def thetas_along(self, direction: np.ndarray, t: np.ndarray) -> Iterator[np.ndarray]:
+        """Yield the thetas at theta + t * direction for ``t (n,)``, a batch at a time, since memory holds few large ones."""
+        width = max(self.simulator.width, 1)
+        for first in range(0, t.size, width):
+            yield self.theta[:, None] + direction[:, None] * t[first : first + width]
+
+    def costs_along(self, direction: np.ndarray, t: np.ndarray) -> np.ndarray:
+        """Return the costs ``(n,)`` at theta + t * direction for t of n numbers."""
+        return np.concatenate([self.costs(thetas) for thetas in self.thetas_along(direction, t.ravel())])
 
     def gradient_at(self, theta: np.ndarray, w: np.ndarray | None = None) -> np.ndarray:
         """Return the simulator's gradient at ``theta (d,)``."""
@@ -175,12 +200,10 @@ class GradientStages:
         edges = np.linspace(start, end, panels + 1)
         half = np.diff(edges)[:, None] / 2
         t, weights = ((edges[:-1, None] + half) + half * x).ravel(), (half * weight).ravel()
-        slopes = []
-        for first in range(0, t.size, max(self.simulator.width, 1)):
-            part = t[first : first + max(self.simulator.width, 1)]
-            at = self.theta[:, None] + direction[:, None] * part
-            w = None if self.w is None else np.repeat(self.w, part.size, axis=1)
-            slopes.append(direction @ self.simulator.gradients(at, w))
+        slopes = [
+            direction @ self.simulator.gradients(thetas, self.same_noise(thetas.shape[1]))
+            for thetas in self.thetas_along(direction, t)
+        ]
         return float(weights @ np.concatenate(slopes))
 
     # ------------------------------------------------------------------------------------------------ stages
@@ -235,14 +258,10 @@ class GradientStages:
         """Compare the gradient with two costs per coordinate, and with more where the full steps do not fit."""
         self.clock.start_stage("one step per component")
         slope = None if self.gradient is None else space.project(self.gradient)
-
-        def cost(z: np.ndarray) -> np.ndarray:
-            return self._stored_costs(space, z)
-
-        quick = QuickCheck(
-            cost, space.origin(), space.scale, slope, self.value, self.simulator.unit, self.repeats.spread
-        )
-        names = [f"component {i}" for i in range(space.size)]
+        quick = FewSteps(
+            partial(self._stored_costs, space), space.origin(), space.scale, slope, self.value, self.simulator.unit,
+            self.repeats.spread,
+        )  # fmt: skip
         try:
             for _ in ROUNDS:
                 quick.run_round(self.simulator.width)
@@ -250,7 +269,7 @@ class GradientStages:
                 if self.clock.can_afford(*self._cost_of(steps, space.size), share=SHARE):
                     break
         finally:
-            outcome = quick.check(names)
+            outcome = quick.check()
             if outcome is not None:
                 self.check, self.is_quick = space.restore(outcome), True
                 self.is_complete = len(outcome.parts) == space.size
@@ -258,32 +277,25 @@ class GradientStages:
     def _repeat(self) -> None:
         """Repeat calls, after equal and after other thetas, and compare the results."""
         self.clock.start_stage("repeating a call")
-        other = self.theta + 1e-3 * self.scale
-        after: dict[str, list[float]] = {"theta": [], "other": []}
-        others: list[float] = []
+        theta, other = self.theta, self.theta + 1e-3 * self.scale
+        calls, values = (theta, other, theta, theta, other, theta, theta), []  # the first one follows other thetas
         try:
-            for before, at in (
-                ("other", self.theta), ("theta", other), ("other", self.theta), ("theta", self.theta), ("theta", other),
-                ("other", self.theta), ("theta", self.theta),
-            ):  # fmt: skip
-                value = float(self.costs(at[:, None])[0])
-                if at is other:
-                    others.append(value)
-                else:
-                    after[before].append(value)
-            self._repeated = True
+            for at in calls:
+                values.append(float(self.costs(at[:, None])[0]))
         except OutOfTime:
             self.left_out.append("repeating a call")
         self._repeat_gradient(other)
-        spreads = []
-        for values in ([*after["theta"], *after["other"], self.value], others):
-            if len(values) > 1 and np.isfinite(values).all():
-                spreads.append(float(np.ptp(values)))
-        self.repeats.spread = max([self._costs_store.spread, *spreads])
-        last = after["other"][1:]  # the first of them followed the differences, so other thetas
-        if self.repeats.spread > 0 and len(after["theta"]) > 1 and len(last) > 1:
-            apart = abs(after["theta"][-1] - last[-1])
-            is_alike = max(np.ptp(after["theta"]), np.ptp(last)) <= STATE * apart
+        self.repeats.spread = self._costs_store.spread
+        for at in (theta, other):
+            same = [value for value, each in zip(values, calls, strict=False) if each is at] + [self.value] * (
+                at is theta
+            )
+            if len(same) > 1 and np.isfinite(same).all():
+                self.repeats.spread = max(self.repeats.spread, float(np.ptp(same)))
+        self._repeated = len(values) == len(calls)
+        if self._repeated and self.repeats.spread > 0:
+            after_theta, after_other = values[3::3], values[2::3]
+            is_alike = max(np.ptp(after_theta), np.ptp(after_other)) <= STATE * abs(after_theta[-1] - after_other[-1])
             # last digits that vary at random are alike by chance
             self.repeats.has_state = bool(is_alike and self.repeats.spread > self.repeats.floor)
 
@@ -458,8 +470,7 @@ class GradientStages:
         for part in outcome.parts:
             sample, finite = part.sample, part.sample.finite
             change = np.abs(sample.plus - sample.minus)[finite].max(initial=0.0)
-            noise = sample.noise or 0.0
-            rough.append(noise > ROUGH * change and noise > 1e6 * sample.unit * abs(sample.centre))
+            rough.append(sample.noise > ROUGH * change and sample.noise > 1e6 * sample.unit * abs(sample.centre))
         parts = tuple(
             replace(part, verdict="unsettled") if is_rough else part
             for part, is_rough in zip(outcome.parts, rough, strict=True)
@@ -499,12 +510,12 @@ class GradientStages:
             return self.costs(thetas)
 
         one, unit = [index], self.simulator.unit
-        quick = QuickCheck(
+        quick = FewSteps(
             cost, self.theta[one], self.scale[one], self.gradient[one], self.value, unit, self.repeats.spread
         )
         for _ in ROUNDS:
             quick.run_round()
-        outcome = quick.check([f"component {index}"])
+        outcome = quick.check()
         if outcome is not None and outcome.cause in FAULTS:
             added = replace(outcome.parts[0], component=index, verdict=verdict)
             self.check = replace(self.check, parts=(added, *self.check.parts))

@@ -87,7 +87,8 @@ def noise_answer(report: Findings) -> str:
         reason = f"The bias of the mean gradient is below {number(max(largest, 1e-3))}%"
         reason += "" if report.derivative == RIGHT else f", though {derivative}"
     elif report.smoothed and not report.noise_cause:
-        reason = "a gradient there is not a number"
+        is_known = all(one.known for one in report.smoothed)
+        reason = "a gradient there is not a number" if is_known else "no draw moves the cost"
     elif report.derivative != RIGHT:
         reason = derivative
     else:

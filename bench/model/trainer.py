@@ -21,6 +21,7 @@ LOGGED: Mapping[str, str] = {
     "gradient_norm": "norm of the actor's gradient before clipping",
     "gradient_largest": "largest absolute entry of the actor's gradient before clipping",
     "cut": "share of rollouts in which an episode ended, or the gradient was cut, before the window's end",
+    "used": "share of the rollouts' control steps that the update uses, for trainers that ignore those after an episode's end",
     "contacts": "mean number of closed contacts after a control step",
     "penetration": "largest penetration after a control step [m]",
     "contact_force": "largest contact force after a control step [N]; NaN for a law without forces",

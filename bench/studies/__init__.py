@@ -1,1 +1,74 @@
 """The built-in studies, one package each: what to measure per cell, and the tables, charts and page to write."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from bench.experiment.cell import Cell
+from bench.experiment.experiment import Experiment
+from bench.experiment.session import Session
+from bench.experiment.study import Study
+from bench.experiment.views import Views
+from bench.measure import noise, timing
+from bench.model import Problem
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+@dataclass(frozen=True)
+class StudyPackage(Study):
+    """A study whose package has modules ``measure`` and ``views`` with a function of that name, imported at first use."""
+
+    def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
+        """Return one cell's results by column."""
+        return self._function("measure")(cell, session, self)  # type: ignore[no-any-return]
+
+    def views(self, experiment: Experiment, rows: pd.DataFrame) -> Views:
+        """Return the tables and charts of the rows, and why cells have no result."""
+        from bench.report.writer import reasons
+
+        found: Views = self._function("views")(experiment, rows)
+        return replace(found, remarks=[*found.remarks, *reasons(rows)])
+
+    def _function(self, name: str) -> Any:
+        package = next(c.__module__ for c in type(self).__mro__ if c.__module__.startswith(f"{__name__}."))
+        return getattr(import_module(f"{package}.{name}"), name)
+
+
+def finite_status(reason: str, *values: Any) -> dict[str, str]:
+    """Return the columns ``status`` and ``reason`` of numbers that may not be finite."""
+    is_finite = all(np.isfinite(value).all() for value in values)
+    return {"status": "ok" if is_finite else "nonfinite", "reason": "" if is_finite else reason}
+
+
+def norm(vector: np.ndarray) -> float:
+    """Return the norm of a vector."""
+    return float(np.linalg.norm(vector))
+
+
+def ratio(value: float, size: float) -> float:
+    """Return a value in units of a size, NaN if that is 0."""
+    return value / size if size > 0 else math.nan
+
+
+def relative_error(vector: np.ndarray, expected: np.ndarray) -> float:
+    """Return the distance of two vectors relative to the norm of the second."""
+    return ratio(norm(vector - expected), norm(expected))
+
+
+def first_batch(cell: Cell, width: int) -> np.ndarray:
+    """Return the noise of the first ``samples`` rollouts of a cell, ``(width, samples)``."""
+    return np.ascontiguousarray(noise.shared(cell.seed, cell.scene.name, 1, cell.samples, width)[0].T)
+
+
+def gradient_seconds(problem: Problem, w: np.ndarray, calls: int) -> dict[str, float]:
+    """Return the median time [s] of gradients of the noise ``w (n_w, B)``, and the time [s] to compile them."""
+    problem.reset_usage()
+    _, clock = timing.timed(lambda _: problem.grad(problem.program.theta0, w), calls)
+    return {"gradient_s": clock.median_s, "compile_s": problem.usage.compile_s}

@@ -1,7 +1,8 @@
-"""Fits a value network to targets by passes over shuffled batches."""
+"""Fits networks to data by passes over shuffled batches."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -9,6 +10,7 @@ import optax
 
 from bench.errors import UserError
 from bench.model.ops import Array
+from bench.training.steps import step_log
 
 
 def batches_of(key: Array, count: int, passes: int, batches: int) -> Array:
@@ -23,20 +25,25 @@ def batches_of(key: Array, count: int, passes: int, batches: int) -> Array:
 
 
 def fit(
-    optimizer: optax.GradientTransformation, network: Any, memory: Any, states: Array, targets: Array, passes: int,
-    batches: int, key: Array,
-) -> tuple[Any, Any, Array]:  # fmt: skip
-    """Return network, optimizer memory and mean loss of the last pass, fitted to ``targets (N,)`` at ``states (n, N)``."""
+    optimizer: optax.GradientTransformation, loss: Callable[..., Array], network: Any, memory: Any, data: tuple[Array, ...],
+    passes: int, batches: int, key: Array,
+) -> tuple[Any, Any, dict[str, Array]]:  # fmt: skip
+    """Return network, optimizer memory and the log of each step, ``(passes * batches,)``, after descent on a loss.
 
-    def loss(network: Any, x: Array, y: Array) -> Array:
-        return ((network(x)[0] - y) ** 2).mean()
+    ``loss(network, *batch)`` is of columns of the ``data``, each ``(N,)`` or ``(n, N)``.
+    """
 
-    def step(carry: Any, columns: Array) -> tuple[Any, Array]:
+    def step(carry: Any, columns: Array) -> tuple[Any, dict[str, Array]]:
         network, memory = carry
-        cost, gradient = jax.value_and_grad(loss)(network, states[:, columns], targets[columns])
+        cost, gradient = jax.value_and_grad(loss)(network, *(part[..., columns] for part in data))
         change, memory = optimizer.update(gradient, memory)
-        return (optax.apply_updates(network, change), memory), cost
+        return (optax.apply_updates(network, change), memory), {"loss": cost, **step_log(gradient, change, network)}
 
-    order = batches_of(key, targets.shape[0], passes, batches)
-    (network, memory), costs = jax.lax.scan(step, (network, memory), order)
-    return network, memory, costs[-batches:].mean()
+    order = batches_of(key, data[0].shape[-1], passes, batches)
+    (network, memory), log = jax.lax.scan(step, (network, memory), order)
+    return network, memory, log
+
+
+def squared_error(network: Any, states: Array, targets: Array) -> Array:
+    """Return the mean squared error of a critic's values of normalised ``states (n, N)``."""
+    return ((network(states)[0] - targets) ** 2).mean()

@@ -37,9 +37,14 @@ def updated(known: Normaliser, observations: Array) -> Normaliser:
     return Normaliser(total, known.mean + change * count / total, squares / total)
 
 
-def normalised(known: Normaliser, observations: Array) -> Array:
-    """Return ``observations (n, ...)`` minus their mean, over their standard deviation."""
+def deviation(known: Normaliser) -> Array:
+    """Return the standard deviations, ``(n,)``."""
     import jax.numpy as jnp
 
+    return jnp.sqrt(known.variance + FLOOR)
+
+
+def normalised(known: Normaliser, observations: Array) -> Array:
+    """Return ``observations (n, ...)`` minus their mean, over their standard deviation."""
     column = (-1, *(1,) * (observations.ndim - 1))
-    return (observations - known.mean.reshape(column)) / jnp.sqrt(known.variance + FLOOR).reshape(column)
+    return (observations - known.mean.reshape(column)) / deviation(known).reshape(column)

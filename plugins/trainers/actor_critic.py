@@ -35,7 +35,7 @@ class ActorCritic(Neural):
 
         run = super().start(env, seed)
         key, key_critic = jax.random.split(run.key)
-        network = Network(key_critic, [env.n_observations, self.hidden, self.hidden, 1], env.dtype)
+        network = Network(key_critic, [env.n_observations, self.hidden, self.hidden, 1], env.dtype, self.activation)
         memory = self.critic_optimizer(env).init(network)
         return run._replace(key=key, critic=Critic(network, jax.tree.map(lambda x: 1.0 * x, network), memory))
 

@@ -20,7 +20,10 @@ class Search(NamedTuple):
 
 @dataclass(frozen=True)
 class PopulationTrainer(Trainer):
-    """Runs one episode each of ``population`` policies per update. A state has ``theta`` and ``normaliser``."""
+    """Runs one episode each of ``population`` policies per update. A state has ``theta`` and ``normaliser``.
+
+    Rollouts last as long as an episode can. Steps after an episode's first end count as control steps, but are not used.
+    """
 
     population: int = param(64, "policies per update, an even number", low=2)
     width: float = param(0.05, "standard deviation of the parameters", positive=True)
@@ -37,8 +40,8 @@ class PopulationTrainer(Trainer):
 
         return ravel_pytree(Network(key, [env.n_observations, self.hidden, self.hidden, env.n_actions], env.dtype))
 
-    def returns(self, env: Any, state: Any, points: Any, first: Any, keys: tuple[Any, Any]) -> tuple[Any, Any]:
-        """Return the returns ``(B,)`` of policies with parameters ``points (B, d)`` from given starts, and the window."""
+    def returns(self, env: Any, state: Any, points: Any, first: Any, keys: tuple[Any, Any]) -> tuple[Any, ...]:
+        """Return the returns ``(B,)`` of policies with parameters ``points (B, d)`` from given starts, observations and log."""
         import jax
         import jax.numpy as jnp
 
@@ -54,7 +57,8 @@ class PopulationTrainer(Trainer):
         _, window = windows.rollout(env, policy, first, env.length, keys[1])
         # an episode counts up to its first end
         is_running = jnp.cumsum(window.ended, axis=0) - window.ended == 0
-        return jnp.where(is_running, window.reward, 0.0).sum(axis=0), window
+        log = {**windows.log_of(window), "used": is_running.mean(dtype=window.reward.dtype)}
+        return jnp.where(is_running, window.reward, 0.0).sum(axis=0), windows.flat(window.observation), log
 
     def action(self, env: Any, state: Any, observation: Any) -> Any:
         import jax
@@ -98,7 +102,7 @@ class Evolution(PopulationTrainer):
         import jax.numpy as jnp
         import optax
 
-        from bench.training import normaliser, steps, windows
+        from bench.training import normaliser, steps
 
         key, key_points, key_start, key_rollout = jax.random.split(state.key, 4)
         half = self.population // 2
@@ -106,12 +110,12 @@ class Evolution(PopulationTrainer):
         points = state.theta + self.width * jnp.concatenate([direction, -direction])
         numbers = env.normal(key_start, (env.n_start, half))
         first = env.start(jnp.concatenate([numbers, numbers], axis=1))
-        total, window = self.returns(env, state, points, first, (key, key_rollout))
+        total, seen, log = self.returns(env, state, points, first, (key, key_rollout))
         rank = jnp.argsort(jnp.argsort(jnp.where(jnp.isfinite(total), total, -jnp.inf))) / (2 * half - 1) - 0.5
         rank = rank.astype(state.theta.dtype)
         gradient = -(rank[:half] - rank[half:]) @ direction / (2 * half * self.width)
         change, memory = self._optimizer(env).update(gradient, state.memory)
         theta = optax.apply_updates(state.theta, change)
-        log = {"loss": -total.mean() / env.length, **windows.log_of(window), **steps.step_log(gradient, change, theta)}
-        known = normaliser.updated(state.normaliser, windows.flat(window.observation))
+        log |= {"loss": -total.mean() / env.length, **steps.step_log(gradient, change, theta)}
+        known = normaliser.updated(state.normaliser, seen)
         return Search(theta, memory, known, key), log

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 from bench.model import Trainer, param
 
@@ -27,12 +27,17 @@ class Run(NamedTuple):
     key: Any
     critic: Critic | None = None
     returns: Any = None
-    """Running mean and variance of returns, for a critic in their unit; None for a critic of raw returns."""
+    """Running mean and variance of returns, where the critic's unit is their deviation."""
 
 
 @dataclass(frozen=True)
 class Neural(Trainer):
     """Trains an actor with two hidden layers on normalised observations, by Adam with rates that fall linearly to 1e-5."""
+
+    activation: ClassVar[str] = "normalised_elu"
+    """Of the hidden layers of each network."""
+    gain: ClassVar[float] = 1.0
+    """Of the weights of the actor's last layer at the start."""
 
     rollouts: int = param(64, "parallel rollouts", positive=True)
     hidden: int = param(64, "width of the two hidden layers of each network", positive=True)
@@ -60,7 +65,7 @@ class Neural(Trainer):
 
         key, key_actor, key_start = jax.random.split(jax.random.PRNGKey(seed), 3)
         layers = [env.n_observations, self.hidden, self.hidden, env.n_actions]
-        actor = Actor(key_actor, layers, env.dtype, log_deviation=self.log_deviation)
+        actor = Actor(key_actor, layers, env.dtype, self.log_deviation, activation=self.activation, gain=self.gain)
         episodes = env.start(env.normal(key_start, (env.n_start, self.rollouts)))
         known = normaliser.start(env.n_observations, env.dtype)
         return Run(actor, self.actor_optimizer(env).init(actor), known, episodes, key)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 from bench.model import param
 
@@ -19,14 +19,24 @@ class Ppo(ActorCritic):
     min(r A, clip(r, 1 - range, 1 + range) A), with the ratio r of the probabilities of an action under the new and the
     old policy, and generalised advantages A (lambda = ``decay``) of the critic, in standard deviations per batch. The
     critic takes as many steps towards the lambda-returns. Only rewards of the simulation are used, not its derivative.
+    Defaults are those of Stable-Baselines3 (Raffin et al. 2021), with 8 rollouts and a rate that falls.
     """
 
     name = "ppo"
+    revision: ClassVar[int] = 2
+    activation: ClassVar[str] = "tanh"
+    gain: ClassVar[float] = 0.01
 
-    actor_rate: float = param(1e-3, "first learning rate of the actor", positive=True)
+    rollouts: int = param(8, "parallel rollouts", positive=True)
+    window: int = param(256, "h, control steps of a window", "steps", positive=True)
+    actor_rate: float = param(3e-4, "first learning rate of the actor", positive=True)
+    critic_rate: float = param(3e-4, "first learning rate of the critic", positive=True)
+    log_deviation: float = param(0.0, "initial log standard deviation of the actions")
+    clip: float = param(0.5, "norm at which gradients are clipped", positive=True)
     beta1: float = param(0.9, "decay of Adam's mean gradient", low=0.0, high=0.999999)
     beta2: float = param(0.999, "decay of Adam's mean square", low=0.0, high=0.999999)
-    passes: int = param(8, "passes over the states of a window", positive=True)
+    passes: int = param(10, "passes over the states of a window", positive=True)
+    batches: int = param(32, "batches in a pass", positive=True)
     range: float = param(0.2, "distance of a ratio from 1 at which the objective is clipped", positive=True)
     entropy: float = param(0.0, "weight of the actions' log deviation in the objective", low=0.0)
 
@@ -52,49 +62,38 @@ class Ppo(ActorCritic):
     def update(self, env: Any, state: Run) -> tuple[Run, dict[str, Any]]:
         import jax
         import jax.numpy as jnp
-        import optax
 
-        from bench.training import fitting, normaliser, steps, values, windows
+        from bench.training import fitting, normaliser, values, windows
 
         assert state.critic is not None
-        critic, key = state.critic, state.key
-        key, key_window, key_batches = jax.random.split(key, 3)
+        critic = state.critic
+        key, key_window, key_actor, key_critic = jax.random.split(state.key, 4)
         episodes, window = self.window_of(env, state, state.actor, key_window)
-        seen = normaliser.normalised(state.normaliser, windows.flat(window.observation))
-        action = windows.flat(window.action)
-        # the critic is in units of the returns so far, so that its rate suits rewards of any scale
-        unit = jnp.sqrt(state.returns.mean**2 + state.returns.variance)
-        value = unit * self.values_of(state, critic.network, window)
-        before = unit * critic.network(seen).reshape(value.shape)
-        advantage = values.advantages(window.reward, before, value, window.ended, self.discount, self.decay)
-        targets, advantage = (advantage + before).reshape(1, -1), advantage.reshape(-1)
-        returns = normaliser.updated(state.returns, targets)
-        targets = targets[0] / unit
+        observation, action = windows.flat(window.observation), windows.flat(window.action)
+        seen = normaliser.normalised(state.normaliser, observation)
+        # rewards are in standard deviations of the returns so far, without the critic's values, whose errors would grow
+        alone = values.td_lambda(window.reward, jnp.zeros_like(window.reward), window.ended, self.discount, 1.0)
+        returns = normaliser.updated(state.returns, alone.reshape(1, -1))
+        unit = normaliser.deviation(returns)[0]
+        value, before = self.values_of(state, critic.network, window), critic.network(seen).reshape(window.reward.shape)
+        advantage = values.advantages(window.reward / unit, before, value, window.ended, self.discount, self.decay)
         old = state.actor.log_probability(seen, action)
-        actor_optimizer, critic_optimizer = self.actor_optimizer(env), self.critic_optimizer(env)
 
-        def value_loss(network: Any, x: Any, y: Any) -> Any:
-            return ((network(x)[0] - y) ** 2).mean()
+        def loss(actor: Any, *batch: Any) -> Any:
+            seen, action, old, better = batch
+            return self.surrogate(actor, seen, action, old, (better - better.mean()) / (better.std() + 1e-8))
 
-        def step(carry: Any, columns: Any) -> tuple[Any, Any]:
-            actor, memory, network, critic_memory = carry
-            x, better = seen[:, columns], advantage[columns]
-            better = (better - better.mean()) / (better.std() + 1e-8)
-            cost, gradient = jax.value_and_grad(self.surrogate)(actor, x, action[:, columns], old[columns], better)
-            change, memory = actor_optimizer.update(gradient, memory)
-            misfit, slope = jax.value_and_grad(value_loss)(network, x, targets[columns])
-            moved, critic_memory = critic_optimizer.update(slope, critic_memory)
-            carry = (optax.apply_updates(actor, change), memory, optax.apply_updates(network, moved), critic_memory)
-            return carry, (cost, misfit, steps.step_log(gradient, change, actor))
-
-        order = fitting.batches_of(key_batches, targets.shape[0], self.passes, self.batches)
-        first = (state.actor, state.memory, critic.network, critic.memory)
-        (actor, memory, network, critic_memory), (costs, misfits, logs) = jax.lax.scan(step, first, order)
-        log = {
-            "loss": costs[0], "value_loss": misfits[-self.batches :].mean() * unit[0] ** 2,
+        actor, memory, log = fitting.fit(
+            self.actor_optimizer(env), loss, state.actor, state.memory, (seen, action, old, advantage.reshape(-1)),
+            self.passes, self.batches, key_actor,
+        )  # fmt: skip
+        network, critic_memory, fitted = fitting.fit(
+            self.critic_optimizer(env), fitting.squared_error, critic.network, critic.memory,
+            (seen, (advantage + before).reshape(-1)), self.passes, self.batches, key_critic,
+        )  # fmt: skip
+        log = {name: entries[0] for name, entries in log.items()} | {
+            "value_loss": fitted["loss"][-self.batches :].mean() * unit**2,
             "deviation": jnp.exp(actor.log_deviation).mean(), **windows.log_of(window),
-            **{name: part[0] for name, part in logs.items()},
-            "step_length": optax.tree.norm(jax.tree.map(lambda a, b: a - b, actor, state.actor)),
         }  # fmt: skip
-        known = normaliser.updated(state.normaliser, windows.flat(window.observation))
+        known = normaliser.updated(state.normaliser, observation)
         return Run(actor, memory, known, episodes, key, Critic(network, critic.target, critic_memory), returns), log

@@ -56,14 +56,14 @@ class SepCmaEs(PopulationTrainer):
         import jax
         import jax.numpy as jnp
 
-        from bench.training import normaliser, steps, windows
+        from bench.training import normaliser, steps
 
         key, key_points, key_start, key_rollout = jax.random.split(state.key, 4)
         size, d = 2 * (self.population // 2), state.theta.size
         y = jnp.sqrt(state.variance) * env.normal(key_points, (size, d))
         numbers = jnp.broadcast_to(env.normal(key_start, (env.n_start, 1)), (env.n_start, size))
         points = state.theta + state.sigma * y
-        total, window = self.returns(env, state, points, env.start(numbers), (key, key_rollout))
+        total, seen, log = self.returns(env, state, points, env.start(numbers), (key, key_rollout))
 
         k = constants(d, size)
         c_1 = min(1.0, k.c_1 * (d + 2) / 3)
@@ -83,11 +83,11 @@ class SepCmaEs(PopulationTrainer):
 
         change = state.sigma * step
         theta = state.theta + change
-        log = {
+        log |= {
             "loss": -total.mean() / env.length, "deviation": state.sigma * jnp.sqrt(state.variance.mean()),
-            **windows.log_of(window), **steps.step_log(-step, change, theta),
+            **steps.step_log(-step, change, theta),
         }  # fmt: skip
-        known = normaliser.updated(state.normaliser, windows.flat(window.observation))
+        known = normaliser.updated(state.normaliser, seen)
         kind = state.theta.dtype
         return Search(
             theta.astype(kind), sigma.astype(kind), variance.astype(kind), path_sigma.astype(kind), path_c.astype(kind),

@@ -55,13 +55,13 @@ class Shac(ActorCritic):
 
         targets = values.td_lambda(window.reward, value, window.ended, self.discount, self.decay)
         seen = windows.flat(window.observation)
-        network, critic_memory, value_loss = fitting.fit(
-            self.critic_optimizer(env), critic.network, critic.memory, normaliser.normalised(state.normaliser, seen),
-            targets.reshape(-1), self.passes, self.batches, key_critic,
+        network, critic_memory, fitted = fitting.fit(
+            self.critic_optimizer(env), fitting.squared_error, critic.network, critic.memory,
+            (normaliser.normalised(state.normaliser, seen), targets.reshape(-1)), self.passes, self.batches, key_critic,
         )  # fmt: skip
         target = optax.incremental_update(network, critic.target, self.follow)
         log = {
-            "loss": cost, "value_loss": value_loss, "deviation": jnp.exp(actor.log_deviation).mean(),
+            "loss": cost, "value_loss": fitted["loss"][-self.batches :].mean(), "deviation": jnp.exp(actor.log_deviation).mean(),
             **windows.log_of(window), **steps.step_log(gradient, change, actor),
         }  # fmt: skip
         known = normaliser.updated(state.normaliser, seen)

@@ -13,7 +13,6 @@ import pytest
 
 import bench
 from bench.errors import UserError
-from bench.examine.clock import ExaminationClock, lost_time, thread_times
 from bench.model.simulator.clock import Clock, OutOfTime
 
 THETA = [0.4, 0.3, 0.5]
@@ -45,29 +44,6 @@ def test_fewer_calls_than_components_decide_nothing():
         assert (report.status, report.cause) == (3, "undecided"), calls
         assert re.search(r"[0-2] of 3 components", str(report))
     assert "calls=14" in report.advice
-
-
-def test_more_calls_only_add_to_what_was_checked():
-    steps = [
-        max(
-            part.sample.step.size for part in bench.examine(cost, THETA, grad=grad, progress=False, calls=n).check.parts
-        )
-        for n in (8, 200, 900)
-    ]
-    assert steps == [1, 9, 17]
-
-
-def test_calls_give_the_same_report_whatever_the_time():
-    def texts(pause):
-        def slow(x):
-            time.sleep(pause)
-            return cost(x)
-
-        report = bench.examine(slow, THETA, grad=grad, progress=False, calls=40)
-        spent = report.spent
-        return report.status, report.cause, spent.costs, spent.gradients, report.left_out, report.conclusion
-
-    assert texts(0.0) == texts(0.005)
 
 
 def pendulum_gradients():
@@ -139,59 +115,6 @@ def test_a_gradient_that_compiles_too_long_is_tried_once():
     report = bench.examine(cost, THETA, grad=hangs, progress=False, budget=5, compile_budget=0.2)
     assert (report.status, report.cause) == (3, "undecided")
     assert len(tried) == 1
-
-
-@pytest.fixture
-def first_call(monkeypatch):
-    """A clock with a limit of 2 s, and a first call up to a time, with seconds on a processor and of waiting for one."""
-    now, spent = [0.0], (0.0, 0.0)
-    monkeypatch.setattr("time.perf_counter", lambda: now[0])
-    monkeypatch.setattr(sys.modules[ExaminationClock.__module__], "thread_times", lambda: {"thread": spent})
-    clock = ExaminationClock(60.0, compile_budget=2.0)
-
-    def call(end, running, waiting):
-        nonlocal spent
-        with clock.interrupt_when_over(first=True):
-            now[0], spent = end, (running, waiting)
-            signal.raise_signal(signal.SIGALRM)
-
-    return clock, call
-
-
-def test_a_first_call_is_not_charged_for_the_time_that_other_programs_take(first_call):
-    """1 s of work that takes 10 s on a loaded machine, then 10 s of sleep."""
-    clock, call = first_call
-    call(10.0, 1.0, 9.0)
-    assert clock.compile_s == 10.0
-    assert clock.compile_budget - clock.compile_s == pytest.approx(1.0)
-    with pytest.raises(OutOfTime):
-        call(20.0, 1.0, 9.0)
-
-
-def test_other_programs_extend_first_calls_tenfold_at_most(first_call):
-    _, call = first_call
-    call(19.5, 0.0, 19.5)
-    with pytest.raises(OutOfTime):
-        call(21.5, 0.0, 21.5)
-
-
-def test_lost_time_is_that_of_waiting_for_a_processor():
-    assert lost_time(running=1.0, waiting=3.0, seconds=4.0, processors=2) == pytest.approx(3.0)
-    assert lost_time(running=1.0, waiting=1.0, seconds=4.0, processors=2) == pytest.approx(1.0)  # and 2 s of sleep
-    assert lost_time(running=8.0, waiting=8.0, seconds=4.0, processors=2) == 0.0  # its own threads wait for each other
-    assert lost_time(running=2.0, waiting=14.0, seconds=4.0, processors=2) == pytest.approx(3.0)
-    assert lost_time(running=0.0, waiting=0.0, seconds=4.0, processors=2) == 0.0
-
-
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="needs /proc")
-def test_times_include_threads_and_children():
-    words = [sys.executable, "-c", "import sys; sum(range(10**6)); print(flush=True); sys.stdin.read()"]
-    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as child:
-        child.stdout.readline()
-        times = thread_times()
-        child.stdin.close()
-    assert times[f"/proc/{child.pid}/task/{child.pid}"][0] > 0.0
-    assert len(times) > 1
 
 
 COUNTED = """

@@ -56,13 +56,6 @@ def test_a_small_component_that_differences_contradict_is_not_called_right(secon
     assert right.status == 0, str(right)
 
 
-def test_a_minimum_is_resolved_by_the_slopes_around_it():
-    report = bench.examine(
-        lambda t: float(((t - POINT) ** 2).sum() + 3.0), POINT, grad=lambda t: 2 * (t - POINT) + 1e-17, calls=800
-    )
-    assert report.derivative == "right", str(report)
-
-
 def test_a_gradient_of_the_call_before_is_wrong_at_few_calls():
     held = {"theta": POINT}
 
@@ -86,25 +79,6 @@ def test_few_calls_at_a_kink_never_blame_a_slope_of_one_side(given, distance):
     assert report.status != 1 or report.cause == "kink", str(report)
 
 
-@pytest.mark.slow
-def test_the_measured_bias_decides_over_what_a_line_misses():
-    """A jump at 2 sigma: a bias of 5%, while single lines miss more than 10% of the cost's change."""
-    sigma = 0.1
-    share = np.exp(-(2.0**2) / 2) / np.sqrt(2 * np.pi) / sigma
-    height = 0.05 * np.sqrt(2) / share
-
-    def cost(theta):
-        return float(theta[0] + theta[1] + height * (theta[0] > 2 * sigma))
-
-    for seed in range(3):
-        report = bench.examine(
-            cost, np.zeros(2), grad=lambda t: np.ones(2), sigma=sigma, seed=seed, calls=12_000, scale=1.0
-        )
-        ((low, high),) = [one.bias_percent for one in report.smoothed]
-        assert low < 10
-        assert (report.status == 0) == (high < 10), str(report)
-
-
 def test_a_smoothed_gradient_that_noise_hides_is_not_decided():
     rng = np.random.default_rng(0)
     shift = rng.standard_normal(2)
@@ -117,15 +91,6 @@ def test_a_smoothed_gradient_that_noise_hides_is_not_decided():
 
     report = bench.examine(cost, np.array([0.3, 0.4]), grad=gradient, sigma=0.5, calls=5000)
     assert report.status != 0, str(report)
-
-
-def test_an_undecided_derivative_leaves_its_use_undecided():
-    def cost(theta):
-        return float("nan") if theta[0] > 0 else float(theta.sum())
-
-    report = bench.examine(cost, np.zeros(2), grad=lambda t: np.ones(2), calls=300)
-    assert report.derivative == "not shown"
-    assert "not usable" not in str(report)
 
 
 @pytest.mark.parametrize("bend", [0.3, 3e-4])

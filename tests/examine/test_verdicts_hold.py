@@ -118,3 +118,12 @@ def test_a_rounded_latent_moves_the_cost_under_noise():
     assert "does theta reach the simulator" not in str(report)
     assert (report.status, report.noise_cause) == (1, "staircase"), str(report)
     assert any(text.startswith("biased") for text in report.problems)
+
+
+def test_draws_that_do_not_move_the_cost_show_no_gradient_under_noise():
+    """The jump is 300 standard deviations away: grad J is 0 with an error of 0, of which no bias is known."""
+    report = bench.examine(
+        lambda x: 1.0 * (x[0] > 30), [0.0], grad=lambda x: [0.0], sigma=0.1, calls=4000, progress=False
+    )
+    assert (report.status, report.derivative, report.use) == (3, "not shown", "not shown")
+    assert "no draw moves the cost" in report.noise_answer

@@ -212,7 +212,7 @@ def test_noise_of_the_cost_is_measured():
     rough = check(lambda x: cost(x) + 1e-7 * np.sin(1e13 * x).sum(axis=0), gradient, THETA)
     assert rough.cause == "rounding"
     assert 1e-8 < rough.noise < 1e-6
-    assert check(cost, gradient, THETA).roundoff < 4 * UNIT
+    assert check(cost, gradient, THETA).noise < 4 * UNIT
 
 
 def test_single_precision_that_is_declared_is_no_fault():

@@ -12,7 +12,7 @@ from bench import run
 from bench.cli import main
 from bench.experiment.columns import IDENTITY
 from bench.measure import noise
-from bench.measure.gradcheck import EPS, FAULTS, VERDICTS, Sample, diagnose
+from bench.measure.gradcheck import EPS, FAULTS, VERDICTS, Sample, judge
 from bench.model import Problem, compose, registry
 from bench.run import store
 from bench.studies.gradient_check import GradientCheck, measure
@@ -60,7 +60,7 @@ def verdicts(problem, unit=FLOAT64):
     places, found = measure.examine(problem, problem.program.theta0, drawn, directions, unit, SEARCH)
     told = {}
     for place, (sample, _) in zip(places, found, strict=True):
-        told.setdefault(place.point, []).append(diagnose(sample))
+        told.setdefault(place.point, []).append(judge(sample).verdict)
     return {point: set(names) for point, names in told.items()}
 
 
@@ -169,7 +169,7 @@ def test_sources_initial_state_of_the_bounce_is_a_kink():
             step, costs[: step.size], costs[step.size], costs[step.size + 1 :],
             float(direction @ problem.grad(theta, np.zeros((3, 1)))[:, 0]), np.zeros(step.size, bool), scale=2.24,
         )  # fmt: skip
-        told.append(diagnose(sample))
+        told.append(judge(sample).verdict)
     assert told[0] == "kink"
     assert told[1] not in ("kink", *FAULTS)
 

@@ -10,7 +10,6 @@ from matplotlib.colors import to_rgb
 
 from bench.report.colours import estimator_order
 from bench.report.style import MARKERS, PALETTE, colour
-from bench.studies.growth import views as growth
 from bench.studies.optimise import views as searches
 
 DEUTERANOPIA = np.array(
@@ -82,7 +81,7 @@ def test_twelve_estimators_stay_distinct_for_colour_blind_readers_too(eyes):
 
 
 def test_an_estimator_keeps_its_colour_in_searches_and_in_errors_and_what_sees_costs_only_is_grey_and_dashed():
-    """fobg was blue in one experiment's searches, pink in another's, and orange in growth."""
+    """fobg was blue in one experiment's searches, pink in another's."""
     found = searches.styles(
         ["cem[elites=8,population=40]", "fobg, adam", "fobg, line_search", "windowed[steps=5], adam"]
     )
@@ -96,4 +95,3 @@ def test_an_estimator_keeps_its_colour_in_searches_and_in_errors_and_what_sees_c
     context = found["cem[elites=8,population=40]"]
     assert len(set(to_rgb(context.colour))) == 1
     assert context.line != "-"
-    assert growth.looks()["first_order"].colour == found["fobg, adam"].colour

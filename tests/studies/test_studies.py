@@ -28,9 +28,7 @@ from bench.report.writer import write
 from bench.run.files import make_directory
 from bench.studies.gradient_check import views as gradient_check
 from bench.studies.gradient_check.lines import PER_COMPONENT
-from bench.studies.growth import views as growth
-from bench.studies.stability import views as stability
-from bench.studies.three_errors import views as three_errors
+from bench.studies.stability.views import cells_of
 from bench.studies.twins import views as twins
 
 SPRUNG = '''
@@ -149,13 +147,6 @@ def test_untrusted_undecided_and_missing_gradients_come_first_and_are_never_righ
     assert verdicts.loc[["wrong_factor", "nonfinite"], "trusted"].tolist() == ["no", "no"]
     assert list(shown.charts[0].frame["letter"]) == ["X", "ok"], "the worse verdict of the backends"
     assert "      python -m bench gradcheck 0" in shown.tables[1].notes
-    rows.at[1, "check_verdict"], rows.at[1, "point"] = ["jump"], ["noise"]
-    for name in ("check_verdict", "point", "check_error", "check_eps"):
-        rows[name] = [[]] * len(rows)
-    rows["status"], rows["reason"] = "unsupported", "no root finder"
-    nothing = gradient_check.views(given, rows)
-    assert not nothing.charts
-    assert nothing.remarks == ["4 unsupported: no root finder"]
 
 
 # ---------------------------------------------------------------------------------------------------- three_errors
@@ -167,48 +158,17 @@ def erring(*words):
     return given, rows.assign(**numbers, bias=0.1, bias_rel=0.1, bias_low=0.05, bias_high=0.2, reference_norm=1.0)
 
 
-@pytest.mark.slow
-def test_three_errors_of_two_integrators_are_twice_as_many_lines():
-    words = ["scenes=[bounce_once]", "contacts=[impulse,penalty]", "integrators=[semi_implicit_euler,event_driven]"]
-    given, rows = erring(*words, "sweep.dt=[0.1,0.05,0.02]")
-    found = three_errors.views(given, rows)
-    lines = readable(found.tables[0])
-    assert len(lines) == 2 * 2 * 3 * 2, "a line per cell, of two estimators"
-    assert lines.groupby(["contact", "integrator"], sort=False).ngroups == 4
-    drawn = found.charts[0].plotted()
-    assert list(dict.fromkeys(drawn["law"])) == [
-        f"{law}, {step}" for law in ("impulse", "penalty") for step in ("semi_implicit_euler", "event_driven")
-    ]
-    assert len(drawn) == 2 * 4, "both errors at the smallest step"
-
-
-@pytest.mark.slow
-def test_three_errors_without_a_swept_axis_have_a_table_and_a_chart(tmp_path):
-    given, rows = erring("scenes=[bounce_once]", "contacts=[impulse,penalty]", f"results_dir={tmp_path}", "formats=[]")
-    make_directory(given.directory)
-    write(given, three_errors.views(given, rows))
-    assert "| bounce_once | penalty | fobg |" in (given.directory / "three_errors.md").read_text()
-    assert list(pd.read_csv(given.directory / "three_errors.csv")["estimator"]) == ["fobg", "reinforce"] * 2
-    assert list(three_errors.views(given, rows).charts[0].frame["law"]) == ["impulse"] * 2 + ["penalty"] * 2
-
-
 def test_the_main_chart_of_three_errors_is_along_the_time_step_where_it_is_swept():
     """As in the standard experiment: the time step, stepping with the horizon, and parameters of the laws."""
     words = ["scenes=[bounce_once]", "contacts=[penalty,softplus]", "bounce_once.dt=0.05", "bounce_once.horizon=20"]
     sweep = "sweep.union=[{zip:{horizon:[10,20,40],dt:[0.1,0.05,0.025]}},{penalty.stiffness:[50,1000,10000]},{beta:[100,1000]}]"
     given, rows = erring(*(f"scene.{word}" if word.startswith("bounce") else word for word in words), sweep)
-    drawn = three_errors.views(given, rows).charts[0].frame
+    drawn = given.study.views(given, rows).charts[0].frame
     assert set(drawn["dt"]) == {0.025}
     assert len(set(drawn["law"])) == 2
     given, rows = erring("scenes=[bounce_once]", "contacts=[impulse,softplus]", "sweep.beta=[100,1000]")
-    drawn = three_errors.views(given, rows).charts[0].frame
+    drawn = given.study.views(given, rows).charts[0].frame
     assert len(set(drawn["law"])) == 3, "every cell without a sweep of the step"
-
-
-def test_the_page_of_three_errors_draws_along_every_swept_parameter():
-    given, rows = erring("scenes=[bounce_once]", "contacts=[softplus]", "sweep.beta=[100,1000]", "sweep.dt=[0.1,0.05]")
-    chart = three_errors.views(given, rows).charts[1]
-    assert [column.heading for column in chart.x] == ["beta [1/m]", "dt [s]"]
 
 
 # ------------------------------------------------------------------------------------------------------- stability
@@ -224,8 +184,8 @@ def test_maps_are_apart_by_parameters_and_their_titles_say_defaults():
         "scenes=[mass_spring]", "sweep.stiffness=[10,100]", "sweep.zip.dt=[0.1,0.05]", "sweep.zip.horizon=[10,20]",
         "sweep.mass_spring.damping=[0,1,10]",
     )  # fmt: skip
-    first, every = stability.views(given, rows).charts
-    assert dict(every.frame["problem"].value_counts()) == {f"mass_spring, damping={d}": 4 for d in (0, 1, 10)}
+    [first] = given.study.views(given, rows).charts
+    assert dict(cells_of(given, rows)["problem"].value_counts()) == {f"mass_spring, damping={d}": 4 for d in (0, 1, 10)}
     assert list(first.frame["problem"]) == ["mass_spring, damping=0"] * 4
 
 
@@ -233,19 +193,19 @@ def test_maps_of_scenes_that_no_label_tells_apart_are_apart():
     """sigma has a column of its own, and so is in no identity string."""
     given, rows = mapped("scenes=['mass_spring[sigma=0.1]','mass_spring[sigma=0.2]']", "sweep.stiffness=[10,100]")
     assert rows["scene"].nunique() == 1
-    every = stability.views(given, rows).charts[1].frame
+    every = cells_of(given, rows)
     assert list(dict.fromkeys(every["problem"])) == ["mass_spring, sigma=0.1", "mass_spring, sigma=0.2"]
 
 
 def test_a_stiffness_that_equals_another_swept_number_stays_on_its_map():
     given, rows = mapped("scenes=[mass_spring]", "sweep.stiffness=[10,100]", "sweep.mass_spring.damping=[10,100]")
-    for _, part in stability.views(given, rows).charts[1].frame.groupby("problem"):
+    for _, part in cells_of(given, rows).groupby("problem"):
         assert list(part["stiffness"]) == [10.0, 100.0]
 
 
 def test_a_share_is_not_named_after_a_parameter_that_varies_in_it():
     given, rows = mapped("scenes=[mass_spring]", "sweep.stiffness=[10,100]", "sweep.mass_spring.damping=[0,1]")
-    (line,) = stability.views(given, rows).tables[0].frame.to_dict("records")
+    (line,) = given.study.views(given, rows).tables[0].frame.to_dict("records")
     assert (line["scene"], line["step"]) == ("mass_spring", "semi_implicit_euler")
 
 
@@ -256,7 +216,7 @@ def test_growth_keeps_noises_apart_and_joins_what_steps_with_the_horizon():
     words = ["study=growth", "scenes=[double_integrator]", "estimators=[fobg]", "sweep.sigma=[0.1,0.2]"]
     given, rows = made(*words, "sweep.zip.horizon=[10,20]", "sweep.zip.dt=[0.1,0.05]")
     rows = rows.assign(gradient_median=1.0, time_horizon=rows["horizon"] * rows["dt"])
-    shown = growth.views(given, rows)
+    shown = given.study.views(given, rows)
     assert dict(shown.rows["problem"].value_counts()) == {
         "double_integrator, sigma=0.1": 2, "double_integrator, sigma=0.2": 2
     }  # fmt: skip
@@ -296,7 +256,7 @@ def test_a_scene_with_a_stiffness_of_its_own_keeps_its_cells_apart(own):
     assert axis.unit == "N/m"
     assert rows["stiffness"].nunique() == 1  # that of the law
     given, rows = mapped(*words, "sweep.sprung.stiffness=[1,10,100]", "sweep.penalty.stiffness=[1,10]")
-    maps = stability.views(given, rows).charts[1].frame.groupby("problem")
+    maps = cells_of(given, rows).groupby("problem")
     assert [list(cells["stiffness"]) for _, cells in maps] == [[1.0, 10.0]] * 3
 
 
@@ -309,10 +269,9 @@ def test_a_study_without_a_page_gets_its_numbers_and_filters_by_what_varies(own)
     rows = rows.assign(weight=[1.0, 2.0, 30.0], outcome=["good", "bad", "good"])
     views = views_of(given, rows)
     data = page_data(given, rows, views, [[]] * 3)
-    assert [axis["label"] for axis in data["charts"][0]["y"]] == ["weight [kg]"]
-    assert data["charts"][0]["x"][0]["column"] == "mass"
+    assert [(chart.x[0].name, chart.y[0].heading) for chart in views.charts] == [("mass", "weight [kg]")]
     assert data["filters"] == ["mass", "outcome"]
-    assert data["tables"]["rows"]["mass"]() == [1, 2, 3]
+    assert data["cells"]["mass"]() == [1, 2, 3]
 
 
 def test_verdicts_and_what_was_swept_can_be_filtered_by():
@@ -427,6 +386,14 @@ def test_the_command_of_a_gradient_check_repeats_its_cell(words):
 def test_the_command_of_a_gradient_check_without_time_steps_has_no_horizon():
     (cell,) = cells(config.load(["study=gradient_check", "scenes=[quadratic]", "estimators=[fobg]"]))
     assert reproduce.check_of(cell) == "python -m bench gradcheck quadratic 'backends=[jax]' seed=0"
+
+
+@pytest.mark.parametrize("name", one_a_study())
+def test_cells_without_results_are_said_so(name):
+    given, rows = made(f"experiment={name}")
+    shown = given.study.views(given, rows.assign(status="unsupported", reason="planted"))
+    assert not shown.charts
+    assert shown.remarks == [f"{len(rows)} unsupported: planted"]
 
 
 @pytest.mark.parametrize("name", sorted(registry.entries()["studies"]))

@@ -1,7 +1,8 @@
 """Gradient checks: pure functions of a cost and a gradient, independent of problems."""
 
 from .check import Check, Options, Part, check, settle
-from .direction import EPS, FINE, Finding, Sample, best, diagnose, judge
+from .direction import EPS, FINE, Finding, Sample, best, judge
+from .few import ROUNDS, FewSteps, is_nothing
 from .sampling import order, points, repeats, samples
 from .verdicts import BROKEN, FAULTS, MEANING, TRUSTED, UNDECIDED, VERDICTS, most_severe
 
@@ -11,17 +12,19 @@ __all__ = [
     "FAULTS",
     "FINE",
     "MEANING",
+    "ROUNDS",
     "TRUSTED",
     "UNDECIDED",
     "VERDICTS",
     "Check",
+    "FewSteps",
     "Finding",
     "Options",
     "Part",
     "Sample",
     "best",
     "check",
-    "diagnose",
+    "is_nothing",
     "judge",
     "most_severe",
     "order",

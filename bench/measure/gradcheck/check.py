@@ -68,31 +68,26 @@ class Options:
     """Seed of the random directions and thetas."""
 
 
-@dataclass(frozen=True)
-class Part:
+@dataclass(frozen=True, kw_only=True)
+class Part(Finding):
     """One derivative checked: a component of the gradient, or the slope along a random direction."""
 
     name: str
     """``component 3``, ``direction 0`` or ``draw 2 direction 0``."""
-    component: int | None
-    program: float
-    """The program's derivative."""
-    difference: float
-    """The most reliable difference of costs."""
-    uncertainty: float
-    """The error of the difference, from differences at neighbouring steps and the noise of the cost."""
-    step: float
-    """The step of the difference, in units of the input."""
-    left: float
-    """One-sided slope towards smaller values."""
-    right: float
-    """One-sided slope towards larger values."""
-    order: float
-    """Order of the Taylor remainder: 2 for a right gradient, 1 for a wrong one, NaN where the remainder is only noise."""
-    verdict: str
+    component: int | None = None
     sample: Sample
     modes: tuple[Sequence[str], Sequence[str]] = ((), ())
     """Contact modes at each step, on the minus and on the plus side; empty without contact modes."""
+
+    @property
+    def program(self) -> float:
+        """The program's derivative."""
+        return self.sample.derivative
+
+    @property
+    def order(self) -> float:
+        """Order of the Taylor remainder: 2 for a right gradient, 1 for a wrong one, NaN where the remainder is only noise."""
+        return order(self.sample)
 
     @property
     def ratio(self) -> float:
@@ -105,6 +100,12 @@ class Part:
         """|program - difference| over the larger of the two; 0 for two zeros."""
         size = max(abs(self.program), abs(self.difference))
         return 0.0 if size == 0.0 else abs(self.program - self.difference) / size
+
+    @property
+    def ratio_with_error(self) -> Ratio:
+        """The ratio with the error that follows from that of the difference."""
+        size = abs(self.difference)
+        return Ratio(self.ratio, abs(self.ratio) * self.uncertainty / size if size > 0.0 else 0.0)
 
 
 @dataclass(frozen=True)
@@ -120,16 +121,18 @@ class Check:
     """Components and random directions at theta."""
     draws: tuple[Part, ...]
     """Random directions at other thetas."""
-    noise: float
-    """Measured standard deviation of the cost's noise."""
-    roundoff: float
-    """Effective unit roundoff: the noise relative to the cost, or the declared unit roundoff if larger."""
-    order: float
-    """Median order of the Taylor remainder along the random directions, NaN where noise hides it."""
-    evaluations: int
-    """Number of costs computed."""
-    gradients: int
-    """Number of gradients computed."""
+
+    @property
+    def noise(self) -> float:
+        """Measured standard deviation of the cost's noise."""
+        return max((part.sample.noise for part in self.parts), default=0.0)
+
+    @property
+    def order(self) -> float:
+        """Median order of the Taylor remainder along the random directions, NaN where noise hides it."""
+        orders = [part.order for part in self.parts if part.component is None]
+        known = [order for order in orders if np.isfinite(order)]
+        return float(np.median(known)) if known else float("nan")
 
     @property
     def trusted(self) -> bool:
@@ -188,27 +191,35 @@ def check(
 
 
 def settle(
-    cost: Cost,
-    theta: np.ndarray,
-    vector: np.ndarray,
-    length: float,
-    sample: Sample,
-    finding: Finding,
-    tangent: Tangent | None,
-) -> tuple[Finding, float]:
-    """Return the finding on an unsettled direction from smaller steps or from the tangent, and the step it is from."""
+    cost: Cost, theta: np.ndarray, vector: np.ndarray, length: float, sample: Sample, tangent: Tangent | None
+) -> Finding | None:
+    """Return the finding on an unsettled direction from smaller steps or from the tangent; None if it stays unsettled."""
     values = cost(points(theta[:, None], vector[:, None], sample.unit, FINE)).reshape(1, -1)
-    (fine,) = samples(
-        values, np.array([length]), np.array([sample.derivative]), sample.unit, FINE, doubts=np.array([sample.doubt])
-    )
+    one = np.array([[length], [sample.derivative], [sample.doubt]])
+    (fine,) = samples(values, one[0], one[1], sample.unit, FINE, doubts=one[2])
     better = judge(fine)
     if better.verdict != "unsettled":
-        return replace(better, index=min(better.index, sample.step.size - 1)), float(fine.step[better.index])
-    step = float(sample.step[finding.index])
+        return better
     slope = float("nan") if tangent is None else tangent(theta, vector) / length
+    known = judge(sample)
     if abs(slope - sample.derivative) <= AGREES * abs(slope):
-        return replace(finding, verdict="nonlinear", difference=slope, uncertainty=AGREES * abs(slope)), step
-    return finding, step
+        return replace(known, verdict="nonlinear", difference=slope, uncertainty=AGREES * abs(slope))
+    return None
+
+
+@dataclass(frozen=True)
+class _Line:
+    """A direction to check: from ``theta (d,)`` along ``vector (d,)``, where the program has ``gradient (d,)``.
+
+    A derivative is per unit of ``length``, the vector's length in units of the derivative.
+    """
+
+    name: str
+    theta: np.ndarray
+    gradient: np.ndarray
+    vector: np.ndarray
+    length: float = 1.0
+    component: int | None = None
 
 
 class _Checker:
@@ -227,7 +238,6 @@ class _Checker:
             raise ValueError(f"theta is a vector of at least one number, not of shape {theta.shape}")
         self._cost, self._gradient, self._modes, self._tangent = cost, gradient, modes, tangent
         self.theta, self.options, self.unit = theta, options, options.unit
-        self.evaluations = self.gradients = 0
         self.scale = self._scales() if options.scale is None else np.asarray(options.scale, dtype=np.float64)
         self.random = np.random.default_rng([options.seed, 0x67726164])
         self._rates: list[float] = []
@@ -247,7 +257,6 @@ class _Checker:
         return scale
 
     def cost(self, thetas: np.ndarray) -> np.ndarray:
-        self.evaluations += thetas.shape[1]
         values = np.asarray(self._cost(thetas))
         if np.iscomplexobj(values):
             raise TypeError("the cost is complex; a check needs a real one")
@@ -258,7 +267,6 @@ class _Checker:
     def gradient(self, theta: np.ndarray) -> np.ndarray:
         if self._gradient is None:
             return np.full(theta.size, np.nan)
-        self.gradients += 1
         result = np.asarray(self._gradient(theta.copy()))
         if np.iscomplexobj(result):
             raise TypeError("the gradient is complex; a check needs a real one")
@@ -278,19 +286,18 @@ class _Checker:
             doubt = np.abs(self.gradient(theta + 4.0 * self.unit * self.scale) - first)
         at_draws = [self.gradient(other) for other in around.T]
         again = self.gradient(theta)
-        count = options.directions
-        names = [f"component {i}" for i in chosen] + [f"direction {i}" for i in range(count)]
-        vectors, lengths = self._directions(chosen)
-        every = np.repeat(theta[:, None], len(names), axis=1), np.repeat(first[:, None], len(names), axis=1)
-        parts = self._check_parts(*every, vectors, lengths, names, [*chosen, *[None] * count], doubt)
-        names = [f"draw {k} direction {i}" for k in range(options.draws) for i in range(count)]
-        draws: list[Part] = []
-        if names:
-            vectors = np.concatenate([self._directions([])[0] for _ in range(options.draws)], axis=1)
-            gradients = np.repeat(np.stack(at_draws, axis=1), count, axis=1)
-            none: list[int | None] = [None] * len(names)
-            starts = np.repeat(around, count, axis=1)
-            draws = self._check_parts(starts, gradients, vectors, np.ones(len(names)), names, none, doubt, twice=False)
+        lines = [_Line(f"component {i}", theta, first, self._along(i), self.scale[i], i) for i in chosen]
+        lines += [_Line(f"direction {i}", theta, first, vector) for i, vector in enumerate(self._directions())]
+        parts = self._check_lines(lines, doubt)
+        draws = self._check_lines(
+            [
+                _Line(f"draw {k} direction {i}", other, gradient, vector)
+                for k, (other, gradient) in enumerate(zip(around.T, at_draws, strict=True))
+                for i, vector in enumerate(self._directions())
+            ],
+            doubt,
+            twice=False,
+        )
         parts, draws = self._with_causes(parts, draws, around, at_draws)
         causes = [part.verdict for part in parts]
         # at other thetas only faults count: a kink at another theta is not a kink at theta
@@ -299,10 +306,6 @@ class _Checker:
             causes.append("nan_gradient")
         elif not repeats(first, again, self.unit).all():
             causes.append("nondeterministic")
-        centres = [part.sample for part in parts]
-        noise = max((sample.noise or 0.0 for sample in centres), default=0.0)
-        size = max((abs(sample.centre) for sample in centres), default=0.0)
-        orders = [part.order for part in parts if part.component is None and np.isfinite(part.order)]
         return Check(
             cause=most_severe(causes),
             theta=theta,
@@ -310,11 +313,6 @@ class _Checker:
             scale=self.scale,
             parts=tuple(parts),
             draws=tuple(draws),
-            noise=noise,
-            roundoff=max(self.unit, noise / size if size else 0.0),
-            order=float(np.median(orders)) if orders else float("nan"),
-            evaluations=self.evaluations,
-            gradients=self.gradients,
         )
 
     def _components(self, gradient: np.ndarray) -> list[int]:
@@ -325,35 +323,31 @@ class _Checker:
         share = np.argsort(np.nan_to_num(np.abs(gradient * self.scale), nan=np.inf), kind="stable")
         return sorted(int(i) for i in np.r_[share[: most // 2], share[dim - (most - most // 2) :]])
 
-    def _directions(self, chosen: list[int]) -> tuple[np.ndarray, np.ndarray]:
-        """Return the direction vectors ``(d, M)`` of chosen components and random directions, and their lengths ``(M,)``.
+    def _along(self, component: int) -> np.ndarray:
+        """Return the vector ``(d,)`` of a component, of the length of its scale."""
+        vector = np.zeros(self.theta.size)
+        vector[component] = self.scale[component]
+        return vector
+
+    def _directions(self) -> np.ndarray:
+        """Return random directions ``(n, d)``, of length 1 in units of the inputs' scales."""
+        random = self.random.standard_normal((self.theta.size, self.options.directions))
+        random *= self.scale[:, None] / np.linalg.norm(random, axis=0)
+        return np.asarray(random.T)
+
+    def _check_lines(self, lines: Sequence[_Line], doubt: np.ndarray | None = None, twice: bool = True) -> list[Part]:
+        """Return a checked part for each line, from one batch of costs; ``doubt (d,)`` is the gradient's own error.
 
         A component's derivative is per unit of the input. A derivative along a random direction is per unit of the
         inputs' scales.
         """
-        dim, count = self.theta.size, self.options.directions
-        random = self.random.standard_normal((dim, count))
-        random *= self.scale[:, None] / np.linalg.norm(random, axis=0)
-        single = np.zeros((dim, len(chosen)))
-        single[chosen, range(len(chosen))] = self.scale[chosen]
-        vectors = np.concatenate([single, random], axis=1)
-        return vectors, np.concatenate([self.scale[chosen], np.ones(count)])
-
-    def _check_parts(
-        self,
-        thetas: np.ndarray,
-        gradients: np.ndarray,
-        vectors: np.ndarray,
-        lengths: np.ndarray,
-        names: list[str],
-        components: Sequence[int | None],
-        doubt: np.ndarray,
-        twice: bool = True,
-    ) -> list[Part]:
-        """Return a checked part for each of ``vectors (d, M)``, at ``thetas (d, M)``, from one batch of costs."""
-        eps, count = self.options.eps, vectors.shape[1]
-        if not count:
+        if not lines:
             return []
+        eps, count = self.options.eps, len(lines)
+        thetas, gradients, vectors = (
+            np.stack(columns, axis=1) for columns in zip(*((o.theta, o.gradient, o.vector) for o in lines), strict=True)
+        )
+        lengths = np.array([line.length for line in lines])
         at = points(thetas, vectors, self.unit, eps)
         values = self.cost(at).reshape(count, -1)
         repeatable = np.ones(count, bool)
@@ -366,41 +360,37 @@ class _Checker:
             program = np.where(vectors != 0.0, vectors * gradients, 0.0).sum(axis=0) / lengths
         if self._gradient is None:
             program = np.zeros(count)
-        doubts = np.abs(vectors).T @ np.nan_to_num(doubt, nan=0.0, posinf=0.0) / lengths
         # a component this much smaller than the others may be only their rounding, unless it is exactly 0
         whole = np.abs(np.nan_to_num(gradients, posinf=0.0, neginf=0.0)) * self.scale[:, None]
-        doubts += np.where(program != 0.0, np.sqrt(self.unit) * whole.max(axis=0) / lengths, 0.0)
+        doubts = np.where(program != 0.0, np.sqrt(self.unit) * whole.max(axis=0) / lengths, 0.0)
+        if doubt is not None:
+            doubts += np.abs(vectors).T @ np.nan_to_num(doubt, nan=0.0, posinf=0.0) / lengths
         measured = samples(values, lengths, program, self.unit, eps, minus != plus, repeatable, doubts)
         if self._gradient is None:
             measured = [replace(s, derivative=judge(s).difference) for s in measured]
         findings = [judge(sample) for sample in measured]
-        steps = [float(sample.step[finding.index]) for sample, finding in zip(measured, findings, strict=True)]
         if twice:
-            findings = self._with_staircases(thetas, vectors, measured, findings)
-            for m, finding in enumerate(findings):
-                if finding.verdict == "unsettled" and self._gradient is not None:
-                    place = thetas[:, m], vectors[:, m]
-                    findings[m], steps[m] = settle(
-                        self.cost, *place, float(lengths[m]), measured[m], finding, self._tangent
-                    )
-        for m, finding in enumerate(findings):
-            apart = abs(finding.difference - measured[m].derivative) * float(lengths[m])
+            findings = self._with_staircases(lines, measured, findings)
+        for m, (line, finding) in enumerate(zip(lines, findings, strict=True)):
+            if twice and finding.verdict == "unsettled" and self._gradient is not None:
+                better = settle(self.cost, line.theta, line.vector, line.length, measured[m], self._tangent)
+                findings[m] = finding = better or finding
+            apart = abs(finding.difference - measured[m].derivative) * line.length
             is_close = finding.verdict == "wrong_adjoint" and apart <= LOOSE * whole[:, m].max()
-            if is_close and self._has_loose_solver(thetas[:, m], gradients[:, m], apart):
+            if is_close and self._has_loose_solver(line, apart):
                 findings[m] = replace(finding, verdict="rounding")
-        modes = [(tuple(a), tuple(b)) for a, b in zip(minus, plus, strict=True)]
         return [
-            replace(_part(names[m], components[m], sample, finding, modes[m]), step=steps[m])
-            for m, (sample, finding) in enumerate(zip(measured, findings, strict=True))
+            Part(name=line.name, component=line.component, sample=sample, modes=(tuple(a), tuple(b)), **vars(finding))
+            for line, sample, finding, a, b in zip(lines, measured, findings, minus, plus, strict=True)
         ]
 
-    def _has_loose_solver(self, theta: np.ndarray, gradient: np.ndarray, apart: float) -> bool:
+    def _has_loose_solver(self, line: _Line, apart: float) -> bool:
         """Return whether small jumps of the cost explain an error ``apart`` of a slope in units of the inputs' scales.
 
         Such jumps show a solver that stops early. The cost is scanned along its gradient, for at most
         :attr:`Options.scanned` thetas.
         """
-        steepest = self.scale * gradient
+        steepest = self.scale * line.gradient
         vector = self.scale * steepest / np.linalg.norm(steepest)
         for reach in roughness.REACHES:
             if apart <= EXPLAINED * max(self._rates, default=0.0):
@@ -409,7 +399,7 @@ class _Checker:
                 return False
             along = np.linspace(-reach, reach, roughness.STOPPED)
             with np.errstate(all="ignore"):
-                values = self.cost(theta[:, None] + vector[:, None] * along)
+                values = self.cost(line.theta[:, None] + vector[:, None] * along)
                 least = 8.0 * self.unit * float(np.abs(values).max())
                 self._rates.append(roughness.stopping_rate(values, 2.0 * reach, least))
         return apart <= EXPLAINED * max(self._rates)
@@ -424,7 +414,7 @@ class _Checker:
         return names[:, :eps], names[:, eps:]
 
     def _with_staircases(
-        self, thetas: np.ndarray, vectors: np.ndarray, measured: list[Sample], findings: list[Finding]
+        self, lines: Sequence[_Line], measured: list[Sample], findings: list[Finding]
     ) -> list[Finding]:
         """Return the findings, replaced for each direction along which the cost is a staircase.
 
@@ -440,7 +430,7 @@ class _Checker:
         ][: self.options.scanned]
         along = roughness.staircase_offsets(1.0, self.unit)
         for m in to_scan:
-            at = thetas[:, m : m + 1] + vectors[:, m : m + 1] * along.reshape(1, -1)
+            at = lines[m].theta[:, None] + lines[m].vector[:, None] * along.reshape(1, -1)
             values = self.cost(at).reshape(along.shape)
             for row in values:
                 if roughness.is_staircase(row, 8.0 * self.unit * float(np.abs(row).max())):
@@ -456,7 +446,7 @@ class _Checker:
         tread = float(np.ptp(np.diff(row)))
         if GUARD * float(self.unit) * abs(sample.centre) >= tread:
             return finding
-        coarse = judge(replace(sample, noise=max(sample.noise or 0.0, tread)))
+        coarse = judge(replace(sample, noise=max(sample.noise, tread)))
         return replace(coarse, verdict="precision" if coarse.verdict in TRUSTED else "staircase")
 
     def _with_causes(
@@ -474,24 +464,21 @@ class _Checker:
         if still and at_draws[0].any() and not here:
             return parts, [_with_verdict(part, "stale_gradient", ("wrong_adjoint",)) for part in draws]
         components = [p.component for p in parts if any(p is one for one in wrong) and p.component is not None]
-        ratios = {i: [_ratio(part) for part in parts if part.component == i] for i in components}
-        count, few = len(components), min(len(at_draws), ELSEWHERE)
-        again = self._check_parts(
-            np.repeat(around[:, :few], count, axis=1),
-            np.repeat(np.stack(at_draws[:few], axis=1), count, axis=1) if few else np.zeros((around.shape[0], 0)),
-            np.tile(np.diag(self.scale)[:, components], few),
-            np.tile(self.scale[components], few),
-            [""] * (count * few),
-            components * few,
-            np.zeros(self.theta.size),
+        ratios = {i: [part.ratio_with_error for part in parts if part.component == i] for i in components}
+        again = self._check_lines(
+            [
+                _Line("", other, gradient, self._along(i), self.scale[i], i)
+                for other, gradient in list(zip(around.T, at_draws, strict=True))[:ELSEWHERE]
+                for i in components
+            ],
             twice=False,
         )
         for part in again:
             if part.component is not None and part.verdict in ("wrong_adjoint", *TRUSTED):
-                ratios[part.component].append(_ratio(part))
+                ratios[part.component].append(part.ratio_with_error)
         whole = [part for part in (*parts, *draws) if part.component is None and part.verdict == "wrong_adjoint"]
         right = any(part.verdict in TRUSTED and part.verdict != "zero" for part in parts if part.component is not None)
-        along = [_ratio(part) for part in whole]
+        along = [part.ratio_with_error for part in whole]
         cause = causes_of_ratios(ratios, along, right)
         if "wrong_adjoint" in cause.values() and self._is_right_far_away():
             cause = causes_of_ratios(ratios, along, right, right_elsewhere=True)
@@ -506,41 +493,16 @@ class _Checker:
         """
         count = self.options.draws
         away = np.repeat(FAR, count) * self.scale[:, None]
-        thetas = self.theta[:, None] + away * self.random.standard_normal((self.theta.size, len(FAR) * count))
-        gradients = np.stack([np.zeros(self.theta.size), *(self.gradient(theta) for theta in thetas.T)], axis=1)[:, 1:]
+        thetas = (self.theta[:, None] + away * self.random.standard_normal((self.theta.size, len(FAR) * count))).T
+        right = [(theta, self.gradient(theta)) for theta in thetas]
         for _ in range(2):
-            vectors = self.scale[:, None] * self.random.standard_normal(thetas.shape)
-            names, none = [""] * thetas.shape[1], [None] * thetas.shape[1]
-            doubt = np.zeros(self.theta.size)
-            parts = self._check_parts(thetas, gradients, vectors, np.ones(len(names)), names, none, doubt, twice=False)
-            right = [k for k, part in enumerate(parts) if part.verdict in PLAINLY and part.program != 0.0]
-            thetas, gradients = thetas[:, right], gradients[:, right]
-        return bool(thetas.shape[1] > 0)
-
-
-def _ratio(part: Part) -> Ratio:
-    """Return a part's ratio, with the error that follows from the error of its difference."""
-    size = abs(part.difference)
-    return Ratio(part.ratio, abs(part.ratio) * part.uncertainty / size if size > 0.0 else 0.0)
-
-
-def _part(
-    name: str, component: int | None, sample: Sample, finding: Finding, modes: tuple[Sequence[str], Sequence[str]]
-) -> Part:
-    return Part(
-        name=name,
-        component=component,
-        program=sample.derivative,
-        difference=finding.difference,
-        uncertainty=finding.uncertainty,
-        step=float(sample.step[finding.index]),
-        left=finding.left,
-        right=finding.right,
-        order=order(sample),
-        verdict=finding.verdict,
-        sample=sample,
-        modes=modes,
-    )
+            vectors = self.scale[:, None] * self.random.standard_normal((self.theta.size, len(right)))
+            lines = [_Line("", *each, vector) for each, vector in zip(right, vectors.T, strict=True)]
+            parts = self._check_lines(lines, twice=False)
+            right = [
+                each for each, part in zip(right, parts, strict=True) if part.verdict in PLAINLY and part.program != 0.0
+            ]
+        return bool(right)
 
 
 def _with_verdict(part: Part, verdict: str, instead: Sequence[str]) -> Part:

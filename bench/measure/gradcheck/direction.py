@@ -41,9 +41,8 @@ class Sample:
 
     ``step (K,)`` are displacements in falling order, ``minus`` and ``plus (K,)`` the costs at -step and +step, and
     ``centre`` is the cost at the point. ``crossing (K,)`` marks steps whose two sides differ in contact mode. ``scale``
-    is the size of theta, ``slope`` the norm of the program's gradient and ``unit`` the unit roundoff of its arithmetic.
-    ``noise`` is the measured standard deviation of the cost's noise (None: not measured), and ``doubt`` the error of
-    the program's derivative from rounding theta.
+    is the size of theta, and ``unit`` the unit roundoff of the program's arithmetic. ``noise`` is the measured standard
+    deviation of the cost's noise, and ``doubt`` the error of the program's derivative from rounding theta.
     """
 
     step: np.ndarray
@@ -54,9 +53,8 @@ class Sample:
     crossing: np.ndarray
     repeatable: bool = True
     scale: float = 1.0
-    slope: float = 0.0
     unit: float = float(np.finfo(np.float64).eps)
-    noise: float | None = None
+    noise: float = 0.0
     doubt: float = 0.0
 
     @property
@@ -91,17 +89,14 @@ class Sample:
         costs = np.maximum(np.maximum(np.abs(self.minus), np.abs(self.plus)), abs(self.centre))
         # numbers below the smallest normal one have no relative precision
         costs = costs + float(np.finfo(np.float64).tiny) / unit
-        if self.noise is None:
-            return np.asarray(GUARD * unit * (costs + self.slope * self.scale) / self.step)
-        # measured noise covers more than the estimate above and does not rely on the program's gradient. Rounding theta
-        # changes the cost by the slope times the rounding; at a minimum, the slope is that of one side.
+        # rounding theta changes the cost by the slope times the rounding; at a minimum, the slope is that of one side
         slopes = np.maximum(np.abs(self.left), np.abs(self.right))
         return np.asarray(MEASURED * unit * (costs + slopes * self.scale) / self.step)
 
     @property
     def uncertainty(self) -> np.ndarray:
         """The error of the differences that rounding and measured noise explain, ``(K,)``."""
-        return np.asarray(self.rounding(self.unit) + MEASURED * (self.noise or 0.0) / self.step)
+        return np.asarray(self.rounding(self.unit) + MEASURED * self.noise / self.step)
 
     def size(self, index: int) -> float:
         """Return the larger of |derivative| and |difference| at one step, to which relative errors refer."""
@@ -112,12 +107,12 @@ class Sample:
 class Finding:
     """A verdict, and the numbers that support it; NaN where a verdict has no numbers.
 
-    ``difference`` is the trusted slope, with its ``uncertainty``, at step number ``index``. ``left`` and ``right`` are
-    the one-sided slopes at the same step. For a kink, this step resolves the kink best.
+    ``difference`` is the trusted slope, with its ``uncertainty``, at ``step``. ``left`` and ``right`` are the one-sided
+    slopes at this step. For a kink, it resolves the kink best.
     """
 
     verdict: str
-    index: int = 0
+    step: float = float("nan")
     difference: float = float("nan")
     uncertainty: float = float("nan")
     left: float = float("nan")
@@ -130,13 +125,8 @@ def best(sample: Sample) -> int:
     return int(np.argmin(np.nan_to_num(sample.errors, nan=np.inf)))
 
 
-def diagnose(sample: Sample) -> str:
-    """Return the verdict of :func:`judge` without its numbers."""
-    return judge(sample).verdict
-
-
 def judge(sample: Sample) -> Finding:
-    """Return the verdict on the program's derivative, from differences of the cost.
+    """Return the verdict on the program's derivative, from differences of the cost, and its numbers.
 
     - ``nondeterministic``: the same call returns another cost. ``nonfinite``: the cost at the point or at too many
       steps is NaN or infinite. ``nan_gradient``: only the derivative is NaN or infinite.
@@ -153,33 +143,31 @@ def judge(sample: Sample) -> Finding:
       does not. Otherwise ``smooth``.
     """
     if not sample.repeatable:
-        return Finding("nondeterministic")
+        return Finding("nondeterministic", float(sample.step[0]))
     finite = sample.finite
     if not np.isfinite(sample.centre) or finite.sum() < MIN_STEPS:
-        return Finding("nonfinite")
-    where = np.flatnonzero(finite)
-    parts = {name: getattr(sample, name)[where] for name in ("step", "minus", "plus", "crossing")}
+        return Finding("nonfinite", float(sample.step[0]))
+    parts = {name: getattr(sample, name)[finite] for name in ("step", "minus", "plus", "crossing")}
     with np.errstate(over="ignore", invalid="ignore"):
-        finding = _judge(replace(sample, **parts))
-    return replace(finding, index=int(where[finding.index]))
+        return _judge(replace(sample, **parts))
 
 
 def _judge(sample: Sample) -> Finding:
     if not np.isfinite(sample.derivative):
         noise = sample.uncertainty
         index, spread = plateau(sample, noise)
-        return _finding(sample, "nan_gradient", index, spread + float(noise[index]))
+        return finding_at(sample, "nan_gradient", index, spread + float(noise[index]))
     still = (sample.plus == sample.centre) & (sample.minus == sample.centre)
     if sample.derivative == 0.0 and still.all():
-        return Finding("zero", 0, 0.0, float(sample.uncertainty[0]), 0.0, 0.0)
+        return finding_at(sample, "zero", 0, float(sample.uncertainty[0]))
     noise = sample.uncertainty
     if _has_jump(sample, noise):
-        return _finding(sample, "jump", sample.step.size - 1, float("nan"))
+        return finding_at(sample, "jump", sample.step.size - 1, float("nan"))
     bend = sample.right - sample.left
     kink = _last_stable_index(sample.step, bend, 2.0 * noise)
     if kink is not None:
-        return _finding(
-            sample, "kink" if _is_between_slopes(sample, noise) else _classify_wrong(sample), kink, float(noise[kink])
+        return finding_at(
+            sample, "kink" if _is_between_slopes(sample, noise) else wrong(sample), kink, float(noise[kink])
         )
     index, spread = plateau(sample, noise)
     uncertainty = spread + float(noise[index])
@@ -190,18 +178,20 @@ def _judge(sample: Sample) -> Finding:
     resolved = uncertainty <= max(alike, rounding)
     # a tolerance as large as the derivative would accept half of the derivative
     if apart <= min(tolerance, alike + rounding + sample.doubt) and resolved:
-        return _finding(sample, _classify_right(sample, index, still), index, uncertainty)
+        return finding_at(sample, _classify_right(sample, index, still), index, uncertainty)
     if sample.crossing[index]:
-        return _finding(sample, _judge_one_sided(sample, noise), index, uncertainty)
+        return finding_at(sample, _judge_one_sided(sample, noise), index, uncertainty)
     if sample.derivative == 0.0 and _vanishes(sample, noise):
-        return _finding(sample, "nonlinear", int(np.argmin(np.abs(sample.differences) + noise)), uncertainty)
+        return finding_at(sample, "nonlinear", int(np.argmin(np.abs(sample.differences) + noise)), uncertainty)
     settled = apart > tolerance and _is_credible(sample, index, uncertainty, tolerance)
-    return _finding(sample, _classify_wrong(sample) if settled else "unsettled", index, uncertainty)
+    return finding_at(sample, wrong(sample) if settled else "unsettled", index, uncertainty)
 
 
-def _finding(sample: Sample, verdict: str, index: int, uncertainty: float) -> Finding:
-    sides = float(sample.left[index]), float(sample.right[index])
-    return Finding(verdict, index, float(sample.differences[index]), uncertainty, *sides)
+def finding_at(sample: Sample, verdict: str, index: int, uncertainty: float) -> Finding:
+    """Return a verdict with the numbers of one step."""
+    numbers = (float(values[index]) for values in (sample.step, sample.differences, sample.left, sample.right))
+    step, difference, left, right = numbers
+    return Finding(verdict, step, difference, uncertainty, left, right)
 
 
 def plateau(sample: Sample, noise: np.ndarray) -> tuple[int, float]:
@@ -245,7 +235,7 @@ def _is_credible(sample: Sample, index: int, uncertainty: float, tolerance: floa
     settled = bool(lasting[max(0, index - SHORT_WINDOW + 1) : index + 1].any())
     if settled and uncertainty <= ALIKE * abs(differences[index]):
         return True
-    plain = (sample.noise or 0.0) / sample.step[index] <= sample.rounding(sample.unit)[index]
+    plain = sample.noise / sample.step[index] <= sample.rounding(sample.unit)[index]
     return bool(plain and abs(differences[index] - sample.derivative) > 2.0 * tolerance)
 
 
@@ -265,7 +255,7 @@ def _judge_one_sided(sample: Sample, noise: np.ndarray) -> str:
             tolerance = 2.0 * spread + noises + float(np.cbrt(sample.unit)) * abs(middle)
             if abs(middle - sample.derivative) <= tolerance:
                 return "kink"
-    return _classify_wrong(sample) if settled else "unsettled"
+    return wrong(sample) if settled else "unsettled"
 
 
 def _vanishes(sample: Sample, noise: np.ndarray) -> bool:
@@ -287,7 +277,8 @@ def _resolution(sample: Sample, index: int) -> float:
     return float(np.cbrt(sample.unit)) * sample.size(index)
 
 
-def _classify_wrong(sample: Sample) -> str:
+def wrong(sample: Sample) -> str:
+    """Return the verdict on a derivative that is not the difference."""
     return "disconnected" if sample.derivative == 0.0 else "wrong_adjoint"
 
 
@@ -353,8 +344,7 @@ def _classify_right(sample: Sample, index: int, still: np.ndarray) -> str:
         return "saturated"
     errors = np.abs(sample.differences - sample.derivative)
     small = np.arange(errors.size) > index
-    guard = 10.0 if sample.noise is None else 10.0 * GUARD / MEASURED
-    if (errors > guard * sample.rounding(float(np.finfo(np.float64).eps)))[small].sum() >= 3:
+    if (errors > 10.0 * GUARD / MEASURED * sample.rounding(float(np.finfo(np.float64).eps)))[small].sum() >= 3:
         return "rounding"
     risen = (errors > RISE * sample.size(index)) & ~small & (errors > sample.uncertainty)
     if (risen & sample.crossing).any():

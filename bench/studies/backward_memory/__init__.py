@@ -3,22 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import ClassVar
 
 from bench.experiment.cell import Cell
 from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, text
-from bench.experiment.experiment import Experiment
-from bench.experiment.session import Session
-from bench.experiment.study import Study
-from bench.experiment.views import Views
 from bench.model import param
-
-if TYPE_CHECKING:
-    import pandas as pd
+from bench.studies import StudyPackage
 
 
 @dataclass(frozen=True)
-class BackwardMemory(Study):
+class BackwardMemory(StudyPackage):
     """Measures the peak memory and the time of a batch of gradients on each backend, each cell in its own process."""
 
     name = "backward_memory"
@@ -46,18 +40,6 @@ class BackwardMemory(Study):
         6, "measured calls: the range of six contains the median of their distribution with probability 97%", low=6
     )
 
-    def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
-        """Return one cell's results by column: memory [MiB] and time [s] of a batch of gradients, and their agreement."""
-        from bench.studies.backward_memory.measure import measure
-
-        return measure(cell, session, self.calls)
-
     def unsupported_reason(self, cell: Cell) -> str | None:
         """Return that the backend computes no gradients, or None."""
         return None if "grad" in cell.backend.provides else f"backend {cell.backend.name} computes no gradients"
-
-    def views(self, experiment: Experiment, rows: pd.DataFrame) -> Views:
-        """Return the tables of growth and of cells, and the charts of memory and time along the horizon."""
-        from bench.studies.backward_memory.views import views
-
-        return views(experiment, rows)

@@ -13,12 +13,11 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from bench.errors import failure
 from bench.experiment.cell import Cell
-from bench.measure import noise, timing
+from bench.measure import timing
 from bench.model import Compilations, registry
+from bench.studies import first_batch
 
 
 def main() -> None:
@@ -44,7 +43,8 @@ def measured(cell: Cell, calls: int, cache: Path | None) -> dict[str, Any]:
     problem = cell.backend.compile(cell.program())
     problem.compilations = Compilations(cache)
     problem.block, problem.threads = cell.samples, 1
-    theta, w = problem.program.theta0, batch(cell)
+    theta = problem.program.theta0
+    w = first_batch(cell, problem.program.n_noise)
     gradient = problem.grad(theta, w).mean(axis=1)
     seconds, peaks, before = [], [], []
     for _ in range(calls):
@@ -57,12 +57,6 @@ def measured(cell: Cell, calls: int, cache: Path | None) -> dict[str, Any]:
         seconds.append(time.process_time() - started)
         peaks.append(timing.peak_memory_mb() - before[-1])
     return {"gradient": gradient.tolist(), "seconds": seconds, "peaks": peaks, "before": before}
-
-
-def batch(cell: Cell) -> np.ndarray:
-    """Return the noise of a cell's batch, ``(n_w, samples)``."""
-    drawn = noise.shared(cell.seed, cell.scene.name, 1, cell.samples, cell.program().n_noise)
-    return np.ascontiguousarray(drawn[0].T)
 
 
 def _trim() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 import pickle
 import subprocess
@@ -18,7 +17,8 @@ from bench.errors import Crashed
 from bench.experiment.cell import Cell
 from bench.experiment.session import Session
 from bench.model import registry
-from bench.studies.backward_memory.child import batch
+from bench.studies import finite_status, first_batch, relative_error
+from bench.studies.backward_memory import BackwardMemory
 
 PROGRAM = (
     "import sys; sys.path[:] = sys.argv.pop().split(chr(0x1f)); "
@@ -36,22 +36,22 @@ ENVIRONMENT = {
 returns to the system when they are freed. By default it raises that limit, and keeps freed blocks for later calls."""
 
 
-def measure(cell: Cell, session: Session, calls: int) -> dict[str, Any]:
+def measure(cell: Cell, session: Session, study: BackwardMemory) -> dict[str, Any]:
     """Return one cell's results by column. Raises :class:`Crashed` if the cell's process ends without a result."""
-    answer = in_process(cell, calls, session.problems.compilations.folder)
+    answer = in_process(cell, study.calls, session.problems.compilations.folder)
     if "status" in answer:
         return answer
     gradient = np.array(answer["gradient"])
-    is_finite = bool(np.isfinite(gradient).all())
-    return {
-        "status": "ok" if is_finite else "nonfinite",
-        "reason": "" if is_finite else "the gradient is not finite",
-        "gradient": answer["gradient"],
-        **_agreement(cell, session, gradient),
-        **spread("gradient_s", answer["seconds"]),
-        **spread("memory_mb", answer["peaks"]),
-        "process_mb": float(np.median(answer["before"])),
-    }
+    result = finite_status("the gradient is not finite", gradient) | {
+        "gradient": answer["gradient"], **spread("gradient_s", answer["seconds"]), **spread("memory_mb", answer["peaks"]),
+        "process_mb": float(np.median(answer["before"])), "compared_with": "",
+    }  # fmt: skip
+    if cell.ranked_backends:
+        other = session.problems.of(cell.ranked_backends[0], cell)
+        expected = other.grad(other.program.theta0, first_batch(cell, other.program.n_noise)).mean(axis=1)
+        error = relative_error(gradient, expected)
+        result |= {"compared_with": cell.ranked_backends[0].name, "gradient_error_rel": error}
+    return result
 
 
 def in_process(cell: Cell, calls: int, cache: Path | None) -> dict[str, Any]:
@@ -74,14 +74,3 @@ def spread(name: str, values: list[float]) -> dict[str, float]:
     The range of n independent values contains their distribution's median with probability 1 - 2^(1 - n).
     """
     return {name: float(np.median(values)), f"{name}_low": min(values), f"{name}_high": max(values)}
-
-
-def _agreement(cell: Cell, session: Session, gradient: np.ndarray) -> dict[str, Any]:
-    """Return the distance from the gradient of the first backend that computes references, relative to its norm."""
-    if not cell.ranked_backends:
-        return {"compared_with": ""}
-    other = session.problems.of(cell.ranked_backends[0], cell)
-    expected = other.grad(other.program.theta0, batch(cell)).mean(axis=1)
-    scale = float(np.linalg.norm(expected))
-    error = float(np.linalg.norm(gradient - expected)) / scale if scale > 0 else math.nan
-    return {"compared_with": cell.ranked_backends[0].name, "gradient_error_rel": error}

@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
-from typing import Any, NamedTuple
 
+import numpy as np
 import pandas as pd
 
 from bench.experiment import grid
 from bench.experiment.columns import Column, text
 from bench.experiment.experiment import Experiment
-from bench.experiment.views import Chart, Style, Table, Views
+from bench.experiment.views import Chart, Table, Views
 from bench.report.shown import Shown
-from bench.report.style import colour, marker
-from bench.report.writer import reasons
 
 FLOOR = 0.3
 """Error of a measured memory in MiB: the kernel counts resident pages late, so that peaks are 0.1 to 0.25 MiB too low."""
 SMALL = 1.0
 """Memory in MiB, about three floors, below which a memory is an upper limit without ratios and orders."""
+ENDS = ("", "_low", "_high")
+"""Endings of the columns of a value and of the ends of its interval."""
 SHOWN = ("memory_mb", "gradient_s", "process_mb", "gradient_error_rel")
 LINES = (
     text("problem"),
@@ -45,17 +44,6 @@ CELLS_NOTE = (
 )
 
 
-class Ratio(NamedTuple):
-    """A ratio of two positive numbers with its interval, NaN where it is not known."""
-
-    value: float
-    low: float
-    high: float
-
-
-UNKNOWN = Ratio(math.nan, math.nan, math.nan)
-
-
 def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     """Return the tables of the longest horizon and of all cells, and the charts of memory and time."""
     shown = Shown(experiment, rows, along=["horizon"])
@@ -64,15 +52,16 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     own[0] = replace(own[0], limit="is_small")
     title, always = "memory and time of a backward pass", ("scene", "backend", "horizon")
     cells = shown.cells(own, title, [CELLS_NOTE], always, tried, terminal=False)
-    if not _has_result(tried).any():
-        return Views([cells], remarks=reasons(rows))
+    has_result = (tried["status"] == "ok") & tried["memory_mb"].notna()
+    if not has_result.any():
+        return Views([cells])
     # the first method is the experiment's first, in whatever order rows were stored
     places = {cell.key: place for place, cell in enumerate(grid.cells(experiment))}
     tried = tried.iloc[tried["key"].map(places).fillna(len(places)).to_numpy().argsort(kind="stable")]
-    first, good = str(tried["method"].iloc[0]), tried[_has_result(tried)]
+    first, good = str(tried["method"].iloc[0]), tried[has_result]
     lines = longest(good, first)
     table = Table("backward_memory_methods", lines, LINES, "Memory and time of a backward pass", [NOTE], terminal=True, page=True)  # fmt: skip
-    return Views([table, cells], _charts(experiment, good), remarks=reasons(rows))
+    return Views([table, cells], _charts(shown, good))
 
 
 def with_error(rows: pd.DataFrame) -> pd.DataFrame:
@@ -89,71 +78,46 @@ def with_error(rows: pd.DataFrame) -> pd.DataFrame:
     )  # fmt: skip
 
 
-def _has_result(rows: pd.DataFrame) -> pd.Series:
-    return (rows["status"] == "ok") & rows["memory_mb"].notna()
-
-
 def longest(good: pd.DataFrame, first: str) -> pd.DataFrame:
     """Return a line per problem and method at the problem's longest horizon, with ratios to the method ``first``."""
-    entries: list[dict[str, Any]] = []
-    for _, part in good.groupby("problem", sort=False):
-        horizon = part["horizon"].max()
-        last = part[part["horizon"] == horizon].drop_duplicates("method", keep="last")
-        before = part[part["horizon"] < horizon]
-        base = last[last["method"] == first]
-        for _, row in last.iterrows():
-            less = longer = UNKNOWN
-            if len(base) and row["method"] != first:
-                less, longer = ratio(base.iloc[0], row, "memory_mb"), ratio(row, base.iloc[0], "gradient_s")
-            earlier = before[before["method"] == row["method"]].sort_values("horizon").tail(1)
-            order = _order(earlier.iloc[0], row) if len(earlier) else UNKNOWN
-            names = ("problem", "method", "horizon", "is_small", *(f"{n}{e}" for n in ("memory_mb", "gradient_s") for e in ("", "_low", "_high")))  # fmt: skip
-            entries.append({name: row[name] for name in names} | {
-                f"{name}{end}": value
-                for name, one in (("less", less), ("longer", longer), ("order", order))
-                for end, value in zip(("", "_low", "_high"), one, strict=True)
-            })  # fmt: skip
-    return pd.DataFrame(entries)
+    keys, most = ["problem", "method"], good.groupby("problem")["horizon"].transform("max")
+    last = good[good["horizon"] == most].drop_duplicates(keys, keep="last")
+    last = pd.concat([part for _, part in last.groupby("problem", sort=False)]).set_index(keys, drop=False)
+    is_first = last["method"] == first
+    base = last[is_first].set_index("problem").reindex(last["problem"]).set_index(last.index).mask(is_first)
+    before = good[good["horizon"] < most].sort_values("horizon").drop_duplicates(keys, keep="last")
+    before = before.set_index(keys).reindex(last.index)
+    order = np.log(ratio(last, before, "memory_mb")).div(np.log(last["horizon"] / before["horizon"]), axis=0)
+    ratios = {"less": ratio(base, last, "memory_mb"), "longer": ratio(last, base, "gradient_s"), "order": order}
+    kept = [f"{name}{end}" for name in ("memory_mb", "gradient_s") for end in ENDS]
+    parts = [
+        last[["problem", "method", "horizon", "is_small", *kept]],
+        *(ratios[name].add_prefix(name) for name in ratios),
+    ]
+    return pd.concat(parts, axis=1).reset_index(drop=True)
 
 
-def ratio(a: pd.Series, b: pd.Series, name: str) -> Ratio:
-    """Return the ratio of a column of two rows; unknown where a memory is only an upper limit.
+def ratio(a: pd.DataFrame, b: pd.DataFrame, name: str) -> pd.DataFrame:
+    """Return the ratio of a column of aligned rows with its ends; missing where a memory is only an upper limit.
 
     The interval divides the ends of both intervals, so it covers at least as often as both of them together.
     """
-    if name == "memory_mb" and (a["is_small"] or b["is_small"]):
-        return UNKNOWN
-    above, below = ([float(row[f"{name}{end}"]) for end in ("", "_low", "_high")] for row in (a, b))
-    return Ratio(above[0] / below[0], above[1] / below[2], above[2] / below[1])
+    above, below = ([one[f"{name}{end}"].astype(float) for end in ENDS] for one in (a, b))
+    found = pd.DataFrame(dict(zip(ENDS, (above[0] / below[0], above[1] / below[2], above[2] / below[1]), strict=True)))
+    return found.mask(a["is_small"].eq(True) | b["is_small"].eq(True)) if name == "memory_mb" else found
 
 
-def _order(earlier: pd.Series, later: pd.Series) -> Ratio:
-    """Return p in memory ~ T^p between two horizons; unknown where a memory is only an upper limit."""
-    steps = math.log(later["horizon"] / earlier["horizon"])
-    return Ratio(*(math.log(value) / steps for value in ratio(later, earlier, "memory_mb")))
-
-
-def _charts(experiment: Experiment, good: pd.DataFrame) -> list[Chart]:
+def _charts(shown: Shown, good: pd.DataFrame) -> list[Chart]:
     """Return the charts of memory and of time along the horizon, a panel per problem and a line per method."""
-    own = experiment.columns.by_name
-    methods = dict.fromkeys(good["method"])
-    styles = {method: Style(colour(i), marker(i)) for i, method in enumerate(methods)}
-    horizon = replace(own["horizon"], label="horizon T", log=True)
-    memory = replace(own["memory_mb"], limit="is_small", log=True)
-    seconds = replace(own["gradient_s"], label="time of a batch of gradients", log=True)
+    horizon = shown.column("horizon", label="horizon T", log=True)
     samples = " or ".join(f"{count:g}" for count in good["samples"].unique())
-    conditions = f"Batches of {samples} rollouts on one thread, a process per point"
-    limits = f". Hollow: at most so much, since little is known below {SMALL:.0f} MiB" if good["is_small"].any() else ""
-    shared: dict[str, Any] = dict(
-        series="method", panel="problem", styles=styles, across=2,
-    )  # fmt: skip
+    drawn = {
+        "backward_memory": shown.column("memory_mb", limit="is_small", log=True),
+        "backward_time": shown.column("gradient_s", label="time of a batch of gradients", log=True),
+    }
     return [
-        Chart(
-            "backward_memory", good, [horizon], [memory],
-            text="Peak of the resident memory beyond the memory before the gradients.", subtitle=conditions + limits, **shared,
-        ),
-        Chart(
-            "backward_time", good, [horizon], [seconds],
-            text="Median and range of the measured calls.", subtitle=conditions, **shared,
-        ),
+        Chart(name, good, [horizon], [y], series="method", panel="problem", across=2,
+              subtitle=f"Batches of {samples} rollouts on one thread, a process per point",
+              text=f"Median and range of the measured calls. A hollow marker is an upper limit: little is known below {SMALL:.0f} MiB.")
+        for name, y in drawn.items()
     ]  # fmt: skip

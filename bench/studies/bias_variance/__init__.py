@@ -3,23 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import ClassVar
 
-from bench.experiment.cell import Cell
 from bench.experiment.columns import Columns
-from bench.experiment.experiment import Experiment
-from bench.experiment.session import Session
-from bench.experiment.study import Study
-from bench.experiment.views import Views
 from bench.model import param
+from bench.studies import StudyPackage
 from bench.studies.bias_variance.columns import COLUMNS
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 
 @dataclass(frozen=True)
-class BiasVariance(Study):
+class BiasVariance(StudyPackage):
     """Measures bias and variance of estimates against the reference gradient, and the cost of an estimate."""
 
     name = "bias_variance"
@@ -34,15 +27,3 @@ class BiasVariance(Study):
         0.02, "time within which calls are repeated until their interquartile range is below 10% of the median", "s",
         low=0.0,
     )  # fmt: skip
-
-    def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
-        """Return one cell's results by column: statistics of its estimates, and their time."""
-        from bench.studies.bias_variance.measure import measure
-
-        return measure(cell, session, self.timed_calls, self.settle_s)
-
-    def views(self, experiment: Experiment, rows: pd.DataFrame) -> Views:
-        """Return the tables, comparisons among them, and the charts."""
-        from bench.studies.bias_variance.views import views
-
-        return views(experiment, rows)

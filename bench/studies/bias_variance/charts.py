@@ -7,14 +7,12 @@ import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from bench.experiment.axes import Axis
 from bench.experiment.columns import Column, text
-from bench.experiment.parameters import number_problems
 from bench.experiment.views import Chart, Mark, Style
 from bench.model import SURROGATE, registry
 from bench.report.colours import estimator_order
@@ -39,9 +37,9 @@ from bench.studies.bias_variance.time_to_accuracy import SAMPLES, TARGETS
 FLOOR = 1e-4
 """Relative biases below this are drawn here, as upper limits."""
 SERIES = 3
-"""Most estimators of a printed chart along an axis; the page has all."""
+"""Most estimators of a chart along an axis."""
 PANELS = 4
-"""Most problems of a printed chart along an axis."""
+"""Most problems of a chart along an axis."""
 POOLED = ("horizon", "stiffness", "sigma", "smoothing")
 """Columns that change the cost of an estimate: each value has a panel of its own."""
 DISTINCT = 1.2
@@ -75,38 +73,19 @@ def charts(
     labelled = replace(shown, rows=with_plotted_columns(shown.rows))
     styles = estimator_styles(shown.rows)
     subtitle = _conditions(shown)
-    main: list[Chart] = []
-    page_only: list[Chart] = []
     swept = shown.swept()
-    for axis in sorted(swept, key=lambda a: (-swept[a], a.column != "stiffness")):
-        if axis.column == "samples" and not best.empty:
-            continue
-        chart = _along(labelled, axis, methods, comparisons, styles, subtitle)
-        main += [chart] if chart is not None else []
+    along = [
+        _along(labelled, axis, methods, comparisons, styles, subtitle)
+        for axis in sorted(swept, key=lambda a: (-swept[a], a.column != "stiffness"))
+        if axis.column != "samples" or best.empty
+    ]
     if not best.empty:
-        first = _speed_accuracy(labelled, best, styles, subtitle)
-        main = [*([first] if first is not None else []), *main]
+        along = [_speed_accuracy(labelled, best, styles, subtitle), *along]
     elif shown.rows["backend"].nunique() > 1:
-        main += [_error_and_cost(labelled, styles, subtitle)]
+        along += [_error_and_cost(labelled, styles, subtitle)]
     if not swept and methods["problem"].nunique() > 1:
-        main = [_estimators(methods), *main]
-    everything = labelled.rows
-    page_only.append(
-        Chart(
-            "error_against_time", everything, TIMES, [RMSE, BIAS], "points", series="series",
-            panel="problem_", front="setting_", styles=styles, printed=False,
-            text="Each point is one cell. Lower left is better; above 1 an estimate is worse than the zero estimate. Points with "
-            "a ring are not beaten in both by any point shown of the same problem.",
-        )
-    )  # fmt: skip
-    page_only.append(
-        Chart(
-            "bias_against_spread", everything, [SPREAD], [BIAS], "points", series="series",
-            panel="problem_", styles=styles, printed=False,
-            text="Towards the left more samples do not help; towards the top the error is bias.",
-        )
-    )  # fmt: skip
-    return [*main, *(chart for chart in page_only if len(chart.frame))]
+        along = [_estimators(methods), *along]
+    return [chart for chart in along if chart is not None and len(chart.frame)]
 
 
 # ------------------------------------------------------------------------------------------------------- frames
@@ -136,7 +115,6 @@ def with_plotted_columns(rows: pd.DataFrame) -> pd.DataFrame:
         series=estimator_labels(rows),
         problem_=titled(rows.assign(**named_values(rows, POOLED)), ["scene", "contact", *POOLED]),
         line=rows["backend"] + " " + rows["dtype"],
-        setting_=number_problems(rows).astype(str),
         failed=~good,
         row=np.arange(len(rows), dtype=float),
     )
@@ -317,7 +295,7 @@ def _error_and_cost(shown: Arranged, styles: Mapping[str, Style], subtitle: str)
     return Chart(
         "speed_accuracy", rows, TIMES[:1], [RMSE], "points", series="series", shape="backend", panel="problem_",
         styles=styles, across=3, height=1.9, subtitle=", ".join(filter(None, [subtitle, *shares])),
-        chosen=(("problem_", chosen),), on_page=False,
+        chosen=(("problem_", chosen),),
     )  # fmt: skip
 
 
@@ -326,21 +304,18 @@ def _error_and_cost(shown: Arranged, styles: Mapping[str, Style], subtitle: str)
 
 def _estimators(methods: pd.DataFrame) -> Chart:
     """Return the heat table of errors: estimators by their worst case, in families, against problems."""
-    known = methods.assign(worst=methods["error"].where(methods["status"] == "ok", math.inf))
-    order = known.groupby("estimator", sort=False)["worst"].max().sort_values(kind="stable").index
-    families = {name: _family(name.partition("[")[0]) for name in order}
-    lines: list[dict[str, Any]] = []
-    for name in sorted(order, key=lambda n: list(dict.fromkeys(families.values())).index(families[n])):
-        for row in methods[methods["estimator"] == name].to_dict("records"):
-            mark = {FAILS: " fails", NO_RESULT: row["status"]}.get(row["verdict"], "")
-            lines.append({
-                "panel": families[name], "series": name, "problem": row["problem"],
-                "value": min(max(row["error"], 1e-3), 1e3) if math.isfinite(row["error"]) else math.nan,
-                "error": row["error"], "cell": number(row["error"]) if math.isfinite(row["error"]) else mark,
-            })  # fmt: skip
-    frame = pd.DataFrame(lines)
+    worst = methods["error"].where(methods["status"] == "ok", math.inf)
+    names = worst.groupby(methods["estimator"], sort=False).max().sort_values(kind="stable").index
+    families = {name: _family(name.partition("[")[0]) for name in names}
+    order = sorted(names, key=lambda name: list(dict.fromkeys(families.values())).index(families[name]))
+    frame = methods.iloc[methods["estimator"].map(order.index).argsort(kind="stable")]
+    error, known = frame["error"], np.isfinite(frame["error"])
+    marks = frame["status"].where(frame["verdict"] == NO_RESULT, "").mask(frame["verdict"] == FAILS, " fails")
     return Chart(
-        "estimators", frame, [text("problem", label="")], [ESTIMATOR], "grid", panel="panel", value="value",
+        "estimators",
+        frame.assign(panel=frame["estimator"].map(families), series=frame["estimator"], value=error.clip(1e-3, 1e3).where(known),
+                     cell=error.map(number).where(known, marks)),
+        [text("problem", label="")], [ESTIMATOR], "grid", panel="panel", value="value",
         cell="cell", across=1, height=0.2, value_range=(1e-2, 1e2),
         subtitle="relative RMSE of one estimate, sorted by the worst case; above 1 the zero estimate is better",
     )  # fmt: skip

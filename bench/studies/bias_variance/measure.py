@@ -14,14 +14,15 @@ from bench.experiment.cell import Cell
 from bench.experiment.session import Session
 from bench.measure import noise, statistics, timing
 from bench.model import SURROGATE, Auxiliaries, Problem
+from bench.studies.bias_variance import BiasVariance
 from bench.studies.bias_variance.estimates import Estimates
 
 
-def measure(cell: Cell, session: Session, timed_calls: int, settle_s: float) -> dict[str, Any]:
+def measure(cell: Cell, session: Session, study: BiasVariance) -> dict[str, Any]:
     """Return one cell's results by column: its status, the reason, and statistics of its estimates.
 
     A timed cell computes ``timed_calls`` estimates one by one, or all of them on a backend that compiles. Other cells
-    compute all estimates together. ``settle_s`` [s] limits how long calls are repeated until their times are steady.
+    compute all estimates together.
     """
     session.compilations.restart()
     program = cell.program()
@@ -31,14 +32,16 @@ def measure(cell: Cell, session: Session, timed_calls: int, settle_s: float) -> 
     estimates = Estimates(cell, problem, theta)
 
     timing.reset_peak_memory()
-    calls = (cell.repeats if cell.backend.compiles else min(timed_calls, cell.repeats)) if cell.timing else 0
+    calls = (cell.repeats if cell.backend.compiles else min(study.timed_calls, cell.repeats)) if cell.timing else 0
     # count only the estimates: the reference may have used the same problem
     problem.reset_usage()
     started = time.perf_counter()
     parts: list[np.ndarray] = []
     clock: timing.Timing | None = None
     if calls:
-        parts, clock = timing.timed(lambda r: estimates.of(r, r + 1), calls, settle_s=settle_s, pause=estimates.pause)
+        parts, clock = timing.timed(
+            lambda r: estimates.of(r, r + 1), calls, settle_s=study.settle_s, pause=estimates.pause
+        )
     # copied here, because the estimates below, which are not timed, raise the counts further
     usage, n_counted = replace(problem.usage), clock.calls if clock else cell.repeats
     if calls < cell.repeats:

@@ -8,9 +8,9 @@ import pandas as pd
 
 from bench.experiment.experiment import Experiment
 from bench.experiment.views import Views
+from bench.report.text import counted
 from bench.report.views import arrange
-from bench.report.writer import reasons
-from bench.studies.bias_variance import charts, reported, tables, time_to_accuracy
+from bench.studies.bias_variance import charts, tables, time_to_accuracy
 from bench.studies.bias_variance.columns import COLUMNS
 from bench.studies.bias_variance.comparisons import compare_errors, method_table
 from bench.studies.bias_variance.costs import with_gradient_cost
@@ -23,7 +23,7 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     shown = arrange(experiment, with_gradient_cost(rows))
     methods = method_table(shown)
     if methods.empty:
-        return Views([replace(tables.every_cell(experiment, rows), files=["csv", "md"])], remarks=reasons(rows))
+        return Views([replace(tables.every_cell(experiment, rows), files=["csv", "md"])])
     errors = compare_errors(methods)
     best = time_to_accuracy.table(shown)
     comparisons = errors if best.empty else pd.concat([errors, time_to_accuracy.comparisons(best)], ignore_index=True)
@@ -38,9 +38,18 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
             replace(COLUMNS.by_name["time_s"], label="time"),
             *(COLUMNS.by_name[name] for name in RESULTS),
         ],
-        remarks=[
-            *reasons(rows),
-            *reported.loose_references(rows, experiment.reference.tolerance),
-            *reported.sentences(rows),
-        ],
+        remarks=loose_references(rows, experiment.reference.tolerance),
     )
+
+
+def loose_references(rows: pd.DataFrame, tolerance: float) -> list[str]:
+    """Return in how many cells the reference's relative standard error is above the experiment's ``tolerance``, and the largest."""
+    good = rows[(rows["status"] == "ok") & (rows["reference_norm"] > 0)]
+    error = good["reference_se"] / good["reference_norm"]
+    loose = error[error > tolerance]
+    if loose.empty:
+        return []
+    return [
+        f"the standard error of the reference is above its tolerance of {100 * tolerance:g}% in {counted(len(loose), 'cell')}, up to "
+        f"{100 * loose.max():.2g}% ({good.loc[loose.idxmax(), 'scene']}): more reference.samples make it smaller"
+    ]

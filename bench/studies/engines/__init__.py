@@ -3,22 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import ClassVar
 
-from bench.experiment.cell import Cell
 from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, text
-from bench.experiment.experiment import Experiment
-from bench.experiment.session import Session
-from bench.experiment.study import Study
-from bench.experiment.views import Views
 from bench.model import param
-
-if TYPE_CHECKING:
-    import pandas as pd
+from bench.studies import StudyPackage
 
 
 @dataclass(frozen=True)
-class Engines(Study):
+class Engines(StudyPackage):
     """Measures whether an engine's gradient is right, its bias and variance, and what it costs."""
 
     name = "engines"
@@ -62,15 +55,3 @@ class Engines(Study):
 
     batch: int = param(64, "gradients in a timed call", positive=True)
     timed_calls: int = param(3, "timed calls", positive=True)
-
-    def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
-        """Return one cell's results by column: errors at w = 0, statistics of averaged gradients, times and memory."""
-        from bench.studies.engines.measure import measure
-
-        return measure(cell, session, self.batch, self.timed_calls)
-
-    def views(self, experiment: Experiment, rows: pd.DataFrame) -> Views:
-        """Return the table with a line per engine and scene, and the grid of usable gradients."""
-        from bench.studies.engines.views import views
-
-        return views(experiment, rows)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable
 from dataclasses import asdict
@@ -15,70 +14,69 @@ from bench.experiment.cell import Cell
 from bench.experiment.session import Session
 from bench.measure import noise, statistics, timing
 from bench.model import Problem, zeroth_order
+from bench.studies import finite_status, relative_error
+from bench.studies.engines import Engines
 from bench.studies.three_errors.measure import difference_check
 
-RIGID, OWN = "rigid contact", "the scene's own program"
-"""What the model error compares with."""
 SUMMARY = ("reference_norm", "reference_se", "bias", "bias_low", "bias_high", "variance", "rmse_rel")
 """Columns that are statistics of averaged gradients."""
 
 
-def measure(cell: Cell, session: Session, batch: int, timed_calls: int) -> dict[str, Any]:
+def measure(cell: Cell, session: Session, study: Engines) -> dict[str, Any]:
     """Return one cell's results by column. Backends without gradients get the columns of costs only."""
     problem = session.problem(cell)
     program = problem.program
     theta, has_gradient = program.theta0, "grad" in cell.backend.provides
-    result: dict[str, Any] = {"status": "ok", "reason": ""} | _times(cell, problem, batch, timed_calls, has_gradient)
+    result = _times(cell, problem, study, has_gradient)
     truth = session.references.of(cell)
-    result["reference_method"] = truth.method
-    if not np.isfinite(truth.batches).all():
-        result |= {"status": "nonfinite", "reason": truth.note or "the reference gradient is not finite"}
+    known, noted = truth.known(), truth.note or "the reference gradient is not finite"
+    status = finite_status(noted, truth.batches)
     w = noise.shared(cell.seed, cell.scene.name, cell.repeats, cell.samples, program.n_noise)
-    known = truth.known()
     zeroth = zeroth_order(problem, theta, w).mean(axis=1)
-    result["zeroth_rmse_rel"] = asdict(statistics.summarise(zeroth, known, cell.samples))["rmse_rel"]
+    result |= {
+        "reference_method": truth.method, "device": problem.device,
+        "zeroth_rmse_rel": statistics.summarise(zeroth, known, cell.samples).rmse_rel,
+    }  # fmt: skip
+    remark = "computes no gradients"
     if has_gradient:
         check = difference_check(problem)
-        scale = float(np.linalg.norm(check.difference))
-        error = float(np.linalg.norm(check.gradient - check.difference))
-        result |= {
-            "gradient": check.gradient.tolist(),
-            "program_error_rel": error / scale if scale > 0 else math.nan,
-            "difference_step": check.step,
-        } | _model_error(cell, session, check.gradient)
         gradients = problem.grad(theta, w.reshape(-1, program.n_noise).T)
-        result["nan_share"] = float(1.0 - np.isfinite(gradients).all(axis=0).mean())
         means = gradients.T.reshape(cell.repeats, cell.samples, -1).mean(axis=1)
         summary = asdict(statistics.summarise(means, known, cell.samples))
-        result |= {name: summary[name] for name in SUMMARY}
-        if result["status"] == "ok" and not (np.isfinite(gradients).all() and np.isfinite(check.gradient).all()):
-            result |= {"status": "nonfinite", "reason": "some gradients are not finite"}
-        result["reason"] = "; ".join(part for part in (result["reason"], summary["note"]) if part)
-    else:
-        result["reason"] = "; ".join(part for part in (result["reason"], "computes no gradients") if part)
-    result["device"] = problem.device
+        result |= {
+            "gradient": check.gradient.tolist(),
+            "program_error_rel": relative_error(check.gradient, check.difference),
+            "difference_step": check.step,
+            "nan_share": float(1.0 - np.isfinite(gradients).all(axis=0).mean()),
+            **_model_error(cell, session, check.gradient), **{name: summary[name] for name in SUMMARY},
+        }  # fmt: skip
+        if status["status"] == "ok":
+            status = finite_status("some gradients are not finite", gradients, check.gradient)
+        remark = summary["note"]
+    status["reason"] = "; ".join(filter(None, (status["reason"], remark)))
     if isinstance(problem, EngineProblem):
         result["engine_settings"] = ";".join(f"{name}={value}" for name, value in problem.settings.items())
-    result["memory_mb"] = problem.peak_memory_mb if isinstance(problem, EngineProblem) else timing.peak_memory_mb()
-    return result
+    memory = problem.peak_memory_mb if isinstance(problem, EngineProblem) else timing.peak_memory_mb()
+    return status | result | {"memory_mb": memory}
 
 
 def _model_error(cell: Cell, session: Session, gradient: np.ndarray) -> dict[str, Any]:
     """Return the distance from the gradient of rigid contact or, where it is unknown, of the scene's own program."""
-    expected, model = cell.program().physical_gradient(), RIGID
+    expected, model = cell.program().physical_gradient(), "rigid contact"
     if expected is None:
         if not cell.ranked_backends:
             return {"model": ""}
         own = session.problems.of(cell.ranked_backends[0], cell)
-        expected, model = own.grad(own.program.theta0, np.zeros((own.program.n_noise, 1)))[:, 0], OWN
-    error = float(np.linalg.norm(gradient - expected) / np.linalg.norm(expected))
+        expected = own.grad(own.program.theta0, np.zeros((own.program.n_noise, 1)))[:, 0]
+        model = "the scene's own program"
+    error = relative_error(gradient, expected)
     return {"model": model, "model_gradient": expected.tolist(), "model_error_rel": error}
 
 
-def _times(cell: Cell, problem: Problem, batch: int, timed_calls: int, has_gradient: bool) -> dict[str, float]:
+def _times(cell: Cell, problem: Problem, study: Engines, has_gradient: bool) -> dict[str, Any]:
     """Return the times of first and later calls, and the shares of a gradient's time outside the engine."""
     theta, n_noise = problem.program.theta0, problem.program.n_noise
-    w = noise.shared(cell.seed, cell.scene.name, 1, batch, n_noise)[0].T
+    w = noise.shared(cell.seed, cell.scene.name, 1, study.batch, n_noise)[0].T
     functions: dict[str, Callable[..., np.ndarray]] = {"value_s": problem.value}
     if has_gradient:
         functions["gradient_s"] = problem.grad
@@ -89,7 +87,7 @@ def _times(cell: Cell, problem: Problem, batch: int, timed_calls: int, has_gradi
     for name, function in functions.items():
         before = _inside(problem)
         started = time.perf_counter()
-        _, clock = timing.timed(lambda _, function=function: function(theta, w), timed_calls)  # type: ignore[misc]
+        _, clock = timing.timed(lambda _, function=function: function(theta, w), study.timed_calls)  # type: ignore[misc]
         elapsed = time.perf_counter() - started
         result[name] = clock.median_s
         if name == "gradient_s" and isinstance(problem, EngineProblem):

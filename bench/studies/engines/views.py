@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pandas as pd
 from scipy.special import chdtri
@@ -14,7 +12,6 @@ from bench.experiment.views import Chart, Style, Views
 from bench.report.shown import Shown
 from bench.report.style import PALETTE
 from bench.report.text import number
-from bench.report.writer import reasons
 
 ACCURATE = 0.02
 """Relative program error up to which a gradient counts as the derivative of its program. Differences of float32 costs
@@ -56,44 +53,36 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     shown = Shown(experiment, rows)
     cells = with_limits(shown.rows)
     measured = cells["status"].isin(("ok", "nonfinite"))
-    levels = [
-        level(row) if is_measured else "" for (_, row), is_measured in zip(cells.iterrows(), measured, strict=True)
-    ]
-    cells = cells.assign(level=levels)
+    cells = cells.assign(level=np.where(measured, levels(cells), ""))
     columns = experiment.columns.by_name | {"rmse_rel": shown.column("rmse_rel", limit="rmse_is_limit")}
     own, details = ([columns[name] for name in names] for names in (SHOWN, DETAILS))
     table = shown.cells([text("level", label="gradient"), *own], "gradients of physics engines", NOTES, rows=cells)
     charts = [_chart(cells[measured])] if measured.any() else []
-    return Views(
-        [table], charts, rows=with_limits(shown.arranged.rows), columns=[*own, *details], remarks=reasons(rows)
-    )
+    return Views([table], charts, with_limits(shown.arranged.rows), [*own, *details])
 
 
-def level(row: pd.Series) -> str:
-    """Return the level of a row's gradient, a key of :data:`LEVELS`."""
-    if len(row["gradient"]) == 0:
-        return "none"
-    if row["status"] != "ok" or row["nan_share"] > 0 or not row["program_error_rel"] <= ACCURATE:
-        return "wrong"
-    low, high = rmse_interval(row)
-    if low >= USELESS:
-        return "noisy"
-    if not high < USELESS:
-        return "open"
-    return "right" if row["model_error_rel"] <= SAME else "own"
+def levels(rows: pd.DataFrame) -> np.ndarray:
+    """Return the level of each row's gradient, a key of :data:`LEVELS`."""
+    low, high = rmse_interval(rows)
+    is_right = (rows["status"] == "ok") & ~(rows["nan_share"] > 0) & (rows["program_error_rel"] <= ACCURATE)
+    kinds = {
+        "none": rows["gradient"].map(len) == 0, "wrong": ~is_right, "noisy": low >= USELESS, "open": ~(high < USELESS),
+        "right": rows["model_error_rel"] <= SAME,
+    }  # fmt: skip
+    return np.select(list(kinds.values()), list(kinds), "own")
 
 
-def rmse_interval(row: pd.Series) -> tuple[float, float]:
-    """Return an interval of at least 95% of a row's relative RMSE, from the intervals of bias, variance and norm.
+def rmse_interval(rows: pd.DataFrame) -> tuple[pd.Series, pd.Series]:
+    """Return an interval of at least 95% of each relative RMSE, from the intervals of bias, variance and norm.
 
     The variance's interval is that of normal numbers, one per repeat. The reference's error is in the interval of the bias,
     and makes that of the norm two standard errors wide. The upper end is infinite where the norm may be 0.
     """
-    free = max(int(row["repeats"]) - 1, 1)
-    low, high = (math.sqrt(row["variance"] * free / float(chdtri(free, tail))) for tail in (0.025, 0.975))
-    reach, norm = 2.0 * row["reference_se"], row["reference_norm"]
-    upper = math.hypot(row["bias_high"], high) / (norm - reach) if norm > reach else math.inf
-    return math.hypot(row["bias_low"], low) / (norm + reach), upper
+    free = np.maximum(rows["repeats"] - 1, 1)
+    low, high = (np.sqrt(rows["variance"] * free / chdtri(free, tail)) for tail in (0.025, 0.975))
+    reach, norm = 2.0 * rows["reference_se"], rows["reference_norm"]
+    upper = np.hypot(rows["bias_high"], high) / (norm - reach)
+    return np.hypot(rows["bias_low"], low) / (norm + reach), upper.where(norm > reach, np.inf)
 
 
 def with_limits(rows: pd.DataFrame) -> pd.DataFrame:
@@ -103,26 +92,16 @@ def with_limits(rows: pd.DataFrame) -> pd.DataFrame:
     """
     known = rows["reference_norm"].notna()
     hidden = known & ~(rows["rmse_rel"] > 2.0 * rows["reference_se"] / rows["reference_norm"])
-    limits = pd.Series({i: rmse_interval(row)[1] for i, row in rows[hidden].iterrows()}, dtype=float)
-    shown = rows.assign(rmse_is_limit=hidden)
-    shown.loc[hidden, "rmse_rel"] = limits.where(np.isfinite(limits))
-    return shown
+    limit = rmse_interval(rows)[1].replace(np.inf, np.nan)
+    return rows.assign(rmse_is_limit=hidden, rmse_rel=rows["rmse_rel"].mask(hidden, limit))
 
 
 def _chart(measured: pd.DataFrame) -> Chart:
     """Return the grid of engines and scenes, coloured by level, with the model error of each gradient."""
-    several = measured["contact"].nunique() > 1
-    places = [
-        f"{row['scene']}, rigid" if several and row["contact"] == "impulse" else row["scene"]
-        for _, row in measured.iterrows()
-    ]
-    frame = measured.assign(
-        place=places,
-        cell=[
-            f"{LEVELS[row['level']].letter} {number(row['model_error_rel'])}" if row["level"] != "none" else "-"
-            for _, row in measured.iterrows()
-        ],
-    )
+    rigid = (measured["contact"] == "impulse") & (measured["contact"].nunique() > 1)
+    letters = measured["level"].map({name: style.letter for name, style in LEVELS.items()})
+    errors = (" " + measured["model_error_rel"].map(number)).mask(measured["level"] == "none", "")
+    frame = measured.assign(place=measured["scene"] + rigid.map({True: ", rigid", False: ""}), cell=letters + errors)
     return Chart(
         "engines", frame, [text("place", label="")], [text("method", label="")], "grid",
         level="level", cell="cell", styles=LEVELS, height=0.3, across=1,

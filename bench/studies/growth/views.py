@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pandas as pd
+from scipy.special import stdtrit
 
 from bench.experiment.columns import COMMON, Column, text
 from bench.experiment.experiment import Experiment
-from bench.experiment.views import Chart, Style, Table, Views
-from bench.report.colours import estimator_colour
-from bench.report.shown import Shown, stacked
+from bench.experiment.views import Chart, Table, Views
+from bench.report.shown import Shown
 from bench.report.text import axis_value
-from bench.report.writer import reasons
-from bench.studies.growth.columns import ORDERS
-from bench.studies.growth.fits import fit
+from bench.studies.growth import ORDERS, RATES
 
+STRONG = 20.0
+"""Ratio of likelihoods from which one curve beats the other. By it, at most 5% of noisy power laws count as exploding."""
+ROUNDING = 1e-6
+"""Smallest error of a norm's logarithm: norms that a curve describes exactly differ from it by rounding."""
+FEWEST = 5
+"""Fewest horizons of a verdict: with four, 8% of noisy power laws count as exploding."""
 PROBLEM = ("scene", "contact", "integrator", "backend")
 """Parts of the grid that identify a problem. It is drawn along the horizon and the axes that step with it."""
-FIRST = "first order at every horizon"
 VERDICT = (
     text("problem"),
     text("verdict", "what the norms do along the horizon"),
@@ -41,92 +45,92 @@ NOTE = (
     "and of the spectral radius of the Jacobian product dx_N/dx_0, per second, mean and 95% interval. Jacobian product: "
     "exploding if the spectral radius certainly grows, vanishing if the stretch certainly falls. variance: per sample, median."
 )
-RATES = ("stretch", "spectral")
 
 
 def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     """Return a table with a line per problem and one with a line per cell, and the charts."""
     shown = Shown(experiment, rows, along=["horizon"], method=(), problem=PROBLEM)
     per_second = {
-        f"{rate}_{end}": shown.rows[f"{rate}_{end}"] / shown.rows["dt"]
-        for rate in RATES
-        for end in ("rate", "low", "high")
-    }
+        f"{name}_{end}": shown.rows[f"{name}_{end}"] / shown.rows["dt"] for name in RATES for end in ("rate", "low", "high")
+    }  # fmt: skip
     columns = [
         COMMON["horizon"], shown.column("time_horizon"), shown.column("gradient_median"),
-        *(shown.column(f"{rate}_rate", unit="1/s") for rate in RATES), shown.column("growth"),
+        *(shown.column(f"{name}_rate", unit="1/s") for name in RATES), shown.column("growth"),
         *(shown.column(f"{order}_variance", low="", high="") for order in ORDERS),
     ]  # fmt: skip
     cells = shown.cells(columns, "growth of gradients with the horizon", [NOTE], ("scene", "contact"),
                         shown.rows.assign(**per_second), terminal=False)  # fmt: skip
     good = shown.rows[np.isfinite(shown.rows["gradient_median"]) & (shown.rows["gradient_median"] > 0)]
     if good.empty:
-        return Views([cells], remarks=reasons(rows))
-    lines = verdicts(good)
+        return Views([cells])
+    lines = pd.DataFrame([verdict(part) for _, part in good.groupby("problem", sort=False)])
     answers = Table(
         "growth_verdicts", lines, VERDICT, "Growth of the gradient", [VERDICT_NOTE], terminal=True, page=True
     )
+    drawn = ("gradient_median", *(f"{order}_variance" for order in ORDERS))
+    chart = Chart(
+        "growth", good, [shown.column("time_horizon", log=True), COMMON["horizon"]],
+        [*(shown.column(name, log=True) for name in drawn), *(shown.column(f"{name}_rate", unit="per step") for name in RATES)],
+        panel="problem", across=5, height=1.9, band=True, panel_notes=dict(zip(lines["problem"], lines["verdict"], strict=True)),
+        text="Medians, and 5% to 95% of the noise samples (of the repeats, for variances); rates are means with 95% intervals. "
+        "On these axes a power law is straight and an exponential bends upwards.",
+    )  # fmt: skip
     named = shown.arranged.rows.assign(problem=shown.rows["problem"]).fillna({"problem": ""})
-    return Views([answers, cells], charts(shown, good, lines), named, remarks=reasons(rows))
+    return Views([answers, cells], [chart], named)
 
 
-def verdicts(good: pd.DataFrame) -> pd.DataFrame:
-    """Return a line per problem: the curves through the norms of its rows, the verdict, and where variances cross."""
-    lines = []
-    for problem, part in good.groupby("problem", sort=False):
-        part = part.sort_values("time_horizon", kind="stable")
-        counts = part["samples"] * part["repeats"] * part["finite_fraction"]
-        spread = np.log(part["gradient_three_quarters"] / part["gradient_quarter"])
-        # standard error of a normal median: 1.2533 sigma / sqrt(n), and sigma is the interquartile range / 1.349
-        errors = (1.2533 / 1.349 * spread / np.sqrt(counts)).fillna(0.0).to_numpy(float)
-        horizons, norms = (part[name].to_numpy(float) for name in ("time_horizon", "gradient_median"))
-        fitted = fit(horizons, norms, errors, bounded=part["growth"].iloc[-1] in ("neutral", "vanishing"))
-        slopes = {"order": fitted.power, "rate": fitted.exponential}
-        ends = {f"{name}{end}": value for name, slope in slopes.items()
-                for end, value in (("", slope.value), ("_low", slope.low), ("_high", slope.high))}  # fmt: skip
-        zeroth = (part["zeroth_order_variance_high"] < part["first_order_variance_low"]).to_numpy()
-        start = 0 if zeroth.all() else len(zeroth) - int(np.argmin(zeroth[::-1]))
-        lower = (
-            FIRST
-            if (part["first_order_variance_high"] < part["zeroth_order_variance_low"]).all()
-            else "open at the longest horizon"
-        )
-        if is_crossed := start < len(horizons):
-            lower = f"zeroth order from {axis_value(horizons[start])} s"
-        lines.append({"problem": problem, "verdict": fitted.verdict, "odds": fitted.odds, **ends, "lower": lower,
-                      "zeroth_from": horizons[start] if is_crossed else math.nan})  # fmt: skip
-    return pd.DataFrame(lines)
+def verdict(rows: pd.DataFrame) -> dict[str, Any]:
+    """Return the line of one problem: the curves through its norms, the verdict, and where variances cross."""
+    rows = rows.sort_values("time_horizon", kind="stable")
+    counts = rows["samples"] * rows["repeats"] * rows["finite_fraction"]
+    spread = np.log(rows["gradient_three_quarters"] / rows["gradient_quarter"])
+    # standard error of a normal median: 1.2533 sigma / sqrt(n), and sigma is the interquartile range / 1.349
+    errors = (1.2533 / 1.349 * spread / np.sqrt(counts)).fillna(0.0).to_numpy(float)
+    horizons, norms = (rows[name].to_numpy(float) for name in ("time_horizon", "gradient_median"))
+    fitted = fit(horizons, norms, errors, bounded=rows["growth"].iloc[-1] in ("neutral", "vanishing"))
+    zeroth = (rows["zeroth_order_variance_high"] < rows["first_order_variance_low"]).to_numpy()
+    is_first = (rows["first_order_variance_high"] < rows["zeroth_order_variance_low"]).all()
+    # the first of the longest horizons at all of which the zeroth order varies less
+    start = horizons[np.logical_and.accumulate(zeroth[::-1])[::-1]].min(initial=math.inf)
+    lower = "first order at every horizon" if is_first else "open at the longest horizon"
+    is_crossed = math.isfinite(start)
+    return {"problem": rows["problem"].iloc[0], **fitted,
+            "lower": f"zeroth order from {axis_value(start)} s" if is_crossed else lower,
+            "zeroth_from": start if is_crossed else math.nan}  # fmt: skip
 
 
-def looks() -> dict[str, Style]:
-    """Return the look of the variance of each order."""
-    return {
-        "first_order": Style(estimator_colour("fobg"), "D"),
-        "zeroth_order": Style(estimator_colour("reinforce"), "P", (0, (4, 1.5))),
+def fit(horizons: np.ndarray, norms: np.ndarray, errors: np.ndarray, bounded: bool = False) -> dict[str, Any]:
+    """Fit a power law and an exponential to norms ``(n,)``; return the verdict on which they follow, ``odds`` and slopes.
+
+    ``errors`` are the standard errors of the norms' logarithms. ``bounded`` states that the Jacobian product does not
+    grow, which leaves the power law if the norms do not contradict it. The ratio of likelihoods of two least-squares fits
+    with equally many parameters is (residual_1 / residual_2)^(n/2).
+    """
+    errors, places = np.maximum(errors, ROUNDING), {"order": np.log(horizons), "rate": horizons}
+    found = {
+        f"{name}{end}": value for name, at in places.items() for end, value in _slope(at, np.log(norms), errors).items()
     }
+    residuals = [found.pop(f"{name}_residual") for name in places]
+    odds = (residuals[0] / residuals[1]) ** (len(norms) / 2) if len(norms) >= FEWEST else math.nan
+    verdict = "open"
+    if odds >= STRONG and found["rate_low"] > 0:
+        verdict = "exploding"
+    elif (odds >= STRONG and found["rate_high"] < 0) or (odds <= 1 / STRONG and found["order_high"] < 0):
+        verdict = "vanishing"
+    elif found["order_low"] > 0 and (odds <= 1 / STRONG or (odds <= 1 and bounded)):
+        verdict = "polynomial"
+    return {"verdict": verdict, "odds": odds, **found}
 
 
-def charts(shown: Shown, good: pd.DataFrame, lines: pd.DataFrame) -> list[Chart]:
-    """Return the norms along the horizon, and for the page variances of both orders, rates, and gains by lag."""
-    horizon = [shown.column("time_horizon", log=True), COMMON["horizon"]]
-    names = {order: f"{name} term" for order, name in ORDERS.items()}
-    variances = stacked(good, {name: f"{order}_variance" for order, name in names.items()}, "variance")
-    variance = Column("variance", label="variance per sample", low="variance_low", high="variance_high", log=True)
-    values = ["lags", "gain", "gain_low", "gain_high"]
-    longest = good.sort_values("horizon", kind="stable").drop_duplicates("problem", keep="last").sort_index()
-    gains = longest[["problem", "row", *values]].explode(values, ignore_index=True).astype(dict.fromkeys(values, float))
-    gain = shown.column("gain", kind="number", low="gain_low", high="gain_high", log=True)
-    rates = [shown.column(f"{rate}_rate", unit="per step") for rate in reversed(RATES)]
-    norm = shown.column("gradient_median", log=True)
-    return [
-        Chart("growth", good, horizon[:1], [norm], panel="problem", across=5, height=1.9, band=True,
-              panel_notes=dict(zip(lines["problem"], lines["verdict"], strict=True)),
-              text="Median over noise samples, and 5% to 95% of them. On these axes a power law is straight and an exponential "
-              "bends upwards."),
-        Chart("growth_variances", variances, horizon, [variance], series="series", panel="problem", printed=False,
-              styles={name: looks()[order] for order, name in names.items()}, text="Median over repeats, and 5% to 95% of them."),
-        Chart("growth_rates", good, horizon, [norm, *rates], series="problem", printed=False,
-              text="Means over noise samples with 95% intervals, per step."),
-        Chart("growth_gains", gains, [shown.column("lags", kind="number", label="lag")], [gain], series="problem", printed=False,
-              text="Largest singular value of the Jacobian product over that many steps: median and 5% to 95% of the rollouts."),
-    ]  # fmt: skip
+def _slope(places: np.ndarray, logarithms: np.ndarray, errors: np.ndarray) -> dict[str, float]:
+    """Return the slope of a line with its 95% interval (Student's t), and the sum of squared residuals and errors."""
+    count, names = len(places), ("", "_low", "_high", "_residual")
+    if count < 3 or np.ptp(places) == 0:
+        return dict.fromkeys(names, math.nan)
+    away = places - places.mean()
+    slope = float(away @ logarithms / (away @ away))
+    start = float(logarithms.mean() - slope * places.mean())
+    left = logarithms - start - slope * places
+    residual = float(left @ left + errors @ errors)
+    reach = float(stdtrit(count - 2, 0.975)) * math.sqrt(residual / (count - 2) / float(away @ away))
+    return dict(zip(names, (slope, slope - reach, slope + reach, residual), strict=True))

@@ -4,27 +4,34 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import ClassVar
 
 from bench.experiment.cell import Cell
 from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, text
-from bench.experiment.experiment import Experiment
-from bench.experiment.session import Session
-from bench.experiment.study import Study
-from bench.experiment.views import Views
 from bench.model import Estimator, KnownOptimum, Optimizer, Plugin, param
 from bench.model.program import OWN
-
-if TYPE_CHECKING:
-    import pandas as pd
+from bench.studies import StudyPackage
 
 
 @dataclass(frozen=True)
-class Optimise(Study):
+class SearchStudy(StudyPackage):
+    """A study whose cells search with an optimizer."""
+
+    axes: ClassVar[tuple[str, ...]] = ("scene", "contact", "integrator", "backend", "estimator", "optimizer")
+
+    def parts(self, given: dict[str, Plugin | None]) -> dict[str, Plugin | None]:
+        """Return the plugins, without the estimator if the optimizer uses only costs: it then has no effect."""
+        optimizer = given.get("optimizer")
+        if isinstance(optimizer, Optimizer) and "gradient" not in optimizer.needs:
+            return given | {"estimator": None}
+        return given
+
+
+@dataclass(frozen=True)
+class Optimise(SearchStudy):
     """Searches for the best theta with each estimator and optimizer, and records the path."""
 
     name = "optimise"
-    axes: ClassVar[tuple[str, ...]] = ("scene", "contact", "integrator", "backend", "estimator", "optimizer")
     timed: ClassVar[bool] = True
     columns: ClassVar[Columns] = Columns.of(
         text("optimizer", "identity string of the optimizer"),
@@ -74,19 +81,6 @@ class Optimise(Study):
     quality: str = param("start", "where the gradient's quality is measured", choices=("none", "start", "path"))
     quality_samples: int = param(4096, "gradients of the reference of the quality", low=64)
 
-    def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
-        """Return one cell's results by column. Untimed cells that differ only in their seed share batches of rollouts."""
-        from bench.studies.optimise.measure import measure
-
-        return measure(cell, session, self)
-
-    def parts(self, given: dict[str, Plugin | None]) -> dict[str, Plugin | None]:
-        """Return the plugins, without the estimator if the optimizer uses only costs: it then has no effect."""
-        optimizer = given.get("optimizer")
-        if isinstance(optimizer, Optimizer) and "gradient" not in optimizer.needs:
-            return given | {"estimator": None}
-        return given
-
     def unsupported_reason(self, cell: Cell) -> str | None:
         """Return why a cell cannot be searched (no gradient, or a target below the optimum), or None."""
         optimizer, estimator = cell.parts["optimizer"], cell.parts["estimator"]
@@ -102,9 +96,3 @@ class Optimise(Study):
             if self.target < optimum:
                 return f"target={self.target:g} is below the optimum {optimum:.10g} of scene {cell.scene.name} ({how})"
         return None
-
-    def views(self, experiment: Experiment, rows: pd.DataFrame) -> Views:
-        """Return the tables and charts: targets reached by method, regret, errors of gradients, tuning."""
-        from bench.studies.optimise.views import views
-
-        return views(experiment, rows)

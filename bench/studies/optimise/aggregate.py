@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -43,16 +42,6 @@ class RunSet:
     tuned_axes: tuple[Axis, ...]
     """The swept parameters of optimizers."""
 
-    @property
-    def problems(self) -> list[str]:
-        """The problems, in order of appearance."""
-        return list(dict.fromkeys(self.rows["problem"]))
-
-    @property
-    def methods(self) -> list[str]:
-        """The methods, in order of appearance."""
-        return list(dict.fromkeys(self.rows["method"]))
-
     @cached_property
     def tuning_seeds(self) -> tuple[int, ...]:
         """The seeds that choose the tunings and do not score: the first third. Empty without tunings or with few seeds."""
@@ -67,28 +56,20 @@ class RunSet:
         The median is over the tuning seeds, or over all seeds if there are no tuning seeds. A failed search counts as
         inf.
         """
-        best: dict[tuple[str, str], tuple[float, str]] = {}
         rows = self.rows[self.rows["seed"].isin(self.tuning_seeds)] if self.tuning_seeds else self.rows
         final = rows["final_cost"].where(rows["status"] == "ok", math.inf).fillna(math.inf)
-        for key, part in final.groupby([rows[n] for n in ("problem", "method", "tuning")], sort=False):
-            problem, method, tuning = (str(k) for k in key)
-            # the lower of the two middle costs, because their mean is infinite if one search failed
-            middle = float(np.sort(part.to_numpy())[(len(part) - 1) // 2])
-            if (problem, method) not in best or middle < best[problem, method][0]:
-                best[problem, method] = (middle, tuning)
-        return {key: tuning for key, (_, tuning) in best.items()}
+        # the lower of the two middle costs, because their mean is infinite if one search failed
+        groups = final.groupby([rows[n] for n in ("problem", "method", "tuning")], sort=False)
+        middle = groups.agg(lambda costs: np.sort(costs)[(len(costs) - 1) // 2])
+        best = middle.reset_index().sort_values("final_cost", kind="stable").drop_duplicates(["problem", "method"])
+        return dict(zip(zip(best["problem"], best["method"], strict=True), best["tuning"], strict=True))
 
     @cached_property
     def best_runs(self) -> pd.DataFrame:
         """The rows of each method's best tuning on each problem, without the tuning seeds."""
         rows = self.rows[~self.rows["seed"].isin(self.tuning_seeds)]
-        keys = zip(rows["problem"], rows["method"], rows["tuning"], strict=True)
-        return rows[[self.best_tunings.get((problem, method)) == tuning for problem, method, tuning in keys]]
-
-    def by_method(self) -> Iterator[tuple[str, str, pd.DataFrame]]:
-        """Yield each problem and method, with the rows of its best tuning."""
-        for key, part in self.best_runs.groupby(["problem", "method"], sort=False):
-            yield str(key[0]), str(key[1]), part
+        best = [(*key, tuning) for key, tuning in self.best_tunings.items()]
+        return rows[pd.MultiIndex.from_frame(rows[["problem", "method", "tuning"]]).isin(best)]
 
     def gradient_ratio(self, problem: str, default: float) -> float:
         """Return the rollouts that take as long as one gradient: the median over searches, or ``default`` if untimed."""
@@ -142,71 +123,42 @@ def _best_known_cost(rows: pd.DataFrame) -> tuple[pd.Series, pd.Series]:
     return known.mask(below, lowest), status
 
 
-# -------------------------------------------------------------------------------------------------- single paths
-
-
-def rollouts_spent(row: pd.Series, ratio: float) -> np.ndarray:
-    """Return the rollouts spent up to each stored point of a path, where a gradient counts as ``ratio`` rollouts."""
-    return np.asarray(row["path_rollouts"], dtype=float) + ratio * np.asarray(row["path_gradients"], dtype=float)
-
-
-def regret(row: pd.Series) -> np.ndarray:
-    """Return the regret J(theta_t) - J* at each stored point of a path, at least :data:`ROUNDING` of the first regret."""
-    cost = np.asarray(row["path_cost"], dtype=float)
-    rounding = ROUNDING * max(abs(row["start_cost"] - row["best_known"]), 1e-300)
-    return np.asarray(np.maximum(cost - row["best_known"], rounding))
-
-
-def regret_quantiles(rows: pd.DataFrame, spent: Sequence[np.ndarray], grid: np.ndarray) -> np.ndarray:
-    """Return the 20%, 50% and 80% quantiles of regret over paths at each budget of ``grid``: ``(3, len(grid))``.
-
-    ``spent`` has the budget spent up to each point of each path. After its end, a path has its last regret, or infinite
-    regret if it diverged.
-    """
-    lines = []
-    for places, (_, row) in zip(spent, rows.iterrows(), strict=True):
-        values = np.append(regret(row), math.inf if row["status"] == "diverged" else regret(row)[-1])
-        ends = np.append(places, places[-1] * (1 + 1e-9) + 1e-12)
-        lines.append(values[np.maximum(np.searchsorted(ends, grid, side="right") - 1, 0)])
-    return np.quantile(np.where(np.isnan(lines), math.inf, lines), [0.2, 0.5, 0.8], axis=0, method="nearest")
-
-
-def hitting_times(rows: pd.DataFrame, factor: float, ratio: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rollouts until each path's regret is at most its first regret / ``factor``, and whether it reaches that.
-
-    A path that never reaches the target has the number of all its rollouts. A gradient counts as ``ratio`` rollouts.
-    """
-    rollouts, reached = [], []
-    for _, row in rows.iterrows():
-        spent = rollouts_spent(row, ratio)
-        below = np.flatnonzero(regret(row) <= regret(row)[0] / factor)
-        rollouts.append(float(spent[below[0] if below.size else -1]))
-        reached.append(bool(below.size))
-    return np.array(rollouts), np.array(reached)
-
-
 # ------------------------------------------------------------------------------------------------------- tables
 
 
 @remember
-def times_to_targets(runs: RunSet, default: float) -> pd.DataFrame:
-    """Return, per problem, method and target, successes with Wilson's interval and the average runtime in rollouts.
+def hits(runs: RunSet, default: float) -> pd.DataFrame:
+    """Return a line per search and target: the rollouts until it is reached, of the whole search if not, and whether.
 
-    ``default``, here and below, is the number of rollouts that a gradient counts as if no times were measured.
+    Reached is where the regret J(theta_t) - J* is at most the first regret over the target. ``default``, here and below,
+    is the number of rollouts that a gradient counts as if no times were measured.
     """
     lines = []
-    for problem, method, part in runs.by_method():
-        ratio = runs.gradient_ratio(problem, default)
-        for factor in TARGETS:
-            costs, reached = hitting_times(part, factor, ratio)
-            low, high = performance.wilson(int(reached.sum()), len(reached))
-            art_low, art_high = performance.runtime_interval(costs, reached)
-            lines.append({
-                "problem": problem, "method": method, "tuning": runs.best_tunings[problem, method], "target": factor,
-                "successes": int(reached.sum()), "searches": len(reached), "rate": float(reached.mean()),
-                "rate_low": low, "rate_high": high, "art": performance.average_runtime(costs, reached),
-                "art_low": art_low, "art_high": art_high,
-            })  # fmt: skip
+    for row in runs.best_runs.to_dict("records"):
+        ratio = runs.gradient_ratio(row["problem"], default)
+        spent = np.asarray(row["path_rollouts"], dtype=float) + ratio * np.asarray(row["path_gradients"], dtype=float)
+        rounding = ROUNDING * max(abs(row["start_cost"] - row["best_known"]), 1e-300)
+        regret = np.maximum(np.asarray(row["path_cost"], dtype=float) - row["best_known"], rounding)
+        for target in TARGETS:
+            below = np.flatnonzero(regret <= regret[0] / target)
+            lines.append([row["problem"], row["method"], target, spent[below[0] if below.size else -1], below.size > 0])
+    return pd.DataFrame(lines, columns=["problem", "method", "target", "spent", "reached"])
+
+
+@remember
+def times_to_targets(runs: RunSet, default: float) -> pd.DataFrame:
+    """Return, per problem, method and target, successes with Wilson's interval and the average runtime in rollouts."""
+    lines = []
+    for (problem, method, target), part in hits(runs, default).groupby(["problem", "method", "target"], sort=False):
+        costs, reached = part["spent"].to_numpy(), part["reached"].to_numpy()
+        low, high = performance.wilson(int(reached.sum()), len(reached))
+        art_low, art_high = performance.runtime_interval(costs, reached)
+        lines.append({
+            "problem": problem, "method": method, "tuning": runs.best_tunings[problem, method], "target": target,
+            "successes": int(reached.sum()), "searches": len(reached), "rate": float(reached.mean()),
+            "rate_low": low, "rate_high": high, "art": performance.average_runtime(costs, reached),
+            "art_low": art_low, "art_high": art_high,
+        })  # fmt: skip
     return pd.DataFrame(lines)
 
 
@@ -215,13 +167,10 @@ def runtimes(runs: RunSet, default: float) -> pd.DataFrame:
 
     The weights of a method add up to 1, in equal parts for its problems and targets.
     """
-    lines = []
-    for problem, method, part in runs.by_method():
-        for factor in TARGETS:
-            spent, reached = hitting_times(part, factor, runs.gradient_ratio(problem, default))
-            lines += [(method, 1.0 / len(spent), cost) for cost in np.where(reached, spent, math.inf)]
-    table = pd.DataFrame(lines, columns=["method", "weight", "runtime"])
-    return table.assign(weight=table["weight"] / table.groupby("method")["weight"].transform("sum"))
+    table = hits(runs, default)
+    weight = 1.0 / table.groupby(["problem", "method", "target"])["spent"].transform("size")
+    total = weight.groupby(table["method"]).transform("sum")
+    return table.assign(runtime=table["spent"].where(table["reached"], math.inf), weight=weight / total)
 
 
 def share_of_targets(reached: pd.DataFrame) -> tuple[float, float]:
@@ -245,7 +194,7 @@ def summarise(runs: RunSet, default: float, baseline: str = "fobg") -> pd.DataFr
     """
     reached = times_to_targets(runs, default)
     fastest = reached.groupby(["problem", "target"])["art"].transform("min") if len(reached) else None
-    base = next((m for m in runs.methods if m.partition(",")[0].partition("[")[0] == baseline), None)
+    base = next((m for m in runs.rows["method"].unique() if m.partition(",")[0].partition("[")[0] == baseline), None)
     lines = []
     for method, part in runs.best_runs.groupby("method", sort=False):
         strata = [scores["score"].dropna().to_numpy() for _, scores in part.groupby("problem", sort=False)]
@@ -295,18 +244,15 @@ def quality_and_runtime(runs: RunSet, default: float, factor: float = TARGETS[0]
 
     ``art`` is the average runtime, in rollouts, until the regret is the first regret / ``factor``.
     """
-    lines = []
-    for problem, method, part in runs.by_method():
+    reached, lines = times_to_targets(runs, default).set_index(["problem", "method", "target"])["art"], []
+    for (problem, method), part in runs.best_runs.groupby(["problem", "method"], sort=False):
         first = part.iloc[0]
-        if not math.isfinite(first["quality_rmse_rel"]):
-            continue
-        costs, reached = hitting_times(part, factor, runs.gradient_ratio(problem, default))
-        lines.append({
-            "problem": problem, "method": method, "estimator": method.partition(",")[0], "scene_class": first["scene_class"],
-            "rmse_rel": float(part["quality_rmse_rel"].median()), "cosine": float(part["quality_cosine"].median()),
-            "bias_share": float(part["quality_bias_share"].median()), "sigma": first["sigma"],
-            "art": performance.average_runtime(costs, reached), "most": float(costs.max()),
-        })  # fmt: skip
+        if math.isfinite(first["quality_rmse_rel"]):
+            lines.append({
+                "problem": problem, "method": method, "scene_class": first["scene_class"],
+                **{name: float(part[f"quality_{name}"].median()) for name in ("rmse_rel", "cosine", "bias_share")},
+                "art": reached[problem, method, factor],
+            })  # fmt: skip
     return pd.DataFrame(lines)
 
 
@@ -371,34 +317,18 @@ def path_quality(runs: RunSet) -> pd.DataFrame:
 
     There is one line per problem, method and point of the path, and none if quality was measured only at the start.
     """
-    parts = []
-    for problem, method, part in runs.by_method():
-        counts = part["path_quality_iteration"].map(lambda places: len(_as_list(places)))
-        if not counts.max() > 1:
-            continue
-        whole = part[counts == counts.max()]
-        line: dict[str, Any] = {"problem": problem, "method": method}
-        line["iteration"] = np.median(np.stack(whole["path_quality_iteration"]), axis=0)
-        for prefix, quantity in (("", "rmse_rel"), ("cosine_", "cosine")):
-            ends = np.quantile(np.stack(whole[f"path_quality_{quantity}"]), [0.2, 0.5, 0.8], axis=0)
-            line |= dict(zip((f"{prefix}low", f"{prefix}value", f"{prefix}high"), ends, strict=True))
-        parts.append(pd.DataFrame(line))
-    return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame()
-
-
-def _as_list(value: object) -> list[float]:
-    return list(value) if isinstance(value, list | tuple | np.ndarray) else []
-
-
-def scores_by_tuning(runs: RunSet) -> pd.DataFrame:
-    """Return the median score and its 20% to 80% range by problem, method and value of each tuned parameter."""
-    lines = []
-    for axis in runs.tuned_axes:
-        known = runs.rows[np.isfinite(runs.rows[axis.column].astype(float))]
-        for key, part in known.groupby(["problem", "method", axis.column], sort=False):
-            low, middle, high = part["score"].fillna(0.0).quantile([0.2, 0.5, 0.8])
-            lines.append({
-                "axis": axis.column, "problem": key[0], "method": key[1], "value": float(key[2]),
-                "score": middle, "low": low, "high": high, "searches": len(part),
-            })  # fmt: skip
-    return pd.DataFrame(lines, columns=["axis", "problem", "method", "value", "score", "low", "high", "searches"])
+    names = {f"path_quality_{name}": name for name in ("iteration", "rmse_rel", "cosine")}
+    rows = runs.best_runs[["problem", "method", *names]].rename(columns=names)
+    counts = rows["iteration"].map(np.size)
+    most = counts.groupby([rows["problem"], rows["method"]]).transform("max")
+    long = rows[(counts == most) & (most > 1)].explode([*names.values()])
+    groups = long.astype(dict.fromkeys(names.values(), float)).groupby(
+        ["problem", "method", long.groupby(level=0).cumcount()], sort=False
+    )
+    parts = [groups["iteration"].median()]
+    for prefix, name in (("", "rmse_rel"), ("cosine_", "cosine")):
+        parts += [
+            groups[name].quantile(q).rename(f"{prefix}{end}")
+            for end, q in (("low", 0.2), ("value", 0.5), ("high", 0.8))
+        ]
+    return pd.concat(parts, axis=1).reset_index(level=[0, 1])

@@ -8,24 +8,12 @@ import threading
 from collections.abc import Callable, Sequence
 from queue import SimpleQueue
 from typing import Any
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from bench.errors import StorageError, Unsupported
-from bench.experiment.cell import Cell
-from bench.experiment.experiment import Experiment
-from bench.experiment.grid import cells
-from bench.experiment.session import Session
+from bench.errors import StorageError
 from bench.model import Problem
-from bench.studies.optimise.search import (
-    OptimizerRun,
-    Settings,
-    gradient_quality,
-    known_optimum,
-    run_search,
-    scene_class,
-)
+from bench.studies.optimise.search import Wrapped
 
 Outcome = dict[str, Any] | BaseException
 """The columns that a search returns, or the exception that it raises."""
@@ -41,7 +29,7 @@ class Request:
     outcome: Outcome | None = None
 
 
-class Lane(Problem):
+class Lane(Wrapped):
     """A problem shared by several searches: each call waits until every search has made one, then all run as one batch.
 
     Each search has its own thread and its own lane. Only one thread runs at a time, always in the same order, so that
@@ -49,8 +37,8 @@ class Lane(Problem):
     """
 
     def __init__(self, inner: Problem, search: Callable[[Problem], dict[str, Any]]) -> None:
-        super().__init__(inner.program)
-        self._inner, self._search = inner, search
+        super().__init__(inner)
+        self._search = search
         self.device, self.provides = inner.device, inner.provides
         self._requests: SimpleQueue[Request] = SimpleQueue()
         self._answers: SimpleQueue[np.ndarray | BaseException] = SimpleQueue()
@@ -95,21 +83,6 @@ class Lane(Problem):
         """Return per-sample scores ``(d, B)``."""
         return self._call("score", theta, w)
 
-    @property
-    def gives_jacobians(self) -> bool:
-        """Whether the shared problem defines :meth:`jacobians`."""
-        return self._inner.gives_jacobians
-
-    def jacobians(self, theta: np.ndarray, w: np.ndarray) -> Any:
-        """Return the step Jacobians."""
-        return self._inner.jacobians(theta, w)
-
-    def trajectory(self, theta: np.ndarray, w: np.ndarray) -> Any:
-        """Return the states."""
-        return self._inner.trajectory(theta, w)
-
-    _value = _grad = _score = None  # type: ignore[assignment]
-
 
 def run_batched(problem: Problem, searches: Sequence[Callable[[Problem], dict[str, Any]]]) -> list[Outcome]:
     """Run searches in lockstep and return their outcomes in order.
@@ -142,79 +115,3 @@ def _evaluate(problem: Problem, requests: list[Request]) -> list[np.ndarray | Ba
             return [error]
         return list(itertools.chain.from_iterable(_evaluate(problem, [request]) for request in requests))
     return [np.ascontiguousarray(part) for part in np.split(values, np.cumsum(widths)[:-1], axis=-1)]
-
-
-# ------------------------------------------------------------------------------------------------- cells of a study
-
-
-@dataclasses.dataclass(frozen=True)
-class LaneSession:
-    """A session for :func:`~.search.run_search` whose problem is a lane."""
-
-    experiment: Experiment
-    lane: Problem
-
-    def problem(self, cell: Cell) -> Problem:
-        """Return the lane as the problem of any cell."""
-        return self.lane
-
-
-_outcomes: WeakKeyDictionary[Session, dict[str, Outcome]] = WeakKeyDictionary()
-"""Outcomes of searches whose cells are measured later, by session and cell key."""
-_groups: WeakKeyDictionary[Session, dict[str, list[Cell]]] = WeakKeyDictionary()
-"""Cells that differ only in their seed, by session and by their key with seed 0."""
-
-
-def measure_batched(cell: Cell, session: Session, settings: Settings) -> dict[str, Any]:
-    """Return one cell's results by column; cache the results of later cells that differ only in their seed."""
-    outcomes = _outcomes.setdefault(session, {})
-    if cell.key not in outcomes:
-        outcomes |= _run_group(_seed_group(cell, session), session, settings)
-    outcome = outcomes.pop(cell.key)
-    if isinstance(outcome, BaseException):
-        raise outcome
-    return outcome
-
-
-def _seed_group(cell: Cell, session: Session) -> list[Cell]:
-    """Return the cell and the later cells of the experiment that differ from it only in their seed.
-
-    The processes of several workers do not know the other cells: there the cell is searched for separately.
-    """
-    if not session.experiment.choices:
-        return [cell]
-    if session not in _groups:
-        groups: dict[str, list[Cell]] = {}
-        for other in cells(session.experiment):
-            groups.setdefault(_without_seed(other), []).append(other)
-        _groups[session] = groups
-    group = _groups[session].get(_without_seed(cell), [])
-    index = next((i for i, other in enumerate(group) if other.key == cell.key), None)
-    return [cell] if index is None else list({other.key: other for other in group[index:]}.values())
-
-
-def _without_seed(cell: Cell) -> str:
-    return dataclasses.replace(cell, seed=0).key
-
-
-def _run_group(group: list[Cell], session: Session, settings: Settings) -> dict[str, Outcome]:
-    problem = session.problem(group[0])
-    _fill_caches(group[0], problem, session, settings)
-
-    def search(cell: Cell) -> Callable[[Problem], dict[str, Any]]:
-        return lambda lane: run_search(cell, LaneSession(session.experiment, lane), settings)  # type: ignore[arg-type]
-
-    outcomes = run_batched(problem, [search(cell) for cell in group])
-    return {cell.key: outcome for cell, outcome in zip(group, outcomes, strict=True)}
-
-
-def _fill_caches(cell: Cell, problem: Problem, session: Session, settings: Settings) -> None:
-    """Compute the cached values that do not depend on the seed. Ignore errors, because each search raises them again."""
-    try:
-        known_optimum(cell, problem, session, settings)
-        scene_class(cell, problem)
-        if settings.quality != "none":
-            theta0 = np.array(problem.program.theta0, dtype=np.float64)
-            gradient_quality(OptimizerRun(cell, problem, settings), theta0, settings)
-    except (Unsupported, ArithmeticError, ValueError, TypeError):
-        return

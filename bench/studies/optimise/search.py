@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import json
+import math
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,22 +18,43 @@ from bench.measure.solve import solve
 from bench.model import Answer, Estimator, KnownOptimum, Optimizer, Problem, Rollout
 from bench.model.program import OWN
 from bench.run.files import make_directory, write_whole
+from bench.studies.optimise import Optimise
 
 MAX_POINTS = 300
 """Most points of a path to store, about; they are denser in early iterations."""
 MAX_NEWTON_DIM = 1000
 """Largest dimension of theta for which Newton's method computes the optimum."""
 
-Settings = Any
-"""An ``Optimise`` study: its parameters are the settings. Its module imports this module, so its type cannot be named."""
+
+class Wrapped(Problem):
+    """A problem that changes the calls of another one, on the same compiled program."""
+
+    def __init__(self, inner: Problem) -> None:
+        super().__init__(inner.program)
+        self._inner = inner
+
+    @property
+    def gives_jacobians(self) -> bool:
+        """Whether the inner problem defines :meth:`jacobians`."""
+        return self._inner.gives_jacobians
+
+    def jacobians(self, theta: np.ndarray, w: np.ndarray) -> Any:
+        """Return the step Jacobians."""
+        return self._inner.jacobians(theta, w)
+
+    def trajectory(self, theta: np.ndarray, w: np.ndarray) -> Any:
+        """Return the states."""
+        return self._inner.trajectory(theta, w)
+
+    _value = _grad = _score = None  # type: ignore[assignment]
 
 
-class ScaledNoiseProblem(Problem):
-    """A problem with its noise multiplied by a factor, on the same compiled program."""
+class ScaledNoiseProblem(Wrapped):
+    """A problem with its noise multiplied by a factor."""
 
     def __init__(self, inner: Problem, factor: float) -> None:
-        super().__init__(inner.program)
-        self._inner, self._factor = inner, factor
+        super().__init__(inner)
+        self._factor = factor
         self.usage = inner.usage
 
     @property
@@ -52,11 +74,6 @@ class ScaledNoiseProblem(Problem):
         """Return scores ``(d, B)`` under the scaled noise. They are linear in w and inverse to the noise's variance."""
         return self._inner.score(theta, self._factor * w) / self._factor**2
 
-    @property
-    def gives_jacobians(self) -> bool:
-        """Whether the problem defines :meth:`jacobians`."""
-        return self._inner.gives_jacobians
-
     def jacobians(self, theta: np.ndarray, w: np.ndarray) -> Any:
         """Return the step Jacobians under the scaled noise."""
         return self._inner.jacobians(theta, self._factor * w)
@@ -65,32 +82,11 @@ class ScaledNoiseProblem(Problem):
         """Return the states under the scaled noise."""
         return self._inner.trajectory(theta, self._factor * w)
 
-    _value = _grad = _score = None  # type: ignore[assignment]
-
-
-@dataclass
-class SearchPath:
-    """The path of a search. Each list has one entry per iteration: cost, and counts and time [s] up to that iteration."""
-
-    iteration: list[int] = field(default_factory=list)
-    cost: list[float] = field(default_factory=list)
-    rollouts: list[int] = field(default_factory=list)
-    gradients: list[int] = field(default_factory=list)
-    seconds: list[float] = field(default_factory=list)
-
-    def stored_indices(self) -> np.ndarray:
-        """Return the indices of about :data:`MAX_POINTS` entries to store: log-spaced, with the last and lowest cost."""
-        count = len(self.iteration)
-        if count <= MAX_POINTS:
-            return np.arange(count)
-        spaced = np.unique(np.round(np.geomspace(1, count, MAX_POINTS)).astype(int)) - 1
-        return np.unique(np.append(spaced, np.nanargmin(self.cost)))
-
 
 class OptimizerRun:
     """One search on one problem: computes single iterations, and the objective at a point."""
 
-    def __init__(self, cell: Cell, problem: Problem, settings: Settings) -> None:
+    def __init__(self, cell: Cell, problem: Problem, settings: Optimise) -> None:
         self.cell, self.problem, self.settings = cell, problem, settings
         optimizer, estimator = cell.parts["optimizer"], cell.parts["estimator"]
         assert isinstance(optimizer, Optimizer)
@@ -170,100 +166,96 @@ def advance(
     return optimizer.tell(state, points, Answer(value, gradient))
 
 
-def run_search(cell: Cell, session: Session, settings: Settings) -> dict[str, Any]:
+def run_search(cell: Cell, session: Session, settings: Optimise) -> dict[str, Any]:
     """Search until the budget, the target, a plateau or divergence; return the cell's results by column."""
     problem = session.problem(cell)
-    optimum, how = known_optimum(cell, problem, session, settings)
+    optimum, how = known_optimum(cell, problem, session, settings.scored)
     search = OptimizerRun(cell, problem, settings)
     theta0 = np.array(problem.program.theta0, dtype=np.float64)
     start_quality = gradient_quality(search, theta0, settings) if settings.quality != "none" else None
     state = search.optimizer.start(theta0)
     search.step(state, 1)  # compiles, untimed
-    path, stopped, thetas = follow_path(search, state, settings)
-    stored = path.stored_indices()
-    start, final, best = path.cost[0], path.cost[-1], float(np.nanmin(path.cost))
-    qualities = {} if start_quality is None else {0: start_quality}
-    if settings.quality == "path" and stopped != "diverged":
-        for index in sorted({round(share * (len(thetas) - 1)) for share in QUALITY_SHARES} - {0}):
-            quality = gradient_quality(search, thetas[index], settings)
-            if quality is not None:
-                qualities[path.iteration[index]] = quality
+    path, stopped = follow_path(search, state, settings)
+    cost, thetas, last = path["cost"], path.pop("theta"), {name: values[-1] for name, values in path.items()}
+    start, final, stored, is_lost = cost[0], cost[-1], stored_indices(cost), stopped == "diverged"
     result = {
-        "status": "diverged" if stopped == "diverged" else "ok",
-        "reason": f"the cost left {settings.limit:g} (|J0| + 1) or is not finite" if stopped == "diverged" else "",
-        "stopped": stopped,
-        "scene_class": scene_class(cell, problem),
-        "iterations": path.iteration[-1],
-        "rollouts": path.rollouts[-1],
-        "gradients": path.gradients[-1],
+        "status": "diverged" if is_lost else "ok",
+        "reason": f"the cost left {settings.limit:g} (|J0| + 1) or is not finite" if is_lost else "",
+        "stopped": stopped, "scene_class": scene_class(cell, problem),
+        "iterations": last["iteration"], "rollouts": last["rollouts"], "gradients": last["gradients"],
         "gradient_ratio": gradient_ratio(problem, cell) if cell.timing and search.estimator is not None else np.nan,
-        "search_s": path.seconds[-1],
-        "start_cost": start,
-        "final_cost": final,
-        "best_cost": best,
-        "optimum": optimum,
-        "optimum_status": how,
+        "search_s": last["s"], "start_cost": start, "final_cost": final, "best_cost": float(np.nanmin(cost)),
+        "optimum": optimum, "optimum_status": how,
         "score": float(np.clip((start - final) / (start - optimum), 0.0, 1.0)) if start > optimum else np.nan,
-        **{f"path_{name}": np.asarray(getattr(path, name))[stored].tolist() for name in PATH_COLUMNS},
-        "path_s": np.asarray(path.seconds)[stored].tolist(),
+        **{f"path_{name}": np.asarray(values)[stored].tolist() for name, values in path.items()},
         "theta": thetas[-1].tolist(),
-    }
+    }  # fmt: skip
     if start_quality is not None:
+        qualities = {0: start_quality}
+        if settings.quality == "path" and not is_lost:
+            for index in sorted({round(share * (len(thetas) - 1)) for share in QUALITY_SHARES} - {0}):
+                if quality := gradient_quality(search, thetas[index], settings):
+                    qualities[path["iteration"][index]] = quality
         result |= {f"quality_{name}": value for name, value in start_quality.items()}
         result["path_quality_iteration"] = list(qualities)
         for name in ("rmse_rel", "cosine"):
             result[f"path_quality_{name}"] = [quality[name] for quality in qualities.values()]
-    if not np.isfinite(result["score"]) and stopped == "diverged":
+    if not np.isfinite(result["score"]) and is_lost:
         result["score"] = 0.0
     return result
 
 
 QUALITY_SHARES = (0.25, 0.5, 0.75, 1.0)
 """Shares of a path's iterations at which the gradient's quality is measured, in addition to the start."""
-PATH_COLUMNS = ("iteration", "cost", "rollouts", "gradients")
 
 
-def follow_path(
-    search: OptimizerRun, state: dict[str, Any], settings: Settings
-) -> tuple[SearchPath, str, list[np.ndarray]]:
-    """Iterate until a stopping rule applies; return the path, the name of the rule, and theta ``(d,)`` at each point."""
-    problem, path, thetas = search.problem, SearchPath(), []
-    problem.usage.rollouts = problem.usage.gradients = 0
-    spent_s, best, waited, stopped = 0.0, np.inf, 0, ""
-    iteration = 0
-    while True:
+def stored_indices(cost: Sequence[float]) -> np.ndarray:
+    """Return the indices of about :data:`MAX_POINTS` points of a path to store: log-spaced, with the last and lowest cost."""
+    if len(cost) <= MAX_POINTS:
+        return np.arange(len(cost))
+    spaced = np.unique(np.round(np.geomspace(1, len(cost), MAX_POINTS)).astype(int)) - 1
+    return np.unique(np.append(spaced, np.nanargmin(cost)))
+
+
+def follow_path(search: OptimizerRun, state: dict[str, Any], settings: Optimise) -> tuple[dict[str, list[Any]], str]:
+    """Iterate until a stopping rule applies; return the path and the name of the rule.
+
+    The path has lists with an entry per iteration: iteration, cost, rollouts, gradients, time ``s`` and theta ``(d,)``.
+    """
+    usage = search.problem.usage
+    path: dict[str, list[Any]] = {}
+    usage.rollouts = usage.gradients = 0
+    seconds, best, waited = 0.0, np.inf, 0
+    for iteration in itertools.count():
         cost = search.objective(state["theta"])
-        path.iteration.append(iteration)
-        path.cost.append(cost)
-        path.rollouts.append(problem.usage.rollouts)
-        path.gradients.append(problem.usage.gradients)
-        path.seconds.append(spent_s)
-        thetas.append(np.array(state["theta"]))
+        point = {"iteration": iteration, "cost": cost, "rollouts": usage.rollouts, "gradients": usage.gradients,
+                 "s": seconds, "theta": np.array(state["theta"])}  # fmt: skip
+        for name, value in point.items():
+            path.setdefault(name, []).append(value)
         waited = 0 if cost < best - 1e-12 * abs(best) or not np.isfinite(best) else waited + 1
         best = min(best, cost)
-        spent = problem.usage.rollouts + settings.gradient_cost * problem.usage.gradients
-        if not np.isfinite(cost) or abs(cost) > settings.limit * (abs(path.cost[0]) + 1.0):
-            stopped = "diverged"
-        elif settings.target is not None and cost <= settings.target:
-            stopped = "target"
-        elif spent >= settings.budget or (settings.iterations is not None and iteration >= settings.iterations):
-            stopped = "budget"
-        elif settings.patience is not None and waited >= settings.patience:
-            stopped = "plateau"
-        if stopped:
-            return path, stopped, thetas
-        iteration += 1
+        spent = usage.rollouts + settings.gradient_cost * usage.gradients
+        most = settings.iterations if settings.iterations is not None else math.inf
+        rules = {
+            "diverged": not np.isfinite(cost) or abs(cost) > settings.limit * (abs(path["cost"][0]) + 1.0),
+            "target": settings.target is not None and cost <= settings.target,
+            "budget": spent >= settings.budget or iteration >= most,
+            "plateau": settings.patience is not None and waited >= settings.patience,
+        }
+        if any(rules.values()):
+            break
         started = time.perf_counter()
-        state = search.step(state, iteration)
-        spent_s += time.perf_counter() - started
+        state = search.step(state, iteration + 1)
+        seconds += time.perf_counter() - started
+    return path, next(name for name, applies in rules.items() if applies)
 
 
 # ------------------------------------------------------------------------------------------------ the objective
 
 
-def known_optimum(cell: Cell, problem: Problem, session: Session, settings: Settings) -> tuple[float, str]:
+def known_optimum(cell: Cell, problem: Problem, session: Session, scored: str = "plain") -> tuple[float, str]:
     """Return J* and its source: the scene, or Newton's method, whose result is stored in a file; NaN if unknown."""
-    if settings.scored != "plain":
+    if scored != "plain":
         return np.nan, "unknown: the objective is smoothed"
     if isinstance(cell.scene, KnownOptimum) and cell.decision == OWN:
         known = cell.scene.optimum(cell.contact, cell.integrator)
@@ -350,7 +342,7 @@ MAX_REFERENCE_SHARE = 0.5
 _qualities: dict[tuple[Any, ...], dict[str, float]] = {}
 
 
-def gradient_quality(search: OptimizerRun, theta: np.ndarray, settings: Settings) -> dict[str, float] | None:
+def gradient_quality(search: OptimizerRun, theta: np.ndarray, settings: Optimise) -> dict[str, float] | None:
     """Return relative error, cosine and share of bias of the estimator's gradients at ``theta (d,)``.
 
     Returns None without an estimator. The reference is the mean of many gradients or of many zeroth-order terms,

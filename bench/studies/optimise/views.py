@@ -13,19 +13,16 @@ import pandas as pd
 from bench.experiment.axes import table
 from bench.experiment.columns import Column, text
 from bench.experiment.experiment import Experiment
-from bench.experiment.views import Chart, Mark, Style, Table, Views
+from bench.experiment.views import Chart, Style, Table, Views
 from bench.report.colours import estimator_colour, estimator_marker
 from bench.report.style import DEVIANT, MARKERS, VARIANTS
-from bench.report.writer import reasons
 from bench.studies.optimise import aggregate
-from bench.studies.optimise.aggregate import TARGETS, RunSet
+from bench.studies.optimise.aggregate import RunSet
 
 CONTEXT = tuple(zip(("#666666", "#8c8c8c", "#4d4d4d", "#767676"), (*VARIANTS[1:], *DEVIANT[:2]), strict=True))
 """Grey and line style of each method without an estimator."""
 STEPS = 40
 """Number of points of a drawn curve."""
-DEPTH = 3e-4
-"""Smallest regret that is drawn, as a share of the first: below the hardest target."""
 METHOD, PROBLEM = text("method"), text("problem")
 REACHED = Column(
     "reached", label="targets reached", format="percent", low="reached_low", high="reached_high", log=False
@@ -39,8 +36,6 @@ RUNTIME = Column(
 )  # fmt: skip
 RATE = Column("rate", label="searches that reach it", low="rate_low", high="rate_high")
 SPENT = Column("spent", label="rollouts", log=True)
-SECONDS = Column("spent", label="time", format="seconds", log=True)
-REGRET = Column("regret", label="regret / first regret", low="low", high="high", log=True)
 ERROR = Column("rmse_rel", label="relative error of a gradient at the start", log=True)
 NOTES = (
     "targets reached: share of searches whose regret falls to 1/10, 1/100 and 1/1000 of the first, the mean over problems and "
@@ -73,14 +68,14 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
         every = Table(
             "optimise", rows, [text("scene"), text("optimizer"), text("status")], data=table(experiment, rows)
         )
-        return Views([every], remarks=reasons(rows))
-    name = short_names(runs.methods)
+        return Views([every])
+    name = short_names(runs.rows["method"].unique())
     cells = rows.assign(**{c: runs.rows[c] for c in ("problem", "method", "tuning", "best_known", "score")})
     cells = cells.fillna({"problem": "", "method": "", "tuning": ""}).astype({"score": float, "best_known": float})
     by_name = experiment.columns.by_name | {"best_known": Column("best_known", label="J*")}
     return Views(
         tables(experiment, rows, runs, default, name), charts(runs, default, name), rows=cells,
-        columns=[METHOD, *(by_name[column] for column in PAGE)], remarks=reasons(rows),
+        columns=[METHOD, *(by_name[column] for column in PAGE)],
     )  # fmt: skip
 
 
@@ -109,7 +104,7 @@ def tables(
         diverged_of=[f"{d} of {n}" for d, n in zip(methods["diverged"], methods["searches"], strict=True)],
         name=methods["method"].map(name),
     )
-    key = "; ".join(f"{name(method)}: {method}" for method in runs.methods if name(method) != method)
+    key = "; ".join(f"{name(method)}: {method}" for method in runs.rows["method"].unique() if name(method) != method)
     methods["verdict"] = np.where(aggregate.is_tied(methods), "first or tied", "")
     first = runs.rows.drop_duplicates("problem")
     effects = aggregate.effects_of_error(runs, default)
@@ -167,27 +162,13 @@ def styles(methods: Sequence[str], name: Callable[[str], str] = str) -> dict[str
 
 def charts(runs: RunSet, default: float, name: Callable[[str], str]) -> list[Chart]:
     """Return the charts, the shares of targets reached first."""
-    looks = styles(runs.methods, name)
-    charts_ = [
-        _targets(runs, default),
-        _progress(runs, default),
-        _quality(runs, default),
-        *_paths(runs, default),
+    looks = styles(runs.rows["method"].unique(), name)
+    found = (_targets(runs, default), _progress(runs, default), _quality(runs, default), _path_quality(runs))
+    return [
+        replace(chart, frame=chart.frame.assign(method=chart.frame["method"].map(name)), series="method", styles=looks)
+        for chart in found
+        if chart is not None and len(chart.frame)
     ]
-    charts_ += [*_tunings(runs), _path_quality(runs)]
-    out = []
-    for chart in charts_:
-        if chart is not None and len(chart.frame):
-            frame = chart.frame.assign(method=chart.frame["method"].map(name))
-            out.append(
-                replace(
-                    chart,
-                    frame=frame,
-                    series="method",
-                    styles={n: looks[n] for n in looks if n in set(frame["method"])},
-                )
-            )
-    return out
 
 
 def _targets(runs: RunSet, default: float) -> Chart:
@@ -196,12 +177,13 @@ def _targets(runs: RunSet, default: float) -> Chart:
     return Chart(
         "targets", frame, [REACHED, SCORE, PROFILE, MEDIAN], [METHOD], "dots", height=0.24,
         subtitle=_where(runs, "targets: a tenth, a hundredth and a thousandth of the first regret"),
-        text="Bars are 95% intervals over seeds. Choose the score or the profile to rank by them.",
+        text="Bars are 95% intervals over seeds.",
     )  # fmt: skip
 
 
 def _where(runs: RunSet, what: str) -> str:
-    return f"{len(runs.problems)} problems, {what}" if len(runs.problems) > 1 else f"{runs.problems[0]}, {what}"
+    problems = runs.rows["problem"].unique()
+    return f"{len(problems)} problems, {what}" if len(problems) > 1 else f"{problems[0]}, {what}"
 
 
 def _progress(runs: RunSet, default: float) -> Chart | None:
@@ -240,56 +222,6 @@ def _quality(runs: RunSet, default: float) -> Chart | None:
         subtitle="average runtime: expected rollouts per search that reaches a tenth of the first regret; a cross: never reached",
         text="A point per problem and method. Methods that never reach the target have no point.",
     )  # fmt: skip
-
-
-def _paths(runs: RunSet, default: float) -> list[Chart]:
-    """Return the regret along the paths against rollouts, and for the page against time."""
-    charts_ = []
-    for unit in ("rollouts", "seconds"):
-        lines = []
-        for problem in runs.problems:
-            ratio = runs.gradient_ratio(problem, default)
-            for method, part in runs.best_runs[runs.best_runs["problem"] == problem].groupby("method", sort=False):
-                places = [
-                    aggregate.rollouts_spent(row, ratio)
-                    if unit == "rollouts"
-                    else np.asarray(row["path_s"], dtype=float)
-                    for _, row in part.iterrows()
-                ]
-                known = [place for place in places if len(place) > 1 and place[-1] > 0]
-                if len(known) < len(places) or not known:
-                    continue
-                grid = np.geomspace(
-                    max(min(place[1] for place in known), 1e-6), max(place[-1] for place in known), STEPS
-                )
-                first = max(part["start_cost"].iloc[0] - part["best_known"].iloc[0], 1e-300)
-                low, middle, high = np.clip(aggregate.regret_quantiles(part, places, grid) / first, DEPTH, None)
-                lines += [(problem, method, *values) for values in zip(grid, middle, low, high, strict=True)]
-        frame = pd.DataFrame(lines, columns=["problem", "method", "spent", "regret", "low", "high"]).replace(
-            np.inf, np.nan
-        )
-        charts_.append(Chart(
-            "anytime" if unit == "rollouts" else "anytime_seconds", frame, [SPENT if unit == "rollouts" else SECONDS], [REGRET],
-            panel="problem", band=True, height=1.55, printed=unit == "rollouts",
-            marks=[Mark("", 1 / target, axis="y") for target in TARGETS],
-            subtitle=f"medians and 20% to 80% of the seeds, each method at its best tuning; lines: the targets; cut at {DEPTH:g}",
-        ))  # fmt: skip
-    return charts_
-
-
-def _tunings(runs: RunSet) -> list[Chart]:
-    """Return the score against each tuned parameter, by problem."""
-    lines = aggregate.scores_by_tuning(runs)
-    lines = lines[lines.groupby(["problem", "method", "axis"])["value"].transform("nunique") > 1]
-    several = lines["axis"].nunique() > 1
-    return [
-        Chart(
-            f"learning_rates_{axis}" if several else "learning_rates", part,
-            [Column("value", label=str(axis), format="setting")], [Column("score", low="low", high="high", log=False)], panel="problem",
-            band=True, height=1.45, subtitle="median over seeds, and 20% to 80% of them",
-        )
-        for axis, part in lines.groupby("axis", sort=False)
-    ]  # fmt: skip
 
 
 def _path_quality(runs: RunSet) -> Chart | None:

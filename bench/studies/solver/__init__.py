@@ -3,23 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import ClassVar
 
 from bench.experiment.cell import Cell
 from bench.experiment.columns import Column, Columns, ComparisonRule, numbers
-from bench.experiment.experiment import Experiment
-from bench.experiment.session import Session
-from bench.experiment.study import Study
-from bench.experiment.views import Views
 from bench.model import param
 from bench.model.parameters import values
-
-if TYPE_CHECKING:
-    import pandas as pd
+from bench.studies import StudyPackage
 
 
 @dataclass(frozen=True)
-class Solver(Study):
+class Solver(StudyPackage):
     """Measures the error of a gradient to the gradient of the program with a converged constraint solver, and its time."""
 
     name = "solver"
@@ -43,20 +37,8 @@ class Solver(Study):
     converged: int = param(100, "iterations of the program that counts as converged", positive=True)
     timed_calls: int = param(5, "calls timed", positive=True)
 
-    def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
-        """Return one cell's results by column: errors to the converged program at w = 0, and the time of gradients [s]."""
-        from bench.studies.solver.measure import measure
-
-        return measure(cell, session, self.converged, self.timed_calls)
-
     def unsupported_reason(self, cell: Cell) -> str | None:
         """Return that the backend has no constraint solver whose iterations are a parameter, or None."""
         if "iterations" in values(cell.backend):
             return None
         return f"backend {cell.backend.name} has no parameter iterations, the iterations of a constraint solver"
-
-    def views(self, experiment: Experiment, rows: pd.DataFrame) -> Views:
-        """Return the table of errors and times, and the chart of errors along the iterations."""
-        from bench.studies.solver.views import views
-
-        return views(experiment, rows)

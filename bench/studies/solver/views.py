@@ -7,7 +7,6 @@ import pandas as pd
 from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Mark, Views
 from bench.report.shown import Shown, floored
-from bench.report.writer import reasons
 
 FLOOR = 1e-16
 """Smallest relative error that is drawn; smaller ones, 0 included, are drawn here as upper limits."""
@@ -30,4 +29,4 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
         marks=[Mark("as large as the gradient", 1.0, axis="y")],
         text="The error is the distance from the gradient of the program with a converged solver.",
     )  # fmt: skip
-    return Views([cells], [chart], remarks=reasons(rows))
+    return Views([cells], [chart])

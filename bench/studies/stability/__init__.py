@@ -3,24 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import ClassVar
 
-from bench.experiment.cell import Cell
 from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, text
-from bench.experiment.experiment import Experiment
-from bench.experiment.session import Session
-from bench.experiment.study import Study
-from bench.experiment.views import Views
 from bench.model import param
-
-if TYPE_CHECKING:
-    import pandas as pd
+from bench.studies import StudyPackage
 
 WORST_FIRST = ("nonfinite", "diverged", "wrong_sign", "zero", "inaccurate", "unresolved", "ok")
 
 
 @dataclass(frozen=True)
-class Stability(Study):
+class Stability(StudyPackage):
     """Measures where a program's gradient is right, inaccurate, of wrong sign, zero or lost, one rollout per cell."""
 
     name = "stability"
@@ -60,15 +53,3 @@ class Stability(Study):
         1 << 14, "fewest steps of the refined truth; half as many say how far it has converged", low=2
     )
     finer: int = param(4, "fewest steps of the refined truth to one of the cell's", positive=True)
-
-    def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
-        """Return one cell's results by column: the verdict on its gradient, its errors and their cause."""
-        from bench.studies.stability.measure import measure
-
-        return measure(cell, session, self)
-
-    def views(self, experiment: Experiment, rows: pd.DataFrame) -> Views:
-        """Return the tables of shares and limits, and the maps."""
-        from bench.studies.stability.views import views
-
-        return views(experiment, rows)

@@ -18,7 +18,6 @@ import numpy as np
 from bench.experiment.cell import Cell
 from bench.experiment.session import Session
 from bench.model import (
-    Backend,
     ContactScene,
     DampedScene,
     Dynamics,
@@ -26,12 +25,13 @@ from bench.model import (
     Integrator,
     LoopOps,
     Oscillator,
-    Program,
     Rollout,
     Trajectory,
     Unsupported,
     rollout,
 )
+from bench.studies import norm
+from bench.studies.stability import Stability
 
 NEGLIGIBLE = 1e-9
 """Share of the truth's norm up to which one of its components counts as 0."""
@@ -41,28 +41,20 @@ REACH = np.logspace(-3, 4, 141)
 """Values of dt^2 stiffness that the search for the stability limit tries."""
 
 
-Settings = Any
-"""A ``Stability`` study: its parameters are the settings. Its module imports this module, so its type cannot be named."""
-
-
-def measure(cell: Cell, session: Session, limits: Settings) -> dict[str, Any]:
+@np.errstate(over="ignore", invalid="ignore")  # what overflows becomes a status
+def measure(cell: Cell, session: Session, limits: Stability) -> dict[str, Any]:
     """Return one cell's results by column, verdict included.
 
     Raises :class:`Unsupported` if the program has no time steps, step states or truth.
     """
     program = rollout(cell.program())
-    with np.errstate(over="ignore", invalid="ignore"):  # what overflows becomes a status
-        return _measured(cell, program, session, limits)
-
-
-def _measured(cell: Cell, program: Rollout, session: Session, limits: Settings) -> dict[str, Any]:
     problem, scene = session.problem(cell), program.scene
     theta, still = program.theta0, np.zeros((problem.program.n_noise, 1))
     gradient = problem.grad(theta, still)[:, 0]
     trajectory = problem.trajectory(theta, still)
     states, largest = trajectory.states[:, :, 0], bounds(program, trajectory, limits.diverged)
     growth = growth_factor(states) if isinstance(scene, Oscillator) else math.nan
-    result = {"status": "ok", "grad_norm": float(np.linalg.norm(gradient)), "growth_factor": growth, **theory(cell)}
+    result = {"status": "ok", "grad_norm": norm(gradient), "growth_factor": growth, **theory(cell)}
     failure = first_bad_step(states, largest, growth, limits)
     if failure is not None:
         step, verdict, description = failure
@@ -72,7 +64,7 @@ def _measured(cell: Cell, program: Rollout, session: Session, limits: Settings) 
     if not np.isfinite(gradient).all():
         return result | {"status": "nonfinite", "verdict": "nonfinite", "reason": "the gradient of a finite rollout"}
     kind, truth, error = compute_truth(cell, limits)
-    result |= {"truth": kind, "truth_norm": float(np.linalg.norm(truth)), "truth_error": error}
+    result |= {"truth": kind, "truth_norm": norm(truth), "truth_error": error}
     resolved = limits.inaccurate / 2
     if not error <= resolved:
         reason = f"halving the finest step moves the truth by {error:.1%}, more than {resolved:.0%}"
@@ -85,7 +77,7 @@ def _measured(cell: Cell, program: Rollout, session: Session, limits: Settings) 
 
 
 def first_bad_step(
-    states: np.ndarray, largest: np.ndarray, growth: float, limits: Settings
+    states: np.ndarray, largest: np.ndarray, growth: float, limits: Stability
 ) -> tuple[int, str, str] | None:
     """Return the first bad step of ``states (T + 1, n)`` with its verdict and a description, or None without a bad step.
 
@@ -94,7 +86,7 @@ def first_bad_step(
     """
     steps = len(states)
     outside = ~(np.abs(states) <= largest).all(axis=1)
-    left = int(np.argmax(outside)) if outside.any() else steps
+    left = int(np.argmax([*outside, True]))
     slow = math.ceil(math.log(limits.grown) / math.log(growth)) if growth > NEUTRAL else steps
     step = min(left, slow)
     if step >= steps:
@@ -113,8 +105,7 @@ def growth_factor(states: np.ndarray) -> float:
     It is the spectral radius of the linear map fitted by least squares to all pairs of consecutive states, each pair
     scaled to the size of its first state (dynamic mode decomposition; Schmid 2010).
     """
-    finite = np.isfinite(states).all(axis=1)
-    count = len(states) if finite.all() else int(np.argmin(finite))
+    count = int(np.argmin([*np.isfinite(states).all(axis=1), False]))
     if count < 3:
         return math.nan
     scaled = states[:count] / np.maximum(np.abs(states[:count]).max(axis=0), np.finfo(float).tiny)
@@ -145,7 +136,7 @@ def bounds(program: Rollout, trajectory: Trajectory, factor: float) -> np.ndarra
 # ---------------------------------------------------------------------------------------------------- truth
 
 
-def compute_truth(cell: Cell, limits: Settings) -> tuple[str, np.ndarray, float]:
+def compute_truth(cell: Cell, limits: Stability) -> tuple[str, np.ndarray, float]:
     """Return the kind of truth (``physical`` or ``refined``), the true gradient ``(d,)``, and its relative error."""
     program = rollout(cell.program())
     physical = program.physical_gradient()
@@ -153,8 +144,8 @@ def compute_truth(cell: Cell, limits: Settings) -> tuple[str, np.ndarray, float]
         return "physical", np.asarray(physical), 0.0
     steps = max(limits.fine_steps, limits.finer * program.scene.horizon)
     coarse, fine = _gradient_at(cell, steps // 2), _gradient_at(cell, steps)
-    change = float(np.linalg.norm(fine - coarse))
-    return "refined", fine, change / float(np.linalg.norm(fine)) if change else 0.0
+    change = norm(fine - coarse)
+    return "refined", fine, change / norm(fine) if change else 0.0
 
 
 def _refined(cell: Cell, steps: int) -> Cell:
@@ -179,7 +170,12 @@ def _refined(cell: Cell, steps: int) -> Cell:
 def _gradient_at(cell: Cell, steps: int) -> np.ndarray:
     """Return the cell's gradient ``(d,)`` with its duration divided into ``steps`` steps."""
     fine = _refined(cell, steps)
-    return _cached(fine.program_key, lambda: _gradient(fine.reference_backends[0], fine.program()))
+
+    def gradient() -> np.ndarray:
+        problem = fine.reference_backends[0].compile(fine.program())
+        return problem.grad(problem.program.theta0, np.zeros((problem.program.n_noise, 1)))[:, 0]
+
+    return _cached(fine.program_key, gradient)
 
 
 def _cached(key: str, compute: Callable[[], np.ndarray]) -> np.ndarray:
@@ -196,10 +192,6 @@ _fine_gradients: dict[str, np.ndarray] = {}
 """Gradients at fine steps by program key, shared by all cells with the same fine program."""
 
 
-def _gradient(backend: Backend, program: Program) -> np.ndarray:
-    return backend.compile(program).grad(program.theta0, np.zeros((program.n_noise, 1)))[:, 0]
-
-
 def compare(gradient: np.ndarray, truth: np.ndarray, inaccurate: float) -> dict[str, Any]:
     """Return verdict, relative error and cosine of a finite gradient.
 
@@ -207,16 +199,11 @@ def compare(gradient: np.ndarray, truth: np.ndarray, inaccurate: float) -> dict[
     the directional derivative along the truth is negative. ``inaccurate``: the relative error exceeds that limit.
     ``ok``: otherwise.
     """
-    norm, size = float(np.linalg.norm(truth)), float(np.linalg.norm(gradient))
-    distance = float(np.linalg.norm(gradient - truth))
-    error = distance / norm if norm else math.inf if distance else 0.0
-    cosine = float(gradient / size @ (truth / norm)) if norm and size else math.nan
-    if ((gradient == 0) & (np.abs(truth) > NEGLIGIBLE * norm)).any():
-        verdict = "zero"
-    elif cosine < 0:
-        verdict = "wrong_sign"
-    else:
-        verdict = "ok" if error <= inaccurate else "inaccurate"
+    length, size, distance = norm(truth), norm(gradient), norm(gradient - truth)
+    error = distance / length if length else math.inf if distance else 0.0
+    cosine = float(gradient / size @ (truth / length)) if length and size else math.nan
+    is_zero = ((gradient == 0) & (np.abs(truth) > NEGLIGIBLE * length)).any()
+    verdict = "zero" if is_zero else "wrong_sign" if cosine < 0 else "ok" if error <= inaccurate else "inaccurate"
     return {"verdict": verdict, "relative_error": error, "cosine": cosine}
 
 
@@ -230,7 +217,7 @@ step.
 """
 
 
-def cause_of(cell: Cell, truth_kind: str, gradient: np.ndarray, truth: np.ndarray, limits: Settings) -> dict[str, Any]:
+def cause_of(cell: Cell, truth_kind: str, gradient: np.ndarray, truth: np.ndarray, limits: Stability) -> dict[str, Any]:
     """Return why a gradient is wrong: ``cause``, and ``step_error`` and ``law_error`` in units of the truth's norm.
 
     The law's own gradient is the gradient of the same law and integrator at a far smaller step. The step error is the
@@ -238,14 +225,14 @@ def cause_of(cell: Cell, truth_kind: str, gradient: np.ndarray, truth: np.ndarra
     the truth. Their sum is at least the cell's error, so one of them is a cause. Without a contact law, or with a
     refined truth, the cause is the step.
     """
-    norm = float(np.linalg.norm(truth))
-    error = float(np.linalg.norm(gradient - truth)) / norm if norm else math.inf
+    size = norm(truth)
     if truth_kind != "physical" or cell.contact is None:
+        error = norm(gradient - truth) / size if size else math.inf
         return {"cause": "step", "step_error": error, "law_error": 0.0}
-    if not norm:
+    if not size:
         return {"cause": "unknown"}
     fine, coarse = law_gradient(cell, limits)
-    step, law, change = (float(np.linalg.norm(part)) / norm for part in (gradient - fine, fine - truth, fine - coarse))
+    step, law, change = (norm(part) / size for part in (gradient - fine, fine - truth, fine - coarse))
     errors = {"step_error": step, "law_error": law}
     if not change <= limits.inaccurate / 2:
         return {"cause": "unknown"} | errors
@@ -253,7 +240,7 @@ def cause_of(cell: Cell, truth_kind: str, gradient: np.ndarray, truth: np.ndarra
     return {"cause": "both" if len(causes) == 2 else causes[0] if causes else "step" if step >= law else "law"} | errors
 
 
-def law_gradient(cell: Cell, limits: Settings) -> tuple[np.ndarray, np.ndarray]:
+def law_gradient(cell: Cell, limits: Stability) -> tuple[np.ndarray, np.ndarray]:
     """Return the gradient ``(d,)`` of the cell's law at a far smaller step, and the gradient with half as many steps.
 
     Both are central differences of the cost over :data:`SPAN` (twice that for the second). A derivative through a
@@ -272,10 +259,8 @@ def _differences(cell: Cell, steps: int, span: float) -> np.ndarray:
         problem = fine.reference_backends[0].compile(program)
         theta, still = program.theta0, np.zeros((program.n_noise, 1))
         h = span * (float(np.abs(theta).max(initial=0.0)) or 1.0)
-        ends = [
-            (problem.value(theta + e, still)[0], problem.value(theta - e, still)[0]) for e in h * np.eye(len(theta))
-        ]
-        return np.array([(after - before) / (2 * h) for after, before in ends])
+        costs = [[problem.value(theta + s * e, still)[0] for s in (1, -1)] for e in h * np.eye(len(theta))]
+        return np.array([(after - before) / (2 * h) for after, before in costs])
 
     return _cached(f"{fine.program_key} {span}", differences)
 

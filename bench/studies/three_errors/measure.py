@@ -17,6 +17,8 @@ from bench.experiment.cell import Cell
 from bench.experiment.session import Session
 from bench.measure import noise, statistics
 from bench.model import Problem, Program
+from bench.studies import finite_status, norm, ratio, relative_error
+from bench.studies.three_errors import ThreeErrors
 
 SUMMARY = (
     "reference_norm", "reference_se", "bias", "bias_low", "bias_high", "bias_rel", "variance", "rmse_rel", "cosine",
@@ -29,22 +31,20 @@ STEPS = 10.0 ** -np.arange(1.0, 9.5, 0.5)
 """Step sizes of the central differences, in the units of theta."""
 
 
-def measure(cell: Cell, session: Session) -> dict[str, Any]:
+def measure(cell: Cell, session: Session, study: ThreeErrors) -> dict[str, Any]:
     """Return one cell's results by column: forward, program and model error at w = 0, and the bias of its estimator."""
     problem = session.problem(cell)
     check = difference_check(problem)
-    result = {"status": "ok", "reason": ""} | check.columns() | _against_physics(problem.program, check)
     truth = session.references.of(cell)
-    result["reference_method"] = truth.method
-    if not np.isfinite(truth.batches).all():
-        return result | {"status": "nonfinite", "reason": truth.note or "the reference gradient is not finite"}
+    result = check.columns() | _against_physics(problem.program, check) | {"reference_method": truth.method}
+    status = finite_status(truth.note or "the reference gradient is not finite", truth.batches)
+    if status["status"] != "ok":
+        return result | status
     w = noise.shared(cell.seed, cell.scene.name, cell.repeats, cell.samples, problem.program.n_noise)
     estimates = np.asarray(cell.estimator.estimate(problem, problem.program.theta0, w), dtype=np.float64)
     summary = asdict(statistics.summarise(estimates, truth.known(), cell.samples))
-    result |= {name: summary[name] for name in SUMMARY} | {"reason": summary["note"]}
-    if not (np.isfinite(estimates).all() and np.isfinite(check.gradient).all()):
-        result["status"] = "nonfinite"
-    return result
+    status = finite_status("", estimates, check.gradient) | {"reason": summary["note"]}
+    return result | {name: summary[name] for name in SUMMARY} | status
 
 
 @dataclass(frozen=True)
@@ -60,15 +60,11 @@ class DifferenceCheck:
 
     def columns(self) -> dict[str, Any]:
         """Return the columns of cost, gradient and program error."""
-        norm, error = _norm(self.difference), _norm(self.gradient - self.difference)
         return {
-            "cost": self.cost,
-            "gradient": self.gradient.tolist(),
-            "program_norm": _norm(self.gradient),
-            "program_error": error,
-            "program_error_rel": _ratio(error, norm),
-            "difference_step": self.step,
-        }
+            "cost": self.cost, "gradient": self.gradient.tolist(), "program_norm": norm(self.gradient),
+            "program_error": norm(self.gradient - self.difference),
+            "program_error_rel": relative_error(self.gradient, self.difference), "difference_step": self.step,
+        }  # fmt: skip
 
 
 def difference_check(problem: Problem, steps: np.ndarray = STEPS) -> DifferenceCheck:
@@ -100,31 +96,19 @@ def _against_physics(program: Program, check: DifferenceCheck) -> dict[str, Any]
     cost, physical = program.physical_cost(), program.physical_gradient()
     if cost is not None:
         error = abs(check.cost - cost)
-        result |= {"physical_cost": cost, "forward_error": error, "forward_error_rel": _ratio(error, abs(cost))}
+        result |= {"physical_cost": cost, "forward_error": error, "forward_error_rel": ratio(error, abs(cost))}
     if physical is not None:
-        norm, error = _norm(physical), _norm(check.gradient - physical)
         signs, physical_signs = _signs(check.gradient), _signs(physical)
+        has_sign = physical_signs != 0
         result |= {
-            "physical_gradient": physical.tolist(),
-            "physical_norm": norm,
-            "model_error": error,
-            "model_error_rel": _ratio(error, norm),
-            "model_cosine": _ratio(float(check.gradient @ physical), norm * _norm(check.gradient)),
-            "model_signs": (
-                float((signs == physical_signs)[physical_signs != 0].mean()) if physical_signs.any() else math.nan
-            ),
-        }
+            "physical_gradient": physical.tolist(), "physical_norm": norm(physical),
+            "model_error": norm(check.gradient - physical), "model_error_rel": relative_error(check.gradient, physical),
+            "model_cosine": ratio(float(check.gradient @ physical), norm(physical) * norm(check.gradient)),
+            "model_signs": float((signs == physical_signs)[has_sign].mean()) if has_sign.any() else math.nan,
+        }  # fmt: skip
     return result
 
 
 def _signs(gradient: np.ndarray) -> np.ndarray:
     """Return the signs of a gradient's coordinates, 0 where a coordinate is rounding error."""
-    return np.where(np.abs(gradient) > ROUNDING * _norm(gradient), np.sign(gradient), 0.0)
-
-
-def _norm(vector: np.ndarray) -> float:
-    return float(np.linalg.norm(vector))
-
-
-def _ratio(value: float, norm: float) -> float:
-    return value / norm if norm > 0 else math.nan
+    return np.where(np.abs(gradient) > ROUNDING * norm(gradient), np.sign(gradient), 0.0)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pandas as pd
 
 from bench.experiment.columns import COMMON, Column, text
@@ -12,8 +10,6 @@ from bench.experiment.views import Chart, Style, Table, Views
 from bench.report.problems import problem_names
 from bench.report.shown import Shown, floored, stacked
 from bench.report.style import PALETTE
-from bench.report.writer import reasons
-from bench.studies.three_errors.columns import COLUMNS
 
 EXACT = 1e-6
 """Program error up to which a gradient counts as exact."""
@@ -49,24 +45,24 @@ TRAP_NOTE = (
 def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     """Return a line per cell, the traps, the misleading gradients by problem, and the charts."""
     shown = Shown(experiment, rows, ["dt"], ["estimator"], PROGRAM)
-    own, biases = COLUMNS.by_name, shown.rows["reference_norm"]
-    ends = {f"bias_rel_{end}": shown.rows[f"bias_{end}"] / biases for end in ("low", "high")}
-    bias = replace(own["bias_rel"], low="bias_rel_low", high="bias_rel_high")
+    ends = {f"bias_rel_{end}": shown.rows[f"bias_{end}"] / shown.rows["reference_norm"] for end in ("low", "high")}
+    bias = shown.column("bias_rel", low="bias_rel_low", high="bias_rel_high")
     cells = shown.cells(
-        [COMMON["dt"], *(own[name] for name in RESULTS), bias], "program, model and estimator error", [NOTE],
+        [COMMON["dt"], *map(shown.column, RESULTS), bias], "program, model and estimator error", [NOTE],
         ("scene", "contact", "estimator"), shown.rows.assign(**ends),
     )  # fmt: skip
     if shown.good.empty:
-        return Views([cells], remarks=reasons(rows))
-    trapped = traps(shown)
+        return Views([cells])
+    trapped, wrong, problem = traps(shown), _wrong(shown.rows), text("problem")
     either = Column("largest", label="at the largest step"), Column("smallest", label="at the smallest step")
     tables = [
         cells,
-        Table("three_errors_traps", trapped, [text("problem"), text("error"), *either], title="Traps", notes=[TRAP_NOTE],
+        Table("three_errors_traps", trapped, [problem, text("error"), *either], title="Traps", notes=[TRAP_NOTE],
               files=["csv"] if len(trapped) else [], terminal=bool(len(trapped)), page=True),
-        Table("three_errors_wrong", *_wrong(shown.rows), title="Right for the program, wrong for the physics", files=[], page=True),
+        Table("three_errors_wrong", wrong, [problem, Column("cells", format="setting"), *map(shown.column, ERRORS)],
+              title="Right for the program, wrong for the physics", files=[], page=True),
     ]  # fmt: skip
-    return Views(tables, [_dumbbells(shown, trapped), *_further(shown)], remarks=reasons(rows))
+    return Views(tables, [_dumbbells(shown, trapped)])
 
 
 def along_steps(shown: Shown) -> pd.DataFrame:
@@ -78,29 +74,24 @@ def along_steps(shown: Shown) -> pd.DataFrame:
 
 def traps(shown: Shown) -> pd.DataFrame:
     """Return two or three lines per trap: its errors at the largest and the smallest time step. A missing error is no trap."""
-    lines = []
+    lines, names = [], ("forward_error_rel", "model_error_rel", "model_cosine")
     for problem, rows in along_steps(shown).groupby("problem", sort=False):
         steps = rows.drop_duplicates("dt")
-        forward, cosine, model, program = (
-            steps[name] for name in ("forward_error_rel", "model_cosine", "model_error_rel", "program_error_rel")
-        )
+        forward, model, cosine, program = (steps[name] for name in (*names, "program_error_rel"))
         converges = forward.is_monotonic_increasing and forward.iloc[0] <= CONVERGED * forward.iloc[-1]
         stays_wrong = model.iloc[0] > max(CONVERGED * model.iloc[-1], WRONG)
         is_trap = ((cosine < 0).all() or stays_wrong) and program.max(skipna=False) <= EXACT and converges
         if is_trap and len(steps) > 1:
-            for name in ("forward_error_rel", "model_error_rel", "model_cosine"):
-                ends = {"largest": steps[name].iloc[-1], "smallest": steps[name].iloc[0]}
-                lines.append({"problem": problem, "error": COLUMNS.by_name[name].heading} | ends)
+            lines += [[problem, shown.column(name).heading, *steps[name].iloc[[-1, 0]]] for name in names]
     return pd.DataFrame(lines, columns=["problem", "error", "largest", "smallest"])
 
 
-def _wrong(rows: pd.DataFrame) -> tuple[pd.DataFrame, list[Column]]:
+def _wrong(rows: pd.DataFrame) -> pd.DataFrame:
     """Return a line per problem with misleading gradients: their number and the largest errors, the worst first."""
     wrong = rows[(rows["program_error_rel"] <= AGREES) & (rows["model_error_rel"] > WRONG)]
     groups = wrong.groupby("problem", sort=False)
-    frame = groups[list(ERRORS)].max().assign(cells=groups.size()).sort_values("model_error_rel", ascending=False)
-    largest = [replace(COLUMNS.by_name[name], low="", high="") for name in ERRORS]
-    return frame.reset_index(), [text("problem"), Column("cells", format="setting"), *largest]
+    frame = groups[list(ERRORS)].max().assign(cells=groups.size())
+    return frame.sort_values("model_error_rel", ascending=False).reset_index()
 
 
 def _dumbbells(shown: Shown, trapped: pd.DataFrame) -> Chart:
@@ -120,20 +111,3 @@ def _dumbbells(shown: Shown, trapped: pd.DataFrame) -> Chart:
         subtitle="At the smallest time step." if shown.over else "",
         text="The longer the line, the better a wrong gradient passes a check against differences of its own cost.",
     )  # fmt: skip
-
-
-def _further(shown: Shown) -> list[Chart]:
-    """Return the charts of the page: each error along the swept parameters, and the errors against each other."""
-    names = (
-        problem_names(shown.arranged, parts, shown.arranged.axes, parts, shown.rows)
-        for parts in (["scene"], PROGRAM[1:3])
-    )
-    frame = shown.rows.assign(**dict(zip(("problem", "law"), names, strict=True)))
-    model, *others = (replace(COLUMNS.by_name[name], log=True, above_one="larger than the gradient") for name in ERRORS)
-    swept = [Column(axis.column, label=axis.title, format="setting") for axis in shown.arranged.swept()]
-    charts = {"three_errors_swept": (swept, [model, *others]), "three_errors_pairs": (others, [model])}
-    return [
-        Chart(name, frame, x, y, "points", series="law", panel="problem", printed=False)
-        for name, (x, y) in charts.items()
-        if x
-    ]

@@ -49,7 +49,9 @@ class Train(Study):
         Column("window_bias_low", "lower end of its 95% interval over independent batches of rollouts"),
         Column("window_bias_high", "upper end of its 95% interval"),
         Column("difference_error", "relative distance of a directional derivative halfway from its central difference, the smallest over step lengths"),
-        text("verdicts", "JSON list of what the log shows, with the numbers that show it", table=False),
+        numbers("difference_errors", "the same for each step length, longest first", table=False),
+        Column("gradient_zero", "share of updates with a gradient of exactly 0"),
+        Column("unmoved", "share of the arrays of the actor's parameters that the run left as they were"),
         numbers("curve_update", "updates at which the policy was evaluated", table=False),
         numbers("curve_step", "control steps up to those updates", table=False),
         numbers("curve_s", "time up to those updates", "s", table=False, measured=True),
@@ -77,7 +79,7 @@ class Train(Study):
     )
 
     def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
-        """Return one cell's results by column: returns along the run, the log, and what the log shows."""
+        """Return one cell's results by column: returns along the run, and the log."""
         from bench.studies.train.measure import measure
 
         return measure(cell, session, self)

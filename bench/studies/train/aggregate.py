@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -15,6 +14,7 @@ from bench.experiment.parameters import flatten
 from bench.measure.performance import bootstrap, bootstrap_along, interquartile_mean
 from bench.report.problems import problem_names
 from bench.report.views import arrange, attempted
+from bench.studies.train.verdicts import judge
 
 PARTS = ("scene", "contact", "integrator", "backend")
 """Parts of the grid that identify a problem."""
@@ -153,24 +153,21 @@ def windows(runs: pd.DataFrame) -> pd.DataFrame:
 
 
 def faults(runs: pd.DataFrame) -> pd.DataFrame:
-    """Return a line per run and fault: problem, method, seed, the fault's ``code`` and the numbers that show it.
+    """Return a line per run and fault: problem, method, seed, and the fault's ``code``, ``value`` and ``update``.
 
     A gradient that is cut at the ends of episodes is a fault only of trainers that differentiate windows shorter than an
-    episode: whole episodes are cut at their end by construction. Where every update has contact, that a peak has it says
-    nothing, and ``with_contact`` is left out.
+    episode: whole episodes are cut at their end by construction.
     """
     lines: list[dict[str, Any]] = []
     for row in runs.to_dict("records"):
         is_first_order = len(row["cosine_update"]) > 0 or math.isfinite(row["difference_error"])
         has_windows = is_first_order and row["window"] < row["horizon"]
-        always_contact = min(np.asarray(row["log_contacts"], float), default=0.0) > 0
-        for fault in json.loads(row["verdicts"] or "[]"):
-            if fault["code"] == "cut" and not has_windows:
-                continue
-            if always_contact:
-                fault.pop("with_contact", None)
-            lines.append({"problem": row["problem"], "method": row["method"], "seed": row["seed"], **fault})
-    return pd.DataFrame(lines, columns=None if lines else ["problem", "method", "seed", "code"])
+        lines += [
+            {"problem": row["problem"], "method": row["method"], "seed": row["seed"], **fault}
+            for fault in judge(row)
+            if fault["code"] != "cut" or has_windows
+        ]
+    return pd.DataFrame(lines, columns=["problem", "method", "seed", "code", "update", "value"])
 
 
 def logs(runs: pd.DataFrame, quantities: Sequence[str]) -> pd.DataFrame:

@@ -1,9 +1,8 @@
-"""Runs one training: updates, evaluations on the way, comparisons of gradients, and the log with its verdicts."""
+"""Runs one training: updates, evaluations on the way, comparisons of gradients, and the log."""
 
 from __future__ import annotations
 
 import itertools
-import json
 import math
 import time
 from typing import Any
@@ -16,13 +15,13 @@ from bench.measure import noise
 from bench.measure.statistics import Sampling, bias_interval
 from bench.model import Trainer
 from bench.model.trainer import LOGGED
-from bench.studies.train.verdicts import Log, judge
+from bench.studies.train.verdicts import FINITE
 from bench.training.environment import Environment
 from bench.training.run import Training
 
 Settings = Any
 """A ``Train`` study: its parameters are the settings. Its module imports this module, so its type cannot be named."""
-MEANS = frozenset({"loss", "reward", "value_loss", "cut", "contacts", "step_length", "deviation"})
+MEANS = frozenset({"loss", "reward", "value_loss", "cut", "used", "contacts", "step_length", "deviation"})
 """Quantities whose mean an entry of a stored log has; it has the largest value of the others, so that no peak is lost."""
 Z = 1.959963984540054
 """The 0.975 quantile of the standard normal distribution."""
@@ -45,21 +44,23 @@ def measure(cell: Cell, session: Session, settings: Settings) -> dict[str, Any]:
     halfway = max(total // 2, 1) if trainer.first_order else 0
 
     state = training.start(cell.seed)
+    untrained = _arrays(state)
     training.returns(state, starts)
     training.compile_update(state)
     compile_s = training.compile_s
     curve: list[tuple[float, ...]] = []
     cosines: list[tuple[float, float, float]] = []
-    log = Log()
-    probe: dict[str, float] = {}
+    log: list[dict[str, float]] = []
+    bad: tuple[int, str] | None = None
+    probe: dict[str, Any] = {}
     spent = 0.0
     pending: list[Any] = []
     for update in range(total + 1):
         if update in marks or update == total:
-            log.extend(pending)
-            pending = []
+            log += [{name: float(value) for name, value in entry.items()} for entry in pending]
+            pending, bad = [], _first_not_finite(log)
             curve.append((update, update * per_update, spent, *_interval(training.returns(state, starts))))
-            if log.first_not_finite is not None or update == total:
+            if bad is not None or update == total:
                 break
         if update in checks:
             agreement = training.agreement(state, update + 1, settings.copies)
@@ -73,24 +74,41 @@ def measure(cell: Cell, session: Session, settings: Settings) -> dict[str, Any]:
         pending.append(entry)
 
     table = np.array(curve)
-    faults = judge(log, table[:, 0], table[:, 3:6], np.array(cosines).reshape(-1, 3), probe)
-    bad = log.first_not_finite
     final = table[-1, 3:]
-    norms = log.column("gradient_norm")
+    norms = _column(log, "gradient_norm")
+    is_unmoved = [np.array_equal(a, b) for a, b in zip(untrained, _arrays(state), strict=True)]
     return {
         "status": "ok" if bad is None else "nonfinite",
         "reason": "" if bad is None else f"{bad[1]} is not finite at update {bad[0]}",
         "first_return": table[0, 3], "final_return": final[0], "final_return_low": final[1], "final_return_high": final[2],
         "final_median": final[3], "updates": int(table[-1, 0]), "steps": int(table[-1, 1]), "train_s": spent,
         "compile_s": compile_s, "gradient_typical": float(np.nanmedian(norms)), "gradient_peak": float(np.nanmax(norms)),
+        "gradient_zero": float((norms == 0).mean()), "unmoved": float(np.mean(is_unmoved)) if is_unmoved else math.nan,
         **probe,
-        "verdicts": json.dumps(faults),
         "curve_update": table[:, 0].tolist(), "curve_step": table[:, 1].tolist(), "curve_s": table[:, 2].tolist(),
         "curve_return": table[:, 3].tolist(), "curve_return_low": table[:, 4].tolist(),
         "curve_return_high": table[:, 5].tolist(),
         **{name: [row[i] for row in cosines] for i, name in enumerate(("cosine_update", "cosine", "cosine_denoised"))},
         **_thinned(log, settings.entries),
     }  # fmt: skip
+
+
+def _first_not_finite(log: list[dict[str, float]]) -> tuple[int, str] | None:
+    """Return the first update with a quantity that has to be finite and is not, and the quantity; None without one."""
+    bad = ((i, name) for i, entry in enumerate(log, 1) for name in FINITE if not math.isfinite(entry.get(name, 0.0)))
+    return next(((update, name.replace("_", " ")) for update, name in bad), None)
+
+
+def _column(log: list[dict[str, float]], name: str) -> np.ndarray:
+    """Return one quantity by update, ``(n,)``; NaN where a trainer does not have it."""
+    return np.array([entry.get(name, math.nan) for entry in log])
+
+
+def _arrays(state: Any) -> list[np.ndarray]:
+    """Return copies of the parameters of a state's actor, by array; empty for a state without one."""
+    import jax
+
+    return [np.array(leaf) for leaf in jax.tree.leaves(getattr(state, "actor", ()))]
 
 
 def _spread(total: int, count: int) -> set[int]:
@@ -104,7 +122,7 @@ def _interval(returns: np.ndarray) -> tuple[float, float, float, float]:
     return mean, mean - half, mean + half, float(np.median(returns))
 
 
-def _probe(training: Training, state: Any, batches: int) -> dict[str, float]:
+def _probe(training: Training, state: Any, batches: int) -> dict[str, Any]:
     """Return the error of a directional derivative, and the bias of windows, at one state of a run.
 
     The direction is that of the gradient of the same rollouts, and the error the smallest over :data:`SHIFTS`. The gradient of
@@ -114,13 +132,14 @@ def _probe(training: Training, state: Any, batches: int) -> dict[str, float]:
     """
     gradient = training.gradient(state, 0)
     norm = float(np.linalg.norm(gradient))
-    result = {"difference_error": math.nan}
+    result: dict[str, Any] = {"difference_error": math.nan}
     if norm > 0 and math.isfinite(norm):
         errors = []
         for length in SHIFTS[training.env.dtype]:
             shift = length * gradient / norm
             slope = training.mean_return(state, 0, shift) - training.mean_return(state, 0, -shift)
             errors.append(abs(slope / (2 * length) / norm - 1.0))
+        result["difference_errors"] = errors
         result["difference_error"] = float(np.nanmin(errors)) if np.isfinite(errors).any() else math.nan
     if batches > 1 and hasattr(training.trainer, "window"):
         length, every = training.env.length, training.trainer.window
@@ -136,13 +155,13 @@ def _probe(training: Training, state: Any, batches: int) -> dict[str, float]:
     return result
 
 
-def _thinned(log: Log, entries: int) -> dict[str, list[float]]:
+def _thinned(log: list[dict[str, float]], entries: int) -> dict[str, list[float]]:
     """Return the log in at most ``entries`` entries per quantity, with five significant digits."""
     count = len(log)
     edges = np.unique(np.linspace(0, count, min(entries, count) + 1).round().astype(int))
     result = {"log_update": edges[1:].tolist()}
     for name in LOGGED:
-        values = log.column(name)
+        values = _column(log, name)
         if np.isnan(values).all():
             continue
         parts = [values[a:b] for a, b in itertools.pairwise(edges)]

@@ -14,6 +14,7 @@ from bench.experiment.views import Chart, Style, Table, Views
 from bench.report.style import DEVIANT, VARIANTS, colour, marker
 from bench.report.writer import reasons
 from bench.studies.train import aggregate
+from bench.studies.train.verdicts import MEANINGS
 
 PROBLEM, METHOD, VERDICT = text("problem"), text("method", label="trainer"), text("verdict")
 FINAL = Column("final", label="final return", low="final_low", high="final_high", digits=3, log=False)
@@ -40,6 +41,7 @@ FAULTS = (
     Column("seed", format="setting"),
     text("code", label="the log shows"),
     Column("update", format="setting"),
+    Column("value"),
 )
 COST = Column("cost", label="cost of an episode", low="cost_low", high="cost_high")
 STEP, SECONDS = (
@@ -77,23 +79,7 @@ WINDOW_NOTE = (
     "to it, with its 95% interval, each the median over runs. The policies differ between windows. "
     f"final return: {SEEDS}."
 )
-FAULT_CODES = {
-    "not_finite": "a quantity is not finite",
-    "zero": "the gradient is exactly 0",
-    "explodes": "the gradient is more than 100 times its median before",
-    "returns": "the gradient nearly vanishes, and then returns to its usual size",
-    "vanishes": "the gradient stays below 1/100 of its size, and the return rises no more",
-    "grows": "the gradient grows step by step, to more than 100 times its first size",
-    "differences": "central differences do not agree with the gradient, which is open where the cost has jumps",
-    "opposed": "the first-order gradient points away from the zeroth-order one",
-    "worse": "the loss falls while the return worsens",
-    "soft_contact": "the reward rises with the penetration: the policy uses the soft contact",
-    "parameters": "the largest parameter of the policy is more than 100 times its first value",
-    "deviation": "the deviation of the actions is unphysical",
-    "cut": "the gradient is cut in most windows, so that it seldom reaches their ends",
-}
-"""What each code of a fault means."""
-FAULT_NOTE = "update: where it starts. factor: on the value before. peaks: updates with an explosion, with_contact: those with contact."
+FAULT_NOTE = "update: where it starts. value:"
 VERDICTS = (
     "verdict: first, tied (not distinguishable), behind (by a Mann-Whitney test at 5%), or open where none is behind."
 )
@@ -130,16 +116,12 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
             )
         )
     if len(faults):
-        columns = [*FAULTS, *(Column(name) for name in faults if name not in {column.name for column in FAULTS})]
-        tables.append(Table("faults", faults, columns, "Faults in the logs", _fault_notes(faults), page=True))
+        notes = [FAULT_NOTE, *(f"- {code}: {MEANINGS[code]}" for code in faults["code"].unique())]
+        tables.append(Table("faults", faults, FAULTS, "Faults in the logs", notes, page=True))
     cells = rows.assign(problem=runs["problem"], method=runs["method"]).fillna({"problem": "", "method": ""})
     by_name = experiment.columns.by_name
     return Views(tables, _charts(runs, summary, windows), cells,
                  [METHOD, *(by_name[name] for name in PAGE)], reasons(rows))  # fmt: skip
-
-
-def _fault_notes(faults: pd.DataFrame) -> list[str]:
-    return [FAULT_NOTE, *(f"- {code}: {FAULT_CODES[code]}" for code in faults["code"].unique())]
 
 
 def _styles(summary: pd.DataFrame) -> dict[str, Style]:
@@ -172,7 +154,7 @@ def _charts(runs: pd.DataFrame, summary: pd.DataFrame, windows: pd.DataFrame) ->
 def _windows(windows: pd.DataFrame) -> Chart:
     return Chart(
         "windows", windows, [replace(WINDOW, log=True)], [FINAL, WINDOW_BIAS, WINDOW_GRADIENT], series="family", panel="problem",
-        subtitle=f"final return: {SEEDS}", text="A point per length of window. Choose the quantity.",
+        subtitle=f"final return: {SEEDS}", text="A point per length of window.",
     )  # fmt: skip
 
 

@@ -3,22 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import ClassVar
 
-from bench.experiment.cell import Cell
 from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, text
-from bench.experiment.experiment import Experiment
-from bench.experiment.session import Session
-from bench.experiment.study import Study
-from bench.experiment.views import Views
 from bench.model import param
-
-if TYPE_CHECKING:
-    import pandas as pd
+from bench.studies import StudyPackage
 
 
 @dataclass(frozen=True)
-class Twins(Study):
+class Twins(StudyPackage):
     """Measures the difference between a physics engine's twin and the scene's own program, and the time of gradients."""
 
     name = "twins"
@@ -49,15 +42,3 @@ class Twins(Study):
     )  # fmt: skip
 
     timed_calls: int = param(5, "calls timed for costs and for gradients", positive=True)
-
-    def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
-        """Return one cell's results by column: differences at w = 0, and the times of costs and gradients [s]."""
-        from bench.studies.twins.measure import measure
-
-        return measure(cell, session, self.timed_calls)
-
-    def views(self, experiment: Experiment, rows: pd.DataFrame) -> Views:
-        """Return the table of differences and times, and the chart of differences."""
-        from bench.studies.twins.views import views
-
-        return views(experiment, rows)

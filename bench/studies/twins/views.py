@@ -6,26 +6,18 @@ import pandas as pd
 
 from bench.experiment.columns import text
 from bench.experiment.experiment import Experiment
-from bench.experiment.views import Chart, Mark, Style, Views
+from bench.experiment.views import Chart, Mark, Views
 from bench.report.shown import Shown, floored
-from bench.report.style import PALETTE
-from bench.report.writer import reasons
 
 FLOOR = 1e-17
 """Smallest difference that is drawn; smaller ones, 0 included, are drawn here as upper limits."""
 ROUNDING = 1e-6
 """Relative difference above which a twin's states or gradient count as different. Accumulated rounding is smaller."""
-COLOURS = (PALETTE[2], PALETTE[0], PALETTE[3], PALETTE[4])
+DIFFERENCES = ("gradient_difference_rel", "state_difference_rel", "cost_difference_rel")
 SHOWN = (
     "state_difference", "state_difference_rel", "cost_difference_rel", "gradient_difference_rel", "gradient_cosine",
     "value_s", "gradient_s", "compile_s",
 )  # fmt: skip
-DIFFERENCES = {
-    "gradient_difference_rel": "relative difference of the gradient",
-    "state_difference_rel": "relative difference of states",
-    "cost_difference_rel": "relative difference of costs",
-}
-"""Drawn quantities with their labels."""
 NOTES = (
     "Differences between the engine's twin and the scene's own program at theta without noise. Difference of states: the "
     "largest over the rollout; relative: in units of the coordinate's largest value. Times are of one batch of `samples` "
@@ -38,15 +30,11 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     shown = Shown(experiment, rows)
     numbers = [shown.column(name, digits=3) for name in SHOWN]
     cells = shown.cells(numbers, "engines compared with the scenes' own programs", NOTES)
-    good = shown.good
-    order = good.groupby("problem")["gradient_difference_rel"].max().sort_values(ascending=False).index
-    frame = floored(good.set_index("problem").loc[order].reset_index(), FLOOR, DIFFERENCES)
-    x = [shown.column(name, label=label, limit=f"{name}_limit", log=True) for name, label in DIFFERENCES.items()]
-    engines = dict.fromkeys(frame["method"])
+    worst = shown.good.groupby("problem")["gradient_difference_rel"].transform("max")
+    frame = floored(shown.good.loc[worst.sort_values(ascending=False, kind="stable").index], FLOOR, DIFFERENCES)
     chart = Chart(
-        "twins", frame, x, [text("problem", label="")], "dots", series="method",
-        styles={engine: Style(COLOURS[i % 4], "oD^v"[i % 4]) for i, engine in enumerate(engines)},
-        marks=[Mark("rounding up to here", ROUNDING)], height=0.3,
+        "twins", frame, [shown.column(name, limit=f"{name}_limit", log=True) for name in DIFFERENCES],
+        [text("problem", label="")], "dots", series="method", marks=[Mark("rounding up to here", ROUNDING)], height=0.3,
         text="One dot per problem and engine. Left of the dashed line a difference is accumulated rounding.",
     )  # fmt: skip
-    return Views([cells], [chart], remarks=reasons(rows))
+    return Views([cells], [chart])

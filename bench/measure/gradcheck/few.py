@@ -1,0 +1,121 @@
+"""Compares a gradient with differences at one to three steps per coordinate: the first, cheapest stage of an examination.
+
+One step needs two costs per coordinate. The one-sided slopes at the same step differ by h f'' where the cost is smooth and
+by a constant at a kink, so half of their difference bounds the error of the central difference, whose own error is of
+order h^2 (Nocedal and Wright 2006, section 8.1). Further steps replace this bound by the agreement between steps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from .causes import causes_of_ratios
+from .check import Check, Part
+from .direction import ALIKE, MEASURED, Sample, finding_at, wrong
+from .verdicts import most_severe
+
+ROUNDS = (1.0, 30.0, 0.1)
+"""Steps of the rounds, in multiples of the cube root of the unit roundoff, at which rounding and curvature balance."""
+ROUNDED = 16.0
+"""Allowed rounding error of a cost, in unit roundoffs."""
+CLEAR = 2.0
+"""Least distance of a wrong derivative from the difference, in multiples of the difference's uncertainty."""
+SHRINKS = 0.5
+"""Largest ratio of the bounds at two steps, ten times apart or more, at which a cost counts as smooth."""
+FLOOR = 4.0
+"""Allowed non-repeatability of a cost, in multiples of the largest difference seen between equal calls."""
+
+
+class FewSteps:
+    """Differences of a cost at one to three steps per coordinate. Each finished difference is kept."""
+
+    def __init__(
+        self,
+        cost: Callable[[np.ndarray], np.ndarray],
+        theta: np.ndarray,
+        scale: np.ndarray,
+        gradient: np.ndarray | None,
+        centre: float,
+        unit: float,
+        floor: float = 0.0,
+    ) -> None:
+        self._cost, self.theta, self.scale, self.centre = cost, theta, scale, centre
+        self.gradient, self.unit, self.floor = gradient, unit, floor
+        self._rounds = 0
+        self._values: list[list[tuple[float, float, float]]] = [[] for _ in range(theta.size)]
+
+    def run_round(self, width: int = 1) -> None:
+        """Compute two costs per coordinate at the next step, at most ``width`` costs per call."""
+        steps = ROUNDS[self._rounds] * float(np.cbrt(self.unit)) * self.scale
+        for chosen in np.array_split(np.arange(self.theta.size), -(-self.theta.size // max(width // 2, 1))):
+            moved = np.repeat(self.theta[:, None], 2 * chosen.size, axis=1)
+            moved[np.tile(chosen, 2), np.arange(2 * chosen.size)] += np.r_[-steps[chosen], steps[chosen]]
+            costs = self._cost(moved).reshape(2, -1)
+            for index, minus, plus in zip(chosen, *costs, strict=True):
+                self._values[index].append((float(steps[index]), float(minus), float(plus)))
+        self._rounds += 1
+
+    def check(self) -> Check | None:
+        """Return the outcome for the coordinates with at least one difference; None if there are none."""
+        parts = [self._part(i) for i, values in enumerate(self._values) if values]
+        if not parts:
+            return None
+        ratios = {i: [part.ratio_with_error] for i, part in enumerate(parts) if part.verdict == "wrong_adjoint"}
+        if ratios:
+            causes = causes_of_ratios(ratios, [], any(part.verdict == "smooth" for part in parts))
+            if set(causes.values()) == {"wrong_factor"}:
+                parts = [replace(p, verdict="wrong_factor") if i in ratios else p for i, p in enumerate(parts)]
+        gradient = np.full(self.theta.size, np.nan) if self.gradient is None else self.gradient
+        return Check(most_severe(part.verdict for part in parts), self.theta, gradient, self.scale, tuple(parts), ())
+
+    @np.errstate(all="ignore")
+    def _part(self, index: int) -> Part:
+        step, minus, plus = np.array(sorted(self._values[index], reverse=True)).T
+        program = 0.0 if self.gradient is None else float(self.gradient[index])
+        sample = Sample(
+            step, minus, self.centre, plus, program, np.zeros(step.size, bool), scale=float(self.scale[index]),
+            unit=self.unit, noise=self.floor,
+        )  # fmt: skip
+        noise = ROUNDED / MEASURED * sample.rounding(self.unit) + FLOOR * self.floor / step
+        bounds = np.abs(sample.right - sample.left) / 2 + noise
+        finite = np.isfinite(bounds)
+        best = int(np.argmin(np.where(finite, bounds, np.inf)))
+        difference, uncertainty = float(sample.differences[best]), float(bounds[best])
+        others = np.abs(np.delete(sample.differences, best) - difference)
+        # at a kink central differences agree, and the bounds do not shrink with the step
+        shrinks = bounds[best] <= SHRINKS * np.max(bounds, initial=0.0, where=finite)
+        if others.size and np.isfinite(others).all() and shrinks:
+            uncertainty = min(uncertainty, float(others.min() + noise[best]))
+        if self.gradient is None:
+            sample = replace(sample, derivative=difference)
+        is_contradicted = bool((np.abs(sample.differences - difference) > bounds + uncertainty).any())
+        finding = finding_at(sample, _judge(sample, difference, uncertainty, is_contradicted), best, uncertainty)
+        return Part(name=f"component {index}", component=index, sample=sample, **vars(finding))
+
+
+def _judge(sample: Sample, difference: float, uncertainty: float, is_contradicted: bool) -> str:
+    program = sample.derivative
+    size, apart = max(abs(program), abs(difference)), abs(program - difference)
+    if not np.isfinite(sample.centre) or not np.isfinite(sample.differences).any():
+        return "nonfinite"
+    if not np.isfinite(program):
+        return "nan_gradient"
+    if is_nothing(sample):
+        return "zero"
+    if is_contradicted:
+        return "unsettled"
+    if apart > CLEAR * uncertainty and apart > float(np.cbrt(sample.unit)) * size:
+        return wrong(sample)
+    return "smooth" if uncertainty <= ALIKE * size else "unsettled"
+
+
+def is_nothing(sample: Sample) -> bool:
+    """Return whether a cost does not move, and its derivative is 0 or changes it by less than its rounding.
+
+    The derivative's change is that over the whole scale of the input.
+    """
+    is_still = ((sample.minus == sample.centre) & (sample.plus == sample.centre)).all()
+    return bool(is_still and abs(sample.derivative) * sample.scale <= ROUNDED * sample.unit * abs(sample.centre))
