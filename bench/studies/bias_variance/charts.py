@@ -92,7 +92,7 @@ def charts(
         text="Each point is one cell. Lower left is better; above 1 an estimate is worse than the zero estimate. Points with "
         "a ring are not beaten in both by any point shown of the same problem.",
     )  # fmt: skip
-    return [chart for chart in (*along, cloud) if chart is not None and len(chart.frame)]
+    return [chart for chart in (*along, cloud) if chart is not None]
 
 
 # ------------------------------------------------------------------------------------------------------- frames

@@ -167,7 +167,7 @@ def charts(runs: RunSet, default: float, name: Callable[[str], str]) -> list[Cha
     return [
         replace(chart, frame=chart.frame.assign(method=chart.frame["method"].map(name)), series="method", styles=looks)
         for chart in found
-        if chart is not None and len(chart.frame)
+        if chart is not None
     ]
 
 
