@@ -46,10 +46,9 @@ class Page:
             self.page.wait_for_timeout(50)
 
     def open(self, path: Path) -> None:
-        """Open a file and wait until it is loaded and, on the page of an experiment, its visible charts are drawn."""
+        """Open a file and wait until it is loaded."""
         self.said.clear()
         self.page.goto(path.resolve().as_uri())
-        self.do("typeof settled === 'function' && settled()")
 
     def size(self, width: int, height: int, dark: bool = False) -> None:
         """Set the size of the window in pixels, and whether the system prefers a dark theme."""

@@ -22,11 +22,11 @@ from bench.experiment.columns import Column, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Style, Views
 from bench.model import registry
-from bench.report import terminal
+from bench.report import terminal, writer
 from bench.report.problems import varying_identity
 from bench.report.tables import plain_markdown
 from bench.report.text import axis_value, counted, one_line
-from bench.report.web.document import assemble
+from bench.report.web.document import blocks
 from bench.run.files import make_directory, write_all
 
 PRINTED = 30
@@ -184,7 +184,8 @@ def page(comparison: Comparison) -> str:
     )
     shown = page_views(comparison)
     assert shown.rows is not None
-    return assemble(experiment, shown.rows, shown, [[] for _ in range(len(shown.rows))], {})
+    drawn = writer.drawings(experiment, shown)
+    return "".join(blocks(experiment, shown.rows, shown, drawn, [[] for _ in range(len(shown.rows))], {}))
 
 
 def page_views(comparison: Comparison) -> Views:
@@ -222,5 +223,5 @@ def _before_after(before: Column, after: Column, rows: pd.DataFrame) -> Chart:
     frame = rows[["outcome", "experiment", before.name, after.name]].assign(row=range(len(rows)))
     return Chart(
         after.name, frame, [before], [after], "points", title, series="outcome", panel="experiment", styles=STYLES,
-        printed=False, text="Points above the diagonal are larger after.",
+        text="Points above the diagonal are larger after.",
     )  # fmt: skip

@@ -51,9 +51,9 @@ def write(report: Findings, directory: Path) -> list[Path]:
     pictures = []
     with styled():
         for chart in charts(report):
-            saved = save(draw(chart), directory / chart.name, data=chart.plotted())
-            paths += saved
-            pictures.append(f"<h2>{escape(chart.title)}</h2>{shell.picture(saved[0], chart.title)}")
+            figure = draw(chart)
+            paths += save(figure, directory / chart.name, data=chart.plotted())
+            pictures.append(f"<h2>{escape(chart.title)}</h2>{shell.drawing(figure, chart.name, chart.title)}")
     title = f"Examination of {report.name}"
     body = BODY.format(
         title=escape(title),

@@ -46,7 +46,7 @@ class Mark:
 
 @dataclass(frozen=True)
 class Chart:
-    """A chart as data: which columns of a table are drawn against each other, for print and page.
+    """A chart as data: which columns of a table are drawn against each other, for files and page.
 
     - ``lines``: y against x, a line per ``series``, 95% intervals where the columns have them.
     - ``points``: the same without lines.
@@ -60,7 +60,7 @@ class Chart:
     frame: pd.DataFrame
     """A line per point. Its column ``row``, if any, is the position of the cell in ``Views.rows``."""
     x: Sequence[Column]
-    """The horizontal quantities: print draws the first, a reader of the page chooses."""
+    """The horizontal quantities: the first is drawn, ``*.plotted.csv`` has all."""
     y: Sequence[Column]
     kind: ChartKind = "lines"
     title: str = ""
@@ -79,7 +79,7 @@ class Chart:
     text: str = ""
     """How to read the chart, for the page."""
     subtitle: str = ""
-    """Conditions that all panels share, for print."""
+    """Conditions that all panels share."""
     value_range: tuple[float, float] | None = None
     """The numbers ``value`` of the lightest and the darkest cell; by default the smallest and the largest."""
     panel_notes: Mapping[str, str] = field(default_factory=dict)
@@ -88,8 +88,6 @@ class Chart:
     """The looks of series or levels; others get a colour each."""
     marks: Sequence[Mark] = ()
     join: bool = False
-    front: str = ""
-    """On the page: the column within whose values points are marked that no other point beats in both x and y."""
     failed: str = ""
     """The column that is true where a point has no value: a cross at the upper edge."""
     labels: Literal["ends", "legend"] = "legend"
@@ -103,12 +101,9 @@ class Chart:
     shape: str = ""
     """The column whose values have a marker each, where ``series`` has the colours."""
     chosen: Sequence[tuple[str, Sequence[Any]]] = ()
-    """What print draws of the table: columns with the values to keep, in this order. The page draws all."""
+    """What is drawn of the table: columns with the values to keep, in this order."""
     own_scales: bool = False
     """Whether each panel has its own scale of y (of x, for dots); panels above each other then share that of x."""
-    printed: bool = True
-    """Whether the chart is drawn as a file."""
-    on_page: bool = True
 
     def __post_init__(self) -> None:
         columns = (self.series, self.line, self.panel, self.panel_row, self.shape, self.level, self.value, self.cell,
@@ -119,7 +114,7 @@ class Chart:
             raise ValueError(f"chart {self.name}: its table has no column {', '.join(missing)}")
 
     def drawn(self) -> pd.DataFrame:
-        """Return the lines of the table that print draws."""
+        """Return the lines of the table that are drawn."""
         frame = self.frame
         for name, values in self.chosen:
             kept = frame[frame[name].isin(values)]

@@ -534,7 +534,7 @@ def _label_ends(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str,
         style = styles[series]
         panel.annotate(
             plain(_clipped(style.meaning or series, 0.42 * width)), (1.015, place), xycoords="axes fraction",
-            va="center", ha="left", color=style.colour, fontsize=SIZE, annotation_clip=False,
+            va="center", ha="left", color=[0.75 * part for part in to_rgb(style.colour)], fontsize=SIZE, annotation_clip=False,
         )  # fmt: skip
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,6 +21,10 @@ from bench.run.files import write_whole
 DPI = 150
 PLACES = 6
 """Decimal places of positions, in units of the figure."""
+FONTS = ["DejaVu Sans", "Verdana"]
+"""Fonts of one width: the one that texts are measured in, and one that most systems have."""
+UNNEEDED = re.compile(r'<!--.*?-->\s*| *<metadata>.*?</metadata>\s*| id="[\w.]+_\d+"', re.DOTALL)
+"""Parts of an SVG that nothing refers to: comments, metadata, and ids that count elements, the same in every figure."""
 METADATA: dict[str, dict[str, Any]] = {"png": {"Software": None}, "svg": {"Date": None}, "pdf": {"CreationDate": None}}
 """Metadata to omit from each file format, because it would differ between equal figures."""
 
@@ -50,6 +55,23 @@ def save(figure: Figure, stem: Path, formats: Sequence[str] = ("png",), data: pd
     for suffix, content in contents.items():
         write_whole(stem.with_name(f"{stem.name}.{suffix}"), content)
     return [stem.with_name(f"{stem.name}.{suffix}") for suffix in contents]
+
+
+def inline_svg(figure: Figure, name: str) -> str:
+    """Return a figure as an SVG element for a page whose other elements have other names, without the title at its top.
+
+    The ground is transparent and texts are texts, in a font as wide as the one they were measured in.
+    """
+    _settle(figure)
+    title, width = figure.texts[0], figure.get_figwidth()
+    below = Bbox.from_extents(0, 0, width, title.get_window_extent().y0 / figure.dpi)
+    title.set_visible(False)
+    buffer = io.BytesIO()
+    with matplotlib.rc_context({"svg.hashsalt": name, "svg.fonttype": "none", "font.sans-serif": FONTS}):
+        figure.savefig(buffer, format="svg", transparent=True, bbox_inches=below, metadata=METADATA["svg"])
+    drawn = buffer.getvalue().decode()
+    drawn = UNNEEDED.sub("", drawn[drawn.index("<svg") :])
+    return re.sub(r' width="[^"]*" height="[^"]*"', f' style="--inches: {width:g}"', drawn, count=1)
 
 
 def _settle(figure: Figure) -> None:

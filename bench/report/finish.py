@@ -58,14 +58,15 @@ def write(experiment: Experiment, rows: pd.DataFrame) -> tuple[Views, list[Path]
         guard.protect_process(),
     ):  # building the commands that repeat cells runs code of plugins
         views = views_of(experiment, rows)
-        paths = [*writer.write(experiment, views), *web.write(experiment, rows, views)]
+        drawn = writer.drawings(experiment, views)
+        paths = [*writer.write(experiment, views, drawn), *web.write(experiment, rows, views, drawn)]
         if own := getattr(study_of(experiment), "write", None):
             paths += own(experiment, rows)
         return views, paths
 
 
 def views_of(experiment: Experiment, rows: pd.DataFrame) -> Views:
-    """Return what the study shows of its rows, or else a table of its numbers and a chart of any two of them."""
+    """Return what the study shows of its rows, or else a table of its numbers and a chart of the first."""
     rows = rows.reset_index(drop=True)
     views = study_of(experiment).views(experiment, rows) or generic.views(experiment, rows)
     if experiment.execution.ladder:

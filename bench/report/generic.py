@@ -1,4 +1,4 @@
-"""The views of a study that has none of its own: a table of its numbers and a chart of any two of them."""
+"""The views of a study that has none of its own: a table of its numbers and a chart of the first along what was swept."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from bench.report.views import arrange
 
 
 def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
-    """Return the table of the study's own numbers, and their chart on the page."""
+    """Return the table of the study's own numbers, and a chart of the first of them."""
     shown = arrange(experiment, rows)
     table = shown.rows
     own = [
@@ -25,14 +25,11 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     labels = [COMMON[name] for name in IDENTITY if table[name].nunique(dropna=False) > 1] or [COMMON["scene"]]
     swept = [Column(axis.column, label=axis.title, format="setting") for axis in shown.swept()]
     labels = [column for column in labels if column.name not in {axis.name for axis in swept}]
+    x = [*swept, *(column for column in labels if column.kind == "number")]
     y = [column for column in own if column.kind == "number"]
-    x = [*swept, *(column for column in labels if column.kind == "number"), *y]
     names = [column.name for column in labels if column.kind == "text"] or ["scene"]
-    frame = table.assign(series=titled(table, names), row=range(len(table)))
-    charts = [
-        Chart(experiment.study.name, frame, x, y, "points", series="series", printed=False,
-              text="Choose the quantities of both axes.")
-    ] if y else []  # fmt: skip
+    frame = table.assign(series=titled(table, names))
+    charts = [Chart(experiment.study.name, frame, x[:1], y[:1], "points", series="series")] if x and y else []
     return Views(
         tables=[
             Table(experiment.study.name, table, [*labels, *swept, *(replace(c, digits=3) for c in own), COMMON["status"]],

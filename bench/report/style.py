@@ -8,8 +8,8 @@ from typing import Any
 
 from bench.report.text import one_line
 
-PALETTE = ("#0072B2", "#000000", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7F6000")
-"""Colours that colour-blind readers can distinguish (Okabe and Ito, yellow replaced by brown for white paper)."""
+PALETTE = ("#0072B2", "#000000", "#D55E00", "#009E73", "#CC79A7", "#C88031", "#3598D9", "#7406BE")
+"""Colours that colour-blind readers can distinguish, with contrasts above 3 on white (Okabe and Ito, the light ones replaced)."""
 MARKERS = "osD^vPX*"
 VARIANTS = ("-", (0, (4, 1.5)), (0, (1, 1.2)))
 """Line styles of one estimator's parameter variants."""
@@ -35,16 +35,14 @@ STYLE: dict[str, Any] = {
 
 
 def colour(place: int) -> str:
-    """Return the colour of a position, from 0: the palette, then its hues mixed with black or white; no colour repeats."""
+    """Return the colour of a position, from 0: the palette, then its hues darker, and black lighter; no colour repeats."""
     from matplotlib.colors import to_hex, to_rgb
 
     turn, index = divmod(place, len(PALETTE))
     if turn == 0:
         return PALETTE[index]
-    # odd turns darken, even turns lighten, and each adds less than the one before; black can only be lightened
-    share = 0.45 * 0.7 ** ((turn - 1) // 2)
-    end = 1.0 if turn % 2 == 0 or PALETTE[index] == "#000000" else 0.0
-    share = share / 2 if turn % 2 == 0 and PALETTE[index] == "#000000" else share
+    share = 0.1 + 0.6 * (0.618034 * turn % 1)  # steps of the golden ratio never repeat
+    end = 1.0 if PALETTE[index] == "#000000" else 0.0
     red, green, blue = ((1 - share) * part + share * end for part in to_rgb(PALETTE[index]))
     return to_hex((red, green, blue))
 

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pandas as pd
+from matplotlib.figure import Figure
 
 from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Table, Views
@@ -22,29 +23,43 @@ from bench.run.files import write_all
 
 ANSWER = "answer.json"
 """The file with an experiment's question, answer and main chart."""
+LEAST = 3
+"""Fewest values that are drawn."""
 
 
-def write(experiment: Experiment, views: Views) -> list[Path]:
-    """Write all tables, charts and the answer of an experiment; return the files' paths."""
-    drawn = [chart for chart in views.charts if chart.printed and len(chart.drawn())]
-    charts = [path for chart in drawn for path in _draw(experiment, chart)]
-    paths = write_all(experiment.directory, [(ANSWER, _answer(experiment, views))])
+def write(experiment: Experiment, views: Views, drawn: Sequence[tuple[Chart, Figure]]) -> list[Path]:
+    """Write all tables, the charts as :func:`drawings` gives them, and the answer of an experiment; return the files' paths."""
+    charts = []
+    with styled():
+        for chart, figure in drawn:
+            charts += save(figure, experiment.directory / chart.name, experiment.formats, chart.plotted())
+    paths = write_all(experiment.directory, [(ANSWER, _answer(experiment, views, drawn[0][0].name if drawn else ""))])
     for name in dict.fromkeys(table.name for table in views.tables):
         tables = [table for table in views.tables if table.name == name]
         paths += write_all(experiment.directory, table_files(tables, experiment.name))
     return [*paths, *charts]
 
 
-def _draw(experiment: Experiment, chart: Chart) -> list[Path]:
+def drawings(experiment: Experiment, views: Views) -> list[tuple[Chart, Figure]]:
+    """Return the charts with enough values to show something, drawn; those without a title have the experiment's question."""
     with styled():
-        titled = replace(chart, title=chart.title or experiment.question)
-        return save(draw(titled), experiment.directory / chart.name, experiment.formats, chart.plotted())
+        return [
+            (chart, draw(replace(chart, title=chart.title or experiment.question)))
+            for chart in views.charts
+            if _is_telling(chart)
+        ]
 
 
-def _answer(experiment: Experiment, views: Views) -> str:
-    main = next((chart.name for chart in views.charts if chart.printed and len(chart.drawn())), "")
+def _is_telling(chart: Chart) -> bool:
+    """Return whether at least :data:`LEAST` points are drawn, and lines have as many places along a numeric axis."""
+    frame, x = chart.drawn(), chart.x[0].name
+    is_line = chart.kind == "lines" and pd.api.types.is_numeric_dtype(frame[x])
+    return len(frame) >= LEAST and (not is_line or frame[x].nunique() >= LEAST)
+
+
+def _answer(experiment: Experiment, views: Views, chart: str) -> str:
     content = {
-        "experiment": experiment.name, "question": experiment.question, "answer": views.headline, "chart": main
+        "experiment": experiment.name, "question": experiment.question, "answer": views.headline, "chart": chart
     }  # fmt: skip
     return json.dumps(content, indent=1, ensure_ascii=False) + "\n"
 
@@ -91,7 +106,10 @@ def _in_markdown(one: TableCell) -> str:
 
 
 def show(experiment: Experiment, rows: pd.DataFrame, views: Views) -> None:
-    """Print the counts of cells, the headline, the tables that are meant for the terminal, and the headline again."""
+    """Print the counts of cells, the headline, the tables that are meant for the terminal, and the headline again.
+
+    Notes of a table that are in its Markdown file are not repeated.
+    """
     console = terminal.open_console()
     console.print(f"\n{experiment.name}: {experiment.question}" if experiment.question else f"\n{experiment.name}")
     counts = rows["status"].value_counts()
@@ -105,7 +123,7 @@ def show(experiment: Experiment, rows: pd.DataFrame, views: Views) -> None:
             for place, (heading, part) in enumerate(parts(table)):
                 texts = _terminal_text(replace(table, frame=part), console.width)
                 terminal.print_table(console, texts, heading or (table.title if place == 0 else ""), right=right)
-            for note in table.notes:
+            for note in table.notes if "md" not in table.files else ():
                 console.print(one_line(note))
     for text in map(one_line, views.remarks):
         console.print(text, soft_wrap="python -m bench" in text)  # a command stays one line, so that it can be copied
@@ -124,9 +142,13 @@ def _terminal_text(table: Table, width: int) -> pd.DataFrame:
 
 
 def reasons(rows: pd.DataFrame) -> list[str]:
-    """Return why cells failed, were refused or have remarks; reasons that differ only in numbers are counted together."""
+    """Return why cells failed, were refused or have remarks; counted together where reasons differ only in numbers.
+
+    All that are unsupported are one line.
+    """
     given = rows[rows["reason"] != ""]
     kinds = given["reason"].str.replace(r"\d+(\.\d+)?(e[+-]?\d+)?", "#", regex=True)
+    kinds = kinds.mask(given["status"] == "unsupported", "")
     groups = sorted(given.groupby(["status", kinds]), key=lambda item: -len(item[1]))
     return [
         f"{len(part)} {status}: {part['reason'].iloc[0]}" + ("" if part["reason"].nunique() == 1 else " (for example)")

@@ -54,7 +54,8 @@ def made(tmp_path):
 
 def written(made, rows):
     """The paths of all files of rows, tables and charts."""
-    return writer.write(made, made.study.views(made, rows))
+    shown = made.study.views(made, rows)
+    return writer.write(made, shown, writer.drawings(made, shown))
 
 
 @pytest.fixture(scope="module")
@@ -201,7 +202,7 @@ def drawn(rows, swept, sweep=None, **given):
     if sweep is None:
         sweep = {name: sorted(map(float, rows[name].unique())) for name in swept}
     made = experiment(sweep=sweep, **given)
-    return {chart.name: chart for chart in made.study.views(made, rows).charts if chart.printed}
+    return {chart.name: chart for chart in made.study.views(made, rows).charts}
 
 
 def figure_of(chart):

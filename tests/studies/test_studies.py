@@ -28,6 +28,7 @@ from bench.report.writer import write
 from bench.run.files import make_directory
 from bench.studies.gradient_check import views as gradient_check
 from bench.studies.gradient_check.lines import PER_COMPONENT
+from bench.studies.stability.views import cells_of
 from bench.studies.twins import views as twins
 
 SPRUNG = '''
@@ -170,12 +171,6 @@ def test_the_main_chart_of_three_errors_is_along_the_time_step_where_it_is_swept
     assert len(set(drawn["law"])) == 3, "every cell without a sweep of the step"
 
 
-def test_the_page_of_three_errors_draws_along_every_swept_parameter():
-    given, rows = erring("scenes=[bounce_once]", "contacts=[softplus]", "sweep.beta=[100,1000]", "sweep.dt=[0.1,0.05]")
-    chart = given.study.views(given, rows).charts[1]
-    assert [column.heading for column in chart.x] == ["beta [1/m]", "dt [s]"]
-
-
 # ------------------------------------------------------------------------------------------------------- stability
 
 
@@ -189,8 +184,8 @@ def test_maps_are_apart_by_parameters_and_their_titles_say_defaults():
         "scenes=[mass_spring]", "sweep.stiffness=[10,100]", "sweep.zip.dt=[0.1,0.05]", "sweep.zip.horizon=[10,20]",
         "sweep.mass_spring.damping=[0,1,10]",
     )  # fmt: skip
-    first, every = given.study.views(given, rows).charts
-    assert dict(every.frame["problem"].value_counts()) == {f"mass_spring, damping={d}": 4 for d in (0, 1, 10)}
+    [first] = given.study.views(given, rows).charts
+    assert dict(cells_of(given, rows)["problem"].value_counts()) == {f"mass_spring, damping={d}": 4 for d in (0, 1, 10)}
     assert list(first.frame["problem"]) == ["mass_spring, damping=0"] * 4
 
 
@@ -198,13 +193,13 @@ def test_maps_of_scenes_that_no_label_tells_apart_are_apart():
     """sigma has a column of its own, and so is in no identity string."""
     given, rows = mapped("scenes=['mass_spring[sigma=0.1]','mass_spring[sigma=0.2]']", "sweep.stiffness=[10,100]")
     assert rows["scene"].nunique() == 1
-    every = given.study.views(given, rows).charts[1].frame
+    every = cells_of(given, rows)
     assert list(dict.fromkeys(every["problem"])) == ["mass_spring, sigma=0.1", "mass_spring, sigma=0.2"]
 
 
 def test_a_stiffness_that_equals_another_swept_number_stays_on_its_map():
     given, rows = mapped("scenes=[mass_spring]", "sweep.stiffness=[10,100]", "sweep.mass_spring.damping=[10,100]")
-    for _, part in given.study.views(given, rows).charts[1].frame.groupby("problem"):
+    for _, part in cells_of(given, rows).groupby("problem"):
         assert list(part["stiffness"]) == [10.0, 100.0]
 
 
@@ -261,7 +256,7 @@ def test_a_scene_with_a_stiffness_of_its_own_keeps_its_cells_apart(own):
     assert axis.unit == "N/m"
     assert rows["stiffness"].nunique() == 1  # that of the law
     given, rows = mapped(*words, "sweep.sprung.stiffness=[1,10,100]", "sweep.penalty.stiffness=[1,10]")
-    maps = given.study.views(given, rows).charts[1].frame.groupby("problem")
+    maps = cells_of(given, rows).groupby("problem")
     assert [list(cells["stiffness"]) for _, cells in maps] == [[1.0, 10.0]] * 3
 
 
@@ -274,10 +269,9 @@ def test_a_study_without_a_page_gets_its_numbers_and_filters_by_what_varies(own)
     rows = rows.assign(weight=[1.0, 2.0, 30.0], outcome=["good", "bad", "good"])
     views = views_of(given, rows)
     data = page_data(given, rows, views, [[]] * 3)
-    assert [axis["label"] for axis in data["charts"][0]["y"]] == ["weight [kg]"]
-    assert data["charts"][0]["x"][0]["column"] == "mass"
+    assert [(chart.x[0].name, chart.y[0].heading) for chart in views.charts] == [("mass", "weight [kg]")]
     assert data["filters"] == ["mass", "outcome"]
-    assert data["tables"]["rows"]["mass"]() == [1, 2, 3]
+    assert data["cells"]["mass"]() == [1, 2, 3]
 
 
 def test_verdicts_and_what_was_swept_can_be_filtered_by():

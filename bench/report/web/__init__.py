@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import pandas as pd
+from matplotlib.figure import Figure
 
 from bench.experiment.experiment import Experiment
-from bench.experiment.views import Views
+from bench.experiment.views import Chart, Views
 from bench.report import reproduce
 from bench.report.web.document import blocks
 from bench.run.files import write_whole
 from bench.run.rows import read_record
 
 
-def write(experiment: Experiment, rows: pd.DataFrame, views: Views) -> list[Path]:
-    """Write ``report.html`` from rows and what the study shows of them, with the facts of ``run.json``; return its path."""
+def write(
+    experiment: Experiment, rows: pd.DataFrame, views: Views, drawn: Sequence[tuple[Chart, Figure]]
+) -> list[Path]:
+    """Write ``report.html`` from rows, what the study shows of them and its charts, with the facts of ``run.json``; return its path."""
     rows = rows.reset_index(drop=True)
     path = experiment.directory / "report.html"
-    text = blocks(experiment, rows, views, reproduce.commands(experiment, rows), read_record(path.parent))
+    text = blocks(experiment, rows, views, drawn, reproduce.commands(experiment, rows), read_record(path.parent))
     write_whole(path, (block.encode() for block in text))
     return [path]

@@ -1,4 +1,4 @@
-"""Assembles the HTML file of an experiment's page: escaped texts, data by column, and the scripts that draw it."""
+"""Assembles the HTML file of an experiment's page: escaped texts, drawings, the cells by column, and their script."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ import json
 import re
 import uuid
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from functools import cache
 from html import escape
-from importlib.util import find_spec
+from itertools import starmap
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
+from matplotlib.figure import Figure
 
 from bench.experiment.experiment import Experiment
-from bench.experiment.views import Views
+from bench.experiment.views import Chart, Views
 from bench.report.cells import readable
 from bench.report.web import shell
 from bench.report.web.data import page_data
@@ -23,25 +23,18 @@ from bench.report.web.data import page_data
 HERE = Path(__file__).parent
 
 
-def assemble(
-    experiment: Experiment,
-    rows: pd.DataFrame,
-    views: Views,
-    commands: Sequence[Sequence[str]],
-    record: Mapping[str, Any],
-) -> str:
-    """Return the page as HTML. ``commands`` are the words that run each row's cell, ``record`` is ``run.json``."""
-    return "".join(blocks(experiment, rows, views, commands, record))
-
-
 def blocks(
     experiment: Experiment,
     rows: pd.DataFrame,
     views: Views,
+    drawn: Sequence[tuple[Chart, Figure]],
     commands: Sequence[Sequence[str]],
     record: Mapping[str, Any],
 ) -> Iterator[str]:
-    """Yield :func:`assemble` in blocks, so that a long page is never in memory as one string."""
+    """Yield the page as HTML in blocks, so that a long page is never in memory as one string.
+
+    ``commands`` are the words that run each row's cell, ``record`` is ``run.json``.
+    """
     counts = (rows if views.rows is None else views.rows)["status"].value_counts()
     statuses = "".join(f'<li class="{escape(str(s))}"><b>{n}</b> {escape(str(s))}</li>' for s, n in counts.items())
     data = page_data(experiment, rows, views, commands)
@@ -51,12 +44,13 @@ def blocks(
         "headline": escape(views.headline),
         "counts": f"<li><b>{counts.sum()}</b> cells</li>{statuses}",
         "answers": _answers(views),
+        "charts": "\n".join(starmap(_chart, drawn)),
         "made": _made(record),
         "data": (place := uuid.uuid4().hex),
     }
     template = (HERE / "page.html").read_text()
     body = re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], template)
-    before, after = shell.document(experiment.name, body, [plotly(), shell.script("page.js")]).split(place)
+    before, after = shell.document(experiment.name, body, [shell.script("page.js")]).split(place)
     yield before
     yield from map(in_script, json_blocks(data))
     yield after
@@ -79,15 +73,6 @@ def in_script(text: str) -> str:
     return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
 
 
-@cache
-def plotly() -> str:
-    """Return Plotly's script. It is embedded as it is, so that charts exist when a page is printed immediately."""
-    spec = find_spec("plotly")
-    assert spec is not None
-    assert spec.origin is not None
-    return (Path(spec.origin).parent / "package_data" / "plotly.min.js").read_text()
-
-
 # -------------------------------------------------------------------------------------------------------- texts
 
 
@@ -100,6 +85,13 @@ def _answers(views: Views) -> str:
     if table.split:
         texts.insert(0, "", table.frame[table.split].to_numpy())
     return f'<section id="answers"><h2>{escape(table.title)}</h2>{shell.table(texts)}</section>'
+
+
+def _chart(chart: Chart, figure: Figure) -> str:
+    """Return a chart as HTML with its heading and how to read it."""
+    title = chart.title or chart.name.replace("_", " ").capitalize()
+    text = f"<p>{escape(chart.text)}</p>" if chart.text else ""
+    return f"<section><h2>{escape(title)}</h2>{text}{shell.drawing(figure, chart.name, title)}</section>"
 
 
 def _made(record: Mapping[str, Any]) -> str:

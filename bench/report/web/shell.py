@@ -11,6 +11,9 @@ from html import escape
 from pathlib import Path
 
 import pandas as pd
+from matplotlib.figure import Figure
+
+from bench.report.figures import inline_svg
 
 HERE = Path(__file__).parent
 
@@ -72,14 +75,20 @@ def table(frame: pd.DataFrame, numbers: Collection[str] = (), marked: Mapping[st
 
 
 def _breakable(text: str) -> str:
-    """Return a text as HTML that may also break after a comma without a space, as in the settings of a plugin."""
-    return re.sub(r",(?=\S)", ",<wbr>", escape(text))
+    """Return a text as HTML that may also break within a name and its settings."""
+    return re.sub(r"[,\[](?=\S)|_(?=[a-z]{6})", r"\g<0><wbr>", escape(text))
 
 
 def picture(path: Path, description: str) -> str:
     """Return a PNG file as an embedded image, with a description for readers who do not see it."""
     data = base64.b64encode(path.read_bytes()).decode()
     return f'<img alt="{escape(description)}" src="data:image/png;base64,{data}">'
+
+
+def drawing(figure: Figure, name: str, description: str) -> str:
+    """Return a chart in a box that scrolls sideways where the window is narrow; no two of a page have one name."""
+    drawn = inline_svg(figure, name).replace("<svg", f'<svg role="img" aria-label="{escape(description)}"', 1)
+    return f'<div class="scroll drawing" tabindex="0">{drawn}</div>'
 
 
 def script(name: str) -> str:

@@ -13,7 +13,6 @@ import pandas as pd
 
 from bench.experiment.axes import Axis
 from bench.experiment.columns import Column, text
-from bench.experiment.parameters import number_problems
 from bench.experiment.views import Chart, Mark, Style
 from bench.model import SURROGATE, registry
 from bench.report.colours import estimator_order
@@ -38,9 +37,9 @@ from bench.studies.bias_variance.time_to_accuracy import SAMPLES, TARGETS
 FLOOR = 1e-4
 """Relative biases below this are drawn here, as upper limits."""
 SERIES = 3
-"""Most estimators of a printed chart along an axis; the page has all."""
+"""Most estimators of a chart along an axis."""
 PANELS = 4
-"""Most problems of a printed chart along an axis."""
+"""Most problems of a chart along an axis."""
 POOLED = ("horizon", "stiffness", "sigma", "smoothing")
 """Columns that change the cost of an estimate: each value has a panel of its own."""
 DISTINCT = 1.2
@@ -86,13 +85,7 @@ def charts(
         along += [_error_and_cost(labelled, styles, subtitle)]
     if not swept and methods["problem"].nunique() > 1:
         along = [_estimators(methods), *along]
-    cloud = Chart(
-        "error_against_time", labelled.rows, [*TIMES, SPREAD], [RMSE, BIAS], "points", series="series",
-        panel="problem_", front="setting_", styles=styles, printed=False,
-        text="Each point is one cell. Lower left is better; above 1 an estimate is worse than the zero estimate. Points with "
-        "a ring are not beaten in both by any point shown of the same problem.",
-    )  # fmt: skip
-    return [chart for chart in (*along, cloud) if chart is not None]
+    return [chart for chart in along if chart is not None]
 
 
 # ------------------------------------------------------------------------------------------------------- frames
@@ -122,7 +115,6 @@ def with_plotted_columns(rows: pd.DataFrame) -> pd.DataFrame:
         series=estimator_labels(rows),
         problem_=titled(rows.assign(**named_values(rows, POOLED)), ["scene", "contact", *POOLED]),
         line=rows["backend"] + " " + rows["dtype"],
-        setting_=number_problems(rows).astype(str),
         failed=~good,
         row=np.arange(len(rows), dtype=float),
     )
@@ -303,7 +295,7 @@ def _error_and_cost(shown: Arranged, styles: Mapping[str, Style], subtitle: str)
     return Chart(
         "speed_accuracy", rows, TIMES[:1], [RMSE], "points", series="series", shape="backend", panel="problem_",
         styles=styles, across=3, height=1.9, subtitle=", ".join(filter(None, [subtitle, *shares])),
-        chosen=(("problem_", chosen),), on_page=False,
+        chosen=(("problem_", chosen),),
     )  # fmt: skip
 
 

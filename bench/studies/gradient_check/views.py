@@ -12,7 +12,7 @@ from bench.experiment.columns import COMMON, Column, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Style, Table, Views
 from bench.measure.gradcheck import FAULTS, MEANING, TRUSTED, UNDECIDED, VERDICTS
-from bench.report.problems import axes_of, label_columns, problem_names, titled
+from bench.report.problems import axes_of, label_columns, problem_names
 from bench.report.style import PALETTE
 from bench.report.text import counted
 from bench.report.views import Arranged, arrange
@@ -34,10 +34,6 @@ KINDS: dict[str, tuple[tuple[str, ...], Style]] = {
     "ok": (TRUSTED, Style("#cfe8df", letter="ok", meaning="ok: right")),
 }
 """Verdicts and look of each letter in a cell, the worst first."""
-LOOKS = {
-    point: Style(PALETTE[place], marker) for point, place, marker in zip(POINTS, (0, 5, 2, 3, 4), "osD^X", strict=True)
-}
-"""Look of each point at which gradients are checked."""
 ERROR = Column("error", label="best error")
 EPS = Column("eps", label="best eps", digits=1)
 NOTE = (
@@ -64,7 +60,7 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
               title="gradients against differences of the cost", notes=[NOTE, *faults, *reasons(rows)]),
         Table("gradient_components", component_table(rows), [], files=["csv"]),
     ]  # fmt: skip
-    charts = [] if points.empty else [_grid(points), _errors(shown)]
+    charts = [] if points.empty else [_grid(points)]
     columns = [experiment.columns.by_name[name] for name in ("verdict", "best_error", "best_eps")]
     switches = dict.fromkeys(f"contact switch: {name}" for names in rows["contact_switch"] for name in _switches(names))
     return Views(tables, charts, shown.rows, columns, [*switches, *faults])
@@ -134,24 +130,4 @@ def _grid(points: pd.DataFrame) -> Chart:
         panel="steps", level="letter", cell="letter", styles={letter: style for letter, (_, style) in KINDS.items()},
         height=0.17, subtitle=switches,
         text="The worst verdict over backends and checks: at the start, and before, at and after a switch of contact mode.",
-    )  # fmt: skip
-
-
-def _errors(shown: Arranged) -> Chart:
-    """Return the chart of the page: the error of each check against the step of the differences."""
-    parts = [*PROBLEM, "backend"]
-    rows = shown.rows.assign(
-        row=range(len(shown.rows)),
-        problem=problem_names(shown, parts, axes_of(shown, "horizon"), parts),
-        cell=problem_names(shown, ["scene"], always=["horizon"]),
-    )
-    long = long_table(rows)
-    long = long[long["eps"].notna()]
-    frame = long.assign(check=titled(long, ["point", "sample", "direction", "cell"]), row=long["row"].astype(int))
-    frame = frame.astype({"eps": float, "relative_error": float})
-    return Chart(
-        "gradient_errors", frame,
-        [Column("eps", label="eps, in units of the natural scale", log=True)],
-        [Column("relative_error", log=True, above_one="larger than the gradient")], series="point", line="check", panel="problem",
-        styles=LOOKS, printed=False, text="That of a wrong gradient stays constant.",
     )  # fmt: skip

@@ -177,7 +177,7 @@ def _targets(runs: RunSet, default: float) -> Chart:
     return Chart(
         "targets", frame, [REACHED, SCORE, PROFILE, MEDIAN], [METHOD], "dots", height=0.24,
         subtitle=_where(runs, "targets: a tenth, a hundredth and a thousandth of the first regret"),
-        text="Bars are 95% intervals over seeds. Choose the score or the profile to rank by them.",
+        text="Bars are 95% intervals over seeds.",
     )  # fmt: skip
 
 

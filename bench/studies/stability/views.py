@@ -54,7 +54,7 @@ LIMIT_NOTES = (
 
 
 def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
-    """Return the tables of shares and of stability limits, and the maps."""
+    """Return the tables of shares and of stability limits, and the map."""
     cells = cells_of(experiment, rows)
     lines = limits(cells)
     whole = Table("stability_map", lines, LIMITS, "stability limits [N/m]", LIMIT_NOTES, data=table(experiment, rows))
@@ -63,7 +63,7 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     shares = Table("stability_shares", shares_of(cells), SHARES, "How often each contact law and step gives the right gradient",
                    SHARE_NOTES, terminal=True, page=True)  # fmt: skip
     columns = [experiment.columns.by_name[name] for name in RESULTS]
-    return Views([shares, whole], charts(cells), arrange(experiment, rows).rows, columns)
+    return Views([shares, whole], [chart(cells)], arrange(experiment, rows).rows, columns)
 
 
 def cells_of(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:
@@ -108,8 +108,8 @@ def limits(cells: pd.DataFrame) -> pd.DataFrame:
     )
 
 
-def charts(cells: pd.DataFrame) -> list[Chart]:
-    """Return the map of the first variant of each scene, law and integrator, and all maps for the page."""
+def chart(cells: pd.DataFrame) -> Chart:
+    """Return the map of the first variant of each scene, law and integrator."""
     missing = cells["stiffness"].isna()  # a law without stiffness is the same at each one
     levels = pd.DataFrame({"stiffness": sorted(cells["stiffness"].dropna().unique()) or [math.nan]})
     spread = cells[missing].drop(columns="stiffness").merge(levels, how="cross")
@@ -118,11 +118,8 @@ def charts(cells: pd.DataFrame) -> list[Chart]:
     frame = frame.drop_duplicates(["problem", "dt", "stiffness"]).sort_index()
     first = frame.groupby(["integrator", "place"], sort=False)["problem"].transform("first")
     dt, stiffness = replace(COMMON["dt"], label="time step"), COMMON["stiffness"]
-    printed = Chart(
+    return Chart(
         "stability_map", frame[frame["problem"] == first], [dt], [stiffness], "grid", level="level", styles=LOOKS, panel="place",
         panel_row="integrator", cell="mark", height=0.085, subtitle=f"{BEYOND} beyond the stability limit in theory",
         text="The worst verdict where backends disagree. Blank: not supported.",
     )  # fmt: skip
-    every = Chart("stability_maps", frame, [dt], [stiffness], "grid", level="level", styles=LOOKS, panel="problem",
-                  printed=False)  # fmt: skip
-    return [printed, every]

@@ -62,7 +62,7 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
         Table("three_errors_wrong", wrong, [problem, Column("cells", format="setting"), *map(shown.column, ERRORS)],
               title="Right for the program, wrong for the physics", files=[], page=True),
     ]  # fmt: skip
-    return Views(tables, [_dumbbells(shown, trapped), *_swept(shown)])
+    return Views(tables, [_dumbbells(shown, trapped)])
 
 
 def along_steps(shown: Shown) -> pd.DataFrame:
@@ -111,10 +111,3 @@ def _dumbbells(shown: Shown, trapped: pd.DataFrame) -> Chart:
         subtitle="At the smallest time step." if shown.over else "",
         text="The longer the line, the better a wrong gradient passes a check against differences of its own cost.",
     )  # fmt: skip
-
-
-def _swept(shown: Shown) -> list[Chart]:
-    """Return the chart of the page: each error along the swept parameters."""
-    x = [Column(axis.column, label=axis.title, format="setting") for axis in shown.arranged.swept()]
-    y = [shown.column(name, log=True, above_one="larger than the gradient") for name in ERRORS]
-    return [Chart("three_errors_swept", shown.rows, x, y, "points", series="problem", printed=False)] if x else []

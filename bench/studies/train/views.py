@@ -154,7 +154,7 @@ def _charts(runs: pd.DataFrame, summary: pd.DataFrame, windows: pd.DataFrame) ->
 def _windows(windows: pd.DataFrame) -> Chart:
     return Chart(
         "windows", windows, [replace(WINDOW, log=True)], [FINAL, WINDOW_BIAS, WINDOW_GRADIENT], series="family", panel="problem",
-        subtitle=f"final return: {SEEDS}", text="A point per length of window. Choose the quantity.",
+        subtitle=f"final return: {SEEDS}", text="A point per length of window.",
     )  # fmt: skip
 
 
