@@ -313,7 +313,6 @@ def test_tables_charts_and_page(finished):
         "optimise.md",
         "targets.csv",
         "summary.csv",
-        "quality_runtime.png",
         "runtimes.png",
         "answer.json",
         "effect_of_error.csv",
@@ -472,7 +471,6 @@ def test_quality_along_the_path_is_summed_up_over_seeds():
     rows = found.rows.assign(
         path_quality_iteration=[[0, 10, 20], [0, 10, 20], [0, 12, 20]],
         path_quality_rmse_rel=[[0.1, 0.2, 0.4], [0.1, 0.3, 0.8], [0.1, 0.4, 0.6]],
-        path_quality_cosine=[[1.0, 0.9, 0.5]] * 3,
     )
     lines = aggregate.path_quality(aggregate.RunSet(rows, ()))
     assert lines["iteration"].tolist() == [0, 10, 20]
@@ -480,7 +478,6 @@ def test_quality_along_the_path_is_summed_up_over_seeds():
     assert lines["low"].iloc[2] == pytest.approx(np.quantile([0.4, 0.8, 0.6], 0.2))
     chart = shown._path_quality(aggregate.RunSet(rows, ()))
     assert chart.frame["value"].tolist() == pytest.approx([0.1, 0.3, 0.6])
-    assert chart.frame["cosine_value"].tolist() == pytest.approx([1.0, 0.9, 0.5])
     alone = rows.assign(path_quality_iteration=[[0]] * 3)
     assert shown._path_quality(aggregate.RunSet(alone, ())) is None
 
