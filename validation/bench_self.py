@@ -19,19 +19,16 @@ from bench.experiment.words import parse_flag, parse_words
 
 
 def main(words: Sequence[str]) -> int:
-    """Measure speeds, write files and print the table. Returns 0. ``quick=true`` runs small sizes."""
+    """Measure and print speeds, and write them. Returns 0. ``quick=true`` runs small sizes."""
     names, settings, _ = parse_words(words, "bench_self", {"quick": "false", "results_dir": "results"})
     if names:
         raise UserError(f"bench_self takes quick=true|false and results_dir=FOLDER, not '{names[0]}'")
     load_before = list(os.getloadavg()) if hasattr(os, "getloadavg") else None
     rows = []
     for row in measure(parse_flag(settings, "quick")):
-        print(f"{row.what}: {row.value:.3g} {row.unit}", file=sys.stderr, flush=True)
+        print(f"{row.what}: {row.value:.3g} {row.unit}{row.note and f' ({row.note})'}", flush=True)
         rows.append(row)
-    paths = speed_rows.write(rows, Path(settings["results_dir"]).expanduser() / "bench_self", load_before)
-    speed_rows.show(rows)
-    for path in paths:
-        print(f"  {path}")
+    print(speed_rows.write(rows, Path(settings["results_dir"]).expanduser() / "bench_self", load_before))
     return 0
 
 

@@ -6,9 +6,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
-
-import numpy as np
+from typing import Any, ClassVar, Literal
 
 from bench.model import Plugin
 
@@ -121,7 +119,7 @@ class Outcome:
     reservation: str = ""
     """A condition or doubt that readers must know although the figures agree."""
     series: Mapping[str, Any] = field(default_factory=dict)
-    """Numbers and lists of numbers for the chart."""
+    """Numbers, lists and arrays of numbers for the chart: values, or means with their standard errors."""
 
 
 def verdict(figures: Sequence[Figure], reservation: str = "") -> str:
@@ -153,36 +151,13 @@ class Claim(Plugin):
     """Whether measuring takes less than 5 s on two cores."""
     labels: ClassVar[tuple[str, str]] = ("", "")
     """Labels of the chart's x and y axis."""
-    curves: ClassVar[Mapping[str, Sequence[str]]] = {}
-    """The curves of the chart by the name of their series: label, Matplotlib format, and if need be a colour or the estimator
-    whose colour it is."""
+    curves: ClassVar[Mapping[str, str]] = {}
+    """The curves of the chart: the names of their series with their labels, against the first series or its places."""
     logarithmic: ClassVar[str] = ""
     """The axes that are logarithmic: ``x``, ``y`` or ``xy``."""
-    marks: ClassVar[Sequence[tuple[str, float, str]]] = ()
+    marks: ClassVar[Sequence[tuple[Literal["x", "y"], float, str]]] = ()
     """Values that are drawn as lines: axis, value and label."""
-    has_ticks: ClassVar[bool] = False
-    """Whether the ticks of x are its values."""
 
     @abstractmethod
     def measure(self) -> Outcome:
         """Measure the figures. Raises :class:`bench.Unsupported` if a library is missing."""
-
-    def draw(self, axes: Any, series: Mapping[str, Any]) -> None:
-        """Draw :attr:`curves` against the first of the stored series: means with standard errors have 95% intervals."""
-        from bench.claims.colours import GREY, bars, estimator_colour
-
-        axes.set(**{f"{axis}scale": "log" for axis in self.logarithmic})
-        x = next(iter(series.values()), ())
-        for name, (label, form, *colour) in self.curves.items():
-            look = {"label": label}
-            if colour:
-                look["color"] = colour[0] if colour[0].startswith("#") else estimator_colour(colour[0])
-            if np.ndim(series[name]) > 1:
-                bars(axes, x, series[name], fmt=form, **look)
-            else:
-                axes.plot(x, series[name], form, **look)
-        for axis, value, label in self.marks:
-            line = axes.axvline if axis == "x" else axes.axhline
-            line(value, color=GREY, linewidth=0.6, label=label)
-        if self.has_ticks:
-            axes.set_xticks(x, [f"{value:g}" for value in x])

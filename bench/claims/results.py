@@ -9,6 +9,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from bench.claims import toolkit
 from bench.claims.claim import UNDECIDED, Claim, Figure, verdict
 from bench.errors import Unsupported
@@ -39,7 +41,7 @@ class ClaimResult:
 
     def to_json(self) -> str:
         """Return the result as JSON, with every digit."""
-        return json.dumps(asdict(self), indent=1)
+        return json.dumps(asdict(self), indent=1, default=np.ndarray.tolist)
 
 
 def measure(claim: type[Claim]) -> ClaimResult:
@@ -53,16 +55,10 @@ def measure(claim: type[Claim]) -> ClaimResult:
     except Exception as error:
         return ClaimResult(claim.name, FAILED, time.process_time() - started, remark=f"{type(error).__name__}: {error}")
     used = tuple(sorted(toolkit.used))
+    decided, seconds = verdict(outcome.figures, outcome.reservation), time.process_time() - started
     return ClaimResult(
-        claim.name,
-        verdict(outcome.figures, outcome.reservation),
-        time.process_time() - started,
-        tuple(outcome.figures),
-        outcome.reservation,
-        outcome.series,
-        key_of(claim, used),
-        used,
-    )
+        claim.name, decided, seconds, tuple(outcome.figures), outcome.reservation, outcome.series, key_of(claim, used), used
+    )  # fmt: skip
 
 
 def key_of(claim: type[Claim], used: tuple[tuple[str, str], ...]) -> str:
@@ -70,15 +66,10 @@ def key_of(claim: type[Claim], used: tuple[tuple[str, str], ...]) -> str:
     return hashed(code_of(claim), [code_of(registry.usable(kind, name)) for kind, name in used])
 
 
-def path_of(directory: Path, name: str) -> Path:
-    """Return the path of a claim's stored result."""
-    return directory / f"{name}.json"
-
-
 def read(directory: Path, claim: type[Claim]) -> ClaimResult | None:
     """Return the stored result, or None if it is missing, unreadable or measured by other code."""
     try:
-        values = json.loads(path_of(directory, claim.name).read_text())
+        values = json.loads((directory / f"{claim.name}.json").read_text())
         values["figures"] = tuple(Figure(**one) for one in values["figures"])
         values["plugins"] = tuple((kind, name) for kind, name in values["plugins"])
         result = ClaimResult(**values)
@@ -91,4 +82,4 @@ def read(directory: Path, claim: type[Claim]) -> ClaimResult | None:
 def store(directory: Path, result: ClaimResult) -> None:
     """Store a result that has figures. A claim that failed or could not run is measured again next time."""
     if result.key:
-        write_whole(path_of(directory, result.name), result.to_json().encode())
+        write_whole(directory / f"{result.name}.json", result.to_json().encode())

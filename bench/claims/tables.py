@@ -2,59 +2,61 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from textwrap import fill
 
+import numpy as np
 import pandas as pd
 
 from bench.claims.claim import VERDICTS, Claim, Figure
 from bench.claims.discovery import LESSONS
 from bench.claims.results import FAILED, ClaimResult
-from bench.report.tables import escape_latex, escape_markdown, plain_markdown
+from bench.experiment.columns import Column, text
+from bench.experiment.views import Chart, Mark, Style, Table
+from bench.report import latex as writer
+from bench.report.colours import estimator_colour, estimator_marker
+from bench.report.tables import escape_markdown, plain_markdown
 from bench.report.text import counted, duration, number
 
 Results = Sequence[tuple[type[Claim], ClaimResult]]
-WIDE = 26
-"""Length of the longest label [characters] for which a legend below a chart has two columns."""
-BOLD_WIDTH, SMALL_WIDTH = 48, 54
-"""Characters of a bold and of a small line above a chart 3.5 inches wide."""
+ESTIMATORS = {
+    **dict.fromkeys(("first", "pathwise", "coarse"), "fobg"), **dict.fromkeys(("zeroth", "score"), "reinforce"),
+    "measure-valued": "measure_valued", "gauss": "randomized_smoothing", "sphere": "sphere_smoothing",
+}  # fmt: skip
+"""Series that have the look of an estimator, with its name."""
 
 
 def chart(directory: Path, claim: type[Claim], result: ClaimResult) -> list[Path]:
     """Draw one claim from its stored series. Returns the path of the chart, or an empty list without a series."""
-    if not result.series:
+    if not (result.series and claim.curves):
         return []
-    from cycler import cycler
-    from matplotlib import rcParams
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure as Picture
-    from matplotlib.ticker import NullFormatter
-
+    from bench.report.draw import draw
     from bench.report.figures import save, styled
-    from bench.report.style import GREY, PALETTE
 
+    first, is_log, parts = next(iter(result.series)), {axis: axis in claim.logarithmic for axis in "xy"}, []
+    x = pd.to_numeric(pd.Series(result.series[first]), errors="coerce")
+    for name, label in claim.curves.items():
+        # a second column has the standard errors of means
+        values = pd.DataFrame(np.reshape(result.series[name], (len(result.series[name]), -1))).reindex(columns=[0, 1])
+        at = pd.Series(values.index, dtype=float) if first in claim.curves or x.isna().any() else x
+        low, high = (values[0] + side * 1.96 * values[1] for side in (-1, 1))
+        parts.append(pd.DataFrame({
+            "series": label, "x": at, "y": values[0], "low": np.maximum(low, 0.1 * values[0]) if is_log["y"] else low, "high": high,
+        }))  # fmt: skip
+    looks = {
+        claim.curves[n]: Style(estimator_colour(e), estimator_marker(e))
+        for n, e in ESTIMATORS.items()
+        if n in claim.curves
+    }
+    picture = Chart(
+        claim.name, pd.concat(parts, ignore_index=True), [Column("x", label=claim.labels[0], log=is_log["x"])],
+        [Column("y", label=claim.labels[1], low="low", high="high", log=is_log["y"])], title=claim.learned, series="series",
+        styles=looks, marks=[Mark(label, value, axis=axis) for axis, value, label in claim.marks],
+        subtitle=f"{claim.name}, {claim.source.partition(';')[0]}: {result.verdict}",
+    )  # fmt: skip
     with styled():
-        rcParams["axes.prop_cycle"] = cycler(color=[PALETTE[i] for i in (2, 0, 3, 4)])
-        picture = Picture(figsize=(3.5, 3.3), layout="constrained")
-        FigureCanvasAgg(picture)
-        axes = picture.add_subplot()
-        claim().draw(axes, result.series)
-        # on short logarithmic axes, labels between powers of ten would overlap
-        for axis in (axes.xaxis, axes.yaxis):
-            if axis.get_scale() == "log":
-                axis.set_minor_formatter(NullFormatter())
-        axes.set_xlabel(claim.labels[0])
-        axes.set_ylabel(claim.labels[1])
-        picture.suptitle(fill(claim.learned, BOLD_WIDTH), x=0.02, ha="left", fontsize=8.5, fontweight="bold")
-        origin = f"{claim.name}, {claim.source.partition(';')[0]}: {result.verdict}"
-        axes.set_title(fill(origin, SMALL_WIDTH), loc="left", fontsize=7, color=GREY)
-        labels = axes.get_legend_handles_labels()[1]
-        if labels:
-            columns = 2 if max(map(len, labels)) <= WIDE else 1
-            picture.legend(loc="outside lower center", ncols=columns, fontsize=7, frameon=False)
-        series = {name: pd.Series(values) for name, values in result.series.items()}
-        return save(picture, directory / claim.name, data=pd.DataFrame(series))[:1]
+        return save(draw(picture), directory / claim.name, data=picture.plotted())[:1]
 
 
 def measured_text(figure: Figure) -> str:
@@ -154,20 +156,15 @@ def latex(results: Results) -> str:
 
     The figure is the most sensitive figure that disagrees or, if all figures agree, the most sensitive figure.
     """
-    lines = [
-        r"\begin{table*}\centering\footnotesize\setlength{\tabcolsep}{3pt}",
-        r"\begin{tabular}{@{}lp{3.7cm}p{5cm}rrp{2.7cm}@{}}",
-        r"\toprule",
-        r"claim & source & figure & published & measured & verdict \\",
-        r"\midrule",
-    ]
+    lines = []
     for claim, result in results:
         shown = [f for f in result.figures if f.value] or list(result.figures)
-        figure = min(shown, key=lambda f: (f.agrees, f.detectable_error), default=None)
-        cells = [claim.name, claim.source]
-        cells += [figure.what, figure.published, number(figure.measured, 4)] if figure else ["", "", ""]
-        lines.append(" & ".join(map(escape_latex, [*cells, result.verdict])) + r" \\")
-    return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", r"\end{table*}", ""])
+        figure = min(shown, key=lambda f: (f.agrees, f.detectable_error), default=Figure("", "", math.nan))
+        name = f"{claim.name}, {claim.source}: {figure.what}"
+        lines.append([name, figure.published, figure.measured, result.verdict])
+    columns = [text("claim"), text("published"), Column("measured", digits=4), text("verdict")]
+    frame = pd.DataFrame(lines, columns=[column.name for column in columns])
+    return writer.latex([Table("claims", frame, columns)], "Published claims, run again")
 
 
 def result_lines(claim: type[Claim], result: ClaimResult, is_stored: bool) -> Iterator[str]:

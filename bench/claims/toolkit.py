@@ -129,6 +129,16 @@ def descend(
     return theta, np.array(path)
 
 
+def exact_descent(
+    problem: Problem, start: np.ndarray, rate: float, iterations: int, every: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the last point ``(d,)`` of descent on the gradient without noise, and the cost of every so many steps."""
+    still = np.zeros((problem.program.n_noise, 1))
+    end, path = descend(lambda theta, _: problem.grad(theta, still)[:, 0], start, rate, iterations)
+    points = path[::every].T
+    return end, problem.value(points, np.repeat(still, points.shape[1], axis=1))
+
+
 def stochastic_descent(
     problem: Problem,
     zeroth: bool,

@@ -43,7 +43,8 @@ def colour(place: int) -> str:
         return PALETTE[index]
     share = 0.1 + 0.6 * (0.618034 * turn % 1)  # steps of the golden ratio never repeat
     end = 1.0 if PALETTE[index] == "#000000" else 0.0
-    return to_hex([(1 - share) * part + share * end for part in to_rgb(PALETTE[index])])
+    red, green, blue = ((1 - share) * part + share * end for part in to_rgb(PALETTE[index]))
+    return to_hex((red, green, blue))
 
 
 def marker(place: int, variant: int = 0) -> str:

@@ -140,7 +140,7 @@ class Toy(Claim):
     """A claim that counts how often it is measured."""
 
     name, lesson, statement, source, learned = "T1", "Tests", "one is one", "here", "that it is"
-    labels = ("x", "y")
+    labels, curves = ("x", "y"), {"y": "line"}
     calls = 0
     value = 1.0
 
@@ -149,9 +149,6 @@ class Toy(Claim):
         if self.value is None:
             raise ValueError("no value")
         return Outcome([Figure("one", "1.00", self.value)], series={"x": [0, 1], "y": [0, 1]})
-
-    def draw(self, axes, series):
-        axes.plot(series["x"], series["y"], label="line")
 
 
 @pytest.fixture
@@ -172,7 +169,7 @@ def test_results_are_kept_and_measured_again_when_asked(toy, tmp_path, capsys):
     names = {path.name for path in (tmp_path / "claims").iterdir()}
     assert {"T1.json", "T1.png", "claims.md", "claims.csv", "claims.tex", "claims.html"} <= names
     assert "one is one" in (tmp_path / "claims" / "claims.html").read_text()
-    assert r"T1 & here & one & 1.00 & 1.000 & reproduced \\" in (tmp_path / "claims" / "claims.tex").read_text()
+    assert "T1, here: one & 1.00 & 1.000 & reproduced" in (tmp_path / "claims" / "claims.tex").read_text()
 
 
 def test_a_spoilt_file_or_other_code_is_measured_again(toy, tmp_path):
@@ -216,13 +213,10 @@ from bench.claims import Claim, Figure, Outcome
 
 class Mine(Claim):
     name, lesson, statement, source, learned = "M1", "My lesson", "two is two", "my package", "that it is"
-    labels = ("x", "y")
+    labels, curves = ("x", "y"), {"x": "line"}
 
     def measure(self):
         return Outcome([Figure("two", "2.00", 2.0)], series={"x": [0, 1]})
-
-    def draw(self, axes, series):
-        axes.plot(series["x"], series["x"])
 """
 
 

@@ -151,17 +151,6 @@ def without(rows, *names):
     return rows.assign(parameters=rows["parameters"].map(remove))
 
 
-def test_a_parameter_that_a_stored_row_lacks_is_its_present_default():
-    columns, rows = of_study("bias_variance", "scenes=[pushing]", "contacts=[penalty]")
-    stored = without(rows, "scene.mass", "study.timed_calls", "reference.tolerance")
-    for before, after in ((stored, rows), (rows, stored)):
-        assert list(compared(before, after, False, columns)["outcome"]) == ["same"]
-    _, heavy = of_study("bias_variance", "scenes=[pushing]", "contacts=[penalty]", "scene.pushing.mass=9")
-    changes = compared(stored, heavy, False, columns)["change"]
-    assert changes[0].startswith("gone, it was ok; the nearest cell after has pushing.mass=9.0 instead of ")
-    assert "," not in changes[0].partition(";")[2], "no other parameter differs"
-
-
 def test_a_missing_parameter_is_named_in_a_remark(tmp_path, capsys):
     _, rows = of_study("bias_variance", "scenes=[pushing]", "contacts=[penalty]")
     rows = rows.assign(experiment="some")

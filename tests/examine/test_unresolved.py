@@ -93,15 +93,6 @@ def test_a_smoothed_gradient_that_noise_hides_is_not_decided():
     assert report.status != 0, str(report)
 
 
-def test_an_undecided_derivative_leaves_its_use_undecided():
-    def cost(theta):
-        return float("nan") if theta[0] > 0 else float(theta.sum())
-
-    report = bench.examine(cost, np.zeros(2), grad=lambda t: np.ones(2), calls=300)
-    assert report.derivative == "not shown"
-    assert "not usable" not in str(report)
-
-
 @pytest.mark.parametrize("bend", [0.3, 3e-4])
 def test_a_small_change_of_slope_is_a_kink_at_every_number_of_steps(bend):
     """The first slope changes at theta by little, where 9 steps of a decade do not show it over three decades of noise."""

@@ -1,7 +1,5 @@
 """Parameters of stored rows as typed columns, and the columns that make rows the same problem."""
 
-import json
-
 import numpy as np
 from helpers import loaded, rows_of
 
@@ -44,14 +42,6 @@ def test_a_problem_is_scene_law_integrator_study_and_theta_less_the_swept_names(
     assert number_problems(rows, without=["mass"]).tolist() == [0, 0, 1, 1, 0, 0]
     assert number_problems(rows, ["backend"]).nunique() == 1
     assert not any(column.startswith(("estimator.", "backend.")) for column in problem_columns(rows))
-
-
-def test_a_row_that_lacks_a_new_parameter_is_the_same_problem():
-    rows = rows_with()
-    given = json.loads(rows["parameters"].iloc[0])
-    del given["scene"]["hold"]
-    rows.loc[rows.index[0], "parameters"] = json.dumps(given)
-    assert number_problems(rows).tolist() == [0, 0, 1, 1]
 
 
 def test_rows_without_parameters_are_distinguished_by_their_identity():

@@ -6,8 +6,6 @@ import math
 import numpy as np
 import pytest
 from bench.plugins.backends.jax import Jax
-from bench.plugins.backends.numpy import Numpy
-from bench.plugins.backends.torch import Torch
 from bench.plugins.contacts.impulse import Impulse
 from bench.plugins.contacts.penalty import Penalty
 from bench.plugins.integrators.explicit_euler import ExplicitEuler
@@ -170,7 +168,7 @@ def test_wall_exact_gradient():
 
 @pytest.mark.slow
 def test_pushing_published_gradient_norm():
-    """Norm of the mean of 1,000 gradients, the same on all backends for the same noise."""
+    """Norm of the mean of 1,000 gradients."""
     scene = Pushing(horizon=100, velocity_factor=0.1, push=1.0, speed=0.1)
     made = program(scene, Penalty)
     theta, w = scene.theta0(), normal(100, 1000)
@@ -181,5 +179,3 @@ def test_pushing_published_gradient_norm():
     error = (mean / norm @ samples).std() / math.sqrt(1000)
     assert abs(norm - 18.66) < 5 * error
     assert error < 0.05
-    assert Torch().compile(made).grad(theta, w) == pytest.approx(samples, rel=1e-9, abs=1e-9)
-    assert Numpy().compile(made).value(theta, w) == pytest.approx(problem.value(theta, w), rel=1e-12)

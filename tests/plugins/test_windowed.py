@@ -1,55 +1,22 @@
 """Gradients through windows: the adjoint behind them, fixed points in closed form, and what may not cross an end."""
 
-from dataclasses import dataclass
-
 import numpy as np
 import pytest
 from bench.plugins.backends.numpy import Numpy
 from bench.plugins.estimators.fobg import Fobg
 from bench.plugins.estimators.windowed import Windowed
 from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
-from bench.plugins.scenes.lqr import Lqr
 from bench.plugins.scenes.static_gain import StaticGain
 
 import bench
-from bench.model import MechanicalScene, State, adjoint_gradient, compose, param, slopes
+from bench.model import adjoint_gradient, compose, slopes
 
 DIFFERENCED = 1e-6
 """Relative agreement of two gradients by central differences of step 1e-6."""
 FIXED = 1e-5
 """Agreement of fixed points with their closed form, as the sheet asks."""
-GAINS = {1: 0.0, 2: 0.090909, 3: 0.160305, 4: 0.206541, 5: 0.234621, 6: 0.250723}
-"""K_H of x' = x + u, cost x^2 + 10 u^2: H Riccati steps from 0."""
 BEST, VALUE = 0.270156, 3.701562
 """K* and P of the infinite horizon."""
-
-
-@dataclass(frozen=True)
-class Plan(MechanicalScene):
-    """x' = x + u from 1 with cost x^2 + 10 u^2 and the controls as theta."""
-
-    name = "plan"
-    open_loop = True
-    n_q = 1
-    n_u = 1
-    noise: str = param("action", "what the noise perturbs", choices=("action",))
-    horizon: int = param(12, "steps", positive=True)
-    dt: float = param(1.0, "step", positive=True)
-
-    def theta0(self):
-        return np.zeros(self.horizon)
-
-    def initial_state(self, xp, theta):
-        return State(0.0 * theta[:1], 0.0 * theta[:1] + 1.0)
-
-    def acceleration(self, xp, q, v, u):
-        return u
-
-    def stage_cost(self, xp, q, v, u):
-        return v[0] ** 2 + 10.0 * u[0] ** 2
-
-    def terminal_cost(self, xp, q, v):
-        return 0.0 * v[0]
 
 
 def numpy_problem(scene):
@@ -79,23 +46,6 @@ def test_adjoint_without_a_cut_is_the_gradient(problem):
     assert np.abs(found - expected).max() < 10 * DIFFERENCED * np.abs(expected).max() + rounding
 
 
-def fixed_point(estimator, scene):
-    """The plan at which the windowed gradient, affine in theta here, is 0."""
-    problem, d = numpy_problem(scene), scene.horizon
-    still = np.zeros((1, 1, d))
-    offset = estimator.estimate(problem, np.zeros(d), still)[0]
-    matrix = np.stack([estimator.estimate(problem, e, still)[0] - offset for e in np.eye(d)], axis=1)
-    plan = np.linalg.solve(matrix, -offset)
-    return plan, problem.trajectory(plan, still[0].T).states[:, 1, 0]
-
-
-@pytest.mark.parametrize("steps", GAINS)
-def test_first_gain_of_a_window_without_value(steps):
-    plan, x = fixed_point(Windowed(steps=steps), Plan(horizon=60))
-    for start in range(0, 60, steps):
-        assert plan[start] == pytest.approx(-GAINS[steps] * x[start], abs=FIXED)
-
-
 def test_a_window_keeps_the_last_part_of_the_gradient():
     """The derivatives by the controls are proportional to 20, 19, ..., 1, and the last five remain: 55 of 2,870."""
     problem = bench.problem("double_integrator[horizon=20]", backend="numpy")
@@ -113,16 +63,6 @@ def test_with_the_exact_value_the_optimal_gain_is_a_fixed_point_at_every_length(
     assert abs(found[0, 0]) < FIXED * size
     bare = Windowed(steps=steps, terminal="none").estimate(problem, problem.program.theta0, still)
     assert abs(bare[0, 0]) > 0.01 * size  # without the value it is none
-
-
-def test_with_the_exact_value_the_optimal_plan_is_a_fixed_point():
-    scene = Lqr(horizon=12)
-    for steps in (1, 4):
-        plan, _ = fixed_point(Windowed(steps=steps, terminal="exact"), scene)
-        problem = numpy_problem(scene)
-        assert problem.value(plan, np.zeros((12, 1)))[0] == pytest.approx(
-            scene.optimum(None, SemiImplicitEuler())[0], rel=1e-8
-        )
 
 
 def test_nothing_crosses_the_end_of_a_window():

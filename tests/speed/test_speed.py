@@ -298,4 +298,3 @@ def test_bench_self_writes_its_table(tmp_path):
     assert counted["value"] == counted["target"]
     assert any(what.startswith("native C kernel") for what in found)
     assert found["fused over jax, pushing, 64 rollouts"]["value"] > 0
-    assert (tmp_path / "bench_self" / "bench_self.csv").exists()

@@ -11,14 +11,9 @@ from bench.plugins.optimizers.adam import Adam
 from bench.plugins.optimizers.gradient_descent import GradientDescent
 from bench.plugins.scenes.cartpole_swing import CartpoleSwing
 from bench.plugins.scenes.quadratic import Quadratic
-from matplotlib.collections import LineCollection
 
 import bench
 from bench.experiment import config
-from bench.experiment.columns import Column
-from bench.experiment.views import Chart, Table
-from bench.report.cells import readable
-from bench.report.draw import draw
 from bench.studies.dose_response import analysis, views
 from bench.studies.dose_response.ground import BestGradient, scored_noise
 from bench.studies.dose_response.measure import compare, hypotheses_hash
@@ -62,13 +57,6 @@ def test_descent_along_a_rotated_gradient_takes_the_updates_of_its_closed_form(b
     reachable = [e if e <= 200 else math.inf for e in expected]
     assert factor < 1
     assert search.updates == reachable
-
-
-def test_descent_across_the_gradient_is_censored_and_never_dropped(bowl):
-    method = Method(GradientDescent(rate=0.1 / curvature(bowl)), Planted(base="best", angle=90.0), 1, is_random=False)
-    search = follow(bowl, method, task_of(bowl), seed=0)
-    assert search.updates == [math.inf] * len(TARGETS)
-    assert search.steps == 200
 
 
 def test_descent_with_relative_noise_has_the_mean_regret_of_its_closed_form(bowl):
@@ -166,12 +154,7 @@ def test_every_cell_of_a_run_has_a_row_with_the_hash_of_the_hypotheses(run):
     assert set(run["status"]) == {"ok"}
     assert set(run["hypotheses"]) == {hypotheses_hash()}
     assert len(hypotheses_hash()) == 12
-
-
-@pytest.mark.slow
-def test_times_are_kept_in_a_run_without_timing_since_the_cost_of_a_gradient_is_their_ratio(run):
-    assert run["gradient_s"].gt(0).all()
-    assert run["rollout_s"].gt(0).all()
+    assert run[["gradient_s", "rollout_s"]].gt(0).all(axis=None), "a run without timing keeps the cost of a gradient"
 
 
 def test_planted_errors_of_a_run_have_their_size_on_the_common_path(run):
@@ -228,10 +211,6 @@ def test_methods_that_use_only_costs_stand_beside_the_best_gradient():
     assert wide.loc["easy", "cem"] == 120.0
     assert np.isnan(wide.loc["hard", "cem"])
     assert np.isnan(wide.loc["hard", "fobg"])
-
-
-def test_without_methods_that_use_only_costs_nothing_is_compared():
-    assert analysis.reached(pd.DataFrame(searches_of("p", fobg=("first order", 0, 1, LOST)))).empty
 
 
 # ------------------------------------------------------------------------------------------------ without a model
@@ -309,17 +288,7 @@ def test_orders_are_compared_at_their_cheapest_number_of_samples():
     assert found["fewest samples / others, first order"] == 120 / 160
 
 
-def test_an_interval_above_1_is_not_printed_as_if_it_held_1():
-    """Of eight ratios the interval is from the lowest to the highest: 1.03 rounds to 1.0 with two digits."""
-    ratios = (1.03, 2.0, 2.0, 2.5, 2.5, 3.0, 3.0, 6.94)
-    lines = [planted(f"p{i}", kind, dose, updates) for i, ratio in enumerate(ratios)
-             for kind, dose, updates in ((analysis.RANDOM, 0.3, 100.0), (analysis.RANDOM, 3.0, 100.0 * ratio))]  # fmt: skip
-    pairs = analysis.by_scene(analysis.ratios(pd.DataFrame(lines)))
-    (line, *_) = readable(Table("pairs", pairs, views.PAIRS)).to_dict("records")
-    assert line["ratio"] == "2.5 [1.03, 6.9]"
-
-
-def test_a_ratio_beyond_the_budget_has_only_a_lower_end_in_its_chart():
+def test_a_ratio_beyond_the_budget_has_only_a_lower_end():
     """Of eight problems five miss the target with the larger error: the median is infinite, and the least ratio is 27 / 17."""
     missed = [planted(f"p{i}", analysis.RANDOM, 3.0, math.inf if i < 5 else 20.0 + i) for i in range(8)]
     small = [planted(f"p{i}", analysis.RANDOM, 0.3, math.inf if i < 2 else 10.0 + i) for i in range(8)]
@@ -328,12 +297,6 @@ def test_a_ratio_beyond_the_budget_has_only_a_lower_end_in_its_chart():
         "size"
     )
     assert (points.loc[0.3, "time_high"], points.loc[3.0, "is_missed"]) == (math.inf, True)
-    chart = Chart("x", pd.DataFrame({"a": [1.0], "b": [2.0], "low": [1.0], "high": [math.inf]}), [Column("a")],
-                  [Column("b", low="low", high="high", log=True)])  # fmt: skip
-    (bars,) = [item for item in draw(chart).axes[0].collections if isinstance(item, LineCollection)]
-    (ends,) = bars.get_segments()
-    assert ends[0][1] == 1.0
-    assert ends[1][1] > 1e6
 
 
 def test_planted_errors_alone_have_a_report_that_compares_no_orders(run):

@@ -9,12 +9,10 @@ from bench.plugins.backends.jax import Jax
 from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
 from bench.plugins.scenes.double_integrator import DoubleIntegrator
 
-from bench.cli import main
 from bench.experiment import config
 from bench.experiment.grid import cells
 from bench.model import Jacobians, compose
 from bench.report.cells import readable
-from bench.run.store import Store
 from bench.studies.growth import Growth
 from bench.studies.growth.measure import classify, products, rate
 from bench.studies.growth.views import fit
@@ -68,24 +66,6 @@ def test_rate_interval_covers():
         _, low, high = rate(10 * (0.3 + rng.standard_normal(16)), 10)
         hits += low <= 0.3 <= high
     assert abs(hits - 950) < 4 * math.sqrt(1000 * 0.95 * 0.05)
-
-
-@pytest.mark.slow
-def test_from_the_command_line(tmp_path):
-    words = [
-        "study=growth", "name=small", "scenes=[double_integrator,double_pendulum]", "integrators=[rk4]",
-        "estimators=[fobg]", "sweep.horizon=[10,50]", "samples=16", "repeats=4", f"results_dir={tmp_path}",
-    ]  # fmt: skip
-    assert main(words) == 0
-    for name in ("csv", "md", "png"):
-        assert (tmp_path / "small" / f"growth.{name}").stat().st_size > 0
-    assert set(pd.read_csv(tmp_path / "small" / "growth_verdicts.csv")["verdict"]) == {"open"}
-    rows = Store(tmp_path / "small", COLUMNS).load().set_index(["scene", "horizon"])
-    assert rows.loc[("double_integrator", 50.0), "growth"] == "neutral"
-    chaotic = rows.loc[("double_pendulum", 50.0)]
-    assert chaotic["growth"] == "exploding"
-    assert chaotic["gain_of"] == "states"
-    assert len(chaotic["lags"]) == len(chaotic["gain"])
 
 
 TIMES = np.array([0.5, 1.0, 2.5, 5.0, 10.0])
@@ -177,7 +157,3 @@ def test_ranges_of_variances_that_overlap_and_lost_horizons_are_open():
     assert list(shown.tables[0].frame["verdict"]) == ["open", "open"]
     assert list(shown.tables[0].frame["lower"]) == ["open at the longest horizon"] * 2
     assert len(shown.tables[1].frame) == len(rows)
-    rows["status"], rows["gradient_median"], rows["reason"] = "nonfinite", math.nan, "not finite"
-    shown = given.study.views(given, rows)
-    assert not shown.charts
-    assert shown.remarks == ["10 nonfinite: not finite"]

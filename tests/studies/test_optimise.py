@@ -119,48 +119,12 @@ def test_two_balls():
     assert Lqr().optimum(None, ExplicitEuler()) is None
 
 
-@pytest.mark.parametrize(
-    ("scene", "start", "least"),
-    [
-        ("pendulum_swing[dt=0.02]", 2008.0153, 872.590419),
-        ("pendulum_swing", 2022.303027, 349.49046),
-        ("pendulum_swing[terminal=1]", 1856.154406, 349.490454),
-    ],
-)
-@pytest.mark.slow
-def test_newton_finds_the_checked_optima(scene, start, least):
-    problem = bench.problem(scene)
-    found = solve(problem)
-    assert problem.value(problem.program.theta0, np.zeros((200, 1)))[0] == pytest.approx(start, rel=CHECKED)
-    assert found.cost == pytest.approx(least, rel=CHECKED)
-    assert found.certified
-
-
 @pytest.mark.parametrize("steps", [4, 10, 50])
 def test_least_effort_from_rest_to_rest(steps):
     """A metre in a second: 12 in continuous time, 12 / (1 - 1 / N^2) in N semi-implicit steps."""
     ends = {"position": 0.0, "speed": 0.0, "end_position": 1e9, "end_speed": 1e9}
     scene = Lqr(horizon=steps, dt=1 / steps, effort=1 / steps, **ends)
     assert scene.optimum(None, SemiImplicitEuler())[0] == pytest.approx(12 / (1 - 1 / steps**2), rel=CHECKED)
-
-
-def test_valleys_of_a_record():
-    """Frequencies D apart differ by 1 - sin(DT) / (DT): downhill is towards the record until D = 4.4934 / T, then away from it."""
-    problem = bench.problem("spring_record[stiffness=100,damping=0,dt=0.01,horizon=1200]", backend="numpy")
-    ways = np.array([0.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0])  # D T, with T = 12
-    theta = np.stack([(10.0 + ways / 12.0) ** 2, 0.0 * ways])
-    costs = problem.value(theta, np.zeros((2, ways.size)))
-    assert costs[0] == 0.0
-    # apart from terms at twice the frequency, whose mean is below 1 / (10 T), and (dt omega)^2 / 24 in the frequencies
-    assert costs == pytest.approx(1 - np.sinc(ways / np.pi), abs=0.02)
-    assert (np.diff(costs[:4]) > 0).all()
-    assert (np.diff(costs[4:]) < 0).all()
-    false = np.array([7.0, 7.725252, 8.5])  # the first valley that is none
-    theta = np.stack([(10.0 + false / 12.0) ** 2, 0.0 * false])
-    left, bottom, right = problem.value(theta, np.zeros((2, 3)))
-    assert bottom == pytest.approx(0.871625, abs=0.02)
-    assert bottom < min(left, right)
-    assert problem.program.scene.optimum(None, ExplicitEuler())[0] == 0.0
 
 
 def test_classes_of_problems():
@@ -314,20 +278,6 @@ def test_step_jacobians_of_searches_that_share_batches():
     theta, still = np.ones(5), np.zeros((5, 1))
     (shared,) = run_batched(problem, [lambda lane: {"a": slopes(lane, theta, still).a}])
     assert np.array_equal(shared["a"], slopes(problem, theta, still).a)
-
-
-@pytest.mark.slow
-def test_an_untimed_search_runs_in_another_process(tmp_path):
-    words = [word for word in BARE if not word.startswith("workers")] + [
-        "workers=1",
-        "timing=false",
-        "samples=2",
-        "repeats=2",
-    ]
-    assert main([*words, "study=optimise[iterations=2]", "sweep.seed=[0,1]", f"results_dir={tmp_path}"]) == 0
-    rows = bench.load(tmp_path / "none")
-    assert (rows["status"] == "ok").all()
-    assert (rows["gradients"] == 4).all()
 
 
 def test_tables_charts_and_page(finished):
@@ -626,11 +576,3 @@ def test_short_names_stay_unique():
     name = shown.short_names(["cem[population=40]", "cem[population=20]", "windowed[terminal=learned], adam"])
     assert name("cem[population=40]") == "cem[population=40]"
     assert name("windowed[terminal=learned], adam") == "windowed, adam"
-
-
-def test_searches_without_results_are_said_so(standard):
-    given, rows, _ = standard
-    none = rows.assign(status="unsupported", reason="planted")
-    views = study_of(given).views(given, none)
-    assert not views.charts
-    assert views.remarks == [f"{len(rows)} unsupported: planted"]

@@ -147,13 +147,6 @@ def test_untrusted_undecided_and_missing_gradients_come_first_and_are_never_righ
     assert verdicts.loc[["wrong_factor", "nonfinite"], "trusted"].tolist() == ["no", "no"]
     assert list(shown.charts[0].frame["letter"]) == ["X", "ok"], "the worse verdict of the backends"
     assert "      python -m bench gradcheck 0" in shown.tables[1].notes
-    rows.at[1, "check_verdict"], rows.at[1, "point"] = ["jump"], ["noise"]
-    for name in ("check_verdict", "point", "check_error", "check_eps"):
-        rows[name] = [[]] * len(rows)
-    rows["status"], rows["reason"] = "unsupported", "no root finder"
-    nothing = gradient_check.views(given, rows)
-    assert not nothing.charts
-    assert nothing.remarks == ["4 unsupported: no root finder"]
 
 
 # ---------------------------------------------------------------------------------------------------- three_errors
@@ -163,31 +156,6 @@ def erring(*words):
     given, rows = made("study=three_errors", "backends=[jax]", "estimators=[fobg,reinforce]", *words)
     numbers = {name: 0.5 for name in ("forward_error_rel", "program_error_rel", "model_error_rel", "model_cosine")}
     return given, rows.assign(**numbers, bias=0.1, bias_rel=0.1, bias_low=0.05, bias_high=0.2, reference_norm=1.0)
-
-
-@pytest.mark.slow
-def test_three_errors_of_two_integrators_are_twice_as_many_lines():
-    words = ["scenes=[bounce_once]", "contacts=[impulse,penalty]", "integrators=[semi_implicit_euler,event_driven]"]
-    given, rows = erring(*words, "sweep.dt=[0.1,0.05,0.02]")
-    found = given.study.views(given, rows)
-    lines = readable(found.tables[0])
-    assert len(lines) == 2 * 2 * 3 * 2, "a line per cell, of two estimators"
-    assert lines.groupby(["contact", "integrator"], sort=False).ngroups == 4
-    drawn = found.charts[0].plotted()
-    assert list(dict.fromkeys(drawn["law"])) == [
-        f"{law}, {step}" for law in ("impulse", "penalty") for step in ("semi_implicit_euler", "event_driven")
-    ]
-    assert len(drawn) == 2 * 4, "both errors at the smallest step"
-
-
-@pytest.mark.slow
-def test_three_errors_without_a_swept_axis_have_a_table_and_a_chart(tmp_path):
-    given, rows = erring("scenes=[bounce_once]", "contacts=[impulse,penalty]", f"results_dir={tmp_path}", "formats=[]")
-    make_directory(given.directory)
-    write(given, given.study.views(given, rows))
-    assert "| bounce_once | penalty | fobg |" in (given.directory / "three_errors.md").read_text()
-    assert list(pd.read_csv(given.directory / "three_errors.csv")["estimator"]) == ["fobg", "reinforce"] * 2
-    assert list(given.study.views(given, rows).charts[0].frame["law"]) == ["impulse"] * 2 + ["penalty"] * 2
 
 
 def test_the_main_chart_of_three_errors_is_along_the_time_step_where_it_is_swept():
@@ -418,6 +386,14 @@ def test_the_command_of_a_gradient_check_repeats_its_cell(words):
 def test_the_command_of_a_gradient_check_without_time_steps_has_no_horizon():
     (cell,) = cells(config.load(["study=gradient_check", "scenes=[quadratic]", "estimators=[fobg]"]))
     assert reproduce.check_of(cell) == "python -m bench gradcheck quadratic 'backends=[jax]' seed=0"
+
+
+@pytest.mark.parametrize("name", one_a_study())
+def test_cells_without_results_are_said_so(name):
+    given, rows = made(f"experiment={name}")
+    shown = given.study.views(given, rows.assign(status="unsupported", reason="planted"))
+    assert not shown.charts
+    assert shown.remarks == [f"{len(rows)} unsupported: planted"]
 
 
 @pytest.mark.parametrize("name", sorted(registry.entries()["studies"]))

@@ -12,12 +12,10 @@ from bench.plugins.scenes.bounce_once import BounceOnce
 from bench.plugins.scenes.bouncing_ball import BouncingBall
 from bench.plugins.scenes.wall_penalty_1d import WallPenalty1d
 
-from bench.cli import main
 from bench.experiment import config
 from bench.experiment.grid import cells
 from bench.model import compose
 from bench.report.shown import Shown
-from bench.run.store import Store
 from bench.studies.three_errors import ThreeErrors, measure
 from bench.studies.three_errors.measure import difference_check
 from bench.studies.three_errors.views import FLOOR, OWN, PROGRAM, TRAP, traps, views
@@ -44,20 +42,6 @@ def test_the_trap_is_exact_for_its_program_and_wrong_for_the_physics_at_every_st
         forward.append(abs(found.cost - scene.physical_cost()))
     assert forward[0] > 2 * forward[1] > 4 * forward[2]
     assert all(error <= 4.0 / n for error, n in zip(forward, horizons, strict=True))  # one step at 2 m/s, reversed
-
-
-def test_in_one_dimension_the_cosine_is_minus_one():
-    for horizon in (32, 128, 512):
-        scene = WallPenalty1d(start=0.15, horizon=horizon, dt=2.0 / horizon)
-        assert check(scene, NO_IMPACT).gradient == pytest.approx([1.0])
-        assert scene.physical_gradient()[0] < 0
-
-
-def test_time_of_impact_mends_bounce_once():
-    scene = BounceOnce(horizon=128, dt=1 / 128)
-    found = check(scene, Impulse())
-    assert found.gradient == pytest.approx(scene.physical_gradient(), rel=1e-9)
-    assert found.cost == pytest.approx(scene.physical_cost(), rel=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -88,29 +72,6 @@ def test_a_wrong_derivative_is_seen():
     problem = Jax().compile(compose(BouncingBall(horizon=50), Impulse(), SemiImplicitEuler()))
     found = difference_check(Wrong(problem))
     assert np.linalg.norm(found.gradient - found.difference) == pytest.approx(2 * np.linalg.norm(found.gradient))
-
-
-@pytest.mark.slow
-def test_from_the_command_line(tmp_path, capsys):
-    words = [
-        "study=three_errors", "name=small", "scenes=[bounce_once]", "contacts=[impulse,impulse[time_of_impact=false]]",
-        "backends=[jax]", "estimators=[fobg,reinforce]", "sweep.zip.horizon=[64,256]", "sweep.zip.dt=[0.015625,0.00390625]",
-        "samples=64", "repeats=16", "reference.samples=4096", f"results_dir={tmp_path}",
-    ]  # fmt: skip
-    assert main(words) == 0
-    for name in ("csv", "md", "png"):
-        assert (tmp_path / "small" / f"three_errors.{name}").stat().st_size > 0
-    printed = capsys.readouterr().out
-    assert "right signs" in printed
-    assert "Traps" in printed
-    trapped = pd.read_csv(tmp_path / "small" / "three_errors_traps.csv")
-    assert set(trapped["problem"]) == {"bounce_once, impulse[time_of_impact=false]"}
-    rows = Store(tmp_path / "small", COLUMNS).load()
-    trap = rows[rows["contact"].str.contains("false")]
-    assert (trap["program_error_rel"] < 1e-9).all()
-    assert (trap["model_error_rel"] > 1.5).all()
-    assert (trap[trap["estimator"] == "fobg"]["bias_low"] > 0).all()
-    assert (rows[rows["contact"] == "impulse"]["model_error_rel"] < 1e-9).all()
 
 
 @pytest.mark.parametrize(
@@ -167,9 +128,6 @@ def test_gradients_are_drawn_once_whatever_estimates_them_and_only_where_compare
     assert list(zero["law"]) == ["impulse"]
     assert zero["error_limit"].all()
     assert drawn["error"].notna().all()
-    given, rows = laws(model)
-    rows["status"], rows["reason"] = "unsupported", "no physics"
-    assert not views(given, rows).charts
 
 
 def test_rounding_has_no_sign():
@@ -177,11 +135,3 @@ def test_rounding_has_no_sign():
 
 
 LAWS = [("impulse", True), ("impulse", False), ("penalty", True), ("softplus", True), ("complementarity", True)]
-
-
-def test_the_standard_experiment_covers_four_scenes_and_all_laws():
-    found = cells(config.load(["+experiment=three_errors"]))
-    scenes = {"bounce_once", "wall_penalty_1d", "ground_wall", "bouncing_ball"}
-    assert {cell.scene.name for cell in found} == scenes
-    laws = {(cell.scene.name, cell.contact.name, getattr(cell.contact, "time_of_impact", True)) for cell in found}
-    assert laws == {(scene, *law) for scene in scenes for law in LAWS}

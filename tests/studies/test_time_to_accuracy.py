@@ -40,8 +40,24 @@ def rows(bias=0.0, resolved=None, **values):
     )
 
 
-def table(given, found):
-    return table_of(arrange(given, with_gradient_cost(found)))
+GIVEN = config.load(["sweep.samples=[16,64,256]"])
+
+
+def table(*parts, width=None):
+    """The table of some rows, whose variances of one sample have intervals ``width`` times up and down."""
+    found = pd.concat(parts, ignore_index=True)
+    if width:
+        ends = {"_low": 1 / width, "_high": width, "": 1.0}
+        found = found.assign(
+            **{f"variance_per_sample{end}": found["variance"] * found["samples"] * k for end, k in ends.items()}
+        )
+        found = found.assign(**{f"variance{end}": found["variance"] * k for end, k in ends.items()})
+    return table_of(arrange(GIVEN, with_gradient_cost(found)))
+
+
+def entry(*parts, by="rollouts", target=0.1, width=None):
+    found = table(*parts, width=width)
+    return found[(found["by"] == by) & (found["relative error"] == target)].iloc[0]
 
 
 def line(**values):
@@ -83,9 +99,8 @@ def test_a_gradient_costs_what_it_takes():
     assert ROLLOUTS.of(found).tolist()[::3] == pytest.approx([48, 16, 64, 32])
 
 
-def test_without_times_only_rollouts_are_ranked_and_numbers_are_numbers(tmp_path):
-    given = config.load(["sweep.samples=[16,64,256]", f"results_dir={tmp_path}"])
-    found = table(given, rows(time_s=math.nan))
+def test_without_times_only_rollouts_are_ranked_and_numbers_are_numbers():
+    found = table(rows(time_s=math.nan))
     assert set(found["by"]) == {"rollouts"}
     assert [str(found[name].dtype) for name in ("relative error", "cost", "factor")] == ["float64"] * 3
 
@@ -121,110 +136,79 @@ def test_samples_that_are_coupled_are_not_extrapolated(name):
     assert required_cost(curve, 0.2, TIME).samples == pytest.approx(100)
 
 
-def entry_of(tmp_path, *parts, target=0.1, width=1.01):
-    given = config.load(["sweep.samples=[16,64,256]", f"results_dir={tmp_path}"])
-    found = table(given, with_intervals(pd.concat(parts, ignore_index=True), width))
-    return found[(found["by"] == "rollouts") & (found["relative error"] == target)].iloc[0]
+def better(times, **values):
+    """Rows whose error is smaller by a factor."""
+    return rows(**values).assign(
+        rmse_rel=lambda r: r["rmse_rel"] / times, variance=lambda r: r["variance"] / times**2
+    )  # fmt: skip
 
 
-def test_an_estimator_beyond_the_measured_samples_leaves_the_order_open(tmp_path):
+def slower(times, **values):
+    return rows(**values).assign(time_s=lambda r: times * r["time_s"])
+
+
+def test_an_estimator_beyond_the_measured_samples_leaves_the_order_open():
     """The first takes 800 rollouts; the other has half the error at 256 samples, and more than 512 rollouts to go."""
-    other = rows(estimator="orthogonal").assign(
-        rmse_rel=lambda r: r["rmse_rel"] * 0.9, variance=lambda r: r["variance"] * 0.81
-    )
-    entry = entry_of(tmp_path, rows(), other)
-    assert (entry["fastest"], entry["next"], entry["tied"], entry["unknown"]) == (
-        "e",
-        "orthogonal",
-        ("orthogonal",),
-        "orthogonal",
-    )
-    assert limits(pd.DataFrame([entry])) == ["not known"]
+    found = entry(rows(), better(1 / 0.9, estimator="orthogonal"), width=1.01)
+    names = tuple(found[["fastest", "next", "tied", "unknown"]])
+    assert names == ("e", "orthogonal", ("orthogonal",), "orthogonal")
+    assert limits(pd.DataFrame([found])) == ["not known"]
 
 
-def test_an_estimator_beyond_the_measured_samples_is_behind_one_that_needs_fewer(tmp_path):
+def test_an_estimator_beyond_the_measured_samples_is_behind_one_that_needs_fewer():
     """A hundredth of the variance takes 4 samples for 0.1: measured at 16, and the other takes more than 512 rollouts."""
-    good = rows().assign(rmse_rel=lambda r: r["rmse_rel"] / 3, variance=lambda r: r["variance"] / 9)
-    entry = entry_of(tmp_path, good, rows(estimator="sobol"))
-    assert math.isnan(entry["factor"])
-    assert entry["factor_low"] == pytest.approx(512 / (800 / 9), rel=0.05)
+    found = entry(better(3), rows(estimator="sobol"), width=1.01)
+    assert math.isnan(found["factor"])
+    assert found["factor_low"] == pytest.approx(512 / (800 / 9), rel=0.05)
 
 
-def test_a_cost_at_the_fewest_samples_is_a_limit(tmp_path):
+def test_a_cost_at_the_fewest_samples_is_a_limit():
     """The first reaches 50% with 16 samples and may with fewer, the other with 64: at least 4 times, less the interval."""
-    quick, slow = (rows(estimator=name) for name in ("quick", "slow"))
-    quick = quick.assign(rmse_rel=lambda r: r["rmse_rel"] / 10, variance=lambda r: r["variance"] / 100)
-    entry = entry_of(tmp_path, quick, slow, width=1.001)
-    assert entry["how"] == "at once"
-    assert (math.isnan(entry["factor"]), entry["factor_high"]) == (True, math.inf)
-    assert limits(pd.DataFrame([entry])) == ["at least 25"]
+    found = entry(better(10, estimator="quick"), rows(estimator="slow"), width=1.001)
+    assert found["how"] == "at once"
+    assert (math.isnan(found["factor"]), found["factor_high"]) == (True, math.inf)
+    assert limits(pd.DataFrame([found])) == ["at least 25"]
 
 
-def test_table_names_the_fastest_and_by_how_much(tmp_path):
-    given = config.load(["sweep.samples=[16,64,256]", f"results_dir={tmp_path}"])
-    slow = rows(estimator="slow").assign(time_s=lambda r: 3 * r["time_s"])
-    found = table(given, pd.concat([rows(), slow, rows(bias=0.3, estimator="biased")], ignore_index=True))
-    first = found[(found["by"] == "time") & (found["relative error"] == 0.1)].iloc[0]
-    assert (first["fastest"], first["next"]) == ("e on b", "slow on b")
-    assert first["factor"] == pytest.approx(3.0)
-    assert first["never"] == "biased on b"
-    assert first["how"] == "extrapolated"
-    assert len(found) == 4
+@pytest.mark.parametrize(("width", "tied"), [(None, ()), (1.2, ()), (3.0, ("slow on b",))])
+def test_the_table_names_the_fastest_and_a_factor_only_where_its_interval_excludes_1(width, tied):
+    found = entry(rows(), slower(3, estimator="slow"), rows(bias=0.3, estimator="biased"), by="time", width=width)
+    assert (found["fastest"], found["next"], found["how"]) == ("e on b", "slow on b", "extrapolated")
+    assert found["factor"] == pytest.approx(3.0)
+    assert found["never"] == "biased on b"
+    if width:
+        assert (found["factor_low"] > 1.0, found["tied"]) == (not tied, tied)
 
 
-@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
-def test_rollouts_are_those_of_the_cheapest_backend(tmp_path, order):
+@pytest.mark.parametrize("order", [1, -1])
+def test_rollouts_are_those_of_the_cheapest_backend(order):
     """A backend that fails, as one that differences across a jump, takes nothing from the estimator."""
-    given = config.load(["sweep.samples=[16,64,256]", f"results_dir={tmp_path}"])
-    parts = [rows(), rows(backend="other", status="nonfinite")]
-    found = table(given, pd.concat([parts[i] for i in order], ignore_index=True))
-    line = found[(found["by"] == "rollouts") & (found["relative error"] == 0.1)].iloc[0]
-    assert (line["fastest"], line["how"]) == ("e", "extrapolated")
-    assert line["cost"] == pytest.approx(800.0)
+    found = entry(*[rows(), rows(backend="other", status="nonfinite")][::order])
+    assert (found["fastest"], found["how"]) == ("e", "extrapolated")
+    assert found["cost"] == pytest.approx(800.0)
 
 
-def test_nothing_is_told_where_samples_are_not_swept(tmp_path):
-    given = config.load([f"results_dir={tmp_path}"])
-    assert table(given, rows()[:1]).empty
+def test_nothing_is_told_where_samples_are_not_swept():
+    assert table(rows()[:1]).empty
 
 
-def with_intervals(table, width):
-    """Rows with an interval of the variance of one sample, ``width`` times up and down."""
-    v = table["variance"] * table["samples"]
-    table = table.assign(variance_low=table["variance"] / width, variance_high=table["variance"] * width)
-    return table.assign(variance_per_sample=v, variance_per_sample_low=v / width, variance_per_sample_high=v * width)
-
-
-@pytest.mark.parametrize(("width", "tied"), [(1.2, ()), (3.0, ("slow on b",))])
-def test_a_factor_is_claimed_only_where_its_interval_excludes_1(tmp_path, width, tied):
-    given = config.load(["sweep.samples=[16,64,256]", f"results_dir={tmp_path}"])
-    slow = rows(estimator="slow").assign(time_s=lambda r: 3 * r["time_s"])
-    found = table(given, with_intervals(pd.concat([rows(), slow], ignore_index=True), width))
-    entry = found[(found["by"] == "time") & (found["relative error"] == 0.1)].iloc[0]
-    assert entry["factor"] == pytest.approx(3.0)
-    assert (entry["factor_low"] > 1.0, entry["tied"]) == (not tied, tied)
-
-
-def test_an_error_far_above_all_variances_leaves_no_doubt_about_the_times(tmp_path):
+def test_an_error_far_above_all_variances_leaves_no_doubt_about_the_times():
     """Both reach it with their smallest batch and more: only their times differ, however uncertain their variances."""
-    given = config.load(["sweep.samples=[16,64,256]", f"results_dir={tmp_path}"])
-    quick = rows(variance=1e-9, rmse=1e-4, rmse_rel=5e-5, time_s=1e-3)
-    slow = rows(variance=1e-9, rmse=1e-4, rmse_rel=5e-5, time_s=3e-3, estimator="slow")
-    found = table(given, with_intervals(pd.concat([quick, slow], ignore_index=True), 50.0))
-    by_time = found[found["by"] == "time"].iloc[0]
-    assert list(by_time[["factor", "factor_low", "factor_high"]]) == pytest.approx([3.0] * 3)
+    tiny = {"variance": 1e-9, "rmse": 1e-4, "rmse_rel": 5e-5}
+    parts = rows(time_s=1e-3, **tiny), rows(time_s=3e-3, estimator="slow", **tiny)
+    assert list(entry(*parts, by="time", width=50.0)[["factor", "factor_low", "factor_high"]]) == pytest.approx(
+        [3.0] * 3
+    )
     # by rollouts both costs are upper limits: one sample of either may do
-    assert found[found["by"] == "rollouts"].iloc[0]["tied"] == ("slow",)
+    assert entry(*parts, width=50.0)["tied"] == ("slow",)
 
 
-def test_the_next_is_another_estimator_or_the_same_on_another_backend_by_time_alone(tmp_path):
-    given = config.load(["sweep.samples=[16,64,256]", f"results_dir={tmp_path}"])
-    other = rows(backend="other").assign(time_s=lambda r: 2 * r["time_s"])
-    slow = rows(estimator="slow").assign(time_s=lambda r: 3 * r["time_s"])
-    both = with_intervals(pd.concat([rows(), other], ignore_index=True), 50.0)
-    assert list(table(given, both).iloc[0][["factor", "factor_low", "factor_high"]]) == pytest.approx([2.0] * 3)
-    every = with_intervals(pd.concat([rows(), other, slow], ignore_index=True), 1.1)
-    assert table(given, every).iloc[0]["next"] == "slow on b"
+def test_the_next_is_another_estimator_or_the_same_on_another_backend_by_time_alone():
+    parts = rows(), slower(2, backend="other")
+    assert list(entry(*parts, by="time", width=50.0)[["factor", "factor_low", "factor_high"]]) == pytest.approx(
+        [2.0] * 3
+    )
+    assert entry(*parts, slower(3, estimator="slow"), by="time", width=1.1)["next"] == "slow on b"
 
 
 def test_a_sweep_of_samples_in_which_a_scene_fails_has_its_report(tmp_path):

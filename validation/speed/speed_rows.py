@@ -1,4 +1,4 @@
-"""Rows of the speed table: measured number and target, and the files that they are written to."""
+"""Rows of the speed table: measured number and target, and the file that they are written to."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from bench.report.tables import plain_markdown
 from bench.run.files import make_directory, write_all
 from bench.run.record import machine
 
@@ -32,50 +31,13 @@ class SpeedRow:
         return self.value / self.target
 
 
-def format_rows(rows: Sequence[SpeedRow]) -> list[dict[str, str]]:
-    """Return the rows as printed, each as strings by column."""
-    return [
-        {
-            "what": row.what,
-            "measured": _number(row.value),
-            "unit": row.unit,
-            "target": _number(row.target),
-            "ratio": _number(row.ratio),
-            "spread": "" if math.isnan(row.spread) else f"{row.spread:.0%}",
-            "note": row.note,
-        }
-        for row in rows
-    ]
-
-
-def _number(value: float) -> str:
-    return "" if math.isnan(value) else f"{value:.3g}" if abs(value) < 1e4 else f"{value:.0f}"
-
-
-def show(rows: Sequence[SpeedRow]) -> None:
-    """Print the table."""
-    import pandas as pd
-
-    from bench.report import terminal
-
-    formatted = pd.DataFrame(format_rows(rows))
-    terminal.print_table(
-        terminal.open_console(), formatted, title="bench-self", right=("measured", "target", "ratio", "spread")
-    )
-
-
-def write(rows: Sequence[SpeedRow], directory: Path, load_before: list[float] | None) -> list[Path]:
-    """Write ``bench_self`` as .csv, .md and .json. Returns their paths."""
-    import pandas as pd
-
+def write(rows: Sequence[SpeedRow], directory: Path, load_before: list[float] | None) -> Path:
+    """Write ``bench_self.json``. Returns its path."""
     make_directory(directory)
-    table = pd.DataFrame([{**asdict(row), "ratio": row.ratio} for row in rows])
-    record: dict[str, Any] = {
-        "machine": machine(), "load_average_before": load_before, "lines": json.loads(table.to_json(orient="records")),
-    }  # fmt: skip
-    contents = {
-        "bench_self.csv": table.to_csv(index=False, lineterminator="\n"),
-        "bench_self.md": "# bench-self\n\n" + plain_markdown(pd.DataFrame(format_rows(rows))) + "\n",
-        "bench_self.json": json.dumps(record, indent=1) + "\n",
-    }
-    return write_all(directory, contents)
+    lines = [
+        {name: None if isinstance(value, float) and math.isnan(value) else value for name, value in line.items()}
+        for line in (asdict(row) | {"ratio": row.ratio} for row in rows)
+    ]
+    record: dict[str, Any] = {"machine": machine(), "load_average_before": load_before, "lines": lines}
+    (path,) = write_all(directory, {"bench_self.json": json.dumps(record, indent=1) + "\n"})
+    return path

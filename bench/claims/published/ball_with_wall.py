@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -10,7 +9,6 @@ import numpy as np
 from scipy.optimize import brentq
 
 from bench.claims.claim import Claim, Figure, Outcome
-from bench.claims.colours import GREY, estimator_colour
 from bench.claims.toolkit import centre, estimator, expectation, problem, rule, stochastic_descent
 from bench.model import Array, FunctionScene, Problem, param
 
@@ -57,7 +55,7 @@ class ThrownBall(Claim):
         "the samples can resolve turns alpha-order into the zeroth order."
     )
     labels = ("angle [rad]", "gradient of the smoothed cost")
-    curves = {"truth": ("true", "-", GREY), "first": ("first-order mean", "-", "fobg")}
+    curves = {"truth": "true", "first": "first-order mean"}
     marks = (("y", 0.0, ""),)
     quick = False
 
@@ -88,7 +86,7 @@ class ThrownBall(Claim):
         for text, x in (("0.0257", 0.695), ("0.01665", 0.6), ("4.0e-4", 1.0)):
             (a, a_error), (b, b_error) = first(x), zeroth(x)
             figures.append(Figure(f"bias at {x}", text, abs(a - b), max(a_error, b_error)))
-        ends, off, between, paths = self._descents(at)
+        ends, off, between = self._descents(at)
         without_noise = _exact_descent(at)
         late = int(np.argmax(without_noise >= 0.8331))
         figures += [
@@ -111,22 +109,18 @@ class ThrownBall(Claim):
                 "steps fewer would explain the difference"
             ),
             series={
-                "x": grid.tolist(),
+                "x": grid,
                 "first": [first(x, 20_000)[0] for x in grid],
                 "truth": [zeroth(x, 20_000)[0] for x in grid],
-                "first_end": ends["fobg"][0], "zeroth_end": ends["reinforce"][0],
-                "path": paths.tolist(),
             },
         )  # fmt: skip
 
-    def _descents(
-        self, at: Problem
-    ) -> tuple[dict[str, tuple[float, float]], list[tuple[float, float]], float, np.ndarray]:
-        """Return ends and shares of alpha = 0 with standard errors, the share's spread between runs, and a path.
+    def _descents(self, at: Problem) -> tuple[dict[str, tuple[float, float]], list[tuple[float, float]], float]:
+        """Return ends and shares of alpha = 0 with standard errors, and the share's spread between runs.
 
         The shares are for the published setting, the same with a baseline, and the setting of the published code.
         """
-        first, path = stochastic_descent(at, False, 0.1, 0.1, 1000, seed=3)
+        first = stochastic_descent(at, False, 0.1, 0.1, 1000, seed=3)[0]
         ends = {"fobg": centre(first), "reinforce": centre(stochastic_descent(at, True, 0.1, 0.1, 1000, seed=33)[0])}
         share, spread = [], 0.0
         noise = np.random.default_rng(333).standard_normal((1000, 1, RUNS * 50))
@@ -143,13 +137,7 @@ class ThrownBall(Claim):
         code = estimator("alpha_order[gamma=0.01,delta=0.95,sharing=shared]")
         decided = code.estimate_with_diagnostics(at, np.array([0.1]), noise[:, 0, :50, None])[1]["alpha"]
         share.append((float(np.mean(decided == 0)), 0.0))
-        return ends, share, spread, path[::20, 0]
-
-    def draw(self, axes: Any, series: Mapping[str, Any]) -> None:
-        """Draw both gradients and the ends of the descents."""
-        super().draw(axes, series)
-        axes.plot([series["first_end"]], [0], "o", color=estimator_colour("fobg"), label="first order ends")
-        axes.plot([series["zeroth_end"]], [0], "s", color=estimator_colour("reinforce"), label="zeroth order ends")
+        return ends, share, spread
 
 
 def _exact_descent(at: Problem) -> np.ndarray:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from bench.claims.claim import Claim, Figure, Outcome
-from bench.claims.colours import GREY
 from bench.claims.toolkit import problem
 
 SIGMA = 0.3
@@ -25,7 +24,7 @@ class Missed(Claim):
         "A surrogate gradient sees what was missed and keeps the motion, but it is not the derivative of the program."
     )
     labels = ("force across u0 [N]", "df / du0")
-    curves = {"truth": ("true", "-", GREY), "plain": ("plain", "--"), "surrogate": ("surrogate", "-")}
+    curves = {"truth": "true", "plain": "plain", "surrogate": "surrogate"}
     quick = False
 
     def measure(self) -> Outcome:
@@ -74,10 +73,10 @@ class Missed(Claim):
                 f"beyond |u0| = 2.6, where the true gradient is 0, it pushes at {pushes['surrogate']:.0%} of the forces"
             ),
             series={
-                "u": wide[inside][::8].tolist(),
-                "truth": truth[::8].tolist(),
-                "plain": means["plain"][::8].tolist(),
-                "surrogate": means["surrogate"][::8].tolist(),
+                "u": wide[inside][::8],
+                "truth": truth[::8],
+                "plain": means["plain"][::8],
+                "surrogate": means["surrogate"][::8],
             },
         )
 

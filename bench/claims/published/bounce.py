@@ -25,7 +25,7 @@ class TimeOfImpact(Claim):
         "A motion that is right to first order can have a derivative of the wrong sign, and refining does not help."
     )
     labels = ("initial height [m]", "final height [m]")
-    curves = {"with": ("with time of impact: slope -1", "-"), "without": ("without: slope +1 on every tooth", "-")}
+    curves = {"with": "with time of impact: slope -1", "without": "without: slope +1 on every tooth"}
 
     def measure(self) -> Outcome:
         """Differentiate both programs away from the boundary between steps, and around the source's start."""
@@ -33,7 +33,7 @@ class TimeOfImpact(Claim):
         step = 1 / 480
         heights = np.linspace(1 - 4 * step, 1 + 8 * step, 97)
         theta = np.stack([heights, np.full_like(heights, -2.0), np.zeros_like(heights)])
-        figures, series = [], {"height": heights.tolist()}
+        figures, series = [], {"height": heights}
         for name, law in (("with", "impulse"), ("without", "impulse[time_of_impact=false]")):
             at = problem("bounce_once", law)
             # 1 + 1/480 is half way between two boundaries; a start 2/480 m higher meets the ground one step later
@@ -42,7 +42,7 @@ class TimeOfImpact(Claim):
             figures += [
                 Figure(f"{part}, {name}", text, float(x)) for part, text, x in zip(NAMES, exact, late, strict=True)
             ]
-            series[name] = at.value(theta, np.zeros((3, heights.size))).tolist()
+            series[name] = at.value(theta, np.zeros((3, heights.size)))
         return Outcome(
             figures,
             reservation=(
@@ -64,7 +64,7 @@ class PenaltyPhase(Claim):
     learned = "What counts is stiffness times squared step: how many steps a contact lasts."
     labels = ("stiffness [N/m]", "RMS of df/dy0 + 1")
     logarithmic = "xy"
-    curves = {"480": ("dt = 1/480 s", "o-"), "48000": ("dt = 1/48000 s", "s-")}
+    curves = {"480": "dt = 1/480 s", "48000": "dt = 1/48000 s"}
     quick = False
 
     def measure(self) -> Outcome:

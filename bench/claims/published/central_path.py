@@ -80,7 +80,7 @@ class CentralPath(Claim):
     source = "Suh, Pang, Tedrake 2022; Pang et al. 2023"
     learned = "Analytic smoothing and smoothing by noise are the same thing; only the analytic one has no variance."
     labels = ("gap without force / sqrt(c)", "derivative of the gap after it")
-    curves = {"relaxed": ("central path = t(2) noise", "-"), "gauss": ("closest Gaussian", "--")}
+    curves = {"relaxed": "central path = t(2) noise", "gauss": "closest Gaussian"}
 
     def measure(self) -> Outcome:
         """Compare the relaxed derivative with the chance under that noise, and the kink's variances."""
@@ -105,7 +105,7 @@ class CentralPath(Claim):
         ]
         return Outcome(
             figures,
-            series={"a": a[::8].tolist(), "relaxed": relaxed[::8].tolist(), "gauss": ndtr(a / closest.x)[::8].tolist()},
+            series={"a": a[::8], "relaxed": relaxed[::8], "gauss": ndtr(a / closest.x)[::8]},
         )
 
 

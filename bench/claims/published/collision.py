@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from bench.claims.claim import Claim, Figure, Outcome
-from bench.claims.toolkit import descend, native
+from bench.claims.toolkit import exact_descent, native
 
 if TYPE_CHECKING:
     from bench.model import Problem
@@ -33,7 +32,7 @@ class Collision(Claim):
     source = "Zhong, Han, Brikis 2022, arXiv 2207.05060, task 3"
     learned = "With the wrong sign at the impact the optimiser learns not to touch: it gives up."
     labels = ("iteration", "cost")
-    curves = {name: (label, "-") for name, label in LABELS.items()}
+    curves = LABELS
     marks = (("y", 2.0, "doing nothing"),)
     quick = False
 
@@ -45,11 +44,12 @@ class Collision(Claim):
             ("without", "impulse[time_of_impact=false]", "2.001432"),
             ("penalty", f"penalty[stiffness={FITTED!r}]", "1.6694"),
         )
-        figures, series = [], {"iteration": list(range(0, 1001, 20))}
+        figures: list[Figure] = []
+        series: dict[str, Any] = {"iteration": list(range(0, 1001, 20))}
         for name, law, loss in cases:
             values = _costs(native(scene, law))
             figures.append(Figure(f"cost at the end, {name}", loss, float(values[-1])))
-            series[name] = values.tolist()
+            series[name] = values
         tried = {k: float(_costs(native(scene, f"penalty[stiffness={k!r}]"))[-1]) for k in TRIED}
         ends = ", ".join(f"{end:.4f} at {k:g}" for k, end in tried.items())
         last = series["penalty"][-5:]
@@ -67,11 +67,4 @@ class Collision(Claim):
 
 def _costs(at: Problem) -> np.ndarray:
     """Return the costs of every 20th of 1,000 steps of descent."""
-    _, path = descend(partial(_slope, at), np.full(960, 3.0), 10.0, 1000)
-    costs: np.ndarray = at.value(path[::20].T, np.zeros((960, 51)))
-    return costs
-
-
-def _slope(at: Problem, theta: np.ndarray, _: int) -> np.ndarray:
-    """Return the gradient without noise."""
-    return at.grad(theta, np.zeros((theta.size, 1)))[:, 0]
+    return exact_descent(at, np.full(960, 3.0), 10.0, 1000, 20)[1]

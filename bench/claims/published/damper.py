@@ -31,7 +31,7 @@ class Damper(Claim):
     learned = "A stiff contact does not bias the first order; a force that jumps does, at any step."
     labels = ("stiffness", "distance of first from zeroth order")
     logarithmic = "xy"
-    curves = {str(steps): (f"{steps} steps", "o-") for steps in DISTANCES}
+    curves = {str(steps): f"{steps} steps" for steps in DISTANCES}
 
     def measure(self) -> Outcome:
         """Estimate both means with the same samples."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -43,7 +42,7 @@ class Sticking(Claim):
     source = "Le Lidec et al. 2023"
     learned = "An exact zero can be right and still of no use to an optimiser; noise looks past the edge of the cone."
     labels = ("push F", "derivative of the acceleration")
-    curves = {"smooth": ("smoothed, s = mu", "-")}
+    curves = {"smooth": "smoothed, s = mu"}
 
     def measure(self) -> Outcome:
         """Compute the exact derivative, and integrate both orders over the noise."""
@@ -67,10 +66,5 @@ class Sticking(Claim):
         ]
         return Outcome(
             figures,
-            series={"force": forces.tolist(), "smooth": smooth},
+            series={"force": forces, "smooth": smooth},
         )
-
-    def draw(self, axes: Any, series: Mapping[str, Any]) -> None:
-        """Draw the exact and the smoothed derivative."""
-        axes.plot([-4, -1, -1, 1, 1, 4], [1, 1, 0, 0, 1, 1], label="exact")
-        super().draw(axes, series)

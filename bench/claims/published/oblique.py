@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import fields
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from bench.claims.claim import Claim, Figure, Outcome
-from bench.claims.toolkit import descend, plugin, problem
+from bench.claims.toolkit import exact_descent, plugin, problem
 from bench.errors import Unsupported
 from bench.model import Array, MechanicalScene, State
-
-if TYPE_CHECKING:
-    from bench.model import Problem
 
 STEPS, RATE, ITERATIONS = 480, 200.0, 500
 OPTIMUM = 0.311417
@@ -62,21 +58,23 @@ class ObliqueCollision(Claim):
     source = "Zhong, Han, Brikis 2023, arXiv 2305.00092"
     learned = "Where the normal turns with the place of impact, the right position with a wrong velocity is worse than neither."
     labels = ("iteration", "cost")
-    curves = {name: (label, "-") for name, label in LABELS.items()}
+    logarithmic = "y"
+    curves = LABELS
     marks = (("y", OPTIMUM, "optimum"),)
     quick = False
 
     def measure(self) -> Outcome:
         """Descend at rate 200 under each program."""
         scene = oblique()
-        figures, series = [], {"iteration": list(range(0, ITERATIONS + 1, EVERY))}
+        figures: list[Figure] = []
+        series: dict[str, Any] = {"iteration": list(range(0, ITERATIONS + 1, EVERY))}
         for name, (law, integrator, end) in CASES.items():
             try:
                 at = problem(scene, law, "fused", integrator)
             except Unsupported:
                 at = problem(scene, law, "jax", integrator)
-            costs = _costs(at)
-            series[name] = costs.tolist()
+            costs = exact_descent(at, at.program.theta0, RATE, ITERATIONS, EVERY)[1]
+            series[name] = costs
             figures.append(Figure(f"cost at the end, {LABELS[name]}", end, costs[-1], spread=SHARE * float(end)))
         # the optimum is a bound: within 3% of it, or 10% above it
         figures.append(
@@ -92,17 +90,3 @@ class ObliqueCollision(Claim):
             ),
             series=series,
         )
-
-    def draw(self, axes: Any, series: Mapping[str, Any]) -> None:
-        """Draw the costs near the optimum."""
-        super().draw(axes, series)
-        axes.set_ylim(0.25, 0.6)
-
-
-def _costs(at: Problem) -> np.ndarray:
-    """Return the costs of every tenth step of the descent."""
-    still = np.zeros((at.program.n_noise, 1))
-    _, path = descend(lambda theta, _: at.grad(theta, still)[:, 0], at.program.theta0, RATE, ITERATIONS)
-    thetas = path[::EVERY].T
-    costs: np.ndarray = at.value(thetas, np.zeros((len(still), thetas.shape[1])))
-    return costs

@@ -65,8 +65,8 @@ class ElasticPair(Claim):
     )
     source = "nimblephysics, issue 97"
     learned = "A program can end at the right place with the derivatives of the wrong ball."
-    labels = ("variable", "derivative of the second ball's end")
-    curves = {name: (name, "o-") for name in ("with time of impact", "without", "event driven")}
+    labels = ("variable: x1, x2, v1, v2", "derivative of the second ball's end")
+    curves = {name: name for name in ("with time of impact", "without", "event driven")}
 
     def measure(self) -> Outcome:
         """Differentiate the end under the impulse law with and without the time of impact, and under event-driven steps."""
@@ -75,7 +75,8 @@ class ElasticPair(Claim):
             "without": ("impulse[time_of_impact=false]", "semi_implicit_euler", ("0.00", "1.00", "0.69", "0.31")),
             "event driven": ("impulse", "event_driven", ("1.00", "0.00", "1.00", "0.00")),
         }
-        figures, series = [], {"names": list(NAMES)}
+        figures: list[Figure] = []
+        series: dict[str, Any] = {"names": list(NAMES)}
         for label, (law, integrator, published) in cases.items():
             at = problem(Pair(), law, integrator=integrator)
             still = np.zeros((at.program.n_noise, 1))
@@ -87,5 +88,5 @@ class ElasticPair(Claim):
             end = float(at.value(at.program.theta0, still)[0])
             if label != "without":
                 figures.append(Figure(f"place at the end, {label}", "1.200", end, spread=1e-9))
-            series[label] = slopes.tolist()
+            series[label] = slopes
         return Outcome(figures, series=series)

@@ -9,7 +9,6 @@ from typing import Any, ClassVar
 import numpy as np
 
 from bench.claims.claim import Claim, Figure, Outcome
-from bench.claims.colours import GREY
 from bench.claims.toolkit import centre, expectation, problem, stochastic_descent
 from bench.model import Array, FunctionScene, param
 
@@ -43,7 +42,7 @@ class FallingPivot(Claim):
     source = "Suh et al. 2022, ICML"
     learned = "Near the edge the first-order gradient misses exactly the part that warns: the jump times its density."
     labels = ("angle [rad]", "mean gradient")
-    curves = {"truth": ("true", "-", GREY), "first": ("first-order mean", "-", "fobg")}
+    curves = {"truth": "true", "first": "first-order mean"}
     marks = (("x", math.pi / 4, "edge"),)
 
     def measure(self) -> Outcome:
@@ -74,5 +73,5 @@ class FallingPivot(Claim):
         both = [means(x, 20_000) for x in grid]
         return Outcome(
             figures,
-            series={"x": grid.tolist(), "first": [a[0] for a, _ in both], "truth": [b[0] for _, b in both]},
+            series={"x": grid, "first": [a[0] for a, _ in both], "truth": [b[0] for _, b in both]},
         )

@@ -50,7 +50,7 @@ class SmoothedPush(Claim):
     learned = "Smooth contact until its width is that of a sample's motion: then the first order is far better."
     labels = ("sharpness beta [1/m]", "variance of one sample")
     logarithmic = "xy"
-    curves = {"first": ("first order", "o-", "fobg"), "zeroth": ("zeroth order", "s-", "reinforce")}
+    curves = {"first": "first order", "zeroth": "zeroth order"}
     quick = False
 
     def measure(self) -> Outcome:
@@ -105,9 +105,9 @@ class StiffPush(Claim):
     labels = ("stiffness [N/m]", "variance of one sample")
     logarithmic = "xy"
     curves = {
-        "coarse": ("first order, step 5 ms", "o-", "fobg"),
-        "fine": ("first order, step 0.25 ms", "o--", "fobg"),
-        "zeroth": ("zeroth order", "s-", "reinforce"),
+        "coarse": "first order, step 5 ms",
+        "fine": "first order, step 0.25 ms",
+        "zeroth": "zeroth order",
     }
     quick = False
 

@@ -25,7 +25,7 @@ class Ramp(Claim):
     learned = "An unbiased gradient can be useless: in finite samples a steep ramp is a jump."
     labels = ("width of the ramp / sigma", "variance of one sample")
     logarithmic = "xy"
-    curves = {"first": ("first order", "-", "fobg"), "zeroth": ("zeroth order", "-", "reinforce")}
+    curves = {"first": "first order", "zeroth": "zeroth order"}
     marks = (("x", 1.517, "published crossing"),)
     quick = False
 
@@ -58,7 +58,7 @@ class Ramp(Claim):
         return Outcome(
             figures,
             series={
-                "width": (widths / SIGMA).tolist(),
+                "width": (widths / SIGMA),
                 "first": [moments(one, first, count=40_000)[1][0] for one in problems],
                 "zeroth": [moments(one, zeroth, count=40_000)[1][0] for one in problems],
             },

@@ -28,7 +28,7 @@ class SoftWall(Claim):
     learned = "Before blaming contact, halve the time step and look again."
     labels = ("time step [s]", "mean error of df/dq0")
     logarithmic = "xy"
-    curves = {"error": ("penalty program", "o-")}
+    curves = {"error": "penalty program"}
     marks = (("y", SPEED, "size of the gradient"),)
 
     def measure(self) -> Outcome:

@@ -20,8 +20,8 @@ class Step(Claim):
     learned = "A gradient that repeats itself perfectly can be wholly wrong."
     labels = ("theta", "mean gradient")
     curves = {
-        "zeroth": ("zeroth order: the slope", "-", "reinforce"),
-        "first": ("first order: 0 everywhere", "-", "fobg"),
+        "zeroth": "zeroth order: the slope",
+        "first": "first order: 0 everywhere",
     }
 
     def measure(self) -> Outcome:
@@ -44,7 +44,7 @@ class Step(Claim):
         return Outcome(
             figures,
             series={
-                "theta": thetas.tolist(),
+                "theta": thetas,
                 "first": [moments(at, first, x, 4000)[0][0] for x in thetas],
                 "zeroth": [moments(at, zeroth, x, 4000)[0][0] for x in thetas],
             },

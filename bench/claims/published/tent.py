@@ -51,7 +51,7 @@ class Chaos(Claim):
     learned = "Beyond the horizon of chaos derivatives are right and useless; sampling does not care."
     labels = ("steps T", "variance of one sample")
     logarithmic = "y"
-    curves = {"first": ("first order: 4^T", "o-", "fobg"), "zeroth": ("zeroth order", "s-", "reinforce")}
+    curves = {"first": "first order: 4^T", "zeroth": "zeroth order"}
 
     def measure(self) -> Outcome:
         """Sample both orders at several horizons."""

@@ -3,17 +3,12 @@
 from __future__ import annotations
 
 import math
-from functools import partial
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
 from bench.claims.claim import Claim, Figure, Outcome
-from bench.claims.toolkit import descend, native
-
-if TYPE_CHECKING:
-    from bench.model import Problem
-
+from bench.claims.toolkit import exact_descent, native
 
 SINGLE = 2 * 2.0**-24 * math.sqrt(288)
 """Relative rounding error of position and velocity over 288 steps in single precision, as in the published ends."""
@@ -35,7 +30,7 @@ class Throw(Claim):
     )
     labels = ("iteration", "squared distance to the target [m^2]")
     logarithmic = "y"
-    curves = {name: (label, "-") for name, label in LABELS.items()}
+    curves = LABELS
     quick = False
 
     def measure(self) -> Outcome:
@@ -45,20 +40,14 @@ class Throw(Claim):
             ("without", "impulse[time_of_impact=false]", "0.00425", ("-2.493337", "-4.298402")),
             ("penalty", "penalty", "7e-12", ("10.638576", "-4.282096")),
         )
-        figures, series = [], {"iteration": list(range(0, 1001, 20))}
+        figures: list[Figure] = []
+        series: dict[str, Any] = {"iteration": list(range(0, 1001, 20))}
         for name, law, loss, ends in cases:
-            at = native("ground_wall", law)
-            end, path = descend(partial(_slope, at), np.array([5.0, -5.0]), 0.01, 1000)
-            values = at.value(path[::20].T, np.zeros((2, 51)))
+            end, values = exact_descent(native("ground_wall", law), np.array([5.0, -5.0]), 0.01, 1000, 20)
             figures.append(Figure(f"loss at the end, {name}", loss, float(values[-1])))
             for part, text, x in zip(("vx", "vy"), ends, end, strict=True):
                 figures.append(
                     Figure(f"{part} at the end, {name}", text, float(x), spread=SINGLE * float(np.abs(end).max()))
                 )
-            series[name] = values.tolist()
+            series[name] = values
         return Outcome(figures, series=series)
-
-
-def _slope(at: Problem, theta: np.ndarray, _: int) -> np.ndarray:
-    """Return the gradient without noise."""
-    return at.grad(theta, np.zeros((theta.size, 1)))[:, 0]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -49,7 +48,7 @@ class Windows(Claim):
     learned = "Cutting a rollout is cheap only if its end is worth something."
     labels = ("window H", "excess cost")
     logarithmic = "y"
-    curves = {"excess": ("no value at the end", "o-")}
+    curves = {"excess": "no value at the end"}
 
     def measure(self) -> Outcome:
         """Compute the optimum of each window from its gradient, which is linear in the controls."""
@@ -94,7 +93,8 @@ class OtherObjective(Claim):
     statement = "iLQR swings a pendulum up in five iterations: 1856.154, 1202.106, 699.799, 423.583, 357.476, 357.297."
     source = "Suh et al. 2021, Bundled gradients, public result file"
     learned = "Say which objective was given and on which one it is scored; nobody can tell from the curve."
-    labels = ("iteration", "cost above the least, 349.49")
+    labels = ("iteration", "cost, at least 349.49")
+    curves = {"given": "given weights 1/2 and 20", "scored": "given weights 1 and 1"}
 
     def measure(self) -> Outcome:
         """Run iLQR with weights 1/2 and 20 and with weights 1 and 1, both scored with 1 and 1."""
@@ -114,11 +114,6 @@ class OtherObjective(Claim):
             ),
             series={"given": given, "scored": scored[:8]},
         )
-
-    def draw(self, axes: Any, series: Mapping[str, Any]) -> None:
-        """Draw both curves above the optimum."""
-        for name, label in (("given", "given weights 1/2 and 20"), ("scored", "given weights 1 and 1")):
-            axes.semilogy(np.array(series[name]) - 349.490454, "o-", label=label)
 
 
 def _ilqr(effort: float, terminal: float, iterations: int, dt: float = 0.05, horizon: int = 200) -> list[float]:

@@ -225,24 +225,19 @@ def ranking(methods: pd.DataFrame) -> Table:
     """
     counts = verdicts_by_estimator(methods)
     worst = methods.assign(known=methods["error"].fillna(math.inf)).sort_values("known", kind="stable")
-    worst = worst.groupby(["estimator", "problem"], sort=False).tail(1).set_index(["estimator", "problem"])
-    problems = list(dict.fromkeys(methods["problem"]))
-    lines = []
-    for name, verdicts in counts.iterrows():
-        line: dict[str, Any] = {"method": name, **verdicts.to_dict()}
-        for i, problem in enumerate(problems):
-            row = worst.loc[(name, problem)] if (name, problem) in worst.index else None
-            line |= {f"p{i}": math.nan, f"p{i}_low": math.nan, f"p{i}_high": math.nan, f"p{i}_note": ""}
-            if row is not None:
-                work = f"({row['evaluations']:.0f}x)" if row["evaluations"] > MANY else ""
-                share = "biased" if row["bias_share"] > 0.5 else ""
-                note = row["status"] if row["status"] != "ok" else ", ".join(filter(None, (row["verdict"], share)))
-                line |= {f"p{i}": row["error"], f"p{i}_low": row["error_low"], f"p{i}_high": row["error_high"]}
-                line[f"p{i}_note"] = " ".join(filter(None, (note, work)))
-        finite = [line[f"p{i}"] for i in range(len(problems))]
-        line["worst"] = max(finite) if all(map(math.isfinite, finite)) else math.nan
-        lines.append(line)
-    frame = pd.DataFrame(lines).sort_values("worst", kind="stable", na_position="last")
+    worst = worst.drop_duplicates(["estimator", "problem"], keep="last")
+    shares = worst["verdict"] + np.where(worst["bias_share"] > 0.5, ", biased", "")
+    work = worst["evaluations"].map(" ({:.0f}x)".format).where(worst["evaluations"] > MANY, "")
+    worst = worst.assign(note=shares.mask(worst["status"] != "ok", worst["status"]) + work)
+    problems, parts = list(dict.fromkeys(methods["problem"])), []
+    for i, problem in enumerate(problems):
+        own = worst[worst["problem"] == problem].set_index("estimator").reindex(counts.index)
+        named = {"error": f"p{i}", "error_low": f"p{i}_low", "error_high": f"p{i}_high", "note": f"p{i}_note"}
+        parts.append(own[[*named]].rename(columns=named).fillna({f"p{i}_note": ""}))
+    frame = pd.concat([counts, *parts], axis=1).rename_axis("method").reset_index()
+    errors = frame[[f"p{i}" for i in range(len(problems))]]
+    frame["worst"] = errors.max(axis=1).where(np.isfinite(errors).all(axis=1))
+    frame = frame.sort_values("worst", kind="stable", na_position="last")
     columns = [
         ESTIMATOR,
         *(Column(str(name), format="setting") for name in counts),

@@ -3,26 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import ClassVar
 
 from bench.experiment.cell import Cell
 from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, text
-from bench.experiment.experiment import Experiment
-from bench.experiment.session import Session
-from bench.experiment.study import Study
-from bench.experiment.views import Views
-from bench.model import Estimator, Optimizer, Plugin, param
-
-if TYPE_CHECKING:
-    import pandas as pd
+from bench.model import Estimator, Optimizer, param
+from bench.studies.optimise import SearchStudy
 
 
 @dataclass(frozen=True)
-class DoseResponse(Study):
+class DoseResponse(SearchStudy):
     """Searches with gradients of known error at their best rate, and counts the updates until the regret has fallen."""
 
     name = "dose_response"
-    axes: ClassVar[tuple[str, ...]] = ("scene", "contact", "integrator", "backend", "estimator", "optimizer")
     columns: ClassVar[Columns] = Columns.of(
         text("optimizer", "identity string of the optimizer"),
         text("scene_class", "smooth, stiff (contact), chaotic (gradients vary more than costs), discontinuous or identification",
@@ -68,19 +61,6 @@ class DoseResponse(Study):
         half = (self.rates - 1) / 2
         return [0.1 * 10 ** (0.5 * (i - half)) for i in range(self.rates)]
 
-    def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
-        """Return one cell's results by column."""
-        from bench.studies.dose_response.measure import measure
-
-        return measure(cell, session, self)
-
-    def parts(self, given: dict[str, Plugin | None]) -> dict[str, Plugin | None]:
-        """Return the plugins, without the estimator if the optimizer uses only costs: it then has no effect."""
-        optimizer = given.get("optimizer")
-        if isinstance(optimizer, Optimizer) and "gradient" not in optimizer.needs:
-            return given | {"estimator": None}
-        return given
-
     def unsupported_reason(self, cell: Cell) -> str | None:
         """Return why a cell cannot be searched, or None."""
         optimizer, estimator = cell.parts["optimizer"], cell.parts["estimator"]
@@ -91,9 +71,3 @@ class DoseResponse(Study):
         if "gradient" in optimizer.needs and estimator is not None and not estimator.gives_gradient:
             return f"optimizer {optimizer.name} needs gradients, which {estimator.name} does not give"
         return None
-
-    def views(self, experiment: Experiment, rows: pd.DataFrame) -> Views:
-        """Return the cost of an error by class, with the natural methods on it, and the tables."""
-        from bench.studies.dose_response.views import views
-
-        return views(experiment, rows)

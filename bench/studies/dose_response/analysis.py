@@ -235,9 +235,7 @@ def reached(table: pd.DataFrame) -> pd.DataFrame:
     if not (main["kind"] == COSTS_ONLY).any():
         return main.iloc[:0]
     names = main["method"].str.partition("[")[0]
-    main["method"] = names.where(
-        main.assign(name=names).groupby("name")["method"].transform("nunique") == 1, main["method"]
-    )
+    main["method"] = names.where(main.groupby(names)["method"].transform("nunique") == 1, main["method"])
     spent = main["times"] * (main["rollouts_per_update"] + main["gradients_per_update"])
     main["missed"] = np.isinf(main["median"])
     main["hits"], main["runs"] = spent.map(lambda v: int(np.isfinite(v).sum())), spent.map(len)

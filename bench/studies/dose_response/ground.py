@@ -95,15 +95,10 @@ def _compute(cell: Cell, problem: Problem, session: Session, settings: Any, opti
     if "gradient" not in optimizer.needs:
         return empty
     task = Task(cell.scene.name, scored, start, optimum, settings.iterations)
-    method = Method(
-        optimizer, BestGradient(), 1 if problem.program.continuous else PRECISE, not problem.program.continuous
-    )
-    first = BestGradient().estimate(
-        problem,
-        theta0,
-        noise.draw(0, cell.scene.name, 1, method.samples, problem.program.n_noise, "dose_response: first"),
-    )[0]
-    scale = unit_rate(optimizer, first)
+    is_random = not problem.program.continuous
+    method = Method(optimizer, BestGradient(), PRECISE if is_random else 1, is_random)
+    w = noise.draw(0, cell.scene.name, 1, method.samples, problem.program.n_noise, "dose_response: first")
+    scale = unit_rate(optimizer, BestGradient().estimate(problem, theta0, w)[0])
     tuning = tune(problem, task, method, [0], [scale * r for r in settings.grid()], settings.widenings)
     best = with_rate(method, tuning.rates[tuning.best[-1]])
     (search,) = run_searches(problem, task, [best], [0], keep=True)
@@ -147,10 +142,7 @@ def _optimum(cell: Cell, problem: Problem, session: Session, scored: np.ndarray)
 
     with np.errstate(all="ignore"):
         near = minimize(cost, theta0, jac=slope, method="L-BFGS-B", options={"maxiter": 200})
-        starts = [theta0, near.x] if not problem.program.continuous else [near.x]
-        ends = (
-            [minimize(cost, x, method="Powell", options={"maxfev": SEARCHED}) for x in starts]
-            if theta0.size <= 100
-            else []
-        )
+        starts = [near.x] if problem.program.continuous else [theta0, near.x]
+        starts = starts if theta0.size <= 100 else []
+        ends = [minimize(cost, x, method="Powell", options={"maxfev": SEARCHED}) for x in starts]
     return float(min([near.fun, *(end.fun for end in ends)])), "lowest cost found by L-BFGS and Powell's method"

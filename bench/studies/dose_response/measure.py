@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -14,11 +15,11 @@ from bench.experiment.config import config_dir
 from bench.experiment.session import Session
 from bench.measure import noise
 from bench.model import Estimator, Optimizer, Problem
+from bench.studies.dose_response import DoseResponse
 from bench.studies.dose_response.ground import Ground, ground_of, scored_noise
 from bench.studies.dose_response.search import (
     MOST_NUMBERS,
     Method,
-    Search,
     Task,
     run_searches,
     tune,
@@ -35,53 +36,42 @@ TIMED = 256
 """Columns of a timed call."""
 
 
-def measure(cell: Cell, session: Session, settings: Any) -> dict[str, Any]:
+def measure(cell: Cell, session: Session, settings: DoseResponse) -> dict[str, Any]:
     """Return one cell's results by column."""
     problem = session.problem(cell)
     with np.errstate(all="ignore"):
         ground = ground_of(cell, problem, session, settings)
-        task = Task(
-            cell.scene.name, scored_noise(problem, cell.scene.name), ground.start, ground.optimum, settings.iterations
-        )
+        scored = scored_noise(problem, cell.scene.name)
+        task = Task(cell.scene.name, scored, ground.start, ground.optimum, settings.iterations)
         method, first = _method(cell, problem)
-        scale = unit_rate(method.optimizer, first)
         n_tuning, n_runs = (settings.tuning_seeds, settings.seeds) if method.is_random else (1, 1)
-        base = 100_000 * cell.seed
+        seeds, scale = 100_000 * cell.seed + np.arange(n_runs), unit_rate(method.optimizer, first)
         tuning = tune(
-            problem, task, method, range(base + TUNING_SEED, base + TUNING_SEED + n_tuning),
+            problem, task, method, (100_000 * cell.seed + TUNING_SEED + np.arange(n_tuning)).tolist(),
             [scale * rate for rate in settings.grid()], settings.widenings,
         )  # fmt: skip
-        searches: dict[int, list[Search]] = {}
-        pairs = [(best, seed) for best in dict.fromkeys(tuning.best) for seed in range(base, base + n_runs)]
-        methods = [with_rate(method, tuning.rates[best]) for best, _ in pairs]
-        results = run_searches(problem, task, methods, [seed for _, seed in pairs])
-        for (best, _), search in zip(pairs, results, strict=True):
-            searches.setdefault(best, []).append(search)
+        best = list(dict.fromkeys(tuning.best))
+        methods = [with_rate(method, tuning.rates[place]) for place in best for _ in seeds]
+        results = run_searches(problem, task, methods, seeds.tolist() * len(best))
+        searches = {place: results[i * n_runs : (i + 1) * n_runs] for i, place in enumerate(best)}
         errors = errors_on_path(cell, problem, method, ground) if method.estimator is not None else {}
-    updates = [[search.updates[k] for search in searches[best]] for k, best in enumerate(tuning.best)]
+    updates = [search.updates[k] for k, place in enumerate(tuning.best) for search in searches[place]]
     return {
-        "status": "ok",
-        "reason": "",
-        "scene_class": scene_class(cell, problem),
-        "start_cost": ground.start,
-        "optimum": ground.optimum,
-        "optimum_status": ground.how,
-        "budget": settings.iterations,
-        "runs": n_runs,
-        "updates": [value if math.isfinite(value) else math.nan for row in updates for value in row],
-        "best_rates": [tuning.rates[best] for best in tuning.best],
-        "is_inside": [float(inside) for inside in tuning.is_inside],
-        "rates": tuning.rates,
-        "rate_updates": [v if math.isfinite(v) else math.nan for v in tuning.updates.ravel()],
-        "tuning_rollouts": tuning.rollouts,
-        "tuning_gradients": tuning.gradients,
-        "rollouts_per_update": float(np.mean([s.rollouts for s in results])),
+        "status": "ok", "reason": "", "scene_class": scene_class(cell, problem), "start_cost": ground.start,
+        "optimum": ground.optimum, "optimum_status": ground.how, "budget": settings.iterations, "runs": n_runs,
+        "updates": _finite(updates), "best_rates": [tuning.rates[place] for place in tuning.best],
+        "is_inside": [float(inside) for inside in tuning.is_inside], "rates": tuning.rates,
+        "rate_updates": _finite(tuning.updates.ravel()), "tuning_rollouts": tuning.rollouts,
+        "tuning_gradients": tuning.gradients, "rollouts_per_update": float(np.mean([s.rollouts for s in results])),
         "gradients_per_update": float(np.mean([s.gradients for s in results])),
         "lowest": float(np.median([s.lowest for s in searches[tuning.best[-1]]])),
-        "hypotheses": hypotheses_hash(),
-        **_times(cell, problem),
-        **errors,
-    }
+        "hypotheses": hypotheses_hash(), **_times(cell, problem), **errors,
+    }  # fmt: skip
+
+
+def _finite(values: Iterable[float]) -> list[float]:
+    """Return values with NaN instead of infinities."""
+    return [value if math.isfinite(value) else math.nan for value in values]
 
 
 def hypotheses_hash() -> str:

@@ -10,7 +10,6 @@ from bench.experiment.columns import Column, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Style, Table, Views
 from bench.report.style import MARKERS, PALETTE, VARIANTS
-from bench.report.writer import reasons
 from bench.studies.dose_response import analysis
 from bench.studies.dose_response.analysis import BIAS, COSTS_ONLY, FIXED, MAIN, RANDOM, ROTATION, TAILS
 
@@ -61,7 +60,7 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     """Return the tables and charts."""
     table = analysis.searches(rows)
     if table.empty:
-        return Views(remarks=reasons(rows))
+        return Views()
     lines, beside = analysis.counted(table), analysis.reached(table)
     pairs, cells = analysis.by_scene(analysis.ratios(lines)), csv_table(experiment, rows)
     main = pairs[pairs["target"] == MAIN]
@@ -79,26 +78,22 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
         tables, charts = [_reached(beside), *tables[2:]], [_reached_chart(beside)]
     named = rows.assign(problem=[analysis.problem_name(row) for _, row in rows.iterrows()])
     columns = [experiment.columns.by_name[name] for name in CELLS]
-    return Views([one for one in tables if len(one.frame)], charts, named, columns, reasons(rows))
+    return Views([one for one in tables if len(one.frame)], charts, named, columns)
 
 
 def _methods(table: pd.DataFrame) -> pd.DataFrame:
     part = table[(table["target"] == MAIN) & ~table["kind"].isin(analysis.PLANTED)]
-    floor = (
-        analysis.floors(table).query("target == @MAIN and reason == ''", local_dict={"MAIN": MAIN}).set_index("problem")
-    )
-    updates = [
-        part[f"tuning_{name}"] / part[f"{name}_per_update"].replace(0.0, np.nan) for name in ("rollouts", "gradients")
-    ]
+    known = analysis.floors(table)
+    floor = known[(known["target"] == MAIN) & (known["reason"] == "")].set_index("problem")["floor"]
+    updates = [part[f"tuning_{n}"] / part[f"{n}_per_update"].replace(0.0, np.nan) for n in ("rollouts", "gradients")]
     part = part.assign(
-        relative=part["median"] / part["problem"].map(floor["floor"]), reached=np.isfinite(part["median"]),
+        relative=part["median"] / part["problem"].map(floor), reached=np.isfinite(part["median"]),
         over_rates=part["by_rate"].map(np.median) / part["median"], tuning=updates[0].fillna(updates[1]) / part["median"],
     )  # fmt: skip
     summary = {name: (name, "median") for name in ("error", "relative", "over_rates", "tuning")}
     shares = {name: (name, "mean") for name in ("reached", "inside")}
-    return part.groupby(["scene_class", "method", "samples"], sort=False).agg(
-        problems=("problem", "nunique"), **summary, **shares
-    ).reset_index()  # fmt: skip
+    groups = part.groupby(["scene_class", "method", "samples"], sort=False)
+    return groups.agg(problems=("problem", "nunique"), **summary, **shares).reset_index()
 
 
 def _problems(table: pd.DataFrame) -> Table:

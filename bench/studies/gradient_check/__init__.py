@@ -7,11 +7,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from bench.experiment.cell import Cell
 from bench.experiment.columns import Columns
-from bench.experiment.experiment import Experiment
 from bench.experiment.session import Session
-from bench.experiment.study import Study
-from bench.experiment.views import Views
 from bench.model import param
+from bench.studies import StudyPackage
 from bench.studies.gradient_check.columns import COLUMNS
 
 if TYPE_CHECKING:
@@ -19,7 +17,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class GradientCheck(Study):
+class GradientCheck(StudyPackage):
     """Checks the program's gradient against differences of its cost, at theta0 and around a contact switch."""
 
     name = "gradient_check"
@@ -39,16 +37,8 @@ class GradientCheck(Study):
     def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
         """Return one cell's results by column: all checks, and the shell command that repeats them."""
         from bench.report.reproduce import check_of
-        from bench.studies.gradient_check.measure import SwitchSearch, measure
 
-        search = SwitchSearch(self.directions, self.drawn, self.reach, self.aside, self.around)
-        return measure(cell, session, search) | {"command": check_of(cell)}
-
-    def views(self, experiment: Experiment, rows: pd.DataFrame) -> Views:
-        """Return which gradients can be trusted, the tables of checks, the grid of verdicts, and how to repeat faults."""
-        from bench.studies.gradient_check.views import views
-
-        return views(experiment, rows)
+        return super().measure(cell, session) | {"command": check_of(cell)}
 
     def faults(self, rows: pd.DataFrame) -> int:
         """Return the number of rows with a gradient that cannot be trusted, or without a finite cost."""

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Any
-
 import numpy as np
 import pandas as pd
 
@@ -25,11 +22,18 @@ PROBLEM = ("scene", "contact", "integrator")
 """Parts of the grid that identify a problem."""
 
 
-def checks(rows: pd.DataFrame) -> Iterator[tuple[dict[str, Any], int, str]]:
-    """Yield each check of each row: the row, the number of the check within it, and the verdict."""
-    for row in rows.to_dict("records"):
-        for i, verdict in enumerate(row["check_verdict"]):
-            yield {str(name): value for name, value in row.items()}, i, verdict
+def checks(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return one line per check with the columns of its row; ``row`` is the position of the row."""
+    split = {
+        name: [np.array_split(np.asarray(values, dtype=object), max(len(verdicts), 1))
+               for values, verdicts in zip(rows[name], rows["check_verdict"], strict=True)]
+        for name in PER_STEP
+    }  # fmt: skip
+    whole = rows.drop(columns="verdict").rename(
+        columns={"check_verdict": "verdict", "check_error": "error", "check_eps": "at_eps"}
+    )
+    whole = whole.assign(row=range(len(rows)), **split)[rows["check_verdict"].map(len) > 0]
+    return whole.explode([*PER_CHECK, "verdict", "error", "at_eps", *PER_STEP], ignore_index=True)
 
 
 def long_table(rows: pd.DataFrame) -> pd.DataFrame:
@@ -39,32 +43,21 @@ def long_table(rows: pd.DataFrame) -> pd.DataFrame:
     since it would be repeated on every line: ``rows.parquet`` has it under the same ``key``.
     """
     whole = ["experiment", *IDENTITY, "dim", "status", "reason"]
-    added = [name for name in rows if name not in COLUMNS.by_name]
-    last = list(dict.fromkeys(["key", *map(str, added), *(name for name in ("study",) if name in rows)]))
-    lines = []
-    for row, i, verdict in checks(rows):
-        check = {name: row[name] for name in whole} | {name: row[name][i] for name in PER_CHECK}
-        end = {"verdict": verdict} | {name: row[name] for name in last}
-        count = len(row["eps"])
-        for k in range(count):
-            values = {name: row[name][i * count + k] for name in PER_STEP}
-            lines.append(check | {"eps": row["eps"][k]} | values | end)
-    unchecked = rows[[len(verdicts) == 0 for verdicts in rows["check_verdict"]]]
-    lines += unchecked[[*whole, "verdict", *last]].to_dict("records")
-    table = pd.DataFrame(lines, columns=[*whole, *PER_CHECK, "eps", *PER_STEP, "verdict", *last])
+    added = [str(name) for name in rows if name not in COLUMNS.by_name]
+    last = list(dict.fromkeys(["key", *added, *(name for name in ("study",) if name in rows)]))
+    names = [*whole, *PER_CHECK, "eps", *PER_STEP, "verdict", *last]
+    lines = checks(rows).explode(["eps", *PER_STEP], ignore_index=True)
+    unchecked = rows.loc[rows["check_verdict"].map(len) == 0, [*whole, "verdict", *last]]
+    table = pd.concat([lines[names].infer_objects(), unchecked], ignore_index=True).reindex(columns=names)
     counts = ["horizon", "samples", "repeats", "dim", "seed", "sample", "direction"]
-    return table.astype(dict.fromkeys(counts, "Int64"))
+    return table.astype(dict.fromkeys(counts, float)).astype(dict.fromkeys(counts, "Int64"))
 
 
 def component_table(rows: pd.DataFrame) -> pd.DataFrame:
     """Return one line per cell and component of theta, with the columns :data:`PER_COMPONENT`."""
-    names = ["experiment", *IDENTITY, "dim"]
-    lines = [
-        {name: row[name] for name in names} | dict(zip(PER_COMPONENT, values, strict=True)) | {"key": row["key"]}
-        for row in rows.to_dict("records")
-        for values in zip(*(row[name] for name in PER_COMPONENT), strict=True)
-    ]
-    return pd.DataFrame(lines, columns=[*names, *PER_COMPONENT, "key"])
+    names = ["experiment", *IDENTITY, "dim", *PER_COMPONENT, "key"]
+    given = rows.loc[rows["component"].map(len) > 0, names]
+    return given.explode([*PER_COMPONENT], ignore_index=True).infer_objects()
 
 
 def by_point(rows: pd.DataFrame) -> pd.DataFrame:
@@ -74,12 +67,8 @@ def by_point(rows: pd.DataFrame) -> pd.DataFrame:
     follow. ``problem`` is a number, the same for cells with equal parameters of scene, contact law and integrator.
     """
     cells = rows.reset_index(drop=True).assign(problem=problem_numbers(rows, PROBLEM).to_numpy())
-    lines = [
-        {"row": row["row"], "point": row["point"][i], "verdict": verdict, "rank": VERDICTS.index(verdict),
-         "error": row["check_error"][i], "eps": row["check_eps"][i]}
-        for row, i, verdict in checks(cells.assign(row=cells.index))
-    ]  # fmt: skip
-    table = pd.DataFrame(lines, columns=["row", "point", "verdict", "rank", "error", "eps"])
+    table = checks(cells)[["row", "point", "verdict", "error", "at_eps"]].rename(columns={"at_eps": "eps"})
+    table = table.astype({"error": float, "eps": float}).assign(rank=table["verdict"].map(VERDICTS.index))
     table = table.sort_values(["rank", "error"], ascending=[True, False], kind="stable")
     table = table.drop_duplicates(["row", "point"]).sort_index()
     return table.join(cells.drop(columns=table.columns, errors="ignore"), on="row")
@@ -94,18 +83,15 @@ def not_right(rows: pd.DataFrame) -> str:
 
     What only noise reaches does not count as a fault of the gradient.
     """
-    points: dict[str, list[str]] = {}
-    cells = set()
-    for row, i, verdict in checks(rows):
-        point = row["point"][i]
-        if not is_trusted(point, verdict) and point != UNDER_NOISE:
-            points.setdefault(verdict, []).append(point)
-            cells.add(row["key"])
-    verdicts = listed(f"{verdict} ({', '.join(dict.fromkeys(at))})" for verdict, at in points.items()) if points else ""
-    return f"{verdicts} in {len(cells)} of {counted(len(rows), 'cell')}" if points else ""
+    found = untrusted(checks(rows)).query("point != @UNDER_NOISE", local_dict={"UNDER_NOISE": UNDER_NOISE})
+    if found.empty:
+        return ""
+    points = found.groupby("verdict", sort=False)["point"].unique()
+    verdicts = listed(f"{verdict} ({', '.join(at)})" for verdict, at in points.items())
+    return f"{verdicts} in {found['key'].nunique()} of {counted(len(rows), 'cell')}"
 
 
 def untrusted(summary: pd.DataFrame) -> pd.DataFrame:
-    """Return the lines of :func:`by_point` whose gradient cannot be trusted."""
+    """Return the lines, of checks or of points, whose gradient cannot be trusted."""
     pairs = zip(summary["point"], summary["verdict"], strict=True)
     return summary[np.array([not is_trusted(point, verdict) for point, verdict in pairs], dtype=bool)]

@@ -18,6 +18,8 @@ from bench.measure.batches import in_columns
 from bench.measure.contacts import active_contacts, contact_names, engine_contacts
 from bench.measure.jumps import MissedSlope, jump_under_noise, missed_slope
 from bench.model import SURROGATE, ContactScene, EngineScene, ForceLaw, LoopOps, Problem, Rollout, Unsupported
+from bench.studies import norm
+from bench.studies.gradient_check import GradientCheck
 from bench.studies.gradient_check.points import is_trusted
 
 COLUMNS_AT_ONCE = 128
@@ -57,7 +59,11 @@ class SwitchSearch:
     around: int = 8
 
 
-def measure(cell: Cell, session: Session, search: SwitchSearch) -> dict[str, Any]:
+Search = SwitchSearch | GradientCheck
+"""What has the parameters of the checks."""
+
+
+def measure(cell: Cell, session: Session, search: GradientCheck) -> dict[str, Any]:
     """Return one cell's results by column, except ``command``, from checks at theta0 and around contact switches."""
     problem = session.problem(cell)
     theta = problem.program.theta0
@@ -87,7 +93,7 @@ def measure(cell: Cell, session: Session, search: SwitchSearch) -> dict[str, Any
     parts = whole.components
     remarks = [SURROGATE] if problem.program.surrogate else []
     remarks += [] if whole.cause in PLAIN else [whole.sentence()]
-    distance = float(np.linalg.norm(at_jump)) if jump.height else math.nan
+    distance = norm(at_jump) if jump.height else math.nan
     if jump.height:
         remarks.append(
             f"the cost jumps by {jump.height:.3g}, {jump.height / jump.span:.2g} of its range, under noise of "
@@ -96,7 +102,7 @@ def measure(cell: Cell, session: Session, search: SwitchSearch) -> dict[str, Any
     if missed.share:
         remarks.append(
             f"sampled gradients miss {missed.share:.2g} of the mean slope along a line through the noise, most of it near "
-            f"{float(np.linalg.norm(missed.w)):.2g} standard deviations: a steep rise, or a far kink"
+            f"{norm(missed.w):.2g} standard deviations: a steep rise, or a far kink"
         )
     return {
         "status": "nonfinite" if lost else "ok",
@@ -113,14 +119,7 @@ def measure(cell: Cell, session: Session, search: SwitchSearch) -> dict[str, Any
         "cost_noise": whole.noise,
         "device": problem.device,
         "component": [part.component for part in parts],
-        "component_program": [part.program for part in parts],
-        "component_difference": [part.difference for part in parts],
-        "component_uncertainty": [part.uncertainty for part in parts],
-        "component_step": [part.step for part in parts],
-        "component_ratio": [part.ratio for part in parts],
-        "component_left": [part.left for part in parts],
-        "component_right": [part.right for part in parts],
-        "component_verdict": [part.verdict for part in parts],
+        **{f"component_{name}": [getattr(part, name) for part in parts] for name in PER_COMPONENT},
         "point": [point.point for point in points],
         "sample": [point.noise for point in points],
         "direction": [point.number for point in points],
@@ -137,6 +136,8 @@ def measure(cell: Cell, session: Session, search: SwitchSearch) -> dict[str, Any
     }
 
 
+PER_COMPONENT = ("program", "difference", "uncertainty", "step", "ratio", "left", "right", "verdict")
+"""What is stored of each checked component."""
 PLAIN = ("smooth", "nonlinear", "zero", "mode_crossing")
 """Verdicts on theta0 that need no remark."""
 
@@ -161,7 +162,7 @@ class Point:
     """The contact switch that it is at, in words."""
 
 
-def start(problem: Problem, theta: np.ndarray, unit: float, search: SwitchSearch, seed: int) -> gradcheck.Check:
+def start(problem: Problem, theta: np.ndarray, unit: float, search: Search, seed: int) -> gradcheck.Check:
     """Check every component and random directions at ``theta (d,)`` and at other thetas near it, without noise.
 
     ``unit`` is the unit roundoff of the program's arithmetic. Costs are evaluated in batches of a fixed width, so that
@@ -287,7 +288,7 @@ def _joined(parts: Iterator[np.ndarray]) -> list[float]:
 
 def scale_of(theta: np.ndarray) -> float:
     """Return the natural scale of displacements of theta: its norm, but at least 1."""
-    return max(1.0, float(np.linalg.norm(theta)))
+    return max(1.0, norm(theta))
 
 
 # ----------------------------------------------------------------------------------------------------- checks
@@ -299,7 +300,7 @@ def examine(
     drawn: np.ndarray,
     directions: np.ndarray,
     unit: float,
-    search: SwitchSearch,
+    search: Search,
     more: Sequence[Place] = (),
 ) -> tuple[list[Place], list[tuple[gradcheck.Sample, list[tuple[str, str]]]]]:
     """Check directional derivatives at ``theta (d,)``, without noise and with ``drawn (n_w,)``, and at contact switches.
@@ -343,7 +344,7 @@ def examine(
 
 
 def boundary(
-    modes: ContactModes, theta: np.ndarray, direction: np.ndarray, w: np.ndarray, number: int, search: SwitchSearch
+    modes: ContactModes, theta: np.ndarray, direction: np.ndarray, w: np.ndarray, number: int, search: Search
 ) -> list[Place]:
     """Return places before, at and after the contact switch nearest to theta along a direction; empty without a switch."""
     scale = scale_of(theta)

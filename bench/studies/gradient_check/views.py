@@ -63,7 +63,7 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     charts = [] if points.empty else [_grid(points)]
     columns = [experiment.columns.by_name[name] for name in ("verdict", "best_error", "best_eps")]
     switches = dict.fromkeys(f"contact switch: {name}" for names in rows["contact_switch"] for name in _switches(names))
-    return Views(tables, charts, shown.rows, columns, [*switches, *faults, *reasons(rows)])
+    return Views(tables, charts, shown.rows, columns, [*switches, *faults])
 
 
 # ------------------------------------------------------------------------------------------------------- tables

@@ -4,23 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import ClassVar
 
 from bench.errors import Unsupported
 from bench.experiment.cell import Cell
 from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, text
-from bench.experiment.experiment import Experiment
-from bench.experiment.session import Session
-from bench.experiment.study import Study
-from bench.experiment.views import Views
 from bench.model import Identified, MechanicalScene, Optimizer, param
-
-if TYPE_CHECKING:
-    import pandas as pd
+from bench.studies import StudyPackage
 
 
 @dataclass(frozen=True)
-class Identify(Study):
+class Identify(StudyPackage):
     """Fits parameters of a scene to noisy records of its motion, and compares the fits with the Cramer-Rao bound."""
 
     name = "identify"
@@ -95,12 +89,6 @@ class Identify(Study):
     measured: str | None = param(None, "names of its measured columns, a+b; null: all")
     time: str | None = param(None, "name of its column of times in s, from which lines may be missing; null: all steps")
 
-    def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
-        """Return one cell's results by column: fits of all records by each shooting method, and the Cramer-Rao bound."""
-        from bench.studies.identify.measure import measure
-
-        return measure(cell, self)
-
     def unsupported_reason(self, cell: Cell) -> str | None:
         """Return why a cell cannot be fitted (no motion, no unknowns, no NumPy steps, sampling, unusable data), or None."""
         from bench.studies.identify.measure import model_of, read
@@ -125,9 +113,3 @@ class Identify(Study):
             except (OSError, ValueError, Unsupported) as error:
                 return str(error).strip()
         return None
-
-    def views(self, experiment: Experiment, rows: pd.DataFrame) -> Views:
-        """Return the tables of fits and of identifiable parameters, and the charts of their precision."""
-        from bench.studies.identify.views import views
-
-        return views(experiment, rows)

@@ -15,10 +15,13 @@ from scipy.special import chdtri
 
 from bench.errors import Unsupported
 from bench.experiment.cell import Cell
+from bench.experiment.session import Session
 from bench.measure import adequacy, noise, performance
 from bench.measure.identification import Information
 from bench.model import Answer, Decision, Identified, LoopOps, MechanicalScene, Optimizer, Rollout, State, compose
 from bench.model.parameters import Parameter, named
+from bench.studies import norm
+from bench.studies.identify import Identify
 
 STEP = 1e-5
 """Step of central differences in the logarithms of parameters. Its relative error is about 1e-10."""
@@ -37,8 +40,6 @@ UNEXPLAINED = 1e-3
 
 Push = Callable[[np.ndarray, np.ndarray], Any]
 """An acceleration as a function of q and v."""
-Settings = Any
-"""An ``Identify`` study: its parameters are the settings. Its module imports this module, so its type cannot be named."""
 
 
 def still(q: np.ndarray, v: np.ndarray) -> float:
@@ -129,7 +130,7 @@ def model_of(cell: Cell, refinement: int = 1) -> Model:
     return Model(program, tuple(names), measured, tuple(steps))
 
 
-def read(settings: Settings, model: Model) -> tuple[np.ndarray, tuple[int, ...]]:
+def read(settings: Identify, model: Model) -> tuple[np.ndarray, tuple[int, ...]]:
     """Return the measurements ``(m, 1)`` of the study's CSV file and the steps, from 1, after which they were made.
 
     With a column of time, lines may be missing, and lines before the first step are left out. Raises ValueError with the
@@ -285,7 +286,7 @@ def run_fits(
             is_finite = np.isfinite(own).all() and np.isfinite(slope).all()
             if is_finite and np.array_equal(states[i]["theta"], query[:, 0]):
                 step = slope[:, :, 0] @ np.linalg.lstsq(slope[:, :, 0], own[:, 0], rcond=1e-8)[0]
-                size = float(np.linalg.norm(own[:, 0])) / math.sqrt(len(own))
+                size = norm(own[:, 0]) / math.sqrt(len(own))
                 has_converged[i] = np.linalg.norm(step) <= CONVERGED * max(size, CONVERGED)
     return np.stack([state["theta"] for state in states], axis=1), has_converged
 
@@ -295,7 +296,7 @@ def count_windows(horizon: int, most: int) -> int:
     return max((n for n in range(1, most + 1) if horizon % n == 0 and horizon // n >= 2), default=1)
 
 
-def measure(cell: Cell, settings: Settings) -> dict[str, Any]:
+def measure(cell: Cell, session: Session, settings: Identify) -> dict[str, Any]:
     """Return one cell's results by column: fits of all records by each shooting method, and the Cramer-Rao bound.
 
     Raises :class:`Unsupported` if a record without a stated noise has no more measurements than parameters.
@@ -317,12 +318,9 @@ def measure(cell: Cell, settings: Settings) -> dict[str, Any]:
     has_windows = len(model.steps) == horizon and n_windows > 1
 
     def fit(shooting: str, sigma: float) -> Fit:
-        count = 1 if shooting == "single" else n_windows
-        fitting = Fitting(model, shooting, count, sigma, _unit(model))
-        solution, has_converged = run_fits(fitting, optimizer, fitting.start(start, data), data, settings.iterations)
-        return Fit(
-            fitting, solution, has_converged, fitting.residuals(solution, data), fitting.jacobians(solution, data)
-        )
+        fitting = Fitting(model, shooting, 1 if shooting == "single" else n_windows, sigma, _unit(model))
+        fitted = run_fits(fitting, optimizer, fitting.start(start, data), data, settings.iterations)
+        return Fit(fitting, *fitted, fitting.residuals(fitted[0], data), fitting.jacobians(fitted[0], data))
 
     is_noise_known = settings.measurement is not None or not is_own
     sigma = settings.measurement or (float(np.std(data)) or 1.0 if is_own else NOISE)
@@ -333,7 +331,7 @@ def measure(cell: Cell, settings: Settings) -> dict[str, Any]:
             raise Unsupported(
                 f"{settings.data} has {len(data)} measurements for {len(model.names)} unknowns: state the noise, measurement=.."
             )
-        sigma *= float(np.linalg.norm(single.residual)) / math.sqrt(free) or 1.0
+        sigma *= norm(single.residual) / math.sqrt(free) or 1.0
         single = fit("single", sigma)
     theta = np.exp(single.solution[:, 0]) if is_own else model.values
     known = information(model, theta, sigma)
@@ -383,7 +381,7 @@ def _unit(model: Model) -> np.ndarray:
     return np.asarray(np.maximum(np.abs(states).max(axis=(0, 2)), 1e-6))
 
 
-def scan(model: Model, n_windows: int, data: np.ndarray, sigma: float, settings: Settings) -> dict[str, list[Any]]:
+def scan(model: Model, n_windows: int, data: np.ndarray, sigma: float, settings: Identify) -> dict[str, list[Any]]:
     """Return the loss of one record ``data (m, 1)`` along each unknown, and how many local minima it has.
 
     ``scan`` equally spaced values from the truth over ``span`` to the truth times ``span``, within the parameter's
@@ -453,7 +451,7 @@ def _explanation(model: Model, fit: Fit, known: Information, is_noise_known: boo
     return {
         "explained": float(np.mean([one.is_explained for one in verdicts])) + 0.0 * first.probability,  # nan: untested
         "contradictions": ", ".join(f"{name} ({value:.2g})" for name, value in first.contradictions.items()),
-        "noise_size": sigma * float(np.linalg.norm(residual[:, 0])) / math.sqrt(free), "misfit": first.probability,
+        "noise_size": sigma * norm(residual[:, 0]) / math.sqrt(free), "misfit": first.probability,
         "terms": list(first.reach), "unnoticed": biases.ravel().tolist(),
     }  # fmt: skip
 
@@ -543,13 +541,12 @@ def _fit_statistics(fit: Fit, known: Information, is_own: bool, is_noise_known: 
     apart = logs - (known.invariants @ np.log(fit.fitting.model.values))[:, None]
     errors = (apart / known.bound[:, None])[:, chosen]
     is_covered = (np.abs(apart) <= halves)[:, chosen]
-    n_converged = int(has_converged.sum())
+    n_converged, coverage, interval = int(has_converged.sum()), math.nan, (math.nan, math.nan)
     low, high = performance.wilson(n_converged, n_fits)
-    coverage = float(is_covered.mean()) if is_covered.size else math.nan
-    # the sample size of this interval is the number of records: invariants of one record are dependent
-    interval = (
-        performance.wilson(round(coverage * n_converged), n_converged) if is_covered.size else (math.nan, math.nan)
-    )
+    if is_covered.size:
+        coverage = float(is_covered.mean())
+        # the sample size of this interval is the number of records: invariants of one record are dependent
+        interval = performance.wilson(round(coverage * n_converged), n_converged)
     with np.errstate(over="ignore"):
         ends = [np.exp(logs[:, 0] + side * halves[:, 0]).tolist() for side in (-1.0, 1.0)]
     return {
@@ -572,7 +569,7 @@ def information(model: Model, theta: np.ndarray, sigma: float) -> Information:
     return Information(model.names, fitting.jacobians(points, model.record(theta[:, None]))[:, :, 0])
 
 
-def records(cell: Cell, settings: Settings) -> np.ndarray:
+def records(cell: Cell, settings: Identify) -> np.ndarray:
     """Return ``repeats`` noisy records ``(m, B)`` of the true motion."""
     source = model_of(cell, settings.refine)
     clean = source.record(source.values[:, None])
@@ -590,7 +587,4 @@ def step_dependence(cell: Cell, model: Model, theta: np.ndarray, known: Informat
     if not known.rank or not np.isfinite(change).all():
         return {"step_shift": math.nan, "step_shift_bound": math.nan}
     shift = np.abs(np.linalg.pinv(known.along(known.jacobian)) @ change)
-    return {
-        "step_shift": float(shift.max()),
-        "step_shift_bound": float((shift / known.bound).max()),
-    }
+    return {"step_shift": float(shift.max()), "step_shift_bound": float((shift / known.bound).max())}

@@ -18,7 +18,6 @@ from bench.measure.performance import Z
 from bench.report.problems import problem_names
 from bench.report.style import PALETTE
 from bench.report.views import arrange, attempted
-from bench.report.writer import reasons
 from bench.studies.identify.measure import is_minimum
 
 PARTS = ("scene", "contact", "integrator")
@@ -122,8 +121,8 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
             )
         )  # fmt: skip
     if lines.empty:
-        return Views(tables[:1], remarks=reasons(rows))
-    return Views(tables, [*charts(lines, fits), *scan_charts(scans)], remarks=reasons(rows))
+        return Views(tables[:1])
+    return Views(tables, [*charts(lines, fits), *scan_charts(scans)])
 
 
 def fits_of(rows: pd.DataFrame) -> pd.DataFrame:
@@ -227,32 +226,30 @@ def scanned(rows: pd.DataFrame) -> pd.DataFrame:
 
 def scan_charts(scans: pd.DataFrame) -> list[Chart]:
     """Return a chart of the loss along each unknown: a panel per window, with its local minima and the truth."""
-    if scans.empty:
-        return []
-    numbers = pd.Series(scans["problem"].factorize()[0] + 1, scans.index).astype(str)
-    names = "scan_" + scans["unknown"] + ("_" + numbers).where(numbers != "1", "")
-    return [_scan_chart(scan, str(name)) for name, scan in scans.groupby(names, sort=False)]
-
-
-def _scan_chart(scan: pd.DataFrame, name: str) -> Chart:
-    one, parts = scan.iloc[0], []
-    for line in scan.to_dict("records"):
-        loss = np.where(np.isfinite(line["loss"]), line["loss"], np.nan)
-        values = np.linspace(line["from"], line["to"], len(loss))
-        whole = line["steps"] == one["steps"]
-        panel = f"{'whole record' if whole else 'windows'} of {line['steps']} steps: {line['minima']:.0f} {'minimum' if line['minima'] == 1 else 'minima'}"
-        curve = pd.DataFrame({"value": values, "loss": loss, "part": CURVE, "window": panel, "row": line["row"]})
-        parts += [curve, curve[is_minimum(loss)].assign(part=MINIMUM)]
-    return Chart(
-        name, pd.concat(parts, ignore_index=True),
-        [Column("value", label=str(one["unknown"]), unit=str(one["unit"]), log=False)],
-        [Column("loss", label="mean square of residual / noise", log=True)],
-        "lines", series="part", panel="window", across=3, height=1.9, labels="legend",
-        styles={CURVE: Style(PALETTE[0], "", width=0.8), MINIMUM: Style(PALETTE[1], ".", line="none")},
-        marks=[*([Mark("truth", one["truth"])] if np.isfinite(one["truth"]) else []), Mark("", 1.0, axis="y")],
-        subtitle="grey line: 1, the noise of a sample",
-        text="The loss along one unknown, all others at their own values. Windows start at the measurements.",
-    )  # fmt: skip
+    charts_ = []
+    for place, (_, every) in enumerate(scans.groupby("problem", sort=False) if len(scans) else ()):
+        for unknown, scan in every.groupby("unknown", sort=False):
+            one, parts = scan.iloc[0], []
+            for line in scan.to_dict("records"):
+                loss = np.where(np.isfinite(line["loss"]), line["loss"], np.nan)
+                part = "whole record" if line["steps"] == one["steps"] else "windows"
+                panel = f"{part} of {line['steps']} steps, local minima: {line['minima']:.0f}"
+                values = np.linspace(line["from"], line["to"], len(loss))
+                curve = pd.DataFrame(
+                    {"value": values, "loss": loss, "part": CURVE, "window": panel, "row": line["row"]}
+                )
+                parts += [curve, curve[is_minimum(loss)].assign(part=MINIMUM)]
+            charts_.append(Chart(
+                f"scan_{unknown}" + f"_{place + 1}" * (place > 0), pd.concat(parts, ignore_index=True),
+                [Column("value", label=str(unknown), unit=str(one["unit"]), log=False)],
+                [Column("loss", label="mean square of residual / noise", log=True)],
+                "lines", series="part", panel="window", across=3, height=1.9,
+                styles={CURVE: Style(PALETTE[0], "", width=0.8), MINIMUM: Style(PALETTE[1], ".", line="none")},
+                marks=[*([Mark("truth", one["truth"])] if np.isfinite(one["truth"]) else []), Mark("", 1.0, axis="y")],
+                subtitle="grey line: 1, the noise of a sample",
+                text="The loss along one unknown, all others at their own values. Windows start at the measurements.",
+            ))  # fmt: skip
+    return charts_
 
 
 # --------------------------------------------------------------------------------------------------------- charts
