@@ -220,7 +220,7 @@ def _items(plugin_class: type[Plugin]) -> Iterator[tuple[str, Any, Check]]:
         yield plugin_class.name, plugin_class, function
     try:
         instances = variants(plugin_class)
-    except Exception:
+    except (Exception, SystemExit):
         yield plugin_class.name, plugin_class, builds
         return
     for name, plugin in instances.items():
@@ -263,7 +263,7 @@ def _outcome(function: Check, subject: Any, name: str) -> CheckResult:
         outcome, detail = "skip", str(reason)
     except Failed as reason:
         outcome, detail = "fail", str(reason)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         outcome, detail = "fail", f"{type(error).__name__}: {error}"
     return CheckResult(name, function.__name__, outcome, " ".join(detail.split()))
 
