@@ -79,12 +79,12 @@ def main(names: Sequence[str], limit: float = LIMIT_S) -> int:
         if names and entry.name not in names:
             continue
         plugins += 1
-        if entry.plugin is None or not entry.available:
-            results = iter([CheckResult(entry.name, "available", "fail" if names else "skip", entry.reason)])
-        elif reason := missing_environment(entry.plugin):
-            results = iter([CheckResult(entry.name, "available", "fail" if names else "skip", reason)])
+        plugin = entry.plugin if entry.available else None
+        reason = entry.reason if plugin is None else missing_environment(plugin)
+        if plugin is None or reason:
+            results = iter([CheckResult(entry.name, "available", "fail" if names else "skip", reason or "")])
         else:
-            results = _results(entry.plugin, limit=limit)
+            results = _results(plugin, limit=limit)
         for result in results:
             tally[result.outcome] += 1
             print(f"{result.outcome}  {result.plugin:<38} {result.check:<38} {result.detail}", flush=True)

@@ -677,18 +677,10 @@ def test_unavailable_plugin_is_skipped_unless_named(capsys, monkeypatch):
 
 
 def test_a_plugin_that_ends_the_process_fails_its_check():
-    @dataclass(frozen=True)
-    class Leaves(SampleMean):
-        """Ends the process."""
-
-        name = "leaves"
-        needs = frozenset({"grad"})
-
-        def terms(self, problem: Problem, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-            raise SystemExit(0)
-
-    (result,) = check(Leaves, {"shape_and_repeatability"})
-    assert (result.outcome, result.detail) == ("fail", "SystemExit: 0")
+    leaves = type("Leaves", (WrongSign,), {"terms": lambda *given: sys.exit(0)})
+    assert check(leaves, {"shape_and_repeatability"}) == [
+        conformance.CheckResult("wrong_sign", "shape_and_repeatability", "fail", "SystemExit: 0")
+    ]
 
 
 # ------------------------------------------------------------------------------------------------ abstract plugins
