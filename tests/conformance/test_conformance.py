@@ -676,6 +676,13 @@ def test_unavailable_plugin_is_skipped_unless_named(capsys, monkeypatch):
     assert "pip install some-dist" in named
 
 
+def test_a_plugin_that_ends_the_process_fails_its_check():
+    leaves = type("Leaves", (WrongSign,), {"terms": lambda *given: sys.exit(0)})
+    assert check(leaves, {"shape_and_repeatability"}) == [
+        conformance.CheckResult("wrong_sign", "shape_and_repeatability", "fail", "SystemExit: 0")
+    ]
+
+
 # ------------------------------------------------------------------------------------------------ abstract plugins
 
 
