@@ -184,8 +184,7 @@ def page(comparison: Comparison) -> str:
     )
     shown = page_views(comparison)
     assert shown.rows is not None
-    drawn = writer.drawings(experiment, shown)
-    return "".join(blocks(experiment, shown.rows, shown, drawn, [[] for _ in range(len(shown.rows))], {}))
+    return "".join(blocks(experiment, shown.rows, shown, writer.drawings(experiment, shown), [], {}))
 
 
 def page_views(comparison: Comparison) -> Views:

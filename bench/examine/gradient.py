@@ -82,25 +82,29 @@ class Store:
     """Values by coordinates. A stored value is used once; the next request computes it again and compares."""
 
     def __init__(self) -> None:
-        self._values: dict[bytes, tuple[np.ndarray, bool]] = {}
+        self._values: dict[bytes, np.ndarray] = {}
+        self._fresh: set[bytes] = set()
         self.spread = 0.0
         """Largest difference between two values of one key."""
 
     def take(self, key: bytes) -> np.ndarray | None:
-        """Return a value that has not been used since it was computed, or None."""
-        value, is_fresh = self._values.get(key, (None, False))
-        if value is None or not is_fresh:
+        """Return a value that has not been used since it was computed or refreshed, or None."""
+        if key not in self._fresh:
             return None
-        self._values[key] = value, False
-        return value
+        self._fresh.remove(key)
+        return self._values[key]
 
-    def put(self, key: bytes, value: np.ndarray, is_fresh: bool = False) -> None:
-        """Store a computed value, for one more request if ``is_fresh``."""
+    def put(self, key: bytes, value: np.ndarray) -> None:
+        """Store a computed value."""
         if key in self._values:
             with np.errstate(invalid="ignore"):
-                apart = np.abs(self._values[key][0] - value)
+                apart = np.abs(self._values[key] - value)
             self.spread = max(self.spread, float(np.nan_to_num(apart).max(initial=0.0)))
-        self._values[key] = value, is_fresh
+        self._values[key] = value
+
+    def refresh(self) -> None:
+        """Let every value be used once more."""
+        self._fresh = set(self._values)
 
 
 class GradientStages:
@@ -192,7 +196,7 @@ class GradientStages:
     def _refresh(self) -> None:
         """Let the next stage use every stored value once."""
         for store in (self._costs_store, self._gradients_store):
-            store._values = {key: (value, True) for key, (value, _) in store._values.items()}
+            store.refresh()
 
     def integrate(self, direction: np.ndarray, start: float, end: float, panels: int) -> float:
         """Return the integral of the gradient along ``theta + t * direction`` by Gauss-Legendre, 4 points per panel."""
@@ -222,7 +226,8 @@ class GradientStages:
         space = choose(self.layout, self.scale, self.gradient, self.seed)
         self.groups = space.groups
         if self.gradient is not None:
-            self._gradients_store.put(space.origin().tobytes(), space.project(self.gradient), is_fresh=True)
+            self._gradients_store.put(space.origin().tobytes(), space.project(self.gradient))
+            self._gradients_store.refresh()
         try:
             for stage in (partial(self._compare_quickly, space), self._repeat):
                 stage()
@@ -443,7 +448,7 @@ class GradientStages:
             outcome = recaused(
                 replace(outcome, draws=tuple(part for part in outcome.draws if np.isfinite(part.program)))
             )
-        return self._with_roughness(self._without_small_spread(space, _with_zeros(outcome)))
+        return _with_roughness(self._without_small_spread(space, _with_zeros(outcome)))
 
     def _spread_of_gradients(self, space: Subspace) -> float:
         """Return the largest difference between equal calls of the gradient, relative to its norm."""
@@ -461,21 +466,6 @@ class GradientStages:
         ):
             return outcome
         return recaused(outcome)
-
-    def _with_roughness(self, outcome: Check) -> Check:
-        """Return a check with the cause ``rough`` where the cost varies as much between neighbours as over a wide step."""
-        if outcome.cause != "unsettled":
-            return outcome
-        rough = []
-        for part in outcome.parts:
-            sample, finite = part.sample, part.sample.finite
-            change = np.abs(sample.plus - sample.minus)[finite].max(initial=0.0)
-            rough.append(sample.noise > ROUGH * change and sample.noise > 1e6 * sample.unit * abs(sample.centre))
-        parts = tuple(
-            replace(part, verdict="unsettled") if is_rough else part
-            for part, is_rough in zip(outcome.parts, rough, strict=True)
-        )
-        return replace(outcome, parts=parts, cause="rough" if any(rough) else outcome.cause)
 
     def _locate(self, space: Subspace) -> None:
         """Find the numbers that cause the error of each wrong group."""
@@ -547,6 +537,17 @@ def _with_zeros(outcome: Check) -> Check:
     if all(part.verdict == "zero" for part in zeros):
         return outcome
     return recaused(outcome, lambda part: replace(part, verdict="zero") if any(part is p for p in zeros) else part)
+
+
+def _with_roughness(outcome: Check) -> Check:
+    """Return a check with the cause ``rough`` where the cost varies as much between neighbours as over a wide step."""
+    samples = [part.sample for part in outcome.parts if outcome.cause == "unsettled"]
+    changes = [np.abs(sample.plus - sample.minus)[sample.finite].max(initial=0.0) for sample in samples]
+    is_rough = any(
+        sample.noise > ROUGH * change and sample.noise > 1e6 * sample.unit * abs(sample.centre)
+        for sample, change in zip(samples, changes, strict=True)
+    )
+    return replace(outcome, cause="rough") if is_rough else outcome
 
 
 def recaused(outcome: Check, replaced: Callable[[Part], Part] = lambda part: part) -> Check:

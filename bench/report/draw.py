@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 import re
-import textwrap
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
@@ -41,6 +40,8 @@ UPRIGHT = 1.15
 """Height in inches of the titles of panels too narrow for them; these titles read upwards."""
 UNLIMITED = 1e9
 """Factor on a value at which the bar of an interval without an upper end stops, beyond every logarithmic axis."""
+BAND: dict[str, Any] = {"color": "#D55E00", "alpha": 0.12, "linewidth": 0}
+"""Look of a named range of an axis."""
 MANY = 12
 """Most points of a line that are drawn with markers; longer lines are drawn without."""
 
@@ -75,6 +76,8 @@ def draw(chart: Chart, width: float | None = None) -> Figure:
     ]
     head = _Head(chart, width)
     legend = [] if chart.labels == "ends" else _legend(chart, styles, width - 0.6)
+    bands = dict.fromkeys(mark.name for mark in chart.marks if mark.to is not None)
+    legend += [Patch(label=plain(name), **BAND) for name in bands]
     columns = _legend_columns([str(handle.get_label()) for handle in legend], width)
     heights = [height + 0.5 * max(map(width_in_inches, map(plain, places)), default=0.0) for height in heights]
     lines = [str(handle.get_label()).count("\n") + 1 for handle in legend]  # one column if any label is broken
@@ -184,7 +187,7 @@ class _Head:
     def __init__(self, chart: Chart, width: float) -> None:
         self._width = width
         self._title = _fill(chart.title.rstrip("."), 0.97 * width / BOLD)
-        subtitle = ", ".join(filter(None, [chart.subtitle, _grey(chart)]))
+        subtitle = ", ".join(filter(None, [chart.subtitle.rstrip("."), _grey(chart)]))
         self._subtitle = _fill(subtitle, 0.97 * width) if subtitle else ""
         self._lines = self._title.count("\n") + 1
         self.height = (
@@ -356,10 +359,8 @@ def _draw_lines(chart: Chart, panel: Axes, name: str, part: pd.DataFrame, styles
         series = str(key[0]) if chart.series else ""
         style = styles[series]
         points = points.sort_values(x.name, kind="stable") if chart.kind == "lines" else points
-        values = points[y.name].to_numpy(float)
-        values = np.where(values > 0, values, np.nan) if log else values
+        values, low, high, limit = _values(points, y, log)
         places = points[x.name].to_numpy(float)
-        limit = points[y.limit].to_numpy(bool) if y.limit else np.zeros(len(points), dtype=bool)
         line = style.line if chart.kind == "lines" else "none"
         is_short = chart.kind == "points" or len(points) <= MANY or style.line == "none"
         mark = style.marker if is_short else ""
@@ -367,34 +368,38 @@ def _draw_lines(chart: Chart, panel: Axes, name: str, part: pd.DataFrame, styles
         common: dict[str, Any] = {"color": style.colour, "zorder": 3 + 0.01 * order}
         panel.plot(places, values, linestyle=line, linewidth=style.width, **common)
         if mark:
-            panel.plot(places[~limit], values[~limit], linestyle="none", marker=mark, markersize=4, **common)
-            panel.plot(
-                places[limit],
-                values[limit],
-                linestyle="none",
-                marker=mark,
-                markersize=4,
-                markerfacecolor="white",
-                **common,
-            )
-        if y.low and y.high:
-            low, high = (points[end].to_numpy(float) for end in (y.low, y.high))
-            low = np.where(low > 0, low, np.nan) if log and chart.band else low
-            high = np.where(np.isinf(high), values * UNLIMITED, high) if log and not chart.band else high
-            known = np.isfinite(values) & np.isfinite(low) & np.isfinite(high) & ~limit
-            if chart.band:
-                panel.fill_between(
-                    places, low, high, where=known, color=style.colour, alpha=0.18, linewidth=0, zorder=2
-                )
-            else:
-                bottom = np.maximum(low, 1e-300) if log else low
-                panel.vlines(places[known], bottom[known], high[known], linewidth=0.9, **common)
+            _mark(panel, places, values, limit, marker=mark, **common)
+        if chart.band:
+            panel.fill_between(places, low, high, color=style.colour, alpha=0.18, linewidth=0, zorder=2)
+        else:
+            known = np.isfinite(low)
+            panel.vlines(places[known], low[known], high[known], linewidth=1.0, **common)
         lost = points[chart.failed].to_numpy(bool) if chart.failed else np.zeros(len(points), dtype=bool)
         if lost.any():
             panel.plot(
                 places[lost], np.full(lost.sum(), 0.97), "x", transform=panel.get_xaxis_transform(), markersize=5,
                 markeredgewidth=1.4, clip_on=False, **common,
             )  # fmt: skip
+
+
+def _values(points: pd.DataFrame, column: Column, log: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return a column's values, the ends of their intervals and which are limits; NaN where nothing can be drawn."""
+    values = points[column.name].to_numpy(float)
+    values = np.where(values > 0, values, np.nan) if log else values
+    limit = points[column.limit].to_numpy(bool) if column.limit else np.zeros(len(points), dtype=bool)
+    if not (column.low and column.high):
+        return values, np.full(len(points), np.nan), np.full(len(points), np.nan), limit
+    low, high = (points[end].to_numpy(float) for end in (column.low, column.high))
+    if log:
+        low, high = np.maximum(low, 1e-300), np.where(np.isinf(high), values * UNLIMITED, high)
+    known = np.isfinite(values + low + high) & ~limit
+    return values, np.where(known, low, np.nan), np.where(known, high, np.nan), limit
+
+
+def _mark(panel: Axes, x: np.ndarray, y: np.ndarray, limit: np.ndarray, **look: Any) -> None:
+    """Draw markers, hollow where the value is a limit."""
+    panel.plot(x[~limit], y[~limit], linestyle="none", **look)
+    panel.plot(x[limit], y[limit], linestyle="none", markerfacecolor="white", **look)
 
 
 def _label_axes(chart: Chart, panel: Axes, first: bool, last: bool) -> None:
@@ -468,14 +473,7 @@ def _draw_marks(chart: Chart, panel: Axes, name: str, part: pd.DataFrame) -> Non
             if start >= end:
                 continue
             span = panel.axvspan if mark.axis == "x" else panel.axhspan
-            span(start, end, zorder=0, color="#D55E00", alpha=0.12, linewidth=0)
-            if mark.name:
-                middle = math.sqrt(start * end) if start > 0 and panel.get_xscale() == "log" else (start + end) / 2
-                lines = textwrap.wrap(plain(mark.name), 16)
-                panel.text(
-                    middle, _free_height(panel, start, end, LINE * len(lines) / chart.height), "\n".join(lines),
-                    transform=panel.get_xaxis_transform(), ha="center", va="center", color="#9c4400", fontsize=SIZE - 0.5,
-                )  # fmt: skip
+            span(start, end, zorder=0, **BAND)
         elif low < mark.at < high:
             # a mark without a name is a quiet line, not to be taken for a series
             dash, shade = (next(dashes), "#595959") if mark.name else ("-", "#c0c0c0")
@@ -493,20 +491,6 @@ def _draw_marks(chart: Chart, panel: Axes, name: str, part: pd.DataFrame) -> Non
                         0.005, mark.at, plain(mark.name), transform=panel.get_yaxis_transform(), va="bottom",
                         fontsize=SIZE - 1, color="#404040",
                     )  # fmt: skip
-
-
-def _free_height(panel: Axes, start: float, end: float, height: float) -> float:
-    """Return where, between 0 and 1, a text of some height is farthest from the lines drawn between two values of x."""
-    taken: list[float] = []
-    for line in panel.lines:
-        if line.get_transform() == panel.transData and len(np.asarray(line.get_xdata())) > 1:
-            x, y = panel.transAxes.inverted().transform(panel.transData.transform(line.get_xydata())).T
-            left, right = panel.transAxes.inverted().transform(panel.transData.transform([(start, 1), (end, 1)]))[:, 0]
-            known = np.isfinite(x) & np.isfinite(y)
-            if known.sum() > 1:
-                taken += list(np.interp(np.linspace(left, right, 50), x[known], y[known]))
-    choices = np.linspace(height / 2 + 0.02, 0.98 - height / 2, 21)
-    return float(max(choices, key=lambda at: min((abs(at - y) for y in taken), default=-at)))
 
 
 def _label_ends(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str, Style], width: float) -> None:
@@ -570,20 +554,11 @@ def _draw_dots(chart: Chart, panel: Axes, name: str, part: pd.DataFrame, styles:
         if several and part[y.name].nunique() < len(part):
             shift = -0.5 * (number - (len(names) - 1) / 2) / max(len(names), 2)
         rows = np.array([place[str(v)] for v in points[y.name]]) + shift
-        at = points[x.name].to_numpy(float)
-        limit = points[x.limit].to_numpy(bool) if x.limit else np.zeros(len(at), dtype=bool)
-        known = np.isfinite(at) & ((at > 0) | (not log))
+        at, low, high, limit = _values(points, x, log)
         common: dict[str, Any] = {"color": style.colour, "zorder": 3}
-        if x.low and x.high:
-            low, high = (points[end].to_numpy(float) for end in (x.low, x.high))
-            shown = known & np.isfinite(low) & np.isfinite(high) & ~limit
-            low = np.maximum(low, 1e-300) if log else low
-            panel.hlines(rows[shown], low[shown], high[shown], linewidth=1.1, **common)
-        panel.plot(at[known & ~limit], rows[known & ~limit], linestyle="none", marker=style.marker or "o", **common)
-        panel.plot(
-            at[known & limit], rows[known & limit], linestyle="none", marker=style.marker or "o", markerfacecolor="white",
-            **common,
-        )  # fmt: skip
+        known = np.isfinite(low)
+        panel.hlines(rows[known], low[known], high[known], linewidth=1.0, **common)
+        _mark(panel, at, rows, limit, marker=style.marker or "o", **common)
         for row in rows[points[chart.failed].to_numpy(bool)] if chart.failed else ():
             panel.plot([0.985], [row], "x", transform=panel.get_yaxis_transform(), color=style.colour, markersize=5)
     labels = [_in_lines(category, room, int(chart.height / LINE)) for category in place]
@@ -654,7 +629,7 @@ def _draw_grid(
 
 def _grid_labels(chart: Chart, column: Column, names: Sequence[str], width: float) -> list[str]:
     """Return the labels of an axis of a grid, y labels beside at most half of it, x labels in lines as wide as a cell."""
-    widest = min(3.0, max(0.45 * width, 1.2))
+    widest = min(3.0, max(0.45 * width, 1.2 if chart.own_scales else 1.9))
     if column is chart.y[0] or column.kind != "text":
         return [plain(_clipped(name, widest)) for name in names]
     beside = min(widest, max(map(width_in_inches, map(plain, _categories(chart.y[0], chart.frame))), default=0.0))
@@ -745,12 +720,6 @@ def _shade(norm: Normalize, value: float) -> str:
     if not math.isfinite(value):
         return "#f0f0f0"
     return to_hex(colormaps["YlOrBr"](0.08 + 0.84 * float(norm(value))))
-
-
-def cell_colours(chart: Chart) -> list[str]:
-    """Return the colour of each line of a grid whose cells are coloured by a number."""
-    norm = _norm(chart)
-    return [_shade(norm, value) for value in chart.frame[chart.value].astype(float)]
 
 
 def ink_on(ground: str) -> str:

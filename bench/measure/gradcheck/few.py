@@ -69,7 +69,7 @@ class FewSteps:
             if set(causes.values()) == {"wrong_factor"}:
                 parts = [replace(p, verdict="wrong_factor") if i in ratios else p for i, p in enumerate(parts)]
         gradient = np.full(self.theta.size, np.nan) if self.gradient is None else self.gradient
-        return Check(most_severe(part.verdict for part in parts), self.theta, gradient, self.scale, tuple(parts), ())
+        return Check(most_severe(part.verdict for part in parts), gradient, tuple(parts), ())
 
     @np.errstate(all="ignore")
     def _part(self, index: int) -> Part:
