@@ -44,16 +44,8 @@ class Subspace:
     With ``groups`` empty and all components chosen, z is the displacement of theta itself.
     """
 
-    def __init__(
-        self,
-        layout: ParameterTree,
-        scale: np.ndarray,
-        components: list[int],
-        groups: list[Group],
-        theta: np.ndarray | None = None,
-    ) -> None:
-        self.layout, self.components, self.groups = layout, components, groups
-        self.theta = layout.vector if theta is None else theta
+    def __init__(self, layout: ParameterTree, scale: np.ndarray, components: list[int], groups: list[Group]) -> None:
+        self.theta, self.components, self.groups = layout.vector, components, groups
         self.scale = np.r_[scale[components], np.ones(len(groups))]
         """The size of each coordinate ``(m,)``."""
         self.is_whole = not groups

@@ -570,8 +570,8 @@ def _draw_dots(chart: Chart, panel: Axes, name: str, part: pd.DataFrame, styles:
     panel.set_xlabel(axis_text(x))
     text = _values_text(x)
     if log:
-        low, high = _log_range(x, values, [mark for mark in chart.marks if mark.axis == "x"])
-        log_axis(panel, "x", low, high, text=text)
+        marks = [mark for mark in chart.marks if mark.axis == "x"]
+        log_axis(panel, "x", *_log_range(x, values, marks), text=text)
     elif text:
         panel.xaxis.set_major_formatter(FuncFormatter(lambda value, _: text(value)))
     if x.above_one and log and panel.get_xlim()[1] > 1:
@@ -629,7 +629,7 @@ def _draw_grid(
 
 def _grid_labels(chart: Chart, column: Column, names: Sequence[str], width: float) -> list[str]:
     """Return the labels of an axis of a grid, y labels beside at most half of it, x labels in lines as wide as a cell."""
-    widest = min(3.0, max(0.45 * width, 1.2 if chart.own_scales else 1.9))
+    widest = min(3.0, max(0.45 * width, 1.2 if chart.own_scales else 2.1))
     if column is chart.y[0] or column.kind != "text":
         return [plain(_clipped(name, widest)) for name in names]
     beside = min(widest, max(map(width_in_inches, map(plain, _categories(chart.y[0], chart.frame))), default=0.0))

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -65,7 +66,8 @@ def chart(trace: Trace) -> Figure:
     drawn = [_gap, *([_rows] if _names(table) else []), _force] if contact else [_positions]
     figure = Figure(figsize=(WIDTH, PANEL * (len(drawn) + 3) + 1.0), layout="constrained")
     axes: Sequence[Axes] = figure.subplots(len(drawn) + 3, 1, sharex=True)
-    for panel, ax in zip([*drawn, _jacobian, _adjoint, _cost], axes, strict=True):
+    norms: list[Any] = [partial(_norm, name=name) for name in NAMES]
+    for panel, ax in zip([*drawn, *norms, _cost], axes, strict=True):
         _contacts(ax, table)
         panel(ax, table)
         ax.margins(x=0.01)
@@ -96,11 +98,16 @@ def _contacts(ax: Axes, table: pd.DataFrame) -> None:
     time = table["time"].to_numpy()
     half = 0.5 * (time[1] - time[0])
     for name, look in (("contacts", SHADE), ("slipping", SLIPPING)):
-        edges = np.diff(np.concatenate([[False], table[name].to_numpy() > 0, [False]]).astype(int))
-        for start, end in zip(np.flatnonzero(edges == 1), np.flatnonzero(edges == -1), strict=True):
+        for start, end in _runs(table[name]):
             ax.axvspan(time[start] - half, time[end - 1] + half, **look)
     for k in np.flatnonzero(table["switch"]):
         ax.axvline(time[k] - half, **SWITCH)
+
+
+def _runs(values: pd.Series) -> Iterator[tuple[int, int]]:
+    """Return first and last place, exclusive, of each run of positive values."""
+    edges = np.diff(np.concatenate([[0], values > 0, [0]]))
+    return zip(np.flatnonzero(edges == 1), np.flatnonzero(edges == -1), strict=True)
 
 
 def _gap(ax: Axes, table: pd.DataFrame) -> None:
@@ -121,9 +128,7 @@ def _rows(ax: Axes, table: pd.DataFrame) -> None:
     time, names = table["time"].to_numpy(), _names(table)
     half = 0.5 * (time[1] - time[0])
     for row, name in enumerate(names):
-        edges = np.diff(np.concatenate([[0], table[name].to_numpy(dtype=int), [0]]))
-        runs = zip(np.flatnonzero(edges == 1), np.flatnonzero(edges == -1), strict=True)
-        bars = [(time[start] - half, time[end - 1] - time[start] + 2 * half) for start, end in runs]
+        bars = [(time[start] - half, time[end - 1] - time[start] + 2 * half) for start, end in _runs(table[name])]
         ax.broken_barh(bars, (row - 0.3, 0.6), color=BLUE, linewidth=0)
     ax.set_yticks(range(len(names)), [plain(name.removeprefix(TOUCHES)) for name in names])
     ax.set_ylim(len(names) - 0.4, -0.6)
@@ -147,14 +152,6 @@ def _positions(ax: Axes, table: pd.DataFrame) -> None:
     if len(shown) > 1:
         ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), handlelength=1.2)
     ax.set_ylabel("position" if shown != names or not len(names) else "state")
-
-
-def _jacobian(ax: Axes, table: pd.DataFrame) -> None:
-    _norm(ax, table, "jacobian_norm")
-
-
-def _adjoint(ax: Axes, table: pd.DataFrame) -> None:
-    _norm(ax, table, "adjoint_norm")
 
 
 def _norm(ax: Axes, table: pd.DataFrame, name: str) -> None:
