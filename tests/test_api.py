@@ -122,14 +122,6 @@ def test_a_problem_takes_lists_and_one_sample():
             function(0.1, [0.0, 0.1, 0.2])
 
 
-def test_estimate_of_a_scene_by_name_is_that_of_its_problem():
-    few = {"samples": 8, "repeats": 4, "reference_samples": 4096}
-    found = bench.estimate("heaviside", "reinforce[baseline=none]", **few)
-    same = bench.estimate(bench.problem("heaviside"), "reinforce[baseline=none]", **few)
-    np.testing.assert_array_equal(found.values, same.values)
-    assert found.estimator == "reinforce[baseline=none]"
-
-
 def test_a_printed_estimate_is_relative_as_in_tables():
     found = bench.estimate(bench.problem("quadratic", backend="numpy"), "fobg", samples=8, repeats=16)
     facts = found._facts()
@@ -216,12 +208,6 @@ def test_estimate_is_that_of_a_cell(rows):
     found = bench.estimate(problem, "fobg", samples=8, repeats=4, seed=0, reference_samples=4096).as_dict()
     for name in ("bias", "variance", "rmse"):
         assert found[name] == pytest.approx(cell[name], rel=1e-9)
-
-
-def test_theta_can_be_named_parameters():
-    problem = bench.problem("pushing[horizon=3]", backend="numpy", theta=["mass", "stiffness"], theta0=[0.2, 500.0])
-    assert list(problem.program.theta0) == [0.2, 500.0]
-    assert problem.dim == 2
 
 
 @pytest.mark.parametrize(

@@ -80,21 +80,6 @@ def test_a_failing_cell_is_a_row_and_exit_status_1(tmp_path):
     assert "at least 4 samples" in table.loc["inverse_variance", "reason"]
 
 
-@pytest.mark.slow
-def test_unsupported_combinations_are_rows(tmp_path):
-    words = [
-        "scenes=[pushing]", "contacts=[penalty,complementarity]", "integrators=[semi_implicit_euler,explicit_euler]",
-        "backends=[numpy]", "estimators=[reinforce]", "scene.pushing.horizon=3", "samples=8", "repeats=4",
-        "reference.samples=4096", "name=mixed", f"results_dir={tmp_path}",
-    ]  # fmt: skip
-    assert main(words) == 0
-    table = pd.read_csv(tmp_path / "mixed" / "bias_variance.csv")
-    assert sorted(table["status"]) == ["ok", "ok", "unsupported", "unsupported"]
-    reasons = " ".join(table["reason"].dropna())
-    assert "numpy has no root finder" in reasons
-    assert "explicit_euler cannot apply the impulses" in reasons
-
-
 @pytest.mark.parametrize("value", ["[fobg,reinforce[baseline=none]]", "[fobg,'reinforce[baseline=none]']"])
 def test_identity_strings_survive_the_shell(value, tmp_path):
     assert main([*TINY, f"estimators={value}", f"results_dir={tmp_path}"]) == 0

@@ -79,12 +79,12 @@ def main(names: Sequence[str], limit: float = LIMIT_S) -> int:
         if names and entry.name not in names:
             continue
         plugins += 1
-        if entry.plugin is None or not entry.available:
-            results = iter([CheckResult(entry.name, "available", "fail" if names else "skip", entry.reason)])
-        elif reason := missing_environment(entry.plugin):
-            results = iter([CheckResult(entry.name, "available", "fail" if names else "skip", reason)])
+        plugin = entry.plugin if entry.available else None
+        reason = entry.reason if plugin is None else missing_environment(plugin)
+        if plugin is None or reason:
+            results = iter([CheckResult(entry.name, "available", "fail" if names else "skip", reason or "")])
         else:
-            results = _results(entry.plugin, limit=limit)
+            results = _results(plugin, limit=limit)
         for result in results:
             tally[result.outcome] += 1
             print(f"{result.outcome}  {result.plugin:<38} {result.check:<38} {result.detail}", flush=True)
@@ -220,7 +220,7 @@ def _items(plugin_class: type[Plugin]) -> Iterator[tuple[str, Any, Check]]:
         yield plugin_class.name, plugin_class, function
     try:
         instances = variants(plugin_class)
-    except Exception:
+    except (Exception, SystemExit):
         yield plugin_class.name, plugin_class, builds
         return
     for name, plugin in instances.items():
@@ -263,7 +263,7 @@ def _outcome(function: Check, subject: Any, name: str) -> CheckResult:
         outcome, detail = "skip", str(reason)
     except Failed as reason:
         outcome, detail = "fail", str(reason)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         outcome, detail = "fail", f"{type(error).__name__}: {error}"
     return CheckResult(name, function.__name__, outcome, " ".join(detail.split()))
 

@@ -31,6 +31,10 @@ FILES = ("baseline", "save")
 OUTPUTS = ("markdown", "junit")
 """Files of a whole command."""
 QUIET, MATRIX = "--quiet", "--matrix"
+EXAMPLES = {
+    "cost": "python -m bench examine FILE:NAME [theta=1,0] [grad=jax] [sigma=0.1]",
+    "file": "python -m bench examine --matrix FILE.toml [markdown=FILE] [junit=FILE]",
+}
 WIDTH, LEAST_WIDTH = 100, 40
 """Width of the text without a terminal, and the least width, in characters."""
 
@@ -40,39 +44,36 @@ def run(words: Sequence[str]) -> Report:
 
     Raises :class:`UserError` for a command line that cannot be parsed.
     """
-    (cost, settings), _ = _parse(words)
-    report = _examined(cost, settings, QUIET not in words)
+    cost, settings = _parse(words, (*SETTINGS, *OUTPUTS))
+    report = _examined(cost, {key: value for key, value in settings.items() if key in SETTINGS}, QUIET not in words)
     print(_wrapped(str(report)))
     _save(report, settings)
+    _write(settings, [report], {})
     return report
 
 
 def main(words: Sequence[str]) -> int:
     """Run the command, and return the exit status: 0 right, 1 wrong, 3 not decided; 2 is bad input."""
-    if any(word == MATRIX or word.startswith(f"{MATRIX}=") for word in words):
-        return _run_matrix(words)
-    _, outputs = _parse(words)
-    report = run(words)
-    _write(outputs, [report], {})
+    if any(word.partition("=")[0] == MATRIX for word in words):
+        return _run_matrix([word.removeprefix(f"{MATRIX}=") for word in words if word != MATRIX])
+    status = run(words).status
     sys.stdout.flush()
-    return report.status
+    return status
 
 
-def _parse(words: Sequence[str]) -> tuple[tuple[str, dict[str, str]], dict[str, str]]:
-    """Return the cost with its settings, and the files to write."""
-    costs = [word for word in words if "=" not in word and word != QUIET]
-    if len(costs) != 1:
-        given = f", not {len(costs)}" if costs else ""
-        raise UserError(f"name one cost{given}: python -m bench examine FILE:NAME [theta=1,0] [grad=jax] [sigma=0.1]")
-    settings: dict[str, str] = {}
-    for word in words:
-        if "=" in word:
-            key, _, value = word.partition("=")
-            if key not in (*SETTINGS, *OUTPUTS):
-                raise unknown("setting of examine", key, (*SETTINGS, *OUTPUTS))
-            settings[key] = value
-    outputs = {key: settings.pop(key) for key in OUTPUTS if key in settings}
-    return (costs[0], settings), outputs
+def _parse(
+    words: Sequence[str], allowed: Sequence[str], verb: str = "examine", one: str = "cost"
+) -> tuple[str, dict[str, str]]:
+    """Return the name of a cost or file, and its settings."""
+    names = [word for word in words if "=" not in word and word != QUIET]
+    if len(names) != 1:
+        given = f", not {len(names)}" if names else ""
+        raise UserError(f"name one {one}{given}: {EXAMPLES[one]}")
+    settings = dict(word.split("=", 1) for word in words if "=" in word)
+    for key in settings:
+        if key not in allowed:
+            raise unknown(f"setting of {verb}", key, allowed)
+    return names[0], settings
 
 
 def _wrapped(text: str) -> str:
@@ -117,17 +118,10 @@ def _save(report: Report, settings: Mapping[str, Any]) -> None:
 
 def _run_matrix(words: Sequence[str]) -> int:
     """Examine every cost of a TOML file, print one table, and return the exit status."""
-    joined = [word.partition("=")[2] for word in words if word.startswith(f"{MATRIX}=")]
-    rest = [word for word in words if not word.startswith(MATRIX) and word != QUIET]
-    outputs = {key: value for key, _, value in (word.partition("=") for word in rest if "=" in word)}
-    files = [*joined, *(word for word in rest if "=" not in word)]
-    if wrong := [key for key in outputs if key not in OUTPUTS]:
-        raise unknown("setting of examine --matrix", wrong[0], OUTPUTS)
-    if len(files) != 1:
-        raise UserError("name one file: python -m bench examine --matrix FILE.toml [markdown=FILE] [junit=FILE]")
+    file, outputs = _parse(words, OUTPUTS, "examine --matrix", "file")
     reports: list[Report] = []
     refused: dict[str, str] = {}
-    for name, cost, settings in read_matrix(Path(files[0])):
+    for name, cost, settings in read_matrix(Path(file)):
         try:
             report = _examined(cost, settings, QUIET not in words)
         except UserError as error:

@@ -87,23 +87,14 @@ def compare_gradients(stages: GradientStages, twin_grad: Any) -> tuple[float, fl
     return float(own_error / size), float(other_error / size)
 
 
-def check_refined(stages: GradientStages, refined: Callable[..., Any]) -> Check | None:
-    """Return a check of the same gradient against few differences of a refined cost."""
-    space = choose(stages.layout, stages.scale, stages.gradient, stages.seed)
-    other = _simulator(stages, refined, None)
-    quick = _quick(stages, other, space)
-    for _ in range(2):
-        quick.run_round(other.width)
-    outcome = quick.check()
-    return None if outcome is None else space.restore(outcome)
-
-
 @dataclass(frozen=True)
 class Gap:
     """At one theta, the distances of the gradient and of the cost's own differences from those of a refined cost."""
 
     gradient: float
     own: float
+    size: float
+    """Norm of the refined cost's differences."""
 
 
 @dataclass
@@ -120,8 +111,6 @@ class Explanation:
     """Largest relative difference between the cost and its twin."""
     twin_error: tuple[float, float] | None = None
     """Relative errors of the gradient and of the second gradient."""
-    refined: Check | None = None
-    """The gradient against differences of a refined cost."""
     gaps: Sequence[Gap] = ()
     """At theta and at others: how far gradient and cost are from the refined cost; empty without a refined cost."""
     growth: Sequence[Horizon] = ()
@@ -144,7 +133,7 @@ def refined_gaps(stages: GradientStages, refined: Callable[..., Any]) -> list[Ga
         w = stages.same_noise(at.shape[1])
         own, exact = (np.subtract(*np.split(costs, 2)) / (2 * eps) for costs in (stages.costs(at), other.costs(at, w)))
         slopes = stages.gradient_at(theta) @ vectors
-        gaps.append(Gap(float(np.linalg.norm(slopes - exact)), float(np.linalg.norm(own - exact))))
+        gaps.append(Gap(*(float(np.linalg.norm(values)) for values in (slopes - exact, own - exact, exact))))
     return gaps
 
 
@@ -164,7 +153,14 @@ def errors_by_horizon(stages: GradientStages, horizons: Sequence[int]) -> list[H
         other = _simulator(stages, partial(simulator._cost, steps=steps), grad)
         gradient = other.gradients(stages.theta[:, None], stages.w)[:, 0]
         space = choose(stages.layout, stages.scale, gradient, stages.seed, most=4)
-        quick = _quick(stages, other, space, space.project(gradient))
+
+        def costs(thetas: np.ndarray, other: Simulator = other) -> np.ndarray:
+            return other.costs(thetas, stages.same_noise(thetas.shape[1]))
+
+        quick = FewSteps(
+            partial(space.costs, costs, width=other.width), space.origin(), space.scale, space.project(gradient),
+            float(costs(stages.theta[:, None])[0]), simulator.unit, stages.repeats.spread,
+        )  # fmt: skip
         quick.run_round(other.width)
         outcome = quick.check()
         if outcome is None:
@@ -260,18 +256,3 @@ def _simulator(stages: GradientStages, cost: Callable[..., Any], grad: Any) -> S
     own = stages.simulator
     batch = own.batch + (f":{own.fixed}" if own.fixed else "")
     return Simulator(cost, stages.layout, grad, own.noise, batch, stages.clock, own.library)
-
-
-def _quick(stages: GradientStages, other: Simulator, space: Any, slope: np.ndarray | None = None) -> FewSteps:
-    """Return a quick check of another cost in the coordinates of a space, with the given or theta's gradient."""
-
-    def cost(z: np.ndarray) -> np.ndarray:
-        def costs(thetas: np.ndarray) -> np.ndarray:
-            return other.costs(thetas, stages.same_noise(thetas.shape[1]))
-
-        return np.asarray(space.costs(costs, z, other.width))
-
-    if slope is None and stages.gradient is not None:
-        slope = space.project(stages.gradient)
-    centre = float(cost(space.origin()[:, None])[0])
-    return FewSteps(cost, space.origin(), space.scale, slope, centre, stages.simulator.unit, stages.repeats.spread)

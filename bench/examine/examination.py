@@ -241,22 +241,16 @@ class _Examination:
         self.left_out += stages.left_out
         checked = stages.check
         is_wrong = checked is not None and checked.cause in SUSPICIOUS
-        if twin is not None:
-            self._explain("twin", "comparison with the twin", lambda: diagnosis.compare_costs(stages, twin))
-        if twin_grad is not None and stages.gradient is not None:
-            self._explain(
-                "twin_error",
-                "comparison with the twin's gradient",
-                lambda: diagnosis.compare_gradients(stages, twin_grad),
-            )
-        if refined is not None:
-            self._explain("refined", "the refined cost", lambda: diagnosis.check_refined(stages, refined))
-            if is_wrong and stages.gradient is not None:
-                self._explain(
-                    "gaps", "the refined cost at other thetas", lambda: diagnosis.refined_gaps(stages, refined)
-                )
-        if setup.horizons:
-            self._explain("growth", "horizons", lambda: diagnosis.errors_by_horizon(stages, setup.horizons))
+        has_gradient = stages.gradient is not None
+        comparisons: tuple[tuple[str, str, Any, Any], ...] = (
+            ("twin", "comparison with the twin", diagnosis.compare_costs, twin),
+            ("twin_error", "comparison with the twin's gradient", diagnosis.compare_gradients, twin_grad if has_gradient else None),
+            ("gaps", "the refined cost", diagnosis.refined_gaps, refined if is_wrong and has_gradient else None),
+            ("growth", "horizons", diagnosis.errors_by_horizon, setup.horizons or None),
+        )  # fmt: skip
+        for name, what, function, given in comparisons:
+            if given is not None:
+                self._explain(name, what, partial(function, stages, given))
         can_go_on = not (stages.gradient is None and simulator.has_gradient) and not stages.is_failed
         if checked is not None and is_wrong and can_go_on and explained.is_adaptive is None:
             explained.is_adaptive = self._compare_along_lines(checked)
@@ -424,13 +418,11 @@ class _Examination:
         if not self.clock.can_afford(0, 4 * sum(PANELS)):
             self.left_out.append("the integral of the gradient along a line")
             return math.nan
-        integrals = [self._integral(line, panels) for panels in PANELS]
+        ends = float(line.at[0]), float(line.at[-1])
+        integrals = [self.stages.integrate(line.direction, *ends, panels) for panels in PANELS]
         missed = abs(line.costs[-1] - line.costs[0] - integrals[-1]) / changes
         doubt = abs(integrals[-1] - integrals[0]) / changes
         return float(missed) if doubt < max(0.1 * missed, LEAST_MISSED) else math.nan
-
-    def _integral(self, line: LineScan, panels: int) -> float:
-        return self.stages.integrate(line.direction, float(line.at[0]), float(line.at[-1]), panels)
 
     # ------------------------------------------------------------------------------------------------ noise
 

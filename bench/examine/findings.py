@@ -290,7 +290,7 @@ class Findings:
                 return "adaptive"
             if cause in (*SUSPICIOUS, "unsettled", "disconnected") and self.is_overwritten:
                 return "overwritten"
-            is_open = cause in SUSPICIOUS and explained.is_unexplained and explained.refined is None
+            is_open = cause in SUSPICIOUS and explained.is_unexplained and not explained.gaps
             return "undecided" if is_open else cause
         if not check.components or not self.is_complete:
             return "undecided"
@@ -355,8 +355,7 @@ class Findings:
         elif self.misses_jumps:
             found.append(("staircase" if self.tread else "jumps", None))
         for one in self.smoothed:
-            kinds = {"nonfinite": not one.defined, "biased": one.biased, "spread": one.unshown or one.hidden}
-            found += [(cause, one) for cause, is_found in kinds.items() if is_found]
+            found += [(one.cause, one)] if one.cause else []
         if self.gradient and len(self.smoothed) < len(self.setup.sigmas):
             found.append(("unmeasured", None))
         return sorted(found, key=lambda each: NOISE_CAUSES.index(each[0]))

@@ -52,6 +52,8 @@ IN_CELL = 0.4
 """Distance from a float32 number, in units of its last place, that float32 rounds away."""
 CELLS, DISTINCT_CELLS = 9, 6
 """Number of neighbouring float32 thetas at which costs are compared, and fewest different costs of a cost in float32."""
+MOST_OF_IT = 0.9
+"""Share of the remaining budget after which a running stage is stopped."""
 SHARE = 0.8
 """Largest share of the remaining budget of a stage, whatever is measured after it."""
 STATE = 0.1
@@ -82,25 +84,29 @@ class Store:
     """Values by coordinates. A stored value is used once; the next request computes it again and compares."""
 
     def __init__(self) -> None:
-        self._values: dict[bytes, tuple[np.ndarray, bool]] = {}
+        self._values: dict[bytes, np.ndarray] = {}
+        self._fresh: set[bytes] = set()
         self.spread = 0.0
         """Largest difference between two values of one key."""
 
     def take(self, key: bytes) -> np.ndarray | None:
-        """Return a value that has not been used since it was computed, or None."""
-        value, is_fresh = self._values.get(key, (None, False))
-        if value is None or not is_fresh:
+        """Return a value that has not been used since it was computed or refreshed, or None."""
+        if key not in self._fresh:
             return None
-        self._values[key] = value, False
-        return value
+        self._fresh.remove(key)
+        return self._values[key]
 
-    def put(self, key: bytes, value: np.ndarray, is_fresh: bool = False) -> None:
-        """Store a computed value, for one more request if ``is_fresh``."""
+    def put(self, key: bytes, value: np.ndarray) -> None:
+        """Store a computed value."""
         if key in self._values:
             with np.errstate(invalid="ignore"):
-                apart = np.abs(self._values[key][0] - value)
+                apart = np.abs(self._values[key] - value)
             self.spread = max(self.spread, float(np.nan_to_num(apart).max(initial=0.0)))
-        self._values[key] = value, is_fresh
+        self._values[key] = value
+
+    def refresh(self) -> None:
+        """Let every value be used once more."""
+        self._fresh = set(self._values)
 
 
 class GradientStages:
@@ -192,7 +198,7 @@ class GradientStages:
     def _refresh(self) -> None:
         """Let the next stage use every stored value once."""
         for store in (self._costs_store, self._gradients_store):
-            store._values = {key: (value, True) for key, (value, _) in store._values.items()}
+            store.refresh()
 
     def integrate(self, direction: np.ndarray, start: float, end: float, panels: int) -> float:
         """Return the integral of the gradient along ``theta + t * direction`` by Gauss-Legendre, 4 points per panel."""
@@ -222,7 +228,8 @@ class GradientStages:
         space = choose(self.layout, self.scale, self.gradient, self.seed)
         self.groups = space.groups
         if self.gradient is not None:
-            self._gradients_store.put(space.origin().tobytes(), space.project(self.gradient), is_fresh=True)
+            self._gradients_store.put(space.origin().tobytes(), space.project(self.gradient))
+            self._gradients_store.refresh()
         try:
             for stage in (partial(self._compare_quickly, space), self._repeat):
                 stage()
@@ -265,7 +272,7 @@ class GradientStages:
         try:
             for _ in ROUNDS:
                 quick.run_round(self.simulator.width)
-                steps = self._plan(space.size, True)[0][1]
+                steps = self._plan(space.size, True)["more steps"]
                 if self.clock.can_afford(*self._cost_of(steps, space.size), share=SHARE):
                     break
         finally:
@@ -342,37 +349,27 @@ class GradientStages:
         is_constant = _are_equal(np.r_[cells[0], inside[0]]) and _are_equal(np.r_[cells[CELLS // 2], inside[1:]])
         return is_constant and np.unique(cells).size >= DISTINCT_CELLS
 
-    def _plan(self, size: int, is_right: bool) -> list[tuple[str, Options]]:
+    def _plan(self, size: int, is_right: bool) -> dict[str, Options]:
         """Return the stages after the quick one, from the cheapest to the full check."""
         unit = self.simulator.unit
-        eps = EPS if unit < 1e-10 else SINGLE_EPS
-        few = EPS[::2] if unit < 1e-10 else SINGLE_EPS
+        eps, few = (EPS, EPS[::2]) if unit < 1e-10 else (SINGLE_EPS, SINGLE_EPS)
         base = Options(
             components=size, directions=0, draws=0, eps=few, unit=unit, scanned=0, repeated=False, seed=self.seed,
         )  # fmt: skip
-        repeated = self.repeats.spread == 0.0
+        whole = replace(base, eps=eps, directions=2)
         # a wrong gradient is named by its ratios at other thetas first, and then searched for staircases
         scanned = 4 if is_right else 0
-        stages = [
-            ("more steps", base),
-            (
-                ALL_STEPS,
-                replace(base, eps=eps, directions=2, scanned=scanned, repeated=repeated),
-            ),
-            (FEW_DRAWS, replace(base, eps=eps if is_right else few, directions=2, draws=2, scanned=scanned)),
-            (DRAWS, replace(base, eps=eps, directions=2, draws=8, scanned=4)),
-        ]
+        stages = {"more steps": base, ALL_STEPS: replace(whole, scanned=scanned, repeated=self.repeats.spread == 0.0)}
         if self.theta.size > MANY:
-            return [*stages[:2], (FEW_DRAWS, replace(base, eps=eps, directions=2, draws=2, scanned=2))]
-        return stages
+            return stages | {FEW_DRAWS: replace(whole, draws=2, scanned=2)}
+        few_draws = replace(whole, eps=eps if is_right else few, draws=2, scanned=scanned)
+        return stages | {FEW_DRAWS: few_draws, DRAWS: replace(whole, draws=8, scanned=4)}
 
     def _cost_of(self, options: Options, size: int) -> tuple[int, int]:
         """Return the numbers of costs and gradients of a stage that no stored value makes cheaper."""
         each = 2 * options.eps.size + NOISE_POINTS
-        here = size + options.directions
-        costs = here * each * (2 if options.repeated else 0) + options.draws * options.directions * each
-        if not options.repeated and not options.draws:
-            costs = here * each
+        here = (size + options.directions) * (2 if options.repeated else int(not options.draws))
+        costs = (here + options.draws * options.directions) * each
         wrong = 0 if self.check is None else sum(part.verdict in FAULTS for part in self.check.parts)
         if wrong and options.draws:
             costs += min(4, options.draws) * wrong * each + 4 * options.draws * each
@@ -384,36 +381,35 @@ class GradientStages:
     def _check_in_stages(self, space: Subspace, explain: Callable[[Check], bool]) -> None:
         self.clock.start_stage("checking the gradient")
         assert self.check is not None
-        is_done: list[str] = []
-        names = [name for name, _ in self._plan(space.size, True)]
-        for name in names:
-            plan = dict(self._plan(space.size, self.check.trusted))
+
+        def fits(options: Options) -> bool:
+            return self.clock.can_afford(*self._cost_of(options, space.size), share=SHARE)
+
+        for name in self._plan(space.size, True):
+            plan = self._plan(space.size, self.check.trusted)
             is_wrong = any(part.verdict in FAULTS for part in self.check.parts)
             if name == ALL_STEPS and is_wrong:
                 explain(self.check)
                 continue  # the ratios at other thetas name the fault, and these stages also have all steps
-            if not self.clock.can_afford(*self._cost_of(plan[name], space.size), share=SHARE):
+            if not fits(plan[name]):
                 self.left_out.append(name)
                 if name != FEW_DRAWS:
                     break
                 continue
             # a wrong gradient is named by few thetas first, so that the name does not depend on the time that is left
-            is_skipped = name == FEW_DRAWS != names[-1] and not is_wrong
-            if is_skipped and self.clock.can_afford(*self._cost_of(plan[names[-1]], space.size), share=SHARE):
+            if name == FEW_DRAWS and not is_wrong and DRAWS in plan and fits(plan[DRAWS]):
                 continue
-            options = plan[name]
             self._refresh()
-            self.clock.limit(max(SHARE, 0.9))
+            self.clock.limit(MOST_OF_IT)
             try:
-                self._run_stage(space, options)
-                is_done.append(name)
+                self._run_stage(space, plan[name])
             except OutOfTime:
                 self.left_out.append(name)
                 break
             finally:
                 self.clock.limit(1.0)
-        if DRAWS in is_done:
-            self.left_out = [name for name in self.left_out if name != FEW_DRAWS]
+            if name == DRAWS:
+                self.left_out = [left for left in self.left_out if left != FEW_DRAWS]
 
     def _run_stage(self, space: Subspace, options: Options) -> None:
         outcome = self._check_once(space, options)
@@ -443,7 +439,7 @@ class GradientStages:
             outcome = recaused(
                 replace(outcome, draws=tuple(part for part in outcome.draws if np.isfinite(part.program)))
             )
-        return self._with_roughness(self._without_small_spread(space, _with_zeros(outcome)))
+        return _with_roughness(self._without_small_spread(space, _with_zeros(outcome)))
 
     def _spread_of_gradients(self, space: Subspace) -> float:
         """Return the largest difference between equal calls of the gradient, relative to its norm."""
@@ -461,21 +457,6 @@ class GradientStages:
         ):
             return outcome
         return recaused(outcome)
-
-    def _with_roughness(self, outcome: Check) -> Check:
-        """Return a check with the cause ``rough`` where the cost varies as much between neighbours as over a wide step."""
-        if outcome.cause != "unsettled":
-            return outcome
-        rough = []
-        for part in outcome.parts:
-            sample, finite = part.sample, part.sample.finite
-            change = np.abs(sample.plus - sample.minus)[finite].max(initial=0.0)
-            rough.append(sample.noise > ROUGH * change and sample.noise > 1e6 * sample.unit * abs(sample.centre))
-        parts = tuple(
-            replace(part, verdict="unsettled") if is_rough else part
-            for part, is_rough in zip(outcome.parts, rough, strict=True)
-        )
-        return replace(outcome, parts=parts, cause="rough" if any(rough) else outcome.cause)
 
     def _locate(self, space: Subspace) -> None:
         """Find the numbers that cause the error of each wrong group."""
@@ -525,7 +506,7 @@ class GradientStages:
         if self.w is None or self.check is None or not self.check.trusted or self.is_quick:
             return
         space = choose(self.layout, self.scale, self.gradient, self.seed)
-        options = replace(self._plan(space.size, True)[1][1], components=0, scanned=0, repeated=False)
+        options = replace(self._plan(space.size, True)[ALL_STEPS], components=0, scanned=0, repeated=False)
         if not self.clock.can_afford(*self._cost_of(options, 0), share=SHARE):
             self.left_out.append("checks under other noise")
             return
@@ -547,6 +528,17 @@ def _with_zeros(outcome: Check) -> Check:
     if all(part.verdict == "zero" for part in zeros):
         return outcome
     return recaused(outcome, lambda part: replace(part, verdict="zero") if any(part is p for p in zeros) else part)
+
+
+def _with_roughness(outcome: Check) -> Check:
+    """Return a check with the cause ``rough`` where the cost varies as much between neighbours as over a wide step."""
+    samples = [part.sample for part in outcome.parts if outcome.cause == "unsettled"]
+    changes = [np.abs(sample.plus - sample.minus)[sample.finite].max(initial=0.0) for sample in samples]
+    is_rough = any(
+        sample.noise > ROUGH * change and sample.noise > 1e6 * sample.unit * abs(sample.centre)
+        for sample, change in zip(samples, changes, strict=True)
+    )
+    return replace(outcome, cause="rough") if is_rough else outcome
 
 
 def recaused(outcome: Check, replaced: Callable[[Part], Part] = lambda part: part) -> Check:

@@ -9,7 +9,7 @@ level. This search follows each place separately with two costs per halving, sin
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -47,8 +47,6 @@ class Break:
     """Position t on the line ``theta + t * direction``."""
     size: float
     """The height of a jump, or the change of slope per unit of t at a kink."""
-    near: tuple[tuple[float, float], ...] = ()
-    """Values of t beside the break with their costs, in rising order, for a picture."""
 
 
 @dataclass(frozen=True)
@@ -202,13 +200,10 @@ def _confirmed(
     sides = along(np.concatenate([at - step * away, at + step * away], axis=1)).reshape(len(breaks), 2, SIDES)
     confirmed = []
     for one, both, width in zip(breaks, sides, step[:, 0], strict=True):
-        left = zip(one.at - width * away[::-1], both[0, ::-1], strict=True)
-        right = zip(one.at + width * away, both[1], strict=True)
-        near = tuple((float(t), float(f)) for t, f in (*left, *right))
         bends = np.abs(np.diff(both, 2, axis=1)).max()
         size = one.size if one.kind == "jump" else one.size * width
         if bends <= CONFIRMED * size + 4.0 * noise:
-            confirmed.append(replace(one, near=near))
+            confirmed.append(one)
     return confirmed
 
 

@@ -72,11 +72,6 @@ class Smoothed:
     methods: tuple[Method, ...]
 
     @property
-    def defined(self) -> bool:
-        """Whether every cost is finite, so grad J exists."""
-        return math.isfinite(self.norm)
-
-    @property
     def bias_percent(self) -> tuple[float, float]:
         """The ends of the bias interval in percent of |grad J|, which is not 0."""
         return 100 * self.bias_low / self.norm, 100 * self.bias_high / self.norm
@@ -87,25 +82,24 @@ class Smoothed:
         return self.norm > 4.0 * self.error
 
     @property
-    def hidden(self) -> bool:
-        """Whether grad J is not distinguishable from 0, though its error is not 0."""
-        return not self.known and self.error > 0.0
-
-    @property
     def decided(self) -> bool:
         """Whether the bias interval is entirely above or entirely below 10% of |grad J|."""
         edge = TARGET_ERROR * self.norm
         return not self.bias_low <= edge <= self.bias_high
 
     @property
-    def biased(self) -> bool:
-        """Whether the bias interval of the program's gradient is entirely above 10% of |grad J|."""
-        return self.known and bool(self.bias_low > TARGET_ERROR * self.norm)
+    def cause(self) -> str:
+        """The problem with the mean of the program's gradients: ``nonfinite``, ``biased``, ``spread``, or empty.
 
-    @property
-    def unshown(self) -> bool:
-        """Whether the bias interval contains 10% of |grad J|, so that it shows neither a usable nor a biased gradient."""
-        return self.known and not self.biased and bool(self.bias_high > TARGET_ERROR * self.norm)
+        It is ``biased`` where the bias interval is entirely above 10% of |grad J|, and ``spread`` where the interval contains
+        10%, or where grad J is not distinguishable from 0 though its error is not 0.
+        """
+        edge = TARGET_ERROR * self.norm
+        if not math.isfinite(self.norm):
+            return "nonfinite"
+        if self.known and self.bias_low > edge:
+            return "biased"
+        return "spread" if (self.bias_high > edge if self.known else self.error > 0.0) else ""
 
     @property
     def best(self) -> Method | None:

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bench.measure.gradcheck import Check, Part
+from bench.measure.gradcheck import Check, Part, extremes
 from bench.model.simulator.tree import ParameterTree
 
 MOST = 16
@@ -44,16 +44,8 @@ class Subspace:
     With ``groups`` empty and all components chosen, z is the displacement of theta itself.
     """
 
-    def __init__(
-        self,
-        layout: ParameterTree,
-        scale: np.ndarray,
-        components: list[int],
-        groups: list[Group],
-        theta: np.ndarray | None = None,
-    ) -> None:
-        self.layout, self.components, self.groups = layout, components, groups
-        self.theta = layout.vector if theta is None else theta
+    def __init__(self, layout: ParameterTree, scale: np.ndarray, components: list[int], groups: list[Group]) -> None:
+        self.theta, self.components, self.groups = layout.vector, components, groups
         self.scale = np.r_[scale[components], np.ones(len(groups))]
         """The size of each coordinate ``(m,)``."""
         self.is_whole = not groups
@@ -63,12 +55,6 @@ class Subspace:
     def size(self) -> int:
         """Number of coordinates m."""
         return len(self.components) + len(self.groups)
-
-    @property
-    def names(self) -> list[str]:
-        """The name of each coordinate."""
-        names = self.layout.names
-        return [names[i] for i in self.components] + [group.name for group in self.groups]
 
     def origin(self) -> np.ndarray:
         """Return the coordinates of theta, ``(m,)``: theta itself where every component is a coordinate, else 0."""
@@ -134,9 +120,7 @@ def choose(
     dim = layout.vector.size
     if dim <= MOST:
         return Subspace(layout, scale, list(range(dim)), [])
-    weight = scale if gradient is None else np.nan_to_num(np.abs(gradient * scale), nan=np.inf)
-    order = np.argsort(weight, kind="stable")
-    chosen = sorted({int(i) for i in np.r_[order[: most // 2], order[dim - (most - most // 2) :]]}) if most else []
+    chosen = extremes(scale if gradient is None else gradient * scale, most)
     return Subspace(layout, scale, chosen, groups_of(layout, scale, seed))
 
 

@@ -140,9 +140,9 @@ def derivative_facts(report: Findings) -> list[str]:
         facts.append("so little that adaptive steps may explain it")
     if cause == "adaptive" and explained.steps:
         facts.append(f"the loop at {explained.steps} has another length at other thetas")
-    if explained.refined is not None and cause == "adaptive":
-        errors = [part.error for part in explained.refined.components if math.isfinite(part.error)]
-        facts.append(f"from the refined cost {number(100 * max(errors, default=math.nan))}%")
+    if explained.gaps and cause == "adaptive":
+        here = explained.gaps[0]
+        facts.append(f"from the refined cost {number(100 * here.gradient / (here.size or math.nan))}%")
     if explained.twin_error is not None and cause == "overwritten":
         facts.append(f"the second gradient is right to {number(100 * explained.twin_error[1])}%")
     return facts
@@ -282,7 +282,7 @@ def warnings(report: Findings) -> list[str]:
 def advice(report: Findings) -> str:
     """Return the next step, with the settings that take it."""
     cause, spent, explained = report.cause, report.spent, report.explained
-    has_refined = explained.refined is not None
+    has_refined = bool(explained.gaps)
     given = {
         "{more}": not report.left_out and all(one.pairs >= PAIRS for one in report.smoothed),
         "sigma": not report.gradient or bool(report.setup.levels),

@@ -27,18 +27,19 @@ class StudyPackage(Study):
 
     def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
         """Return one cell's results by column."""
-        return self._function("measure")(cell, session, self)  # type: ignore[no-any-return]
+        return self._module("measure").measure(cell, session, self)  # type: ignore[no-any-return]
 
     def views(self, experiment: Experiment, rows: pd.DataFrame) -> Views:
-        """Return the tables and charts of the rows, and why cells have no result."""
+        """Return the tables of the rows and the charts that are not empty, and why cells have no result."""
         from bench.report.writer import reasons
 
-        found: Views = self._function("views")(experiment, rows)
-        return replace(found, remarks=[*found.remarks, *reasons(rows)])
+        found: Views = self._module("views").views(experiment, rows)
+        drawn = [chart for chart in found.charts if len(chart.frame)]
+        return replace(found, charts=drawn, remarks=[*found.remarks, *reasons(rows)])
 
-    def _function(self, name: str) -> Any:
+    def _module(self, name: str) -> Any:
         package = next(c.__module__ for c in type(self).__mro__ if c.__module__.startswith(f"{__name__}."))
-        return getattr(import_module(f"{package}.{name}"), name)
+        return import_module(f"{package}.{name}")
 
 
 def finite_status(reason: str, *values: Any) -> dict[str, str]:

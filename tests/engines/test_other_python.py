@@ -170,20 +170,6 @@ def test_an_error_in_an_engine_names_its_file_and_line_and_the_engine_goes_on():
 
 
 @pytest.mark.slow
-def test_an_engine_killed_in_mid_sweep_loses_nothing(tmp_path):
-    """Rows are those of a sweep in which the engine lives."""
-    results = []
-    for name, fault in ("killed", f",fault=exit,marker={tmp_path / 'marker'}"), ("alive", ""):
-        words = [f"name={name}", *SETTINGS, "estimators=[fobg,randomized_smoothing]", "workers=0"]
-        assert main([*words, f"backends=['toy[python={HERE}{fault}]']", f"results_dir={tmp_path}"]) == 0
-        results.append(bench.load(tmp_path / name))
-    assert (tmp_path / "marker").exists()
-    killed, alive = results
-    assert list(killed["status"]) == ["ok", "ok"]
-    assert [list(x) for x in killed["mean_estimate"]] == [list(x) for x in alive["mean_estimate"]]
-
-
-@pytest.mark.slow
 def test_an_engine_ends_with_its_run_even_if_it_hangs():
     code = f"""
 import sys, threading, time

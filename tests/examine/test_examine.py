@@ -419,6 +419,16 @@ def test_fixture_fails_on_a_wrong_gradient(examine):
         examine(bowl, [1.0, 0.5], grad=lambda x: [2 * part for part in slope(x)])
 
 
+@pytest.mark.parametrize(
+    ("error", "low", "high", "cause"),
+    [(0.01, 0.2, 0.4, "biased"), (0.5, 0.2, 0.4, "spread"), (0.5, 0.0, 0.05, "spread"), (0.01, 0.06, 0.2, "spread"),
+     (0.01, 0.0, 0.09, ""), (0.0, 0.0, 0.0, "")],
+)  # fmt: skip
+def test_a_bias_interval_decides_where_grad_j_is_known(error, low, high, cause):
+    norm = float(error > 0)
+    assert smoothing.Smoothed(0.1, np.zeros(2), error, norm, 64, 0.0, low, high, math.nan, "", ()).cause == cause
+
+
 def test_a_method_costs_its_samples_times_the_calls_of_each():
     terms = np.array([[1.0, -1.0] * 50])
     found = smoothing._method("smoothing", 0.06, terms, 2.0, 2, 0.5)

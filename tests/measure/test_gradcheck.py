@@ -212,10 +212,10 @@ TINY = ["contacts=[penalty]", "backends=[numpy]", "sweep.horizon=[1,5]", "worker
 
 
 def test_command_writes_files_and_exits_with_0(tmp_path, capsys):
-    words = ["gradcheck", "bounce_once", "pendulum", *TINY, "formats=[png,svg]", f"results_dir={tmp_path}"]
+    words = ["gradcheck", "bounce_once", *TINY, "formats=[png]", f"results_dir={tmp_path}"]
     assert main(words) == 0
     directory = tmp_path / "gradcheck"
-    for name in ("gradient_check.csv", "gradient_check.md", "gradient_check.png", "gradient_check.svg"):
+    for name in ("gradient_check.csv", "gradient_check.md", "gradient_check.png"):
         assert (directory / name).stat().st_size > 0
     table = pd.read_csv(directory / "gradient_check.csv")
     assert {*IDENTITY, "point", "direction", "eps", "derivative_program", "derivative_differences"} <= set(
@@ -335,7 +335,7 @@ def test_components_are_columns_of_the_row(tmp_path):
 def test_worst_check_decides_the_line_of_a_point():
     rows = pd.DataFrame([GradientCheck.columns.blank() | {
         "point": ["start", "start"], "check_verdict": ["smooth", "wrong_adjoint"], "check_error": [1e-9, 0.5],
-        "check_eps": [1e-5, 1e-6], "key": "k",
+        "check_eps": [1e-5, 1e-6], "key": "k", "sample": [0, 0], "direction": [0, 1], "derivative_program": [1.0, 1.0],
     }])  # fmt: skip
     (line,) = by_point(rows).to_dict("records")
     assert (line["verdict"], line["error"]) == ("wrong_adjoint", 0.5)

@@ -364,7 +364,7 @@ class Setting:
 
 
 @pytest.mark.parametrize("biased", [False, True], ids=["no bias", "bias"])
-@pytest.mark.parametrize("noise", ["normal", "t5"])
+@pytest.mark.parametrize("noise", ["normal", pytest.param("t5", marks=pytest.mark.slow)])
 def test_bias_interval_is_calibrated(noise: str, biased: bool) -> None:
     # The share covered is known to 0.6 points.
     rng = np.random.default_rng(17)

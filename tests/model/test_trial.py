@@ -132,21 +132,6 @@ def test_what_plugins_print_reaches_no_terminal_raw(tmp_path):
     assert "asked" in done.stderr
 
 
-def test_a_thread_and_a_fault_of_ones_own_hold_no_command(tmp_path):
-    """An unexpected error is told in full, and what a plugin has left running does not keep it waiting."""
-    code = """if True:
-        import sys, threading, time
-        import bench.__main__ as command
-        threading.Thread(target=time.sleep, args=(600,)).start()
-        command.main = lambda: 1 / 0
-        command.command()
-    """
-    command = [sys.executable, "-c", code]
-    done = subprocess.run(command, cwd=tmp_path, env=INHERITED, capture_output=True, text=True, timeout=500)
-    assert done.returncode == 1
-    assert "ZeroDivisionError" in done.stderr
-
-
 def test_an_error_that_cannot_be_printed_is_one_of_its_plugin():
     silent = type("Silent", (Exception,), {"__str__": lambda self: sys.exit(0)})()
     assert printable(silent) == "(a message that cannot be printed)"

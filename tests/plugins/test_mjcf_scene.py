@@ -78,20 +78,6 @@ def test_gradients_are_differences_of_the_cost(values):
     assert along @ given.grad(theta, w) == pytest.approx(differences, rel=100 * DIFFERENCED)
 
 
-@pytest.mark.slow
-def test_windows_follow_the_tangents_of_a_free_joint():
-    given = problem()
-    sample = noise.draw(0, "mjcf", 1, 3, given.program.n_noise, "test")
-    first = make("estimators", "fobg").estimate(given, given.program.theta0, sample)
-    whole = make("estimators", "windowed[steps=3,terminal=learned]").estimate(given, given.program.theta0, sample)
-    assert whole.shape == first.shape
-    from bench.model import adjoint_gradient, slopes
-
-    w = sample[0].T
-    by_steps = adjoint_gradient(given, slopes(given, given.program.theta0, w))
-    assert by_steps == pytest.approx(given.grad(given.program.theta0, w), rel=1e-4, abs=1e-6)
-
-
 def test_a_fallen_robot_stays_where_it_fell(tmp_path):
     (tmp_path / "pendulum.xml").write_text(PENDULUM.format(damping=0.0))
     (tmp_path / "pendulum.py").write_text(TASK + "\n\ndef has_ended(xp, q, v):\n    return q[0] < 0.3\n")

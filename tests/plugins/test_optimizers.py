@@ -147,26 +147,6 @@ def test_cma_es_on_a_narrow_valley():
     assert scale @ state["theta"] ** 2 < 1e-12  # from 1500
 
 
-@pytest.mark.parametrize("optimizer", [Lbfgs(), LineSearch(first=1.0, shrink=0.5, slope=1e-4, tries=20)])
-def test_searches_with_steps_descend_on_a_banana(optimizer):
-    state = optimizer.start(np.array([-1.2, 1.0]))
-    costs = [banana(state["theta"][:, None])[0][0]]
-    for _ in range(200):
-        points = optimizer.ask(state, np.empty((2, 0)))
-        value, gradient = banana(points)
-        wanted = optimizer.required_fields(state)
-        known = {"value": value, "gradient": gradient}
-        state = optimizer.tell(state, points, Answer(**{name: known[name] for name in wanted}))
-        costs.append(banana(state["theta"][:, None])[0][0])
-    assert (np.diff(costs) <= 0).all()
-    assert costs[-1] < (1e-12 if isinstance(optimizer, Lbfgs) else 5.0)
-
-
-def banana(x):
-    cost = 100 * (x[1] - x[0] ** 2) ** 2 + (1 - x[0]) ** 2
-    return cost, np.stack([-400 * x[0] * (x[1] - x[0] ** 2) - 2 * (1 - x[0]), 200 * (x[1] - x[0] ** 2)])
-
-
 def test_gauss_newton_takes_back_a_bad_step():
     optimizer = GaussNewton()
     state = optimizer.start(np.array([3.0]))

@@ -89,29 +89,6 @@ def test_the_adjoint_without_jax_takes_differences(monkeypatch):
     assert np.abs(by_differences - by_product).max() < DIFFERENCED * np.abs(by_product).max()
 
 
-class Final(CartpoleSwing):
-    """A cart-pole that also pays at the end."""
-
-    def terminal_cost(self, xp, q, v):
-        return 3.0 * q[0] ** 2 + v[1] ** 2
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("where", ["action", pytest.param("parameter", marks=pytest.mark.slow)])
-def test_backends_agree_on_a_gradient_with_a_terminal_cost(where):
-    scene = Final(policy="mlp[hidden=4]", horizon=12, noise=where)
-    exact = compile_problem(scene, None, "semi_implicit_euler", "jax")
-    theta, w = exact.program.theta0, sample(exact)
-    gradient = exact.grad(theta, w)
-    scale = np.abs(gradient).max()
-    others = {name: REVERSED for name in ("torch", "implicit", "fused", "checkpointed")}
-    for backend, error in (others | {"numpy": DIFFERENCED, "checkpointed[keep=jacobians]": DIFFERENCED}).items():
-        other = compile_problem(scene, None, "semi_implicit_euler", backend)
-        assert other.value(theta, w) == pytest.approx(exact.value(theta, w), rel=1e-12), backend
-        assert np.abs(other.grad(theta, w) - gradient).max() < error * scale, backend
-    assert np.abs(adjoint_gradient(exact, slopes(exact, theta, w)) - gradient).max() < DIFFERENCED * scale
-
-
 @pytest.mark.slow
 def test_a_long_theta_has_blocks_of_few_columns(monkeypatch):
     usual = problem(horizon=5)

@@ -1,6 +1,7 @@
 """Rows outlast kills, full disks and runs side by side."""
 
 import errno
+import itertools
 import math
 import os
 import random
@@ -16,6 +17,7 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from pairwise import pairwise
 
 from bench.cli import main
 from bench.errors import StorageError, UserError
@@ -304,9 +306,12 @@ def test_a_file_system_without_locks_keeps_the_small_files(tmp_path, monkeypatch
 # ------------------------------------------------------------------------------------------------ commands
 
 
-@pytest.mark.parametrize("content", [b"", b"garbage", "truncated"])
-@pytest.mark.parametrize("place", ["rows.parquet", "pending/part.parquet", "pending/row.json"])
-@pytest.mark.parametrize("verb", ["run", "plan", "report"])
+PLACES, VERBS = ("rows.parquet", "pending/part.parquet", "pending/row.json"), ("run", "plan", "report")
+
+
+@pytest.mark.parametrize(
+    ("place", "content", "verb"), pairwise(itertools.product(PLACES, (b"", b"garbage", "truncated"), VERBS))
+)
 def test_unreadable_file_is_named_and_left_alone(tmp_path, capsys, place, content, verb):
     path = tmp_path / "tiny" / place
     path.parent.mkdir(parents=True)

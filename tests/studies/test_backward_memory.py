@@ -96,27 +96,32 @@ def test_the_range_of_six_calls_covers_a_median():
 # ----------------------------------------------------------------------------------------------------- views
 
 
-def rows(times=(1.0, 2.0, 1.5), apart=0.1, error=1e-13):
+MEMORY = ["memory_mb", "memory_mb_low", "memory_mb_high"]
+SECONDS = {"jax": 1.0, "torch": 2.0, "fused": 1.5}
+
+
+def rows():
     """An experiment, and rows of three backends at three horizons: memory T, T / 10, and the root of T."""
-    given = config.load(
-        [
-            "study=backward_memory",
-            "scenes=[mass_spring]",
-            "backends=[jax,torch,fused]",
-            "sweep.horizon=[100,1000,10000]",
-        ]
-    )
+    words = ("scenes=[mass_spring]", "backends=[jax,torch,fused]", "sweep.horizon=[100,1000,10000]")
+    given = config.load(["study=backward_memory", *words])
     lines = []
     for cell in cells(given):
         steps, name = cell.scene.horizon, cell.backend.name
         memory = {"jax": steps, "torch": steps / 10, "fused": math.sqrt(steps)}[name]
-        seconds = dict(zip(("jax", "torch", "fused"), times, strict=True))[name]
         lines.append(given.columns.blank() | cell.columns() | {
-            "experiment": given.name, "status": "ok", "compared_with": "jax", "gradient_error_rel": error,
+            "experiment": given.name, "status": "ok", "compared_with": "jax", "gradient_error_rel": 1e-13,
             **spread("memory_mb", [memory * 0.99, memory, memory * 1.01]),
-            **spread("gradient_s", [seconds * (1 - apart), seconds, seconds * (1 + apart)]),
+            **spread("gradient_s", [SECONDS[name] * k for k in (0.9, 1.0, 1.1)]),
         })  # fmt: skip
     return given, given.columns.typed(pd.DataFrame(lines))
+
+
+def shown(memory, where="backend == 'fused'"):
+    """The line per method with another memory of some rows, and the chart."""
+    given, table = rows()
+    table.loc[table.query(where).index, MEMORY] = memory
+    found = views.views(given, table)
+    return found.tables[0].frame.set_index("method"), found.charts[0].plotted()
 
 
 def test_orders_and_ratios_at_the_longest_horizon_are_those_of_the_memory():
@@ -130,49 +135,33 @@ def test_orders_and_ratios_at_the_longest_horizon_are_those_of_the_memory():
 
 
 def test_memory_below_the_resolution_is_an_upper_limit_without_an_order():
-    given, table = rows()
-    columns = ["memory_mb", "memory_mb_low", "memory_mb_high"]
-    table.loc[table["backend"] == "fused", columns] = 0.01
-    shown = views.views(given, table)
-    line = shown.tables[0].frame.set_index("method").loc["fused"]
-    assert math.isnan(line["order"])
-    assert math.isnan(line["less"])
-    drawn = shown.charts[0].plotted()
+    lines, drawn = shown(0.01)
+    assert lines.loc["fused", ["order", "less"]].isna().all()
     assert drawn["is_small"].sum() == 3
     assert drawn["memory_mb"].min() == views.SMALL
 
 
 def test_an_order_needs_both_memories_above_the_resolution():
-    given, table = rows()
-    columns = ["memory_mb", "memory_mb_low", "memory_mb_high"]
-    table.loc[(table["backend"] == "fused") & (table["horizon"] == 1000), columns] = 0.9
-    line = views.views(given, table).tables[0].frame.set_index("method").loc["fused"]
+    line = shown(0.9, "backend == 'fused' and horizon == 1000")[0].loc["fused"]
     assert math.isnan(line["order"])
     assert line["less"] == pytest.approx(100.0)
 
 
 def test_intervals_of_memory_contain_the_error_of_the_measurement():
     """Peaks are up to a quarter of a MiB too low."""
-    given, table = rows()
-    columns = ["memory_mb", "memory_mb_low", "memory_mb_high"]
-    table.loc[table["backend"] == "fused", columns] = [2.0, 1.9, 2.1]
-    line = views.views(given, table).tables[0].frame.set_index("method").loc["fused"]
-    assert list(line[columns]) == pytest.approx([2.0, 1.6, 2.4])
+    line = shown([2.0, 1.9, 2.1])[0].loc["fused"]
+    assert list(line[MEMORY]) == pytest.approx([2.0, 1.6, 2.4])
     assert line["less_high"] == pytest.approx(10100.3 / 1.6)
 
 
 def test_without_a_result_of_the_first_method_no_other_takes_its_place():
     given, table = rows()
     table.loc[table["backend"] == "jax", "status"] = "error"
-    shown = views.views(given, table)
-    assert shown.tables[0].frame["less"].isna().all()
+    assert views.views(given, table).tables[0].frame["less"].isna().all()
 
 
 def test_methods_that_are_not_distinguishable_have_a_ratio_whose_interval_contains_1():
-    given, table = rows()
-    columns = ["memory_mb", "memory_mb_low", "memory_mb_high"]
-    table[columns] = [10.0, 9.0, 11.0]
-    lines = views.views(given, table).tables[0].frame.set_index("method").loc[["torch", "fused"]]
+    lines = shown([10.0, 9.0, 11.0], "horizon > 0")[0].loc[["torch", "fused"]]
     assert (lines["less_low"] < 1).all()
     assert (lines["less_high"] > 1).all()
 

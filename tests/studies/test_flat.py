@@ -7,7 +7,7 @@ import pytest
 
 from bench.experiment import config
 from bench.experiment.grid import cells
-from bench.measure import noise, statistics, timing
+from bench.measure import noise, statistics
 from bench.model import compose, registry
 from bench.studies.bias_variance.estimates import Estimates
 
@@ -100,45 +100,6 @@ def test_an_estimator_with_an_estimate_of_its_own_is_not_taken_apart():
     _, expected = made(cell)
     _, found = made(cell.with_part("estimator", Doubled()))
     np.testing.assert_allclose(found, 2.0 * expected, rtol=ROUNDED)
-
-
-@pytest.fixture
-def clock(monkeypatch):
-    """A clock of calls that only moves when it is told to: ``clock(seconds)``."""
-    now = [0.0]
-    monkeypatch.setattr(timing.time, "perf_counter", lambda: now[0])
-
-    def move(seconds):
-        now[0] += seconds
-
-    return move
-
-
-def test_pauses_are_no_time_of_a_call(clock):
-    pause = timing.Pause()
-
-    def call(_):
-        clock(0.003)
-        with pause:
-            clock(0.02)
-        return np.zeros(1)
-
-    _, found = timing.timed(call, 3, least_s=0.0, pause=pause)
-    assert found.median_s == pytest.approx(0.003)
-
-
-def test_times_are_repeated_until_they_are_steady(clock):
-    def timed(*first, **more):
-        waits = iter([0.0, *first * 2, *[0.002] * 400])
-
-        def call(_):
-            clock(next(waits))
-            return np.zeros(1)
-
-        return timing.timed(call, 2, least_s=0.0, most=100, **more)[1]
-
-    assert timed(0.001, 0.003).calls == 3
-    assert timed(0.001, 0.004, settle_s=0.2).calls > 5
 
 
 def test_a_gradient_by_differences_counts_once():

@@ -46,6 +46,11 @@ def cell_of(*words):
     return cell
 
 
+def row_of(*words):
+    cell = cell_of(*words)
+    return cell.study.measure(cell, None)
+
+
 def displacement(k, c, t):
     """x(t) of a unit mass released from rest at 1."""
     a = c / 2
@@ -115,8 +120,7 @@ def test_friction_fitted_with_a_step_holds_for_that_step():
 
 @pytest.mark.slow
 def test_a_row_in_all_ways():
-    cell = cell_of("scenes=[mass_spring_damper[horizon=80]]", "integrators=[rk4]", "repeats=12")
-    row = cell.study.measure(cell, None)
+    row = row_of("scenes=[mass_spring_damper[horizon=80]]", "integrators=[rk4]", "repeats=12")
     assert row["shooting"] == ["single", "multiple", "windows"]
     assert row["hidden"] == [0, 0, 0]
     assert min(row["converged"]) == 1.0
@@ -127,15 +131,14 @@ def test_a_row_in_all_ways():
 
 
 def test_model_of_a_coarse_step_says_so():
-    row = made("study=identify[refine=16]").study.measure(cell_of("scenes=[sliding_block]", "repeats=16"), None)
+    row = row_of("study=identify[refine=16]", "scenes=[sliding_block]", "repeats=16")
     assert row["step_shift_bound"] > shown.MAX_STEP_SHIFT
     assert row["coverage_high"][0] < 0.95
 
 
 @pytest.mark.slow
 def test_cramer_rao_is_reached_over_500_records_and_none_hides_the_gauge():
-    cell = cell_of(*SPRING, "repeats=500")
-    row = made("study=identify[windows=2]").study.measure(cell, None)
+    row = row_of("study=identify[windows=2]", *SPRING, "repeats=500")
     assert row["hidden"][0] == 0
     # the relative error of a standard deviation from 500 draws of two numbers
     assert abs(row["error"][0] - 1.0) < 4 / math.sqrt(2 * 1000)
@@ -191,9 +194,7 @@ def test_a_table_with_times_may_lack_lines_and_its_noise_is_estimated(tmp_path):
     x = displacement(4.4, 0.5, t) + 0.02 / math.sqrt(2) * np.random.default_rng(1).laplace(size=201)
     table = pd.DataFrame({"t": t, "other": 1.0 + t, "x": x})
     table[np.arange(201) % 7 != 3].to_csv(tmp_path / "own.csv", index=False)
-    experiment = made(*SPRING, f"study=identify[data={tmp_path / 'own.csv'},time=t,measured=x]")
-    (cell,) = cells(experiment)
-    row = experiment.study.measure(cell, None)
+    row = row_of(*SPRING, f"study=identify[data={tmp_path / 'own.csv'},time=t,measured=x]")
     assert row["explained"] == 1.0
     assert row["noise_size"] == pytest.approx(0.02, rel=0.2)  # three standard errors of Laplace noise
     assert row["intervals"] == ["own size"]
@@ -204,20 +205,17 @@ def test_a_table_with_times_may_lack_lines_and_its_noise_is_estimated(tmp_path):
 def test_as_many_measurements_as_unknowns_need_a_stated_noise(tmp_path):
     (tmp_path / "two.csv").write_text("0.99\n0.97\n")
     short = ("scenes=[mass_spring_damper[horizon=2]]", "integrators=[rk4]", "theta=[stiffness,damping]")
-    experiment = made(*short, f"study=identify[data={tmp_path / 'two.csv'}]")
-    (cell,) = cells(experiment)
     with pytest.raises(Unsupported, match="2 measurements for 2 unknowns: state the noise"):
-        experiment.study.measure(cell, None)
-    experiment = made(*short, f"study=identify[data={tmp_path / 'two.csv'},measurement=0.01]")
-    row = experiment.study.measure(next(iter(cells(experiment))), None)
+        row_of(*short, f"study=identify[data={tmp_path / 'two.csv'}]")
+    row = row_of(*short, f"study=identify[data={tmp_path / 'two.csv'},measurement=0.01]")
     assert math.isnan(row["explained"])  # too few to test
 
 
-def table_of(experiment, row):
+def table_of(*words):
     """The table of estimates by parameter, and that of biases that go unnoticed."""
-    (cell,) = cells(experiment)
-    rows = experiment.columns.typed(pd.DataFrame([cell.columns() | row | {"experiment": "own"}]))
-    views = study_of(experiment).views(experiment, rows)
+    experiment = made(*words)
+    rows = experiment.columns.typed(pd.DataFrame([cell_of(*words).columns() | row_of(*words) | {"experiment": "own"}]))
+    views = experiment.study.views(experiment, rows)
     return views.tables[0].frame.set_index("parameter"), views.tables[1]
 
 
@@ -225,9 +223,7 @@ def test_estimates_come_first_and_only_what_is_identifiable_has_one(tmp_path):
     t = 0.05 * np.arange(1, 201)
     noise = 0.01 * np.random.default_rng(2).standard_normal(200)
     np.savetxt(tmp_path / "own.csv", displacement(4.4, 0.5, t) + noise)
-    experiment = made(*SPRING, f"study=identify[data={tmp_path / 'own.csv'}]")
-    row = experiment.study.measure(next(iter(cells(experiment))), None)
-    estimates, unnoticed = table_of(experiment, row)
+    estimates, unnoticed = table_of(*SPRING, f"study=identify[data={tmp_path / 'own.csv'}]")
     assert list(estimates.index) == ["stiffness/mass", "damping/mass", "mass", "stiffness", "damping"]
     assert estimates["unit"].tolist() == ["(N/m)/kg", "(N s/m)/kg", "kg", "N/m", "N s/m"]
     assert estimates["identifiable"].tolist() == [
@@ -244,9 +240,8 @@ def test_estimates_come_first_and_only_what_is_identifiable_has_one(tmp_path):
 
 
 def test_a_parameter_that_moves_nothing_has_no_interval():
-    experiment = made(*SPRING, "theta=[stiffness,damping,hold]", "scene.mass_spring_damper.hold=1", "repeats=2")
-    row = experiment.study.measure(next(iter(cells(experiment))), None)
-    estimates, _ = table_of(experiment, row)
+    words = ("theta=[stiffness,damping,hold]", "scene.mass_spring_damper.hold=1", "repeats=2")
+    estimates, _ = table_of(*SPRING, *words)
     assert estimates.loc["hold", "identifiable"] == "no"
     assert estimates.loc["hold", ["estimate", "low", "high"]].isna().all()
     assert estimates.loc["stiffness", "identifiable"] == "yes"
@@ -296,9 +291,7 @@ def own_record(tmp_path, name):
     path = tmp_path / "own.csv"
     np.savetxt(path, clean[:, None] + 0.01 * noise(np.random.default_rng(3), (200, 1)), delimiter=",")
     own = ("scene.mass_spring_damper.damping=0.3", "scene.mass_spring_damper.start=3.0")
-    experiment = made(*SPRING, "theta=[stiffness,damping]", *own, f"study=identify[data={path}]")
-    (cell,) = cells(experiment)
-    return experiment.study.measure(cell, None)
+    return row_of(*SPRING, "theta=[stiffness,damping]", *own, f"study=identify[data={path}]")
 
 
 @pytest.mark.slow
@@ -516,14 +509,6 @@ def test_local_minima_of_the_logistic_map_depend_on_the_window_and_on_its_last_s
     place = found["scan_steps"].index(window)
     assert (found["scan_low"], found["scan_high"]) == ([2.0], [4.0])
     assert (found["minima"][place], found["minima_open"][place]) == (with_last, without)
-
-
-def test_a_map_step_is_exact():
-    model = model_of(cell_of(*CHAOS))
-    x, record = 0.5, model.record(model.values[:, None])[:, 0]
-    for found in record:
-        x = 3.78 * x * (1 - x)
-        assert found == x
 
 
 def test_scanned_loss_of_an_undamped_spring_is_the_closed_form():

@@ -1,7 +1,5 @@
 """Program, model and estimator error kept apart: the impulse without time of impact, which only the model error betrays."""
 
-import dataclasses
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -10,7 +8,6 @@ from bench.plugins.contacts.impulse import Impulse
 from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
 from bench.plugins.scenes.bounce_once import BounceOnce
 from bench.plugins.scenes.bouncing_ball import BouncingBall
-from bench.plugins.scenes.wall_penalty_1d import WallPenalty1d
 
 from bench.experiment import config
 from bench.experiment.grid import cells
@@ -42,25 +39,6 @@ def test_the_trap_is_exact_for_its_program_and_wrong_for_the_physics_at_every_st
         forward.append(abs(found.cost - scene.physical_cost()))
     assert forward[0] > 2 * forward[1] > 4 * forward[2]
     assert all(error <= 4.0 / n for error, n in zip(forward, horizons, strict=True))  # one step at 2 m/s, reversed
-
-
-@pytest.mark.parametrize(
-    ("scene", "fields"),
-    [
-        (BounceOnce(), ("height", "velocity")),
-        (BouncingBall(restitution=0.8), ("height", "velocity")),
-        (WallPenalty1d(start=0.6), ("start",)),
-        (WallPenalty1d(start=0.2), ("start",)),
-        (WallPenalty1d(start=1.8), ("start",)),
-    ],
-)
-def test_physical_cost_has_the_physical_gradient(scene, fields):
-    eps = 1e-6
-    for i, name in enumerate(fields):
-        ahead, behind = (
-            dataclasses.replace(scene, **{name: getattr(scene, name) + e}).physical_cost() for e in (eps, -eps)
-        )
-        assert (ahead - behind) / (2 * eps) == pytest.approx(scene.physical_gradient()[i], rel=1e-6, abs=1e-8)
 
 
 def test_a_wrong_derivative_is_seen():

@@ -90,6 +90,7 @@ def test_every_fault_is_planted():
 
 HARMLESS = {
     "nothing": {},
+    "a trainer that logs its reward only": {f"log_{name}": np.nan for name in LOGGED if name != "reward"},
     "a peak that clipping absorbs": gradient(slice(42, 43), 50.0),
     "a small gradient while the return rises": gradient(slice(40, None), 1e-4),
     "a gradient that vanishes for a while": gradient(slice(20, 80), 1e-4) | SETTLED,

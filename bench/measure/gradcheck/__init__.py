@@ -1,6 +1,6 @@
 """Gradient checks: pure functions of a cost and a gradient, independent of problems."""
 
-from .check import Check, Options, Part, check, settle
+from .check import Check, Options, Part, check, extremes, settle
 from .direction import EPS, FINE, Finding, Sample, best, judge
 from .few import ROUNDS, FewSteps, is_nothing
 from .sampling import order, points, repeats, samples
@@ -24,6 +24,7 @@ __all__ = [
     "Sample",
     "best",
     "check",
+    "extremes",
     "is_nothing",
     "judge",
     "most_severe",

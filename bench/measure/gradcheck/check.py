@@ -114,9 +114,7 @@ class Check:
 
     cause: str
     """The worst verdict, one of :data:`.verdicts.VERDICTS`."""
-    theta: np.ndarray
     gradient: np.ndarray
-    scale: np.ndarray
     parts: tuple[Part, ...]
     """Components and random directions at theta."""
     draws: tuple[Part, ...]
@@ -188,6 +186,14 @@ def check(
     Raises :class:`TypeError` for complex costs or gradients and :class:`ValueError` for wrong shapes.
     """
     return _Checker(cost, gradient, np.array(theta, dtype=np.float64), options or Options(), modes, tangent).run()
+
+
+def extremes(weights: np.ndarray, most: int) -> list[int]:
+    """Return the indices of at most ``most`` numbers: half of them the largest in size, half the smallest."""
+    if weights.size <= most:
+        return list(range(weights.size))
+    order = np.argsort(np.nan_to_num(np.abs(weights), nan=np.inf), kind="stable")
+    return sorted(int(i) for i in np.r_[order[: most // 2], order[order.size - (most - most // 2) :]])
 
 
 def settle(
@@ -277,7 +283,7 @@ class _Checker:
     def run(self) -> Check:
         theta, options = self.theta, self.options
         first = self.gradient(theta)
-        chosen = self._components(first)
+        chosen = extremes(first * self.scale, options.components)
         around = theta[:, None] + options.reach * self.scale[:, None] * self.random.standard_normal(
             (theta.size, options.draws)
         )
@@ -306,22 +312,7 @@ class _Checker:
             causes.append("nan_gradient")
         elif not repeats(first, again, self.unit).all():
             causes.append("nondeterministic")
-        return Check(
-            cause=most_severe(causes),
-            theta=theta,
-            gradient=first,
-            scale=self.scale,
-            parts=tuple(parts),
-            draws=tuple(draws),
-        )
-
-    def _components(self, gradient: np.ndarray) -> list[int]:
-        """Return the indices of the components to check one by one."""
-        dim, most = gradient.size, self.options.components
-        if dim <= most:
-            return list(range(dim))
-        share = np.argsort(np.nan_to_num(np.abs(gradient * self.scale), nan=np.inf), kind="stable")
-        return sorted(int(i) for i in np.r_[share[: most // 2], share[dim - (most - most // 2) :]])
+        return Check(cause=most_severe(causes), gradient=first, parts=tuple(parts), draws=tuple(draws))
 
     def _along(self, component: int) -> np.ndarray:
         """Return the vector ``(d,)`` of a component, of the length of its scale."""

@@ -7,8 +7,9 @@ order h^2 (Nocedal and Wright 2006, section 8.1). Further steps replace this bou
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -29,38 +30,38 @@ FLOOR = 4.0
 """Allowed non-repeatability of a cost, in multiples of the largest difference seen between equal calls."""
 
 
+@dataclass
 class FewSteps:
     """Differences of a cost at one to three steps per coordinate. Each finished difference is kept."""
 
-    def __init__(
-        self,
-        cost: Callable[[np.ndarray], np.ndarray],
-        theta: np.ndarray,
-        scale: np.ndarray,
-        gradient: np.ndarray | None,
-        centre: float,
-        unit: float,
-        floor: float = 0.0,
-    ) -> None:
-        self._cost, self.theta, self.scale, self.centre = cost, theta, scale, centre
-        self.gradient, self.unit, self.floor = gradient, unit, floor
-        self._rounds = 0
-        self._values: list[list[tuple[float, float, float]]] = [[] for _ in range(theta.size)]
+    cost: Callable[[np.ndarray], np.ndarray]
+    theta: np.ndarray
+    scale: np.ndarray
+    gradient: np.ndarray | None
+    centre: float
+    """The cost at theta."""
+    unit: float
+    floor: float = 0.0
+    """Largest difference between equal calls of the cost."""
+    rounds: int = 0
+    """Number of finished rounds."""
+    values: dict[int, list[tuple[float, float, float]]] = field(default_factory=lambda: defaultdict(list))
+    """Step and costs on both sides, by coordinate."""
 
     def run_round(self, width: int = 1) -> None:
         """Compute two costs per coordinate at the next step, at most ``width`` costs per call."""
-        steps = ROUNDS[self._rounds] * float(np.cbrt(self.unit)) * self.scale
+        steps = ROUNDS[self.rounds] * float(np.cbrt(self.unit)) * self.scale
         for chosen in np.array_split(np.arange(self.theta.size), -(-self.theta.size // max(width // 2, 1))):
             moved = np.repeat(self.theta[:, None], 2 * chosen.size, axis=1)
             moved[np.tile(chosen, 2), np.arange(2 * chosen.size)] += np.r_[-steps[chosen], steps[chosen]]
-            costs = self._cost(moved).reshape(2, -1)
+            costs = self.cost(moved).reshape(2, -1)
             for index, minus, plus in zip(chosen, *costs, strict=True):
-                self._values[index].append((float(steps[index]), float(minus), float(plus)))
-        self._rounds += 1
+                self.values[int(index)].append((float(steps[index]), float(minus), float(plus)))
+        self.rounds += 1
 
     def check(self) -> Check | None:
         """Return the outcome for the coordinates with at least one difference; None if there are none."""
-        parts = [self._part(i) for i, values in enumerate(self._values) if values]
+        parts = [self._part(i) for i in sorted(self.values)]
         if not parts:
             return None
         ratios = {i: [part.ratio_with_error] for i, part in enumerate(parts) if part.verdict == "wrong_adjoint"}
@@ -69,11 +70,11 @@ class FewSteps:
             if set(causes.values()) == {"wrong_factor"}:
                 parts = [replace(p, verdict="wrong_factor") if i in ratios else p for i, p in enumerate(parts)]
         gradient = np.full(self.theta.size, np.nan) if self.gradient is None else self.gradient
-        return Check(most_severe(part.verdict for part in parts), self.theta, gradient, self.scale, tuple(parts), ())
+        return Check(most_severe(part.verdict for part in parts), gradient, tuple(parts), ())
 
     @np.errstate(all="ignore")
     def _part(self, index: int) -> Part:
-        step, minus, plus = np.array(sorted(self._values[index], reverse=True)).T
+        step, minus, plus = np.array(sorted(self.values[index], reverse=True)).T
         program = 0.0 if self.gradient is None else float(self.gradient[index])
         sample = Sample(
             step, minus, self.centre, plus, program, np.zeros(step.size, bool), scale=float(self.scale[index]),

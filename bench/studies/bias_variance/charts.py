@@ -52,14 +52,8 @@ BIAS = Column(
     "bias_shown", label="relative bias", low="bias_from", high="bias_to", limit="bias_limit", log=True,
     above_one="larger than the gradient",
 )  # fmt: skip
-SPREAD = Column(
-    "spread", label="standard deviation of one estimate, relative", low="spread_low", high="spread_high", log=True
-)
-TIMES = (
-    replace(COLUMNS.by_name["time_s"], label="time of one estimate", log=True),
-    Column("time_total_s", label="time of the first estimate, with compilation", format="seconds", log=True),
-    Column("rollouts_", label="rollouts of one estimate, a gradient at its measured cost", log=True),
-)
+SECONDS = replace(COLUMNS.by_name["time_s"], label="time of one estimate", log=True)
+ROLLOUTS_SPENT = Column("rollouts_", label="rollouts of one estimate, a gradient at its measured cost", log=True)
 ESTIMATOR = text("series", label="")
 
 
@@ -85,7 +79,7 @@ def charts(
         along += [_error_and_cost(labelled, styles, subtitle)]
     if not swept and methods["problem"].nunique() > 1:
         along = [_estimators(methods), *along]
-    return [chart for chart in along if chart is not None and len(chart.frame)]
+    return [chart for chart in along if chart is not None]
 
 
 # ------------------------------------------------------------------------------------------------------- frames
@@ -102,10 +96,6 @@ def with_plotted_columns(rows: pd.DataFrame) -> pd.DataFrame:
         "bias_shown": (rows["bias"].where(~limit, rows["bias_high"]) / norm).clip(lower=FLOOR),
         "bias_from": (rows["bias_low"] / norm).clip(lower=FLOOR),
         "bias_to": rows["bias_high"] / norm,
-        "spread": np.sqrt(rows["variance"]) / norm,
-        "spread_low": np.sqrt(rows["variance_low"]) / norm,
-        "spread_high": np.sqrt(rows["variance_high"]) / norm,
-        "time_total_s": rows["time_s"] + rows["compile_s"].fillna(0.0),
         "rollouts_": ROLLOUTS.of(rows),
     }
     good = rows["status"] == "ok"
@@ -173,7 +163,7 @@ def _along(
     marks = _unstable(shown, axis, frame[frame["panel"].isin(panels) & frame["first"]], names)
     x = Column("x", label=axis.title, format="setting")
     return Chart(
-        "bias_variance_" + re.sub(r"\W", "_", axis.column), frame, [x], [RMSE, BIAS, SPREAD], series="series",
+        "bias_variance_" + re.sub(r"\W", "_", axis.column), frame, [x], [RMSE, BIAS], series="series",
         line="line", panel="panel", styles=styles, marks=marks, failed="failed", across=len(drawn),
         labels="ends" if len(drawn) <= 2 else "legend", height=2.7 if len(drawn) <= 2 else 2.1,
         subtitle=", ".join(filter(None, [subtitle, *notes, *shares])), chosen=(("first", [True]), ("series", names), ("panel", panels)),
@@ -255,7 +245,7 @@ def choose_problems(problems: Sequence[ProblemRows], room: int) -> tuple[list[Pr
 def _speed_accuracy(shown: Arranged, best: pd.DataFrame, styles: Mapping[str, Style], subtitle: str) -> Chart | None:
     """Return error against cost where samples were swept: of each estimator the best backends' front, per problem."""
     timed = bool((best["by"] == "time").any())
-    cost, x = (TIME, TIMES[0]) if timed else (ROLLOUTS, TIMES[2])
+    cost, x = (TIME, SECONDS) if timed else (ROLLOUTS, ROLLOUTS_SPENT)
     parts = []
     for problem in split_by_problem(shown, SAMPLES, ("scene",)):
         rows = cost.known(problem.rows)
@@ -293,7 +283,7 @@ def _error_and_cost(shown: Arranged, styles: Mapping[str, Style], subtitle: str)
     chosen = problems[::step]
     shares = [f"{len(chosen)} of {counted(len(problems), 'problem')}"] if len(chosen) < len(problems) else []
     return Chart(
-        "speed_accuracy", rows, TIMES[:1], [RMSE], "points", series="series", shape="backend", panel="problem_",
+        "speed_accuracy", rows, [SECONDS], [RMSE], "points", series="series", shape="backend", panel="problem_",
         styles=styles, across=3, height=1.9, subtitle=", ".join(filter(None, [subtitle, *shares])),
         chosen=(("problem_", chosen),),
     )  # fmt: skip

@@ -27,12 +27,18 @@ QUANTILES = {"sample_low": 0.05, "sample_median": 0.5, "sample_high": 0.95}
 
 
 @dataclass
-class TermStatistics:
-    """One repeat's number of terms, number of terms that are exactly 0, and norms of its first terms."""
+class Terms:
+    """Sums over the terms of one repeat."""
 
-    n_terms: int = 0
-    n_zeros: int = 0
+    rest: Any = 0.0
+    """The sum of (term - common centre), ``(d,)``."""
+    square: float = 0.0
+    """The sum of the squared norms of the same."""
+    count: int = 0
+    zeros: int = 0
+    """Number of terms that are exactly 0."""
     norms: list[np.ndarray] = field(default_factory=list)
+    """Norms of the first terms."""
 
 
 class Estimates:
@@ -52,8 +58,7 @@ class Estimates:
             noise.shared(cell.seed, cell.scene.name, cell.repeats, cell.samples, self._width) if fits else None
         )
         self._centre: np.ndarray | None = None
-        self._sums: dict[int, tuple[np.ndarray, float]] = {}
-        self._terms: dict[int, TermStatistics] = {}
+        self._terms: dict[int, Terms] = {}
 
     def of(self, start: int, stop: int) -> np.ndarray:
         """Return the estimates of repeats ``start`` to ``stop - 1``, ``(stop - start, d)``."""
@@ -76,10 +81,8 @@ class Estimates:
     @property
     def sums(self) -> tuple[np.ndarray, np.ndarray] | None:
         """Per repeat, the sum of (term - common centre) and the sum of its squared norms; None without single terms."""
-        if not self._sums:
-            return None
-        ordered = [self._sums[repeat] for repeat in sorted(self._sums)]
-        return np.array([total for total, _ in ordered]), np.array([square for _, square in ordered])
+        ordered = [self._terms[repeat] for repeat in sorted(self._terms)]
+        return (np.array([one.rest for one in ordered]), np.array([one.square for one in ordered])) if ordered else None
 
     @property
     def singles(self) -> dict[str, float]:
@@ -88,7 +91,7 @@ class Estimates:
         norms = np.concatenate([part for repeat in repeats for part in repeat.norms]) if repeats else np.empty(0)
         if not np.isfinite(norms).all() or not norms.size:
             return dict.fromkeys(("sample_zeros", *QUANTILES), math.nan)
-        zeros = sum(repeat.n_zeros for repeat in repeats) / sum(repeat.n_terms for repeat in repeats)
+        zeros = sum(repeat.zeros for repeat in repeats) / sum(repeat.count for repeat in repeats)
         values = np.quantile(norms, list(QUANTILES.values()))
         return {"sample_zeros": zeros, **dict(zip(QUANTILES, values.tolist(), strict=True))}
 
@@ -115,14 +118,12 @@ class Estimates:
         result: np.ndarray = split.mean(axis=1)
         with self.pause:
             for i, repeat in enumerate(range(start, start + len(block))):
-                if repeat not in self._sums:
-                    self._sums[repeat] = self._sum_terms(split[i].T)
-                    self._terms[repeat] = self._count_terms(TermStatistics(), split[i].T)
+                if repeat not in self._terms:
+                    self._terms[repeat] = self._added(Terms(), split[i].T)
         return result
 
     def _mean_of_parts(self, estimator: SampleMean, repeat: int) -> np.ndarray:
-        total, sums, square = np.zeros(self._problem.dim), np.zeros(self._problem.dim), 0.0
-        parts, statistics = self._draw_parts(repeat), TermStatistics()
+        total, parts, found = np.zeros(self._problem.dim), self._draw_parts(repeat), Terms()
         while True:
             with self.pause:
                 part = next(parts, None)
@@ -132,34 +133,27 @@ class Estimates:
             self._check_shape(terms, (self._problem.dim, part.shape[1]))
             total += terms.sum(axis=1)
             with self.pause:
-                more = self._sum_terms(terms)
-                sums, square = sums + more[0], square + more[1]
-                self._count_terms(statistics, terms)
-        self._sums.setdefault(repeat, (sums, square))
-        self._terms.setdefault(repeat, statistics)
+                self._added(found, terms)
+        self._terms.setdefault(repeat, found)
         return total / self._cell.samples
 
-    def _sum_terms(self, terms: np.ndarray) -> tuple[np.ndarray, float]:
-        """Subtract the first batch's mean from terms ``(d, b)``; return their sum ``(d,)`` and the sum of squared norms."""
+    def _added(self, found: Terms, terms: np.ndarray) -> Terms:
+        """Add terms ``(d, b)`` to the sums of their repeat, and return the sums. The first batch's mean is the centre."""
         if self._centre is None:
             self._centre = terms.mean(axis=1)
+        room = max(1, MOST_NORMS // self._cell.repeats) - sum(map(len, found.norms))
         with np.errstate(all="ignore"):
             rest = terms - self._centre[:, None]
-            return rest.sum(axis=1), float(np.vdot(rest, rest))
+            found.rest, found.square = found.rest + rest.sum(axis=1), found.square + float(np.vdot(rest, rest))
+            found.norms.append(np.linalg.norm(terms[:, : max(0, room)], axis=0))
+        found.zeros += int((terms == 0.0).all(axis=0).sum())
+        found.count += terms.shape[1]
+        return found
 
     def _as_float64(self, result: Any) -> np.ndarray:
         if np.iscomplexobj(result):  # a cast would silently drop the imaginary part
             raise TypeError(f"{self._estimator.name} returned complex numbers; gradients are real")
         return np.asarray(result, dtype=np.float64)
-
-    def _count_terms(self, statistics: TermStatistics, terms: np.ndarray) -> TermStatistics:
-        """Add terms ``(d, b)`` to the statistics of their repeat, and return the statistics."""
-        room = max(1, MOST_NORMS // self._cell.repeats) - sum(map(len, statistics.norms))
-        with np.errstate(all="ignore"):
-            statistics.norms.append(np.linalg.norm(terms[:, : max(0, room)], axis=0))
-        statistics.n_zeros += int((terms == 0.0).all(axis=0).sum())
-        statistics.n_terms += terms.shape[1]
-        return statistics
 
     def _check_shape(self, result: np.ndarray, shape: tuple[int, ...]) -> None:
         if result.shape != shape:

@@ -67,13 +67,10 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     answers = Table(
         "growth_verdicts", lines, VERDICT, "Growth of the gradient", [VERDICT_NOTE], terminal=True, page=True
     )
-    drawn = ("gradient_median", *(f"{order}_variance" for order in ORDERS))
     chart = Chart(
-        "growth", good, [shown.column("time_horizon", log=True), COMMON["horizon"]],
-        [*(shown.column(name, log=True) for name in drawn), *(shown.column(f"{name}_rate", unit="per step") for name in RATES)],
-        panel="problem", across=5, height=1.9, band=True, panel_notes=dict(zip(lines["problem"], lines["verdict"], strict=True)),
-        text="Medians, and 5% to 95% of the noise samples (of the repeats, for variances); rates are means with 95% intervals. "
-        "On these axes a power law is straight and an exponential bends upwards.",
+        "growth", good, [shown.column("time_horizon", log=True)], [shown.column("gradient_median", log=True)], panel="problem",
+        across=5, height=1.9, band=True, panel_notes=dict(zip(lines["problem"], lines["verdict"], strict=True)),
+        text="Median over noise samples, and 5% to 95% of them. On these axes a power law is straight and an exponential bends upwards.",
     )  # fmt: skip
     named = shown.arranged.rows.assign(problem=shown.rows["problem"]).fillna({"problem": ""})
     return Views([answers, cells], [chart], named)

@@ -91,8 +91,6 @@ class Identify(StudyPackage):
 
     def unsupported_reason(self, cell: Cell) -> str | None:
         """Return why a cell cannot be fitted (no motion, no unknowns, no NumPy steps, sampling, unusable data), or None."""
-        from bench.studies.identify.measure import model_of, read
-
         scene, optimizer = cell.scene, cell.parts["optimizer"]
         assert isinstance(optimizer, Optimizer)
         if not isinstance(scene, MechanicalScene):
@@ -109,7 +107,8 @@ class Identify(StudyPackage):
             return f"optimizer {optimizer.name} samples, and fits are compared along one path: use a deterministic one"
         if self.data is not None:
             try:
-                read(self, model_of(cell))
+                module = self._module("measure")
+                module.read(self, module.model_of(cell))
             except (OSError, ValueError, Unsupported) as error:
                 return str(error).strip()
         return None

@@ -167,7 +167,7 @@ def charts(runs: RunSet, default: float, name: Callable[[str], str]) -> list[Cha
     return [
         replace(chart, frame=chart.frame.assign(method=chart.frame["method"].map(name)), series="method", styles=looks)
         for chart in found
-        if chart is not None and len(chart.frame)
+        if chart is not None
     ]
 
 
@@ -175,7 +175,7 @@ def _targets(runs: RunSet, default: float) -> Chart:
     """Return the share of targets that each method reaches, the largest first."""
     frame = aggregate.summarise(runs, default).sort_values("reached", ascending=False, kind="stable")
     return Chart(
-        "targets", frame, [REACHED, SCORE, PROFILE, MEDIAN], [METHOD], "dots", height=0.24,
+        "targets", frame, [REACHED], [METHOD], "dots", height=0.24,
         subtitle=_where(runs, "targets: a tenth, a hundredth and a thousandth of the first regret"),
         text="Bars are 95% intervals over seeds.",
     )  # fmt: skip
@@ -215,9 +215,8 @@ def _quality(runs: RunSet, default: float) -> Chart | None:
     missed = ~np.isfinite(points["art"])
     scenes = points["problem"].str.split(r"[,\[]").str[0]
     frame = points.assign(art=points["art"].mask(missed), missed=missed, scene=scenes)
-    others = [Column("bias_share", label="share of bias in the error", log=False), Column("cosine", log=False)]
     return Chart(
-        "quality_runtime", frame, [ERROR, *others], [replace(RUNTIME, low="", high="")], "points", panel="scene_class",
+        "quality_runtime", frame, [ERROR], [replace(RUNTIME, low="", high="")], "points", panel="scene_class",
         shape="scene", panel_notes=dict(zip(rho["scene_class"], rho["verdict"], strict=True)), failed="missed", across=2, height=1.9, own_scales=False,
         subtitle="average runtime: expected rollouts per search that reaches a tenth of the first regret; a cross: never reached",
         text="A point per problem and method. Methods that never reach the target have no point.",
@@ -227,11 +226,8 @@ def _quality(runs: RunSet, default: float) -> Chart | None:
 def _path_quality(runs: RunSet) -> Chart | None:
     """Return the gradient's error along the path; None if it was measured only at the start."""
     frame = aggregate.path_quality(runs)
-    if frame.empty:
-        return None
-    return Chart(
+    return None if frame.empty else Chart(
         "path_quality", frame, [Column("iteration", log=False)],
-        [Column("value", label="relative error of a gradient", low="low", high="high", log=True),
-         Column("cosine_value", label="cosine with the reference", low="cosine_low", high="cosine_high", log=False)],
-        panel="problem", band=True, subtitle="medians and 20% to 80% of the seeds",
+        [Column("value", label="relative error of a gradient", low="low", high="high", log=True)], panel="problem", band=True,
+        subtitle="medians and 20% to 80% of the seeds",
     )  # fmt: skip

@@ -60,8 +60,8 @@ def judge(run: Mapping[str, Any]) -> list[Verdict]:
 
     A statement about means needs their intervals apart; what noise can explain does not count.
     """
-    updates = np.asarray(run["log_update"], dtype=float)
-    log = {name: np.asarray(run[f"log_{name}"], dtype=float) for name in LOGGED}
+    updates = _series(run["log_update"])
+    log = {name: _series(run[f"log_{name}"]) for name in LOGGED}
     norms, tenth = log["gradient_norm"], max(len(updates) // 10, 1)
     found: dict[str, Verdict] = {}
 
@@ -87,11 +87,11 @@ def judge(run: Mapping[str, Any]) -> list[Verdict]:
         check("vanishes", has_vanished, late / early if early else math.nan, small)
     check("unmoved", run["unmoved"] > 0, run["unmoved"])
     # one length may agree by chance, and curvature spoils long ones, rounding short ones: the second best decides
-    errors = np.atleast_1d(np.asarray(run["difference_errors"], dtype=float))
+    errors = _series(run["difference_errors"])
     errors = np.sort(errors[np.isfinite(errors)])
     error = errors[1] if len(errors) > 1 else run["difference_error"]
     check("differences", error > DISAGREES, error)
-    cosines = np.asarray(run["cosine"], dtype=float)
+    cosines = _series(run["cosine"])
     cosines = cosines[np.isfinite(cosines)]
     check("opposed", len(cosines) >= MIN_CHECKS and _student(cosines)[1] < 0, cosines.mean() if len(cosines) else 0.0)
     _check_return(run, check)
@@ -109,6 +109,11 @@ def judge(run: Mapping[str, Any]) -> list[Verdict]:
     share = log["cut"].mean() if len(log["cut"]) else 0.0
     check("cut", share > ALWAYS, share)
     return [found[code] for code in MEANINGS if code in found]
+
+
+def _series(values: Any) -> np.ndarray:
+    """Return a stored list, empty where a row has none, which may be NaN."""
+    return np.asarray(values, dtype=float) if np.ndim(values) else np.empty(0)
 
 
 def _check_return(run: Mapping[str, Any], check: Any) -> None:
