@@ -168,7 +168,12 @@ def test_reference_of_an_engine_is_its_own():
 
 @pytest.mark.slow
 def test_twins_study_measures_writes_and_draws(tmp_path):
-    words = ["+experiment=twins", "scenes=[pendulum,bounce_once,tossed_box]", "backends=[jax,mujoco]", "samples=2"]
+    words = [
+        "+experiment=twins",
+        "scenes=[pendulum,cartpole,bounce_once,tossed_box]",
+        "backends=[jax,mujoco]",
+        "samples=2",
+    ]
     assert main([*words, f"results_dir={tmp_path}"]) == 0
     written = {path.name for path in (tmp_path / "twins").iterdir()}
     assert {"twins.csv", "twins.md", "twins.png", "report.html"} <= written

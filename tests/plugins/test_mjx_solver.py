@@ -207,7 +207,7 @@ def test_elliptic_cone_in_reverse_agrees_with_differences_of_the_backends_own_co
 @pytest.mark.slow
 def test_study_of_the_solver_finds_the_wrong_sign_of_one_iteration(tmp_path):
     words = ["study=solver", "scenes=[ant]", "backends=[mujoco,jax]", "backend.mujoco.impedance=0.9", "name=mine"]
-    words += ["sweep.iterations=[1,100]", "samples=1", "workers=0", "timing=false"]
+    words += ["sweep.iterations=[1,10,100]", "samples=1", "workers=0", "timing=false"]
     assert main([*words, f"results_dir={tmp_path}"]) == 0
     rows = pd.read_parquet(tmp_path / "mine" / "rows.parquet")
     assert {"solver.png", "solver.md", "solver.csv"} <= {path.name for path in (tmp_path / "mine").iterdir()}
