@@ -442,7 +442,7 @@ def test_a_million_inputs_take_less_than_a_gigabyte_and_the_wrong_array_is_named
     assert first == "1 disconnected True"
     seconds, gigabytes = map(float, second.split())
     assert gigabytes < 1.0
-    assert seconds < 125e-6 * size  # of processor time: twice of what is measured
+    assert seconds < 125.0  # of processor time: 60 s for a million, and as much again on a slow machine
 
 
 def test_groups_cover_every_number_once():
