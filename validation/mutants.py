@@ -52,7 +52,8 @@ EL, EF, EX, ES, EG = (
 )
 OF_PLAN, OF_MECHANISMS = "tests/examine/test_budget.py", "tests/examine/test_mechanisms.py"
 OF_UNRESOLVED = "tests/examine/test_unresolved.py"
-OF_GROUPS = "tests/examine/test_mechanisms.py -k 10_000\\ or\\ may_hide"
+OF_HOLD = "tests/examine/test_verdicts_hold.py"
+OF_GROUPS = "-m not\\ full tests/examine/test_mechanisms.py -k 10_000\\ or\\ may_hide"
 OF_EXAMINE = "-m not\\ slow tests/examine/test_examine.py --deselect tests/examine/test_examine.py::test_python_number_from_torch_is_disconnected_in_double_precision"
 OF_ESTIMATORS = "tests/plugins/test_weights.py tests/plugins/test_estimators.py"
 OF_VARIANCE = "tests/plugins/test_variance_reduction.py"
@@ -306,15 +307,17 @@ GROUPS: dict[tuple[str, str], list[tuple[str, str]]] = {
     ],
     (EF, OF_EXAMINE): [
         ("return any(line.steps for line in self.lines)", "return False"),
-        ("is_still = not self.moves_around", "is_still = True"),
+        ("return self.missed > (SEEN if self.tread else TARGET_ERROR) and not self.is_measured", "return self.missed > (SEEN if self.tread else TARGET_ERROR)"),
         ("return max(treads) if min(treads) > (1 - ALIKE) * max(treads) else 0.0", "return max(treads)"),
         ("        elif self.misses_jumps:", "        elif False:"),
         ("checks = [self.settled, *self.more]", "checks = [self.settled]"),
         ("[(one.cause, one)] if one.cause else []", "[]"),
         ("{\"open\": 3, \"right\": 0}.get(RULES[self.cause].kind, 1)", "{\"open\": 3, \"right\": 0}.get(RULES[self.cause].kind, 0)"),
     ],
+    (EF, OF_HOLD): [
+        ("is_still = not self.moves_around", "is_still = True"),
+    ],
     (EF, OF_UNRESOLVED): [
-        ("return self.missed > (SEEN if self.tread else TARGET_ERROR) and not self.is_measured", "return self.missed > (SEEN if self.tread else TARGET_ERROR)"),
         ("return hidden + contradicted", "return hidden"),
         ("return hidden + contradicted", "return contradicted"),
         ("DIGIT * max(abs(p.difference), _slope_nearby(p.sample))", "DIGIT * abs(p.difference)"),

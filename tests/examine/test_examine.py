@@ -213,6 +213,13 @@ def test_a_check_under_other_noise_decides_too(right):
     assert (report.cause, report.status) == ("missing_term", 1)
 
 
+def test_an_integral_that_its_panels_do_not_resolve_tells_nothing():
+    report = bench.examine(
+        lambda x: float(np.sin(5e3 * x[0])), [0.3], grad=lambda x: 5e3 * np.cos(5e3 * x), sigma=0.01, calls=4000
+    )
+    assert [math.isnan(line.missed) for line in report.lines] == [True]
+
+
 def test_bias_at_a_jump_is_that_of_the_closed_form():
     """f = x^2 + 1[x > 0]: grad J = 2 theta + pdf(theta / sigma) / sigma, of which each gradient sees 2 theta."""
     theta, sigma = 0.1, 0.2

@@ -56,6 +56,13 @@ def test_a_small_component_that_differences_contradict_is_not_called_right(secon
     assert right.status == 0, str(right)
 
 
+def test_a_minimum_is_resolved_by_the_slopes_around_it():
+    report = bench.examine(
+        lambda t: float(((t - POINT) ** 2).sum() + 3.0), POINT, grad=lambda t: 2 * (t - POINT) + 1e-17, calls=800
+    )
+    assert report.derivative == "right", str(report)
+
+
 def test_a_gradient_of_the_call_before_is_wrong_at_few_calls():
     held = {"theta": POINT}
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from bench.measure.gradcheck import EPS, TRUSTED, VERDICTS, Options, check, judge, most_severe, roughness
+from bench.measure.gradcheck.check import scales
 from bench.measure.gradcheck.sampling import points, samples
 
 THETA = np.array([0.3, 1.2, -0.7])
@@ -179,6 +180,7 @@ def test_inputs_of_very_different_size_have_steps_of_their_own():
     found = check(mixed, slopes, theta)
     assert [part.verdict for part in found.components] == ["smooth"] * 3
     assert [part.sample.scale for part in found.components] == [1e6, 1e-6, 1.0]
+    assert np.array_equal(scales(theta), [1e6, 1e-6, 1.0])
 
 
 def test_rounding_of_a_large_component_is_no_fault_of_a_small_one_but_an_exact_0_is():
