@@ -58,7 +58,7 @@ class Chart:
     name: str
     """The stem of the files' names."""
     frame: pd.DataFrame
-    """A line per point. Its column ``row``, if any, is the position of the cell in ``Views.rows``."""
+    """A line per point."""
     x: Sequence[Column]
     """The horizontal quantities: the first is drawn, ``*.plotted.csv`` has all."""
     y: Sequence[Column]

@@ -63,6 +63,15 @@ def relative_error(vector: np.ndarray, expected: np.ndarray) -> float:
     return ratio(norm(vector - expected), norm(expected))
 
 
+def mean_interval(values: np.ndarray) -> tuple[float, float, float]:
+    """Return the mean of independent values ``(n,)``, at least two, and the ends of its 95% interval (Student's t)."""
+    from scipy.special import stdtrit
+
+    reach = float(stdtrit(values.size - 1, 0.975)) * float(values.std(ddof=1)) / math.sqrt(values.size)
+    mean = float(values.mean())
+    return mean, mean - reach, mean + reach
+
+
 def first_batch(cell: Cell, width: int) -> np.ndarray:
     """Return the noise of the first ``samples`` rollouts of a cell, ``(width, samples)``."""
     return np.ascontiguousarray(noise.shared(cell.seed, cell.scene.name, 1, cell.samples, width)[0].T)

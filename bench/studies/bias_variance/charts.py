@@ -106,7 +106,6 @@ def with_plotted_columns(rows: pd.DataFrame) -> pd.DataFrame:
         problem_=titled(rows.assign(**named_values(rows, POOLED)), ["scene", "contact", *POOLED]),
         line=rows["backend"] + " " + rows["dtype"],
         failed=~good,
-        row=np.arange(len(rows), dtype=float),
     )
 
 
@@ -148,13 +147,11 @@ def _along(
     styles: Mapping[str, Style],
     subtitle: str,
 ) -> Chart | None:
-    """Return the chart of errors along an axis: print draws the main estimators on the main problems, the page all."""
+    """Return the chart of errors along an axis, of the main estimators on the main problems."""
     problems = [p for p in split_by_problem(shown, axis) if attempted(p.rows)["x"].nunique() > 1]
     if not problems:
         return None
     frame = pd.concat([_lines(problem) for problem in problems], ignore_index=True)
-    if shown.rows["seed"].nunique() > 1:
-        frame = frame.drop(columns="row")  # a median over seeds is not a cell
     drawn, notes = choose_problems(problems, PANELS)
     names = _main_series(frame, methods, comparisons)
     total = frame["series"].nunique()

@@ -54,13 +54,13 @@ def searches(rows: pd.DataFrame) -> pd.DataFrame:
     Methods that use costs only have kind ``costs only``. Copies of the best gradient with fewer samples are left out.
     """
     lines = []
-    for index, row in rows[rows["status"] == "ok"].iterrows():
+    for _, row in rows[rows["status"] == "ok"].iterrows():
         kind, dose = _kind(row)
         shape = (-1, len(TARGETS))
         times = np.nan_to_num(np.asarray(row["updates"], dtype=float), nan=np.inf).reshape(shape[::-1])
         by_rate = np.nan_to_num(np.asarray(row["rate_updates"], dtype=float), nan=np.inf).reshape(shape)
         lines += [{
-            "row": index, "problem": problem_name(row), "scene": row["scene"], "scene_class": row["scene_class"], "kind": kind,
+            "problem": problem_name(row), "scene": row["scene"], "scene_class": row["scene_class"], "kind": kind,
             "method": _method(row, kind), "dose": dose, "target": target, "times": times[k], "median": float(np.median(times[k])),
             "samples": row["samples"], "rates": np.asarray(row["rates"], dtype=float), "by_rate": by_rate[:, k],
             "best_rate": row["best_rates"][k], "inside": bool(row["is_inside"][k]), **{name: row[name] for name in MEASURED},

@@ -7,13 +7,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.special import stdtrit
 
 from bench.experiment.cell import Cell
 from bench.experiment.session import Session
 from bench.measure import noise
 from bench.model import Jacobians, Problem, Rollout, columns
-from bench.studies import norm
+from bench.studies import mean_interval, norm
 from bench.studies.growth import ORDERS, QUANTILES, Growth
 
 ROUNDING = 1e-6
@@ -91,9 +90,7 @@ def rate(logarithms: np.ndarray, steps: int) -> tuple[float, float, float]:
     rates = logarithms[np.isfinite(logarithms)] / steps
     if rates.size < 2:
         return math.nan, -math.inf, math.inf
-    reach = float(stdtrit(rates.size - 1, 0.975)) * float(rates.std(ddof=1)) / math.sqrt(rates.size)
-    mean = float(rates.mean())
-    return mean, mean - reach, mean + reach
+    return mean_interval(rates)
 
 
 def classify(stretch_high: float, spectral_low: float, tolerance: float) -> str:

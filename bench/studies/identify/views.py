@@ -77,7 +77,7 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     given = given[(given["status"] == "ok") & (given["units"].map(np.ndim) > 0)]
     names = problem_names(shown, PARTS, rows=given)
     given = given.assign(
-        row=given.index, scan=names, intervals=[values[0] for values in given["intervals"]],
+        scan=names, intervals=[values[0] for values in given["intervals"]],
         problem=names + (", " + given["optimizer"] if given["optimizer"].nunique() > 1 else ""),
     )  # fmt: skip
     by_name = {c.name: replace(c, kind="number") if c.name in STATISTICS else c for c in experiment.columns.all}
@@ -108,7 +108,7 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
         ),
         Table("estimates", found, [], files=["csv"]),
         Table("unnoticed", hidden, [], files=["csv"]),
-        Table("fits", lines.drop(columns="row"), [], files=["csv"]),
+        Table("fits", lines, [], files=["csv"]),
     ]  # fmt: skip
     scans = scanned(given)
     if len(scans):
@@ -126,8 +126,8 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
 
 
 def fits_of(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return one line per problem, optimizer, seed and shooting method; ``row`` is the position of the cell."""
-    kept = ["row", "problem", "scene", "integrator", "condition", "fits", "explained"]
+    """Return one line per problem, optimizer, seed and shooting method."""
+    kept = ["problem", "scene", "integrator", "condition", "fits", "explained"]
     lines = rows[[*kept, "shooting", *STATISTICS]].explode(["shooting", *STATISTICS], ignore_index=True)
     lines = lines.astype(dict.fromkeys(STATISTICS, float))
     low, high = error_interval(lines["error"], lines["converged"] * lines["fits"])
@@ -215,7 +215,7 @@ def scanned(rows: pd.DataFrame) -> pd.DataFrame:
         losses = np.array(row["scan_loss"], dtype=float).reshape(len(names), len(steps), -1)
         for i, j in np.ndindex(losses.shape[:2]):
             lines.append({
-                "row": row["row"], "problem": row["scan"], "unknown": names[i], "unit": row["units"][i],
+                "problem": row["scan"], "unknown": names[i], "unit": row["units"][i],
                 "values": losses.shape[2], "from": row["scan_low"][i], "to": row["scan_high"][i], "steps": steps[j],
                 "minima": row["minima"][i * len(steps) + j], "minima_open": row["minima_open"][i * len(steps) + j],
                 "truth": row["truth"][i],
@@ -235,9 +235,7 @@ def scan_charts(scans: pd.DataFrame) -> list[Chart]:
                 part = "whole record" if line["steps"] == one["steps"] else "windows"
                 panel = f"{part} of {line['steps']} steps, local minima: {line['minima']:.0f}"
                 values = np.linspace(line["from"], line["to"], len(loss))
-                curve = pd.DataFrame(
-                    {"value": values, "loss": loss, "part": CURVE, "window": panel, "row": line["row"]}
-                )
+                curve = pd.DataFrame({"value": values, "loss": loss, "part": CURVE, "window": panel})
                 parts += [curve, curve[is_minimum(loss)].assign(part=MINIMUM)]
             charts_.append(Chart(
                 f"scan_{unknown}" + f"_{place + 1}" * (place > 0), pd.concat(parts, ignore_index=True),

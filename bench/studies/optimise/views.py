@@ -217,7 +217,7 @@ def _quality(runs: RunSet, default: float) -> Chart | None:
     frame = points.assign(art=points["art"].mask(missed), missed=missed, scene=scenes)
     return Chart(
         "quality_runtime", frame, [ERROR], [replace(RUNTIME, low="", high="")], "points", panel="scene_class",
-        shape="scene", panel_notes=dict(zip(rho["scene_class"], rho["verdict"], strict=True)), failed="missed", across=2, height=1.9, own_scales=False,
+        shape="scene", panel_notes=dict(zip(rho["scene_class"], rho["verdict"], strict=True)), failed="missed", across=2, height=1.9,
         subtitle="average runtime: expected rollouts per search that reaches a tenth of the first regret; a cross: never reached",
         text="A point per problem and method. Methods that never reach the target have no point.",
     )  # fmt: skip

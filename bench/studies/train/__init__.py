@@ -3,24 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import ClassVar
 
 from bench.experiment.cell import Cell
 from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, text
-from bench.experiment.experiment import Experiment
-from bench.experiment.session import Session
-from bench.experiment.study import Study
-from bench.experiment.views import Views
 from bench.model import Trainer, param
 from bench.model.policy import PolicyScene
 from bench.model.trainer import LOGGED
-
-if TYPE_CHECKING:
-    import pandas as pd
+from bench.studies import StudyPackage
 
 
 @dataclass(frozen=True)
-class Train(Study):
+class Train(StudyPackage):
     """Trains a policy with each trainer and seed; records returns along the run and a log of every update."""
 
     name = "train"
@@ -78,12 +72,6 @@ class Train(Study):
         250, "most entries of a stored log; an entry is the mean or largest value of its updates", low=10
     )
 
-    def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
-        """Return one cell's results by column: returns along the run, and the log."""
-        from bench.studies.train.measure import measure
-
-        return measure(cell, session, self)
-
     def unsupported_reason(self, cell: Cell) -> str | None:
         """Return why a policy cannot be trained in a cell, or None."""
         if not isinstance(cell.parts["trainer"], Trainer):
@@ -93,9 +81,3 @@ class Train(Study):
         if not hasattr(cell.backend, "ops"):
             return f"backend {cell.backend.name} does not run programs in JAX, which trainers do"
         return None
-
-    def views(self, experiment: Experiment, rows: pd.DataFrame) -> Views:
-        """Return the table of returns, the table of windows, and charts of returns and logs."""
-        from bench.studies.train.views import views
-
-        return views(experiment, rows)

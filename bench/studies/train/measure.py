@@ -15,12 +15,11 @@ from bench.measure import noise
 from bench.measure.statistics import Sampling, bias_interval
 from bench.model import Trainer
 from bench.model.trainer import LOGGED
+from bench.studies.train import Train
 from bench.studies.train.verdicts import FINITE
 from bench.training.environment import Environment
 from bench.training.run import Training
 
-Settings = Any
-"""A ``Train`` study: its parameters are the settings. Its module imports this module, so its type cannot be named."""
 MEANS = frozenset({"loss", "reward", "value_loss", "cut", "used", "contacts", "step_length", "deviation"})
 """Quantities whose mean an entry of a stored log has; it has the largest value of the others, so that no peak is lost."""
 Z = 1.959963984540054
@@ -29,7 +28,7 @@ SHIFTS = {"float64": (1e-3, 1e-4, 1e-5, 1e-6), "float32": (1e-2, 1e-3, 1e-4, 1e-
 """Lengths of the change of the actor's parameters in central differences: curvature spoils long ones, rounding short ones."""
 
 
-def measure(cell: Cell, session: Session, settings: Settings) -> dict[str, Any]:
+def measure(cell: Cell, session: Session, settings: Train) -> dict[str, Any]:
     """Return one cell's results by column."""
     trainer, backend = cell.parts["trainer"], cell.backend
     assert isinstance(trainer, Trainer)

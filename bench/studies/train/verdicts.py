@@ -9,13 +9,14 @@ from typing import Any
 import numpy as np
 
 from bench.model.trainer import LOGGED
+from bench.studies import mean_interval
 
 FACTOR = 100.0
 """Factor between the gradients of the first ten updates and of the last tenth of a run, above which it grows or vanishes."""
 PEAK, USUAL = 200.0, 0.9
 """Factor on a run's usual gradient, this quantile of all, above which one explodes; clipping absorbs smaller peaks."""
 FIRST = 10
-"""Updates at the start whose smallest gradient, and whose largest parameter, are compared."""
+"""Updates at the start whose smallest gradient is compared with the last tenth of a run."""
 SILENT = 0.2
 """Share of updates with a gradient of exactly 0 that is a fault: less may come from saturated actions."""
 LOST = 0.5
@@ -93,7 +94,9 @@ def judge(run: Mapping[str, Any]) -> list[Verdict]:
     check("differences", error > DISAGREES, error)
     cosines = _series(run["cosine"])
     cosines = cosines[np.isfinite(cosines)]
-    check("opposed", len(cosines) >= MIN_CHECKS and _student(cosines)[1] < 0, cosines.mean() if len(cosines) else 0.0)
+    check(
+        "opposed", len(cosines) >= MIN_CHECKS and mean_interval(cosines)[2] < 0, cosines.mean() if len(cosines) else 0.0
+    )
     _check_return(run, check)
     reward, depth = log["reward"], log["penetration"]
     if len(depth) >= 3 * tenth and tenth > 1 and depth[:tenth].mean() > 0:
@@ -132,14 +135,6 @@ def _rises(run: Mapping[str, Any], since: float) -> bool:
     return bool(run["curve_return_low"][-1] > run["curve_return_high"][at])
 
 
-def _student(values: np.ndarray) -> tuple[float, float]:
-    """Return Student's 95% interval of the mean of independent values."""
-    from scipy.special import stdtrit
-
-    half = float(stdtrit(len(values) - 1, 0.975)) * float(values.std(ddof=1)) / math.sqrt(len(values))
-    return float(values.mean()) - half, float(values.mean()) + half
-
-
 def _is_below(a: np.ndarray, b: np.ndarray) -> bool:
     """Return whether the mean of ``a`` is certainly below that of ``b``: their Student intervals do not overlap."""
-    return bool(np.isfinite([*a, *b]).all() and _student(a)[1] < _student(b)[0])
+    return bool(np.isfinite([*a, *b]).all() and mean_interval(a)[2] < mean_interval(b)[1])

@@ -12,7 +12,6 @@ from bench.experiment.columns import Column, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Style, Table, Views
 from bench.report.style import DEVIANT, VARIANTS, colour, marker
-from bench.report.writer import reasons
 from bench.studies.train import aggregate
 from bench.studies.train.verdicts import MEANINGS
 
@@ -63,7 +62,7 @@ QUANTITIES = {
 LOGARITHMIC = ("gradient_norm", "gradient_largest")
 """Quantities that are drawn as their logarithms, since spikes are orders of magnitude high."""
 MAX_LOGS = 4
-"""Most trainers in the printed chart of logs, the best of each family; the page has all."""
+"""Most trainers in the chart of logs, the best of each family."""
 LINES = (*VARIANTS, *DEVIANT)
 SEEDS = f"interquartile mean over seeds, with its 95% bootstrap interval from {aggregate.MIN_SEEDS} seeds on"
 NOTE = (
@@ -93,7 +92,7 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     data = table(experiment, rows)
     if runs.empty:
         every = Table("train", rows, [text("scene"), text("trainer"), text("status")], data=data)
-        return Views([every], remarks=reasons(rows))
+        return Views([every])
     summary, windows, faults = aggregate.summarise(runs), aggregate.windows(runs), aggregate.faults(runs)
     summary = summary.assign(verdict=aggregate.ranked(summary, ["problem"])).drop(columns="returns")
     tables = [
@@ -121,7 +120,7 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     cells = rows.assign(problem=runs["problem"], method=runs["method"]).fillna({"problem": "", "method": ""})
     by_name = experiment.columns.by_name
     return Views(tables, _charts(runs, summary, windows), cells,
-                 [METHOD, *(by_name[name] for name in PAGE)], reasons(rows))  # fmt: skip
+                 [METHOD, *(by_name[name] for name in PAGE)])  # fmt: skip
 
 
 def _styles(summary: pd.DataFrame) -> dict[str, Style]:
