@@ -96,6 +96,8 @@ class Chart:
     """Most panels side by side."""
     height: float = 2.3
     """Height of a panel in inches; of a row of dots or cells, in ``dots`` and ``grid``, if below 1."""
+    front: bool = False
+    """Whether a line joins the Pareto front of a panel: the points that no other beats in x and y, smaller being better."""
     band: bool = False
     """Whether intervals are drawn as bands and not as bars."""
     shape: str = ""

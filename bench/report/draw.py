@@ -28,7 +28,7 @@ from bench.experiment.views import Chart, Mark, Style
 from bench.report.scales import log_axis
 from bench.report.style import GREY, MARKERS, MARKS, SHADE, SIZE, colour, plain, width_in_inches
 from bench.report.text import axis_value, duration
-from bench.report.views import is_logarithmic
+from bench.report.views import is_logarithmic, pareto
 
 WIDTH, NARROW = 7.16, 3.5
 """Figure widths in inches: two columns of a paper, or one."""
@@ -42,6 +42,8 @@ UNLIMITED = 1e9
 """Factor on a value at which the bar of an interval without an upper end stops, beyond every logarithmic axis."""
 BAND: dict[str, Any] = {"color": "#D55E00", "alpha": 0.12, "linewidth": 0}
 """Look of a named range of an axis."""
+FRONT: dict[str, Any] = {"color": GREY, "linewidth": 0.8, "linestyle": "--"}
+"""Look of the Pareto front."""
 MANY = 12
 """Most points of a line that are drawn with markers; longer lines are drawn without."""
 
@@ -78,6 +80,7 @@ def draw(chart: Chart, width: float | None = None) -> Figure:
     legend = [] if chart.labels == "ends" else _legend(chart, styles, width - 0.6)
     bands = dict.fromkeys(mark.name for mark in chart.marks if mark.to is not None)
     legend += [Patch(label=plain(name), **BAND) for name in bands]
+    legend += [Line2D([], [], label="Pareto front", **FRONT)] * chart.front
     columns = _legend_columns([str(handle.get_label()) for handle in legend], width)
     heights = [height + 0.5 * max(map(width_in_inches, map(plain, places)), default=0.0) for height in heights]
     lines = [str(handle.get_label()).count("\n") + 1 for handle in legend]  # one column if any label is broken
@@ -380,6 +383,10 @@ def _draw_lines(chart: Chart, panel: Axes, name: str, part: pd.DataFrame, styles
                 places[lost], np.full(lost.sum(), 0.97), "x", transform=panel.get_xaxis_transform(), markersize=5,
                 markeredgewidth=1.4, clip_on=False, **common,
             )  # fmt: skip
+    if chart.front:
+        known = part[np.isfinite(part[[x.name, y.name]]).all(axis=1)].sort_values(x.name)
+        best = known[pareto(known[x.name], known[y.name])]
+        panel.plot(best[x.name], best[y.name], zorder=2, **FRONT)
 
 
 def _values(points: pd.DataFrame, column: Column, log: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

@@ -28,8 +28,10 @@ from helpers import (
     table,
 )
 from matplotlib.figure import Figure
+from trees import ROOT
 
 from bench.cli import main
+from bench.experiment import config
 from bench.experiment.axes import axes
 from bench.experiment.experiment import TableLayout
 from bench.report import latex, views, writer
@@ -100,6 +102,19 @@ def test_pareto_is_what_brute_force_finds():
     time, error = (pd.Series(np.random.default_rng(seed).integers(1, 6, 60) / 10) for seed in (0, 1))
     beaten = [((time < t) & (error < e)).any() for t, e in zip(time, error, strict=True)]
     assert list(views.pareto(time, error)) == [not one for one in beaten]
+
+
+def test_a_chart_of_speed_and_accuracy_marks_the_pareto_front():
+    swept = config.load(["experiment=stiffness_sweep"])
+    shown = swept.study.views(swept, pd.read_parquet(ROOT / "results/standard/stiffness_sweep" / "rows.parquet"))
+    chart = next(c for c in shown.charts if c.name == "speed_accuracy")
+    lines = [line for axes in draw(chart).axes for line in axes.lines if line.get_linestyle() == "--"]
+    assert len(lines) == chart.drawn()["problem_"].nunique()
+    for line in lines:
+        x, y = map(np.asarray, line.get_data())
+        assert x.size
+        assert (np.diff(x) >= 0).all()
+        assert (np.diff(y) <= 0).all()
 
 
 def test_bias_within_its_noise_is_told_apart(made):

@@ -282,7 +282,7 @@ def _error_and_cost(shown: Arranged, styles: Mapping[str, Style], subtitle: str)
     return Chart(
         "speed_accuracy", rows, [SECONDS], [RMSE], "points", series="series", shape="backend", panel="problem_",
         styles=styles, across=3, height=1.9, subtitle=", ".join(filter(None, [subtitle, *shares])),
-        chosen=(("problem_", chosen),),
+        chosen=(("problem_", chosen),), front=True,
     )  # fmt: skip
 
 
