@@ -14,6 +14,7 @@ import json
 import re
 from collections.abc import Callable
 from functools import cache
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -21,15 +22,15 @@ import pandas as pd
 
 from bench.experiment import config
 from bench.measure.performance import wilson
+from bench.model import registry
 from bench.report import answer
 from bench.report.text import axis_value, number
 from bench.report.text import interval as text_of_interval
 from bench.report.text import span as ends_of
 from bench.studies.bias_variance import trust
-from bench.studies.dose_response import analysis
 from bench.studies.gradient_check.points import is_trusted
 from bench.studies.train import aggregate
-from docs.results import STANDARD, answer_of, comparison, rmse_interval, rows_of, select, table_of
+from docs.results import PAPER, STANDARD, answer_of, comparison, rmse_interval, rows_of, select, table_of
 
 MARK = re.compile(r"<!--=([\w.-]+|[^>\n]+\|.*?)-->(.*?)<!--/-->", re.DOTALL)
 SOURCE = re.compile(r"<!-- figures: (.*?) -->\n?")
@@ -471,6 +472,8 @@ def dose_runs() -> str:
 
 def windows_missed() -> str:
     """Return on how many problems the best gradient reaches 1/100 and a window of no length does, of how many."""
+    registry.add_folder(PAPER)
+    analysis = import_module(f"{registry.usable('studies', 'dose_response').__module__}.analysis")
     searches = analysis.searches(rows_of("dose_response_windows")).query("target == 100")
     medians = searches.pivot_table(index="problem", columns="method", values="median", aggfunc="first")
     missed = np.isfinite(medians[analysis.BEST]) & np.isinf(medians.filter(like="windowed")).all(axis=1)

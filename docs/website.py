@@ -171,8 +171,8 @@ def experiment_page(entry: Entry) -> str:
         parts.append(f"{{.finding}}\n{escape_markdown(entry.answer)}")
     if entry.chart:
         parts.append(f"![{escape_markdown(entry.question)}]({folder}/{entry.chart.name})")
-    parts += ["## Run it", f"    python -m bench +experiment={entry.name}", "Or write its page from the stored rows:"]
-    parts += [f"    python -m bench report +experiment={entry.name} results_dir=results/standard", entry.made]
+    parts += ["## Run it", f"    {entry.command}", "Or write its page from the stored rows:"]
+    parts += [f"    {entry.command.replace('bench', 'bench report', 1)} results_dir=results/standard", entry.made]
     for path in entry.tables:
         table = short_tables(path.read_text())
         parts.append(f"## {path.stem.replace('_', ' ').capitalize()}\n\n{table}" if table else "")

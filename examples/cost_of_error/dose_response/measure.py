@@ -5,19 +5,21 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from bench.errors import Unsupported
 from bench.experiment.cell import Cell
-from bench.experiment.config import config_dir
 from bench.experiment.session import Session
 from bench.measure import noise
 from bench.model import Estimator, Optimizer, Problem
-from bench.studies.dose_response import DoseResponse
-from bench.studies.dose_response.ground import Ground, ground_of, scored_noise
-from bench.studies.dose_response.search import (
+from bench.studies.optimise.search import fastest, scene_class
+
+from . import DoseResponse
+from .ground import Ground, ground_of, scored_noise
+from .search import (
     MOST_NUMBERS,
     Method,
     Task,
@@ -26,9 +28,8 @@ from bench.studies.dose_response.search import (
     unit_rate,
     with_rate,
 )
-from bench.studies.optimise.search import fastest, scene_class
 
-HYPOTHESES = config_dir() / "hypotheses" / "dose_response.md"
+HYPOTHESES = Path(__file__).parents[1] / "hypotheses.md"
 """The hypotheses that were written before the first run."""
 TUNING_SEED = 10_000
 """First seed of the searches that choose the rate."""

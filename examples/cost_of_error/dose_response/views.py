@@ -10,8 +10,9 @@ from bench.experiment.columns import Column, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Style, Table, Views
 from bench.report.style import MARKERS, PALETTE, VARIANTS
-from bench.studies.dose_response import analysis
-from bench.studies.dose_response.analysis import BIAS, COSTS_ONLY, FIXED, MAIN, RANDOM, ROTATION, TAILS
+
+from . import analysis
+from .analysis import BIAS, COSTS_ONLY, FIXED, MAIN, RANDOM, ROTATION, TAILS
 
 STYLES = {
     RANDOM: Style(PALETTE[0], "o"),

@@ -12,7 +12,8 @@ import pandas as pd
 from scipy.special import bdtr
 
 from bench.report.text import axis_value
-from bench.studies.dose_response.search import TARGETS
+
+from .search import TARGETS
 
 CLASSES = ("smooth", "stiff", "discontinuous", "chaotic", "identification")
 """The classes of problems, in the order in which they are shown."""
