@@ -154,7 +154,7 @@ def score(method: str, column: str = "rmse_rel", **conditions: Any) -> float:
     return float(value)
 
 
-CONTACT, JUMP = "pushing, penalty", "heaviside[theta=0.05]"
+CONTACT, JUMP = "pushing", "heaviside"
 """The stiff contact and the jump of ``estimators``."""
 
 
@@ -683,12 +683,12 @@ FIGURES: dict[str, Callable[[], str]] = {
     "spring-rk4": lambda: percent(right("mass_spring")["rk4"]),
     "spring-implicit": lambda: percent(right("mass_spring")["implicit_euler"]),
     "ball-event": lambda: percent(right("bouncing_ball", "impulse")["event_driven"]),
-    "clip-90": lambda: span(estimators("clipped", problem=CONTACT)),
-    "clip-50": lambda: span(estimators("clipped", "quantile=0.5", problem=CONTACT)),
-    "difference-short": lambda: span(estimators("finite_difference", problem=CONTACT)),
-    "difference-long": lambda: span(estimators("finite_difference", "step=0.1", problem=CONTACT)),
-    "weights-contact": lambda: span(estimators("total_propagation", "per=action", problem=CONTACT)),
-    "weights-jump": lambda: span(estimators("total_propagation", problem=JUMP)),
+    "clip-90": lambda: span(estimators("clipped", scene=CONTACT)),
+    "clip-50": lambda: span(estimators("clipped", "quantile=0.5", scene=CONTACT)),
+    "difference-short": lambda: span(estimators("finite_difference", scene=CONTACT)),
+    "difference-long": lambda: span(estimators("finite_difference", "step=0.1", scene=CONTACT)),
+    "weights-contact": lambda: span(estimators("total_propagation", "per=action", scene=CONTACT)),
+    "weights-jump": lambda: span(estimators("total_propagation", scene=JUMP)),
     "equal-rollouts": equal_rollouts_table,
     "equal-rollouts-reference": equal_rollouts_reference,
     "backward-memory": backward_memory_table,

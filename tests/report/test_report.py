@@ -303,6 +303,21 @@ def test_a_parameter_in_an_identity_string_is_an_axis():
     assert "bias_variance_ratio" in drawn(rows, ["ratio"], sweep=sweep)
 
 
+def test_a_problem_is_named_by_every_parameter_that_differs_from_its_scenes_defaults():
+    words = ["contacts=['penalty[stiffness=1e5]']", "sweep.samples=[16,64]", "estimators=[fobg]"]
+    for more, name in (
+        (["scenes=['pushing[sigma=0.2]',bouncing_ball]"], "pushing[sigma=0.2], penalty[stiffness=100000]"),
+        (
+            ["scenes=['pushing[horizon=8]']", "sweep.sigma=[0.1,0.3]"],
+            "pushing[horizon=8], penalty[stiffness=100000], sigma=0.1",
+        ),
+        (["scenes=[pushing]", "sweep.stiffness=[10,1e5]"], "pushing, penalty, stiffness=10"),
+    ):
+        given, cells = loaded(*words, *more)
+        shown = views.arrange(given, rows_of(given, cells))
+        assert split_by_problem(shown, axes(given.sweep, shown.rows)[0], ("scene", "contact"))[0].title() == name
+
+
 def test_the_parameter_behind_smoothing_is_an_axis():
     sweep = {"union": [{"beta": [1.0, 10.0]}, {"kappa": [1e-6, 1e-4]}]}
     rows = [row(contact="softplus", smoothing=b) for b in (1.0, 10.0)]
