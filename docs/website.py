@@ -191,11 +191,11 @@ LONGEST = 30
 
 
 def short_tables(text: str) -> str:
-    """Return the tables and notes of a Markdown file without its title and the list of every cell.
+    """Return the tables and notes of a Markdown file without its title.
 
     Headings become bold lines, and of a table with more than :data:`LONGEST` rows the first ones are shown.
     """
-    text = re.sub(r"\A# .*\n", "", text).partition("\n## Every cell")[0]
+    text = re.sub(r"\A# .*\n", "", text)
     lines: list[str] = []
     count = 0
     for line in text.splitlines():

@@ -204,9 +204,13 @@ def build_plugins(given: Mapping[str, Any]) -> dict[str, Plugin | None]:
     for axis, part in given.items():
         if axis in NOT_PLUGINS:
             continue
-        values = {} if part is None else {name: value for name, value in part.items() if name != "name"}
-        parts[axis] = None if part is None else build(registry.usable(registry.kind_of(axis), part["name"]), values)
+        parts[axis] = None if part is None else build_part(axis, part)
     return parts
+
+
+def build_part(axis: str, part: Mapping[str, Any]) -> Plugin:
+    """Return the plugin of one axis from its name and parameters; raises :class:`UserError` if it is not installed."""
+    return build(registry.usable(registry.kind_of(axis), part["name"]), {k: v for k, v in part.items() if k != "name"})
 
 
 def relabel(rows: pd.DataFrame, axes: Sequence[Axis]) -> pd.DataFrame:
@@ -227,7 +231,7 @@ def relabel(rows: pd.DataFrame, axes: Sequence[Axis]) -> pd.DataFrame:
         problem = {axis: part for axis, part in given.items() if axis != "estimator"}
         lines.append(read(json.dumps(problem)) | read(json.dumps(estimator)))
     changed = dict.fromkeys(name for line in lines for name in line)
-    columns = {name: [line.get(name) for line in lines] for name in changed}
+    columns = {name: [line.get(name) for line in lines] for name in changed if name in rows}
     return rows.assign(
         **{
             name: [old if (new := texts[code]) is None else new for code, old in zip(codes, rows[name], strict=True)]
@@ -242,7 +246,7 @@ def _labels(given: Mapping[str, Any], names: Sequence[str], views: Sequence[str]
         for axis, part in given.items()
         if axis not in NOT_PLUGINS and part is not None
     }
-    if "estimator" in given and not hidden["estimator"]:
+    if "estimator" in given and not hidden.get("estimator"):
         return {}
     try:
         return labels(build_plugins(given), hidden, views)

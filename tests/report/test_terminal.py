@@ -10,7 +10,7 @@ from rich.console import Console
 
 from bench.experiment import config
 from bench.report import finish, terminal, writer
-from bench.report.labels import Labels, shortened
+from bench.report.labels import Labels
 from bench.report.views import newest_rows
 from bench.run.execute import store_of
 
@@ -84,9 +84,9 @@ def test_two_columns_of_one_name_are_both_shown():
 
 
 def test_equal_parameters_have_equal_letters_and_short_names_stay():
-    labels, key = shortened([LONG, "fobg", "reinforce[baseline=none]", LONG.replace("alpha_order", "other")])
-    assert list(labels.values()) == ["alpha_order[a]", "fobg", "reinforce[baseline=none]", "other[a]"]
-    assert key == ["[a] delta=0.95, gamma=4, sharing=shared"]
+    labels, given = Labels(), [LONG, "fobg", "reinforce[baseline=none]", LONG.replace("alpha_order", "other")]
+    assert [*map(labels.short, given)] == ["alpha_order[a]", "fobg", "reinforce[baseline=none]", "other[a]"]
+    assert labels.key == ["[a] delta=0.95, gamma=4, sharing=shared"]
     many = Labels(longest=5)
     assert [many.short(f"name[x={index}]") for index in (0, 25, 0, 26)] == ["name[a]", "name[b]", "name[a]", "name[c]"]
     assert len({many.short(f"name[x={index}]") for index in range(800)}) == 800

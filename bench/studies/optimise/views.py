@@ -163,7 +163,7 @@ def styles(methods: Sequence[str], name: Callable[[str], str] = str) -> dict[str
 def charts(runs: RunSet, default: float, name: Callable[[str], str]) -> list[Chart]:
     """Return the charts, the shares of targets reached first."""
     looks = styles(runs.rows["method"].unique(), name)
-    found = (_targets(runs, default), _progress(runs, default), _quality(runs, default), _path_quality(runs))
+    found = (_targets(runs, default), _progress(runs, default), _quality(runs, default))
     return [
         replace(chart, frame=chart.frame.assign(method=chart.frame["method"].map(name)), series="method", styles=looks)
         for chart in found
@@ -220,14 +220,4 @@ def _quality(runs: RunSet, default: float) -> Chart | None:
         shape="scene", panel_notes=dict(zip(rho["scene_class"], rho["verdict"], strict=True)), failed="missed", across=2, height=1.9,
         subtitle="average runtime: expected rollouts per search that reaches a tenth of the first regret; a cross: never reached",
         text="A point per problem and method. Methods that never reach the target have no point.",
-    )  # fmt: skip
-
-
-def _path_quality(runs: RunSet) -> Chart | None:
-    """Return the gradient's error along the path; None if it was measured only at the start."""
-    frame = aggregate.path_quality(runs)
-    return None if frame.empty else Chart(
-        "path_quality", frame, [Column("iteration", log=False)],
-        [Column("value", label="relative error of a gradient", low="low", high="high", log=True)], panel="problem", band=True,
-        subtitle="medians and 20% to 80% of the seeds",
     )  # fmt: skip
