@@ -73,8 +73,8 @@ def code_of(plugin: type[Plugin]) -> str:
             revisions |= revisions_of(vars(owner).get("uses", ()))
         elif owner.__module__.partition(".")[0] not in sys.stdlib_module_names:
             module = sys.modules.get(owner.__module__)
-            if hasattr(module, "REVISION"):
-                revisions[owner.__qualname__] = module.REVISION
+            if revision := getattr(module, "REVISION", 0):
+                revisions[owner.__qualname__] = revision
             else:
                 files.append(getattr(module, "__file__", None))
     return json.dumps([raised(revisions), files_hash(Path(file) for file in files if file)])
