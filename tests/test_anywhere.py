@@ -112,8 +112,8 @@ OWN_STUDY = """
 from dataclasses import dataclass
 from typing import ClassVar
 import numpy as np
-from bench.experiment.columns import Column, Columns, ComparisonRule
-from bench.run.files import write_all
+from bench.experiment.columns import Column, Columns, ComparisonRule, text
+from bench.experiment.views import Table, Views
 from bench.experiment.study import Study
 
 @dataclass(frozen=True)
@@ -129,8 +129,8 @@ class CostAt(Study):
         w = np.zeros((problem.program.n_noise, 1))
         return {"status": "ok", "cost_at_theta": float(problem.value(problem.program.theta0, w)[0])}
 
-    def write(self, experiment, rows):
-        return write_all(experiment.directory, {"costs.csv": rows[["scene", "cost_at_theta"]].to_csv(index=False)})
+    def views(self, experiment, rows):
+        return Views([Table("costs", rows[["scene", "cost_at_theta"]], [text("scene")])])
 """
 EXPERIMENT = """
 # @package _global_

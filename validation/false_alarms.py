@@ -16,7 +16,7 @@ import numpy as np
 
 from bench.measure.gradcheck import FAULTS
 from bench.model import compose, registry
-from bench.studies.gradient_check import measure
+from bench.studies.gradient_check import GradientCheck, measure
 
 SCENES = (
     "pendulum", "double_pendulum", "cartpole", "mass_spring", "double_integrator", "stiff_decay", "quadratic",
@@ -54,7 +54,7 @@ def run(count, only=None, first=0):
     chosen = [entry for entry in programs() if only is None or only(entry[0])]
     cycle = [place for place, entry in enumerate(chosen) for _ in range(entry[3])]
     lines = []
-    unit, search = float(np.finfo(np.float64).eps), measure.SwitchSearch(2, 16, 2.0, 1e-4)
+    unit, search = float(np.finfo(np.float64).eps), GradientCheck()
     for place, (name, program, horizon, _) in enumerate(chosen):
         numbers = [n for n in range(first, count) if cycle[n % len(cycle)] == place]
         problem = registry.make("backends", "jax", {}).compile(program) if numbers else None

@@ -36,6 +36,8 @@ CELLS = {
     "policy": ["scenes=['cartpole_swing[policy=linear]']", "integrators=[rk4]", "backends=[numpy]", "estimators=[fobg]"],
 }  # fmt: skip
 """One cell of each kind whose keys are compared."""
+PAPER = ROOT / "examples" / "cost_of_error"
+EXPERIMENTS = sorted(path for folder in (ROOT / "conf", PAPER) for path in (folder / "experiment").rglob("*.yaml"))
 REFERENCED = {name for name in CELLS if name not in ("adam", "growth")}
 PUSHED = {"fobg", "reinforce", "windowed", "fused", "mujoco", "mjx", "adam", "growth"}
 MOVED = {
@@ -158,6 +160,12 @@ def test_a_plugin_from_outside_counts_by_its_file_and_what_that_imports_from_its
     assert outside("fourth_plugin", imports + "\nMORE = 1", **{helper: "GAIN = 1\n"}) != plain
 
 
+def test_a_plugin_from_outside_whose_module_has_a_revision_counts_by_it(outside):
+    first = outside("first_module", "REVISION = 1")
+    assert outside("second_module", "REVISION = 1\nMORE = 1") == first
+    assert json.loads(outside("third_module", "REVISION = 2")) == [{"Mine": 2}, ""]
+
+
 def test_a_plugin_from_outside_has_the_revisions_of_its_bases(outside, monkeypatch):
     from bench.plugins.estimators.fobg import Fobg
 
@@ -193,12 +201,13 @@ def test_an_estimator_whose_smoothing_fails_has_a_key_and_no_reference(cells, mo
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("path", sorted((ROOT / "conf/experiment").rglob("*.yaml")), ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", EXPERIMENTS, ids=lambda path: path.stem)
 def test_stored_rows_are_those_of_the_cells_of_their_experiment(path: Path):
     """Documents count the rows of a folder, so a row from an earlier version of the experiment would count too."""
     import pandas as pd
 
-    experiment = config.load([f"+experiment={path.relative_to(ROOT / 'conf/experiment').with_suffix('')}"])
+    folder = next(parent for parent in path.parents if parent.name == "experiment")
+    experiment = config.load([f"+experiment={path.relative_to(folder).with_suffix('')}", f"plugins={PAPER}"])
     stored = ROOT / "results/standard" / experiment.name / "rows.parquet"
     if stored.exists():
         found = pd.read_parquet(stored, columns=["key"])["key"]

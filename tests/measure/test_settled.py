@@ -5,10 +5,11 @@ import pytest
 
 from bench.measure import gradcheck
 from bench.model import compose, registry
-from bench.studies.gradient_check.measure import SwitchSearch, complex_step, start
+from bench.studies.gradient_check import GradientCheck
+from bench.studies.gradient_check.measure import complex_step, start
 
 UNIT = float(np.finfo(float).eps)
-SEARCH = SwitchSearch(2, 16, 2.0, 1e-4)
+SEARCH = GradientCheck()
 
 
 def check(cost, gradient, theta):

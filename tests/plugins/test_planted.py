@@ -8,10 +8,10 @@ from bench.plugins.estimators.fobg import Fobg
 from bench.plugins.estimators.planted import Planted, direction
 from bench.plugins.scenes.heaviside import Heaviside
 from bench.plugins.scenes.quadratic import Quadratic
+from dose_response.measure import compare
 from scipy.stats import f, kstest
 
 import bench
-from bench.studies.dose_response.measure import compare
 
 ROUNDING = 1e-12
 """Relative rounding of sums of 20 numbers."""
