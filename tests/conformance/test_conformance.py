@@ -13,6 +13,7 @@ from bench.plugins.contacts.penalty import Penalty
 from bench.plugins.contacts.softplus import Softplus
 from bench.plugins.estimators.sobol import Sobol
 from bench.plugins.integrators.explicit_euler import ExplicitEuler
+from bench.plugins.integrators.midpoint import Midpoint
 from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
 from bench.plugins.scenes.cubic import Cubic
 from bench.plugins.scenes.double_integrator import DoubleIntegrator
@@ -520,6 +521,26 @@ class DropsImpulses(ExplicitEuler):
     takes_impulses = True
 
 
+@dataclass(frozen=True)
+class WrongStabilityFunction(Midpoint):
+    """A second-order step that states the factor of a first-order one."""
+
+    name = "wrong_stability_function"
+
+    def amplification(self, z: Any) -> Any:
+        return 1 + z
+
+
+@dataclass(frozen=True)
+class ForgetsTheFactor(SemiImplicitEuler):
+    """States a matrix without the velocity factor."""
+
+    name = "forgets_the_factor"
+
+    def transition(self, dt: Any, stiffness: Any, damping: Any, factor: Any) -> Any:
+        return super().transition(dt, stiffness, damping, 1.0)
+
+
 # ---------------------------------------------------------------------------------------------- planted: any plugin
 
 
@@ -626,6 +647,8 @@ PLANTED = {
     OneSided: {"impulse_keeps_momentum"},
     WrongOrder: {"error_falls_with_declared_order"},
     DropsImpulses: {"takes_impulses_is_truthful"},
+    WrongStabilityFunction: {"amplification_is_that_of_the_step"},
+    ForgetsTheFactor: {"transition_is_that_of_the_step"},
     NotADataclass: {"is_frozen_dataclass"},
     Undocumented: {"has_docstring"},
     BadName: {"has_good_name"},

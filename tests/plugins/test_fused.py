@@ -13,8 +13,7 @@ from bench.model import Array, Compilations, FunctionScene, compose, param, regi
 pytest.importorskip("numba")
 
 from bench.plugins.backends.fused import _source, _Structure
-from bench.plugins.fused import functions, kernels, trace
-from bench.plugins.fused.graph import Graph, Refused
+from bench.plugins.fused import functions, kernels
 
 SAME = 1e-12
 """Relative difference allowed from JAX, which adds the same terms in another order."""
@@ -163,28 +162,6 @@ def test_an_operation_without_scalar_form_is_refused_by_name():
         registry.make("integrators", "semi_implicit_euler"),
     )
     assert "surrogate" in str(backend.incompatibility(surrogate))
-
-
-def test_formulas_of_a_step_are_found_along_the_horizon():
-    """A force in the first step only becomes one formula with a table, not one per step."""
-    tracer = trace._Tracer()
-    graph = tracer.loop.graph
-    early, late = graph.leaf("theta", 2), graph.literal(0.0)
-    node = tracer._along([early, late, late, late])
-    assert node.op == "select_n"
-    assert [table.tolist() for table in tracer.loop.constants] == [[0.0, 1.0, 1.0, 1.0]]
-    many = [graph.apply(op, early) for op in ("sin", "cos", "tan", "exp", "log")]
-    with pytest.raises(Refused, match="too many different forms"):
-        tracer._along(many)
-
-
-def test_equal_expressions_exist_once_and_nan_is_not_simplified_away():
-    graph = Graph()
-    x, y = graph.leaf("theta", 0), graph.leaf("theta", 1)
-    assert graph.apply("mul", x, y) is graph.apply("mul", y, x)
-    assert graph.apply("add", x, graph.literal(0.0)) is x
-    assert graph.apply("mul", graph.literal(0.0), x).op == "mul"
-    assert graph.apply("integer_pow", x, data=2) is graph.apply("mul", x, x)
 
 
 def test_sine_and_cosine_are_accurate_in_the_whole_range():

@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -10,7 +9,6 @@ from bench.plugins.backends.implicit import Implicit
 from bench.plugins.backends.jax import Jax
 from bench.plugins.backends.numpy import Numpy
 from bench.plugins.backends.torch import Torch
-from bench.plugins.contacts.complementarity import Complementarity
 from bench.plugins.contacts.impulse import Impulse
 from bench.plugins.contacts.penalty import Penalty
 from bench.plugins.integrators.event_driven import EventDriven
@@ -25,10 +23,7 @@ from bench.plugins.scenes.bounce_once import BounceOnce
 from bench.plugins.scenes.bouncing_ball import BouncingBall
 from bench.plugins.scenes.double_pendulum import DoublePendulum
 from bench.plugins.scenes.mass_spring import MassSpring
-from bench.plugins.scenes.pushing import Pushing
 
-from bench.conformance import check
-from bench.conformance.subjects import NewtonOps
 from bench.model import compose
 
 EXPLICIT = [ExplicitEuler(), SemiImplicitEuler(), Midpoint(), Rk4(), StormerVerlet(), EventDriven()]
@@ -57,47 +52,7 @@ def gradient(problem):
     return problem.grad(problem.program.theta0, quiet(problem))[:, 0]
 
 
-def states(scene, integrator):
-    """q and v at theta0 before each step and after the last, ``(horizon + 1, n, 1)`` each."""
-    program = compose(scene, None, integrator)
-    visited = [
-        state for state, _ in program.steps(NewtonOps(), scene.theta0()[:, None], np.zeros((program.n_noise, 1)))
-    ]
-    return tuple(np.stack([np.asarray(part) for part in parts]) for parts in zip(*visited, strict=True))
-
-
 # ------------------------------------------------------------------------------------- planted faults, and sources
-
-
-@dataclass(frozen=True)
-class WrongStabilityFunction(Rk4):
-    """A fourth-order step that states the factor of a second-order one."""
-
-    name = "wrong_stability_function"
-
-    def amplification(self, z):
-        return 1 + z + z * z / 2
-
-
-@dataclass(frozen=True)
-class ForgetsTheFactor(SemiImplicitEuler):
-    """States a matrix without the velocity factor."""
-
-    name = "forgets_the_factor"
-
-    def transition(self, dt, stiffness, damping, factor):
-        return super().transition(dt, stiffness, damping, 1.0)
-
-
-@pytest.mark.parametrize(
-    ("plugin", "fault"),
-    [
-        (WrongStabilityFunction, "amplification_is_that_of_the_step"),
-        (ForgetsTheFactor, "transition_is_that_of_the_step"),
-    ],
-)
-def test_planted_fault_is_caught(plugin, fault):
-    assert {result.check for result in check(plugin) if result.outcome == "fail"} == {fault}
 
 
 # -------------------------------------------------------------------------------------------------- mass_spring
@@ -218,24 +173,3 @@ def test_event_driven_comes_to_rest():
 
 
 # ---------------------------------------------------------------------------------------------------- implicit
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("scene", "law", "integrator"),
-    [
-        (DoublePendulum(horizon=50), None, ImplicitEuler()),
-        (DoublePendulum(horizon=50), None, ImplicitMidpoint()),
-        (Pushing(), Penalty(stiffness=1e7), ImplicitEuler()),
-        (BouncingBall(horizon=200, dt=0.005), Penalty(stiffness=1e4), ImplicitMidpoint()),
-        (BouncingBall(horizon=48, dt=0.01), Complementarity(), ImplicitEuler()),
-    ],
-    ids=lambda value: getattr(value, "name", "none"),
-)
-def test_implicit_gradient_is_that_of_its_program(scene, law, integrator):
-    problem = compiled(scene, integrator, law)
-    theta, w = scene.theta0(), 0.5 * normal(problem, 4)
-    exact, step = problem.grad(theta, w), 1e-6 * np.eye(theta.size)[0]
-    difference = (problem.value(theta + step, w) - problem.value(theta - step, w)) / 2e-6
-    # 1e-9: rounding of the costs over the step
-    assert np.abs(exact[0] - difference).max() <= 1e-5 * np.abs(exact).max() + 1e-9

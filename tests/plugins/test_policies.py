@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from bench.plugins.scenes.cartpole_swing import CartpoleSwing
 
-import bench
 from bench.errors import UserError
 from bench.experiment.by_name import compile_problem, make
 from bench.measure import noise
@@ -165,14 +164,3 @@ def test_energy_is_kept_without_force():
     for _ in range(60):
         state = program.step(LoopOps(), state, np.zeros((1, 1)))
     assert energy(*state) == pytest.approx(before, rel=1e-4)  # 24,000 steps of first order
-
-
-@pytest.mark.slow
-def test_policies_are_swept(tmp_path):
-    rows = bench.run(
-        name="policies", scenes=["cartpole_swing[horizon=20]"], backends=["jax"], estimators=["fobg"],
-        sweep={"policy": ["linear", "mlp[hidden=[8]]"]}, samples=4, repeats=4, timing=False, results_dir=tmp_path,
-        reference={"samples": 256},
-    )  # fmt: skip
-    assert rows.status.tolist() == ["ok", "ok"]
-    assert sorted(rows.dim) == [6, 57]
