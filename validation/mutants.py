@@ -44,7 +44,7 @@ GC, GD, GF, GK, GR, GS, GV = (
     for name in ("check", "direction", "few", "causes", "roughness", "sampling", "verdicts")
 )
 X = "plugins/estimators/"
-OF_TIMING = "tests/studies/test_flat.py tests/speed/test_speed.py::test_timing_repeats_fast_calls_and_keeps_the_results_asked_for tests/speed/test_speed.py::test_slow_calls_are_made_once_each tests/measure/test_timing.py"
+OF_TIMING = "tests/studies/test_flat.py tests/measure/test_timing.py"
 OF_STORE = "-m not\\ slow tests/run/test_store.py tests/run/test_nothing_lost.py"
 OF_CHECKS = "tests/measure/test_direction.py tests/measure/test_check.py"
 EL, EF, EX, ES, EG = (
@@ -105,9 +105,6 @@ GROUPS: dict[tuple[str, str], list[tuple[str, str]]] = {
     (B, OF_REFERENCE): [
         ("[..., :count]", ""),
     ],
-    (N, OF_REFERENCE): [
-        ("zlib.crc32(stream.encode())", "0"),
-    ],
     (S, OF_STATISTICS): [
         ("doubt = sum(error.trace**2 / error.degrees", "doubt = sum(error.trace / error.degrees"),
         ("ndtri(probability) if math.isinf(degrees) else stdtrit(degrees, probability)", "ndtri(probability)"),
@@ -160,6 +157,7 @@ GROUPS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("* f.shape[1] / (f.shape[1] - 1)", ""),
     ],
     (N, "tests/measure/test_noise.py"): [
+        ("zlib.crc32(stream.encode())", "0"),
         ("zlib.crc32(scene.encode()), repeat]", "0, repeat]"),
         ("zlib.crc32(scene.encode()), repeat]", "zlib.crc32(scene.encode()), 0]"),
         ("SeedSequence([seed, ", "SeedSequence([0, "),

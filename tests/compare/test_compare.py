@@ -113,17 +113,6 @@ def test_verdicts_are_judged_by_the_order_of_their_study(study, was, now, outcom
     assert only(found, outcome) == f"verdict {was} to {now}"
 
 
-@pytest.mark.parametrize("study", list(registry.entries()["studies"]))
-def test_the_columns_that_a_rule_needs_are_columns_of_the_study(study):
-    columns = sources.columns_of(study)
-    assert columns.compared
-    for column in columns.compared:
-        if column.comparison.by == "interval":
-            assert set(judging._interval_columns(column, columns)) <= set(columns.by_name)
-        if column.comparison.by == "verdict":
-            assert column.comparison.order
-
-
 def test_cells_are_matched_by_all_their_parameters():
     """Labels leave out defaults and timed calls; the parameters do not. Their order does not matter."""
     columns, rows = of_study("bias_variance", "scenes=[quadratic]")

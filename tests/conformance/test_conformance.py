@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from bench.plugins.backends.numpy import Numpy, NumpyProblem
 from bench.plugins.contacts.penalty import Penalty
-from bench.plugins.contacts.softplus import Softplus
 from bench.plugins.estimators.sobol import Sobol
 from bench.plugins.integrators.explicit_euler import ExplicitEuler
 from bench.plugins.integrators.midpoint import Midpoint
@@ -231,22 +230,6 @@ class Faulty(Numpy):
 
     def compile(self, program: Program) -> Problem:
         return self.faulty(program, self.dtype, 1e-6 if self.dtype == "float64" else 5e-3)
-
-
-class OtherLawProblem(NumpyProblem):
-    def _grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        program = self.program
-        if isinstance(program.contact, Penalty):
-            program = compose(program.scene, Softplus(stiffness=program.contact.stiffness), program.integrator)
-        return NumpyProblem(program, self._dtype.name, self._step)._grad(theta, w)
-
-
-@dataclass(frozen=True)
-class GradientOfAnotherLaw(Faulty):
-    """Costs of the penalty law, gradients of the softplus law."""
-
-    name = "gradient_of_another_law"
-    faulty = OtherLawProblem
 
 
 @dataclass(frozen=True)
@@ -621,7 +604,6 @@ PLANTED = {
     DeniesJumps: {"bias_across_jumps_is_as_declared"},
     LastingBias: {"bias_is_as_declared"},
     RefusesEverything: {"something_was_checked"},
-    GradientOfAnotherLaw: {"gradient_is_that_of_value"},
     HalfStiffnessGradient: {"gradient_is_that_of_value"},
     ClaimsSurrogates: {"gradient_is_that_of_value"},
     GradientOfItsOwnTheta: {"gradient_is_that_of_value"},

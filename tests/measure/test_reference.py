@@ -314,12 +314,6 @@ def test_constant_gradient_takes_the_least_samples_and_no_fewer():
     assert found_at(found, "n") == reference.LEAST_SAMPLES
 
 
-def test_streams_scenes_and_repeats_have_noise_of_their_own():
-    drawn = [noise.draw(0, scene, 2, 4, 1, stream) for scene in ("a", "b") for stream in ("cells", "pilot", "check")]
-    numbers = np.concatenate([block.ravel() for block in drawn])
-    assert np.unique(numbers).size == numbers.size
-
-
 def test_tails_that_samples_do_not_show_are_part_of_the_error():
     """4.2 sigma away, 1e-5 of samples: of 16384 none or one; far tails along each coordinate are looked at."""
     case = ridge(bank.power(1), bank.ramp(4.2, 2000.0), dim=3)
