@@ -1,9 +1,8 @@
-"""Counts the rule of when to trust `fobg` on scenes that were not used to find it: `python validation/trusted.py`.
+"""Counts the rule of when to trust `fobg` on scenes that were not used to find it: `python validation/trusted.py [new]`.
 
 The rule trusts a cell where one estimate spreads by less than half of its mean and the command `gradcheck` refuses nothing.
-Eighteen families have four or more scenes each. Scenes of even number in the first ten families may be looked at while the
-rule changes; those of odd number, and the last eight families, are only counted. A cell is one scene and one seed. It is wrong
-where the relative RMSE is 0.5 or more. The truth is a dense rule in one dimension, and 4 million pairs of costs in more.
+Eighteen families have three or four scenes each. A cell is one scene and one seed. It is wrong where the relative RMSE is
+0.5 or more. The truth is a dense rule in one dimension, and 4 million pairs of costs in more.
 """
 
 from __future__ import annotations
@@ -113,16 +112,12 @@ def latch(force: float, stiffness: float) -> Callable[[Any, Any], Any]:
 
 
 def friction(mu: float, width: float) -> Callable[[Any, Any], Any]:
-    """A block slides until dry friction stops it (width 0), or with friction smoothed over a slip speed."""
+    """A block slides with friction that is smoothed over a slip speed."""
 
     def cost(xp: Any, v0: Any) -> Any:
         x, v = 0.0 * v0[0], v0[0]
         for _ in range(50):
-            if width:
-                v = v - 0.02 * mu * 9.81 * xp.tanh(v / width)
-            else:
-                change = 0.02 * mu * 9.81
-                v = xp.where(xp.abs(v) > change, v - change * xp.sign(v), 0.0 * v)
+            v = v - 0.02 * mu * 9.81 * xp.tanh(v / width)
             x = x + 0.02 * v
         return (x - 0.3) ** 2
 
@@ -168,14 +163,14 @@ def chaos(rate: float, steps: int) -> Callable[[Any, Any], Any]:
     return cost
 
 
-def saturation(limit: float, gain: float, hard: bool) -> Callable[[Any, Any], Any]:
+def saturation(limit: float, gain: float) -> Callable[[Any, Any], Any]:
     """A servo with a limited actuator follows a step."""
 
     def cost(xp: Any, k: Any) -> Any:
         x, v = 0.0 * k[0], 0.0 * k[0]
         for _ in range(40):
             u = gain * k[0] * (1.0 - x) - 0.8 * v
-            u = xp.clip(u, -limit, limit) if hard else limit * xp.tanh(u / limit)
+            u = limit * xp.tanh(u / limit)
             v = v + 0.05 * u
             x = x + 0.05 * v
         return (x - 1.0) ** 2 + 0.05 * v * v
@@ -184,7 +179,7 @@ def saturation(limit: float, gain: float, hard: bool) -> Callable[[Any, Any], An
 
 
 def plane(dim: int, at: float, height: float) -> Callable[[Any, Any], Any]:
-    """A smooth cost of several inputs with a jump across a slanted plane, or without for height 0."""
+    """A smooth cost of several inputs with a jump across a slanted plane."""
     slanted = np.ones(dim) / math.sqrt(dim)
 
     def cost(xp: Any, x: Any) -> Any:
@@ -268,34 +263,25 @@ def table(edges: tuple[float, ...], values: tuple[float, ...], width: float) -> 
 
 def scenes() -> Iterator[Scene]:
     """Yield every scene, family by family."""
-    for at, height, drag in ((1.4, 1.0, 1.0), (1.2, 1.0, 1.0), (1.5, 3.0, 1.0), (1.7, 1.0, 1.0), (1.0, 0.2, 1.5), (1.3, 5.0, 0.7)):  # fmt: skip
+    for at, height, drag in ((1.2, 1.0, 1.0), (1.7, 1.0, 1.0), (1.3, 5.0, 0.7)):
         yield Scene("edge", f"at {at} by {height}, drag {drag}", edge(at, height, drag), (2.0,), 0.2)
-    for at, drop, sigma in ((1.8, 0.5, 0.2), (1.2, 0.5, 0.2), (2.2, 1.0, 0.3), (1.5, 0.1, 0.1), (3.0, 2.0, 0.2), (1.7, 0.02, 0.3)):  # fmt: skip
+    for at, drop, sigma in ((1.2, 0.5, 0.2), (1.5, 0.1, 0.1), (1.7, 0.02, 0.3)):
         yield Scene("ledge", f"at {at}, drop {drop}", ledge(at, drop), (3.0,), sigma)
-    for low, high, prize in ((0.8, 1.2, 1.0), (1.4, 1.6, 0.5), (0.2, 0.4, 2.0), (1.9, 2.5, 5.0), (-1.0, 0.1, 1.0), (0.95, 1.0, 0.2)):  # fmt: skip
+    for low, high, prize in ((1.4, 1.6, 0.5), (1.9, 2.5, 5.0), (0.95, 1.0, 0.2)):
         yield Scene("gate", f"{low} to {high} for {prize}", gate(low, high, prize), (0.4,), 0.3)
-    for force, stiffness, theta in ((0.2, 5.0, 1.0), (0.2, 20.0, 0.8), (0.5, 5.0, 0.5), (0.0, 5.0, 1.4), (0.3, 50.0, 1.0), (0.0, 1.0, 0.7)):  # fmt: skip
+    for force, stiffness, theta in ((0.2, 20.0, 0.8), (0.0, 5.0, 1.4), (0.0, 1.0, 0.7)):
         yield Scene("latch", f"force {force}, k {stiffness}, v {theta}", latch(force, stiffness), (theta,), 0.2)
-    for mu, width, theta in ((0.3, 0.0, 1.0), (0.3, 0.01, 1.0), (0.5, 0.0, 3.0), (0.1, 0.001, 1.0), (0.6, 0.0, 0.4), (0.2, 0.1, 2.0)):  # fmt: skip
+    for mu, width, theta in ((0.3, 0.01, 1.0), (0.1, 0.001, 1.0), (0.2, 0.1, 2.0)):
         yield Scene("friction", f"mu {mu}, slip {width}, v {theta}", friction(mu, width), (theta,), 0.2)
-    for target, wind, theta in ((2.0, 0.0, (3.0, 2.0)), (2.0, 0.1, (3.0, 2.0)), (1.0, 0.3, (4.0, 1.0)), (5.0, 0.05, (2.0, 5.0)), (1.7, 0.0, (3.0, 3.0)), (0.0, 1.0, (6.0, 6.0))):  # fmt: skip
+    for target, wind, theta in ((2.0, 0.1, (3.0, 2.0)), (5.0, 0.05, (2.0, 5.0)), (0.0, 1.0, (6.0, 6.0))):
         yield Scene("free flight", f"to {target}, drag {wind}, v {theta}", flight(target, wind), theta, 0.3)
-    for stiffness, wall, theta in ((100.0, 0.3, 1.0), (1e3, 0.3, 1.0), (1e4, 0.3, 1.0), (1e4, 0.6, 0.8), (5e4, 0.3, 1.0), (1e5, 0.75, 1.0)):  # fmt: skip
+    for stiffness, wall, theta in ((1e3, 0.3, 1.0), (1e4, 0.6, 0.8), (1e5, 0.75, 1.0)):
         yield Scene("soft contact", f"k {stiffness:g}, wall {wall}, v {theta}", contact(stiffness, wall), (theta,), 0.1)
-    for rate, steps in ((3.9, 3), (3.9, 6), (3.9, 12), (3.9, 30), (3.2, 30), (3.57, 40)):
+    for rate, steps in ((3.9, 6), (3.9, 30), (3.57, 40)):
         yield Scene("chaos", f"rate {rate}, {steps} steps", chaos(rate, steps), (0.3,), 0.1)
-    for limit, gain, hard in ((1.0, 1.0, True), (0.5, 2.0, False), (0.3, 4.0, True), (5.0, 1.0, False), (0.1, 4.0, True), (0.1, 4.0, False)):  # fmt: skip
-        yield Scene(
-            "saturation", f"limit {limit}, gain {gain}, hard {hard}", saturation(limit, gain, hard), (1.0,), 0.3
-        )
-    for dim, at, height in (
-        (2, 1.0, 1.0),
-        (3, 2.0, 3.0),
-        (5, 1.0, 0.0),
-        (5, 2.5, 10.0),
-        (10, 1.5, 2.0),
-        (10, 3.0, 22.6),
-    ):
+    for limit, gain in ((0.5, 2.0), (5.0, 1.0), (0.1, 4.0)):
+        yield Scene("saturation", f"limit {limit}, gain {gain}", saturation(limit, gain), (1.0,), 0.3)
+    for dim, at, height in ((3, 2.0, 3.0), (5, 2.5, 10.0), (10, 3.0, 22.6)):
         yield Scene("plane", f"d {dim}, at {at} by {height}", plane(dim, at, height), (0.5,) * dim, 1.0)
     for height, at, width in ((5.0, 0.7, 1e-5), (2.0, 1.5, 1e-6), (0.5, 0.2, 1e-4), (20.0, 2.2, 1e-5)):
         yield Scene("steep switch", f"{height} at {at} over {width}", switch(height, at, width), (0.0,), 1.0)
@@ -318,7 +304,7 @@ def scenes() -> Iterator[Scene]:
 
 
 NEW = ("steep switch", "far stop", "corner", "relay", "backlash", "quantiser", "delay", "table")
-"""Families that were added when the rule was complete, and are only counted."""
+"""Families that were added when the rule was complete."""
 PLUGIN = '''"""The scenes of trusted.py as a plugin, so that `gradcheck` runs on them as a user runs it."""
 
 from dataclasses import dataclass
@@ -422,16 +408,14 @@ def outcomes(index: int, scene: Scene, verdicts: dict[int, dict[int, str]]) -> l
 
 
 def main() -> int:
-    """Print a line per scene and the counts by part; return 1 if the rule trusts a wrong cell that was only counted.
+    """Print a line per scene and the counts by part; return 1 if the rule trusts a wrong cell.
 
     With the name of a part, as `new`, only its scenes are counted.
     """
-    parts: dict[str, list[Outcome]] = {"seen": [], "counted only": [], "new": []}
-    number: dict[str, int] = {}
+    parts: dict[str, list[Outcome]] = {"first": [], "new": []}
     chosen = []
     for index, scene in enumerate(scenes()):
-        place = number[scene.family] = number.get(scene.family, -1) + 1
-        part = "new" if scene.family in NEW else "counted only" if place % 2 else "seen"
+        part = "new" if scene.family in NEW else "first"
         if part in (sys.argv[1:] or parts):
             chosen.append((index, scene, part))
     with tempfile.TemporaryDirectory() as folder:
@@ -460,7 +444,7 @@ def main() -> int:
             f"{name}: cells of {n} scenes are trusted"
             + (f"; no wrong one: below {100 * (1 - 0.05 ** (1 / n)):.0f}% by scene" if n else "")
         )
-    return int(any(o.trusted and o.wrong for name in ("counted only", "new") for o in parts[name]))
+    return int(any(o.trusted and o.wrong for cells in parts.values() for o in cells))
 
 
 if __name__ == "__main__":

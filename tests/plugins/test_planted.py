@@ -86,11 +86,6 @@ def test_errors_relative_to_the_start_grow_as_the_gradient_falls():
     np.testing.assert_allclose(found, 0.5 * np.linalg.norm(exact[0]) * direction(D), rtol=1e-7)
 
 
-def test_without_an_error_it_equals_fobg():
-    p, w = problem(), drawn()
-    np.testing.assert_array_equal(Planted().estimate(p, p.program.theta0, w), Fobg().estimate(p, p.program.theta0, w))
-
-
 def test_best_gradient_of_a_jump_comes_from_costs():
     p = problem(Heaviside())
     w = drawn(repeats=8, samples=4000, width=1)
