@@ -27,7 +27,7 @@ PathFinder.find_spec = staticmethod(absent)
 
 
 @pytest.fixture(scope="module")
-def wheel(tmp_path_factory) -> Path:
+def wheel(tmp_path_factory):
     """The built wheel."""
     pytest.importorskip("hatchling")
     source = tmp_path_factory.mktemp("wheel") / "source"
@@ -40,7 +40,7 @@ def wheel(tmp_path_factory) -> Path:
     return source / command(sys.executable, "-c", script, cwd=source).splitlines()[-1]
 
 
-def command(python: Path | str, *words: str, cwd: Path) -> str:
+def command(python, *words, cwd):
     """Return the output of a command that sees nothing of this checkout and has to succeed."""
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     done = subprocess.run([str(python), *words], cwd=cwd, env=environment, capture_output=True, text=True)

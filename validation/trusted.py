@@ -5,13 +5,11 @@ Eighteen families have three or four scenes each. A cell is one scene and one se
 0.5 or more. The truth is a dense rule in one dimension, and 4 million pairs of costs in more.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -41,14 +39,14 @@ class Given(FunctionScene):
     name = "given"
     key: str = param("", "what tells programs apart, so that none runs the code compiled for another")
 
-    def __init__(self, key: str, function: Callable[[Any, Any], Any], theta: tuple[float, ...], sigma: float) -> None:
+    def __init__(self, key, function, theta, sigma):
         for name, value in dict(key=key, function=function, start=theta, sigma=sigma, noise="parameter").items():
             object.__setattr__(self, name, value)
 
-    def theta0(self) -> np.ndarray:
+    def theta0(self):
         return np.array(self.start)
 
-    def cost(self, xp: Any, x: Any) -> Any:
+    def cost(self, xp, x):
         return self.function(xp, x)
 
 
@@ -62,10 +60,10 @@ class Scene(NamedTuple):
     sigma: float
 
 
-def edge(at: float, height: float, drag: float) -> Callable[[Any, Any], Any]:
+def edge(at, height, drag):
     """A puck slides with viscous drag for 1 s; beyond the edge of the table the target is another."""
 
-    def cost(xp: Any, v0: Any) -> Any:
+    def cost(xp, v0):
         x, v = 0.0 * v0[0], v0[0]
         for _ in range(100):
             x, v = x + 0.01 * v, v - 0.01 * drag * v
@@ -74,10 +72,10 @@ def edge(at: float, height: float, drag: float) -> Callable[[Any, Any], Any]:
     return cost
 
 
-def ledge(at: float, drop: float) -> Callable[[Any, Any], Any]:
+def ledge(at, drop):
     """A ball thrown from 1 m lands on a floor that drops behind a ledge; the cost is the distance to 2 m."""
 
-    def cost(xp: Any, v: Any) -> Any:
+    def cost(xp, v):
         g, up = 9.81, 1.0
         near = (up + math.sqrt(up * up + 2 * g * 1.0)) / g
         far = (up + math.sqrt(up * up + 2 * g * (1.0 + drop))) / g
@@ -87,20 +85,20 @@ def ledge(at: float, drop: float) -> Callable[[Any, Any], Any]:
     return cost
 
 
-def gate(low: float, high: float, prize: float) -> Callable[[Any, Any], Any]:
+def gate(low, high, prize):
     """A cart passes a plane; between the posts it earns a prize."""
 
-    def cost(xp: Any, x: Any) -> Any:
+    def cost(xp, x):
         y = x[0] + 0.3 * xp.sin(x[0])
         return 0.5 * (y - 1.0) ** 2 - prize * xp.where((y > low) & (y < high), 1.0, 0.0)
 
     return cost
 
 
-def latch(force: float, stiffness: float) -> Callable[[Any, Any], Any]:
+def latch(force, stiffness):
     """A mass on a spring; once it passes 1 m, a second spring catches it for good."""
 
-    def cost(xp: Any, v0: Any) -> Any:
+    def cost(xp, v0):
         x, v, caught = 0.0 * v0[0], v0[0], 0.0 * v0[0]
         for _ in range(40):
             caught = xp.where(x > 1.0, 1.0, caught)
@@ -111,10 +109,10 @@ def latch(force: float, stiffness: float) -> Callable[[Any, Any], Any]:
     return cost
 
 
-def friction(mu: float, width: float) -> Callable[[Any, Any], Any]:
+def friction(mu, width):
     """A block slides with friction that is smoothed over a slip speed."""
 
-    def cost(xp: Any, v0: Any) -> Any:
+    def cost(xp, v0):
         x, v = 0.0 * v0[0], v0[0]
         for _ in range(50):
             v = v - 0.02 * mu * 9.81 * xp.tanh(v / width)
@@ -124,10 +122,10 @@ def friction(mu: float, width: float) -> Callable[[Any, Any], Any]:
     return cost
 
 
-def flight(target: float, wind: float) -> Callable[[Any, Any], Any]:
+def flight(target, wind):
     """A ball in free flight with quadratic drag."""
 
-    def cost(xp: Any, theta: Any) -> Any:
+    def cost(xp, theta):
         x, y, vx, vy = 0.0 * theta[0], 0.0 * theta[0], theta[0], theta[-1]
         for _ in range(30):
             speed = xp.sqrt(vx * vx + vy * vy + 1e-9)
@@ -138,10 +136,10 @@ def flight(target: float, wind: float) -> Callable[[Any, Any], Any]:
     return cost
 
 
-def contact(stiffness: float, wall: float) -> Callable[[Any, Any], Any]:
+def contact(stiffness, wall):
     """A ball hits a wall of stiffness k (penalty), dt = 0.01 s."""
 
-    def cost(xp: Any, v0: Any) -> Any:
+    def cost(xp, v0):
         x, v = 0.0 * v0[0], v0[0]
         for _ in range(60):
             v = v + 0.01 * (-stiffness * xp.maximum(x - wall, 0.0))
@@ -151,10 +149,10 @@ def contact(stiffness: float, wall: float) -> Callable[[Any, Any], Any]:
     return cost
 
 
-def chaos(rate: float, steps: int) -> Callable[[Any, Any], Any]:
+def chaos(rate, steps):
     """The logistic map, whose gradient grows with the steps where it is chaotic."""
 
-    def cost(xp: Any, x: Any) -> Any:
+    def cost(xp, x):
         y = 1.0 / (1.0 + xp.exp(-x[0]))
         for _ in range(steps):
             y = rate * y * (1.0 - y)
@@ -163,10 +161,10 @@ def chaos(rate: float, steps: int) -> Callable[[Any, Any], Any]:
     return cost
 
 
-def saturation(limit: float, gain: float) -> Callable[[Any, Any], Any]:
+def saturation(limit, gain):
     """A servo with a limited actuator follows a step."""
 
-    def cost(xp: Any, k: Any) -> Any:
+    def cost(xp, k):
         x, v = 0.0 * k[0], 0.0 * k[0]
         for _ in range(40):
             u = gain * k[0] * (1.0 - x) - 0.8 * v
@@ -178,36 +176,36 @@ def saturation(limit: float, gain: float) -> Callable[[Any, Any], Any]:
     return cost
 
 
-def plane(dim: int, at: float, height: float) -> Callable[[Any, Any], Any]:
+def plane(dim, at, height):
     """A smooth cost of several inputs with a jump across a slanted plane."""
     slanted = np.ones(dim) / math.sqrt(dim)
 
-    def cost(xp: Any, x: Any) -> Any:
+    def cost(xp, x):
         along = sum(float(a) * x[i] for i, a in enumerate(slanted))
         return x[0] + 0.3 * x[-1] ** 2 + height * xp.where(along > at, 1.0, 0.0)
 
     return cost
 
 
-def switch(height: float, at: float, width: float) -> Callable[[Any, Any], Any]:
+def switch(height, at, width):
     """A smoothed switch that may be too narrow for any sample."""
     return lambda xp, x: x[0] + 0.1 * x[0] ** 2 + height * 0.5 * (1 + xp.tanh((x[0] - at) / width))
 
 
-def stop(stiffness: float, at: float) -> Callable[[Any, Any], Any]:
+def stop(stiffness, at):
     """A stiff stop, continuous, met by few samples or none."""
     return lambda xp, x: x[0] + 0.1 * x[0] ** 2 + stiffness * xp.maximum(x[0] - at, 0.0 * x[0])
 
 
-def corner(first: float, second: float, height: float) -> Callable[[Any, Any], Any]:
+def corner(first, second, height):
     """A jump in a quadrant of the plane."""
     return lambda xp, x: x[1] + 0.3 * x[0] + height * xp.where((x[0] > first) & (x[1] > second), 1.0, 0.0)
 
 
-def relay(gain: float, dead: float) -> Callable[[Any, Any], Any]:
+def relay(gain, dead):
     """A mass under a relay with a dead zone."""
 
-    def cost(xp: Any, x0: Any) -> Any:
+    def cost(xp, x0):
         x, v = x0[0], 0.0 * x0[0]
         for _ in range(40):
             u = xp.where(x > dead, -gain, xp.where(x < -dead, gain, 0.0))
@@ -218,10 +216,10 @@ def relay(gain: float, dead: float) -> Callable[[Any, Any], Any]:
     return cost
 
 
-def backlash(gap: float, rate: float) -> Callable[[Any, Any], Any]:
+def backlash(gap, rate):
     """A load behind a gear with backlash follows a sine of amplitude theta."""
 
-    def cost(xp: Any, a: Any) -> Any:
+    def cost(xp, a):
         y = 0.0 * a[0]
         for i in range(40):
             x = a[0] * math.sin(rate * i)
@@ -231,15 +229,15 @@ def backlash(gap: float, rate: float) -> Callable[[Any, Any], Any]:
     return cost
 
 
-def quantiser(step: float, slope: float) -> Callable[[Any, Any], Any]:
+def quantiser(step, slope):
     """A sensor with steps beside a part that is continuous."""
     return lambda xp, x: (step * xp.floor(x[0] / step) - 1.0) ** 2 + slope * x[0]
 
 
-def delay(steps: int, gain: float) -> Callable[[Any, Any], Any]:
+def delay(steps, gain):
     """Feedback of gain theta that acts after a dead time."""
 
-    def cost(xp: Any, k: Any) -> Any:
+    def cost(xp, k):
         past = [1.0 + 0.0 * k[0]] * (steps + 1)
         for _ in range(60):
             past.append(past[-1] - 0.05 * gain * k[0] * past[-1 - steps])
@@ -248,10 +246,10 @@ def delay(steps: int, gain: float) -> Callable[[Any, Any], Any]:
     return cost
 
 
-def table(edges: tuple[float, ...], values: tuple[float, ...], width: float) -> Callable[[Any, Any], Any]:
+def table(edges, values, width):
     """A table between whose entries the cost jumps, or climbs over a width."""
 
-    def cost(xp: Any, x: Any) -> Any:
+    def cost(xp, x):
         total = values[0] + 0.2 * x[0]
         for at, low, high in zip(edges, values, values[1:], strict=False):
             risen = xp.where(x[0] > at, 1.0, 0.0) if width == 0 else xp.clip((x[0] - at) / width, 0.0, 1.0)
@@ -261,7 +259,7 @@ def table(edges: tuple[float, ...], values: tuple[float, ...], width: float) -> 
     return cost
 
 
-def scenes() -> Iterator[Scene]:
+def scenes():
     """Yield every scene, family by family."""
     for at, height, drag in ((1.2, 1.0, 1.0), (1.7, 1.0, 1.0), (1.3, 5.0, 0.7)):
         yield Scene("edge", f"at {at} by {height}, drag {drag}", edge(at, height, drag), (2.0,), 0.2)
@@ -333,7 +331,7 @@ class Counted(FunctionScene):
 '''
 
 
-def refused(seed: int, indices: tuple[int, ...], folder: str) -> dict[int, str]:
+def refused(seed, indices, folder):
     """Return the verdicts with which the command `gradcheck` refuses scenes, by their number; empty for those it does not.
 
     ``folder`` has the plugin.
@@ -353,7 +351,7 @@ def refused(seed: int, indices: tuple[int, ...], folder: str) -> dict[int, str]:
 
 
 @cache
-def truth(scene: Scene) -> np.ndarray:
+def truth(scene):
     """Return the smoothed gradient ``(d,)``, from costs only, without the harness."""
     theta, dim = np.array(scene.theta), len(scene.theta)
     if dim == 1:
@@ -377,22 +375,22 @@ class Outcome(NamedTuple):
     rmse: float
 
     @property
-    def trusted_without_search(self) -> bool:
+    def trusted_without_search(self):
         """Whether the spread alone trusts the cell."""
         return self.spread < SPREAD
 
     @property
-    def trusted(self) -> bool:
+    def trusted(self):
         """Whether the rule trusts the cell."""
         return self.trusted_without_search and not self.refused
 
     @property
-    def wrong(self) -> bool:
+    def wrong(self):
         """Whether one estimate is wrong by half of the gradient or more."""
         return self.rmse >= WRONG
 
 
-def outcomes(index: int, scene: Scene, verdicts: dict[int, dict[int, str]]) -> list[Outcome]:
+def outcomes(index, scene, verdicts):
     """Return the outcome of every seed of a scene, from its estimates and the verdicts by seed and number."""
     problem = Jax().compile(compose(Given(f"{scene.family} {scene.label}", scene.cost, scene.theta, scene.sigma)))
     theta, known = np.array(scene.theta), truth(scene)
@@ -407,12 +405,12 @@ def outcomes(index: int, scene: Scene, verdicts: dict[int, dict[int, str]]) -> l
     return found
 
 
-def main() -> int:
+def main():
     """Print a line per scene and the counts by part; return 1 if the rule trusts a wrong cell.
 
     With the name of a part, as `new`, only its scenes are counted.
     """
-    parts: dict[str, list[Outcome]] = {"first": [], "new": []}
+    parts = {"first": [], "new": []}
     chosen = []
     for index, scene in enumerate(scenes()):
         part = "new" if scene.family in NEW else "first"
@@ -422,7 +420,7 @@ def main() -> int:
         (Path(folder) / "counted.py").write_text(PLUGIN)
         indices = tuple(index for index, _, _ in chosen)
         verdicts = {seed: refused(seed, indices, folder) for seed in SEEDS}
-    trusted_scenes: dict[str, set[int]] = {part: set() for part in parts}
+    trusted_scenes = {part: set() for part in parts}
     for index, scene, part in chosen:
         found = outcomes(index, scene, verdicts)
         parts[part] += found

@@ -1,7 +1,5 @@
 """Statistics against closed forms, and the coverage of their intervals."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 
@@ -14,20 +12,20 @@ from bench.measure.statistics import Sampling, Summary, Truth, bias_interval, he
 # ---------------------------------------------------------------------------------------------- closed forms
 
 
-def moments(estimates: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
+def moments(estimates, truth):
     """Squared distance of the mean from the truth, and trace of the covariance of one estimate, the long way."""
     difference = estimates.mean(axis=0) - truth
     return float(difference @ difference), float(np.trace(np.atleast_2d(np.cov(estimates.T, ddof=1))))
 
 
-def with_covariance(mean: np.ndarray, covariance: np.ndarray) -> Truth:
+def with_covariance(mean, covariance):
     """A truth whose error has a diagonal covariance."""
     return Truth(mean, Sampling(np.sqrt(covariance), math.inf))
 
 
 @pytest.mark.parametrize("dim", [1, 3, 40])
 @pytest.mark.parametrize("repeats", [2, 5, 64])
-def test_columns_are_their_formulas(dim: int, repeats: int) -> None:
+def test_columns_are_their_formulas(dim, repeats):
     rng = np.random.default_rng(1)
     reference = rng.standard_normal(dim)
     estimates = reference + 3.0 + rng.standard_normal((repeats, dim))
@@ -53,7 +51,7 @@ def test_columns_are_their_formulas(dim: int, repeats: int) -> None:
     assert summary.variance_low <= summary.variance <= summary.variance_high
 
 
-def test_reference_by_batches_is_its_mean_and_covariance() -> None:
+def test_reference_by_batches_is_its_mean_and_covariance():
     rng = np.random.default_rng(4)
     batches = rng.standard_normal((32, 3)) + 1.0
     truth = Truth.from_batches(batches)
@@ -63,7 +61,7 @@ def test_reference_by_batches_is_its_mean_and_covariance() -> None:
     assert truth.sampling.rows.T @ truth.sampling.rows == pytest.approx(covariance)
 
 
-def test_error_of_an_exact_reference_is_the_norm_of_its_error() -> None:
+def test_error_of_an_exact_reference_is_the_norm_of_its_error():
     truth = Truth.exact(np.zeros(5), error=0.3)
     assert truth.standard_error == pytest.approx(0.3)
     assert truth.sampling.rows.T @ truth.sampling.rows == pytest.approx(np.eye(5) * 0.09 / 5)
@@ -71,7 +69,7 @@ def test_error_of_an_exact_reference_is_the_norm_of_its_error() -> None:
 
 
 @pytest.mark.parametrize("noise", ["normal", "lognormal"])
-def test_trace_of_the_squared_covariance_is_unbiased_under_any_noise(noise: str) -> None:
+def test_trace_of_the_squared_covariance_is_unbiased_under_any_noise(noise):
     rng = np.random.default_rng(5)
     repeats, dim, trials = 8, 20, 3000
     scale = np.geomspace(1.0, 0.1, dim)
@@ -91,7 +89,7 @@ def test_trace_of_the_squared_covariance_is_unbiased_under_any_noise(noise: str)
 
 
 @pytest.mark.parametrize(("repeats", "batches"), [(5, 8), (8, 5)])
-def test_interval_of_two_error_sources_has_welchs_degrees(repeats: int, batches: int) -> None:
+def test_interval_of_two_error_sources_has_welchs_degrees(repeats, batches):
     # Far from zero, in one dimension, the ends are |m| -+ t se with Welch's degrees of freedom.
     from scipy.special import stdtrit
 
@@ -111,14 +109,14 @@ def test_interval_of_two_error_sources_has_welchs_degrees(repeats: int, batches:
     assert summary.rmse_rel == pytest.approx(summary.rmse / abs(float(reference.mean())))
 
 
-def test_cosine_and_signs() -> None:
+def test_cosine_and_signs():
     estimates = np.array([[1.0, 1.0, 5.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 0.0], [2.0, 0.0, 0.0]])
     summary = summarise(estimates, Truth.exact(np.array([1.0, 0.0, 0.0])), 1)
     assert summary.cosine == pytest.approx((1 / math.sqrt(27) - 1 + 0 + 1) / 4)
     assert summary.sign_agreement == pytest.approx(0.5)  # only the first coordinate has a sign to agree with
 
 
-def test_unit_of_the_gradient_does_not_matter() -> None:
+def test_unit_of_the_gradient_does_not_matter():
     rng = np.random.default_rng(9)
     estimates, batches = rng.standard_normal((16, 3)) + 1.0, rng.standard_normal((8, 3)) * 0.1
     one = summarise(estimates, Truth.from_batches(batches), 4)
@@ -133,7 +131,7 @@ def test_unit_of_the_gradient_does_not_matter() -> None:
 # ---------------------------------------------------------------------------------------------------- edges
 
 
-def test_identical_estimates_have_the_width_of_the_rule_of_three() -> None:
+def test_identical_estimates_have_the_width_of_the_rule_of_three():
     # First-order gradients of a step: 0 every time, and wholly biased.
     summary = summarise(np.zeros((64, 1)), Truth.exact(np.array([3.98942])), samples=256)
     rare = 3 / (64 * 256)
@@ -150,7 +148,7 @@ def test_identical_estimates_have_the_width_of_the_rule_of_three() -> None:
     assert f"{3 / (64 * 256):.2g}" in summary.note
 
 
-def test_identical_estimates_against_a_sampled_reference_keep_its_error() -> None:
+def test_identical_estimates_against_a_sampled_reference_keep_its_error():
     batches = np.random.default_rng(10).standard_normal((30, 2)) + 1.0
     truth = Truth.from_batches(batches)
     summary = summarise(np.ones((20, 2)), truth, 5)
@@ -160,7 +158,7 @@ def test_identical_estimates_against_a_sampled_reference_keep_its_error() -> Non
     assert "identical" in summary.note
 
 
-def test_rounding_is_neither_bias_nor_spread() -> None:
+def test_rounding_is_neither_bias_nor_spread():
     reference = np.array([0.1, -7.0, 3.0])
     estimates = np.tile(reference * (1 + 3e-16), (12, 1))
     estimates[::2] *= 1 - 2e-16
@@ -175,7 +173,7 @@ def test_rounding_is_neither_bias_nor_spread() -> None:
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-def test_estimates_that_are_not_finite_leave_only_what_does_not_rest_on_them(bad: float) -> None:
+def test_estimates_that_are_not_finite_leave_only_what_does_not_rest_on_them(bad):
     estimates = np.ones((8, 2))
     estimates[3, 1] = bad
     summary = summarise(estimates, Truth.exact(np.array([3.0, 4.0]), error=0.5), 1)
@@ -189,7 +187,7 @@ def test_estimates_that_are_not_finite_leave_only_what_does_not_rest_on_them(bad
     assert summary.note == "1 of 8 estimates are not finite"
 
 
-def test_reference_of_zero_has_no_relative_columns() -> None:
+def test_reference_of_zero_has_no_relative_columns():
     summary = summarise(np.random.default_rng(11).standard_normal((16, 2)), Truth.exact(np.zeros(2)), 1)
     for name in ("bias_rel", "rmse_rel", "cosine", "sign_agreement"):
         assert math.isnan(getattr(summary, name))
@@ -197,13 +195,13 @@ def test_reference_of_zero_has_no_relative_columns() -> None:
     assert summary.rmse > 0.0
 
 
-def test_zero_everywhere() -> None:
+def test_zero_everywhere():
     summary = summarise(np.zeros((4, 2)), Truth.exact(np.zeros(2)), 10)
     assert summary.bias == summary.bias_high == summary.rmse == summary.variance == 0.0
     assert summary.indistinguishable
 
 
-def test_one_repeat_has_no_variance() -> None:
+def test_one_repeat_has_no_variance():
     summary = summarise(np.array([[1.0, 2.0]]), Truth.exact(np.array([1.0, 0.0])), 1)
     assert math.isnan(summary.variance)
     assert math.isnan(summary.bias)
@@ -214,7 +212,7 @@ def test_one_repeat_has_no_variance() -> None:
 
 @pytest.mark.parametrize("repeats", [2, 3, 4])
 @pytest.mark.parametrize("dim", [1, 2, 50])
-def test_few_repeats_give_wide_intervals_and_say_so(repeats: int, dim: int) -> None:
+def test_few_repeats_give_wide_intervals_and_say_so(repeats, dim):
     rng = np.random.default_rng(12)
     inside = 0
     for _ in range(100):
@@ -226,7 +224,7 @@ def test_few_repeats_give_wide_intervals_and_say_so(repeats: int, dim: int) -> N
 
 
 @pytest.mark.parametrize("ratio", [1e3, 1e6, 1e9, 1e12])
-def test_bias_far_above_the_noise(ratio: float) -> None:
+def test_bias_far_above_the_noise(ratio):
     noise = np.random.default_rng(14).standard_normal((32, 3))
     error = math.sqrt(Sampling.of(noise).trace)
     _, low, high = bias_interval(np.array([ratio * error, 0.0, 0.0]), Sampling.of(noise))
@@ -235,7 +233,7 @@ def test_bias_far_above_the_noise(ratio: float) -> None:
     assert (high - low) / error == pytest.approx(4.08 / math.sqrt(3), rel=0.6)
 
 
-def test_lucky_draw_does_not_claim_more_than_the_noise_allows() -> None:
+def test_lucky_draw_does_not_claim_more_than_the_noise_allows():
     errors = Sampling.of(np.random.default_rng(15).standard_normal((64, 50)))
     bias, low, high = bias_interval(np.zeros(50), errors)
     assert (bias, low) == (0.0, 0.0)
@@ -243,7 +241,7 @@ def test_lucky_draw_does_not_claim_more_than_the_noise_allows() -> None:
     assert high / math.sqrt(errors.trace) == pytest.approx(0.758, rel=0.1)
 
 
-def test_heavy_tails_are_remarked_on_and_ordinary_ones_are_not() -> None:
+def test_heavy_tails_are_remarked_on_and_ordinary_ones_are_not():
     rng = np.random.default_rng(16)
     truth = Truth.exact(np.zeros(3))
     remarks = [summarise(rng.standard_normal((64, 3)), truth, 1).note for _ in range(500)]
@@ -260,7 +258,7 @@ def test_heavy_tails_are_remarked_on_and_ordinary_ones_are_not() -> None:
 
 
 @pytest.mark.parametrize(("share", "least", "most"), [(0.5, 0.5, 0.9), (0.3, 0.0, 0.0)])
-def test_terms_of_two_values_at_equal_distances_are_a_remark(share: float, least: float, most: float) -> None:
+def test_terms_of_two_values_at_equal_distances_are_a_remark(share, least, most):
     """The variance p (1 - p) is largest at p = 1/2, so that it hardly depends on the number of each value there."""
     rng, missed, remarks = np.random.default_rng(3), [], 0
     for _ in range(200):
@@ -276,7 +274,7 @@ def test_terms_of_two_values_at_equal_distances_are_a_remark(share: float, least
     assert np.mean(missed) < 0.1
 
 
-def test_one_repeat_that_differs_bounds_no_variance() -> None:
+def test_one_repeat_that_differs_bounds_no_variance():
     estimates = np.zeros((64, 2))
     estimates[5] = 3.0
     summary = summarise(estimates, Truth.exact(np.ones(2)), 1)
@@ -284,7 +282,7 @@ def test_one_repeat_that_differs_bounds_no_variance() -> None:
     assert "heavy tails" in summary.note
 
 
-def test_bad_input_is_refused_with_the_shapes() -> None:
+def test_bad_input_is_refused_with_the_shapes():
     truth = Truth.exact(np.zeros(3))
     with pytest.raises(ValueError, match=r"\(R, 3\).*given \(4, 2\)"):
         summarise(np.zeros((4, 2)), truth, 1)
@@ -337,14 +335,14 @@ def test_variance_interval_is_calibrated_for_normal_noise(dim):
     assert 0.91 <= inside / cells <= 0.99
 
 
-def test_ends_are_quantiles_of_the_chi_square_with_the_moments_of_the_square() -> None:
+def test_ends_are_quantiles_of_the_chi_square_with_the_moments_of_the_square():
     """The documented g, nu and q by hand, for a known covariance that is far from round."""
     m, covariance = np.array([3.0, 0.4, -0.2]), np.diag([1.0, 0.3, 0.01])
     _, low, high = bias_interval(m, *with_covariance(m, covariance).errors)
     trace, square, total = np.trace(covariance), np.trace(covariance @ covariance), m @ m
     once, twice = m @ covariance @ m, m @ covariance @ covariance @ m
 
-    def chance(beta: float) -> float:
+    def chance(beta):
         q = min(max(once - square + twice / once * (beta**2 - total + trace), 0.0), trace * beta**2)
         g = (square + 2.0 * q) / (trace + 2.0 * beta**2)
         return float(scipy.stats.ncx2.cdf(total / g, trace / g, beta**2 / g))
@@ -355,14 +353,14 @@ def test_ends_are_quantiles_of_the_chi_square_with_the_moments_of_the_square() -
 
 
 @pytest.mark.parametrize(("largest", "heavy"), [(30.0, True), (20.0, True), (18.0, False), (1.0, False)])
-def test_tails_are_heavy_below_three_quarters_of_the_root_of_the_repeats(largest: float, heavy: bool) -> None:
+def test_tails_are_heavy_below_three_quarters_of_the_root_of_the_repeats(largest, heavy):
     """Sixteen repeats of which one has a square of ``largest``: (sum y)^2 / sum y^2 is 2.2, 2.95, 3.2 and 16."""
     deviations = np.sqrt(np.array([largest, *[1.0] * 15]))[:, None]
     share = largest / (largest + 15.0)
     assert heavy_tails(deviations) == pytest.approx(share if heavy else 0.0)
 
 
-def test_variance_interval_allows_for_skewed_squares() -> None:
+def test_variance_interval_allows_for_skewed_squares():
     """Means of 16 lognormal terms; symmetric intervals lie too low for 10% of them."""
     rng = np.random.default_rng(21)
     truth, above, below, sets = (math.e - 1.0) * math.e / 16, 0, 0, 400
@@ -375,7 +373,7 @@ def test_variance_interval_allows_for_skewed_squares() -> None:
     assert below / sets < 0.05
 
 
-def test_upper_end_of_a_variance_is_that_of_hall() -> None:
+def test_upper_end_of_a_variance_is_that_of_hall():
     """Pseudo-values by leaving out, one at a time; T is where Hall's cubic has Student's quantile."""
     x = np.array([0.1, -0.3, 0.5, 0.2, 4.0, -0.6, 0.0, 0.3])[:, None]
     repeats = len(x)

@@ -3,12 +3,12 @@
 import math
 import re
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import pytest
 
-from bench.model import Array, Compilations, FunctionScene, compose, param, registry
+from bench.model import Compilations, FunctionScene, compose, param, registry
 
 pytest.importorskip("numba")
 
@@ -28,11 +28,11 @@ class Kinks(FunctionScene):
     sigma: float = param(1e-3, "noise", positive=True)
     scale: float = param(2.0, "a parameter")
 
-    def theta0(self) -> np.ndarray:
+    def theta0(self):
         """Return the kinks themselves, and an angle of 1."""
         return np.array([0.0, 0.0, 0.0, 1.0])
 
-    def cost(self, xp: Any, x: Array) -> Array:
+    def cost(self, xp, x):
         """Return |x0| + max(x1, 0) + (x2 where positive) + scale sin x3, and 0 times 1 / x0."""
         kept = xp.where(x[2] > 0, x[2], 0.0 * x[2])
         return xp.abs(x[0]) + xp.maximum(x[1], 0.0 * x[1]) + kept + self.scale * xp.sin(x[3]) + 0.0 / x[0]
@@ -44,7 +44,7 @@ class Sorted(Kinks):
 
     name = "fused_sorted"
 
-    def cost(self, xp: Any, x: Array) -> Array:
+    def cost(self, xp, x):
         """Return the largest coordinate, found by sorting."""
         return xp.sort(x, axis=0)[-1]
 
@@ -166,7 +166,7 @@ def test_an_operation_without_scalar_form_is_refused_by_name():
 
 def test_sine_and_cosine_are_accurate_in_the_whole_range():
     """The text of the fast functions, run by Python, against the C library: within 2 units in the last place of 1."""
-    scope: dict[str, Any] = {"np": np, "math": math, "F": float, "njit": lambda **options: lambda function: function}
+    scope = {"np": np, "math": math, "F": float, "njit": lambda **options: lambda function: function}
     exec(functions.FAST, scope)
     rng = np.random.default_rng(0)
     angles = np.concatenate([rng.uniform(-s, s, 300) for s in (1e-3, 1.0, 30.0, 1e4, functions.LIMIT)])
