@@ -122,16 +122,6 @@ def test_a_problem_takes_lists_and_one_sample():
             function(0.1, [0.0, 0.1, 0.2])
 
 
-def test_a_printed_estimate_is_relative_as_in_tables():
-    found = bench.estimate(bench.problem("quadratic", backend="numpy"), "fobg", samples=8, repeats=16)
-    facts = found._facts()
-    row = found.as_dict()
-    assert facts["relative RMSE"].split()[0] == number(row["rmse"] / row["reference_norm"], 3)
-    assert row["bias_low"] == 0
-    assert facts["relative bias"] == f"0 (< {number(row['bias_high'] / row['reference_norm'], 3)})"
-    assert facts["|grad J|"] == f"{number(row['reference_norm'], 3)} (closed_form)"
-
-
 def test_an_estimate_of_a_gradient_of_0_is_printed_without_division():
     found = bench.estimate(
         bench.problem("quadratic[dimension=2]", backend="numpy", theta0=[0.0, 0.0]),

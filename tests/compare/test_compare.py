@@ -468,16 +468,16 @@ def test_history_draws_what_changed():
     lines = [
         (result, "some", series, "RMSE", error, 0 if math.isnan(error) else 3, moved, failed, 4)
         for series, errors, moves, failures in (
-            ("same", (1.0, 1.001, 0.999), (0, 0, 0), (0, 0, 0)), ("little", (1.0, 1.0, 1.1), (math.nan,) * 3, (0, 0, 0)),
-            ("much", (1.0, 3.0, 1.0), (0, 0, 0), (0, 0, 0)), ("lost", (1.0, 1.0, 1.0), (0, 0, 0), (1, 1, 2)),
-            ("moved", (1.0, 1.0, 1.0), (0, 0.01, 0.01), (0, 0, 0)), ("unknown", (math.nan,) * 3, (math.nan,) * 3, (4, 4, 4)),
+            ("same", (1.0, 1.001, 0.999), (0, 0, 0), (0, 0, 0)), ("much", (1.0, 3.0, 1.0), (math.nan,) * 3, (0, 0, 0)),
+            ("lost", (1.0, 1.0, 1.0), (0, 0, 0), (1, 1, 2)), ("moved", (1.0, 1.0, 1.0), (0, 0.01, 0.01), (0, 0, 0)),
+            ("unknown", (math.nan,) * 3, (math.nan,) * 3, (4, 4, 4)),
         )
         for result, error, moved, failed in zip("abc", errors, moves, failures, strict=True)
     ]  # fmt: skip
     names = ["result", "experiment", "series", "column", "error", "cells", "moved", "failed", "of"]
     made = history.views(history.History(pd.DataFrame(lines, columns=names), ["a", "b", "c"]))
     (chart,) = made.charts
-    assert list(dict.fromkeys(chart.frame["line"])) == ["some: much", "some: lost", "some: little", "some: moved"]
+    assert list(dict.fromkeys(chart.frame["line"])) == ["some: much", "some: lost", "some: moved"]
     assert chart.panel_notes == {"some: lost": "failed: 1, 1, 2 of 4"}
 
 
@@ -496,17 +496,6 @@ def test_a_gradient_that_a_release_of_an_engine_changes_is_told(tmp_path):
     table = pd.read_csv(tmp_path / "out" / "history.csv")
     assert list(table["moved"].round(5)) == [0.0, 0.00045]
     assert "1 of 1 series changed" in (tmp_path / "out" / "history.md").read_text()
-
-
-def test_results_are_named_by_what_differs():
-    """Revisions of one folder by the revision, folders by their names; what would be empty stays."""
-    for names, short in (
-        (["HEAD~1:results/standard", "abc:results/standard/"], ["HEAD~1", "abc"]),
-        (["runs/v1", "runs/v2"], ["runs/v1", "runs/v2"]),
-        (["old/results", "new/results"], ["old", "new"]),
-        (["HEAD:results", "results"], ["HEAD:results", "results"]),
-    ):
-        assert list(history._short_names(names).values()) == short
 
 
 @pytest.mark.parametrize(

@@ -1,13 +1,11 @@
 """The site: every document and result has a page, the pages agree with the stored results, and it works offline."""
 
 import json
-import math
 import re
 import shutil
 import subprocess
 from pathlib import Path
 
-import pandas as pd
 import pytest
 import yaml
 
@@ -53,26 +51,6 @@ def test_every_estimator_has_a_page_with_its_source(pages):
         assert "## Where it wins and fails" in page
         for year in re.findall(r"et al\. (\d{4})", entry.plugin.__doc__):
             assert year in page.partition("## Source")[2].partition("\n## ")[0], (name, year)
-
-
-def test_verdicts_are_those_of_the_rows():
-    """Recomputes failing estimators row by row."""
-    rows = pd.read_parquet(results.STANDARD / "estimators" / "rows.parquet").query("status == 'ok'").to_dict("records")
-    ends = {}
-    for row in rows:
-        low, high = (
-            math.hypot(row[f"bias_{end}"], math.sqrt(row[f"variance_{end}"])) / row["reference_norm"]
-            for end in ("low", "high")
-        )
-        ends.setdefault(row["scene"], {})[row["estimator"], row["estimator_params"]] = low, high
-    fails = {(scene, *name) for scene, part in ends.items() for name, (low, _) in part.items() if low > 1}
-    table = results.comparison("estimators").assign(scene=lambda rows: rows["problem"].str.partition(", penalty")[0])
-    failing = table[table["verdict"] == "fails"]
-    assert set(zip(failing["scene"], failing["estimator"], failing["estimator_params"], strict=True)) == fails
-    assert fails
-    for problem, part in table.groupby("problem"):
-        assert part.loc[part["rmse_rel"].idxmin(), "best"], problem
-        assert not part[part["best"]]["low"].gt(part["high"].min()).any(), "intervals that are apart are no tie"
 
 
 def entry(folder, text):

@@ -154,24 +154,6 @@ def test_switch_of_a_damped_contact_is_a_jump():
 # ------------------------------------------------------------------------------------------------- contact modes
 
 
-def test_switch_is_found_to_the_last_digit():
-    edge = measure.switch(lambda at: ["left" if a < -0.7 else "right" for a in at], 2.0)
-    assert edge is not None
-    assert edge[1] < -0.7 <= edge[0]
-    assert edge[0] - edge[1] <= 4.0 * np.spacing(2.0)
-    assert measure.switch(lambda at: ["same"] * at.size, 2.0) is None
-
-
-def test_signature_names_the_steps():
-    contacts = np.zeros((2, 60), bool)
-    assert measure.signature(contacts) == "-;-"
-    contacts[0, 3:6] = contacts[1, 9] = True
-    assert measure.signature(contacts) == "3-5;9"
-    contacts[0, ::2] = True
-    assert len(measure.signature(contacts)) == 24
-    assert measure.signature(contacts) != measure.signature(contacts[::-1])
-
-
 @pytest.mark.parametrize("law", ["penalty", "impulse", "complementarity"])
 def test_every_kind_of_law_shows_when_it_acts(law):
     """A ball 5.3 steps above the ground, at 1 step's worth a step, is first pushed in step 5 or the one after."""

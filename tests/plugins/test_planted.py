@@ -99,9 +99,3 @@ def test_rotation_of_one_coordinate_is_refused():
     reason = Planted(angle=30.0).unsupported_reason(problem(Heaviside()).program)
     assert reason is not None
     assert "at least 2 coordinates" in reason
-
-
-def test_noise_without_samples_left_for_the_base_is_an_error():
-    p = problem()
-    with pytest.raises(ValueError, match="needs 2 samples, got 1"):
-        Planted(noise=1.0).estimate(p, p.program.theta0, drawn(samples=1))

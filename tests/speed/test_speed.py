@@ -34,11 +34,6 @@ def test_blocks_are_alike_and_few(most, grain, threads):
         assert parts == 1 or parts >= -(-count // most)
 
 
-def test_few_shapes_serve_all_batches():
-    shapes = {blocks.block_size(count, 1024, 128, 2) for count in range(1, 20_000, 7)}
-    assert len(shapes) <= 1024 // 128
-
-
 @pytest.mark.parametrize("threads", [1, 2, 5])
 @pytest.mark.parametrize("own_theta", [False, True])
 def test_blocks_cover_each_column_once(threads, own_theta):
@@ -121,15 +116,6 @@ def test_row_wise_evaluation_gives_the_same_numbers(function):
     for whole, split in zip(*whole_and_by_rows(function, q, v), strict=True):
         assert whole.shape == split.shape
         np.testing.assert_allclose(split, whole, rtol=1e-15)
-
-
-def test_row_wise_steps_hold_no_stack():
-    """The point of it: nothing in the step of a scene has to be put together again."""
-    problem = Jax().compile(pushing())
-    text = str(jax.make_jaxpr(problem._cost)(problem._parameters, jnp.zeros((8, 4)), jnp.zeros((8, 4))))
-    scan = text[text.index("scan[") :]
-    assert "stack" not in scan[: scan.index("length")]
-    assert "concatenate" not in scan[: scan.index("length")]
 
 
 # ------------------------------------------------------------------------------------------------------ compilations
