@@ -9,17 +9,19 @@ from typing import ClassVar
 import numpy as np
 import pytest
 from bench.plugins.backends.numpy import Numpy, NumpyProblem
-from bench.plugins.contacts.penalty import Penalty
-from bench.plugins.estimators.sobol import Sobol
-from bench.plugins.integrators.explicit_euler import ExplicitEuler
-from bench.plugins.integrators.midpoint import Midpoint
-from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
-from bench.plugins.scenes.cubic import Cubic
-from bench.plugins.scenes.double_integrator import DoubleIntegrator
-from bench.plugins.scenes.heaviside import Heaviside
-from bench.plugins.scenes.mass_spring import MassSpring
-from bench.plugins.scenes.pushing import Pushing
-from bench.plugins.scenes.quadratic import Quadratic
+from classes import (
+    Cubic,
+    DoubleIntegrator,
+    ExplicitEuler,
+    Heaviside,
+    MassSpring,
+    Midpoint,
+    Penalty,
+    Pushing,
+    Quadratic,
+    SemiImplicitEuler,
+    Sobol,
+)
 
 from bench import cli, conformance
 from bench.conformance import Skipped, check, kit, main, parametrize, subjects

@@ -8,8 +8,7 @@ from types import SimpleNamespace
 import bank
 import numpy as np
 import pytest
-from bench.plugins.backends.numpy import Numpy
-from bench.plugins.scenes.heaviside import Heaviside
+from classes import Heaviside, Numpy
 
 from bench.measure import noise, reference
 from bench.measure.batches import in_columns

@@ -5,14 +5,7 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
-from bench.plugins.backends.numpy import Numpy
-from bench.plugins.estimators.fobg import Fobg
-from bench.plugins.estimators.guided import Guided
-from bench.plugins.estimators.measure_valued import MeasureValued
-from bench.plugins.estimators.orthogonal import Orthogonal
-from bench.plugins.estimators.randomized_smoothing import RandomizedSmoothing
-from bench.plugins.estimators.reinforce import Reinforce
-from bench.plugins.estimators.sphere_smoothing import SphereSmoothing
+from classes import Fobg, Guided, MeasureValued, Numpy, Orthogonal, RandomizedSmoothing, Reinforce, SphereSmoothing
 from helpers import loaded
 
 from bench.experiment.session import Problems

@@ -7,19 +7,21 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
-from bench.plugins.backends.implicit import Implicit
-from bench.plugins.backends.jax import Jax
 from bench.plugins.backends.numpy import NumpyOps
-from bench.plugins.backends.torch import Torch
-from bench.plugins.contacts.complementarity import Complementarity
-from bench.plugins.contacts.impulse import Impulse
-from bench.plugins.contacts.penalty import Penalty
-from bench.plugins.contacts.softplus import Softplus
-from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
-from bench.plugins.scenes.bounce_once import BounceOnce
-from bench.plugins.scenes.friction_block import FrictionBlock
-from bench.plugins.scenes.ground_wall import GroundWall
-from bench.plugins.scenes.hopper import Hopper
+from classes import (
+    BounceOnce,
+    Complementarity,
+    FrictionBlock,
+    GroundWall,
+    Hopper,
+    Implicit,
+    Impulse,
+    Jax,
+    Penalty,
+    SemiImplicitEuler,
+    Softplus,
+    Torch,
+)
 
 from bench.model import ContactScene, State, compose, param
 

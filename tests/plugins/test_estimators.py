@@ -4,23 +4,25 @@ import math
 
 import numpy as np
 import pytest
-from bench.plugins.backends.numpy import Numpy
-from bench.plugins.backends.torch import Torch
-from bench.plugins.contacts.penalty import Penalty
-from bench.plugins.estimators.alpha_order import AlphaOrder
-from bench.plugins.estimators.clipped import Clipped
-from bench.plugins.estimators.control_variate import ControlVariate
-from bench.plugins.estimators.finite_difference import FiniteDifference
-from bench.plugins.estimators.fobg import Fobg
-from bench.plugins.estimators.guided import Guided
-from bench.plugins.estimators.orthogonal import Orthogonal
-from bench.plugins.estimators.randomized_smoothing import RandomizedSmoothing
-from bench.plugins.estimators.reinforce import Reinforce
-from bench.plugins.estimators.sphere_smoothing import SphereSmoothing
-from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
 from bench.plugins.scenes.linear import Linear
-from bench.plugins.scenes.pushing import Pushing
-from bench.plugins.scenes.soft_heaviside import SoftHeaviside
+from classes import (
+    AlphaOrder,
+    Clipped,
+    ControlVariate,
+    FiniteDifference,
+    Fobg,
+    Guided,
+    Numpy,
+    Orthogonal,
+    Penalty,
+    Pushing,
+    RandomizedSmoothing,
+    Reinforce,
+    SemiImplicitEuler,
+    SoftHeaviside,
+    SphereSmoothing,
+    Torch,
+)
 
 from bench.measure import noise
 from bench.measure.reference import certify

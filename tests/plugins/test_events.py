@@ -6,18 +6,20 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from bench.plugins.backends.torch import Torch
-from bench.plugins.contacts.impulse import Impulse
-from bench.plugins.contacts.penalty import Penalty
-from bench.plugins.estimators.boundary import Boundary
-from bench.plugins.estimators.fobg import Fobg
-from bench.plugins.estimators.stochastic_derivative import StochasticDerivative
-from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
-from bench.plugins.scenes.coin_walk import CoinWalk
-from bench.plugins.scenes.cubic import Cubic
-from bench.plugins.scenes.heaviside import Heaviside
-from bench.plugins.scenes.ledge import Ledge
-from bench.plugins.scenes.pushing import Pushing
+from classes import (
+    Boundary,
+    CoinWalk,
+    Cubic,
+    Fobg,
+    Heaviside,
+    Impulse,
+    Ledge,
+    Penalty,
+    Pushing,
+    SemiImplicitEuler,
+    StochasticDerivative,
+    Torch,
+)
 from scipy import stats
 
 from bench.model import Decision, DisturbedScene, Events, EventScene, FunctionScene, compose, half_spaces

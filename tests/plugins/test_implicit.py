@@ -4,17 +4,19 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from bench.plugins.backends.implicit import Implicit
-from bench.plugins.backends.jax import Jax
-from bench.plugins.backends.numpy import Numpy
-from bench.plugins.backends.torch import Torch
-from bench.plugins.contacts.complementarity import Complementarity
-from bench.plugins.contacts.penalty import Penalty
-from bench.plugins.integrators.implicit_euler import ImplicitEuler
-from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
-from bench.plugins.scenes.bounce_once import BounceOnce
-from bench.plugins.scenes.ground_wall import GroundWall
-from bench.plugins.scenes.pushing import Pushing
+from classes import (
+    BounceOnce,
+    Complementarity,
+    GroundWall,
+    Implicit,
+    ImplicitEuler,
+    Jax,
+    Numpy,
+    Penalty,
+    Pushing,
+    SemiImplicitEuler,
+    Torch,
+)
 
 from bench.model import FunctionScene, compose
 

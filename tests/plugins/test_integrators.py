@@ -5,24 +5,26 @@ import math
 
 import numpy as np
 import pytest
-from bench.plugins.backends.implicit import Implicit
-from bench.plugins.backends.jax import Jax
-from bench.plugins.backends.numpy import Numpy
-from bench.plugins.backends.torch import Torch
-from bench.plugins.contacts.impulse import Impulse
-from bench.plugins.contacts.penalty import Penalty
-from bench.plugins.integrators.event_driven import EventDriven
-from bench.plugins.integrators.explicit_euler import ExplicitEuler
-from bench.plugins.integrators.implicit_euler import ImplicitEuler
-from bench.plugins.integrators.implicit_midpoint import ImplicitMidpoint
-from bench.plugins.integrators.midpoint import Midpoint
-from bench.plugins.integrators.rk4 import Rk4
-from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
-from bench.plugins.integrators.stormer_verlet import StormerVerlet
-from bench.plugins.scenes.bounce_once import BounceOnce
-from bench.plugins.scenes.bouncing_ball import BouncingBall
-from bench.plugins.scenes.double_pendulum import DoublePendulum
-from bench.plugins.scenes.mass_spring import MassSpring
+from classes import (
+    BounceOnce,
+    BouncingBall,
+    DoublePendulum,
+    EventDriven,
+    ExplicitEuler,
+    Implicit,
+    ImplicitEuler,
+    ImplicitMidpoint,
+    Impulse,
+    Jax,
+    MassSpring,
+    Midpoint,
+    Numpy,
+    Penalty,
+    Rk4,
+    SemiImplicitEuler,
+    StormerVerlet,
+    Torch,
+)
 
 from bench.model import compose
 

@@ -2,16 +2,9 @@
 
 import numpy as np
 import pytest
-from bench.plugins.optimizers.adam import Adam
-from bench.plugins.optimizers.cem import Cem
 from bench.plugins.optimizers.cma_es import CmaEs, constants
-from bench.plugins.optimizers.gauss_newton import GaussNewton
-from bench.plugins.optimizers.gradient_descent import GradientDescent
-from bench.plugins.optimizers.lbfgs import Lbfgs
-from bench.plugins.optimizers.line_search import LineSearch
-from bench.plugins.optimizers.momentum import Momentum
-from bench.plugins.optimizers.mppi import Mppi
 from bench.plugins.optimizers.ppo import Ppo
+from classes import Adam, Cem, GaussNewton, GradientDescent, Lbfgs, LineSearch, Momentum, Mppi
 from scipy.stats import norm
 
 from bench.conformance import optimizers as kit

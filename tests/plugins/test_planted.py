@@ -4,10 +4,8 @@ import math
 
 import numpy as np
 import pytest
-from bench.plugins.estimators.fobg import Fobg
 from bench.plugins.estimators.planted import Planted, direction
-from bench.plugins.scenes.heaviside import Heaviside
-from bench.plugins.scenes.quadratic import Quadratic
+from classes import Fobg, Heaviside, Quadratic
 from scipy.stats import f, kstest
 
 import bench

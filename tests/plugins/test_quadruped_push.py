@@ -2,10 +2,7 @@
 
 import numpy as np
 import pytest
-from bench.plugins.backends.mujoco import Mujoco
-from bench.plugins.contacts.penalty import Penalty
-from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
-from bench.plugins.scenes.quadruped_push import QuadrupedPush
+from classes import Mujoco, Penalty, QuadrupedPush, SemiImplicitEuler
 
 from bench.model import compose, registry
 

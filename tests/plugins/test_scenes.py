@@ -4,18 +4,20 @@ import math
 
 import numpy as np
 import pytest
-from bench.plugins.backends.jax import Jax
-from bench.plugins.contacts.impulse import Impulse
-from bench.plugins.contacts.penalty import Penalty
-from bench.plugins.integrators.explicit_euler import ExplicitEuler
-from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
-from bench.plugins.scenes.bounce_once import BounceOnce
-from bench.plugins.scenes.bouncing_ball import BouncingBall
-from bench.plugins.scenes.cartpole import Cartpole
-from bench.plugins.scenes.cubic import Cubic
-from bench.plugins.scenes.double_integrator import DoubleIntegrator
-from bench.plugins.scenes.pushing import Pushing
-from bench.plugins.scenes.wall_penalty_1d import WallPenalty1d
+from classes import (
+    BounceOnce,
+    BouncingBall,
+    Cartpole,
+    Cubic,
+    DoubleIntegrator,
+    ExplicitEuler,
+    Impulse,
+    Jax,
+    Penalty,
+    Pushing,
+    SemiImplicitEuler,
+    WallPenalty1d,
+)
 
 from bench.model import compose
 

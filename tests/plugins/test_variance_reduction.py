@@ -2,15 +2,9 @@
 
 import numpy as np
 import pytest
-from bench.plugins.backends.numpy import Numpy
-from bench.plugins.estimators.optimal_baseline import OptimalBaseline
-from bench.plugins.estimators.quadratic_model import QuadraticModel
-from bench.plugins.estimators.randomized_smoothing import RandomizedSmoothing
 from bench.plugins.estimators.sobol import Sobol, directions, points
-from bench.plugins.scenes.cubic import Cubic
-from bench.plugins.scenes.heaviside import Heaviside
 from bench.plugins.scenes.linear import Linear
-from bench.plugins.scenes.quadratic import Quadratic
+from classes import Cubic, Heaviside, Numpy, OptimalBaseline, Quadratic, QuadraticModel, RandomizedSmoothing
 from scipy import stats
 
 import bench

@@ -2,11 +2,7 @@
 
 import numpy as np
 import pytest
-from bench.plugins.backends.numpy import Numpy
-from bench.plugins.estimators.fobg import Fobg
-from bench.plugins.estimators.windowed import Windowed
-from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
-from bench.plugins.scenes.static_gain import StaticGain
+from classes import Fobg, Numpy, SemiImplicitEuler, StaticGain, Windowed
 
 import bench
 from bench.model import adjoint_gradient, compose, slopes

@@ -10,12 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from bench.plugins.backends import rows
-from bench.plugins.backends.jax import Jax
-from bench.plugins.contacts.complementarity import Complementarity
-from bench.plugins.contacts.penalty import Penalty
-from bench.plugins.contacts.softplus import Softplus
-from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
-from bench.plugins.scenes.pushing import Pushing
+from classes import Complementarity, Jax, Penalty, Pushing, SemiImplicitEuler, Softplus
 
 from bench import cli
 from bench.model import Compilations, blocks, compose, registry

@@ -5,14 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 import pytest
-from bench.plugins.backends.implicit import Implicit
-from bench.plugins.backends.jax import Jax
-from bench.plugins.contacts.complementarity import Complementarity
-from bench.plugins.contacts.impulse import Impulse
-from bench.plugins.contacts.penalty import Penalty
-from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
-from bench.plugins.scenes.bounce_once import BounceOnce
-from bench.plugins.scenes.pushing import Pushing
+from classes import BounceOnce, Complementarity, Implicit, Impulse, Jax, Penalty, Pushing, SemiImplicitEuler
 
 from bench.cli import main
 from bench.experiment import config
