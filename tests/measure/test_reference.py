@@ -13,10 +13,9 @@ from classes import Heaviside, Numpy
 from bench.measure import noise, reference
 from bench.measure.batches import in_columns
 from bench.measure.jumps import largest_jump
-from bench.measure.quadrature import NODES, SEARCH, Integral
+from bench.measure.quadrature import Integral
 from bench.measure.reference import BATCHES, certify
 from bench.model import compose
-from bench.model.problem import Problem
 
 EVERY = bank.cases()
 SAMPLES = 1 << 14
@@ -249,18 +248,6 @@ def test_sampling_stops_at_its_tolerance_and_not_before(tolerance):
     assert n < 1 << 20
     # half as many would not do, unless it was the least number
     assert n == reference.LEAST_SAMPLES or found.known().standard_error * 2**0.5 > 0.9 * tolerance * norm
-
-
-def test_points_of_a_quadrature_are_those_it_evaluates(monkeypatch):
-    seen = []
-    plain = Problem.value
-    monkeypatch.setattr(Problem, "value", lambda self, theta, w: seen.append(w.copy()) or plain(self, theta, w))
-    found = bank.certified(ridge(bank.power(3), dim=1), 1 << 18)
-    points = np.unique(np.concatenate([w[0] for w in seen]))
-    # with those of the level before and of the search on a line
-    levels = found_at(found, "points") * 1.5 + NODES * sum(SEARCH)
-    assert points.size == pytest.approx(levels, rel=0.02)
-    assert found_at(found, "spacing") == pytest.approx(18 / found_at(found, "points"), rel=0.02)
 
 
 def test_parts_of_one_length_give_the_whole():

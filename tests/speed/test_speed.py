@@ -96,10 +96,7 @@ def whole_and_by_rows(function, *arguments):
 @pytest.mark.parametrize(
     "function",
     [
-        lambda q, v: jnp.stack([v[0] - 2.0, q[1] * q[0]]) / (1.0 + q**2),
         lambda q, v: jnp.concatenate([q[1:2], v, jnp.ones((1, 5))])[::-1],
-        lambda q, v: jnp.where(q > 0, q, jnp.zeros_like(q)) + jnp.sum(v, axis=0, keepdims=True),
-        lambda q, v: q / jnp.sqrt(v[0:1] ** 2 + 1.0) + jnp.min(v, axis=0),
         lambda q, v: jnp.logaddexp(q, 0.0) @ jnp.ones((5, 5)) + jax.nn.softplus(v),
         lambda q, v: jnp.reshape(q, (-1,))[:5] + v[1] + jnp.broadcast_to(q[0], (5,)),
         lambda q, v: jax.lax.fori_loop(0, 3, lambda i, x: 0.5 * x + v, q),
