@@ -168,21 +168,6 @@ def test_the_closed_form_of_the_walk_is_the_sum_over_all_walks():
     np.testing.assert_allclose(scene.closed_form_gradient(None, None), expected, rtol=1e-9)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("scene", "estimator"),
-    [
-        (CoinWalk(pull=-0.2, sigma=0.4), StochasticDerivative()),
-        (CoinWalk(push=-0.5, goal=-6.0), StochasticDerivative()),
-        pytest.param(CoinWalk(pull=-0.2, sigma=0.4), Boundary(), marks=pytest.mark.slow),
-        pytest.param(CoinWalk(push=-0.5, goal=-6.0), Boundary(), marks=pytest.mark.slow),
-    ],
-    ids=str,
-)
-def test_events_in_a_row_are_unbiased(scene, estimator):
-    assert agrees(estimates(estimator, scene, repeats=3000), scene.closed_form_gradient(None, None))
-
-
 # ------------------------------------------------------------------------------------------------- refusals
 
 

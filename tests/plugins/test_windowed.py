@@ -22,12 +22,9 @@ def numpy_problem(scene):
 @pytest.mark.parametrize(
     "problem",
     [
-        bench.problem("pendulum_swing[horizon=12]", backend="numpy"),
         bench.problem("cartpole[horizon=12]", backend="numpy"),
-        bench.problem("cartpole[horizon=12,noise=parameter]", backend="numpy"),
         bench.problem("static_gain[noise=action]", backend="numpy"),
         bench.problem("pushing[horizon=12]", contact="softplus[beta=100]", backend="numpy"),
-        bench.problem("ground_wall[horizon=12]", backend="numpy"),
         bench.problem("friction_block[horizon=12]", backend="numpy"),
     ],
     ids=lambda problem: problem.program.scene.name,
