@@ -24,8 +24,6 @@ class Case:
     causes: tuple[str, ...] = ()
     """Correct names of the planted fault; empty for a correct gradient."""
     settings: dict[str, Any] = field(default_factory=dict)
-    warned: str = ""
-    """Expected start of a warning about a correct gradient."""
 
 
 # ------------------------------------------------------------------------------------------------ NumPy
@@ -191,14 +189,6 @@ def torch_cases():
         def backward(context, slope):
             return 0.5 * slope * context.saved_tensors[0].cos()
 
-    grid = torch.linspace(-1, 1, 20001)
-
-    def snapped(x):
-        return fall(x) + 0.1 * torch.argmin((grid - x[0]).abs()) / 20000
-
-    def masked(x):
-        return fall(x) + torch.where(x[0] > 0.1, torch.sqrt(x[0] - 0.1), torch.zeros_like(x[0]))
-
     def ranked(x):
         return (x * torch.argsort(x).double()).sum() + torch.sort(x).indices.double()[0]
 
@@ -207,9 +197,6 @@ def torch_cases():
     yield Case("item() in the loop", lambda x: fall(x, state=lambda q: q * 0 + q.item()), at, "torch", off)
     yield Case("in-place clamp of data", lambda x: fall(x, state=clamped), at, "torch", cut)
     yield Case("rounded", lambda x: fall((x * 1e5).long() / 1e5), at, "torch", ("staircase",))
-    yield Case("float32 inside", lambda x: fall(x.float()).double(), at, "torch", warned="precision")
-    yield Case("NaN behind where", masked, at, "torch", ("nan_gradient",))
-    yield Case("argmin of a grid", snapped, at, "torch", ("staircase",))
     yield Case("rank by sorting", ranked, [0.3, 0.3], "torch", ("jump",))
     yield Case("wrong backward", lambda x: Halved.apply(x).sum(), [0.3, 0.7], "torch", ("wrong_factor",))
 
@@ -245,15 +232,10 @@ def jax_cases():
 
     wrong.defvjp(lambda x: (jnp.sin(x), x), lambda x, g: (-g * jnp.cos(x),))
 
-    def norm(x):
-        return jnp.linalg.norm(x[1:]) ** 2 + x[0] ** 2
-
     at = [1.0, 0.1]
     yield Case("stop_gradient on contact", lambda x: push(x, jax.lax.stop_gradient), at, "jax", ("missing_term",))
     yield Case("stop_gradient on theta", lambda x: push(jax.lax.stop_gradient(x)), at, "jax", ("disconnected",))
-    yield Case("cast to int", lambda x: push((x * 1e5).astype(int) / 1e5), at, "jax", ("staircase",))
     yield Case("wrong custom_vjp", lambda x: wrong(x).sum(), at, "jax", ("wrong_factor",))
-    yield Case("norm at 0, squared", norm, [0.3, 0.0], "jax", ("nan_gradient",))
     yield Case("float(x) in the loop", lambda x: push(x) + float(x[0]), at, "jax", ("raised",))
 
     yield Case("pushing", push, at, "jax")

@@ -307,19 +307,27 @@ def test_cells_that_are_gone_or_new_are_reported():
 # ------------------------------------------------------------------------------------------------------- command
 
 
-def test_exit_status_files_and_table(tmp_path, capsys):
+def test_files_say_what_the_exit_status_says(tmp_path, capsys):
     before, after = given(), given()
-    after.loc[good(after), ["status", "reason"]] = ["error", "it broke"]
+    after.loc[good(after), ["status", "reason"]] = ["error", "it broke\x00 <badly> & \x1b[31m"]
     old, new = save(before, tmp_path / "old"), save(after, tmp_path / "new")
-    assert run(old, old, out=tmp_path / "out") == 0
-    assert run(old, new, out=tmp_path / "out") == 1
-    printed = capsys.readouterr().out
-    assert "status ok to error (it broke)" in printed
-    table = pd.read_csv(tmp_path / "out" / "compare.csv")
+    out = tmp_path / "out"
+    for other, failures in ((old, 0), (new, 1)):
+        assert run(old, other, out=out) == failures
+        result = json.loads((out / "compare.json").read_text())
+        assert result["worse"] == bool(failures)
+        assert result["counts"]["worse"] == len(result["cells"]) == failures
+        assert sum(result["counts"].values()) == len(before)
+        suites = ElementTree.parse(out / "compare.xml").getroot()
+        assert int(suites.get("failures")) == len(suites.findall("./testsuite/testcase/failure")) == failures
+        assert len(suites.findall("./testsuite/testcase")) == len(before)
+        table = pd.read_csv(out / "compare.csv")
+        assert (table["outcome"] == "worse").sum() == failures
+    assert "<badly>" in suites.find(".//failure").get("message")
     assert list(table.columns) == ["experiment", *cells.FIRST, *cells.both_sides(COLUMNS.compared), *cells.LAST]
-    assert (table["outcome"] == "worse").sum() == 1
-    assert "it broke" in (tmp_path / "out" / "compare.md").read_text()
-    assert "it broke" in (tmp_path / "out" / "compare.html").read_text()
+    assert "status ok to error (it broke" in capsys.readouterr().out
+    for name in ("compare.md", "compare.html"):
+        assert "it broke" in (out / name).read_text()
 
 
 def test_further_runs_of_before_are_read(tmp_path):
@@ -328,22 +336,6 @@ def test_further_runs_of_before_are_read(tmp_path):
     old, new, *again = (save(rows, tmp_path / str(i)) for i, rows in enumerate((before, after, *more)))
     assert run(old, new, "--timings", out=tmp_path / "out") == 0
     assert run(old, new, "--timings", f"again={again[0]},{again[1]}", out=tmp_path / "out") == 1
-
-
-def test_json_and_junit_say_what_the_exit_status_says(tmp_path):
-    before, after = given(), given()
-    after.loc[good(after), ["status", "reason"]] = ["error", "it broke\x00 <badly> & \x1b[31m"]
-    old, new = save(before, tmp_path / "old"), save(after, tmp_path / "new")
-    for other, failures in ((old, 0), (new, 1)):
-        assert run(old, other, out=tmp_path / "out") == failures
-        result = json.loads((tmp_path / "out" / "compare.json").read_text())
-        assert result["worse"] == bool(failures)
-        assert result["counts"]["worse"] == len(result["cells"]) == failures
-        assert sum(result["counts"].values()) == len(before)
-        suites = ElementTree.parse(tmp_path / "out" / "compare.xml").getroot()
-        assert int(suites.get("failures")) == len(suites.findall("./testsuite/testcase/failure")) == failures
-        assert len(suites.findall("./testsuite/testcase")) == len(before)
-    assert "<badly>" in suites.find(".//failure").get("message")
 
 
 @pytest.mark.slow

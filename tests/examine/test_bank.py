@@ -12,7 +12,6 @@ def judge(case):
     assert bool(report.status) == bool(case.causes), f"{case.name}: {report.cause}\n{report}"
     if case.causes and case.name not in UNNAMED:
         assert report.cause in case.causes, case.name
-    assert not case.warned or any(case.warned in text for text in report.warnings), case.name
 
 
 RIGHT = {case.name: case for case in simulators.right_cases()}

@@ -83,25 +83,6 @@ def test_ties_and_nan_are_those_of_jax(kinks):
     assert fused.value(theta, np.zeros((4, 1)))[0] == pytest.approx(3.0 + 2.0 * math.sin(1e9 + 0.5), rel=SAME)
 
 
-@pytest.mark.slow
-def test_rollouts_are_those_of_jax_for_every_batch_and_thread(pushing):
-    fused, jax = pushing
-    rng = np.random.default_rng(0)
-    w = rng.standard_normal((3, 1100))
-    theta = jax.program.theta0[:, None] + 0.1 * rng.standard_normal((3, 1100))
-    whole = fused.grad(theta, w)
-    assert relative(whole, jax.grad(theta, w)) < SAME
-    fused.block, fused.threads, fused.least = 96, 1, 1
-    one = fused.grad(theta, w)
-    fused.threads = 2
-    two = fused.grad(theta, w)
-    assert np.array_equal(one, whole)
-    assert np.array_equal(two, whole)
-    shared = fused.grad(jax.program.theta0, w)
-    assert np.array_equal(fused.grad(jax.program.theta0, w[:, :1]), shared[:, :1])
-    assert np.array_equal(fused.grad(jax.program.theta0, w[:, 7:40]), shared[:, 7:40])
-
-
 @pytest.mark.parametrize(("dtype", "huge"), [("float64", 1e200), pytest.param("float32", 1e25, marks=pytest.mark.slow)])
 def test_a_cost_that_overflows_has_no_gradient_finite_as_its_slope_may_be(pushing, dtype, huge):
     """In float32 the slope of such a cost once came out as a number."""

@@ -13,8 +13,6 @@ from bench.measure import noise
 from bench.model import LoopOps, State, adjoint_gradient, slopes
 from bench.model.policy import policy_of, uniform
 
-REVERSED = 1e-9
-"""Relative difference of gradients by one reverse pass and step by step: rounding over 30 steps."""
 DIFFERENCED = 1e-6
 """Relative error of central differences of the cost, whose steps are 1e-6."""
 
@@ -86,16 +84,6 @@ def test_the_adjoint_without_jax_takes_differences(monkeypatch):
     monkeypatch.setattr(CartpoleSwing, "pullback", lambda *_, **__: None)
     by_differences = adjoint_gradient(exact, slopes(exact, theta, w))
     assert np.abs(by_differences - by_product).max() < DIFFERENCED * np.abs(by_product).max()
-
-
-@pytest.mark.slow
-def test_a_long_theta_has_blocks_of_few_columns(monkeypatch):
-    usual = problem(horizon=5)
-    theta, w = usual.program.theta0, sample(usual, 11)
-    monkeypatch.setattr("bench.plugins.backends.jax.LARGE", usual.dim)
-    long = problem(horizon=5)
-    assert (long.grain, long.block) == (8, 8)
-    assert long.grad(theta, w) == pytest.approx(usual.grad(theta, w), rel=REVERSED)
 
 
 def test_the_adjoint_keeps_no_copy_of_theta_for_each_step():

@@ -72,8 +72,10 @@ def pushing(horizon=8, contact=None, **values):
     return compose(Pushing(horizon=horizon, **values), contact or Penalty(), SemiImplicitEuler())
 
 
-@pytest.mark.parametrize("name", ["jax", "torch", "numpy"])
+@pytest.mark.parametrize("name", ["jax", "torch", "numpy", pytest.param("fused", marks=pytest.mark.slow)])
 def test_padding_and_sharing_change_no_result(name):
+    if reason := registry.find("backends", name).reason:
+        pytest.skip(reason)
     problem = registry.make("backends", name).compile(pushing())
     w = np.random.default_rng(0).standard_normal((8, 130))
     theta = problem.program.theta0
