@@ -4,10 +4,8 @@ import json
 import re
 import shutil
 import subprocess
-from pathlib import Path
 
 import pytest
-import yaml
 
 from bench.errors import UserError
 from bench.model import registry
@@ -101,22 +99,6 @@ def test_long_tables_are_shortened():
     short = website.short_tables(f"# title\n\n{table}\n## Every cell\n\n{table}")
     assert short.count("\n| ") == website.LONGEST
     assert "further rows" in short
-
-
-def test_links_to_files_become_copies():
-    text = website.localise(
-        "[a](docs/trust.md#three-errors) [b](LICENSE) [c](docs) ![d](docs/site.css)", Path("README.md")
-    )
-    assert text == "[a](trust.md#three-errors) {download}`b </repo/LICENSE>` c ![d](/repo/docs/site.css)"
-
-
-def test_the_workflow_publishes_what_make_site_builds():
-    workflow = yaml.safe_load((website.ROOT / ".github" / "workflows" / "site.yml").read_text())
-    steps = workflow["jobs"]["build"]["steps"]
-    assert {"run": "make site"} in steps
-    assert "\nsite: $(VENV)/.installed\n\t$(BIN)/python -m docs.build site\n" in (website.ROOT / "Makefile").read_text()
-    assert steps[-1]["with"]["path"] == "build/site/html"
-    assert workflow["jobs"]["publish"]["needs"] == "build"
 
 
 # --------------------------------------------------------------------------------------------------- the built site
