@@ -90,16 +90,6 @@ def test_readme_is_short():
     assert len(README.splitlines()) <= 150
 
 
-def test_readme_names_the_two_commands_that_set_everything_up():
-    section = README.partition("## Two commands\n")[2].partition("\n## ")[0]
-    commands = re.findall(r"^    (make \w+)", section, re.MULTILINE)
-    assert commands == ["make run", "make test"]
-    for command in commands:
-        assert f"| `{command}` |" in section
-        assert f"\n{command.split()[1]}: $(VENV)/.installed\n" in (ROOT / "Makefile").read_text()
-    assert " make test\n" in (ROOT / ".ci" / "run").read_text()
-
-
 def test_every_page_is_linked_from_the_readme():
     for name in DOCS:
         assert f"(docs/{name}" in README, name

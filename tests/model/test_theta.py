@@ -187,11 +187,6 @@ def test_theta0_moves_where_gradients_are_taken():
     assert there / own == pytest.approx(moved.theta0 / scene.theta0())
 
 
-def test_theta0_of_named_parameters_is_their_value():
-    assert program_of(*CASES["pushing"]).theta0.tolist() == [0.1, 1000.0]
-    assert program_of(*CASES["pushing at"]).theta0.tolist() == [700.0, 0.2]
-
-
 def test_rollout_of_named_parameters_shows_their_states():
     program = program_of(*CASES["mass_spring"])
     plain = compose(dataclasses.replace(program.scene, damping=1.0), None, SemiImplicitEuler())
