@@ -4,8 +4,6 @@ Each fault whose file or text contains a word is planted in a copy of the tree. 
 forked after the libraries are loaded. Run by hand: all faults take half an hour.
 """
 
-from __future__ import annotations
-
 import os
 import resource
 import shlex
@@ -454,7 +452,7 @@ that may stop below its least number of points: it never stops before the second
 FAULTS = [Fault(path, old, new, tests) for (path, tests), lines in GROUPS.items() for old, new in lines]
 
 
-def killed(fault: Fault, folder: Path) -> bool:
+def killed(fault, folder):
     """Plant the fault in the copy at ``folder``, run its tests in a forked process, and return whether one failed."""
     path = folder / fault.path
     text = path.read_text()
@@ -484,13 +482,13 @@ def killed(fault: Fault, folder: Path) -> bool:
     return code != 0
 
 
-def stale(faults: list[Fault]) -> list[str]:
+def stale(faults):
     """Return a message per fault that cannot be planted, since the code does not contain its text exactly once."""
     held = {path: (ROOT / path).read_text() for path in {fault.path for fault in faults}}
     return [f"{f.path} does not hold exactly one: {f.old}" for f in faults if held[f.path].count(f.old) != 1]
 
 
-def main(words: list[str]) -> int:
+def main(words):
     """Run the faults whose file or text contains one of the words, or all; return 1 if any survives."""
     chosen = [fault for fault in FAULTS if not words or any(word in f"{fault.path} {fault.old}" for word in words)]
     if lost := stale(chosen):

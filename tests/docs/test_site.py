@@ -94,13 +94,6 @@ def test_answers_are_carried_by_the_stored_tables():
             assert not json.loads(stored.read_text())["answer"], name
 
 
-def test_long_tables_are_shortened():
-    table = "| a |\n|---|\n" + "".join(f"| {i} |\n" for i in range(100))
-    short = website.short_tables(f"# title\n\n{table}\n## Every cell\n\n{table}")
-    assert short.count("\n| ") == website.LONGEST
-    assert "further rows" in short
-
-
 # --------------------------------------------------------------------------------------------------- the built site
 
 

@@ -115,10 +115,8 @@ def test_double_pendulum_acceleration_is_that_of_its_energy():
 
 BOUNCES = [
     pytest.param(BouncingBall(), marks=pytest.mark.slow),
-    pytest.param(BouncingBall(horizon=50, dt=0.02), marks=pytest.mark.slow),
     BouncingBall(horizon=7, dt=1 / 7),
     pytest.param(BouncingBall(horizon=300, dt=0.01, velocity=1.0), marks=pytest.mark.slow),
-    pytest.param(BouncingBall(horizon=120, dt=0.01, restitution=0.7), marks=pytest.mark.slow),
     BouncingBall(horizon=120, dt=0.01, restitution=0.7, mass=3.0, velocity=-2.0),
 ]
 

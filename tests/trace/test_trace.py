@@ -243,10 +243,6 @@ def test_one_spike_among_many_switches_is_left_open():
     assert "chance could explain it" in said[1]
 
 
-def test_no_switch_is_said():
-    assert all("no contact switches" in line for line in verdict(planted(spike_at=(30,))))
-
-
 # --------------------------------------------------------------------------------------------------------- command
 
 
