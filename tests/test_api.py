@@ -229,11 +229,9 @@ def test_keywords_are_the_override_words_of_the_command_line():
     same = [
         (["samples=8", "sweep.stiffness=[100,1e4]"], {"samples": np.int64(8), "sweep": {"stiffness": np.array([100, 1e4])}}),
         (["sweep.zip={stiffness:[1,2],dt:[0.01,0.001]}"], {"sweep": {"zip": {"stiffness": [1, 2], "dt": (0.01, 0.001)}}}),
-        (["sweep.union=[{stiffness:[1]},{mass:[2]}]"], {"sweep": {"union": [{"stiffness": [1]}, {"mass": [2]}]}}),
         (["estimators=[reinforce[baseline=none]]"], {"estimators": ["reinforce[baseline=none]"]}),
         (["study=bias_variance[timed_calls=3]"], {"study": "bias_variance[timed_calls=3]"}),
         (["theta=[mass]", "theta0=[0.3]"], {"theta": ["mass"], "theta0": np.array([0.3])}),
-        (["timing=false", "reference.samples=8192"], {"timing": np.bool_(False), "reference": {"samples": 8192}}),
         (["sweep.bound=[null,1.0]", "estimators=[alpha_order]"], {"sweep": {"bound": [None, 1.0]}, "estimators": ["alpha_order"]}),
     ]  # fmt: skip
     for words, overrides in same:
