@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
-from bench.errors import Unsupported
+from bench.errors import UserError
 from bench.experiment.cell import Cell
 from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, text
 from bench.model import Identified, MechanicalScene, Optimizer, param
@@ -34,7 +34,7 @@ class Identify(StudyPackage):
         text("contradictions", "tests that the first record's fit fails, each with its statistic in units of its edge"),
         Column("noise_size", "standard deviation of the residuals of the first record", "m"),
         numbers("terms", "terms that the model lacks, whose effect on the record is tested"),
-        numbers("unnoticed", "by invariant and term, the largest relative bias of an estimate that a term causes while 5% of "
+        numbers("unnoticed", "by invariant and term, the largest bias of an estimate that a term causes while 5% of "
                 "records do not show it"),
         numbers("unknowns", "names of the parameters"),
         numbers("units", "units of the parameters", table=False),
@@ -71,7 +71,7 @@ class Identify(StudyPackage):
                 table=False),
     )  # fmt: skip
 
-    revision: ClassVar[int] = 2
+    revision: ClassVar[int] = 3
 
     measurement: float | None = param(
         None,
@@ -86,8 +86,13 @@ class Identify(StudyPackage):
     scan: int = param(0, "values of each unknown at which the loss is scanned; 0: no scan", low=0, high=10_000)
     span: float = param(2.0, "a scan covers the truth over this to the truth times this", low=1.0)
     data: str | None = param(None, "CSV file with measurements of your own, a line per step; null: made from the truth")
-    measured: str | None = param(None, "names of its measured columns, a+b; null: all")
-    time: str | None = param(None, "name of its column of times in s, from which lines may be missing; null: all steps")
+    measured: str | None = param(None, "what its columns measure, q0=angle*pi/180;v0=rate; null: all columns, in order")
+    time: str | None = param(None, "its time in s, an expression too, with which lines may be missing; null: all steps")
+    interpolate: bool = param(False, "interpolate it linearly at the steps")
+    free: str | None = param(
+        None, "entries of the initial state that are unknown too, q0+v0; unknowns start.q0, start.v0"
+    )
+    terms: str | None = param(None, "accelerations that the model may lack, name=v*q**2;other=sign(v)*abs(q1)")
 
     def unsupported_reason(self, cell: Cell) -> str | None:
         """Return why a cell cannot be fitted (no motion, no unknowns, no NumPy steps, sampling, unusable data), or None."""
@@ -105,10 +110,8 @@ class Identify(StudyPackage):
             )
         if optimizer.draws(2):
             return f"optimizer {optimizer.name} samples, and fits are compared along one path: use a deterministic one"
-        if self.data is not None:
-            try:
-                module = self._module("measure")
-                module.read(self, module.model_of(cell))
-            except (OSError, ValueError, Unsupported) as error:
-                return str(error).strip()
+        try:
+            self._module("measure").prepared(cell, self)
+        except (OSError, ValueError, UserError) as error:
+            return str(error).strip()
         return None

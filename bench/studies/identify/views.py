@@ -36,10 +36,10 @@ the 95% intervals miss the truth instead of 5%.
 DIGITS = 4
 """Significant digits of estimates."""
 PROBLEM, SHOOTING, PARAMETER = text("problem"), text("shooting"), text("parameter")
-BIAS = Column("bias", label="unnoticed bias")
+BIAS = Column("bias", label="unseen bias")
 ESTIMATES = (
-    "estimate: of the first record, by one rollout. low, high: its 95% interval. identifiable: a parameter that is not has no estimate; "
-    "only the products named are. unnoticed bias: the largest that a term of the next table can cause, to first order, while 5% of "
+    "estimate: of the first record, by one rollout. low, high: its 95% interval. identified: a parameter that is not has no estimate; in "
+    "products: only products with it are. unseen bias: the largest that a term of the next table can cause, to first order, while 5% of "
     "records do not show it. doubt: unfinished, no optimum was reached; not explained, the residuals contradict the model; untested, too "
     "few measurements for a test; time step, halving it moves the estimate by more than half its standard error.",
 )
@@ -88,7 +88,7 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
         Table(
             "identify", found,
             [PARAMETER, *(Column(name, digits=DIGITS) for name in ("estimate", "low", "high")), BIAS, text("doubt"), text("unit"),
-             text("identifiable"), Column("start", format="setting")],
+             text("identifiable", label="identified"), Column("start", format="setting")],
             "Estimates", ESTIMATES, terminal=True, page=True, split=split, data=table(experiment, rows),
         ),
         Table(
@@ -98,8 +98,8 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
         ),
         Table(
             "identify", given,
-            [PROBLEM, by_name["explained"], text("intervals"), by_name["noise_size"],
-             by_name["step_shift_bound"], by_name["condition"], by_name["contradictions"]],
+            [PROBLEM, by_name["explained"], by_name["contradictions"], text("intervals"), by_name["noise_size"],
+             by_name["step_shift_bound"], by_name["condition"]],
             "Records", RECORDS, terminal=True, page=True,
         ),
         Table(
@@ -149,15 +149,14 @@ def estimates(rows: pd.DataFrame) -> pd.DataFrame:
         for k, name in enumerate(dict.fromkeys([*invariants, *unknowns])):
             is_known = k < len(invariants)
             powers = exponents[k] if is_known else np.eye(len(unknowns))[unknowns.index(name)]
-            products = [one for one, power in zip(invariants, exponents @ powers, strict=True) if abs(power) > 1e-4]
             ends = [row[column][k] if is_known else np.nan for column in ("estimate", "estimate_low", "estimate_high")]
             biases = np.reshape(row["unnoticed"], (len(invariants) or 1, -1))[k] if is_known else np.array(())
             lines.append({
                 "problem": row["problem"], "parameter": name, **dict(zip(("estimate", "low", "high"), ends, strict=True)),
                 "unit": row["units"][unknowns.index(name)] if name in unknowns else product(units, powers),
-                "identifiable": "yes" if is_known else "only " + ", ".join(products) if products else "no",
+                "identifiable": "yes" if is_known else "in products" if (abs(exponents @ powers) > 1e-4).any() else "no",
                 "start": np.prod(np.power(row["start"], powers)),
-                "bias": ends[0] * biases.max() if biases.size else np.nan,
+                "bias": biases.max() if biases.size else np.nan,
                 "doubt": ", ".join(doubt for doubt, holds in doubts.items() if holds),
             })  # fmt: skip
     return pd.DataFrame(lines)
@@ -169,11 +168,10 @@ def unnoticed(rows: pd.DataFrame) -> pd.DataFrame:
     for row in rows.to_dict("records"):
         biases = np.reshape(row["unnoticed"], (-1, len(row["terms"]) or 1))
         for k, j in np.ndindex(biases.shape) if biases.size else ():
-            with np.errstate(divide="ignore"):
-                width = np.diff(np.log([row["estimate_low"][k], row["estimate_high"][k]]))[0]
+            width = row["estimate_high"][k] - row["estimate_low"][k]
             lines.append({
                 "problem": row["problem"], "parameter": row["invariants"][k], "term": row["terms"][j],
-                "bias": row["estimate"][k] * biases[k, j], "errors": biases[k, j] * 2.0 * Z / width,
+                "bias": biases[k, j], "errors": biases[k, j] * 2.0 * Z / width,
             })  # fmt: skip
     table_ = pd.DataFrame(lines, columns=["problem", "parameter", "term", "bias", "errors"])
     return table_.sort_values("errors", ascending=False, ignore_index=True)
