@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -17,7 +16,7 @@ from bench.errors import Unsupported, unknown
 from bench.experiment.cell import Cell
 from bench.experiment.session import Session
 from bench.measure import adequacy, noise, performance
-from bench.measure.identification import Information
+from bench.measure.identification import Information, product
 from bench.model import Answer, Decision, Identified, LoopOps, MechanicalScene, Optimizer, Rollout, State, compose
 from bench.model.parameters import Parameter, named
 from bench.studies import norm
@@ -36,6 +35,8 @@ NOISE = 0.01
 """Noise of records that are made from the truth, if none is stated."""
 CONVERGED = 1e-3
 """Remaining step of a converged fit, in standard errors by its residuals, and its square by the noise."""
+SHARE = 1e-4
+"""Exponents below this are 0."""
 TESTED = 64
 """Most records whose residuals are tested."""
 UNEXPLAINED = 1e-3
@@ -105,7 +106,7 @@ class Model:
         """Return the unknowns ``(p, B)`` of coordinates."""
         scale = self.scale[:, None]
         with np.errstate(over="ignore"):
-            return np.where(scale, scale * points, np.exp(points))
+            return np.asarray(np.where(scale, scale * points, np.exp(points)))
 
     def points(self, theta: np.ndarray) -> np.ndarray:
         """Return the coordinates ``(p, B)`` of unknowns."""
@@ -122,15 +123,11 @@ class Model:
 
         At a scale, the record differs from that of 0 by a hundredth of its size. An unknown that is not 0 is its own scale.
         """
-        is_linear = (self.values <= 0.0) | (np.arange(len(self.names)) >= len(self.program.theta0))
-        sizes, scale = 10.0 ** np.arange(-15, 10), np.where(is_linear, 1.0, 0.0)
-        for i in np.flatnonzero(is_linear):
-            theta = np.repeat(self.values[:, None], len(sizes) + 1, axis=1)
-            theta[i, 1:] += sizes
-            moved = self.record(theta)
-            with np.errstate(all="ignore"):
-                is_small = norms(moved[:, 1:] - moved[:, :1]) <= 0.01 * norms(moved[:, :1])
-            scale[i] = sizes[is_small].max(initial=sizes[0])
+        p = len(self.names)
+        record = self.record(self.values[:, None] + STEP * np.eye(p, p + 1, 1))
+        slopes = np.linalg.norm(record[:, 1:] - record[:, :1], axis=0) / STEP
+        scale = 0.01 * (norm(record[:, 0]) or 1.0) / np.where(slopes > 0.0, slopes, 1.0)
+        scale[(self.values > 0.0) & (np.arange(p) < len(self.program.theta0))] = 0.0
         return dataclasses.replace(self, scale=scale).scaled(self.values)
 
     def _start(self, theta: np.ndarray) -> tuple[Rollout, np.ndarray, State, tuple[np.ndarray, ...]]:
@@ -184,11 +181,6 @@ class Model:
         """Return the measurements ``(m, B)`` of the states ``(horizon, n, B)`` after each step."""
         measured: np.ndarray = states[np.array(self.steps) - 1][:, list(self.measured)]
         return measured.reshape(-1, states.shape[2])
-
-
-def norms(columns: np.ndarray) -> np.ndarray:
-    """Return the norms of columns ``(m, B)``."""
-    return np.asarray(np.linalg.norm(columns, axis=0))
 
 
 def model_of(cell: Cell, refinement: int = 1) -> Model:
@@ -302,10 +294,11 @@ class Fitting:
             states[:] = self.model.motion(theta)[0][at]
             table = data.reshape(-1, len(self.model.measured), batch)
             n_q, dt = self.model.program.scene.n_q, self.model.program.scene.dt
-            for column, coordinate in enumerate(self.model.measured if n_q == 0 or n == 2 * n_q else ()):
-                states[:, coordinate] = table[at - 1, column]
-                if n_q:
-                    states[:, n_q + coordinate] = (table[at, column] - table[at - 2, column]) / (2 * dt)
+            slopes = np.gradient(table, dt, axis=0)
+            for column, entry in enumerate(self.model.measured if n in (n_q, 2 * n_q) or not n_q else ()):
+                if n_q and entry < n_q:
+                    states[:, n_q + entry] = slopes[at - 1, column]
+                states[:, entry] = table[at - 1, column]
         return np.concatenate([self.model.points(theta), (states / self.model.unit[:, None]).reshape(-1, batch)])
 
 
@@ -327,10 +320,9 @@ def run_fits(
         counts = [points.shape[1] for points in queries]
         points, many = np.concatenate(queries, axis=1), np.repeat(data[:, active], counts, axis=1)
         residual, jacobian = fitting.residuals(points, many), fitting.jacobians(points, many)
-        ends = np.cumsum([0, *counts])
-        for i, query, (low, high) in zip(active, queries, itertools.pairwise(ends), strict=True):
-            own = residual[:, low:high]
-            slope = jacobian[:, :, low:high]
+        ends = np.cumsum(counts)[:-1]
+        parts = np.split(residual, ends, axis=1), np.split(jacobian, ends, axis=2)
+        for i, query, own, slope in zip(active, queries, *parts, strict=True):
             gradient = np.einsum("mdb,mb->db", slope, own)
             answer = Answer(value=0.5 * (own**2).sum(axis=0), residual=own, jacobian=slope, gradient=gradient)
             states[i] = optimizer.tell(states[i], query, answer)
@@ -354,7 +346,7 @@ def prepared(cell: Cell, settings: Identify) -> tuple[Model, np.ndarray | None]:
     """
     model = model_of(cell)
     for text in expressions(settings.terms).values():
-        evaluate(text, dict.fromkeys((*model.entries, "q", "v"), 0.0))
+        evaluate(text, dict.fromkeys((*model.entries, "q", "v", "t"), np.zeros(2)))
     if settings.data is None:
         return model, None
     data, model = own_record(settings, model)
@@ -399,19 +391,23 @@ def measure(cell: Cell, session: Session, settings: Identify) -> dict[str, Any]:
     known = information(model, theta, sigma)
     result: dict[str, Any] = {
         "status": "ok", "reason": "", "rank": known.rank, "condition": known.condition, "fits": data.shape[1],
-        "unknowns": list(model.names), "units": [parameter.unit for parameter in model.parameters],
-        "truth": [math.nan] * len(theta) if is_own else theta.tolist(), "start": start[:, 0].tolist(),
-        "invariants": known.labels, "exponents": known.invariants.ravel().tolist(),
-        "bound": known.bound.tolist(), "fisher": known.fisher.ravel().tolist(),
+        "unknowns": list(model.names), "truth": [math.nan] * len(theta) if is_own else theta.tolist(),
+        "invariants": known.labels, "bound": known.bound.tolist(), "fisher": known.fisher.ravel().tolist(),
         **step_dependence(cell, model, theta, known, sigma),
-        **_explanation(model, single, known, is_noise_known, expressions(settings.terms)),
+        **_estimates(single, known, start[:, 0], is_noise_known, expressions(settings.terms)),
     }  # fmt: skip
     fits = [single, *(fit(shooting, sigma) for shooting in SHOOTING[1:] if has_windows)]
-    found = [_fit_statistics(one, known, is_own, is_noise_known) for one in fits]
-    lines = {name: np.concatenate([np.atleast_1d(one[name]) for one in found]).tolist() for name in found[0]}
+    result |= columns_of(_fit_statistics(one, known, is_own, is_noise_known) for one in fits)
     if settings.scan:
-        lines |= scan(model, n_windows if has_windows else 1, data[:, :1], sigma, settings)
-    return result | lines
+        result |= columns_of(scan(model, n_windows if has_windows else 1, data[:, :1], sigma, settings))
+        result["scan_loss"] = np.concatenate(result["scan_loss"]).tolist()
+    return result
+
+
+def columns_of(lines: Iterable[Mapping[str, Any]]) -> dict[str, list[Any]]:
+    """Return lines as lists by column."""
+    every = list(lines)
+    return {name: [line[name] for line in every] for name in every[0]} if every else {}
 
 
 @dataclass(frozen=True)
@@ -437,8 +433,8 @@ class Fit:
         return np.asarray(own - later @ (np.linalg.pinv(later) @ own))
 
 
-def scan(model: Model, n_windows: int, data: np.ndarray, sigma: float, settings: Identify) -> dict[str, list[Any]]:
-    """Return the loss of one record ``data (m, 1)`` along each unknown, and how many local minima it has.
+def scan(model: Model, n_windows: int, data: np.ndarray, sigma: float, settings: Identify) -> Iterator[dict[str, Any]]:
+    """Yield the loss of one record ``data (m, 1)`` along each unknown and window, and how many local minima it has.
 
     ``scan`` equally spaced values from the truth over ``span`` to the truth times ``span``, within the parameter's
     declared bounds, with all other unknowns at the truth. The loss is the mean square of the residuals in units of the
@@ -451,20 +447,14 @@ def scan(model: Model, n_windows: int, data: np.ndarray, sigma: float, settings:
         counts.insert(1, n_windows)
         n_windows = n_windows // 2 if n_windows % 2 == 0 else 1
     horizon, steps = model.program.scene.horizon, np.repeat(model.steps, len(model.measured))
-    result: dict[str, list[Any]] = {
-        "scan_steps": [horizon // count for count in counts], "scan_low": [], "scan_high": [],
-        "minima": [], "minima_open": [], "scan_loss": [],
-    }  # fmt: skip
     flat = dataclasses.replace(model, scale=np.ones(len(model.names)))
     for i, (value, parameter) in enumerate(zip(model.values, model.parameters, strict=True)):
-        ends = (
-            np.sort([value / settings.span, value * settings.span]) if value else model.scale[i] * np.array([-1.0, 1.0])
+        ends = np.sort([value / settings.span, value * settings.span]) + (value == 0.0) * model.scale[i] * np.array(
+            [-1.0, 1.0]
         )
         low, high = np.clip(ends, parameter.low, parameter.high).tolist()
         theta = np.repeat(model.values[:, None], settings.scan, axis=1)
         theta[i] = np.linspace(low, high, settings.scan)
-        result["scan_low"].append(low)
-        result["scan_high"].append(high)
         for count in counts:
             fitting = Fitting(flat, "windows", count, sigma)
             points = np.repeat(fitting.start(model.values[:, None], data), settings.scan, axis=1)
@@ -473,10 +463,12 @@ def scan(model: Model, n_windows: int, data: np.ndarray, sigma: float, settings:
                 square = np.square(fitting.residuals(points, data))
             inner = steps % (horizon // count) != 0
             loss = square.mean(axis=0)
-            result["minima"].append(int(is_minimum(loss).sum()))
-            result["minima_open"].append(int(is_minimum(square[inner].mean(axis=0)).sum()) if inner.any() else math.nan)
-            result["scan_loss"].extend(loss.tolist())
-    return result
+            yield {
+                "scanned": model.names[i], "scan_unit": parameter.unit, "scan_low": low, "scan_high": high, "scan_truth": math.nan if settings.data else value,
+                "scan_steps": horizon // count, "minima": int(is_minimum(loss).sum()),
+                "minima_open": int(is_minimum(square[inner].mean(axis=0)).sum()) if inner.any() else math.nan,
+                "scan_loss": loss,
+            }  # fmt: skip
 
 
 def is_minimum(values: np.ndarray) -> np.ndarray:
@@ -489,48 +481,91 @@ def is_minimum(values: np.ndarray) -> np.ndarray:
     return np.concatenate([[False], (inner < values[:-2]) & (inner < values[2:]), [False]])
 
 
-def _explanation(
-    model: Model, fit: Fit, known: Information, is_noise_known: bool, own: Mapping[str, str]
+def _estimates(
+    fit: Fit, known: Information, start: np.ndarray, is_noise_known: bool, own: Mapping[str, str]
 ) -> dict[str, Any]:
-    """Return whether the fits by single shooting explain the records, and the biases that tests of them can miss.
+    """Return the first record's estimates, whether fits explain the records, and the biases that tests can miss.
 
     ``explained`` is the share of records that no test contradicts. The other columns belong to the first record.
     """
-    residual, sigma = fit.residual, fit.fitting.noise
+    model, invariants, residual, sigma = fit.fitting.model, known.invariants, fit.residual, fit.fitting.noise
+    p, rank = len(known.names), known.rank
+    theta = model.theta(fit.solution[:p, :1])[:, 0]
+    names = list(dict.fromkeys([*known.labels, *known.names]))
+    exponents = np.concatenate([invariants, np.eye(p)[[known.names.index(name) for name in names[rank:]]]])
+    is_seen = (np.abs(exponents @ invariants.T) > SHARE).any(axis=1)
+    own_units = dict(zip(known.names, (one.unit for one in model.parameters), strict=True))
+    units = tuple(f"({unit})" if {*unit} & {*" /"} else unit or "1" for unit in own_units.values())
+    # an unknown without a logarithm has an interval of its own values
+    estimate, half, noise_kind = _products(theta, invariants), *_half_widths(fit, 0, known, is_noise_known)
+    size = np.abs(_products(np.where(model.scale, model.scale, theta), invariants))
+    is_linear = np.abs(invariants) @ (model.scale != 0.0) > SHARE
+    with np.errstate(over="ignore", invalid="ignore"):
+        low, high = (
+            np.where(is_linear, estimate + side * size * half, estimate * np.exp(side * half)) for side in (-1.0, 1.0)
+        )
+    nothing = [math.nan] * (len(names) - rank)
+    result: dict[str, Any] = {
+        "parameter": names, "estimate": [*estimate, *nothing], "estimate_low": [*low, *nothing],
+        "estimate_high": [*high, *nothing], "unit": [own_units.get(name) or product(units, row) for name, row in zip(names, exponents, strict=True)],
+        "start": _products(start, exponents).tolist(), "interval_noise": noise_kind,
+        "identifiable": ["yes" if k < rank else "in products" if seen else "no" for k, seen in enumerate(is_seen)],
+        "bias": [math.nan] * len(names), "biased": [], "term": [], "unnoticed": [], "errors": [],
+    }  # fmt: skip
     finite = np.flatnonzero(fit.is_finite)[:TESTED].tolist()
-    if not finite or finite[0] or not known.rank:
-        return {"terms": [], "unnoticed": []}
+    if not finite or finite[0] or not rank:
+        return result
     # the effects of missing terms at one fit serve all records, which have the same truth
-    theta = model.theta(fit.solution[: len(known.names), :1])[:, 0]
     terms = missing_terms(model, theta, sigma, own)
     verdicts = [
         adequacy.judge(residual[:, i], known.along(fit.slopes(i)), len(model.measured), terms, i, is_noise_known)
         for i in finite
     ]
-    first, free = verdicts[0], max(len(residual) - known.rank, 1)
+    first, free = verdicts[0], max(len(residual) - rank, 1)
     effects = np.array([terms[name] for name in first.reach]).reshape(-1, len(residual))
     shares = np.abs(np.linalg.pinv(known.along(fit.slopes(0))) @ effects.T) / known.bound[:, None]
     with np.errstate(invalid="ignore"):  # an effect that is all in one estimate moves no other
-        errors = np.where(
+        biases = known.bound[:, None] * np.where(
             shares > adequacy.RESOLVED * shares.max(axis=0, initial=0.0), shares * [*first.reach.values()], 0.0
         )
-    return {
+    unnoticed = biases * size[:, None]
+    return result | {
         "explained": float(np.mean([one.is_explained for one in verdicts])) + 0.0 * first.probability,  # nan: untested
         "contradictions": ", ".join(f"{name} ({value:.2g})" for name, value in first.contradictions.items()),
         "noise_size": sigma * norm(residual[:, 0]) / math.sqrt(free), "misfit": first.probability,
-        "terms": list(first.reach), "unnoticed": (errors * (known.bound * _sizes(model, known, theta))[:, None]).ravel().tolist(),
+        "bias": [*unnoticed.max(axis=1, initial=0.0), *nothing] if effects.size else result["bias"],
+        "biased": np.repeat(known.labels, len(effects)).tolist(), "term": [*first.reach] * rank,
+        "unnoticed": unnoticed.ravel().tolist(), "errors": (biases * performance.Z / half[:, None]).ravel().tolist(),
     }  # fmt: skip
 
 
+def _half_widths(fit: Fit, i: int, known: Information, is_noise_known: bool) -> tuple[np.ndarray, str]:
+    """Return half the widths of fit ``i``'s 95% intervals of the invariants' coordinates, and the noise they allow for."""
+    slopes = known.along(fit.slopes(i))
+    if not fit.is_finite[i] or Information(known.names, fit.slopes(i)).rank < known.rank:
+        return np.full(known.rank, np.inf), ""
+    if fit.fitting.shooting != "single":
+        return performance.Z * np.sqrt(np.diag(np.linalg.inv(slopes.T @ slopes))), ""
+    channels = len(fit.fitting.model.measured)
+    variance, kind, quantile = adequacy.variances(fit.residual[:, i], slopes, channels, is_noise_known)
+    return quantile * np.sqrt(variance), kind
+
+
 TERMS = {
-    "constant force": "1", "drag v|v|": "v*abs(v)", "drag v^3": "v**3", "dry friction": "sign(v)", "spring q^2": "q**2",
-    "spring q^3": "q**3",
+    "start": {"start": "1"},
+    "acceleration": {
+        "constant force": "1", "drag v|v|": "v*abs(v)", "drag v^3": "v**3", "dry friction": "sign(v)",
+        "spring q^2": "q**2", "spring q^3": "q**3", "hysteresis": "hysteresis(q)",
+    },
+    "control": {"lag": "slope(x)", "dead zone": "sign(x)"},
+    "sensor": {"offset": "1", "gain": "x", "drift": "t", "delay": "slope(x)"},
 }  # fmt: skip
-"""Accelerations of a coordinate that a model may lack, as expressions of its q and v, and of q0, q1, ..., v0, v1, ..."""
+"""Effects that a model may lack by where they act, as expressions along the motion.
+
+x is what they act on, q and v are the coordinate that they accelerate, q0, v0, ... the state, and t rises from -1 to 1.
+"""
 RELATIVE = 1e-4
-"""Size of a missing acceleration whose effect is computed, relative to the largest acceleration of the motion."""
-SLIP = 0.1
-"""Distance over which the force of hysteresis changes its sign, relative to the largest distance from the origin."""
+"""Size of a missing effect when it is computed, relative to the largest value of what it acts on."""
 
 
 def missing_terms(
@@ -538,55 +573,44 @@ def missing_terms(
 ) -> dict[str, np.ndarray]:
     """Return the change of the standardised record ``(m,)`` per unit of effects that the model lacks, by name.
 
-    The effects are an offset, gain, drift and delay of each sensor, the start of each entry of the state, the accelerations
-    of :data:`TERMS`, of ``own`` expressions, of a spring with dry friction in series (hysteresis) and of couplings, and a lag
-    and dead zone of each control. To first order, they act along the motion of ``theta (p,)``.
+    The effects are :data:`TERMS`, accelerations in other coordinates, and the accelerations ``own``. They act along the
+    motion of ``theta (p,)``, to first order.
     """
-    entries, channels = model.entries, len(model.measured)
+    entries, scene, steps = model.entries, model.program.scene, np.array(model.steps)
     path, controls = (part[:, :, 0] for part in model.motion(theta[:, None]))
-    plain = path[np.array(model.steps)][:, list(model.measured)]
-    faults, times = {"offset": np.ones_like(plain), "gain": plain}, np.array(model.steps, dtype=float)
-    if len(times) > 1:
-        faults["drift"] = np.repeat((2.0 * times / times[-1] - 1.0)[:, None], channels, axis=1)
-        faults["delay"] = -np.gradient(plain, times, axis=0)
-    terms = {
-        f"{name} of sensor {entries[entry]}": (effect * np.eye(channels)[c]).ravel() / sigma
-        for c, entry in enumerate(model.measured)
-        for name, effect in faults.items()
-    }
-    n_q, n = model.program.scene.n_q, len(entries)
-    by_name = dict(zip(entries, path.T, strict=True))
-    # by name of a change: whether it is one of the start, the acceleration or the control, of which entry, and its series
-    changes = {f"start of {entry}": (0, j, np.abs(path[1:, j]).max()) for j, entry in enumerate(entries)}
-    for i, of in enumerate(entries[:n_q] if n == 2 * n_q else ()):
-        q, v = path[:, i], path[:, n_q + i]
-        slip = np.diff(q) / (SLIP * np.abs(q).max() or 1.0)
-        forces = {name: evaluate(text, by_name | {"q": q, "v": v}) for name, text in (TERMS | dict(own or {})).items()}
-        forces["hysteresis"] = -np.array(
-            [*itertools.accumulate(slip, lambda z, by: min(max(z + by, -1.0), 1.0), initial=0.0)]
-        )
-        forces |= {f"coupling with {name}": x for name, x in by_name.items() if name[1:] != of[1:]}
-        changes |= {f"{name} of {of}": (1, i, force) for name, force in forces.items()}
-    for k, u in enumerate(controls.T if len(controls) > 1 else ()):
-        changes |= {f"lag of u{k}": (2, k, -np.gradient(u)), f"dead zone of u{k}": (2, k, -np.sign(u))}
-    starts, pushes, nudges = (np.zeros((*part.shape, len(changes))) for part in (path[:1], path[:, n_q:], controls))
-    size = np.abs(np.diff(path[:, n_q:], axis=0)).max(initial=0.0) / model.program.scene.dt
-    for place, (kind, at, series) in enumerate(changes.values()):
-        largest = np.abs(series).max() or 1.0
-        scale = (largest, size, np.abs(controls).max(initial=0.0))[kind] / largest
-        (starts, pushes, nudges)[kind][:, at, place] = scale * series
-    wide = np.repeat(theta[:, None], len(changes), axis=1)
-
-    def moved(by: float) -> np.ndarray:
-        return model.record(wide, lambda s, *_: by * pushes[s], lambda s: by * nudges[s], by * starts[0])
-
-    change = (moved(RELATIVE) - moved(-RELATIVE)) / (2.0 * RELATIVE * sigma)
-    terms |= dict(zip(changes, change.T, strict=True))
-    unknown_starts = {name.replace(".", " of ") for name in model.names}
+    state, n_v = dict(zip(entries, path.T, strict=True)), len(entries) - scene.n_q
+    signals = np.hstack(
+        [path, path[:, scene.n_q :], np.pad(controls, ((0, 1), (0, 0)), "edge"), path[:, model.measured]]
+    )
+    places = [
+        *(("start", entry) for entry in entries), *(("acceleration", f"q{i}") for i in range(n_v)),
+        *(("control", f"u{k}") for k in range(controls.shape[1])),
+        *(("sensor", f"sensor {entries[entry]}") for entry in model.measured),
+    ]  # fmt: skip
+    changes: dict[str, tuple[int, Any]] = {}
+    for place, (kind, of) in enumerate(places):
+        known = state | {"t": np.linspace(-1.0, 1.0, len(path)), "x": signals[:, place]}
+        texts = TERMS[kind]
+        if kind == "acceleration":
+            texts = texts | {f"coupling with {e}": e for e in entries if e[1:] != of[1:]} | dict(own or {})
+            known |= {"q": state.get(of), "v": state[f"v{of[1:]}"]}
+        if kind != "acceleration" or n_v == scene.n_q:
+            changes |= {f"{name} of {of}": (place, evaluate(text, known)) for name, text in texts.items()}
+    sizes = np.abs(signals).max(axis=0)
+    sizes[len(entries) :][:n_v] = np.abs(np.diff(path[:, scene.n_q :], axis=0)).max() / scene.dt
+    courses = np.zeros((*signals.shape, len(changes)))
+    for k, (place, course) in enumerate(changes.values()):
+        courses[:, place, k] = RELATIVE * sizes[place] * course / (np.abs(course).max() or 1.0)
+    ends = np.cumsum([len(entries), n_v, controls.shape[1]])
+    starts, pushes, nudges, sensors = np.split(np.concatenate([courses, -courses], axis=2), ends, axis=1)
+    wide = np.repeat(theta[:, None], starts.shape[2], axis=1)
+    moved = model.record(wide, lambda s, *_: pushes[s], lambda s: nudges[s], starts[0])
+    up, down = np.split((moved + sensors[steps].reshape(moved.shape)) / (2.0 * RELATIVE * sigma), 2, axis=1)
+    free = {name.replace(".", " of ") for name in model.names}
     return {
         name: effect
-        for name, effect in terms.items()
-        if np.isfinite(effect).all() and effect.any() and name not in unknown_starts
+        for name, effect in zip(changes, (up - down).T, strict=True)
+        if name not in free and np.isfinite(effect).all() and effect.any()
     }
 
 
@@ -596,35 +620,20 @@ def _products(theta: np.ndarray, exponents: np.ndarray) -> np.ndarray:
         return np.asarray(np.prod(np.sign(theta) ** np.rint(exponents) * np.abs(theta) ** exponents, axis=1))
 
 
-def _sizes(model: Model, known: Information, theta: np.ndarray) -> np.ndarray:
-    """Return the change of each invariant per unit of its coordinate, ``(r,)``."""
-    return np.abs(_products(np.where(model.scale, model.scale, theta), known.invariants))
-
-
 def _fit_statistics(fit: Fit, known: Information, is_own: bool, is_noise_known: bool) -> dict[str, Any]:
-    """Return the entries of one shooting method in columns of lists."""
-    p, n_fits, shooting = len(known.names), fit.solution.shape[1], fit.fitting.shooting
-    measured = len(fit.fitting.model.steps) * len(fit.fitting.model.measured)
+    """Return the entries of one shooting method."""
+    p, n_fits, shooting, model = len(known.names), fit.solution.shape[1], fit.fitting.shooting, fit.fitting.model
+    measured = len(model.steps) * len(model.measured)
     square = (fit.residual[:measured] ** 2).sum(axis=0)
     # gaps of multiple shooting tie its initial states to the parameters
     free = max(measured - (fit.fitting.dim if shooting == "windows" else p), 1)
     has_converged = np.isfinite(square) & (square <= chdtri(free, UNEXPLAINED))
-    model, invariants = fit.fitting.model, known.invariants
-    logs = invariants @ fit.solution[:p]
-    halves, noises, hidden = np.full_like(logs, np.nan), [""] * n_fits, 0
-    for i in np.flatnonzero(fit.is_finite).tolist():
-        rank = Information(known.names, fit.slopes(i)).rank
-        hidden += rank > known.rank
-        slopes, channels = known.along(fit.slopes(i)), len(model.measured)
-        if rank < known.rank:
-            halves[:, i] = np.inf
-        elif shooting == "single":
-            variance, noises[i], quantile = adequacy.variances(fit.residual[:, i], slopes, channels, is_noise_known)
-            halves[:, i] = quantile * np.sqrt(variance)
-        else:
-            halves[:, i] = performance.Z * np.sqrt(np.diag(np.linalg.inv(slopes.T @ slopes)))
+    hidden = sum(
+        Information(known.names, fit.slopes(i)).rank > known.rank for i in np.flatnonzero(fit.is_finite).tolist()
+    )
+    halves = np.stack([_half_widths(fit, i, known, is_noise_known)[0] for i in range(n_fits)], axis=1)
     chosen = has_converged & np.isfinite(halves).all(axis=0) & (not is_own)
-    apart = logs - invariants @ model.points(model.values[:, None])
+    apart = known.invariants @ (fit.solution[:p] - model.points(model.values[:, None]))
     errors = (apart / known.bound[:, None])[:, chosen]
     is_covered = (np.abs(apart) <= halves)[:, chosen]
     n_converged, coverage, interval = int(has_converged.sum()), math.nan, (math.nan, math.nan)
@@ -633,21 +642,11 @@ def _fit_statistics(fit: Fit, known: Information, is_own: bool, is_noise_known: 
         coverage = float(is_covered.mean())
         # the sample size of this interval is the number of records: invariants of one record are dependent
         interval = performance.wilson(round(coverage * n_converged), n_converged)
-    theta = model.theta(fit.solution[:p, :1])[:, 0]
-    estimate, size, half = _products(theta, invariants), _sizes(model, known, theta), halves[:, 0]
-    is_linear = np.abs(invariants) @ (model.scale != 0.0) > 0.5
-    with np.errstate(over="ignore", invalid="ignore"):
-        ends = [
-            np.where(is_linear, estimate + side * size * half, estimate * np.exp(side * half)).tolist()
-            for side in (-1.0, 1.0)
-        ]
     return {
         "shooting": shooting, "optimum": float(fit.has_converged.mean()),
         "converged": n_converged / n_fits, "converged_low": low, "converged_high": high,
         "error": float(np.sqrt(np.mean(np.square(errors)))) if errors.size else math.nan,
         "coverage": coverage, "coverage_low": interval[0], "coverage_high": interval[1], "hidden": hidden,
-        "estimate": estimate.tolist(), "estimate_low": ends[0], "estimate_high": ends[1],
-        "intervals": noises[0],
     }  # fmt: skip
 
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import ast
+import itertools
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -17,9 +18,22 @@ OPERATIONS: dict[type[ast.AST], np.ufunc] = {
     ast.Add: np.add, ast.Sub: np.subtract, ast.Mult: np.multiply, ast.Div: np.divide, ast.Pow: np.power,
     ast.USub: np.negative,
 }  # fmt: skip
-FUNCTIONS = ("abs", "cos", "exp", "sign", "sin", "sqrt", "tanh")
+SLIP = 0.1
+"""Distance over which the force of hysteresis rises, relative to the largest distance from 0."""
 OFF = 0.01
 """Share of a step by which a time may differ from a multiple of it."""
+
+
+def hysteresis(x: np.ndarray) -> np.ndarray:
+    """Return the force of a spring with dry friction in series along positions ``(n,)``, at most 1."""
+    slips = np.diff(x) / max(SLIP * float(np.abs(x).max()), 1e-300)
+    return np.array([*itertools.accumulate(slips, lambda force, by: np.clip(force + by, -1.0, 1.0), initial=0.0)])
+
+
+FUNCTIONS: dict[str, Callable[[Any], Any]] = {
+    "abs": np.abs, "cos": np.cos, "exp": np.exp, "hysteresis": hysteresis, "sign": np.sign, "sin": np.sin,
+    "slope": np.gradient, "sqrt": np.sqrt, "tanh": np.tanh,
+}  # fmt: skip
 
 
 def evaluate(text: str, names: Mapping[str, Any]) -> Any:
@@ -44,7 +58,7 @@ def evaluate(text: str, names: Mapping[str, Any]) -> Any:
             case ast.BinOp(left=left, op=operation, right=right) if type(operation) in OPERATIONS:
                 return OPERATIONS[type(operation)](value(left), value(right))
             case ast.Call(func=ast.Name(id=name), args=[operand], keywords=[]) if name in FUNCTIONS:
-                return getattr(np, name)(value(operand))
+                return FUNCTIONS[name](value(operand))
         raise unknown(f"name or operation in '{text}':", ast.unparse(node), [*names, *FUNCTIONS])
 
     try:
