@@ -10,7 +10,7 @@ from bench.model import Array, EngineTwin, MechanicalScene, State, param
 
 @dataclass(frozen=True)
 class Pendulum(EngineTwin, MechanicalScene):
-    """A point mass on a rod, at rest at ``angle``: m l^2 q'' = u - m g l sin q - b q'; q from the lowest point.
+    """A point mass on a rod, hanging at rest: m l^2 q'' = u - m g l sin q - b q'; q from the lowest point.
 
     State (q, q'); theta is the torque of each step (d = horizon). f = 1 + cos q_T + 0.1 q'_T^2 (0 at rest upright)
     plus ``effort`` dt sum u^2.
@@ -31,7 +31,6 @@ class Pendulum(EngineTwin, MechanicalScene):
     length: float = param(0.5, "length of the rod", "m", positive=True)
     gravity: float = param(9.81, "gravitational acceleration", "m/s^2")
     damping: float = param(0.0, "b, torque per angular velocity at the pivot", "N m s", low=0.0)
-    angle: float = param(0.0, "q at the start", "rad")
     torque: float = param(2.0, "torque of every step at theta", "N m")
     effort: float = param(1e-3, "cost per squared torque and second", "1/(N^2 m^2 s)", low=0.0)
 
@@ -40,7 +39,7 @@ class Pendulum(EngineTwin, MechanicalScene):
 
     def initial_state(self, xp: Any, theta: Array) -> State:
         zero = 0.0 * theta[:1]
-        return State(zero + self.angle, zero)
+        return State(zero, zero)
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
         inertia = self.mass * self.length * self.length
