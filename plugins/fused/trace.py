@@ -109,8 +109,7 @@ class _Tracer:
         if name in MOVES:
             return [MOVES[name](parameters, equation.outvars[0].aval, *values)]
         if name == "unstack":  # since JAX 0.11
-            rows = np.moveaxis(values[0], parameters["axis"], 0)
-            return [rows[i, ...] for i in range(len(rows))]
+            return [np.asarray(row) for row in np.moveaxis(values[0], parameters["axis"], 0)]
         if name in REDUCTIONS:
             return [self._reduce(REDUCTIONS[name], values[0], parameters["axes"])]
         if name == "dot_general":

@@ -80,16 +80,15 @@ class Mjcf(PolicyScene, JointScene):
     def module(self) -> ModuleType:
         """The module with observation and cost. Raises :class:`UserError` if it lacks one of them."""
         place = Path(self.functions).expanduser() if self.functions else self.path.with_suffix(".py")
-        if not place.is_file() and (ROBOTS / place.name).is_file():
-            place = ROBOTS / place.name
-        if not place.is_file():
+        found = next(filter(Path.is_file, (place, ROBOTS / place.name)), None)
+        if found is None:
             raise UserError(
                 f"mjcf.functions: the file {place} does not exist; it should have the functions {', '.join(FUNCTIONS)}"
             )
-        module = load_module(str(place))
+        module = load_module(str(found))
         for name in FUNCTIONS:
             if not callable(getattr(module, name, None)):
-                raise UserError(f"{place} defines no function {name}: required are {', '.join(FUNCTIONS)}")
+                raise UserError(f"{found} defines no function {name}: required are {', '.join(FUNCTIONS)}")
         return module
 
     @property
@@ -137,7 +136,7 @@ class Mjcf(PolicyScene, JointScene):
     @property
     def n_start(self) -> int:  # type: ignore[override]
         """Number of standard normal numbers of a random start: ``n_start`` of the Python file, or 0."""
-        return int(getattr(self.module, "n_start", 0)) if self.theta == "policy" else 0
+        return int(self.theta == "policy" and getattr(self.module, "n_start", 0))
 
     @property
     def n_observations(self) -> int:  # type: ignore[override]
@@ -230,11 +229,9 @@ def _model_files(path: Path) -> list[Path]:
     paths, waiting = [], [path]
     while waiting:
         current = waiting.pop()
-        if current in paths or not current.is_file():
-            continue
-        paths.append(current)
-        if current.suffix == ".xml":
-            text = current.read_text()
+        if current.is_file() and current not in paths:
+            paths.append(current)
+            text = current.read_text() if current.suffix == ".xml" else ""
             folders = re.findall(r'(?:meshdir|texturedir|assetdir)\s*=\s*"([^"]*)"', text)
             for name in re.findall(r'\bfile\s*=\s*"([^"]*)"', text):
                 waiting += [(current.parent / folder / name).resolve() for folder in ("", *folders)]
@@ -245,6 +242,7 @@ def _package_folder(package: str) -> Path:
     import importlib.util
 
     spec = importlib.util.find_spec(package) if package.isidentifier() else None
-    if spec is None or not spec.submodule_search_locations:
+    folders = spec and spec.submodule_search_locations
+    if not folders:
         raise UserError(f"mjcf.file: the Python package '{package}' is not installed: pip install {package}")
-    return Path(spec.submodule_search_locations[0])
+    return Path(folders[0])
