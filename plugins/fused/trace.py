@@ -127,7 +127,7 @@ class _Tracer:
         if name not in FOLD and name != "integer_pow":
             raise Refused(name)
         if all(value.dtype != object for value in values):
-            fold = (lambda x: x ** float(parameters["y"])) if name == "integer_pow" else FOLD[name]
+            fold: Any = (lambda x: x ** float(parameters["y"])) if name == "integer_pow" else FOLD[name]
             with np.errstate(all="ignore"):
                 return np.asarray(fold(*values), dtype=out.dtype)
         if len(values) > 3:

@@ -136,7 +136,7 @@ class Mjcf(PolicyScene, JointScene):
     @property
     def n_start(self) -> int:  # type: ignore[override]
         """Number of standard normal numbers of a random start: ``n_start`` of the Python file, or 0."""
-        return int(self.theta == "policy" and getattr(self.module, "n_start", 0))
+        return int(getattr(self.module, "n_start", 0)) if self.theta == "policy" else 0
 
     @property
     def n_observations(self) -> int:  # type: ignore[override]
