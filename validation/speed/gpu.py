@@ -196,7 +196,8 @@ def work(unit: Unit, folder: Path, began: float, whole: bool, reference: bool) -
         with alone():
             kept = json.loads(REFERENCE.read_text()) if REFERENCE.is_file() else {}
             kept[unit.case] = projected(gradients).tolist()
-            REFERENCE.write_text(json.dumps(kept, indent=1) + "\n")
+            lines = [f"{json.dumps(name)}: {json.dumps(rows)}" for name, rows in kept.items()]
+            REFERENCE.write_text("{\n" + ",\n".join(lines) + "\n}\n")
         return
     platform = "cpu" if unit.backend == "fused" else jax.default_backend()
     whole = unit.backend != "fused" and (whole or platform != "cpu")
