@@ -4,7 +4,6 @@ import importlib
 import json
 import sys
 from dataclasses import replace
-from pathlib import Path
 from types import ModuleType
 
 import bench.plugins.fused
@@ -13,7 +12,6 @@ from trees import ROOT
 
 from bench.experiment import cell as cell_module
 from bench.experiment import config, grid, keys
-from bench.experiment.cell import Cell
 from bench.measure import noise, reference, statistics
 from bench.model import Backend, PolicyScene, Scene, adjoint, program, registry
 from bench.plugins import mjcf, mjx_solver
@@ -68,7 +66,7 @@ MOVED = {
 """What declares a revision, with the cells whose keys change if it is raised. All references here are computed by ``jax``."""
 
 
-def forget() -> None:
+def forget():
     """Forget the hashes that keys are computed from."""
     keys.code_of.cache_clear()
     own = (cell_module._ranked, cell_module._rest, cell_module._program_keys, cell_module._reference_keys)
@@ -84,11 +82,11 @@ def fresh():
 
 
 @pytest.fixture(scope="module")
-def cells() -> dict[str, Cell]:
+def cells():
     return {name: grid.cells(config.load(words))[0] for name, words in CELLS.items()}
 
 
-def keys_of(cells: dict[str, Cell]) -> dict[str, str]:
+def keys_of(cells):
     forget()
     return {name: replace(cell).key for name, cell in cells.items()}
 
@@ -131,7 +129,7 @@ def outside(tmp_path, monkeypatch):
     """Return a function that gives the code of an estimator of another folder, whose files have these contents."""
     monkeypatch.syspath_prepend(tmp_path)
 
-    def code(name: str, imports: str = "", **files: str) -> str:
+    def code(name, imports="", **files):
         (tmp_path / f"{name}.py").write_text(OUTSIDE.format(name="mine", imports=imports))
         for helper, text in files.items():
             path = tmp_path / f"{helper.replace('__', '/')}.py"
@@ -176,7 +174,7 @@ def test_a_plugin_from_outside_has_the_revisions_of_its_bases(outside, monkeypat
 
 
 def test_a_simulator_counts_by_its_file_and_what_that_imports(tmp_path):
-    def key(gain: str) -> str:
+    def key(gain):
         (tmp_path / "physics.py").write_text(f"GAIN = {gain}\n")
         (tmp_path / "mysim.py").write_text(
             "import physics\n\ntheta = [1.0]\n\n\ndef cost(theta):\n    return theta[0]\n"
@@ -202,7 +200,7 @@ def test_an_estimator_whose_smoothing_fails_has_a_key_and_no_reference(cells, mo
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", EXPERIMENTS, ids=lambda path: path.stem)
-def test_stored_rows_are_those_of_the_cells_of_their_experiment(path: Path):
+def test_stored_rows_are_those_of_the_cells_of_their_experiment(path):
     """Documents count the rows of a folder, so a row from an earlier version of the experiment would count too."""
     import pandas as pd
 
