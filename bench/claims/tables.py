@@ -162,9 +162,12 @@ def latex(results: Results) -> str:
 
 
 def result_lines(claim: type[Claim], result: ClaimResult, is_stored: bool) -> Iterator[str]:
-    """Yield the lines printed for one claim."""
+    """Yield the lines printed for one claim; that no figure detects an error of 5% stands first."""
     origin = ", as stored" if is_stored else ""
-    yield f"{claim.name:<4} {result.verdict:<29} {duration(result.seconds):>7}{origin}  {claim.statement}"
+    blind = "detects no error of 5%: " if result.figures and all(f.limitation for f in result.figures) else ""
+    yield (
+        f"{claim.name:<4} {result.verdict:<29} {duration(result.seconds):>7}{origin}  {blind}{claim.source}: {claim.statement}"
+    )
     for figure in result.figures:
         if not figure.agrees:
             yield f"       {figure.what}: published {figure.published}, measured {measured_text(figure)}"
