@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -219,27 +219,18 @@ def plain_lines(text: str) -> str:
     return "\n".join(map(plain, text.split("\n")))
 
 
-def _fill(text: str, width: float) -> str:
-    """Break text into lines of at most ``width`` inches, measured in the charts' font; wider words after a comma or slash."""
+def _fill(text: str, width: float, ends: str = " ,/") -> str:
+    """Break text after the characters ``ends`` into lines of at most ``width`` inches, measured in the charts' font."""
     lines: list[str] = []
     for paragraph in text.split("\n"):
         line = ""
-        for space, word in _words(paragraph, width):
-            longer = f"{line}{space}{word}".strip()
-            if line and width_in_inches(plain(longer)) > width:
-                lines.append(line)
-                line = word
-            else:
-                line = longer
-        lines.append(line)
+        for piece in re.findall(rf"[^{ends}]*[{ends}]*", paragraph):
+            if line and width_in_inches(plain((line + piece).rstrip())) > width:
+                lines.append(line.rstrip())
+                line = ""
+            line += piece
+        lines.append(line.rstrip())
     return "\n".join(lines)
-
-
-def _words(paragraph: str, width: float) -> Iterator[tuple[str, str]]:
-    """Yield each word with the space before it, and the parts of a word that is wider than ``width`` inches without one."""
-    for word in paragraph.split():
-        parts = re.split(r"(?<=[,/])", word) if width_in_inches(plain(word)) > width else [word]
-        yield from zip([" ", *[""] * (len(parts) - 1)], parts, strict=True)
 
 
 def _panels(chart: Chart) -> list[tuple[str, pd.DataFrame]]:
@@ -644,17 +635,10 @@ def _grid_labels(chart: Chart, column: Column, names: Sequence[str], width: floa
         across = max(1, round(WIDTH / width))
         beside /= across
     room = max(0.3, (width - beside - 0.15) / len(names))
-    return ["\n".join(plain(_clipped(line, room)) for line in _broken(name, room).split("\n", 2)[:3]) for name in names]
-
-
-def _broken(text: str, width: float) -> str:
-    """Break a name after its punctuation into lines of at most ``width`` inches, where it can be broken."""
-    lines = [""]
-    for piece in re.findall(r"[^_,\[ ]*[_,\[ ]*", text):
-        if lines[-1] and width_in_inches(plain(lines[-1] + piece)) > width:
-            lines.append("")
-        lines[-1] += piece
-    return "\n".join(lines)
+    return [
+        "\n".join(plain(_clipped(line, room)) for line in _fill(name, room, r"_,\[ ").split("\n", 2)[:3])
+        for name in names
+    ]
 
 
 def _in_lines(text: str, width: float, most: int) -> str:
