@@ -200,12 +200,7 @@ def _escape_formula(text: Any) -> Any:
 
 def build_plugins(given: Mapping[str, Any]) -> dict[str, Plugin | None]:
     """Build the plugins described by a row's parameters, by axis; raises :class:`UserError` if one is not installed."""
-    parts: dict[str, Plugin | None] = {}
-    for axis, part in given.items():
-        if axis in NOT_PLUGINS:
-            continue
-        parts[axis] = None if part is None else build_part(axis, part)
-    return parts
+    return {a: None if p is None else build_part(a, p) for a, p in given.items() if a not in NOT_PLUGINS}
 
 
 def build_part(axis: str, part: Mapping[str, Any]) -> Plugin:
