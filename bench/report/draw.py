@@ -619,9 +619,9 @@ def _grid_labels(chart: Chart, column: Column, names: Sequence[str], width: floa
     if chart.panel and not chart.own_scales:  # the labels beside the first panel serve all
         across = max(1, round(WIDTH / width))
         beside /= across
-    room = max(0.3, (width - beside - 0.15) / len(names))
+    room = max(0.3, (width - beside - 0.15) / len(names) - 0.06)
     return [
-        "\n".join(plain(_clipped(line, room)) for line in filled(name, room, r"_,\[ ").split("\n", 2)[:3])
+        "\n".join(plain(_clipped(line, room)) for line in filled(name, room, r"_,\[ ").split("\n", 4)[:5])
         for name in names
     ]
 

@@ -71,12 +71,12 @@ def width_in_inches(text: str) -> float:
     return float(width / 72)
 
 
-def filled(text: str, width: float, ends: str = " ,/") -> str:
+def filled(text: str, width: float, ends: str = r" ,/\[") -> str:
     """Break text after the characters ``ends`` into lines of at most ``width`` inches, measured in the charts' font."""
     lines: list[str] = []
     for paragraph in text.split("\n"):
         line = ""
-        for piece in re.findall(rf"[^{ends}]*[{ends}]*", paragraph):
+        for piece in re.findall(rf"[^{ends}]+[{ends}]*|[{ends}]+", paragraph):
             if line and width_in_inches(plain((line + piece).rstrip())) > width:
                 lines.append(line.rstrip())
                 line = ""
