@@ -409,6 +409,23 @@ def scenes_table() -> str:
     return block(head + [f"| {scene} | " + " | ".join(map(number, values)) + " |" for scene, values in ratios.items()])
 
 
+def gpu_table() -> str:
+    """Return gradients per second, their agreement with the CPU and compile time by case and precision as Markdown."""
+    rows = pd.read_csv(STANDARD / "gpu" / "gpu.csv")
+    keys = ["case", "backend", "dtype"]
+    rates = rows.pivot(index=keys, columns="batch", values="gradients_per_s")[[1, 1024, 16384]]
+    most = rows.groupby(keys)[["agreement", "compile_s"]].max()
+    head = [
+        "| scene | backend | precision | 1 | 1,024 | 16,384 | agreement | compiles [s] |",
+        "|---|---|---|--:|--:|--:|--:|--:|",
+    ]
+    return block(head + [
+        f"| {case} | `{backend}` | {dtype} | " + " | ".join(map(number, [*rates.loc[key], *most.loc[key]])) + " |"
+        for key in rows[keys].drop_duplicates().itertuples(index=False, name=None)
+        for case, backend, dtype in [key]
+    ])  # fmt: skip
+
+
 def dose(table: str, name: str = "dose_response") -> pd.DataFrame:
     """Return a table of a study of errors as stored."""
     return pd.read_csv(STANDARD / name / f"{table}.csv", keep_default_na=True)
@@ -709,6 +726,7 @@ FIGURES: dict[str, Callable[[], str]] = {
     "speed-cell": lambda: number(speeds()["overhead of a cell"]),
     "speed-rollouts": rollouts_table,
     "speed-scenes": scenes_table,
+    "speed-gpu": gpu_table,
     "speed-one-thread": lambda: span(speed("fused on one thread over the C kernel, * rollouts")),
     "speed-agree": lambda: number(speeds()["native C kernel: largest relative difference"]),
     "speed-memory-fused": lambda: span(speed("fused grad, penalty, * rollouts: peak memory"), 3),

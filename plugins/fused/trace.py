@@ -102,6 +102,9 @@ class _Tracer:
             return self._scan(parameters, values)
         if name in MOVES:
             return [MOVES[name](parameters, equation.outvars[0].aval, *values)]
+        if name == "unstack":  # since JAX 0.11
+            rows = np.moveaxis(values[0], parameters["axis"], 0)
+            return [rows[i, ...] for i in range(len(rows))]
         if name in REDUCTIONS:
             return [self._reduce(REDUCTIONS[name], values[0], parameters["axes"])]
         if name == "dot_general":
@@ -174,9 +177,12 @@ class _Tracer:
         if parameters["reverse"]:
             raise Refused("scan backwards")
         loop.length = parameters["length"]
-        n_consts, n_carry = parameters["num_consts"], parameters["num_carry"]
-        consts, first, xs = values[:n_consts], values[n_consts : n_consts + n_carry], values[n_consts + n_carry :]
-        if len(closed.jaxpr.outvars) != n_carry:
+        if "ft_in" in parameters:  # since JAX 0.11
+            consts, first, xs = map(list, parameters["ft_in"].update(values).unpack())
+        else:
+            n_consts, end = parameters["num_consts"], parameters["num_consts"] + parameters["num_carry"]
+            consts, first, xs = values[:n_consts], values[n_consts:end], values[end:]
+        if len(closed.jaxpr.outvars) != len(first):
             raise Refused("scan that returns a value of each step")
         loop.first = [node for part in first for node in self.nodes(part)]
         symbols = [loop.graph.leaf("carry", i) for i in range(len(loop.first))]
