@@ -447,7 +447,7 @@ def searches(finals: dict[tuple[str, str], list[float]]) -> aggregate.RunSet:
         for (method, tuning), costs in finals.items()
         for seed, cost in enumerate(costs)
     ]
-    return aggregate.RunSet(pd.DataFrame(rows), ())
+    return aggregate.RunSet(pd.DataFrame(rows))
 
 
 def test_seeds_that_choose_a_tuning_do_not_score_it():
