@@ -13,7 +13,6 @@ from classes import (
     Complementarity,
     FrictionBlock,
     GroundWall,
-    Hopper,
     Implicit,
     Impulse,
     Jax,
@@ -72,26 +71,6 @@ def test_ground_wall_has_no_physical_gradient_at_rest():
     resting = GroundWall(restitution=0.1, horizon=2000)
     assert resting.physical_gradient() is None
     assert resting.physical_cost() is None
-
-
-# ------------------------------------------------------------------------------------------------------ hopper
-
-
-def test_hopper_conserves_energy_in_flight():
-    """Without damper and policy, the semi-implicit step keeps the energy of a flight to O(dt)."""
-    drift = []
-    for dt in (2e-3, 1e-3):
-        scene = Hopper(leg_damping=0.0, dt=dt, horizon=round(0.16 / dt))  # lands after 0.175 s
-        made = compose(scene, None, SemiImplicitEuler())
-        state = State(np.array([[0.7], [0.12]]), np.array([[0.3], [-0.2]]))
-        masses = np.array([[scene.body_mass], [scene.foot_mass]])
-        energy = []
-        for _ in range(scene.horizon):
-            spring = 0.5 * scene.leg_stiffness * (scene.leg - state.q[0] + state.q[1]) ** 2
-            energy.append((masses * (0.5 * state.v**2 + scene.gravity * state.q)).sum() + spring[0])
-            state = made.step(NumpyOps(), state, np.zeros((1, 1)))
-        drift.append(np.ptp(energy))
-    assert drift[0] / drift[1] == pytest.approx(2.0, rel=0.1)
 
 
 # ---------------------------------------------------------------------------------------------- friction_block
