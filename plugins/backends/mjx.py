@@ -268,6 +268,9 @@ class MjxProgram(Rollout):
 
         # MJX creates numbers in JAX's default precision
         with jax.enable_x64(kind == np.float64), self._solver():
+            if state.q.shape[1] == 1:  # without vmap, whose loops compute both branches
+                after = column(state.q[:, 0], state.v[:, 0], u[:, 0])
+                return jax.tree.map(lambda leaf: leaf[..., None], after)
             return jax.vmap(column, in_axes=-1, out_axes=-1)(state.q, state.v, u)
 
 
