@@ -137,8 +137,9 @@ class MjxProblem(JaxProblem):
     def _blocks(
         self, function: Callable[..., np.ndarray], theta: np.ndarray, w: np.ndarray, lead: tuple[int, ...]
     ) -> np.ndarray:
-        self.grain = 1 if w.shape[1] <= SINGLE else 16
-        if self.device == "cpu":
+        is_cpu = self.device == "cpu"
+        self.grain = 1 if w.shape[1] <= (SINGLE if is_cpu else 1) else 16
+        if is_cpu:
             self.block = self.least = self.grain
         return super()._blocks(function, theta, w, lead)
 
