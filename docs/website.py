@@ -38,7 +38,7 @@ PAGES: Mapping[str, str] = {
 """The site's page of each document, and its path in the repository."""
 SECTIONS: Mapping[str, Sequence[str]] = {
     "start": ("reading-results", "python"),
-    "trust": ("gradcheck", "examine"),
+    "trust": ("gradcheck", "examine", "conformance"),
     "results": ("experiment/*", "estimators", "claims", "controller", "dose-response", "training", "engines", "speed"),
     "extending": ("architecture", "contributing"),
     "reference": (
@@ -51,6 +51,7 @@ SECTIONS: Mapping[str, Sequence[str]] = {
         "glossary",
         "validation",
         "sources",
+        "upstream",
         "changelog",
     ),
 }
