@@ -2,9 +2,6 @@
 
 import json
 
-import pytest
-
-from bench.errors import UserError
 from bench.experiment import config
 from docs import build
 
@@ -43,17 +40,3 @@ def test_results_have_answers_and_name_experiments_without_rows(tmp_path, monkey
     )
     page.write_text(text)
     assert build.results_page(page, tmp_path) == text
-
-
-def test_results_need_their_marks(tmp_path):
-    page = tmp_path / "results.md"
-    page.write_text("no marks")
-    with pytest.raises(UserError, match="has no place for the answers"):
-        build.results_page(page, tmp_path)
-
-
-def test_unknown_part_is_refused():
-    with pytest.raises(
-        UserError, match="unknown part 'pages' \\(allowed: results, columns, verdicts, figures, site, all\\)"
-    ):
-        build.main(["pages"])
