@@ -112,6 +112,6 @@ def _cell(rows: list[dict[str, Any]]) -> str:
     wrong = [row for row in judged if not row["is_right"]]
     faults = {row["looks_like"] for row in wrong} - {""}
     words = f"wrong: {', '.join(row['term'] for row in wrong)}" + (f" ({'; '.join(sorted(faults))})" if faults else "")
-    digits = f"{min(row['digits'] for row in judged):.1f}"
+    digits = f"{min(row['digits'] or 0.0 for row in judged):.1f}"
     own = ", own differences" if judged[0]["against"] != "the set" else ""
     return f"{digits} {words if wrong else own}".strip().replace(" ,", ",")

@@ -85,8 +85,9 @@ def _case(name: str, data: dict[str, Any]) -> Case:
 def differences(engine: Any, case: Case, term: str) -> tuple[np.ndarray, float]:
     """Return the derivative by central differences of the engine's own costs, and its uncertainty.
 
-    Each component takes the neighbouring steps of the ladder whose extrapolated differences agree best; the uncertainty
-    is the largest remaining disagreement.
+    Each component takes the neighbouring steps of the ladder whose extrapolated differences agree best. Their disagreement
+    is the uncertainty, or the disagreement at a smaller step if that is larger for its step: rounding grows as 1 / step. Steps
+    at which a cost no longer changes do not count.
     """
     basis = np.eye(case.qvel.size if term == "qpos" else getattr(case, term).size)
     steps = LADDER * (1.0 if term == "qpos" else max(1.0, np.abs(getattr(case, term)).max(initial=0.0)))
@@ -96,7 +97,9 @@ def differences(engine: Any, case: Case, term: str) -> tuple[np.ndarray, float]:
 
     slopes = np.array([[(cost(h * e) - cost(-h * e)) / (2 * h) for e in basis] for h in steps])
     better = (10 * slopes[1:] - slopes[:-1]) / 9  # the ladder's factor is the root of 10, the error of order 2
-    gaps = np.abs(np.diff(better, axis=0))
+    gaps = np.abs(np.diff(better, axis=0)) * steps[2:, None]
+    gaps = np.maximum.accumulate(gaps[::-1])[::-1] / steps[2:, None]
+    gaps[(slopes[2:] == 0) & slopes.any(axis=0)] = np.inf
     best = gaps.argmin(axis=0)[None]
     return np.take_along_axis(better[1:], best, 0)[0], float(np.take_along_axis(gaps, best, 0).max(initial=0.0))
 
@@ -111,8 +114,8 @@ def check(engine: Any, case: Case) -> list[dict[str, Any]]:
         results = {"value": engine.rollout(case), **engine.gradient(case)}
     except Exception as error:  # another engine's code may raise anything
         is_right = None if isinstance(error, NotImplementedError) else False
-        return [{"case": case.name, "term": "all", "is_right": is_right, "reason": f"{type(error).__name__}: {error}"}]
-    seconds, differs = time.perf_counter() - started, getattr(engine, "differs", {}).get(case.name, "")
+        return [_row(case, "all", is_right, reason=f"{type(error).__name__}: {error}")]
+    seconds, differs = round(time.perf_counter() - started, 4), getattr(engine, "differs", {}).get(case.name, "")
     rows = []
     for term, result in results.items():
         result, faults = np.ravel(np.array(result, dtype=float)), {}
@@ -124,23 +127,35 @@ def check(engine: Any, case: Case) -> list[dict[str, Any]]:
             expected, doubt = differences(engine, case, term)
         else:
             expected, doubt = case.data["expected"][term], np.inf
+        if result.size != np.size(expected):
+            rows.append(_row(case, term, False, reason=f"{result.size} numbers instead of {np.size(expected)}"))
+            continue
         off = float(np.abs(result - np.ravel(expected)).max(initial=0.0))
-        scale, margin = np.abs(expected).max(initial=1e-300), DOUBTS * doubt
+        scale, margin = np.abs(expected).max(initial=1e-9), DOUBTS * doubt
         is_right = bool(off <= getattr(engine, "tolerance", 1e-6) * scale + margin)
         looks_like = [
             fault
             for fault, numbers in faults.items()
             if not is_right and np.abs(result - np.ravel(numbers.get(term, np.inf))).max(initial=0.0) <= EXPLAINED * off
         ]
-        rows.append(
-            {
-                "case": case.name, "term": term, "is_right": is_right if margin <= UNCERTAIN * scale else None,
-                "digits": round(float(-np.log10(max(off / scale, 1e-16))), 1) if np.isfinite(off) else 0.0,
-                "looks_like": " or ".join(looks_like), "against": "own differences" if differs else "the set",
-                "seconds": round(seconds, 4), "reason": differs,
-            }
-        )  # fmt: skip
+        digits = round(float(-np.log10(max(off / scale, 1e-16))), 1) if np.isfinite(off) else None
+        verdict = is_right if margin <= UNCERTAIN * scale else None
+        against = "own differences" if differs else "the set"
+        rows.append(_row(case, term, verdict, digits, " or ".join(looks_like), against, seconds, differs))
     return rows
+
+
+def _row(
+    case: Case,
+    term: str,
+    is_right: bool | None,
+    digits: float | None = None,
+    looks_like: str = "",
+    against: str = "",
+    seconds: float | None = None,
+    reason: str = "",
+) -> dict[str, Any]:
+    return {**locals(), "case": case.name}
 
 
 def run(engine: Any, *names: str) -> list[dict[str, Any]]:
