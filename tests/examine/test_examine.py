@@ -299,7 +299,7 @@ def test_alarm_of_someone_else_is_left_alone():
 
     signal.signal(signal.SIGALRM, mine)
     try:
-        assert bench.examine(bowl, [1.0, 0.5], grad=slope, **QUICK).status == 0
+        assert bench.examine(bowl, [1.0, 0.5], grad=slope, sigma=None, **QUICK).status == 0
         assert signal.getsignal(signal.SIGALRM) is mine
     finally:
         signal.signal(signal.SIGALRM, signal.SIG_DFL)
