@@ -38,7 +38,7 @@ PAGES: Mapping[str, str] = {
 """The site's page of each document, and its path in the repository."""
 SECTIONS: Mapping[str, Sequence[str]] = {
     "start": ("reading-results", "python"),
-    "trust": ("gradcheck", "examine"),
+    "trust": ("gradcheck", "examine", "conformance"),
     "results": (
         "answers",
         "experiment/*",
@@ -62,6 +62,7 @@ SECTIONS: Mapping[str, Sequence[str]] = {
         "peers",
         "validation",
         "sources",
+        "upstream",
         "changelog",
     ),
 }
