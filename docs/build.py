@@ -29,7 +29,7 @@ from bench.model import registry
 from bench.report.tables import escape_markdown
 from bench.run.files import write_whole
 from docs import figures, website
-from docs.results import STANDARD, Entry, entries_of
+from docs.results import PAPER, STANDARD, Entry, entries_of
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCS = ROOT / "docs"
@@ -58,7 +58,7 @@ def answers_page(index: Path, results: Path = STANDARD) -> str:
 def results_entry(entry: Entry, folder: Path) -> str:
     """Return an experiment's name, question, chart, answer and command; paths are relative to ``folder``."""
     chart = Path(os.path.relpath(entry.chart, folder)).as_posix() if entry.chart else ""
-    command = f"`python -m bench +experiment={entry.name}`"
+    command = f"`{entry.command}`"
     data = Path(os.path.relpath(entry.folder, folder)).as_posix()
     missing = f"its results are part of `{entry.joined}`" if entry.joined else "no stored results"
     parts = [
@@ -121,6 +121,7 @@ ALSO_IN_CSV = ("study", "parameters")
 
 def columns_page() -> str:
     """Return the text of ``docs/columns.md``: a table of the common columns and one per study."""
+    registry.add_folder(PAPER)
     sections = [section("Common columns", "", COMMON.values())]
     for name, entry in sorted(registry.entries()["studies"].items()):
         study = cast(type[Study], entry.plugin)

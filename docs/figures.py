@@ -14,6 +14,7 @@ import json
 import re
 from collections.abc import Callable
 from functools import cache
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -21,15 +22,15 @@ import pandas as pd
 
 from bench.experiment import config
 from bench.measure.performance import wilson
+from bench.model import registry
 from bench.report import answer
 from bench.report.text import axis_value, number
 from bench.report.text import interval as text_of_interval
 from bench.report.text import span as ends_of
 from bench.studies.bias_variance import trust
-from bench.studies.dose_response import analysis
 from bench.studies.gradient_check.points import is_trusted
 from bench.studies.train import aggregate
-from docs.results import STANDARD, answer_of, comparison, rmse_interval, rows_of, select, table_of
+from docs.results import PAPER, STANDARD, answer_of, comparison, rmse_interval, rows_of, select, table_of
 
 MARK = re.compile(r"<!--=([\w.-]+|[^>\n]+\|.*?)-->(.*?)<!--/-->", re.DOTALL)
 SOURCE = re.compile(r"<!-- figures: (.*?) -->\n?")
@@ -153,7 +154,7 @@ def score(method: str, column: str = "rmse_rel", **conditions: Any) -> float:
     return float(value)
 
 
-CONTACT, JUMP = "pushing, penalty", "heaviside[theta=0.05]"
+CONTACT, JUMP = "pushing", "heaviside"
 """The stiff contact and the jump of ``estimators``."""
 
 
@@ -419,6 +420,23 @@ def scenes_table() -> str:
     return block(head + [f"| {scene} | " + " | ".join(map(number, values)) + " |" for scene, values in ratios.items()])
 
 
+def gpu_table() -> str:
+    """Return gradients per second, their agreement with the CPU and compile time by case and precision as Markdown."""
+    rows = pd.read_csv(STANDARD / "gpu" / "gpu.csv")
+    keys = ["case", "backend", "dtype"]
+    rates = rows.pivot(index=keys, columns="batch", values="gradients_per_s")[[1, 1024, 16384]]
+    most = rows.groupby(keys)[["agreement", "compile_s"]].max()
+    head = [
+        "| scene | backend | precision | 1 | 1,024 | 16,384 | agreement | compiles [s] |",
+        "|---|---|---|--:|--:|--:|--:|--:|",
+    ]
+    return block(head + [
+        f"| {case} | `{backend}` | {dtype} | " + " | ".join(map(number, [*rates.loc[key], *most.loc[key]])) + " |"
+        for key in rows[keys].drop_duplicates().itertuples(index=False, name=None)
+        for case, backend, dtype in [key]
+    ])  # fmt: skip
+
+
 def dose(table: str, name: str = "dose_response") -> pd.DataFrame:
     """Return a table of a study of errors as stored."""
     return pd.read_csv(STANDARD / name / f"{table}.csv", keep_default_na=True)
@@ -471,6 +489,8 @@ def dose_runs() -> str:
 
 def windows_missed() -> str:
     """Return on how many problems the best gradient reaches 1/100 and a window of no length does, of how many."""
+    registry.add_folder(PAPER)
+    analysis = import_module(f"{registry.usable('studies', 'dose_response').__module__}.analysis")
     searches = analysis.searches(rows_of("dose_response_windows")).query("target == 100")
     medians = searches.pivot_table(index="problem", columns="method", values="median", aggfunc="first")
     missed = np.isfinite(medians[analysis.BEST]) & np.isinf(medians.filter(like="windowed")).all(axis=1)
@@ -680,12 +700,12 @@ FIGURES: dict[str, Callable[[], str]] = {
     "spring-rk4": lambda: percent(right("mass_spring")["rk4"]),
     "spring-implicit": lambda: percent(right("mass_spring")["implicit_euler"]),
     "ball-event": lambda: percent(right("bouncing_ball", "impulse")["event_driven"]),
-    "clip-90": lambda: span(estimators("clipped", problem=CONTACT)),
-    "clip-50": lambda: span(estimators("clipped", "quantile=0.5", problem=CONTACT)),
-    "difference-short": lambda: span(estimators("finite_difference", problem=CONTACT)),
-    "difference-long": lambda: span(estimators("finite_difference", "step=0.1", problem=CONTACT)),
-    "weights-contact": lambda: span(estimators("total_propagation", "per=action", problem=CONTACT)),
-    "weights-jump": lambda: span(estimators("total_propagation", problem=JUMP)),
+    "clip-90": lambda: span(estimators("clipped", scene=CONTACT)),
+    "clip-50": lambda: span(estimators("clipped", "quantile=0.5", scene=CONTACT)),
+    "difference-short": lambda: span(estimators("finite_difference", scene=CONTACT)),
+    "difference-long": lambda: span(estimators("finite_difference", "step=0.1", scene=CONTACT)),
+    "weights-contact": lambda: span(estimators("total_propagation", "per=action", scene=CONTACT)),
+    "weights-jump": lambda: span(estimators("total_propagation", scene=JUMP)),
     "equal-rollouts": equal_rollouts_table,
     "equal-rollouts-reference": equal_rollouts_reference,
     "backward-memory": backward_memory_table,
@@ -721,6 +741,7 @@ FIGURES: dict[str, Callable[[], str]] = {
     "speed-cell": lambda: number(speeds()["overhead of a cell"]),
     "speed-rollouts": rollouts_table,
     "speed-scenes": scenes_table,
+    "speed-gpu": gpu_table,
     "speed-one-thread": lambda: span(speed("fused on one thread over the C kernel, * rollouts")),
     "speed-agree": lambda: number(speeds()["native C kernel: largest relative difference"]),
     "speed-memory-fused": lambda: span(speed("fused grad, penalty, * rollouts: peak memory"), 3),

@@ -186,8 +186,8 @@ def experiment_page(entry: Entry) -> str:
         parts.append(f"{{.finding}}\n{escape_markdown(entry.answer)}")
     if entry.chart:
         parts.append(f"![{escape_markdown(entry.question)}]({folder}/{entry.chart.name})")
-    parts += ["## Run it", f"    python -m bench +experiment={entry.name}", "Or write its page from the stored rows:"]
-    parts += [f"    python -m bench report +experiment={entry.name} results_dir=results/standard", entry.made]
+    parts += ["## Run it", f"    {entry.command}", "Or write its page from the stored rows:"]
+    parts += [f"    {entry.command.replace('bench', 'bench report', 1)} results_dir=results/standard", entry.made]
     for path in entry.tables:
         table = short_tables(path.read_text())
         parts.append(f"## {path.stem.replace('_', ' ').capitalize()}\n\n{table}" if table else "")
@@ -206,11 +206,11 @@ LONGEST = 30
 
 
 def short_tables(text: str) -> str:
-    """Return the tables and notes of a Markdown file without its title and the list of every cell.
+    """Return the tables and notes of a Markdown file without its title.
 
     Headings become bold lines, and of a table with more than :data:`LONGEST` rows the first ones are shown.
     """
-    text = re.sub(r"\A# .*\n", "", text).partition("\n## Every cell")[0]
+    text = re.sub(r"\A# .*\n", "", text)
     lines: list[str] = []
     count = 0
     for line in text.splitlines():

@@ -1,7 +1,5 @@
 """Commands that run in a copy of the code, or with default signal handlers."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess
@@ -14,17 +12,17 @@ ROOT = Path(__file__).resolve().parents[1]
 class Tree:
     """A copy of the code, in which tests add plugins, edit files and run commands."""
 
-    def __init__(self, root: Path) -> None:
+    def __init__(self, root):
         self.root, self.packages = root / "tree", root / "site"
         for part in ("bench", "plugins", "conf"):
             shutil.copytree(ROOT / part, self.root / part)  # with the bytecode, which an edit of its file makes void
         self.packages.mkdir()
 
-    def add(self, path: str, text: str) -> None:
+    def add(self, path, text):
         """Write a file of the copy, at a path relative to its root."""
         (self.root / path).write_text(text)
 
-    def install(self, package: str, text: str, entry_points: str) -> None:
+    def install(self, package, text, entry_points):
         """Install a package of one module as ``pip install`` does: its code, and metadata with its entry points."""
         (self.packages / f"{package}.py").write_text(text)
         information = self.packages / f"{package}-1.0.dist-info"
@@ -32,7 +30,7 @@ class Tree:
         (information / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")
         (information / "entry_points.txt").write_text(entry_points)
 
-    def run(self, *words: str) -> subprocess.CompletedProcess[str]:
+    def run(self, *words):
         """Run ``python -m bench`` with these arguments in the copy."""
         environment = {**os.environ, "PYTHONPATH": str(self.packages), "PYTHONDONTWRITEBYTECODE": "1"}
         return subprocess.run(
@@ -48,7 +46,7 @@ os.execv(sys.argv[1], sys.argv[1:])
 """
 
 
-def hearing_signals(*words: str) -> list[str]:
+def hearing_signals(*words):
     """Return the command line of ``python -m bench`` with default signal handlers.
 
     A shell ignores SIGINT in background jobs, nohup ignores SIGHUP, and child processes inherit ignored signals.

@@ -2,9 +2,6 @@
 
 import json
 
-import pytest
-
-from bench.errors import UserError
 from bench.experiment import config
 from docs import build
 
@@ -38,10 +35,3 @@ def test_answers_stand_under_their_question_and_name_experiments_without_rows(tm
         "## Does it work?\n\n### quick\n\n*Does the whole path work on this machine?*\n\n![quick](quick/chart.png)\n\n"
         "First &lt;b&gt;. Second.\n\n" in text
     )
-
-
-def test_unknown_part_is_refused():
-    with pytest.raises(
-        UserError, match="unknown part 'pages' \\(allowed: results, columns, verdicts, figures, site, all\\)"
-    ):
-        build.main(["pages"])

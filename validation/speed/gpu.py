@@ -2,6 +2,7 @@
 
     python validation/speed/gpu.py --device cpu --reference    # gradients of a few samples on the CPU, kept beside this file
     python validation/speed/gpu.py --out FOLDER --seconds 500  # the rows: FOLDER/gpu.csv
+    python validation/speed/gpu.py --draw FOLDER               # their chart: FOLDER/gpu.png
 
 Each program of one shape compiles in a process of its own, ``--jobs`` at once, and a lock lets one of them use the
 device. A row is written as soon as it is measured. Rows come in the order of their worth, and at the end of
@@ -195,7 +196,8 @@ def work(unit: Unit, folder: Path, began: float, whole: bool, reference: bool) -
         with alone():
             kept = json.loads(REFERENCE.read_text()) if REFERENCE.is_file() else {}
             kept[unit.case] = projected(gradients).tolist()
-            REFERENCE.write_text(json.dumps(kept, indent=1) + "\n")
+            lines = [f"{json.dumps(name)}: {json.dumps(rows)}" for name, rows in kept.items()]
+            REFERENCE.write_text("{\n" + ",\n".join(lines) + "\n}\n")
         return
     platform = "cpu" if unit.backend == "fused" else jax.default_backend()
     whole = unit.backend != "fused" and (whole or platform != "cpu")
@@ -259,6 +261,26 @@ def measured(given: Any, unit: Unit, batch: int, whole: bool) -> dict[str, Any]:
     }
 
 
+def draw(folder: Path) -> None:
+    """Draw gradients per second against the batch, a panel per case."""
+    import pandas as pd
+
+    from bench.experiment.columns import Column
+    from bench.experiment.views import Chart
+    from bench.report.draw import draw as drawn_chart
+    from bench.report.figures import save, styled
+
+    rows = pd.read_csv(folder / "gpu.csv").query("status == 'ok'")
+    about = json.loads((folder / "machine.json").read_text())
+    on = rows["device"].map({"gpu": f"one {about['device']}", "cpu": f"fused on {about['cores']} cores"})
+    frame = rows.assign(series=rows["dtype"] + ", " + on)
+    batch, rate = Column("batch", label="rollouts at once"), Column("gradients_per_s", label="gradients per second")
+    chart = Chart("gpu", frame, [batch], [rate], title="How many gradients a second does a GPU compute?", series="series",
+                  panel="case")  # fmt: skip
+    with styled():
+        save(drawn_chart(chart), folder / "gpu")
+
+
 # ------------------------------------------------------------------------------------------------- all processes
 
 
@@ -304,8 +326,12 @@ def main() -> None:
     parser.add_argument("--cases", default=",".join((*ROBOTS, *SCENES)))
     parser.add_argument("--whole", action="store_true", help="a batch is one program on the CPU too")
     parser.add_argument("--reference", action="store_true", help=f"write {REFERENCE.name} instead of rows")
+    parser.add_argument("--draw", type=Path, help="draw the rows of a folder")
     parser.add_argument("--unit", nargs=5, help=argparse.SUPPRESS)
     options = parser.parse_args()
+    if options.draw:
+        draw(options.draw)
+        return
     if options.unit:
         case, backend, dtype, batches, began = options.unit
         unit = Unit(case, backend, dtype, tuple(map(int, batches.split(","))))
