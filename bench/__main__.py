@@ -1,39 +1,42 @@
 """``python -m bench``."""
 
 import contextlib
-import logging
 import os
+import select
 import signal
 import subprocess
 import sys
-import threading
+import time
 import traceback
-from functools import partial
 
 from bench.cli import main
 from bench.model import guard
 from bench.run.pool import describe_exit
+from bench.run.reaper import MARK, Reaper
 
-JUDGES = ("check", "claims", "compare", "examine", "gradcheck")
-"""The commands whose status is a verdict on a user's code, which may end the process that runs it with any status."""
 NO_VERDICT = 3
-"""The status of a command that ended without a verdict."""
-VERDICT = "BENCH_VERDICT"
-"""Environment variable with the descriptor to which the process of a verdict writes its status."""
+"""The status of a command whose process ended without one."""
+CHANNEL = "BENCH_CHANNEL"
+"""Environment variable of a command's process: the descriptor to which it writes its status, and its parent's id."""
 FORWARDED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+AGAIN_S = 0.5
+"""Seconds after which a further signal ends a command immediately: a terminal and a parent may send the same one."""
+POLL_S, EXIT_S = 0.2, 1.0
+"""Seconds between checks of the command's process, and seconds in which it ends after it has written its status."""
 
 
 def command() -> None:
-    """Run one command and end the process with its status, even if plugins have left threads or processes running.
+    """Run one command and end with its status, even if plugins have left threads or processes running.
 
-    A command that judges runs in a child process: the code that it judges may end that process with any status, and
-    without a verdict the status is :data:`NO_VERDICT`.
+    The command has a process of its own, since code that it runs, such as a plugin or a user's cost, may end that process with
+    any status. All processes that it has started end with it.
     """
-    verdict = os.environ.pop(VERDICT, "")
-    if not verdict and sys.argv[1:2] and sys.argv[1] in JUDGES:
-        sys.exit(_judged())
-    if verdict:
-        os.set_inheritable(int(verdict), False)
+    channel = os.environ.pop(CHANNEL, "")
+    if not channel:
+        os._exit(_watched())  # without waiting for threads
+    descriptor, parent = map(int, channel.split())
+    os.set_inheritable(descriptor, False)
+    guard.die_with(parent)
     pid = os.getpid()
     try:
         status = main()
@@ -44,53 +47,41 @@ def command() -> None:
         traceback.print_exc()
         status = 1
     guard.exit_if_forked(pid)
-    if verdict:
-        for stream in (sys.stdout, sys.stderr):
-            with contextlib.suppress(Exception):
-                stream.flush()
-        with contextlib.suppress(OSError):  # the code that is judged may have closed it
-            os.write(int(verdict), bytes([status]))
-    guard.kill_children()
-    if all(thread.daemon or thread is threading.main_thread() for thread in threading.enumerate()):
-        sys.exit(status)
-    # sys.exit would wait for the other threads, and a thread of a plugin may never end. This package needs no cleanup at
-    # exit: its files and temporary folders are closed when a command returns
-    logging.shutdown()
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(Exception):  # a plugin may have closed or replaced it
             stream.flush()
-    os._exit(status)
+    with contextlib.suppress(OSError):
+        os.write(descriptor, bytes([status]))
+    sys.exit(status)
 
 
-def _judged() -> int:
-    """Run this command in a child process, and return the status that the child tells before it ends.
-
-    The child is the leader of a process group, which is killed after its end.
-    """
+def _watched() -> int:
+    """Run this command in a marked child process, and return the status that the child writes before it ends."""
     reader, writer = os.pipe()
-    child: subprocess.Popen[bytes] | None = None
+    reaper = Reaper()
+    variables = {MARK: reaper.mark, CHANNEL: f"{writer} {os.getpid()}"}
+    child = subprocess.Popen([sys.executable, *sys.orig_argv[1:]], env=os.environ | variables, pass_fds=[writer])
+    first = 0.0
 
     def forward(number: int, _: object) -> None:
-        if child is not None:
-            child.send_signal(number)
+        nonlocal first
+        first = first or time.monotonic()
+        child.send_signal(number if time.monotonic() < first + AGAIN_S else signal.SIGKILL)
 
     for number in FORWARDED:
         if signal.getsignal(number) is not signal.SIG_IGN:  # as under nohup
             signal.signal(number, forward)
-    child = subprocess.Popen(
-        [sys.executable, *sys.orig_argv[1:]], env=os.environ | {VERDICT: str(writer)}, pass_fds=[writer],
-        # a process group in the background cannot read from a terminal
-        stdin=subprocess.DEVNULL if os.isatty(0) else None, process_group=0,
-        preexec_fn=partial(guard.die_with, os.getpid()),
-    )  # fmt: skip
+    reaper.wait_until_ready()
+    while child.poll() is None and not select.select([reader], [], [], POLL_S)[0]:
+        pass
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        child.wait(EXIT_S)
+    reaper.close()
     code = child.wait()
-    with contextlib.suppress(ProcessLookupError, PermissionError):
-        os.killpg(child.pid, signal.SIGKILL)
-    os.set_blocking(reader, False)
-    with contextlib.suppress(BlockingIOError):
+    if select.select([reader], [], [], 0)[0]:
         return os.read(reader, 1)[0]
-    if -code in FORWARDED:
-        return 128 - code
+    if first:
+        return 128 + signal.SIGINT
     print(f"bench: the process ended before a verdict: {describe_exit(code)}", file=sys.stderr)
     return NO_VERDICT
 

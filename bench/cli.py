@@ -119,7 +119,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 @contextmanager
 def _stop_on_signals() -> Iterator[None]:
-    """Make SIGTERM and SIGHUP stop a command like Ctrl-C, and a second signal end it immediately without a message.
+    """Make SIGTERM and SIGHUP stop a command like Ctrl-C; further signals are ignored, and left to the parent process.
 
     No finished row is lost, since rows are on disk and workers end with their run. In a finaliser or a callback of the
     garbage collector, Python would print the KeyboardInterrupt and continue: it is not printed there, and since
@@ -132,7 +132,7 @@ def _stop_on_signals() -> Iterator[None]:
 
     def stop(*_: object) -> None:
         for name in names:
-            signal.signal(name, signal.SIG_DFL)
+            signal.signal(name, signal.SIG_IGN)
         INTERRUPTED.set()
         raise KeyboardInterrupt
 

@@ -250,7 +250,6 @@ class Pool:
         self._retries: deque[deque[Any]] = deque()
         self._crashed: set[int] = set()
         self._n_failed_starts = 0
-        self._mark = uuid.uuid4().hex
         self._reaper: Reaper | None = None
 
     def __enter__(self) -> Pool:
@@ -334,12 +333,12 @@ class Pool:
 
     def _start_worker(self) -> _Worker:
         if self._reaper is None:
-            self._reaper = Reaper(self._mark)
+            self._reaper = Reaper()
         ours, theirs = socket.socketpair()
         # a worker that has sent half a message, or reads none, is not waited for
         for option in (socket.SO_RCVTIMEO, socket.SO_SNDTIMEO):
             ours.setsockopt(socket.SOL_SOCKET, option, struct.pack("@ll", int(EXIT_S), 0))
-        output, mark = guard.temporary_file(), f"{self._mark}-{uuid.uuid4().hex}"
+        output, mark = guard.temporary_file(), f"{self._reaper.mark}{uuid.uuid4().hex}"
         process = subprocess.Popen(
             command(theirs.fileno()), pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL,
             stdout=output, stderr=output, start_new_session=True,

@@ -13,35 +13,41 @@ import signal
 import subprocess
 import sys
 import time
+import uuid
 from contextlib import suppress
 
-MARK = "BENCH_WORKER"
-"""Environment variable that marks a worker and every process it starts, even in another session."""
+MARK = "BENCH_MARK"
+"""Environment variable that marks a process and every process that it starts, even in another session."""
 DEATH_SIGNAL = 1
 """PR_SET_PDEATHSIG of prctl(2)."""
 PASSES, PAUSE_S = 5, 0.2
-"""Number of searches for marked processes, which may start others meanwhile, and pause in seconds after each search."""
+"""Most searches for marked processes, which may start others meanwhile, and the reaper's pause in seconds after each."""
 READY_S = 0.02
 """Seconds between two signals to a reaper that is not ready."""
 
 
 class Reaper:
-    """Starts a reaper, which kills every process marked with ``mark`` when this process ends, even if it is killed.
+    """Kills every process whose environment has its ``mark`` when it is closed or this process ends, even if it is killed.
 
-    The reaper waits on a pipe that the system closes when this process ends.
+    The reaper waits on a pipe that the system closes when this process ends. If this process is marked itself, the reaper of
+    its mark does that too: marks begin with the mark of the process that made them.
     """
 
-    def __init__(self, mark: str) -> None:
-        environment = {name: value for name, value in os.environ.items() if name != MARK}
-        self._process = subprocess.Popen(
-            [sys.executable, "-I", "-S", __file__, mark, chr(0x1F).join(sys.path)],  # without importing the package
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=environment,
-            start_new_session=True,
-        )  # fmt: skip
-        self._is_ready = False
+    def __init__(self) -> None:
+        self.mark = f"{os.environ.get(MARK, '')}{uuid.uuid4().hex}"
+        self._is_ready = MARK in os.environ
+        self._process: subprocess.Popen[bytes] | None = None
+        if not self._is_ready:
+            self._process = subprocess.Popen(
+                [sys.executable, "-I", "-S", __file__, self.mark, chr(0x1F).join(sys.path)],  # without the package
+                stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, start_new_session=True,
+            )  # fmt: skip
 
     def wait_until_ready(self) -> None:
         """Wait until the end of this process would resume a stopped reaper; until then, a stopped reaper is resumed here."""
+        if self._is_ready:
+            return
+        assert self._process is not None
         assert self._process.stdout is not None
         poll = select.poll()
         poll.register(self._process.stdout, select.POLLIN)
@@ -50,12 +56,13 @@ class Reaper:
             self._is_ready = bool(poll.poll(1000 * READY_S))
 
     def close(self) -> None:
-        """End the reaper's process. End the workers first."""
-        self._process.kill()
-        self._process.wait()
-        for pipe in (self._process.stdin, self._process.stdout):
-            assert pipe is not None
-            pipe.close()
+        """Kill the marked processes, then the reaper's own."""
+        for _ in range(PASSES):
+            if not kill_marked_processes(self.mark):
+                break
+        if self._process is not None:
+            with self._process as process:  # closes its pipes
+                process.kill()
 
 
 def main() -> None:
@@ -72,14 +79,17 @@ def main() -> None:
         time.sleep(PAUSE_S)
 
 
-def kill_marked_processes(mark: str) -> None:
-    """Kill all other processes whose mark is ``mark`` or starts with it."""
+def kill_marked_processes(mark: str) -> int:
+    """Kill all other processes whose mark is ``mark`` or starts with it, and return their number."""
     import psutil
 
+    n_killed = 0
     for process in psutil.process_iter():
         with suppress(psutil.Error):
             if process.pid != os.getpid() and process.environ().get(MARK, "").startswith(mark):
                 process.kill()
+                n_killed += 1
+    return n_killed
 
 
 if __name__ == "__main__":

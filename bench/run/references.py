@@ -18,6 +18,7 @@ from bench.measure import reference, smoothed
 from bench.measure.reference import Reference
 from bench.model import Backend
 from bench.run.files import make_directory, write_whole
+from bench.run.rows import read_parquet
 
 
 class References:
@@ -121,12 +122,10 @@ def save(reference: Reference, path: Path) -> None:
 
 def load(path: Path) -> Reference | None:
     """Load a stored reference; returns None if the file is missing or unreadable."""
-    import pandas as pd
-
-    if not path.exists():
+    if not path.is_file():
         return None
     try:
-        table = pd.read_parquet(path)
+        table = read_parquet(path)
         rows = {name: np.stack(list(part)) for name, part in table.groupby("part")["gradient"]}
         vectors = {name: rows[name][0] for name in ("plain", "physical") if name in rows}
         method, error = str(table["method"][0]), float(table["error"][0])

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 
 MAX_ROWS = 5_000_000
 """Largest number of rows of a file: five times the largest sweep."""
-MAX_BYTES, MAX_GROWTH, ALWAYS_BYTES = 1 << 33, 1000, 1 << 29
-"""Largest size of a table in memory, as its file states it; also as a multiple of the file's size, above 512 MiB."""
+MAX_BYTES, MAX_GROWTH, ALWAYS_BYTES = 1 << 33, 500, 1 << 28
+"""Largest size of a table in memory; also as a multiple of the file's size, above 256 MiB."""
 MAX_TEXT = 1_000_000
 """Length of the longest string, in characters."""
 COUNTS = {"samples": 1, "repeats": 1, "seed": 0, "horizon": 0}
@@ -70,9 +70,12 @@ def read_parquet(path: Path, columns: Sequence[str] | None = None) -> pd.DataFra
     most = min(MAX_BYTES, max(ALWAYS_BYTES, MAX_GROWTH * content.getbuffer().nbytes))
     if metadata.num_rows > MAX_ROWS or size > most:
         raise ValueError(f"{metadata.num_rows} rows and {size} bytes are more than a run writes")
-    texts = [field.name for field in file.schema_arrow if str(field.type) in ("string", "large_string")]
+    leaves = [metadata.schema.column(i) for i in range(metadata.num_columns)]
+    texts = [leaf.path for leaf in leaves if leaf.physical_type == "BYTE_ARRAY"]
     content.seek(0)
     table = pyarrow.parquet.read_table(content, columns=columns and list(columns), read_dictionary=texts)
+    if (size := sum(_text_bytes(chunk) for column in table.columns for chunk in column.chunks)) > most:
+        raise ValueError(f"{size} bytes of strings are more than a run writes")
     # a column is freed as soon as it is converted
     frame = table.to_pandas(split_blocks=True, self_destruct=True)
     if not all(isinstance(name, str) for name in frame):
@@ -80,15 +83,26 @@ def read_parquet(path: Path, columns: Sequence[str] | None = None) -> pd.DataFra
     return frame.assign(**{name: _shared(frame[name]) for name in texts if name in frame})
 
 
+def _text_bytes(items: Any) -> int:
+    """Return the bytes that the strings of an Arrow array take once each is copied, as for a list or a written file."""
+    import pyarrow.compute as pc
+
+    if hasattr(items, "dictionary"):
+        return pc.sum(pc.binary_length(items.dictionary).take(items.indices)).as_py() or 0
+    parts = items.flatten() if hasattr(items, "flatten") else []
+    return sum(map(_text_bytes, parts if isinstance(parts, list) else [parts]))
+
+
 def _shared(values: pd.Series) -> pd.Series:
-    """Return a categorical column as strings, of which equal ones are one object: most columns have few distinct strings."""
+    """Return a categorical column as strings or bytes, of which equal ones are one object: most columns have few distinct ones."""
     import numpy as np
     import pandas as pd
 
     if not isinstance(values.dtype, pd.CategoricalDtype):
         return values
     distinct = np.array([*values.cat.categories, math.nan], dtype=object)  # the code of a missing string is -1
-    dtype = pd.StringDtype("python", na_value=math.nan)
+    is_text = all(isinstance(value, str) for value in values.cat.categories)
+    dtype = pd.StringDtype("python", na_value=math.nan) if is_text else object
     return pd.Series(pd.array(distinct[values.cat.codes.to_numpy()], dtype=dtype), index=values.index)
 
 

@@ -330,7 +330,7 @@ def test_an_open_connection_without_messages_is_not_a_fault():
 
 @pytest.mark.skipif(sys.platform != "linux", reason="processes stop otherwise")
 def test_a_reaper_that_is_stopped_at_its_start_is_resumed():
-    reaper = Reaper("nobody")
+    reaper = Reaper()
     try:
         reaper._process.send_signal(signal.SIGSTOP)
         reaper.wait_until_ready()
