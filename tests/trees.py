@@ -6,7 +6,11 @@ import os
 import shutil
 import subprocess
 import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
+
+import psutil
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -54,3 +58,23 @@ def hearing_signals(*words: str) -> list[str]:
     A shell ignores SIGINT in background jobs, nohup ignores SIGHUP, and child processes inherit ignored signals.
     """
     return [sys.executable, "-c", DEFAULT_SIGNALS, sys.executable, "-m", "bench", *words]
+
+
+def processes_in(folder: Path) -> list[psutil.Process]:
+    """Return the processes that were started in a folder and have not ended."""
+    found = []
+    for process in psutil.process_iter():
+        try:
+            if Path(process.cwd()).is_relative_to(folder) and process.status() != psutil.STATUS_ZOMBIE:
+                found.append(process)
+        except psutil.Error:
+            continue
+    return found
+
+
+def wait_for(condition: Callable[[], bool], seconds: float = 60.0) -> None:
+    """Wait until a condition holds."""
+    until = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < until, "waited in vain"
+        time.sleep(0.05)
