@@ -36,6 +36,8 @@ site: $(VENV)/.installed
 gallery: $(VENV)/.installed
 	for name in $$(cd conf/experiment && find * -name '*.yaml' | sed 's/\.yaml$$//' | sort); do \
 	  $(RUN) +experiment=$$name results_dir=results/standard || exit 1; done
+	for name in $$(cd examples/cost_of_error/experiment && find * -name '*.yaml' | sed 's/\.yaml$$//' | sort); do \
+	  $(RUN) +experiment=$$name plugins=examples/cost_of_error results_dir=results/standard || exit 1; done
 	$(BIN)/python -m docs.build results figures
 
 # The examples on other people's engines, in an environment of their own: their pins and ours do not live together.

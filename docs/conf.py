@@ -4,6 +4,9 @@ import re
 from pathlib import Path
 from typing import Any
 
+from docutils import nodes
+from docutils.utils.math import latex2mathml
+
 import bench
 
 HERE = Path(__file__).parent
@@ -16,7 +19,7 @@ version = release = bench.__version__
 extensions = ["myst_parser", "sphinx.ext.autodoc"]
 exclude_patterns = ["repo", "data"]
 suppress_warnings = ["myst.header"]
-myst_enable_extensions = ["colon_fence", "attrs_block"]
+myst_enable_extensions = ["colon_fence", "attrs_block", "dollarmath"]
 myst_heading_anchors = 4
 
 autodoc_member_order = "bysource"
@@ -24,6 +27,8 @@ autodoc_typehints = "signature"
 autodoc_preserve_defaults = True
 
 html_theme = "pydata_sphinx_theme"
+html_math_renderer = "mathml"  # needs neither a script nor a network
+html_context = {"default_mode": "auto"}
 html_title = "bench: which gradient can I trust?"
 html_static_path = [str(HERE / "site.css"), str(HERE / "site.js")]
 html_css_files = ["site.css"]
@@ -52,6 +57,13 @@ def escape_bars(app: Any, what: str, name: str, value: Any, options: Any, lines:
     lines[:] = [re.sub(r"(``.*?``)|\|", lambda match: match[1] or r"\|", line) for line in lines]
 
 
+def write_math(self: Any, node: Any) -> None:
+    """Write a formula as MathML."""
+    self.body.append(latex2mathml.tex2mathml(node.astext(), isinstance(node, nodes.math_block)))
+    raise nodes.SkipNode
+
+
 def setup(app: Any) -> None:
     """Connect the functions above to Sphinx."""
+    app.add_html_math_renderer("mathml", (write_math, None), (write_math, None))
     app.connect("autodoc-process-docstring", escape_bars)

@@ -14,6 +14,7 @@ import json
 import re
 from collections.abc import Callable
 from functools import cache
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -21,15 +22,15 @@ import pandas as pd
 
 from bench.experiment import config
 from bench.measure.performance import wilson
+from bench.model import registry
 from bench.report import answer
 from bench.report.text import axis_value, number
 from bench.report.text import interval as text_of_interval
 from bench.report.text import span as ends_of
 from bench.studies.bias_variance import trust
-from bench.studies.dose_response import analysis
 from bench.studies.gradient_check.points import is_trusted
 from bench.studies.train import aggregate
-from docs.results import STANDARD, answer_of, comparison, rmse_interval, rows_of, select, table_of
+from docs.results import PAPER, STANDARD, answer_of, comparison, rmse_interval, rows_of, select, table_of
 
 MARK = re.compile(r"<!--=([\w.-]+|[^>\n]+\|.*?)-->(.*?)<!--/-->", re.DOTALL)
 SOURCE = re.compile(r"<!-- figures: (.*?) -->\n?")
@@ -153,7 +154,7 @@ def score(method: str, column: str = "rmse_rel", **conditions: Any) -> float:
     return float(value)
 
 
-CONTACT, JUMP = "pushing, penalty", "heaviside[theta=0.05]"
+CONTACT, JUMP = "pushing", "heaviside"
 """The stiff contact and the jump of ``estimators``."""
 
 
@@ -223,9 +224,10 @@ def backward_memory_table() -> str:
     ])  # fmt: skip
 
 
-def with_ends(row: pd.Series, name: str) -> str:
-    """Return a number with the ends of its interval."""
-    return f"{number(row[name])} [{number(row[f'{name}_low'])}, {number(row[f'{name}_high'])}]"
+def with_ends(row: Any, name: str, digits: int = 2) -> str:
+    """Return a number with the ends of its interval, or without one where that is not known."""
+    value, low, high = (number(row[f"{name}{end}"], digits) for end in ("", "_low", "_high"))
+    return f"{value} [{low}, {high}]" if np.isfinite(row[f"{name}_low"]) else value
 
 
 def backward_memory_of(row: pd.Series) -> str:
@@ -309,22 +311,17 @@ def window_bias(line: dict[str, Any]) -> str:
     return f"{number(line['window_bias'])} [{low}, {high}]" if line["window_bias_low"] > 0 else f"0 (< {high})"
 
 
-def final_return(line: dict[str, Any]) -> str:
-    """Return a final return with its interval, or without one where there are too few seeds."""
-    ends = f" [{number(line['final_low'], 3)}, {number(line['final_high'], 3)}]"
-    return number(line["final"], 3) + (ends if np.isfinite(line["final_low"]) else "")
-
-
 def trained_table(experiment: str = "train") -> str:
-    """Return the final return, steps and times by trainer as a Markdown table."""
-    head = [
-        "| trainer | final return | worst seed | control steps | training | compilation |",
-        "|---" + "|--:" * 5 + "|",
-    ]
-    return block(head + [
-        f"| `{line['method']}` | {final_return(line)} | "
-        f"{number(line['worst'], 3)} | {count(line['steps'])} | {number(line['train_s'])} s | {number(line['compile_s'])} s |"
-        for line in aggregate.summarise(trained(experiment)).to_dict("records")
+    """Return the final return, steps and times by trainer as a Markdown table, and the return at equal used steps if some are not."""
+    lines = aggregate.summarise(trained(experiment)).to_dict("records")
+    has_unused = any(line["used"] < line["steps"] for line in lines)
+    more = " used steps | at equal used steps |" * has_unused
+    head = f"| trainer | final return | worst seed | control steps |{more} training | compilation |"
+    return block([head, "|---" + "|--:" * (5 + 2 * has_unused) + "|"] + [
+        f"| `{line['method']}` | {with_ends(line, 'final', 3)} | {number(line['worst'], 3)} | {count(line['steps'])} |"
+        + f" {count(round(line['used'], -3))} | {with_ends(line, 'equal', 3)} |" * has_unused
+        + f" {number(line['train_s'])} s | {number(line['compile_s'])} s |"
+        for line in lines
     ])  # fmt: skip
 
 
@@ -333,7 +330,7 @@ def windows_table(experiment: str = "train") -> str:
     has_bias = experiment == "train"
     head = f"| window [steps] | norm of the gradient |{' its bias |' * has_bias} final return |"
     return block([head, "|--:" * (3 + has_bias) + "|"] + [
-        f"| {line['window']:.0f} | {number(line['window_gradient'])} |{f' {window_bias(line)} |' * has_bias} {final_return(line)} |"
+        f"| {line['window']:.0f} | {number(line['window_gradient'])} |{f' {window_bias(line)} |' * has_bias} {with_ends(line, 'final', 3)} |"
         for line in aggregate.windows(trained(experiment)).to_dict("records")
     ])  # fmt: skip
 
@@ -342,7 +339,7 @@ def stiffness_table() -> str:
     """Return gradient and final return by the stiffness of the ground and the length of a window, as Markdown."""
     head = ["| stiffness [N/m] | window [steps] | norm of the gradient | final return |", "|--:" * 4 + "|"]
     return block(head + [
-        f"| {count(stiffness)} | {line['window']:.0f} | {number(line['window_gradient'])} | {final_return(line)} |"
+        f"| {count(stiffness)} | {line['window']:.0f} | {number(line['window_gradient'])} | {with_ends(line, 'final', 3)} |"
         for stiffness, part in trained("train/stiffness").groupby("stiffness")
         for line in aggregate.windows(part).to_dict("records")
     ])  # fmt: skip
@@ -354,15 +351,9 @@ def gradient_norms(experiment: str, window: int) -> str:
     return span(runs.loc[runs["trainer"].str.contains(f"window={window}]", regex=False), "gradient_typical"])
 
 
-def used_steps(experiment: str) -> str:
-    """Return the range over runs of the share of control steps that trainers use which ignore others, over a whole run."""
-    shares = pd.Series([np.mean(log) for log in trained(experiment)["log_used"] if np.size(log) > 1])
-    return f"{shares.min():.0%} to {shares.max():.0%}"
-
-
-def faults_table(experiment: str) -> str:
-    """Return per trainer and fault the number of runs whose log shows it, and the numbers of the first, as Markdown."""
-    runs = trained(experiment)
+def faults_table() -> str:
+    """Return per trainer and fault the number of half-cheetahs whose log shows it, and the numbers of the first, as Markdown."""
+    runs = trained("train/half_cheetah")
     seeds = runs.groupby("method")["seed"].nunique()
     faults, numbers = aggregate.faults(runs), ["update", "value"]
     head = ["trainer", "fault", "runs", "first in seed", *numbers]
@@ -419,6 +410,23 @@ def scenes_table() -> str:
     return block(head + [f"| {scene} | " + " | ".join(map(number, values)) + " |" for scene, values in ratios.items()])
 
 
+def gpu_table() -> str:
+    """Return gradients per second, their agreement with the CPU and compile time by case and precision as Markdown."""
+    rows = pd.read_csv(STANDARD / "gpu" / "gpu.csv")
+    keys = ["case", "backend", "dtype"]
+    rates = rows.pivot(index=keys, columns="batch", values="gradients_per_s")[[1, 1024, 16384]]
+    most = rows.groupby(keys)[["agreement", "compile_s"]].max()
+    head = [
+        "| scene | backend | precision | 1 | 1,024 | 16,384 | agreement | compiles [s] |",
+        "|---|---|---|--:|--:|--:|--:|--:|",
+    ]
+    return block(head + [
+        f"| {case} | `{backend}` | {dtype} | " + " | ".join(map(number, [*rates.loc[key], *most.loc[key]])) + " |"
+        for key in rows[keys].drop_duplicates().itertuples(index=False, name=None)
+        for case, backend, dtype in [key]
+    ])  # fmt: skip
+
+
 def dose(table: str, name: str = "dose_response") -> pd.DataFrame:
     """Return a table of a study of errors as stored."""
     return pd.read_csv(STANDARD / name / f"{table}.csv", keep_default_na=True)
@@ -471,6 +479,8 @@ def dose_runs() -> str:
 
 def windows_missed() -> str:
     """Return on how many problems the best gradient reaches 1/100 and a window of no length does, of how many."""
+    registry.add_folder(PAPER)
+    analysis = import_module(f"{registry.usable('studies', 'dose_response').__module__}.analysis")
     searches = analysis.searches(rows_of("dose_response_windows")).query("target == 100")
     medians = searches.pivot_table(index="problem", columns="method", values="median", aggfunc="first")
     missed = np.isfinite(medians[analysis.BEST]) & np.isinf(medians.filter(like="windowed")).all(axis=1)
@@ -680,12 +690,12 @@ FIGURES: dict[str, Callable[[], str]] = {
     "spring-rk4": lambda: percent(right("mass_spring")["rk4"]),
     "spring-implicit": lambda: percent(right("mass_spring")["implicit_euler"]),
     "ball-event": lambda: percent(right("bouncing_ball", "impulse")["event_driven"]),
-    "clip-90": lambda: span(estimators("clipped", problem=CONTACT)),
-    "clip-50": lambda: span(estimators("clipped", "quantile=0.5", problem=CONTACT)),
-    "difference-short": lambda: span(estimators("finite_difference", problem=CONTACT)),
-    "difference-long": lambda: span(estimators("finite_difference", "step=0.1", problem=CONTACT)),
-    "weights-contact": lambda: span(estimators("total_propagation", "per=action", problem=CONTACT)),
-    "weights-jump": lambda: span(estimators("total_propagation", problem=JUMP)),
+    "clip-90": lambda: span(estimators("clipped", scene=CONTACT)),
+    "clip-50": lambda: span(estimators("clipped", "quantile=0.5", scene=CONTACT)),
+    "difference-short": lambda: span(estimators("finite_difference", scene=CONTACT)),
+    "difference-long": lambda: span(estimators("finite_difference", "step=0.1", scene=CONTACT)),
+    "weights-contact": lambda: span(estimators("total_propagation", "per=action", scene=CONTACT)),
+    "weights-jump": lambda: span(estimators("total_propagation", scene=JUMP)),
     "equal-rollouts": equal_rollouts_table,
     "equal-rollouts-reference": equal_rollouts_reference,
     "backward-memory": backward_memory_table,
@@ -703,14 +713,12 @@ FIGURES: dict[str, Callable[[], str]] = {
     "hopper-answer": lambda: answer_of("train/hopper"),
     "hopper-table": lambda: trained_table("train/hopper"),
     "hopper-stiffness": stiffness_table,
-    "hopper-used": lambda: used_steps("train/hopper"),
     "hopper-windows": lambda: windows_table("train/hopper"),
-    "hopper-faults": lambda: faults_table("train/hopper"),
     "cheetah-answer": lambda: answer_of("train/half_cheetah"),
     "cheetah-table": lambda: trained_table("train/half_cheetah"),
     "cheetah-norms-8": lambda: gradient_norms("train/half_cheetah", 8),
     "cheetah-norms-16": lambda: gradient_norms("train/half_cheetah", 16),
-    "cheetah-faults": lambda: faults_table("train/half_cheetah"),
+    "cheetah-faults": faults_table,
     "fits-hidden": hidden,
     "fits-bound": lambda: span(fits("error", "rk4", (0, 1))),
     "fits-coverage": lambda: span(100 * fits("coverage", "rk4", (0, 1)), suffix="%"),
@@ -721,6 +729,7 @@ FIGURES: dict[str, Callable[[], str]] = {
     "speed-cell": lambda: number(speeds()["overhead of a cell"]),
     "speed-rollouts": rollouts_table,
     "speed-scenes": scenes_table,
+    "speed-gpu": gpu_table,
     "speed-one-thread": lambda: span(speed("fused on one thread over the C kernel, * rollouts")),
     "speed-agree": lambda: number(speeds()["native C kernel: largest relative difference"]),
     "speed-memory-fused": lambda: span(speed("fused grad, penalty, * rollouts: peak memory"), 3),

@@ -16,6 +16,7 @@ import bench
 from bench.errors import UserError
 from bench.experiment import config
 from bench.experiment.experiment import Experiment
+from bench.model import registry
 from bench.report import answer
 from bench.report.views import arrange
 from bench.report.writer import ANSWER
@@ -23,6 +24,8 @@ from bench.studies.bias_variance import comparisons
 
 ROOT = Path(__file__).resolve().parent.parent
 STANDARD = ROOT / "results" / "standard"
+PAPER = ROOT / "examples" / "cost_of_error"
+"""A study outside the package, with experiments whose results are stored too."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +44,12 @@ class Entry:
     def page(self) -> str:
         """The name of the experiment's page on the site, that of its folder."""
         return f"experiment/{self.folder.name}"
+
+    @property
+    def command(self) -> str:
+        """The command that runs the experiment."""
+        is_own = not (PAPER / "experiment" / f"{self.name}.yaml").exists()
+        return f"python -m bench +experiment={self.name}" + ("" if is_own else f" plugins={PAPER.relative_to(ROOT)}")
 
     @property
     def has_results(self) -> bool:
@@ -96,7 +105,8 @@ def joined_experiments(results: Path) -> dict[str, str]:
 @cache
 def loaded(results: Path) -> dict[str, Experiment]:
     """Return every experiment by name."""
-    return {name: config.load([f"experiment={name}", f"results_dir={results}"]) for name in config.experiments()}
+    registry.add_folder(PAPER)
+    return {name: config.load([f"experiment={name}", f"results_dir={results}"]) for name in config.experiments([PAPER])}
 
 
 def entry_of(name: str, question: str, folder: Path) -> Entry:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import inspect
 import re
 import shutil
@@ -16,6 +15,7 @@ from typing import Any, cast
 import pandas as pd
 
 import bench
+import bench.plugin
 from bench.errors import UserError
 from bench.model import registry
 from bench.model.parameters import parameters
@@ -39,7 +39,17 @@ PAGES: Mapping[str, str] = {
 SECTIONS: Mapping[str, Sequence[str]] = {
     "start": ("reading-results", "python"),
     "trust": ("gradcheck", "examine"),
-    "results": ("experiment/*", "estimators", "claims", "controller", "dose-response", "training", "engines", "speed"),
+    "results": (
+        "answers",
+        "experiment/*",
+        "estimators",
+        "claims",
+        "controller",
+        "dose-response",
+        "training",
+        "engines",
+        "speed",
+    ),
     "extending": ("architecture", "contributing"),
     "reference": (
         "commands",
@@ -49,6 +59,7 @@ SECTIONS: Mapping[str, Sequence[str]] = {
         "machines",
         "ci",
         "glossary",
+        "peers",
         "validation",
         "sources",
         "changelog",
@@ -57,6 +68,9 @@ SECTIONS: Mapping[str, Sequence[str]] = {
 """The five entries of the site and the pages below each."""
 TITLES = {"start": "Start", "trust": "Is my gradient right?", "results": "Results", "extending": "Extend"}
 """Titles of the entries in the navigation where they differ from their page's heading."""
+MODULES = bench, bench.plugin
+EXAMPLES = "python", "examine", "extending", "training", "claims"
+"""The modules with public names, and the documents that show them in use."""
 
 
 def build(out: Path, results: Path = STANDARD) -> Path:
@@ -84,7 +98,7 @@ def sources(results: Path = STANDARD) -> dict[str, str]:
     pages |= {f"estimator/{name}": text for name, text in estimator_pages(results).items()}
     pages |= claim_pages(results)
     pages["estimators"] = estimators_page(results)
-    pages["api"] = api_page()
+    pages |= api_pages()
     pages["reference"] = "# Reference\n"
     pages["index"] = home_page()
     for parent, children in SECTIONS.items():
@@ -92,6 +106,7 @@ def sources(results: Path = STANDARD) -> dict[str, str]:
         pages[parent] += toctree(names, hidden=parent != "reference")
     pages["estimators"] += toctree(expand("estimator/*", pages))
     pages["claims"] += toctree(expand("claim/*", pages))
+    pages["api"] += toctree(expand("api/*", pages))
     pages["index"] += toctree([f"{TITLES[name]} <{name}>" if name in TITLES else name for name in SECTIONS])
     return pages
 
@@ -156,7 +171,7 @@ def home_page() -> str:
         "- [Extend](extending.md): add an estimator, a scene, a backend or a study",
         "- [Reference](reference.md): commands, columns, Python interface, validation",
     ]
-    index = (ROOT / PAGES["results"]).read_text().partition("\n## ")[0].replace("](#", "](results.md#")
+    index = (ROOT / PAGES["results"]).read_text().partition("\n## ")[0]
     questions = [line for line in index.splitlines() if line.startswith("|")]
     return "\n".join(
         [localise(opening, Path("README.md")), "", *lines, "", "## Results by question", "", *questions, ""]
@@ -171,8 +186,8 @@ def experiment_page(entry: Entry) -> str:
         parts.append(f"{{.finding}}\n{escape_markdown(entry.answer)}")
     if entry.chart:
         parts.append(f"![{escape_markdown(entry.question)}]({folder}/{entry.chart.name})")
-    parts += ["## Run it", f"    python -m bench +experiment={entry.name}", "Or write its page from the stored rows:"]
-    parts += [f"    python -m bench report +experiment={entry.name} results_dir=results/standard", entry.made]
+    parts += ["## Run it", f"    {entry.command}", "Or write its page from the stored rows:"]
+    parts += [f"    {entry.command.replace('bench', 'bench report', 1)} results_dir=results/standard", entry.made]
     for path in entry.tables:
         table = short_tables(path.read_text())
         parts.append(f"## {path.stem.replace('_', ' ').capitalize()}\n\n{table}" if table else "")
@@ -191,11 +206,11 @@ LONGEST = 30
 
 
 def short_tables(text: str) -> str:
-    """Return the tables and notes of a Markdown file without its title and the list of every cell.
+    """Return the tables and notes of a Markdown file without its title.
 
     Headings become bold lines, and of a table with more than :data:`LONGEST` rows the first ones are shown.
     """
-    text = re.sub(r"\A# .*\n", "", text).partition("\n## Every cell")[0]
+    text = re.sub(r"\A# .*\n", "", text)
     lines: list[str] = []
     count = 0
     for line in text.splitlines():
@@ -347,27 +362,32 @@ def estimators_page(results: Path) -> str:
 # ------------------------------------------------------------------------------------------------------------- API
 
 
-def api_page() -> str:
-    """Return the page of the Python interface, whose entries Sphinx writes from signatures and docstrings."""
-    text = (
-        "# Python interface\n\nEvery public name, with its signature and docstring. [Python](python.md) shows the functions "
-        "in use, and [Extend](extending.md) the contracts.\n\nArrays are component-first and batch-last: B is the batch, d "
-        "the length of theta, n_w the length of a sample's noise, R the number of estimates and N the samples in each.\n"
-    )
-    modules = [bench, *(importlib.import_module(name) for name in ("bench.plugin",) if importlib.util.find_spec(name))]
-    seen: set[int] = set()
+def api_pages() -> dict[str, str]:
+    """Return the page of the Python interface and one per public name, which Sphinx writes from its docstring."""
+    pages = {
+        "api": "# Python interface\n\nA page per public name. [Python](python.md) shows the functions in use, and "
+        "[Extend](extending.md) the contracts.\n\nArrays are component-first and batch-last: B is the batch, d the length of "
+        "theta, n_w the length of a sample's noise, R the number of estimates and N the samples in each.\n"
+    }
+    public = [(f"{module.__name__}.{name}", getattr(module, name)) for module in MODULES for name in names_of(module)]
     returned = {value for name in names_of(bench) for value in annotated_classes(getattr(bench, name))}
-    for module in modules:
-        public = {name: getattr(module, name) for name in names_of(module)}
-        entries = [
-            directive(f"{module.__name__}.{name}", value) for name, value in public.items() if id(value) not in seen
-        ]
-        text += f"\n## {module.__name__}\n\n```{{eval-rst}}\n" + "\n".join(filter(None, entries)) + "\n```\n"
-        seen |= set(map(id, public.values()))
-    others = (value for value in returned if id(value) not in seen)
-    entries = sorted(directive(f"{value.__module__}.{value.__qualname__}", value) for value in others)
-    title = "\n## Returned objects\n\n```{eval-rst}\n"
-    return text + (title + "\n".join(entries) + "\n```\n" if entries else "")
+    public += sorted((f"{value.__module__}.{value.__qualname__}", value) for value in returned)
+    seen: set[int] = set()
+    for name, value in public:
+        entry = directive(name, value)
+        if entry and id(value) not in seen:
+            last = name.rpartition(".")[2]
+            doc = attribute_doc(last) if entry.startswith(".. py:data") else (value.__doc__ or "").partition("\n\n")[0]
+            uses = [
+                f"[{page}](../{page}.md)"
+                for page in EXAMPLES
+                if re.search(rf"\b{last}\b", (DOCS / f"{page}.md").read_text())
+            ]
+            shown = f"\nShown in {', '.join(uses)}.\n" if uses else ""
+            pages[f"api/{name}"] = f"# {last}\n\n```{{eval-rst}}\n{entry}```\n{shown}"
+            pages["api"] += f"\n- [{name}](api/{name}.md): {' '.join(markdown(doc).split())}"
+        seen.add(id(value))
+    return pages
 
 
 def names_of(module: ModuleType) -> list[str]:

@@ -43,6 +43,10 @@ def unsupported_reason(backend: Any, program: Program) -> str | None:
         return f"{backend.name} uses its own contact model, which replaces penalty, not {law.name}"
     if law is not None and law.damping and law.damping_mode != "clipped":
         return f"{backend.name}'s contacts never pull: it supports damping_mode=clipped only, not {law.damping_mode}"
+    if scene.model_file() is not None:
+        for name in ("cone", "impedance"):
+            if (value := getattr(backend, name)) != getattr(type(backend), name):
+                return f"contacts of scene {scene.name} are as its file says: {name}={value} would have no effect"
     return None
 
 
@@ -152,15 +156,6 @@ def _disabled(bit: Any, model: Any, lean: bool) -> int:
         if not count:
             off |= flag
     return int(off)
-
-
-def contact_dimensions(program: Program) -> set[int]:
-    """Return the dimensions (condim) of the contacts of the scene's twin: 1 without friction, 3 with friction."""
-    import mujoco
-
-    assert isinstance(program.scene, EngineTwin)
-    model = mujoco.MjModel.from_xml_string(f"<mujoco>{program.scene.mjcf()}</mujoco>")
-    return {int(dimension) for dimension in model.pair_dim}
 
 
 FAR = 1e3

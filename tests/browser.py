@@ -1,13 +1,8 @@
 """Drives the installed Chromium with Playwright, to test the pages. Nothing is downloaded."""
 
-from __future__ import annotations
-
 import shutil
 import time
-from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
-from typing import Any
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 MISSING = "no Chromium to open pages in: apt-get install chromium"
@@ -16,12 +11,12 @@ MISSING = "no Chromium to open pages in: apt-get install chromium"
 class Page:
     """A page opened from disk without a network."""
 
-    def __init__(self, page: Any) -> None:
+    def __init__(self, page):
         self.page = page
         """The page of Playwright."""
-        self.said: list[str] = []
+        self.said = []
         """Errors and warnings: from the console, exceptions and the browser's own log."""
-        self.requests: list[str] = []
+        self.requests = []
         """Addresses the page requested from outside its own folder."""
         page.on("pageerror", lambda error: self.said.append(str(error)))
         page.on(
@@ -29,15 +24,15 @@ class Page:
         )
         page.on("request", lambda request: self._note(request.url))
 
-    def _note(self, address: str) -> None:
+    def _note(self, address):
         if not address.startswith(("file:", "data:", "blob:", "about:")):
             self.requests.append(address)
 
-    def do(self, script: str) -> Any:
+    def do(self, script):
         """Evaluate a JavaScript expression in the page, await it, and return its value."""
         return self.page.evaluate(script)
 
-    def wait(self, condition: str, seconds: float = 60.0) -> None:
+    def wait(self, condition, seconds=60.0):
         """Wait until a JavaScript condition is true; raises AssertionError after ``seconds``."""
         # not Playwright's wait_for_function, which the pages' security policy forbids
         end = time.monotonic() + seconds
@@ -45,38 +40,38 @@ class Page:
             assert time.monotonic() < end, f"not within {seconds} s: {condition}; messages of the page: {self.said}"
             self.page.wait_for_timeout(50)
 
-    def open(self, path: Path) -> None:
+    def open(self, path):
         """Open a file and wait until it is loaded."""
         self.said.clear()
         self.page.goto(path.resolve().as_uri())
 
-    def size(self, width: int, height: int, dark: bool = False) -> None:
+    def size(self, width, height, dark=False):
         """Set the size of the window in pixels, and whether the system prefers a dark theme."""
         self.page.set_viewport_size({"width": width, "height": height})
         self.page.emulate_media(color_scheme="dark" if dark else "light", media="null")
 
-    def press(self, key: str) -> None:
+    def press(self, key):
         """Press and release a key."""
         self.page.keyboard.press(key)
 
-    def click(self, x: float, y: float) -> None:
+    def click(self, x, y):
         """Click the left button at a position in the window, in pixels."""
         self.page.mouse.click(x, y)
 
-    def violations(self) -> list[str]:
+    def violations(self):
         """Return what axe-core finds against WCAG 2.2 AA and its best practices: rule, help and elements."""
         from axe_playwright_python.sync_playwright import Axe
 
         found = Axe().run(self.page).response["violations"]
         return [f"{one['id']}: {one['help']}: {[node['html'][:200] for node in one['nodes'][:5]]}" for one in found]
 
-    def overflow(self) -> float:
+    def overflow(self):
         """Return by how many pixels the page is wider than its window."""
         return float(self.do("document.documentElement.scrollWidth - document.documentElement.clientWidth"))
 
 
 @contextmanager
-def chromium() -> Iterator[Page]:
+def chromium():
     """Start the installed browser with an empty profile and yield its page."""
     from playwright.sync_api import sync_playwright
 

@@ -1,20 +1,15 @@
 """Result rows for tests of reports, without a run: of real cells, or made up from columns."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import math
 import zlib
-from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from bench.experiment import config
-from bench.experiment.cell import Cell
 from bench.experiment.columns import IDENTITY
 from bench.experiment.experiment import Experiment, TableLayout
 from bench.experiment.grid import cells
@@ -38,7 +33,7 @@ WHO = (*IDENTITY, "experiment", "dim", "key", "study", "parameters")
 # ------------------------------------------------------------------------------------------------ made-up results
 
 
-def results(stiffness: float, sigma: float, samples: int, repeats: int, seed: int, estimator: str, backend: str, contact: str) -> dict[str, Any]:  # fmt: skip
+def results(stiffness, sigma, samples, repeats, seed, estimator, backend, contact):
     """Return made-up results of a cell: stiff contact makes only first-order estimates biased and noisy."""
     k, n = stiffness, samples
     stiff = max(k, 1.0) / 3e3 if math.isfinite(k) else 0.1
@@ -69,13 +64,13 @@ def results(stiffness: float, sigma: float, samples: int, repeats: int, seed: in
 # ------------------------------------------------------------------------------------------------ from real cells
 
 
-def loaded(*words: str) -> tuple[Experiment, list[Cell]]:
+def loaded(*words):
     """Return the experiment of a command line, and its cells."""
     made = config.load(list(words))
     return made, cells(made)
 
 
-def rows_of(made: Experiment, of: Sequence[Cell]) -> pd.DataFrame:
+def rows_of(made, of):
     """Return rows of real cells with made-up results. Cells that a run would refuse have the refusal's status and reason."""
     rows = []
     for cell in of:
@@ -94,7 +89,7 @@ def rows_of(made: Experiment, of: Sequence[Cell]) -> pd.DataFrame:
 # ------------------------------------------------------------------------------------------- made up of columns
 
 
-def row(**values: Any) -> dict[str, Any]:
+def row(**values):
     """Return a made-up row with these columns and the ``parameters`` they imply. Its plugins need not exist."""
     given = {
         "scene": "pushing", "contact": "penalty", "integrator": "semi_implicit_euler", "backend": "jax",
@@ -104,21 +99,21 @@ def row(**values: Any) -> dict[str, Any]:
     numbers = {name: given[name] for name in ("stiffness", "sigma", "samples", "repeats", "seed")}
     made = results(**numbers, estimator=given["estimator"], backend=given["backend"], contact=given["contact"])
     named = {"experiment": "made_up", "study": "bias_variance"}
-    result: dict[str, Any] = COLUMNS.blank() | made | named | given
+    result = COLUMNS.blank() | made | named | given
     result["parameters"] = json.dumps(described_by(result), allow_nan=False)
     result["key"] = f"{zlib.crc32(repr(sorted(given.items())).encode()):08x}"
     return result
 
 
-def failed(status: str, reason: str, **values: Any) -> dict[str, Any]:
+def failed(status, reason, **values):
     """Return a row of a failed cell, without results."""
     made, empty = row(**values), COLUMNS.blank()
     return {name: made[name] if name in WHO else empty[name] for name in made} | {"status": status, "reason": reason}
 
 
-def described_by(given: Mapping[str, Any]) -> dict[str, Any]:
+def described_by(given):
     """Return the parameters of a cell with these identity columns."""
-    parts: dict[str, Any] = {"study": {"name": "bias_variance", "timed_calls": 5}}
+    parts = {"study": {"name": "bias_variance", "timed_calls": 5}}
     for axis in BiasVariance.axes:
         name, own = _parsed(axis, given)
         entry = registry.entries()[registry.kind_of(axis)].get(name)
@@ -133,7 +128,7 @@ def described_by(given: Mapping[str, Any]) -> dict[str, Any]:
     return parts | {"theta": None, "reference": {"samples": 262144, "tolerance": 0.005}}
 
 
-def _parsed(axis: str, given: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
+def _parsed(axis, given):
     """Return name and parameters of an identity string. Without such a plugin, the whole string is the name."""
     params = given["estimator_params"] if axis == "estimator" else ""
     try:
@@ -143,21 +138,21 @@ def _parsed(axis: str, given: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
     return (name, own) if name in registry.entries()[registry.kind_of(axis)] else (given[axis], {})
 
 
-def _plain(value: Any) -> Any:
+def _plain(value):
     return str(value) if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def table(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
+def table(rows):
     """Return rows as a typed table, as loading a store does."""
     return COLUMNS.typed(pd.DataFrame(rows))
 
 
 def stiffness_rows(
-    stiffness: Sequence[float] = STIFFNESS,
-    sigmas: Sequence[float] = (0.1, 0.3),
-    estimators: Sequence[str] = NAMES,
-    backends: Sequence[str] = BACKENDS,
-) -> pd.DataFrame:
+    stiffness=STIFFNESS,
+    sigmas=(0.1, 0.3),
+    estimators=NAMES,
+    backends=BACKENDS,
+):
     """Return made-up rows: by default 4 backends, 6 estimators, 7 stiffnesses and 2 sigmas, under 2 contact laws."""
     rows = []
     for sigma, k, contact, backend, estimator in itertools.product(
@@ -178,19 +173,19 @@ def stiffness_rows(
     return table(rows)
 
 
-def small_rows(**given: Any) -> pd.DataFrame:
+def small_rows(**given):
     """Return made-up rows of two stiffnesses at one sigma."""
     return stiffness_rows(**{"stiffness": (1e2, 1e4), "sigmas": (0.1,), **given})
 
 
 def experiment(
-    directory: Path = Path("unused"),
-    sweep: Mapping[str, Any] | None = None,
-    marks: Mapping[str, Mapping[str, float]] | None = None,
-    name: str = "made_up",
-    formats: tuple[str, ...] = ("png",),
-    table: TableLayout | None = None,
-) -> Experiment:
+    directory=Path("unused"),
+    sweep=None,
+    marks=None,
+    name="made_up",
+    formats=("png",),
+    table=None,
+):
     """Return an experiment for reports of made-up rows; it cannot be run."""
     return Experiment(
         name=name,

@@ -122,16 +122,6 @@ def test_a_problem_takes_lists_and_one_sample():
             function(0.1, [0.0, 0.1, 0.2])
 
 
-def test_a_printed_estimate_is_relative_as_in_tables():
-    found = bench.estimate(bench.problem("quadratic", backend="numpy"), "fobg", samples=8, repeats=16)
-    facts = found._facts()
-    row = found.as_dict()
-    assert facts["relative RMSE"].split()[0] == number(row["rmse"] / row["reference_norm"], 3)
-    assert row["bias_low"] == 0
-    assert facts["relative bias"] == f"0 (< {number(row['bias_high'] / row['reference_norm'], 3)})"
-    assert facts["|grad J|"] == f"{number(row['reference_norm'], 3)} (closed_form)"
-
-
 def test_an_estimate_of_a_gradient_of_0_is_printed_without_division():
     found = bench.estimate(
         bench.problem("quadratic[dimension=2]", backend="numpy", theta0=[0.0, 0.0]),
@@ -216,9 +206,6 @@ def test_estimate_is_that_of_a_cell(rows):
         (lambda: bench.run("stiffness_swep"), "did you mean 'stiffness_sweep'"),
         (lambda: bench.run(sampels=8), "did you mean 'samples'"),
         (lambda: bench.problem("quadratc"), "did you mean 'quadratic'"),
-        (lambda: bench.problem("quadratic[sgima=1]"), "did you mean 'sigma'"),
-        (lambda: bench.problem("pushing", contact="penaltie"), "did you mean 'penalty'"),
-        (lambda: bench.problem("quadratic", backend="numpi"), "did you mean 'numpy'"),
         (lambda: bench.estimate(bench.problem("quadratic", backend="numpy"), "fob"), "did you mean 'fobg'"),
         (lambda: bench.load("no_such_folder"), "no rows are stored in 'no_such_folder'"),
     ],
@@ -241,17 +228,11 @@ def test_what_cannot_work_is_unsupported():
 def test_keywords_are_the_override_words_of_the_command_line():
     same = [
         (["samples=8", "sweep.stiffness=[100,1e4]"], {"samples": np.int64(8), "sweep": {"stiffness": np.array([100, 1e4])}}),
-        (["sweep.seed=[0,1,2]"], {"sweep": {"seed": range(3)}}),
         (["sweep.zip={stiffness:[1,2],dt:[0.01,0.001]}"], {"sweep": {"zip": {"stiffness": [1, 2], "dt": (0.01, 0.001)}}}),
-        (["sweep.union=[{stiffness:[1]},{mass:[2]}]"], {"sweep": {"union": [{"stiffness": [1]}, {"mass": [2]}]}}),
-        (["scene.pushing.mass=0.2"], {"scene": {"pushing": {"mass": np.float64(0.2)}}}),
         (["estimators=[reinforce[baseline=none]]"], {"estimators": ["reinforce[baseline=none]"]}),
-        (["estimators=[alpha_order[delta=0.1,gamma=4]]"], {"estimators": "alpha_order[delta=0.1,gamma=4]"}),
         (["study=bias_variance[timed_calls=3]"], {"study": "bias_variance[timed_calls=3]"}),
         (["theta=[mass]", "theta0=[0.3]"], {"theta": ["mass"], "theta0": np.array([0.3])}),
-        (["timing=false", "reference.samples=8192"], {"timing": np.bool_(False), "reference": {"samples": 8192}}),
         (["sweep.bound=[null,1.0]", "estimators=[alpha_order]"], {"sweep": {"bound": [None, 1.0]}, "estimators": ["alpha_order"]}),
-        (["sweep.penalty.stiffness=[1,2]"], {"sweep": {"penalty.stiffness": [1, 2]}}),
     ]  # fmt: skip
     for words, overrides in same:
         assert [cell.key for cell in cells(*words)] == [cell.key for cell in cells(**overrides)], overrides
@@ -284,9 +265,6 @@ def test_bench_has_a_dozen_names_and_every_contract_is_in_bench_plugin():
     assert set(bench.model.__all__) < set(bench.plugin.__all__)
     for name in bench.model.__all__:
         assert getattr(bench.plugin, name) is getattr(bench.model, name)
-    public = {name for name, value in vars(bench.model).items() if not name.startswith("_") and getattr(value, "__module__", "") != "bench.model" and not hasattr(value, "__path__") and type(value).__name__ != "module"}  # fmt: skip
-    shared_by_plugins = {"adjoint"}  # a module whose revision plugins name in `uses`
-    assert public | shared_by_plugins == set(bench.model.__all__)
 
 
 def test_a_star_import_replaces_no_builtin():

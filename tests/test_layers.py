@@ -2,7 +2,6 @@
 
 import ast
 import graphlib
-from collections.abc import Iterator
 from functools import cache
 from importlib.util import resolve_name
 from pathlib import Path
@@ -33,7 +32,7 @@ FILES = sorted(BENCH.rglob("*.py"))
 PLUGINS = sorted((ROOT / "plugins").rglob("*.py"))
 
 
-def module_of(path: Path) -> str:
+def module_of(path):
     """``bench.report.tables`` of its file, ``bench.report`` of the ``__init__.py``."""
     base = "bench.plugins" if (ROOT / "plugins") in path.parents else ""
     parts = path.relative_to(ROOT / "plugins" if base else ROOT).with_suffix("").parts
@@ -41,12 +40,12 @@ def module_of(path: Path) -> str:
 
 
 @cache
-def imported(path: Path) -> list[str]:
+def imported(path):
     """Every module and name that a file imports, at its top, later, or for types only, as ``bench.experiment.cell.Cell``."""
     return list(_imported(path))
 
 
-def _imported(path: Path) -> Iterator[str]:
+def _imported(path):
     own = module_of(path)
     parent = own if path.name == "__init__.py" else own.rpartition(".")[0]
     for node in ast.walk(ast.parse(path.read_text())):
@@ -57,7 +56,7 @@ def _imported(path: Path) -> Iterator[str]:
             yield from (f"{base}.{alias.name}" for alias in node.names)
 
 
-def room(name: str) -> str:
+def room(name):
     """``report`` of ``bench.report.tables``; ``__init__`` of a name that ``bench`` itself offers."""
     part = name.split(".")[1] if "." in name else "__init__"
     return part if any(part in layer for layer in LAYERS) else "__init__"
@@ -85,10 +84,10 @@ def check_imports(path, own):
             )
 
 
-def graph() -> dict[str, set[str]]:
+def graph():
     """Modules, and those of the package that each imports."""
     modules = {module_of(path): path for path in FILES}
-    found: dict[str, set[str]] = {}
+    found = {}
     for name, path in modules.items():
         taken = {inner if inner in modules else inner.rpartition(".")[0] for inner in imported(path)}
         found[name] = {other for other in taken if other in modules and other not in (name, "bench")}

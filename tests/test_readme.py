@@ -90,16 +90,6 @@ def test_readme_is_short():
     assert len(README.splitlines()) <= 150
 
 
-def test_readme_names_the_two_commands_that_set_everything_up():
-    section = README.partition("## Two commands\n")[2].partition("\n## ")[0]
-    commands = re.findall(r"^    (make \w+)", section, re.MULTILINE)
-    assert commands == ["make run", "make test"]
-    for command in commands:
-        assert f"| `{command}` |" in section
-        assert f"\n{command.split()[1]}: $(VENV)/.installed\n" in (ROOT / "Makefile").read_text()
-    assert " make test\n" in (ROOT / ".ci" / "run").read_text()
-
-
 def test_every_page_is_linked_from_the_readme():
     for name in DOCS:
         assert f"(docs/{name}" in README, name
@@ -117,17 +107,11 @@ def test_installation_names_this_package():
             assert requirement in (name, "tesseract-core"), path
 
 
-def test_own_sweeps_in_documents_have_names_of_their_own():
-    for page, words in COMMANDS:
-        name = next((word.removeprefix("name=") for word in words if word.startswith("name=")), "")
-        assert name not in config.experiments(), (page, words)
-
-
 def test_every_scene_and_experiment_is_described():
     for name in registry.entries()["scenes"]:
         assert f"| `{name}` |" in DOCS["experiments.md"]
     for name in config.experiments():
-        assert f"\n## {name}\n" in DOCS["results.md"]
+        assert f"\n### {name}\n" in DOCS["answers.md"]
 
 
 def test_every_command_and_setting_is_described():
@@ -196,24 +180,19 @@ def test_readme_example_runs(folder, monkeypatch, capsys):
     monkeypatch.chdir(folder)
     exec(example, {})
     printed = capsys.readouterr().out
-    assert printed.startswith(
-        "fobg on pushing[sigma=0.1], penalty, semi_implicit_euler, numpy: 16 estimates of 32 samples"
-    )
-    assert "\nrandomized_smoothing on pushing" in printed
-    assert printed.count("\nrelative bias ") == 2
+    assert printed.startswith("Derivative: right.")
+    assert "\nUnder noise of sigma 0.010: usable." in printed
 
 
 @pytest.mark.slow
 def test_examples_of_the_python_page_run(folder):
     printed = python(folder, "-c", "\n".join(python_blocks(DOCS["python.md"])))
     assert "randomized_smoothing" in printed
+    assert "fobg on pushing[sigma=0.1], penalty" in printed
+    assert printed.count("\nrelative bias ") == 2
 
 
 # ------------------------------------------------------------------------------------------------------- plugins
-
-
-def test_an_estimator_takes_at_most_25_lines():
-    assert len(EXAMPLES["my_plugins/clipped_fobg.py"].strip().splitlines()) <= 25
 
 
 @pytest.mark.slow

@@ -1,13 +1,10 @@
 """Commands that run in a copy of the code, or with default signal handlers."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import psutil
@@ -18,17 +15,17 @@ ROOT = Path(__file__).resolve().parents[1]
 class Tree:
     """A copy of the code, in which tests add plugins, edit files and run commands."""
 
-    def __init__(self, root: Path) -> None:
+    def __init__(self, root):
         self.root, self.packages = root / "tree", root / "site"
         for part in ("bench", "plugins", "conf"):
             shutil.copytree(ROOT / part, self.root / part)  # with the bytecode, which an edit of its file makes void
         self.packages.mkdir()
 
-    def add(self, path: str, text: str) -> None:
+    def add(self, path, text):
         """Write a file of the copy, at a path relative to its root."""
         (self.root / path).write_text(text)
 
-    def install(self, package: str, text: str, entry_points: str) -> None:
+    def install(self, package, text, entry_points):
         """Install a package of one module as ``pip install`` does: its code, and metadata with its entry points."""
         (self.packages / f"{package}.py").write_text(text)
         information = self.packages / f"{package}-1.0.dist-info"
@@ -36,7 +33,7 @@ class Tree:
         (information / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")
         (information / "entry_points.txt").write_text(entry_points)
 
-    def run(self, *words: str) -> subprocess.CompletedProcess[str]:
+    def run(self, *words):
         """Run ``python -m bench`` with these arguments in the copy."""
         environment = {**os.environ, "PYTHONPATH": str(self.packages), "PYTHONDONTWRITEBYTECODE": "1"}
         return subprocess.run(
@@ -52,7 +49,7 @@ os.execv(sys.argv[1], sys.argv[1:])
 """
 
 
-def hearing_signals(*words: str) -> list[str]:
+def hearing_signals(*words):
     """Return the command line of ``python -m bench`` with default signal handlers.
 
     A shell ignores SIGINT in background jobs, nohup ignores SIGHUP, and child processes inherit ignored signals.
@@ -60,7 +57,7 @@ def hearing_signals(*words: str) -> list[str]:
     return [sys.executable, "-c", DEFAULT_SIGNALS, sys.executable, "-m", "bench", *words]
 
 
-def processes_in(folder: Path) -> list[psutil.Process]:
+def processes_in(folder):
     """Return the processes that were started in a folder and have not ended."""
     found = []
     for process in psutil.process_iter():
@@ -72,7 +69,7 @@ def processes_in(folder: Path) -> list[psutil.Process]:
     return found
 
 
-def wait_for(condition: Callable[[], bool], seconds: float = 60.0) -> None:
+def wait_for(condition, seconds=60.0):
     """Wait until a condition holds."""
     until = time.monotonic() + seconds
     while not condition():

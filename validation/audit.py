@@ -2,7 +2,7 @@
 
 The true values come from closed forms, or from code below that imports no statistics, scene or contact law of this package.
 Coverage is the share of SETS simulated data sets whose 95% interval contains the true value, without leaving out any set.
-Sections: tails, references.
+Sections: tails, references, features.
 """
 
 from __future__ import annotations
@@ -214,7 +214,98 @@ def _compared(name: str, found, own: np.ndarray, allowed: float) -> Line:
     return label, not apart <= allowed
 
 
-SECTIONS = (tails, references)
+# ----------------------------------------------------------------------------------------------------- features
+
+
+def _slope(kind: str, k: int, m: float, width: float, radius: float) -> float:
+    """Return the derivative by m of E[g(|W - c|)] over W ~ N(0, I_k) with |c| = m; ``width`` is the power of a pole."""
+    if kind == "pole":
+        factor = 2 ** (-width / 2) * special.gamma((k - width) / 2) / special.gamma(k / 2)
+        return float(-m * width / k * factor * special.hyp1f1(width / 2 + 1, k / 2 + 1, -(m**2) / 2))
+    if kind != "shell":
+        v = 1 + width**2
+        return -((width / math.sqrt(v)) ** k) * math.exp(-(m**2) / (2 * v)) * m / v
+    # the density of the distance is that of a noncentral chi distribution
+    x, weight = special.roots_legendre(400)
+    low, high = max(radius - 8 * width, 0.0), radius + 8 * width
+    rho, order = (low + high) / 2 + (high - low) / 2 * x, k / 2 - 1
+    change = rho * special.ive(order + 1, rho * m) - m * special.ive(order, rho * m)
+    density = rho * (rho / m) ** order * np.exp(-((rho - m) ** 2) / 2) * change
+    return float((high - low) / 2 * weight @ (density * np.exp(-(((rho - radius) / width) ** 2) / 2)))
+
+
+def _profile(kind: str, width: float, radius: float) -> Callable:
+    if kind == "pole":
+        return lambda rho: rho**-width
+    return lambda rho: np.exp(-(((rho - radius) / width) ** 2) / 2)
+
+
+def _featured(kind: str, d: int, random: np.random.Generator):
+    """Return a scene of .2 x plus a feature, its gradient at 0, and the feature's width or power.
+
+    A feature is a function of the distance from a centre, or from a plane (a ridge), that many standard deviations from
+    theta: .5 to 3.2; a shell has this radius and its centre at .3 to 1. Widths are 3e-5 to .1, powers .1 to .9 of d.
+    """
+    import bank
+
+    k = 1 if kind == "ridge" else d
+    m, radius = random.uniform(0.5, 3.2), 0.0
+    if kind == "shell":
+        m, radius = random.uniform(0.3, 1.0), m
+    width = random.uniform(0.1, 0.9) * d if kind == "pole" else 10 ** random.uniform(math.log10(3e-5), -1)
+    axes = np.linalg.qr(random.standard_normal((d, d)))[0][:k]
+    centre = random.standard_normal(k)
+    centre *= m / np.linalg.norm(centre)
+    slope = _slope(kind, k, m, width, radius)
+    height = 0.2 * 10 ** random.uniform(-0.5, 1.0) / abs(slope)
+    profile = _profile(kind, width, radius)
+    first = np.eye(d)[0]
+    feature = bank.Piece(
+        kind, lambda u: height * profile(np.linalg.norm(u - centre[:, None], axis=0)), lambda u, s: 0.0
+    )
+    scene = bank.Ridge([bank.power(1, 0.2), feature], [first, axes], np.zeros(d), 1.0)
+    return scene, 0.2 * first - height * slope * axes.T @ centre / m, width
+
+
+def _smooth(d: int, random: np.random.Generator):
+    """Return a scene of one to four waves, bumps, powers and exponentials along random lines, and its gradient."""
+    import bank
+
+    makers = (
+        lambda: bank.wave(random.uniform(0.3, 2.0)), lambda: bank.bump(random.normal(), random.uniform(0.5, 2.0), 1.0),
+        lambda: bank.power(int(random.integers(2, 4))), lambda: bank.growth(random.uniform(0.1, 0.7)),
+    )  # fmt: skip
+    pieces = [makers[random.integers(4)]() for _ in range(random.integers(1, 5))]
+    along = [v / np.linalg.norm(v) for v in random.standard_normal((len(pieces), d))]
+    scene = bank.Ridge(pieces, along, random.standard_normal(d), 10 ** random.uniform(-2, 0))
+    return scene, scene.truth(), 0.0
+
+
+def features(sets: int) -> Iterator[Line]:
+    """References of costs with a narrow feature in 1, 2 and 3 to 10 dimensions, and of smooth costs, which need no remark."""
+    import bank
+
+    from bench.model import compose
+
+    random = np.random.default_rng(11)
+    kinds = ("spike", "ridge", "pole", "shell")
+    groups = [(f"{kind}s, d = {d}", kind, (d,), sets // 8) for d in (1, 2) for kind in kinds]
+    groups += [(f"{kind}s, d = 3 to 10", kind, range(3, 11), sets // 16) for kind in kinds]
+    for label, kind, dims, count in [*groups, ("smooth costs, d = 1 to 10", "", range(1, 11), sets)]:
+        results = []
+        for i in range(count):
+            d = dims[i % len(dims)]
+            scene, truth, width = _featured(kind, d, random) if kind else _smooth(d, random)
+            object.__setattr__(scene, "name", f"{label} {i}")  # noise is drawn by name
+            found = bank.certified(bank.Case("", compose(scene), truth), 1 << 16)
+            is_off = found.is_finite and np.linalg.norm(found.gradient - truth) > 4 * found.known().standard_error
+            results.append((is_off, bool(found.note), is_off and not found.note, width))
+        off, noted, silent, widths = np.array(results).T
+        wrong = f", of widths up to {widths[silent > 0].max():.2g}" if silent.any() else ""
+        yield f"{label}: {count}, off by more than 4 stated errors {off.sum():.0f}, with a remark {noted.sum():.0f}, off without {silent.sum():.0f}{wrong}", bool(silent.any()) and dims == (1,)  # fmt: skip
+
+
+SECTIONS = (tails, references, features)
 
 
 def main(sets: int = 200, *sections: str) -> int:

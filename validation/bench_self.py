@@ -4,11 +4,8 @@
 sizes.
 """
 
-from __future__ import annotations
-
 import os
 import sys
-from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from speed import compilations, harness, rollouts, speed_rows
@@ -18,7 +15,7 @@ from bench.experiment.config import config_dir
 from bench.experiment.words import parse_flag, parse_words
 
 
-def main(words: Sequence[str]) -> int:
+def main(words):
     """Measure and print speeds, and write them. Returns 0. ``quick=true`` runs small sizes."""
     names, settings, _ = parse_words(words, "bench_self", {"quick": "false", "results_dir": "results"})
     if names:
@@ -32,7 +29,7 @@ def main(words: Sequence[str]) -> int:
     return 0
 
 
-def measure(quick: bool) -> Iterator[speed_rows.SpeedRow]:
+def measure(quick):
     """Measure and yield every row of the table."""
     import yaml
 

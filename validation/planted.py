@@ -4,14 +4,10 @@ Every cell runs in this process on the NumPy backend, without and with each faul
 estimates and the reference use, as if the next version of a simulator were broken.
 """
 
-from __future__ import annotations
-
 import sys
-from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -33,20 +29,20 @@ WORDS = (
 )  # fmt: skip
 
 
-def _scaled(factor: float, gradient: np.ndarray) -> np.ndarray:
+def _scaled(factor, gradient):
     return factor * gradient
 
 
-def _flipped(gradient: np.ndarray) -> np.ndarray:
+def _flipped(gradient):
     return gradient * np.where(np.arange(len(gradient)) == 0, -1.0, 1.0)[:, None]
 
 
-def _noisy(share: float, gradient: np.ndarray) -> np.ndarray:
+def _noisy(share, gradient):
     generator = np.random.default_rng(0)
     return gradient * (1 + share * generator.standard_normal(gradient.shape))
 
 
-GRADIENTS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+GRADIENTS = {
     "gradient * 1.02": partial(_scaled, 1.02),
     "gradient * 1.05": partial(_scaled, 1.05),
     "gradient * 1.1": partial(_scaled, 1.1),
@@ -57,16 +53,16 @@ FAULTS = ("none", *GRADIENTS, "sigma * 1.05")
 
 
 @contextmanager
-def planted(fault: str) -> Iterator[None]:
+def planted(fault):
     """Plant a fault in every problem while the context is open."""
     grad, value = Problem.grad, Problem.value
     stretch = 1.05 if fault.startswith("sigma") else 1.0
     change = GRADIENTS.get(fault, lambda gradient: gradient)
 
-    def faulty_grad(self: Problem, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+    def faulty_grad(self, theta, w):
         return change(grad(self, theta, stretch * w))
 
-    def faulty_value(self: Problem, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+    def faulty_value(self, theta, w):
         return value(self, theta, stretch * w)
 
     Problem.grad, Problem.value = faulty_grad, faulty_value  # type: ignore[method-assign]
@@ -76,7 +72,7 @@ def planted(fault: str) -> Iterator[None]:
         Problem.grad, Problem.value = grad, value  # type: ignore[method-assign]
 
 
-def rows(scene: str, fault: str) -> tuple[Any, pd.DataFrame]:
+def rows(scene, fault):
     """Return the study's columns, and the rows of a scene's runnable cells with a fault."""
     more = [f"scene.{scene}.horizon=10"] if scene in SHORT else []
     made, found = loaded(f"scenes=[{scene}]", *WORDS, *more)
@@ -90,7 +86,7 @@ def rows(scene: str, fault: str) -> tuple[Any, pd.DataFrame]:
     return made.columns, made.columns.typed(pd.DataFrame(table))
 
 
-def judged(scene: str, faults: Sequence[str] = FAULTS) -> pd.DataFrame:
+def judged(scene, faults=FAULTS):
     """Return the line of the comparison for each fault and cell of a scene; empty if no cell can run."""
     columns, before = rows(scene, "none")
     if before.empty:
@@ -102,7 +98,7 @@ def judged(scene: str, faults: Sequence[str] = FAULTS) -> pd.DataFrame:
     return pd.concat(parts)
 
 
-def main() -> None:
+def main():
     """Print, per scene and fault, the outcome of the comparison for the estimator fobg."""
     for scene in sys.argv[1:] or sorted(registry.entries()["scenes"]):
         found = judged(scene)

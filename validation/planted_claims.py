@@ -3,14 +3,10 @@
 Prints a table of the bugs, the claims that were run and those that fail. A bug that no claim notices ends with status 1.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
-from typing import Any
 from unittest import mock
 
 from bench.plugins.contacts.complementarity import Complementarity
@@ -23,19 +19,19 @@ from bench.model import DiagnosticEstimator, Problem, SampleMean, State, registr
 
 
 @contextlib.contextmanager
-def changed(owner: type, name: str, wrapper: Callable[..., Any]) -> Iterator[None]:
+def changed(owner, name, wrapper):
     """Replace a method by ``wrapper(original, self, *arguments)``."""
     original = getattr(owner, name)
     with mock.patch.object(owner, name, lambda self, *a, **k: wrapper(original, self, *a, **k)):
         yield
 
 
-def scaled(factor: float) -> Callable[..., Any]:
+def scaled(factor):
     """Return a wrapper that multiplies a method's result."""
     return lambda original, self, *a, **k: factor * original(self, *a, **k)
 
 
-def halved_kappa(original: Any, self: Any, ops: Any, contact: Any, before: Any, free: Any, dt: Any) -> Any:
+def halved_kappa(original, self, ops, contact, before, free, dt):
     import copy
 
     twin = copy.copy(self)
@@ -43,7 +39,7 @@ def halved_kappa(original: Any, self: Any, ops: Any, contact: Any, before: Any, 
     return original(twin, ops, contact, before, free, dt)
 
 
-def swapped_weights(original: Any, self: Any, problem: Any, theta: Any, noise: Any) -> Any:
+def swapped_weights(original, self, problem, theta, noise):
     from bench.plugins.estimators import inverse_variance
 
     plain = inverse_variance.halves
@@ -54,25 +50,21 @@ def swapped_weights(original: Any, self: Any, problem: Any, theta: Any, noise: A
         return weight * first.mean(axis=1) + (1 - weight) * zeroth.mean(axis=1), {"weight": weight}
 
 
-def early_impact(original: Any, self: Any, ops: Any, contact: Any, before: Any, free: Any, dt: Any) -> Any:
+def early_impact(original, self, ops, contact, before, free, dt):
     change = original(self, ops, contact, before, free, dt)
     return State(0.9 * change.q, change.v)
 
 
-def fast_step(original: Any, self: Any, dynamics: Any, state: Any, u: Any, dt: Any) -> Any:
+def fast_step(original, self, dynamics, state, u, dt):
     return original(self, dynamics, state, u, 1.05 * dt)
 
 
-def with_numbers(original: Any, self: Any, problem: Any, theta: Any, noise: Any) -> Any:
+def with_numbers(original, self, problem, theta, noise):
     values, numbers = original(self, problem, theta, noise)
     return 1.05 * values, numbers
 
 
-Bug = tuple[type, str, Callable[..., Any], tuple[str, ...]]
-"""The class and method with the bug, the wrapper, and the claims that are run."""
-
-
-def of(kind: str, name: str) -> type:
+def of(kind, name):
     """Return a plugin's class."""
     plugin = registry.find(kind, name).plugin
     assert plugin is not None
@@ -90,7 +82,7 @@ CLAIMS = {
 """The claims that use a plugin, by kind and name. `impulse` and `complementarity` have bugs of their own below."""
 
 
-def _bugs() -> Iterator[tuple[str, Bug]]:
+def _bugs():
     yield "kappa halved", (Complementarity, "impulse", halved_kappa, ("C5",))
     yield "time of impact .9 dt", (Impulse, "impulse", early_impact, ("C8", "C13"))
     yield "score 5% large", (Problem, "score", scaled(1.05), ("C1", "C5", "C6"))
@@ -98,7 +90,7 @@ def _bugs() -> Iterator[tuple[str, Bug]]:
     for name, claims in CLAIMS["estimators"].items():
         plugin = of("estimators", name)
         if issubclass(plugin, DiagnosticEstimator):
-            bug: Bug = (plugin, "estimate_with_diagnostics", with_numbers, claims)
+            bug = (plugin, "estimate_with_diagnostics", with_numbers, claims)
         else:
             bug = (plugin, "terms" if issubclass(plugin, SampleMean) else "estimate", scaled(1.05), claims)
         yield f"{name} 5% large", bug
@@ -108,11 +100,11 @@ def _bugs() -> Iterator[tuple[str, Bug]]:
         yield f"{name} step 5% long", (of("integrators", name), "step", fast_step, claims)
 
 
-BUGS: dict[str, Bug] = dict(_bugs())
+BUGS = dict(_bugs())
 """Bugs by name."""
 
 
-def failing(bug: str) -> tuple[list[str], list[str]]:
+def failing(bug):
     """Return the claims that are run under a bug, and those that are then not reproduced.
 
     The bug is planted in a process of its own: a program that was compiled without the bug would run without it.
@@ -126,7 +118,7 @@ def failing(bug: str) -> tuple[list[str], list[str]]:
     return list(claims), [claim for claim in claims if verdicts[claim] == NOT_REPRODUCED]
 
 
-def verdicts(bug: str) -> dict[str, str]:
+def verdicts(bug):
     """Return the verdict of each claim that is run under a bug, or its error; nothing may have been compiled before."""
     owner, name, wrapper, claims = BUGS[bug]
     found = {}
@@ -139,7 +131,7 @@ def verdicts(bug: str) -> dict[str, str]:
     return found
 
 
-def main(bugs: list[str]) -> int:
+def main(bugs):
     """Print a line per bug; return 1 if a bug passes every claim that is run."""
     if bugs[:1] == ["--process"]:
         print(json.dumps(verdicts(bugs[1])))

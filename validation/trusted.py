@@ -1,18 +1,15 @@
-"""Counts the rule of when to trust `fobg` on scenes that were not used to find it: `python validation/trusted.py`.
+"""Counts the rule of when to trust `fobg` on scenes that were not used to find it: `python validation/trusted.py [new]`.
 
 The rule trusts a cell where one estimate spreads by less than half of its mean and the command `gradcheck` refuses nothing.
-Eighteen families have four or more scenes each. Scenes of even number in the first ten families may be looked at while the
-rule changes; those of odd number, and the last eight families, are only counted. A cell is one scene and one seed. It is wrong
-where the relative RMSE is 0.5 or more. The truth is a dense rule in one dimension, and 4 million pairs of costs in more.
+Eighteen families have three or four scenes each. A cell is one scene and one seed. It is wrong where the relative RMSE is
+0.5 or more. The truth is a dense rule in one dimension, and 4 million pairs of costs in more.
 """
-
-from __future__ import annotations
 
 import json
 import math
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -42,14 +39,14 @@ class Given(FunctionScene):
     name = "given"
     key: str = param("", "what tells programs apart, so that none runs the code compiled for another")
 
-    def __init__(self, key: str, function: Callable[[Any, Any], Any], theta: tuple[float, ...], sigma: float) -> None:
+    def __init__(self, key, function, theta, sigma):
         for name, value in dict(key=key, function=function, start=theta, sigma=sigma, noise="parameter").items():
             object.__setattr__(self, name, value)
 
-    def theta0(self) -> np.ndarray:
+    def theta0(self):
         return np.array(self.start)
 
-    def cost(self, xp: Any, x: Any) -> Any:
+    def cost(self, xp, x):
         return self.function(xp, x)
 
 
@@ -63,10 +60,10 @@ class Scene(NamedTuple):
     sigma: float
 
 
-def edge(at: float, height: float, drag: float) -> Callable[[Any, Any], Any]:
+def edge(at, height, drag):
     """A puck slides with viscous drag for 1 s; beyond the edge of the table the target is another."""
 
-    def cost(xp: Any, v0: Any) -> Any:
+    def cost(xp, v0):
         x, v = 0.0 * v0[0], v0[0]
         for _ in range(100):
             x, v = x + 0.01 * v, v - 0.01 * drag * v
@@ -75,10 +72,10 @@ def edge(at: float, height: float, drag: float) -> Callable[[Any, Any], Any]:
     return cost
 
 
-def ledge(at: float, drop: float) -> Callable[[Any, Any], Any]:
+def ledge(at, drop):
     """A ball thrown from 1 m lands on a floor that drops behind a ledge; the cost is the distance to 2 m."""
 
-    def cost(xp: Any, v: Any) -> Any:
+    def cost(xp, v):
         g, up = 9.81, 1.0
         near = (up + math.sqrt(up * up + 2 * g * 1.0)) / g
         far = (up + math.sqrt(up * up + 2 * g * (1.0 + drop))) / g
@@ -88,20 +85,20 @@ def ledge(at: float, drop: float) -> Callable[[Any, Any], Any]:
     return cost
 
 
-def gate(low: float, high: float, prize: float) -> Callable[[Any, Any], Any]:
+def gate(low, high, prize):
     """A cart passes a plane; between the posts it earns a prize."""
 
-    def cost(xp: Any, x: Any) -> Any:
+    def cost(xp, x):
         y = x[0] + 0.3 * xp.sin(x[0])
         return 0.5 * (y - 1.0) ** 2 - prize * xp.where((y > low) & (y < high), 1.0, 0.0)
 
     return cost
 
 
-def latch(force: float, stiffness: float) -> Callable[[Any, Any], Any]:
+def latch(force, stiffness):
     """A mass on a spring; once it passes 1 m, a second spring catches it for good."""
 
-    def cost(xp: Any, v0: Any) -> Any:
+    def cost(xp, v0):
         x, v, caught = 0.0 * v0[0], v0[0], 0.0 * v0[0]
         for _ in range(40):
             caught = xp.where(x > 1.0, 1.0, caught)
@@ -112,27 +109,23 @@ def latch(force: float, stiffness: float) -> Callable[[Any, Any], Any]:
     return cost
 
 
-def friction(mu: float, width: float) -> Callable[[Any, Any], Any]:
-    """A block slides until dry friction stops it (width 0), or with friction smoothed over a slip speed."""
+def friction(mu, width):
+    """A block slides with friction that is smoothed over a slip speed."""
 
-    def cost(xp: Any, v0: Any) -> Any:
+    def cost(xp, v0):
         x, v = 0.0 * v0[0], v0[0]
         for _ in range(50):
-            if width:
-                v = v - 0.02 * mu * 9.81 * xp.tanh(v / width)
-            else:
-                change = 0.02 * mu * 9.81
-                v = xp.where(xp.abs(v) > change, v - change * xp.sign(v), 0.0 * v)
+            v = v - 0.02 * mu * 9.81 * xp.tanh(v / width)
             x = x + 0.02 * v
         return (x - 0.3) ** 2
 
     return cost
 
 
-def flight(target: float, wind: float) -> Callable[[Any, Any], Any]:
+def flight(target, wind):
     """A ball in free flight with quadratic drag."""
 
-    def cost(xp: Any, theta: Any) -> Any:
+    def cost(xp, theta):
         x, y, vx, vy = 0.0 * theta[0], 0.0 * theta[0], theta[0], theta[-1]
         for _ in range(30):
             speed = xp.sqrt(vx * vx + vy * vy + 1e-9)
@@ -143,10 +136,10 @@ def flight(target: float, wind: float) -> Callable[[Any, Any], Any]:
     return cost
 
 
-def contact(stiffness: float, wall: float) -> Callable[[Any, Any], Any]:
+def contact(stiffness, wall):
     """A ball hits a wall of stiffness k (penalty), dt = 0.01 s."""
 
-    def cost(xp: Any, v0: Any) -> Any:
+    def cost(xp, v0):
         x, v = 0.0 * v0[0], v0[0]
         for _ in range(60):
             v = v + 0.01 * (-stiffness * xp.maximum(x - wall, 0.0))
@@ -156,10 +149,10 @@ def contact(stiffness: float, wall: float) -> Callable[[Any, Any], Any]:
     return cost
 
 
-def chaos(rate: float, steps: int) -> Callable[[Any, Any], Any]:
+def chaos(rate, steps):
     """The logistic map, whose gradient grows with the steps where it is chaotic."""
 
-    def cost(xp: Any, x: Any) -> Any:
+    def cost(xp, x):
         y = 1.0 / (1.0 + xp.exp(-x[0]))
         for _ in range(steps):
             y = rate * y * (1.0 - y)
@@ -168,14 +161,14 @@ def chaos(rate: float, steps: int) -> Callable[[Any, Any], Any]:
     return cost
 
 
-def saturation(limit: float, gain: float, hard: bool) -> Callable[[Any, Any], Any]:
+def saturation(limit, gain):
     """A servo with a limited actuator follows a step."""
 
-    def cost(xp: Any, k: Any) -> Any:
+    def cost(xp, k):
         x, v = 0.0 * k[0], 0.0 * k[0]
         for _ in range(40):
             u = gain * k[0] * (1.0 - x) - 0.8 * v
-            u = xp.clip(u, -limit, limit) if hard else limit * xp.tanh(u / limit)
+            u = limit * xp.tanh(u / limit)
             v = v + 0.05 * u
             x = x + 0.05 * v
         return (x - 1.0) ** 2 + 0.05 * v * v
@@ -183,36 +176,36 @@ def saturation(limit: float, gain: float, hard: bool) -> Callable[[Any, Any], An
     return cost
 
 
-def plane(dim: int, at: float, height: float) -> Callable[[Any, Any], Any]:
-    """A smooth cost of several inputs with a jump across a slanted plane, or without for height 0."""
+def plane(dim, at, height):
+    """A smooth cost of several inputs with a jump across a slanted plane."""
     slanted = np.ones(dim) / math.sqrt(dim)
 
-    def cost(xp: Any, x: Any) -> Any:
+    def cost(xp, x):
         along = sum(float(a) * x[i] for i, a in enumerate(slanted))
         return x[0] + 0.3 * x[-1] ** 2 + height * xp.where(along > at, 1.0, 0.0)
 
     return cost
 
 
-def switch(height: float, at: float, width: float) -> Callable[[Any, Any], Any]:
+def switch(height, at, width):
     """A smoothed switch that may be too narrow for any sample."""
     return lambda xp, x: x[0] + 0.1 * x[0] ** 2 + height * 0.5 * (1 + xp.tanh((x[0] - at) / width))
 
 
-def stop(stiffness: float, at: float) -> Callable[[Any, Any], Any]:
+def stop(stiffness, at):
     """A stiff stop, continuous, met by few samples or none."""
     return lambda xp, x: x[0] + 0.1 * x[0] ** 2 + stiffness * xp.maximum(x[0] - at, 0.0 * x[0])
 
 
-def corner(first: float, second: float, height: float) -> Callable[[Any, Any], Any]:
+def corner(first, second, height):
     """A jump in a quadrant of the plane."""
     return lambda xp, x: x[1] + 0.3 * x[0] + height * xp.where((x[0] > first) & (x[1] > second), 1.0, 0.0)
 
 
-def relay(gain: float, dead: float) -> Callable[[Any, Any], Any]:
+def relay(gain, dead):
     """A mass under a relay with a dead zone."""
 
-    def cost(xp: Any, x0: Any) -> Any:
+    def cost(xp, x0):
         x, v = x0[0], 0.0 * x0[0]
         for _ in range(40):
             u = xp.where(x > dead, -gain, xp.where(x < -dead, gain, 0.0))
@@ -223,10 +216,10 @@ def relay(gain: float, dead: float) -> Callable[[Any, Any], Any]:
     return cost
 
 
-def backlash(gap: float, rate: float) -> Callable[[Any, Any], Any]:
+def backlash(gap, rate):
     """A load behind a gear with backlash follows a sine of amplitude theta."""
 
-    def cost(xp: Any, a: Any) -> Any:
+    def cost(xp, a):
         y = 0.0 * a[0]
         for i in range(40):
             x = a[0] * math.sin(rate * i)
@@ -236,15 +229,15 @@ def backlash(gap: float, rate: float) -> Callable[[Any, Any], Any]:
     return cost
 
 
-def quantiser(step: float, slope: float) -> Callable[[Any, Any], Any]:
+def quantiser(step, slope):
     """A sensor with steps beside a part that is continuous."""
     return lambda xp, x: (step * xp.floor(x[0] / step) - 1.0) ** 2 + slope * x[0]
 
 
-def delay(steps: int, gain: float) -> Callable[[Any, Any], Any]:
+def delay(steps, gain):
     """Feedback of gain theta that acts after a dead time."""
 
-    def cost(xp: Any, k: Any) -> Any:
+    def cost(xp, k):
         past = [1.0 + 0.0 * k[0]] * (steps + 1)
         for _ in range(60):
             past.append(past[-1] - 0.05 * gain * k[0] * past[-1 - steps])
@@ -253,10 +246,10 @@ def delay(steps: int, gain: float) -> Callable[[Any, Any], Any]:
     return cost
 
 
-def table(edges: tuple[float, ...], values: tuple[float, ...], width: float) -> Callable[[Any, Any], Any]:
+def table(edges, values, width):
     """A table between whose entries the cost jumps, or climbs over a width."""
 
-    def cost(xp: Any, x: Any) -> Any:
+    def cost(xp, x):
         total = values[0] + 0.2 * x[0]
         for at, low, high in zip(edges, values, values[1:], strict=False):
             risen = xp.where(x[0] > at, 1.0, 0.0) if width == 0 else xp.clip((x[0] - at) / width, 0.0, 1.0)
@@ -266,36 +259,27 @@ def table(edges: tuple[float, ...], values: tuple[float, ...], width: float) -> 
     return cost
 
 
-def scenes() -> Iterator[Scene]:
+def scenes():
     """Yield every scene, family by family."""
-    for at, height, drag in ((1.4, 1.0, 1.0), (1.2, 1.0, 1.0), (1.5, 3.0, 1.0), (1.7, 1.0, 1.0), (1.0, 0.2, 1.5), (1.3, 5.0, 0.7)):  # fmt: skip
+    for at, height, drag in ((1.2, 1.0, 1.0), (1.7, 1.0, 1.0), (1.3, 5.0, 0.7)):
         yield Scene("edge", f"at {at} by {height}, drag {drag}", edge(at, height, drag), (2.0,), 0.2)
-    for at, drop, sigma in ((1.8, 0.5, 0.2), (1.2, 0.5, 0.2), (2.2, 1.0, 0.3), (1.5, 0.1, 0.1), (3.0, 2.0, 0.2), (1.7, 0.02, 0.3)):  # fmt: skip
+    for at, drop, sigma in ((1.2, 0.5, 0.2), (1.5, 0.1, 0.1), (1.7, 0.02, 0.3)):
         yield Scene("ledge", f"at {at}, drop {drop}", ledge(at, drop), (3.0,), sigma)
-    for low, high, prize in ((0.8, 1.2, 1.0), (1.4, 1.6, 0.5), (0.2, 0.4, 2.0), (1.9, 2.5, 5.0), (-1.0, 0.1, 1.0), (0.95, 1.0, 0.2)):  # fmt: skip
+    for low, high, prize in ((1.4, 1.6, 0.5), (1.9, 2.5, 5.0), (0.95, 1.0, 0.2)):
         yield Scene("gate", f"{low} to {high} for {prize}", gate(low, high, prize), (0.4,), 0.3)
-    for force, stiffness, theta in ((0.2, 5.0, 1.0), (0.2, 20.0, 0.8), (0.5, 5.0, 0.5), (0.0, 5.0, 1.4), (0.3, 50.0, 1.0), (0.0, 1.0, 0.7)):  # fmt: skip
+    for force, stiffness, theta in ((0.2, 20.0, 0.8), (0.0, 5.0, 1.4), (0.0, 1.0, 0.7)):
         yield Scene("latch", f"force {force}, k {stiffness}, v {theta}", latch(force, stiffness), (theta,), 0.2)
-    for mu, width, theta in ((0.3, 0.0, 1.0), (0.3, 0.01, 1.0), (0.5, 0.0, 3.0), (0.1, 0.001, 1.0), (0.6, 0.0, 0.4), (0.2, 0.1, 2.0)):  # fmt: skip
+    for mu, width, theta in ((0.3, 0.01, 1.0), (0.1, 0.001, 1.0), (0.2, 0.1, 2.0)):
         yield Scene("friction", f"mu {mu}, slip {width}, v {theta}", friction(mu, width), (theta,), 0.2)
-    for target, wind, theta in ((2.0, 0.0, (3.0, 2.0)), (2.0, 0.1, (3.0, 2.0)), (1.0, 0.3, (4.0, 1.0)), (5.0, 0.05, (2.0, 5.0)), (1.7, 0.0, (3.0, 3.0)), (0.0, 1.0, (6.0, 6.0))):  # fmt: skip
+    for target, wind, theta in ((2.0, 0.1, (3.0, 2.0)), (5.0, 0.05, (2.0, 5.0)), (0.0, 1.0, (6.0, 6.0))):
         yield Scene("free flight", f"to {target}, drag {wind}, v {theta}", flight(target, wind), theta, 0.3)
-    for stiffness, wall, theta in ((100.0, 0.3, 1.0), (1e3, 0.3, 1.0), (1e4, 0.3, 1.0), (1e4, 0.6, 0.8), (5e4, 0.3, 1.0), (1e5, 0.75, 1.0)):  # fmt: skip
+    for stiffness, wall, theta in ((1e3, 0.3, 1.0), (1e4, 0.6, 0.8), (1e5, 0.75, 1.0)):
         yield Scene("soft contact", f"k {stiffness:g}, wall {wall}, v {theta}", contact(stiffness, wall), (theta,), 0.1)
-    for rate, steps in ((3.9, 3), (3.9, 6), (3.9, 12), (3.9, 30), (3.2, 30), (3.57, 40)):
+    for rate, steps in ((3.9, 6), (3.9, 30), (3.57, 40)):
         yield Scene("chaos", f"rate {rate}, {steps} steps", chaos(rate, steps), (0.3,), 0.1)
-    for limit, gain, hard in ((1.0, 1.0, True), (0.5, 2.0, False), (0.3, 4.0, True), (5.0, 1.0, False), (0.1, 4.0, True), (0.1, 4.0, False)):  # fmt: skip
-        yield Scene(
-            "saturation", f"limit {limit}, gain {gain}, hard {hard}", saturation(limit, gain, hard), (1.0,), 0.3
-        )
-    for dim, at, height in (
-        (2, 1.0, 1.0),
-        (3, 2.0, 3.0),
-        (5, 1.0, 0.0),
-        (5, 2.5, 10.0),
-        (10, 1.5, 2.0),
-        (10, 3.0, 22.6),
-    ):
+    for limit, gain in ((0.5, 2.0), (5.0, 1.0), (0.1, 4.0)):
+        yield Scene("saturation", f"limit {limit}, gain {gain}", saturation(limit, gain), (1.0,), 0.3)
+    for dim, at, height in ((3, 2.0, 3.0), (5, 2.5, 10.0), (10, 3.0, 22.6)):
         yield Scene("plane", f"d {dim}, at {at} by {height}", plane(dim, at, height), (0.5,) * dim, 1.0)
     for height, at, width in ((5.0, 0.7, 1e-5), (2.0, 1.5, 1e-6), (0.5, 0.2, 1e-4), (20.0, 2.2, 1e-5)):
         yield Scene("steep switch", f"{height} at {at} over {width}", switch(height, at, width), (0.0,), 1.0)
@@ -318,7 +302,7 @@ def scenes() -> Iterator[Scene]:
 
 
 NEW = ("steep switch", "far stop", "corner", "relay", "backlash", "quantiser", "delay", "table")
-"""Families that were added when the rule was complete, and are only counted."""
+"""Families that were added when the rule was complete."""
 PLUGIN = '''"""The scenes of trusted.py as a plugin, so that `gradcheck` runs on them as a user runs it."""
 
 from dataclasses import dataclass
@@ -347,7 +331,7 @@ class Counted(FunctionScene):
 '''
 
 
-def refused(seed: int, indices: tuple[int, ...], folder: str) -> dict[int, str]:
+def refused(seed, indices, folder):
     """Return the verdicts with which the command `gradcheck` refuses scenes, by their number; empty for those it does not.
 
     ``folder`` has the plugin.
@@ -367,7 +351,7 @@ def refused(seed: int, indices: tuple[int, ...], folder: str) -> dict[int, str]:
 
 
 @cache
-def truth(scene: Scene) -> np.ndarray:
+def truth(scene):
     """Return the smoothed gradient ``(d,)``, from costs only, without the harness."""
     theta, dim = np.array(scene.theta), len(scene.theta)
     if dim == 1:
@@ -391,22 +375,22 @@ class Outcome(NamedTuple):
     rmse: float
 
     @property
-    def trusted_without_search(self) -> bool:
+    def trusted_without_search(self):
         """Whether the spread alone trusts the cell."""
         return self.spread < SPREAD
 
     @property
-    def trusted(self) -> bool:
+    def trusted(self):
         """Whether the rule trusts the cell."""
         return self.trusted_without_search and not self.refused
 
     @property
-    def wrong(self) -> bool:
+    def wrong(self):
         """Whether one estimate is wrong by half of the gradient or more."""
         return self.rmse >= WRONG
 
 
-def outcomes(index: int, scene: Scene, verdicts: dict[int, dict[int, str]]) -> list[Outcome]:
+def outcomes(index, scene, verdicts):
     """Return the outcome of every seed of a scene, from its estimates and the verdicts by seed and number."""
     problem = Jax().compile(compose(Given(f"{scene.family} {scene.label}", scene.cost, scene.theta, scene.sigma)))
     theta, known = np.array(scene.theta), truth(scene)
@@ -421,24 +405,22 @@ def outcomes(index: int, scene: Scene, verdicts: dict[int, dict[int, str]]) -> l
     return found
 
 
-def main() -> int:
-    """Print a line per scene and the counts by part; return 1 if the rule trusts a wrong cell that was only counted.
+def main():
+    """Print a line per scene and the counts by part; return 1 if the rule trusts a wrong cell.
 
     With the name of a part, as `new`, only its scenes are counted.
     """
-    parts: dict[str, list[Outcome]] = {"seen": [], "counted only": [], "new": []}
-    number: dict[str, int] = {}
+    parts = {"first": [], "new": []}
     chosen = []
     for index, scene in enumerate(scenes()):
-        place = number[scene.family] = number.get(scene.family, -1) + 1
-        part = "new" if scene.family in NEW else "counted only" if place % 2 else "seen"
+        part = "new" if scene.family in NEW else "first"
         if part in (sys.argv[1:] or parts):
             chosen.append((index, scene, part))
     with tempfile.TemporaryDirectory() as folder:
         (Path(folder) / "counted.py").write_text(PLUGIN)
         indices = tuple(index for index, _, _ in chosen)
         verdicts = {seed: refused(seed, indices, folder) for seed in SEEDS}
-    trusted_scenes: dict[str, set[int]] = {part: set() for part in parts}
+    trusted_scenes = {part: set() for part in parts}
     for index, scene, part in chosen:
         found = outcomes(index, scene, verdicts)
         parts[part] += found
@@ -460,7 +442,7 @@ def main() -> int:
             f"{name}: cells of {n} scenes are trusted"
             + (f"; no wrong one: below {100 * (1 - 0.05 ** (1 / n)):.0f}% by scene" if n else "")
         )
-    return int(any(o.trusted and o.wrong for name in ("counted only", "new") for o in parts[name]))
+    return int(any(o.trusted and o.wrong for cells in parts.values() for o in cells))
 
 
 if __name__ == "__main__":

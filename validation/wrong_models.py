@@ -65,7 +65,7 @@ def cases():
     yield "right", clean, plain
     for term, sizes in SIZES.items():
         for size in sizes:
-            push = lambda q, v, term=term, size=size: size * TERMS[term](q, v)[None]  # noqa: E731
+            push = lambda s, q, v, term=term, size=size: size * TERMS[term](q, v)[None]  # noqa: E731
             yield f"{size:g} {term}", right.record(right.values[:, None], push)[:, 0], plain
     for offset in (0.1, 0.25, 0.5, 1.0):
         yield f"offset {offset:g} sigma", clean + offset * SIGMA, plain
@@ -99,7 +99,7 @@ def run(clean, noise, records, seed=0):
     """Return the share of records that are not explained, and the coverage of plain and of printed intervals."""
     model = model_of(SCENE)
     data = clean[:, None] + SIGMA * noise(np.random.default_rng([seed, 5]), (STEPS, records))
-    fitting = Fitting(model, "single", 1, SIGMA, np.ones(2))
+    fitting = Fitting(model, "single", 1, SIGMA)
     start = fitting.start(np.repeat(model.values[:, None] * 1.1, records, axis=1), data)
     solution, _ = run_fits(fitting, GaussNewton(), start, data, 15)
     residual, jacobian = fitting.residuals(solution, data), fitting.jacobians(solution, data)
@@ -118,7 +118,7 @@ def run(clean, noise, records, seed=0):
 def limit(clean, level=adequacy.LEVEL):
     """Return the share of records in which a test that knows the missing term, and tests no other, notices it."""
     model = model_of(SCENE)
-    fitting = Fitting(model, "single", 1, SIGMA, np.ones(2))
+    fitting = Fitting(model, "single", 1, SIGMA)
     solution, _ = run_fits(
         fitting, GaussNewton(), fitting.start(model.values[:, None] * 1.1, clean[:, None]), clean[:, None], 15
     )

@@ -11,6 +11,8 @@ from bench.claims import tables
 from bench.claims.claim import REPRODUCED, RESERVED, VERDICTS, Claim
 from bench.claims.results import FAILED, ClaimResult
 from bench.claims.tables import Results
+from bench.report.draw import draw
+from bench.report.figures import save, styled
 from bench.report.tables import csv
 from bench.report.text import counted, duration
 from bench.report.web import shell
@@ -27,35 +29,40 @@ LOOKS = {REPRODUCED: "good", RESERVED: "reserved"}
 
 def write(directory: Path, results: Results) -> list[Path]:
     """Write charts, tables and the page of all results. Returns their paths, the charts first."""
-    charts = {claim.name: path for claim, result in results for path in tables.chart(directory, claim, result)}
+    drawings, charts = {}, []
+    with styled():
+        for chart in filter(None, (tables.chart(claim, result) for claim, result in results)):
+            figure = draw(chart)
+            charts += save(figure, directory / chart.name, data=chart.plotted())[:1]
+            drawings[chart.name] = shell.drawing(figure, chart.name, chart.title)
     paths = write_all(
         directory,
         {
             "claims.md": tables.markdown(results),
             "claims.csv": csv(tables.figures_table(results)),
             "claims.tex": tables.latex(results),
-            "claims.html": page(results, charts),
+            "claims.html": page(results, drawings),
             ANSWER: json.dumps(
                 {
                     "experiment": "claims",
                     "question": QUESTION,
                     "answer": f"{counted(len(results), 'published claim')}: {tables.count_verdicts(results)}.",
-                    "chart": next(iter(charts), ""),
+                    "chart": next(iter(drawings), ""),
                 },
                 indent=1,
             )
             + "\n",
         },
     )
-    return [*charts.values(), *paths]
+    return [*charts, *paths]
 
 
-def page(results: Results, charts: Mapping[str, Path]) -> str:
-    """Return the HTML page with contents, lessons, claims, figures and embedded charts."""
+def page(results: Results, drawings: Mapping[str, str]) -> str:
+    """Return the HTML page with contents, lessons, claims, figures and the claims' drawings as HTML."""
     body = (
         f"<header><h1>{TITLE}</h1>"
         f"<p>{counted(len(results), 'claim')}: {escape(tables.count_verdicts(results))}.</p></header>\n"
-        f"{_contents(results)}\n<main>\n{''.join(_sections(results, charts))}</main>"
+        f"{_contents(results)}\n<main>\n{''.join(_sections(results, drawings))}</main>"
     )
     return shell.document(TITLE, body, [shell.script("filter.js")])
 
@@ -91,19 +98,19 @@ def _verdict(result: ClaimResult) -> str:
     return f'<span class="{LOOKS.get(result.verdict, "bad")}">{escape(result.verdict)}</span>'
 
 
-def _sections(results: Results, charts: Mapping[str, Path]) -> Iterator[str]:
+def _sections(results: Results, drawings: Mapping[str, str]) -> Iterator[str]:
     """Yield the HTML of each lesson with its claims."""
     for lesson, summary, own in tables.by_lesson(results):
-        articles = "".join(_article(claim, result, charts.get(claim.name)) for claim, result in own)
+        articles = "".join(_article(claim, result, drawings.get(claim.name, "")) for claim, result in own)
         yield f"<section><h2>{escape(lesson)}</h2><p>{escape(summary)}</p>{articles}</section>\n"
 
 
-def _article(claim: type[Claim], result: ClaimResult, chart: Path | None) -> str:
+def _article(claim: type[Claim], result: ClaimResult, drawing: str) -> str:
     """Return the HTML of one claim: what it states, the verdict with its figures, and the command that repeats it."""
     name = escape(claim.name)
     parts = [
         f"<h3>{name}: {_verdict(result)}</h3>",
-        shell.picture(chart, claim.statement) if chart else "",
+        drawing,
         f"<p>{escape(claim.statement)} <cite>{escape(claim.source)}</cite></p>",
         f"<p><b>Learned:</b> {escape(claim.learned)}</p>",
     ]

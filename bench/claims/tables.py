@@ -1,10 +1,9 @@
-"""Writes the results of claims: a chart per claim, and tables in Markdown, CSV and LaTeX."""
+"""Shows the results of claims: a chart per claim, and tables in Markdown, CSV and LaTeX."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -27,13 +26,10 @@ ESTIMATORS = {
 """Series that have the look of an estimator, with its name."""
 
 
-def chart(directory: Path, claim: type[Claim], result: ClaimResult) -> list[Path]:
-    """Draw one claim from its stored series. Returns the path of the chart, or an empty list without a series."""
+def chart(claim: type[Claim], result: ClaimResult) -> Chart | None:
+    """Return the chart of a claim from its stored series; None without a series."""
     if not (result.series and claim.curves):
-        return []
-    from bench.report.draw import draw
-    from bench.report.figures import save, styled
-
+        return None
     first, is_log, parts = next(iter(result.series)), {axis: axis in claim.logarithmic for axis in "xy"}, []
     x = pd.to_numeric(pd.Series(result.series[first]), errors="coerce")
     for name, label in claim.curves.items():
@@ -49,14 +45,12 @@ def chart(directory: Path, claim: type[Claim], result: ClaimResult) -> list[Path
         for n, e in ESTIMATORS.items()
         if n in claim.curves
     }
-    picture = Chart(
+    return Chart(
         claim.name, pd.concat(parts, ignore_index=True), [Column("x", label=claim.labels[0], log=is_log["x"])],
         [Column("y", label=claim.labels[1], low="low", high="high", log=is_log["y"])], title=claim.learned, series="series",
         styles=looks, marks=[Mark(label, value, axis=axis) for axis, value, label in claim.marks],
         subtitle=f"{claim.name}, {claim.source.partition(';')[0]}: {result.verdict}",
     )  # fmt: skip
-    with styled():
-        return save(draw(picture), directory / claim.name, data=picture.plotted())[:1]
 
 
 def measured_text(figure: Figure) -> str:

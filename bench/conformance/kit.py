@@ -15,7 +15,7 @@ from typing import Any
 
 from bench.engines.backend import EngineBackend
 from bench.engines.process import close_engines
-from bench.errors import unknown
+from bench.errors import failure, unknown
 from bench.model import Plugin, registry
 from bench.model.identity import identity
 from bench.model.parameters import build, parameters
@@ -85,12 +85,16 @@ def main(names: Sequence[str], limit: float = LIMIT_S) -> int:
             results = iter([CheckResult(entry.name, "available", "fail" if names else "skip", reason or "")])
         else:
             results = _results(plugin, limit=limit)
+        last = ""
         for result in results:
             tally[result.outcome] += 1
-            print(f"{result.outcome}  {result.plugin:<38} {result.check:<38} {result.detail}", flush=True)
-    seconds = time.perf_counter() - started
-    counts = f"{tally['pass']} passed, {tally['fail']} failed, {tally['skip']} skipped"
-    print(f"\n{plugins} plugin{'s' * (plugins != 1)}, {sum(tally.values())} checks: {counts} in {seconds:.1f} s")
+            detail = "as above" if result.outcome == "fail" and result.detail == last else result.detail
+            last = result.detail
+            print(f"{result.outcome}  {result.plugin:<38} {result.check:<38} {detail}", flush=True)
+    print(
+        f"\n{plugins} plugin{'s' * (plugins != 1)}, {sum(tally.values())} checks: {tally['pass']} passed, "
+        f"{tally['fail']} failed, {tally['skip']} skipped in {time.perf_counter() - started:.1f} s"
+    )
     return 1 if tally["fail"] else 0
 
 
@@ -110,12 +114,7 @@ def _results(
     shows = limit is not None and sys.stderr.isatty()
     for index, (name, subject, function) in enumerate(items):
         if shows:
-            print(
-                f"\r\033[Kcheck {index + 1} of {len(items)}: {name} {function.__name__}",
-                end="",
-                file=sys.stderr,
-                flush=True,
-            )
+            _show(f"\r\033[Kcheck {index + 1} of {len(items)}: {name} {function.__name__}")
         started = time.perf_counter()
         try:
             with _time_limit(limit, f"fail  {name} {function.__name__}"):
@@ -127,9 +126,13 @@ def _results(
             )
             result = CheckResult(name, function.__name__, "fail", text)
         if shows:
-            print("\r\033[K", end="", file=sys.stderr, flush=True)
+            _show("\r\033[K")
         if result.check != something_was_checked.__name__ or result.outcome == "fail":
             yield result
+
+
+def _show(text: str) -> None:
+    print(text, end="", file=sys.stderr, flush=True)
 
 
 @contextlib.contextmanager
@@ -264,7 +267,7 @@ def _outcome(function: Check, subject: Any, name: str) -> CheckResult:
     except Failed as reason:
         outcome, detail = "fail", str(reason)
     except (Exception, SystemExit) as error:
-        outcome, detail = "fail", f"{type(error).__name__}: {error}"
+        outcome, detail = "fail", failure(error)["reason"]
     return CheckResult(name, function.__name__, outcome, " ".join(detail.split()))
 
 

@@ -158,13 +158,10 @@ def _levels(sigma: Any, layout: ParameterTree) -> list[tuple[float, np.ndarray]]
         every = [layout.spread(one, "sigma", 0.0) for one in ([sigma] if isinstance(sigma, Mapping) else sigma)]
     else:
         try:
-            given = np.asarray(sigma, dtype=np.float64)
+            given = np.asarray([] if sigma is None else sigma, float)
         except (TypeError, ValueError):
             given = np.array([math.nan])
-        if given.ndim == 2 and given.shape[1] == size:
-            every = list(given)
-        else:
-            every = [np.full(size, one) for one in given.ravel()]
+        every = list(given) if given.shape[1:] == (size,) else [np.full(size, one) for one in given.ravel()]
     if not all(np.isfinite(one).all() and (one >= 0).all() and one.any() for one in every):
         raise UserError(f"sigma={sigma} is not valid: sigma has standard deviations of noise on theta, numbers above 0")
     return [(float(one.max()), one) for one in every]

@@ -9,7 +9,7 @@ from functools import cache
 from typing import TYPE_CHECKING, Any
 
 from bench.errors import UserError
-from bench.experiment.cell import labels
+from bench.experiment.cell import VIEWS, labels
 from bench.experiment.experiment import Experiment
 from bench.experiment.grid import COUNTS, THETA, applies, expand, is_theta_axis, parameter_name, swept
 from bench.experiment.parameters import NOT_PLUGINS, as_number, flatten, parse, swept_columns
@@ -204,20 +204,26 @@ def build_plugins(given: Mapping[str, Any]) -> dict[str, Plugin | None]:
     for axis, part in given.items():
         if axis in NOT_PLUGINS:
             continue
-        values = {} if part is None else {name: value for name, value in part.items() if name != "name"}
-        parts[axis] = None if part is None else build(registry.usable(registry.kind_of(axis), part["name"]), values)
+        parts[axis] = None if part is None else build_part(axis, part)
     return parts
+
+
+def build_part(axis: str, part: Mapping[str, Any]) -> Plugin:
+    """Return the plugin of one axis from its name and parameters; raises :class:`UserError` if it is not installed."""
+    return build(registry.usable(registry.kind_of(axis), part["name"]), {k: v for k, v in part.items() if k != "name"})
 
 
 def relabel(rows: pd.DataFrame, axes: Sequence[Axis]) -> pd.DataFrame:
     """Return rows whose identity strings omit the parameters of swept axes, since these have their own columns.
 
+    Parameters with columns of their own that do not vary between the rows of a scene and law are in the strings.
     Rows whose plugins are not installed keep their identity strings.
     """
     import pandas as pd
 
     names = [name for axis in axes for name in axis.names]
-    read = cache(lambda text: _labels(json.loads(text), names))
+    views = [name for name in VIEWS if (rows.groupby(["scene", "contact"])[name].nunique() > 1).any()]
+    read = cache(lambda text: _labels(json.loads(text), names, views))
     codes, distinct = pd.factorize(rows["parameters"]) if "parameters" in rows else ([], [])
     lines = []
     for given in parse(pd.DataFrame({"parameters": distinct})):
@@ -225,7 +231,7 @@ def relabel(rows: pd.DataFrame, axes: Sequence[Axis]) -> pd.DataFrame:
         problem = {axis: part for axis, part in given.items() if axis != "estimator"}
         lines.append(read(json.dumps(problem)) | read(json.dumps(estimator)))
     changed = dict.fromkeys(name for line in lines for name in line)
-    columns = {name: [line.get(name) for line in lines] for name in changed}
+    columns = {name: [line.get(name) for line in lines] for name in changed if name in rows}
     return rows.assign(
         **{
             name: [old if (new := texts[code]) is None else new for code, old in zip(codes, rows[name], strict=True)]
@@ -234,15 +240,15 @@ def relabel(rows: pd.DataFrame, axes: Sequence[Axis]) -> pd.DataFrame:
     )
 
 
-def _labels(given: Mapping[str, Any], names: Sequence[str]) -> dict[str, str]:
+def _labels(given: Mapping[str, Any], names: Sequence[str], views: Sequence[str]) -> dict[str, str]:
     hidden = {
         axis: {parameter for name in names if (parameter := applies(name, registry.kind_of(axis), part["name"], part))}
         for axis, part in given.items()
         if axis not in NOT_PLUGINS and part is not None
     }
-    if not any(hidden.values()):
+    if "estimator" in given and not hidden.get("estimator"):
         return {}
     try:
-        return labels(build_plugins(given), hidden)
+        return labels(build_plugins(given), hidden, views)
     except UserError:
         return {}

@@ -34,18 +34,22 @@ from bench.model.identity import described, label
 from bench.model.parameters import parameters, singular
 from bench.model.program import OWN
 
-VIEWS = ("horizon", "dt", "sigma", "stiffness", "noise", "dtype")
+VIEWS = ("horizon", "dt", "sigma", "stiffness", "noise", "dtype", "smoothing")
 """Plugin parameters with their own columns, which are therefore omitted from identity strings."""
 
 
-def labels(parts: Mapping[str, Plugin | None], without: Mapping[str, Collection[str]] | None = None) -> dict[str, str]:
-    """Return identity strings by column, without the parameters in :data:`VIEWS` and, by axis, in ``without``."""
+def labels(
+    parts: Mapping[str, Plugin | None],
+    without: Mapping[str, Collection[str]] | None = None,
+    views: Collection[str] = VIEWS,
+) -> dict[str, str]:
+    """Return identity strings by column, without the parameters in ``views`` and, by axis, in ``without``."""
     without = without or {}
     scene, law = parts.get("scene"), parts.get("contact")
     scene_values = dict(scene.contact_values) if isinstance(scene, MechanicalScene) else {}
-    omitted = {axis: {*VIEWS, *without.get(axis, ())} for axis in parts}
+    omitted = {axis: {*views, *without.get(axis, ())} for axis in parts}
     if isinstance(law, ContactLaw):
-        omitted["contact"].add(law.smoothing)
+        omitted["contact"] |= {law.smoothing} if "smoothing" in views else set()
         if "stiffness" in parameters(type(law)) and "stiffness" not in without.get("scene", ()):
             omitted["scene"].discard("stiffness")  # the column of that name is the law's
     strings = {

@@ -47,8 +47,15 @@ def experiments(config_dirs: Sequence[Path] = ()) -> list[str]:
 def load(overrides: Sequence[str], config_dirs: Sequence[Path] = ()) -> Experiment:
     """Return the experiment that Hydra composes from overrides; raises :class:`UserError` if an override is invalid or not read.
 
-    ``config_dirs`` are folders with the user's own experiments, as ``experiment/NAME.yaml``.
+    ``config_dirs`` are folders with the user's own experiments, as ``experiment/NAME.yaml``. Plugin folders may have some too.
     """
+    for key, _, value in _split_words(overrides):
+        if key == "plugins":
+            for path in _split(value) or ([] if value.startswith("[") else [""]):
+                if not path.strip("'\" "):
+                    raise UserError(f"plugins={value} names no folder; the current one is plugins=.")
+                registry.add_folder(Path(path))
+    config_dirs = [*config_dirs, *(folder for folder in registry.folders() if (folder / "experiment").is_dir())]
     loaded = _composed(overrides, config_dirs)
     _refuse_unread(loaded, overrides)
     return loaded
@@ -60,12 +67,6 @@ def _composed(overrides: Sequence[str], config_dirs: Sequence[Path]) -> Experime
     from hydra.errors import HydraException
     from omegaconf import OmegaConf
 
-    for key, _, value in _split_words(overrides):
-        if key == "plugins":
-            for path in _split(value) or ([] if value.startswith("[") else [""]):
-                if not path.strip("'\" "):
-                    raise UserError(f"plugins={value} names no folder; the current one is plugins=.")
-                registry.add_folder(Path(path))
     for folder in config_dirs:
         if not (folder / "experiment").is_dir():
             raise UserError(

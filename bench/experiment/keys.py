@@ -72,7 +72,11 @@ def code_of(plugin: type[Plugin]) -> str:
             revisions[owner.__qualname__] = vars(owner).get("revision", 1)
             revisions |= revisions_of(vars(owner).get("uses", ()))
         elif owner.__module__.partition(".")[0] not in sys.stdlib_module_names:
-            files.append(getattr(sys.modules.get(owner.__module__), "__file__", None))
+            module = sys.modules.get(owner.__module__)
+            if revision := getattr(module, "REVISION", 0):
+                revisions[owner.__qualname__] = revision
+            else:
+                files.append(getattr(module, "__file__", None))
     return json.dumps([raised(revisions), files_hash(Path(file) for file in files if file)])
 
 

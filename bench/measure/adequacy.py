@@ -118,8 +118,7 @@ def _statistics(
 
 def _excess(residual: np.ndarray) -> float:
     """Return the kurtosis of residuals ``(m,)`` above that of normal numbers."""
-    square = np.square(residual)
-    return float(np.square(square).mean() / max(np.square(square.mean()), 1e-300)) - 3.0
+    return float(np.mean(residual**4) / max(np.mean(residual**2) ** 2, 1e-300)) - 3.0
 
 
 def variances(

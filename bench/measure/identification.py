@@ -24,61 +24,35 @@ class Information:
     names: tuple[str, ...]
     jacobian: np.ndarray
 
-    @cached_property
-    def _svd(self) -> tuple[np.ndarray, np.ndarray]:
-        _, values, rows = np.linalg.svd(self.jacobian, full_matrices=True)
-        return np.append(values, np.zeros(len(rows) - len(values))), rows
-
     @property
     def fisher(self) -> np.ndarray:
         """The Fisher information of the logarithms, ``(p, p)``."""
         return np.asarray(self.jacobian.T @ self.jacobian)
 
-    @property
+    @cached_property
     def rank(self) -> int:
         """Number of identifiable directions."""
-        values, _ = self._svd
-        return int((values > RANK_TOLERANCE * values[0]).sum()) if values[0] > 0 else 0
+        return int(np.linalg.matrix_rank(self.jacobian, rtol=RANK_TOLERANCE))
 
     @property
     def condition(self) -> float:
         """The largest singular value over the smallest that counts as nonzero; inf if none does."""
-        values, _ = self._svd
+        values = np.linalg.svd(self.jacobian, compute_uv=False)
         return float(values[0] / values[self.rank - 1]) if self.rank else np.inf
-
-    @property
-    def gauge(self) -> np.ndarray:
-        """The unidentifiable directions as rows, ``(p - rank, p)``."""
-        return self._svd[1][self.rank :]
 
     @cached_property
     def invariants(self) -> np.ndarray:
         """Exponents of the identifiable products of powers, ``(rank, p)``; unit vectors if all are identifiable.
 
-        Each unidentifiable direction has one leading parameter. Every other parameter is divided by the powers of the
-        leading parameters that scale with it.
+        A parameter depends on those after it if it moves the data as they do together. Every other parameter is multiplied
+        by the powers of the dependent ones that scale with it.
         """
-        rows = self.gauge.copy()
-        leaders: list[int] = []
-        for i in range(len(rows)):
-            free = [j for j in range(rows.shape[1]) if j not in leaders]
-            size = np.abs(rows[i][free])
-            # the first of nearly equal entries, so that the text does not depend on rounding
-            lead = free[int(np.flatnonzero(size > 0.9 * size.max())[0])]
-            rows[i] /= rows[i, lead]
-            for k in range(len(rows)):
-                if k != i:
-                    rows[k] -= rows[k, lead] * rows[i]
-            leaders.append(lead)
-        result = []
-        for j in range(len(self.names)):
-            if j not in leaders:
-                exponents = np.zeros(len(self.names))
-                exponents[j] = 1.0
-                for lead, row in zip(leaders, rows, strict=True):
-                    exponents[lead] -= row[j]
-                result.append(exponents)
-        return np.array(result).reshape(-1, len(self.names))
+        least = RANK_TOLERANCE * np.linalg.norm(self.jacobian, 2)
+        ranks = [np.linalg.matrix_rank(self.jacobian[:, i:], least) for i in range(len(self.names) + 1)]
+        is_dependent = np.diff(ranks) == 0
+        result = np.eye(len(self.names))[~is_dependent]
+        result[:, is_dependent] = np.linalg.pinv(self.jacobian[:, ~is_dependent]) @ self.jacobian[:, is_dependent]
+        return np.asarray(result)
 
     @property
     def labels(self) -> list[str]:

@@ -44,8 +44,9 @@ SETTLED = 1e-10
 """Relative error at which refinement stops."""
 TOLERANCE = 1e-3
 """Relative error above which a rule with equal panels is not accepted."""
-HALVINGS, MOST, AROUND = 32, 1 << 14, 256
-"""Most halvings of a panel, most panels that are halved together, and panels around the largest cost."""
+HALVINGS, SLOW, MOST, AROUND = 32, 20, 1 << 14, 256
+"""Most halvings of a panel, halvings from which the error falls slowly, as at a pole, most panels that are halved together, and
+panels around the largest cost."""
 SEARCHED, SEARCH = 5.0, (1 << 11, 1 << 13)
 """Distance searched for narrow features on lines through w = 0, and panels of the coarse and the fine rule on a line."""
 SOLVED = 1e-11
@@ -157,8 +158,7 @@ def integrate(problem: Problem, theta: np.ndarray, points: int, columns: int) ->
         power = max(_bisected(line, np.linspace(-1.0, 1.0, AROUND))[3] for line in lines)
     if power > POLE:
         place = ", ".join(f"{x:.6g}" for x in theta[:width] + problem.sigma * peak)
-        exists = "does not exist" if width == 1 else "may not exist"
-        note = f"the cost is infinite near theta = ({place}), a pole, so its mean {exists}"
+        note = f"the cost is infinite near theta = ({place}), a pole, so its mean may not exist"
         return Integral(np.full(dim, math.nan), math.nan, used, spacing, note)
     # the error falls as spacing^(1 - p), so a halving shows only a part of it
     error /= 2.0 ** (1.0 - power) - 1.0
@@ -166,7 +166,7 @@ def integrate(problem: Problem, theta: np.ndarray, points: int, columns: int) ->
     if is_narrow:
         error += missed
         doubts.append("the cost has a feature narrower than the spacing of the points")
-    if width > 1 and power >= 0.5:
+    if power >= 0.5:
         doubts.append(f"the cost grows as 1 / distance^{power:.2g}, so samples have no variance")
     error += beyond + rounding + (SOLVED if problem.program.needs_root else ROUNDED * np.finfo(float).eps) * size
     return Integral(previous, error, used, spacing, "; ".join(doubts))
@@ -243,8 +243,8 @@ def _bisected(integrand: Callable[[np.ndarray], np.ndarray], ends: np.ndarray) -
     """Return the mean of ``integrand (B,) -> (B,)`` under the normal density, its last change, the points used, and a power.
 
     Panels between ``ends`` that change when they are halved are halved again, so that spikes, jumps and poles are
-    resolved. At a pole 1 / distance^p, the changes of successive halvings fall by the ratio 2^(p - 1), which shows the
-    power p. It is 0 where all changes vanish.
+    resolved. At a pole 1 / distance^p, the changes of successive halvings fall by the ratio 2^(p - 1), whose fit shows the
+    power p. It is 0 where changes vanish within :data:`SLOW` halvings.
     """
     x, w = np.polynomial.legendre.leggauss(NODES)
 
@@ -272,8 +272,14 @@ def _bisected(integrand: Callable[[np.ndarray], np.ndarray], ends: np.ndarray) -
             break
         low, high = np.concatenate([low[is_open], middle[is_open]]), np.concatenate([middle[is_open], high[is_open]])
         whole = parts[:, is_open].ravel()
-    power = 1.0 + math.log2(changes[-1] / changes[-11]) / 10.0 if len(changes) == HALVINGS else 0.0
-    return total, closed, used, max(power, 0.0)
+    power = 0.0
+    if len(changes) > SLOW:
+        # any one change may vanish by chance, or be infinite where a node meets the pole
+        tail = np.array(changes[8:])
+        at = np.flatnonzero(np.isfinite(tail) & (tail > 0.0))
+        closed = max(closed, *tail[at[-5:]])
+        power = max(1.0 + float(np.polyfit(at, np.log2(tail[at]), 1)[0]), 0.0)
+    return total, closed, used, power
 
 
 def _panels(edges: np.ndarray, count: int, shift: float) -> tuple[np.ndarray, np.ndarray]:

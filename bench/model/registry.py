@@ -131,7 +131,7 @@ def entries() -> Table:
         except KeyboardInterrupt:
             raise
         except BaseException as error:  # includes SystemExit: a plugin must not end the command
-            _add_unavailable(table, _guess_kind(point.name), point.name, error)
+            _add_unavailable(table, _kind_in_source(point.module), point.name, error)
         else:
             _add(table, plugin)
     return table
@@ -198,13 +198,8 @@ def _modules(package: ModuleType) -> Iterator[tuple[str, str]]:
             yield package.__name__.rpartition(".")[2], name
     for folder in sorted(path for place in package.__path__ for path in Path(place).iterdir()):
         # folders without __init__.py are (namespace) packages too, but pkgutil does not list them
-        bare = (
-            folder.is_dir()
-            and folder.name.isidentifier()
-            and folder.name not in NOT_PLUGINS
-            and not (folder / "__init__.py").exists()
-        )
-        if bare and any(folder.glob("*.py")):
+        is_package = (folder / "__init__.py").exists() or not any(folder.glob("*.py"))
+        if folder.name.isidentifier() and folder.name not in NOT_PLUGINS and not is_package:
             space = importlib.import_module(f"{package.__name__}.{folder.name}")
             for module in sorted(pkgutil.iter_modules(space.__path__), key=lambda m: m.name):
                 yield folder.name, f"{space.__name__}.{module.name}"
@@ -219,7 +214,7 @@ def _load_module(table: Table, kind: str, path: str, fatal: str) -> None:
         raise
     except BaseException as error:
         # a broken plugin is listed with its error, so that it neither hides the others nor ends the command (sys.exit)
-        _add_unavailable(table, kind if kind in table else "estimators", path.rpartition(".")[2], error)
+        _add_unavailable(table, kind if kind in table else _kind_in_source(path), path.rpartition(".")[2], error)
         return
     _add_members(table, kind, module)
 
@@ -237,8 +232,13 @@ def _add_members(table: Table, kind: str, module: ModuleType) -> None:
             _add(table, plugin)
 
 
-def _guess_kind(name: str) -> str:
-    return next((kind for kind in KINDS if name.startswith(kind)), "estimators")
+def _kind_in_source(path: str) -> str:
+    """Return the kind of the first contract that a module's source names, without its import; else ``estimators``."""
+    folder, _, name = path.rpartition(".")
+    file = Path(*getattr(sys.modules.get(folder), "__path__", ()), f"{name}.py")
+    words = re.findall(r"\w+", file.read_text(errors="replace")) if file.exists() else ()
+    kinds = (getattr(vars(sys.modules["bench.model"]).get(word), "kind", "") for word in words)
+    return next((kind for kind in kinds if kind in KINDS), "estimators")
 
 
 def _add_unavailable(table: Table, kind: str, name: str, error: BaseException, problem: str = "import failed") -> None:
@@ -290,11 +290,8 @@ def _faults(plugin: type[Plugin]) -> str:
 
 
 def _missing(plugin: type[Plugin]) -> str:
-    missing = []
-    for requirement in plugin.requires:
-        module, _, distribution = requirement.partition("=")
-        if not installed(module):
-            missing.append(distribution or module)
+    parts = (requirement.partition("=") for requirement in plugin.requires)
+    missing = [distribution or module for module, _, distribution in parts if not installed(module)]
     return f"not installed: {', '.join(missing)}; pip install {' '.join(missing)}" if missing else ""
 
 

@@ -47,10 +47,7 @@ def report(experiment: Experiment) -> tuple[pd.DataFrame, Views, list[Path]]:
 
 
 def write(experiment: Experiment, rows: pd.DataFrame) -> tuple[Views, list[Path]]:
-    """Write tables, charts and page; return the views and the files' paths. Raises :class:`UserError` without rows.
-
-    A study with a method ``write``, as in version 0.4, also writes files of its own.
-    """
+    """Write tables, charts and page; return the views and the files' paths. Raises :class:`UserError` without rows."""
     if rows.empty:
         raise UserError(f"no rows are stored in '{experiment.directory}': run the experiment first")
     with (
@@ -59,10 +56,7 @@ def write(experiment: Experiment, rows: pd.DataFrame) -> tuple[Views, list[Path]
     ):  # building the commands that repeat cells runs code of plugins
         views = views_of(experiment, rows)
         drawn = writer.drawings(experiment, views)
-        paths = [*writer.write(experiment, views, drawn), *web.write(experiment, rows, views, drawn)]
-        if own := getattr(study_of(experiment), "write", None):
-            paths += own(experiment, rows)
-        return views, paths
+        return views, [*writer.write(experiment, views, drawn), *web.write(experiment, rows, views, drawn)]
 
 
 def views_of(experiment: Experiment, rows: pd.DataFrame) -> Views:

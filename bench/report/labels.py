@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
 from itertools import count, product
 from string import ascii_lowercase
 
@@ -41,9 +40,3 @@ class Labels:
     def key(self) -> list[str]:
         """Each letter that :meth:`short` has used, with its parameters."""
         return [f"[{letter}] {', '.join(values.split(','))}" for values, letter in self._letters.items()]
-
-
-def shortened(texts: Iterable[str], longest: int = LONGEST) -> tuple[dict[str, str], list[str]]:
-    """Return a short label for each text, and the key of the labels."""
-    labels = Labels(longest)
-    return {text: labels.short(text) for text in texts}, labels.key

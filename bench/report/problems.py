@@ -159,10 +159,10 @@ def titled(rows: pd.DataFrame, names: Sequence[str]) -> pd.Series:
 
 
 def named_values(rows: pd.DataFrame, names: Sequence[str]) -> dict[str, list[str]]:
-    """Return some columns of numbers as strings, ``sigma=0.1``; empty if a column has one value or a row has none."""
-    several = {name: rows[name].nunique() > 1 for name in names}
+    """Return some columns of numbers as strings, ``sigma=0.1``; empty where they are the same for the scene and law."""
+    varying = rows.groupby(["scene", "contact"])[list(names)].transform("nunique") > 1
     return {
-        name: [f"{name}={axis_value(x)}" if several[name] and math.isfinite(x) else "" for x in rows[name]]
+        name: [f"{name}={axis_value(x)}" if varies else "" for x, varies in zip(rows[name], varying[name], strict=True)]
         for name in names
     }
 

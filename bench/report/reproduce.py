@@ -12,14 +12,14 @@ from typing import Any
 import pandas as pd
 
 from bench.errors import UserError
+from bench.experiment.axes import build_part
 from bench.experiment.cell import Cell
 from bench.experiment.experiment import Budget, Experiment
 from bench.experiment.grid import COUNTS
 from bench.experiment.parameters import NOT_PLUGINS, parse
 from bench.experiment.study import Study
-from bench.model import Decision, MechanicalScene, Plugin, registry
+from bench.model import Decision, MechanicalScene, Plugin
 from bench.model.identity import changed, identity
-from bench.model.parameters import build
 
 HEAD = "python -m bench name=one_cell"
 
@@ -27,10 +27,10 @@ HEAD = "python -m bench name=one_cell"
 def commands(experiment: Experiment, rows: pd.DataFrame) -> list[list[str]]:
     """Return, per row, the words after :data:`HEAD` that rerun its cell, shell-quoted; empty if a plugin is missing."""
     folders = [shlex.quote(word) for word in plugin_folders(experiment.plugins)]
-    builder = PluginBuilder()
+    known: dict[str, Plugin] = {}
     codes, distinct = pd.factorize(rows["parameters"]) if "parameters" in rows else ([0] * len(rows), [""])
     parsed = parse(pd.DataFrame({"parameters": distinct}))
-    every = [_Commands(builder, given, folders, experiment.timing) for given in parsed]
+    every = [_Commands(known, given, folders, experiment.timing) for given in parsed]
     facts = zip(codes, rows["key"], *(rows[name].tolist() for name in COUNTS), strict=True)
     return [every[code].words(key, counts) for code, key, *counts in facts]
 
@@ -39,12 +39,12 @@ class _Commands:
     """The commands of rows with the same parameters, which differ in counts and in whether they are timed."""
 
     def __init__(
-        self, builder: PluginBuilder, given: Mapping[str, Any], folders: Sequence[str], is_timed: bool
+        self, known: dict[str, Plugin], given: Mapping[str, Any], folders: Sequence[str], is_timed: bool
     ) -> None:
         self._folders, self._is_timed = folders, is_timed
         self._settings: dict[bool, tuple[list[str], list[str]]] = {}
         try:
-            self._cell: Cell | None = builder.cell(given)
+            self._cell: Cell | None = cell_of(given, known)
         except (UserError, KeyError):
             self._cell = None
 
@@ -69,37 +69,28 @@ class _Commands:
         return [*self._folders, *before, f"samples={samples}", f"repeats={repeats}", f"seed={seed}", *after]
 
 
-class PluginBuilder:
-    """Builds the plugins of rows; each is built once and shared."""
+def cell_of(given: Mapping[str, Any], known: dict[str, Plugin]) -> Cell:
+    """Return a cell of a row's parameters, with counts of 0; raises :class:`UserError` if a plugin is not installed.
 
-    def __init__(self) -> None:
-        self._known: dict[str, Plugin] = {}
-
-    def cell(self, given: Mapping[str, Any]) -> Cell:
-        """Return a cell of a row's parameters, with counts of 0; raises :class:`UserError` if a plugin is not installed."""
-        study = self._plugin("study", given["study"])
-        assert study is not None
-        theta, budget = given["theta"], given["reference"]
-        return Cell(
-            {axis: self._plugin(axis, part) for axis, part in given.items() if axis not in NOT_PLUGINS},
-            samples=0,
-            repeats=0,
-            seed=0,
-            study=study,
-            decision=Decision()
-            if theta is None
-            else Decision(tuple(theta["names"]), theta["at"] and tuple(theta["at"])),
-            budget=None if budget is None else Budget(**budget),
-        )
-
-    def _plugin(self, axis: str, part: Mapping[str, Any] | None) -> Plugin | None:
-        if part is None:
-            return None
+    ``known`` are the plugins built so far, which cells share.
+    """
+    parts: dict[str, Plugin | None] = {}
+    for axis, part in given.items():
         text = json.dumps([axis, part])
-        if text not in self._known:
-            values = {name: value for name, value in part.items() if name != "name"}
-            self._known[text] = build(registry.usable(registry.kind_of(axis), part["name"]), values)
-        return self._known[text]
+        if part is not None and text not in known and axis not in ("theta", "reference"):
+            known[text] = build_part(axis, part)
+        parts[axis] = known.get(text)
+    study, theta, budget = parts["study"], given["theta"], given["reference"]
+    assert study is not None
+    return Cell(
+        {axis: plugin for axis, plugin in parts.items() if axis not in NOT_PLUGINS},
+        samples=0,
+        repeats=0,
+        seed=0,
+        study=study,
+        decision=Decision(**{name: value and tuple(value) for name, value in theta.items()}) if theta else Decision(),
+        budget=Budget(**budget) if budget else None,
+    )
 
 
 def _settings_around_counts(cell: Cell) -> tuple[list[str], list[str]]:

@@ -30,8 +30,6 @@ VIEWS_OF_LAWS = ("stiffness", "smoothing")
 """Columns that repeat a parameter of the contact law, which may be swept under its own name."""
 CELL = ("study", "parameters", "samples", "repeats", "seed")
 """The columns that identify a cell."""
-UNSTEADY = "!"
-"""Mark of a time whose interquartile range is too large."""
 EXACT, CLOSE = 1e-6, 1e-2
 """Largest relative differences between backends whose numbers count as equal, and as nearly equal."""
 

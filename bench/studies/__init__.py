@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from dataclasses import dataclass, replace
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
@@ -38,7 +39,7 @@ class StudyPackage(Study):
         return replace(found, charts=drawn, remarks=[*found.remarks, *reasons(rows)])
 
     def _module(self, name: str) -> Any:
-        package = next(c.__module__ for c in type(self).__mro__ if c.__module__.startswith(f"{__name__}."))
+        package = next(c.__module__ for c in type(self).__mro__ if hasattr(sys.modules[c.__module__], "__path__"))
         return import_module(f"{package}.{name}")
 
 

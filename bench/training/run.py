@@ -15,6 +15,8 @@ from bench.training.environment import Environment
 
 _compiled: dict[tuple[Any, ...], tuple[Callable[..., Any], float]] = {}
 """Executables and the seconds of their compilation, by environment structure, trainer, function and shapes."""
+LARGE = 1e8
+"""Mean square far above that of gradients, whose norm trainers clip at about 1."""
 
 
 class Training:
@@ -37,12 +39,6 @@ class Training:
     def compile_update(self, state: Any) -> None:
         """Compile the update without running it, so that its time is not part of the first update's."""
         self._executable("update", self.trainer.update, (state,))
-
-    def wait(self, state: Any) -> None:
-        """Wait until a state is computed, since JAX returns before that."""
-        import jax
-
-        jax.block_until_ready(state)
 
     def returns(self, state: Any, numbers: np.ndarray) -> np.ndarray:
         """Return the returns ``(B,)`` of the deterministic policy from starts ``numbers (n_start, B)``."""
@@ -69,36 +65,60 @@ class Training:
         cosines = self._call(f"agreement {copies}", compare, state, np.uint32(seed))
         return {name: float(value) for name, value in cosines.items()}
 
-    def gradient(self, state: Any, seed: int, window: int | None = None, every: int = 0) -> np.ndarray:
+    def gradient(self, state: Any, seed: int, window: int, every: int = 0) -> np.ndarray:
         """Return the derivative of the mean return of rollouts from new starts by the actor's parameters, ``(d,)``.
 
-        For trainers with windows: ``window`` replaces the number of control steps, and a positive ``every`` cuts them into
-        windows of that length, each of which ends in the critic's value. The noise is the same for each ``every``.
+        For trainers with windows: of ``window`` control steps. A positive ``every`` cuts them into windows of that length, each
+        of which ends in the critic's value. The noise is the same for each ``every``.
         """
-        trainer: Any = self.trainer if window is None else dataclasses.replace(self.trainer, window=window)  # type: ignore[call-arg]
+        trainer: Any = dataclasses.replace(self.trainer, window=window)  # type: ignore[call-arg]
 
         def differentiate(env: Environment, state: Any, seed: Any) -> Any:
             import jax
             from jax.flatten_util import ravel_pytree
 
-            return ravel_pytree(
-                jax.grad(lambda actor: _mean_return(trainer, env, state, actor, seed, every))(state.actor)
-            )[0]
+            def mean_return(actor: Any) -> Any:
+                key_start, key = jax.random.split(jax.random.PRNGKey(seed))
+                fresh = trainer.fresh(env, state, key_start)
+                return trainer.parts(env, fresh, actor, key, every=every)[0].sum(axis=0).mean()
+
+            return ravel_pytree(jax.grad(mean_return)(state.actor))[0]
 
         return np.asarray(
             self._call(f"gradient {window} {every}", differentiate, state, np.uint32(seed)), dtype=np.float64
         )
 
-    def mean_return(self, state: Any, seed: int, shift: np.ndarray) -> float:
-        """Return the mean return that :meth:`gradient` differentiates, at the actor's parameters plus ``shift (d,)``."""
+    def loss(self, state: Any, shift: np.ndarray) -> float:
+        """Return the loss that the next update logs, at the actor's parameters plus ``shift (d,)``."""
 
-        def evaluate(env: Environment, state: Any, seed: Any, shift: Any) -> Any:
+        def evaluate(env: Environment, state: Any, shift: Any) -> Any:
             from jax.flatten_util import ravel_pytree
 
             theta, unflatten = ravel_pytree(state.actor)
-            return _mean_return(self.trainer, env, state, unflatten(theta + shift), seed)
+            return self.trainer.update(env, state._replace(actor=unflatten(theta + shift)))[1]["loss"]
 
-        return float(self._call("mean return", evaluate, state, np.uint32(seed), np.asarray(shift, self.env.dtype)))
+        return float(self._call("loss", evaluate, state, np.asarray(shift, self.env.dtype)))
+
+    def applied(self, state: Any) -> np.ndarray:
+        """Return the gradient along which the next update moves the actor, ``(d,)``, of length 1.
+
+        Adam's mean is set to 0 and its mean square to a large constant, so that its step has the gradient's direction.
+        """
+
+        def move(env: Environment, state: Any) -> Any:
+            import jax
+            import jax.numpy as jnp
+            import optax
+            from jax.flatten_util import ravel_pytree
+
+            means = jax.tree.map(jnp.zeros_like, optax.tree.get(state.memory, "mu"))
+            squares = jax.tree.map(lambda x: x + LARGE, means)
+            memory = optax.tree.set(state.memory, mu=means, nu=squares)
+            after, _ = self.trainer.update(env, state._replace(memory=memory))
+            change = ravel_pytree(state.actor)[0] - ravel_pytree(after.actor)[0]
+            return change / jnp.linalg.norm(change)
+
+        return np.asarray(self._call("applied", move, state), dtype=np.float64)
 
     def _call(self, name: str, function: Callable[..., Any], *arguments: Any) -> Any:
         return self._executable(name, function, arguments)(self.env.parameters(), *arguments)
@@ -122,11 +142,3 @@ class Training:
             self._used.add(key)
             self.compile_s += seconds
         return executable
-
-
-def _mean_return(trainer: Trainer, env: Environment, state: Any, actor: Any, seed: Any, every: int = 0) -> Any:
-    import jax
-
-    key_start, key = jax.random.split(jax.random.PRNGKey(seed))
-    windows = {"every": every} if every else {}
-    return trainer.parts(env, trainer.fresh(env, state, key_start), actor, key, **windows)[0].sum(axis=0).mean()

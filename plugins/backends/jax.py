@@ -19,7 +19,10 @@ from bench.model import (
     Rollout,
     State,
     Trajectory,
+    difference,
+    n_changes,
     param,
+    retract,
     rollout,
 )
 
@@ -157,7 +160,7 @@ class JaxProblem(Problem):
         return Trajectory(*self._parts(self._trajectory, theta, w))
 
     def jacobians(self, theta: np.ndarray, w: np.ndarray) -> Jacobians:
-        """Return states, controls and step Jacobians, by forward mode through each step."""
+        """Return states, controls and step Jacobians, by forward mode through each step and by changes of the state."""
         return Jacobians(*self._parts(self._linearised, theta, w))
 
     def _trajectory(self, parameters: Array, theta: Array, w: Array) -> tuple[Array, Array]:
@@ -180,19 +183,24 @@ class JaxProblem(Problem):
 
         states, controls = self._trajectory(parameters, theta, w)
         program, *_ = rollout(self.program.bind(parameters)).resolved(self._ops, theta, w)
-        n_q = program.scene.n_q
+        scene = program.scene
+        still = jnp.zeros((n_changes(scene), theta.shape[1]), states.dtype)
 
-        def step(x: Array, u: Array) -> Array:
-            return jnp.concatenate(program.step(self._ops, State(x[:n_q], x[n_q:]), u))
+        def derivatives(at: tuple[Array, Array, Array]) -> list[Array]:
+            x, u, after = at
 
-        def derivative(function: Callable[[Array], Array], point: Array) -> Array:
-            basis = jnp.eye(point.shape[0], dtype=point.dtype)[:, :, None] + jnp.zeros_like(point)
-            return jax.vmap(lambda e: jax.jvp(function, (point,), (e,))[1], out_axes=1)(basis)
+            def step(change: Array, u: Array) -> Array:
+                moved = retract(scene, jnp, x, change)
+                state = program.step(self._ops, State(moved[: scene.n_q], moved[scene.n_q :]), u)
+                return difference(scene, jnp, jnp.concatenate(state), after)
 
-        a, b = jax.lax.map(
-            lambda at: (derivative(lambda x: step(x, at[1]), at[0]), derivative(lambda u: step(at[0], u), at[1])),
-            (states[:-1], controls),
-        )
+            def by(function: Callable[[Array], Array], point: Array) -> Array:
+                basis = jnp.eye(len(point), dtype=point.dtype)[:, :, None] + jnp.zeros_like(point)
+                return jax.vmap(lambda e: jax.jvp(function, (point,), (e,))[1], out_axes=1)(basis)
+
+            return [by(lambda change: step(change, u), still), by(lambda u: step(still, u), u)]
+
+        a, b = jax.lax.map(derivatives, (states[:-1], controls, states[1:]))
         return states, controls, a, b
 
     def _parts(self, function: Callable[..., Any], theta: np.ndarray, w: np.ndarray) -> list[np.ndarray]:

@@ -14,16 +14,13 @@ from bench.model import (
     Array,
     Backend,
     EngineTwin,
-    JointScene,
     Ops,
     Problem,
     Program,
     Rollout,
     State,
-    difference,
-    n_changes,
+    Unsupported,
     param,
-    retract,
     rollout,
 )
 
@@ -75,31 +72,38 @@ class Mjx(Jax):
 
     def unsupported_reason(self, program: Program) -> str | None:
         """Return why the program cannot run: it has no twin, or MJX cannot differentiate it; or None."""
-        reason = mjcf.unsupported_reason(self, program)
-        if reason is None and isinstance(program.scene, EngineTwin) and program.scene.model_file() is not None:
-            return (
-                None
-                if self.is_implicit
-                else f"one solver iteration is exact for springs only: use {self.name}[iterations=20]"
-            )
-        if reason is None and self.cone == "elliptic":
-            reason = self._elliptic_reason(mjcf.contact_dimensions(program))
-        if reason is None and not self.is_implicit and self.mode == "reverse" and self.iterations > 1:
+        if reason := mjcf.unsupported_reason(self, program):
+            return reason
+        scene = program.scene
+        is_file = isinstance(scene, EngineTwin) and scene.model_file() is not None
+        if is_file and self.iterations == 1 and not self.is_implicit:
+            return f"one solver iteration is exact for springs only: use {self.name}[iterations=20]"
+        if (is_file or self.cone == "elliptic") and (reason := self._elliptic_reason(mjcf.build(self, program))):
+            return reason
+        if not self.is_implicit and self.mode == "reverse" and self.iterations > 1:
             return (
                 f"MJX's solver has no reverse mode with iterations={self.iterations} and derivative=unrolled: use "
                 "derivative=implicit, mode=forward or iterations=1"
             )
-        return reason
+        return None
 
-    def _elliptic_reason(self, dimensions: set[int]) -> str | None:
-        """Return why contacts of these dimensions exclude elliptic cones, or None."""
+    def _elliptic_reason(self, model: Any) -> str | None:
+        """Return why contacts with elliptic cones exclude the model, or None."""
+        import mujoco
+
+        mjx_solver.library()
+        from mujoco.mjx._src.collision_driver import make_condim
+
+        if model.opt.cone != mujoco.mjtCone.mjCONE_ELLIPTIC:
+            return None
+        dimensions = make_condim(model)
         if 1 in dimensions:
-            return "MJX has no contacts without friction beside elliptic cones: use cone=pyramidal, which is the same there"
-        if dimensions and not self.is_implicit:
+            return "MJX has no contacts without friction beside elliptic cones: use pyramidal cones"
+        if len(dimensions) and not self.is_implicit:
             return (
                 "MJX's derivatives through the iterations of its solver are NaN with elliptic friction cones "
                 f"(iterations={self.iterations}, derivative={self.derivative}): use derivative=implicit and iterations=100, "
-                "or cone=pyramidal"
+                "or pyramidal cones"
             )
         return None
 
@@ -123,39 +127,20 @@ class Mjx(Jax):
         return "reverse" if has_reverse and program.dim > FORWARD_UP_TO else "forward"
 
 
+SINGLE = 4
+"""Maximum number of columns that run one by one, since padding columns are expensive."""
+
+
 class MjxProblem(JaxProblem):
-    """A program stepped by MJX, in smaller blocks, since padding columns are expensive."""
+    """A program stepped by MJX. A processor has two compiled shapes: one column, for small batches, and 16."""
 
-    grain = 16
-
-    def _linearised(self, parameters: Array, theta: Array, w: Array) -> tuple[Array, Array, Array, Array]:
-        """Return states, controls and step Jacobians, by changes of the state if positions are on a manifold."""
-        import jax
-        import jax.numpy as jnp
-
-        scene = rollout(self.program).scene
-        if not isinstance(scene, JointScene):
-            return super()._linearised(parameters, theta, w)
-        states, controls = self._trajectory(parameters, theta, w)
-        program, *_ = rollout(self.program.bind(parameters)).resolved(self._ops, theta, w)
-        still = jnp.zeros((n_changes(scene), theta.shape[1]), states.dtype)
-
-        def derivatives(at: tuple[Array, Array, Array]) -> list[Array]:
-            x, u, after = at
-
-            def step(change: Array, u: Array) -> Array:
-                moved = retract(scene, jnp, x, change)
-                state = program.step(self._ops, State(moved[: scene.n_q], moved[scene.n_q :]), u)
-                return difference(scene, jnp, jnp.concatenate(state), after)
-
-            def by(function: Callable[[Array], Array], point: Array) -> Array:
-                basis = jnp.eye(len(point), dtype=point.dtype)[:, :, None] + jnp.zeros_like(point)
-                return jax.vmap(lambda e: jax.jvp(function, (point,), (e,))[1], out_axes=1)(basis)
-
-            return [by(lambda change: step(change, u), still), by(lambda u: step(still, u), u)]
-
-        a, b = jax.lax.map(derivatives, (states[:-1], controls, states[1:]))
-        return states, controls, a, b
+    def _blocks(
+        self, function: Callable[..., np.ndarray], theta: np.ndarray, w: np.ndarray, lead: tuple[int, ...]
+    ) -> np.ndarray:
+        self.grain = 1 if w.shape[1] <= SINGLE else 16
+        if self.device == "cpu":
+            self.block = self.least = self.grain
+        return super()._blocks(function, theta, w, lead)
 
     def engine_contacts(self) -> mjcf.Contacts:
         """Return the contacts of the twin's model, by the C engine's collisions."""
@@ -192,7 +177,10 @@ class MjxProgram(Rollout):
         mjx = mjx_solver.library()
         super().__init__(program.scene, program.contact, program.integrator, program.decision)
         self.source = model = mjcf.build(backend, program)
-        leaves, self._tree = jax.tree.flatten(mjx.put_model(model))
+        try:
+            leaves, self._tree = jax.tree.flatten(mjx.put_model(model))
+        except NotImplementedError as error:
+            raise Unsupported(f"MJX does not run this model: {error}") from None
         self._leaves = [np.asarray(leaf) for leaf in leaves]
         self._model: Any = None
         self._data = mjx.make_data(model)

@@ -57,6 +57,8 @@ def _apply(equation: Any, values: list[Any]) -> list[Any]:
     out = equation.outvars[0].aval
     if name in ("jit", "pjit"):
         return evaluate(parameters["jaxpr"].jaxpr, parameters["jaxpr"].consts, values)
+    if name == "unstack" and parameters["axis"] == 0 and isinstance(values[0], tuple):  # since JAX 0.11
+        return list(values[0])
     rows = None
     if any(isinstance(value, tuple) for value in values) or name == "stack":
         rows = _rows(name, parameters, primitive, values, out)

@@ -52,13 +52,10 @@ def active(nodes: list[Node], wanted: Callable[[Node], bool]) -> set[int]:
     """Return the numbers of the nodes with a derivative by a wanted node. ``nodes`` is ordered, arguments first."""
     found: set[int] = set()
     for node in nodes:
-        if wanted(node) or (node.op not in FLAT and any(arg.number in found for arg in _differentiable(node))):
+        args = node.args[node.op == "select_n" :]  # without the condition
+        if wanted(node) or (node.op not in FLAT and any(arg.number in found for arg in args)):
             found.add(node.number)
     return found
-
-
-def _differentiable(node: Node) -> tuple[Node, ...]:
-    return node.args[1:] if node.op == "select_n" else node.args
 
 
 def pullback(graph: Graph, seeds: list[tuple[Node, Node]], wanted: Callable[[Node], bool]) -> dict[Node, Node]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -120,10 +121,7 @@ class Graph:
 
     def sum(self, terms: Iterable[Node]) -> Node:
         """Return the sum of nodes, from left to right."""
-        total = self.literal(0.0)
-        for term in terms:
-            total = self.apply("add", total, term)
-        return total
+        return reduce(lambda total, term: self.apply("add", total, term), terms, self.literal(0.0))
 
     def _node(self, op: str, args: tuple[Node, ...], data: Any) -> Node:
         key = (op, tuple(arg.number for arg in args), repr(data) if op == "literal" else data)

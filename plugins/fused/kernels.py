@@ -60,33 +60,13 @@ def _compile(name: str, text: str, dtype: str, folder: Path | None) -> Kernel:
     from numba import types
 
     started = time.perf_counter()
-    real: Any = {"float64": types.float64, "float32": types.float32}[dtype]
     module = _module(name, text, folder)
     kernel = module.kernel
-    vector, whole = types.Array(real, 1, "C"), types.Array(types.int64, 1, "C")
     size = types.int64
-    kernel.compile(
-        (
-            vector,
-            vector,
-            whole,
-            size,
-            vector,
-            size,
-            size,
-            vector,
-            size,
-            size,
-            vector,
-            size,
-            vector,
-            size,
-            size,
-            size,
-            size,
-        )
-    )
-    loaded = bool(kernel.stats.cache_hits) if folder is not None else False
+    vector, whole = types.Array(getattr(types, dtype), 1, "C"), types.Array(size, 1, "C")
+    column = (vector, size, size)
+    kernel.compile((vector, vector, whole, size, *column, *column, vector, size, vector, size, size, size, size))
+    loaded = folder is not None and bool(kernel.stats.cache_hits)
     return Kernel(name, kernel, time.perf_counter() - started, loaded)
 
 

@@ -70,6 +70,12 @@ def _objects(items: Sequence[Any], shape: tuple[int, ...]) -> np.ndarray:
     return array.reshape(shape)
 
 
+def _shaped(items: Sequence[Any], parts: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Return the items, one after another, in the shapes of ``parts``."""
+    at = iter(items)
+    return [_objects([next(at) for _ in range(part.size)], part.shape) for part in parts]
+
+
 class _Tracer:
     """Evaluates jaxprs on arrays of nodes. Arrays of constants remain plain NumPy arrays."""
 
@@ -102,6 +108,8 @@ class _Tracer:
             return self._scan(parameters, values)
         if name in MOVES:
             return [MOVES[name](parameters, equation.outvars[0].aval, *values)]
+        if name == "unstack":  # since JAX 0.11
+            return [np.asarray(row) for row in np.moveaxis(values[0], parameters["axis"], 0)]
         if name in REDUCTIONS:
             return [self._reduce(REDUCTIONS[name], values[0], parameters["axes"])]
         if name == "dot_general":
@@ -119,10 +127,9 @@ class _Tracer:
         if name not in FOLD and name != "integer_pow":
             raise Refused(name)
         if all(value.dtype != object for value in values):
+            fold: Any = (lambda x: x ** float(parameters["y"])) if name == "integer_pow" else FOLD[name]
             with np.errstate(all="ignore"):
-                if name == "integer_pow":
-                    return np.asarray(values[0] ** float(parameters["y"]), dtype=out.dtype)
-                return np.asarray(FOLD[name](*values), dtype=out.dtype)
+                return np.asarray(fold(*values), dtype=out.dtype)
         if len(values) > 3:
             raise Refused(f"{name} of more than two cases")
         rows = [self.nodes(np.broadcast_to(value, out.shape)) for value in values]
@@ -134,8 +141,9 @@ class _Tracer:
         if value.dtype != object:
             return value.astype(dtype)
         if np.issubdtype(dtype, np.floating):
-            graph, one, zero = self.loop.graph, self.loop.graph.literal(1.0), self.loop.graph.literal(0.0)
-            items = [graph.apply("select_n", x, zero, one) if x.op in LOGICAL else x for x in self.nodes(value)]
+            graph = self.loop.graph
+            cases = graph.literal(0.0), graph.literal(1.0)
+            items = [graph.apply("select_n", x, *cases) if x.op in LOGICAL else x for x in self.nodes(value)]
             return _objects(items, value.shape)
         raise Refused(f"convert_element_type to {dtype}")
 
@@ -155,17 +163,12 @@ class _Tracer:
         a = np.moveaxis(left, over_left, range(left.ndim - len(over_left), left.ndim))
         b = np.moveaxis(right, over_right, range(len(over_right)))
         kept = a.shape[: a.ndim - len(over_left)] + b.shape[len(over_right) :]
-        a, b = (
-            a.reshape(-1, int(np.prod(a.shape[a.ndim - len(over_left) :]))),
-            b.reshape(-1, int(np.prod(b.shape[len(over_right) :]))),
-        )
+        count = int(np.prod(b.shape[: len(over_right)]))
+        a, b = a.reshape(-1, count), b.reshape(count, -1)
         graph = self.loop.graph
-        entries = []
-        for row in a:
-            for column in b.T:
-                pairs = zip(self.nodes(row), self.nodes(column), strict=True)
-                entries.append(graph.sum(graph.apply("mul", x, y) for x, y in pairs))
-        return _objects(entries, kept)
+        rows, columns = map(self.nodes, a), [self.nodes(column) for column in b.T]
+        pairs = [zip(row, column, strict=True) for row in rows for column in columns]
+        return _objects([graph.sum(graph.apply("mul", x, y) for x, y in each) for each in pairs], kept)
 
     def _scan(self, parameters: Any, values: list[np.ndarray]) -> list[np.ndarray]:
         loop, closed = self.loop, parameters["jaxpr"]
@@ -174,24 +177,19 @@ class _Tracer:
         if parameters["reverse"]:
             raise Refused("scan backwards")
         loop.length = parameters["length"]
-        n_consts, n_carry = parameters["num_consts"], parameters["num_carry"]
-        consts, first, xs = values[:n_consts], values[n_consts : n_consts + n_carry], values[n_consts + n_carry :]
-        if len(closed.jaxpr.outvars) != n_carry:
+        if "ft_in" in parameters:  # since JAX 0.11
+            consts, first, xs = map(list, parameters["ft_in"].update(values).unpack())
+        else:
+            n_consts, end = parameters["num_consts"], parameters["num_consts"] + parameters["num_carry"]
+            consts, first, xs = values[:n_consts], values[n_consts:end], values[end:]
+        if len(closed.jaxpr.outvars) != len(first):
             raise Refused("scan that returns a value of each step")
         loop.first = [node for part in first for node in self.nodes(part)]
         symbols = [loop.graph.leaf("carry", i) for i in range(len(loop.first))]
-        carry, at = [], 0
-        for part in first:
-            carry.append(_objects(symbols[at : at + part.size], part.shape))
-            at += part.size
         slices = [self._slice(x) for x in xs]
-        after = self.run(closed.jaxpr, closed.consts, [*consts, *carry, *slices])
+        after = self.run(closed.jaxpr, closed.consts, [*consts, *_shaped(symbols, first), *slices])
         loop.step = [node for part in after for node in self.nodes(part)]
-        finals, at, result = [loop.graph.leaf("final", i) for i in range(len(symbols))], 0, []
-        for part in first:
-            result.append(_objects(finals[at : at + part.size], part.shape))
-            at += part.size
-        return result
+        return _shaped([loop.graph.leaf("final", i) for i in range(len(symbols))], first)
 
     def _slice(self, x: np.ndarray) -> np.ndarray:
         """Return one step's slice of an array ``(length, ...)``, as formulas that are valid at every step."""

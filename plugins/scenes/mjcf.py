@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -16,8 +15,8 @@ from bench.model import Array, JointScene, PolicyScene, State, Unsupported, User
 
 ROBOTS = Path(__file__).parents[1] / "robots"
 """The folder of the built-in robots."""
-FUNCTIONS = ("observation", "stage_cost", "terminal_cost", "has_ended", "random_start")
-"""Functions that the Python file may define; the first two are required."""
+FUNCTIONS = ("observation", "stage_cost")
+"""Functions that the Python file must define."""
 
 
 class Robot(NamedTuple):
@@ -60,6 +59,9 @@ class Mjcf(PolicyScene, JointScene):
     file: str = param("quadruped.xml", "MJCF file; PACKAGE:FILE of an installed Python package, or a built-in robot")
     functions: str = param("", "Python file with observation and cost; empty: the MJCF file's name with .py")
     action_scale: float = param(0.3, "controls per unit of the policy's output")
+    theta: str = param(
+        "policy", "the policy's parameters, or the velocities at the start", choices=("policy", "velocity")
+    )
 
     @property
     def path(self) -> Path:
@@ -70,7 +72,7 @@ class Mjcf(PolicyScene, JointScene):
             if path.is_file():
                 return path.resolve()
         built_in = sorted(path.name for path in ROBOTS.glob("*.xml"))
-        if place.suffix == ".xml" and len(place.parts) == 1:
+        if len(place.parts) == 1:
             raise unknown("MJCF file, or built-in robot:", self.file, built_in)
         raise UserError(f"mjcf.file={self.file}: this file does not exist; built-in robots are {', '.join(built_in)}")
 
@@ -78,22 +80,24 @@ class Mjcf(PolicyScene, JointScene):
     def module(self) -> ModuleType:
         """The module with observation and cost. Raises :class:`UserError` if it lacks one of them."""
         place = Path(self.functions).expanduser() if self.functions else self.path.with_suffix(".py")
-        if not place.is_file() and (ROBOTS / place.name).is_file():
-            place = ROBOTS / place.name
-        if not place.is_file():
+        found = next(filter(Path.is_file, (place, ROBOTS / place.name)), None)
+        if found is None:
             raise UserError(
-                f"mjcf.functions: the file {place} does not exist; it should have the functions {', '.join(FUNCTIONS[:2])}"
+                f"mjcf.functions: the file {place} does not exist; it should have the functions {', '.join(FUNCTIONS)}"
             )
-        module = load_module(str(place))
-        for name in FUNCTIONS[:2]:
+        module = load_module(str(found))
+        for name in FUNCTIONS:
             if not callable(getattr(module, name, None)):
-                raise UserError(f"{place} defines no function {name}: required are {', '.join(FUNCTIONS[:2])}")
+                raise UserError(f"{found} defines no function {name}: required are {', '.join(FUNCTIONS)}")
         return module
 
     @property
     def robot(self) -> Robot:
         """The robot's start and joints."""
-        return _read(self.path, self.path.stat().st_mtime_ns)
+        robot = _read(self.path, self.path.stat().st_mtime_ns)
+        if not len(robot.controls) and self.theta == "policy":
+            raise UserError(f"mjcf.file={self.path} has no actuators for a policy: use theta=velocity")
+        return robot
 
     def files(self) -> tuple[Path, ...]:
         """Return all files that decide the robot's motion and cost. If one changes, the scene's cells run again."""
@@ -132,35 +136,46 @@ class Mjcf(PolicyScene, JointScene):
     @property
     def n_start(self) -> int:  # type: ignore[override]
         """Number of standard normal numbers of a random start: ``n_start`` of the Python file, or 0."""
-        return int(getattr(self.module, "n_start", 0))
+        return int(getattr(self.module, "n_start", 0)) if self.theta == "policy" else 0
 
     @property
     def n_observations(self) -> int:  # type: ignore[override]
         """Length of the observation."""
         q, v = (part[:, None] for part in self.robot[:2])
-        return int(np.shape(self.module.observation(np, q, v))[0])
+        return len(self.module.observation(np, q, v))
 
     # --------------------------------------------------------------------------------------------------- physics
 
+    def theta0(self) -> np.ndarray:
+        return super().theta0() if self.theta == "policy" else self.robot.v.copy()
+
     def initial_state(self, xp: Any, theta: Array) -> State:
-        zero = 0.0 * theta[:1]
-        return State(*(xp.asarray(part[:, None], dtype=theta.dtype) + zero for part in self.robot[:2]))
+        q, v = self._start(xp, theta)
+        return State(q, v if self.theta == "policy" else theta)
 
     def random_start(self, xp: Any, e: Array) -> State:
-        q, v = (xp.asarray(part[:, None], dtype=e.dtype) + 0.0 * e[:1] for part in self.robot[:2])
-        return State(*self._function("random_start")(xp, q, v, e))
+        state = self._optional("random_start", xp, *self._start(xp, e), e)
+        return State(*state) if state else super().random_start(xp, e)
+
+    def _start(self, xp: Any, like: Array) -> list[Array]:
+        """Return the robot's own positions and velocities, with the columns and type of an array ``(n, B)``."""
+        return [xp.asarray(part[:, None], dtype=like.dtype) + 0.0 * like[:1] for part in self.robot[:2]]
 
     def observation(self, xp: Any, q: Array, v: Array) -> Array:
         return self.module.observation(xp, q, v)
 
     def feedback(self, xp: Any, theta: Array, q: Array, v: Array) -> Array:
-        """Return u0 + action_scale pi(theta, o), ``(n_u, B)``."""
-        act = self.plugin.act(xp, theta, self.observation(xp, q, v))
-        return xp.asarray(self.robot.controls[:, None], dtype=act.dtype) + self.action_scale * act
+        """Return u0 + action_scale pi(theta, o), or u0 if theta is the velocities at the start, ``(n_u, B)``."""
+        if self.theta == "velocity":
+            return self._controls(xp, 0.0 * q[:1])
+        return self._controls(xp, self.plugin.act(xp, theta, self.observation(xp, q, v)))
 
     def controls_of(self, xp: Any, action: Array) -> Array:
         """Return u0 + action_scale tanh(action), since actuators have limits, beyond which a derivative is 0."""
-        return xp.asarray(self.robot.controls[:, None], dtype=action.dtype) + self.action_scale * xp.tanh(action)
+        return self._controls(xp, xp.tanh(action))
+
+    def _controls(self, xp: Any, change: Array) -> Array:
+        return xp.asarray(self.robot.controls[:, None], dtype=change.dtype) + self.action_scale * change
 
     def stage_cost(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
         """Return the cost of a step of the Python file; 0 after the end."""
@@ -170,19 +185,16 @@ class Mjcf(PolicyScene, JointScene):
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
         """Return the terminal cost of the Python file, or 0."""
-        function = getattr(self.module, "terminal_cost", None)
-        return 0.0 * v[0] if function is None else function(xp, q, v)
+        cost = self._optional("terminal_cost", xp, q, v)
+        return 0.0 * v[0] if cost is None else cost
 
     def has_ended(self, xp: Any, q: Array, v: Array) -> Array | None:
         """Return whether rollouts have ended, by the Python file; None if they never do."""
-        function = getattr(self.module, "has_ended", None)
-        return None if function is None else function(xp, q, v)
+        return self._optional("has_ended", xp, q, v)
 
-    def _function(self, name: str) -> Callable[..., Any]:
+    def _optional(self, name: str, *arguments: Any) -> Any:
         function = getattr(self.module, name, None)
-        if not callable(function):
-            raise UserError(f"{self.module.__file__} sets n_start and defines no function {name}")
-        return function  # type: ignore[no-any-return]
+        return function and function(*arguments)
 
 
 @cache
@@ -204,11 +216,11 @@ def _read(path: Path, changed: int) -> Robot:
     data = mujoco.MjData(model)
     if model.nkey:
         mujoco.mj_resetDataKeyframe(model, data, 0)
-    types = {
-        int(getattr(mujoco.mjtJoint, f"mjJNT_{name.upper()}")): name for name in ("free", "ball", "slide", "hinge")
-    }
     return Robot(
-        data.qpos.copy(), data.qvel.copy(), data.ctrl.copy(), tuple(types[int(kind)] for kind in model.jnt_type)
+        data.qpos,
+        data.qvel,
+        data.ctrl,
+        tuple(mujoco.mjtJoint(kind).name.removeprefix("mjJNT_").lower() for kind in model.jnt_type),
     )
 
 
@@ -217,11 +229,9 @@ def _model_files(path: Path) -> list[Path]:
     paths, waiting = [], [path]
     while waiting:
         current = waiting.pop()
-        if current in paths or not current.is_file():
-            continue
-        paths.append(current)
-        if current.suffix == ".xml":
-            text = current.read_text()
+        if current.is_file() and current not in paths:
+            paths.append(current)
+            text = current.read_text() if current.suffix == ".xml" else ""
             folders = re.findall(r'(?:meshdir|texturedir|assetdir)\s*=\s*"([^"]*)"', text)
             for name in re.findall(r'\bfile\s*=\s*"([^"]*)"', text):
                 waiting += [(current.parent / folder / name).resolve() for folder in ("", *folders)]
@@ -232,6 +242,7 @@ def _package_folder(package: str) -> Path:
     import importlib.util
 
     spec = importlib.util.find_spec(package) if package.isidentifier() else None
-    if spec is None or not spec.submodule_search_locations:
+    folders = spec and spec.submodule_search_locations
+    if not folders:
         raise UserError(f"mjcf.file: the Python package '{package}' is not installed: pip install {package}")
-    return Path(spec.submodule_search_locations[0])
+    return Path(folders[0])

@@ -25,17 +25,7 @@ def converged(x):
     return (inner(x, 400) - 0.3) ** 2
 
 
-def implicit(x, n=4):
-    z = inner(x, n)
+def implicit(x):
+    z = inner(x, 4)
     by_x = np.array([1.0, -np.sin(z)]) / (1 + x[1] * np.cos(z))
     return 2 * (z - 0.3) * by_x
-
-
-def broken(x):
-    """A plainly wrong adjoint of the converged problem too: the sine term has the wrong sign in the denominator."""
-    z = inner(x, 4)
-    return 2 * (z - 0.3) * np.array([1.0, -np.sin(z)]) / (1 - 0.35 * x[1] * np.cos(z))
-
-
-def short(x):
-    return 0.7 * implicit(x)

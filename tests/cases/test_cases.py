@@ -5,9 +5,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from detached_damper import ball, theta
 
-import bench
 from bench.cli import main
 from bench.errors import UserError
 from bench.examine.command import run
@@ -16,7 +14,6 @@ HERE = Path(__file__).parent
 PLUGINS = f"plugins={HERE / 'plugins_bugs'}"
 WRONG, RIGHT = 1, 0
 CASES = [
-    ("c01_eigh_degenerate:cost grad=torch sigma=0.01", WRONG, "nan_gradient", "at other thetas"),
     ("c02_so3_log:cost grad=torch", WRONG, "nan_gradient", "differences 0"),
     ("c02_so3_log:smooth grad=torch", RIGHT, "smooth", ""),
     ("c03_event_time:cost grad=frozen", WRONG, "disconnected", ""),
@@ -24,26 +21,11 @@ CASES = [
     ("c03_event_time:counted grad=zero", WRONG, "staircase", ""),
     ("c04_unconverged_implicit:cost grad=implicit", WRONG, "missing_term", ""),
     ("c04_unconverged_implicit:cost grad=implicit refined=converged", WRONG, "missing_term", ""),
-    ("c04_unconverged_implicit:cost grad=short refined=converged", WRONG, "missing_term", ""),
-    ("c04_unconverged_implicit:cost grad=broken refined=converged", WRONG, "wrong_adjoint", ""),
-    ("c05_backward_cg:cost grad=cg", WRONG, "disconnected", ""),
-    ("c05_backward_cg:cost grad=stopped", WRONG, "wrong_adjoint", ""),
-    ("c05_backward_cg:cost grad=right", RIGHT, "smooth", ""),
-    ("c06_step_size:cost grad=damped", WRONG, "", " times the derivative, here and at other thetas"),
-    ("c07_accumulate:cost grad=doubled horizons=1,2,5,10,20", WRONG, "", "steps"),
-    ("c08_lp_layer:cost grad=layer sigma=0.05,0.2", WRONG, "staircase", ""),
-    ("c10_checkpoint_rng:cost grad=torch", WRONG, "", ""),
-    ("c10_checkpoint_rng:plain grad=torch", RIGHT, "", ""),
     ("c11_quaternion:cost grad=unit", WRONG, "missing_term", "along theta itself"),
-    ("c12_detached_pupil:cost grad=torch", WRONG, "missing_term", ""),
-    ("c12_detached_pupil:attached grad=torch", RIGHT, "", ""),
     ("c13_second_step_nan:cost grad=grad horizons=1,2,3", WRONG, "nan_gradient", "from step 2 on"),
-    ("c14_five_percent:cost grad=adjoint", WRONG, "", "32%"),
     ("c15_buffer:cost grad=grad", RIGHT, "", ""),
     ("c15_buffer:cost grad=double", WRONG, "wrong_factor", ""),
     ("c15_buffer:work grad=work_grad", RIGHT, "", ""),
-    ("c16_exploding:cost grad=jax sigma=0.003", 3, "spread", ""),
-    ("c21_argmax:cost grad=last sigma=0.1", WRONG, "", ""),
     # 4,096 pairs do not resolve grad J here: not shown, though it is biased
     ("c22_own_noise_jump:cost grad=pathwise noise=1", 3, "spread", ""),
     ("c22_own_noise_jump:many grad=pathwise noise=20 calls=40000", WRONG, "biased", ""),
@@ -52,15 +34,10 @@ CASES = [
     ("m1_atol:cost grad=grad atol=1e-2", RIGHT, "", "small error, within the tolerance"),
     ("m1_atol:cost grad=grad", WRONG, "", ""),
     ("m1_atol:flat grad=residue sigma=0.3", WRONG, "staircase", ""),
-    ("m3_refined:cost grad=five refined=refined", WRONG, "wrong_factor", "off by 4.0%"),
-    ("m3_refined:coarse grad=half refined=refined", WRONG, "wrong_factor", ""),
-    ("m3_refined:coarse grad=wide refined=refined", WRONG, "wrong_factor", ""),
-    ("m3_refined:coarse grad=sign refined=refined", WRONG, "wrong_factor", ""),
 ]  # fmt: skip
 """Arguments of ``examine``, exit status, cause where it is known, and words of the report."""
 SCENES = [
-    ("table_edge", "jump"), ("sharp_switch", "missed_slope"), ("far_stop", "missed_slope"), ("corner_catch", "jump"),
-    ("inside_box", "nan_gradient"),
+    ("table_edge", "jump"), ("far_stop", "missed_slope"), ("corner_catch", "jump"), ("inside_box", "nan_gradient"),
 ]  # fmt: skip
 
 
@@ -99,20 +76,5 @@ def test_gradcheck_refuses_what_sampled_gradients_miss(scene, verdict, tmp_path,
 
 
 @pytest.mark.slow
-def test_gradcheck_checks_the_horizon_of_the_scene(tmp_path):
-    main(["gradcheck", "table_edge", "backends=[jax]", "workers=0", PLUGINS, f"results_dir={tmp_path}", "--quiet"])
-    rows = pd.read_parquet(tmp_path / "gradcheck" / "rows.parquet")
-    assert set(rows["horizon"]) == {1, 10, 50, 100}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("plugin", ["batch_mean", "unscaled_es", "inside_box"])
-def test_the_kit_refuses_a_plugin_with_a_fault(plugin):
-    assert main(["check", plugin, PLUGINS]) == 1
-
-
-@pytest.mark.parametrize("damping", [0.02, pytest.param(0.5, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("sigma", [(), pytest.param((0.01, 0.1), marks=pytest.mark.slow)])
-def test_a_detached_damper_is_wrong_at_every_sigma(damping, sigma):
-    report = bench.examine(ball(damping, True), theta, grad="jax", sigma=list(sigma), calls=3000, progress=False)
-    assert (report.status, report.cause) == (1, "missing_term"), str(report)
+def test_the_kit_refuses_a_plugin_with_a_fault():
+    assert main(["check", "inside_box", PLUGINS]) == 1

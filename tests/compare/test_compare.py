@@ -113,17 +113,6 @@ def test_verdicts_are_judged_by_the_order_of_their_study(study, was, now, outcom
     assert only(found, outcome) == f"verdict {was} to {now}"
 
 
-@pytest.mark.parametrize("study", list(registry.entries()["studies"]))
-def test_the_columns_that_a_rule_needs_are_columns_of_the_study(study):
-    columns = sources.columns_of(study)
-    assert columns.compared
-    for column in columns.compared:
-        if column.comparison.by == "interval":
-            assert set(judging._interval_columns(column, columns)) <= set(columns.by_name)
-        if column.comparison.by == "verdict":
-            assert column.comparison.order
-
-
 def test_cells_are_matched_by_all_their_parameters():
     """Labels leave out defaults and timed calls; the parameters do not. Their order does not matter."""
     columns, rows = of_study("bias_variance", "scenes=[quadratic]")
@@ -318,19 +307,27 @@ def test_cells_that_are_gone_or_new_are_reported():
 # ------------------------------------------------------------------------------------------------------- command
 
 
-def test_exit_status_files_and_table(tmp_path, capsys):
+def test_files_say_what_the_exit_status_says(tmp_path, capsys):
     before, after = given(), given()
-    after.loc[good(after), ["status", "reason"]] = ["error", "it broke"]
+    after.loc[good(after), ["status", "reason"]] = ["error", "it broke\x00 <badly> & \x1b[31m"]
     old, new = save(before, tmp_path / "old"), save(after, tmp_path / "new")
-    assert run(old, old, out=tmp_path / "out") == 0
-    assert run(old, new, out=tmp_path / "out") == 1
-    printed = capsys.readouterr().out
-    assert "status ok to error (it broke)" in printed
-    table = pd.read_csv(tmp_path / "out" / "compare.csv")
+    out = tmp_path / "out"
+    for other, failures in ((old, 0), (new, 1)):
+        assert run(old, other, out=out) == failures
+        result = json.loads((out / "compare.json").read_text())
+        assert result["worse"] == bool(failures)
+        assert result["counts"]["worse"] == len(result["cells"]) == failures
+        assert sum(result["counts"].values()) == len(before)
+        suites = ElementTree.parse(out / "compare.xml").getroot()
+        assert int(suites.get("failures")) == len(suites.findall("./testsuite/testcase/failure")) == failures
+        assert len(suites.findall("./testsuite/testcase")) == len(before)
+        table = pd.read_csv(out / "compare.csv")
+        assert (table["outcome"] == "worse").sum() == failures
+    assert "<badly>" in suites.find(".//failure").get("message")
     assert list(table.columns) == ["experiment", *cells.FIRST, *cells.both_sides(COLUMNS.compared), *cells.LAST]
-    assert (table["outcome"] == "worse").sum() == 1
-    assert "it broke" in (tmp_path / "out" / "compare.md").read_text()
-    assert "it broke" in (tmp_path / "out" / "compare.html").read_text()
+    assert "status ok to error (it broke" in capsys.readouterr().out
+    for name in ("compare.md", "compare.html"):
+        assert "it broke" in (out / name).read_text()
 
 
 def test_further_runs_of_before_are_read(tmp_path):
@@ -339,22 +336,6 @@ def test_further_runs_of_before_are_read(tmp_path):
     old, new, *again = (save(rows, tmp_path / str(i)) for i, rows in enumerate((before, after, *more)))
     assert run(old, new, "--timings", out=tmp_path / "out") == 0
     assert run(old, new, "--timings", f"again={again[0]},{again[1]}", out=tmp_path / "out") == 1
-
-
-def test_json_and_junit_say_what_the_exit_status_says(tmp_path):
-    before, after = given(), given()
-    after.loc[good(after), ["status", "reason"]] = ["error", "it broke\x00 <badly> & \x1b[31m"]
-    old, new = save(before, tmp_path / "old"), save(after, tmp_path / "new")
-    for other, failures in ((old, 0), (new, 1)):
-        assert run(old, other, out=tmp_path / "out") == failures
-        result = json.loads((tmp_path / "out" / "compare.json").read_text())
-        assert result["worse"] == bool(failures)
-        assert result["counts"]["worse"] == len(result["cells"]) == failures
-        assert sum(result["counts"].values()) == len(before)
-        suites = ElementTree.parse(tmp_path / "out" / "compare.xml").getroot()
-        assert int(suites.get("failures")) == len(suites.findall("./testsuite/testcase/failure")) == failures
-        assert len(suites.findall("./testsuite/testcase")) == len(before)
-    assert "<badly>" in suites.find(".//failure").get("message")
 
 
 @pytest.mark.slow
@@ -479,16 +460,16 @@ def test_history_draws_what_changed():
     lines = [
         (result, "some", series, "RMSE", error, 0 if math.isnan(error) else 3, moved, failed, 4)
         for series, errors, moves, failures in (
-            ("same", (1.0, 1.001, 0.999), (0, 0, 0), (0, 0, 0)), ("little", (1.0, 1.0, 1.1), (math.nan,) * 3, (0, 0, 0)),
-            ("much", (1.0, 3.0, 1.0), (0, 0, 0), (0, 0, 0)), ("lost", (1.0, 1.0, 1.0), (0, 0, 0), (1, 1, 2)),
-            ("moved", (1.0, 1.0, 1.0), (0, 0.01, 0.01), (0, 0, 0)), ("unknown", (math.nan,) * 3, (math.nan,) * 3, (4, 4, 4)),
+            ("same", (1.0, 1.001, 0.999), (0, 0, 0), (0, 0, 0)), ("much", (1.0, 3.0, 1.0), (math.nan,) * 3, (0, 0, 0)),
+            ("lost", (1.0, 1.0, 1.0), (0, 0, 0), (1, 1, 2)), ("moved", (1.0, 1.0, 1.0), (0, 0.01, 0.01), (0, 0, 0)),
+            ("unknown", (math.nan,) * 3, (math.nan,) * 3, (4, 4, 4)),
         )
         for result, error, moved, failed in zip("abc", errors, moves, failures, strict=True)
     ]  # fmt: skip
     names = ["result", "experiment", "series", "column", "error", "cells", "moved", "failed", "of"]
     made = history.views(history.History(pd.DataFrame(lines, columns=names), ["a", "b", "c"]))
     (chart,) = made.charts
-    assert list(dict.fromkeys(chart.frame["line"])) == ["some: much", "some: lost", "some: little", "some: moved"]
+    assert list(dict.fromkeys(chart.frame["line"])) == ["some: much", "some: lost", "some: moved"]
     assert chart.panel_notes == {"some: lost": "failed: 1, 1, 2 of 4"}
 
 
@@ -507,17 +488,6 @@ def test_a_gradient_that_a_release_of_an_engine_changes_is_told(tmp_path):
     table = pd.read_csv(tmp_path / "out" / "history.csv")
     assert list(table["moved"].round(5)) == [0.0, 0.00045]
     assert "1 of 1 series changed" in (tmp_path / "out" / "history.md").read_text()
-
-
-def test_results_are_named_by_what_differs():
-    """Revisions of one folder by the revision, folders by their names; what would be empty stays."""
-    for names, short in (
-        (["HEAD~1:results/standard", "abc:results/standard/"], ["HEAD~1", "abc"]),
-        (["runs/v1", "runs/v2"], ["runs/v1", "runs/v2"]),
-        (["old/results", "new/results"], ["old", "new"]),
-        (["HEAD:results", "results"], ["HEAD:results", "results"]),
-    ):
-        assert list(history._short_names(names).values()) == short
 
 
 @pytest.mark.parametrize(

@@ -4,22 +4,24 @@ import contextlib
 import re
 import sys
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import pytest
 from bench.plugins.backends.numpy import Numpy, NumpyProblem
-from bench.plugins.contacts.penalty import Penalty
-from bench.plugins.contacts.softplus import Softplus
-from bench.plugins.estimators.sobol import Sobol
-from bench.plugins.integrators.explicit_euler import ExplicitEuler
-from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
-from bench.plugins.scenes.cubic import Cubic
-from bench.plugins.scenes.double_integrator import DoubleIntegrator
-from bench.plugins.scenes.heaviside import Heaviside
-from bench.plugins.scenes.mass_spring import MassSpring
-from bench.plugins.scenes.pushing import Pushing
-from bench.plugins.scenes.quadratic import Quadratic
+from classes import (
+    Cubic,
+    DoubleIntegrator,
+    ExplicitEuler,
+    Heaviside,
+    MassSpring,
+    Midpoint,
+    Penalty,
+    Pushing,
+    Quadratic,
+    SemiImplicitEuler,
+    Sobol,
+)
 
 from bench import cli, conformance
 from bench.conformance import Skipped, check, kit, main, parametrize, subjects
@@ -27,7 +29,6 @@ from bench.conformance.kit import variants
 from bench.conformance.subjects import all_programs, distinguishing_programs, sound_scenes
 from bench.errors import UserError
 from bench.model import (
-    Array,
     Backend,
     ContactScene,
     EngineScene,
@@ -37,8 +38,6 @@ from bench.model import (
     ImpulseLaw,
     MechanicalScene,
     Plugin,
-    Problem,
-    Program,
     SampleMean,
     Scene,
     columns,
@@ -58,7 +57,7 @@ class WrongSign(SampleMean):
     name = "wrong_sign"
     needs = frozenset({"grad"})
 
-    def terms(self, problem: Problem, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+    def terms(self, problem, theta, w):
         return -problem.grad(theta, w)
 
 
@@ -69,7 +68,7 @@ class SigmaForSigmaSquared(SampleMean):
     name = "sigma_for_sigma_squared"
     unbiased_at_discontinuities = True
 
-    def terms(self, problem: Problem, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+    def terms(self, problem, theta, w):
         cost = problem.value(theta, w) - problem.value(theta, 0 * w[:, :1])
         return cost * problem.sigma * w / problem.sigma
 
@@ -81,10 +80,10 @@ class SecondHalfIsTheFirst(SampleMean):
     name = "second_half_is_the_first"
     needs = frozenset({"grad"})
 
-    def terms(self, problem: Problem, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+    def terms(self, problem, theta, w):
         return problem.grad(theta, w)
 
-    def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    def estimate(self, problem, theta, noise):
         half = noise[:, : noise.shape[1] // 2]
         return super().estimate(problem, theta, np.concatenate([half, half], axis=1))
 
@@ -95,7 +94,7 @@ class RepeatsAreTheFirst(SecondHalfIsTheFirst):
 
     name = "repeats_are_the_first"
 
-    def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    def estimate(self, problem, theta, noise):
         return SampleMean.estimate(self, problem, theta, np.broadcast_to(noise[:1], noise.shape))
 
 
@@ -105,7 +104,7 @@ class SixteenSamples(SecondHalfIsTheFirst):
 
     name = "sixteen_samples"
 
-    def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    def estimate(self, problem, theta, noise):
         return SampleMean.estimate(self, problem, theta, noise[:, :16])
 
 
@@ -125,7 +124,7 @@ class OwnSampleInBaseline(Estimator):
     needs = frozenset({"value", "score"})
     unbiased_at_discontinuities = True
 
-    def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    def estimate(self, problem, theta, noise):
         w = columns(noise)
         f, score = per_repeat(problem.value(theta, w), noise), per_repeat(problem.score(theta, w), noise)
         return ((f - f.mean(axis=1, keepdims=True))[..., None] * score).mean(axis=1)
@@ -139,7 +138,7 @@ class OpenLoopScore(SampleMean):
     needs = frozenset({"value", "score"})
     unbiased_at_discontinuities = True
 
-    def terms(self, problem: Problem, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+    def terms(self, problem, theta, w):
         cost = problem.value(theta, w) - problem.value(theta, 0 * w[:, :1])
         return cost * (0 * problem.score(theta, w) + w[: problem.dim] / problem.sigma)
 
@@ -151,7 +150,7 @@ class OwnNoise(SampleMean):
     name = "own_noise"
     needs = frozenset({"grad"})
 
-    def terms(self, problem: Problem, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+    def terms(self, problem, theta, w):
         return problem.grad(theta, np.random.default_rng().standard_normal(w.shape))
 
 
@@ -162,7 +161,7 @@ class UndeclaredValue(SampleMean):
     name = "undeclared_value"
     needs = frozenset({"grad"})
 
-    def terms(self, problem: Problem, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+    def terms(self, problem, theta, w):
         return problem.grad(theta, w) + 0 * problem.value(theta, w)
 
 
@@ -173,7 +172,7 @@ class UnusedScore(SecondHalfIsTheFirst):
     name = "unused_score"
     needs = frozenset({"grad", "score"})
 
-    def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    def estimate(self, problem, theta, noise):
         return SampleMean.estimate(self, problem, theta, noise)
 
 
@@ -193,7 +192,7 @@ class DeniesJumps(SampleMean):
     name = "denies_jumps"
     needs = frozenset({"value", "score"})
 
-    def terms(self, problem: Problem, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+    def terms(self, problem, theta, w):
         return problem.value(theta, w) * problem.score(theta, w)
 
 
@@ -205,7 +204,7 @@ class LastingBias(UnusedScore):
     needs = frozenset({"grad"})
     unbiased = False
 
-    def terms(self, problem: Problem, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+    def terms(self, problem, theta, w):
         return 2.5 * problem.grad(theta, w)
 
 
@@ -215,7 +214,7 @@ class RefusesEverything(UnusedScore):
 
     name = "refuses_everything"
 
-    def unsupported_reason(self, program: Program) -> str | None:
+    def unsupported_reason(self, program):
         return "not this one"
 
 
@@ -228,24 +227,8 @@ class Faulty(Numpy):
 
     faulty: ClassVar[type[NumpyProblem]]
 
-    def compile(self, program: Program) -> Problem:
+    def compile(self, program):
         return self.faulty(program, self.dtype, 1e-6 if self.dtype == "float64" else 5e-3)
-
-
-class OtherLawProblem(NumpyProblem):
-    def _grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        program = self.program
-        if isinstance(program.contact, Penalty):
-            program = compose(program.scene, Softplus(stiffness=program.contact.stiffness), program.integrator)
-        return NumpyProblem(program, self._dtype.name, self._step)._grad(theta, w)
-
-
-@dataclass(frozen=True)
-class GradientOfAnotherLaw(Faulty):
-    """Costs of the penalty law, gradients of the softplus law."""
-
-    name = "gradient_of_another_law"
-    faulty = OtherLawProblem
 
 
 @dataclass(frozen=True)
@@ -258,7 +241,7 @@ class ClaimsSurrogates(Faulty):
 
 
 class SofterProblem(NumpyProblem):
-    def _grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+    def _grad(self, theta, w):
         program = self.program
         if isinstance(program.contact, Penalty):
             law = Penalty(stiffness=program.contact.stiffness / 2, damping=program.contact.damping)
@@ -275,7 +258,7 @@ class HalfStiffnessGradient(Faulty):
 
 
 class HomeProblem(NumpyProblem):
-    def _grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+    def _grad(self, theta, w):
         home = self.program.theta0[:, None]
         near = np.clip(theta, home - self.sigma, home + self.sigma)
         return super()._grad(near, w)
@@ -290,7 +273,7 @@ class GradientOfItsOwnTheta(Faulty):
 
 
 class ForgetfulProblem(NumpyProblem):
-    def _score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+    def _score(self, theta, w):
         return np.broadcast_to(w.sum(axis=0) / self.sigma, (self.dim, w.shape[1]))
 
 
@@ -303,7 +286,7 @@ class WrongScore(Faulty):
 
 
 class LeakyProblem(NumpyProblem):
-    def _value(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+    def _value(self, theta, w):
         cost = super()._value(theta, w)
         return cost + 1e-3 * cost.mean()
 
@@ -330,7 +313,7 @@ class DoubleAnyway(Numpy):
 
     name = "double_anyway"
 
-    def compile(self, program: Program) -> Problem:
+    def compile(self, program):
         return NumpyProblem(program, "float64", 1e-6)
 
 
@@ -343,7 +326,7 @@ class WrongClosedForm(Quadratic):
 
     name = "wrong_closed_form"
 
-    def closed_form_gradient(self, contact: Any, integrator: Any) -> np.ndarray:
+    def closed_form_gradient(self, contact, integrator):
         return 1.05 * super().closed_form_gradient(contact, integrator)
 
 
@@ -369,7 +352,7 @@ class JumpsElsewhere(Cubic):
 
     name = "jumps_elsewhere"
 
-    def cost(self, xp: Any, x: Array) -> Array:
+    def cost(self, xp, x):
         return super().cost(xp, x) + xp.where(x[0] > self.theta0()[0] + 7.0 * self.sigma, 1.0, 0.0)
 
 
@@ -379,7 +362,7 @@ class WrongPhysics(MassSpring):
 
     name = "wrong_physics"
 
-    def physical_gradient(self) -> np.ndarray | None:
+    def physical_gradient(self):
         gradient = super().physical_gradient()
         return None if gradient is None else gradient * [1.0, 1.5]
 
@@ -390,7 +373,7 @@ class ClaimsControls(DoubleIntegrator):
 
     name = "claims_controls"
 
-    def planned_controls(self, xp: Any, theta: Array) -> Array:
+    def planned_controls(self, xp, theta):
         return 2.0 * super().planned_controls(xp, theta)
 
 
@@ -400,10 +383,10 @@ class MixedColumns(FunctionScene):
 
     name = "mixed_columns"
 
-    def theta0(self) -> np.ndarray:
+    def theta0(self):
         return np.ones(2)
 
-    def cost(self, xp: Any, x: Array) -> Array:
+    def cost(self, xp, x):
         return xp.sum(x * x, axis=0) - xp.mean(x)
 
 
@@ -413,7 +396,7 @@ class NumpyOnly(MixedColumns):
 
     name = "numpy_only"
 
-    def cost(self, xp: Any, x: Array) -> Array:
+    def cost(self, xp, x):
         return np.square(np.array(x)).sum(axis=0)
 
 
@@ -423,7 +406,7 @@ class PullsTogether(Pushing):
 
     name = "pulls_together"
 
-    def contact_acceleration(self, xp: Any, q: Array, force: Array) -> Array:
+    def contact_acceleration(self, xp, q, force):
         return -super().contact_acceleration(xp, q, force)
 
 
@@ -433,7 +416,7 @@ class WrongGapRate(Pushing):
 
     name = "wrong_gap_rate"
 
-    def gap_rate(self, xp: Any, q: Array, v: Array) -> Array:
+    def gap_rate(self, xp, q, v):
         return v[1:2]
 
 
@@ -462,7 +445,7 @@ class Attracts(ForceLaw):
 
     name = "attracts"
 
-    def force(self, xp: Any, gap: Array, gap_rate: Array) -> Array:
+    def force(self, xp, gap, gap_rate):
         return xp.where(gap < 0, 1e3 * gap, 0.0 * gap)
 
 
@@ -475,7 +458,7 @@ class SmoothsNothing(Penalty):
 
     beta: float = param(100.0, "unused", positive=True)
 
-    def force(self, xp: Any, gap: Array, gap_rate: Array) -> Array:
+    def force(self, xp, gap, gap_rate):
         return super().force(xp, gap, gap_rate) + 0.1
 
 
@@ -496,7 +479,7 @@ class OneSided(ImpulseLaw):
     name = "one_sided"
     continuous = False
 
-    def impulse(self, ops: Any, contact: Any, before: Any, free: Any, dt: Any) -> Any:
+    def impulse(self, ops, contact, before, free, dt):
         rate = contact.gap_rate(before.q, before.v)
         hit = (contact.gap(before.q + dt * before.v) < 0) & (rate < 0)
         change = contact.acceleration(before.q, ops.xp.where(hit, -rate, 0.0 * rate))
@@ -518,6 +501,26 @@ class DropsImpulses(ExplicitEuler):
 
     name = "drops_impulses"
     takes_impulses = True
+
+
+@dataclass(frozen=True)
+class WrongStabilityFunction(Midpoint):
+    """A second-order step that states the factor of a first-order one."""
+
+    name = "wrong_stability_function"
+
+    def amplification(self, z):
+        return 1 + z
+
+
+@dataclass(frozen=True)
+class ForgetsTheFactor(SemiImplicitEuler):
+    """States a matrix without the velocity factor."""
+
+    name = "forgets_the_factor"
+
+    def transition(self, dt, stiffness, damping, factor):
+        return super().transition(dt, stiffness, damping, 1.0)
 
 
 # ---------------------------------------------------------------------------------------------- planted: any plugin
@@ -574,7 +577,7 @@ class RefusedDefault(Cubic):
     width: float = param(-1.0, "width", positive=True)
 
 
-def _local() -> type[Cubic]:
+def _local():
     @dataclass(frozen=True)
     class Unpicklable(Cubic):
         """A class that no other process can find."""
@@ -600,7 +603,6 @@ PLANTED = {
     DeniesJumps: {"bias_across_jumps_is_as_declared"},
     LastingBias: {"bias_is_as_declared"},
     RefusesEverything: {"something_was_checked"},
-    GradientOfAnotherLaw: {"gradient_is_that_of_value"},
     HalfStiffnessGradient: {"gradient_is_that_of_value"},
     ClaimsSurrogates: {"gradient_is_that_of_value"},
     GradientOfItsOwnTheta: {"gradient_is_that_of_value"},
@@ -626,6 +628,8 @@ PLANTED = {
     OneSided: {"impulse_keeps_momentum"},
     WrongOrder: {"error_falls_with_declared_order"},
     DropsImpulses: {"takes_impulses_is_truthful"},
+    WrongStabilityFunction: {"amplification_is_that_of_the_step"},
+    ForgetsTheFactor: {"transition_is_that_of_the_step"},
     NotADataclass: {"is_frozen_dataclass"},
     Undocumented: {"has_docstring"},
     BadName: {"has_good_name"},
@@ -678,9 +682,9 @@ def test_unavailable_plugin_is_skipped_unless_named(capsys, monkeypatch):
 
 def test_a_plugin_that_ends_the_process_fails_its_check():
     leaves = type("Leaves", (WrongSign,), {"terms": lambda *given: sys.exit(0)})
-    assert check(leaves, {"shape_and_repeatability"}) == [
-        conformance.CheckResult("wrong_sign", "shape_and_repeatability", "fail", "SystemExit: 0")
-    ]
+    (result,) = check(leaves, {"shape_and_repeatability"})
+    assert result.outcome == "fail"
+    assert re.match(r"SystemExit: 0 \(test_conformance\.py:\d+ in ", result.detail)
 
 
 # ------------------------------------------------------------------------------------------------ abstract plugins
@@ -707,10 +711,12 @@ def test_registry_says_which_methods_are_missing(tmp_path):
         "    def cost(self, xp, x):\n"
         "        return x[0]\n"
     )
+    (tmp_path / "broken.py").write_text("from bench.model import FunctionScene\nimport no_such_module\n")
     with folder_of_plugins(tmp_path):
         entry = registry.find("scenes", "half_done")
         assert not entry.available
         assert entry.reason == "HalfDone does not define theta0"
+        assert "no_such_module" in registry.find("scenes", "broken").reason
         with pytest.raises(UserError, match=r"scene 'half_done' cannot be used: HalfDone does not define theta0"):
             registry.make("scenes", "half_done")
 

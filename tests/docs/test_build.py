@@ -2,9 +2,6 @@
 
 import json
 
-import pytest
-
-from bench.errors import UserError
 from bench.experiment import config
 from docs import build
 
@@ -24,36 +21,17 @@ def test_a_stale_document_is_listed_with_its_lines_and_not_written(tmp_path, mon
     assert page.read_text().startswith("# Rows")
 
 
-def test_results_have_answers_and_name_experiments_without_rows(tmp_path, monkeypatch):
+def test_answers_stand_under_their_question_and_name_experiments_without_rows(tmp_path, monkeypatch):
     (tmp_path / "quick").mkdir()
     (tmp_path / "quick" / "chart.png").write_bytes(b"")
     record = {"question": "Why?", "answer": "First <b>. Second.", "chart": "chart"}
     (tmp_path / "quick" / "answer.json").write_text(json.dumps(record))
     monkeypatch.setattr(config, "experiments", lambda *_: ["twins", "quick"])
-    page = tmp_path / "page.md"
-    page.write_text(f"before {build.MARKS[0]}old{build.MARKS[1]} after")
-    text = build.results_page(page, tmp_path)
-    assert text.startswith("before ")
-    assert text.endswith(" after")
-    assert "old" not in text
-    assert "`python -m bench +experiment=twins` (no stored results)" in text
+    index = tmp_path / "results.md"
+    index.write_text("| question | experiments |\n|---|---|\n| Does it work? | [all](answers.md#quick) |\n")
+    text = build.answers_page(index, tmp_path)
+    assert "`python -m bench +experiment=twins` (no stored results)" in text.partition("\n## What else")[2]
     assert (
-        "## quick\n\n*Does the whole path work on this machine?*\n\n![quick](quick/chart.png)\n\nFirst &lt;b&gt;. Second.\n\n"
-        in text
+        "## Does it work?\n\n### quick\n\n*Does the whole path work on this machine?*\n\n![quick](quick/chart.png)\n\n"
+        "First &lt;b&gt;. Second.\n\n" in text
     )
-    page.write_text(text)
-    assert build.results_page(page, tmp_path) == text
-
-
-def test_results_need_their_marks(tmp_path):
-    page = tmp_path / "results.md"
-    page.write_text("no marks")
-    with pytest.raises(UserError, match="has no place for the answers"):
-        build.results_page(page, tmp_path)
-
-
-def test_unknown_part_is_refused():
-    with pytest.raises(
-        UserError, match="unknown part 'pages' \\(allowed: results, columns, verdicts, figures, site, all\\)"
-    ):
-        build.main(["pages"])

@@ -35,7 +35,7 @@ def shared(x, steps=20):
 # ------------------------------------------------------------------------------------- adaptive, overwritten
 
 
-def adaptive(calls=1500, **settings):
+def adaptive(calls, **settings):
     def cost(x):
         return mechanisms.adaptive(x, rtol=1e-3)
 
@@ -45,12 +45,13 @@ def adaptive(calls=1500, **settings):
     return bench.examine(cost, [1.0, 1.0, 0.5], grad=grad, progress=False, calls=calls, **settings)
 
 
-@pytest.mark.slow
-def test_adaptive_steps_are_no_missing_term():
-    report = adaptive()
+@pytest.mark.parametrize("calls", [700, pytest.param(1500, marks=pytest.mark.slow)])
+def test_adaptive_steps_are_no_missing_term(calls):
+    """700 calls, as a solver of 50 ms has in a minute on a loaded machine."""
+    report = adaptive(calls)
     assert (report.status, report.cause, report.derivative) == (3, "adaptive", "not shown")
     assert "refined=COST" in report.advice
-    assert adaptive(expect="adaptive").status == 0
+    assert adaptive(calls, expect="adaptive").status == 0
 
 
 def separate(rtol, calls=3000, forgotten=0.0, **settings):
@@ -106,11 +107,6 @@ def test_a_small_jump_on_a_curved_line_is_found():
     """The largest changes of slope on the line are those of its bends, 40 times the jump."""
     line = lines.scan(lambda x: np.cos(x[0]) + 1e-4 * (x[0] > 1.2345), np.zeros(1), np.ones(1), 1e-16)
     assert [one.at for one in line.jumps] == pytest.approx([1.2345], abs=1e-5)
-
-
-def test_adaptive_steps_are_considered_before_a_small_error_is_named():
-    """700 calls, as a solver of 50 ms has in a minute on a loaded machine."""
-    assert adaptive(calls=700).cause == "adaptive"
 
 
 def test_memory_overwritten_between_forward_and_backward_is_named_by_growth_or_by_a_second_gradient():

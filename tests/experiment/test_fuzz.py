@@ -47,17 +47,17 @@ word = st.one_of(
 FEW = ["samples", "repeats", "sweep.samples"]
 
 
-def affordable(words: list[str]) -> bool:
+def affordable(words):
     """Whether nothing asks for more samples than a test can pay."""
     sizes = [w for w in words if w.partition("=")[0].lstrip("+") in FEW]
     return not any(len(piece) > 4 for w in sizes for piece in w.partition("=")[2].strip("[]").split(","))
 
 
-def outcome(words: list[str], verb: str, where: Path) -> int:
+def outcome(words, verb, where):
     return main([verb, "scenes=[heaviside]", "estimators=[fobg]", *BASE, *words, f"results_dir={where}"])
 
 
-def check(words: list[str], verb: str, capsys: pytest.CaptureFixture[str]) -> None:
+def check(words, verb, capsys):
     with tempfile.TemporaryDirectory() as folder:
         where = Path(folder) / "in" / "out"
         status = outcome(words, verb, where)

@@ -9,7 +9,6 @@ import pytest
 from bench.cli import main
 from bench.errors import UserError
 from bench.experiment import config, grid
-from bench.experiment.cell import Cell
 from bench.experiment.keys import fingerprint
 from bench.run import plan, tasks
 from bench.run.store import Store
@@ -18,7 +17,7 @@ from bench.studies.bias_variance.columns import COLUMNS
 PLAIN = ["scenes=[pushing]", "contacts=[penalty]", "backends=[numpy]", "estimators=[fobg,alpha_order]"]
 
 
-def cells(*words: str) -> list[Cell]:
+def cells(*words):
     return grid.cells(config.load([*PLAIN, *words]))
 
 

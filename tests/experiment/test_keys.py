@@ -4,7 +4,6 @@ import importlib
 import json
 import sys
 from dataclasses import replace
-from pathlib import Path
 from types import ModuleType
 
 import bench.plugins.fused
@@ -13,7 +12,6 @@ from trees import ROOT
 
 from bench.experiment import cell as cell_module
 from bench.experiment import config, grid, keys
-from bench.experiment.cell import Cell
 from bench.measure import noise, reference, statistics
 from bench.model import Backend, PolicyScene, Scene, adjoint, program, registry
 from bench.plugins import mjcf, mjx_solver
@@ -36,6 +34,8 @@ CELLS = {
     "policy": ["scenes=['cartpole_swing[policy=linear]']", "integrators=[rk4]", "backends=[numpy]", "estimators=[fobg]"],
 }  # fmt: skip
 """One cell of each kind whose keys are compared."""
+PAPER = ROOT / "examples" / "cost_of_error"
+EXPERIMENTS = sorted(path for folder in (ROOT / "conf", PAPER) for path in (folder / "experiment").rglob("*.yaml"))
 REFERENCED = {name for name in CELLS if name not in ("adam", "growth")}
 PUSHED = {"fobg", "reinforce", "windowed", "fused", "mujoco", "mjx", "adam", "growth"}
 MOVED = {
@@ -66,7 +66,7 @@ MOVED = {
 """What declares a revision, with the cells whose keys change if it is raised. All references here are computed by ``jax``."""
 
 
-def forget() -> None:
+def forget():
     """Forget the hashes that keys are computed from."""
     keys.code_of.cache_clear()
     own = (cell_module._ranked, cell_module._rest, cell_module._program_keys, cell_module._reference_keys)
@@ -82,11 +82,11 @@ def fresh():
 
 
 @pytest.fixture(scope="module")
-def cells() -> dict[str, Cell]:
+def cells():
     return {name: grid.cells(config.load(words))[0] for name, words in CELLS.items()}
 
 
-def keys_of(cells: dict[str, Cell]) -> dict[str, str]:
+def keys_of(cells):
     forget()
     return {name: replace(cell).key for name, cell in cells.items()}
 
@@ -129,7 +129,7 @@ def outside(tmp_path, monkeypatch):
     """Return a function that gives the code of an estimator of another folder, whose files have these contents."""
     monkeypatch.syspath_prepend(tmp_path)
 
-    def code(name: str, imports: str = "", **files: str) -> str:
+    def code(name, imports="", **files):
         (tmp_path / f"{name}.py").write_text(OUTSIDE.format(name="mine", imports=imports))
         for helper, text in files.items():
             path = tmp_path / f"{helper.replace('__', '/')}.py"
@@ -158,6 +158,12 @@ def test_a_plugin_from_outside_counts_by_its_file_and_what_that_imports_from_its
     assert outside("fourth_plugin", imports + "\nMORE = 1", **{helper: "GAIN = 1\n"}) != plain
 
 
+def test_a_plugin_from_outside_whose_module_has_a_revision_counts_by_it(outside):
+    first = outside("first_module", "REVISION = 1")
+    assert outside("second_module", "REVISION = 1\nMORE = 1") == first
+    assert json.loads(outside("third_module", "REVISION = 2")) == [{"Mine": 2}, ""]
+
+
 def test_a_plugin_from_outside_has_the_revisions_of_its_bases(outside, monkeypatch):
     from bench.plugins.estimators.fobg import Fobg
 
@@ -168,7 +174,7 @@ def test_a_plugin_from_outside_has_the_revisions_of_its_bases(outside, monkeypat
 
 
 def test_a_simulator_counts_by_its_file_and_what_that_imports(tmp_path):
-    def key(gain: str) -> str:
+    def key(gain):
         (tmp_path / "physics.py").write_text(f"GAIN = {gain}\n")
         (tmp_path / "mysim.py").write_text(
             "import physics\n\ntheta = [1.0]\n\n\ndef cost(theta):\n    return theta[0]\n"
@@ -193,12 +199,13 @@ def test_an_estimator_whose_smoothing_fails_has_a_key_and_no_reference(cells, mo
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("path", sorted((ROOT / "conf/experiment").rglob("*.yaml")), ids=lambda path: path.stem)
-def test_stored_rows_are_those_of_the_cells_of_their_experiment(path: Path):
+@pytest.mark.parametrize("path", EXPERIMENTS, ids=lambda path: path.stem)
+def test_stored_rows_are_those_of_the_cells_of_their_experiment(path):
     """Documents count the rows of a folder, so a row from an earlier version of the experiment would count too."""
     import pandas as pd
 
-    experiment = config.load([f"+experiment={path.relative_to(ROOT / 'conf/experiment').with_suffix('')}"])
+    folder = next(parent for parent in path.parents if parent.name == "experiment")
+    experiment = config.load([f"+experiment={path.relative_to(folder).with_suffix('')}", f"plugins={PAPER}"])
     stored = ROOT / "results/standard" / experiment.name / "rows.parquet"
     if stored.exists():
         found = pd.read_parquet(stored, columns=["key"])["key"]

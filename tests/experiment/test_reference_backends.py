@@ -2,10 +2,7 @@
 
 import numpy as np
 import pytest
-from bench.plugins.backends.jax import Jax
-from bench.plugins.backends.numpy import Numpy
-from bench.plugins.scenes.cubic import Cubic
-from bench.plugins.scenes.heaviside import Heaviside
+from classes import Cubic, Heaviside, Jax, Numpy
 from helpers import loaded
 
 from bench.experiment.session import Problems

@@ -1,38 +1,29 @@
 """Golden cells: how they are composed, measured and compared, and which plugins explain those whose numbers moved."""
 
-from __future__ import annotations
-
 import inspect
 import json
 import math
 import tempfile
 from collections import defaultdict
-from collections.abc import Collection, Mapping
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import yaml
 
 from bench.experiment import config, grid
-from bench.experiment.cell import Cell
-from bench.experiment.experiment import Experiment
-from bench.model import Plugin, registry
+from bench.model import registry
 from bench.model.identity import label, parse_identity
 from bench.run.session import Session
 from bench.run.tasks import measure_cell
 
 FOLDER = Path(__file__).parent
-TABLE: dict[str, Any] = yaml.safe_load((FOLDER / "cells.yaml").read_text())
-LINES: dict[str, str] = TABLE["fast"] | TABLE["slow"]
+TABLE = yaml.safe_load((FOLDER / "cells.yaml").read_text())
+LINES = TABLE["fast"] | TABLE["slow"]
 NUMBERS = FOLDER / "numbers.json"
 """By cell: its numbers, and how far they move by rounding, in units of their tolerance."""
 WRITE = "python tests/golden/write.py"
-
-Numbers = dict[str, Any]
-"""The values of one cell by column: numbers, words, or lists of either."""
 
 TOLERANCE, LEAST = 1e-8, 1e-10
 """Allowed difference, relative to the largest number of a column, and its least size, since errors of exact gradients are
@@ -51,7 +42,7 @@ UNCOMPARED = frozenset(
 
 
 @cache
-def experiment_of(line: str) -> tuple[Experiment, dict[str, Cell]]:
+def experiment_of(line):
     """Return the experiment of a line of the table, and its cells by line and identity strings."""
     words = LINES[line].split()
     study = next((word.partition("=")[2] for word in words if word.startswith("study=")), "bias_variance")
@@ -61,17 +52,17 @@ def experiment_of(line: str) -> tuple[Experiment, dict[str, Cell]]:
     return experiment, {f"{line}: {name_of(cell)}": cell for cell in grid.cells(experiment)}
 
 
-def name_of(cell: Cell) -> str:
+def name_of(cell):
     """Return the identity strings of a cell's plugins."""
     return " ".join(label(part) for part in (cell.study, *cell.parts.values()) if part is not None)
 
 
-def session_of(experiment: Experiment, folder: str) -> Session:
+def session_of(experiment, folder):
     """Return a session that finds no references computed earlier."""
     return Session(replace(experiment, results_dir=Path(folder)))
 
 
-def measure_line(line: str) -> dict[str, Numbers]:
+def measure_line(line):
     """Return the numbers of a line's cells by name, without cells whose libraries are not installed."""
     experiment, cells = experiment_of(line)
     with tempfile.TemporaryDirectory() as folder:
@@ -79,13 +70,13 @@ def measure_line(line: str) -> dict[str, Numbers]:
         return {name: measure(cell, session) for name, cell in cells.items() if is_installed(cell)}
 
 
-def is_installed(cell: Cell) -> bool:
+def is_installed(cell):
     """Return whether the libraries of a cell's plugins are installed."""
     refusal = cell.refusal()
     return refusal is None or refusal[0] != "unavailable"
 
 
-def measure(cell: Cell, session: Session) -> Numbers:
+def measure(cell, session):
     """Return the columns of a cell that its plugins and counts decide."""
     columns = cell.study.columns.by_name  # type: ignore[attr-defined]
     result = measure_cell(replace(cell, timing=False), session, cell.study)  # type: ignore[arg-type]
@@ -95,14 +86,14 @@ def measure(cell: Cell, session: Session) -> Numbers:
     return {name: parsed(name, value) for name, value in kept.items() if not columns[name].measured}
 
 
-def parsed(name: str, value: Any) -> Any:
+def parsed(name, value):
     """Return a value, with the table of diagnostics as a list of its numbers."""
     if name != "auxiliaries":
         return value
     return [number for row in json.loads(value or "{}").values() for number in row.values()]
 
 
-def distance(name: str, first: Any, second: Any) -> float:
+def distance(name, first, second):
     """Return the difference of two values of a column in units of what is allowed; infinite where words or gaps differ."""
     a, b = (np.atleast_1d(np.array(value)) for value in (first, second))
     if a.shape != b.shape:
@@ -117,25 +108,25 @@ def distance(name: str, first: Any, second: Any) -> float:
     return float(changes.max() / (relative * sizes.max() + least)) if finite.any() else 0.0
 
 
-def moved_columns(stored: Numbers, measured: Numbers, allowed: float = 1.0) -> list[str]:
+def moved_columns(stored, measured, allowed=1.0):
     """Return the columns of which only one has a value, or whose values differ by more than ``allowed`` tolerances."""
     columns = stored.keys() | measured.keys()
     return sorted(c for c in columns if not distance(c, stored.get(c, []), measured.get(c, [])) <= allowed)
 
 
-def plugins_of(cell: Cell) -> set[type[Plugin]]:
+def plugins_of(cell):
     """Return the classes of a cell's plugins, with its study and the policy of its scene."""
     plugins = {type(part) for part in (*cell.parts.values(), cell.study) if part is not None}
     policy = getattr(cell.scene, "policy", None)
     return plugins | ({registry.usable("policies", parse_identity(policy)[0])} if policy else set())
 
 
-def suspects(moved: Collection[str], plugins: Mapping[str, set[type[Plugin]]]) -> list[tuple[list[type], set[str]]]:
+def suspects(moved, plugins):
     """Return the fewest classes that explain the cells that moved, each with those cells; classes that explain as much are one list.
 
     A class explains cells if no cell that uses it, or none that uses it or a class derived from it, came out equal.
     """
-    users: dict[tuple[bool, type], set[str]] = defaultdict(set)
+    users = defaultdict(set)
     for name, classes in plugins.items():
         for plugin in classes:
             users[True, plugin].add(name)
@@ -151,7 +142,7 @@ def suspects(moved: Collection[str], plugins: Mapping[str, set[type[Plugin]]]) -
     return result + ([([], left)] if left else [])
 
 
-def sentence(classes: list[type], cells: Collection[str], columns: Mapping[str, list[str]]) -> str:
+def sentence(classes, cells, columns):
     """Return what moved, in which cells and columns, and the lines to change if that is intended."""
     some = "; ".join(f"{cell}: {', '.join(columns[cell][:4])}" for cell in sorted(cells)[:3])
     who = " or ".join(sorted(cls.__name__ for cls in classes)) or "what several plugins share"

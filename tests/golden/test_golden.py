@@ -26,12 +26,12 @@ TOGETHER = {"scenes callable", "backends callable"}
 
 
 @cache
-def moved_cells(line: str) -> dict[str, list[str]]:
+def moved_cells(line):
     """Return the columns that moved, by cell; cells whose libraries are not installed are left out."""
     return {name: moved_columns(STORED[name]["numbers"], numbers) for name, numbers in measure_line(line).items()}
 
 
-def explain(lines: list[str]) -> str:
+def explain(lines):
     columns = {name: moved for line in lines for name, moved in moved_cells(line).items()}
     plugins = {name: plugins_of(experiment_of(line)[1][name]) for line in lines for name in moved_cells(line)}
     moved = {name for name, some in columns.items() if some}

@@ -64,6 +64,7 @@ def sampled(rows: pd.DataFrame) -> pd.DataFrame:
 
 @pytest.mark.parametrize(("name", "is_mjx"), CASES)
 def test_stored_rows_come_out_again(name, is_mjx, tmp_path):
+    registry.add_folder(ROOT / "examples/cost_of_error")
     rows = pd.read_parquet(ROOT / "results/standard" / name / "rows.parquet")
     rows = sampled(rows[rows.backend.str.startswith("mjx") == is_mjx])
     pairs = [(cell_of(row), row) for _, row in rows.iterrows()]

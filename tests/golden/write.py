@@ -4,22 +4,17 @@ Each cell is measured twice, the second time with theta and the parameters of it
 A cell whose numbers move by more than a tenth of their tolerance is refused; the largest move is stored.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 import tempfile
-from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import fields, replace
-from typing import Any
 from unittest import mock
 
 import numpy as np
 from golden_cells import (
     LINES,
     NUMBERS,
-    Numbers,
     distance,
     experiment_of,
     measure,
@@ -27,14 +22,12 @@ from golden_cells import (
     session_of,
 )
 
-from bench.experiment.cell import Cell
-
 SHARE = 0.1
 """Largest move by rounding that is stored, in units of the tolerance."""
 
 
 @contextmanager
-def moved_by_rounding(cell: Cell) -> Iterator[Cell]:
+def moved_by_rounding(cell):
     """Move the scene's fractional parameters by one unit in the last place, and theta if it does not depend on them.
 
     Whole numbers are left, since code compares with them: a factor of 1 is no factor.
@@ -55,7 +48,7 @@ def moved_by_rounding(cell: Cell) -> Iterator[Cell]:
         yield moved
 
 
-def rounding(line: str, numbers: dict[str, Numbers]) -> dict[str, float]:
+def rounding(line, numbers):
     """Return by cell the largest move of its numbers by rounding, in units of their tolerance."""
     experiment, cells = experiment_of(line)
     result = {}
@@ -69,7 +62,7 @@ def rounding(line: str, numbers: dict[str, Numbers]) -> dict[str, float]:
     return result
 
 
-def main(lines: list[str]) -> None:
+def main(lines):
     """Write the numbers of lines; exits with a message at a line with a cell whose rounding grows."""
     table = json.loads(NUMBERS.read_text())
     table = {name: entry for name, entry in table.items() if name.partition(":")[0] in LINES}
@@ -84,7 +77,7 @@ def main(lines: list[str]) -> None:
         NUMBERS.write_text("{\n" + ",\n".join(rows) + "\n}\n")
 
 
-def shortened(value: Any) -> Any:
+def shortened(value):
     """Return a value with its numbers to twelve digits."""
     if isinstance(value, dict):
         return {name: shortened(v) for name, v in value.items()}

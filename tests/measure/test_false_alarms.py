@@ -9,6 +9,6 @@ from bench.measure.gradcheck import FAULTS
 @pytest.mark.slow
 def test_smooth_scenes_are_not_blamed():
     lines = false_alarms.run(20, only=lambda name: name.endswith(("1000 rk4", "300 semi_implicit_euler", "None")))
-    assert not [line for line in lines if line[3] in FAULTS]
+    assert not [line for line in lines if line[2] in FAULTS]
     assert len(lines) == 20
     assert len(false_alarms.SCENES) > 5

@@ -46,7 +46,11 @@ def test_a_continuous_cost_has_no_jump(name):
     assert search(SEEN[name])[0].height == 0.0
 
 
-@pytest.mark.parametrize("name", [key for key in SEEN if key[0] in ("gate", "edge")][::2], ids=str)
+FAR = "1.9 to 2.5 for 5.0"
+"""A gate 4.2 standard deviations away."""
+
+
+@pytest.mark.parametrize("name", [key for key in SEEN if key[0] in ("gate", "edge") and key[1] != FAR], ids=str)
 def test_a_jump_within_reach_is_found(name):
     jump, w = search(SEEN[name])
     assert jump.height > 0.0

@@ -5,14 +5,7 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
-from bench.plugins.backends.numpy import Numpy
-from bench.plugins.estimators.fobg import Fobg
-from bench.plugins.estimators.guided import Guided
-from bench.plugins.estimators.measure_valued import MeasureValued
-from bench.plugins.estimators.orthogonal import Orthogonal
-from bench.plugins.estimators.randomized_smoothing import RandomizedSmoothing
-from bench.plugins.estimators.reinforce import Reinforce
-from bench.plugins.estimators.sphere_smoothing import SphereSmoothing
+from classes import Fobg, Guided, MeasureValued, Numpy, Orthogonal, RandomizedSmoothing, Reinforce, SphereSmoothing
 from helpers import loaded
 
 from bench.experiment.session import Problems
@@ -61,7 +54,7 @@ def compiled(scene):
 
 @pytest.mark.parametrize(
     "estimator",
-    [Fobg(), Reinforce(), MeasureValued(), RandomizedSmoothing(), RandomizedSmoothing(variant="forward"), Orthogonal(),
+    [Fobg(), Reinforce(), MeasureValued(), RandomizedSmoothing(), RandomizedSmoothing(variant="forward"), Orthogonal(), Guided(share=1.0),
      SphereSmoothing()],
     ids=str,
 )  # fmt: skip
@@ -72,13 +65,6 @@ def test_estimators_average_over_the_scenes_own_noise(estimator):
     found = estimator.estimate(problem, problem.program.theta0, noise)
     error = found.std(axis=0, ddof=1) / 8
     assert (np.abs(found.mean(axis=0) - [2.0, 3.0]) < ERRORS * error + DIFFERENCES).all(), (found.mean(axis=0), error)
-
-
-def test_guided_directions_keep_the_scenes_own_noise():
-    problem = compiled(Windy())
-    noise = np.random.default_rng(1).standard_normal((64, 256, 4))
-    found = Guided(share=1.0).estimate(problem, problem.program.theta0, noise)
-    assert np.abs(found.mean(axis=0) - [2.0, 3.0]).max() < ERRORS * found.std(axis=0).max() / 8
 
 
 def test_the_reference_averages_over_the_scenes_own_noise():

@@ -4,15 +4,17 @@ import math
 
 import numpy as np
 import pytest
-from bench.plugins.backends.numpy import Numpy
-from bench.plugins.estimators.finite_difference import FiniteDifference
-from bench.plugins.estimators.fobg import Fobg
-from bench.plugins.estimators.randomized_smoothing import RandomizedSmoothing
-from bench.plugins.estimators.reinforce import Reinforce
-from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
-from bench.plugins.scenes.cartpole import Cartpole
-from bench.plugins.scenes.heaviside import Heaviside
-from bench.plugins.scenes.quadratic import Quadratic
+from classes import (
+    Cartpole,
+    FiniteDifference,
+    Fobg,
+    Heaviside,
+    Numpy,
+    Quadratic,
+    RandomizedSmoothing,
+    Reinforce,
+    SemiImplicitEuler,
+)
 from helpers import small_rows
 
 from bench.compare import judging

@@ -1,15 +1,13 @@
 """Scenes with free and ball joints: Jacobians by changes of the state, and gradients of engines through quaternions."""
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import pytest
-from bench.plugins.contacts.penalty import Penalty
-from bench.plugins.estimators.windowed import Windowed
-from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
+from classes import Penalty, SemiImplicitEuler, Windowed
 
-from bench.model import Array, JointScene, Problem, State, adjoint_gradient, compose, param, registry, slopes
+from bench.model import JointScene, State, adjoint_gradient, compose, param, registry, slopes
 from bench.model.manifold import difference, n_changes, retract
 from bench.trace.trace import trace
 
@@ -30,29 +28,29 @@ class Tumbling(JointScene):
     horizon: int = param(40, "number of time steps", positive=True)
     dt: float = param(0.005, "length of a time step", "s", positive=True)
 
-    def theta0(self) -> np.ndarray:
+    def theta0(self):
         return np.array([0.7, 0.4, 1.3, 0.2, -0.3])
 
-    def initial_state(self, xp: Any, theta: Array) -> State:
+    def initial_state(self, xp, theta):
         zero, one = 0.0 * theta[0], 1.0 + 0.0 * theta[0]
         angle = theta[0] / 2
         q = [zero, zero, zero + 0.12, xp.cos(angle), xp.sin(angle), zero, zero, one, zero, zero, zero, zero]
         v = [theta[1], zero, zero - 0.5, theta[2], one, zero, theta[3], one, theta[4], zero]
         return State(xp.stack(q), xp.stack(v))
 
-    def feedback(self, xp: Any, theta: Array, q: Array, v: Array) -> Array | None:
+    def feedback(self, xp, theta, q, v):
         return xp.stack([theta[3] * q[4] - theta[4] * v[3]]) if self.feeds_back else None
 
-    def planned_controls(self, xp: Any, theta: Array) -> Array | None:
+    def planned_controls(self, xp, theta):
         return None if self.feeds_back else theta[None, 3:4] + xp.zeros((self.horizon, 1, 1))
 
-    def stage_cost(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
+    def stage_cost(self, xp, q, v, u):
         return 0.1 * (q[4] * q[9] + v[3] * v[3] + u[0] * u[0])
 
-    def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
+    def terminal_cost(self, xp, q, v):
         return q[0] * q[0] + q[3] * q[5] + q[8] + v[4] * v[7] + q[11] * q[11]
 
-    def mjcf(self) -> str:
+    def mjcf(self):
         return """
             <option gravity="0 0 -9.81"/>
             <worldbody>
@@ -75,14 +73,14 @@ class Steered(Tumbling):
     feeds_back: ClassVar[bool] = True
 
 
-def problem(scene: Any, backend: str = "mujoco", **values: Any) -> Problem:
+def problem(scene, backend="mujoco", **values):
     law = Penalty(stiffness=2000.0, damping=10.0, damping_mode="clipped")
     made = registry.make("backends", backend, values or None)
     assert made.incompatibility(compose(scene, law, SemiImplicitEuler())) is None
     return made.compile(compose(scene, law, SemiImplicitEuler()))
 
 
-def difference_gradient(p: Problem, w: np.ndarray, h: float = 1e-6) -> np.ndarray:
+def difference_gradient(p, w, h=1e-6):
     theta = p.program.theta0
     return np.stack([(p.value(theta + h * e, w) - p.value(theta - h * e, w)) / (2 * h) for e in np.eye(p.dim)])
 

@@ -32,7 +32,7 @@ class Dropped(SampleMean):
 
 
 @pytest.fixture(scope="module")
-def tree(tmp_path_factory) -> Tree:
+def tree(tmp_path_factory):
     made = Tree(tmp_path_factory.mktemp("plugins"))
     made.add("plugins/estimators/half_step.py", ESTIMATOR.format(name="half_step", requires=""))
     made.add("plugins/estimators/broken.py", "import no_such_module_at_all\n")
@@ -48,14 +48,14 @@ def tree(tmp_path_factory) -> Tree:
 
 
 @pytest.fixture(scope="module")
-def listing(tree) -> str:
+def listing(tree):
     done = tree.run("list")
     assert done.returncode == 0, done.stderr
     return done.stdout
 
 
 @pytest.fixture(scope="module")
-def rows(tree) -> pd.DataFrame:
+def rows(tree):
     """A run of a dropped, a third-party and an unavailable plugin beside a built-in one."""
     done = tree.run(
         "scenes=[quadratic]", "backends=[numpy]", "estimators=[fobg,half_step,third_name,absent]",
@@ -65,7 +65,7 @@ def rows(tree) -> pd.DataFrame:
     return pd.read_parquet(tree.root / "out" / "mine" / "rows.parquet").set_index("estimator")
 
 
-def entry_of(listing: str, name: str) -> str:
+def entry_of(listing, name):
     """The lines about one plugin in the output of ``list``."""
     lines = listing.splitlines()
     start = next(i for i, line in enumerate(lines) if line.startswith(f"  {name} "))

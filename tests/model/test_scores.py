@@ -5,8 +5,7 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
-from bench.plugins.backends.numpy import Numpy
-from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
+from classes import Numpy, SemiImplicitEuler
 
 import bench
 from bench.conformance.kit import Skipped

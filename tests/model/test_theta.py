@@ -4,23 +4,25 @@ import dataclasses
 
 import numpy as np
 import pytest
-from bench.plugins.backends.jax import Jax
-from bench.plugins.backends.numpy import Numpy
-from bench.plugins.backends.torch import Torch
-from bench.plugins.contacts.complementarity import Complementarity
-from bench.plugins.contacts.impulse import Impulse
-from bench.plugins.contacts.penalty import Penalty
-from bench.plugins.contacts.softplus import Softplus
-from bench.plugins.integrators.implicit_euler import ImplicitEuler
-from bench.plugins.integrators.rk4 import Rk4
-from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
-from bench.plugins.scenes.bouncing_ball import BouncingBall
-from bench.plugins.scenes.cartpole import Cartpole
-from bench.plugins.scenes.heaviside import Heaviside
-from bench.plugins.scenes.hopper import Hopper
-from bench.plugins.scenes.mass_spring import MassSpring
-from bench.plugins.scenes.pushing import Pushing
-from bench.plugins.scenes.quadratic import Quadratic
+from classes import (
+    BouncingBall,
+    Cartpole,
+    Complementarity,
+    Heaviside,
+    Hopper,
+    ImplicitEuler,
+    Impulse,
+    Jax,
+    MassSpring,
+    Numpy,
+    Penalty,
+    Pushing,
+    Quadratic,
+    Rk4,
+    SemiImplicitEuler,
+    Softplus,
+    Torch,
+)
 
 from bench.errors import UserError
 from bench.measure.reference import certify
@@ -183,11 +185,6 @@ def test_theta0_moves_where_gradients_are_taken():
     w = np.zeros((5, 1))
     own, there = (Jax().compile(program).grad(program.theta0, w)[:, 0] for program in (compose(scene), moved))
     assert there / own == pytest.approx(moved.theta0 / scene.theta0())
-
-
-def test_theta0_of_named_parameters_is_their_value():
-    assert program_of(*CASES["pushing"]).theta0.tolist() == [0.1, 1000.0]
-    assert program_of(*CASES["pushing at"]).theta0.tolist() == [700.0, 0.2]
 
 
 def test_rollout_of_named_parameters_shows_their_states():

@@ -11,8 +11,6 @@ pytest.importorskip("jax")
 
 from bench.plugins.backends.checkpointed import _nested
 
-SAME = 1e-12
-"""Relative difference allowed from JAX, which adds the same terms in another order."""
 BATCH = 256
 """Rollouts, so that the states dominate the memory."""
 ORDERS = {0: 1.0, 1: 1.0, 2: 1 / 2, 3: 1 / 3}
@@ -35,15 +33,6 @@ def problem(horizon, backend="checkpointed", scene="cartpole", **values):
 def gradient(one):
     w = np.random.default_rng(0).standard_normal((one.program.n_noise, 3))
     return one.grad(one.program.theta0, w)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("horizon", [pytest.param(1, marks=pytest.mark.slow), 7])
-def test_the_gradient_is_that_of_jax_at_every_number_of_levels(horizon):
-    expected = gradient(problem(horizon, "jax"))
-    for levels in (1, 2, 3):
-        found = gradient(problem(horizon, levels=levels))
-        np.testing.assert_allclose(found, expected, rtol=SAME, atol=SAME * abs(expected).max())
 
 
 @pytest.mark.parametrize("levels", ORDERS)

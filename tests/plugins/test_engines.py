@@ -9,24 +9,26 @@ import numpy as np
 import pandas as pd
 import pytest
 from bench.plugins.backends import mujoco
-from bench.plugins.backends.jax import Jax
-from bench.plugins.backends.mjx import Mjx
-from bench.plugins.backends.mujoco import Mujoco
-from bench.plugins.backends.numpy import Numpy
-from bench.plugins.contacts.complementarity import Complementarity
-from bench.plugins.contacts.penalty import Penalty
-from bench.plugins.estimators.fobg import Fobg
-from bench.plugins.integrators.rk4 import Rk4
-from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
-from bench.plugins.scenes.bounce_once import BounceOnce
-from bench.plugins.scenes.bouncing_ball import BouncingBall
-from bench.plugins.scenes.double_pendulum import DoublePendulum
-from bench.plugins.scenes.hopper import Hopper
-from bench.plugins.scenes.pendulum import Pendulum
-from bench.plugins.scenes.pushing import Pushing
-from bench.plugins.scenes.quadruped import Quadruped
-from bench.plugins.scenes.tossed_box import TossedBox
-from bench.plugins.scenes.wall_penalty_1d import WallPenalty1d
+from classes import (
+    BounceOnce,
+    BouncingBall,
+    Complementarity,
+    DoublePendulum,
+    Fobg,
+    Hopper,
+    Jax,
+    Mjx,
+    Mujoco,
+    Numpy,
+    Penalty,
+    Pendulum,
+    Pushing,
+    Quadruped,
+    Rk4,
+    SemiImplicitEuler,
+    TossedBox,
+    WallPenalty1d,
+)
 
 from bench.cli import main
 from bench.conformance import backends, scenes

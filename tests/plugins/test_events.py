@@ -6,18 +6,20 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from bench.plugins.backends.torch import Torch
-from bench.plugins.contacts.impulse import Impulse
-from bench.plugins.contacts.penalty import Penalty
-from bench.plugins.estimators.boundary import Boundary
-from bench.plugins.estimators.fobg import Fobg
-from bench.plugins.estimators.stochastic_derivative import StochasticDerivative
-from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
-from bench.plugins.scenes.coin_walk import CoinWalk
-from bench.plugins.scenes.cubic import Cubic
-from bench.plugins.scenes.heaviside import Heaviside
-from bench.plugins.scenes.ledge import Ledge
-from bench.plugins.scenes.pushing import Pushing
+from classes import (
+    Boundary,
+    CoinWalk,
+    Cubic,
+    Fobg,
+    Heaviside,
+    Impulse,
+    Ledge,
+    Penalty,
+    Pushing,
+    SemiImplicitEuler,
+    StochasticDerivative,
+    Torch,
+)
 from scipy import stats
 
 from bench.model import Decision, DisturbedScene, Events, EventScene, FunctionScene, compose, half_spaces
@@ -164,21 +166,6 @@ def test_the_closed_form_of_the_walk_is_the_sum_over_all_walks():
     expected = walk_by_enumeration(scene, scene.theta0())
     expected[0] += 2 * scene.effort * scene.push
     np.testing.assert_allclose(scene.closed_form_gradient(None, None), expected, rtol=1e-9)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("scene", "estimator"),
-    [
-        (CoinWalk(pull=-0.2, sigma=0.4), StochasticDerivative()),
-        (CoinWalk(push=-0.5, goal=-6.0), StochasticDerivative()),
-        pytest.param(CoinWalk(pull=-0.2, sigma=0.4), Boundary(), marks=pytest.mark.slow),
-        pytest.param(CoinWalk(push=-0.5, goal=-6.0), Boundary(), marks=pytest.mark.slow),
-    ],
-    ids=str,
-)
-def test_events_in_a_row_are_unbiased(scene, estimator):
-    assert agrees(estimates(estimator, scene, repeats=3000), scene.closed_form_gradient(None, None))
 
 
 # ------------------------------------------------------------------------------------------------- refusals

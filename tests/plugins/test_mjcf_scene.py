@@ -18,6 +18,7 @@ PENDULUM = """
 <mujoco>
   <option timestep="0.01"/>
   <worldbody>
+    <geom type="plane" pos="0 0 -5" size="1 1 1"/>
     <body><joint name="hinge" type="hinge" axis="0 1 0" damping="{damping}"/>
       <geom type="capsule" fromto="0 0 0 0 0 -0.5" size="0.02" mass="1"/></body>
   </worldbody>
@@ -31,7 +32,7 @@ def observation(xp, q, v):
 
 
 def stage_cost(xp, q, v, u):
-    return q[0] ** 2 + 0.01 * u[0] ** 2
+    return q[0] ** 2 + 0.01 * xp.sum(u * u, axis=0)
 """
 
 
@@ -67,7 +68,10 @@ def test_costs_are_those_of_a_loop_over_mujoco(pendulum):
     assert given.value(theta, w)[0] == pytest.approx(total, rel=1e-12)
 
 
-@pytest.mark.parametrize("values", [{}, {"policy": "mlp[hidden=4]"}, {"noise": "parameter"}])
+@pytest.mark.parametrize(
+    "values",
+    [{}, {"policy": "mlp[hidden=4]"}, {"noise": "parameter"}, {"noise": "parameter", "theta": "velocity"}],
+)
 def test_gradients_are_differences_of_the_cost(values):
     given = problem(**values)
     theta, w = given.program.theta0, drawn(given)
@@ -134,9 +138,48 @@ def test_a_broken_model_is_named(pendulum):
         problem(pendulum)
 
 
-def test_one_solver_iteration_of_mjx_is_refused():
-    with pytest.raises(bench.Unsupported, match=r"use mjx\[iterations=20\]"):
-        problem(backend="mjx")
+ELLIPTIC = {"<option": '<option cone="elliptic"'}
+PASSIVE = {'<motor joint="hinge"/>': "", 'ctrl="0.2"': 'qvel="0.3"'}
+
+
+def changed(file, changes):
+    for old, new in changes.items():
+        file.write_text(file.read_text().replace(old, new))
+    return file
+
+
+@pytest.mark.parametrize(
+    ("changes", "backend", "reason"),
+    [
+        ({}, "mjx", r"use mjx\[iterations=20\]"),
+        ({}, "mjx[derivative=unrolled]", r"use mjx\[iterations=20\]"),
+        ({}, "mjx[iterations=5,derivative=unrolled,mode=reverse]", "no reverse mode with iterations=5"),
+        ({}, "mjx[iterations=5,cone=elliptic]", "cone=elliptic would have no effect"),
+        ({}, "mujoco[impedance=0.5]", "impedance=0.5 would have no effect"),
+        (ELLIPTIC | {"<geom": '<geom condim="1"'}, "mjx[iterations=5]", "use pyramidal cones"),
+        (ELLIPTIC, "mjx[iterations=5,derivative=unrolled]", "NaN with elliptic friction cones"),
+    ],
+)
+def test_what_an_engine_cannot_do_with_a_file_is_named(pendulum, changes, backend, reason):
+    with pytest.raises(bench.Unsupported, match=reason):
+        problem(changed(pendulum, changes), backend)
+
+
+def test_a_file_without_actuators_has_velocities_as_theta(pendulum):
+    file = changed(pendulum, PASSIVE)
+    with pytest.raises(UserError, match="no actuators for a policy: use theta=velocity"):
+        problem(file)
+    given = problem(file, theta="velocity", noise="parameter")
+    assert np.isfinite(given.grad(given.program.theta0, drawn(given))).all()
+    assert given.program.theta0 == 0.3
+
+
+def test_small_batches_of_mjx_compute_no_padding_columns(pendulum, monkeypatch):
+    given, widths = problem(pendulum, "mjx[iterations=5]"), []
+    monkeypatch.setattr(given, "_grad", lambda theta, w: widths.append(w.shape[1]) or np.zeros((3, w.shape[1])))
+    for count in (1, 3, 20):
+        given.grad(given.program.theta0, drawn(given, count))
+    assert sorted(widths) == [1, 1, 1, 1, 16, 16]
 
 
 @pytest.mark.slow

@@ -2,13 +2,8 @@
 
 import numpy as np
 import pytest
-from bench.plugins.backends.numpy import Numpy
 from bench.plugins.estimators.total_propagation import TotalPropagation, _weight
-from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
-from bench.plugins.scenes.bouncing_ball import BouncingBall
-from bench.plugins.scenes.cartpole import Cartpole
-from bench.plugins.scenes.double_integrator import DoubleIntegrator
-from bench.plugins.scenes.pushing import Pushing
+from classes import BouncingBall, Cartpole, DoubleIntegrator, Numpy, Pushing, SemiImplicitEuler
 
 from bench.model import by_actions, by_theta, compose, slopes
 

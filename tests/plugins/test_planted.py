@@ -4,14 +4,12 @@ import math
 
 import numpy as np
 import pytest
-from bench.plugins.estimators.fobg import Fobg
 from bench.plugins.estimators.planted import Planted, direction
-from bench.plugins.scenes.heaviside import Heaviside
-from bench.plugins.scenes.quadratic import Quadratic
+from classes import Fobg, Heaviside, Quadratic
+from dose_response.measure import compare
 from scipy.stats import f, kstest
 
 import bench
-from bench.studies.dose_response.measure import compare
 
 ROUNDING = 1e-12
 """Relative rounding of sums of 20 numbers."""
@@ -86,11 +84,6 @@ def test_errors_relative_to_the_start_grow_as_the_gradient_falls():
     np.testing.assert_allclose(found, 0.5 * np.linalg.norm(exact[0]) * direction(D), rtol=1e-7)
 
 
-def test_without_an_error_it_equals_fobg():
-    p, w = problem(), drawn()
-    np.testing.assert_array_equal(Planted().estimate(p, p.program.theta0, w), Fobg().estimate(p, p.program.theta0, w))
-
-
 def test_best_gradient_of_a_jump_comes_from_costs():
     p = problem(Heaviside())
     w = drawn(repeats=8, samples=4000, width=1)
@@ -104,9 +97,3 @@ def test_rotation_of_one_coordinate_is_refused():
     reason = Planted(angle=30.0).unsupported_reason(problem(Heaviside()).program)
     assert reason is not None
     assert "at least 2 coordinates" in reason
-
-
-def test_noise_without_samples_left_for_the_base_is_an_error():
-    p = problem()
-    with pytest.raises(ValueError, match="needs 2 samples, got 1"):
-        Planted(noise=1.0).estimate(p, p.program.theta0, drawn(samples=1))

@@ -7,15 +7,12 @@ import numpy as np
 import pytest
 from bench.plugins.scenes.cartpole_swing import CartpoleSwing
 
-import bench
 from bench.errors import UserError
 from bench.experiment.by_name import compile_problem, make
 from bench.measure import noise
 from bench.model import LoopOps, State, adjoint_gradient, slopes
 from bench.model.policy import policy_of, uniform
 
-REVERSED = 1e-9
-"""Relative difference of gradients by one reverse pass and step by step: rounding over 30 steps."""
 DIFFERENCED = 1e-6
 """Relative error of central differences of the cost, whose steps are 1e-6."""
 
@@ -89,16 +86,6 @@ def test_the_adjoint_without_jax_takes_differences(monkeypatch):
     assert np.abs(by_differences - by_product).max() < DIFFERENCED * np.abs(by_product).max()
 
 
-@pytest.mark.slow
-def test_a_long_theta_has_blocks_of_few_columns(monkeypatch):
-    usual = problem(horizon=5)
-    theta, w = usual.program.theta0, sample(usual, 11)
-    monkeypatch.setattr("bench.plugins.backends.jax.LARGE", usual.dim)
-    long = problem(horizon=5)
-    assert (long.grain, long.block) == (8, 8)
-    assert long.grad(theta, w) == pytest.approx(usual.grad(theta, w), rel=REVERSED)
-
-
 def test_the_adjoint_keeps_no_copy_of_theta_for_each_step():
     long = problem("mlp[hidden=64x64]")
     theta, w = long.program.theta0, sample(long)
@@ -165,14 +152,3 @@ def test_energy_is_kept_without_force():
     for _ in range(60):
         state = program.step(LoopOps(), state, np.zeros((1, 1)))
     assert energy(*state) == pytest.approx(before, rel=1e-4)  # 24,000 steps of first order
-
-
-@pytest.mark.slow
-def test_policies_are_swept(tmp_path):
-    rows = bench.run(
-        name="policies", scenes=["cartpole_swing[horizon=20]"], backends=["jax"], estimators=["fobg"],
-        sweep={"policy": ["linear", "mlp[hidden=[8]]"]}, samples=4, repeats=4, timing=False, results_dir=tmp_path,
-        reference={"samples": 256},
-    )  # fmt: skip
-    assert rows.status.tolist() == ["ok", "ok"]
-    assert sorted(rows.dim) == [6, 57]

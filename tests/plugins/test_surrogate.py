@@ -2,20 +2,22 @@
 
 import numpy as np
 import pytest
-from bench.plugins.backends.implicit import Implicit
-from bench.plugins.backends.jax import Jax
-from bench.plugins.backends.numpy import Numpy
-from bench.plugins.backends.torch import Torch
-from bench.plugins.contacts.complementarity import Complementarity
-from bench.plugins.contacts.penalty import Penalty
-from bench.plugins.contacts.softplus import Softplus
-from bench.plugins.contacts.straight_through import StraightThrough
-from bench.plugins.contacts.surrogate_backward import SurrogateBackward
-from bench.plugins.estimators.control_variate import ControlVariate
-from bench.plugins.estimators.fobg import Fobg
-from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
-from bench.plugins.scenes.billiard import Billiard
-from bench.plugins.scenes.bounce_once import BounceOnce
+from classes import (
+    Billiard,
+    BounceOnce,
+    Complementarity,
+    ControlVariate,
+    Fobg,
+    Implicit,
+    Jax,
+    Numpy,
+    Penalty,
+    SemiImplicitEuler,
+    Softplus,
+    StraightThrough,
+    SurrogateBackward,
+    Torch,
+)
 
 import bench
 from bench.measure.reference import certify

@@ -2,19 +2,21 @@
 
 import numpy as np
 import pytest
-from bench.plugins.backends.numpy import Numpy
-from bench.plugins.contacts.penalty import Penalty
-from bench.plugins.estimators.alpha_order import AlphaOrder
-from bench.plugins.estimators.clipped import Clipped
-from bench.plugins.estimators.control_variate import ControlVariate
-from bench.plugins.estimators.inverse_variance import InverseVariance
-from bench.plugins.estimators.measure_valued import MeasureValued
-from bench.plugins.estimators.reinforce import Reinforce
-from bench.plugins.estimators.sphere_smoothing import SphereSmoothing
-from bench.plugins.estimators.total_propagation import TotalPropagation
-from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
-from bench.plugins.scenes.cubic import Cubic
-from bench.plugins.scenes.two_balls import TwoBalls
+from classes import (
+    AlphaOrder,
+    Clipped,
+    ControlVariate,
+    Cubic,
+    InverseVariance,
+    MeasureValued,
+    Numpy,
+    Penalty,
+    Reinforce,
+    SemiImplicitEuler,
+    SphereSmoothing,
+    TotalPropagation,
+    TwoBalls,
+)
 from scipy.special import ndtri
 
 from bench.model import compose

@@ -2,11 +2,7 @@
 
 import numpy as np
 import pytest
-from bench.plugins.backends.numpy import Numpy
-from bench.plugins.estimators.fobg import Fobg
-from bench.plugins.estimators.windowed import Windowed
-from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
-from bench.plugins.scenes.static_gain import StaticGain
+from classes import Fobg, Numpy, SemiImplicitEuler, StaticGain, Windowed
 
 import bench
 from bench.model import adjoint_gradient, compose, slopes
@@ -26,12 +22,9 @@ def numpy_problem(scene):
 @pytest.mark.parametrize(
     "problem",
     [
-        bench.problem("pendulum_swing[horizon=12]", backend="numpy"),
         bench.problem("cartpole[horizon=12]", backend="numpy"),
-        bench.problem("cartpole[horizon=12,noise=parameter]", backend="numpy"),
         bench.problem("static_gain[noise=action]", backend="numpy"),
         bench.problem("pushing[horizon=12]", contact="softplus[beta=100]", backend="numpy"),
-        bench.problem("ground_wall[horizon=12]", backend="numpy"),
         bench.problem("friction_block[horizon=12]", backend="numpy"),
     ],
     ids=lambda problem: problem.program.scene.name,

@@ -1,11 +1,11 @@
 """The logistic map: a record of chaos, whose rate has more local minima of the fit the longer the windows are."""
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
-from bench.model import Array, Identified, MechanicalScene, State, param
+from bench.model import Identified, MechanicalScene, State, param
 
 
 @dataclass(frozen=True)
@@ -30,22 +30,22 @@ class LogisticMap(Identified, MechanicalScene):
     rate: float = param(3.78, "factor of x (1 - x)", "1/s", low=0.0, high=4.0)
     start: float = param(0.5, "x_0 at theta", low=0.0, high=1.0)
 
-    def theta0(self) -> np.ndarray:
+    def theta0(self):
         """Return (x_0,)."""
         return np.array([self.start])
 
-    def initial_state(self, xp: Any, theta: Array) -> State:
+    def initial_state(self, xp, theta):
         """Return no position and x_0 as velocity."""
         return State(theta[:0], theta)
 
-    def carried(self, v: Array) -> Array:
+    def carried(self, v):
         """Return (1 - dt) x: the decay -x over a step of explicit Euler."""
         return (1.0 - self.dt) * v
 
-    def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
+    def acceleration(self, xp, q, v, u):
         """Return rate x (1 - x)."""
         return self.rate * v * (1.0 - v)
 
-    def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
+    def terminal_cost(self, xp, q, v):
         """Return x_N."""
         return v[0]

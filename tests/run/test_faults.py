@@ -3,7 +3,6 @@
 import os
 import signal
 import subprocess
-from pathlib import Path
 
 import pandas as pd
 import pytest
@@ -162,7 +161,7 @@ BASE = ["scenes=[quadratic]", "backends=[numpy]", "samples=8", "repeats=4", "tim
 
 
 @pytest.fixture(scope="module")
-def tree(tmp_path_factory) -> Tree:
+def tree(tmp_path_factory):
     made = Tree(tmp_path_factory.mktemp("faults"))
     made.add("plugins/estimators/faults.py", FAULTS)
     return made
@@ -234,7 +233,7 @@ def test_first_failure_can_end_the_run(tree):
     assert len(pd.read_csv(tree.root / "out" / "stops" / "bias_variance.csv")) == 3
 
 
-def start(tree: Tree, *words: str) -> subprocess.Popen[str]:
+def start(tree, *words):
     environment = {**os.environ, "PYTHONPATH": str(tree.packages)}
     return subprocess.Popen(
         hearing_signals(*words),
@@ -251,7 +250,7 @@ def test_killing_a_run_leaves_rows_and_no_process(tree):
     where = "killed"
     words = [*BASE, "estimators=[fobg,hangs]", f"name={where}", "results_dir=out", "workers=1", "timeout=null"]
     process = start(tree, *words)
-    folder: Path = tree.root / "out" / where
+    folder = tree.root / "out" / where
     wait_for(lambda: list(folder.glob("pending/*.json")))
     process.send_signal(signal.SIGKILL)
     process.communicate(timeout=30)

@@ -48,7 +48,7 @@ WORDS = [
 ]  # fmt: skip
 
 
-def backend(name: str, scene: str) -> str:
+def backend(name, scene):
     return FORGETFUL.replace("NAME", name).replace("SCENE", scene)
 
 
@@ -68,7 +68,7 @@ def climbed(tmp_path_factory):
     return words, config.load(words)
 
 
-def statuses(experiment, backend) -> dict[str, str]:
+def statuses(experiment, backend):
     rows = store_of(experiment).load()
     rows = rows[rows["backend"] == backend]
     return dict(zip(rows["scene"], rows["status"], strict=True))

@@ -6,7 +6,6 @@ import os
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import pandas as pd
 import pytest
@@ -63,12 +62,12 @@ WHERE = ("stored_at", "sequence", "wall_s", "experiment")
 """Columns that say when and where a row was made."""
 
 
-def rows(folder: Path) -> pd.DataFrame:
+def rows(folder):
     table = pd.read_parquet(folder / "rows.parquet").sort_values("key").reset_index(drop=True)
     return table.drop(columns=[*WHERE])
 
 
-def bench(*words: str, **more) -> subprocess.CompletedProcess[str]:
+def bench(*words, **more):
     return subprocess.run([sys.executable, "-m", "bench", *words], capture_output=True, text=True, **more)
 
 

@@ -2,7 +2,6 @@
 
 import json
 
-import pandas as pd
 import pytest
 
 from bench.cli import main
@@ -16,7 +15,7 @@ WORDS = [
 ]  # fmt: skip
 
 
-def older(rows: pd.DataFrame, **without: str) -> list[dict]:
+def older(rows, **without):
     """Rows as older code would have stored them: under other keys, and without some parameters of plugins."""
     result = []
     for row in rows.to_dict("records"):
@@ -35,7 +34,7 @@ def stored(tmp_path):
     return store_of(config.load(words[:-1])).load()
 
 
-def planned_after(rows: list[dict], *words: str):
+def planned_after(rows, *words):
     experiment = config.load([*WORDS, *words])
     store = store_of(experiment)
     store.prepare()

@@ -30,11 +30,11 @@ from bench.studies.bias_variance.columns import COLUMNS
 TINY = ["scenes=[heaviside]", "backends=[numpy]", "estimators=[fobg]", "samples=8", "repeats=4", "timing=false"]
 
 
-def row(number: int, **values) -> dict:
+def row(number, **values):
     return COLUMNS.blank() | {"key": f"{number:032x}", "status": "ok", "bias": float(number), **values}
 
 
-def keys(store: Store) -> list[int]:
+def keys(store):
     return sorted(int(key, 16) for key in store.load()["key"])
 
 
@@ -159,11 +159,11 @@ def test_two_columns_of_one_name_are_refused(tmp_path):
 @pytest.mark.slow
 def test_writers_readers_and_compactions_side_by_side(tmp_path):
     """Four threads store and fold, one reads: what was stored stays, and is never missed for a moment."""
-    stored: set[int] = set()
-    faults: list[str] = []
+    stored = set()
+    faults = []
     done = threading.Event()
 
-    def write(writer: int) -> None:
+    def write(writer):
         store = Store(tmp_path, COLUMNS)
         for i in range(25):
             store.append(row(writer * 100 + i))
@@ -172,7 +172,7 @@ def test_writers_readers_and_compactions_side_by_side(tmp_path):
                 store.compact()
         store.compact()
 
-    def read() -> None:
+    def read():
         while not done.is_set():
             before = set(stored)
             lost = before - set(keys(Store(tmp_path, COLUMNS)))
@@ -368,22 +368,22 @@ def test_directory_that_refuses(tmp_path, capsys, monkeypatch):
 # ---------------------------------------------------------------------------------------- kills and company
 
 
-def bench(*words: str) -> subprocess.CompletedProcess[str]:
+def bench(*words):
     return subprocess.run([sys.executable, "-m", "bench", *words], capture_output=True, text=True)
 
 
-def start(*words: str) -> subprocess.Popen[bytes]:
+def start(*words):
     command = [sys.executable, "-m", "bench", *words]
     return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
 
-def sweep(cells: int) -> list[str]:
+def sweep(cells):
     sigmas = ",".join(f"{0.01 * (i + 1):.2f}" for i in range(cells // 2))
     words = [w for w in TINY if not w.startswith(("estimators", "samples"))]
     return [*words, "estimators=[fobg,reinforce]", "samples=4096", f"sweep.sigma=[{sigmas}]", "name=sweep", "workers=2"]
 
 
-def table(directory) -> pd.DataFrame:
+def table(directory):
     return pd.read_parquet(directory / "sweep" / "rows.parquet").drop(columns=["stored_at", "wall_s", "sequence"])
 
 
@@ -420,7 +420,7 @@ def test_killed_again_and_again(tmp_path, kills):
     assert bench(*words, f"results_dir={tmp_path / 'whole'}").returncode == 0
     store = Store(tmp_path / "cut" / "sweep", COLUMNS)
     dice = random.Random(0)
-    had: set[str] = set()
+    had = set()
     for _ in range(kills):
         run = start(*words, f"results_dir={tmp_path / 'cut'}")
         had_at_start = len(had)

@@ -3,7 +3,6 @@
 import itertools
 import json
 import threading
-import time
 
 import bench_self
 import jax
@@ -11,21 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from bench.plugins.backends import rows
-from bench.plugins.backends.implicit import Implicit
-from bench.plugins.backends.jax import Jax
-from bench.plugins.contacts.complementarity import Complementarity
-from bench.plugins.contacts.penalty import Penalty
-from bench.plugins.contacts.softplus import Softplus
-from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
-from bench.plugins.scenes.pushing import Pushing
+from classes import Complementarity, Jax, Penalty, Pushing, SemiImplicitEuler, Softplus
 
 from bench import cli
-from bench.errors import UserError
-from bench.experiment import config
-from bench.measure import timing
 from bench.model import Compilations, blocks, compose, registry
-from bench.run.execute import store_of
-from bench.run.plan import plan
 
 # ------------------------------------------------------------------------------------------------------------ blocks
 
@@ -39,11 +27,6 @@ def test_blocks_are_alike_and_few(most, grain, threads):
         assert size <= -(-most // grain) * grain
         assert parts * size - count < parts * grain + size
         assert parts == 1 or parts >= -(-count // most)
-
-
-def test_few_shapes_serve_all_batches():
-    shapes = {blocks.block_size(count, 1024, 128, 2) for count in range(1, 20_000, 7)}
-    assert len(shapes) <= 1024 // 128
 
 
 @pytest.mark.parametrize("threads", [1, 2, 5])
@@ -60,14 +43,6 @@ def test_blocks_cover_each_column_once(threads, own_theta):
     found = blocks.evaluate(function, theta, w, 16, threads, (2,))
     np.testing.assert_array_equal(found, w[:2] * theta)
     assert seen == [16] * 7
-
-
-def test_failure_in_a_block_is_raised():
-    def fails(theta, w):
-        raise ValueError("no")
-
-    with pytest.raises(ValueError, match="no"):
-        blocks.evaluate(fails, np.zeros((1, 1)), np.zeros((1, 50)), 10, 2, (1,))
 
 
 def test_failure_in_another_thread_is_raised():
@@ -97,8 +72,10 @@ def pushing(horizon=8, contact=None, **values):
     return compose(Pushing(horizon=horizon, **values), contact or Penalty(), SemiImplicitEuler())
 
 
-@pytest.mark.parametrize("name", ["jax", "torch", "numpy"])
+@pytest.mark.parametrize("name", ["jax", "torch", "numpy", pytest.param("fused", marks=pytest.mark.slow)])
 def test_padding_and_sharing_change_no_result(name):
+    if reason := registry.find("backends", name).reason:
+        pytest.skip(reason)
     problem = registry.make("backends", name).compile(pushing())
     w = np.random.default_rng(0).standard_normal((8, 130))
     theta = problem.program.theta0
@@ -121,10 +98,7 @@ def whole_and_by_rows(function, *arguments):
 @pytest.mark.parametrize(
     "function",
     [
-        lambda q, v: jnp.stack([v[0] - 2.0, q[1] * q[0]]) / (1.0 + q**2),
         lambda q, v: jnp.concatenate([q[1:2], v, jnp.ones((1, 5))])[::-1],
-        lambda q, v: jnp.where(q > 0, q, jnp.zeros_like(q)) + jnp.sum(v, axis=0, keepdims=True),
-        lambda q, v: q / jnp.sqrt(v[0:1] ** 2 + 1.0) + jnp.min(v, axis=0),
         lambda q, v: jnp.logaddexp(q, 0.0) @ jnp.ones((5, 5)) + jax.nn.softplus(v),
         lambda q, v: jnp.reshape(q, (-1,))[:5] + v[1] + jnp.broadcast_to(q[0], (5,)),
         lambda q, v: jax.lax.fori_loop(0, 3, lambda i, x: 0.5 * x + v, q),
@@ -136,15 +110,6 @@ def test_row_wise_evaluation_gives_the_same_numbers(function):
     for whole, split in zip(*whole_and_by_rows(function, q, v), strict=True):
         assert whole.shape == split.shape
         np.testing.assert_allclose(split, whole, rtol=1e-15)
-
-
-def test_row_wise_steps_hold_no_stack():
-    """The point of it: nothing in the step of a scene has to be put together again."""
-    problem = Jax().compile(pushing())
-    text = str(jax.make_jaxpr(problem._cost)(problem._parameters, jnp.zeros((8, 4)), jnp.zeros((8, 4))))
-    scan = text[text.index("scan[") :]
-    assert "stack" not in scan[: scan.index("length")]
-    assert "concatenate" not in scan[: scan.index("length")]
 
 
 # ------------------------------------------------------------------------------------------------------ compilations
@@ -163,23 +128,20 @@ def test_a_sweep_compiles_each_shape_once():
 
 
 @pytest.mark.slow
-def test_what_libraries_compile_while_a_program_is_traced_is_no_program():
+@pytest.mark.parametrize(
+    ("backend", "law"),
+    [
+        ("implicit", lambda k: Complementarity(stiffness=k, kappa=1e-6)),
+        ("mjx", lambda k: Penalty(stiffness=k, damping=0.0)),
+    ],
+)
+def test_what_libraries_compile_while_a_program_is_traced_is_no_program(backend, law):
+    entry = registry.find("backends", backend)
+    if not entry.available:
+        pytest.skip(entry.reason)
     compilations = Compilations()
     for stiffness in (1e2, 1e3):
-        problem = Implicit().compile(pushing(8, Complementarity(stiffness=stiffness, kappa=1e-6)))
-        problem.compilations = compilations
-        problem.grad(problem.program.theta0, np.ones((8, 20)))
-    assert compilations.made == len(compilations.shapes) == 1
-
-
-@pytest.mark.slow
-def test_mjx_compiles_once_along_stiffness():
-    pytest.importorskip("mujoco.mjx")
-    from bench.plugins.backends.mjx import Mjx
-
-    compilations = Compilations()
-    for stiffness in (1e2, 1e3):
-        problem = Mjx().compile(pushing(8, Penalty(stiffness=stiffness, damping=0.0)))
+        problem = registry.make("backends", backend).compile(pushing(8, law(stiffness)))
         problem.compilations = compilations
         problem.grad(problem.program.theta0, np.ones((8, 20)))
     assert compilations.made == len(compilations.shapes) == 1
@@ -219,37 +181,6 @@ def test_measured_compilation_is_not_taken_from_the_folder(tmp_path):
     assert made == [1, 0, 1]
 
 
-# ------------------------------------------------------------------------------------------------------------ timing
-
-
-def test_timing_repeats_fast_calls_and_keeps_the_results_asked_for():
-    called = []
-
-    def call(index):
-        called.append(index)
-        return np.array([index])
-
-    results, clock = timing.timed(call, 3, least_s=1.0, most=4)
-    assert [int(r[0]) for r in results] == [0, 1, 2]
-    assert len(called) == clock.calls == 1 + 3 * 4
-    assert called[:7] == [0, 0, 1, 2, 0, 1, 2]
-
-
-def test_slow_calls_are_made_once_each():
-
-    results, clock = timing.timed(lambda index: time.sleep(0.01) or np.zeros(1), 3, least_s=0.001)
-    assert (len(results), clock.calls) == (3, 4)
-    assert clock.median_s > 0.01
-
-
-def test_unsteady_times_are_marked():
-    from bench.report.views import unsteady
-
-    assert unsteady({"time_s": 1.0, "time_iqr_s": 0.21})
-    assert not unsteady({"time_s": 1.0, "time_iqr_s": 0.19})
-    assert not unsteady({"time_s": float("nan"), "time_iqr_s": float("nan")})
-
-
 # -------------------------------------------------------------------------------------------------------- bench_self
 
 
@@ -265,28 +196,6 @@ def test_numpy_loop_and_native_kernel_give_the_gradient():
     except native.Unavailable as error:
         pytest.skip(str(error))
     np.testing.assert_allclose(kernel(scene.theta0(), w), wanted, rtol=1e-9)
-
-
-def test_no_compiler_is_a_line_and_no_failure(monkeypatch):
-    from speed import native
-
-    monkeypatch.setattr("shutil.which", lambda name: None)
-    with pytest.raises(native.Unavailable, match="no C compiler"):
-        native.gradient(Pushing(), 1e3)
-
-
-def test_bench_self_refuses_what_it_does_not_know():
-    with pytest.raises(UserError, match="did you mean 'quick'"):
-        bench_self.main(["quik=true"])
-
-
-def test_bench_self_resumes_what_it_stored(tmp_path):
-    from speed import harness
-
-    words = [*harness.SMALL, "sweep.seed=[0,1,2]", "name=many", f"results_dir={tmp_path}"]
-    harness.store_all(config.load(words))
-    planned = plan(config.load(words), store_of(config.load(words)))
-    assert [item.stored for item in planned] == [True] * 3
 
 
 @pytest.mark.full

@@ -466,22 +466,6 @@ def test_few_seeds_or_nothing_tuned_use_all_seeds(finals):
     assert len(found.best_runs) == len(next(iter(finals.values())))
 
 
-def test_quality_along_the_path_is_summed_up_over_seeds():
-    found = searches({("one", ""): [1, 2, 3]})
-    rows = found.rows.assign(
-        path_quality_iteration=[[0, 10, 20], [0, 10, 20], [0, 12, 20]],
-        path_quality_rmse_rel=[[0.1, 0.2, 0.4], [0.1, 0.3, 0.8], [0.1, 0.4, 0.6]],
-    )
-    lines = aggregate.path_quality(aggregate.RunSet(rows, ()))
-    assert lines["iteration"].tolist() == [0, 10, 20]
-    assert lines["value"].tolist() == pytest.approx([0.1, 0.3, 0.6])
-    assert lines["low"].iloc[2] == pytest.approx(np.quantile([0.4, 0.8, 0.6], 0.2))
-    chart = shown._path_quality(aggregate.RunSet(rows, ()))
-    assert chart.frame["value"].tolist() == pytest.approx([0.1, 0.3, 0.6])
-    alone = rows.assign(path_quality_iteration=[[0]] * 3)
-    assert shown._path_quality(aggregate.RunSet(alone, ())) is None
-
-
 # ---------------------------------------------------------------------------------------------------- what is shown
 
 

@@ -63,9 +63,6 @@ class Counted(Study):
 
     def measure(self, cell, session):
         return {"status": "ok", "weight": 1.0, "outcome": "good"}
-
-    def write(self, experiment, rows):
-        return []
 '''
 
 

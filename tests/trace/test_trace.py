@@ -5,27 +5,18 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 import pytest
-from bench.plugins.backends.implicit import Implicit
-from bench.plugins.backends.jax import Jax
-from bench.plugins.contacts.complementarity import Complementarity
-from bench.plugins.contacts.impulse import Impulse
-from bench.plugins.contacts.penalty import Penalty
-from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
-from bench.plugins.scenes.bounce_once import BounceOnce
-from bench.plugins.scenes.cartpole import Cartpole
-from bench.plugins.scenes.pushing import Pushing
+from classes import BounceOnce, Complementarity, Implicit, Impulse, Jax, Penalty, Pushing, SemiImplicitEuler
 
 from bench.cli import main
 from bench.experiment import config
 from bench.experiment.grid import cells
 from bench.measure import noise
-from bench.measure.contacts import active_contacts, engine_contacts, split
-from bench.model import Decision, FrictionScene, Jacobians, LoopOps, Unsupported, compose
-from bench.trace.adjoints import adjoints
+from bench.measure.contacts import active_contacts, engine_contacts
+from bench.model import Decision, FrictionScene, Unsupported, compose
 from bench.trace.chart import chart
 from bench.trace.equations import Newton
 from bench.trace.sentences import report, verdict
-from bench.trace.spikes import align, changes, spikes
+from bench.trace.spikes import align
 from bench.trace.trace import COLUMNS, Trace, run, trace
 
 
@@ -44,32 +35,6 @@ def drawn(problem, seed=3):
 def test_adjoints_give_the_programs_gradient_through_solved_steps():
     problem = compiled(Pushing(), Complementarity(stiffness=1e3), Implicit())
     assert trace(problem, drawn(problem))[1] < 1e-9
-
-
-@pytest.mark.slow
-def test_adjoint_of_every_state_is_the_slope_of_the_cost_to_go():
-    problem = compiled(Cartpole())
-    w = drawn(problem)
-    program, scene = problem.program, problem.program.scene
-    path = Jacobians(*(part[..., 0] for part in problem.jacobians(scene.theta0(), w)))
-    adjoint, _ = adjoints(program, scene.theta0(), w, path)
-    ops = LoopOps()
-    theta, _, scanned = program.start(ops, scene.theta0()[:, None], w)
-
-    def cost_to_go(k, x):
-        state, cost = split(scene, x[:, None]), 0.0
-        for t in range(k, scene.horizon):
-            u = program.control(ops, theta, state, tuple(part[t] for part in scanned))
-            cost = cost + scene.stage_cost(np, *state, u)
-            state = program.step(ops, state, u)
-        return float((cost + scene.terminal_cost(np, *state))[0])
-
-    step = 1e-5
-    for k in (0, 17, scene.horizon):
-        shifts = step * np.eye(4)
-        slope = [(cost_to_go(k, path.states[k] + s) - cost_to_go(k, path.states[k] - s)) / (2 * step) for s in shifts]
-        # Central differences of a cost of about 1: truncation and rounding both near 1e-10.
-        np.testing.assert_allclose(adjoint[k], slope, rtol=1e-7, atol=1e-8)
 
 
 @pytest.mark.slow
@@ -276,29 +241,6 @@ def test_spikes_away_from_switches_do_not():
 def test_one_spike_among_many_switches_is_left_open():
     said = verdict(planted(spike_at=(30,), switch_at=range(10, 90, 5)))
     assert "chance could explain it" in said[1]
-
-
-def test_no_switch_is_said():
-    assert all("no contact switches" in line for line in verdict(planted(spike_at=(30,))))
-
-
-def test_by_chance_the_p_value_is_honest():
-    """Spikes and switches drawn apart from each other: p <= 0.05 in at most 5% of the cases, within 3 standard errors."""
-    random = np.random.default_rng(0)
-    cases, low = 1000, 0
-    for _ in range(cases):
-        spiked = random.choice(np.arange(1, 100), 6, replace=False)
-        switched = random.choice(np.arange(1, 100), 8, replace=False)
-        table = planted(spiked, switched)
-        low += align(table["adjoint_norm"], table["switch"]).p_value <= 0.05
-    assert low / cases <= 0.05 + 3 * np.sqrt(0.05 * 0.95 / cases)
-
-
-def test_changes_and_spikes():
-    np.testing.assert_allclose(changes([1.0, 2.0, 1.0, 0.0, np.inf, np.nan]), [np.log(2), np.log(2), 0, 0, 0])
-    rising = [1.0] * 10 + [5.0, 50.0, 200.0] + [200.0] * 40
-    assert list(np.flatnonzero(spikes(rising))) == [10]
-    assert not spikes(np.exp(0.5 * np.arange(50))).any()
 
 
 # --------------------------------------------------------------------------------------------------------- command

@@ -7,6 +7,7 @@ import pytest
 
 from bench.experiment.by_name import make
 from bench.model import compose
+from bench.studies.train.measure import slope_errors
 from bench.training.environment import Environment
 from bench.training.run import Training
 
@@ -84,7 +85,4 @@ def test_a_transition_is_that_of_mujoco_with_bounded_controls(ball):
 def test_the_gradient_of_a_window_is_its_derivative(ball):
     run = Training(ball[1], make("trainers", "shac[hidden=4,steps=400,rollouts=4,window=5,passes=2,batches=2]"))
     state = run.start(0)
-    gradient = run.gradient(state, 1)
-    step = 1e-5 * gradient / np.linalg.norm(gradient)
-    slope = (run.mean_return(state, 1, step) - run.mean_return(state, 1, -step)) / 2e-5
-    assert slope == pytest.approx(np.linalg.norm(gradient), rel=1e-5)
+    assert max(slope_errors(run, state)) < 1e-4

@@ -4,15 +4,21 @@ import os
 import pickle
 import subprocess
 import sys
+from dataclasses import dataclass
 
+import equinox
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
+from bench.plugins.trainers.shac import Shac
 from problems import Untouched, cartpole_program, pressed_program
 from trees import ROOT
 
 from bench.model import Answer, registry
+from bench.studies.train.measure import slope_errors
+from bench.studies.train.verdicts import DISAGREES
 from bench.training.agreement import cosine
 from bench.training.environment import Environment
 from bench.training.networks import Actor
@@ -86,6 +92,42 @@ def test_the_first_step_of_sep_cma_es_is_the_diagonal_of_that_of_cma_es():
     assert float(after.sigma) == pytest.approx(expected["sigma"], rel=1e-9)
     change = np.diag(expected["covariance"]) - 1.0
     np.testing.assert_allclose(after.variance - 1.0, change * (state.theta.size + 2) / 3, rtol=1e-6, atol=1e-9)
+
+
+WRONG = {
+    "none": lambda g: g,
+    "sign": lambda g: -g,
+    "ten times": lambda g: 10.0 * g,
+    "noise": lambda g: jnp.linalg.norm(g) / g.size**0.5 * jax.random.normal(jax.random.PRNGKey(0), g.shape),
+    "half of the units": lambda g: g.at[::2].set(0.0),
+    "nothing": jnp.zeros_like,
+}
+
+
+@dataclass(frozen=True)
+class Planted(Shac):
+    """SHAC whose second layer of weights moves along a wrong gradient."""
+
+    fault: str = "none"
+
+    def actor_optimizer(self, env):
+        def place(actor):
+            return actor.mean.weights[1]
+
+        plant = optax.stateless(lambda g, _: equinox.tree_at(place, g, WRONG[self.fault](place(g))))
+        return optax.chain(plant, super().actor_optimizer(env))
+
+
+@pytest.mark.parametrize(
+    "fault", [fault if fault == "noise" else pytest.param(fault, marks=pytest.mark.slow) for fault in WRONG]
+)
+def test_a_layer_that_moves_along_a_wrong_gradient_is_named(fault):
+    env = Environment(cartpole_program(horizon=12, substeps=1), registry.make("backends", "jax").ops())
+    exact = Training(env, Planted(**TRAINERS["shac"], fault=fault))
+    errors = np.array(slope_errors(exact, exact.start(0)))
+    is_second = np.arange(errors.size) == 1
+    assert (errors[~is_second] < 1e-4).all()
+    assert (errors[is_second] > DISAGREES).all() == (fault != "none")
 
 
 @pytest.mark.slow

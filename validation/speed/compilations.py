@@ -1,10 +1,6 @@
 """Counts compilations in a sweep over parameters that do not change array shapes."""
 
-from __future__ import annotations
-
 import itertools
-from collections.abc import Iterator, Mapping
-from typing import Any
 
 from bench.model import Compilations
 from speed.rollouts import batch, problem
@@ -14,7 +10,7 @@ FACTORS = (0.5, 1.0, 2.0)
 """Factors by which each parameter is multiplied."""
 
 
-def count_compilations(settings: Mapping[str, Any]) -> Iterator[SpeedRow]:
+def count_compilations(settings):
     """Yield one row: the number of programs that a sweep compiles, with the number of distinct shapes as target."""
     backend, swept = settings["subjects"][0]["backend"], settings["sweep"]
     points = list(itertools.product(FACTORS, repeat=len(swept["parameters"])))

@@ -1,16 +1,12 @@
 """Times the harness: planning, resuming, listing, and the overhead per cell."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 from bench.experiment import config
-from bench.experiment.experiment import Experiment
 from bench.experiment.grid import cells
 from bench.run.execute import store_of
 from bench.run.plan import plan
@@ -24,7 +20,7 @@ CELLS, QUICK_CELLS = 500, 40
 SMALL = ("scenes=[quadratic]", "backends=[numpy]", "estimators=[fobg]", "samples=16", "repeats=4")
 
 
-def measure_commands(quick: bool) -> Iterator[SpeedRow]:
+def measure_commands(quick):
     """Time the commands of the harness, each in a separate process, as for a user."""
     with tempfile.TemporaryDirectory() as folder:
         side = QUICK_SIDE if quick else SIDE
@@ -45,7 +41,7 @@ def measure_commands(quick: bool) -> Iterator[SpeedRow]:
         yield _overhead_per_cell(Path(folder), QUICK_CELLS if quick else CELLS)
 
 
-def store_all(experiment: Experiment) -> None:
+def store_all(experiment):
     """Store a row for every cell of an experiment, so that its plan has nothing to run."""
     store = store_of(experiment)
     store.prepare()
@@ -54,11 +50,11 @@ def store_all(experiment: Experiment) -> None:
     assert all(item.stored for item in plan(experiment, store)), "stored cells are planned again"
 
 
-def _range_text(count: int, start: int = 0) -> str:
+def _range_text(count, start=0):
     return ",".join(map(str, range(start, start + count)))
 
 
-def _fastest_call(*words: str, calls: int = 3) -> float:
+def _fastest_call(*words, calls=3):
     seconds = []
     for _ in range(calls):
         started = time.perf_counter()
@@ -68,7 +64,7 @@ def _fastest_call(*words: str, calls: int = 3) -> float:
     return min(seconds)
 
 
-def _overhead_per_cell(folder: Path, count: int) -> SpeedRow:
+def _overhead_per_cell(folder, count):
     """Return the time per cell [ms] between the first and the last stored cell, without the time of their estimates."""
     words = [*SMALL, f"sweep.seed=[{_range_text(count)}]", "name=overhead", f"results_dir={folder}"]
     subprocess.run([sys.executable, "-m", "bench", *words], check=True, capture_output=True)

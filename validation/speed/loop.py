@@ -1,13 +1,9 @@
 """The gradient of `pushing` as a plain NumPy loop with a hand-written adjoint, as a baseline."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import numpy as np
 
 
-def gradient(scene: Any, stiffness: float, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+def gradient(scene, stiffness, theta, w):
     """Return df/dtheta ``(T, B)`` with the penalty spring and semi-implicit Euler, for ``theta (T,)``, ``w (T, B)``."""
     h, h_over_m, c, s = scene.dt, scene.dt / scene.mass, scene.velocity_factor, scene.speed
     goal, weight = np.array([[1.0], [2.0]]), np.array([[0.1], [10.0]])
@@ -21,7 +17,7 @@ def gradient(scene: Any, stiffness: float, theta: np.ndarray, w: np.ndarray) -> 
         x = x + h * v
     rest = np.array([[s], [0.0]])
     a, b = 2.0 * weight * (x - goal), 0.2 * (v - rest)
-    result: np.ndarray = np.empty_like(u)
+    result = np.empty_like(u)
     for t in range(len(u) - 1, -1, -1):
         x, v = states[t]
         d = b + h * a

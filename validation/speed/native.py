@@ -1,14 +1,10 @@
 """The native baseline: a fused C loop with a hand-written adjoint, compiled by the system's compiler."""
 
-from __future__ import annotations
-
 import ctypes
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -28,7 +24,7 @@ class Parameters(ctypes.Structure):
     _fields_ = [(name, ctypes.c_double) for name in ("dt", "mass", "factor", "speed", "sigma", "stiffness")]
 
 
-def gradient(scene: Any, stiffness: float) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+def gradient(scene, stiffness):
     """Return the function from ``theta (T,)`` and ``w (T, B)`` to df/dtheta ``(T, B)``. Raises :class:`Unavailable`."""
     library = _library()
     values = Parameters(scene.dt, scene.mass, scene.velocity_factor, scene.speed, scene.sigma, stiffness)
@@ -36,7 +32,7 @@ def gradient(scene: Any, stiffness: float) -> Callable[[np.ndarray, np.ndarray],
     size = ctypes.c_size_t
     library.pushing.argtypes = [ctypes.POINTER(Parameters), size, size, pointer, pointer, pointer, pointer]
 
-    def call(theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+    def call(theta, w):
         steps, batch = w.shape
         cost, result = np.empty(batch), np.empty((steps, batch))
         if library.pushing(ctypes.byref(values), steps, batch, theta, np.ascontiguousarray(w), cost, result):
@@ -46,7 +42,7 @@ def gradient(scene: Any, stiffness: float) -> Callable[[np.ndarray, np.ndarray],
     return call
 
 
-def _library() -> ctypes.CDLL:
+def _library():
     compiler = next(filter(None, map(shutil.which, COMPILERS)), None)
     if compiler is None:
         raise Unavailable(f"no C compiler ({', '.join(COMPILERS)}) was found")

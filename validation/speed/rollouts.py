@@ -1,18 +1,14 @@
 """Measures time and memory per rollout and gradient on each backend, in a NumPy loop and in native code."""
 
-from __future__ import annotations
-
 import math
-from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 
 from bench.experiment.by_name import compile_problem
 from bench.measure import noise, timing
-from bench.model import Problem, blocks, registry
+from bench.model import blocks, registry
 from speed import loop, native
 from speed.speed_rows import SpeedRow
 
@@ -31,9 +27,7 @@ CPU = "cpu"
 """The device of a problem without an attribute ``device``."""
 
 
-def problem(
-    settings: Mapping[str, Any], backend: str, contact: str | None, scale: Mapping[str, float] | None = None
-) -> Problem:
+def problem(settings, backend, contact, scale=None):
     """Compile the scene of the settings. ``scale`` has factors for sigma and for parameters of the contact law."""
     scene = registry.make("scenes", settings["scene"], settings["values"])
     law = None if contact is None else registry.make("contacts", contact, settings["contacts"].get(contact))
@@ -44,22 +38,22 @@ def problem(
     return compile_problem(scene, law, settings["integrator"], backend)
 
 
-def batch(compiled: Problem, count: int) -> np.ndarray:
+def batch(compiled, count):
     """Return noise ``(n_w, count)``: at most 10,000 random columns, repeated."""
     scene, width = compiled.program.scene.name, compiled.program.n_noise
     drawn = noise.shared(0, scene, 1, min(count, 10_000), width)[0].T
     return np.ascontiguousarray(np.tile(drawn, (1, -(-count // drawn.shape[1])))[:, :count])
 
 
-def timed(what: str, call: Callable[[], Any], count: int, target: float = float("nan"), note: str = "") -> SpeedRow:
+def timed(what, call, count, target=float("nan"), note=""):
     """Return the time per rollout [us] of a call that runs ``count`` rollouts."""
     _, clock = timing.timed(lambda _: call()[..., :1].copy(), 3, SECONDS, CALLS)
     return SpeedRow(what, clock.median_s / count * 1e6, "us", target, clock.spread, note)
 
 
-def measure_backends(settings: Mapping[str, Any], quick: bool) -> Iterator[SpeedRow]:
+def measure_backends(settings, quick):
     """Measure the time of every subject at every batch size, and the memory of large batches."""
-    devices: set[str] = set()
+    devices = set()
     for subject in settings["subjects"]:
         entry = registry.find("backends", subject["backend"])
         if not entry.available:
@@ -88,16 +82,16 @@ def measure_backends(settings: Mapping[str, Any], quick: bool) -> Iterator[Speed
         yield SpeedRow("rollouts on an accelerator", math.nan, "us", note="no device: every row is of the processor")
 
 
-def _caller_mb(w: np.ndarray, gradient: bool, dim: int) -> float:
+def _caller_mb(w, gradient, dim):
     """Return the memory of the noise and the result, which the caller holds, in MB of 2^20 bytes."""
     return float(w.nbytes + w.shape[1] * 8 * (dim if gradient else 1)) / 2**20
 
 
-def measure_baselines(settings: Mapping[str, Any], quick: bool) -> Iterator[SpeedRow]:
+def measure_baselines(settings, quick):
     """Measure the same gradient in a NumPy loop and in native code, which is verified against the first subject."""
     subject = settings["subjects"][0]
     compiled = problem(settings, subject["backend"], subject["contact"])
-    scene: Any = compiled.program.scene
+    scene = compiled.program.scene
     theta = compiled.program.theta0
     sizes = QUICK_SIZES if quick else SIZES
     stiffness = settings["contacts"][subject["contact"]]["stiffness"]
@@ -131,7 +125,7 @@ def measure_baselines(settings: Mapping[str, Any], quick: bool) -> Iterator[Spee
             yield SpeedRow(share, row.value / line.value, "", target, row.spread)
 
 
-def compare_backends(settings: Mapping[str, Any], quick: bool) -> Iterator[SpeedRow]:
+def compare_backends(settings, quick):
     """Measure the gradients of two backends on several scenes, and the ratio of the second time to the first."""
     chosen = settings["compared"]
     missing = [name for name in chosen["backends"] if not registry.find("backends", name).available]

@@ -1,13 +1,8 @@
 """Rows of the speed table: measured number and target, and the file that they are written to."""
 
-from __future__ import annotations
-
 import json
 import math
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
-from typing import Any
 
 from bench.run.files import make_directory, write_all
 from bench.run.record import machine
@@ -26,18 +21,18 @@ class SpeedRow:
     note: str = ""
 
     @property
-    def ratio(self) -> float:
+    def ratio(self):
         """Value over target."""
         return self.value / self.target
 
 
-def write(rows: Sequence[SpeedRow], directory: Path, load_before: list[float] | None) -> Path:
+def write(rows, directory, load_before):
     """Write ``bench_self.json``. Returns its path."""
     make_directory(directory)
     lines = [
         {name: None if isinstance(value, float) and math.isnan(value) else value for name, value in line.items()}
         for line in (asdict(row) | {"ratio": row.ratio} for row in rows)
     ]
-    record: dict[str, Any] = {"machine": machine(), "load_average_before": load_before, "lines": lines}
+    record = {"machine": machine(), "load_average_before": load_before, "lines": lines}
     (path,) = write_all(directory, {"bench_self.json": json.dumps(record, indent=1) + "\n"})
     return path

@@ -79,12 +79,6 @@ def _breakable(text: str) -> str:
     return re.sub(r"[,\[](?=\S)|_(?=[a-z]{6})", r"\g<0><wbr>", escape(text))
 
 
-def picture(path: Path, description: str) -> str:
-    """Return a PNG file as an embedded image, with a description for readers who do not see it."""
-    data = base64.b64encode(path.read_bytes()).decode()
-    return f'<img alt="{escape(description)}" src="data:image/png;base64,{data}">'
-
-
 def drawing(figure: Figure, name: str, description: str) -> str:
     """Return a chart in a box that scrolls sideways where the window is narrow; no two of a page have one name."""
     drawn = inline_svg(figure, name).replace("<svg", f'<svg role="img" aria-label="{escape(description)}"', 1)

@@ -81,7 +81,7 @@ def method_table(shown: Arranged) -> pd.DataFrame:
         axis, problem = _at_equal_rollouts(axis, problem)
         curves = estimator_curves(problem.rows)
         along_samples = axis is not None and axis.column == "samples"
-        kinds = {name: str(problem.rows[name].iloc[0]) for name in CATEGORIES}
+        kinds = {name: str(problem.rows[name].iloc[0]).partition("[")[0] for name in CATEGORIES}
         for curve, name in zip(curves, method_names(curves), strict=True):
             for x, row in curve.at.items():
                 low, high = (float(end) for end in rmse_interval(row))

@@ -1,4 +1,4 @@
-"""The tables of the main study: estimators along an axis, every cell, error against cost, ranking, comparisons."""
+"""The tables of the main study: estimators along an axis, error against cost, ranking, comparisons."""
 
 from __future__ import annotations
 
@@ -13,21 +13,13 @@ import pandas as pd
 from bench.errors import unknown
 from bench.experiment import axes
 from bench.experiment.axes import Axis
-from bench.experiment.columns import COMMON, IDENTITY, Column, text
+from bench.experiment.columns import IDENTITY, Column, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.parameters import number_problems
 from bench.experiment.views import Table
-from bench.measure.statistics import is_unexplained
 from bench.report.problems import ProblemRows, split_by_problem
 from bench.report.text import axis_value, span
-from bench.report.views import (
-    UNSTEADY,
-    Arranged,
-    estimator_curves,
-    pareto,
-    rmse_interval,
-    unsteady,
-)
+from bench.report.views import Arranged, estimator_curves, pareto, rmse_interval
 from bench.studies.bias_variance.columns import COLUMNS
 from bench.studies.bias_variance.comparisons import COLUMNS as COMPARED
 from bench.studies.bias_variance.comparisons import (
@@ -67,7 +59,7 @@ def tables(
     experiment: Experiment, rows: pd.DataFrame, shown: Arranged, methods: pd.DataFrame, comparisons: pd.DataFrame
 ) -> list[Table]:
     """Return all tables but those of the cost to reach an error."""
-    result = [*pivots(experiment, shown), every_cell(experiment, rows)]
+    result = pivots(experiment, shown)
     result[0] = replace(result[0], data=axes.table(experiment, rows))
     columns = [COLUMNS.by_name[name] for name in ("scene", "contact", "backend", "estimator", "rmse_rel", "time_s")]
     result.append(Table("speed_accuracy", speed_accuracy(rows), columns, files=["csv"]))
@@ -170,39 +162,7 @@ def _notes(result: Sequence[Table]) -> list[str]:
     return notes + ([" ".join(signs)] if signs else [])
 
 
-# ------------------------------------------------------------------------------------------------ every cell
-
-
-def every_cell(experiment: Experiment, rows: pd.DataFrame) -> Table:
-    """Return the table with a line per cell: what identifies it, its bias and variance, and its remark by number."""
-    swept = axes.axes(experiment.sweep, rows)
-    table = axes.relabel(axes.with_axes(experiment, rows), swept)
-    names = [name for name in (*IDENTITY, *(a.column for a in swept)) if table[name].nunique(dropna=False) > 1]
-    reasons = {text_: i + 1 for i, text_ in enumerate(dict.fromkeys(r for r in table["reason"] if r))}
-    norm = table["reference_norm"].where(table["reference_norm"] > 0)
-    frame = table.assign(
-        bias_limit=~(table["bias_low"] > 0) & np.isfinite(table["bias_high"]),
-        bias_note=[REMARKED if is_unexplained(text_) else "" for text_ in table["reason"]],
-        bias_relative=table["bias"] / norm, bias_relative_high=table["bias_high"] / norm,
-        time_note=[UNSTEADY if flag else "" for flag in unsteady(table)],
-        remark=[f"{s} ({reasons[r]})" if r else s for s, r in zip(table["status"], table["reason"], strict=True)],
-    ).astype({"bias_limit": bool})  # fmt: skip
-    known = {axis.column: Column(axis.column, label=axis.title, format="setting") for axis in swept}
-    columns = [
-        *(known.get(name) or COMMON[name] for name in dict.fromkeys(names)),
-        replace(COLUMNS.by_name["bias"], digits=3, limit="bias_limit", note="bias_note"),
-        Column("bias_relative", label="relative bias", digits=3, high="bias_relative_high", limit="bias_limit"),
-        *(replace(COLUMNS.by_name[name], digits=3) for name in ("variance", "rmse_rel", "cosine")),
-        replace(COLUMNS.by_name["time_s"], note="time_note"),
-        text("remark", label="status"),
-    ]
-    notes = [
-        "< u: the bias is not distinguishable from 0, and its 95% interval reaches up to u. "
-        f"{REMARKED}: a bias where the estimator declares none. {UNSTEADY}: an unsteady time, whose interquartile range is "
-        "over 20% of it. Times are of one estimate, in steady state, without compilation.",
-        *(f"({i}) {reason}" for reason, i in reasons.items()),
-    ]
-    return Table("bias_variance", frame, columns, "Every cell", notes, files=["md"])
+# --------------------------------------------------------------------------------------------------- error and cost
 
 
 def speed_accuracy(rows: pd.DataFrame) -> pd.DataFrame:

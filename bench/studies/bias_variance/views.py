@@ -6,8 +6,10 @@ from dataclasses import replace
 
 import pandas as pd
 
+from bench.experiment import axes
+from bench.experiment.columns import COMMON
 from bench.experiment.experiment import Experiment
-from bench.experiment.views import Views
+from bench.experiment.views import Table, Views
 from bench.report.text import counted
 from bench.report.views import arrange
 from bench.studies.bias_variance import charts, tables, time_to_accuracy
@@ -23,7 +25,8 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     shown = arrange(experiment, with_gradient_cost(rows))
     methods = method_table(shown)
     if methods.empty:
-        return Views([replace(tables.every_cell(experiment, rows), files=["csv", "md"])])
+        columns = [COMMON[name] for name in ("scene", "contact", "backend", "estimator", "status")]
+        return Views([Table("bias_variance", rows, columns, data=axes.table(experiment, rows))])
     errors = compare_errors(methods)
     best = time_to_accuracy.table(shown)
     comparisons = errors if best.empty else pd.concat([errors, time_to_accuracy.comparisons(best)], ignore_index=True)

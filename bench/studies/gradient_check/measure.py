@@ -48,21 +48,6 @@ class Place:
     """The contact switch that the place is at, in words."""
 
 
-@dataclass(frozen=True)
-class SwitchSearch:
-    """Number of directions and search range of the checks: parameters of ``GradientCheck``, which explains them."""
-
-    directions: int
-    drawn: int
-    reach: float
-    aside: float
-    around: int = 8
-
-
-Search = SwitchSearch | GradientCheck
-"""What has the parameters of the checks."""
-
-
 def measure(cell: Cell, session: Session, search: GradientCheck) -> dict[str, Any]:
     """Return one cell's results by column, except ``command``, from checks at theta0 and around contact switches."""
     problem = session.problem(cell)
@@ -162,7 +147,7 @@ class Point:
     """The contact switch that it is at, in words."""
 
 
-def start(problem: Problem, theta: np.ndarray, unit: float, search: Search, seed: int) -> gradcheck.Check:
+def start(problem: Problem, theta: np.ndarray, unit: float, search: GradientCheck, seed: int) -> gradcheck.Check:
     """Check every component and random directions at ``theta (d,)`` and at other thetas near it, without noise.
 
     ``unit`` is the unit roundoff of the program's arithmetic. Costs are evaluated in batches of a fixed width, so that
@@ -300,7 +285,7 @@ def examine(
     drawn: np.ndarray,
     directions: np.ndarray,
     unit: float,
-    search: Search,
+    search: GradientCheck,
     more: Sequence[Place] = (),
 ) -> tuple[list[Place], list[tuple[gradcheck.Sample, list[tuple[str, str]]]]]:
     """Check directional derivatives at ``theta (d,)``, without noise and with ``drawn (n_w,)``, and at contact switches.
@@ -344,7 +329,7 @@ def examine(
 
 
 def boundary(
-    modes: ContactModes, theta: np.ndarray, direction: np.ndarray, w: np.ndarray, number: int, search: Search
+    modes: ContactModes, theta: np.ndarray, direction: np.ndarray, w: np.ndarray, number: int, search: GradientCheck
 ) -> list[Place]:
     """Return places before, at and after the contact switch nearest to theta along a direction; empty without a switch."""
     scale = scale_of(theta)

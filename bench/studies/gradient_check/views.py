@@ -99,7 +99,7 @@ def _lines(shown: Arranged, points: pd.DataFrame) -> tuple[pd.DataFrame, list[Co
 def _verdicts(points: pd.DataFrame) -> tuple[pd.DataFrame, list[Column]]:
     """Return a line per verdict: its meaning, the number of points, the largest error and the scenes; and the columns."""
     lines = [
-        {"verdict": verdict, "meaning": MEANING[verdict], "trusted": "yes" if untrusted(part).empty else "no",
+        {"verdict": verdict, "meaning": MEANING[verdict], "trusted": _trusted(verdict, part),
          "points": len(part), "error": part["error"].max(), "scenes": ", ".join(dict.fromkeys(part["scene"]))}
         for verdict in VERDICTS if len(part := points[points["verdict"] == verdict])
     ]  # fmt: skip
@@ -108,6 +108,12 @@ def _verdicts(points: pd.DataFrame) -> tuple[pd.DataFrame, list[Column]]:
         Column("error", label="largest error"), text("scenes"),
     ]  # fmt: skip
     return pd.DataFrame(lines, columns=[column.name for column in columns]), columns
+
+
+def _trusted(verdict: str, points: pd.DataFrame) -> str:
+    if len(untrusted(points)):
+        return "no"
+    return "yes" if verdict in TRUSTED else "beside the switch"
 
 
 # ------------------------------------------------------------------------------------------------------- charts

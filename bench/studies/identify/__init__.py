@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
-from bench.errors import Unsupported
+from bench.errors import UserError
 from bench.experiment.cell import Cell
 from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, text
 from bench.model import Identified, MechanicalScene, Optimizer, param
@@ -33,15 +33,23 @@ class Identify(StudyPackage):
         Column("misfit", "share of records of a right model that contradict it as much as the first record"),
         text("contradictions", "tests that the first record's fit fails, each with its statistic in units of its edge"),
         Column("noise_size", "standard deviation of the residuals of the first record", "m"),
-        numbers("terms", "terms that the model lacks, whose effect on the record is tested"),
-        numbers("unnoticed", "by invariant and term, the largest relative bias of an estimate that a term causes while 5% of "
-                "records do not show it"),
+        text("interval_noise", "noise that the first record's intervals allow for: of stated size, own size (that of the residuals), or "
+             "correlated; empty: not all products are identifiable"),
+        numbers("parameter", "identifiable products of powers of the unknowns, then unknowns that are not identifiable"),
+        numbers("estimate", "estimate of the first record by single shooting; nan: not identifiable", digits=4),
+        numbers("estimate_low", "lower end of its 95% interval", digits=4, label="low"),
+        numbers("estimate_high", "its upper end", digits=4, label="high"),
+        numbers("unit", "its unit"),
+        numbers("start", "value where its fit starts", format="setting"),
+        numbers("identifiable", "yes, in products, or no", label="identified"),
+        numbers("bias", "the largest bias that a missing term causes while 5% of records do not show it", label="unseen bias"),
+        numbers("biased", "identifiable products, each with every term that the model lacks and whose effect is tested", label="parameter"),
+        numbers("term", "the term"),
+        numbers("unnoticed", "the largest bias that it causes while 5% of records do not show it", label="unseen bias"),
+        numbers("errors", "this bias in standard errors", label="in standard errors"),
         numbers("unknowns", "names of the parameters"),
-        numbers("units", "units of the parameters", table=False),
         numbers("truth", "true values of the parameters; nan: a record of your own"),
-        numbers("start", "values of the parameters where fits start"),
         numbers("invariants", "identifiable products of powers of the parameters"),
-        numbers("exponents", "by invariant and unknown, its exponent", table=False),
         numbers("bound", "Cramer-Rao bound of the relative standard deviation of each invariant"),
         numbers("fisher", "Fisher information of the logarithms, row by row", table=False),
         numbers("shooting", "the shooting methods: single, multiple, windows"),
@@ -57,21 +65,18 @@ class Identify(StudyPackage):
         numbers("coverage_low", "lower end of its 95% interval over records"),
         numbers("coverage_high", "upper end of its 95% interval over records"),
         numbers("hidden", "by shooting method, fits with more identifiable directions than the record has"),
-        numbers("estimate", "by shooting method and invariant, the estimate of the first record"),
-        numbers("estimate_low", "by shooting method and invariant, lower end of its 95% interval"),
-        numbers("estimate_high", "by shooting method and invariant, its upper end"),
-        numbers("intervals", "by shooting method, the noise of these intervals: of stated size, own size (that of the residuals), "
-                "or correlated; empty: stated"),
-        numbers("scan_steps", "steps of the windows of each scan of the loss, the whole record first"),
-        numbers("scan_low", "by unknown, the first value of the scan"),
-        numbers("scan_high", "by unknown, its last value"),
-        numbers("minima", "by unknown and window, local minima of the loss over the values of the scan"),
-        numbers("minima_open", "the same if the last sample of a window, where the next one starts, is not compared"),
-        numbers("scan_loss", "by unknown, window and value, mean squared residual of the first record in units of the noise",
-                table=False),
+        numbers("scanned", "unknowns of a scan of the loss, each with every window", label="unknown"),
+        numbers("scan_unit", "unit of the unknown", label="unit"),
+        numbers("scan_low", "first value of the scan", format="setting", label="from"),
+        numbers("scan_high", "its last value", format="setting", label="to"),
+        numbers("scan_truth", "true value of the unknown", label="truth"),
+        numbers("scan_steps", "steps of the windows, the whole record first", format="setting", label="steps"),
+        numbers("minima", "local minima of the loss over the values of the scan", format="setting"),
+        numbers("minima_open", "the same if the last sample of a window, where the next one starts, is not compared", format="setting"),
+        numbers("scan_loss", "by scan and value, mean squared residual of the first record in units of the noise", table=False),
     )  # fmt: skip
 
-    revision: ClassVar[int] = 2
+    revision: ClassVar[int] = 3
 
     measurement: float | None = param(
         None,
@@ -86,8 +91,13 @@ class Identify(StudyPackage):
     scan: int = param(0, "values of each unknown at which the loss is scanned; 0: no scan", low=0, high=10_000)
     span: float = param(2.0, "a scan covers the truth over this to the truth times this", low=1.0)
     data: str | None = param(None, "CSV file with measurements of your own, a line per step; null: made from the truth")
-    measured: str | None = param(None, "names of its measured columns, a+b; null: all")
-    time: str | None = param(None, "name of its column of times in s, from which lines may be missing; null: all steps")
+    measured: str | None = param(None, "what its columns measure, q0=angle*pi/180;v0=rate; null: all columns, in order")
+    time: str | None = param(None, "its time in s, an expression too, with which lines may be missing; null: all steps")
+    interpolate: bool = param(False, "interpolate it linearly at the steps")
+    free: str | None = param(
+        None, "entries of the initial state that are unknown too, q0+v0; unknowns start.q0, start.v0"
+    )
+    terms: str | None = param(None, "accelerations that the model may lack, name=v*q**2;other=sign(v)*abs(q1)")
 
     def unsupported_reason(self, cell: Cell) -> str | None:
         """Return why a cell cannot be fitted (no motion, no unknowns, no NumPy steps, sampling, unusable data), or None."""
@@ -105,10 +115,8 @@ class Identify(StudyPackage):
             )
         if optimizer.draws(2):
             return f"optimizer {optimizer.name} samples, and fits are compared along one path: use a deterministic one"
-        if self.data is not None:
-            try:
-                module = self._module("measure")
-                module.read(self, module.model_of(cell))
-            except (OSError, ValueError, Unsupported) as error:
-                return str(error).strip()
+        try:
+            self._module("measure").prepared(cell, self)
+        except (OSError, ValueError, UserError) as error:
+            return str(error).strip()
         return None

@@ -3,28 +3,30 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
-import pandas as pd
 from scipy.special import chdtri
 
-from bench.errors import Unsupported
+from bench.errors import Unsupported, unknown
 from bench.experiment.cell import Cell
 from bench.experiment.session import Session
 from bench.measure import adequacy, noise, performance
-from bench.measure.identification import Information
+from bench.measure.identification import Information, product
 from bench.model import Answer, Decision, Identified, LoopOps, MechanicalScene, Optimizer, Rollout, State, compose
 from bench.model.parameters import Parameter, named
 from bench.studies import norm
 from bench.studies.identify import Identify
+from bench.studies.identify.record import evaluate, expressions, read
 
 STEP = 1e-5
-"""Step of central differences in the logarithms of parameters. Its relative error is about 1e-10."""
+"""Step of central differences in the coordinates of unknowns. Its relative error is about 1e-10."""
+NOTICEABLE = 0.01
+"""Least size of an unknown without a logarithm, in units of its scale, that becomes its scale."""
 SHOOTING = ("single", "multiple", "windows")
 """Shooting methods: one rollout, consecutive windows joined by a penalty on gaps, and independent windows."""
 GAP_WEIGHT = 100.0
@@ -33,76 +35,147 @@ NOISE = 0.01
 """Noise of records that are made from the truth, if none is stated."""
 CONVERGED = 1e-3
 """Remaining step of a converged fit, in standard errors by its residuals, and its square by the noise."""
+SHARE = 1e-4
+"""Exponents below this are 0."""
 TESTED = 64
 """Most records whose residuals are tested."""
 UNEXPLAINED = 1e-3
 """Share of fits to a right model whose residuals are larger than those that count as consistent with the noise."""
 
-Push = Callable[[np.ndarray, np.ndarray], Any]
-"""An acceleration as a function of q and v."""
+Push = Callable[[int, np.ndarray, np.ndarray], Any]
+"""An acceleration as a function of step, q and v."""
 
 
-def still(q: np.ndarray, v: np.ndarray) -> float:
+def still(*_: Any) -> float:
     """Return no acceleration."""
     return 0.0
 
 
 @dataclass(frozen=True)
 class Model:
-    """A program whose named parameters are estimated from measured positions."""
+    """A program of which named parameters, and entries of its initial state, are estimated from measurements.
+
+    Fits use one coordinate per unknown: the logarithm, or for an unknown with a ``scale`` its value over that.
+    """
 
     program: Rollout
     names: tuple[str, ...]
     measured: tuple[int, ...]
     """Indices of the measured entries of the state (q, v)."""
     steps: tuple[int, ...]
-    """Numbers of the steps after which positions are measured, from 1."""
+    """Numbers of the steps after which the entries are measured, from 1."""
+    free: tuple[int, ...] = ()
+    """Indices of the entries of the initial state that are unknown, after the parameters."""
+    scale: np.ndarray = field(default_factory=lambda: np.zeros(1))
+    """Scales of the unknowns that have no logarithm, ``(p,)``; 0: fitted by its logarithm."""
 
-    @property
+    @cached_property
     def values(self) -> np.ndarray:
-        """The scene's own values of the parameters, ``(p,)``."""
-        return self.program.theta0
+        """The scene's own values of the unknowns, ``(p,)``."""
+        theta = self.program.theta0
+        return np.append(theta, np.concatenate(self._start(theta[:, None])[2])[list(self.free), 0])
 
     @property
     def parameters(self) -> list[Parameter]:
-        """The declarations of the parameters."""
-        found = [named(map(type, self.program.parts.values()), name) for name in self.names]
-        return [parameter for parameter in found if parameter is not None]
+        """The declarations of the unknowns."""
+        parts = [*map(type, self.program.parts.values())]
+        return [named(parts, name) or Parameter(name, float, 0.0) for name in self.names]
+
+    @property
+    def entries(self) -> list[str]:
+        """The names of the entries of the state: q0, q1, v0, v1."""
+        scene = self.program.scene
+        n_v = scene.n_q if scene.n_v is None else scene.n_v
+        return [f"q{i}" for i in range(scene.n_q)] + [f"v{i}" for i in range(n_v)]
+
+    @cached_property
+    def unit(self) -> np.ndarray:
+        """The largest size of each entry of the state along the scene's own motion, ``(n,)``."""
+        path, _ = self.motion(self.values[:, None])
+        return np.asarray(np.maximum(np.abs(path[1:]).max(axis=(0, 2)), 1e-6))
+
+    def places(self, names: Iterable[str]) -> tuple[int, ...]:
+        """Return the indices of entries of the state; raises :class:`UserError` for an unknown one."""
+        entries = self.entries
+        for name in names:
+            if name not in entries:
+                raise unknown(f"entry of the state of scene {self.program.scene.name}:", name, entries)
+        return tuple(map(entries.index, names))
+
+    def theta(self, points: np.ndarray) -> np.ndarray:
+        """Return the unknowns ``(p, B)`` of coordinates."""
+        scale = self.scale[:, None]
+        with np.errstate(over="ignore"):
+            return np.asarray(np.where(scale, scale * points, np.exp(points)))
+
+    def points(self, theta: np.ndarray) -> np.ndarray:
+        """Return the coordinates ``(p, B)`` of unknowns."""
+        scale = self.scale[:, None]
+        return np.where(scale, theta / np.where(scale, scale, 1.0), np.log(np.where(scale, 1.0, theta)))
+
+    def scaled(self, theta: np.ndarray) -> Model:
+        """Return the model with the sizes in ``theta (p,)`` as scales, where they change the motion noticeably."""
+        is_large = np.abs(theta) > NOTICEABLE * np.abs(self.scale)
+        return dataclasses.replace(self, scale=np.where(self.scale * is_large, theta, self.scale))
+
+    def with_scales(self) -> Model:
+        """Return the model with a scale for each unknown that is no positive parameter.
+
+        At a scale, the record differs from that of 0 by a hundredth of its size. An unknown that is not 0 is its own scale.
+        """
+        p = len(self.names)
+        record = self.record(self.values[:, None] + STEP * np.eye(p, p + 1, 1))
+        slopes = np.linalg.norm(record[:, 1:] - record[:, :1], axis=0) / STEP
+        scale = 0.01 * (norm(record[:, 0]) or 1.0) / np.where(slopes > 0.0, slopes, 1.0)
+        scale[(self.values > 0.0) & (np.arange(p) < len(self.program.theta0))] = 0.0
+        return dataclasses.replace(self, scale=scale).scaled(self.values)
 
     def _start(self, theta: np.ndarray) -> tuple[Rollout, np.ndarray, State, tuple[np.ndarray, ...]]:
         w = np.zeros((self.program.n_noise, theta.shape[1]))
-        program, own, w = self.program.resolved(LoopOps(), theta, w)
+        program, own, w = self.program.resolved(LoopOps(), theta[: len(self.program.theta0)], w)
         own, state, scanned = program.start(LoopOps(), own, w)
         return program, own, state, scanned
 
     def initial_states(self, theta: np.ndarray) -> np.ndarray:
         """Return the initial states ``(n, B)`` for ``theta (p, B)``."""
-        return np.concatenate(self._start(theta)[2])
+        states = np.concatenate(self._start(theta)[2])
+        states[list(self.free)] = theta[len(self.program.theta0) :]
+        return states
 
     def simulate(
-        self, theta: np.ndarray, x: np.ndarray, begin: np.ndarray, steps: int, push: Push = still
-    ) -> np.ndarray:
-        """Return the states ``(steps, n, B)`` after each step, from ``x (n, B)`` before the steps ``begin (B,)``.
+        self, theta: np.ndarray, x: np.ndarray, begin: np.ndarray, steps: int, push: Push = still, nudge: Any = still
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the states ``(steps, n, B)`` after, and the controls in, each step from ``x (n, B)`` before ``begin (B,)``.
 
-        ``push`` is an additional acceleration ``(n_v, B)`` of a state, half a step before and after each step.
+        ``push`` is an additional acceleration ``(n_v, B)`` of a step and state, half a step before and after each step,
+        and ``nudge`` an additional control of a step.
         """
         program, own, state, scanned = self._start(theta)
         half = 0.5 * program.scene.dt
         n_q, columns = len(state.q), np.arange(theta.shape[1])
-        now, states = State(x[:n_q], x[n_q:]), []
+        now, states, controls = State(x[:n_q], x[n_q:]), [], []
         with np.errstate(all="ignore"):
             for s in range(steps):
                 at = np.minimum(begin + s, program.scene.horizon - 1)
-                u = program.control(LoopOps(), own, now, tuple(part[at, :, columns].T for part in scanned))
-                now = program.step(LoopOps(), State(now.q, now.v + half * push(*now)), u)
-                now = State(now.q, now.v + half * push(*now))
+                u = program.control(LoopOps(), own, now, tuple(part[at, :, columns].T for part in scanned)) + nudge(s)
+                now = program.step(LoopOps(), State(now.q, now.v + half * push(s, *now)), u)
+                now = State(now.q, now.v + half * push(s + 1, *now))
                 states.append(np.concatenate(now))
-        return np.stack(states)
+                controls.append(u)
+        return np.stack(states), np.stack(controls)
 
-    def record(self, theta: np.ndarray, push: Push = still, shift: Any = 0.0) -> np.ndarray:
-        """Return the measurements ``(m, B)`` along whole rollouts of ``theta (p, B)`` from a start moved by ``shift``."""
-        begin, origin = np.zeros(theta.shape[1], dtype=int), self.initial_states(theta) + shift
-        return self.measurements(self.simulate(theta, origin, begin, self.program.scene.horizon, push))
+    def motion(
+        self, theta: np.ndarray, push: Push = still, nudge: Any = still, shift: Any = 0.0
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the path ``(horizon + 1, n, B)`` of ``theta (p, B)`` from a start moved by ``shift``, and its controls."""
+        origin = self.initial_states(theta) + shift
+        begin = np.zeros(theta.shape[1], dtype=int)
+        states, controls = self.simulate(theta, origin, begin, self.program.scene.horizon, push, nudge)
+        return np.concatenate([origin[None], states]), controls
+
+    def record(self, theta: np.ndarray, *changes: Any) -> np.ndarray:
+        """Return the measurements ``(m, B)`` along whole rollouts of ``theta (p, B)``, see :meth:`motion`."""
+        return self.measurements(self.motion(theta, *changes)[0][1:])
 
     def measurements(self, states: np.ndarray) -> np.ndarray:
         """Return the measurements ``(m, B)`` of the states ``(horizon, n, B)`` after each step."""
@@ -113,67 +186,47 @@ class Model:
 def model_of(cell: Cell, refinement: int = 1) -> Model:
     """Return the cell's model, with a time step ``refinement`` times shorter and the same measurements.
 
-    Raises :class:`Unsupported` if an unknown is not positive.
+    Raises ValueError if an unknown entry of the initial state does not exist.
     """
-    own = cell.scene
+    own, settings = cell.scene, cell.study
     assert isinstance(own, MechanicalScene)
+    assert isinstance(settings, Identify)
     scene = dataclasses.replace(own, dt=own.dt / refinement, horizon=own.horizon * refinement)
     role = own if isinstance(own, Identified) else None
     names = cell.decision.names or (role.unknowns if role else ())
     program = compose(scene, cell.contact, cell.integrator, Decision(tuple(names)))
     assert isinstance(program, Rollout)
-    if (program.theta0 <= 0).any():
-        raise Unsupported(f"unknowns {list(names)} are {program.theta0.tolist()}: relative errors need positive values")
     measured = (role and role.measured) or tuple(range(scene.n_q))
     first = own.horizon if role and role.end_only else 1
     steps = range(first * refinement, scene.horizon + 1, refinement)
-    return Model(program, tuple(names), measured, tuple(steps))
+    model = Model(program, tuple(names), measured, tuple(steps))
+    starts = settings.free.split("+") if settings.free else []
+    free = model.places(starts)
+    return dataclasses.replace(model, names=(*names, *(f"start.{name}" for name in starts)), free=free).with_scales()
 
 
-def read(settings: Identify, model: Model) -> tuple[np.ndarray, tuple[int, ...]]:
-    """Return the measurements ``(m, 1)`` of the study's CSV file and the steps, from 1, after which they were made.
+def own_record(settings: Identify, model: Model) -> tuple[np.ndarray, Model]:
+    """Return the measurements ``(m, 1)`` of the study's CSV file, and the model with what they measure and when.
 
-    With a column of time, lines may be missing, and lines before the first step are left out. Raises ValueError with the
-    number of the first line that cannot be used.
+    Raises ValueError, with the number of the first line that cannot be used.
     """
-    path, scene = settings.data, model.program.scene
-    words = pd.read_csv(
-        path, header=None, dtype=str, keep_default_na=False, skip_blank_lines=False, skipinitialspace=True
-    )
-    table = words.apply(pd.to_numeric, errors="coerce")
-    if table.iloc[0].isna().all():
-        table = table[1:].set_axis(words.iloc[0], axis=1)
-    names = settings.measured.split("+") if settings.measured else [c for c in table if c != settings.time]
-    if lost := {*names, settings.time or names[0]} - {*table}:
-        raise ValueError(f"{path} has no column {min(lost)}; its columns are {', '.join(map(str, table))}")
-    wrong = ~np.isfinite(table[[settings.time or names[0], *names]]).all(axis=1)
-    if wrong.any():
-        line = wrong.idxmax()
-        raise ValueError(f"{path}, line {line + 1}: {words.loc[line].tolist()} are not finite numbers")
-    if len(names) != len(model.measured):
+    path, scene, columns = settings.data, model.program.scene, expressions(settings.measured)
+    assert path is not None
+    values, steps = read(path, columns, settings.time, scene.dt, settings.interpolate)
+    measured = model.places(columns) or model.measured
+    if len(values.columns) != len(measured):
         raise ValueError(
-            f"{path} has {len(names)} columns, scene {scene.name} is measured in {len(model.measured)} positions: name them, "
-            "measured=a+b; numbers need decimal points"
+            f"{path} has {len(values.columns)} columns, scene {scene.name} is measured in {len(measured)} positions: name them, "
+            "measured=q0=angle*pi/180;v0=rate; numbers need decimal points"
         )
-    values, steps = table[names].to_numpy(), np.array(model.steps)
-    if settings.time:
-        times = table[settings.time].to_numpy() / scene.dt
-        steps = np.rint(times).astype(int)
-        wrong = (np.abs(times - steps) > 0.01) | (np.diff(steps, prepend=steps[:1] - 1) < 1)
-        if wrong.any():
-            raise ValueError(
-                f"{path}, line {table.index[wrong][0] + 1}: its time is not a later multiple of scene {scene.name}'s dt={scene.dt:g}"
-            )
-        values, steps = values[steps > 0], steps[steps > 0]
-    if len(values) != len(steps) or not values.size or not {*steps} <= {*model.steps}:
+    expected = steps if settings.time else model.steps
+    if len(steps) != len(expected) or not len(steps) or not {*steps} <= {*model.steps}:
         raise ValueError(
             f"{path} has {len(values)} lines{f' up to step {max(steps, default=0)}' * bool(settings.time)}, scene {scene.name} is "
             f"measured {len(model.steps)} times, up to step {model.steps[-1]}: set horizon"
         )
-    for name, column in zip(names, values.T, strict=True):
-        if len(column) > 1 and np.ptp(column) == 0.0:
-            raise ValueError(f"{path}: column {name} is constant")
-    return values.reshape(-1, 1), tuple(steps.tolist())
+    data = values.to_numpy().reshape(-1, 1)
+    return data, dataclasses.replace(model, measured=measured, steps=tuple(steps.tolist()))
 
 
 # ----------------------------------------------------------------------------------------------- shooting methods
@@ -183,8 +236,7 @@ def read(settings: Identify, model: Model) -> tuple[np.ndarray, tuple[int, ...]]
 class Fitting:
     """The residuals of a batch of fits by one shooting method.
 
-    The unknowns are the logarithms of the parameters, then the initial states of all windows but the first, divided by
-    ``unit``. A window of L steps is compared with the L samples after its start, the last one included: that is the
+    The unknowns are the model's coordinates, then the initial states of all windows but the first, divided by its ``unit``. A window of L steps is compared with the L samples after its start, the last one included: that is the
     sample at which the next window starts. Each sample of the record is compared exactly once.
     """
 
@@ -192,13 +244,11 @@ class Fitting:
     shooting: str
     n_windows: int
     noise: float
-    unit: np.ndarray
-    """Scale of the states, ``(n,)``."""
 
     @property
     def dim(self) -> int:
         """Number of unknowns of a fit."""
-        return len(self.model.names) + (self.n_windows - 1) * len(self.unit)
+        return len(self.model.names) + (self.n_windows - 1) * len(self.model.unit)
 
     @property
     def window_steps(self) -> int:
@@ -207,18 +257,14 @@ class Fitting:
 
     def residuals(self, points: np.ndarray, data: np.ndarray) -> np.ndarray:
         """Return residuals ``(m, B)`` of ``points (dim, B)`` against ``data (m', B)``, and of gaps, in units of the noise."""
-        p = len(self.model.names)
-        return self.residuals_at(np.exp(points[:p]), points[p:], data)
-
-    def residuals_at(self, theta: np.ndarray, starts_later: np.ndarray, data: np.ndarray) -> np.ndarray:
-        """Return :meth:`residuals` of parameters ``theta (p, B)`` themselves and of the other unknowns ``(dim - p, B)``."""
-        batch, n = theta.shape[1], len(self.unit)
+        p, n, batch = len(self.model.names), len(self.model.unit), points.shape[1]
+        theta = self.model.theta(points[:p])
         first = self.model.initial_states(theta)
-        later = starts_later.reshape(self.n_windows - 1, n, batch) * self.unit[:, None]
+        later = points[p:].reshape(self.n_windows - 1, n, batch) * self.model.unit[:, None]
         starts = np.concatenate([first[None], later])
         flat = np.moveaxis(starts, 0, 1).reshape(n, -1)  # columns ordered by window, then by fit
         begin = np.repeat(np.arange(self.n_windows) * self.window_steps, batch)
-        states = self.model.simulate(np.tile(theta, (1, self.n_windows)), flat, begin, self.window_steps)
+        states, _ = self.model.simulate(np.tile(theta, (1, self.n_windows)), flat, begin, self.window_steps)
         states = states.reshape(self.window_steps, n, self.n_windows, batch)
         path = np.moveaxis(states, 2, 0).reshape(self.n_windows * self.window_steps, n, batch)
         parts = [(self.model.measurements(path) - data) / self.noise]
@@ -241,21 +287,19 @@ class Fitting:
         Windows after the first start at the measured positions and finite differences of them; in a first-order scene at
         the measured states. What is not measured starts on the rollout of theta.
         """
-        batch, n = data.shape[1], len(self.unit)
+        batch, n = data.shape[1], len(self.model.unit)
         states = np.zeros((self.n_windows - 1, n, batch))
         if self.n_windows > 1:
-            begin = np.zeros(batch, dtype=int)
-            steps = self.window_steps * self.n_windows
-            rollout = self.model.simulate(theta, self.model.initial_states(theta), begin, steps)
             at = np.arange(1, self.n_windows) * self.window_steps
-            states[:] = rollout[at - 1]
+            states[:] = self.model.motion(theta)[0][at]
             table = data.reshape(-1, len(self.model.measured), batch)
             n_q, dt = self.model.program.scene.n_q, self.model.program.scene.dt
-            for column, coordinate in enumerate(self.model.measured if n_q == 0 or n == 2 * n_q else ()):
-                states[:, coordinate] = table[at - 1, column]
-                if n_q:
-                    states[:, n_q + coordinate] = (table[at, column] - table[at - 2, column]) / (2 * dt)
-        return np.concatenate([np.log(theta), (states / self.unit[:, None]).reshape(-1, batch)])
+            slopes = np.gradient(table, dt, axis=0)
+            for column, entry in enumerate(self.model.measured if n in (n_q, 2 * n_q) or not n_q else ()):
+                if n_q and entry < n_q:
+                    states[:, n_q + entry] = slopes[at - 1, column]
+                states[:, entry] = table[at - 1, column]
+        return np.concatenate([self.model.points(theta), (states / self.model.unit[:, None]).reshape(-1, batch)])
 
 
 def run_fits(
@@ -276,10 +320,9 @@ def run_fits(
         counts = [points.shape[1] for points in queries]
         points, many = np.concatenate(queries, axis=1), np.repeat(data[:, active], counts, axis=1)
         residual, jacobian = fitting.residuals(points, many), fitting.jacobians(points, many)
-        ends = np.cumsum([0, *counts])
-        for i, query, (low, high) in zip(active, queries, itertools.pairwise(ends), strict=True):
-            own = residual[:, low:high]
-            slope = jacobian[:, :, low:high]
+        ends = np.cumsum(counts)[:-1]
+        parts = np.split(residual, ends, axis=1), np.split(jacobian, ends, axis=2)
+        for i, query, own, slope in zip(active, queries, *parts, strict=True):
             gradient = np.einsum("mdb,mb->db", slope, own)
             answer = Answer(value=0.5 * (own**2).sum(axis=0), residual=own, jacobian=slope, gradient=gradient)
             states[i] = optimizer.tell(states[i], query, answer)
@@ -296,6 +339,20 @@ def count_windows(horizon: int, most: int) -> int:
     return max((n for n in range(1, most + 1) if horizon % n == 0 and horizon // n >= 2), default=1)
 
 
+def prepared(cell: Cell, settings: Identify) -> tuple[Model, np.ndarray | None]:
+    """Return the cell's model and the user's own measurements ``(m, 1)``, or None if records are made from the truth.
+
+    Raises ValueError, :class:`UserError` or OSError for settings or a file that cannot be used.
+    """
+    model = model_of(cell)
+    for text in expressions(settings.terms).values():
+        evaluate(text, dict.fromkeys((*model.entries, "q", "v", "t"), np.zeros(2)))
+    if settings.data is None:
+        return model, None
+    data, model = own_record(settings, model)
+    return model, data
+
+
 def measure(cell: Cell, session: Session, settings: Identify) -> dict[str, Any]:
     """Return one cell's results by column: fits of all records by each shooting method, and the Cramer-Rao bound.
 
@@ -303,52 +360,54 @@ def measure(cell: Cell, session: Session, settings: Identify) -> dict[str, Any]:
     """
     optimizer = cell.parts["optimizer"]
     assert isinstance(optimizer, Optimizer)
-    model, is_own = model_of(cell), settings.data is not None
-    if is_own:
-        data, steps = read(settings, model)
-        model = dataclasses.replace(model, steps=steps)
-    else:
-        data = records(cell, settings)
+    model, measurements = prepared(cell, settings)
+    is_own, data = measurements is not None, records(cell, settings) if measurements is None else measurements
     factor = np.where(np.arange(data.shape[1]) % 2 == 0, settings.start, 1.0 / settings.start)
-    start = model.values[:, None] * factor[None, :]
+    theta, start = model.values, model.values[:, None] * factor
     if cell.decision.at is not None:
-        start = np.repeat(np.array(cell.decision.at)[:, None], data.shape[1], axis=1)
+        start[: len(cell.decision.at)] = np.array(cell.decision.at)[:, None]
     horizon = model.program.scene.horizon
     n_windows = count_windows(horizon, settings.windows)
     has_windows = len(model.steps) == horizon and n_windows > 1
 
     def fit(shooting: str, sigma: float) -> Fit:
-        fitting = Fitting(model, shooting, 1 if shooting == "single" else n_windows, sigma, _unit(model))
+        fitting = Fitting(model, shooting, 1 if shooting == "single" else n_windows, sigma)
         fitted = run_fits(fitting, optimizer, fitting.start(start, data), data, settings.iterations)
         return Fit(fitting, *fitted, fitting.residuals(fitted[0], data), fitting.jacobians(fitted[0], data))
 
     is_noise_known = settings.measurement is not None or not is_own
     sigma = settings.measurement or (float(np.std(data)) or 1.0 if is_own else NOISE)
-    single = fit("single", sigma)
-    if not is_noise_known:
-        free = len(data) - len(model.names)
-        if free < 1:
+    if is_own:
+        first, free = fit("single", sigma), len(data) - len(theta)
+        if not is_noise_known and free < 1:
             raise Unsupported(
-                f"{settings.data} has {len(data)} measurements for {len(model.names)} unknowns: state the noise, measurement=.."
+                f"{settings.data} has {len(data)} measurements for {len(theta)} unknowns: state the noise, measurement=.."
             )
-        sigma *= norm(single.residual) / math.sqrt(free) or 1.0
-        single = fit("single", sigma)
-    theta = np.exp(single.solution[:, 0]) if is_own else model.values
+        if not is_noise_known:
+            sigma *= norm(first.residual) / math.sqrt(free) or 1.0
+        theta = model.theta(first.solution)[:, 0]
+        model = model.scaled(theta)
+    single = fit("single", sigma)
     known = information(model, theta, sigma)
     result: dict[str, Any] = {
         "status": "ok", "reason": "", "rank": known.rank, "condition": known.condition, "fits": data.shape[1],
-        "unknowns": list(model.names), "units": [parameter.unit for parameter in model.parameters],
-        "truth": [math.nan] * len(theta) if is_own else theta.tolist(), "start": start[:, 0].tolist(),
-        "invariants": known.labels, "exponents": known.invariants.ravel().tolist(),
-        "bound": known.bound.tolist(), "fisher": known.fisher.ravel().tolist(),
-        **step_dependence(cell, model, theta, known, sigma), **_explanation(model, single, known, is_noise_known),
+        "unknowns": list(model.names), "truth": [math.nan] * len(theta) if is_own else theta.tolist(),
+        "invariants": known.labels, "bound": known.bound.tolist(), "fisher": known.fisher.ravel().tolist(),
+        **step_dependence(cell, model, theta, known, sigma),
+        **_estimates(single, known, start[:, 0], is_noise_known, expressions(settings.terms)),
     }  # fmt: skip
     fits = [single, *(fit(shooting, sigma) for shooting in SHOOTING[1:] if has_windows)]
-    found = [_fit_statistics(one, known, is_own, is_noise_known) for one in fits]
-    lines = {name: np.concatenate([np.atleast_1d(one[name]) for one in found]).tolist() for name in found[0]}
+    result |= columns_of(_fit_statistics(one, known, is_own, is_noise_known) for one in fits)
     if settings.scan:
-        lines |= scan(model, n_windows if has_windows else 1, data[:, :1], sigma, settings)
-    return result | lines
+        result |= columns_of(scan(model, n_windows if has_windows else 1, data[:, :1], sigma, settings))
+        result["scan_loss"] = np.concatenate(result["scan_loss"]).tolist()
+    return result
+
+
+def columns_of(lines: Iterable[Mapping[str, Any]]) -> dict[str, list[Any]]:
+    """Return lines as lists by column."""
+    every = list(lines)
+    return {name: [line[name] for line in every] for name in every[0]} if every else {}
 
 
 @dataclass(frozen=True)
@@ -374,15 +433,8 @@ class Fit:
         return np.asarray(own - later @ (np.linalg.pinv(later) @ own))
 
 
-def _unit(model: Model) -> np.ndarray:
-    """Return the largest size of each entry of the state along the scene's own motion, ``(n,)``."""
-    theta = model.values[:, None]
-    states = model.simulate(theta, model.initial_states(theta), np.zeros(1, dtype=int), model.program.scene.horizon)
-    return np.asarray(np.maximum(np.abs(states).max(axis=(0, 2)), 1e-6))
-
-
-def scan(model: Model, n_windows: int, data: np.ndarray, sigma: float, settings: Identify) -> dict[str, list[Any]]:
-    """Return the loss of one record ``data (m, 1)`` along each unknown, and how many local minima it has.
+def scan(model: Model, n_windows: int, data: np.ndarray, sigma: float, settings: Identify) -> Iterator[dict[str, Any]]:
+    """Yield the loss of one record ``data (m, 1)`` along each unknown and window, and how many local minima it has.
 
     ``scan`` equally spaced values from the truth over ``span`` to the truth times ``span``, within the parameter's
     declared bounds, with all other unknowns at the truth. The loss is the mean square of the residuals in units of the
@@ -395,29 +447,28 @@ def scan(model: Model, n_windows: int, data: np.ndarray, sigma: float, settings:
         counts.insert(1, n_windows)
         n_windows = n_windows // 2 if n_windows % 2 == 0 else 1
     horizon, steps = model.program.scene.horizon, np.repeat(model.steps, len(model.measured))
-    result: dict[str, list[Any]] = {
-        "scan_steps": [horizon // count for count in counts], "scan_low": [], "scan_high": [],
-        "minima": [], "minima_open": [], "scan_loss": [],
-    }  # fmt: skip
+    flat = dataclasses.replace(model, scale=np.ones(len(model.names)))
     for i, (value, parameter) in enumerate(zip(model.values, model.parameters, strict=True)):
-        ends = np.clip([value / settings.span, value * settings.span], parameter.low, parameter.high)
-        low, high = ends.tolist()
+        ends = np.sort([value / settings.span, value * settings.span]) + (value == 0.0) * model.scale[i] * np.array(
+            [-1.0, 1.0]
+        )
+        low, high = np.clip(ends, parameter.low, parameter.high).tolist()
         theta = np.repeat(model.values[:, None], settings.scan, axis=1)
         theta[i] = np.linspace(low, high, settings.scan)
-        result["scan_low"].append(low)
-        result["scan_high"].append(high)
         for count in counts:
-            unit = np.ones(len(model.initial_states(theta[:, :1])))
-            fitting = Fitting(model, "windows", count, sigma, unit)
-            start = fitting.start(model.values[:, None], data)[len(theta) :]
+            fitting = Fitting(flat, "windows", count, sigma)
+            points = np.repeat(fitting.start(model.values[:, None], data), settings.scan, axis=1)
+            points[: len(theta)] = theta
             with np.errstate(all="ignore"):
-                square = np.square(fitting.residuals_at(theta, np.repeat(start, settings.scan, axis=1), data))
+                square = np.square(fitting.residuals(points, data))
             inner = steps % (horizon // count) != 0
             loss = square.mean(axis=0)
-            result["minima"].append(int(is_minimum(loss).sum()))
-            result["minima_open"].append(int(is_minimum(square[inner].mean(axis=0)).sum()) if inner.any() else math.nan)
-            result["scan_loss"].extend(loss.tolist())
-    return result
+            yield {
+                "scanned": model.names[i], "scan_unit": parameter.unit, "scan_low": low, "scan_high": high, "scan_truth": math.nan if settings.data else value,
+                "scan_steps": horizon // count, "minima": int(is_minimum(loss).sum()),
+                "minima_open": int(is_minimum(square[inner].mean(axis=0)).sum()) if inner.any() else math.nan,
+                "scan_loss": loss,
+            }  # fmt: skip
 
 
 def is_minimum(values: np.ndarray) -> np.ndarray:
@@ -430,115 +481,159 @@ def is_minimum(values: np.ndarray) -> np.ndarray:
     return np.concatenate([[False], (inner < values[:-2]) & (inner < values[2:]), [False]])
 
 
-def _explanation(model: Model, fit: Fit, known: Information, is_noise_known: bool) -> dict[str, Any]:
-    """Return whether the fits by single shooting explain the records, and the biases that tests of them can miss.
+def _estimates(
+    fit: Fit, known: Information, start: np.ndarray, is_noise_known: bool, own: Mapping[str, str]
+) -> dict[str, Any]:
+    """Return the first record's estimates, whether fits explain the records, and the biases that tests can miss.
 
     ``explained`` is the share of records that no test contradicts. The other columns belong to the first record.
     """
-    residual, sigma = fit.residual, fit.fitting.noise
+    model, invariants, residual, sigma = fit.fitting.model, known.invariants, fit.residual, fit.fitting.noise
+    p, rank = len(known.names), known.rank
+    theta = model.theta(fit.solution[:p, :1])[:, 0]
+    names = list(dict.fromkeys([*known.labels, *known.names]))
+    exponents = np.concatenate([invariants, np.eye(p)[[known.names.index(name) for name in names[rank:]]]])
+    is_seen = (np.abs(exponents @ invariants.T) > SHARE).any(axis=1)
+    own_units = dict(zip(known.names, (one.unit for one in model.parameters), strict=True))
+    units = tuple(f"({unit})" if {*unit} & {*" /"} else unit or "1" for unit in own_units.values())
+    # an unknown without a logarithm has an interval of its own values
+    estimate, half, noise_kind = _products(theta, invariants), *_half_widths(fit, 0, known, is_noise_known)
+    size = np.abs(_products(np.where(model.scale, model.scale, theta), invariants))
+    is_linear = np.abs(invariants) @ (model.scale != 0.0) > SHARE
+    with np.errstate(over="ignore", invalid="ignore"):
+        low, high = (
+            np.where(is_linear, estimate + side * size * half, estimate * np.exp(side * half)) for side in (-1.0, 1.0)
+        )
+    nothing = [math.nan] * (len(names) - rank)
+    result: dict[str, Any] = {
+        "parameter": names, "estimate": [*estimate, *nothing], "estimate_low": [*low, *nothing],
+        "estimate_high": [*high, *nothing], "unit": [own_units.get(name) or product(units, row) for name, row in zip(names, exponents, strict=True)],
+        "start": _products(start, exponents).tolist(), "interval_noise": noise_kind,
+        "identifiable": ["yes" if k < rank else "in products" if seen else "no" for k, seen in enumerate(is_seen)],
+        "bias": [math.nan] * len(names), "biased": [], "term": [], "unnoticed": [], "errors": [],
+    }  # fmt: skip
     finite = np.flatnonzero(fit.is_finite)[:TESTED].tolist()
-    if not finite or finite[0] or not known.rank:
-        return {"terms": [], "unnoticed": []}
+    if not finite or finite[0] or not rank:
+        return result
     # the effects of missing terms at one fit serve all records, which have the same truth
-    terms = missing_terms(model, np.exp(fit.solution[:, 0]), sigma)
+    terms = missing_terms(model, theta, sigma, own)
     verdicts = [
         adequacy.judge(residual[:, i], known.along(fit.slopes(i)), len(model.measured), terms, i, is_noise_known)
         for i in finite
     ]
-    first, free = verdicts[0], max(len(residual) - known.rank, 1)
+    first, free = verdicts[0], max(len(residual) - rank, 1)
     effects = np.array([terms[name] for name in first.reach]).reshape(-1, len(residual))
-    biases = np.abs(np.linalg.pinv(known.along(fit.slopes(0))) @ effects.T) * np.array(list(first.reach.values()))
-    return {
+    shares = np.abs(np.linalg.pinv(known.along(fit.slopes(0))) @ effects.T) / known.bound[:, None]
+    with np.errstate(invalid="ignore"):  # an effect that is all in one estimate moves no other
+        biases = known.bound[:, None] * np.where(
+            shares > adequacy.RESOLVED * shares.max(axis=0, initial=0.0), shares * [*first.reach.values()], 0.0
+        )
+    unnoticed = biases * size[:, None]
+    return result | {
         "explained": float(np.mean([one.is_explained for one in verdicts])) + 0.0 * first.probability,  # nan: untested
         "contradictions": ", ".join(f"{name} ({value:.2g})" for name, value in first.contradictions.items()),
         "noise_size": sigma * norm(residual[:, 0]) / math.sqrt(free), "misfit": first.probability,
-        "terms": list(first.reach), "unnoticed": biases.ravel().tolist(),
+        "bias": [*unnoticed.max(axis=1, initial=0.0), *nothing] if effects.size else result["bias"],
+        "biased": np.repeat(known.labels, len(effects)).tolist(), "term": [*first.reach] * rank,
+        "unnoticed": unnoticed.ravel().tolist(), "errors": (biases * performance.Z / half[:, None]).ravel().tolist(),
     }  # fmt: skip
 
 
-def missing_terms(model: Model, theta: np.ndarray, sigma: float) -> dict[str, np.ndarray]:
+def _half_widths(fit: Fit, i: int, known: Information, is_noise_known: bool) -> tuple[np.ndarray, str]:
+    """Return half the widths of fit ``i``'s 95% intervals of the invariants' coordinates, and the noise they allow for."""
+    slopes = known.along(fit.slopes(i))
+    if not fit.is_finite[i] or Information(known.names, fit.slopes(i)).rank < known.rank:
+        return np.full(known.rank, np.inf), ""
+    if fit.fitting.shooting != "single":
+        return performance.Z * np.sqrt(np.diag(np.linalg.inv(slopes.T @ slopes))), ""
+    channels = len(fit.fitting.model.measured)
+    variance, kind, quantile = adequacy.variances(fit.residual[:, i], slopes, channels, is_noise_known)
+    return quantile * np.sqrt(variance), kind
+
+
+TERMS = {
+    "start": {"start": "1"},
+    "acceleration": {
+        "constant force": "1", "drag v|v|": "v*abs(v)", "drag v^3": "v**3", "dry friction": "sign(v)",
+        "spring q^2": "q**2", "spring q^3": "q**3", "hysteresis": "hysteresis(q)",
+    },
+    "control": {"lag": "slope(x)", "dead zone": "sign(x)"},
+    "sensor": {"offset": "1", "gain": "x", "drift": "t", "delay": "slope(x)"},
+}  # fmt: skip
+"""Effects that a model may lack by where they act, as expressions along the motion.
+
+x is what they act on, q and v are the coordinate that they accelerate, q0, v0, ... the state, and t rises from -1 to 1.
+"""
+RELATIVE = 1e-4
+"""Size of a missing effect when it is computed, relative to the largest value of what it acts on."""
+
+
+def missing_terms(
+    model: Model, theta: np.ndarray, sigma: float, own: Mapping[str, str] | None = None
+) -> dict[str, np.ndarray]:
     """Return the change of the standardised record ``(m,)`` per unit of effects that the model lacks, by name.
 
-    The effects are an offset, gain, drift and delay of each sensor, the start of each entry of the state, and accelerations
-    of each coordinate: constant, quadratic, cubic and signed in its velocity and position, and linear in other positions.
-    They are computed at ``theta (p,)`` by central differences.
+    The effects are :data:`TERMS`, accelerations in other coordinates, and the accelerations ``own``. They act along the
+    motion of ``theta (p,)``, to first order.
     """
-    scene = model.program.scene
-    channels, columns = len(model.measured), theta[:, None]
-    plain = model.record(columns)[:, 0]
-    terms = {}
-    times = np.array(model.steps, dtype=float)
-    table = plain.reshape(-1, channels)
-    faults = {"offset": np.ones_like(table), "gain": table}
-    if len(times) > 1:
-        faults["drift"] = np.repeat((2.0 * times / times[-1] - 1.0)[:, None], channels, axis=1)
-        faults["delay"] = -np.gradient(table, times, axis=0)
-    for c, coordinate in enumerate(model.measured):
-        for name, effect in faults.items():
-            terms[f"{name} of sensor {coordinate}"] = (effect * np.eye(channels)[c]).ravel() / sigma
-    begin = np.zeros(1, dtype=int)
-    states = model.simulate(columns, model.initial_states(columns), begin, scene.horizon)[:, :, 0]
-    largest, n_q = np.maximum(np.abs(states).max(axis=0), 1e-12), scene.n_q
-
-    def moved(by: float, shift: Any, force: Any, effect: Push) -> np.ndarray:
-        return model.record(columns, lambda q, v: by * force * effect(q, v), by * shift)[:, 0]
-
-    def change(*by: Any) -> np.ndarray:
-        return np.asarray((moved(RELATIVE, *by) - moved(-RELATIVE, *by)) / (2.0 * RELATIVE * sigma))
-
-    for j, unit in enumerate(np.diag(largest)[:, :, None]):
-        terms[f"start of {'v' if j >= n_q else 'q'}{j % max(n_q, 1)}"] = change(unit, 0.0, still)
-    size = max(float(np.abs(np.diff(states[:, n_q:], axis=0)).max(initial=0.0)) / scene.dt, 1e-12)
-    for i in range(n_q if len(largest) == 2 * n_q else 0):
-        force = size * np.eye(n_q)[:, i : i + 1]
-        terms |= {
-            name: change(0.0, force, effect) for name, effect in _effects(i, largest[:n_q], largest[n_q + i]).items()
-        }
-    return {name: effect for name, effect in terms.items() if np.isfinite(effect).all() and effect.any()}
-
-
-RELATIVE = 1e-4
-"""Size of a missing acceleration whose effect is computed, relative to the largest acceleration of the motion."""
-
-
-def _effects(i: int, x: np.ndarray, v: float) -> dict[str, Any]:
-    """Return accelerations of coordinate ``i`` as functions of q and v, scaled by the largest positions ``x`` and velocity v."""
-    of = f"of coordinate {i}"
+    entries, scene, steps = model.entries, model.program.scene, np.array(model.steps)
+    path, controls = (part[:, :, 0] for part in model.motion(theta[:, None]))
+    state, n_v = dict(zip(entries, path.T, strict=True)), len(entries) - scene.n_q
+    signals = np.hstack(
+        [path, path[:, scene.n_q :], np.pad(controls, ((0, 1), (0, 0)), "edge"), path[:, model.measured]]
+    )
+    places = [
+        *(("start", entry) for entry in entries), *(("acceleration", f"q{i}") for i in range(n_v)),
+        *(("control", f"u{k}") for k in range(controls.shape[1])),
+        *(("sensor", f"sensor {entries[entry]}") for entry in model.measured),
+    ]  # fmt: skip
+    changes: dict[str, tuple[int, Any]] = {}
+    for place, (kind, of) in enumerate(places):
+        known = state | {"t": np.linspace(-1.0, 1.0, len(path)), "x": signals[:, place]}
+        texts = TERMS[kind]
+        if kind == "acceleration":
+            texts = texts | {f"coupling with {e}": e for e in entries if e[1:] != of[1:]} | dict(own or {})
+            known |= {"q": state.get(of), "v": state[f"v{of[1:]}"]}
+        if kind != "acceleration" or n_v == scene.n_q:
+            changes |= {f"{name} of {of}": (place, evaluate(text, known)) for name, text in texts.items()}
+    sizes = np.abs(signals).max(axis=0)
+    sizes[len(entries) :][:n_v] = np.abs(np.diff(path[:, scene.n_q :], axis=0)).max() / scene.dt
+    courses = np.zeros((*signals.shape, len(changes)))
+    for k, (place, course) in enumerate(changes.values()):
+        courses[:, place, k] = RELATIVE * sizes[place] * course / (np.abs(course).max() or 1.0)
+    ends = np.cumsum([len(entries), n_v, controls.shape[1]])
+    starts, pushes, nudges, sensors = np.split(np.concatenate([courses, -courses], axis=2), ends, axis=1)
+    wide = np.repeat(theta[:, None], starts.shape[2], axis=1)
+    moved = model.record(wide, lambda s, *_: pushes[s], lambda s: nudges[s], starts[0])
+    up, down = np.split((moved + sensors[steps].reshape(moved.shape)) / (2.0 * RELATIVE * sigma), 2, axis=1)
+    free = {name.replace(".", " of ") for name in model.names}
     return {
-        f"constant force {of}": lambda q, r: 1.0 + 0.0 * q[i],
-        f"drag {of} in v|v|": lambda q, r: r[i] * np.abs(r[i]) / v**2,
-        f"drag {of} in v^3": lambda q, r: (r[i] / v) ** 3,
-        f"friction {of} in the sign of v": lambda q, r: np.tanh(100.0 * r[i] / v),
-        f"spring {of} in q^2": lambda q, r: (q[i] / x[i]) ** 2,
-        f"spring {of} in q^3": lambda q, r: (q[i] / x[i]) ** 3,
-    } | {
-        f"coupling {of} with {j}": lambda q, r, j=j: q[j] / x[j] for j in range(len(x)) if j != i
-    }  # fmt: skip
+        name: effect
+        for name, effect in zip(changes, (up - down).T, strict=True)
+        if name not in free and np.isfinite(effect).all() and effect.any()
+    }
+
+
+def _products(theta: np.ndarray, exponents: np.ndarray) -> np.ndarray:
+    """Return products of powers ``(r,)`` of ``theta (p,)``, for exponents ``(r, p)``."""
+    with np.errstate(all="ignore"):
+        return np.asarray(np.prod(np.sign(theta) ** np.rint(exponents) * np.abs(theta) ** exponents, axis=1))
 
 
 def _fit_statistics(fit: Fit, known: Information, is_own: bool, is_noise_known: bool) -> dict[str, Any]:
-    """Return the entries of one shooting method in columns of lists."""
-    p, n_fits, shooting = len(known.names), fit.solution.shape[1], fit.fitting.shooting
-    measured = len(fit.fitting.model.steps) * len(fit.fitting.model.measured)
+    """Return the entries of one shooting method."""
+    p, n_fits, shooting, model = len(known.names), fit.solution.shape[1], fit.fitting.shooting, fit.fitting.model
+    measured = len(model.steps) * len(model.measured)
     square = (fit.residual[:measured] ** 2).sum(axis=0)
     # gaps of multiple shooting tie its initial states to the parameters
     free = max(measured - (fit.fitting.dim if shooting == "windows" else p), 1)
     has_converged = np.isfinite(square) & (square <= chdtri(free, UNEXPLAINED))
-    logs = known.invariants @ fit.solution[:p]
-    halves, noises, hidden = np.full_like(logs, np.nan), [""] * n_fits, 0
-    for i in np.flatnonzero(fit.is_finite).tolist():
-        rank = Information(known.names, fit.slopes(i)).rank
-        hidden += rank > known.rank
-        slopes, channels = known.along(fit.slopes(i)), len(fit.fitting.model.measured)
-        if rank < known.rank:
-            halves[:, i] = np.inf
-        elif shooting == "single":
-            variance, noises[i], quantile = adequacy.variances(fit.residual[:, i], slopes, channels, is_noise_known)
-            halves[:, i] = quantile * np.sqrt(variance)
-        else:
-            halves[:, i] = performance.Z * np.sqrt(np.diag(np.linalg.inv(slopes.T @ slopes)))
+    hidden = sum(
+        Information(known.names, fit.slopes(i)).rank > known.rank for i in np.flatnonzero(fit.is_finite).tolist()
+    )
+    halves = np.stack([_half_widths(fit, i, known, is_noise_known)[0] for i in range(n_fits)], axis=1)
     chosen = has_converged & np.isfinite(halves).all(axis=0) & (not is_own)
-    apart = logs - (known.invariants @ np.log(fit.fitting.model.values))[:, None]
+    apart = known.invariants @ (fit.solution[:p] - model.points(model.values[:, None]))
     errors = (apart / known.bound[:, None])[:, chosen]
     is_covered = (np.abs(apart) <= halves)[:, chosen]
     n_converged, coverage, interval = int(has_converged.sum()), math.nan, (math.nan, math.nan)
@@ -547,15 +642,11 @@ def _fit_statistics(fit: Fit, known: Information, is_own: bool, is_noise_known: 
         coverage = float(is_covered.mean())
         # the sample size of this interval is the number of records: invariants of one record are dependent
         interval = performance.wilson(round(coverage * n_converged), n_converged)
-    with np.errstate(over="ignore"):
-        ends = [np.exp(logs[:, 0] + side * halves[:, 0]).tolist() for side in (-1.0, 1.0)]
     return {
         "shooting": shooting, "optimum": float(fit.has_converged.mean()),
         "converged": n_converged / n_fits, "converged_low": low, "converged_high": high,
         "error": float(np.sqrt(np.mean(np.square(errors)))) if errors.size else math.nan,
         "coverage": coverage, "coverage_low": interval[0], "coverage_high": interval[1], "hidden": hidden,
-        "estimate": np.exp(logs[:, 0]).tolist(), "estimate_low": ends[0], "estimate_high": ends[1],
-        "intervals": noises[0],
     }  # fmt: skip
 
 
@@ -564,8 +655,8 @@ def information(model: Model, theta: np.ndarray, sigma: float) -> Information:
 
     ``sigma`` is the standard deviation of a measurement's noise.
     """
-    points = np.log(theta)[:, None]
-    fitting = Fitting(model, "single", 1, sigma, np.ones(len(model.initial_states(theta[:, None]))))
+    points = model.points(theta[:, None])
+    fitting = Fitting(model, "single", 1, sigma)
     return Information(model.names, fitting.jacobians(points, model.record(theta[:, None]))[:, :, 0])
 
 
@@ -582,7 +673,8 @@ def step_dependence(cell: Cell, model: Model, theta: np.ndarray, known: Informat
 
     To first order, it is the least-squares change of the parameters that compensates the change of the record.
     """
-    half = dataclasses.replace(model_of(cell, 2), steps=tuple(2 * step for step in model.steps))
+    steps = tuple(2 * step for step in model.steps)
+    half = dataclasses.replace(model_of(cell, 2), measured=model.measured, steps=steps)
     change = (half.record(theta[:, None]) - model.record(theta[:, None]))[:, 0] / sigma
     if not known.rank or not np.isfinite(change).all():
         return {"step_shift": math.nan, "step_shift_bound": math.nan}

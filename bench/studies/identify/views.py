@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -12,13 +13,9 @@ from scipy.stats import chi2
 from bench.experiment.axes import table
 from bench.experiment.columns import Column, text
 from bench.experiment.experiment import Experiment
-from bench.experiment.views import Chart, Mark, Style, Table, Views
-from bench.measure.identification import product
-from bench.measure.performance import Z
+from bench.experiment.views import Chart, Mark, Table, Views
 from bench.report.problems import problem_names
-from bench.report.style import PALETTE
 from bench.report.views import arrange, attempted
-from bench.studies.identify.measure import is_minimum
 
 PARTS = ("scene", "contact", "integrator")
 STATISTICS = (
@@ -33,13 +30,15 @@ MAX_STEP_SHIFT = 0.5
 To first order in the step, the error of the estimate is twice this change: one bound. With a bias of one bound, 17% of
 the 95% intervals miss the truth instead of 5%.
 """
-DIGITS = 4
-"""Significant digits of estimates."""
-PROBLEM, SHOOTING, PARAMETER = text("problem"), text("shooting"), text("parameter")
-BIAS = Column("bias", label="unnoticed bias")
+ESTIMATED = ("parameter", "estimate", "estimate_low", "estimate_high", "bias", "unit", "identifiable", "start")
+BIASED = ("biased", "term", "unnoticed", "errors")
+SCANNED = ("scanned", "scan_unit", "scan_low", "scan_high", "scan_truth", "scan_steps", "minima", "minima_open")
+"""Columns with lists whose entries are lines of a table."""
+TEXTS = ("shooting", "parameter", "unit", "identifiable", "biased", "term", "scanned", "scan_unit")
+"""Those with lists of words."""
 ESTIMATES = (
-    "estimate: of the first record, by one rollout. low, high: its 95% interval. identifiable: a parameter that is not has no estimate; "
-    "only the products named are. unnoticed bias: the largest that a term of the next table can cause, to first order, while 5% of "
+    "estimate: of the first record, by one rollout. low, high: its 95% interval. identified: a parameter that is not has no estimate; in "
+    "products: only products with it are. unseen bias: the largest that a term of the next table can cause, to first order, while 5% of "
     "records do not show it. doubt: unfinished, no optimum was reached; not explained, the residuals contradict the model; untested, too "
     "few measurements for a test; time step, halving it moves the estimate by more than half its standard error.",
 )
@@ -59,14 +58,13 @@ NOTES = (
     "contain the truth less often than stated; precise, neither, and errors reach the bound. single: one rollout. multiple: windows whose ends must meet. "
     "windows: independent windows.",
 )
-SCANNED = (
+SCANS = (
     "steps: length of a window. minima: values of the scan at which the loss is below that at both neighbours; all other unknowns have their own "
     "values, and windows start at the measurements. A count holds for its values: others, and for a chaotic record another "
     "rounding, give another.",
     "A window is compared with all samples after its start, its last one included, at which the next window starts. minima "
     "open: the same windows if that sample is not compared.",
 )
-CURVE, MINIMUM = "loss", "local minimum"
 
 
 def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
@@ -74,109 +72,69 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     shown = arrange(experiment, rows)
     given = attempted(shown.rows)
     # rows of older versions lack the columns
-    given = given[(given["status"] == "ok") & (given["units"].map(np.ndim) > 0)]
+    given = given[(given["status"] == "ok") & (given["parameter"].map(np.ndim) > 0)]
     names = problem_names(shown, PARTS, rows=given)
+    doubts = {
+        "unfinished": [values[0] < 1.0 for values in given["optimum"]], "not explained": given["contradictions"] != "",
+        "untested": given["misfit"].isna(), "time step": given["step_shift_bound"] > MAX_STEP_SHIFT,
+    }  # fmt: skip
     given = given.assign(
-        scan=names, intervals=[values[0] for values in given["intervals"]],
-        problem=names + (", " + given["optimizer"] if given["optimizer"].nunique() > 1 else ""),
+        scan=names, problem=names + (", " + given["optimizer"] if given["optimizer"].nunique() > 1 else ""),
+        doubt=[", ".join(name for name, holds in zip(doubts, row, strict=True) if holds) for row in zip(*doubts.values(), strict=True)],
     )  # fmt: skip
-    by_name = {c.name: replace(c, kind="number") if c.name in STATISTICS else c for c in experiment.columns.all}
-    fits = [by_name[name] for name in ("converged", "error", "coverage")]
-    lines, found, hidden = fits_of(given), estimates(given), unnoticed(given)
-    split = "problem" if len(given) > 1 else ""
+    kinds: dict[str, Any] = {"list": "number"} | dict.fromkeys(TEXTS, "text")
+    by_name = {c.name: replace(c, kind=kinds.get(c.name, kinds.get(c.kind, c.kind))) for c in experiment.columns.all}
+    by_name |= {name: text(name) for name in ("problem", "doubt", "verdict")}
+
+    def columns(*names: str) -> list[Column]:
+        return [by_name[name] for name in names]
+
+    lines, found = fits_of(given), exploded(given, ["doubt"], ESTIMATED)
+    hidden = exploded(given, [], BIASED).sort_values("errors", ascending=False, ignore_index=True)
+    split, scans = "problem" if len(given) > 1 else "", scanned(given)
     tables = [
         Table(
             "identify", found,
-            [PARAMETER, *(Column(name, digits=DIGITS) for name in ("estimate", "low", "high")), BIAS, text("doubt"), text("unit"),
-             text("identifiable"), Column("start", format="setting")],
+            columns(*ESTIMATED[:5], "doubt", *ESTIMATED[5:]),
             "Estimates", ESTIMATES, terminal=True, page=True, split=split, data=table(experiment, rows),
         ),
         Table(
-            "identify", hidden[hidden["errors"] > 1.0],
-            [PARAMETER, text("term"), BIAS, Column("errors", label="in standard errors")],
+            "identify", hidden[hidden["errors"] > 1.0], columns(*BIASED),
             "What a record cannot show", UNNOTICED, terminal=not split, page=True, split=split,
         ),
         Table(
             "identify", given,
-            [PROBLEM, by_name["explained"], text("intervals"), by_name["noise_size"],
-             by_name["step_shift_bound"], by_name["condition"], by_name["contradictions"]],
+            columns("problem", "explained", "contradictions", "interval_noise", "noise_size", "step_shift_bound", "condition"),
             "Records", RECORDS, terminal=True, page=True,
         ),
         Table(
-            "identify", lines, [PROBLEM, SHOOTING, text("verdict"), *fits, by_name["hidden"], by_name["fits"]],
+            "identify", lines,
+            columns("problem", "shooting", "verdict", "converged", "error", "coverage", "hidden", "fits"),
             "Fits", NOTES, terminal=True, page=True,
         ),
-        Table("estimates", found, [], files=["csv"]),
-        Table("unnoticed", hidden, [], files=["csv"]),
-        Table("fits", lines, [], files=["csv"]),
+        *(Table(name, frame, [], files=["csv"]) for name, frame in (("estimates", found), ("unnoticed", hidden), ("fits", lines))),
+        *[Table(
+            "identify", scans.drop(columns=["loss"]), columns("problem", *SCANNED),
+            "Local minima of the loss along each unknown", SCANS, terminal=True, page=True,
+        )] * bool(len(scans)),
     ]  # fmt: skip
-    scans = scanned(given)
-    if len(scans):
-        settings = ("values", "from", "to", "steps", "minima", "minima_open")
-        columns = [PROBLEM, text("unknown"), *(Column(name, format="setting") for name in settings)]
-        tables.append(
-            Table(
-                "identify", scans.drop(columns=["loss", "unit"]), columns, "Local minima of the loss along each unknown",
-                SCANNED, terminal=True, page=True,
-            )
-        )  # fmt: skip
     if lines.empty:
         return Views(tables[:1])
-    return Views(tables, [*charts(lines, fits), *scan_charts(scans)])
+    return Views(tables, [*charts(lines, columns("error", "coverage")), *scan_charts(scans)])
+
+
+def exploded(rows: pd.DataFrame, kept: Sequence[str], lists: Sequence[str]) -> pd.DataFrame:
+    """Return a line per entry of the columns ``lists``, with its problem and the columns ``kept``."""
+    lines = rows[["problem", *kept, *lists]].explode([*lists], ignore_index=True)
+    return lines.dropna(subset=[lists[0]]).infer_objects()
 
 
 def fits_of(rows: pd.DataFrame) -> pd.DataFrame:
     """Return one line per problem, optimizer, seed and shooting method."""
-    kept = ["problem", "scene", "integrator", "condition", "fits", "explained"]
-    lines = rows[[*kept, "shooting", *STATISTICS]].explode(["shooting", *STATISTICS], ignore_index=True)
-    lines = lines.astype(dict.fromkeys(STATISTICS, float))
+    lines = exploded(rows, ["scene", "integrator", "condition", "fits", "explained"], ["shooting", *STATISTICS])
     low, high = error_interval(lines["error"], lines["converged"] * lines["fits"])
     lines = lines.assign(error_low=low, error_high=high)
     return lines.assign(verdict=verdicts(lines))
-
-
-def estimates(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return one line per problem and identifiable product, and one per parameter that is not identifiable."""
-    lines = []
-    for row in rows.to_dict("records"):
-        unknowns, invariants = list(row["unknowns"]), list(row["invariants"])
-        doubts = {
-            "unfinished": row["optimum"][0] < 1.0, "not explained": row["contradictions"] != "",
-            "untested": np.isnan(row["misfit"]), "time step": row["step_shift_bound"] > MAX_STEP_SHIFT,
-        }  # fmt: skip
-        exponents = np.reshape(row["exponents"], (-1, len(unknowns)))
-        units = tuple(f"({unit})" if " " in unit or "/" in unit else unit or "1" for unit in row["units"])
-        for k, name in enumerate(dict.fromkeys([*invariants, *unknowns])):
-            is_known = k < len(invariants)
-            powers = exponents[k] if is_known else np.eye(len(unknowns))[unknowns.index(name)]
-            products = [one for one, power in zip(invariants, exponents @ powers, strict=True) if abs(power) > 1e-4]
-            ends = [row[column][k] if is_known else np.nan for column in ("estimate", "estimate_low", "estimate_high")]
-            biases = np.reshape(row["unnoticed"], (len(invariants) or 1, -1))[k] if is_known else np.array(())
-            lines.append({
-                "problem": row["problem"], "parameter": name, **dict(zip(("estimate", "low", "high"), ends, strict=True)),
-                "unit": row["units"][unknowns.index(name)] if name in unknowns else product(units, powers),
-                "identifiable": "yes" if is_known else "only " + ", ".join(products) if products else "no",
-                "start": np.prod(np.power(row["start"], powers)),
-                "bias": ends[0] * biases.max() if biases.size else np.nan,
-                "doubt": ", ".join(doubt for doubt, holds in doubts.items() if holds),
-            })  # fmt: skip
-    return pd.DataFrame(lines)
-
-
-def unnoticed(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return one line per problem, identifiable product and missing term, those of the largest biases first."""
-    lines = []
-    for row in rows.to_dict("records"):
-        biases = np.reshape(row["unnoticed"], (-1, len(row["terms"]) or 1))
-        for k, j in np.ndindex(biases.shape) if biases.size else ():
-            with np.errstate(divide="ignore"):
-                width = np.diff(np.log([row["estimate_low"][k], row["estimate_high"][k]]))[0]
-            lines.append({
-                "problem": row["problem"], "parameter": row["invariants"][k], "term": row["terms"][j],
-                "bias": row["estimate"][k] * biases[k, j], "errors": biases[k, j] * 2.0 * Z / width,
-            })  # fmt: skip
-    table_ = pd.DataFrame(lines, columns=["problem", "parameter", "term", "bias", "errors"])
-    return table_.sort_values("errors", ascending=False, ignore_index=True)
 
 
 def error_interval(error: pd.Series, count: pd.Series) -> tuple[pd.Series, pd.Series]:
@@ -208,45 +166,37 @@ def scanned(rows: pd.DataFrame) -> pd.DataFrame:
 
     Rows that differ by optimizer or seed only have one scan each: the first is shown.
     """
-    rows = rows[[np.ndim(steps) * np.size(steps) > 0 for steps in rows["scan_steps"]]].drop_duplicates("scan")
-    lines = []
-    for row in rows.to_dict("records"):
-        steps, names = list(row["scan_steps"]), list(row["unknowns"])
-        losses = np.array(row["scan_loss"], dtype=float).reshape(len(names), len(steps), -1)
-        for i, j in np.ndindex(losses.shape[:2]):
-            lines.append({
-                "problem": row["scan"], "unknown": names[i], "unit": row["units"][i],
-                "values": losses.shape[2], "from": row["scan_low"][i], "to": row["scan_high"][i], "steps": steps[j],
-                "minima": row["minima"][i * len(steps) + j], "minima_open": row["minima_open"][i * len(steps) + j],
-                "truth": row["truth"][i],
-                "loss": losses[i, j],
-            })  # fmt: skip
-    return pd.DataFrame(lines)
+    has_scan = rows["scan_steps"].map(lambda steps: np.ndim(steps) * np.size(steps)) > 0
+    rows = rows[has_scan].drop_duplicates("scan")
+    losses = [
+        part for _, row in rows.iterrows() for part in np.split(np.array(row["scan_loss"]), len(row["scan_steps"]))
+    ]
+    return exploded(rows.assign(problem=rows["scan"]), [], SCANNED).assign(loss=losses)
 
 
 def scan_charts(scans: pd.DataFrame) -> list[Chart]:
-    """Return a chart of the loss along each unknown: a panel per window, with its local minima and the truth."""
-    charts_ = []
-    for place, (_, every) in enumerate(scans.groupby("problem", sort=False) if len(scans) else ()):
-        for unknown, scan in every.groupby("unknown", sort=False):
-            one, parts = scan.iloc[0], []
-            for line in scan.to_dict("records"):
-                loss = np.where(np.isfinite(line["loss"]), line["loss"], np.nan)
-                part = "whole record" if line["steps"] == one["steps"] else "windows"
-                panel = f"{part} of {line['steps']} steps, local minima: {line['minima']:.0f}"
-                values = np.linspace(line["from"], line["to"], len(loss))
-                curve = pd.DataFrame({"value": values, "loss": loss, "part": CURVE, "window": panel})
-                parts += [curve, curve[is_minimum(loss)].assign(part=MINIMUM)]
-            charts_.append(Chart(
-                f"scan_{unknown}" + f"_{place + 1}" * (place > 0), pd.concat(parts, ignore_index=True),
-                [Column("value", label=str(unknown), unit=str(one["unit"]), log=False)],
-                [Column("loss", label="mean square of residual / noise", log=True)],
-                "lines", series="part", panel="window", across=3, height=1.9,
-                styles={CURVE: Style(PALETTE[0], "", width=0.8), MINIMUM: Style(PALETTE[1], ".", line="none")},
-                marks=[*([Mark("truth", one["truth"])] if np.isfinite(one["truth"]) else []), Mark("", 1.0, axis="y")],
-                subtitle="grey line: 1, the noise of a sample",
-                text="The loss along one unknown, all others at their own values. Windows start at the measurements.",
-            ))  # fmt: skip
+    """Return a chart of the loss along each unknown: a panel per window with the number of its local minima, and the truth."""
+    charts_: list[Chart] = []
+    for (_, unknown), scan in scans.groupby(["problem", "scanned"], sort=False):
+        one = scan.iloc[0]
+        curves = [
+            pd.DataFrame({
+                "value": np.linspace(line["scan_low"], line["scan_high"], len(line["loss"])),
+                "loss": np.where(np.isfinite(line["loss"]), line["loss"], np.nan),
+                "window": f"windows of {line['scan_steps']} steps, local minima: {line['minima']:.0f}",
+            })
+            for line in scan.to_dict("records")
+        ]  # fmt: skip
+        place = sum(chart.x[0].label == unknown for chart in charts_)
+        charts_.append(Chart(
+            f"scan_{unknown}" + f"_{place + 1}" * (place > 0), pd.concat(curves, ignore_index=True),
+            [Column("value", label=unknown, unit=one["scan_unit"], log=False)],
+            [Column("loss", label="mean square of residual / noise", log=True)],
+            "lines", panel="window", across=3, height=1.9,
+            marks=[*([Mark("truth", one["scan_truth"])] * int(np.isfinite(one["scan_truth"]))), Mark("", 1.0, axis="y")],
+            subtitle="grey line: 1, the noise of a sample; the longest window is the whole record",
+            text="The loss along one unknown, all others at their own values. Windows start at the measurements.",
+        ))  # fmt: skip
     return charts_
 
 
@@ -256,7 +206,7 @@ def scan_charts(scans: pd.DataFrame) -> list[Chart]:
 def charts(lines: pd.DataFrame, fits: Sequence[Column]) -> list[Chart]:
     """Return the chart of errors and coverage, or none if no truth is known."""
     parts, marks = [], []
-    for column, ideal, name in ((fits[1], 1.0, "bound"), (fits[2], LEVEL, "")):
+    for column, ideal, name in zip(fits, (1.0, LEVEL), ("bound", ""), strict=True):
         if lines[column.name].notna().any():
             values = {end: lines[c] for end, c in (("value", column.name), ("low", column.low), ("high", column.high))}
             parts.append(lines.assign(**values, panel=column.heading, failed=lines["converged"] == 0))

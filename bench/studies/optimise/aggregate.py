@@ -310,19 +310,3 @@ def rank_correlations(points: pd.DataFrame) -> pd.DataFrame:
             "points": len(pooled), "problems": len(strata),
         })  # fmt: skip
     return pd.DataFrame(lines)
-
-
-def path_quality(runs: RunSet) -> pd.DataFrame:
-    """Return the median, 20% and 80% quantile over seeds of the gradient's relative error along the path.
-
-    There is one line per problem, method and point of the path, and none if quality was measured only at the start.
-    """
-    names = {"path_quality_iteration": "iteration", "path_quality_rmse_rel": "value"}
-    rows = runs.best_runs[["problem", "method", *names]].rename(columns=names)
-    counts = rows["iteration"].map(np.size)
-    most = counts.groupby([rows["problem"], rows["method"]]).transform("max")
-    long = rows[(counts == most) & (most > 1)].explode([*names.values()])
-    point = long.groupby(level=0).cumcount()
-    groups = long.astype(dict.fromkeys(names.values(), float)).groupby(["problem", "method", point], sort=False)
-    ends = {name: groups["value"].quantile(q) for name, q in (("low", 0.2), ("value", 0.5), ("high", 0.8))}
-    return pd.DataFrame({"iteration": groups["iteration"].median(), **ends}).reset_index(level=[0, 1])

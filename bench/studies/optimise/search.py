@@ -377,17 +377,25 @@ def compare_with_reference(estimates: np.ndarray, terms: np.ndarray) -> dict[str
     truth = terms.mean(axis=1)
     reference_error = float(terms.var(axis=1, ddof=1).sum()) / terms.shape[1]
     norm = float(np.linalg.norm(truth))
-    errors = estimates - truth
-    measured = float((errors**2).sum(axis=1).mean())
+    measured = float(((estimates - truth) ** 2).sum(axis=1).mean())
     if not reference_error <= MAX_REFERENCE_SHARE * measured:
         return dict.fromkeys(("rmse_rel", "cosine", "bias_share"), np.nan)
-    error = measured - reference_error
-    spread = float(estimates.var(axis=0, ddof=1).sum())
-    bias = max(float((errors.mean(axis=0) ** 2).sum()) - spread / len(estimates) - reference_error, 0.0)
-    sizes = np.linalg.norm(estimates, axis=1) * norm
-    cosines = np.divide(estimates @ truth, sizes, out=np.zeros(len(estimates)), where=sizes > 0)
+    error, (bias, _, cosine) = measured - reference_error, error_parts(estimates, truth, reference_error)
     return {
         "rmse_rel": float(np.sqrt(error)) / norm if norm else np.nan,
-        "cosine": float(cosines.mean()),
+        "cosine": cosine,
         "bias_share": min(bias / error, 1.0) if error else 0.0,
     }
+
+
+def error_parts(estimates: np.ndarray, reference: np.ndarray, variance: float) -> tuple[float, float, float]:
+    """Return squared bias and squared spread of estimates ``(R, d)``, and their mean cosine with a reference ``(d,)``.
+
+    The noise of the mean estimate, and ``variance``, the squared standard error of the reference, are subtracted from the bias.
+    """
+    spread = float(estimates.var(axis=0, ddof=1).sum())
+    mean_error = estimates.mean(axis=0) - reference
+    bias = max(float(mean_error @ mean_error) - spread / len(estimates) - variance, 0.0)
+    sizes = np.linalg.norm(estimates, axis=1) * np.linalg.norm(reference)
+    cosines = np.divide(estimates @ reference, sizes, out=np.zeros(len(estimates)), where=sizes > 0)
+    return bias, spread, float(cosines.mean())

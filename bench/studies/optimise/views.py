@@ -36,7 +36,6 @@ RUNTIME = Column(
 )  # fmt: skip
 RATE = Column("rate", label="searches that reach it", low="rate_low", high="rate_high")
 SPENT = Column("spent", label="rollouts", log=True)
-ERROR = Column("rmse_rel", label="relative error of a gradient at the start", log=True)
 NOTES = (
     "targets reached: share of searches whose regret falls to 1/10, 1/100 and 1/1000 of the first, the mean over problems and "
     "targets. score: share of the way from the first cost to J*, interquartile mean over searches, with a bootstrap interval "
@@ -163,7 +162,7 @@ def styles(methods: Sequence[str], name: Callable[[str], str] = str) -> dict[str
 def charts(runs: RunSet, default: float, name: Callable[[str], str]) -> list[Chart]:
     """Return the charts, the shares of targets reached first."""
     looks = styles(runs.rows["method"].unique(), name)
-    found = (_targets(runs, default), _progress(runs, default), _quality(runs, default), _path_quality(runs))
+    found = (_targets(runs, default), _progress(runs, default))
     return [
         replace(chart, frame=chart.frame.assign(method=chart.frame["method"].map(name)), series="method", styles=looks)
         for chart in found
@@ -203,31 +202,4 @@ def _progress(runs: RunSet, default: float) -> Chart | None:
         "runtimes", pd.DataFrame(lines), [SPENT], [share], labels="ends", height=2.6, panel="",
         subtitle=_where(runs, "single searches, a gradient counts as its time in rollouts"),
         text="Where a line ends is the share of targets reached in the whole budget.",
-    )  # fmt: skip
-
-
-def _quality(runs: RunSet, default: float) -> Chart | None:
-    """Return the average runtime to a tenth of the first regret against the error of the gradient, by class of scenes."""
-    points = aggregate.quality_and_runtime(runs, default)
-    if points.empty:
-        return None
-    rho = aggregate.effects_of_error(runs, default)
-    missed = ~np.isfinite(points["art"])
-    scenes = points["problem"].str.split(r"[,\[]").str[0]
-    frame = points.assign(art=points["art"].mask(missed), missed=missed, scene=scenes)
-    return Chart(
-        "quality_runtime", frame, [ERROR], [replace(RUNTIME, low="", high="")], "points", panel="scene_class",
-        shape="scene", panel_notes=dict(zip(rho["scene_class"], rho["verdict"], strict=True)), failed="missed", across=2, height=1.9,
-        subtitle="average runtime: expected rollouts per search that reaches a tenth of the first regret; a cross: never reached",
-        text="A point per problem and method. Methods that never reach the target have no point.",
-    )  # fmt: skip
-
-
-def _path_quality(runs: RunSet) -> Chart | None:
-    """Return the gradient's error along the path; None if it was measured only at the start."""
-    frame = aggregate.path_quality(runs)
-    return None if frame.empty else Chart(
-        "path_quality", frame, [Column("iteration", log=False)],
-        [Column("value", label="relative error of a gradient", low="low", high="high", log=True)], panel="problem", band=True,
-        subtitle="medians and 20% to 80% of the seeds",
     )  # fmt: skip

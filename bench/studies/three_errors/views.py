@@ -1,4 +1,4 @@
-"""What the study of three errors shows: a line per cell, gradients that mislead, and the errors of each law."""
+"""What the study of three errors shows: a line per cell, traps, and the errors of each law."""
 
 from __future__ import annotations
 
@@ -13,8 +13,6 @@ from bench.report.style import PALETTE
 
 EXACT = 1e-6
 """Program error up to which a gradient counts as exact."""
-AGREES = 1e-3
-"""Largest program error of a gradient that is right for its program."""
 CONVERGED = 0.5
 """A cost or gradient converges if its error falls at least to this share from the largest to the smallest step."""
 WRONG = 0.1
@@ -23,7 +21,6 @@ FLOOR = 1e-16
 """Smallest error that is drawn; smaller ones, 0 included, are drawn here as upper limits."""
 PROGRAM = ("scene", "contact", "integrator", "backend")
 """Parts of the grid that identify a program, which is the same at every time step."""
-ERRORS = ("model_error_rel", "program_error_rel", "bias_rel", "forward_error_rel")
 RESULTS = ("forward_error_rel", "program_error_rel", "model_error_rel", "model_cosine", "model_signs")
 OWN, PHYSICS, TRAP = "program error", "model error", "model error of a trap"
 STYLES = {
@@ -43,7 +40,7 @@ TRAP_NOTE = (
 
 
 def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
-    """Return a line per cell, the traps, the misleading gradients by problem, and the charts."""
+    """Return a line per cell, the traps and the chart."""
     shown = Shown(experiment, rows, ["dt"], ["estimator"], PROGRAM)
     ends = {f"bias_rel_{end}": shown.rows[f"bias_{end}"] / shown.rows["reference_norm"] for end in ("low", "high")}
     bias = shown.column("bias_rel", low="bias_rel_low", high="bias_rel_high")
@@ -53,14 +50,12 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     )  # fmt: skip
     if shown.good.empty:
         return Views([cells])
-    trapped, wrong, problem = traps(shown), _wrong(shown.rows), text("problem")
+    trapped, problem = traps(shown), text("problem")
     either = Column("largest", label="at the largest step"), Column("smallest", label="at the smallest step")
     tables = [
         cells,
         Table("three_errors_traps", trapped, [problem, text("error"), *either], title="Traps", notes=[TRAP_NOTE],
               files=["csv"] if len(trapped) else [], terminal=bool(len(trapped)), page=True),
-        Table("three_errors_wrong", wrong, [problem, Column("cells", format="setting"), *map(shown.column, ERRORS)],
-              title="Right for the program, wrong for the physics", files=[], page=True),
     ]  # fmt: skip
     return Views(tables, [_dumbbells(shown, trapped)])
 
@@ -84,14 +79,6 @@ def traps(shown: Shown) -> pd.DataFrame:
         if is_trap and len(steps) > 1:
             lines += [[problem, shown.column(name).heading, *steps[name].iloc[[-1, 0]]] for name in names]
     return pd.DataFrame(lines, columns=["problem", "error", "largest", "smallest"])
-
-
-def _wrong(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return a line per problem with misleading gradients: their number and the largest errors, the worst first."""
-    wrong = rows[(rows["program_error_rel"] <= AGREES) & (rows["model_error_rel"] > WRONG)]
-    groups = wrong.groupby("problem", sort=False)
-    frame = groups[list(ERRORS)].max().assign(cells=groups.size())
-    return frame.sort_values("model_error_rel", ascending=False).reset_index()
 
 
 def _dumbbells(shown: Shown, trapped: pd.DataFrame) -> Chart:

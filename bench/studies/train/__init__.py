@@ -42,10 +42,9 @@ class Train(StudyPackage):
                low="window_bias_low", high="window_bias_high", label="bias of the windows"),
         Column("window_bias_low", "lower end of its 95% interval over independent batches of rollouts"),
         Column("window_bias_high", "upper end of its 95% interval"),
-        Column("difference_error", "relative distance of a directional derivative halfway from its central difference, the smallest over step lengths"),
-        numbers("difference_errors", "the same for each step length, longest first", table=False),
+        numbers("slope_errors", "relative error of the gradient along which an update moves, in a random direction in each array of the "
+                "actor (weights by layer, biases by layer, log deviation), halfway in float64; NaN: not known", table=False),
         Column("gradient_zero", "share of updates with a gradient of exactly 0"),
-        Column("unmoved", "share of the arrays of the actor's parameters that the run left as they were"),
         numbers("curve_update", "updates at which the policy was evaluated", table=False),
         numbers("curve_step", "control steps up to those updates", table=False),
         numbers("curve_s", "time up to those updates", "s", table=False, measured=True),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from bench.experiment.parameters import flatten
 from bench.measure.performance import bootstrap, bootstrap_along, interquartile_mean
 from bench.report.problems import problem_names
 from bench.report.views import arrange, attempted
-from bench.studies.train.verdicts import judge
+from bench.studies.train.verdicts import judge, series
 
 PARTS = ("scene", "contact", "integrator", "backend")
 """Parts of the grid that identify a problem."""
@@ -37,22 +37,45 @@ def runs_of(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:
     )
 
 
-def final_returns(part: pd.DataFrame) -> np.ndarray:
+def final_returns(part: pd.DataFrame, column: str = "final_return") -> np.ndarray:
     """Return the final return of each run, ``(n,)``; a run that ended early counts as its untrained policy."""
-    return np.asarray(part["final_return"].where(part["status"] == "ok", part["first_return"]), dtype=float)
+    return np.asarray(part[column].where(part["status"] == "ok", part["first_return"]), dtype=float)
+
+
+def used_steps(run: Mapping[str, Any]) -> np.ndarray:
+    """Return the control steps that a run's updates used up to each evaluation, ``(n,)``: all, where the log has no share."""
+    share = series(run["log_used"])
+    if not share.size:
+        return np.asarray(run["curve_step"], dtype=float)
+    updates = np.append(0.0, run["log_update"])
+    used = np.append(0.0, np.cumsum(share * np.diff(updates)))
+    return np.interp(run["curve_update"], updates, used) * run["steps"] / run["updates"]
+
+
+def at_equal_steps(runs: pd.DataFrame) -> pd.DataFrame:
+    """Return runs with their ``used`` steps, and the return at the last evaluation within the fewest of their problem, ``equal``."""
+    used = pd.Series([used_steps(run) for run in runs.to_dict("records")], runs.index)
+    last = used.map(lambda steps: steps[-1])
+    fewest = last.where(runs["status"] == "ok").groupby(runs["problem"]).transform("min")
+    returns = [
+        curve[max((steps <= limit).sum() - 1, 0)]
+        for curve, steps, limit in zip(runs["curve_return"], used, fewest, strict=True)
+    ]
+    return runs.assign(used=last, equal=returns)
 
 
 def summarise(runs: pd.DataFrame) -> pd.DataFrame:
     """Return a line per problem and method, best first: interquartile mean of the final return over seeds, and medians."""
     lines = []
-    for (problem, method), part in runs.groupby(["problem", "method"], sort=False):
-        final = final_returns(part)
+    for (problem, method), part in at_equal_steps(runs).groupby(["problem", "method"], sort=False):
+        final, equal = final_returns(part), final_returns(part, "equal")
         low, high = interval(final)
         cosines = np.concatenate([np.asarray(c, float) for c in part["cosine"]]) if len(part) else np.empty(0)
         lines.append({
             "problem": problem, "method": method, "family": part["family"].iloc[0], "seeds": len(part),
             "failed": int((part["status"] != "ok").sum()), "returns": final, "final": interquartile_mean(final), "final_low": low,
-            "final_high": high, "worst": float(final.min()), "steps": float(part["steps"].max()),
+            "final_high": high, "worst": float(final.min()), "steps": float(part["steps"].max()), "used": float(part["used"].median()),
+            "equal": interquartile_mean(equal), **dict(zip(("equal_low", "equal_high"), interval(equal), strict=True)),
             "train_s": float(part["train_s"].median()), "compile_s": float(part["compile_s"].max()),
             "gradient_typical": float(part["gradient_typical"].median()),
             "gradient_peak": float(part["gradient_peak"].max()),
@@ -153,20 +176,12 @@ def windows(runs: pd.DataFrame) -> pd.DataFrame:
 
 
 def faults(runs: pd.DataFrame) -> pd.DataFrame:
-    """Return a line per run and fault: problem, method, seed, and the fault's ``code``, ``value`` and ``update``.
-
-    A gradient that is cut at the ends of episodes is a fault only of trainers that differentiate windows shorter than an
-    episode: whole episodes are cut at their end by construction.
-    """
-    lines: list[dict[str, Any]] = []
-    for row in runs.to_dict("records"):
-        is_first_order = len(row["cosine_update"]) > 0 or math.isfinite(row["difference_error"])
-        has_windows = is_first_order and row["window"] < row["horizon"]
-        lines += [
-            {"problem": row["problem"], "method": row["method"], "seed": row["seed"], **fault}
-            for fault in judge(row)
-            if fault["code"] != "cut" or has_windows
-        ]
+    """Return a line per run and fault: problem, method, seed, and the fault's ``code``, ``value`` and ``update``."""
+    lines = [
+        {"problem": row["problem"], "method": row["method"], "seed": row["seed"], **fault}
+        for row in runs.to_dict("records")
+        for fault in judge(row)
+    ]
     return pd.DataFrame(lines, columns=["problem", "method", "seed", "code", "update", "value"])
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 import time
@@ -24,17 +25,20 @@ MEANS = frozenset({"loss", "reward", "value_loss", "cut", "used", "contacts", "s
 """Quantities whose mean an entry of a stored log has; it has the largest value of the others, so that no peak is lost."""
 Z = 1.959963984540054
 """The 0.975 quantile of the standard normal distribution."""
-SHIFTS = {"float64": (1e-3, 1e-4, 1e-5, 1e-6), "float32": (1e-2, 1e-3, 1e-4, 1e-5)}
-"""Lengths of the change of the actor's parameters in central differences: curvature spoils long ones, rounding short ones."""
+LENGTHS = (1e-6, 1e-7, 1e-8)
+"""Changes of parameters in central differences in float64, short enough for episodes with contact."""
+SETTLED = 0.01
+"""Largest relative distance of the three differences from each other for a slope that is known."""
 
 
 def measure(cell: Cell, session: Session, settings: Train) -> dict[str, Any]:
     """Return one cell's results by column."""
+    import jax
+
     trainer, backend = cell.parts["trainer"], cell.backend
     assert isinstance(trainer, Trainer)
-    problem = backend.compile(cell.program())
-    env = Environment(problem.program, backend.ops(), backend.dtype)  # type: ignore[attr-defined]
-    training = Training(env, trainer)
+    training = _training(cell, backend)
+    env = training.env
     # all trainers and seeds are evaluated from the same starts
     starts = noise.draw(0, cell.scene.name, 1, settings.starts, env.n_start, "train: starts")[0].T
     total, per_update = trainer.updates(env), trainer.steps_per_update(env)
@@ -43,7 +47,6 @@ def measure(cell: Cell, session: Session, settings: Train) -> dict[str, Any]:
     halfway = max(total // 2, 1) if trainer.first_order else 0
 
     state = training.start(cell.seed)
-    untrained = _arrays(state)
     training.returns(state, starts)
     training.compile_update(state)
     compile_s = training.compile_s
@@ -65,24 +68,23 @@ def measure(cell: Cell, session: Session, settings: Train) -> dict[str, Any]:
             agreement = training.agreement(state, update + 1, settings.copies)
             cosines.append((update, agreement["cosine"], agreement["cosine_denoised"]))
         if update == halfway and trainer.first_order:
-            probe = _probe(training, state, settings.batches)
+            exact = _training(cell, dataclasses.replace(backend, dtype="float64"))
+            probe = {"slope_errors": slope_errors(exact, state), **_windows(training, state, settings.batches)}
         started = time.perf_counter()
-        state, entry = training.update(state)
-        training.wait(state)
+        state, entry = jax.block_until_ready(training.update(state))
         spent += time.perf_counter() - started
         pending.append(entry)
 
     table = np.array(curve)
     final = table[-1, 3:]
     norms = _column(log, "gradient_norm")
-    is_unmoved = [np.array_equal(a, b) for a, b in zip(untrained, _arrays(state), strict=True)]
     return {
         "status": "ok" if bad is None else "nonfinite",
         "reason": "" if bad is None else f"{bad[1]} is not finite at update {bad[0]}",
         "first_return": table[0, 3], "final_return": final[0], "final_return_low": final[1], "final_return_high": final[2],
         "final_median": final[3], "updates": int(table[-1, 0]), "steps": int(table[-1, 1]), "train_s": spent,
         "compile_s": compile_s, "gradient_typical": float(np.nanmedian(norms)), "gradient_peak": float(np.nanmax(norms)),
-        "gradient_zero": float((norms == 0).mean()), "unmoved": float(np.mean(is_unmoved)) if is_unmoved else math.nan,
+        "gradient_zero": float((norms == 0).mean()),
         **probe,
         "curve_update": table[:, 0].tolist(), "curve_step": table[:, 1].tolist(), "curve_s": table[:, 2].tolist(),
         "curve_return": table[:, 3].tolist(), "curve_return_low": table[:, 4].tolist(),
@@ -90,6 +92,12 @@ def measure(cell: Cell, session: Session, settings: Train) -> dict[str, Any]:
         **{name: [row[i] for row in cosines] for i, name in enumerate(("cosine_update", "cosine", "cosine_denoised"))},
         **_thinned(log, settings.entries),
     }  # fmt: skip
+
+
+def _training(cell: Cell, backend: Any) -> Training:
+    """Return a cell's trainer on its environment, in the precision of a backend."""
+    env = Environment(backend.compile(cell.program()).program, backend.ops(), backend.dtype)
+    return Training(env, cell.parts["trainer"])  # type: ignore[arg-type]
 
 
 def _first_not_finite(log: list[dict[str, float]]) -> tuple[int, str] | None:
@@ -103,13 +111,6 @@ def _column(log: list[dict[str, float]], name: str) -> np.ndarray:
     return np.array([entry.get(name, math.nan) for entry in log])
 
 
-def _arrays(state: Any) -> list[np.ndarray]:
-    """Return copies of the parameters of a state's actor, by array; empty for a state without one."""
-    import jax
-
-    return [np.array(leaf) for leaf in jax.tree.leaves(getattr(state, "actor", ()))]
-
-
 def _spread(total: int, count: int) -> set[int]:
     """Return ``count`` updates spread over a run, in the middles of equal parts."""
     return {int(total * (i + 0.5) / count) for i in range(count)} if count else set()
@@ -121,25 +122,44 @@ def _interval(returns: np.ndarray) -> tuple[float, float, float, float]:
     return mean, mean - half, mean + half, float(np.median(returns))
 
 
-def _probe(training: Training, state: Any, batches: int) -> dict[str, Any]:
-    """Return the error of a directional derivative, and the bias of windows, at one state of a run.
+def slope_errors(exact: Training, state: Any) -> list[float]:
+    """Return the relative error of the gradient along which an update moves the actor, by array, in float64.
 
-    The direction is that of the gradient of the same rollouts, and the error the smallest over :data:`SHIFTS`. The gradient of
-    whole episodes is computed without cuts, and cut into the trainer's windows, each of which ends in the critic's value:
-    without the critic's error and the cuts, both would be equal. ``window_bias`` is the distance of their means, relative to
-    the gradient without cuts, with the interval of :func:`bias_interval`. Both have the same noise.
+    The error is that of its slope along a random direction of signs in that array, against central differences of the update's
+    own loss, with the same noise. Slopes are in units of their median over arrays: Adam does not depend on a common factor. NaN
+    where differences of three lengths do not agree, so that the slope is not known; empty for an optimizer other than Adam.
     """
-    gradient = training.gradient(state, 0)
-    norm = float(np.linalg.norm(gradient))
-    result: dict[str, Any] = {"difference_error": math.nan}
-    if norm > 0 and math.isfinite(norm):
-        errors = []
-        for length in SHIFTS[training.env.dtype]:
-            shift = length * gradient / norm
-            slope = training.mean_return(state, 0, shift) - training.mean_return(state, 0, -shift)
-            errors.append(abs(slope / (2 * length) / norm - 1.0))
-        result["difference_errors"] = errors
-        result["difference_error"] = float(np.nanmin(errors)) if np.isfinite(errors).any() else math.nan
+    import jax
+    import jax.numpy as jnp
+    import optax
+
+    if optax.tree.get(state.memory, "mu") is None:
+        return []
+    state = jax.tree.map(lambda x: x.astype("float64") if jnp.issubdtype(x.dtype, jnp.floating) else x, state)
+    gradient = exact.applied(state)
+    sizes = [leaf.size for leaf in jax.tree.leaves(state.actor)]
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], gradient.size)
+    ratios = []
+    for array in np.split(np.arange(gradient.size), np.cumsum(sizes)[:-1]):
+        direction = np.zeros_like(gradient)
+        direction[array] = signs[array]
+        slopes = np.array(
+            [(exact.loss(state, h * direction) - exact.loss(state, -h * direction)) / (2 * h) for h in LENGTHS]
+        )
+        is_known = np.ptp(slopes) < SETTLED * abs(slopes[1])
+        ratios.append(float(gradient @ direction / slopes[1]) if is_known else math.nan)
+    common = abs(np.nanmedian(ratios)) if np.isfinite(ratios).any() else math.nan
+    return [abs(ratio / common - 1.0) for ratio in ratios]
+
+
+def _windows(training: Training, state: Any, batches: int) -> dict[str, Any]:
+    """Return the bias of windows at one state of a run; empty for a trainer without windows.
+
+    The gradient of whole episodes is computed without cuts, and cut into the trainer's windows, each of which ends in the
+    critic's value: without the critic's error and the cuts, both would be equal. ``window_bias`` is the distance of their
+    means, relative to the gradient without cuts, with the interval of :func:`bias_interval`. Both have the same noise.
+    """
+    result: dict[str, Any] = {}
     if batches > 1 and hasattr(training.trainer, "window"):
         length, every = training.env.length, training.trainer.window
         whole = np.array([training.gradient(state, 1 + i, length) for i in range(batches)])

@@ -20,6 +20,8 @@ FINAL = Column("final", label="final return", low="final_low", high="final_high"
 SUMMARY = (
     PROBLEM, METHOD, FINAL, VERDICT, Column("worst", label="worst seed", digits=3), Column("seeds", format="setting"),
     Column("failed", label="not finite", format="setting"), Column("steps", unit="steps", label="control steps", digits=3),
+    Column("used", label="used steps", digits=3),
+    Column("equal", label="at equal used steps", low="equal_low", high="equal_high", digits=3, log=False),
     Column("train_s", label="training", format="seconds"), Column("compile_s", label="compilation", format="seconds"),
     Column("gradient_typical", label="gradient norm"), Column("gradient_peak", label="largest gradient"),
     Column("cosine", label="cosine"),
@@ -67,7 +69,8 @@ LINES = (*VARIANTS, *DEVIANT)
 SEEDS = f"interquartile mean over seeds, with its 95% bootstrap interval from {aggregate.MIN_SEEDS} seeds on"
 NOTE = (
     f"final return: the mean undiscounted return of the deterministic policy from the same starts, {SEEDS}. A run that is not "
-    "finite counts as its untrained policy. training: "
+    "finite counts as its untrained policy. used steps: control steps that updates use, median. at equal used steps: the return at "
+    "the last evaluation within the used steps of the run that used fewest. training: "
     "median over seeds, without compilation and evaluations. gradient norm: median over updates before clipping, of the "
     "trainer's own objective, so compare it within a trainer only. cosine: between first- and zeroth-order gradients of the "
     "same objective along the runs, mean; noise in either lowers it."
@@ -83,7 +86,7 @@ VERDICTS = (
     "verdict: first, tied (not distinguishable), behind (by a Mann-Whitney test at 5%), or open where none is behind."
 )
 PAGE = ("final_return", "first_return", "final_median", "updates", "steps", "train_s", "compile_s", "gradient_typical",
-        "gradient_peak", "window_gradient", "window_bias", "difference_error")  # fmt: skip
+        "gradient_peak", "window_gradient", "window_bias")  # fmt: skip
 
 
 def views(experiment: Experiment, rows: pd.DataFrame) -> Views:

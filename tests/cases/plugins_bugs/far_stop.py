@@ -1,11 +1,10 @@
 """A stiff stop 3.6 standard deviations away: continuous, met by 1 sample in 6,300."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from bench.plugin import Array, FunctionScene, param
+from bench.plugin import FunctionScene, param
 
 
 @dataclass(frozen=True)
@@ -18,8 +17,8 @@ class FarStop(FunctionScene):
     stiffness: float = param(2e4, "k")
     at: float = param(3.6, "z")
 
-    def theta0(self) -> np.ndarray:
+    def theta0(self):
         return np.array([0.0])
 
-    def cost(self, xp: Any, x: Array) -> Array:
+    def cost(self, xp, x):
         return x[0] + self.stiffness * xp.maximum(x[0] - self.at, 0.0 * x[0])

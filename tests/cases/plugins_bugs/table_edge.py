@@ -1,11 +1,10 @@
 """A puck pushed along a table that ends: it drops to the floor beyond the edge."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from bench.plugin import Array, MechanicalScene, State, param
+from bench.plugin import MechanicalScene, State, param
 
 
 @dataclass(frozen=True)
@@ -23,15 +22,15 @@ class TableEdge(MechanicalScene):
     speed: float = param(2.0, "speed at theta", "m/s")
     goal: float = param(2.0, "goal", "m")
 
-    def theta0(self) -> np.ndarray:
+    def theta0(self):
         return np.array([self.speed])
 
-    def initial_state(self, xp: Any, theta: Array) -> State:
+    def initial_state(self, xp, theta):
         zero = 0.0 * theta[0:1]
         return State(xp.concat([zero, zero + 1.0]), xp.concat([theta[0:1], zero]))
 
-    def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
+    def acceleration(self, xp, q, v, u):
         return xp.stack([-1.0 * v[0], 0.0 * v[1]])
 
-    def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
+    def terminal_cost(self, xp, q, v):
         return (q[0] - self.goal) ** 2 + xp.where(q[0] > self.edge, self.loss + 0.0 * q[0], 0.0 * q[0])

@@ -12,7 +12,8 @@ import pandas as pd
 from scipy.special import bdtr
 
 from bench.report.text import axis_value
-from bench.studies.dose_response.search import TARGETS
+
+from .search import TARGETS
 
 CLASSES = ("smooth", "stiff", "discontinuous", "chaotic", "identification")
 """The classes of problems, in the order in which they are shown."""
@@ -43,8 +44,7 @@ COMPARISONS: dict[str, tuple[tuple[str, float], tuple[str, float]]] = {
     "bias 0.9 / random error 1": ((BIAS, 0.9), (RANDOM, 1.0)),
 }
 """Planted errors that are compared on the same problem, by name: numerator and denominator, each a kind and a size."""
-MEASURED = ("error", "bias", "rollouts_per_update", "gradients_per_update", "rollout_s", "gradient_s", "tuning_rollouts",
-            "tuning_gradients")  # fmt: skip
+MEASURED = ("error", "bias", "rollouts_per_update", "gradients_per_update", "rollout_s", "gradient_s")
 
 
 def searches(rows: pd.DataFrame) -> pd.DataFrame:
@@ -63,7 +63,7 @@ def searches(rows: pd.DataFrame) -> pd.DataFrame:
             "problem": problem_name(row), "scene": row["scene"], "scene_class": row["scene_class"], "kind": kind,
             "method": _method(row, kind), "dose": dose, "target": target, "times": times[k], "median": float(np.median(times[k])),
             "samples": row["samples"], "rates": np.asarray(row["rates"], dtype=float), "by_rate": by_rate[:, k],
-            "best_rate": row["best_rates"][k], "inside": bool(row["is_inside"][k]), **{name: row[name] for name in MEASURED},
+            "best_rate": row["best_rates"][k], **{name: row[name] for name in MEASURED},
         } for k, target in enumerate(TARGETS)]  # fmt: skip
     table = pd.DataFrame(lines)
     if table.empty:

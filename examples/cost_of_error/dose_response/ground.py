@@ -16,8 +16,9 @@ from bench.experiment.session import Session
 from bench.measure import noise
 from bench.model import Estimator, Optimizer, Problem, best_gradient, zeroth_order
 from bench.run.files import make_directory, write_whole
-from bench.studies.dose_response.search import Method, Task, run_searches, tune, unit_rate, with_rate
 from bench.studies.optimise.search import known_optimum, objective
+
+from .search import Method, Task, run_searches, tune, unit_rate, with_rate
 
 POINTS = 10
 """Number of thetas at which errors are measured."""

@@ -10,6 +10,9 @@ from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, t
 from bench.model import Estimator, Optimizer, param
 from bench.studies.optimise import SearchStudy
 
+REVISION = 1
+"""Raised when a stored number moves: the stored rows belong to a revision and not to the content of these files."""
+
 
 @dataclass(frozen=True)
 class DoseResponse(SearchStudy):

@@ -11,15 +11,17 @@ from bench.plugins.optimizers.adam import Adam
 from bench.plugins.optimizers.gradient_descent import GradientDescent
 from bench.plugins.scenes.cartpole_swing import CartpoleSwing
 from bench.plugins.scenes.quadratic import Quadratic
+from dose_response import analysis, views
+from dose_response.ground import BestGradient, scored_noise
+from dose_response.measure import compare, hypotheses_hash
+from dose_response.search import TARGETS, Method, Task, follow, run_searches, tune, unit_rate
+from trees import ROOT
 
 import bench
 from bench.experiment import config
-from bench.studies.dose_response import analysis, views
-from bench.studies.dose_response.ground import BestGradient, scored_noise
-from bench.studies.dose_response.measure import compare, hypotheses_hash
-from bench.studies.dose_response.search import TARGETS, Method, Task, follow, run_searches, tune, unit_rate
 from bench.studies.optimise.search import objective
 
+PAPER = ROOT / "examples" / "cost_of_error"
 D = 8
 DIFFERENCED = 1e-6
 """Relative error of gradients by central differences along a path."""
@@ -139,6 +141,7 @@ def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("dose")
     words = [
         "experiment=dose_response/quick",
+        f"plugins={PAPER}",
         "backends=[numpy]",
         "scenes=[spring_record,double_integrator]",
         "workers=0",
@@ -301,7 +304,7 @@ def test_a_ratio_beyond_the_budget_has_only_a_lower_end():
 
 def test_planted_errors_alone_have_a_report_that_compares_no_orders(run):
     """The fault: without natural methods the tables of costs had no columns, and the report ended in a KeyError."""
-    experiment = config.load(["experiment=dose_response/quick"])
+    experiment = config.load(["experiment=dose_response/quick", f"plugins={PAPER}"])
     for rows in (run[run["estimator"] == "planted"], run[run["estimator_params"] == "base=best"]):
         shown = views.views(experiment, rows.reset_index(drop=True))
         (pairs,) = [table for table in shown.tables if table.name in ("pairs", "problems")][:1]

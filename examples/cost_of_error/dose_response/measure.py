@@ -5,19 +5,21 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from bench.errors import Unsupported
 from bench.experiment.cell import Cell
-from bench.experiment.config import config_dir
 from bench.experiment.session import Session
 from bench.measure import noise
 from bench.model import Estimator, Optimizer, Problem
-from bench.studies.dose_response import DoseResponse
-from bench.studies.dose_response.ground import Ground, ground_of, scored_noise
-from bench.studies.dose_response.search import (
+from bench.studies.optimise.search import error_parts, fastest, scene_class
+
+from . import DoseResponse
+from .ground import Ground, ground_of, scored_noise
+from .search import (
     MOST_NUMBERS,
     Method,
     Task,
@@ -26,9 +28,8 @@ from bench.studies.dose_response.search import (
     unit_rate,
     with_rate,
 )
-from bench.studies.optimise.search import fastest, scene_class
 
-HYPOTHESES = config_dir() / "hypotheses" / "dose_response.md"
+HYPOTHESES = Path(__file__).parents[1] / "hypotheses.md"
 """The hypotheses that were written before the first run."""
 TUNING_SEED = 10_000
 """First seed of the searches that choose the rate."""
@@ -130,14 +131,10 @@ def compare(estimates: np.ndarray, gradient: np.ndarray, variance: float) -> dic
     names = ("error", "bias", "spread", "cosine", "sign_agreement")
     if not np.isfinite(estimates).all() or not norm2 > 4 * variance or not norm2 > 0:
         return dict.fromkeys(names, math.nan)
-    spread2 = float(estimates.var(axis=0, ddof=1).sum())
-    mean_error = estimates.mean(axis=0) - gradient
-    bias2 = max(float(mean_error @ mean_error) - spread2 / len(estimates) - variance, 0.0)
-    sizes = np.linalg.norm(estimates, axis=1) * np.linalg.norm(gradient)
-    cosines = np.divide(estimates @ gradient, sizes, out=np.zeros(len(estimates)), where=sizes > 0)
+    bias2, spread2, cosine = error_parts(estimates, gradient, variance)
     signs = (np.sign(estimates) == np.sign(gradient)).mean()
     values = [math.sqrt((bias2 + spread2) / norm2), math.sqrt(bias2 / norm2), math.sqrt(spread2 / norm2)]
-    return dict(zip(names, [*values, float(cosines.mean()), float(signs)], strict=True))
+    return dict(zip(names, [*values, cosine, float(signs)], strict=True))
 
 
 def _times(cell: Cell, problem: Problem) -> dict[str, float]:

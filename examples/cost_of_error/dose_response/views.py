@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pandas as pd
 
 from bench.experiment.axes import table as csv_table
@@ -10,8 +9,9 @@ from bench.experiment.columns import Column, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Style, Table, Views
 from bench.report.style import MARKERS, PALETTE, VARIANTS
-from bench.studies.dose_response import analysis
-from bench.studies.dose_response.analysis import BIAS, COSTS_ONLY, FIXED, MAIN, RANDOM, ROTATION, TAILS
+
+from . import analysis
+from .analysis import BIAS, COSTS_ONLY, FIXED, MAIN, RANDOM, ROTATION, TAILS
 
 STYLES = {
     RANDOM: Style(PALETTE[0], "o"),
@@ -36,16 +36,6 @@ PAIR_NOTES = (
     "the best gradient. Median over scenes, each with the median of its problems, and its 95% interval. A verdict: the exact sign "
     "test at 5%, which needs six scenes. inf: more than half miss.",
 )
-METHODS = (
-    CLASS, text("method"), Column("samples", format="setting"), PROBLEMS, Column("error", label="relative error"),
-    Column("reached", label="reach 1/100", format="percent"), Column("relative", label="updates / best gradient's"),
-    Column("over_rates", label="median over rates / best rate"), Column("tuning", label="tuning / search, updates"),
-    Column("inside", label="best rate inside", format="percent"),
-)  # fmt: skip
-METHOD_NOTES = (
-    "Medians over problems at the target 1/100, inf where most miss it. Tuning / search: updates of all searches that choose "
-    "the rate, divided by the updates of one search to the target.",
-)
 PROBLEM_NOTES = (
     f"Updates of the best gradient at its best rate. A problem counts for a target if these are finite and at least {analysis.LEAST_UPDATES}.",
 )
@@ -53,7 +43,6 @@ REACHED_NOTES = (
     "Medians over the searches of a method: updates times the rollouts and gradients of an update, a gradient counted as one "
     "rollout. Costs and the best gradient have no noise, `fobg` has that of its samples. -: most searches miss the target.",
 )
-CELLS = ("scene_class", "error", "bias", "spread", "cosine", "lowest")
 
 
 def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
@@ -62,38 +51,21 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     if table.empty:
         return Views()
     lines, beside = analysis.counted(table), analysis.reached(table)
-    pairs, cells = analysis.by_scene(analysis.ratios(lines)), csv_table(experiment, rows)
+    pairs = analysis.by_scene(analysis.ratios(lines))
     main = pairs[pairs["target"] == MAIN]
     tables = [
         Table("pairs", main[main["scene_class"] == analysis.ALL], PAIRS[1:], "Ratios on the same problem", PAIR_NOTES,
               terminal=True, page=True, data=pairs),
         Table("pairs", main[main["scene_class"] != analysis.ALL], PAIRS, "Ratios by class", PAIR_NOTES, page=True,
               split="scene_class"),
-        Table("dose_response", _methods(table), METHODS, "Methods at their best rate", METHOD_NOTES, data=cells),
+        Table("dose_response", csv_table(experiment, rows), [], files=["csv"]),
         _problems(table),
     ]  # fmt: skip
     points = analysis.relative_times(lines[lines["scene_class"].isin(pairs["scene_class"])])
     charts = [_chart(points, pairs)] if len(points) else []
     if len(beside):  # then the question is what such methods take
         tables, charts = [_reached(beside), *tables[2:]], [_reached_chart(beside)]
-    named = rows.assign(problem=[analysis.problem_name(row) for _, row in rows.iterrows()])
-    columns = [experiment.columns.by_name[name] for name in CELLS]
-    return Views([one for one in tables if len(one.frame)], charts, named, columns)
-
-
-def _methods(table: pd.DataFrame) -> pd.DataFrame:
-    part = table[(table["target"] == MAIN) & ~table["kind"].isin(analysis.PLANTED)]
-    known = analysis.floors(table)
-    floor = known[(known["target"] == MAIN) & (known["reason"] == "")].set_index("problem")["floor"]
-    updates = [part[f"tuning_{n}"] / part[f"{n}_per_update"].replace(0.0, np.nan) for n in ("rollouts", "gradients")]
-    part = part.assign(
-        relative=part["median"] / part["problem"].map(floor), reached=np.isfinite(part["median"]),
-        over_rates=part["by_rate"].map(np.median) / part["median"], tuning=updates[0].fillna(updates[1]) / part["median"],
-    )  # fmt: skip
-    summary = {name: (name, "median") for name in ("error", "relative", "over_rates", "tuning")}
-    shares = {name: (name, "mean") for name in ("reached", "inside")}
-    groups = part.groupby(["scene_class", "method", "samples"], sort=False)
-    return groups.agg(problems=("problem", "nunique"), **summary, **shares).reset_index()
+    return Views([one for one in tables if len(one.frame)], charts)
 
 
 def _problems(table: pd.DataFrame) -> Table:
