@@ -56,7 +56,7 @@ def write_whole(path: Path, content: bytes | Iterable[bytes]) -> None:
     """Write a file completely or not at all; raises :class:`StorageError` if it cannot be written."""
     try:
         replace_file(path, content)
-    except OSError as error:
+    except FileNotFoundError as error:
         raise StorageError(f"'{path}' cannot be written: {error.strerror}") from None
 
 

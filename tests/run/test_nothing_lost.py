@@ -9,7 +9,6 @@ import time
 from multiprocessing.connection import Connection
 
 import pandas as pd
-import psutil
 import pytest
 from trees import hearing_signals, processes_in, wait_for
 
@@ -19,7 +18,6 @@ from bench.model.guard import temporary_file
 from bench.run import files
 from bench.run.files import TEMPORARY, remove_stale, temporary
 from bench.run.pool import MalformedMessage, Pool, ResourceLimits, _Worker
-from bench.run.reaper import Reaper
 from bench.run.store import Store
 from bench.studies.bias_variance.columns import COLUMNS
 
@@ -326,18 +324,6 @@ def test_an_open_connection_without_messages_is_not_a_fault():
     assert worker.receive() == []
     assert worker.fault == "closed its connection"
     worker.close()
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="processes stop otherwise")
-def test_a_reaper_that_is_stopped_at_its_start_is_resumed():
-    reaper = Reaper()
-    try:
-        reaper._process.send_signal(signal.SIGSTOP)
-        reaper.wait_until_ready()
-        assert reaper._process.poll() is None
-        assert psutil.Process(reaper._process.pid).status() != psutil.STATUS_STOPPED
-    finally:
-        reaper.close()
 
 
 HELD = """
