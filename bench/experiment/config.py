@@ -20,7 +20,7 @@ from bench.model.identity import parse_identity
 from bench.model.parameters import build, coerce, remember, singular
 
 SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
-RESERVED = ("references", "standard")
+RESERVED = ("claims", "references", "standard", "trace")
 """Names of folders under ``results_dir`` that are not experiments."""
 SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0}
 BYTES = {"k": 2.0**10, "m": 2.0**20, "g": 2.0**30}
@@ -51,7 +51,7 @@ def load(overrides: Sequence[str], config_dirs: Sequence[Path] = ()) -> Experime
     """
     for key, _, value in _split_words(overrides):
         if key == "plugins":
-            for path in _split(value) or [""]:
+            for path in _split(value) or ([] if value.startswith("[") else [""]):
                 if not path.strip("'\" "):
                     raise UserError(f"plugins={value} names no folder; the current one is plugins=.")
                 registry.add_folder(Path(path))
