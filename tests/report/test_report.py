@@ -1,7 +1,5 @@
 """Tables and charts from rows, held to what they promise and to what goes wrong in them."""
 
-from __future__ import annotations
-
 import csv
 import json
 import math
