@@ -412,7 +412,8 @@ def measure(cell: Cell, session: Session, settings: Identify) -> dict[str, Any]:
     if settings.scan:
         scans = pd.DataFrame(scan(model, n_windows if has_windows else 1, data[:, :1], sigma, settings))
         result |= scans.to_dict("list") | {"scan_loss": np.concatenate([*scans["scan_loss"]]).tolist()}
-    return result | lines.to_dict("list")
+    result |= lines.to_dict("list")
+    return result
 
 
 @dataclass(frozen=True)
