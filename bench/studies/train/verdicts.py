@@ -111,7 +111,7 @@ def series(values: Any) -> np.ndarray:
 def _known(values: Any) -> np.ndarray:
     """Return the entries of a stored list that are not NaN."""
     numbers = series(values)
-    return numbers[~np.isnan(numbers)]
+    return np.asarray(numbers[~np.isnan(numbers)])
 
 
 def _check_return(run: Mapping[str, Any], check: Any) -> None:
