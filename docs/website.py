@@ -39,7 +39,7 @@ PAGES: Mapping[str, str] = {
 """The site's page of each document, and its path in the repository."""
 SECTIONS: Mapping[str, Sequence[str]] = {
     "start": ("reading-results", "python"),
-    "trust": ("gradcheck", "examine"),
+    "trust": ("gradcheck", "examine", "conformance"),
     "results": (
         "answers",
         "experiment/*",
@@ -63,6 +63,7 @@ SECTIONS: Mapping[str, Sequence[str]] = {
         "peers",
         "validation",
         "sources",
+        "upstream",
         "changelog",
     ),
 }
