@@ -33,12 +33,13 @@ PAGES: Mapping[str, str] = {
     "start": "README.md",
     "contributing": "CONTRIBUTING.md",
     "changelog": "CHANGELOG.md",
+    "cost-of-error": "examples/cost_of_error/README.md",
     **{path.stem: f"docs/{path.name}" for path in sorted(DOCS.glob("*.md"))},
 }
 """The site's page of each document, and its path in the repository."""
 SECTIONS: Mapping[str, Sequence[str]] = {
     "start": ("reading-results", "python"),
-    "trust": ("gradcheck", "examine"),
+    "trust": ("gradcheck", "examine", "conformance"),
     "results": (
         "answers",
         "experiment/*",
@@ -62,6 +63,7 @@ SECTIONS: Mapping[str, Sequence[str]] = {
         "peers",
         "validation",
         "sources",
+        "upstream",
         "changelog",
     ),
 }

@@ -113,6 +113,8 @@ def test_plugins_import_only_public_names():
             assert family or name.split(".")[2] == path.parent.name, f"{path.name} imports {name} of another kind"
         elif name.startswith("bench.training."):
             assert path.parent.name == "trainers", f"{path.name} imports {name}, which is for trainers"
+        elif name.startswith("bench.engines.conformance."):
+            assert path.stem.endswith("_conformance"), f"{path.name} imports {name}, which is for the conformance set"
         elif name.partition(".")[0] == "bench" and name != "bench.engines.backend.EngineBackend":
             assert name.rpartition(".")[0] == "bench.model", f"a plugin imports bench.model, not {name}"
             assert name.rpartition(".")[2] in model.__all__, f"{name} is not in bench.model.__all__"

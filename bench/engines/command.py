@@ -1,4 +1,4 @@
-"""The command ``engines``: lists the engines that run in a Python of their own, and makes their environments."""
+"""The command ``engines``: lists the engines in a Python of their own, makes their environments, writes their table."""
 
 from __future__ import annotations
 
@@ -7,24 +7,36 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from bench.engines import environments
+from bench.engines import environments, table
 from bench.engines.backend import EngineBackend
 from bench.errors import UserError, printable, unknown
 from bench.model import registry
 
-USAGE = "python -m bench engines [install NAME ... [--again]] [plugins=DIR]"
+USAGE = (
+    "python -m bench engines [install NAME ... [--again] | table [NAME ...] [out=DIR] [key=value ...]] [plugins=DIR]"
+)
 
 
 def main(words: Sequence[str]) -> int:
-    """List all engines with the state of their environments, or install the named ones; returns the exit status."""
+    """List all engines with the state of their environments, install the named ones, or write the table; return the status."""
+    out = Path("results/engines_table")
     for word in words:
         if word.startswith("plugins="):
             registry.add_folder(Path(word.partition("=")[2]))
-    names = [word for word in words if not word.startswith(("plugins=", "--"))]
+        elif word.startswith("out="):
+            out = Path(word.partition("=")[2])
+    names = [word for word in words if not word.startswith(("plugins=", "out=", "--"))]
     if strange := [word for word in words if word.startswith("--") and word != "--again"]:
         raise UserError(f"engines: unknown option {strange[0]} (allowed: --again): {USAGE}")
     if not names:
         return _list()
+    if names[0] == "table":
+        settings = [name for name in names[1:] if "=" in name]
+        wanted = [name for name in names[1:] if "=" not in name]
+        for name in wanted:
+            registry.find("backends", name)
+        print(table.write(wanted, out, settings))
+        return 0
     if names[0] != "install" or not names[1:]:
         raise UserError(f"engines: {' '.join(names)} is not a request: {USAGE}")
     engines = _engines()

@@ -1,0 +1,8 @@
+"""Small cases with certified values and derivatives, by which the authors of a differentiable simulator check it.
+
+The folder needs NumPy only and imports nothing of this package, so that it can be copied.
+"""
+
+from .runner import Case, cases, check, differences, run
+
+__all__ = ["Case", "cases", "check", "differences", "run"]

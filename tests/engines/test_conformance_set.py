@@ -1,0 +1,267 @@
+"""The conformance set for simulators: its numbers are found again, right engines are right, and planted faults are named."""
+
+import dataclasses
+import importlib
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import conformance_set
+import numpy as np
+import pytest
+
+from bench.cli import main
+from bench.engines import conformance
+
+pytest.importorskip("mujoco")
+ROOT = Path(__file__).resolve().parents[2]
+FEW = ("connect_fast", "stacked", "impratio")
+STORED = 1e-5
+"""Relative difference from stored numbers allowed: faults come from single differences of terms, and add up over steps."""
+
+
+def mjx(*names, **settings):
+    pytest.importorskip("mujoco.mjx")
+    return importlib.import_module("bench.plugins.engines.mjx_conformance").Engine(*names, **settings)
+
+
+def wrong(rows):
+    return [row for row in rows if not row["is_right"]]
+
+
+def test_an_engine_that_follows_the_page_runs_without_this_package(tmp_path):
+    """The page's engine has 40 lines at most, in a folder with a copy of the set."""
+    (tmp_path / "tests").mkdir()
+    shutil.copytree(Path(conformance.__file__).parent, tmp_path / "tests" / "conformance")
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs/conformance.md").read_text(), re.DOTALL)
+    assert len(blocks[0].splitlines()) <= 41
+    (tmp_path / "tests" / "my_engine.py").write_text(blocks[0])
+    text = (
+        "import sys\n"
+        + blocks[1]
+        + "\n\ndef test_alone():\n    assert not {'hydra', 'pandas', 'bench'} & set(sys.modules)\n"
+    )
+    (tmp_path / "tests" / "test_mine.py").write_text(text)
+    words = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "tests"]
+    alone = os.environ | {"PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}  # hydra brings a plugin
+    done = subprocess.run(words, cwd=tmp_path, env=alone, capture_output=True, text=True)
+    assert "2 passed" in done.stdout, done.stdout
+    words = [sys.executable, "tests/conformance/runner.py", "tests/my_engine.py", "friction_loss", "free_joint"]
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=True)
+    *rows, last = json.loads(done.stdout.splitlines()[-1])["rows"]
+    assert [row["term"] for row in rows] == ["value", *conformance_set.TERMS]
+    assert all(row["is_right"] and row["digits"] > 10 for row in rows)
+    assert (last["case"], last["term"], last["is_right"]) == ("free_joint", "all", None)
+    assert last["reason"] == "NotImplementedError: only a pendulum with friction loss"
+
+
+class OwnPhysics:
+    """An engine with another law, whose derivative by the controls lacks a factor."""
+
+    differs = {"free_joint": "another law"}
+
+    @staticmethod
+    def rollout(case):
+        return float(np.sin(case.qpos).sum() * case.parameter + (case.controls**3).sum())
+
+    @staticmethod
+    def gradient(case):
+        return {"qpos": np.cos(case.qpos) * case.parameter, "controls": 2 * case.controls**2}
+
+
+def test_physics_that_differ_by_design_are_compared_with_their_own_differences():
+    value, qpos, controls = conformance.run(OwnPhysics(), "free_joint")
+    assert (value["is_right"], value["reason"]) == (None, "another law")
+    assert (qpos["is_right"], qpos["against"]) == (True, "own differences")
+    assert qpos["digits"] > 8
+    assert controls["is_right"] is False
+    assert not controls["looks_like"]
+
+
+class Short:
+    """A pendulum with states of float32, a cost of float64 and the right derivative."""
+
+    differs = {"hinge_limit": "no limit"}
+    tolerance = 1e-3
+
+    @staticmethod
+    def rollout(case):
+        q, v, dt = np.float32(case.qpos[0]), np.float32(case.qvel[0]), np.float32(0.02)
+        for _ in range(20):
+            v = v - dt * np.float32(9.81) * np.sin(q)
+            q = q + dt * v
+        return case.cost(float(q), float(v))
+
+    @staticmethod
+    def gradient(case):
+        start, weights = np.array([case.qpos[0], case.qvel[0]]), case.data["weights"]
+        result = []
+        for q, v in start + 1e-30j * np.eye(2):
+            for _ in range(20):
+                v = v - 0.02 * 9.81 * np.sin(q)
+                q = q + 0.02 * v
+            result.append((weights["qpos"][0] * q + weights["qvel"][0] * v).imag / 1e-30)
+        return {"qpos": result[:1], "qvel": result[1:], "parameter": 0.0}
+
+
+def test_shorter_floats_than_those_of_the_cost_are_no_fault():
+    (case,) = conformance.cases("hinge_limit")
+    for shift in np.linspace(-0.5, 0.5, 40):
+        moved = dataclasses.replace(case, qpos=case.qpos + shift)
+        _, *rows = conformance.check(Short(), moved)
+        assert not [row for row in rows if row["is_right"] is False], rows
+        assert [row["is_right"] for row in rows].count(True) >= 2
+
+
+def test_an_error_of_an_engine_is_a_row():
+    class Broken:
+        def rollout(self, case):
+            raise ZeroDivisionError("no mass")
+
+    (row,) = conformance.run(Broken(), "rk4")
+    assert (row["is_right"], row["reason"]) == (False, "ZeroDivisionError: no mass")
+
+
+def test_too_few_numbers_are_a_row():
+    engine = OwnPhysics()
+    engine.gradient = lambda case: {"qvel": [0.0]}
+    *_, row = conformance.run(engine, "rk4")
+    assert (row["is_right"], row["reason"]) == (False, "1 numbers instead of 2")
+
+
+@pytest.mark.parametrize(
+    ("fault", "case", "engine"),
+    [
+        *(
+            (fault, case, conformance_set.ByTerms(fault))
+            for fault, case in {
+                "sign of equality": "joint_equality",
+                "dropped J-dot v": "weld",
+                "frozen normal": "stacked",
+                "stale velocity": "ball_limit",
+            }.items()
+        ),
+        ("one iteration", "pyramidal_slide", conformance_set.MujocoC(iterations=1)),
+        ("impratio ignored", "impratio", conformance_set.MujocoC(impratio=1.0)),
+    ],
+)
+def test_a_planted_fault_is_named(fault, case, engine):
+    found = wrong(conformance.run(engine, case))
+    assert found
+    assert {row["looks_like"] for row in found} == {fault}
+
+
+def test_every_case_has_sources_that_agree():
+    cases = conformance.cases()
+    assert len(cases) == 28
+    for case in cases:
+        sources = case.data["sources"]
+        assert len(sources) >= 2, case.name
+        assert max(error for source in sources.values() for error in source.values()) < STORED, case.name
+    faults = {fault for case in cases for fault in case.data["faults"]}
+    assert faults == {*conformance_set.BY_TERMS, "one iteration", "one iteration of MJX", "impratio ignored"}
+
+
+@pytest.mark.parametrize("name", ["condim1", *(pytest.param(name, marks=pytest.mark.slow) for name in FEW)])
+def test_a_case_written_again_has_the_stored_numbers(name):
+    (case,) = conformance.cases(name)
+    again = conformance_set.numbers(case)
+    pairs = [(again["expected"], case.data["expected"])]
+    pairs += [(numbers, case.data["faults"][fault]) for fault, numbers in again["faults"].items()]
+    for new, old in pairs:
+        assert new.keys() == old.keys()
+        for term, number in old.items():
+            np.testing.assert_allclose(new[term], number, rtol=0, atol=STORED * np.abs(number).max(), err_msg=term)
+
+
+@pytest.mark.slow
+def test_the_c_engine_is_right():
+    rows = conformance.run(conformance_set.MujocoC())
+    assert not wrong(rows)
+    assert len(rows) == 5 * len(conformance.cases())
+
+
+# --------------------------------------------------------------------------------------------------------- MJX
+
+
+@pytest.mark.parametrize(
+    "option", [pytest.param("pyramidal", marks=pytest.mark.slow), pytest.param("", marks=pytest.mark.full)]
+)
+def test_mjx_is_right(option):
+    """The cases with pyramidal cones are one model; those with other options are a model each."""
+    names = [case.name for case in conformance.cases() if option in case.model.read_text()]
+    rows = conformance.run(mjx(*names), *names)
+    assert {row["case"] for row in rows if row["is_right"] is None} == {"connect", "connect_fast", "weld"}
+    assert not [row for row in rows if row["is_right"] is False]
+
+
+@pytest.mark.slow
+def test_faults_planted_in_mjx_are_named(monkeypatch):
+    """Frozen normals and the sign of equality constraints in one model, and MJX's own lack of J-dot v in another term."""
+    import jax
+    from mujoco.mjx._src import collision_driver, constraint
+
+    collide, make = collision_driver.collision, constraint.make_constraint
+
+    def frozen(model, data):
+        data = collide(model, data)
+        return data.tree_replace({"_impl.contact.frame": jax.lax.stop_gradient(data._impl.contact.frame)})
+
+    def negated(model, data):
+        data = make(model, data)
+        old = data._impl.efc_aref
+        is_equality = np.arange(old.size) == 0  # the only one, before all other rows
+        return data.tree_replace(
+            {"_impl.efc_aref": jax.numpy.where(is_equality, 2 * jax.lax.stop_gradient(old) - old, old)}
+        )
+
+    monkeypatch.setattr(collision_driver, "collision", frozen)
+    monkeypatch.setattr(constraint, "make_constraint", negated)
+    expected = {"stacked": "frozen normal", "joint_equality": "sign of equality"}
+    engine = mjx(*expected)
+    for case, fault in expected.items():
+        found = wrong(conformance.run(engine, case))
+        assert found
+        assert {row["looks_like"] for row in found} == {fault}
+
+
+@pytest.mark.slow
+def test_one_iteration_of_mjx_is_named():
+    engine = mjx("pyramidal_slide", is_implicit=False, iterations=1)
+    found = wrong(conformance.run(engine, "pyramidal_slide"))
+    assert {row["looks_like"] for row in found} == {"one iteration of MJX"}
+
+
+@pytest.mark.slow
+def test_mjx_lacks_the_velocity_product_of_a_weld():
+    """Were it repaired, the documentation and the engine's file would be wrong."""
+    engine = mjx("weld")
+    engine.differs = {}
+    found = {row["term"]: row["looks_like"] for row in wrong(conformance.run(engine, "weld"))}
+    assert found["qpos"] == found["qvel"] == "dropped J-dot v"
+
+
+# -------------------------------------------------------------------------------------------------------- table
+
+
+@pytest.mark.slow
+def test_the_table_has_versions_digits_and_commands(tmp_path):
+    settings = [
+        "scenes=[bounce_once]",
+        "contacts=[penalty]",
+        "samples=2",
+        "repeats=2",
+        "reference.samples=256",
+        "workers=0",
+    ]
+    assert main(["engines", "table", "mujoco", f"out={tmp_path}", *settings]) == 0
+    page = (tmp_path / "engines.md").read_text()
+    assert "| mujoco | mujoco 3." in page
+    assert "`python -m bench engines table mujoco`" in page
+    assert "| stacked | " in page
+    assert "bounce_once" in page
+    assert len((tmp_path / "engines.csv").read_text().splitlines()) > 5 * 28
