@@ -71,7 +71,6 @@ def _watched() -> int:
     for number in FORWARDED:
         if signal.getsignal(number) is not signal.SIG_IGN:  # as under nohup
             signal.signal(number, forward)
-    reaper.wait_until_ready()
     while child.poll() is None and not select.select([reader], [], [], POLL_S)[0]:
         pass
     with contextlib.suppress(subprocess.TimeoutExpired):

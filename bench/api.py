@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, TypedDict, Unpack
 
 import numpy as np
 
-from bench.errors import Unsupported, UserError, unknown
+from bench.errors import Unsupported, UserError, failure, unknown
 from bench.experiment.by_name import compile_problem, make
 from bench.model import Backend, Decision, Estimator, Integrator, Problem, Scene, registry
 from bench.model.identity import label, text_of
@@ -213,9 +213,11 @@ def described(entry: registry.Entry, availability: bool = True) -> str:
         if issubclass(plugin, Backend):
             facts.append(f"provides {', '.join(sorted(plugin.provides))}")
         elif issubclass(plugin, Estimator):
-            # needs that depend on the parameters are a property
-            needs = plugin.needs if isinstance(plugin.needs, frozenset) else plugin().needs
-            facts.append(f"needs {', '.join(sorted(needs))}")
+            try:  # needs that depend on the parameters are a property
+                needs = plugin.needs if isinstance(plugin.needs, frozenset) else plugin().needs
+                facts.append(f"needs {', '.join(sorted(needs))}")
+            except (Exception, SystemExit) as error:
+                facts.append(f"UNAVAILABLE, {failure(error)['reason']}")
             if not plugin.unbiased:
                 facts.append("biased at finite N")
             elif plugin.unbiased_at_discontinuities:

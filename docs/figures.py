@@ -455,9 +455,21 @@ LEAST_SCENES = 6
 """Fewest scenes at which the median of a ratio has an interval."""
 
 
+def dose_analysis() -> Any:
+    """Return the module that compares searches."""
+    registry.add_folder(PAPER)
+    return import_module(f"{registry.usable('studies', 'dose_response').__module__}.analysis")
+
+
 def dose_classes(names: dict[str, str]) -> str:
-    """Return ratios of ``dose_response`` by class as a Markdown table."""
-    return dose_ratios("class", dict(list(dose("pairs").groupby("scene_class", sort=False))), names)
+    """Return ratios of ``dose_response`` by class as a Markdown table, and over all scenes with one value for each model."""
+    analysis = dose_analysis()
+    known = analysis.ratios(analysis.counted(analysis.searches(rows_of("dose_response"))))
+    models = analysis.by_scene(known.assign(scene=known["scene"].str.partition("[")[0])).query(
+        "scene_class == 'all classes'"
+    )
+    parts = dict(list(dose("pairs").groupby("scene_class", sort=False)))
+    return dose_ratios("class", parts | {"all, one value a model": models}, names)
 
 
 DOSE_RUNS = {
@@ -479,8 +491,7 @@ def dose_runs() -> str:
 
 def windows_missed() -> str:
     """Return on how many problems the best gradient reaches 1/100 and a window of no length does, of how many."""
-    registry.add_folder(PAPER)
-    analysis = import_module(f"{registry.usable('studies', 'dose_response').__module__}.analysis")
+    analysis = dose_analysis()
     searches = analysis.searches(rows_of("dose_response_windows")).query("target == 100")
     medians = searches.pivot_table(index="problem", columns="method", values="median", aggfunc="first")
     missed = np.isfinite(medians[analysis.BEST]) & np.isinf(medians.filter(like="windowed")).all(axis=1)

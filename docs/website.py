@@ -33,6 +33,7 @@ PAGES: Mapping[str, str] = {
     "start": "README.md",
     "contributing": "CONTRIBUTING.md",
     "changelog": "CHANGELOG.md",
+    "cost-of-error": "examples/cost_of_error/README.md",
     **{path.stem: f"docs/{path.name}" for path in sorted(DOCS.glob("*.md"))},
 }
 """The site's page of each document, and its path in the repository."""

@@ -34,7 +34,7 @@ def wheel(tmp_path_factory):
     source.mkdir()
     for name in ("bench", "plugins", "conf"):
         shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
+    for name in ("pyproject.toml", "README.md", "LICENSE", "hatch_build.py"):
         shutil.copy(ROOT / name, source / name)
     script = "from hatchling.build import build_wheel; print(build_wheel('.'))"
     return source / command(sys.executable, "-c", script, cwd=source).splitlines()[-1]

@@ -2,16 +2,18 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
 
 import pytest
+from trees import hearing_signals, processes_in, wait_for
 
 from bench.cli import main
 from bench.model.simulator.imports import load_module
 
 COST = """
-import ctypes, os, signal
+import ctypes, os, signal, sys, time
 theta, calls = [0.4, 0.3], []
 def cost(x):
     calls.append(1)
@@ -28,34 +30,55 @@ def cost(x):
     with multiprocessing.get_context("spawn").Pool(1) as pool: return sum(pool.map(square, [float(v) for v in x]))
 def grad(x): return [2 * v for v in x]
 """
-SCENE = '''
-"""A scene that ends the process."""
+PLUGINS = '''
+"""A scene and an estimator that end the process."""
 
 import os
+import sys
 from dataclasses import dataclass
 
-import numpy as np
-
-from bench.plugin import FunctionScene, param
+from bench.plugin import FunctionScene, SampleMean, param
 
 
 @dataclass(frozen=True)
 class Ends(FunctionScene):
-    """Ends the process when its cost is computed.
-
-    Approximates nothing.
-    """
+    """Ends the process when it is asked for theta."""
 
     name = "ends"
     sigma: float = param(0.1, "noise")
 
     def theta0(self):
-        return np.ones(2)
+        {end}
 
     def cost(self, xp, theta):
-        os._exit(0)
+        return (theta**2).sum(0)
+
+
+@dataclass(frozen=True)
+class Leaves(SampleMean):
+    """Ends the process when it is asked what it needs."""
+
+    name = "leaves"
+
+    @property
+    def needs(self):
+        {end}
+
+    def terms(self, problem, theta, w):
+        return problem.grad(theta, w)
 '''
-ENDS = {"exit": "os._exit(0)", "c_exit": "ctypes.CDLL(None).exit(0)", "killed": "os.kill(os.getpid(), signal.SIGKILL)"}
+ENDS = {
+    "exit": "os._exit(0)", "c_exit": "ctypes.CDLL(None).exit(0)", "crash": "ctypes.string_at(0)",
+    "killed": "os.kill(os.getpid(), signal.SIGKILL)",
+}  # fmt: skip
+RUN = ["scenes=[ends]", "backends=[numpy]", "estimators=[fobg]", "timing=false"]
+VERBS = {
+    "run": [*RUN, "workers=0"], "plan": RUN, "list": ["leaves"], "check": ["leaves"], "gradcheck": ["ends", "workers=0"],
+    "trace": ["ends", "backends=[numpy]"],
+}  # fmt: skip
+"""Commands that run the plugins in a process of their own."""
+LISTED = {"list": 0, "check": 1, "gradcheck": 1}
+"""The status of a verdict on a plugin that calls sys.exit."""
 
 
 def status_of(folder, *words):
@@ -82,11 +105,39 @@ def test_the_status_of_a_verdict_and_of_bad_input_arrives(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_scene_that_ends_the_process_is_not_right(tmp_path):
+@pytest.mark.parametrize("verb", VERBS)
+def test_a_plugin_that_ends_the_process_gives_no_status(verb, tmp_path):
+    """The status is 0 only after a verdict, wherever the process ends."""
     (tmp_path / "mine").mkdir()
-    (tmp_path / "mine" / "ends.py").write_text(SCENE)
-    words = ["gradcheck", "ends", "workers=0", f"plugins={tmp_path / 'mine'}", f"results_dir={tmp_path / 'results'}"]
-    assert status_of(tmp_path, *words)[0] == 3
+    for end, expected in (("os._exit(0)", 3), ("sys.exit(0)", LISTED.get(verb, 3))):
+        (tmp_path / "mine" / "ends.py").write_text(PLUGINS.format(end=end))
+        status, said = status_of(tmp_path, verb, *VERBS[verb], f"plugins={tmp_path / 'mine'}")
+        assert status == expected, said
+        assert ("before a verdict" in said) == (expected == 3)
+
+
+FORKS = """if os.fork():
+        os.wait()
+    else:
+        os.setsid()
+        if os.fork() == 0: time.sleep(600)
+        os._exit(0)
+    if len(calls) == 11: open("begun", "w").close(); time.sleep(float(os.environ["HANGS"]))"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("end", [None, signal.SIGINT, signal.SIGKILL])
+def test_a_cost_that_forks_leaves_no_process(tmp_path, end):
+    (tmp_path / "mine.py").write_text(COST.format(end="pass").replace("if len(calls) == 11: pass", FORKS))
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, sys.path)), "HANGS": "600" if end else "0"}
+    words = hearing_signals("examine", "mine.py:cost", "grad=grad", "calls=30", "--quiet")
+    with subprocess.Popen(words, cwd=tmp_path, env=environment, stdout=subprocess.DEVNULL) as run:
+        if end:
+            wait_for(lambda: (tmp_path / "begun").exists())
+            assert len(processes_in(tmp_path)) > 11
+            run.send_signal(end)
+        run.wait(60)
+    wait_for(lambda: not processes_in(tmp_path), 10.0)
 
 
 @pytest.mark.slow

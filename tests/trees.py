@@ -4,7 +4,10 @@ import os
 import shutil
 import subprocess
 import sys
+import time
 from pathlib import Path
+
+import psutil
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -52,3 +55,23 @@ def hearing_signals(*words):
     A shell ignores SIGINT in background jobs, nohup ignores SIGHUP, and child processes inherit ignored signals.
     """
     return [sys.executable, "-c", DEFAULT_SIGNALS, sys.executable, "-m", "bench", *words]
+
+
+def processes_in(folder):
+    """Return the processes that were started in a folder and have not ended."""
+    found = []
+    for process in psutil.process_iter():
+        try:
+            if Path(process.cwd()).is_relative_to(folder) and process.status() != psutil.STATUS_ZOMBIE:
+                found.append(process)
+        except psutil.Error:
+            continue
+    return found
+
+
+def wait_for(condition, seconds=60.0):
+    """Wait until a condition holds."""
+    until = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < until, "waited in vain"
+        time.sleep(0.05)

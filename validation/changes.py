@@ -15,6 +15,7 @@ CHANGES = {
     "torch_threads": ("import torch; torch.set_num_threads(3)", "torch's threads"),
     "torch_seed": ("import torch; torch.manual_seed(1)", "the seed of torch"),
     "no_grad": ("import torch; torch.set_grad_enabled(False)", "torch's gradients"),
+    "special": ("import sys; sys.modules['scipy.special'] = None", "SciPy's error state"),
     "blas_threads": ("import threadpoolctl; threadpoolctl.threadpool_limits(5)", "the threads of linear algebra"),
 }  # fmt: skip
 """Code that changes one setting, and the words that name the change, by kind."""

@@ -45,8 +45,7 @@ def main(words: Sequence[str]) -> int:
     shown = [(claim, result) for name, claim in claims.items() if (result := by_name[name]) is not None]
     if shown:
         for path in page.write(directory, shown):
-            if path.suffix != ".png":
-                print(f"  {path}")
+            print(f"  {path}")
         print(f"{counted(len(shown), 'claim')}: {tables.count_verdicts(shown)}")
     bad = (NOT_REPRODUCED, results.FAILED)
     return int(any(result.verdict in bad for claim, result in shown if claim in selected))

@@ -28,14 +28,14 @@ LOOKS = {REPRODUCED: "good", RESERVED: "reserved"}
 
 
 def write(directory: Path, results: Results) -> list[Path]:
-    """Write charts, tables and the page of all results. Returns their paths, the charts first."""
-    drawings, charts = {}, []
+    """Write charts, tables and the page of all results. Returns the paths of tables and page."""
+    drawings = {}
     with styled():
         for chart in filter(None, (tables.chart(claim, result) for claim, result in results)):
             figure = draw(chart)
-            charts += save(figure, directory / chart.name, data=chart.plotted())[:1]
+            save(figure, directory / chart.name, data=chart.plotted())
             drawings[chart.name] = shell.drawing(figure, chart.name, chart.title)
-    paths = write_all(
+    return write_all(
         directory,
         {
             "claims.md": tables.markdown(results),
@@ -54,7 +54,6 @@ def write(directory: Path, results: Results) -> list[Path]:
             + "\n",
         },
     )
-    return [*charts, *paths]
 
 
 def page(results: Results, drawings: Mapping[str, str]) -> str:

@@ -31,11 +31,11 @@ def chart(claim: type[Claim], result: ClaimResult) -> Chart | None:
     if not (result.series and claim.curves):
         return None
     first, is_log, parts = next(iter(result.series)), {axis: axis in claim.logarithmic for axis in "xy"}, []
-    x = pd.to_numeric(pd.Series(result.series[first]), errors="coerce")
+    x = pd.Series(result.series[first])
     for name, label in claim.curves.items():
         # a second column has the standard errors of means
         values = pd.DataFrame(np.reshape(result.series[name], (len(result.series[name]), -1))).reindex(columns=[0, 1])
-        at = pd.Series(values.index, dtype=float) if first in claim.curves or x.isna().any() else x
+        at = values.index if first in claim.curves else x
         low, high = (values[0] + side * 1.96 * values[1] for side in (-1, 1))
         parts.append(pd.DataFrame({
             "series": label, "x": at, "y": values[0], "low": np.maximum(low, 0.1 * values[0]) if is_log["y"] else low, "high": high,
@@ -47,7 +47,8 @@ def chart(claim: type[Claim], result: ClaimResult) -> Chart | None:
     }
     return Chart(
         claim.name, pd.concat(parts, ignore_index=True), [Column("x", label=claim.labels[0], log=is_log["x"])],
-        [Column("y", label=claim.labels[1], low="low", high="high", log=is_log["y"])], title=claim.learned, series="series",
+        [Column("y", label=claim.labels[1], low="low", high="high", log=is_log["y"])], "lines" if pd.api.types.is_numeric_dtype(x) else "points",
+        claim.learned, "series",
         styles=looks, marks=[Mark(label, value, axis=axis) for axis, value, label in claim.marks],
         subtitle=f"{claim.name}, {claim.source.partition(';')[0]}: {result.verdict}",
     )  # fmt: skip
@@ -162,9 +163,12 @@ def latex(results: Results) -> str:
 
 
 def result_lines(claim: type[Claim], result: ClaimResult, is_stored: bool) -> Iterator[str]:
-    """Yield the lines printed for one claim."""
+    """Yield the lines printed for one claim; that no figure detects an error of 5% stands first."""
     origin = ", as stored" if is_stored else ""
-    yield f"{claim.name:<4} {result.verdict:<29} {duration(result.seconds):>7}{origin}  {claim.statement}"
+    blind = "detects no error of 5%: " if result.figures and all(f.limitation for f in result.figures) else ""
+    yield (
+        f"{claim.name:<4} {result.verdict:<29} {duration(result.seconds):>7}{origin}  {blind}{claim.source}: {claim.statement}"
+    )
     for figure in result.figures:
         if not figure.agrees:
             yield f"       {figure.what}: published {figure.published}, measured {measured_text(figure)}"

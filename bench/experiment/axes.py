@@ -183,8 +183,8 @@ def with_axes(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:
 
 def table(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:
     """Return rows with the columns of the CSV: the study's table, the swept axes, ``study`` and ``parameters``."""
-    extra = [axis.column for axis in axes(experiment.sweep, rows) if axis.column not in rows]
     wide = with_axes(experiment, rows)
+    extra = [name for name in wide if name not in rows]
     wide = wide.reindex(columns=[*experiment.columns.table, *extra, "study", "parameters"])
     texts = [name for name in experiment.columns.of_kind("text") if name in wide]
     escaped = {name: {text: _escape_formula(text) for text in wide[name].unique()} for name in texts}
@@ -200,12 +200,7 @@ def _escape_formula(text: Any) -> Any:
 
 def build_plugins(given: Mapping[str, Any]) -> dict[str, Plugin | None]:
     """Build the plugins described by a row's parameters, by axis; raises :class:`UserError` if one is not installed."""
-    parts: dict[str, Plugin | None] = {}
-    for axis, part in given.items():
-        if axis in NOT_PLUGINS:
-            continue
-        parts[axis] = None if part is None else build_part(axis, part)
-    return parts
+    return {a: None if p is None else build_part(a, p) for a, p in given.items() if a not in NOT_PLUGINS}
 
 
 def build_part(axis: str, part: Mapping[str, Any]) -> Plugin:
@@ -221,23 +216,19 @@ def relabel(rows: pd.DataFrame, axes: Sequence[Axis]) -> pd.DataFrame:
     """
     import pandas as pd
 
+    if "parameters" not in rows:
+        return rows
     names = [name for axis in axes for name in axis.names]
     views = [name for name in VIEWS if (rows.groupby(["scene", "contact"])[name].nunique() > 1).any()]
     read = cache(lambda text: _labels(json.loads(text), names, views))
-    codes, distinct = pd.factorize(rows["parameters"]) if "parameters" in rows else ([], [])
+    codes, distinct = pd.factorize(rows["parameters"])
     lines = []
     for given in parse(pd.DataFrame({"parameters": distinct})):
         estimator = {axis: part for axis, part in given.items() if axis == "estimator"}
         problem = {axis: part for axis, part in given.items() if axis != "estimator"}
         lines.append(read(json.dumps(problem)) | read(json.dumps(estimator)))
-    changed = dict.fromkeys(name for line in lines for name in line)
-    columns = {name: [line.get(name) for line in lines] for name in changed if name in rows}
-    return rows.assign(
-        **{
-            name: [old if (new := texts[code]) is None else new for code, old in zip(codes, rows[name], strict=True)]
-            for name, texts in columns.items()
-        }
-    )
+    found = pd.DataFrame(lines, dtype=object).iloc[codes].set_axis(rows.index)
+    return rows.assign(**{name: found[name].fillna(rows[name]) for name in found if name in rows})
 
 
 def _labels(given: Mapping[str, Any], names: Sequence[str], views: Sequence[str]) -> dict[str, str]:

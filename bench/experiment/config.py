@@ -20,7 +20,7 @@ from bench.model.identity import parse_identity
 from bench.model.parameters import build, coerce, remember, singular
 
 SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
-RESERVED = ("references", "standard")
+RESERVED = ("claims", "references", "standard", "trace")
 """Names of folders under ``results_dir`` that are not experiments."""
 SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0}
 BYTES = {"k": 2.0**10, "m": 2.0**20, "g": 2.0**30}
@@ -51,7 +51,7 @@ def load(overrides: Sequence[str], config_dirs: Sequence[Path] = ()) -> Experime
     """
     for key, _, value in _split_words(overrides):
         if key == "plugins":
-            for path in _split(value) or [""]:
+            for path in _split(value) or ([] if value.startswith("[") else [""]):
                 if not path.strip("'\" "):
                     raise UserError(f"plugins={value} names no folder; the current one is plugins=.")
                 registry.add_folder(Path(path))
@@ -295,8 +295,8 @@ def experiment(config: Mapping[str, Any]) -> Experiment:
                 raise UserError(f"{axis}.{plugin}={given!r} names no parameter: write {axis}.{plugin}.parameter=value")
             if entry.plugin is not None:
                 build(entry.plugin, given)
-    timing = config["timing"]
-    refuse_too_many(_mapping(config, "sweep"))
+    timing, sweep = config["timing"], _mapping(config, "sweep")
+    refuse_too_many(sweep)
     return Experiment(
         name=name,
         study=study,
@@ -305,7 +305,7 @@ def experiment(config: Mapping[str, Any]) -> Experiment:
         execution=_execution(config),
         choices=choices,
         values=values,
-        sweep=_mapping(config, "sweep"),
+        sweep=sweep,
         decision=_decision(config),
         results_dir=_folder(config["results_dir"]),
         question=str(config["question"] or ""),
@@ -313,7 +313,7 @@ def experiment(config: Mapping[str, Any]) -> Experiment:
         marks=_mapping(config, "marks"),
         compile_time=coerce(bool, config["compile_time"], "compile_time"),
         formats=tuple(_one_of("formats", item, FORMATS) for item in _as_list(config["formats"])),
-        table=_table_layout(_mapping(config, "table", LAYOUT), _mapping(config, "sweep")),
+        table=_table_layout(_mapping(config, "table", LAYOUT), sweep),
         reference=_budget(_mapping(config, "reference", BUDGET)),
         compile_cache=_compile_cache(config["compile_cache"]),
         plugins=registry.folders(),

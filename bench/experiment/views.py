@@ -108,11 +108,7 @@ class Chart:
     """Whether each panel has its own scale of y (of x, for dots); panels above each other then share that of x."""
 
     def __post_init__(self) -> None:
-        columns = (self.series, self.line, self.panel, self.panel_row, self.shape, self.level, self.value, self.cell,
-                   self.failed)  # fmt: skip
-        axes = [name for c in (*self.x, *self.y) for name in (c.name, c.low, c.high, c.limit)]
-        missing = sorted({name for name in (*columns, *axes) if name and name not in self.frame})
-        if missing:
+        if missing := sorted(set(self._names()) - set(self.frame)):
             raise ValueError(f"chart {self.name}: its table has no column {', '.join(missing)}")
 
     def drawn(self) -> pd.DataFrame:
@@ -125,10 +121,14 @@ class Chart:
 
     def plotted(self) -> pd.DataFrame:
         """Return the drawn lines and columns: panel, series, levels, and all quantities with their intervals."""
+        return self.drawn()[self._names()]
+
+    def _names(self) -> list[str]:
+        """Return the columns of the table that the chart needs."""
         axes = [name for c in (*self.x, *self.y) for name in (c.name, c.low, c.high, c.limit)]
         names = [self.panel, self.panel_row, self.series, self.line, self.shape, self.level, self.value, self.cell,
                  self.failed, *axes]  # fmt: skip
-        return self.drawn()[[name for name in dict.fromkeys(names) if name]]
+        return [name for name in dict.fromkeys(names) if name]
 
 
 @dataclass(frozen=True)

@@ -76,14 +76,14 @@ class State:
 
     def follow(self) -> None:
         """Add the settings of the libraries that have been imported since: what their imports change is their own."""
-        new = {name: part for name, part in SETTINGS.items() if name not in self._before and part[0] in sys.modules}
+        new = [name for name, part in SETTINGS.items() if name not in self._before and part[0] in sys.modules]
         if not new:
             return
         if self._single_thread:
             self._ends.enter_context(threadpool_limits(1))
         for library in ThreadpoolController().lib_controllers:
             self._threads.setdefault(library.filepath, (library, library.num_threads))
-        self._before |= {name: read(sys.modules[library]) for name, (library, read) in new.items()}
+        self._before |= {name: _read(name) for name in new}
         if "JAX's configuration" in new:
             self._before["JAX's configuration"]["jax_enable_x64"] |= self._double_precision
             self._before[DRAWN] = _numpy_generator()  # the import of JAX draws from it
@@ -93,14 +93,23 @@ class State:
         self.follow()
         phrases = []
         for name, before in self._before.items():
-            library, read = SETTINGS[name]
-            after = read(sys.modules[library])
+            after = _read(name)
             if after != before:
-                parts = sorted(key for key in before if before[key] != after[key]) if isinstance(before, dict) else []
+                are_tables = isinstance(before, dict) and isinstance(after, dict)
+                parts = sorted(key for key in before if before[key] != after[key]) if are_tables else []
                 phrases.append(name + (f" ({', '.join(parts)})" if parts else ""))
         if any(library.get_num_threads() != count for library, count in self._threads.values()):
             phrases.append(THREADS)
         return phrases
+
+
+def _read(name: str) -> Any:
+    """Return a setting, or an error's text if it cannot be read, since a plugin has replaced its library."""
+    library, read = SETTINGS[name]
+    try:
+        return read(sys.modules[library])
+    except Exception as error:
+        return repr(error)
 
 
 @contextmanager
@@ -119,4 +128,4 @@ def named_changes(source: str) -> Iterator[None]:
 
 def reduced_precision() -> bool:
     """Return whether JAX computes in float32, whatever type a plugin asks for."""
-    return "jax" in sys.modules and not sys.modules["jax"].config.jax_enable_x64
+    return not getattr(getattr(sys.modules.get("jax"), "config", None), X64.lower(), True)

@@ -102,7 +102,9 @@ def _try_imports(names: Sequence[str], packages: Mapping[str, Path], timeout_s: 
                     return n_started, f"did not return within {timeout_s:g} s when it was imported"
         finally:
             _terminate(process)
-    return n_started, "" if received.endswith(b"!") else f"{_exit_description(process.returncode)} when it was imported"
+    code = process.returncode
+    cause = f"by {signal.Signals(-code).name}" if code < 0 else f"(exit status {code})"
+    return n_started, "" if received.endswith(b"!") else f"ended the process {cause} when it was imported"
 
 
 def _terminate(process: subprocess.Popen[bytes]) -> None:
@@ -112,8 +114,3 @@ def _terminate(process: subprocess.Popen[bytes]) -> None:
     with contextlib.suppress(ProcessLookupError):
         os.killpg(process.pid, signal.SIGKILL)
     process.wait()
-
-
-def _exit_description(status: int) -> str:
-    cause = f"by {signal.Signals(-status).name}" if status < 0 else f"(exit status {status})"
-    return f"ended the process {cause}"

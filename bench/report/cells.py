@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
 from bench.experiment.columns import Column
@@ -84,32 +82,11 @@ def text_rows(
     columns: Sequence[Column], frame: pd.DataFrame, format_cell: Callable[[TableCell], str]
 ) -> Iterator[tuple[str, ...]]:
     """Yield each row's cells, each as ``format_cell`` returns it, with few rows in memory at a time."""
-    needed = [list(dict.fromkeys(filter(None, (c.name, c.low, c.high, c.limit, c.note, c.emphasis)))) for c in columns]
-    known: list[dict[tuple[Any, ...], str]] = [{} for _ in columns]
-    for start in range(0, len(frame), BLOCK):
-        block = frame.iloc[start : start + BLOCK]
-        values = {name: plain_values(block[name]) for name in dict.fromkeys(itertools.chain(*needed)) if name in block}
-        texts = []
-        for column, names, seen in zip(columns, needed, known, strict=True):
-            names = [name for name in names if name in values]
-            is_plain = not any(block[name].dtype == object for name in names)
-            line = []
-            for key in zip(*(values[name] for name in names), strict=True):
-                text = seen.get(key) if is_plain else None
-                if text is None:
-                    text = format_cell(cell(column, dict(zip(names, key, strict=True))))
-                    # equal numbers have the same text, except 0 and -0; a table of distinct numbers fills no memory
-                    if is_plain and 0 not in key and len(seen) < BLOCK:
-                        seen[key] = text
-                line.append(text)
-            texts.append(line)
-        yield from zip(*texts, strict=True)
-
-
-def plain_values(values: pd.Series) -> list[Any]:
-    """Return the values of a column as a list of Python's own numbers, strings and other objects."""
-    listed = values.astype(object).tolist() if values.dtype.kind == "O" else values.tolist()
-    return [value.item() if isinstance(value, np.generic) else value for value in listed]
+    ends = [name for c in columns for name in (c.name, c.low, c.high, c.limit, c.note, c.emphasis)]
+    needed = frame[[name for name in dict.fromkeys(ends) if name in frame]]
+    for start in range(0, len(needed), BLOCK):
+        for row in needed.iloc[start : start + BLOCK].to_dict("records"):
+            yield tuple(format_cell(cell(column, row)) for column in columns)
 
 
 def parts(table: Table) -> list[tuple[str, pd.DataFrame]]:

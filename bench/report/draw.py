@@ -6,8 +6,7 @@ A chart is drawn at any width: the panels are laid out again, and the text keeps
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -26,7 +25,7 @@ from matplotlib.ticker import FixedLocator, FuncFormatter
 from bench.experiment.columns import Column
 from bench.experiment.views import Chart, Mark, Style
 from bench.report.scales import log_axis
-from bench.report.style import GREY, MARKERS, MARKS, SHADE, SIZE, colour, plain, width_in_inches
+from bench.report.style import GREY, MARKERS, MARKS, SHADE, SIZE, colour, filled, plain, width_in_inches
 from bench.report.text import axis_value, duration
 from bench.report.views import is_logarithmic, pareto
 
@@ -189,9 +188,9 @@ class _Head:
 
     def __init__(self, chart: Chart, width: float) -> None:
         self._width = width
-        self._title = _fill(chart.title.rstrip("."), 0.97 * width / BOLD)
+        self._title = filled(chart.title.rstrip("."), 0.97 * width / BOLD)
         subtitle = ", ".join(filter(None, [chart.subtitle.rstrip("."), _grey(chart)]))
-        self._subtitle = _fill(subtitle, 0.97 * width) if subtitle else ""
+        self._subtitle = filled(subtitle, 0.97 * width) if subtitle else ""
         self._lines = self._title.count("\n") + 1
         self.height = (
             0.08 + LINE * 1.1 * self._lines + (LINE * (self._subtitle.count("\n") + 1) if self._subtitle else 0)
@@ -219,29 +218,6 @@ def plain_lines(text: str) -> str:
     return "\n".join(map(plain, text.split("\n")))
 
 
-def _fill(text: str, width: float) -> str:
-    """Break text into lines of at most ``width`` inches, measured in the charts' font; wider words after a comma or slash."""
-    lines: list[str] = []
-    for paragraph in text.split("\n"):
-        line = ""
-        for space, word in _words(paragraph, width):
-            longer = f"{line}{space}{word}".strip()
-            if line and width_in_inches(plain(longer)) > width:
-                lines.append(line)
-                line = word
-            else:
-                line = longer
-        lines.append(line)
-    return "\n".join(lines)
-
-
-def _words(paragraph: str, width: float) -> Iterator[tuple[str, str]]:
-    """Yield each word with the space before it, and the parts of a word that is wider than ``width`` inches without one."""
-    for word in paragraph.split():
-        parts = re.split(r"(?<=[,/])", word) if width_in_inches(plain(word)) > width else [word]
-        yield from zip([" ", *[""] * (len(parts) - 1)], parts, strict=True)
-
-
 def _panels(chart: Chart) -> list[tuple[str, pd.DataFrame]]:
     if chart.panel_row:
         names = [list(dict.fromkeys(chart.frame[column])) for column in (chart.panel_row, chart.panel)]
@@ -253,7 +229,7 @@ def _panels(chart: Chart) -> list[tuple[str, pd.DataFrame]]:
 
 
 def _panel_title(chart: Chart, name: str, width: float) -> str:
-    parts = [_fill(_clipped(text, 3 * width), width) for text in (name, chart.panel_notes.get(name, "")) if text]
+    parts = [filled(_clipped(text, 3 * width), width) for text in (name, chart.panel_notes.get(name, "")) if text]
     return "\n".join(map(plain_lines, parts))
 
 
@@ -288,7 +264,7 @@ def _height(chart: Chart, part: pd.DataFrame) -> float:
 
 
 def _legend(chart: Chart, styles: dict[str, Style], width: float) -> list[Any]:
-    labels = {name: plain_lines(_fill(style.meaning or name, width)) for name, style in styles.items()}
+    labels = {name: plain_lines(filled(style.meaning or name, width)) for name, style in styles.items()}
     if chart.kind == "grid":
         if not chart.level:
             return []
@@ -643,23 +619,16 @@ def _grid_labels(chart: Chart, column: Column, names: Sequence[str], width: floa
     if chart.panel and not chart.own_scales:  # the labels beside the first panel serve all
         across = max(1, round(WIDTH / width))
         beside /= across
-    room = max(0.3, (width - beside - 0.15) / len(names))
-    return ["\n".join(plain(_clipped(line, room)) for line in _broken(name, room).split("\n", 2)[:3]) for name in names]
-
-
-def _broken(text: str, width: float) -> str:
-    """Break a name after its punctuation into lines of at most ``width`` inches, where it can be broken."""
-    lines = [""]
-    for piece in re.findall(r"[^_,\[ ]*[_,\[ ]*", text):
-        if lines[-1] and width_in_inches(plain(lines[-1] + piece)) > width:
-            lines.append("")
-        lines[-1] += piece
-    return "\n".join(lines)
+    room = max(0.3, (width - beside - 0.15) / len(names) - 0.06)
+    return [
+        "\n".join(plain(_clipped(line, room)) for line in filled(name, room, r"_,\[ ").split("\n", 4)[:5])
+        for name in names
+    ]
 
 
 def _in_lines(text: str, width: float, most: int) -> str:
     """Break a name at commas into at most ``most`` lines, and shorten those wider than ``width`` inches."""
-    lines = _fill(text, width).split("\n")
+    lines = filled(text, width).split("\n")
     lines = [*lines[: most - 1], " ".join(lines[most - 1 :])] if most > 1 else [text]
     return "\n".join(plain(_clipped(line, width)) for line in lines if line)
 

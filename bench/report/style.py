@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
 from functools import cache
 from typing import Any
 
@@ -71,12 +71,15 @@ def width_in_inches(text: str) -> float:
     return float(width / 72)
 
 
-def wrapped(parts: Sequence[str], width: float, between: str = ", ") -> str:
-    """Return parts joined by ``between``, in lines of at most ``width`` inches unless a single part is longer."""
-    out = ""
-    for part in filter(None, parts):
-        last = out.rpartition("\n")[2]
-        out += (
-            "" if not out else between if width_in_inches(last + between + part) <= width else between.rstrip() + "\n"
-        ) + part
-    return out
+def filled(text: str, width: float, ends: str = r" ,/\[") -> str:
+    """Break text after the characters ``ends`` into lines of at most ``width`` inches, measured in the charts' font."""
+    lines: list[str] = []
+    for paragraph in text.split("\n"):
+        line = ""
+        for piece in re.findall(rf"[^{ends}]+[{ends}]*|[{ends}]+", paragraph):
+            if line and width_in_inches(plain((line + piece).rstrip())) > width:
+                lines.append(line.rstrip())
+                line = ""
+            line += piece
+        lines.append(line.rstrip())
+    return "\n".join(lines)

@@ -19,8 +19,6 @@ GAP = 2
 """Blanks between two columns."""
 KEPT = ("status",)
 """Columns that are left out last, after the first column."""
-HEADING = 12
-"""Width up to which the heading of a column of numbers is one line."""
 MOST_NAMES = 24
 """Most names of columns that are listed as left out."""
 
@@ -54,20 +52,27 @@ def print_table(
     least = [_least(names[i], texts[i], whole[i]) for i in places]
     visible, constant, left_out = list(places), [], []
 
-    def is_too_wide() -> bool:
-        return sum(least[i] + GAP for i in visible) - GAP > console.width
+    def spare(shown: Sequence[int]) -> int:
+        return console.width + GAP - sum(least[i] + GAP for i in shown)
 
-    if is_too_wide() and len(table) > 1:
+    if spare(visible) < 0 and len(table) > 1:
         constant = [i for i in visible[1:] if len(set(texts[i])) == 1]
         visible = [i for i in visible if i not in constant]
     ranks = {name: rank for rank, name in enumerate(least_important, -len(least_important))}
     queue = sorted(reversed(visible[1:]), key=lambda i: (names[i] in KEPT, ranks.get(names[i], 0)))
-    while is_too_wide() and queue:
+    while spare(visible) < 0 and queue:
         left_out.append(queue.pop(0))
         visible.remove(left_out[-1])
+    for i in reversed(list(left_out)):  # a narrow column may fit where a wide one did not
+        if spare([*visible, i]) >= 0:
+            visible = sorted([*visible, i])
+            left_out.remove(i)
     grid = Table(box=None, pad_edge=False, padding=(0, GAP, 0, 0), header_style="underline")
     for i in visible:
-        head = "\n".join(wrap(names[i], least[i])) if whole[i] else names[i]
+        missing = max(0, cell_len(names[i]) - least[i])
+        is_wrapped = whole[i] and missing > spare(visible)
+        head = "\n".join(wrap(names[i], least[i])) if is_wrapped else names[i]
+        least[i] += 0 if is_wrapped else missing
         grid.add_column(Text(head), justify="right" if whole[i] else "left", no_wrap=whole[i], overflow="fold")
     for line in zip(*(texts[i] for i in visible), strict=True):
         grid.add_row(*map(Text, line))
@@ -88,8 +93,7 @@ def _least(name: str, texts: Sequence[str], is_whole: bool) -> int:
     """Return the least width of a column: that of its longest text, or of its longest word if its texts may be wrapped."""
     words = [word for text in texts for word in (text.split("\n") if is_whole else text.split())]
     cells = max(map(cell_len, words), default=0)
-    cells = max(cells, min(cell_len(name), HEADING)) if is_whole else min(cells, LONGEST)
-    return max(cells, *map(cell_len, name.split()), 1)
+    return max(cells if is_whole else min(cells, LONGEST), *map(cell_len, name.split()), 1)
 
 
 def _text(value: object, is_number: bool, labels: Labels) -> str:

@@ -6,7 +6,6 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import TYPE_CHECKING
 
 from bench.errors import StorageError, Unsupported, UserError
@@ -91,18 +90,17 @@ def execute(experiment: Experiment, quiet: bool = True) -> Finished:
 
 def _run(experiment: Experiment, planned: list[Planned], store: Store, quiet: bool) -> None:
     with progress.show_progress(experiment.name, planned, quiet) as shown:
+
+        def run(cells: list[Planned]) -> None:
+            runner.run(experiment, cells, store, shown.finished, shown.working)
+
         try:
-            run = partial(_run_cells, experiment, store, shown)
             if experiment.execution.ladder:
                 climb(experiment, planned, store, run, quiet)
             else:
                 run(planned)
         finally:
             _compact(store, planned)
-
-
-def _run_cells(experiment: Experiment, store: Store, shown: progress.Progress, planned: list[Planned]) -> None:
-    runner.run(experiment, planned, store, shown.finished, shown.working)
 
 
 def _refuse_without_supported_cells(experiment: Experiment, planned: Sequence[Planned]) -> None:

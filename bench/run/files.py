@@ -56,7 +56,7 @@ def write_whole(path: Path, content: bytes | Iterable[bytes]) -> None:
     """Write a file completely or not at all; raises :class:`StorageError` if it cannot be written."""
     try:
         replace_file(path, content)
-    except OSError as error:
+    except FileNotFoundError as error:
         raise StorageError(f"'{path}' cannot be written: {error.strerror}") from None
 
 
@@ -71,7 +71,9 @@ def write_all(directory: Path, contents: Mapping[str, str] | Iterable[tuple[str,
 
 
 def make_directory(path: Path) -> None:
-    """Create a directory and its parents; raises :class:`StorageError` if it cannot be created."""
+    """Create a directory and its parents; raises :class:`StorageError` if it cannot be created, or is an address."""
+    if path.parts[:1] and path.parts[0].endswith(":"):
+        raise StorageError(f"'{path}' is an address, and results are written to a folder of this machine")
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:

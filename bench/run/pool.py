@@ -30,7 +30,7 @@ import psutil
 from bench.errors import STATUSES, StorageError, UserError, failure
 from bench.model import guard
 from bench.run.reaper import MARK, Reaper, kill_marked_processes
-from bench.run.worker import Handler, command, first_message
+from bench.run.worker import Handler, command
 
 TICK = 0.05
 """Seconds between checks of the items' time and memory."""
@@ -244,7 +244,7 @@ class Pool:
         outside: Callable[[Any], frozenset[str]] = lambda _: frozenset(),
     ) -> None:
         self._n_workers, self._limits, self._single_thread = n_workers, limits, single_thread
-        self._first_message = first_message(make, pickle.dumps(argument), tuple(folders))
+        self._first_message = pickle.dumps((tuple(folders), make, pickle.dumps(argument)))
         self._outside = outside
         self._workers: list[_Worker] = []
         self._retries: deque[deque[Any]] = deque()
@@ -307,8 +307,6 @@ class Pool:
                 worker = self._start_worker()
                 worker.queue = groups.popleft()
                 self._workers.append(worker)
-        if self._reaper is not None:  # it starts while the workers do
-            self._reaper.wait_until_ready()
         answers: list[Answer] = []
         for worker in self._workers:
             while worker.queue and worker.is_ready and not worker.is_busy:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import ctypes
 import os
-import select
 import signal
 import subprocess
 import sys
@@ -22,8 +21,6 @@ DEATH_SIGNAL = 1
 """PR_SET_PDEATHSIG of prctl(2)."""
 PASSES, PAUSE_S = 5, 0.2
 """Most searches for marked processes, which may start others meanwhile, and the reaper's pause in seconds after each."""
-READY_S = 0.02
-"""Seconds between two signals to a reaper that is not ready."""
 
 
 class Reaper:
@@ -35,25 +32,12 @@ class Reaper:
 
     def __init__(self) -> None:
         self.mark = f"{os.environ.get(MARK, '')}{uuid.uuid4().hex}"
-        self._is_ready = MARK in os.environ
         self._process: subprocess.Popen[bytes] | None = None
-        if not self._is_ready:
+        if MARK not in os.environ:
             self._process = subprocess.Popen(
                 [sys.executable, "-I", "-S", __file__, self.mark, chr(0x1F).join(sys.path)],  # without the package
-                stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, start_new_session=True,
+                stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
             )  # fmt: skip
-
-    def wait_until_ready(self) -> None:
-        """Wait until the end of this process would resume a stopped reaper; until then, a stopped reaper is resumed here."""
-        if self._is_ready:
-            return
-        assert self._process is not None
-        assert self._process.stdout is not None
-        poll = select.poll()
-        poll.register(self._process.stdout, select.POLLIN)
-        while not self._is_ready and self._process.poll() is None:
-            self._process.send_signal(signal.SIGCONT)
-            self._is_ready = bool(poll.poll(1000 * READY_S))
 
     def close(self) -> None:
         """Kill the marked processes, then the reaper's own."""
@@ -61,7 +45,7 @@ class Reaper:
             if not kill_marked_processes(self.mark):
                 break
         if self._process is not None:
-            with self._process as process:  # closes its pipes
+            with self._process as process:  # closes its pipe
                 process.kill()
 
 
@@ -71,8 +55,6 @@ def main() -> None:
         signal.signal(name, signal.SIG_IGN)
     with suppress(OSError, AttributeError):  # on Linux the end of the run resumes this process if it is stopped
         ctypes.CDLL(None).prctl(DEATH_SIGNAL, signal.SIGCONT, 0, 0, 0)
-    with suppress(OSError):
-        os.write(1, b"\n")
     sys.stdin.buffer.read()
     for _ in range(PASSES):
         kill_marked_processes(sys.argv[1])

@@ -49,14 +49,9 @@ def record(experiment: Experiment, rows: pd.DataFrame, words: list[str], seconds
     }
     path = experiment.directory / "run.json"
     text = json.dumps(content, indent=1, default=str) + "\n"
-    if simulated or _configuration(path) != json.loads(text)["config"]:
+    if simulated or read_record(experiment.directory).get("config") != json.loads(text)["config"]:
         write_whole(path, text.encode())
     return path
-
-
-def _configuration(path: Path) -> Any:
-    """Return the configuration in a record, or None if the record is missing or unreadable."""
-    return read_record(path.parent).get("config")
 
 
 def _version(name: str) -> str | None:

@@ -60,6 +60,8 @@ def read_parquet(path: Path, columns: Sequence[str] | None = None) -> pd.DataFra
     """Return the table in a Parquet file, or some of its columns; raises ValueError if it claims more rows or bytes than a run writes."""
     import pyarrow.parquet
 
+    if path.is_fifo():
+        raise ValueError("it is not a file")
     # read once: pandas opens a path twice, and the file may be replaced in between
     content = io.BytesIO(path.read_bytes())
     file = pyarrow.parquet.ParquetFile(content)
@@ -296,7 +298,7 @@ def read_record(folder: Path) -> dict[str, Any]:
 def read_object(path: Path) -> dict[str, Any]:
     """Return the object in a JSON file, with ? for lone surrogates, which cannot be written; empty if it has none."""
     try:
-        content = json.loads(path.read_text())
+        content = json.loads("{}" if path.is_fifo() else path.read_text())
         content = json.loads(json.dumps(content, ensure_ascii=False).encode(errors="replace"))
     except (OSError, ValueError, RecursionError):
         return {}

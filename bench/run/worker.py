@@ -9,10 +9,8 @@ import pickle
 import signal
 import sys
 import time
-from collections.abc import Callable
 from contextlib import suppress
 from multiprocessing.connection import Connection
-from pathlib import Path
 from typing import Any, Protocol
 
 from bench.errors import StorageError, failure
@@ -44,11 +42,6 @@ class Handler(Protocol):
 def command(descriptor: int) -> list[str]:
     """Return the command that starts a worker connected to its run by the socket ``descriptor``."""
     return [sys.executable, "-c", PROGRAM, str(descriptor), str(os.getpid()), chr(0x1F).join(sys.path)]
-
-
-def first_message(make: Callable[[Any], Handler], argument: bytes, folders: tuple[Path, ...]) -> bytes:
-    """Return the first message to a worker: how to build its handler."""
-    return pickle.dumps((folders, make, argument))
 
 
 def main() -> None:

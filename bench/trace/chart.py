@@ -18,7 +18,7 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator
 from bench.report.draw import WIDTH
 from bench.report.figures import save, styled
 from bench.report.scales import log_axis
-from bench.report.style import GREY, PALETTE, SHADE, STYLE, plain, wrapped
+from bench.report.style import GREY, PALETTE, SHADE, STYLE, filled, plain
 from bench.run.files import make_directory, write_whole
 from bench.trace.contacts import TOUCHES
 from bench.trace.sentences import three_digits
@@ -73,7 +73,7 @@ def chart(trace: Trace) -> Figure:
         ax.margins(x=0.01)
     axes[-1].set_xlabel("time [s]")
     figure.align_ylabels()
-    figure.suptitle(wrapped(plain(trace.title).split(", "), WIDTH - 0.3), fontsize=STYLE["font.size"])
+    figure.suptitle(filled(plain(trace.title), WIDTH - 0.3), fontsize=STYLE["font.size"])
     handles = _legend(table)
     if handles:
         figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))

@@ -137,8 +137,9 @@ class MjxProblem(JaxProblem):
     def _blocks(
         self, function: Callable[..., np.ndarray], theta: np.ndarray, w: np.ndarray, lead: tuple[int, ...]
     ) -> np.ndarray:
-        self.grain = 1 if w.shape[1] <= SINGLE else 16
-        if self.device == "cpu":
+        is_cpu = self.device == "cpu"
+        self.grain = 1 if w.shape[1] <= (SINGLE if is_cpu else 1) else 16
+        if is_cpu:
             self.block = self.least = self.grain
         return super()._blocks(function, theta, w, lead)
 
@@ -268,6 +269,9 @@ class MjxProgram(Rollout):
 
         # MJX creates numbers in JAX's default precision
         with jax.enable_x64(kind == np.float64), self._solver():
+            if state.q.shape[1] == 1:  # without vmap, whose loops compute both branches
+                after = column(state.q[:, 0], state.v[:, 0], u[:, 0])
+                return jax.tree.map(lambda leaf: leaf[..., None], after)
             return jax.vmap(column, in_axes=-1, out_axes=-1)(state.q, state.v, u)
 
 

@@ -16,9 +16,6 @@ WRONG, RIGHT = 1, 0
 CASES = [
     ("c02_so3_log:cost grad=torch", WRONG, "nan_gradient", "differences 0"),
     ("c02_so3_log:smooth grad=torch", RIGHT, "smooth", ""),
-    ("c03_event_time:cost grad=frozen", WRONG, "disconnected", ""),
-    ("c03_event_time:cost grad=exact", RIGHT, "smooth", ""),
-    ("c03_event_time:counted grad=zero", WRONG, "staircase", ""),
     ("c04_unconverged_implicit:cost grad=implicit", WRONG, "missing_term", ""),
     ("c04_unconverged_implicit:cost grad=implicit refined=converged", WRONG, "missing_term", ""),
     ("c11_quaternion:cost grad=unit", WRONG, "missing_term", "along theta itself"),

@@ -105,7 +105,9 @@ def test_a_claim_none_of_whose_figures_detects_5_percent_is_reserved_and_says_so
     monkeypatch.setattr(toy, "measure", lambda self: Outcome(coarse))
     assert cli.main(["claims", f"results_dir={tmp_path}"]) == 0
     said = "2 of 2 figures cannot detect an error of 5%: 1 for the source's own spread, 1 for the printed digits"
-    assert said in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert said in printed
+    assert "detects no error of 5%: here: one is one" in printed
     made = tmp_path / "claims"
     assert said in (made / "claims.md").read_text()
     assert "no: the printed digits" in (made / "claims.html").read_text()

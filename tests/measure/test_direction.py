@@ -139,6 +139,16 @@ def test_noise_is_the_standard_deviation_of_independent_normal_numbers():
     assert roughness.noise(values + smooth) == pytest.approx(3e-7, rel=0.02)
 
 
+def test_what_little_a_component_may_be_off_is_by_the_largest_and_an_exact_0_is_none_of_it():
+    def uneven(x):
+        return x[0] ** 2 + 5e-9 * x[1] ** 2
+
+    theta = np.ones(2)
+    assert check(uneven, lambda x: np.array([2.0 * x[0], 1e-8 * x[1] + 1e-8]), theta).trusted
+    assert not check(uneven, lambda x: np.array([2.0 * x[0], 1e-8 * x[1] + 1e-7]), theta).trusted
+    assert check(uneven, lambda x: np.array([2.0 * x[0], 0.0]), theta).cause == "disconnected"
+
+
 def test_treads_of_a_billionth_are_a_staircase():
     assert (
         check(lambda x: 1.0 + (np.floor(x / 7e-10) * 7e-10 * 0.1).sum(axis=0), lambda x: 0.0 * x, np.array([0.3])).cause

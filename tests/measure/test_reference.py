@@ -274,6 +274,11 @@ def test_small_spread_alone_certifies_nothing():
     assert bank.excess(case, found) <= 1.0
 
 
+def test_constant_gradient_takes_the_least_samples_and_no_fewer():
+    found = bank.certified(ridge(bank.power(1), dim=3), 1 << 18)
+    assert found_at(found, "n") == reference.LEAST_SAMPLES
+
+
 def test_tails_that_samples_do_not_show_are_part_of_the_error():
     """4.2 sigma away, 1e-5 of samples: of 16384 none or one; far tails along each coordinate are looked at."""
     case = ridge(bank.power(1), bank.ramp(4.2, 2000.0), dim=3)

@@ -33,6 +33,7 @@ def unchanged():
     torch.random.set_rng_state(seeds[2])
     torch.set_default_dtype(kind)
     torch.set_num_threads(threads)
+    sys.modules["scipy.special"] = special
     special.seterr(**errors)
     jax.config.update("jax_enable_x64", True)
 

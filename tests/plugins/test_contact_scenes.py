@@ -7,44 +7,19 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
-from bench.plugins.backends.numpy import NumpyOps
 from classes import (
     BounceOnce,
     Complementarity,
-    FrictionBlock,
     GroundWall,
-    Hopper,
     Implicit,
     Impulse,
     Jax,
-    Penalty,
     SemiImplicitEuler,
     Softplus,
     Torch,
 )
 
 from bench.model import ContactScene, State, compose, param
-
-
-def program(scene, law, **values):
-    """The scene under a law that takes the scene's contact values, then ``values``."""
-    fields = {f.name for f in dataclasses.fields(law)}
-    given = {k: v for k, v in scene.contact_values.items() if k in fields}
-    return compose(scene, law(**{**given, **values}), SemiImplicitEuler())
-
-
-def quiet(made, columns=1):
-    return np.zeros((made.n_noise, columns))
-
-
-def trajectory(made):
-    """Positions and velocities ``(horizon + 1, n)`` and controls ``(horizon + 1, n_u)`` without noise."""
-    theta = made.theta0[:, None]
-    steps = list(made.steps(NumpyOps(), theta, quiet(made)))
-    return tuple(
-        np.stack(part)[:, :, 0] for part in ([s.q for s, _ in steps], [s.v for s, _ in steps], [u for _, u in steps])
-    )
-
 
 # ------------------------------------------------------------------------------------------------ ground_wall
 
@@ -72,53 +47,6 @@ def test_ground_wall_has_no_physical_gradient_at_rest():
     resting = GroundWall(restitution=0.1, horizon=2000)
     assert resting.physical_gradient() is None
     assert resting.physical_cost() is None
-
-
-# ------------------------------------------------------------------------------------------------------ hopper
-
-
-def test_hopper_conserves_energy_in_flight():
-    """Without damper and policy, the semi-implicit step keeps the energy of a flight to O(dt)."""
-    drift = []
-    for dt in (2e-3, 1e-3):
-        scene = Hopper(leg_damping=0.0, dt=dt, horizon=round(0.16 / dt))  # lands after 0.175 s
-        made = compose(scene, None, SemiImplicitEuler())
-        state = State(np.array([[0.7], [0.12]]), np.array([[0.3], [-0.2]]))
-        masses = np.array([[scene.body_mass], [scene.foot_mass]])
-        energy = []
-        for _ in range(scene.horizon):
-            spring = 0.5 * scene.leg_stiffness * (scene.leg - state.q[0] + state.q[1]) ** 2
-            energy.append((masses * (0.5 * state.v**2 + scene.gravity * state.q)).sum() + spring[0])
-            state = made.step(NumpyOps(), state, np.zeros((1, 1)))
-        drift.append(np.ptp(energy))
-    assert drift[0] / drift[1] == pytest.approx(2.0, rel=0.1)
-
-
-# ---------------------------------------------------------------------------------------------- friction_block
-
-
-@pytest.mark.parametrize("slip_speed", [1e-3, pytest.param(1e-4, marks=pytest.mark.slow)])
-def test_slip_sets_in_at_the_coulomb_bound(slip_speed):
-    """Pulled evenly, the block holds until the spring pulls with mu m g, then moves at V (1 - cos(sqrt(k/m) t)).
-
-    Reaching v = 3 slip_speed on that motion, V k t^2 / 2m, takes an excess k V t = sqrt(6 slip_speed V k m) of force.
-    """
-    scene = FrictionBlock(
-        jerk=0.0, pull=0.2, slip_speed=slip_speed, dt=0.1 * slip_speed, horizon=round(2.5 / slip_speed)
-    )
-    q, v, u = trajectory(program(scene, Penalty))
-    force = scene.spring * (u[:, 0] - q[:, 0])
-    onset = np.flatnonzero(v[:, 0] > 3 * slip_speed)[0]  # tanh 3 = 0.995
-    bound = scene.friction * scene.mass * scene.gravity
-    excess = math.sqrt(6 * slip_speed * scene.pull * scene.spring * scene.mass)
-    assert force[onset] == pytest.approx(bound, abs=excess)
-    assert excess < (0.05 if slip_speed < 1e-3 else 0.15) * bound
-    rate = math.sqrt(scene.spring / scene.mass)
-    time = scene.dt * np.arange(len(q)) - bound / (scene.spring * scene.pull)
-    sliding = (time > 0) & (time < 1.5 * math.pi / rate)
-    assert sliding.sum() > 100
-    exact = scene.pull * (1 - np.cos(rate * time[sliding]))
-    assert np.abs(v[sliding, 0] - exact).max() < 5 * slip_speed + 0.02 * scene.pull
 
 
 def test_a_softplus_contact_pushes_at_touch():

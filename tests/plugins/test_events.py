@@ -1,7 +1,6 @@
 """Estimators that use declared events, against closed forms and exact sums over all outcomes."""
 
 import dataclasses
-import itertools
 from types import SimpleNamespace
 
 import numpy as np
@@ -146,26 +145,6 @@ def test_one_coin_has_the_weights_of_its_source(sign, at):
     np.testing.assert_allclose(terms[0], [happened, not_happened], rtol=1e-7)
     boundary = Boundary().terms(problem(scene), scene.theta0(), np.zeros((2, 1)))
     np.testing.assert_allclose(boundary[0], sign * slope * 3, rtol=1e-7)
-
-
-def walk_by_enumeration(scene, x):
-    """Return the gradient of the mean of (q - goal)^2 at x, from all 2^8 walks and the product rule."""
-    total = np.zeros(2)
-    for steps in itertools.product((1, -1), repeat=scene.exogenous):
-        places = np.cumsum([0, *steps])
-        limits = x[0] - x[1] * places[:-1]
-        up = np.array(steps) > 0
-        chances = np.where(up, stats.norm.cdf(limits), stats.norm.cdf(-limits))
-        slopes = np.where(up, 1, -1) * stats.norm.pdf(limits) * np.array([np.ones(8), -places[:-1]])
-        total += (places[-1] - scene.goal) ** 2 * chances.prod() * (slopes / chances).sum(axis=1)
-    return total
-
-
-def test_the_closed_form_of_the_walk_is_the_sum_over_all_walks():
-    scene = CoinWalk(sigma=1e-6)
-    expected = walk_by_enumeration(scene, scene.theta0())
-    expected[0] += 2 * scene.effort * scene.push
-    np.testing.assert_allclose(scene.closed_form_gradient(None, None), expected, rtol=1e-9)
 
 
 # ------------------------------------------------------------------------------------------------- refusals

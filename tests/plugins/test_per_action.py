@@ -5,7 +5,7 @@ import pytest
 from bench.plugins.estimators.total_propagation import TotalPropagation, _weight
 from classes import BouncingBall, Cartpole, DoubleIntegrator, Numpy, Pushing, SemiImplicitEuler
 
-from bench.model import by_actions, by_theta, compose, slopes
+from bench.model import compose
 
 DIFFERENCES = 1e-6
 """Relative error of gradients from central differences."""
@@ -36,14 +36,6 @@ def test_open_loop_by_hand():
 def policy():
     problem = compiled(Cartpole(horizon=6, sigma=0.5))
     return problem, problem.program.theta0, np.random.default_rng(4).standard_normal((40, 400, problem.program.n_noise))
-
-
-def test_derivatives_by_actions_chained_to_a_policy_are_its_gradient(policy):
-    problem, theta, noise = policy
-    w = noise[0, :5].T
-    found = slopes(problem, theta, w)
-    chained = by_theta(problem, found, *by_actions(found))
-    np.testing.assert_allclose(chained, problem.grad(theta, w), rtol=1e-5, atol=1e-7)
 
 
 def test_zeroth_order_per_action_has_the_policys_gradient_as_its_mean(policy, monkeypatch):

@@ -13,7 +13,6 @@ from classes import (
     Numpy,
     Penalty,
     SemiImplicitEuler,
-    Softplus,
     StraightThrough,
     SurrogateBackward,
     Torch,
@@ -51,20 +50,6 @@ def test_missed_balls_have_no_gradient_except_with_contacts_from_distance(proble
 
 def test_the_same_law_behind_gives_the_derivative(problems):
     np.testing.assert_allclose(problems["same"].grad(U, STILL), problems["hard"].grad(U, STILL), rtol=1e-12, atol=1e-15)
-
-
-@pytest.mark.parametrize("gap", [-0.01, 0.0, 0.02])
-def test_one_force_has_the_forward_value_and_the_backward_slope(gap):
-    import jax
-    import jax.numpy as jnp
-
-    law = StraightThrough(beta=50.0)
-    at = jnp.array([[gap]])
-    force, slope = jax.value_and_grad(lambda x: law.force(jnp, x, 0.0 * x).sum())(at)
-    assert force == Penalty().force(np, np.array([[gap]]), np.zeros((1, 1))).sum()
-    behind = jax.grad(lambda x: Softplus(beta=50.0).force(jnp, x, 0.0 * x).sum())(at)
-    assert slope[0, 0] == behind[0, 0]
-    assert slope[0, 0] < 0
 
 
 @pytest.mark.slow

@@ -67,10 +67,6 @@ def full(tmp_path_factory):
     return found, rows, {path.name for path in written(found, rows)}
 
 
-def tables_of(made, rows, name="bias_variance"):
-    return [table for table in made.study.views(made, rows).tables if table.name == name]
-
-
 # ---------------------------------------------------------------------------------------------------------- tables
 
 

@@ -3,13 +3,11 @@
 import os
 import signal
 import subprocess
-import time
 
 import pandas as pd
-import psutil
 import pytest
 from bench.plugins.scenes.quadratic import Quadratic
-from trees import Tree, hearing_signals
+from trees import Tree, hearing_signals, processes_in, wait_for
 
 from bench.errors import UserError
 from bench.experiment import config
@@ -162,18 +160,6 @@ LIMITS = ["timeout=5", "memory=600m"]
 BASE = ["scenes=[quadratic]", "backends=[numpy]", "samples=8", "repeats=4", "timing=false"]
 
 
-def descendants_of(tree):
-    """Processes that were started in the tree's folder and are still there."""
-    found = []
-    for process in psutil.process_iter():
-        try:
-            if process.cwd().startswith(str(tree.root)) and process.status() != psutil.STATUS_ZOMBIE:
-                found.append(process)
-        except psutil.Error:
-            continue
-    return found
-
-
 @pytest.fixture(scope="module")
 def tree(tmp_path_factory):
     made = Tree(tmp_path_factory.mktemp("faults"))
@@ -230,11 +216,7 @@ def test_what_plugins_print_stays_out_of_our_output(run):
 
 
 def test_no_process_is_left(tree, run):
-    for _ in range(50):
-        if not descendants_of(tree):
-            return
-        time.sleep(0.1)
-    assert not descendants_of(tree)
+    wait_for(lambda: not processes_in(tree.root), 5.0)
 
 
 @pytest.mark.slow
@@ -263,14 +245,6 @@ def start(tree, *words):
     )
 
 
-def wait_for(condition, seconds=60.0):
-    for _ in range(int(seconds / 0.05)):
-        if condition():
-            return
-        time.sleep(0.05)
-    raise AssertionError("waited in vain")
-
-
 @pytest.mark.slow
 def test_killing_a_run_leaves_rows_and_no_process(tree):
     where = "killed"
@@ -280,7 +254,7 @@ def test_killing_a_run_leaves_rows_and_no_process(tree):
     wait_for(lambda: list(folder.glob("pending/*.json")))
     process.send_signal(signal.SIGKILL)
     process.communicate(timeout=30)
-    wait_for(lambda: not descendants_of(tree), 10.0)
+    wait_for(lambda: not processes_in(tree.root), 10.0)
     done = tree.run("plan", *words)
     assert "2 cells, 1 stored, 1 to run" in done.stdout
 

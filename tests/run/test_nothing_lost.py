@@ -9,9 +9,8 @@ import time
 from multiprocessing.connection import Connection
 
 import pandas as pd
-import psutil
 import pytest
-from trees import hearing_signals
+from trees import hearing_signals, processes_in, wait_for
 
 from bench.cli import main
 from bench.errors import StorageError, UserError
@@ -19,7 +18,6 @@ from bench.model.guard import temporary_file
 from bench.run import files
 from bench.run.files import TEMPORARY, remove_stale, temporary
 from bench.run.pool import MalformedMessage, Pool, ResourceLimits, _Worker
-from bench.run.reaper import Reaper
 from bench.run.store import Store
 from bench.studies.bias_variance.columns import COLUMNS
 
@@ -328,18 +326,6 @@ def test_an_open_connection_without_messages_is_not_a_fault():
     worker.close()
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="processes stop otherwise")
-def test_a_reaper_that_is_stopped_at_its_start_is_resumed():
-    reaper = Reaper()
-    try:
-        reaper._process.send_signal(signal.SIGSTOP)
-        reaper.wait_until_ready()
-        assert reaper._process.poll() is None
-        assert psutil.Process(reaper._process.pid).status() != psutil.STATUS_STOPPED
-    finally:
-        reaper.close()
-
-
 HELD = """
 import ctypes, os, subprocess, sys
 from bench.run.pool import _Worker, Pool, ResourceLimits
@@ -368,30 +354,13 @@ def test_workers_that_hold_the_interpreter_lock_end_with_their_run(tmp_path):
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
     run = subprocess.Popen([sys.executable, str(tmp_path / "held.py"), "begun"], cwd=tmp_path, env=environment)
 
-    def left() -> list[psutil.Process]:
-        found = []
-        for process in psutil.process_iter():
-            try:
-                if process.cwd() == str(tmp_path) and process.status() != psutil.STATUS_ZOMBIE:
-                    found.append(process)
-            except psutil.Error:
-                continue
-        return found
-
-    for _ in range(600):
-        if (tmp_path / "begun").exists():
-            break
-        time.sleep(0.05)
-    assert len(left()) >= 4  # the run, its reaper, the worker and what it started
-    (reaper,) = (process for process in left() if "bench/run/reaper.py" in " ".join(process.cmdline()))
+    wait_for(lambda: (tmp_path / "begun").exists())
+    assert len(processes_in(tmp_path)) >= 4  # the run, its reaper, the worker and what it started
+    (reaper,) = (process for process in processes_in(tmp_path) if "bench/run/reaper.py" in " ".join(process.cmdline()))
     reaper.suspend()
     run.kill()
     run.wait()
-    for _ in range(100):  # within 5 s
-        if not left():
-            return
-        time.sleep(0.05)
-    assert not left()
+    wait_for(lambda: not processes_in(tmp_path), 5.0)
 
 
 COLLECTED = """

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,8 +21,6 @@ from bench.studies.bias_variance.comparisons import (
     ratio,
     verdict,
 )
-
-STANDARD = Path(__file__).resolve().parents[2] / "results" / "standard"
 
 
 def cell(error, low, high, **values):

@@ -110,6 +110,3 @@ def test_gradients_are_drawn_once_whatever_estimates_them_and_only_where_compare
 
 def test_rounding_has_no_sign():
     assert list(measure._signs(np.array([-7e-16, 0.4, -1e-3]))) == [0.0, 1.0, -1.0]
-
-
-LAWS = [("impulse", True), ("impulse", False), ("penalty", True), ("softplus", True), ("complementarity", True)]

@@ -10,8 +10,6 @@ device. A row is written as soon as it is measured. Rows come in the order of th
 files and what ``import bench`` needs, but not hydra.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import csv
@@ -24,10 +22,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -76,7 +72,7 @@ DTYPES = ("float32", "float64")
 BATCHES = (1, 16, 64, 256, 1024, 4096, 16384)
 
 
-def units(options: argparse.Namespace) -> list[Unit]:
+def units(options):
     """Return all units in the order of their worth, with the chosen cases and batches only."""
     robots = [
         Unit(name, ROBOTS[name][1], dtype, (batch,))
@@ -101,7 +97,7 @@ def units(options: argparse.Namespace) -> list[Unit]:
 # --------------------------------------------------------------------------------------------------- one process
 
 
-def problem(unit: Unit) -> Any:
+def problem(unit):
     """Compile the unit's scene on its backend."""
     from bench.experiment.by_name import compile_problem
 
@@ -111,7 +107,7 @@ def problem(unit: Unit) -> Any:
     return compile_problem(scene, "penalty", "semi_implicit_euler", f"{name}[{values}]")
 
 
-def drawn(given: Any, batch: int) -> np.ndarray:
+def drawn(given, batch):
     """Return noise ``(n_w, batch)``: at most 1,024 random columns, repeated. The first ones are the same in all batches."""
     from bench.measure import noise
 
@@ -119,13 +115,13 @@ def drawn(given: Any, batch: int) -> np.ndarray:
     return np.ascontiguousarray(np.tile(columns, (1, -(-batch // columns.shape[1])))[:, :batch])
 
 
-def projected(gradients: np.ndarray) -> np.ndarray:
+def projected(gradients):
     """Return a few random projections of the first samples' gradients ``(d, B)``."""
     directions = np.random.default_rng(0).standard_normal((PROJECTIONS, len(gradients)))
     return directions @ gradients[:, :COMPARED] / np.sqrt(len(gradients))
 
 
-def agreement(unit: Unit, gradients: np.ndarray) -> float:
+def agreement(unit, gradients):
     """Return the largest difference from the CPU's gradients in float64, relative to the largest of them; NaN without them."""
     known = json.loads(REFERENCE.read_text()).get(unit.case) if REFERENCE.is_file() else None
     if known is None:
@@ -136,14 +132,14 @@ def agreement(unit: Unit, gradients: np.ndarray) -> float:
 
 
 @contextlib.contextmanager
-def alone() -> Iterator[None]:
+def alone():
     """Hold the device: no other process of this program times or writes meanwhile."""
     with open(SCRATCH / "lock", "w") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         yield
 
 
-def write(folder: Path, row: dict[str, Any]) -> None:
+def write(folder, row):
     """Append a row and wait until it is on the disk."""
     path = folder / "gpu.csv"
     is_new = not path.exists()
@@ -156,9 +152,9 @@ def write(folder: Path, row: dict[str, Any]) -> None:
         os.fsync(file.fileno())
 
 
-def timed(call: Any, seconds: float = SECONDS) -> np.ndarray:
+def timed(call, seconds=SECONDS):
     """Return the seconds of calls, at least one and at least ``seconds`` in sum if they are short."""
-    times: list[float] = []
+    times = []
     while not times or (len(times) < CALLS and sum(times) < seconds) or (len(times) < 3 and times[0] < LONGEST / 3):
         started = time.perf_counter()
         call()
@@ -166,12 +162,12 @@ def timed(call: Any, seconds: float = SECONDS) -> np.ndarray:
     return np.array(times)
 
 
-def key(unit: Unit) -> tuple[str, str, str]:
+def key(unit):
     """Return what names a unit in the rows."""
     return unit.case, unit.backend, unit.dtype
 
 
-def predecessor(folder: Path, unit: Unit, batch: int) -> float:
+def predecessor(folder, unit, batch):
     """Return the seconds expected of a call, by the largest smaller batch; 0 if none is known or it took below 1 s."""
     if not (folder / "gpu.csv").exists():
         return 0.0
@@ -186,7 +182,7 @@ def predecessor(folder: Path, unit: Unit, batch: int) -> float:
     return known[largest] * batch / largest if largest and known[largest] > 1.0 else 0.0
 
 
-def work(unit: Unit, folder: Path, began: float, whole: bool, reference: bool) -> None:
+def work(unit, folder, began, whole, reference):
     """Measure a unit's rows. With ``whole``, or on a GPU, a batch is one program; else the backend splits it into blocks."""
     import jax
 
@@ -213,12 +209,12 @@ def work(unit: Unit, folder: Path, began: float, whole: bool, reference: bool) -
             write(folder, row | {"at_s": time.time() - began})
 
 
-def measured(given: Any, unit: Unit, batch: int, whole: bool) -> dict[str, Any]:
+def measured(given, unit, batch, whole):
     """Return the numbers of one batch."""
     import jax
 
     theta, w = given.program.theta0, drawn(given, batch)
-    numbers: dict[str, Any] = {}
+    numbers = {}
     others, mark = len(list(SCRATCH.glob("compiling-*"))), SCRATCH / f"compiling-{os.getpid()}"
     mark.touch()
     try:
@@ -261,7 +257,7 @@ def measured(given: Any, unit: Unit, batch: int, whole: bool) -> dict[str, Any]:
     }
 
 
-def draw(folder: Path) -> None:
+def draw(folder):
     """Draw gradients per second against the batch, a panel per case."""
     import pandas as pd
 
@@ -284,7 +280,7 @@ def draw(folder: Path) -> None:
 # ------------------------------------------------------------------------------------------------- all processes
 
 
-def started(unit: Unit, options: argparse.Namespace, began: float) -> subprocess.Popen[bytes]:
+def started(unit, options, began):
     """Start the process of a unit."""
     words = [unit.case, unit.backend, unit.dtype, ",".join(map(str, unit.batches)), str(began)]
     flags = [flag for flag, given in (("--whole", options.whole), ("--reference", options.reference)) if given]
@@ -301,7 +297,7 @@ def started(unit: Unit, options: argparse.Namespace, began: float) -> subprocess
     return subprocess.Popen(command, env=environment, stdout=log, stderr=log, start_new_session=True)
 
 
-def machine(options: argparse.Namespace) -> dict[str, Any]:
+def machine(options):
     """Return the device and the versions, from a process of its own: this one must hold no memory of the device."""
     code = (
         "import jax, jaxlib, mujoco, numpy, json; d = jax.devices()[0]; print(json.dumps(dict(platform=d.platform,"
@@ -315,7 +311,7 @@ def machine(options: argparse.Namespace) -> dict[str, Any]:
     return {**json.loads(done.stdout.splitlines()[-1]), "cores": os.cpu_count(), "python": sys.version.split()[0]}
 
 
-def main() -> None:
+def main():
     """Measure all units within the time, or one unit if this is its process."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--device", choices=("gpu", "cpu"), default="gpu")
@@ -347,7 +343,7 @@ def main() -> None:
     if about["platform"] == "cpu" and options.device == "gpu":
         raise SystemExit("JAX sees no GPU")
     waiting = units(options)
-    running: dict[subprocess.Popen[bytes], Unit] = {}
+    running = {}
     try:
         while (waiting or running) and time.time() - began < options.seconds:
             while waiting and len(running) < options.jobs:

@@ -65,7 +65,7 @@ class ElasticPair(Claim):
     )
     source = "nimblephysics, issue 97"
     learned = "A program can end at the right place with the derivatives of the wrong ball."
-    labels = ("variable: x1, x2, v1, v2", "derivative of the second ball's end")
+    labels = ("variable", "derivative of the second ball's end")
     curves = {name: name for name in ("with time of impact", "without", "event driven")}
 
     def measure(self) -> Outcome:

@@ -157,10 +157,7 @@ def start(problem: Problem, theta: np.ndarray, unit: float, search: GradientChec
     still = np.zeros((problem.program.n_noise, COLUMNS_AT_ONCE))
 
     def cost(thetas: np.ndarray) -> np.ndarray:
-        count = thetas.shape[1]
-        index = np.arange(-(-count // COLUMNS_AT_ONCE) * COLUMNS_AT_ONCE).clip(max=count - 1)
-        parts = [problem.value(thetas[:, part], still) for part in index.reshape(-1, COLUMNS_AT_ONCE)]
-        return np.concatenate(parts)[:count]
+        return in_columns(lambda part: problem.value(part, still), thetas, COLUMNS_AT_ONCE)
 
     def gradient(at: np.ndarray) -> np.ndarray:
         return problem.grad(np.stack([theta, at], axis=1), still[:, :2])[:, -1]
@@ -406,13 +403,10 @@ class ContactModes:
 
     def _every(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         """Return which contacts act, ``(B, n_contacts, horizon)``, from batches of a fixed width."""
-        width = w.shape[1]
-        index = np.arange(-(-width // COLUMNS_AT_ONCE) * COLUMNS_AT_ONCE).clip(max=width - 1)
-        parts = []
-        for part in index.reshape(-1, COLUMNS_AT_ONCE):
-            with np.errstate(all="ignore"):
-                parts.append(self.touching(theta[:, part], w[:, part]))
-        return np.concatenate(parts, axis=-1)[..., :width].transpose(2, 1, 0)
+        both, d = np.concatenate([theta, w]), len(theta)
+        with np.errstate(all="ignore"):
+            found = in_columns(lambda part: self.touching(part[:d], part[d:]), both, COLUMNS_AT_ONCE)
+        return found.transpose(2, 1, 0)
 
 
 def contact_modes(problem: Problem) -> ContactModes | None:

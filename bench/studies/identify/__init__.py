@@ -94,6 +94,7 @@ class Identify(StudyPackage):
     measured: str | None = param(None, "what its columns measure, q0=angle*pi/180;v0=rate; null: all columns, in order")
     time: str | None = param(None, "its time in s, an expression too, with which lines may be missing; null: all steps")
     interpolate: bool = param(False, "interpolate it linearly at the steps")
+    state: str | None = param(None, "initial state of the motion, q0=60*pi/180;v0=1; null: the scene's")
     free: str | None = param(
         None, "entries of the initial state that are unknown too, q0+v0; unknowns start.q0, start.v0"
     )

@@ -64,6 +64,8 @@ class Model:
     """Indices of the measured entries of the state (q, v)."""
     steps: tuple[int, ...]
     """Numbers of the steps after which the entries are measured, from 1."""
+    state: Mapping[str, float] = field(default_factory=dict)
+    """Entries of the initial state that are not those of the scene."""
     free: tuple[int, ...] = ()
     """Indices of the entries of the initial state that are unknown, after the parameters."""
     scale: np.ndarray = field(default_factory=lambda: np.zeros(1))
@@ -73,7 +75,7 @@ class Model:
     def values(self) -> np.ndarray:
         """The scene's own values of the unknowns, ``(p,)``."""
         theta = self.program.theta0
-        return np.append(theta, np.concatenate(self._start(theta[:, None])[2])[list(self.free), 0])
+        return np.append(theta, self._origin(theta[:, None])[list(self.free), 0])
 
     @property
     def parameters(self) -> list[Parameter]:
@@ -136,9 +138,14 @@ class Model:
         own, state, scanned = program.start(LoopOps(), own, w)
         return program, own, state, scanned
 
+    def _origin(self, theta: np.ndarray) -> np.ndarray:
+        states = np.concatenate(self._start(theta)[2])
+        states[list(self.places(self.state))] = np.reshape([*self.state.values()], (-1, 1))
+        return states
+
     def initial_states(self, theta: np.ndarray) -> np.ndarray:
         """Return the initial states ``(n, B)`` for ``theta (p, B)``."""
-        states = np.concatenate(self._start(theta)[2])
+        states = self._origin(theta)
         states[list(self.free)] = theta[len(self.program.theta0) :]
         return states
 
@@ -199,7 +206,8 @@ def model_of(cell: Cell, refinement: int = 1) -> Model:
     measured = (role and role.measured) or tuple(range(scene.n_q))
     first = own.horizon if role and role.end_only else 1
     steps = range(first * refinement, scene.horizon + 1, refinement)
-    model = Model(program, tuple(names), measured, tuple(steps))
+    state = {entry: float(evaluate(text, {})) for entry, text in expressions(settings.state).items()}
+    model = Model(program, tuple(names), measured, tuple(steps), state)
     starts = settings.free.split("+") if settings.free else []
     free = model.places(starts)
     return dataclasses.replace(model, names=(*names, *(f"start.{name}" for name in starts)), free=free).with_scales()

@@ -26,6 +26,18 @@ class SearchStudy(StudyPackage):
             return given | {"estimator": None}
         return given
 
+    def unsupported_reason(self, cell: Cell) -> str | None:
+        """Return what the optimizer needs and no part of the cell provides, or None."""
+        optimizer, estimator = cell.parts["optimizer"], cell.parts["estimator"]
+        assert isinstance(optimizer, Optimizer)
+        assert estimator is None or isinstance(estimator, Estimator)
+        available = {"value"} | ({"gradient"} if estimator is not None and estimator.gives_gradient else set())
+        missing = sorted(optimizer.needs - available)
+        if missing:
+            source = f"estimator {estimator.name}" if estimator is not None else f"scene {cell.scene.name}"
+            return f"optimizer {optimizer.name} needs {' and '.join(missing)}, which {source} does not provide"
+        return None
+
 
 @dataclass(frozen=True)
 class Optimise(SearchStudy):
@@ -83,14 +95,8 @@ class Optimise(SearchStudy):
 
     def unsupported_reason(self, cell: Cell) -> str | None:
         """Return why a cell cannot be searched (no gradient, or a target below the optimum), or None."""
-        optimizer, estimator = cell.parts["optimizer"], cell.parts["estimator"]
-        assert isinstance(optimizer, Optimizer)
-        assert estimator is None or isinstance(estimator, Estimator)
-        available = {"value"} | ({"gradient"} if estimator is not None and estimator.gives_gradient else set())
-        missing = sorted(optimizer.needs - available)
-        if missing:
-            source = f"estimator {estimator.name}" if estimator is not None else f"scene {cell.scene.name}"
-            return f"optimizer {optimizer.name} needs {' and '.join(missing)}, which {source} does not provide"
+        if missing := super().unsupported_reason(cell):
+            return missing
         if self.target is not None and isinstance(cell.scene, KnownOptimum) and cell.decision == OWN:
             optimum, how = cell.scene.optimum(cell.contact, cell.integrator) or (-math.inf, "")
             if self.target < optimum:

@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from bench.experiment.cell import Cell
 from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, text
-from bench.model import Estimator, Optimizer, param
+from bench.model import param
 from bench.studies.optimise import SearchStudy
 
 REVISION = 1
@@ -63,14 +62,3 @@ class DoseResponse(SearchStudy):
         """Return the first grid of rates, in units of the largest element of the first step: 0.003 to 3 for 7 rates."""
         half = (self.rates - 1) / 2
         return [0.1 * 10 ** (0.5 * (i - half)) for i in range(self.rates)]
-
-    def unsupported_reason(self, cell: Cell) -> str | None:
-        """Return why a cell cannot be searched, or None."""
-        optimizer, estimator = cell.parts["optimizer"], cell.parts["estimator"]
-        assert isinstance(optimizer, Optimizer)
-        assert estimator is None or isinstance(estimator, Estimator)
-        if missing := sorted(optimizer.needs - {"value", "gradient"}):
-            return f"optimizer {optimizer.name} needs {' and '.join(missing)}, which this study does not compute"
-        if "gradient" in optimizer.needs and estimator is not None and not estimator.gives_gradient:
-            return f"optimizer {optimizer.name} needs gradients, which {estimator.name} does not give"
-        return None
