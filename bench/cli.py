@@ -498,11 +498,12 @@ VERBS = {
         "KIND is scenes, contacts, integrators, backends, estimators, optimizers, policies, trainers or studies.\n", "Experiments",
     ),
     "engines": Verb(
-        _main_of("bench.engines.command"), "engines [install NAME ... [--again] | table [NAME ...] [out=DIR] [key=value ...]] [plugins=DIR]",
-        "physics engines in a Python of their own: versions, installation, conformance",
+        _main_of("bench.engines.command"), "engines [install NAME ... [--again] | table [NAME ...]] [plugins=DIR]",
+        "physics engines in a Python of their own: versions, installation, table",
         "Without arguments: each engine's environment, or how to make it. install makes it from the engine's requirements;\n"
         "--again makes it from the start. The environments are in $BENCH_ENGINES, otherwise in the user's cache. table runs the\n"
-        "conformance set and engine_gradients on all that are installed, and writes a page and a CSV.\n", "Experiments",
+        "conformance set and engine_gradients (its settings: key=value) on all\n"
+        "that are installed, and writes a page and a CSV into out=DIR.\n", "Experiments",
     ),
     "check": Verb(
         _check, "check [NAME ...] [limit=15m] [plugins=DIR]", "plugins: does each do what it declares?",

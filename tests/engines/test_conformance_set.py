@@ -189,13 +189,19 @@ def test_the_c_engine_is_right():
 
 
 @pytest.mark.parametrize(
-    "option", [pytest.param("pyramidal", marks=pytest.mark.slow), pytest.param("", marks=pytest.mark.full)]
+    ("options", "left_out"),
+    [
+        pytest.param('cone="pyramidal"/>', {"connect", "weld"}, marks=pytest.mark.slow),
+        pytest.param("", set(), marks=pytest.mark.full),
+    ],
 )
-def test_mjx_is_right(option):
-    """The cases with pyramidal cones are one model; those with other options are a model each."""
-    names = [case.name for case in conformance.cases() if option in case.model.read_text()]
+def test_mjx_is_right(options, left_out):
+    """The cases of equal options are one model."""
+    names = [
+        case.name for case in conformance.cases() if options in case.model.read_text() and case.name not in left_out
+    ]
     rows = conformance.run(mjx(*names), *names)
-    assert {row["case"] for row in rows if row["is_right"] is None} == {"connect", "connect_fast", "weld"}
+    assert {row["case"] for row in rows if row["is_right"] is None} == {"connect", "connect_fast", "weld"} - left_out
     assert not [row for row in rows if row["is_right"] is False]
 
 
@@ -224,7 +230,7 @@ def test_faults_planted_in_mjx_are_named(monkeypatch):
     expected = {"stacked": "frozen normal", "joint_equality": "sign of equality"}
     engine = mjx(*expected)
     for case, fault in expected.items():
-        found = wrong(conformance.run(engine, case))
+        found = [row for row in wrong(conformance.run(engine, case)) if row["term"] != "parameter"]
         assert found
         assert {row["looks_like"] for row in found} == {fault}
 
