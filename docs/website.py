@@ -47,6 +47,7 @@ SECTIONS: Mapping[str, Sequence[str]] = {
         "claims",
         "controller",
         "dose-response",
+        "cost-of-error",
         "training",
         "engines",
         "speed",
