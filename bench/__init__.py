@@ -15,7 +15,7 @@ from bench.examine import examine
 
 list = list_plugins  # not in __all__: a star import must not replace the built-in type
 
-__version__ = "0.4.0"
+__version__ = "0.5.0"
 __all__ = [
     "Unsupported",
     "UserError",

@@ -5,12 +5,9 @@ Coverage is the share of SETS simulated data sets whose 95% interval contains th
 Sections: tails, references, features.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import sys
-from collections.abc import Callable, Iterator
 
 import numpy as np
 import pandas as pd
@@ -20,14 +17,14 @@ Line = tuple[str, bool]
 """What was measured with its value, and whether that is wrong."""
 
 
-def within(interval: tuple[float, float], truth: float) -> bool:
+def within(interval, truth):
     return bool(interval[0] <= truth <= interval[1])
 
 
 # ---------------------------------------------------------------------------------- estimators (bias_variance)
 
 
-def tails(sets: int) -> Iterator[Line]:
+def tails(sets):
     """Intervals of some estimators of exp(x) and of a hinge that 1 sample in 160 meets, and of every one on a sum of sines.
 
     Many estimates give the true bias, variance and RMSE.
@@ -40,11 +37,11 @@ def tails(sets: int) -> Iterator[Line]:
     from bench.report.views import rmse_interval
     from bench.studies.bias_variance.measure import summarise_diagnostics
 
-    few: list[tuple[str, dict[str, str]]] = [
+    few = [
         ("fobg", {}), ("reinforce", {}), ("reinforce", {"baseline": "leave_one_out"}), ("control_variate", {}),
         ("randomized_smoothing", {}), ("randomized_smoothing", {"variant": "forward"}),
     ]  # fmt: skip
-    every: list[tuple[str, dict[str, str]]] = [(name, {}) for name in sorted(registry.entries()["estimators"])]
+    every = [(name, {}) for name in sorted(registry.entries()["estimators"])]
     one = [np.ones(1)], np.zeros(1), 1.0
     for label, scene, samples, estimators in (
         ("exp(x)", bank.Ridge([bank.growth(1.0)], *one), 16, few),
@@ -98,7 +95,7 @@ def tails(sets: int) -> Iterator[Line]:
 # --------------------------------------------------------------------------------------------------- references
 
 
-def _block(theta: np.ndarray) -> np.ndarray:
+def _block(theta):
     """Return the costs ``(B,)`` of a block dragged with friction, for ``(V, a)`` in columns ``(2, B)``, defaults of the scene."""
     dt, mass, g, mu, slip, k, depth, w, stiffness = 1e-3, 1.0, 9.81, 0.5, 0.005, 400.0, 9.81e-5, 8.0, 1e5
     x, z, vx, vz = np.zeros(theta.shape[1]), np.full(theta.shape[1], -depth), 0.0, 0.0
@@ -111,7 +108,7 @@ def _block(theta: np.ndarray) -> np.ndarray:
     return 0.5 * ((x - 1.0) ** 2 + z**2)
 
 
-def _hop(theta: np.ndarray, noise: np.ndarray, kappa: float = 0.0) -> np.ndarray:
+def _hop(theta, noise, kappa=0.0):
     """Return the costs ``(B,)`` of a hopper with forces ``noise (horizon, B)``, with a spring or on the central path."""
     dt, big, small, rest, k, b, g, target, effort, stiffness = 2e-3, 1.0, 0.1, 0.5, 400.0, 6.0, 9.81, 0.7, 1e-5, 1e4
     y = np.full(noise.shape[1], 0.15)
@@ -138,7 +135,7 @@ def _hop(theta: np.ndarray, noise: np.ndarray, kappa: float = 0.0) -> np.ndarray
     return total + (height(z, y, vz) - target) ** 2
 
 
-def _by_hermite(cost: Callable, theta: np.ndarray, sigma: float, count: int) -> np.ndarray:
+def _by_hermite(cost, theta, sigma, count):
     """Return grad J for noise on two parameters, E[f w] / sigma, by Gauss-Hermite quadrature."""
     nodes, weights = special.roots_hermitenorm(count)
     w = np.array(np.meshgrid(nodes, nodes, indexing="ij")).reshape(2, -1)
@@ -146,9 +143,7 @@ def _by_hermite(cost: Callable, theta: np.ndarray, sigma: float, count: int) -> 
     return (w * both) @ cost(theta[:, None] + sigma * w) / sigma
 
 
-def _by_differences(
-    cost: Callable, theta: np.ndarray, sigma: float, noise: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _by_differences(cost, theta, sigma, noise):
     """Return grad J and its standard errors ``(d,)``, by central differences of theta with the same noise ``(horizon, B)``."""
     columns = []
     for i in range(theta.size):
@@ -159,7 +154,7 @@ def _by_differences(
     return terms.mean(axis=1), terms.std(axis=1, ddof=1) / math.sqrt(noise.shape[1])
 
 
-def _reference(scene, contact, backend: str, samples: int):
+def _reference(scene, contact, backend, samples):
     from bench.measure.reference import certify
     from bench.model import compose, registry
 
@@ -169,7 +164,7 @@ def _reference(scene, contact, backend: str, samples: int):
     return problem, certify(problem, problem.provides, samples, 0.005)
 
 
-def references(sets: int) -> Iterator[Line]:
+def references(sets):
     """Certified references of scenes without closed form, against the simulations above and the engine's own costs."""
     _, found = _reference("friction_block", ("penalty", {"stiffness": 1e5}), "fused", 1 << 14)
     own = [_by_hermite(_block, np.array([0.3, 1.0]), 0.02, count) for count in (44, 60)]
@@ -203,7 +198,7 @@ def references(sets: int) -> Iterator[Line]:
     yield _compared("tossed_box, mujoco", found, terms.mean(axis=1), allowed)
 
 
-def _compared(name: str, found, own: np.ndarray, allowed: float) -> Line:
+def _compared(name, found, own, allowed):
     apart = float(np.linalg.norm(found.gradient - own))
     size = float(np.linalg.norm(own))
     stated = found.known().standard_error
@@ -217,7 +212,7 @@ def _compared(name: str, found, own: np.ndarray, allowed: float) -> Line:
 # ----------------------------------------------------------------------------------------------------- features
 
 
-def _slope(kind: str, k: int, m: float, width: float, radius: float) -> float:
+def _slope(kind, k, m, width, radius):
     """Return the derivative by m of E[g(|W - c|)] over W ~ N(0, I_k) with |c| = m; ``width`` is the power of a pole."""
     if kind == "pole":
         factor = 2 ** (-width / 2) * special.gamma((k - width) / 2) / special.gamma(k / 2)
@@ -234,13 +229,13 @@ def _slope(kind: str, k: int, m: float, width: float, radius: float) -> float:
     return float((high - low) / 2 * weight @ (density * np.exp(-(((rho - radius) / width) ** 2) / 2)))
 
 
-def _profile(kind: str, width: float, radius: float) -> Callable:
+def _profile(kind, width, radius):
     if kind == "pole":
         return lambda rho: rho**-width
     return lambda rho: np.exp(-(((rho - radius) / width) ** 2) / 2)
 
 
-def _featured(kind: str, d: int, random: np.random.Generator):
+def _featured(kind, d, random):
     """Return a scene of .2 x plus a feature, its gradient at 0, and the feature's width or power.
 
     A feature is a function of the distance from a centre, or from a plane (a ridge), that many standard deviations from
@@ -267,7 +262,7 @@ def _featured(kind: str, d: int, random: np.random.Generator):
     return scene, 0.2 * first - height * slope * axes.T @ centre / m, width
 
 
-def _smooth(d: int, random: np.random.Generator):
+def _smooth(d, random):
     """Return a scene of one to four waves, bumps, powers and exponentials along random lines, and its gradient."""
     import bank
 
@@ -281,7 +276,7 @@ def _smooth(d: int, random: np.random.Generator):
     return scene, scene.truth(), 0.0
 
 
-def features(sets: int) -> Iterator[Line]:
+def features(sets):
     """References of costs with a narrow feature in 1, 2 and 3 to 10 dimensions, and of smooth costs, which need no remark."""
     import bank
 
@@ -308,7 +303,7 @@ def features(sets: int) -> Iterator[Line]:
 SECTIONS = (tails, references, features)
 
 
-def main(sets: int = 200, *sections: str) -> int:
+def main(sets=200, *sections):
     """Print a line per figure; return 1 if a difference is too large."""
     failed = False
     for section in SECTIONS:

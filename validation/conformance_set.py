@@ -4,12 +4,9 @@ The inputs of a case are in its files: the model, the start, the controls, the p
 its value and derivatives by up to four sources that have to agree, and the numbers that typical faults give.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import sys
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -34,14 +31,14 @@ class ByTerms:
     force law's slope -W and H = M + J^T W J. For the integrator Euler without damping.
     """
 
-    def __init__(self, fault: str = "") -> None:
+    def __init__(self, fault=""):
         self._fault, self._engine = fault, MujocoC()
 
-    def rollout(self, case: Any) -> float:
+    def rollout(self, case):
         """Return the C engine's cost."""
         return self._engine.rollout(case)
 
-    def gradient(self, case: Any) -> dict[str, np.ndarray]:
+    def gradient(self, case):
         """Return the derivatives by state and controls."""
         model, data = self._engine.start(case)
         steps, before = [], case.qvel
@@ -60,7 +57,7 @@ class ByTerms:
             up = up @ a
         return {"qpos": up[: model.nv], "qvel": up[model.nv :], "controls": np.array(by_control)}
 
-    def _derivatives(self, model: Any, at: Any, warm: np.ndarray, stale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _derivatives(self, model, at, warm, stale):
         """Return the derivatives of the next state by the state and by the controls."""
         data, nv, nu = mujoco.MjData(model), model.nv, model.nu
         q, v, u = at
@@ -104,7 +101,7 @@ class ByTerms:
                 by_q[:, i] += shift / (2 * h)
         return np.vstack([by_q, by_v])[:, : 2 * nv], np.vstack([by_q, by_v])[:, 2 * nv :]
 
-    def _terms(self, model: Any, data: Any, q: Any, v: Any, u: Any, frames: Any = None) -> tuple[np.ndarray, ...]:
+    def _terms(self, model, data, q, v, u, frames=None):
         """Return M, s, J, r, log D and the share of r that is -dJ/dt v, with contact ``frames`` in place of their own."""
         data.qpos, data.qvel, data.ctrl = q, v, u
         mujoco.mj_fwdPosition(model, data)
@@ -123,7 +120,7 @@ class ByTerms:
         return mass, data.qfrc_smooth.copy(), jac, reference, np.log(data.efc_D), reference - law
 
     @staticmethod
-    def _slope(model: Any, data: Any, jac: np.ndarray) -> np.ndarray:
+    def _slope(model, data, jac):
         """Return W: the constraint masses of rows that act, and the Hessians of elliptic contacts that slide."""
         spring = -data.efc_D * (jac @ data.qacc - data.efc_aref)
         acts = (data.efc_force != 0) & (np.abs(data.efc_force - spring) <= 1e-6 * np.abs(data.efc_force))
@@ -136,7 +133,7 @@ class ByTerms:
         return slope
 
     @staticmethod
-    def _jacobian(model: Any, data: Any) -> np.ndarray:
+    def _jacobian(model, data):
         """Return J."""
         jac = np.zeros((data.nefc, model.nv))
         if mujoco.mj_isSparse(model):
@@ -146,7 +143,7 @@ class ByTerms:
         return jac
 
 
-def closed_form(case: Any) -> dict[str, dict[int, float]]:
+def closed_form(case):
     """Return the derivatives of cases whose motion along one coordinate is linear, by term and component."""
     stiffness, damping, width = 1 / (0.9 * 0.02) ** 2, 2 / (0.9 * 0.02), 0.9
     laws = {
@@ -171,37 +168,37 @@ def closed_form(case: Any) -> dict[str, dict[int, float]]:
     return found if case.name == "free_joint" else found | {"controls": dict(enumerate(controls))}
 
 
-def off(result: Any, expected: Any) -> float:
+def off(result, expected):
     """Return the largest difference, relative to the largest component that is expected."""
     return float(np.abs(np.ravel(result) - np.ravel(expected)).max() / np.abs(expected).max())
 
 
-def along(case: Any, result: dict[str, Any]) -> dict[str, Any]:
+def along(case, result):
     """Return derivatives with those by qpos by velocities."""
     if result["qpos"].size > case.qvel.size:
         result["qpos"] = result["qpos"] @ case.tangent()
     return result
 
 
-def seen(case: Any, result: dict[str, Any], expected: dict[str, Any]) -> dict[str, Any]:
+def seen(case, result, expected):
     """Return a fault's numbers of the terms that it changes."""
     result = along(case, result)
     return {term: flat(value) for term, value in result.items() if off(value, expected[term]) > VISIBLE}
 
 
-def one_iteration_of_mjx(mjx: Any, case: Any, expected: dict[str, Any]) -> dict[str, Any]:
+def one_iteration_of_mjx(mjx, case, expected):
     """Return the numbers of MJX with one iteration, whose line search is its own; alone, since all rows share it."""
     once = type(mjx)(case.name, is_implicit=False, iterations=1)
     return seen(case, {"value": np.array(once.rollout(case))} | once.gradient(case), expected)
 
 
-def numbers(case: Any, mjx: Any = None) -> dict[str, Any]:
+def numbers(case, mjx=None):
     """Return the expected value and derivatives, their certainty, the sources' disagreement, and the faults' numbers."""
     engine = MujocoC()
     expected, certainty = {"value": np.array(engine.rollout(case))}, {"value": 1e-12}
     for term in TERMS:
         expected[term], certainty[term] = conformance.differences(engine, case, term)
-    sources: dict[str, dict[str, float]] = {"differences of MuJoCo C": {}}
+    sources = {"differences of MuJoCo C": {}}
     model, _ = engine.start(case)
     is_euler = model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
     others = {"implicit-function theorem by terms of MuJoCo C": ByTerms().gradient(case)} if is_euler else {}
@@ -237,12 +234,12 @@ def numbers(case: Any, mjx: Any = None) -> dict[str, Any]:
     }
 
 
-def flat(value: Any) -> Any:
+def flat(value):
     """Return a number, or a flat list."""
     return float(value) if np.ndim(value) == 0 else [float(number) for number in np.ravel(value)]
 
 
-def main(*names: str) -> None:
+def main(*names):
     """Write the numbers into the files of the named cases, or of all."""
     from bench.plugins.engines.mjx_conformance import Engine as Mjx
 

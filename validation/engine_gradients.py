@@ -19,7 +19,7 @@ SCENES = ("bounce_once", "bouncing_ball", "pushing", "cartpole", "hopper")
 COLUMNS = 64
 
 
-def main() -> None:
+def main():
     """Print a line per scene of an engine."""
     engine, *scenes = sys.argv[1:]
     backend = by_name.make("backends", engine)

@@ -3,8 +3,6 @@
 Each function imitates the mechanism of a failure that was found with an engine, so that tests need no engine.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 ORDER = 3

@@ -123,7 +123,7 @@ def draw(chart: Chart, width: float | None = None) -> Figure:
             panel.set_xticks(range(len(places)), list(map(plain, places)), rotation=30, ha="right")
             panel.set_xlabel("")
         for panel, (name, part) in zip(axes, panels, strict=True):
-            _draw_marks(chart, panel, name, part)
+            _draw_marks(chart, panel, name)
             if chart.labels == "ends":
                 _label_ends(chart, panel, part, styles, width / across)
     if shared and chart.kind in ("dots", "grid"):
@@ -444,7 +444,7 @@ def _scale_x(panel: Axes, column: Column, values: np.ndarray, few: bool) -> None
         panel.xaxis.set_major_formatter(FuncFormatter(lambda value, _: text(value)))
 
 
-def _draw_marks(chart: Chart, panel: Axes, name: str, part: pd.DataFrame) -> None:
+def _draw_marks(chart: Chart, panel: Axes, name: str) -> None:
     """Draw the named values and ranges of the axes, and the notes."""
     dashes = iter(MARKS * 10)
     for mark in chart.marks:
@@ -559,7 +559,7 @@ def _draw_dots(chart: Chart, panel: Axes, name: str, part: pd.DataFrame, styles:
         panel.xaxis.set_major_formatter(FuncFormatter(lambda value, _: text(value)))
     if x.above_one and log and panel.get_xlim()[1] > 1:
         panel.axvspan(1.0, panel.get_xlim()[1], zorder=0, **SHADE)
-    _draw_marks(chart, panel, name, part)
+    _draw_marks(chart, panel, name)
 
 
 # ---------------------------------------------------------------------------------------------------- grid

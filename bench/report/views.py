@@ -99,9 +99,8 @@ def rows_along(shown: Arranged, axis: Axis | None) -> pd.DataFrame:
 
 
 def merge_seeds(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return one row per cell, with medians over the seeds that are ok; the column ``lost`` counts failed seeds."""
+    """Return one row per cell, with medians over the seeds that are ok."""
     good = rows["status"] == "ok"
-    rows = rows.assign(lost=(~good & rows.index.isin(attempted(rows).index)).astype(float))
     if rows["seed"].nunique() < 2:
         return rows
     identity = [c for c in dict.fromkeys((*CELL, *IDENTITY)) if c != "seed"]
@@ -110,7 +109,7 @@ def merge_seeds(rows: pd.DataFrame) -> pd.DataFrame:
     merged = merged.set_index("cell").sort_index().drop(columns="bad")
     medians = rows[good].groupby(cell[good])[list(rows.select_dtypes("number").columns)].median()
     merged.loc[medians.index, medians.columns] = medians
-    return merged.assign(lost=rows["lost"].groupby(cell).sum()).reset_index(drop=True)
+    return merged.reset_index(drop=True)
 
 
 def estimator_label(estimator: str, params: str) -> str:
@@ -136,9 +135,6 @@ class Curve:
     """The first backend's rows, indexed by ``x`` in increasing order."""
     seconds: Mapping[str, float]
     """Median time [s] of one estimate on each backend."""
-    noisy: frozenset[str]
-    """Backends whose times are unsteady in most of the rows."""
-    failed: int
 
     @cached_property
     def at(self) -> dict[float, dict[str, Any]]:
@@ -178,9 +174,7 @@ def estimator_curves(rows: pd.DataFrame, close: float | None = CLOSE) -> list[Cu
             exact = {name: name == first or _agree(mine, runs[name], EXACT) for name in alike}
             backends = dict(sorted(exact.items(), key=lambda item: not item[1]))
             seconds = {name: float(runs[name].rows["time_s"].median()) for name in backends}
-            noisy = frozenset(name for name in backends if unsteady(runs[name].rows).mean() > 0.5)
-            failed = sum(int(runs[name].rows["lost"].sum()) for name in backends)
-            result.append(Curve(str(estimator), str(params), backends, mine.rows, seconds, noisy, failed))
+            result.append(Curve(str(estimator), str(params), backends, mine.rows, seconds))
             runs = {name: run for name, run in runs.items() if name not in backends}
     return result
 

@@ -72,7 +72,7 @@ def write_all(directory: Path, contents: Mapping[str, str] | Iterable[tuple[str,
 
 def make_directory(path: Path) -> None:
     """Create a directory and its parents; raises :class:`StorageError` if it cannot be created, or is an address."""
-    if path.parts[:1] and path.parts[0].endswith(":"):
+    if str(path).partition("/")[0].endswith(":"):
         raise StorageError(f"'{path}' is an address, and results are written to a folder of this machine")
     try:
         path.mkdir(parents=True, exist_ok=True)

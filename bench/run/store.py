@@ -74,7 +74,7 @@ class Store:
         The claim is removed once rows are stored, since rows name their study.
         """
         with self._locked():
-            owner = self._claim.read_text(errors="replace") if self._claim.exists() else ""
+            owner = self._claim.read_text(errors="replace") if self._claim.is_file() else ""
             if owner not in ("", self._study):
                 raise UserError(
                     f"a run of study {printable(owner)} has started in '{self.directory}', and this is study {self._study}: "
@@ -82,7 +82,9 @@ class Store:
                 )
             if self._list_files() != self._files_read:
                 self.load()  # another run has stored rows since the files were read
-            self._in_pending(lambda: self._claim.write_text(self._study), f"'{self._claim}' cannot be created")
+            self._in_pending(
+                lambda: replace_file(self._claim, self._study.encode()), f"'{self._claim}' cannot be created"
+            )
 
     @contextmanager
     def _locked(self) -> Iterator[bool]:
@@ -91,7 +93,7 @@ class Store:
 
         def lock() -> IO[bytes]:
             nonlocal is_locked
-            file = path.open("ab")
+            file = path.open("a+b", buffering=0)  # for writing alone a pipe would be waited for
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:

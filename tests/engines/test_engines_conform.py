@@ -5,12 +5,7 @@
 
 import numpy as np
 import pytest
-from bench.plugins.backends.numpy import Numpy
-from bench.plugins.contacts.impulse import Impulse
-from bench.plugins.contacts.penalty import Penalty
-from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
-from bench.plugins.scenes.bounce_once import BounceOnce
-from bench.plugins.scenes.pushing import Pushing
+from classes import BounceOnce, Impulse, Numpy, Penalty, Pushing, SemiImplicitEuler
 
 import bench.conformance
 from bench.conformance.subjects import law_for

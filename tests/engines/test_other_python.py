@@ -12,16 +12,7 @@ from pathlib import Path
 import numpy as np
 import psutil
 import pytest
-from bench.plugins.backends.numpy import Numpy
-from bench.plugins.contacts.impulse import Impulse
-from bench.plugins.contacts.penalty import Penalty
-from bench.plugins.integrators.rk4 import Rk4
-from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
-from bench.plugins.scenes.bounce_once import BounceOnce
-from bench.plugins.scenes.bouncing_ball import BouncingBall
-from bench.plugins.scenes.cartpole import Cartpole
-from bench.plugins.scenes.hopper import Hopper
-from bench.plugins.scenes.pushing import Pushing
+from classes import BounceOnce, BouncingBall, Cartpole, Hopper, Impulse, Numpy, Penalty, Pushing, Rk4, SemiImplicitEuler
 
 import bench
 from bench.cli import main

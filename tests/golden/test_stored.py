@@ -34,7 +34,7 @@ SEARCHED = {"start_cost", "optimum", "scene_class", "quality_rmse_rel", "quality
 """The columns of a search that are compared: hundreds of iterations multiply rounding by more than any tolerance."""
 
 
-def cell_of(row) -> Cell:
+def cell_of(row):
     """Return the cell of a stored row, from all its parameters."""
     given = json.loads(row["parameters"])
     study, theta, budget = given.pop("study"), given.pop("theta"), given.pop("reference")
@@ -50,7 +50,7 @@ def cell_of(row) -> Cell:
     )
 
 
-def sampled(rows: pd.DataFrame) -> pd.DataFrame:
+def sampled(rows):
     """Return the first quick row of each combination of plugins, at most ``MOST`` of them, and one of each engine."""
     rows = rows[rows.status == "ok"]
     axes = [axis for axis in AXES if axis in rows]

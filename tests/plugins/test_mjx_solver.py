@@ -3,11 +3,7 @@
 import numpy as np
 import pandas as pd
 import pytest
-from bench.plugins.backends.mjx import Mjx
-from bench.plugins.backends.numpy import Numpy
-from bench.plugins.contacts.penalty import Penalty
-from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
-from bench.plugins.scenes.tossed_box import TossedBox
+from classes import Mjx, Numpy, Penalty, SemiImplicitEuler, TossedBox
 
 from bench.cli import main
 from bench.conformance.subjects import law_for

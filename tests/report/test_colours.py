@@ -1,7 +1,5 @@
 """The palette as a reader without green cones sees it (deuteranopia), and estimators beyond its length."""
 
-from __future__ import annotations
-
 from itertools import combinations
 
 import numpy as np
@@ -32,7 +30,7 @@ ESTIMATORS = 16
 """Places that are looked at, twice the palette's length."""
 
 
-def lab(text: str, seen: np.ndarray) -> np.ndarray:
+def lab(text, seen):
     """CIELAB coordinates of a colour after a matrix on linear RGB."""
     rgb = np.array(to_rgb(text))
     linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
@@ -41,11 +39,11 @@ def lab(text: str, seen: np.ndarray) -> np.ndarray:
     return np.array([116 * f[1] - 16, 500 * (f[0] - f[1]), 200 * (f[1] - f[2])])
 
 
-def apart(a: str, b: str, seen: np.ndarray) -> float:
+def apart(a, b, seen):
     return float(np.linalg.norm(lab(a, seen) - lab(b, seen)))
 
 
-def marker(place: int) -> str:
+def marker(place):
     """The marker of an estimator without variants, as :class:`bench.report.style.Look` gives it."""
     return MARKERS[(place + place // len(PALETTE)) % len(MARKERS)]
 

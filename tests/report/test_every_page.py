@@ -1,7 +1,5 @@
 """Every kind of page in a browser: accessible in light and dark, no wider than a phone, and silent."""
 
-from __future__ import annotations
-
 import re
 
 import pytest

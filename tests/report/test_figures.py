@@ -1,7 +1,5 @@
 """Equal figures are equal files, whatever the solver of layouts leaves in the last bits."""
 
-from __future__ import annotations
-
 import numpy as np
 import pandas as pd
 import pytest

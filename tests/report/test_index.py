@@ -1,7 +1,5 @@
 """The page over all experiments of a folder: each is there with its state, literally, and it opens in a browser."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

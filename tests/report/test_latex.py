@@ -1,7 +1,5 @@
 """The LaTeX tables, compiled as a paper would: two columns, no scaling, nothing wider than its place."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess
@@ -21,7 +19,7 @@ NEGLIGIBLE = 1.0
 needs_latex = pytest.mark.skipif(shutil.which("pdflatex") is None, reason="pdflatex is not installed")
 
 
-def overfull(folder: Path, tables: list[Path]) -> list[str]:
+def overfull(folder, tables):
     inputs = r"\clearpage ".join(rf"\input{{{path.as_posix()}}}" for path in tables)
     (folder / "paper.tex").write_text(PAPER.format(inputs=inputs))
     command = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "-draftmode", "paper.tex"]

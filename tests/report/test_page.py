@@ -1,7 +1,5 @@
 """The page of an experiment: what it says, that it stays literal, and what it does in a browser without a network."""
 
-from __future__ import annotations
-
 import html
 import io
 import json

@@ -25,7 +25,7 @@ TINY = ["scenes=[heaviside]", "backends=[numpy]", "samples=8", "repeats=4", "tim
 FOBG = [*TINY, "estimators=[fobg]"]
 
 
-def row(key="a", **values) -> dict:
+def row(key="a", **values):
     return COLUMNS.blank() | {"key": key, "status": "ok", "study": "bias_variance", **values}
 
 
@@ -178,7 +178,7 @@ def test_the_disk_is_told_to_empty_its_cache_where_fsync_does_not(tmp_path, monk
 # ----------------------------------------------------------------------------------------------------------- workers
 
 
-def framed(text: bytes) -> bytes:
+def framed(text):
     return len(text).to_bytes(4, "big") + text
 
 
@@ -197,7 +197,7 @@ MALFORMED = {
 }
 
 
-def _is_socket(descriptor: int) -> bool:
+def _is_socket(descriptor):
     import stat
 
     try:

@@ -469,6 +469,9 @@ def test_a_pipe_and_a_claim_in_other_characters_are_left_alone(tmp_path):
     (tmp_path / "pending").mkdir()
     os.mkfifo(tmp_path / "pending" / "pipe.json")
     assert store.load().empty
+    for name in (".lock", ".study"):
+        os.mkfifo(tmp_path / "pending" / name)
+    store.prepare()
     (tmp_path / "pending" / ".study").write_bytes(b"\xff\xfe")
     with pytest.raises(UserError, match="has started"):
         store.prepare()

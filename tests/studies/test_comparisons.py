@@ -1,7 +1,5 @@
 """Comparisons of the main study: computed a second way from the committed tables, and on planted rows."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -6,11 +6,7 @@ import math
 import numpy as np
 import pandas as pd
 import pytest
-from bench.plugins.estimators.planted import Planted
-from bench.plugins.optimizers.adam import Adam
-from bench.plugins.optimizers.gradient_descent import GradientDescent
-from bench.plugins.scenes.cartpole_swing import CartpoleSwing
-from bench.plugins.scenes.quadratic import Quadratic
+from classes import Adam, CartpoleSwing, GradientDescent, Planted, Quadratic
 from dose_response import analysis, views
 from dose_response.ground import BestGradient, scored_noise
 from dose_response.measure import compare, hypotheses_hash

@@ -5,9 +5,7 @@ import math
 import numpy as np
 import pandas as pd
 import pytest
-from bench.plugins.backends.jax import Jax
-from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
-from bench.plugins.scenes.double_integrator import DoubleIntegrator
+from classes import DoubleIntegrator, Jax, SemiImplicitEuler
 
 from bench.experiment import config
 from bench.experiment.grid import cells

@@ -25,7 +25,6 @@ from bench.run.plan import plan
 from bench.studies.identify import views as shown
 from bench.studies.identify.measure import (
     Fitting,
-    columns_of,
     count_windows,
     information,
     is_minimum,
@@ -305,7 +304,7 @@ def test_estimates_come_first_and_only_what_is_identifiable_has_one(tmp_path):
     assert list(estimates.index) == ["stiffness/mass", "damping/mass", "mass", "stiffness", "damping"]
     assert estimates["unit"].tolist() == ["(N/m)/kg", "(N s/m)/kg", "kg", "N/m", "N s/m"]
     assert estimates["identifiable"].tolist() == [
-        "yes", "yes", "in products", "in products", "in products"
+        "yes", "yes", "product", "product", "product"
     ]  # fmt: skip
     assert estimates["estimate"].isna().tolist() == [False] * 2 + [True] * 3
     assert estimates.loc["damping/mass", "estimate_low"] < 0.5 < estimates.loc["damping/mass", "estimate_high"]
@@ -559,7 +558,7 @@ def test_local_minima_of_the_logistic_map_depend_on_the_window_and_on_its_last_s
     assert minima_of_the_map(window, False) == without
     cell = cell_of(*CHAOS)
     model, settings = model_of(cell), made(SCAN).study
-    found = columns_of(scan(model, 40, model.record(model.values[:, None]), 1e-6, settings))
+    found = pd.DataFrame(scan(model, 40, model.record(model.values[:, None]), 1e-6, settings)).to_dict("list")
     place = found["scan_steps"].index(window)
     assert (found["scan_low"][place], found["scan_high"][place]) == (2.0, 4.0)
     assert (found["minima"][place], found["minima_open"][place]) == (with_last, without)
@@ -570,7 +569,7 @@ def test_scanned_loss_of_an_undamped_spring_is_the_closed_form():
     model = model_of(cell_of("scenes=[mass_spring_damper[damping=1e-12]]", "integrators=[rk4]", "theta=[stiffness]"))
     settings = made("study=identify[scan=301,span=2.5,measurement=1.0]").study
     t = 0.05 * np.arange(1, 201)
-    found = columns_of(scan(model, 4, np.cos(2 * t)[:, None], 1.0, settings))
+    found = pd.DataFrame(scan(model, 4, np.cos(2 * t)[:, None], 1.0, settings)).to_dict("list")
     assert found["scan_steps"] == [200, 100, 50]
     rates = np.sqrt(np.linspace(1.6, 10.0, 301))
     expected = ((np.cos(np.outer(rates, t)) - np.cos(2 * t)) ** 2).mean(axis=1)
@@ -584,7 +583,9 @@ def test_scanned_loss_of_an_undamped_spring_is_the_closed_form():
 
 def test_a_record_of_its_end_only_has_one_scan_without_an_open_count():
     model = model_of(cell_of("scenes=[sliding_block]"))
-    found = columns_of(scan(model, 1, model.record(model.values[:, None]), 0.01, made("study=identify[scan=11]").study))
+    found = pd.DataFrame(
+        scan(model, 1, model.record(model.values[:, None]), 0.01, made("study=identify[scan=11]").study)
+    ).to_dict("list")
     assert found["scan_steps"] == [60]
     assert len(found["scan_loss"][0]) == 11
     assert math.isnan(found["minima_open"][0])

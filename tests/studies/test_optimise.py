@@ -6,15 +6,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from bench.plugins.backends.numpy import Numpy
-from bench.plugins.contacts.impulse import Impulse
-from bench.plugins.contacts.penalty import Penalty
-from bench.plugins.integrators.explicit_euler import ExplicitEuler
-from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
-from bench.plugins.scenes.lqr import Lqr
-from bench.plugins.scenes.quadratic import Quadratic
-from bench.plugins.scenes.static_gain import StaticGain
-from bench.plugins.scenes.two_balls import TwoBalls
+from classes import ExplicitEuler, Impulse, Lqr, Numpy, Penalty, Quadratic, SemiImplicitEuler, StaticGain, TwoBalls
 from scipy.linalg import solve_discrete_lyapunov
 
 import bench
@@ -440,14 +432,14 @@ def test_bootstrap_interval_of_a_mean_covers():
     assert hits / 200 > 0.88
 
 
-def searches(finals: dict[tuple[str, str], list[float]]) -> aggregate.RunSet:
+def searches(finals):
     """One problem's searches: final costs by method and tuning, one for each seed."""
     rows = [
         {"problem": "p", "method": method, "tuning": tuning, "seed": seed, "final_cost": cost, "status": "ok"}
         for (method, tuning), costs in finals.items()
         for seed, cost in enumerate(costs)
     ]
-    return aggregate.RunSet(pd.DataFrame(rows), ())
+    return aggregate.RunSet(pd.DataFrame(rows))
 
 
 def test_seeds_that_choose_a_tuning_do_not_score_it():

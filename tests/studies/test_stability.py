@@ -1,7 +1,5 @@
 """The stability map: verdicts, boundaries against theory, and the files made from them."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 
@@ -10,7 +8,6 @@ import pandas as pd
 import pytest
 
 from bench.experiment import config
-from bench.experiment.cell import Cell
 from bench.experiment.grid import cells
 from bench.model import MechanicalScene, State, registry
 from bench.model.parameters import build
@@ -87,7 +84,7 @@ def cell(tmp_path, *words):
 LIMITS = Stability()
 
 
-def measured(found: Cell, given):
+def measured(found, given):
     return Stability().measure(found, Session(given))
 
 

@@ -1,7 +1,5 @@
 """What studies show of rows: nothing is folded that has parameters of its own, and every row says how to make it again."""
 
-from __future__ import annotations
-
 import ast
 import re
 import shlex

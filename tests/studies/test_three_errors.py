@@ -3,11 +3,7 @@
 import numpy as np
 import pandas as pd
 import pytest
-from bench.plugins.backends.jax import Jax
-from bench.plugins.contacts.impulse import Impulse
-from bench.plugins.integrators.semi_implicit_euler import SemiImplicitEuler
-from bench.plugins.scenes.bounce_once import BounceOnce
-from bench.plugins.scenes.bouncing_ball import BouncingBall
+from classes import BounceOnce, BouncingBall, Impulse, Jax, SemiImplicitEuler
 
 from bench.experiment import config
 from bench.experiment.grid import cells

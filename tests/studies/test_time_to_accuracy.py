@@ -27,7 +27,7 @@ def rows(bias=0.0, resolved=None, **values):
         {
             "scene": "s", "contact": "none", "integrator": "i", "noise": "action", "backend": "b", "dtype": "float64",
             "estimator": "e", "estimator_params": "", "horizon": 10.0, "dt": 0.1, "stiffness": math.nan, "sigma": 0.1,
-            "smoothing": math.nan, "repeats": 8, "seed": 0, "status": "ok", "lost": 0.0, "samples": float(n),
+            "smoothing": math.nan, "repeats": 8, "seed": 0, "status": "ok", "samples": float(n),
             "reference_norm": 2.0, "bias": 2 * bias, "bias_low": 1.9 * bias if resolved else 0.0, "bias_high": 2.1 * bias,
             "variance": 4 * VARIANCE / n, "rmse": 2 * math.sqrt(bias**2 + VARIANCE / n),
             "rmse_rel": math.sqrt(bias**2 + VARIANCE / n), "time_s": 1e-3 * n, "time_iqr_s": 0.0, "compile_s": 2.0,
@@ -62,7 +62,7 @@ def entry(*parts, by="rollouts", target=0.1, width=None):
 
 def line(**values):
     found = rows(**values)
-    return Curve("e", "", {"b": True}, found.set_index("samples"), {"b": 1.0}, frozenset(), 0)
+    return Curve("e", "", {"b": True}, found.set_index("samples"), {"b": 1.0})
 
 
 @pytest.mark.parametrize(
@@ -85,7 +85,7 @@ def test_unbiased_methods_follow_the_law(target, how, samples):
 def test_the_cheapest_sufficient_samples_are_taken_not_the_fewest():
     """Where 16 samples take 120 us and 256 take 64 us, both within the error, the answer is 64 us."""
     slow_start = line().rows.assign(time_s=[120e-6, 200e-6, 64e-6])
-    found = required_cost(Curve("e", "", {"b": True}, slow_start, {"b": 1.0}, frozenset(), 0), 0.6, TIME)
+    found = required_cost(Curve("e", "", {"b": True}, slow_start, {"b": 1.0}), 0.6, TIME)
     assert (found.cost, found.samples) == (64e-6, 256)
 
 
@@ -129,7 +129,7 @@ def test_a_bias_decides_whether_an_error_of_10_percent_is_reached(given, how):
 @pytest.mark.parametrize("name", ["quadratic_model", "sobol", "orthogonal"])
 def test_samples_that_are_coupled_are_not_extrapolated(name):
     """The error of such an estimator need not fall as the root of 1 / N: only measured counts tell."""
-    curve = Curve(name, "", {"b": True}, line().rows, {"b": 1.0}, frozenset(), 0)
+    curve = Curve(name, "", {"b": True}, line().rows, {"b": 1.0})
     beyond = required_cost(curve, 0.1, ROLLOUTS)
     assert (beyond.how, beyond.beyond) == ("unknown", 512)
     assert math.isnan(beyond.cost)

@@ -1,13 +1,13 @@
 """Policy problems of the tests: cart-pole, and a mass that a policy presses onto the ground."""
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
-from bench.model import Array, ContactScene, State, compose, param, registry
+from bench.model import ContactScene, State, compose, param, registry
 from bench.model.policy import PolicyScene, uniform
 
 
-def cartpole_program(**parameters: Any) -> Any:
+def cartpole_program(**parameters):
     """Return the program of cart-pole with semi-implicit Euler."""
     return compose(
         registry.make("scenes", "cartpole_swing", parameters), None, registry.make("integrators", "semi_implicit_euler")
@@ -28,31 +28,31 @@ class Pressed(PolicyScene, ContactScene):
     horizon: int = param(20, "control steps", "steps", positive=True)
     dt: float = param(0.01, "length of a control step", "s", positive=True)
 
-    def initial_state(self, xp: Any, theta: Array) -> State:
+    def initial_state(self, xp, theta):
         return State(0.05 + 0.0 * theta[:1], 0.0 * theta[:1])
 
-    def random_start(self, xp: Any, e: Array) -> State:
+    def random_start(self, xp, e):
         return State(0.05 + 0.02 * uniform(xp, e), 0.0 * e[:1])
 
-    def observation(self, xp: Any, q: Array, v: Array) -> Array:
+    def observation(self, xp, q, v):
         return xp.stack([q[0], v[0]])
 
-    def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
+    def acceleration(self, xp, q, v, u):
         return u - 9.81
 
-    def gap(self, xp: Any, q: Array) -> Array:
+    def gap(self, xp, q):
         return q
 
-    def gap_rate(self, xp: Any, q: Array, v: Array) -> Array:
+    def gap_rate(self, xp, q, v):
         return v
 
-    def contact_acceleration(self, xp: Any, q: Array, force: Array) -> Array:
+    def contact_acceleration(self, xp, q, force):
         return force
 
-    def stage_cost(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
+    def stage_cost(self, xp, q, v, u):
         return (q[0] + 0.01) ** 2
 
-    def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
+    def terminal_cost(self, xp, q, v):
         return 0.0 * q[0]
 
 
@@ -62,14 +62,14 @@ class Untouched(Pressed):
 
     name = "untouched"
 
-    def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
+    def acceleration(self, xp, q, v, u):
         return 0.0 * u
 
-    def stage_cost(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
+    def stage_cost(self, xp, q, v, u):
         return (u[0] - q[0]) ** 2
 
 
-def pressed_program(contact: str = "penalty", scene: PolicyScene | None = None, **parameters: Any) -> Any:
+def pressed_program(contact="penalty", scene=None, **parameters):
     """Return the program of the pressed mass, or of another scene with a contact, under a contact law."""
     return compose(
         scene or Pressed(),

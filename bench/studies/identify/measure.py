@@ -10,6 +10,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from scipy.special import chdtri
 
 from bench.errors import Unsupported, unknown
@@ -120,8 +121,8 @@ class Model:
         is_large = np.abs(theta) > NOTICEABLE * np.abs(self.scale)
         return dataclasses.replace(self, scale=np.where(self.scale * is_large, theta, self.scale))
 
-    def with_scales(self) -> Model:
-        """Return the model with a scale for each unknown that is no positive parameter.
+    def with_scales(self, start: np.ndarray) -> Model:
+        """Return the model with a scale for each unknown that is no parameter with a positive value and ``start``.
 
         At a scale, the record differs from that of 0 by a hundredth of its size. An unknown that is not 0 is its own scale.
         """
@@ -129,7 +130,7 @@ class Model:
         record = self.record(self.values[:, None] + STEP * np.eye(p, p + 1, 1))
         slopes = np.linalg.norm(record[:, 1:] - record[:, :1], axis=0) / STEP
         scale = 0.01 * (norm(record[:, 0]) or 1.0) / np.where(slopes > 0.0, slopes, 1.0)
-        scale[(self.values > 0.0) & (np.arange(p) < len(self.program.theta0))] = 0.0
+        scale[: len(start)] *= np.minimum(self.values[: len(start)], start) <= 0.0
         return dataclasses.replace(self, scale=scale).scaled(self.values)
 
     def _start(self, theta: np.ndarray) -> tuple[Rollout, np.ndarray, State, tuple[np.ndarray, ...]]:
@@ -210,7 +211,9 @@ def model_of(cell: Cell, refinement: int = 1) -> Model:
     model = Model(program, tuple(names), measured, tuple(steps), state)
     starts = settings.free.split("+") if settings.free else []
     free = model.places(starts)
-    return dataclasses.replace(model, names=(*names, *(f"start.{name}" for name in starts)), free=free).with_scales()
+    return dataclasses.replace(model, names=(*names, *(f"start.{name}" for name in starts)), free=free).with_scales(
+        program.theta0 if cell.decision.at is None else np.array(cell.decision.at)
+    )
 
 
 def own_record(settings: Identify, model: Model) -> tuple[np.ndarray, Model]:
@@ -405,17 +408,12 @@ def measure(cell: Cell, session: Session, settings: Identify) -> dict[str, Any]:
         **_estimates(single, known, start[:, 0], is_noise_known, expressions(settings.terms)),
     }  # fmt: skip
     fits = [single, *(fit(shooting, sigma) for shooting in SHOOTING[1:] if has_windows)]
-    result |= columns_of(_fit_statistics(one, known, is_own, is_noise_known) for one in fits)
+    lines = pd.DataFrame([_fit_statistics(one, known, is_own, is_noise_known) for one in fits])
     if settings.scan:
-        result |= columns_of(scan(model, n_windows if has_windows else 1, data[:, :1], sigma, settings))
-        result["scan_loss"] = np.concatenate(result["scan_loss"]).tolist()
+        scans = pd.DataFrame(scan(model, n_windows if has_windows else 1, data[:, :1], sigma, settings))
+        result |= scans.to_dict("list") | {"scan_loss": np.concatenate([*scans["scan_loss"]]).tolist()}
+    result |= lines.to_dict("list")
     return result
-
-
-def columns_of(lines: Iterable[Mapping[str, Any]]) -> dict[str, list[Any]]:
-    """Return lines as lists by column."""
-    every = list(lines)
-    return {name: [line[name] for line in every] for name in every[0]} if every else {}
 
 
 @dataclass(frozen=True)
@@ -517,11 +515,11 @@ def _estimates(
         "parameter": names, "estimate": [*estimate, *nothing], "estimate_low": [*low, *nothing],
         "estimate_high": [*high, *nothing], "unit": [own_units.get(name) or product(units, row) for name, row in zip(names, exponents, strict=True)],
         "start": _products(start, exponents).tolist(), "interval_noise": noise_kind,
-        "identifiable": ["yes" if k < rank else "in products" if seen else "no" for k, seen in enumerate(is_seen)],
+        "identifiable": ["yes" if k < rank else "product" if seen else "no" for k, seen in enumerate(is_seen)],
         "bias": [math.nan] * len(names), "biased": [], "term": [], "unnoticed": [], "errors": [],
     }  # fmt: skip
     finite = np.flatnonzero(fit.is_finite)[:TESTED].tolist()
-    if not finite or finite[0] or not rank:
+    if not finite or finite[0]:
         return result
     # the effects of missing terms at one fit serve all records, which have the same truth
     terms = missing_terms(model, theta, sigma, own)
@@ -549,9 +547,9 @@ def _estimates(
 
 def _half_widths(fit: Fit, i: int, known: Information, is_noise_known: bool) -> tuple[np.ndarray, str]:
     """Return half the widths of fit ``i``'s 95% intervals of the invariants' coordinates, and the noise they allow for."""
-    slopes = known.along(fit.slopes(i))
     if not fit.is_finite[i] or Information(known.names, fit.slopes(i)).rank < known.rank:
         return np.full(known.rank, np.inf), ""
+    slopes = known.along(fit.slopes(i))
     if fit.fitting.shooting != "single":
         return performance.Z * np.sqrt(np.diag(np.linalg.inv(slopes.T @ slopes))), ""
     channels = len(fit.fitting.model.measured)

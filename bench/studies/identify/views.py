@@ -37,8 +37,8 @@ SCANNED = ("scanned", "scan_unit", "scan_low", "scan_high", "scan_truth", "scan_
 TEXTS = ("shooting", "parameter", "unit", "identifiable", "biased", "term", "scanned", "scan_unit")
 """Those with lists of words."""
 ESTIMATES = (
-    "estimate: of the first record, by one rollout. low, high: its 95% interval. identified: a parameter that is not has no estimate; in "
-    "products: only products with it are. unseen bias: the largest that a term of the next table can cause, to first order, while 5% of "
+    "estimate: of the first record, by one rollout. low, high: its 95% interval. seen: whether the record identifies the parameter; product: "
+    "only products with it. bias: the largest that a term of the next table can cause, to first order, while 5% of "
     "records do not show it. doubt: unfinished, no optimum was reached; not explained, the residuals contradict the model; untested, too "
     "few measurements for a test; time step, halving it moves the estimate by more than half its standard error.",
 )
@@ -95,7 +95,7 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     tables = [
         Table(
             "identify", found,
-            columns(*ESTIMATED[:5], "doubt", *ESTIMATED[5:]),
+            columns(*ESTIMATED[:5], *["doubt"] * bool(found["doubt"].any()), *ESTIMATED[5:]),
             "Estimates", ESTIMATES, terminal=True, page=True, split=split, data=table(experiment, rows),
         ),
         Table(

@@ -39,8 +39,6 @@ class RunSet:
     """
 
     rows: pd.DataFrame
-    tuned_axes: tuple[Axis, ...]
-    """The swept parameters of optimizers."""
 
     @cached_property
     def tuning_seeds(self) -> tuple[int, ...]:
@@ -90,7 +88,7 @@ def collect_runs(experiment: Experiment, rows: pd.DataFrame) -> RunSet:
     start, final = runs["start_cost"], runs["final_cost"]
     achievable = (start - best_known).where(start > best_known)
     score = ((start - final) / achievable).clip(0.0, 1.0).mask(runs["status"] != "ok", 0.0)
-    return RunSet(runs.assign(best_known=best_known, best_known_status=status, score=score), tuned_axes)
+    return RunSet(runs.assign(best_known=best_known, best_known_status=status, score=score))
 
 
 def _is_tuned(axis: Axis, rows: pd.DataFrame) -> bool:
