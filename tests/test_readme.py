@@ -50,8 +50,9 @@ COMMANDS = [(path.name, words) for path in PAGES for words in commands(path.read
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A directory with nothing in it except the plugins of docs/extending.md and one experiment."""
+    """A directory with nothing in it except examples, the plugins of docs/extending.md and one experiment."""
     root = tmp_path_factory.mktemp("empty")
+    (root / "examples").symlink_to(ROOT / "examples")
     (root / "my_experiments" / "experiment").mkdir(parents=True)
     (root / "my_experiments" / "experiment" / "soft.yaml").write_text(SOFT)
     for path, text in EXAMPLES.items():
