@@ -27,6 +27,7 @@ from bench.model import Problem, compose, registry
 
 TOYS = Path(__file__).parent / "toys"
 HERE = sys.executable
+PATHS = [str(TOYS.parent), str(TOYS.parents[1])]  # of this file and of `classes`, for a run of its own
 SMALL = ["samples=4", "repeats=4", "timing=false", "reference.samples=256", "reference.tolerance=1", "--quiet"]
 SETTINGS = ["scenes=[bouncing_ball]", "contacts=[penalty]", "scene.bouncing_ball.horizon=40", f"plugins={TOYS}", *SMALL]
 
@@ -164,7 +165,7 @@ def test_an_error_in_an_engine_names_its_file_and_line_and_the_engine_goes_on():
 def test_an_engine_ends_with_its_run_even_if_it_hangs():
     code = f"""
 import sys, threading, time
-sys.path[:0] = {[str(Path(__file__).parent)]!r}
+sys.path[:0] = {PATHS!r}
 from test_other_python import BouncingBall, noise, process, program, registry, toy, TOYS
 registry.add_folder(TOYS)
 problem = toy(fault="loop").compile(program(BouncingBall()))
@@ -210,7 +211,7 @@ def test_children_that_plugins_leave_are_killed_and_engines_are_not():
     code = f"""
 import subprocess, sys
 import psutil
-sys.path[:0] = {[str(Path(__file__).parent)]!r}
+sys.path[:0] = {PATHS!r}
 from bench.model import guard
 from test_other_python import BouncingBall, noise, process, program, registry, toy, TOYS
 registry.add_folder(TOYS)

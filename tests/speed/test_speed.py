@@ -72,8 +72,10 @@ def pushing(horizon=8, contact=None, **values):
     return compose(Pushing(horizon=horizon, **values), contact or Penalty(), SemiImplicitEuler())
 
 
-@pytest.mark.parametrize("name", ["jax", "torch", "numpy", pytest.param("fused", marks=pytest.mark.slow)])
-def test_padding_and_sharing_change_no_result(name):
+@pytest.mark.parametrize(
+    ("name", "grain"), [("jax", 16), ("torch", 16), ("numpy", 16), pytest.param("fused", 32, marks=pytest.mark.slow)]
+)
+def test_padding_and_sharing_change_no_result(name, grain):
     if reason := registry.find("backends", name).reason:
         pytest.skip(reason)
     problem = registry.make("backends", name).compile(pushing())
@@ -81,7 +83,7 @@ def test_padding_and_sharing_change_no_result(name):
     theta = problem.program.theta0
     whole, costs = problem.grad(theta, w), problem.value(theta, w)
     np.testing.assert_allclose(problem.grad(theta, w[:, :57]), whole[:, :57], rtol=1e-12, atol=1e-12)
-    problem.block, problem.grain, problem.threads = 32, 16, 2
+    problem.block, problem.grain, problem.threads = 32, grain, 2
     np.testing.assert_allclose(problem.grad(theta, w), whole, rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(problem.value(theta, w), costs, rtol=1e-12)
 
