@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     list = list_plugins  # not in __all__: a star import must not replace the built-in type
 else:
-    del run, examine  # the packages; the functions of these names are imported at their first use
+    del bench, run, examine  # the packages; the functions of these names are imported at their first use
 
 __version__ = "0.5.0"
 __all__ = [
