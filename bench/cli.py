@@ -63,9 +63,7 @@ EXAMINE = """\
   batch=loop           batching of thetas: loop, vmap, columns (d, B), rows (B, d), columns:64; by default detected
   scale=1,0.1          the typical size of each input; by default its value
   seed=0               of the random directions and noise
-  save=DIR             write text, tables, charts and report.html there
-  markdown=FILE        append a summary in Markdown; junit=FILE: write JUnit XML
-  --matrix FILE.toml   examine each [[cost]] of the file, with the settings above
+  save=DIR             write text, tables and charts there
   --quiet              no progress
 Exit status: 0 right; 1 wrong; 3 not decided; 2 bad input.
 """
