@@ -28,8 +28,7 @@ REACHED = Column(
     "reached", label="targets reached", format="percent", low="reached_low", high="reached_high", log=False
 )
 SCORE = Column("score", low="score_low", high="score_high", digits=3, log=False)
-BETTER = Column("improvement", label="beats fobg", low="improvement_low", high="improvement_high")
-PROFILE, MEDIAN = Column("profile", log=False), Column("median_score", label="median over tunings", log=False)
+MEDIAN = Column("median_score", label="median over tunings", log=False)
 RUNTIME = Column(
     "art", label="average runtime", unit="rollouts", low="art_low", high="art_high", log=True,
     doc="expected rollouts per target reached: all rollouts of all searches over the searches that reached it",
@@ -39,8 +38,7 @@ SPENT = Column("spent", label="rollouts", log=True)
 NOTES = (
     "targets reached: share of searches whose regret falls to 1/10, 1/100 and 1/1000 of the first, the mean over problems and "
     "targets. score: share of the way from the first cost to J*, interquartile mean over searches, with a bootstrap interval "
-    "stratified by problem. beats fobg: chance of a lower final cost, paired by problem and seed. profile: integral of the "
-    "share of targets reached within 1 to 4 times the best method's runtime. average runtime (aRT): expected rollouts per "
+    "stratified by problem. average runtime (aRT): expected rollouts per "
     "target reached, where a gradient counts as many rollouts as take its time: the rollouts of all searches over the number "
     "of searches that reached the target, inf if none did. Each method is shown at its best tuning on each problem, chosen by "
     "median final cost of {seeds}, next to the number of tunings and the median score over all of them. Methods without "
@@ -64,10 +62,8 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     """Return the tables and charts of the searches."""
     runs, default = aggregate.collect_runs(experiment, rows), default_ratio(experiment)
     if not len(runs.rows):
-        every = Table(
-            "optimise", rows, [text("scene"), text("optimizer"), text("status")], data=table(experiment, rows)
-        )
-        return Views([every])
+        columns = [text("scene"), text("optimizer"), text("status")]
+        return Views([Table("optimise", rows, columns, data=table(experiment, rows))])
     name = short_names(runs.rows["method"].unique())
     cells = rows.assign(**{c: runs.rows[c] for c in ("problem", "method", "tuning", "best_known", "score")})
     cells = cells.fillna({"problem": "", "method": "", "tuning": ""}).astype({"score": float, "best_known": float})
@@ -110,7 +106,7 @@ def tables(
     return [
         Table(
             "optimise", methods,
-            [text("name", label="method"), REACHED, text("verdict"), SCORE, BETTER, PROFILE, Column("tunings", format="setting"), MEDIAN, text("diverged_of", label="diverged")],
+            [text("name", label="method"), REACHED, text("verdict"), SCORE, Column("tunings", format="setting"), MEDIAN, text("diverged_of", label="diverged")],
             "methods by the share of targets they reach", [*notes(runs), *([f"{key}."] if key else [])], terminal=True, page=True,
             data=table(experiment, rows),
         ),
