@@ -497,7 +497,7 @@ def test_the_effect_of_errors_needs_five_points_and_an_interval(monkeypatch):
     rho = pd.DataFrame(lines, columns=["scene_class", "points", "rho", "rho_low", "rho_high", "chance", "expected"])
     monkeypatch.setattr(aggregate, "quality_and_runtime", lambda *_: rho)
     monkeypatch.setattr(aggregate, "rank_correlations", lambda points: points)
-    found = aggregate.effects_of_error(None, 4.0)
+    found = aggregate.effects_of_error(None)
     assert found["verdict"].tolist() == found["expected"].tolist()
 
 

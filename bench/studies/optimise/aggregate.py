@@ -39,6 +39,8 @@ class RunSet:
     """
 
     rows: pd.DataFrame
+    gradient_cost: float = 4.0
+    """The rollouts that a gradient counts as where no times were measured."""
 
     @cached_property
     def tuning_seeds(self) -> tuple[int, ...]:
@@ -69,10 +71,10 @@ class RunSet:
         best = [(*key, tuning) for key, tuning in self.best_tunings.items()]
         return rows[pd.MultiIndex.from_frame(rows[["problem", "method", "tuning"]]).isin(best)]
 
-    def gradient_ratio(self, problem: str, default: float) -> float:
-        """Return the rollouts that take as long as one gradient: the median over searches, or ``default`` if untimed."""
-        ratios = self.rows.loc[self.rows["problem"] == problem, "gradient_ratio"].dropna()
-        return float(ratios.median()) if len(ratios) else default
+    def gradient_ratio(self, problem: str) -> float:
+        """Return the rollouts that take as long as one gradient: the median over searches, or what one counts as."""
+        ratios = self.rows.loc[self.rows["problem"] == problem, "gradient_ratio"]
+        return self.gradient_cost if ratios.isna().all() else float(ratios.median())
 
 
 def collect_runs(experiment: Experiment, rows: pd.DataFrame) -> RunSet:
@@ -88,7 +90,8 @@ def collect_runs(experiment: Experiment, rows: pd.DataFrame) -> RunSet:
     start, final = runs["start_cost"], runs["final_cost"]
     achievable = (start - best_known).where(start > best_known)
     score = ((start - final) / achievable).clip(0.0, 1.0).mask(runs["status"] != "ok", 0.0)
-    return RunSet(runs.assign(best_known=best_known, best_known_status=status, score=score))
+    searches = runs.assign(best_known=best_known, best_known_status=status, score=score)
+    return RunSet(searches, experiment.study.gradient_cost)  # type: ignore[attr-defined]
 
 
 def _is_tuned(axis: Axis, rows: pd.DataFrame) -> bool:
@@ -125,15 +128,14 @@ def _best_known_cost(rows: pd.DataFrame) -> tuple[pd.Series, pd.Series]:
 
 
 @remember
-def hits(runs: RunSet, default: float) -> pd.DataFrame:
+def hits(runs: RunSet) -> pd.DataFrame:
     """Return a line per search and target: the rollouts until it is reached, of the whole search if not, and whether.
 
-    Reached is where the regret J(theta_t) - J* is at most the first regret over the target. ``default``, here and below,
-    is the number of rollouts that a gradient counts as if no times were measured.
+    Reached is where the regret J(theta_t) - J* is at most the first regret over the target.
     """
     lines = []
     for row in runs.best_runs.to_dict("records"):
-        ratio = runs.gradient_ratio(row["problem"], default)
+        ratio = runs.gradient_ratio(row["problem"])
         spent = np.asarray(row["path_rollouts"], dtype=float) + ratio * np.asarray(row["path_gradients"], dtype=float)
         rounding = ROUNDING * max(abs(row["start_cost"] - row["best_known"]), 1e-300)
         regret = np.maximum(np.asarray(row["path_cost"], dtype=float) - row["best_known"], rounding)
@@ -144,10 +146,10 @@ def hits(runs: RunSet, default: float) -> pd.DataFrame:
 
 
 @remember
-def times_to_targets(runs: RunSet, default: float) -> pd.DataFrame:
+def times_to_targets(runs: RunSet) -> pd.DataFrame:
     """Return, per problem, method and target, successes with Wilson's interval and the average runtime in rollouts."""
     lines = []
-    for (problem, method, target), part in hits(runs, default).groupby(["problem", "method", "target"], sort=False):
+    for (problem, method, target), part in hits(runs).groupby(["problem", "method", "target"], sort=False):
         costs, reached = part["spent"].to_numpy(), part["reached"].to_numpy()
         low, high = performance.wilson(int(reached.sum()), len(reached))
         art_low, art_high = performance.runtime_interval(costs, reached)
@@ -160,12 +162,12 @@ def times_to_targets(runs: RunSet, default: float) -> pd.DataFrame:
     return pd.DataFrame(lines)
 
 
-def runtimes(runs: RunSet, default: float) -> pd.DataFrame:
+def runtimes(runs: RunSet) -> pd.DataFrame:
     """Return the rollouts of each search until each target, infinite if it is missed, and the weight of the search.
 
     The weights of a method add up to 1, in equal parts for its problems and targets.
     """
-    table = hits(runs, default)
+    table = hits(runs)
     weight = 1.0 / table.groupby(["problem", "method", "target"])["spent"].transform("size")
     total = weight.groupby(table["method"]).transform("sum")
     return table.assign(runtime=table["spent"].where(table["reached"], math.inf), weight=weight / total)
@@ -184,12 +186,12 @@ def share_of_targets(reached: pd.DataFrame) -> tuple[float, float]:
 
 
 @remember
-def summarise(runs: RunSet, default: float) -> pd.DataFrame:
+def summarise(runs: RunSet) -> pd.DataFrame:
     """Return, per method, the share of targets reached and the score.
 
     The score is an interquartile mean, its interval a bootstrap stratified by problem.
     """
-    reached, lines = times_to_targets(runs, default), []
+    reached, lines = times_to_targets(runs), []
     for method, part in runs.best_runs.groupby("method", sort=False):
         strata = [own.to_numpy() for _, own in part["score"].dropna().groupby(part["problem"], sort=False)]
         low, high = performance.bootstrap(strata, _pooled_score) if strata else (math.nan, math.nan)
@@ -211,7 +213,7 @@ def _pooled_score(strata: Sequence[np.ndarray]) -> float:
 
 
 @remember
-def quality_and_runtime(runs: RunSet, default: float, factor: float = TARGETS[0]) -> pd.DataFrame:
+def quality_and_runtime(runs: RunSet, factor: float = TARGETS[0]) -> pd.DataFrame:
     """Return, per problem and method with an estimator, the gradient's error at the start and the runtime to a target.
 
     ``art`` is the average runtime, in rollouts, until the regret is the first regret / ``factor``.
@@ -220,19 +222,19 @@ def quality_and_runtime(runs: RunSet, default: float, factor: float = TARGETS[0]
     found = runs.best_runs.groupby(keys, sort=False).agg(
         scene_class=("scene_class", "first"), rmse_rel=("quality_rmse_rel", "median")
     )
-    reached = times_to_targets(runs, default)
+    reached = times_to_targets(runs)
     runtime = reached[reached["target"] == factor].set_index(keys)["art"]
     return found.dropna(subset=["rmse_rel"]).join(runtime).reset_index()
 
 
 @remember
-def effects_of_error(runs: RunSet, default: float) -> pd.DataFrame:
+def effects_of_error(runs: RunSet) -> pd.DataFrame:
     """Return :func:`rank_correlations` of the errors and runtimes of :func:`quality_and_runtime`, with a verdict.
 
     Gradients with smaller errors reach the target ``sooner`` or ``later`` where the whole interval is on one side of 0, and
     a random order is seldom as good; else it is ``open``.
     """
-    rho = rank_correlations(quality_and_runtime(runs, default))
+    rho = rank_correlations(quality_and_runtime(runs))
     is_known = (rho["points"] >= FEWEST_POINTS) & (rho["chance"] <= CHANCE)
     sides = {"sooner": is_known & (rho["rho_low"] > 0), "later": is_known & (rho["rho_high"] < 0)}
     return rho.assign(verdict=np.select(list(sides.values()), list(sides), "open"))
