@@ -9,8 +9,7 @@ import pandas as pd
 from bench.experiment.axes import table
 from bench.experiment.columns import Column, text
 from bench.experiment.experiment import Experiment
-from bench.experiment.views import Chart, Style, Table, Views
-from bench.report.style import DEVIANT, VARIANTS, colour, marker
+from bench.experiment.views import Chart, Table, Views
 from bench.studies.train import aggregate
 from bench.studies.train.verdicts import MEANINGS
 
@@ -48,7 +47,6 @@ STEP, SECONDS = (
     Column("step", label="control steps", log=False),
     Column("seconds", label="training time [s]", log=False),
 )
-LINES = (*VARIANTS, *DEVIANT)
 SEEDS = f"interquartile mean over seeds, with its 95% bootstrap interval from {aggregate.MIN_SEEDS} seeds on"
 NOTE = (
     f"final return: the mean undiscounted return of the deterministic policy from the same starts, {SEEDS}. A run that is not "
@@ -96,25 +94,16 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
         tables.append(Table("faults", faults, FAULTS, "Faults in the logs", notes, page=True))
     cells = rows.assign(problem=runs["problem"], method=runs["method"]).fillna({"problem": "", "method": ""})
     by_name = experiment.columns.by_name
-    return Views(tables, _charts(runs, summary, windows), cells,
+    return Views(tables, _charts(runs, windows), cells,
                  [METHOD, *(by_name[name] for name in PAGE)])  # fmt: skip
 
 
-def _styles(summary: pd.DataFrame) -> dict[str, Style]:
-    """Return a colour and marker per trainer, and a line style per family."""
-    families = list(dict.fromkeys(summary["family"]))
-    return {
-        method: Style(colour(i), marker(i), LINES[families.index(family) % len(LINES)])
-        for i, (method, family) in enumerate(dict(zip(summary["method"], summary["family"], strict=True)).items())
-    }
-
-
-def _charts(runs: pd.DataFrame, summary: pd.DataFrame, windows: pd.DataFrame) -> list[Chart]:
-    looks, frame = _styles(summary), aggregate.curves(runs)
+def _charts(runs: pd.DataFrame, windows: pd.DataFrame) -> list[Chart]:
+    frame = aggregate.curves(runs)
     cost = replace(COST, log=bool((frame["cost"] > 0).all()))
     curves = [
         Chart(
-            name, frame.dropna(subset=[x.name]), [x], [cost], series="method", panel="problem", styles=looks, band=True,
+            name, frame.dropna(subset=[x.name]), [x], [cost], series="method", panel="problem", band=True,
             subtitle=f"cost: minus the return; {SEEDS}", text="A line per trainer, at its evaluations.",
         )
         for name, x in (("train", STEP), ("train_seconds", SECONDS))
