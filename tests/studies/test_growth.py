@@ -11,8 +11,7 @@ from bench.experiment import config
 from bench.experiment.grid import cells
 from bench.model import Jacobians, compose
 from bench.report.cells import readable
-from bench.studies.growth import Growth
-from bench.studies.growth.measure import classify, products, rate
+from bench.studies.growth import Growth, classify, products, rate
 from bench.studies.growth.views import fit
 
 COLUMNS = Growth.columns
