@@ -48,7 +48,7 @@ class Execution:
     launcher: str = "local"
     """Where cells run: ``local`` or ``ray``."""
     cluster: Mapping[str, Any] = field(default_factory=dict)
-    """Settings of the launcher."""
+    """Settings of the launcher, which validates them."""
     shard: tuple[int, int] | None = None
     """Number, from 1, and count of the parts of which this run is one; None for all cells."""
 

@@ -1,7 +1,7 @@
 """Brax: the scene's twin in the generalized pipeline, in a Python of its own."""
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 from bench.engines.backend import EngineBackend
 from bench.model import Program, param
@@ -20,9 +20,9 @@ class Brax(EngineBackend):
 
     name = "brax"
     file = "../engines/brax.py"
-    helpers: ClassVar[tuple[str, ...]] = ("mujoco_twin.py",)
+    helpers = ("mujoco_twin.py",)
     solver_error = 1e-6
-    libraries: ClassVar[tuple[str, ...]] = ("brax", "jax", "mujoco", "mujoco-mjx", "numpy")
+    libraries = ("brax", "jax", "mujoco", "mujoco-mjx", "numpy")
 
     dtype: str = param("float64", "floating-point type of the simulation", choices=("float64",))
     impedance: float = param(0.01, "share of other forces that a contact cancels", low=1e-3, high=0.9999)

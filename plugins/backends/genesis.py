@@ -1,7 +1,7 @@
 """Genesis: the scene's twin in its rigid solver, in a Python of its own."""
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -21,7 +21,7 @@ class Genesis(EngineBackend):
 
     name = "genesis"
     file = "../engines/genesis.py"
-    libraries: ClassVar[tuple[str, ...]] = ("genesis-world", "torch", "numpy")
+    libraries = ("genesis-world", "torch", "numpy")
 
     dtype: str = param("float64", "floating-point type of the simulation", choices=("float64",))
     impedance: float = param(3e-4, "share of other forces that a contact cancels", low=3e-4, high=0.99)

@@ -1,7 +1,7 @@
 """MuJoCo Warp: the scene's twin in MuJoCo's engine on Warp, without derivatives, in a Python of its own."""
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 from bench.engines.backend import EngineBackend
 from bench.model import Program, param
@@ -15,8 +15,8 @@ class MujocoWarp(EngineBackend):
 
     name = "mujoco_warp"
     file = "../engines/mujoco_warp.py"
-    helpers: ClassVar[tuple[str, ...]] = ("mujoco_twin.py",)
-    libraries: ClassVar[tuple[str, ...]] = ("mujoco-warp", "warp-lang", "mujoco", "numpy")
+    helpers = ("mujoco_twin.py",)
+    libraries = ("mujoco-warp", "warp-lang", "mujoco", "numpy")
     provides = frozenset({"value", "score", "physics"})
 
     dtype: str = param("float32", "floating-point type of the simulation", choices=("float32",))

@@ -1,7 +1,7 @@
 """Newton: the scene's twin in one of Newton's solvers, on Warp, in a Python of its own."""
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 from bench.engines.backend import EngineBackend
 from bench.model import Program, param
@@ -26,7 +26,7 @@ class Newton(EngineBackend):
 
     name = "newton"
     file = "../engines/newton.py"
-    libraries: ClassVar[tuple[str, ...]] = ("newton", "warp-lang", "numpy")
+    libraries = ("newton", "warp-lang", "numpy")
 
     dtype: str = param("float32", "floating-point type of the simulation", choices=("float32",))
     solver: str = param("featherstone", "Newton's solver", choices=("featherstone", "semi_implicit", "xpbd"))

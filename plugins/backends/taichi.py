@@ -1,7 +1,7 @@
 """Taichi: the scene's twin as a kernel of spheres on slides, in a Python of its own."""
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 from bench.engines.backend import EngineBackend
 from bench.model import Program, param
@@ -15,7 +15,7 @@ class Taichi(EngineBackend):
 
     name = "taichi"
     file = "../engines/taichi.py"
-    libraries: ClassVar[tuple[str, ...]] = ("taichi", "numpy")
+    libraries = ("taichi", "numpy")
 
     dtype: str = param("float64", "floating-point type of the simulation", choices=("float64",))
 

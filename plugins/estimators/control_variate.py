@@ -1,7 +1,6 @@
 """Zeroth order with the linear part of the cost as a control variate."""
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -22,7 +21,7 @@ class ControlVariate(DiagnosticEstimator):
     name = "control_variate"
     needs = frozenset({"value", "grad", "score"})
     unbiased_at_discontinuities = True
-    diagnostics: ClassVar[tuple[str, ...]] = ("coefficient",)
+    diagnostics = ("coefficient",)
 
     def estimate_with_diagnostics(
         self, problem: Problem, theta: np.ndarray, noise: np.ndarray

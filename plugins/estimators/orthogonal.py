@@ -1,7 +1,6 @@
 """Zeroth order along orthogonal directions."""
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -23,7 +22,7 @@ class Orthogonal(Estimator):
     name = "orthogonal"
     needs_directions = True
     unbiased_at_discontinuities = True
-    couples_samples: ClassVar[bool] = True
+    couples_samples = True
 
     lengths: str = param("drawn", "lengths of the directions", choices=("drawn", "fixed"))
 

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -32,8 +31,8 @@ class QuadraticModel(DiagnosticEstimator):
     name = "quadratic_model"
     needs_directions = True
     unbiased_at_discontinuities = True
-    couples_samples: ClassVar[bool] = True
-    diagnostics: ClassVar[tuple[str, ...]] = ("explained",)
+    couples_samples = True
+    diagnostics = ("explained",)
 
     block: int = param(256, "largest number of samples in one fit", low=4)
 

@@ -3,7 +3,6 @@
 import math
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import ClassVar
 
 import numpy as np
 
@@ -31,7 +30,7 @@ class Sobol(Estimator):
     name = "sobol"
     needs_directions = True
     unbiased_at_discontinuities = True
-    couples_samples: ClassVar[bool] = True
+    couples_samples = True
 
     def declares_unbiased(self, program: Program) -> bool:
         """Return whether its expectation is grad J_sigma: for noise on theta."""

@@ -184,7 +184,7 @@ def _progress(runs: RunSet) -> Chart | None:
     )
     share = Column("share", label="share of targets reached", format="percent", log=False)
     return Chart(
-        "runtimes", frame.reset_index(), [SPENT], [share], labels="ends", height=2.6, panel="",
+        "runtimes", frame.reset_index(), [SPENT], [share], height=2.6, panel="",
         subtitle=_where(runs, "single searches, a gradient counts as its time in rollouts"),
         text="Where a line ends is the share of targets reached in the whole budget.",
     )  # fmt: skip
