@@ -272,13 +272,14 @@ def test_a_thread_of_a_plugin_and_a_closed_stream_do_not_keep_a_command_waiting(
     """Without a shutdown by Python, what was printed arrives all the same, and the status is that of the command."""
     code = """if True:
         import sys, threading, time
-        import bench.__main__ as command, bench.cli
+        import bench.__main__ as command
+        from bench import cli
         threading.Thread(target=time.sleep, args=(600,)).start()
         def main():
             print("all of it")
             sys.stderr.close()
             return 3
-        bench.cli.main = main
+        cli.main = main
         command.command()
     """
     inherited = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, sys.path))}
