@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import jax
+import jax.numpy as jnp
+
 from bench.model.ops import Array
 from bench.training.environment import Environment, Episodes
 
@@ -14,8 +17,6 @@ def returns(env: Environment, policy: Callable[[Array], Array], numbers: Array) 
 
     ``policy`` gives actions ``(n_u, B)`` from observations ``(n_observations, B)``.
     """
-    import jax
-    import jax.numpy as jnp
 
     def step(carry: tuple[Episodes, Array, Array], _: Any) -> tuple[tuple[Episodes, Array, Array], None]:
         episodes, total, over = carry

@@ -7,10 +7,14 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+import optax
+from jax.flatten_util import ravel_pytree
 
 from bench.model.trainer import Trainer
-from bench.training import evaluation
+from bench.training import agreement, evaluation
 from bench.training.environment import Environment
 
 _compiled: dict[tuple[Any, ...], tuple[Callable[..., Any], float]] = {}
@@ -53,10 +57,6 @@ class Training:
         """Return the cosines of :func:`agreement.cosine` at a first-order trainer's state, from ``copies`` per rollout."""
 
         def compare(env: Environment, state: Any, seed: Any) -> Any:
-            import jax
-
-            from bench.training import agreement
-
             def parts(actor: Any, key: Any) -> Any:
                 return self.trainer.parts(env, state, actor, key)
 
@@ -74,9 +74,6 @@ class Training:
         trainer: Any = dataclasses.replace(self.trainer, window=window)  # type: ignore[call-arg]
 
         def differentiate(env: Environment, state: Any, seed: Any) -> Any:
-            import jax
-            from jax.flatten_util import ravel_pytree
-
             def mean_return(actor: Any) -> Any:
                 key_start, key = jax.random.split(jax.random.PRNGKey(seed))
                 fresh = trainer.fresh(env, state, key_start)
@@ -92,8 +89,6 @@ class Training:
         """Return the loss that the next update logs, at the actor's parameters plus ``shift (d,)``."""
 
         def evaluate(env: Environment, state: Any, shift: Any) -> Any:
-            from jax.flatten_util import ravel_pytree
-
             theta, unflatten = ravel_pytree(state.actor)
             return self.trainer.update(env, state._replace(actor=unflatten(theta + shift)))[1]["loss"]
 
@@ -106,11 +101,6 @@ class Training:
         """
 
         def move(env: Environment, state: Any) -> Any:
-            import jax
-            import jax.numpy as jnp
-            import optax
-            from jax.flatten_util import ravel_pytree
-
             means = jax.tree.map(jnp.zeros_like, optax.tree.get(state.memory, "mu"))
             squares = jax.tree.map(lambda x: x + LARGE, means)
             memory = optax.tree.set(state.memory, mu=means, nu=squares)
@@ -124,8 +114,6 @@ class Training:
         return self._executable(name, function, arguments)(self.env.parameters(), *arguments)
 
     def _executable(self, name: str, function: Callable[..., Any], arguments: tuple[Any, ...]) -> Callable[..., Any]:
-        import jax
-
         shapes = tuple((np.shape(x), str(x.dtype)) for x in jax.tree.leaves(arguments))
         key = (self.env.structure, self.trainer, name, shapes)
         if key not in _compiled:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+import jax
+import jax.numpy as jnp
+
 from bench.model.ops import Array
 
 
@@ -14,8 +17,6 @@ def td_lambda(reward: Array, value: Array, ended: Array, discount: Any, decay: f
     reached, 0 where none follows. After the window's last step, and after a step that ended an episode, the return is
     ``r_t + gamma V_t`` (Sutton, Barto 2018, equation 12.9 in recursive form).
     """
-    import jax
-    import jax.numpy as jnp
 
     def back(following: Array, at: tuple[Array, Array, Array]) -> tuple[Array, Array]:
         r, v, end = at
