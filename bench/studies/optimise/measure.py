@@ -25,35 +25,6 @@ MAX_NEWTON_DIM = 1000
 """Largest dimension of theta for which Newton's method computes the optimum."""
 
 
-class OptimizerRun:
-    """One search on one problem: computes single iterations, and the objective at a point."""
-
-    def __init__(self, cell: Cell, problem: Problem, settings: Optimise) -> None:
-        self.cell, self.problem, self.settings = cell, problem, settings
-        optimizer, estimator = cell.parts["optimizer"], cell.parts["estimator"]
-        assert isinstance(optimizer, Optimizer)
-        assert estimator is None or isinstance(estimator, Estimator)
-        self.optimizer, self.estimator = optimizer, estimator
-        self._still = np.zeros((problem.program.n_noise, 1))
-
-    def objective(self, theta: np.ndarray) -> float:
-        """Return the cost at ``theta (d,)`` without noise. Its rollout is not counted."""
-        return objective(self.problem, theta, self._still)
-
-    def step(self, state: dict[str, Any], iteration: int) -> dict[str, Any]:
-        """Return the optimizer's state after one more iteration, whose number is ``iteration``, from 1."""
-        cell, problem = self.cell, self.problem
-
-        def draw(count: int, width: int, what: str) -> np.ndarray:
-            return noise.draw(cell.seed, cell.scene.name, 1, count, width, f"optimise: {what} {iteration}")
-
-        return advance(
-            self.optimizer, state, draw(self.optimizer.draws(problem.dim), problem.dim, "points")[0].T,
-            lambda points: mean_costs(problem, points, self._still),
-            lambda points: estimates(problem, self.estimator, points, draw(cell.samples, len(self._still), "samples")),
-        )  # fmt: skip
-
-
 def objective(problem: Problem, theta: np.ndarray, scored: np.ndarray) -> float:
     """Return the mean cost at ``theta (d,)`` over some noise ``(n_w, M)``. Its rollouts are not counted."""
     before = problem.usage.rollouts
@@ -94,31 +65,25 @@ def measure(cell: Cell, session: Session, settings: Optimise) -> dict[str, Any]:
     """Search until the budget is spent or the cost has diverged; return the cell's results by column."""
     problem = session.problem(cell)
     optimum, how = known_optimum(cell, problem, session)
-    search = OptimizerRun(cell, problem, settings)
     theta0 = np.array(problem.program.theta0, dtype=np.float64)
-    start_quality = gradient_quality(cell, problem, theta0, settings) if settings.quality != "none" else None
-    state = search.optimizer.start(theta0)
-    search.step(state, 1)  # compiles, untimed
-    path, stopped = follow_path(search, state, settings)
-    cost, thetas, last = path["cost"], path.pop("theta"), {name: values[-1] for name, values in path.items()}
-    start, final, stored, is_lost = cost[0], cost[-1], stored_indices(cost), stopped == "diverged"
-    result = {
+    quality = gradient_quality(cell, problem, theta0, settings) if settings.quality != "none" else None
+    path, theta, stopped = follow_path(cell, problem, theta0, settings)
+    last = {name: values[-1] for name, values in path.items()}
+    cost, is_lost = path["cost"], stopped == "diverged"
+    start, final, stored = cost[0], cost[-1], stored_indices(cost)
+    score = float(np.clip((start - final) / (start - optimum), 0.0, 1.0)) if start > optimum else np.nan
+    return {
         "status": "diverged" if is_lost else "ok",
         "reason": f"the cost left {settings.limit:g} (|J0| + 1) or is not finite" if is_lost else "",
         "stopped": stopped, "scene_class": scene_class(cell, problem),
         "iterations": last["iteration"], "rollouts": last["rollouts"], "gradients": last["gradients"],
-        "gradient_ratio": gradient_ratio(problem, cell) if cell.timing and search.estimator is not None else np.nan,
+        "gradient_ratio": gradient_ratio(problem, cell) if cell.timing and cell.parts["estimator"] else np.nan,
         "search_s": last["s"], "start_cost": start, "final_cost": final, "best_cost": float(np.nanmin(cost)),
-        "optimum": optimum, "optimum_status": how,
-        "score": float(np.clip((start - final) / (start - optimum), 0.0, 1.0)) if start > optimum else np.nan,
+        "optimum": optimum, "optimum_status": how, "score": 0.0 if is_lost and not np.isfinite(score) else score,
         **{f"path_{name}": np.asarray(values)[stored].tolist() for name, values in path.items()},
-        "theta": thetas[-1].tolist(),
+        "theta": theta.tolist(),
+        **{f"quality_{name}": value for name, value in (quality or {}).items()},
     }  # fmt: skip
-    if start_quality is not None:
-        result |= {f"quality_{name}": value for name, value in start_quality.items()}
-    if not np.isfinite(result["score"]) and is_lost:
-        result["score"] = 0.0
-    return result
 
 
 def stored_indices(cost: Sequence[float]) -> np.ndarray:
@@ -129,29 +94,48 @@ def stored_indices(cost: Sequence[float]) -> np.ndarray:
     return np.unique(np.append(spaced, np.nanargmin(cost)))
 
 
-def follow_path(search: OptimizerRun, state: dict[str, Any], settings: Optimise) -> tuple[dict[str, list[Any]], str]:
-    """Iterate until the budget is spent or the cost has diverged; return the path and which of both.
+def follow_path(
+    cell: Cell, problem: Problem, theta0: np.ndarray, settings: Optimise
+) -> tuple[dict[str, list[Any]], np.ndarray, str]:
+    """Iterate until the budget is spent or the cost has diverged; return the path, its last theta, and which of both.
 
-    The path has lists with an entry per iteration: iteration, cost, rollouts, gradients, time ``s`` and theta ``(d,)``.
+    The path has lists with an entry per iteration: iteration, cost, rollouts, gradients and time ``s``.
     """
-    usage = search.problem.usage
+    optimizer, estimator, usage = cell.parts["optimizer"], cell.parts["estimator"], problem.usage
+    assert isinstance(optimizer, Optimizer)
+    assert estimator is None or isinstance(estimator, Estimator)
+    still = np.zeros((problem.program.n_noise, 1))
+
+    def step(state: dict[str, Any], iteration: int) -> dict[str, Any]:
+        def draw(count: int, width: int, what: str) -> np.ndarray:
+            return noise.draw(cell.seed, cell.scene.name, 1, count, width, f"optimise: {what} {iteration}")
+
+        return advance(
+            optimizer, state, draw(optimizer.draws(problem.dim), problem.dim, "points")[0].T,
+            lambda points: mean_costs(problem, points, still),
+            lambda points: estimates(problem, estimator, points, draw(cell.samples, len(still), "samples")),
+        )  # fmt: skip
+
+    state = optimizer.start(theta0)
+    step(state, 1)  # compiles, untimed
     path: dict[str, list[Any]] = {}
     usage.rollouts = usage.gradients = 0
     most = settings.iterations if settings.iterations is not None else math.inf
     iteration, seconds = 0, 0.0
     while True:
-        cost = search.objective(state["theta"])
-        point = {"iteration": iteration, "cost": cost, "rollouts": usage.rollouts, "gradients": usage.gradients,
-                 "s": seconds, "theta": np.array(state["theta"])}  # fmt: skip
+        cost = objective(problem, state["theta"], still)
+        point = {
+            "iteration": iteration, "cost": cost, "rollouts": usage.rollouts, "gradients": usage.gradients, "s": seconds,
+        }  # fmt: skip
         for name, value in point.items():
             path.setdefault(name, []).append(value)
         if not np.isfinite(cost) or abs(cost) > settings.limit * (abs(path["cost"][0]) + 1.0):
-            return path, "diverged"
+            return path, state["theta"], "diverged"
         if usage.rollouts + settings.gradient_cost * usage.gradients >= settings.budget or iteration >= most:
-            return path, "budget"
+            return path, state["theta"], "budget"
         iteration += 1
         started = time.perf_counter()
-        state = search.step(state, iteration)
+        state = step(state, iteration)
         seconds += time.perf_counter() - started
 
 
