@@ -548,9 +548,10 @@ def _draw_grid(
         if which == "x" and any("…" in label for label in labels) and max(map(width_in_inches, names)) < 1.6:
             labels = [plain(name) for name in names]  # short names read upwards rather than shortened
             panel.tick_params(axis="x", rotation=90)
-        # of numbers that would overlap, each second or more is shown
-        needed = max(map(width_in_inches, labels)) + 0.08 if which == "x" else 0.8 * LINE
-        step = math.ceil(needed / (cell_width if which == "x" else cell_height)) if column.kind == "number" else 1
+        step = 1
+        if column.kind == "number":  # of numbers that would overlap, each second or more is shown
+            needed = max(map(width_in_inches, labels)) + 0.08 if which == "x" else 0.8 * LINE
+            step = math.ceil(needed / (cell_width if which == "x" else cell_height))
         getattr(panel, f"set_{which}ticks")(range(0, len(labels), step), labels[::step])
         if column.label or column.kind == "number":
             getattr(panel, f"set_{which}label")(axis_text(column))

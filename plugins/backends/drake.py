@@ -19,5 +19,4 @@ class Drake(EngineBackend):
     libraries = ("drake", "numpy")
     own_contact = True
 
-    dtype: str = param("float64", "floating-point type of the simulation", choices=("float64",))
     dissipation: float = param(0.0, "Hunt and Crossley's dissipation of contacts", "s/m", low=0.0)

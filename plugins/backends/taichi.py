@@ -4,9 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from bench.engines.backend import EngineBackend
-from bench.model import Program, param
-
-from ..contacts.penalty import Penalty
+from bench.model import Program
 
 
 @dataclass(frozen=True)
@@ -16,13 +14,10 @@ class Taichi(EngineBackend):
     name = "taichi"
     file = "../engines/taichi.py"
     libraries = ("taichi", "numpy")
-
-    dtype: str = param("float64", "floating-point type of the simulation", choices=("float64",))
+    damping_mode = ""
 
     def unsupported_twin(self, program: Program, model: dict[str, Any]) -> str | None:
         """Return why the kernel cannot run the twin: hinges, linked bodies or damped contacts; or None."""
         if any(body["joint"] != "slide" or body["parent"] >= 0 for body in model["bodies"]):
             return "taichi's kernel has bodies on slides only, each attached to the world"
-        if isinstance(program.contact, Penalty) and program.contact.damping:
-            return "taichi's kernel has contacts without damping"
         return None

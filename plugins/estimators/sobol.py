@@ -6,7 +6,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from bench.model import Estimator, Problem, Program, columns, per_repeat
+from bench.model import Estimator, Problem, Program, mean_difference
 
 BITS = 52
 """Binary digits of a coordinate: the centres of 2^52 equal intervals are numbers of double precision."""
@@ -43,11 +43,7 @@ class Sobol(Estimator):
 
     def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Return the mean of central differences along the quasi-random directions, ``(R, d)``."""
-        s = problem.sigma
-        shift = s * columns(directions(noise[..., : problem.dim]))
-        centred = problem.centred(columns(noise))
-        change = problem.displaced(shift, theta, centred) - problem.displaced(-shift, theta, centred)
-        return np.asarray(per_repeat(change * shift / (2.0 * s * s), noise).mean(axis=1))
+        return mean_difference(problem, theta, directions(noise[..., : problem.dim]), noise)
 
 
 def directions(noise: np.ndarray) -> np.ndarray:
