@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -119,6 +120,23 @@ class Environment:
         fresh = jax.lax.stop_gradient(self.start(numbers).state)
         state = State(*(jnp.where(ended, new, old) for new, old in zip(fresh, reached, strict=True)))
         return Transition(Episodes(state, jnp.where(ended, 0, age)), reached, reward, ended, terminated)
+
+    def returns(self, policy: Callable[[Array], Array], numbers: Array) -> Array:
+        """Return the undiscounted returns ``(B,)`` of episodes from starts ``numbers (n_start, B)`` to their first end.
+
+        ``policy`` gives actions ``(n_u, B)`` from observations ``(n_observations, B)``.
+        """
+
+        def step(carry: tuple[Episodes, Array, Array], _: Any) -> tuple[tuple[Episodes, Array, Array], None]:
+            episodes, total, over = carry
+            moved = self.step(episodes, policy(self.observe(episodes.state)), numbers)
+            total = total + jnp.where(over, 0.0, moved.reward)
+            return (moved.next, total, over | moved.ended), None
+
+        first = self.start(numbers)
+        carry = (first, jnp.zeros(numbers.shape[1], numbers.dtype), jnp.zeros(numbers.shape[1], dtype=bool))
+        (_, total, _), _ = jax.lax.scan(step, carry, None, length=self.length)
+        return total
 
     def contacts(self, state: State) -> tuple[Array, Array, Array]:
         """Return, per rollout ``(B,)``, closed contacts, largest penetration [m] and largest contact force [N].

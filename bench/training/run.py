@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -14,7 +15,7 @@ import optax
 from jax.flatten_util import ravel_pytree
 
 from bench.model.trainer import Trainer
-from bench.training import agreement, evaluation
+from bench.training import agreement
 from bench.training.environment import Environment
 
 _compiled: dict[tuple[Any, ...], tuple[Callable[..., Any], float]] = {}
@@ -48,7 +49,7 @@ class Training:
         """Return the returns ``(B,)`` of the deterministic policy from starts ``numbers (n_start, B)``."""
 
         def evaluate(env: Environment, state: Any, numbers: Any) -> Any:
-            return evaluation.returns(env, lambda seen: self.trainer.action(env, state, seen), numbers)
+            return env.returns(lambda seen: self.trainer.action(env, state, seen), numbers)
 
         numbers = np.asarray(numbers, dtype=self.env.dtype)
         return np.asarray(self._call("returns", evaluate, state, numbers), dtype=np.float64)
@@ -57,9 +58,7 @@ class Training:
         """Return the cosines of :func:`agreement.cosine` at a first-order trainer's state, from ``copies`` per rollout."""
 
         def compare(env: Environment, state: Any, seed: Any) -> Any:
-            def parts(actor: Any, key: Any) -> Any:
-                return self.trainer.parts(env, state, actor, key)
-
+            parts = partial(self.trainer.parts, env, state)
             return agreement.cosine(parts, state.actor, jax.random.PRNGKey(seed), copies)
 
         cosines = self._call(f"agreement {copies}", compare, state, np.uint32(seed))

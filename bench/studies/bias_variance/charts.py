@@ -30,7 +30,7 @@ from bench.report.views import (
     rmse_interval,
 )
 from bench.studies.bias_variance.columns import COLUMNS
-from bench.studies.bias_variance.comparisons import FAILS, NO_RESULT, leaders
+from bench.studies.bias_variance.comparisons import FAILS, NO_RESULT
 from bench.studies.bias_variance.costs import ROLLOUTS, TIME, Cost
 from bench.studies.bias_variance.time_to_accuracy import SAMPLES, TARGETS
 
@@ -157,7 +157,7 @@ def _along(
     total = frame["series"].nunique()
     panels = [problem.title() for problem in drawn]
     shares = [f"{len(names)} of {total} estimators"] if len(names) < total else []
-    marks = [Mark(name, value) for name, value in shown.marks(axis).items()]
+    marks = [Mark(f"beyond the {name}", value, math.inf) for name, value in shown.marks(axis).items()]
     x = Column("x", label=axis.title, format="setting")
     return Chart(
         "bias_variance_" + re.sub(r"\W", "_", axis.column), frame, [x], [RMSE, BIAS], series="series",
@@ -179,8 +179,9 @@ def _lines(problem: ProblemRows) -> pd.DataFrame:
 
 
 def _main_series(frame: pd.DataFrame, methods: pd.DataFrame, comparisons: pd.DataFrame) -> list[str]:
-    """Return the estimators to print: those that are most often first or tied with it, then others, as far as distinct."""
-    wins = Counter(name for names in leaders(comparisons, methods).values() for name in names)
+    """Return the estimators to print: those that are most often first, then others, as far as distinct."""
+    estimator = dict(zip(methods["method"], methods["estimator"], strict=True))
+    wins = Counter(estimator[name] for name in comparisons["first"] if name)
     names = sorted(frame["series"].unique(), key=lambda name: (-wins[name], "[" in name))
     errors = np.log(frame.pivot_table("rmse_rel", ["panel", "x"], "series", aggfunc="first").reindex(columns=names))
     chosen: list[str] = []
