@@ -63,9 +63,7 @@ EXAMINE = """\
   batch=loop           batching of thetas: loop, vmap, columns (d, B), rows (B, d), columns:64; by default detected
   scale=1,0.1          the typical size of each input; by default its value
   seed=0               of the random directions and noise
-  save=DIR             write text, tables, charts and report.html there
-  markdown=FILE        append a summary in Markdown; junit=FILE: write JUnit XML
-  --matrix FILE.toml   examine each [[cost]] of the file, with the settings above
+  save=DIR             write text, tables and charts there
   --quiet              no progress
 Exit status: 0 right; 1 wrong; 3 not decided; 2 bad input.
 """
@@ -533,7 +531,7 @@ VERBS = {
         _main_of("bench.compare.command"), "compare BEFORE AFTER [--timings] [out=DIR]", "two results, cell by cell: 1 when something got worse",
         "BEFORE and AFTER are directories, or git revisions as REV or REV:PATH. Accuracy decides, paired on equal noise;\n"
         "times only with --timings, compared with the spread between runs: again=DIR,DIR names further runs of BEFORE.\n"
-        "Written to out=DIR (runs/compare): compare.csv, .md, .json, .xml (JUnit) and .html.\n",
+        "Written to out=DIR (runs/compare): compare.csv, .md, .xml (JUnit) and .html.\n",
     ),
     "index": Verb(
         _main_of("bench.report.index"), "index [DIR]", "a page over all experiments of a results folder, with the state of each",

@@ -3,7 +3,7 @@
 import cmath
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -22,8 +22,8 @@ class MassSpring(Oscillator, DampedScene):
 
     name = "mass_spring"
     neglected_effects = "the centre of mass (moves uniformly)"
-    continuous: ClassVar[bool] = True
-    n_q: ClassVar[int] = 1
+    continuous = True
+    n_q = 1
 
     sigma: float = param(0.01, "standard deviation of the noise on stretch and rate", "m and m/s", positive=True)
     horizon: int = param(100, "number of time steps", "steps", positive=True)

@@ -425,7 +425,7 @@ class NoContacts(Pushing):
     """Bodies that touch, and no number of contacts."""
 
     name = "no_contacts"
-    n_contacts: ClassVar[int] = 0
+    n_contacts = 0
 
 
 @dataclass(frozen=True)
@@ -433,7 +433,7 @@ class WrongStateSize(DoubleIntegrator):
     """Two coordinates declared, and one given."""
 
     name = "wrong_state_size"
-    n_q: ClassVar[int] = 2
+    n_q = 2
 
 
 # -------------------------------------------------------------------------------- planted: contacts and integrators
