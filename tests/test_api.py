@@ -179,7 +179,7 @@ def test_compare_finds_what_got_worse(rows, results, tmp_path):
     assert comparison.worse
     assert (comparison.to_frame()["outcome"] == "worse").any()
     assert "worse: notes" in repr(comparison)
-    assert "got worse" in comparison._repr_html_()
+    assert "worse" in comparison._repr_html_()
     assert not bench.compare(results, results).worse
     with pytest.raises(bench.UserError, match="add --timings"):
         bench.compare(results, results, again=[results, results])

@@ -82,7 +82,9 @@ def _examined(cost: str, settings: Mapping[str, str], progress: bool) -> Report:
     if "theta" not in settings and not hasattr(module, "theta"):
         raise UserError("theta is missing: give theta=1,0 or define theta in the file")
     given = {key: value for key, value in {"theta": "theta", **settings}.items() if key not in FILES}
-    values = {key: PARSERS[key](value, key, module) if key in PARSERS else value for key, value in given.items()}
+    values: dict[str, Any] = {
+        key: PARSERS[key](value, key, module) if key in PARSERS else value for key, value in given.items()
+    }
     report = examine(function, name=cost, progress=progress, **values)
     words = " ".join(f"{key}={value}" for key, value in settings.items() if key != "expect")
     report = replace(report, command=f"python -m bench examine {cost} {words}".strip())
