@@ -3,7 +3,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 RUN := $(BIN)/python -m bench
 
-.PHONY: run test lint slow slow-all docs site gallery examples clean
+.PHONY: run test lint slow slow-all docs site gallery clean
 
 run: $(VENV)/.installed
 	$(RUN) +experiment=stiffness_sweep
@@ -39,15 +39,6 @@ gallery: $(VENV)/.installed
 	for name in $$(cd examples/cost_of_error/experiment && find * -name '*.yaml' | sed 's/\.yaml$$//' | sort); do \
 	  $(RUN) +experiment=$$name plugins=examples/cost_of_error results_dir=results/standard || exit 1; done
 	$(BIN)/python -m docs.build results figures
-
-# The examples on other people's engines, in an environment of their own: their pins and ours do not live together.
-examples: .venv-engines/.installed
-	.venv-engines/bin/python examples/table.py
-
-.venv-engines/.installed: examples/requirements-engines.txt
-	$(PYTHON) -m venv .venv-engines
-	.venv-engines/bin/python -m pip install --quiet --disable-pip-version-check -r $<
-	touch $@
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)

@@ -79,7 +79,6 @@ class Settings(TypedDict, total=False):
     table: Mapping[str, Any]
     columns: str | None
     rows: Names
-    compile_time: bool
     marks: Mapping[str, Mapping[str, float]]
 
 

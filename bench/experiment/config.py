@@ -110,7 +110,6 @@ APPEARANCE = (
     "answer",
     "formats",
     "table",
-    "compile_time",
     "compile_cache",
     "plugins",
     "execution",
@@ -260,6 +259,7 @@ def _quote_identities(value: str) -> str:
 
 
 FORMATS = ("png", "svg", "pdf")
+LAUNCHERS = ("local", "ray")
 DEFAULT_PLUGINS = {"optimizers": ["adam"]}
 """Plugins of kinds that are null in the configuration, unless the study has its own default."""
 
@@ -311,7 +311,6 @@ def experiment(config: Mapping[str, Any]) -> Experiment:
         question=str(config["question"] or ""),
         answer=str(config["answer"] or ""),
         marks=_mapping(config, "marks"),
-        compile_time=coerce(bool, config["compile_time"], "compile_time"),
         formats=tuple(_one_of("formats", item, FORMATS) for item in _as_list(config["formats"])),
         table=_table_layout(_mapping(config, "table", LAYOUT), sweep),
         reference=_budget(_mapping(config, "reference", BUDGET)),
@@ -401,6 +400,7 @@ def _execution(config: Mapping[str, Any]) -> Execution:
     workers = config["workers"]
     if workers is not None and coerce(int, workers, "workers") < 0:
         raise UserError(f"workers={workers} must be at least 0, or null for the number of cores")
+    launcher = _one_of("launcher", config["launcher"], LAUNCHERS)
     memory = _amount("memory", config["memory"], BYTES, "4g, 500m")
     return Execution(
         workers=None if workers is None else coerce(int, workers, "workers"),
@@ -410,8 +410,8 @@ def _execution(config: Mapping[str, Any]) -> Execution:
         ladder=coerce(bool, config["ladder"], "ladder"),
         versions=_one_of("versions", config["versions"], ("ignore", "warn", "rerun")),
         retry=tuple(_one_of("retry", status, STATUSES) for status in _as_list(config["retry"]) if status is not None),
-        launcher=_one_of("launcher", config["launcher"], tuple(CLUSTERS)),
-        cluster=_cluster(config, str(config["launcher"])),
+        launcher=launcher,
+        cluster={} if launcher == "local" else _mapping(config, launcher),
         shard=_shard(config),
     )
 
@@ -427,33 +427,6 @@ def _shard(config: Mapping[str, Any]) -> tuple[int, int] | None:
     if config["ladder"]:
         raise UserError("ladder=true needs the rows of all scenes, and shard= runs some: leave one of them out")
     return int(number), int(count)
-
-
-CLUSTERS: dict[str, dict[str, tuple[type, bool]]] = {
-    "local": {},
-    "ray": {"address": (str, True), "cells": (int, False), "cpus": (float, False), "wait": (float, False)},
-}
-"""Settings by launcher: the type of each, and whether it may be null."""
-
-
-def _cluster(config: Mapping[str, Any], launcher: str) -> dict[str, Any]:
-    """Return the settings of the chosen launcher, after validating the settings of all launchers."""
-    settings: dict[str, dict[str, Any]] = {name: {} for name in CLUSTERS}
-    for name, types in CLUSTERS.items():
-        given = _mapping(config, name, types) if types else {}
-        for key, (kind, may_be_null) in types.items():
-            value = given.get(key)
-            settings[name][key] = None if value is None and may_be_null else coerce(kind, value, f"{name}.{key}")
-            number = settings[name][key]
-            if kind is not str and number is not None and not number >= 1:
-                raise UserError(f"{name}.{key}={value} must be at least 1")
-    n_cores, ray = os.cpu_count() or 1, settings["ray"]
-    if launcher == "ray" and not (ray["address"] or os.environ.get("RAY_ADDRESS")) and ray["cpus"] > n_cores:
-        raise UserError(
-            f"ray.cpus={ray['cpus']:g} is more than the {n_cores} cores of this machine, on which a cluster is started without "
-            "ray.address"
-        )
-    return settings[launcher]
 
 
 def _one_of(key: str, value: Any, allowed: Sequence[str]) -> str:

@@ -48,7 +48,7 @@ class Execution:
     launcher: str = "local"
     """Where cells run: ``local`` or ``ray``."""
     cluster: Mapping[str, Any] = field(default_factory=dict)
-    """Settings of the launcher."""
+    """Settings of the launcher, which validates them."""
     shard: tuple[int, int] | None = None
     """Number, from 1, and count of the parts of which this run is one; None for all cells."""
 
@@ -100,8 +100,6 @@ class Experiment:
     """What a person concludes, with references to tables (:mod:`bench.report.answer`); empty if its settings were changed."""
     marks: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     """Named values by axis, drawn as lines in the charts."""
-    compile_time: bool = False
-    """Whether charts of error against time include the compile time."""
     formats: tuple[str, ...] = ("png",)
     """File formats of the charts."""
     table: TableLayout = TableLayout()
@@ -136,7 +134,7 @@ class Experiment:
             "also": [other.record() for other in self.also],
             "theta": list(self.decision.names),
             "theta0": None if self.decision.at is None else list(self.decision.at),
-            **{name: getattr(self, name) for name in ("samples", "repeats", "seed", "timing", "marks", "compile_time")},
+            **{name: getattr(self, name) for name in ("samples", "repeats", "seed", "timing", "marks")},
             "formats": list(self.formats),
             "table": dataclasses.asdict(self.table),
             "reference": dataclasses.asdict(self.reference),

@@ -28,6 +28,7 @@ from bench.model.estimator import (
     columns,
     first_order,
     halves,
+    mean_difference,
     per_repeat,
     zeroth_order,
 )
@@ -147,6 +148,7 @@ __all__ = [
     "halves",
     "load_module",
     "load_simulator",
+    "mean_difference",
     "n_changes",
     "param",
     "per_repeat",

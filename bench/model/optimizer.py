@@ -8,7 +8,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from bench.model.parameters import Plugin
+from bench.model.parameters import Plugin, param
 
 State = dict[str, Any]
 """The complete state of an optimizer between two steps: arrays and numbers by name, including ``theta (d,)``."""
@@ -87,3 +87,16 @@ class Population(Optimizer):
     """An optimizer that evaluates the costs of points sampled around a mean."""
 
     needs: ClassVar[frozenset[str]] = frozenset({"value"})
+
+    population: int = param(100, "points per iteration", low=2)
+
+    def draws(self, dim: int) -> int:
+        """Return the number of points."""
+        return self.population
+
+    @staticmethod
+    def best(theta: np.ndarray, answer: Answer, count: int) -> np.ndarray:
+        """Return the ``count`` points of lowest cost, ``(d, count)``; points without a finite cost rank last."""
+        assert answer.value is not None
+        cost = np.where(np.isfinite(answer.value), answer.value, np.inf)
+        return theta[:, np.argsort(cost, kind="stable")[:count]]

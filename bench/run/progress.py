@@ -137,20 +137,10 @@ def print_plan(experiment: Experiment, planned: Sequence[Planned], rows: pd.Data
     n_stored = sum(item.stored for item in planned)
     refusals = [item.refusal for item in planned if item.refusal is not None]
     runs = [item for item in planned if item.runs]
-    print(
-        f"{experiment.name}: {len(planned)} cells, {n_stored} stored, {len(runs)} to run{_older_code(runs)}, "
-        f"{len(refusals)} refused"
-    )
+    print(f"{experiment.name}: {len(planned)} cells, {n_stored} stored, {len(runs)} to run, {len(refusals)} refused")
     for reason, count in Counter(f"{status}: {reason}" for status, reason in refusals).most_common():
         print(f"  {count} {reason}")
     if runs:
         seconds = expected_seconds(runs, rows)
         known = f"about {seconds:.0f} s of one worker, without new references"
         print(f"expected time: {'not known before some cells have run' if math.isnan(seconds) else known}")
-
-
-def _older_code(runs: Sequence[Planned]) -> str:
-    """Return, in brackets, how many cells older code has stored, and the parameters added since; empty if none."""
-    count = sum(item.by_older_code for item in runs)
-    added = sorted({name for item in runs for name in item.added})
-    return f" ({count} stored by older code{', without ' if added else ''}{', '.join(added)})" if count else ""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 from bench.model import param
 
@@ -23,9 +23,9 @@ class Ppo(ActorCritic):
     """
 
     name = "ppo"
-    revision: ClassVar[int] = 2
-    activation: ClassVar[str] = "tanh"
-    gain: ClassVar[float] = 0.01
+    revision = 2
+    activation = "tanh"
+    gain = 0.01
 
     rollouts: int = param(8, "parallel rollouts", positive=True)
     window: int = param(256, "h, control steps of a window", "steps", positive=True)

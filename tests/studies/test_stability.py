@@ -15,8 +15,8 @@ from bench.run import runner, tasks
 from bench.run.plan import plan
 from bench.run.session import Session
 from bench.run.store import Store
+from bench.studies import stability
 from bench.studies.stability import Stability, views
-from bench.studies.stability import measure as stability
 
 STIFFNESS = tuple(float(k) for k in np.logspace(1, 4, 13))
 HORIZON, DT = 40, 0.05
