@@ -150,7 +150,7 @@ def test_a_notebook_shows_problems_estimates_and_reports():
     assert list(found.to_frame().index) == ["mass"]
     parameters = problem.to_frame().set_index(["part", "parameter"])
     assert parameters.loc[("contact", "stiffness"), "value"] == 500
-    assert report.to_frame()["name"].iloc[0] == "theta[0]"
+    assert report.frame["name"].iloc[0] == "theta[0]"
     figure = report.plot()
     assert figure.axes[0].lines
     assert figure._repr_png_().startswith(b"\x89PNG")
