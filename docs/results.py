@@ -125,7 +125,9 @@ def entry_of(name: str, question: str, folder: Path) -> Entry:
 
 @cache
 def table_of(name: str, results: Path = STANDARD) -> pd.DataFrame:
-    """Return a stored table, ``train/windows``: the folder of an experiment, and the name of its CSV."""
+    """Return a stored table, ``train/windows``: the folder of an experiment and the name of its CSV, or the rows of ``train``."""
+    if "/" not in name:
+        return rows_of(name, results)
     path = results / f"{name}.csv"
     if not path.exists():
         raise UserError(f"'{path}' does not exist")

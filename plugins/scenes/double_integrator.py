@@ -66,8 +66,3 @@ class DoubleIntegrator(EngineTwin, MechanicalScene):
         """Return (c . theta - 1) c."""
         c = self.sensitivity(integrator)
         return None if c is None else (c @ self.theta0() - 1.0) * c
-
-    def first_order_variance(self, integrator: Plugin | None) -> float | None:
-        """Return the trace of the covariance of a sample's gradient, sigma^2 |c|^4."""
-        c = self.sensitivity(integrator)
-        return None if c is None else float(self.sigma**2 * (c @ c) ** 2)

@@ -44,10 +44,6 @@ class MassSpring(Oscillator, DampedScene):
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
         return q[0] * q[0]
 
-    def energy(self, q: Array, v: Array) -> Array:
-        """Return k q^2 / 2 + (m / 2) v^2 / 2 with the reduced mass, ``(B,)`` [J]."""
-        return 0.5 * self.stiffness * q[0] * q[0] + 0.25 * self.mass * v[0] * v[0]
-
     def oscillator(self) -> tuple[float, float, float]:
         """Return stiffness 2 k / m [1/s^2], damping 2 c / m [1/s] and velocity factor, for transition matrices."""
         return 2.0 * self.stiffness / self.mass, 2.0 * self.damping / self.mass, self.velocity_factor

@@ -796,8 +796,8 @@ def test_expected_failure_of_no_check_gets_the_nearest_name():
 
 def test_plugin_that_lacks_a_module_is_skipped():
     absent = dataclass(frozen=True)(type("Absent", (Cubic,), {"name": "absent", "requires": ("no_such_module",)}))
-    for item in items([absent]).values():
-        assert [(m.name, m.kwargs) for m in item.marks] == [("skip", {"reason": "not installed: no_such_module"})]
+    (item,) = items([absent]).values()
+    assert [(m.name, m.kwargs) for m in item.marks] == [("skip", {"reason": "not installed: no_such_module"})]
 
 
 def test_plugin_of_another_kind_needs_no_checks_of_its_own():

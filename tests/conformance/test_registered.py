@@ -1,5 +1,6 @@
 """Every registered plugin passes the conformance kit: on few short programs, slowly on a design of crossings, or on all."""
 
+import contextlib
 import dataclasses
 import itertools
 from functools import cache
@@ -21,7 +22,9 @@ from bench.conformance.subjects import (
     sound_scenes,
 )
 from bench.conformance.subjects import programs as programs_of
+from bench.engines.backend import EngineBackend
 from bench.model import Backend, ContactScene, EngineScene, MechanicalScene, Plugin, compose, registry
+from bench.model.identity import label
 
 STEPS = 50
 """Most steps of a rollout in the fast tests, and as in the slow ones where a scene declares to jump."""
@@ -31,15 +34,20 @@ MOVED = 1e-9
 """Difference of costs of about 1 that is far more than rounding."""
 ENTRIES = [entry for table in registry.entries().values() for entry in table.values()]
 PLUGINS = [entry.plugin for entry in ENTRIES if entry.plugin is not None]
-ITEMS = parametrize(PLUGINS).mark.args[1]
+ITEMS = parametrize(plugin for plugin in PLUGINS if not issubclass(plugin, EngineBackend)).mark.args[1]
+"""Engines in environments of their own have ``tests/engines/test_engines_conform.py``."""
 GENERIC = {check.__name__ for check in kit._CHECKS[Plugin]}
 
 
-def kit_items(keep):
+def kept(keep):
     """The kit's items of registered plugins, beside those of any plugin, whose subject and name of check are to be kept."""
-    named = [(item, item.values[0], item.values[1].args[0].__name__) for item in ITEMS]
-    chosen = [item for item, subject, name in named if name not in GENERIC and keep(subject, name)]
-    return pytest.mark.parametrize(("plugin", "check"), chosen)
+    named = [(item, item.values[0], item.values[1].args[0].__name__) for item in ITEMS if item.values[1]]
+    return [item for item, subject, name in named if name not in GENERIC and keep(subject, name)]
+
+
+def kit_items(keep):
+    """A test of each kept item."""
+    return pytest.mark.parametrize(("plugin", "check"), kept(keep))
 
 
 def is_long(plugin, check):
@@ -97,22 +105,27 @@ def quiet_costs(program):
 
 
 @pytest.fixture
-def few_programs(monkeypatch, check):
-    """Checks run one short program of each sort, or every fourth scene with contacts, and compare ``jax`` with ``numpy``."""
+def on_few_programs(monkeypatch):
+    """Return what runs a check on one short program of each sort, or every fourth scene with contacts, and few backends."""
     programs = distinguishing_programs(
         compose(shortened(program.scene), program.contact, program.integrator) for program in all_programs()
     )
     touching = [scene for scene in sound_scenes() if isinstance(scene, ContactScene) and scene.continuous]
-    compared = check.args[0].__name__ == "backends_agree"
-
-    def few(scene):
-        programs = explicit_programs if compared else programs_of
-        return distinguishing_programs(programs(shortened(scene)))[: 1 if compared else None]
-
     monkeypatch.setattr(conformance.backends, "all_programs", lambda: programs)
-    monkeypatch.setattr(conformance.scenes, "programs", few)
     monkeypatch.setattr(conformance.scenes, "backends", lambda: [b for b in backends() if b.name == "jax"])
     monkeypatch.setattr(conformance.contacts, "sound_scenes", lambda: list(map(shortened, touching[::4])))
+
+    def run(plugin, check):
+        compared = check.args[0].__name__ == "backends_agree"
+
+        def few(scene):
+            programs = explicit_programs if compared else programs_of
+            return distinguishing_programs(programs(shortened(scene)))[: 1 if compared else None]
+
+        monkeypatch.setattr(conformance.scenes, "programs", few)
+        check(plugin)
+
+    return run
 
 
 @pytest.mark.parametrize("entry", ENTRIES, ids=lambda entry: f"{entry.kind}-{entry.name}")
@@ -126,17 +139,21 @@ def is_short(plugin, check):
     return not is_long(plugin, check) and not is_repeated(plugin, check)
 
 
-@pytest.mark.usefixtures("few_programs")
 @kit_items(lambda plugin, check: is_short(plugin, check) and not is_varied(plugin))
-def test_registered_plugin_conforms(plugin, check):
-    check(plugin)
+def test_registered_plugin_conforms(plugin, check, on_few_programs):
+    on_few_programs(plugin, check)
+
+
+VARIED = kept(lambda plugin, check: is_short(plugin, check) and is_varied(plugin))
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("few_programs")
-@kit_items(lambda plugin, check: is_short(plugin, check) and is_varied(plugin))
-def test_registered_plugin_with_other_parameters_conforms(plugin, check):
-    check(plugin)
+@pytest.mark.parametrize("subject", dict.fromkeys(item.values[0] for item in VARIED), ids=label)
+def test_registered_plugin_with_other_parameters_conforms(subject, on_few_programs):
+    for plugin, check in (item.values for item in VARIED):
+        if plugin == subject:
+            with contextlib.suppress(pytest.skip.Exception):
+                on_few_programs(plugin, check)
 
 
 # ----------------------------------------------------------------------------------------------- crossings, slow

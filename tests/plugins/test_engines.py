@@ -142,15 +142,6 @@ def test_what_an_engine_cannot_do_is_refused(engine, of, reason):
     assert reason in engine.unsupported_reason(of)
 
 
-def test_allowed_settings_are_not_refused():
-    for engine in (Mjx(), Mjx(iterations=5), Mjx(mode="reverse", iterations=5), Mujoco(cone="elliptic")):
-        assert engine.unsupported_reason(program(Pushing())) is None
-    for cone in ("pyramidal", "elliptic"):
-        assert Mjx(cone=cone, iterations=5, mode="reverse").unsupported_reason(program(TossedBox())) is None
-    assert Mjx(cone="elliptic").unsupported_reason(program(Pendulum())) is None
-    assert Mjx(integrator="rk4").unsupported_reason(compose(Pendulum(), None, Rk4())) is None
-
-
 def test_scene_for_engines_is_refused_elsewhere():
     scene = TossedBox()
     made = cell(scene, law_for(scene, Penalty), Jax())

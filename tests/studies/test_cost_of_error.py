@@ -230,7 +230,7 @@ def test_interval_of_a_median_covers_and_fewer_than_six_values_leave_it_open():
 
 
 def planted(scene, kind, dose, updates, problem=""):
-    return {"problem": f"{scene}{problem}", "scene": scene, "scene_class": "smooth", "kind": kind, "dose": dose, "target": 100.0,
+    return {"problem": f"{scene}{problem}", "scene": scene, "scene_class": "smooth", "kind": kind, "dose": dose, "error": dose, "target": 100.0,
             "median": updates}  # fmt: skip
 
 
@@ -251,6 +251,17 @@ def test_ratios_are_those_of_the_same_problem_and_missed_targets_count():
     both = compared(lines, "bias 0.9 / random error 1")
     assert (both["problems"], both["ratio"], both["ratio_low"], both["ratio_high"]) == (6, 3.0, 3.0, 3.0)
     assert both.equals(compared(lines, "bias 0.9 / random error 1", analysis.ALL))
+
+
+def test_equal_errors_are_compared_between_the_planted_sizes_that_reach_the_target():
+    """Updates 10 and 40 at .3 and 3 are 20 between them; an error of 5, and a size that misses, do not count."""
+    sizes = (0.3, 10.0), (3.0, 40.0), (10.0, math.inf)
+    lines = [planted(f"p{i}", analysis.RANDOM, *size) for i in range(6) for size in sizes]
+    lines += [planted(f"p{i}", "first order", math.sqrt(0.9), 60.0) for i in range(6)]
+    lines += [planted(f"p{i}", "first order", 5.0, 1e6) for i in range(6)]
+    table = pd.DataFrame(lines).assign(method="fobg", samples=1, rollouts_per_update=0, gradients_per_update=1)
+    found = compared(table, "first order / random error, equal error")
+    assert (found["ratio"], found["verdict"]) == (pytest.approx(3.0), "above 1")
 
 
 @pytest.mark.parametrize(("scenes", "verdict"), [(6, "above 1"), (5, "not known")])

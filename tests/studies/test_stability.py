@@ -15,8 +15,8 @@ from bench.run import runner, tasks
 from bench.run.plan import plan
 from bench.run.session import Session
 from bench.run.store import Store
+from bench.studies import stability
 from bench.studies.stability import Stability, views
-from bench.studies.stability import measure as stability
 
 STIFFNESS = tuple(float(k) for k in np.logspace(1, 4, 13))
 HORIZON, DT = 40, 0.05
@@ -43,7 +43,7 @@ def swept(tmp_path, integrator, *words):
         f"scene.mass_spring.horizon={HORIZON}", f"scene.mass_spring.dt={DT}", *words,
     )  # fmt: skip
     store = Store(given.directory, given.columns)
-    runner.run(given, plan(given, store), store, lambda cell, row: None)
+    runner.Runner(given, store, lambda cell, row: None).run(plan(given, store))
     return given, store.load().sort_values("stiffness").reset_index(drop=True)
 
 

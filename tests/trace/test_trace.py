@@ -13,6 +13,7 @@ from bench.experiment.grid import cells
 from bench.measure import noise
 from bench.measure.contacts import active_contacts, engine_contacts
 from bench.model import Decision, FrictionScene, Unsupported, compose
+from bench.report.draw import draw
 from bench.trace.chart import chart
 from bench.trace.equations import Newton
 from bench.trace.sentences import report, verdict
@@ -281,7 +282,7 @@ def test_a_diverging_rollout_is_drawn_and_told():
     found = Trace("pushing", "pushing", table, error)
     assert not np.isfinite(table["q1"]).all()
     assert all(isinstance(sentence, str) for sentence in found.report())
-    assert len(chart(found).axes) == 5
+    assert len(draw(chart(found)).axes) == 5
 
 
 BAD = [

@@ -92,7 +92,7 @@ def _run_group(group: list[Cell], session: Session, settings: Optimise) -> dict[
 def _fill_caches(cell: Cell, problem: Problem, session: Session, settings: Optimise) -> None:
     """Compute the cached values that do not depend on the seed. Ignore errors, because each search raises them again."""
     try:
-        known_optimum(cell, problem, session, settings.scored)
+        known_optimum(cell, problem, session)
         scene_class(cell, problem)
         if settings.quality != "none":
             theta0 = np.array(problem.program.theta0, dtype=np.float64)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import math
 import time
@@ -26,63 +25,6 @@ MAX_NEWTON_DIM = 1000
 """Largest dimension of theta for which Newton's method computes the optimum."""
 
 
-class Wrapped(Problem):
-    """A problem that changes the calls of another one, on the same compiled program."""
-
-    def __init__(self, inner: Problem) -> None:
-        super().__init__(inner.program)
-        self._inner = inner
-
-    @property
-    def gives_jacobians(self) -> bool:
-        """Whether the inner problem defines :meth:`jacobians`."""
-        return self._inner.gives_jacobians
-
-    def jacobians(self, theta: np.ndarray, w: np.ndarray) -> Any:
-        """Return the step Jacobians."""
-        return self._inner.jacobians(theta, w)
-
-    def trajectory(self, theta: np.ndarray, w: np.ndarray) -> Any:
-        """Return the states."""
-        return self._inner.trajectory(theta, w)
-
-    _value = _grad = _score = None  # type: ignore[assignment]
-
-
-class ScaledNoiseProblem(Wrapped):
-    """A problem with its noise multiplied by a factor."""
-
-    def __init__(self, inner: Problem, factor: float) -> None:
-        super().__init__(inner)
-        self._factor = factor
-        self.usage = inner.usage
-
-    @property
-    def sigma(self) -> float:
-        """Standard deviation of the scaled noise."""
-        return self._factor * self._inner.sigma
-
-    def value(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """Return costs ``(B,)`` under the scaled noise."""
-        return self._inner.value(theta, self._factor * w)
-
-    def grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """Return gradients ``(d, B)`` under the scaled noise."""
-        return self._inner.grad(theta, self._factor * w)
-
-    def score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """Return scores ``(d, B)`` under the scaled noise. They are linear in w and inverse to the noise's variance."""
-        return self._inner.score(theta, self._factor * w) / self._factor**2
-
-    def jacobians(self, theta: np.ndarray, w: np.ndarray) -> Any:
-        """Return the step Jacobians under the scaled noise."""
-        return self._inner.jacobians(theta, self._factor * w)
-
-    def trajectory(self, theta: np.ndarray, w: np.ndarray) -> Any:
-        """Return the states under the scaled noise."""
-        return self._inner.trajectory(theta, self._factor * w)
-
-
 class OptimizerRun:
     """One search on one problem: computes single iterations, and the objective at a point."""
 
@@ -92,42 +34,24 @@ class OptimizerRun:
         assert isinstance(optimizer, Optimizer)
         assert estimator is None or isinstance(estimator, Estimator)
         self.optimizer, self.estimator = optimizer, estimator
-        width = problem.program.n_noise
-        self._still = np.zeros((width, 1))
-        drawn = noise.draw(cell.seed, cell.scene.name, 1, settings.evaluations, width, "optimise: scores")[0].T
-        self._scored = self._still if settings.scored == "plain" else drawn
+        self._still = np.zeros((problem.program.n_noise, 1))
 
     def objective(self, theta: np.ndarray) -> float:
-        """Return the objective at ``theta (d,)``, with noise that no iteration uses. Its rollouts are not counted."""
-        return objective(self.problem, theta, self._scored)
+        """Return the cost at ``theta (d,)`` without noise. Its rollout is not counted."""
+        return objective(self.problem, theta, self._still)
 
     def step(self, state: dict[str, Any], iteration: int) -> dict[str, Any]:
         """Return the optimizer's state after one more iteration, whose number is ``iteration``, from 1."""
-        dim = self.problem.dim
-        normal = noise.draw(
-            self.cell.seed, self.cell.scene.name, 1, self.optimizer.draws(dim), dim, f"optimise: points {iteration}"
-        )[0].T
+        cell, problem = self.cell, self.problem
+
+        def draw(count: int, width: int, what: str) -> np.ndarray:
+            return noise.draw(cell.seed, cell.scene.name, 1, count, width, f"optimise: {what} {iteration}")
+
         return advance(
-            self.optimizer, state, normal, lambda points: self._values(points, iteration),
-            lambda points: self._gradients(points, iteration),
+            self.optimizer, state, draw(self.optimizer.draws(problem.dim), problem.dim, "points")[0].T,
+            lambda points: mean_costs(problem, points, self._still),
+            lambda points: estimates(problem, self.estimator, points, draw(cell.samples, len(self._still), "samples")),
         )  # fmt: skip
-
-    def _noise(self, iteration: int) -> np.ndarray:
-        width = self.problem.program.n_noise
-        return noise.draw(
-            self.cell.seed, self.cell.scene.name, 1, self.cell.samples, width, f"optimise: samples {iteration}"
-        )
-
-    def _values(self, points: np.ndarray, iteration: int) -> np.ndarray:
-        """Return the costs ``(B,)`` of points ``(d, B)``: at w = 0, or means over samples for a smoothed objective."""
-        w = self._still if self.settings.scored == "plain" else self._noise(iteration)[0].T
-        return mean_costs(self.problem, points, w)
-
-    def _gradients(self, points: np.ndarray, iteration: int) -> np.ndarray:
-        problem = self.problem
-        if self.settings.sigma_decay:
-            problem = ScaledNoiseProblem(problem, iteration**-self.settings.sigma_decay)
-        return estimates(problem, self.estimator, points, self._noise(iteration))
 
 
 def objective(problem: Problem, theta: np.ndarray, scored: np.ndarray) -> float:
@@ -167,9 +91,9 @@ def advance(
 
 
 def run_search(cell: Cell, session: Session, settings: Optimise) -> dict[str, Any]:
-    """Search until the budget, the target, a plateau or divergence; return the cell's results by column."""
+    """Search until the budget is spent or the cost has diverged; return the cell's results by column."""
     problem = session.problem(cell)
-    optimum, how = known_optimum(cell, problem, session, settings.scored)
+    optimum, how = known_optimum(cell, problem, session)
     search = OptimizerRun(cell, problem, settings)
     theta0 = np.array(problem.program.theta0, dtype=np.float64)
     start_quality = gradient_quality(search, theta0, settings) if settings.quality != "none" else None
@@ -191,22 +115,10 @@ def run_search(cell: Cell, session: Session, settings: Optimise) -> dict[str, An
         "theta": thetas[-1].tolist(),
     }  # fmt: skip
     if start_quality is not None:
-        qualities = {0: start_quality}
-        if settings.quality == "path" and not is_lost:
-            for index in sorted({round(share * (len(thetas) - 1)) for share in QUALITY_SHARES} - {0}):
-                if quality := gradient_quality(search, thetas[index], settings):
-                    qualities[path["iteration"][index]] = quality
         result |= {f"quality_{name}": value for name, value in start_quality.items()}
-        result["path_quality_iteration"] = list(qualities)
-        for name in ("rmse_rel", "cosine"):
-            result[f"path_quality_{name}"] = [quality[name] for quality in qualities.values()]
     if not np.isfinite(result["score"]) and is_lost:
         result["score"] = 0.0
     return result
-
-
-QUALITY_SHARES = (0.25, 0.5, 0.75, 1.0)
-"""Shares of a path's iterations at which the gradient's quality is measured, in addition to the start."""
 
 
 def stored_indices(cost: Sequence[float]) -> np.ndarray:
@@ -218,45 +130,36 @@ def stored_indices(cost: Sequence[float]) -> np.ndarray:
 
 
 def follow_path(search: OptimizerRun, state: dict[str, Any], settings: Optimise) -> tuple[dict[str, list[Any]], str]:
-    """Iterate until a stopping rule applies; return the path and the name of the rule.
+    """Iterate until the budget is spent or the cost has diverged; return the path and which of both.
 
     The path has lists with an entry per iteration: iteration, cost, rollouts, gradients, time ``s`` and theta ``(d,)``.
     """
     usage = search.problem.usage
     path: dict[str, list[Any]] = {}
     usage.rollouts = usage.gradients = 0
-    seconds, best, waited = 0.0, np.inf, 0
-    for iteration in itertools.count():
+    most = settings.iterations if settings.iterations is not None else math.inf
+    iteration, seconds = 0, 0.0
+    while True:
         cost = search.objective(state["theta"])
         point = {"iteration": iteration, "cost": cost, "rollouts": usage.rollouts, "gradients": usage.gradients,
                  "s": seconds, "theta": np.array(state["theta"])}  # fmt: skip
         for name, value in point.items():
             path.setdefault(name, []).append(value)
-        waited = 0 if cost < best - 1e-12 * abs(best) or not np.isfinite(best) else waited + 1
-        best = min(best, cost)
-        spent = usage.rollouts + settings.gradient_cost * usage.gradients
-        most = settings.iterations if settings.iterations is not None else math.inf
-        rules = {
-            "diverged": not np.isfinite(cost) or abs(cost) > settings.limit * (abs(path["cost"][0]) + 1.0),
-            "target": settings.target is not None and cost <= settings.target,
-            "budget": spent >= settings.budget or iteration >= most,
-            "plateau": settings.patience is not None and waited >= settings.patience,
-        }
-        if any(rules.values()):
-            break
+        if not np.isfinite(cost) or abs(cost) > settings.limit * (abs(path["cost"][0]) + 1.0):
+            return path, "diverged"
+        if usage.rollouts + settings.gradient_cost * usage.gradients >= settings.budget or iteration >= most:
+            return path, "budget"
+        iteration += 1
         started = time.perf_counter()
-        state = search.step(state, iteration + 1)
+        state = search.step(state, iteration)
         seconds += time.perf_counter() - started
-    return path, next(name for name, applies in rules.items() if applies)
 
 
 # ------------------------------------------------------------------------------------------------ the objective
 
 
-def known_optimum(cell: Cell, problem: Problem, session: Session, scored: str = "plain") -> tuple[float, str]:
+def known_optimum(cell: Cell, problem: Problem, session: Session) -> tuple[float, str]:
     """Return J* and its source: the scene, or Newton's method, whose result is stored in a file; NaN if unknown."""
-    if scored != "plain":
-        return np.nan, "unknown: the objective is smoothed"
     if isinstance(cell.scene, KnownOptimum) and cell.decision == OWN:
         known = cell.scene.optimum(cell.contact, cell.integrator)
         if known is not None:
