@@ -9,9 +9,7 @@ import sys
 import time
 import traceback
 
-from bench.cli import main
-from bench.model import guard
-from bench.run.pool import describe_exit
+from bench.errors import describe_exit
 from bench.run.reaper import MARK, Reaper
 
 NO_VERDICT = 3
@@ -34,6 +32,9 @@ def command() -> None:
     channel = os.environ.pop(CHANNEL, "")
     if not channel:
         os._exit(_watched())  # without waiting for threads
+    from bench.cli import main
+    from bench.model import guard
+
     descriptor, parent = map(int, channel.split())
     os.set_inheritable(descriptor, False)
     guard.die_with(parent)

@@ -11,8 +11,8 @@ from bench.model import EngineScene, param
 class Legged(EngineScene):
     """A torso on slides and hinges, q = (x, y, z, yaw, pitch, roll, joints of the legs), for physics engines only."""
 
-    neglected_effects: ClassVar[str] = "joint limits, torque limits, self-collision, contacts other than the feet"
-    n_contacts: ClassVar[int] = 4
+    neglected_effects = "joint limits, torque limits, self-collision, contacts other than the feet"
+    n_contacts = 4
     legs: ClassVar[tuple[str, ...]]
     """Names of the legs; each leg's foot is the geom of that name."""
     joints: ClassVar[tuple[str, ...]]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -28,7 +28,7 @@ class Fused(Backend):
 
     name = "fused"
     uses = (fused,)
-    requires: ClassVar[tuple[str, ...]] = ("jax", "numba")
+    requires = ("jax", "numba")
     # surrogate gradients are not supported
     provides = Jax.provides - {"surrogate"}
 

@@ -52,7 +52,7 @@ def traced(function: Callable[..., Any], shapes: dict[str, int]) -> Loop:
         jax.ShapeDtypeStruct((n,) if name == "parameter" else (n, 1), np.float64) for name, n in shapes.items()
     ]
     closed = jax.make_jaxpr(lambda *columns: function(**dict(zip(shapes, columns, strict=True))))(*arguments)
-    tracer = _Tracer()
+    tracer = Tracer(Graph())
     inputs = [_leaves(tracer.loop.graph, name, n) for name, n in shapes.items()]
     (cost,) = tracer.run(closed.jaxpr, closed.consts, inputs)
     tracer.loop.result = tracer.nodes(cost)[0]
@@ -76,11 +76,14 @@ def _shaped(items: Sequence[Any], parts: Sequence[np.ndarray]) -> list[np.ndarra
     return [_objects([next(at) for _ in range(part.size)], part.shape) for part in parts]
 
 
-class _Tracer:
-    """Evaluates jaxprs on arrays of nodes. Arrays of constants remain plain NumPy arrays."""
+class Tracer:
+    """Evaluates jaxprs on arrays of nodes. Arrays of constants remain plain NumPy arrays.
 
-    def __init__(self) -> None:
-        self.loop = Loop(Graph())
+    ``condition`` is Boolean already where a jaxpr compares it with a number.
+    """
+
+    def __init__(self, graph: Graph, condition: Node | None = None) -> None:
+        self.loop, self._condition = Loop(graph), condition
 
     def nodes(self, array: np.ndarray) -> list[Node]:
         """Return the entries of an array as nodes."""
@@ -119,8 +122,10 @@ class _Tracer:
     def _elementwise(self, name: str, parameters: Any, values: list[np.ndarray], out: Any) -> np.ndarray:
         if name == "convert_element_type":
             return self._convert(values[0], out.dtype)
-        if name == "copy":
+        is_condition = name == "gt" and self._condition is not None and values[0].item() is self._condition
+        if name == "copy" or is_condition:
             return values[0]
+        name = "add" if name == "add_any" else name
         if name == "clamp":
             low, x, high = values
             return self._elementwise("min", {}, [self._elementwise("max", {}, [x, low], out), high], out)

@@ -1,9 +1,8 @@
 """One elastic bounce without gravity: the smallest test of a contact gradient."""
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -22,12 +21,12 @@ class BounceOnce(EngineTwin, ContactScene):
     """
 
     name = "bounce_once"
-    continuous: ClassVar[bool] = True
-    neglected_effects: ClassVar[str] = "the horizontal motion (free, uncoupled), gravity, spin"
-    n_q: ClassVar[int] = 1
-    n_u: ClassVar[int] = 1
-    n_contacts: ClassVar[int] = 1
-    contact_values: ClassVar[Mapping[str, Any]] = {"stiffness": 1e4, "damping": 0.0}
+    continuous = True
+    neglected_effects = "the horizontal motion (free, uncoupled), gravity, spin"
+    n_q = 1
+    n_u = 1
+    n_contacts = 1
+    contact_values = {"stiffness": 1e4, "damping": 0.0}
 
     sigma: float = param(0.1, "standard deviation of the noise on theta", "m, m/s and N", positive=True)
     horizon: int = param(480, "number of time steps", "steps", positive=True)

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 from bench.model import Array, PolicyScene, State, param, uniform
 
@@ -21,11 +21,11 @@ class CartpoleSwing(PolicyScene):
 
     name = "cartpole_swing"
     neglected_effects = "the track's ends, friction"
-    continuous: ClassVar[bool] = True
-    n_q: ClassVar[int] = 2
-    n_u: ClassVar[int] = 1
-    n_observations: ClassVar[int] = 5
-    n_start: ClassVar[int] = 8
+    continuous = True
+    n_q = 2
+    n_u = 1
+    n_observations = 5
+    n_start = 8
 
     sigma: float = param(0.3, "standard deviation of the noise on each action, or on each parameter", positive=True)
     horizon: int = param(240, "number of control steps", "steps", positive=True)

@@ -1,8 +1,7 @@
 """A block dragged through stick and slip."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -26,14 +25,12 @@ class FrictionBlock(FrictionScene):
     """
 
     name = "friction_block"
-    continuous: ClassVar[bool] = True
-    neglected_effects: ClassVar[str] = (
-        "rotation and shape, a higher coefficient at rest, the second horizontal direction"
-    )
-    n_q: ClassVar[int] = 2
-    n_u: ClassVar[int] = 1
-    n_contacts: ClassVar[int] = 1
-    contact_values: ClassVar[Mapping[str, Any]] = {"stiffness": 1e5, "beta": 1e5}
+    continuous = True
+    neglected_effects = "rotation and shape, a higher coefficient at rest, the second horizontal direction"
+    n_q = 2
+    n_u = 1
+    n_contacts = 1
+    contact_values = {"stiffness": 1e5, "beta": 1e5}
 
     sigma: float = param(0.02, "standard deviation of the noise on V and a", "m/s and 1", positive=True)
     horizon: int = param(1500, "number of time steps", "steps", positive=True)

@@ -1,8 +1,7 @@
 """Hopping on one leg: repeated landing and lift-off, under feedback."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -25,13 +24,13 @@ class Hopper(EngineTwin, ContactScene):
     """
 
     name = "hopper"
-    continuous: ClassVar[bool] = True
-    neglected_effects: ClassVar[str] = "forward motion and pitch, the leg's angle and end stops, limits of the actuator"
-    n_q: ClassVar[int] = 2
-    n_u: ClassVar[int] = 1
-    n_contacts: ClassVar[int] = 1
-    twin_difference: ClassVar[float] = 1e-3
-    contact_values: ClassVar[Mapping[str, Any]] = {"stiffness": 1e4}
+    continuous = True
+    neglected_effects = "forward motion and pitch, the leg's angle and end stops, limits of the actuator"
+    n_q = 2
+    n_u = 1
+    n_contacts = 1
+    twin_difference = 1e-3
+    contact_values = {"stiffness": 1e4}
 
     sigma: float = param(1.0, "standard deviation of the noise on the force of each step", "N", positive=True)
     noise: str = param("action", "noise is on the actions", choices=("action",))

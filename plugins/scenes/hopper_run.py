@@ -1,9 +1,8 @@
 """Running on one leg from random starts, under a neural policy."""
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 from bench.model import Array, FrictionScene, PolicyScene, State, param, uniform
 
@@ -35,13 +34,13 @@ class HopperRun(PolicyScene, FrictionScene):
 
     name = "hopper_run"
     neglected_effects = "size of the foot, end stops, the leg's own mass, speed limits of the actuators"
-    continuous: ClassVar[bool] = False
-    n_q: ClassVar[int] = 5
-    n_u: ClassVar[int] = 2
-    n_contacts: ClassVar[int] = 1
-    n_observations: ClassVar[int] = 10
-    n_start: ClassVar[int] = 10
-    contact_values: ClassVar[Mapping[str, Any]] = {"stiffness": 1e4}
+    continuous = False
+    n_q = 5
+    n_u = 2
+    n_contacts = 1
+    n_observations = 10
+    n_start = 10
+    contact_values = {"stiffness": 1e4}
 
     sigma: float = param(0.3, "standard deviation of the noise on each action, or on each parameter", positive=True)
     horizon: int = param(240, "number of control steps", "steps", positive=True)

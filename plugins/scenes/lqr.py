@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -20,10 +20,10 @@ class Lqr(KnownOptimum, KnownValue, MechanicalScene):
 
     name = "lqr"
     neglected_effects = "contact, limits"
-    continuous: ClassVar[bool] = True
-    open_loop: ClassVar[bool] = True
-    n_q: ClassVar[int] = 1
-    n_u: ClassVar[int] = 1
+    continuous = True
+    open_loop = True
+    n_q = 1
+    n_u = 1
 
     sigma: float = param(0.1, "standard deviation of the noise on each control", "m/s^2", positive=True)
     noise: str = param("action", "noise is on the actions", choices=("action",))

@@ -1,7 +1,7 @@
 """A mass on a spring and a damper, released from rest: identifiable and unidentifiable parameters."""
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -19,10 +19,10 @@ class MassSpringDamper(Identified, MechanicalScene):
 
     name = "mass_spring_damper"
     neglected_effects = "dry friction, nonlinear stiffness"
-    continuous: ClassVar[bool] = True
-    n_q: ClassVar[int] = 1
-    n_u: ClassVar[int] = 1
-    unknowns: ClassVar[tuple[str, ...]] = ("mass", "stiffness", "damping")
+    continuous = True
+    n_q = 1
+    n_u = 1
+    unknowns = ("mass", "stiffness", "damping")
 
     sigma: float = param(0.1, "standard deviation of the noise on theta", "m", positive=True)
     horizon: int = param(200, "number of time steps", "steps", positive=True)

@@ -1,7 +1,7 @@
 """Swinging up a pendulum: smooth nonlinear dynamics."""
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -18,10 +18,10 @@ class Pendulum(EngineTwin, MechanicalScene):
 
     name = "pendulum"
     neglected_effects = "the rod's mass, torque limits, contact"
-    continuous: ClassVar[bool] = True
-    open_loop: ClassVar[bool] = True
-    n_q: ClassVar[int] = 1
-    n_u: ClassVar[int] = 1
+    continuous = True
+    open_loop = True
+    n_q = 1
+    n_u = 1
 
     sigma: float = param(0.3, "standard deviation of the noise on each torque", "N m", positive=True)
     noise: str = param("action", "noise is on the actions", choices=("action",))

@@ -1,8 +1,7 @@
 """Momentum transfer through a stiff contact."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -19,16 +18,14 @@ class Pushing(EngineTwin, ZeroOrderHoldScene, DampedScene, ContactScene):
     """
 
     name = "pushing"
-    continuous: ClassVar[bool] = True
-    neglected_effects: ClassVar[str] = (
-        "rotation, friction, the second dimension, shapes (bodies are points with a rest distance)"
-    )
-    open_loop: ClassVar[bool] = True
-    n_q: ClassVar[int] = 2
-    n_u: ClassVar[int] = 1
-    n_contacts: ClassVar[int] = 1
-    twin_difference: ClassVar[float] = 1e-6
-    contact_values: ClassVar[Mapping[str, Any]] = {"stiffness": 1e3}
+    continuous = True
+    neglected_effects = "rotation, friction, the second dimension, shapes (bodies are points with a rest distance)"
+    open_loop = True
+    n_q = 2
+    n_u = 1
+    n_contacts = 1
+    twin_difference = 1e-6
+    contact_values = {"stiffness": 1e3}
 
     sigma: float = param(0.3, "standard deviation of the noise on each force", "N", positive=True)
     noise: str = param("action", "noise is on the actions", choices=("action",))

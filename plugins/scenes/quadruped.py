@@ -1,8 +1,7 @@
 """A walking robot with four legs of three joints, for physics engines only."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -24,12 +23,12 @@ class Quadruped(Legged):
     """
 
     name = "quadruped"
-    n_q: ClassVar[int] = 18
-    n_u: ClassVar[int] = 12
-    legs: ClassVar[tuple[str, ...]] = tuple(SIDES)
-    joints: ClassVar[tuple[str, ...]] = ("side", "hip", "knee")
-    torso: ClassVar[str] = 'type="box" size=".2 .1 .05"'
-    contact_values: ClassVar[Mapping[str, Any]] = {"stiffness": 2e4, "damping": 200.0, "damping_mode": "clipped"}
+    n_q = 18
+    n_u = 12
+    legs = tuple(SIDES)
+    joints = ("side", "hip", "knee")
+    torso = 'type="box" size=".2 .1 .05"'
+    contact_values = {"stiffness": 2e4, "damping": 200.0, "damping_mode": "clipped"}
 
     sigma: float = param(0.02, "standard deviation of the noise on the target angles", "rad", positive=True)
     horizon: int = param(20, "number of time steps", "steps", positive=True)

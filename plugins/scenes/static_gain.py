@@ -1,7 +1,7 @@
 """Copies of x' = x + u under one matrix of gains: a policy with many gauge directions, which do not change the cost."""
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -20,7 +20,7 @@ class StaticGain(KnownOptimum, KnownValue, MechanicalScene):
 
     name = "static_gain"
     neglected_effects = "positions, coupling of the copies"
-    continuous: ClassVar[bool] = True
+    continuous = True
 
     sigma: float = param(0.1, "standard deviation of the noise on the gains, or on each control", positive=True)
     noise: str = param("parameter", "whether noise is on theta or on the actions", choices=("parameter", "action"))

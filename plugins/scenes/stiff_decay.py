@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -20,9 +20,9 @@ class StiffDecay(MechanicalScene):
 
     name = "stiff_decay"
     neglected_effects = "positions, a second time scale"
-    continuous: ClassVar[bool] = True
-    n_q: ClassVar[int] = 0
-    n_v: ClassVar[int | None] = 1
+    continuous = True
+    n_q = 0
+    n_v = 1
 
     sigma: float = param(0.1, "standard deviation of the noise on x_0", positive=True)
     horizon: int = param(20, "number of time steps", "steps", positive=True)

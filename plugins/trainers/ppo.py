@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 from bench.model import param
 
@@ -23,9 +23,9 @@ class Ppo(ActorCritic):
     """
 
     name = "ppo"
-    revision: ClassVar[int] = 2
-    activation: ClassVar[str] = "tanh"
-    gain: ClassVar[float] = 0.01
+    revision = 2
+    activation = "tanh"
+    gain = 0.01
 
     rollouts: int = param(8, "parallel rollouts", positive=True)
     window: int = param(256, "h, control steps of a window", "steps", positive=True)
@@ -76,7 +76,7 @@ class Ppo(ActorCritic):
         returns = normaliser.updated(state.returns, alone.reshape(1, -1))
         unit = normaliser.deviation(returns)[0]
         value, before = self.values_of(state, critic.network, window), critic.network(seen).reshape(window.reward.shape)
-        advantage = values.advantages(window.reward / unit, before, value, window.ended, self.discount, self.decay)
+        advantage = values.td_lambda(window.reward / unit, value, window.ended, self.discount, self.decay) - before
         old = state.actor.log_probability(seen, action)
 
         def loss(actor: Any, *batch: Any) -> Any:
