@@ -20,7 +20,7 @@ from bench.model.simulator.simulator import LIBRARIES
 
 SETTINGS = (
     "theta", "grad", "sigma", "noise", "budget", "batch", "scale", "seed", "calls", "compile_budget", "tolerance", "atol",
-    "allow_zero", "expect", "twin", "twin_grad", "refined", "horizons", "baseline", "save",
+    "allow_zero", "expect", "refined", "horizons", "baseline", "save",
 )  # fmt: skip
 """Settings of one cost."""
 FILES = ("baseline", "save")
@@ -148,7 +148,7 @@ def _gradient(given: str, key: str, module: Any) -> Any:
 
 
 PARSERS: dict[str, Callable[[str, str, Any], Any]] = {
-    "theta": _theta, "scale": _theta, "grad": _gradient, "twin_grad": _gradient, "twin": _function, "refined": _function,
+    "theta": _theta, "scale": _theta, "grad": _gradient, "refined": _function,
     "sigma": _by_input, "tolerance": _one_by_input, "atol": _one_by_input, "allow_zero": _names, "horizons": _counts,
     "noise": _count, "seed": _count, "calls": _count,
 }  # fmt: skip
