@@ -76,7 +76,7 @@ class Ppo(ActorCritic):
         returns = normaliser.updated(state.returns, alone.reshape(1, -1))
         unit = normaliser.deviation(returns)[0]
         value, before = self.values_of(state, critic.network, window), critic.network(seen).reshape(window.reward.shape)
-        advantage = values.advantages(window.reward / unit, before, value, window.ended, self.discount, self.decay)
+        advantage = values.td_lambda(window.reward / unit, value, window.ended, self.discount, self.decay) - before
         old = state.actor.log_probability(seen, action)
 
         def loss(actor: Any, *batch: Any) -> Any:
