@@ -351,19 +351,6 @@ def test_tails_are_heavy_below_three_quarters_of_the_root_of_the_repeats(largest
     assert heavy_tails(deviations) == pytest.approx(share if heavy else 0.0)
 
 
-def test_variance_interval_allows_for_skewed_squares():
-    """Means of 16 lognormal terms; symmetric intervals lie too low for 10% of them."""
-    rng = np.random.default_rng(21)
-    truth, above, below, sets = (math.e - 1.0) * math.e / 16, 0, 0, 400
-    for _ in range(sets):
-        sample = np.exp(rng.standard_normal((16, 16))).mean(axis=1)[:, None]
-        low, high = variance_interval(sample - sample.mean(axis=0))
-        above, below = above + (high < truth), below + (low > truth)
-    # three standard errors of a share of 400 are 3 points
-    assert above / sets < 0.075
-    assert below / sets < 0.05
-
-
 def test_upper_end_of_a_variance_is_that_of_hall():
     """Pseudo-values by leaving out, one at a time; T is where Hall's cubic has Student's quantile."""
     x = np.array([0.1, -0.3, 0.5, 0.2, 4.0, -0.6, 0.0, 0.3])[:, None]
