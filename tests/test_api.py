@@ -178,8 +178,8 @@ def test_compare_finds_what_got_worse(rows, results, tmp_path):
     comparison = bench.compare(results, tmp_path)
     assert comparison.worse
     assert (comparison.to_frame()["outcome"] == "worse").any()
-    assert "got worse" in repr(comparison)
-    assert "got worse" in comparison._repr_html_()
+    assert " worse in: " in repr(comparison)
+    assert " worse in: " in comparison._repr_html_()
     assert not bench.compare(results, results).worse
     with pytest.raises(bench.UserError, match="add --timings"):
         bench.compare(results, results, again=[results, results])
