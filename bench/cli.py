@@ -57,7 +57,6 @@ EXAMINE = """\
   allow_zero=friction  inputs that may have no effect; true: all, false: none
   expect=kink          the known cause, with which the status is 0
   baseline=FILE        compare with this file, which is written if absent: status 0 unless something is worse
-  twin=NAME            a second cost that must agree; twin_grad=NAME: a second gradient, such as one with a tape per step
   refined=NAME         the cost at a tighter tolerance or finer step
   horizons=1,2,10      numbers of steps T: cost(theta, steps=T) and its gradient
   batch=loop           batching of thetas: loop, vmap, columns (d, B), rows (B, d), columns:64; by default detected

@@ -468,7 +468,7 @@ class _Pressed(EngineScene):
     contact_values = {"stiffness": 1e4, "damping": 50.0, "damping_mode": "clipped"}
 
     horizon: int = param(1, "number of time steps", positive=True)
-    dt: float = param(1e-4, "length of a time step", "s", positive=True)
+    dt: float = 1e-4
 
     def theta0(self) -> np.ndarray:
         return np.zeros(self.n_q)

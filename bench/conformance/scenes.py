@@ -167,7 +167,7 @@ def continuity_is_as_declared(scene: Scene) -> str:
     if scene.continuous:
         require(
             not jump,
-            f"is continuous unless it declares `continuous: ClassVar[bool] = False`, but jumps by {jump:.1e} of its range under "
+            f"is continuous unless it declares `continuous = False`, but jumps by {jump:.1e} of its range under "
             f"{describe(runs[0])}",
         )
         jump = max(largest_jump(runs[0], offset=side * ELSEWHERE) for side in (1, -1))

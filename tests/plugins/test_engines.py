@@ -128,7 +128,7 @@ def test_lean_changes_no_number():
         (Mujoco(), compose(Pushing(), Complementarity(), SemiImplicitEuler()), "replaces penalty, not complementarity"),
         (Mujoco(), compose(Pendulum(), None, Rk4()), "not rk4"),
         (Mujoco(), compose(DoublePendulum(), None, SemiImplicitEuler()), "no MJCF twin"),
-        (Mujoco(), compose(WallPenalty1d(), law_for(WallPenalty1d(), Penalty), SemiImplicitEuler()), "damping_mode=clipped only"),
+        (Mujoco(), compose(WallPenalty1d(), law_for(WallPenalty1d(), Penalty), SemiImplicitEuler()), "supports damping_mode=clipped only"),
         (Mujoco(dtype="float32"), program(Pushing()), "double precision"),
         (Mjx(mode="reverse", iterations=2, derivative="unrolled"), program(Pushing()), "use derivative=implicit, mode="),
         (Mjx(cone="elliptic"), program(TossedBox()), "NaN"),
