@@ -21,7 +21,7 @@ slow-all: $(VENV)/.installed
 lint: $(VENV)/.installed
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy
+	$(BIN)/mypy -n 2
 	$(BIN)/python validation/size.py
 
 # The generated parts of the documents: answers, columns and marked figures.

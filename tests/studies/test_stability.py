@@ -43,7 +43,7 @@ def swept(tmp_path, integrator, *words):
         f"scene.mass_spring.horizon={HORIZON}", f"scene.mass_spring.dt={DT}", *words,
     )  # fmt: skip
     store = Store(given.directory, given.columns)
-    runner.run(given, plan(given, store), store, lambda cell, row: None)
+    runner.Runner(given, store, lambda cell, row: None).run(plan(given, store))
     return given, store.load().sort_values("stiffness").reset_index(drop=True)
 
 
