@@ -137,7 +137,9 @@ def test_text_is_escaped_in_every_format(made):
     body = [line for line in markdown.splitlines() if line.startswith("|")]
     assert {len(re.findall(r"(?<!\\)\|", line)) for line in body} == {3}
     text = (made.directory / "bias_variance.tex").read_text()
-    plain = re.sub(r"\\[a-zA-Z]+(\{\})?|\\[&%$#_{}]|\$[<>|]\$", "", "\n".join(text.replace(latex.FIT, "").splitlines()[4:]))
+    plain = re.sub(
+        r"\\[a-zA-Z]+(\{\})?|\\[&%$#_{}]|\$[<>|]\$", "", "\n".join(text.replace(latex.FIT, "").splitlines()[4:])
+    )
     plain = plain.replace("$$", "")  # what is left of a sign such as $\infty$
     plain = plain.replace(r"\\", "")
     assert not set(plain) & set("$#_%~^<>|")
