@@ -246,7 +246,14 @@ def engines_agree() -> str:
     return number(float(max(distances)))
 
 
-FIGURES: dict[str, Callable[[], str]] = {
+FIGURES: dict[str, str | Callable[[], str]] = {
+    "fobg-soft": "stiffness_sweep/bias_variance | estimator=fobg, estimator_params=, contact=penalty, backend=jax, sigma=0.1, stiffness<=3000 | rmse_rel",
+    "reinforce-soft": "stiffness_sweep/bias_variance | estimator=reinforce, estimator_params=, contact=penalty, backend=jax, sigma=0.1, stiffness<=3000 | rmse_rel",
+    "fobg-stiff": 'stiffness_sweep/verdicts | method="fobg (jax, torch, implicit)", problem="pushing, penalty, sigma=0.1", at=10000 | error | interval',
+    "smoothing-stiff": "stiffness_sweep/bias_variance | estimator=randomized_smoothing, estimator_params=, contact=penalty, backend=jax, sigma=0.1, stiffness>=10000 | rmse_rel",
+    "fobg-implicit-stiff": "stiffness_sweep/bias_variance | estimator=fobg, contact=complementarity, backend=implicit, sigma=0.1, stiffness>=10000 | rmse_rel",
+    "implicit-time": "stiffness_sweep/bias_variance | estimator=fobg, contact=complementarity, backend=implicit, sigma=0.1, stiffness>=10000 | time_s | seconds",
+    "explicit-time": "stiffness_sweep/bias_variance | estimator=fobg, estimator_params=, contact=penalty, backend=jax, sigma=0.1, stiffness>=10000 | time_s | seconds",
     "quadruped-sides": sides_right,
     "quadruped-jumps": jumps_at_switches,
     "quadruped-engines": engines_agree,
@@ -288,10 +295,11 @@ def with_figures(text: str) -> str:
 
 
 def figure(name: str) -> str:
-    """Return the present value of a reference to a stored table, of a key of :data:`FIGURES`, or of an experiment's answer."""
-    if "|" in name:
-        return answer.value_of(name, table_of)
-    return FIGURES[name]() if name in FIGURES else answer_of(name)
+    """Return the present value of a reference to a stored table, of an experiment's answer, or of a key of :data:`FIGURES`."""
+    found = FIGURES.get(name, name)
+    if not isinstance(found, str):
+        return found()
+    return answer.value_of(found, table_of) if "|" in found else answer_of(found)
 
 
 def without_marks(text: str) -> str:

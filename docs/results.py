@@ -9,7 +9,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
 import bench
@@ -157,13 +156,6 @@ def select(rows: pd.DataFrame, **conditions: Any) -> pd.DataFrame:
     if rows.empty:
         raise LookupError(f"no rows with {conditions}")
     return rows
-
-
-def rmse_interval(rows: pd.DataFrame) -> tuple[pd.Series, pd.Series]:
-    """Return the ends of the 95% interval of the relative RMSE, from those of bias and variance."""
-    norm = rows["reference_norm"].where(rows["reference_norm"] > 0)
-    low, high = (np.sqrt(rows[f"bias_{end}"] ** 2 + rows[f"variance_{end}"]) / norm for end in ("low", "high"))
-    return low, high
 
 
 @cache

@@ -20,7 +20,7 @@ class Legged(EngineScene):
     torso: ClassVar[str]
     """Shape and size of the torso, as attributes of MJCF."""
 
-    dt: float = param(0.005, "length of a time step", "s", positive=True)
+    dt: float = 0.005
     mass: float = param(2.0, "mass of the torso", "kg", positive=True)
     leg_mass: float = param(0.2, "mass of a thigh and of a shank", "kg", positive=True)
     link: float = param(0.2, "length of a thigh", "m", positive=True)

@@ -51,7 +51,7 @@ def tails(sets):
         problem, theta, truth = Numpy().compile(compose(scene)), scene.start, Truth.exact(scene.truth())
         for name, values in estimators:
             method = registry.make("estimators", name, values)
-            if refused := method.incompatibility(problem.program, problem.provides, "numpy"):
+            if refused := method.refusal(problem.program, problem.provides, "numpy"):
                 print(f"{label}: {refused}")
                 continue
             random = np.random.default_rng(10)

@@ -104,7 +104,7 @@ def programs_for(
     runs = [
         program
         for program in (all_programs() if candidates is None else candidates)
-        if backend.incompatibility(program) is None
+        if backend.refusal(program) is None
     ]
     if not runs:
         raise Skipped("supports no program")
@@ -120,9 +120,7 @@ def value_agrees(backend: Backend) -> str:
     if isinstance(backend, EngineBackend) and backend.own_contact:
         raise Skipped("has contacts of its own")
     plain = plain_backend()
-    programs = programs_for(
-        backend, list, [program for program in all_programs() if plain.incompatibility(program) is None]
-    )
+    programs = programs_for(backend, list, [program for program in all_programs() if plain.refusal(program) is None])
     worst = 0.0
     for program in programs:
         theta, w = samples(program)
@@ -220,7 +218,7 @@ def _is_smooth_at(program: Program, theta: np.ndarray, w: np.ndarray, precision:
     small steps of float64, and for programs that exist in engines only.
     """
     plain = plain_backend()
-    if precision == PRECISIONS["float64"] or plain.incompatibility(program) is not None:
+    if precision == PRECISIONS["float64"] or plain.refusal(program) is not None:
         return np.ones(theta.shape[1], dtype=bool)
     problem = plain.compile(program)
     off, agree = _against_differences(problem, problem.grad(theta, w), theta, w, precision)
@@ -347,7 +345,7 @@ def failed_rollouts_have_no_gradient(backend: Backend) -> str:
         with np.errstate(all="ignore"):
             failed = ~np.isfinite(problem.value(far, w))
             gone = ~np.isfinite(problem.grad(far, w)).all(axis=0)
-            if plain.incompatibility(program) is None:
+            if plain.refusal(program) is None:
                 beyond = ~np.isfinite(plain.compile(program).value(far, w))
                 require(failed[beyond].all(), f"{describe(program)}: a rollout that overflows has a finite cost")
         require(gone[failed].all(), f"{describe(program)}: a cost that is not finite has a finite gradient")
@@ -470,7 +468,7 @@ class _Pressed(EngineScene):
     contact_values = {"stiffness": 1e4, "damping": 50.0, "damping_mode": "clipped"}
 
     horizon: int = param(1, "number of time steps", positive=True)
-    dt: float = param(1e-4, "length of a time step", "s", positive=True)
+    dt: float = 1e-4
 
     def theta0(self) -> np.ndarray:
         return np.zeros(self.n_q)
@@ -513,7 +511,7 @@ def _pressed(backend: Backend, scene: _Pressed, values: dict[str, Any], needs_sp
     if needs_spring:
         laws = [law for law in laws if isinstance(law, ForceLaw) and law.spring() is not None]
     for program in (compose(scene, law, stepping()) for law in laws):
-        if backend.incompatibility(program) is None:
+        if backend.refusal(program) is None:
             return program
     raise Skipped("runs no such contact")
 

@@ -132,4 +132,4 @@ def unsupported_model(
     mode = getattr(law, "damping_mode", "")
     if damping_mode is None or mode == damping_mode or not getattr(law, "damping", 0.0):
         return None
-    return f"{name} runs {f'damping_mode={damping_mode} only' if damping_mode else 'no damping'}, not {mode}"
+    return f"{name} supports {f'damping_mode={damping_mode}' if damping_mode else 'no damping'} only, not {mode}"

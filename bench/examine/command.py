@@ -20,7 +20,7 @@ from bench.model.simulator.simulator import LIBRARIES
 
 SETTINGS = (
     "theta", "grad", "sigma", "noise", "budget", "batch", "scale", "seed", "calls", "compile_budget", "tolerance", "atol",
-    "allow_zero", "expect", "twin", "twin_grad", "refined", "horizons", "baseline", "save",
+    "allow_zero", "expect", "refined", "horizons", "baseline", "save",
 )  # fmt: skip
 """Settings of one cost."""
 FILES = ("baseline", "save")
@@ -82,7 +82,9 @@ def _examined(cost: str, settings: Mapping[str, str], progress: bool) -> Report:
     if "theta" not in settings and not hasattr(module, "theta"):
         raise UserError("theta is missing: give theta=1,0 or define theta in the file")
     given = {key: value for key, value in {"theta": "theta", **settings}.items() if key not in FILES}
-    values = {key: PARSERS[key](value, key, module) if key in PARSERS else value for key, value in given.items()}
+    values: dict[str, Any] = {
+        key: PARSERS[key](value, key, module) if key in PARSERS else value for key, value in given.items()
+    }
     report = examine(function, name=cost, progress=progress, **values)
     words = " ".join(f"{key}={value}" for key, value in settings.items() if key != "expect")
     report = replace(report, command=f"python -m bench examine {cost} {words}".strip())
@@ -146,7 +148,7 @@ def _gradient(given: str, key: str, module: Any) -> Any:
 
 
 PARSERS: dict[str, Callable[[str, str, Any], Any]] = {
-    "theta": _theta, "scale": _theta, "grad": _gradient, "twin_grad": _gradient, "twin": _function, "refined": _function,
+    "theta": _theta, "scale": _theta, "grad": _gradient, "refined": _function,
     "sigma": _by_input, "tolerance": _one_by_input, "atol": _one_by_input, "allow_zero": _names, "horizons": _counts,
     "noise": _count, "seed": _count, "calls": _count,
 }  # fmt: skip

@@ -12,7 +12,6 @@ from bench.examine import baseline, text
 from bench.examine.findings import Findings
 
 if TYPE_CHECKING:
-    import pandas as pd
     from matplotlib.figure import Figure
 
 
@@ -36,10 +35,6 @@ class Report(Findings):
 
     def _repr_html_(self) -> str:
         return f"<p><b>{escape(self.name)}: {escape(self.conclusion)}</b></p><pre>{escape(str(self))}</pre>"
-
-    def to_frame(self) -> pd.DataFrame:
-        """Return one row per checked derivative, as :attr:`frame`."""
-        return self.frame
 
     def plot(self, chart: str = "") -> Figure:
         """Return a chart of the page: ``steps``, ``lines`` or ``sigmas``, by default the first for which there is data.

@@ -250,14 +250,14 @@ class Cell:
     def refusal(self) -> tuple[str, str] | None:
         """Return status and reason if this cell cannot run, or None; an error raised by a plugin is a reason."""
         try:
-            return self._incompatibility()
+            return self._refusal()
         except KeyboardInterrupt:
             raise
         except BaseException as error:
             result = failure(error)
             return result["status"], result["reason"]
 
-    def _incompatibility(self) -> tuple[str, str] | None:
+    def _refusal(self) -> tuple[str, str] | None:
         """Return status and reason of the first plugin that is unavailable or does not fit the others, or None."""
         for part in self.parts.values():
             if part is not None:
@@ -271,10 +271,8 @@ class Cell:
         except (Unsupported, UserError) as error:  # another scene of the sweep may have this theta
             return "unsupported", printable(error)
         backend, estimator = self.backend, self.parts.get("estimator")
-        if reason := backend.incompatibility(program):
+        if reason := backend.refusal(program):
             return "unsupported", reason
-        if isinstance(estimator, Estimator) and (
-            reason := estimator.incompatibility(program, backend.provides, backend.name)
-        ):
+        if isinstance(estimator, Estimator) and (reason := estimator.refusal(program, backend.provides, backend.name)):
             return "unsupported", reason
         return None

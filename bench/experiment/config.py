@@ -8,7 +8,7 @@ import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from bench.errors import STATUSES, UserError, printable, unknown
 from bench.experiment.experiment import Budget, Choice, Execution, Experiment, TableLayout
@@ -16,8 +16,8 @@ from bench.experiment.grid import COUNTS, check_axes, parameter_name, refuse_too
 from bench.experiment.overrides import LISTS_AS, Values, check_file, quoted
 from bench.experiment.study import Study
 from bench.model import Decision, MechanicalScene, Plugin, guard, registry
-from bench.model.identity import parse_identity
-from bench.model.parameters import build, coerce, remember, singular
+from bench.model.identity import parse_identity, split_items
+from bench.model.parameters import build, coerce, parameters, remember, singular
 
 SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 RESERVED = ("claims", "references", "standard", "trace")
@@ -245,16 +245,9 @@ def _split(value: str) -> list[str]:
 def _quote_identities(value: str) -> str:
     """Return a list with its identity strings quoted: Hydra needs quotes around brackets, and a shell removes them."""
     inner = value[1:-1] if value.startswith("[") and value.endswith("]") else value
-    items, depth = [""], 0
-    for character in inner:
-        depth += (character == "[") - (character == "]")
-        if character == "," and depth == 0:
-            items.append("")
-        else:
-            items[-1] += character
-    if depth != 0:
+    if inner.count("[") != inner.count("]"):
         return value
-    names = [item.strip().strip("'\"") for item in items]
+    names = [item.strip().strip("'\"") for item in split_items(inner)]
     return "[" + ",".join(f"'{name}'" for name in names if name) + "]"
 
 
@@ -295,6 +288,10 @@ def experiment(config: Mapping[str, Any]) -> Experiment:
                 raise UserError(f"{axis}.{plugin}={given!r} names no parameter: write {axis}.{plugin}.parameter=value")
             if entry.plugin is not None:
                 build(entry.plugin, given)
+    if config["reference"] is None:
+        raise UserError(
+            "reference=null: the study decides whether there is one; reference.samples=... limits its samples"
+        )
     timing, sweep = config["timing"], _mapping(config, "sweep")
     refuse_too_many(sweep)
     return Experiment(
@@ -313,7 +310,7 @@ def experiment(config: Mapping[str, Any]) -> Experiment:
         marks=_mapping(config, "marks"),
         formats=tuple(_one_of("formats", item, FORMATS) for item in _as_list(config["formats"])),
         table=_table_layout(_mapping(config, "table", LAYOUT), sweep),
-        reference=_budget(_mapping(config, "reference", BUDGET)),
+        reference=cast(Budget, build(Budget, _mapping(config, "reference", parameters(Budget)))),
         compile_cache=_compile_cache(config["compile_cache"]),
         plugins=registry.folders(),
         **{key: _count(config, key) for key in COUNTS},
@@ -344,20 +341,6 @@ def _folder(value: Any) -> Path:
             f"results_dir={printable(value)} is an address, and results are written to a folder of this machine"
         )
     return Path(value).expanduser()
-
-
-BUDGET = ("samples", "tolerance")
-
-
-def _budget(settings: Mapping[str, Any]) -> Budget:
-    for key in BUDGET:
-        if key not in settings:
-            raise UserError(f"reference has no {key}: write reference.{key}=... to change only one of its settings")
-    samples = coerce(int, settings["samples"], "reference.samples")
-    tolerance = coerce(float, settings["tolerance"], "reference.tolerance")
-    if samples < 256 or not tolerance > 0:
-        raise UserError("reference.samples must be at least 256 and reference.tolerance greater than 0")
-    return Budget(samples, tolerance)
 
 
 ROWS = ("estimator", "backend")

@@ -6,12 +6,12 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from bench.experiment.columns import Columns
 from bench.model import Decision, registry
 from bench.model.identity import described, identity
-from bench.model.parameters import Plugin
+from bench.model.parameters import Plugin, param
 from bench.model.program import OWN
 from bench.model.registry import Entry
 
@@ -54,13 +54,14 @@ class Execution:
 
 
 @dataclass(frozen=True)
-class Budget:
-    """The budget of a reference gradient."""
+class Budget(Plugin):
+    """The budget of a reference gradient, the settings ``reference.*``."""
 
-    samples: int = 1 << 18
-    """Largest number of samples."""
-    tolerance: float = 0.005
-    """Standard error, relative to the gradient, at which sampling stops."""
+    kind: ClassVar[str] = "settings"
+    name: ClassVar[str] = "reference"
+
+    samples: int = param(1 << 18, "largest number of samples", low=256)
+    tolerance: float = param(0.005, "standard error, relative to the gradient, at which sampling stops", positive=True)
 
 
 @dataclass(frozen=True)

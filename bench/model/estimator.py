@@ -84,7 +84,7 @@ class Estimator(Plugin):
             return f"{self.name} needs noise on theta, not on a policy's actions"
         return None
 
-    def incompatibility(self, program: Program, provides: frozenset[str], backend: str) -> str | None:
+    def refusal(self, program: Program, provides: frozenset[str], backend: str) -> str | None:
         """Return why the estimator cannot run on a program with the backend's capabilities ``provides``, or None."""
         missing = self.needs - provides
         if missing:

@@ -50,7 +50,7 @@ BY_IMPORTS: list[str] = []
 """Changes by files from outside while they were imported in this process."""
 
 
-class State:
+class ProcessState:
     """The settings of this process at one moment, to be compared with later ones.
 
     With ``double_precision``, JAX computes in float64 from then on, whichever cell imports it. With ``single_thread``, libraries
@@ -115,7 +115,7 @@ def _read(name: str) -> Any:
 @contextmanager
 def named_changes(source: str) -> Iterator[None]:
     """Print what code in the block changes on one line of stderr, and add it to :data:`BY_IMPORTS`."""
-    state = State()
+    state = ProcessState()
     try:
         yield
     finally:

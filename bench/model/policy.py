@@ -111,6 +111,8 @@ class PolicyScene(MechanicalScene):
     program_type: ClassVar[type[Rollout] | None] = PolicyRollout
 
     noise: str = param("action", "whether noise is on the actions or on theta", choices=("action", "parameter"))
+    horizon: int = param(100, "number of control steps", "steps", positive=True)
+    dt: float = param(0.01, "length of a control step", "s", positive=True)
     policy: str = param("linear", "policy, as name or name[parameter=value,...]")
     substeps: int = param(1, "steps of the integrator per control step", positive=True)
 

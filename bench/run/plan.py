@@ -6,7 +6,6 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING
 
 from bench.engines.backend import EngineBackend
@@ -18,6 +17,7 @@ from bench.experiment.grid import COUNTS, cells
 from bench.experiment.study import study_of
 from bench.model import Backend, Plugin, guard
 from bench.model.parameters import remember
+from bench.run.record import version_of
 from bench.run.store import Store
 
 if TYPE_CHECKING:
@@ -155,11 +155,4 @@ def versions(backend: Backend) -> str:
 @remember
 def _versions(backend: type[Plugin]) -> str:
     names = dict.fromkeys(["numpy", *(r.partition("=")[2] or r.partition("=")[0] for r in backend.requires)])
-    return ";".join(f"{name}={_version(name)}" for name in names)
-
-
-def _version(name: str) -> str:
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return "?"
+    return ";".join(f"{name}={version_of(name) or '?'}" for name in names)

@@ -6,7 +6,7 @@ import math
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
 from typing import TYPE_CHECKING, Any
@@ -132,12 +132,23 @@ def print_machines(planned: Sequence[Planned], launcher: str) -> None:
             )
 
 
+def print_others(experiment: Experiment, planned: Sequence[Planned], keys: Iterable[str]) -> None:
+    """Print how many rows of other settings are stored under the experiment's name, of the stored ``keys``."""
+    n_others = len(set(keys) - {item.cell.key for item in planned})
+    if n_others and experiment.execution.shard is None:
+        print(
+            f"bench: stored in '{experiment.directory}' with other settings: {n_others}; name=... chooses another folder",
+            file=sys.stderr,
+        )
+
+
 def print_plan(experiment: Experiment, planned: Sequence[Planned], rows: pd.DataFrame) -> None:
     """Print the number of cells, how many are stored, to run and refused, the reasons, and the expected time."""
     n_stored = sum(item.stored for item in planned)
     refusals = [item.refusal for item in planned if item.refusal is not None]
     runs = [item for item in planned if item.runs]
     print(f"{experiment.name}: {len(planned)} cells, {n_stored} stored, {len(runs)} to run, {len(refusals)} refused")
+    print_others(experiment, planned, rows["key"])
     for reason, count in Counter(f"{status}: {reason}" for status, reason in refusals).most_common():
         print(f"  {count} {reason}")
     if runs:

@@ -90,6 +90,11 @@ class Tracer:
         graph = self.loop.graph
         return [x if isinstance(x, Node) else graph.literal(x) for x in np.asarray(array).ravel()]
 
+    def _each(self, op: str, values: Sequence[np.ndarray], shape: tuple[int, ...], data: Any = None) -> np.ndarray:
+        """Return an operation on each entry of arrays, in the shape ``shape``."""
+        rows = [self.nodes(np.broadcast_to(value, shape)) for value in values]
+        return _objects([self.loop.graph.apply(op, *row, data=data) for row in zip(*rows, strict=True)], shape)
+
     def run(self, jaxpr: Any, consts: Sequence[Any], arguments: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Return the outputs of a jaxpr as arrays of nodes or constants."""
         known = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*map(np.asarray, consts), *arguments], strict=True))
@@ -137,10 +142,7 @@ class Tracer:
                 return np.asarray(fold(*values), dtype=out.dtype)
         if len(values) > 3:
             raise Refused(f"{name} of more than two cases")
-        rows = [self.nodes(np.broadcast_to(value, out.shape)) for value in values]
-        data = parameters.get("y") if name == "integer_pow" else None
-        graph = self.loop.graph
-        return _objects([graph.apply(name, *row, data=data) for row in zip(*rows, strict=True)], out.shape)
+        return self._each(name, values, out.shape, parameters.get("y") if name == "integer_pow" else None)
 
     def _convert(self, value: np.ndarray, dtype: Any) -> np.ndarray:
         if value.dtype != object:
@@ -157,8 +159,7 @@ class Tracer:
         rows = moved.reshape(-1, *moved.shape[len(axes) :])
         total: np.ndarray = rows[0]
         for row in rows[1:]:
-            pairs = zip(self.nodes(total), self.nodes(row), strict=True)
-            total = _objects([self.loop.graph.apply(op, a, b) for a, b in pairs], row.shape)
+            total = self._each(op, (total, row), row.shape)
         return total
 
     def _dot(self, dimensions: Any, left: np.ndarray, right: np.ndarray) -> np.ndarray:

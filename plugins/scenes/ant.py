@@ -30,7 +30,7 @@ class Ant(Legged):
     contact_values = {"stiffness": 1e4, "damping": 100.0, "damping_mode": "clipped"}
 
     sigma: float = param(0.1, "standard deviation of the noise on the torques", "N m", positive=True)
-    horizon: int = param(30, "number of time steps", "steps", positive=True)
+    horizon: int = 30
     link: float = param(0.2, "length of a thigh; a shank is twice as long", "m", positive=True)
     damping: float = param(0.3, "damping of the joints", "N m s/rad", low=0.0)
     stiffness: float = param(4.0, "stiffness of the joints", "N m/rad", low=0.0)

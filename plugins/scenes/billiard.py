@@ -26,8 +26,7 @@ class Billiard(ContactScene):
     contact_values = {"stiffness": 1e3, "beta": 50.0}
 
     sigma: float = param(0.3, "standard deviation of the noise on u0", "N", positive=True)
-    horizon: int = param(300, "number of time steps", "steps", positive=True)
-    dt: float = param(0.01, "length of a time step", "s", positive=True)
+    horizon: int = 300
     mass: float = param(0.17, "mass of each ball", "kg", positive=True)
     radius: float = param(0.042, "radius of each ball", "m", positive=True)
     push: float = param(4.0, "force along x in the first step", "N")

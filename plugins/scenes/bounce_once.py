@@ -29,8 +29,8 @@ class BounceOnce(EngineTwin, ContactScene):
     contact_values = {"stiffness": 1e4, "damping": 0.0}
 
     sigma: float = param(0.1, "standard deviation of the noise on theta", "m, m/s and N", positive=True)
-    horizon: int = param(480, "number of time steps", "steps", positive=True)
-    dt: float = param(1.0 / 480.0, "length of a time step", "s", positive=True)
+    horizon: int = 480
+    dt: float = 1.0 / 480.0
     mass: float = param(1.0, "mass of the ball", "kg", positive=True)
     radius: float = param(0.1, "radius of the ball", "m", positive=True)
     height: float = param(1.0 + 1.0 / 480.0, "initial height of the centre at theta", "m", positive=True)

@@ -30,8 +30,8 @@ class BouncingBall(EngineTwin, ContactScene):
     contact_values = {"stiffness": 1e4}
 
     sigma: float = param(0.05, "standard deviation of the noise on height and velocity", "m and m/s", positive=True)
-    horizon: int = param(400, "number of time steps", "steps", positive=True)
-    dt: float = param(0.0025, "length of a time step", "s", positive=True)
+    horizon: int = 400
+    dt: float = 0.0025
     mass: float = param(1.0, "mass of the ball", "kg", positive=True)
     gravity: float = param(9.81, "gravitational acceleration", "m/s^2", positive=True)
     height: float = param(1.0, "initial height at theta", "m", positive=True)

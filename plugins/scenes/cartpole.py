@@ -26,8 +26,8 @@ class Cartpole(EngineTwin, MechanicalScene):
     n_u = 1
 
     sigma: float = param(0.1, "standard deviation of the noise on each force, or on each gain", "N", positive=True)
-    horizon: int = param(50, "number of time steps", "steps", positive=True)
-    dt: float = param(0.02, "length of a time step", "s", positive=True)
+    horizon: int = 50
+    dt: float = 0.02
     noise: str = param("action", "whether noise is on the actions or on theta", choices=("action", "parameter"))
     cart_mass: float = param(1.0, "M", "kg", positive=True)
     pole_mass: float = param(0.1, "m", "kg", positive=True)

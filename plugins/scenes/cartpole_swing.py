@@ -28,9 +28,9 @@ class CartpoleSwing(PolicyScene):
     n_start = 8
 
     sigma: float = param(0.3, "standard deviation of the noise on each action, or on each parameter", positive=True)
-    horizon: int = param(240, "number of control steps", "steps", positive=True)
-    dt: float = param(1 / 60, "length of a control step", "s", positive=True)
-    substeps: int = param(4, "steps of the integrator per control step", positive=True)
+    horizon: int = 240
+    dt: float = 1 / 60
+    substeps: int = 4
     cart_mass: float = param(1.0, "mass of the cart", "kg", positive=True)
     pole_mass: float = param(0.1, "m, mass of the pole", "kg", positive=True)
     length: float = param(0.5, "l, half the length of the pole", "m", positive=True)

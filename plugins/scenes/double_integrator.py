@@ -25,8 +25,8 @@ class DoubleIntegrator(EngineTwin, MechanicalScene):
 
     sigma: float = param(0.1, "standard deviation of the noise on each control", "m/s^2", positive=True)
     noise: str = param("action", "noise is on the actions", choices=("action",))
-    horizon: int = param(20, "number of time steps", "steps", positive=True)
-    dt: float = param(0.05, "length of a time step", "s", positive=True)
+    horizon: int = 20
+    dt: float = 0.05
     control: float = param(1.0, "control of every step at theta", "m/s^2")
 
     def theta0(self) -> np.ndarray:

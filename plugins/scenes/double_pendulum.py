@@ -23,8 +23,6 @@ class DoublePendulum(MechanicalScene):
     n_q = 2
 
     sigma: float = param(0.1, "standard deviation of the noise on the initial state", "rad and rad/s", positive=True)
-    horizon: int = param(100, "number of time steps", "steps", positive=True)
-    dt: float = param(0.01, "length of a time step", "s", positive=True)
     mass: float = param(0.1, "each point mass", "kg", positive=True)
     length: float = param(1.0, "length of each rod", "m", positive=True)
     gravity: float = param(9.81, "gravitational acceleration", "m/s^2")

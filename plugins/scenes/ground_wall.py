@@ -29,8 +29,8 @@ class GroundWall(ContactScene):
     contact_values = {"stiffness": 1e4, "damping": 10.0, "damping_mode": "approach"}
 
     sigma: float = param(0.1, "standard deviation of the noise on the velocity", "m/s", positive=True)
-    horizon: int = param(288, "number of time steps", "steps", positive=True)
-    dt: float = param(0.6 / 288.0, "length of a time step", "s", positive=True)
+    horizon: int = 288
+    dt: float = 0.6 / 288.0
     mass: float = param(1.0, "mass of the ball", "kg", positive=True)
     radius: float = param(0.1, "radius of the ball", "m", positive=True)
     gravity: float = param(9.8, "gravitational acceleration", "m/s^2", low=0.0)

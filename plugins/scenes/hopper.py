@@ -34,8 +34,8 @@ class Hopper(EngineTwin, ContactScene):
 
     sigma: float = param(1.0, "standard deviation of the noise on the force of each step", "N", positive=True)
     noise: str = param("action", "noise is on the actions", choices=("action",))
-    horizon: int = param(1000, "number of time steps", "steps", positive=True)
-    dt: float = param(0.002, "length of a time step", "s", positive=True)
+    horizon: int = 1000
+    dt: float = 0.002
     body_mass: float = param(1.0, "M, mass of the body", "kg", positive=True)
     foot_mass: float = param(0.1, "mass of the foot", "kg", positive=True)
     leg: float = param(0.5, "rest length of the leg", "m", positive=True)
@@ -45,7 +45,7 @@ class Hopper(EngineTwin, ContactScene):
     drop: float = param(0.15, "initial height of the foot", "m", positive=True)
     target: float = param(0.7, "target energy height", "m", positive=True)
     effort: float = param(1e-5, "weight of the mean squared force", "m^2/N^2", low=0.0)
-    restitution: float = param(0.0, "restitution of impulse laws", low=0.0, high=1.0)
+    restitution: float = 0.0
 
     def theta0(self) -> np.ndarray:
         """Return 100 N s/m^2 and 400 N s/m^3, with which the default body hops a little below target."""

@@ -26,8 +26,6 @@ class MassSpring(Oscillator, DampedScene):
     n_q = 1
 
     sigma: float = param(0.01, "standard deviation of the noise on stretch and rate", "m and m/s", positive=True)
-    horizon: int = param(100, "number of time steps", "steps", positive=True)
-    dt: float = param(0.01, "length of a time step", "s", positive=True)
     stiffness: float = param(50.0, "k of the spring", "N/m", low=0.0)
     damping: float = param(0.0, "c of the damper beside the spring", "N s/m", low=0.0)
     mass: float = param(1.0, "m, mass of each body", "kg", positive=True)

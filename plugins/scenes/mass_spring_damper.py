@@ -25,8 +25,8 @@ class MassSpringDamper(Identified, MechanicalScene):
     unknowns = ("mass", "stiffness", "damping")
 
     sigma: float = param(0.1, "standard deviation of the noise on theta", "m", positive=True)
-    horizon: int = param(200, "number of time steps", "steps", positive=True)
-    dt: float = param(0.05, "length of a time step", "s", positive=True)
+    horizon: int = 200
+    dt: float = 0.05
     mass: float = param(1.0, "m", "kg", positive=True)
     stiffness: float = param(4.0, "k", "N/m", low=0.0)
     damping: float = param(0.4, "c", "N s/m", low=0.0)

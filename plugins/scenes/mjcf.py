@@ -53,8 +53,7 @@ class Mjcf(PolicyScene, JointScene):
     backends = ("mujoco", "mjx")
 
     sigma: float = param(0.05, "standard deviation of the noise on the controls, or on theta", positive=True)
-    horizon: int = param(10, "number of control steps", "steps", positive=True)
-    dt: float = param(0.01, "length of a control step", "s", positive=True)
+    horizon: int = 10
     substeps: int = param(2, "steps of the engine per control step", positive=True)
     file: str = param("quadruped.xml", "MJCF file; PACKAGE:FILE of an installed Python package, or a built-in robot")
     functions: str = param("", "Python file with observation and cost; empty: the MJCF file's name with .py")

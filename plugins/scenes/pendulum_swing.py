@@ -28,8 +28,8 @@ class PendulumSwing(MechanicalScene):
 
     sigma: float = param(0.3, "standard deviation of the noise on each torque", positive=True)
     noise: str = param("action", "noise is on the actions", choices=("action",))
-    horizon: int = param(200, "number of time steps", "steps", positive=True)
-    dt: float = param(0.05, "length of a time step", "s", positive=True)
+    horizon: int = 200
+    dt: float = 0.05
     torque: float = param(0.1, "torque of every step at theta")
     effort: float = param(1.0, "weight of the squared torque", low=0.0)
     terminal: float = param(20.0, "weight of the end state", low=0.0)

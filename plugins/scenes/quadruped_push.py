@@ -32,9 +32,9 @@ class QuadrupedPush(Quadruped):
     torso = f'name="torso" {Quadruped.torso}'
 
     sigma: float = param(0.02, "standard deviation of the noise on the offsets", "rad", positive=True)
-    horizon: int = param(60, "number of time steps", "steps", positive=True)
-    push: float = param(0.0, "initial forward velocity", "m/s")
-    drift: float = param(0.0, "initial sideways velocity", "m/s")
+    horizon: int = 60
+    push: float = 0.0
+    drift: float = 0.0
     target: float = param(0.05, "target of the block", "m", positive=True)
     knots: int = param(3, "number of equal parts of the horizon, each with its own offsets", positive=True)
     lean: float = param(0.0, "offset of all hips at theta, which moves the torso forward", "rad")

@@ -25,8 +25,8 @@ class SlidingBlock(Identified, MechanicalScene):
     end_only = True
 
     sigma: float = param(0.1, "standard deviation of the noise on the speed", "m/s", positive=True)
-    horizon: int = param(60, "number of time steps", "steps", positive=True)
-    dt: float = param(0.02, "length of a time step", "s", positive=True)
+    horizon: int = 60
+    dt: float = 0.02
     friction: float = param(0.3, "Coulomb coefficient", positive=True)
     gravity: float = param(9.81, "g", "m/s^2", positive=True)
     speed: float = param(3.0, "v0, at theta", "m/s", positive=True)

@@ -26,8 +26,7 @@ class SpringRecord(KnownOptimum, MechanicalScene):
     n_u = 2
 
     sigma: float = param(0.1, "standard deviation of the noise on k and c", "1/s^2 and 1/s", positive=True)
-    horizon: int = param(100, "number of time steps", "steps", positive=True)
-    dt: float = param(0.05, "length of a time step", "s", positive=True)
+    dt: float = 0.05
     stiffness: float = param(4.0, "k of the record", "1/s^2", positive=True)
     damping: float = param(0.2, "c of the record", "1/s", low=0.0)
     guess: float = param(1.3, "k at theta over that of the record", positive=True)

@@ -25,8 +25,8 @@ class StiffDecay(MechanicalScene):
     n_v = 1
 
     sigma: float = param(0.1, "standard deviation of the noise on x_0", positive=True)
-    horizon: int = param(20, "number of time steps", "steps", positive=True)
-    dt: float = param(0.05, "length of a time step", "s", positive=True)
+    horizon: int = 20
+    dt: float = 0.05
     rate: float = param(-50.0, "growth rate, negative for decay", "1/s")
     start: float = param(1.0, "x_0 at theta")
 

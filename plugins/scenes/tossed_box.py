@@ -24,8 +24,8 @@ class TossedBox(EngineScene):
     contact_values = {"stiffness": 1e4, "damping": 50.0, "damping_mode": "clipped"}
 
     sigma: float = param(0.1, "standard deviation of the noise on the initial velocity", "m/s and rad/s", positive=True)
-    horizon: int = param(250, "number of time steps", "steps", positive=True)
-    dt: float = param(0.002, "length of a time step", "s", positive=True)
+    horizon: int = 250
+    dt: float = 0.002
     mass: float = param(1.0, "mass of the box", "kg", positive=True)
     side: float = param(0.2, "length of a side", "m", positive=True)
     friction: float = param(0.5, "Coulomb coefficient", low=0.0)

@@ -34,8 +34,8 @@ class TwoBalls(KnownOptimum, ContactScene):
 
     sigma: float = param(0.1, "standard deviation of the noise on each force", "N", positive=True)
     noise: str = param("action", "noise is on the actions", choices=("action",))
-    horizon: int = param(120, "number of time steps", "steps", positive=True)
-    dt: float = param(1 / 120, "length of a time step", "s", positive=True)
+    horizon: int = 120
+    dt: float = 1 / 120
     radius: float = param(0.2, "radius of both balls", "m", positive=True)
     force: float = param(3.0, "both components of the force of every step at theta", "N")
     effort: float = param(0.1, "weight of the squared force", "m^2/(N^2 s)", positive=True)

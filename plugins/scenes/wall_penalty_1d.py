@@ -29,8 +29,7 @@ class WallPenalty1d(EngineTwin, ContactScene):
     contact_values = {"stiffness": 50.0, "damping": 1.0, "damping_mode": "linear"}
 
     sigma: float = param(0.1, "standard deviation of the noise on q0", "m", positive=True)
-    horizon: int = param(200, "number of time steps", "steps", positive=True)
-    dt: float = param(0.01, "length of a time step", "s", positive=True)
+    horizon: int = 200
     start: float = param(0.6, "q0 at theta", "m")
 
     def theta0(self) -> np.ndarray:

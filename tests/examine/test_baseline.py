@@ -62,9 +62,7 @@ def test_settings_of_the_command_line(sim, capsys):
         "tolerance=theta[0]:0.3",
         "atol=1e-9",
         "compile_budget=5s",
-        "twin=cost",
         "refined=cost",
-        "twin_grad=right",
     ]
     assert run(f"{sim}:cost", "grad=off", "calls=400", *settings) == 0
     assert "small error, within the tolerance" in capsys.readouterr().out

@@ -112,7 +112,7 @@ def test_every_backend_has_the_gradient_by_the_parameters(case, backend):
 def check_gradient(case, backend):
     """Compare costs and gradients of a batch with the cost and its differences of each column's own program."""
     program = program_of(*CASES[case])
-    if reason := backend.incompatibility(program):
+    if reason := backend.refusal(program):
         pytest.skip(reason)
     problem, theta = backend.compile(program), program.theta0
     w = np.array([[0.0, 1.0, -0.7], [0.0, 0.4, 1.3]])[: program.dim]

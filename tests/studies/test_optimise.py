@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from classes import ExplicitEuler, Impulse, Lqr, Numpy, Penalty, Quadratic, SemiImplicitEuler, StaticGain, TwoBalls
+from classes import ExplicitEuler, Impulse, Lqr, Penalty, SemiImplicitEuler, StaticGain, TwoBalls
 from scipy.linalg import solve_discrete_lyapunov
 
 import bench
@@ -16,14 +16,12 @@ from bench.experiment.grid import cells
 from bench.experiment.study import study_of
 from bench.measure import performance
 from bench.measure.solve import solve
-from bench.model import Problem, compose, slopes
 from bench.report.views import newest_rows
 from bench.run.execute import store_of
 from bench.run.session import Session
 from bench.studies.optimise import aggregate
 from bench.studies.optimise import views as shown
-from bench.studies.optimise.batched import run_batched
-from bench.studies.optimise.search import compare_with_reference, scene_class
+from bench.studies.optimise.measure import compare_with_reference, scene_class
 
 STANDARD = Path(__file__).resolve().parents[2] / "results" / "standard"
 CHECKED = 1e-6
@@ -228,74 +226,6 @@ def measured(*words, folder):
     experiment = one(*words, f"results_dir={folder}")
     (cell,) = cells(experiment)
     return study_of(experiment).measure(cell, Session(experiment))
-
-
-@pytest.mark.parametrize("optimizer", ["adam[rate=0.1]", "cem[population=20,elites=5]", "line_search"])
-def test_seeds_abreast_have_the_numbers_of_seeds_alone(tmp_path, optimizer, monkeypatch):
-    words = [
-        "scenes=[quadratic]", "backends=[numpy]", "estimators=[fobg]", f"optimizers=[{optimizer}]", "samples=4", "repeats=4",
-        "study=optimise[iterations=12,quality_samples=64]", "timing=false", f"results_dir={tmp_path}",
-    ]  # fmt: skip
-    calls = []
-    own = Problem._blocks
-    monkeypatch.setattr(Problem, "_blocks", lambda self, *args: (calls.append(args[0].__name__), own(self, *args))[1])
-    alone = []
-    for seed in range(4):
-        experiment = config.load([*words, f"seed={seed}"])
-        (cell,) = cells(experiment)
-        alone.append(study_of(experiment).measure(cell, Session(experiment)))
-    each = len(calls)
-    calls.clear()
-    together = config.load([*words, "sweep.seed=[0,1,2,3]"])
-    session = Session(together)
-    rows = [study_of(together).measure(cell, session) for cell in cells(together)]
-    assert [row["path_cost"] for row in rows] == [row["path_cost"] for row in alone]
-    assert [row["theta"] for row in rows] == [row["theta"] for row in alone]
-    assert [row["rollouts"] for row in rows] == [row["rollouts"] for row in alone]
-    assert len({tuple(row["path_cost"]) for row in rows}) == 4
-    assert len(calls) < 0.5 * each
-
-
-def test_a_seed_that_fails_among_others_fails_alone():
-    problem = Numpy().compile(compose(Quadratic(), None, None))
-    asked = []
-
-    def search(seed):
-        def run(lane):
-            first = lane.value(np.full(lane.dim, float(seed)), np.zeros((lane.program.n_noise, 2)))
-            if seed == 1:
-                raise ZeroDivisionError("seed 1")
-            asked.append(seed)
-            return {
-                "cost": float(first[0]),
-                "again": float(lane.value(np.zeros(lane.dim), np.zeros((lane.program.n_noise, 1)))[0]),
-            }
-
-        return run
-
-    found = run_batched(problem, [search(seed) for seed in range(3)])
-    assert isinstance(found[1], ZeroDivisionError)
-    assert asked == [0, 2]
-    assert found[0]["cost"] != found[2]["cost"]
-    assert found[0]["again"] == found[2]["again"]
-
-
-def test_a_call_that_fails_for_one_seed_is_made_for_each_alone():
-    def search(width):
-        return lambda lane: {"cost": lane.value(np.zeros(lane.dim), np.zeros((width, 1)))}
-
-    problem = Numpy().compile(compose(Quadratic(), None, None))
-    good, bad = run_batched(problem, [search(problem.program.n_noise), search(problem.program.n_noise + 1)])
-    assert isinstance(good, dict)
-    assert isinstance(bad, BaseException)
-
-
-def test_step_jacobians_of_searches_that_share_batches():
-    """Without step Jacobians of the backend they are differences, in a shared problem too."""
-    problem = bench.problem("lqr[horizon=5]", backend="numpy")
-    theta, still = np.ones(5), np.zeros((5, 1))
-    (shared,) = run_batched(problem, [lambda lane: {"a": slopes(lane, theta, still).a}])
-    assert np.array_equal(shared["a"], slopes(problem, theta, still).a)
 
 
 def test_tables_charts_and_page(finished):

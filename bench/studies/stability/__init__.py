@@ -229,15 +229,12 @@ def _gradient_at(cell: Cell, steps: int) -> np.ndarray:
 
 
 def _cached(key: str, compute: Callable[[], np.ndarray]) -> np.ndarray:
-    """Return the cached gradient of a key, computed at first use. The oldest entry is dropped when the cache is full."""
+    """Return the cached gradient of a key, computed at first use."""
     if key not in _fine_gradients:
-        if len(_fine_gradients) >= CACHE_SIZE:
-            del _fine_gradients[next(iter(_fine_gradients))]
         _fine_gradients[key] = compute()
     return _fine_gradients[key]
 
 
-CACHE_SIZE = 4096
 _fine_gradients: dict[str, np.ndarray] = {}
 """Gradients at fine steps by program key, shared by all cells with the same fine program."""
 

@@ -29,8 +29,6 @@ LOOKS = {
 }
 """Looks of the colours, the worst first."""
 CAUSES = ("step", "law", "both", "unknown")
-GROWING = 1 + 1e-9
-"""Measured growth per step above which a state counts as growing: 1 plus rounding."""
 BEYOND = "•"
 """Mark of a cell whose stiffness is above the step's limit in theory."""
 MIXED = 0.05, 0.95
@@ -47,19 +45,12 @@ SHARE_NOTES = (
     "wrong by step: the step or its derivative is wrong and the law is right. by law: wrong at any step. by both, by unknown: "
     "the cause is not resolved. Shares are of the cells.",
 )
-LIMITS = (text("problem"), Column("dt", unit="s", format="setting"), *map(Column, ("theory", "stable", "unstable")))
-LIMIT_NOTES = (
-    "theory: stiffness at which the step's spectral radius on the oscillator exceeds 1, 0 if it always does, inf if never. A "
-    "contact is an oscillator while it lasts. stable, unstable: the largest stiffness of the grid below the first at which the "
-    "state diverges or, without contact, grows by more than 1e-9 per step, and that one.",
-)
 
 
 def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
-    """Return the tables of shares and of stability limits, and the map."""
+    """Return the tables of shares and of cells, and the map."""
     cells = cells_of(experiment, rows)
-    lines = limits(cells)
-    whole = Table("stability_map", lines, LIMITS, "stability limits [N/m]", LIMIT_NOTES, data=table(experiment, rows))
+    whole = Table("stability_map", table(experiment, rows), [], files=["csv"])
     if cells.empty:
         return Views([whole])
     shares = Table("stability_shares", shares_of(cells), SHARES, "How often each contact law and step gives the right gradient",
@@ -94,19 +85,6 @@ def shares_of(cells: pd.DataFrame) -> pd.DataFrame:
     order = list(dict.fromkeys(cells["scene_name"]))
     return shares.sort_values("right", ascending=False, kind="stable").sort_values(
         "scene", key=lambda names: names.map(order.index), kind="stable", ignore_index=True
-    )
-
-
-def limits(cells: pd.DataFrame) -> pd.DataFrame:
-    """Return the stability limits by problem and dt: in theory, and the stiffnesses of the grid next to the measured one."""
-    known = cells.dropna(subset=["stiffness", "stiffness_limit"]).sort_values("stiffness", kind="stable")
-    result = []
-    for key, part in known.groupby(["problem", "dt"], sort=False):
-        lost = (part["level"] == "diverged") | (part["growth_factor"] > GROWING)
-        stable, unstable = part.loc[~lost.cummax(), "stiffness"].max(), part.loc[lost, "stiffness"].min()
-        result.append([*key, part["stiffness_limit"].median(), stable, unstable])
-    return pd.DataFrame(result, columns=[column.name for column in LIMITS]).fillna(
-        {"stable": 0.0, "unstable": math.inf}
     )
 
 
