@@ -9,7 +9,7 @@ from collections.abc import Collection, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from bench.errors import Unsupported, UserError, failure, printable
 from bench.experiment.experiment import Budget
@@ -33,6 +33,9 @@ from bench.model import (
 from bench.model.identity import described, label
 from bench.model.parameters import parameters, singular
 from bench.model.program import OWN
+
+if TYPE_CHECKING:
+    from bench.experiment.study import Study
 
 VIEWS = ("horizon", "dt", "sigma", "stiffness", "noise", "dtype", "smoothing")
 """Plugin parameters with their own columns, which are therefore omitted from identity strings."""
@@ -84,7 +87,7 @@ class Cell:
     samples: int
     repeats: int
     seed: int
-    study: Plugin
+    study: Study
     decision: Decision = OWN
     timing: bool = True
     """Whether the row records timings."""
@@ -245,7 +248,7 @@ class Cell:
 
     def program(self) -> Program:
         """Compose the program; raises :class:`Unsupported` if the parts do not fit together."""
-        return compose(self.scene, self.contact, self.integrator, self.decision)
+        return compose(self.scene, self.contact, self.integrator, self.study.decision(self.decision))
 
     def refusal(self) -> tuple[str, str] | None:
         """Return status and reason if this cell cannot run, or None; an error raised by a plugin is a reason."""
