@@ -10,7 +10,8 @@ import time
 import traceback
 
 from bench.cli import main
-from bench.model import guard
+from bench.errors import printable
+from bench.model import guard, registry
 from bench.run.pool import describe_exit
 from bench.run.reaper import MARK, Reaper
 
@@ -43,8 +44,15 @@ def command() -> None:
     except MemoryError:
         print("bench: not enough memory: give the process more (4 GB suffice for most runs)", file=sys.stderr)
         status = 1
-    except Exception:  # a bug of this package
-        traceback.print_exc()
+    except Exception as error:  # a bug of this package, unless a plugin has changed the process
+        if outside := sorted(registry.imported()):
+            place = traceback.extract_tb(error.__traceback__)[-1]
+            where = f"{printable(error)} ({place.filename}:{place.lineno})"
+            print(
+                f"bench: {type(error).__name__}: {where}; imported from outside: {', '.join(outside)}", file=sys.stderr
+            )
+        else:
+            traceback.print_exc()
         status = 1
     guard.exit_if_forked(pid)
     for stream in (sys.stdout, sys.stderr):

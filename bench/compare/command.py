@@ -13,7 +13,7 @@ from bench.compare.cells import assumed_defaults, compare_cells
 from bench.compare.report import Comparison, show, write
 from bench.compare.sources import Results, open_results
 from bench.compare.timings import RUNS
-from bench.errors import UserError
+from bench.errors import UserError, local_path
 from bench.experiment.columns import Column
 from bench.experiment.words import parse_flag, parse_words
 
@@ -148,7 +148,7 @@ def _parse(words: Sequence[str]) -> Request:
         )
     timings = bool(options) or parse_flag(settings, "timings")
     again = tuple(filter(None, settings["again"].split(",")))
-    return request(names[0], names[1], Path(settings["out"]).expanduser(), timings, again)
+    return request(names[0], names[1], local_path("out", settings["out"]), timings, again)
 
 
 def request(before: str, after: str, out: Path = OUT, timings: bool = False, again: tuple[str, ...] = ()) -> Request:

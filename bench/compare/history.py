@@ -15,7 +15,7 @@ import pandas as pd
 from bench.compare.cells import rows_by_cell
 from bench.compare.judging import ROUNDING, Row, distance, value
 from bench.compare.sources import Results, open_results
-from bench.errors import UserError
+from bench.errors import UserError, local_path
 from bench.experiment.columns import Column, Columns, text
 from bench.experiment.views import Chart, Mark, Table, Views
 from bench.experiment.words import parse_words
@@ -53,10 +53,11 @@ def main(words: Sequence[str]) -> int:
     names, settings, _ = parse_words(words, "history", {"out": "runs/history"})
     if len(names) < 2:
         raise UserError("name two results or more, the oldest first: python -m bench history DIR DIR ... [out=DIR]")
+    out = local_path("out", settings["out"])
     with ExitStack() as stack:
         results = [stack.enter_context(open_results(name)) for name in names]
         history = compute_history(names, results)
-    for path in write(history, Path(settings["out"]).expanduser()):
+    for path in write(history, out):
         print(f"  {path}")
     return 0
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.errors import StorageError, UserError, unknown
+from bench.errors import StorageError, UserError, local_path, unknown
 from bench.examine import ci
 from bench.examine.examination import examine
 from bench.examine.report import Report
@@ -73,6 +73,8 @@ def _parse(
     for key in settings:
         if key not in allowed:
             raise unknown(f"setting of {verb}", key, allowed)
+        if key in (*FILES, *OUTPUTS):
+            local_path(key, settings[key])
     return names[0], settings
 
 
@@ -167,7 +169,7 @@ def read_matrix(path: Path) -> list[tuple[str, str, dict[str, Any]]]:
         place, _, function = cost.rpartition(":")
         if place.endswith(".py"):
             cost = f"{path.parent / Path(place).expanduser()}:{function}"
-        settings |= {key: str(path.parent / str(settings[key])) for key in FILES if key in settings}
+        settings |= {key: str(path.parent / local_path(key, settings[key])) for key in FILES if key in settings}
         rows.append((name, cost, settings))
     return rows
 
@@ -176,10 +178,10 @@ def _write(outputs: Mapping[str, str], reports: Sequence[Report], refused: Mappi
     """Write the Markdown summary, appended as a CI server's summary file needs, and the JUnit file."""
     try:
         if "markdown" in outputs:
-            with Path(outputs["markdown"]).expanduser().open("a") as file:
+            with local_path("markdown", outputs["markdown"]).open("a") as file:
                 file.write(ci.as_markdown(reports, refused))
         if "junit" in outputs:
-            Path(outputs["junit"]).expanduser().write_text(ci.as_junit(reports, refused))
+            local_path("junit", outputs["junit"]).write_text(ci.as_junit(reports, refused))
     except OSError as error:
         raise StorageError(f"the summary cannot be written: {error}") from None
 

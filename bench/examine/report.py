@@ -7,7 +7,7 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
-from bench.errors import UserError, unknown
+from bench.errors import UserError, local_path, unknown
 from bench.examine import ci, text
 from bench.examine.findings import Findings
 
@@ -69,7 +69,7 @@ class Report(Findings):
 
         The compared report has status 0 where it is not worse than the baseline.
         """
-        path = Path(baseline).expanduser()
+        path = local_path("baseline", baseline)
         before = ci.read_baseline(path)
         if before is None:
             ci.write_baseline(path, self)
@@ -90,4 +90,4 @@ class Report(Findings):
         # importing charts and tables takes a second, which a report without files does not need
         from bench.examine import page
 
-        return page.write(self, Path(directory).expanduser())
+        return page.write(self, local_path("save", directory))
