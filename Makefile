@@ -3,7 +3,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 RUN := $(BIN)/python -m bench
 
-.PHONY: run test lint slow slow-all docs site gallery examples clean
+.PHONY: run test lint slow slow-all docs site gallery clean
 
 run: $(VENV)/.installed
 	$(RUN) +experiment=stiffness_sweep
@@ -21,7 +21,7 @@ slow-all: $(VENV)/.installed
 lint: $(VENV)/.installed
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy
+	$(BIN)/mypy -n 2
 	$(BIN)/python validation/size.py
 
 # The generated parts of the documents: answers, columns and marked figures.
@@ -39,15 +39,6 @@ gallery: $(VENV)/.installed
 	for name in $$(cd examples/cost_of_error/experiment && find * -name '*.yaml' | sed 's/\.yaml$$//' | sort); do \
 	  $(RUN) +experiment=$$name plugins=examples/cost_of_error results_dir=results/standard || exit 1; done
 	$(BIN)/python -m docs.build results figures
-
-# The examples on other people's engines, in an environment of their own: their pins and ours do not live together.
-examples: .venv-engines/.installed
-	.venv-engines/bin/python examples/table.py
-
-.venv-engines/.installed: examples/requirements-engines.txt
-	$(PYTHON) -m venv .venv-engines
-	.venv-engines/bin/python -m pip install --quiet --disable-pip-version-check -r $<
-	touch $@
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)

@@ -6,14 +6,22 @@
 - Plugins: :func:`list` lists them, and :mod:`bench.plugin` has the contracts that their authors import.
 """
 
-import bench.run  # noqa: F401, before the function of the same name replaces the package here
-from bench import plugin
-from bench.api import estimate, list_plugins, load, problem, run
+import importlib
+from typing import TYPE_CHECKING, Any
+
+import bench.examine
+import bench.run
 from bench.compare import compare
 from bench.errors import Unsupported, UserError
-from bench.examine import examine
 
-list = list_plugins  # not in __all__: a star import must not replace the built-in type
+if TYPE_CHECKING:
+    from bench import plugin
+    from bench.api import estimate, list_plugins, load, problem, run
+    from bench.examine.examination import examine
+
+    list = list_plugins  # not in __all__: a star import must not replace the built-in type
+else:
+    del bench, run, examine  # the packages; the functions of these names are imported at their first use
 
 __version__ = "0.5.0"
 __all__ = [
@@ -27,6 +35,24 @@ __all__ = [
     "problem",
     "run",
 ]
+_SOURCES = {
+    "estimate": ("bench.api", "estimate"),
+    "examine": ("bench.examine.examination", "examine"),
+    "list": ("bench.api", "list_plugins"),
+    "load": ("bench.api", "load"),
+    "problem": ("bench.api", "problem"),
+    "run": ("bench.api", "run"),
+}
+"""The module and the name of each function that is imported at its first use, so that a command starts quickly."""
+
+
+def __getattr__(name: str) -> Any:
+    if name == "plugin":
+        return importlib.import_module("bench.plugin")
+    if name not in _SOURCES:
+        raise AttributeError(f"module 'bench' has no attribute '{name}'")
+    module, function = _SOURCES[name]
+    return globals().setdefault(name, getattr(importlib.import_module(module), function))
 
 
 def __dir__() -> tuple[str, ...]:

@@ -9,10 +9,7 @@ import sys
 import time
 import traceback
 
-from bench.cli import main
-from bench.errors import printable
-from bench.model import guard, registry
-from bench.run.pool import describe_exit
+from bench.errors import describe_exit
 from bench.run.reaper import MARK, Reaper
 
 NO_VERDICT = 3
@@ -35,6 +32,10 @@ def command() -> None:
     channel = os.environ.pop(CHANNEL, "")
     if not channel:
         os._exit(_watched())  # without waiting for threads
+    from bench.cli import main
+    from bench.errors import printable
+    from bench.model import guard, registry
+
     descriptor, parent = map(int, channel.split())
     os.set_inheritable(descriptor, False)
     guard.die_with(parent)

@@ -79,7 +79,6 @@ class Settings(TypedDict, total=False):
     table: Mapping[str, Any]
     columns: str | None
     rows: Names
-    compile_time: bool
     marks: Mapping[str, Mapping[str, float]]
 
 
@@ -280,7 +279,7 @@ def estimate(
         problem = _problem(problem)
     method: Estimator = make("estimators", estimator)
     program = problem.program
-    if reason := method.incompatibility(program, problem.provides, "this backend"):
+    if reason := method.refusal(program, problem.provides, "this backend"):
         raise Unsupported(reason)
     w = noise.shared(seed, program.scene.name, repeats, samples, program.n_noise)
     estimates, diagnostics = method.estimate_with_diagnostics(problem, program.theta0, w)

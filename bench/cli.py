@@ -57,15 +57,12 @@ EXAMINE = """\
   allow_zero=friction  inputs that may have no effect; true: all, false: none
   expect=kink          the known cause, with which the status is 0
   baseline=FILE        compare with this file, which is written if absent: status 0 unless something is worse
-  twin=NAME            a second cost that must agree; twin_grad=NAME: a second gradient, such as one with a tape per step
   refined=NAME         the cost at a tighter tolerance or finer step
   horizons=1,2,10      numbers of steps T: cost(theta, steps=T) and its gradient
   batch=loop           batching of thetas: loop, vmap, columns (d, B), rows (B, d), columns:64; by default detected
   scale=1,0.1          the typical size of each input; by default its value
   seed=0               of the random directions and noise
-  save=DIR             write text, tables, charts and report.html there
-  markdown=FILE        append a summary in Markdown; junit=FILE: write JUnit XML
-  --matrix FILE.toml   examine each [[cost]] of the file, with the settings above
+  save=DIR             write text, tables and charts there
   --quiet              no progress
 Exit status: 0 right; 1 wrong; 3 not decided; 2 bad input.
 """
@@ -122,8 +119,8 @@ def _stop_on_signals() -> Iterator[None]:
     """Make SIGTERM and SIGHUP stop a command like Ctrl-C; further signals are ignored, and left to the parent process.
 
     No finished row is lost, since rows are on disk and workers end with their run. In a finaliser or a callback of the
-    garbage collector, Python would print the KeyboardInterrupt and continue: it is not printed there, and since
-    ``INTERRUPTED`` is set, the run stops after the current cell.
+    garbage collector, Python prints the KeyboardInterrupt and continues: since ``INTERRUPTED`` is set, the run stops after
+    the current cell.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -136,12 +133,6 @@ def _stop_on_signals() -> Iterator[None]:
         INTERRUPTED.set()
         raise KeyboardInterrupt
 
-    def hide_interrupt(unraisable: sys.UnraisableHookArgs, /) -> None:
-        if not (unraisable.exc_type is KeyboardInterrupt and INTERRUPTED.is_set()):
-            previous_hook(unraisable)
-
-    previous_hook = sys.unraisablehook
-    sys.unraisablehook = hide_interrupt
     handlers = {name: signal.getsignal(name) for name in names}
     for name in names:
         if handlers[name] not in (signal.SIG_IGN, None):  # ignored signals stay ignored, as under nohup
@@ -150,8 +141,6 @@ def _stop_on_signals() -> Iterator[None]:
         yield
     finally:
         INTERRUPTED.clear()
-        if sys.unraisablehook is hide_interrupt:
-            sys.unraisablehook = previous_hook
         for name, handler in handlers.items():
             if signal.getsignal(name) is stop:
                 signal.signal(name, handler)
@@ -533,7 +522,7 @@ VERBS = {
         _main_of("bench.compare.command"), "compare BEFORE AFTER [--timings] [out=DIR]", "two results, cell by cell: 1 when something got worse",
         "BEFORE and AFTER are directories, or git revisions as REV or REV:PATH. Accuracy decides, paired on equal noise;\n"
         "times only with --timings, compared with the spread between runs: again=DIR,DIR names further runs of BEFORE.\n"
-        "Written to out=DIR (runs/compare): compare.csv, .md, .json, .xml (JUnit) and .html.\n",
+        "Written to out=DIR (runs/compare): compare.csv, .md, .xml (JUnit) and .html.\n",
     ),
     "index": Verb(
         _main_of("bench.report.index"), "index [DIR]", "a page over all experiments of a results folder, with the state of each",

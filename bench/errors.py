@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import signal
 import sys
 import threading
 import traceback
@@ -93,3 +94,11 @@ def failure(error: BaseException) -> dict[str, str]:
     frames = traceback.extract_tb(error.__traceback__, limit=-3)
     lines = [f"{os.path.basename(frame.filename)}:{frame.lineno} in {frame.name}" for frame in reversed(frames)]
     return {"status": "error", "reason": f"{type(error).__name__}: {printable(error)[:1000]} ({' < '.join(lines)})"}
+
+
+def describe_exit(code: int) -> str:
+    """Describe how a process ended, from its exit code; negative codes are signals."""
+    if code >= 0:
+        return f"the process ended with exit status {code}"
+    name = signal.Signals(-code).name
+    return f"killed by {name}" + (" (out of memory?)" if name == "SIGKILL" else "")

@@ -102,8 +102,8 @@ Beside the files of [every run](reading-results.md#files), each study writes its
 - `engines.csv`: one line per engine and scene: errors, statistics, times and memory of its gradients.
 - `backward_memory.csv`: one line per cell. `backward_memory_methods.csv`: per problem and method, at the longest horizon, memory and
   processor time, their ratios to the first method, and the order p of memory ~ T^p between the two longest horizons.
-- `optimise.csv`: one line per search. `summary.csv`: per method the score with its interval, the probability of beating the
-  baseline, and the share of targets reached in time. `targets.csv`: per problem, method and target (the first regret over
+- `optimise.csv`: one line per search. `summary.csv`: per method the score with its interval
+  and the share of targets reached in time. `targets.csv`: per problem, method and target (the first regret over
   10, 100 and 1,000) the successes with Wilson's interval and the average runtime in rollouts. The runtime includes failed
   searches, and is infinite where none succeeded. Methods are compared at their best tuning on each problem.
   `effect_of_error.csv`: per class of scenes whether gradients with a smaller error reach a tenth of the first regret `sooner`.

@@ -1,6 +1,7 @@
 """Settings of Sphinx for the site, which ``python -m docs.build site`` builds from generated sources."""
 
 import re
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ from docutils.utils.math import latex2mathml
 import bench
 
 HERE = Path(__file__).parent
+HOOKS = tomllib.loads((HERE.parent / "pyproject.toml").read_text())["tool"]["hatch"]["metadata"]["hooks"]
 
 project = "bench"
 author = "The bench authors"
@@ -38,6 +40,7 @@ html_show_sourcelink = False
 html_show_search_summary = False  # it needs a server
 html_sidebars: dict[str, list[str]] = {"index": []}
 html_theme_options = {
+    "github_url": HOOKS["custom"]["repository"],  # no link while it is empty
     "logo": {"text": "bench"},
     "header_links_before_dropdown": 5,
     "collapse_navigation": True,

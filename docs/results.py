@@ -9,7 +9,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
 import bench
@@ -125,7 +124,9 @@ def entry_of(name: str, question: str, folder: Path) -> Entry:
 
 @cache
 def table_of(name: str, results: Path = STANDARD) -> pd.DataFrame:
-    """Return a stored table, ``train/windows``: the folder of an experiment, and the name of its CSV."""
+    """Return a stored table, ``train/windows``: the folder of an experiment and the name of its CSV, or the rows of ``train``."""
+    if "/" not in name:
+        return rows_of(name, results)
     path = results / f"{name}.csv"
     if not path.exists():
         raise UserError(f"'{path}' does not exist")
@@ -155,13 +156,6 @@ def select(rows: pd.DataFrame, **conditions: Any) -> pd.DataFrame:
     if rows.empty:
         raise LookupError(f"no rows with {conditions}")
     return rows
-
-
-def rmse_interval(rows: pd.DataFrame) -> tuple[pd.Series, pd.Series]:
-    """Return the ends of the 95% interval of the relative RMSE, from those of bias and variance."""
-    norm = rows["reference_norm"].where(rows["reference_norm"] > 0)
-    low, high = (np.sqrt(rows[f"bias_{end}"] ** 2 + rows[f"variance_{end}"]) / norm for end in ("low", "high"))
-    return low, high
 
 
 @cache

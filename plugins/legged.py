@@ -11,8 +11,8 @@ from bench.model import EngineScene, param
 class Legged(EngineScene):
     """A torso on slides and hinges, q = (x, y, z, yaw, pitch, roll, joints of the legs), for physics engines only."""
 
-    neglected_effects: ClassVar[str] = "joint limits, torque limits, self-collision, contacts other than the feet"
-    n_contacts: ClassVar[int] = 4
+    neglected_effects = "joint limits, torque limits, self-collision, contacts other than the feet"
+    n_contacts = 4
     legs: ClassVar[tuple[str, ...]]
     """Names of the legs; each leg's foot is the geom of that name."""
     joints: ClassVar[tuple[str, ...]]
@@ -20,7 +20,7 @@ class Legged(EngineScene):
     torso: ClassVar[str]
     """Shape and size of the torso, as attributes of MJCF."""
 
-    dt: float = param(0.005, "length of a time step", "s", positive=True)
+    dt: float = 0.005
     mass: float = param(2.0, "mass of the torso", "kg", positive=True)
     leg_mass: float = param(0.2, "mass of a thigh and of a shank", "kg", positive=True)
     link: float = param(0.2, "length of a thigh", "m", positive=True)

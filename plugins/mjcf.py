@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from bench.engines.backend import unsupported_model
 from bench.model import EngineTwin, MechanicalScene, Program, Unsupported
 
 from .contacts.penalty import Penalty
@@ -31,18 +32,10 @@ def unsupported_reason(backend: Any, program: Program) -> str | None:
     The backend has parameters ``integrator``, ``solver``, ``cone``, ``iterations``, ``ls_iterations``, ``lean`` and
     ``impedance``.
     """
-    scene, law = program.scene, program.contact
-    if not isinstance(scene, EngineTwin):
-        return f"scene {scene.name} has no MJCF twin"
-    if program.decision.names:
-        return f"{backend.name} does not differentiate by parameters of its model: theta={list(program.decision.names)}"
-    if program.integrator is None or program.integrator.name != MATCH[backend.integrator]:
-        name = program.integrator.name if program.integrator else "none"
-        return f"{backend.name} uses its own integrator {backend.integrator}, which replaces {MATCH[backend.integrator]}, not {name}"
-    if law is not None and not isinstance(law, Penalty):
-        return f"{backend.name} uses its own contact model, which replaces penalty, not {law.name}"
-    if law is not None and law.damping and law.damping_mode != "clipped":
-        return f"{backend.name}'s contacts never pull: it supports damping_mode=clipped only, not {law.damping_mode}"
+    own = backend.integrator
+    if reason := unsupported_model(backend.name, program, f" {own}", MATCH[own], ("penalty",), "clipped"):
+        return reason
+    scene: Any = program.scene
     if scene.model_file() is not None:
         for name in ("cone", "impedance"):
             if (value := getattr(backend, name)) != getattr(type(backend), name):

@@ -1,4 +1,4 @@
-"""Settings and fixtures of all tests: quick compilation, and the registered backends."""
+"""Settings and fixtures of all tests: quick compilation, plugins that are forgotten after each test, and a browser."""
 
 import compileall
 import gc
@@ -32,10 +32,6 @@ def pytest_configure(config):
             compileall.compile_dir(config.rootpath / folder, quiet=2)
     os.environ["XDG_CACHE_HOME"] = str(config.rootpath / ".pytest_cache" / "home")
     os.environ["XLA_FLAGS"] = f"{QUICK} {os.environ.get('XLA_FLAGS', '')}".strip()
-    config.addinivalue_line(
-        "markers",
-        "needs(*capabilities): what the backend fixture must provide; physics asks for engines, which else are left out",
-    )
 
 
 @pytest.hookimpl(wrapper=True)
@@ -68,35 +64,6 @@ def pytest_collection_modifyitems(items):
     for item in items:
         if "browser" in getattr(item, "fixturenames", ()) and item.originalname not in DRAWN:
             item.add_marker(pytest.mark.slow)
-
-
-LONG = {"fused"}
-"""Backends that take seconds to compile any program."""
-BACKENDS = [pytest.param(name, marks=[pytest.mark.slow] * (name in LONG)) for name in registry.entries()["backends"]]
-
-
-@pytest.fixture(params=BACKENDS)
-def backend(request):
-    """Return a backend with default parameters: each registered backend that can run a scene's own program.
-
-    A test marked ``needs("root")`` is skipped on backends without a root finder. A test marked ``needs("physics")`` runs
-    on physics engines, which step a model of their own.
-    """
-    entry = registry.find("backends", request.param)
-    if not entry.available:
-        pytest.skip(entry.reason)
-    marker = request.node.get_closest_marker("needs")
-    needs = set(marker.args) if marker else set()
-    chosen = entry.plugin()
-    if reason := chosen.unavailable_reason():
-        pytest.skip(reason)
-    if "physics" in chosen.provides and "physics" not in needs:
-        pytest.skip(f"{chosen.name} steps a model of its own")
-    if "simulator" in chosen.provides:
-        pytest.skip(f"{chosen.name} runs simulators of the user's own")
-    if needs - chosen.provides:
-        pytest.skip(f"{chosen.name} does not provide {', '.join(sorted(needs - chosen.provides))}")
-    return chosen
 
 
 @pytest.fixture(autouse=True)

@@ -150,7 +150,7 @@ def test_a_notebook_shows_problems_estimates_and_reports():
     assert list(found.to_frame().index) == ["mass"]
     parameters = problem.to_frame().set_index(["part", "parameter"])
     assert parameters.loc[("contact", "stiffness"), "value"] == 500
-    assert report.to_frame()["name"].iloc[0] == "theta[0]"
+    assert report.frame["name"].iloc[0] == "theta[0]"
     figure = report.plot()
     assert figure.axes[0].lines
     assert figure._repr_png_().startswith(b"\x89PNG")
@@ -178,8 +178,8 @@ def test_compare_finds_what_got_worse(rows, results, tmp_path):
     comparison = bench.compare(results, tmp_path)
     assert comparison.worse
     assert (comparison.to_frame()["outcome"] == "worse").any()
-    assert "got worse" in repr(comparison)
-    assert "got worse" in comparison._repr_html_()
+    assert " worse in: " in repr(comparison)
+    assert " worse in: " in comparison._repr_html_()
     assert not bench.compare(results, results).worse
     with pytest.raises(bench.UserError, match="add --timings"):
         bench.compare(results, results, again=[results, results])

@@ -273,12 +273,13 @@ def test_a_thread_of_a_plugin_and_a_closed_stream_do_not_keep_a_command_waiting(
     code = """if True:
         import sys, threading, time
         import bench.__main__ as command
+        from bench import cli
         threading.Thread(target=time.sleep, args=(600,)).start()
         def main():
             print("all of it")
             sys.stderr.close()
             return 3
-        command.main = main
+        cli.main = main
         command.command()
     """
     inherited = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, sys.path))}

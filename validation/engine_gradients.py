@@ -32,7 +32,7 @@ def main():
             plugin = registry.usable("contacts", laws[0])
             law = build(plugin, {k: v for k, v in scene.contact_values.items() if k in parameters(plugin)})
         program = compose(scene, law, integrator)
-        if reason := backend.unavailable_reason() or backend.incompatibility(program):
+        if reason := backend.unavailable_reason() or backend.refusal(program):
             print(f"{name:<14} {reason}")
             continue
         problem, own = backend.compile(program), registry.make("backends", "numpy").compile(program)

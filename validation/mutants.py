@@ -380,7 +380,6 @@ GROUPS: dict[tuple[str, str], list[tuple[str, str]]] = {
     ],
     (X + "guided.py", OF_ESTIMATORS): [
         ("np.sqrt(self.share) * (w - inside)", "self.share * (w - inside)"),
-        ("change * shift / (2.0 * s * s)", "change * shift / (2.0 * s)"),
     ],
     (X + "inverse_variance.py", OF_ESTIMATORS): [
         ("weight * first.mean(axis=1) + (1 - weight)", "(1 - weight) * first.mean(axis=1) + weight"),
@@ -419,7 +418,6 @@ GROUPS: dict[tuple[str, str], list[tuple[str, str]]] = {
     ],
     (X + "sobol.py", OF_VARIANCE): [
         ("math.sqrt(count) * noise.mean", "noise.mean"),
-        ("change * shift / (2.0 * s * s)", "change * shift / (s * s)"),
     ],
     (X + "randomized_smoothing.py", OF_ESTIMATORS): [
         ("* direction / (2 * s)", "* direction / s"),
@@ -437,6 +435,7 @@ GROUPS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("variances.reshape(len(variances), -1, part).sum(axis=2)", "variances.reshape(len(variances), part, -1).sum(axis=1)"),
     ],
     ("bench/model/estimator.py", OF_ESTIMATORS): [
+        ("change * shift / (2.0 * s * s)", "change * shift / (2.0 * s)"),
         ("half = noise.shape[1] // 2", "half = noise.shape[1] // 3"),
         ("cost = problem.value(theta, w) - problem.value(theta, np.zeros((w.shape[0], 1)))", "cost = problem.value(theta, w)"),
     ],

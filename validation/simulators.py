@@ -243,7 +243,7 @@ CASES = {"torch": torch_cases, "jax": jax_cases}
 
 def examined(case):
     """Return the report on a case."""
-    from bench.examine import examine
+    from bench.examine.examination import examine
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

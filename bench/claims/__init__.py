@@ -17,7 +17,6 @@ def main(words: Sequence[str]) -> int:
     """Run the named claims, or all, and print verdicts. Returns 1 if a claim is not reproduced or its code fails."""
     from bench.claims import discovery, page, results, tables
     from bench.experiment.words import parse_words
-    from bench.report.text import counted
     from bench.run.files import make_directory
 
     names, settings, options = parse_words(words, "claims", {"results_dir": "results"}, OPTIONS)
@@ -45,6 +44,6 @@ def main(words: Sequence[str]) -> int:
     if shown:
         for path in page.write(directory, shown):
             print(f"  {path}")
-        print(f"{counted(len(shown), 'claim')}: {tables.count_verdicts(shown)}")
+        print(tables.count_verdicts(shown))
     bad = (NOT_REPRODUCED, results.FAILED)
     return int(any(result.verdict in bad for claim, result in shown if claim in selected))

@@ -1,4 +1,4 @@
-"""Shows the results of claims: a chart per claim, and tables in Markdown, CSV and LaTeX."""
+"""Shows the results of claims: a chart per claim, the table of claims and that of their figures."""
 
 from __future__ import annotations
 
@@ -13,12 +13,17 @@ from bench.claims.discovery import LESSONS
 from bench.claims.results import FAILED, ClaimResult
 from bench.experiment.columns import Column, text
 from bench.experiment.views import Chart, Mark, Style, Table
-from bench.report import latex as writer
 from bench.report.colours import estimator_colour, estimator_marker
 from bench.report.tables import escape_markdown, plain_markdown
 from bench.report.text import counted, duration, number
 
 Results = Sequence[tuple[type[Claim], ClaimResult]]
+TITLE = "Published claims, run again"
+FIGURE = (
+    text("claim"), text("figure"), text("published"), Column("measured", digits=4), text("agrees"),
+    Column("resolution", label="would fail at", format="percent"), text("lesson"),
+)  # fmt: skip
+"""Columns of the page's table of figures."""
 ESTIMATORS = {
     **dict.fromkeys(("first", "pathwise", "coarse"), "fobg"), **dict.fromkeys(("zeroth", "score"), "reinforce"),
     "measure-valued": "measure_valued", "gauss": "randomized_smoothing", "sphere": "sphere_smoothing",
@@ -47,9 +52,8 @@ def chart(claim: type[Claim], result: ClaimResult) -> Chart | None:
     }
     return Chart(
         claim.name, pd.concat(parts, ignore_index=True), [Column("x", label=claim.labels[0], log=is_log["x"])],
-        [Column("y", label=claim.labels[1], low="low", high="high", log=is_log["y"])], "lines" if pd.api.types.is_numeric_dtype(x) else "points",
-        claim.learned, "series",
-        styles=looks, marks=[Mark(label, value, axis=axis) for axis, value, label in claim.marks],
+        [Column("y", label=claim.labels[1], low="low", high="high", log=is_log["y"])], "lines",
+        claim.learned, "series", styles=looks, marks=[Mark(label, value, axis=axis) for axis, value, label in claim.marks],
         subtitle=f"{claim.name}, {claim.source.partition(';')[0]}: {result.verdict}",
     )  # fmt: skip
 
@@ -107,7 +111,7 @@ def figures_table(results: Results) -> pd.DataFrame:
             "verdict": result.verdict, "seconds": round(result.seconds, 2),
         }
         for claim, result in results
-        for figure in result.figures
+        for figure in result.figures or (Figure("", "0", math.nan),)
     ]  # fmt: skip
     return pd.DataFrame(rows)
 
@@ -124,12 +128,13 @@ def by_lesson(results: Results) -> Iterator[tuple[str, str, Results]]:
 def count_verdicts(results: Results) -> str:
     """Return the number of claims per verdict, as text."""
     tally = [(verdict, sum(result.verdict == verdict for _, result in results)) for verdict in (*VERDICTS, FAILED)]
-    return ", ".join(f"{count} {verdict}" for verdict, count in tally if count)
+    counts = ", ".join(f"{count} {verdict}" for verdict, count in tally if count)
+    return f"{counted(len(results), 'claim')}: {counts}"
 
 
 def markdown(results: Results) -> str:
     """Return the verdicts and figures as Markdown, by lesson."""
-    parts = [f"# Published claims, run again\n\n{counted(len(results), 'claim')}: {count_verdicts(results)}.\n"]
+    parts = [f"# {TITLE}\n\n{count_verdicts(results)}\n"]
     for lesson, summary, own in by_lesson(results):
         parts.append(f"## {lesson}\n\n{summary}\n")
         for claim, result in own:
@@ -146,20 +151,15 @@ def markdown(results: Results) -> str:
     return "\n".join(parts)
 
 
-def latex(results: Results) -> str:
-    """Return a LaTeX table across both columns of a paper: per claim the verdict and one figure.
-
-    The figure is the most sensitive figure that disagrees or, if all figures agree, the most sensitive figure.
-    """
-    lines = []
-    for claim, result in results:
-        shown = [f for f in result.figures if f.value] or list(result.figures)
-        figure = min(shown, key=lambda f: (f.agrees, f.detectable_error), default=Figure("", "", math.nan))
-        name = f"{claim.name}, {claim.source}: {figure.what}"
-        lines.append([name, figure.published, figure.measured, result.verdict])
-    columns = [text("claim"), text("published"), Column("measured", digits=4), text("verdict")]
+def claims_table(results: Results) -> Table:
+    """Return a line per claim: its verdict, what it states, and the reservation or the reason of a failure."""
+    lines = [
+        (claim.lesson, claim.name, result.verdict, f"{claim.statement} ({claim.source})", result.remark)
+        for claim, result in results
+    ]
+    columns = [text("lesson"), text("claim"), text("verdict"), text("statement"), text("remark")]
     frame = pd.DataFrame(lines, columns=[column.name for column in columns])
-    return writer.latex([Table("claims", frame, columns)], "Published claims, run again")
+    return Table("claims", frame, columns[1:], "Claims", page=True, split="lesson")
 
 
 def result_lines(claim: type[Claim], result: ClaimResult, is_stored: bool) -> Iterator[str]:

@@ -22,6 +22,6 @@ def compare(
     worse. With ``timings``, times are compared too, with the spread between the runs ``again`` of ``before``. Raises
     :class:`bench.UserError` for results that cannot be read or compared.
     """
-    from bench.compare.command import compare_results, request
+    from bench.compare.command import compare_results
 
-    return compare_results(request(str(before), str(after), timings=timings, again=tuple(map(str, again))))
+    return compare_results(str(before), str(after), timings, [*map(str, again)])

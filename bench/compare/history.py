@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -13,10 +12,10 @@ import numpy as np
 import pandas as pd
 
 from bench.compare.cells import rows_by_cell
-from bench.compare.judging import ROUNDING, Row, distance, value
-from bench.compare.sources import Results, open_results
+from bench.compare.judging import ROUNDING, Row, distance, rule_of, value
+from bench.compare.sources import Results, read_results
 from bench.errors import UserError, local_path
-from bench.experiment.columns import Column, Columns, text
+from bench.experiment.columns import Column, text
 from bench.experiment.views import Chart, Mark, Table, Views
 from bench.experiment.words import parse_words
 from bench.report.text import counted
@@ -32,6 +31,12 @@ ERRORS = ("paired", "interval", "exact")
 cells, the first of them if several have."""
 NOT_RUN = ("unsupported", "unavailable", "waiting")
 """Statuses of cells that never ran, which do not count as failures."""
+QUESTION = "Which series changed?"
+NOTES = (
+    "error: geometric mean of the ratios to the errors of the first result, over the cells that are ok in all results. Below "
+    "1 is better.",
+    "gradient moved: largest distance of a cell's gradient from that of the first result, relative to its norm.",
+)
 LONGEST = 18
 """Largest number of characters of a result's name in the chart. The end of a longer name is shown."""
 
@@ -54,10 +59,7 @@ def main(words: Sequence[str]) -> int:
     if len(names) < 2:
         raise UserError("name two results or more, the oldest first: python -m bench history DIR DIR ... [out=DIR]")
     out = local_path("out", settings["out"])
-    with ExitStack() as stack:
-        results = [stack.enter_context(open_results(name)) for name in names]
-        history = compute_history(names, results)
-    for path in write(history, out):
+    for path in write(compute_history(names, [*map(read_results, names)]), out):
         print(f"  {path}")
     return 0
 
@@ -70,45 +72,34 @@ def compute_history(names: Sequence[str], results: Sequence[Mapping[str, Results
     lines = []
     for experiment in shared:
         tables = [rows_by_cell(result[experiment].rows) for result in results]
-        columns = results[0][experiment].columns
-        vectors = [column for column in columns.compared if column.comparison and column.comparison.by == "vector"]
+        compared = results[0][experiment].columns.compared
+        vectors = [column for column in compared if rule_of(column).by == "vector"]
+        errors = [column for by in ERRORS for column in compared if rule_of(column).by == by]
         by = "estimator" if any(row["estimator"] for row in tables[0].values()) else "backend"
         names_of_series = dict.fromkeys(str(row[by]) for row in tables[0].values())
         for series in names_of_series:
             keys = [key for key, row in tables[0].items() if row[by] == series and row["status"] not in NOT_RUN]
             ok_in_all = [key for key in keys if all(table.get(key, {}).get("status") == "ok" for table in tables)]
-            rows = [[table[key] for key in ok_in_all] for table in tables]
-            column = _error_column(columns, rows)
-            for name, table, own in zip(names, tables, rows, strict=True):
-                mine = [table[key] for key in keys if key in table]
-                error, count = _mean_ratio(column, rows[0], own)
-                moved = max(
-                    (distance(vector, *pair) for vector in vectors for pair in zip(rows[0], own, strict=True)),
-                    default=math.nan,
-                )
-                failed = len(keys) - len(mine) + sum(row["status"] != "ok" for row in mine)
+            pairs = [[(tables[0][key], table[key]) for key in ok_in_all] for table in tables]
+            counts = {column.name: min(len(_log_ratios(column, own)) for own in pairs) for column in errors}
+            error = max(errors, key=lambda column: counts[column.name], default=None) if any(counts.values()) else None
+            for name, table, own in zip(names, tables, pairs, strict=True):
+                ratios = _log_ratios(error, own) if error else np.empty(0)
+                moved = max((distance(vector, *pair) for vector in vectors for pair in own), default=math.nan)
+                failed = sum(table.get(key, {}).get("status") != "ok" for key in keys)
                 shown = series if len(names_of_series) > 1 else ""
-                called = column.comparison.called if column and column.comparison else ""
-                lines.append((name, experiment, shown, called, error, count, moved, failed, len(keys)))
+                called = rule_of(error).called if error else ""
+                mean = float(np.exp(ratios.mean())) if len(ratios) else math.nan
+                lines.append((name, experiment, shown, called, mean, len(ratios), moved, failed, len(keys)))
     titles = ["result", "experiment", "series", "column", "error", "cells", "moved", "failed", "of"]
     return History(pd.DataFrame(lines, columns=titles), list(names))
 
 
-def _mean_ratio(column: Column | None, first: Sequence[Row], own: Sequence[Row]) -> tuple[float, int]:
-    """Return the geometric mean of the error ratios of pairs of rows, and the number of pairs with a ratio."""
-    if column is None:
-        return math.nan, 0
-    values = np.array([[value(row, column.name) for row in pair] for pair in zip(first, own, strict=True)])
-    values = values.reshape(-1, 2)
-    values = values[np.isfinite(values).all(axis=1) & (values > 0).all(axis=1)]
-    return (float(np.exp(np.log(values[:, 1] / values[:, 0]).mean())), len(values)) if len(values) else (math.nan, 0)
-
-
-def _error_column(columns: Columns, rows: Sequence[Sequence[Row]]) -> Column | None:
-    """Return the column of an error that has a ratio in the most cells of all results; None if no column has any."""
-    errors = [c for by in ERRORS for c in columns.compared if c.comparison and c.comparison.by == by]
-    counts = [min(_mean_ratio(column, rows[0], own)[1] for own in rows) for column in errors]
-    return errors[counts.index(max(counts))] if any(counts) else None
+def _log_ratios(column: Column, pairs: Sequence[tuple[Row, Row]]) -> np.ndarray:
+    """Return the logarithms of the ratios of a column in the pairs of rows that have one."""
+    values = np.array([[value(row, column.name) for row in pair] for pair in pairs]).reshape(-1, 2)
+    values = values[(np.isfinite(values) & (values > 0)).all(axis=1)]
+    return np.asarray(np.log(values[:, 1] / values[:, 0]))
 
 
 def write(history: History, out: Path) -> list[Path]:
@@ -126,25 +117,14 @@ def write(history: History, out: Path) -> list[Path]:
 
 
 def views(history: History) -> Views:
-    """Return the finding, the table of all series, and small multiples of the series that changed."""
-    short = _short_names(history.names)
+    """Return the table of all series, and small multiples of the series that changed, the largest change first."""
     table = history.table.assign(
         line=[": ".join(filter(None, pair)) for pair in zip(history.table["experiment"], history.table["series"], strict=True)],
         failures=[f"{f} of {n}" for f, n in zip(history.table["failed"], history.table["of"], strict=True)],
-        result=history.table["result"].map(short),
+        result=history.table["result"].map(_short_names(history.names)),
     )  # fmt: skip
-    changes = _changes(table)
+    changes = table.groupby("line", sort=False)[["error", "failed", "of", "moved"]].apply(_change)
     moved = changes[changes > 0].sort_values(ascending=False, kind="stable")
-    compared = table.groupby("line")[["cells", "moved"]].max()
-    blind = int(((compared["cells"] == 0) & compared["moved"].isna()).sum())
-    total = counted(len(changes) - blind, "series", "series")
-    what = f"in error by more than {CHANGED - 1:.0%}, in gradient or in failed cells"
-    finding = f"None of {total} changed {what}."
-    if len(moved):
-        finding = f"{len(moved)} of {counted(len(changes), 'series', 'series')} changed {what}, most {moved.index[0]}."
-    if blind:
-        finding = f"{finding} " if len(moved) or blind < len(changes) else ""
-        finding += f"{counted(blind, 'series', 'series')} cannot be compared: no cell has an error in all results."
     names = list(moved.index[:PANELS]) or list(changes.index[:PANELS])
     frame = pd.concat([table[table["line"] == name] for name in names], ignore_index=True)
     failures = {
@@ -152,44 +132,23 @@ def views(history: History) -> Views:
         for name, part in frame.groupby("line")
         if part["failed"].nunique() > 1
     }
-    subtitle = "geometric mean of the ratios to the errors of the first result"
-    subtitle += f", {len(names)} of {len(moved)} changed series" if len(moved) > len(names) else ""
     chart = Chart(
-        "history", frame, [text("result", label="")], [ERROR], title=finding, panel="line", panel_notes=failures, height=1.2,
-        marks=[Mark("", 1.0, axis="y")], subtitle=subtitle,
+        "history", frame, [text("result", label="")], [ERROR], title=QUESTION, panel="line", panel_notes=failures, height=1.2,
+        marks=[Mark("", 1.0, axis="y")], subtitle=f"{len(moved)} of {counted(len(changes), 'series', 'series')} changed",
     )  # fmt: skip
     columns = [
-        text("result"),
-        text("experiment"),
-        text("series"),
-        replace(ERROR, label="error"),
-        text("column", label="error of"),
-        Column("cells", format="setting"),
-        text("failures", label="failed"),
-    ]
-    notes = [
-        "error: geometric mean of the ratios to the errors of the first result, over the cells that are ok in all results. Below 1 is better."
-    ]
-    if table["moved"].notna().any():
-        columns.insert(-1, Column("moved", label="gradient moved"))
-        notes.append(
-            "gradient moved: largest distance of a cell's gradient from that of the first result, relative to its norm."
-        )
-    every = Table("history", table, columns, finding.rstrip("."), notes, data=history.table)
-    return Views([every], [chart], headline=finding)
+        text("result"), text("experiment"), text("series"), replace(ERROR, label="error"), text("column", label="error of"),
+        Column("cells", format="setting"), Column("moved", label="gradient moved"), text("failures", label="failed"),
+    ]  # fmt: skip
+    return Views([Table("history", table, columns, QUESTION, NOTES, data=history.table)], [chart])
 
 
-def _changes(table: pd.DataFrame) -> pd.Series:
-    """Return how far each series moved: the logarithm of its largest factor, 0 below 1%, plus failures and gradients."""
-    parts = {}
-    for name, part in table.groupby("line", sort=False):
-        factor = np.abs(np.log(part["error"].to_numpy(float)))
-        factor = factor[np.isfinite(factor)].max(initial=0.0)
-        failures = (part["failed"].max() - part["failed"].min()) / max(part["of"].max(), 1)
-        moved = part["moved"].max() if part["moved"].notna().any() else 0.0
-        parts[name] = (factor if factor > math.log(CHANGED) else 0.0) + failures
-        parts[name] += math.log1p(moved) if moved > ROUNDING else 0.0
-    return pd.Series(parts, dtype=float)
+def _change(part: pd.DataFrame) -> float:
+    """Return how far a series moved: the logarithm of its largest factor, 0 below 1%, plus failures and gradients."""
+    factor = float(np.nanmax([0.0, *np.abs(np.log(part["error"]))]))
+    failures = float(np.ptp(part["failed"])) / max(int(part["of"].max()), 1)
+    moved = float(np.nanmax([0.0, *part["moved"]]))
+    return (factor if factor > math.log(CHANGED) else 0.0) + failures + (math.log1p(moved) if moved > ROUNDING else 0.0)
 
 
 def _short_names(names: Sequence[str]) -> dict[str, str]:
@@ -199,6 +158,5 @@ def _short_names(names: Sequence[str]) -> dict[str, str]:
         parts = [part[:-1] for part in parts]
     short = ["".join(part) for part in parts]
     return {
-        name: text_ if len(text_) <= LONGEST else "..." + text_[-LONGEST:]
-        for name, text_ in zip(names, short, strict=True)
+        name: text if len(text) <= LONGEST else "..." + text[-LONGEST:] for name, text in zip(names, short, strict=True)
     }

@@ -20,12 +20,12 @@ Times (``time``) are judged by :mod:`bench.compare.timings`, over all cells toge
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from bench.experiment.columns import Column, Columns, ComparisonRule
+from bench.experiment.columns import Column, ComparisonRule
 from bench.measure.statistics import UNEXPLAINED, is_unexplained
 from bench.report.text import number
 
@@ -66,13 +66,33 @@ class Change(NamedTuple):
     text: str
     """The change in a few words."""
     subject: str = ""
-    """The changed column by its name in sentences, or ``status``, or ``gone`` or ``new`` for a whole cell."""
+    """The changed column by its name in sentences, or ``no longer ok``, or ``gone`` or ``new`` for a whole cell."""
 
 
-def judge(column: Column, columns: Columns, old: Row, new: Row) -> Change | None:
+def judge_cell(columns: Sequence[Column], old: Row | None, new: Row | None) -> list[Change]:
+    """Return the changes of a cell in its status and in its judged columns, except times; either row may be missing."""
+    if old is None:
+        return [Change("changed", "new", "new")]
+    if new is None:
+        return [Change("worse" if old["status"] == "ok" else "changed", f"gone, it was {old['status']}", "gone")]
+    if old["status"] != new["status"]:
+        outcome = "worse" if old["status"] == "ok" else "better" if new["status"] == "ok" else "changed"
+        reason = f" ({new['reason']})" if isinstance(new.get("reason"), str) and new["reason"] else ""
+        return [Change(outcome, f"status {old['status']} to {new['status']}{reason}", "no longer ok")]
+    if old["status"] != "ok":
+        return []
+    judged = [column for column in columns if rule_of(column).by != "time"]
+    pairs = [_pair(rule_of(column), old, new) for column in judged]
+    if any(pair is not None and pair.is_same for pair in pairs):
+        # only the reference can differ then, which makes the estimates neither better nor worse
+        judged = [column for column in judged if rule_of(column).by not in ("interval", "spread")]
+    return [change for column in judged if (change := judge(column, old, new)) is not None]
+
+
+def judge(column: Column, old: Row, new: Row) -> Change | None:
     """Return the change of one judged column between two rows of status ok, or None if it did not change."""
-    rule = _rule(column)
-    change = RULES[rule.by](column, columns, old, new)
+    rule = rule_of(column)
+    change = RULES[rule.by](column, old, new)
     if change is None:
         return None
     change = change._replace(subject=rule.called, outcome="changed" if rule.neutral else change.outcome)
@@ -119,15 +139,9 @@ def _pair(rule: ComparisonRule, old: Row, new: Row) -> _Pair | None:
     return _Pair(means, variances, references, scale)
 
 
-def has_same_estimates(column: Column, old: Row, new: Row) -> bool:
-    """Return whether a paired column has equal estimates on both sides. False if they are not stored."""
-    pair = _pair(_rule(column), old, new)
-    return pair is not None and pair.is_same
-
-
-def _paired(column: Column, columns: Columns, old: Row, new: Row) -> Change | None:
+def _paired(column: Column, old: Row, new: Row) -> Change | None:
     """Judge an error by the mean estimates on the same noise, or return None if a row does not store them."""
-    rule = _rule(column)
+    rule = rule_of(column)
     pair = _pair(rule, old, new)
     if pair is None:
         return None
@@ -166,20 +180,37 @@ def numbers(row: Row, name: str) -> np.ndarray:
     return np.asarray(stored, dtype=float) if isinstance(stored, list | np.ndarray) else np.empty(0)
 
 
-def _interval(column: Column, columns: Columns, old: Row, new: Row) -> Change | None:
-    return _size_change(column, old, new) if _intervals_disjoint(column, columns, old, new) else None
+def value(row: Row, name: str) -> float:
+    """Return the number in column ``name`` of a row; NaN if there is none."""
+    return float(row.get(name, math.nan))
 
 
-def _spread(column: Column, columns: Columns, old: Row, new: Row) -> Change | None:
+def _size_change(column: Column, old: Row, new: Row, is_changed: bool) -> Change | None:
+    was, now = value(old, column.name), value(new, column.name)
+    text = f"{rule_of(column).called} {number(was, 3)} to {number(now, 3)}"
+    return Change("worse" if now > was else "better", text) if is_changed else None
+
+
+def _interval(column: Column, old: Row, new: Row) -> Change | None:
+    return _size_change(column, old, new, _is_disjoint(column, old, new))
+
+
+def _spread(column: Column, old: Row, new: Row) -> Change | None:
     was, now = value(old, column.name), value(new, column.name)
     if not (was > 0 and now > 0) or max(was, now) < EFFECT * min(was, now):
         return None
-    ends = [value(row, name) for row in (old, new) for name in _interval_columns(column, columns)]
-    if all(map(math.isfinite, ends)):
-        is_changed = _intervals_disjoint(column, columns, old, new)
-    else:
-        is_changed = outside_f(now / was, value(old, "repeats"), value(new, "repeats"))
-    return _size_change(column, old, new) if is_changed else None
+    if np.isfinite([value(row, end) for row in (old, new) for end in _ends(column)]).all():
+        return _size_change(column, old, new, _is_disjoint(column, old, new))
+    return _size_change(column, old, new, outside_f(now / was, value(old, "repeats"), value(new, "repeats")))
+
+
+def _ends(column: Column) -> tuple[str, str]:
+    return column.low or f"{column.name}_low", column.high or f"{column.name}_high"
+
+
+def _is_disjoint(column: Column, old: Row, new: Row) -> bool:
+    low, high = _ends(column)
+    return value(new, low) > value(old, high) or value(new, high) < value(old, low)
 
 
 def outside_f(ratio: float, before: float, after: float) -> bool:
@@ -193,10 +224,10 @@ def outside_f(ratio: float, before: float, after: float) -> bool:
     return not low <= ratio <= high
 
 
-def _exact(column: Column, columns: Columns, old: Row, new: Row) -> Change | None:
+def _exact(column: Column, old: Row, new: Row) -> Change | None:
     was, now = value(old, column.name), value(new, column.name)
     is_changed = abs(now - was) > ROUNDING and max(was, now) >= EFFECT * min(was, now)
-    return _size_change(column, old, new) if is_changed else None
+    return _size_change(column, old, new, is_changed)
 
 
 def distance(column: Column, old: Row, new: Row) -> float:
@@ -208,52 +239,31 @@ def distance(column: Column, old: Row, new: Row) -> float:
     return moved / norm if norm > 0 else math.inf if moved > 0 else 0.0
 
 
-def _vector(column: Column, columns: Columns, old: Row, new: Row) -> Change | None:
+def _vector(column: Column, old: Row, new: Row) -> Change | None:
     moved = distance(column, old, new)
     if not moved > ROUNDING:
         return None
     norm = number(math.hypot(*numbers(new, column.name)))
     size = f"by {number(moved)} of its norm" if math.isfinite(moved) else f"from 0 to norm {norm}"
-    return Change("changed", f"{_rule(column).called} moved {size}")
+    return Change("changed", f"{rule_of(column).called} moved {size}")
 
 
-def _verdict(column: Column, columns: Columns, old: Row, new: Row) -> Change | None:
+def _verdict(column: Column, old: Row, new: Row) -> Change | None:
     was, now = old.get(column.name, ""), new.get(column.name, "")
     if was == now:
         return None
-    rule, outcome = _rule(column), "changed"
+    rule, outcome = rule_of(column), "changed"
     if was in rule.order and now in rule.order:
         outcome = "worse" if rule.order.index(now) < rule.order.index(was) else "better"
     return Change(outcome, f"{rule.called} {was or 'none'} to {now or 'none'}")
 
 
-RULES: dict[str, Callable[[Column, Columns, Row, Row], Change | None]] = {
+RULES: dict[str, Callable[[Column, Row, Row], Change | None]] = {
     "paired": _paired, "interval": _interval, "spread": _spread, "exact": _exact, "vector": _vector, "verdict": _verdict,
 }  # fmt: skip
 
 
-def _rule(column: Column) -> ComparisonRule:
+def rule_of(column: Column) -> ComparisonRule:
+    """Return the rule of a judged column."""
     assert column.comparison is not None
     return column.comparison
-
-
-def _size_change(column: Column, old: Row, new: Row) -> Change:
-    was, now = value(old, column.name), value(new, column.name)
-    text = f"{_rule(column).called} {number(was, 3)} to {number(now, 3)}"
-    return Change("worse" if now > was else "better", text)
-
-
-def value(row: Row, name: str) -> float:
-    """Return the number in column ``name`` of a row; NaN if there is none."""
-    return float(row.get(name, math.nan))
-
-
-def _interval_columns(column: Column, columns: Columns) -> tuple[str, str]:
-    """Return the columns of an interval: ``bias_low`` and ``bias_high``, or ``stretch_low`` for ``stretch_rate``."""
-    stem = column.name if f"{column.name}_low" in columns.by_name else column.name.rpartition("_")[0]
-    return f"{stem}_low", f"{stem}_high"
-
-
-def _intervals_disjoint(column: Column, columns: Columns, old: Row, new: Row) -> bool:
-    low, high = _interval_columns(column, columns)
-    return value(new, low) > value(old, high) or value(new, high) < value(old, low)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,22 +11,20 @@ from functools import cached_property
 from html import escape
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import pandas as pd
 
 from bench.compare import timings
-from bench.compare.cells import FIRST, LAST, OUTCOMES, WORSE_IN, both_sides, differing_parameters, flat_parameters
-from bench.compare.exports import as_json, as_junit, count_outcomes
-from bench.compare.judging import NOTES
-from bench.experiment import views
+from bench.compare.cells import FIRST, LAST, OUTCOMES, WORSE_IN, both_sides, flat_parameters
+from bench.compare.judging import NOTES, rule_of
 from bench.experiment.columns import Column, text
-from bench.experiment.experiment import Experiment
-from bench.experiment.views import Chart, Style, Views
-from bench.model import registry
-from bench.report import terminal, writer
+from bench.experiment.views import Table, Views
+from bench.report import terminal
 from bench.report.problems import varying_identity
 from bench.report.tables import plain_markdown
 from bench.report.text import axis_value, counted, one_line
+from bench.report.web.data import cells_data
 from bench.report.web.document import blocks
 from bench.run.files import make_directory, write_all
 
@@ -33,11 +32,8 @@ PRINTED = 30
 """Largest number of printed changes. The files contain all changes."""
 LISTED = 100
 """Largest number of changes in the Markdown file, which CI servers show above a run."""
-PHRASES = {"gone": "gone", "status": "no longer ok"}
-"""Phrases of the summary for changes that are not of one column."""
-STYLES = dict(
-    zip(OUTCOMES, (Style("#D55E00", "^"), Style("#0072B2", "v"), Style("#CC79A7", "s"), Style("#7F6000")), strict=True)
-)
+CONTROL = re.compile(r"[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+"""Characters that XML 1.0 does not allow. Error messages of plugins may contain them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,8 +46,6 @@ class Comparison:
     remarks: Sequence[str]
     judged: Sequence[Column]
     """The judged columns of all studies, each name once."""
-    study: str
-    """The study of the first experiment."""
 
     @property
     def worse(self) -> bool:
@@ -59,9 +53,8 @@ class Comparison:
         return bool((self.table["outcome"] == "worse").any())
 
     def __str__(self) -> str:
-        changes = self.changes.head(PRINTED)
         lines = [self.title, summary(self.table), *(f"  {remark}" for remark in self.remarks)]
-        lines += [": ".join(map(str, line)) for line in changes.to_numpy()]
+        lines += [": ".join(map(str, line)) for line in self.changes.head(PRINTED).to_numpy()]
         return "\n".join(map(one_line, lines))
 
     __repr__ = __str__
@@ -89,27 +82,27 @@ class Comparison:
 
 
 def summary(table: pd.DataFrame) -> str:
-    """Return a sentence: how many cells got worse and in which columns, how many got better, how many are the same."""
-    counts = count_outcomes(table)
+    """Return the number of cells by outcome, and in which columns how many got worse."""
     subjects = Counter(subject for subjects in table[WORSE_IN] for subject in subjects)
-    reasons = ", ".join(f"{n} {PHRASES.get(subject, f'in {subject}')}" for subject, n in subjects.most_common())
-    return (
-        f"Of {counted(len(table), 'cell')}, {counts['worse']} got worse{f' ({reasons})' if reasons else ''}, "
-        f"{counts['better']} got better, {counts['same']} are the same within the uncertainty."
-    )
+    reasons = ", ".join(f"{subject} {n}" for subject, n in subjects.most_common())
+    counts = ", ".join(f"{count} {outcome}" for outcome, count in count_outcomes(table).items())
+    return f"{counted(len(table), 'cell')}: {counts}{f'; worse in: {reasons}' if reasons else ''}"
+
+
+def count_outcomes(table: pd.DataFrame) -> dict[str, int]:
+    """Return the number of cells by outcome, the worst first."""
+    return {outcome: int((table["outcome"] == outcome).sum()) for outcome in OUTCOMES}
 
 
 def write(comparison: Comparison, out: Path) -> list[Path]:
-    """Write ``compare`` as .csv, .md, .json, .xml (JUnit) and .html. Raises :class:`StorageError` if that fails."""
+    """Write ``compare`` as .csv, .md, .xml (JUnit) and .html. Raises :class:`StorageError` if that fails."""
     make_directory(out)
-    table = comparison.table
     return write_all(
         out,
         {
             "compare.csv": comparison.to_frame().drop(columns="cell").to_csv(index=False, lineterminator="\n"),
             "compare.md": markdown(comparison),
-            "compare.json": as_json(comparison.title, table, comparison.cells, comparison.remarks),
-            "compare.xml": as_junit(comparison.title, table, comparison.cells),
+            "compare.xml": junit(comparison),
             "compare.html": page(comparison),
         },
     )
@@ -117,8 +110,7 @@ def write(comparison: Comparison, out: Path) -> list[Path]:
 
 def markdown(comparison: Comparison) -> str:
     """Return the summary, counts by experiment, remarks, first changes (the worst first) and rules as Markdown."""
-    table = comparison.table
-    listed = comparison.changes
+    table, listed = comparison.table, comparison.changes
     by_experiment = pd.DataFrame(
         [{"experiment": str(name)} | count_outcomes(part) for name, part in table.groupby("experiment", sort=False)]
     ).astype(str)
@@ -128,6 +120,29 @@ def markdown(comparison: Comparison) -> str:
     if len(listed) > LISTED:
         texts.append(f"And {len(listed) - LISTED} more in `compare.csv`.")
     return "\n\n".join([*texts, "\n".join(f"- {note}" for note in (*NOTES, timings.NOTE))]) + "\n"
+
+
+def junit(comparison: Comparison) -> str:
+    """Return JUnit XML with a suite per experiment and a test case per cell, which fails if the cell got worse."""
+
+    def element(parent: ElementTree.Element | None, tag: str, **facts: Any) -> ElementTree.Element:
+        safe = {name: CONTROL.sub("?", str(fact)) for name, fact in facts.items()}
+        return ElementTree.Element(tag, safe) if parent is None else ElementTree.SubElement(parent, tag, safe)
+
+    table = comparison.table.assign(cell=comparison.cells)
+    n_worse = count_outcomes(table)["worse"]
+    root = element(None, "testsuites", name=comparison.title, tests=len(table), failures=n_worse)
+    for name, part in table.groupby("experiment", sort=False):
+        n_worse = count_outcomes(part)["worse"]
+        suite = element(root, "testsuite", name=name, tests=len(part), failures=n_worse)
+        for row in part.to_dict("records"):
+            case = element(suite, "testcase", classname=name, name=row["cell"])
+            if row["outcome"] == "worse":
+                element(case, "failure", message=row["change"])
+            elif row["outcome"] != "same":
+                element(case, "system-out").text = CONTROL.sub("?", f"{row['outcome']}: {row['change']}")
+    ElementTree.indent(root)
+    return '<?xml version="1.0" encoding="UTF-8"?>\n' + ElementTree.tostring(root, encoding="unicode") + "\n"
 
 
 def show(comparison: Comparison, paths: Sequence[Path]) -> None:
@@ -153,18 +168,16 @@ def _worst_first(table: pd.DataFrame) -> pd.DataFrame:
 
 def cell_names(table: pd.DataFrame) -> list[str]:
     """Return a name for each cell: the identity columns that vary, and the parameters in which cells of one name differ."""
-    columns = varying_identity(table)
+    columns, table = varying_identity(table), table.reset_index(drop=True)
     names = [", ".join(filter(None, map(_name_part, columns, row))) for row in table[columns].to_numpy(dtype=object)]
-    positions: dict[tuple[str, str], list[int]] = {}
-    for position, key in enumerate(zip(table["experiment"], names, strict=True)):
-        positions.setdefault(key, []).append(position)
-    for (_, name), same_name in positions.items():
-        if len(same_name) > 1:
-            flat = [flat_parameters(table.iloc[position].to_dict()) for position in same_name]
-            differing = differing_parameters(flat)
-            for position, parameters in zip(same_name, flat, strict=True):
-                parts = [_name_part(key, parameters.get(key)) for key in differing]
-                names[position] = ", ".join(filter(None, [name, *parts]))
+    for _, part in table.groupby(["experiment", names], sort=False):
+        if len(part) > 1:
+            flat = pd.DataFrame(
+                [flat_parameters(row) for row in part.to_dict("records")], index=part.index, dtype=object
+            )
+            differing = flat.columns[flat.astype(str).nunique() > 1]
+            for place, values in flat[differing].iterrows():
+                names[place] = ", ".join(filter(None, [names[place], *map(_name_part, differing, values)]))
     return names
 
 
@@ -177,50 +190,18 @@ def _name_part(name: str, value: Any) -> str:
 
 
 def page(comparison: Comparison) -> str:
-    """Return the comparison as an HTML page in the layout of an experiment's page."""
-    study = registry.make("studies", comparison.study)
-    experiment = Experiment(
-        name=comparison.title, study=study, columns=study.columns, choices={}, question="Did something get worse?"
-    )
-    shown = page_views(comparison)
-    assert shown.rows is not None
-    return "".join(blocks(experiment, shown.rows, shown, writer.drawings(experiment, shown), [], {}))
-
-
-def page_views(comparison: Comparison) -> Views:
-    """Return the summary, the rules, all cells before and after, and a chart per number: the worst cells first."""
+    """Return the comparison as an HTML page: summary, remarks, rules, and all cells before and after, the worst first."""
     table = _worst_first(comparison.table).reset_index(drop=True)
-    rows = table.drop(columns=WORSE_IN).assign(status=table["status_after"], reason=table["change"])
+    cells = table.drop(columns=WORSE_IN).assign(status=table["status_after"], reason=table["change"])
     rules = pd.DataFrame({"remark": [*comparison.remarks, *NOTES, timings.NOTE]})
     columns = [
         Column(
-            f"{column.name}_{when}", label=f"{_called(column)} {when}", unit=column.unit, kind=column.kind,
+            f"{column.name}_{when}", label=f"{rule_of(column).called} {when}", unit=column.unit, kind=column.kind,
             format="seconds" if column.unit == "s" else "number",
         )
         for column in comparison.judged
         for when in ("before", "after")
     ]  # fmt: skip
-    return Views(
-        headline=summary(table),
-        tables=[views.Table("rules", rules, [text("remark")], "How cells are judged", files=[], page=True)],
-        charts=[
-            _before_after(before, after, rows)
-            for before, after in zip(columns[::2], columns[1::2], strict=True)
-            if before.kind == "number" and rows[after.name].notna().any()
-        ],
-        rows=rows,
-        columns=[text("outcome"), text("experiment"), *columns],
-    )  # fmt: skip
-
-
-def _called(column: Column) -> str:
-    return column.comparison.called if column.comparison else column.name
-
-
-def _before_after(before: Column, after: Column, rows: pd.DataFrame) -> Chart:
-    title = after.heading.replace(" after", "").capitalize()
-    frame = rows[["outcome", "experiment", before.name, after.name]].assign(row=range(len(rows)))
-    return Chart(
-        after.name, frame, [before], [after], "points", title, series="outcome", panel="experiment", styles=STYLES,
-        text="Points above the diagonal are larger after.",
-    )  # fmt: skip
+    shown = Views([Table("rules", rules, [text("remark")], "How cells are judged", page=True)], headline=summary(table))
+    data = cells_data(cells, [text("outcome"), text("experiment"), *columns])
+    return "".join(blocks(comparison.title, "Did something get worse?", shown, data))

@@ -6,8 +6,6 @@ import io
 import subprocess
 import tarfile
 import tempfile
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,9 +19,7 @@ from bench.run.rows import read_parquet, read_record, valid_rows
 
 STANDARD = "standard"
 """The folder of committed results inside the results folder."""
-CELLS = {*IDENTITY, "status"}
-"""Columns of every table with one row per cell, including tables of older versions."""
-NEEDED = {*CELLS, "key", "study", "parameters"}
+NEEDED = {*IDENTITY, "status", "key", "study", "parameters"}
 """Columns that a comparison needs."""
 BUSY = 1.5
 """Load per core above which a machine counts as busy."""
@@ -38,8 +34,6 @@ class Results:
     machine: str = ""
     busy: str = ""
     """The machine's load, if it was more than BUSY per core."""
-    n_outdated: int = 0
-    """Number of omitted rows, which an older version wrote without their parameters."""
 
     @property
     def columns(self) -> Columns:
@@ -55,21 +49,19 @@ def columns_of(study: str) -> Columns:
     return plugin.columns
 
 
-@contextmanager
-def open_results(name: str) -> Iterator[dict[str, Results]]:
-    """Open the results in a directory, or in ``results`` (``REV``) or a path (``REV:PATH``) of a git revision.
+def read_results(name: str) -> dict[str, Results]:
+    """Return the results in a directory, or in ``results`` (``REV``) or a path (``REV:PATH``) of a git revision.
 
     Results in a folder ``standard`` are read only if there are no others. Raises :class:`UserError` if the name is
     neither a directory nor a revision, or if there are no results.
     """
     directory = Path(name).expanduser()
     if directory.is_dir():
-        yield _read_all(directory, name)
-        return
+        return _read_all(directory, name)
     with tempfile.TemporaryDirectory() as temporary:
         revision, _, path = name.partition(":")
         _extract(name, revision, path or "results", Path(temporary))
-        yield _read_all(Path(temporary), name)
+        return _read_all(Path(temporary), name)
 
 
 def _extract(name: str, revision: str, path: str, target: Path) -> None:
@@ -96,83 +88,38 @@ def _extract(name: str, revision: str, path: str, target: Path) -> None:
 
 
 def _read_all(directory: Path, name: str) -> dict[str, Results]:
-    """Return the results of every experiment with stored rows or a CSV table of rows in a directory or below it."""
-    folders = sorted({path.parent for path in directory.rglob("*") if path.suffix in (".parquet", ".csv")})
+    """Return the results of every experiment with stored rows in a directory or below it."""
+    folders = sorted(path.parent for path in directory.rglob("rows.parquet"))
     own = [folder for folder in folders if STANDARD not in folder.relative_to(directory).parts]
-    results = _read_folders(own, name) or _read_folders(folders, name)
-    if not results:
-        raise UserError(f"'{name}' has no results: no rows.parquet and no table (.csv) with a row per cell")
-    return results
-
-
-def _read_folders(folders: Sequence[Path], name: str) -> dict[str, Results]:
     results: dict[str, Results] = {}
-    for folder in folders:
-        rows = _read_rows(folder)
-        if rows is None:
-            continue
-        label = str(rows["experiment"].iloc[0]) if "experiment" in rows else folder.name
+    for folder in own or folders:
+        label, read = _read(folder)
         if label in results:
             raise UserError(f"'{name}' has results of '{label}' in more than one directory: name one of them")
-        results[label] = _validate(rows, folder, label, name)
+        results[label] = read
+    if not results:
+        raise UserError(f"'{name}' has no results: no rows.parquet")
     return results
 
 
-def _validate(rows: pd.DataFrame, folder: Path, label: str, name: str) -> Results:
-    """Return the rows that store their study and parameters, with the column types of their study."""
-    if not set(rows) >= NEEDED or not (complete := _stores_identity(rows)).any():
-        raise UserError(
-            f"the results of '{label}' in '{name}' were made by an older version, which did not store the parameters of each "
-            "cell: run the experiment again to compare it"
-        )
-    rows = rows[complete]
+def _read(folder: Path) -> tuple[str, Results]:
+    """Return the name and the results of the experiment in a folder, with the column types of its study."""
+    path = folder / "rows.parquet"
+    try:
+        rows = read_parquet(path)
+    except Exception as error:
+        raise UserError(f"'{path}' cannot be read as Parquet ({error})") from None
+    if not set(rows) >= NEEDED or not rows[["study", "parameters"]].map(
+        lambda text: bool(text) and isinstance(text, str)
+    ).all(axis=None):
+        raise UserError(f"rows in '{path}' have no parameters: run the experiment again to compare it")
     studies = list(rows["study"].unique())
-    if len(studies) > 1:
-        raise UserError(f"the results of '{label}' in '{name}' are of several studies ({', '.join(studies)})")
+    if len(studies) != 1:
+        raise UserError(f"the rows in '{path}' are of {len(studies)} studies ({', '.join(studies)})")
     columns = columns_of(studies[0])
-    typed = _one_per_cell(columns.typed(rows).reset_index(drop=True), columns)
-    return Results(typed, studies[0], *_read_machine(folder), n_outdated=int((~complete).sum()))
-
-
-def _one_per_cell(rows: pd.DataFrame, columns: Columns) -> pd.DataFrame:
-    """Return the last row of each key, or the one with the worst verdict if a cell has several lines, one per check."""
-    for column in columns.compared:
-        if column.comparison and column.comparison.by == "verdict":
-            rank = {verdict: -place for place, verdict in enumerate(column.comparison.order)}
-            rows = rows.iloc[
-                rows[column.name].map(lambda verdict, rank=rank: rank.get(verdict, 1)).argsort(kind="stable")
-            ]
-    return rows.drop_duplicates("key", keep="last").sort_index().reset_index(drop=True)
-
-
-def _stores_identity(rows: pd.DataFrame) -> pd.Series:
-    return rows[["study", "parameters"]].map(lambda text: isinstance(text, str) and bool(text)).all(axis=1)
-
-
-def _read_rows(folder: Path) -> pd.DataFrame | None:
-    """Return the rows of a folder: of ``rows.parquet``, else of a CSV table with every value as a string, else None."""
-    stored = folder / "rows.parquet"
-    if stored.exists():
-        try:
-            rows = read_parquet(stored)
-        except Exception as error:
-            raise UserError(f"'{stored}' cannot be read as Parquet ({error})") from None
-        name = str(rows["study"].iloc[0]) if len(rows) and "study" in rows else ""
-        entry = registry.entries()["studies"].get(name)
-        is_study = entry is not None and entry.plugin is not None and issubclass(entry.plugin, Study)
-        rows = valid_rows(rows, columns_of(name) if is_study else Columns.of(), stored)
-        return rows if len(rows) else None
-    older = None
-    for path in sorted(folder.glob("*.csv")):
-        try:
-            table = pd.read_csv(path, dtype=str, keep_default_na=False)
-        except (ValueError, UnicodeDecodeError):
-            continue
-        if len(table) and set(table) >= NEEDED:
-            return table
-        if len(table) and set(table) >= CELLS:
-            older = table
-    return older
+    rows = columns.typed(valid_rows(rows, columns, path)).reset_index(drop=True)
+    label = str(rows["experiment"].iloc[0]) if "experiment" in rows and len(rows) else folder.name
+    return label, Results(rows, studies[0], *_read_machine(folder))
 
 
 def _read_machine(folder: Path) -> tuple[str, str]:
@@ -182,5 +129,5 @@ def _read_machine(folder: Path) -> tuple[str, str]:
         name = f"{machine['processor']}, {machine['cores']} cores, {machine['system']}"
         load = (machine["load_average"] or [0.0])[0]
         return name, f"load {load:.1f}" if load > BUSY * machine["cores"] else ""
-    except (OSError, ValueError, KeyError, TypeError):
+    except (KeyError, TypeError):
         return "", ""

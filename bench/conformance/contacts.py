@@ -28,8 +28,8 @@ class _Tower(ContactScene):
     """Two masses, one above the other, over a floor: two contacts that share a body."""
 
     name = "conformance_tower"
-    n_q: ClassVar[int] = 2
-    n_contacts: ClassVar[int] = 2
+    n_q = 2
+    n_contacts = 2
     masses: ClassVar[tuple[float, float]] = (0.5, 2.0)
 
     def theta0(self) -> np.ndarray:

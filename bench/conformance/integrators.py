@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -30,8 +30,8 @@ class _Swing(DampedScene):
     """The motion q'' = -4 sin q - 0.2 v + u from (q, v) = (1, 0.5), smooth and without a closed form."""
 
     name = "conformance_swing"
-    n_q: ClassVar[int] = 1
-    n_u: ClassVar[int] = 1
+    n_q = 1
+    n_u = 1
 
     stiffness: float = param(4.0, "restoring acceleration at a right angle", "rad/s^2")
     friction: float = param(0.2, "deceleration per velocity", "1/s")
@@ -63,7 +63,7 @@ class _Kick(ImpulseLaw):
 class _Kicked(_Swing, ContactScene):
     """The motion of :class:`_Swing`, with a contact."""
 
-    n_contacts: ClassVar[int] = 1
+    n_contacts = 1
 
     def gap(self, xp: Any, q: Array) -> Array:
         return q
@@ -80,8 +80,8 @@ class _Decay(MechanicalScene):
     """The motion v' = rate v, without positions."""
 
     name = "conformance_decay"
-    n_q: ClassVar[int] = 0
-    n_v: ClassVar[int | None] = 1
+    n_q = 0
+    n_v = 1
 
     rate: float = param(-1.0, "growth rate", "1/s")
 

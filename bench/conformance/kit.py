@@ -166,7 +166,7 @@ def parametrize(plugins: Iterable[type[Plugin]], expected_failures: Mapping[str,
     """Return a ``pytest.mark.parametrize`` over (plugin, check) pairs: one per check of each variant of the plugins.
 
     ``expected_failures`` maps the name of a check, or the id of one test (``variant-check``), to the reason of the
-    failure. If such a check passes, the test fails. Plugins whose required modules are not installed are skipped::
+    failure. If such a check passes, the test fails. A plugin whose required modules are not installed is one skipped test::
 
         @bench.conformance.parametrize([MyEstimator], expected_failures={
             "bias_is_as_declared": "biased below 4 samples, see #12"})
@@ -184,11 +184,14 @@ def parametrize(plugins: Iterable[type[Plugin]], expected_failures: Mapping[str,
         for name, subject, function in _items(plugin_class):
             title = f"{name}-{function.__name__}"
             names |= {title, function.__name__}
-            marks: list[Any] = [pytest.mark.skip(reason="; ".join(missing))] if missing else []
+            if missing:
+                continue
             reason = reasons.get(title, reasons.get(function.__name__))
-            if reason is not None:
-                marks.append(pytest.mark.xfail(reason=reason, strict=True))
+            marks = [] if reason is None else [pytest.mark.xfail(reason=reason, strict=True)]
             items.append(pytest.param(subject, partial(_run, function, name), id=title, marks=marks))
+        if missing:
+            skipped = pytest.mark.skip(reason="; ".join(missing))
+            items.append(pytest.param(plugin_class, None, id=plugin_class.name, marks=[skipped]))
     for name in reasons:
         if name not in names:
             raise unknown("check in expected_failures:", name, names)

@@ -160,14 +160,14 @@ def continuity_is_as_declared(scene: Scene) -> str:
     The lines run through theta0, and for a continuous scene also 6 sigma away from it. The contact law is continuous.
     """
     subjects = [p for p in programs(scene) if p.contact is None or p.contact.continuous]
-    runs = [p for p in subjects if plain_backend().incompatibility(p) is None] or subjects
+    runs = [p for p in subjects if plain_backend().refusal(p) is None] or subjects
     if not runs:
         raise Skipped("no continuous contact law is available")
     jump = largest_jump(runs[0], lines=2)
     if scene.continuous:
         require(
             not jump,
-            f"is continuous unless it declares `continuous: ClassVar[bool] = False`, but jumps by {jump:.1e} of its range under "
+            f"is continuous unless it declares `continuous = False`, but jumps by {jump:.1e} of its range under "
             f"{describe(runs[0])}",
         )
         jump = max(largest_jump(runs[0], offset=side * ELSEWHERE) for side in (1, -1))
@@ -230,7 +230,7 @@ def score_gives_the_gradient(scene: Scene) -> str:
     """
     if isinstance(scene, MechanicalScene):
         scene = dataclasses.replace(scene, horizon=min(scene.horizon, SCORED_STEPS))
-    runs = [p for p in programs(scene) if p.continuous and plain_backend().incompatibility(p) is None]
+    runs = [p for p in programs(scene) if p.continuous and plain_backend().refusal(p) is None]
     if not runs:
         raise Skipped("no continuous program runs on the plain backend")
     program = runs[0]

@@ -89,7 +89,7 @@ def backends() -> list[Backend]:
 def can_run(backend: Backend, program: Program) -> bool:
     """Return whether the backend can run the program; False if its answer is an error, which fails its own checks."""
     with contextlib.suppress(Exception):
-        return backend.incompatibility(program) is None
+        return backend.refusal(program) is None
     return False
 
 
@@ -161,7 +161,7 @@ def all_programs() -> tuple[Program, ...]:
 
 def _is_sound(program: Program) -> bool:
     """Return whether the plain backend computes finite costs or cannot run the program."""
-    if plain_backend().incompatibility(program) is not None:
+    if plain_backend().refusal(program) is not None:
         return True
     try:
         return bool(np.isfinite(plain_backend().compile(program).value(*samples(program))).all())

@@ -33,6 +33,8 @@ class EngineBackend(Backend):
     """Distributions that the engine needs. Rows have their versions."""
     laws: ClassVar[tuple[str, ...]] = ("penalty",)
     """Names of the contact laws that the engine's contacts stand for."""
+    damping_mode: ClassVar[str | None] = None
+    """The law's ``damping_mode`` that the engine's damper stands for; empty: no damper; None: any."""
     integrator: ClassVar[str] = "semi_implicit_euler"
     """Name of the integrator that the engine's step stands for."""
 
@@ -45,6 +47,7 @@ class EngineBackend(Backend):
     has_friction: ClassVar[bool] = False
     """Whether it runs contacts with friction."""
 
+    dtype: str = param("float64", "floating-point type of the simulation", choices=("float64",))
     python: str | None = param(
         None, "Python of the engine's environment; null: the one that `bench engines install` makes"
     )
@@ -71,20 +74,10 @@ class EngineBackend(Backend):
 
     def unsupported_reason(self, program: Program) -> str | None:
         """Return why the engine cannot run the program, or None."""
-        scene, law = program.scene, program.contact
-        if not isinstance(scene, EngineTwin) or not isinstance(scene, MechanicalScene):
-            return f"scene {scene.name} has no MJCF twin"
-        if program.decision.names:
-            return (
-                f"{self.name} does not differentiate by parameters of its model: theta={list(program.decision.names)}"
-            )
-        if program.integrator is None or program.integrator.name != self.integrator:
-            name = program.integrator.name if program.integrator else "none"
-            return f"{self.name} uses its own integrator, which replaces {self.integrator}, not {name}"
-        if law is not None and law.name not in self.laws:
-            return f"{self.name} uses its own contact model, which replaces {' and '.join(self.laws)}, not {law.name}"
+        if reason := unsupported_model(self.name, program, "", self.integrator, self.laws, self.damping_mode):
+            return reason
         try:
-            model = twin.read(scene.mjcf())
+            model = twin.read(program.scene.mjcf())  # type: ignore[attr-defined]
             if not self.has_friction and any(contact["friction"] for contact in model["contacts"]):
                 return f"{self.name} runs contacts without friction only"
             return self.unsupported_twin(program, model)
@@ -116,3 +109,27 @@ class EngineBackend(Backend):
     def requirements(cls) -> Path:
         """Return the file of the engine's requirements, beside the engine's file."""
         return cls.files()[0].with_suffix(".txt")
+
+
+def unsupported_model(
+    name: str, program: Program, own: str, integrator: str, laws: tuple[str, ...], damping_mode: str | None
+) -> str | None:
+    """Return why the engine ``name`` has no model of a program, or None.
+
+    Its integrator ``own`` replaces ``integrator``, its contacts replace ``laws`` with dampers of ``damping_mode``.
+    """
+    scene, law, step = program.scene, program.contact, program.integrator
+    if not isinstance(scene, EngineTwin) or not isinstance(scene, MechanicalScene):
+        return f"scene {scene.name} has no MJCF twin"
+    if program.decision.names:
+        return f"{name} does not differentiate by parameters of its model: theta={list(program.decision.names)}"
+    if step is None or step.name != integrator:
+        return f"{name} uses its own integrator{own}, which replaces {integrator}, not {step.name if step else 'none'}"
+    if law is None:
+        return None
+    if law.name not in laws:
+        return f"{name} uses its own contact model, which replaces {' and '.join(laws)}, not {law.name}"
+    mode = getattr(law, "damping_mode", "")
+    if damping_mode is None or mode == damping_mode or not getattr(law, "damping", 0.0):
+        return None
+    return f"{name} supports {f'damping_mode={damping_mode}' if damping_mode else 'no damping'} only, not {mode}"

@@ -1,4 +1,4 @@
-"""Comparisons that explain a wrong gradient: other costs, other gradients, other numbers of steps, and long lines."""
+"""Comparisons that explain a wrong gradient: a refined cost, other numbers of steps, and long lines."""
 
 from __future__ import annotations
 
@@ -38,8 +38,6 @@ AROUND = 0.05
 """Distance of these thetas, in units of each input's scale."""
 LONGER = 10.0
 """Length of the line on which more jumps are searched, in multiples of the first line."""
-THETAS = 4
-"""Number of other thetas at which two costs are compared."""
 GROWTH = 1.5
 """Least ratio of errors at the largest and at the first wrong number of steps that counts as growth."""
 
@@ -53,38 +51,6 @@ class Horizon:
     """Largest |gradient - difference|, relative to the largest difference, in units of each input's scale."""
     uncertainty: float
     """The error of the differences, relative to the largest."""
-
-
-def compare_costs(stages: GradientStages, twin: Callable[..., Any]) -> float:
-    """Return the largest relative difference between the cost and its twin, at theta and at thetas around it."""
-    other = _simulator(stages, twin, None)
-    random = np.random.default_rng([stages.seed, 0x7477696E])
-    thetas = stages.theta[:, None] + 1e-2 * stages.scale[:, None] * np.c_[
-        np.zeros(stages.theta.size), random.standard_normal((stages.theta.size, THETAS))
-    ]  # fmt: skip
-    a, b = stages.costs(thetas), other.costs(thetas, stages.same_noise(thetas.shape[1]))
-    size = np.maximum(np.abs(a), np.abs(b)).max()
-    return float(np.abs(a - b).max() / size) if size > 0 else 0.0
-
-
-def compare_gradients(stages: GradientStages, twin_grad: Any) -> tuple[float, float]:
-    """Return the relative errors of the gradient and of a second one, both against the checked differences."""
-    simulator = stages.simulator
-    other = Simulator(simulator._cost, stages.layout, twin_grad, simulator.noise, simulator.batch, stages.clock)
-    second = other.gradients(stages.theta[:, None], stages.w)[:, 0]
-    assert stages.gradient is not None
-    space = choose(stages.layout, stages.scale, stages.gradient, stages.seed)
-    if stages.check is None:
-        return float("nan"), float("nan")
-    by_name = {part.name: part for part in stages.check.parts}
-    names = [f"component {i}" for i in space.components] + [group.name for group in space.groups]
-    parts = [by_name.get(name) for name in names]
-    differences = np.array([np.nan if part is None else part.difference for part in parts]) * space.scale
-    own, others = space.project(stages.gradient) * space.scale, space.project(second) * space.scale
-    size, own_error, other_error = (
-        np.nanmax(np.abs(values), initial=0.0) for values in (differences, own - differences, others - differences)
-    )
-    return float(own_error / size), float(other_error / size)
 
 
 @dataclass(frozen=True)
@@ -107,10 +73,6 @@ class Explanation:
     """The place of a loop whose length depends on theta, as ``ode.py:17``; empty without one, None: not searched."""
     is_unexplained: bool = False
     """Whether the error is so small that adaptive steps may explain it, and the budget ended before that was known."""
-    twin: float | None = None
-    """Largest relative difference between the cost and its twin."""
-    twin_error: tuple[float, float] | None = None
-    """Relative errors of the gradient and of the second gradient."""
     gaps: Sequence[Gap] = ()
     """At theta and at others: how far gradient and cost are from the refined cost; empty without a refined cost."""
     growth: Sequence[Horizon] = ()

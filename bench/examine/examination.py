@@ -65,8 +65,6 @@ def examine(
     atol: Any = 0.0,
     allow_zero: bool | str | Sequence[str] | None = None,
     expect: str = "",
-    twin: Callable[..., Any] | None = None,
-    twin_grad: str | Callable[..., Any] | None = None,
     refined: Callable[..., Any] | None = None,
     horizons: Sequence[int] = (),
 ) -> Report:
@@ -91,7 +89,6 @@ def examine(
     numbers. ``allow_zero`` names the inputs that may have no effect (True: all; False: none; by default they cause a
     warning). ``expect`` is a known cause, such as ``"kink"``, with which the report passes; a wrong gradient never does.
 
-    ``twin`` is a second cost that must agree, and ``twin_grad`` a second gradient, such as one with a tape per step.
     ``refined`` is the cost at a tighter tolerance or finer step. ``horizons`` are numbers of steps T at which
     ``cost(theta, steps=T)`` and its gradient are compared, which shows an error that grows with T.
 
@@ -121,7 +118,7 @@ def examine(
     if expect and expect not in RULES:
         raise unknown("expect", expect, RULES)
     named = {"name": name or _function_name(cost), "gradient": _function_name(grad), "expect": expect}
-    cost, grad, twin, twin_grad, refined = map(_with_own_warnings, (cost, grad, twin, twin_grad, refined))
+    cost, grad, refined = map(_with_own_warnings, (cost, grad, refined))
     clock.start_stage("first call")
     # a cost of huge or infinite numbers overflows in the differences too, where a warning would tell nothing
     with end_on_sigterm(clock), np.errstate(all="ignore"):
@@ -133,7 +130,7 @@ def examine(
             raise UserError(f"{took}: give a larger compile_budget or a shorter rollout") from None
         examination = _Examination(simulator, setup, clock)
         try:
-            return examination.run(named, twin, twin_grad, refined)
+            return examination.run(named, refined)
         finally:
             clock.clear_progress()
 
@@ -231,7 +228,7 @@ class _Examination:
         w = random.standard_normal((simulator.noise, 1)) if simulator.noise else None
         self.stages = GradientStages(simulator, setup.scale, clock, setup.seed, w, random)
 
-    def run(self, named: Mapping[str, Any], twin: Any, twin_grad: Any, refined: Any) -> Report:
+    def run(self, named: Mapping[str, Any], refined: Any) -> Report:
         """Run the checks that the budget allows, the decisive ones first, and return the report."""
         simulator, clock, stages, setup, explained = self.simulator, self.clock, self.stages, self.setup, self.explained
         stages.run(self._is_adaptive)
@@ -239,15 +236,10 @@ class _Examination:
         checked = stages.check
         is_wrong = checked is not None and checked.cause in SUSPICIOUS
         has_gradient = stages.gradient is not None
-        comparisons: tuple[tuple[str, str, Any, Any], ...] = (
-            ("twin", "comparison with the twin", diagnosis.compare_costs, twin),
-            ("twin_error", "comparison with the twin's gradient", diagnosis.compare_gradients, twin_grad if has_gradient else None),
-            ("gaps", "the refined cost", diagnosis.refined_gaps, refined if is_wrong and has_gradient else None),
-            ("growth", "horizons", diagnosis.errors_by_horizon, setup.horizons or None),
-        )  # fmt: skip
-        for name, what, function, given in comparisons:
-            if given is not None:
-                self._explain(name, what, partial(function, stages, given))
+        if refined is not None and is_wrong and has_gradient:
+            self._explain("gaps", "the refined cost", lambda: diagnosis.refined_gaps(stages, refined))
+        if setup.horizons:
+            self._explain("growth", "horizons", lambda: diagnosis.errors_by_horizon(stages, setup.horizons))
         can_go_on = not (stages.gradient is None and simulator.has_gradient) and not stages.is_failed
         if checked is not None and is_wrong and can_go_on and explained.is_adaptive is None:
             explained.is_adaptive = self._compare_along_lines(checked)

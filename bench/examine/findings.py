@@ -33,8 +33,6 @@ DEVIATIONS = 4.0
 """Standard deviations of the slope along a random direction that errors within the tolerance do not exceed."""
 SEEN_ALONE = 4.0
 """Multiple of a slope's error from which the error of one number shows along most random directions."""
-DIFFERENT = 1e-6
-"""Relative difference of two costs that must agree, in double precision."""
 AGREES = 0.5
 """Largest distance of a gradient that agrees with a refined cost, relative to that of the cost's own differences."""
 AS_FAR = 4.0
@@ -278,8 +276,6 @@ class Findings:
             return "raised"
         if check is None:
             return "undecided"
-        if explained.twin is not None and explained.twin > max(DIFFERENT, self.unit ** (2 / 3)):
-            return "twin"
         if not repeats.is_small and (repeats.spread > 0 or repeats.of_gradient > 0 or repeats.has_state):
             return "nondeterministic"
         if self.wrong_checks:
@@ -331,12 +327,8 @@ class Findings:
 
     @property
     def is_overwritten(self) -> bool:
-        """Whether another gradient is right where this one is wrong, or its error grows with the number of steps."""
-        rtol = float(self.setup.rtol.max())
-        if self.explained.twin_error is not None:
-            own, other = self.explained.twin_error
-            return other <= max(rtol, 0.01 * own)
-        return grows(self.explained.growth, max(rtol, 1e-3))
+        """Whether the gradient's error grows with the number of steps."""
+        return grows(self.explained.growth, max(float(self.setup.rtol.max()), 1e-3))
 
     @property
     def derivative(self) -> str:

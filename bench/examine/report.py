@@ -8,11 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
 from bench.errors import UserError, local_path, unknown
-from bench.examine import ci, text
+from bench.examine import baseline, text
 from bench.examine.findings import Findings
 
 if TYPE_CHECKING:
-    import pandas as pd
     from matplotlib.figure import Figure
 
 
@@ -37,21 +36,17 @@ class Report(Findings):
     def _repr_html_(self) -> str:
         return f"<p><b>{escape(self.name)}: {escape(self.conclusion)}</b></p><pre>{escape(str(self))}</pre>"
 
-    def to_frame(self) -> pd.DataFrame:
-        """Return one row per checked derivative, as :attr:`frame`."""
-        return self.frame
-
     def plot(self, chart: str = "") -> Figure:
         """Return a chart of the page: ``steps``, ``lines`` or ``sigmas``, by default the first for which there is data.
 
         Raises :class:`bench.UserError` for a chart without data.
         """
-        from bench.examine import page
+        from bench.examine import files
         from bench.report.displays import displayable
         from bench.report.draw import draw
         from bench.report.figures import styled
 
-        figures = {one.name: one for one in page.charts(self)}
+        figures = {one.name: one for one in files.charts(self)}
         if not figures:
             raise UserError("this examination has no data for a chart: give a gradient, sigma or a larger budget")
         if chart and chart not in figures:
@@ -64,30 +59,22 @@ class Report(Findings):
         if self.status:
             raise AssertionError(f"{'; '.join(self.problems)}\n\n{self}")
 
-    def compared(self, baseline: str | Path) -> Self:
+    def compared(self, file: str | Path) -> Self:
         """Return the report compared with a baseline file, which is written if it does not exist.
 
         The compared report has status 0 where it is not worse than the baseline.
         """
-        path = local_path("baseline", baseline)
-        before = ci.read_baseline(path)
+        path = local_path("baseline", file)
+        before = baseline.read_baseline(path)
         if before is None:
-            ci.write_baseline(path, self)
+            baseline.write_baseline(path, self)
             return replace(self, changes=[f"none before, written to {path}"])
-        changes, is_worse = ci.differences(before, self)
+        changes, is_worse = baseline.differences(before, self)
         return replace(self, changes=changes or ["no change"], is_as_before=not is_worse)
 
-    def markdown(self) -> str:
-        """Return a summary in Markdown, as for a CI server's job summary."""
-        return ci.as_markdown([self])
-
-    def junit(self) -> str:
-        """Return JUnit XML with one test case."""
-        return ci.as_junit([self])
-
     def save(self, directory: str | Path) -> list[Path]:
-        """Write text, tables, charts and ``report.html`` into a directory, and return the paths of the files."""
+        """Write text, tables and charts into a directory, and return the paths of the files."""
         # importing charts and tables takes a second, which a report without files does not need
-        from bench.examine import page
+        from bench.examine import files
 
-        return page.write(self, local_path("save", directory))
+        return files.write(self, local_path("save", directory))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bench.measure.gradcheck import verdicts
-from bench.measure.gradcheck.verdicts import FOLLOW, Rule
+from bench.measure.gradcheck.verdicts import FOLLOW, STEPS, Rule
 
 SMOOTHING = "estimate the gradient from costs (smoothing)"
 RULES = verdicts.RULES | {
@@ -14,9 +14,8 @@ RULES = verdicts.RULES | {
     ),
     "overwritten": Rule(
         "fault", "memory is overwritten between forward and backward, or a term acts only later",
-        "use one tape per step, or arrays of its own for each step", ("twin_grad=GRADIENT",),
+        "use one tape per step, or arrays of its own for each step", STEPS,
     ),
-    "twin": Rule("fault", "the two costs that must agree differ"),
     "no_effect": Rule(
         "broken", "an input has no effect on the cost, and is not in allow_zero",
         "check that it reaches the simulator", ("allow_zero=NAME",),

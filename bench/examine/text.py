@@ -37,7 +37,7 @@ def problems(report: Findings) -> list[str]:
         return noise_problems(report)
     cause = report.derivative_cause
     found = [_sentence(cause, derivative_facts(report))]
-    if cause in ("nondeterministic", "twin"):  # they do not hide another fault
+    if cause == "nondeterministic":  # it does not hide another fault
         found += [
             _sentence(one.cause, check_facts(report, one))
             for one in report.wrong_checks[:1]
@@ -120,7 +120,6 @@ def derivative_facts(report: Findings) -> list[str]:
     repeats, explained, cause = report.repeats, report.explained, report.derivative_cause
     own = {
         "raised": [shortened(report.error)],
-        "twin": [f"by {number(100 * (explained.twin or 0.0))}% at theta or near it"],
         "nondeterministic": [
             "the cost depends on the call before it" if repeats.has_state else "",
             f"costs differ by {relative(report, repeats.spread)}" if repeats.spread else "",
@@ -143,8 +142,6 @@ def derivative_facts(report: Findings) -> list[str]:
     if explained.gaps and cause == "adaptive":
         here = explained.gaps[0]
         facts.append(f"from the refined cost {number(100 * here.gradient / (here.size or math.nan))}%")
-    if explained.twin_error is not None and cause == "overwritten":
-        facts.append(f"the second gradient is right to {number(100 * explained.twin_error[1])}%")
     return facts
 
 

@@ -57,7 +57,7 @@ def compile_problem(
         step = make("integrators", integrator) if isinstance(integrator, str) else integrator
     program = compose(given_scene, law, step, decision or Decision())
     engine: Backend = make("backends", backend)
-    if reason := engine.incompatibility(program):
+    if reason := engine.refusal(program):
         raise Unsupported(reason)
     problem = engine.compile(program)
     problem.provides = engine.provides

@@ -9,7 +9,7 @@ from collections.abc import Collection, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 from bench.errors import Unsupported, UserError, failure, printable
 from bench.experiment.experiment import Budget
@@ -33,9 +33,6 @@ from bench.model import (
 from bench.model.identity import described, label
 from bench.model.parameters import parameters, singular
 from bench.model.program import OWN
-
-if TYPE_CHECKING:
-    from bench.experiment.study import Study
 
 VIEWS = ("horizon", "dt", "sigma", "stiffness", "noise", "dtype", "smoothing")
 """Plugin parameters with their own columns, which are therefore omitted from identity strings."""
@@ -87,7 +84,7 @@ class Cell:
     samples: int
     repeats: int
     seed: int
-    study: Study
+    study: Plugin
     decision: Decision = OWN
     timing: bool = True
     """Whether the row records timings."""
@@ -248,19 +245,20 @@ class Cell:
 
     def program(self) -> Program:
         """Compose the program; raises :class:`Unsupported` if the parts do not fit together."""
-        return compose(self.scene, self.contact, self.integrator, self.study.decision(self.decision))
+        study = cast(Any, self.study)  # a Study, whose module imports this one
+        return compose(self.scene, self.contact, self.integrator, study.decision(self.decision))
 
     def refusal(self) -> tuple[str, str] | None:
         """Return status and reason if this cell cannot run, or None; an error raised by a plugin is a reason."""
         try:
-            return self._incompatibility()
+            return self._refusal()
         except KeyboardInterrupt:
             raise
         except BaseException as error:
             result = failure(error)
             return result["status"], result["reason"]
 
-    def _incompatibility(self) -> tuple[str, str] | None:
+    def _refusal(self) -> tuple[str, str] | None:
         """Return status and reason of the first plugin that is unavailable or does not fit the others, or None."""
         for part in self.parts.values():
             if part is not None:
@@ -274,10 +272,8 @@ class Cell:
         except (Unsupported, UserError) as error:  # another scene of the sweep may have this theta
             return "unsupported", printable(error)
         backend, estimator = self.backend, self.parts.get("estimator")
-        if reason := backend.incompatibility(program):
+        if reason := backend.refusal(program):
             return "unsupported", reason
-        if isinstance(estimator, Estimator) and (
-            reason := estimator.incompatibility(program, backend.provides, backend.name)
-        ):
+        if isinstance(estimator, Estimator) and (reason := estimator.refusal(program, backend.provides, backend.name)):
             return "unsupported", reason
         return None

@@ -8,7 +8,7 @@ import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from bench.errors import STATUSES, UserError, local_path, printable, unknown
 from bench.experiment.experiment import Budget, Choice, Execution, Experiment, TableLayout
@@ -16,8 +16,8 @@ from bench.experiment.grid import COUNTS, check_axes, parameter_name, refuse_too
 from bench.experiment.overrides import LISTS_AS, Values, check_file, quoted
 from bench.experiment.study import Study
 from bench.model import Decision, MechanicalScene, Plugin, guard, registry
-from bench.model.identity import parse_identity
-from bench.model.parameters import build, coerce, remember, singular
+from bench.model.identity import parse_identity, split_items
+from bench.model.parameters import build, coerce, parameters, remember, singular
 
 SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 RESERVED = ("claims", "references", "standard", "trace")
@@ -110,7 +110,6 @@ APPEARANCE = (
     "answer",
     "formats",
     "table",
-    "compile_time",
     "compile_cache",
     "plugins",
     "execution",
@@ -246,20 +245,14 @@ def _split(value: str) -> list[str]:
 def _quote_identities(value: str) -> str:
     """Return a list with its identity strings quoted: Hydra needs quotes around brackets, and a shell removes them."""
     inner = value[1:-1] if value.startswith("[") and value.endswith("]") else value
-    items, depth = [""], 0
-    for character in inner:
-        depth += (character == "[") - (character == "]")
-        if character == "," and depth == 0:
-            items.append("")
-        else:
-            items[-1] += character
-    if depth != 0:
+    if inner.count("[") != inner.count("]"):
         return value
-    names = [item.strip().strip("'\"") for item in items]
+    names = [item.strip().strip("'\"") for item in split_items(inner)]
     return "[" + ",".join(f"'{name}'" for name in names if name) + "]"
 
 
 FORMATS = ("png", "svg", "pdf")
+LAUNCHERS = ("local", "ray")
 DEFAULT_PLUGINS = {"optimizers": ["adam"]}
 """Plugins of kinds that are null in the configuration, unless the study has its own default."""
 
@@ -295,6 +288,10 @@ def experiment(config: Mapping[str, Any]) -> Experiment:
                 raise UserError(f"{axis}.{plugin}={given!r} names no parameter: write {axis}.{plugin}.parameter=value")
             if entry.plugin is not None:
                 build(entry.plugin, given)
+    if config["reference"] is None:
+        raise UserError(
+            "reference=null: the study decides whether there is one; reference.samples=... limits its samples"
+        )
     timing, sweep = config["timing"], _mapping(config, "sweep")
     refuse_too_many(sweep)
     return Experiment(
@@ -311,10 +308,9 @@ def experiment(config: Mapping[str, Any]) -> Experiment:
         question=str(config["question"] or ""),
         answer=str(config["answer"] or ""),
         marks=_mapping(config, "marks"),
-        compile_time=coerce(bool, config["compile_time"], "compile_time"),
         formats=tuple(_one_of("formats", item, FORMATS) for item in _as_list(config["formats"])),
         table=_table_layout(_mapping(config, "table", LAYOUT), sweep),
-        reference=_budget(_mapping(config, "reference", BUDGET)),
+        reference=cast(Budget, build(Budget, _mapping(config, "reference", parameters(Budget)))),
         compile_cache=_compile_cache(config["compile_cache"]),
         plugins=registry.folders(),
         **{key: _count(config, key) for key in COUNTS},
@@ -341,20 +337,6 @@ def _folder(value: Any) -> Path:
     if not isinstance(value, str | Path) or not str(value).strip():
         raise UserError(f"results_dir={value!r} must be a folder")
     return local_path("results_dir", value)
-
-
-BUDGET = ("samples", "tolerance")
-
-
-def _budget(settings: Mapping[str, Any]) -> Budget:
-    for key in BUDGET:
-        if key not in settings:
-            raise UserError(f"reference has no {key}: write reference.{key}=... to change only one of its settings")
-    samples = coerce(int, settings["samples"], "reference.samples")
-    tolerance = coerce(float, settings["tolerance"], "reference.tolerance")
-    if samples < 256 or not tolerance > 0:
-        raise UserError("reference.samples must be at least 256 and reference.tolerance greater than 0")
-    return Budget(samples, tolerance)
 
 
 ROWS = ("estimator", "backend")
@@ -397,6 +379,7 @@ def _execution(config: Mapping[str, Any]) -> Execution:
     workers = config["workers"]
     if workers is not None and coerce(int, workers, "workers") < 0:
         raise UserError(f"workers={workers} must be at least 0, or null for the number of cores")
+    launcher = _one_of("launcher", config["launcher"], LAUNCHERS)
     memory = _amount("memory", config["memory"], BYTES, "4g, 500m")
     return Execution(
         workers=None if workers is None else coerce(int, workers, "workers"),
@@ -406,8 +389,8 @@ def _execution(config: Mapping[str, Any]) -> Execution:
         ladder=coerce(bool, config["ladder"], "ladder"),
         versions=_one_of("versions", config["versions"], ("ignore", "warn", "rerun")),
         retry=tuple(_one_of("retry", status, STATUSES) for status in _as_list(config["retry"]) if status is not None),
-        launcher=_one_of("launcher", config["launcher"], tuple(CLUSTERS)),
-        cluster=_cluster(config, str(config["launcher"])),
+        launcher=launcher,
+        cluster={} if launcher == "local" else _mapping(config, launcher),
         shard=_shard(config),
     )
 
@@ -423,33 +406,6 @@ def _shard(config: Mapping[str, Any]) -> tuple[int, int] | None:
     if config["ladder"]:
         raise UserError("ladder=true needs the rows of all scenes, and shard= runs some: leave one of them out")
     return int(number), int(count)
-
-
-CLUSTERS: dict[str, dict[str, tuple[type, bool]]] = {
-    "local": {},
-    "ray": {"address": (str, True), "cells": (int, False), "cpus": (float, False), "wait": (float, False)},
-}
-"""Settings by launcher: the type of each, and whether it may be null."""
-
-
-def _cluster(config: Mapping[str, Any], launcher: str) -> dict[str, Any]:
-    """Return the settings of the chosen launcher, after validating the settings of all launchers."""
-    settings: dict[str, dict[str, Any]] = {name: {} for name in CLUSTERS}
-    for name, types in CLUSTERS.items():
-        given = _mapping(config, name, types) if types else {}
-        for key, (kind, may_be_null) in types.items():
-            value = given.get(key)
-            settings[name][key] = None if value is None and may_be_null else coerce(kind, value, f"{name}.{key}")
-            number = settings[name][key]
-            if kind is not str and number is not None and not number >= 1:
-                raise UserError(f"{name}.{key}={value} must be at least 1")
-    n_cores, ray = os.cpu_count() or 1, settings["ray"]
-    if launcher == "ray" and not (ray["address"] or os.environ.get("RAY_ADDRESS")) and ray["cpus"] > n_cores:
-        raise UserError(
-            f"ray.cpus={ray['cpus']:g} is more than the {n_cores} cores of this machine, on which a cluster is started without "
-            "ray.address"
-        )
-    return settings[launcher]
 
 
 def _one_of(key: str, value: Any, allowed: Sequence[str]) -> str:

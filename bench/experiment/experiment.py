@@ -6,12 +6,12 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from bench.experiment.columns import Columns
 from bench.model import Decision, registry
 from bench.model.identity import described, identity
-from bench.model.parameters import Plugin
+from bench.model.parameters import Plugin, param
 from bench.model.program import OWN
 from bench.model.registry import Entry
 
@@ -48,19 +48,20 @@ class Execution:
     launcher: str = "local"
     """Where cells run: ``local`` or ``ray``."""
     cluster: Mapping[str, Any] = field(default_factory=dict)
-    """Settings of the launcher."""
+    """Settings of the launcher, which validates them."""
     shard: tuple[int, int] | None = None
     """Number, from 1, and count of the parts of which this run is one; None for all cells."""
 
 
 @dataclass(frozen=True)
-class Budget:
-    """The budget of a reference gradient."""
+class Budget(Plugin):
+    """The budget of a reference gradient, the settings ``reference.*``."""
 
-    samples: int = 1 << 18
-    """Largest number of samples."""
-    tolerance: float = 0.005
-    """Standard error, relative to the gradient, at which sampling stops."""
+    kind: ClassVar[str] = "settings"
+    name: ClassVar[str] = "reference"
+
+    samples: int = param(1 << 18, "largest number of samples", low=256)
+    tolerance: float = param(0.005, "standard error, relative to the gradient, at which sampling stops", positive=True)
 
 
 @dataclass(frozen=True)
@@ -100,8 +101,6 @@ class Experiment:
     """What a person concludes, with references to tables (:mod:`bench.report.answer`); empty if its settings were changed."""
     marks: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     """Named values by axis, drawn as lines in the charts."""
-    compile_time: bool = False
-    """Whether charts of error against time include the compile time."""
     formats: tuple[str, ...] = ("png",)
     """File formats of the charts."""
     table: TableLayout = TableLayout()
@@ -136,7 +135,7 @@ class Experiment:
             "also": [other.record() for other in self.also],
             "theta": list(self.decision.names),
             "theta0": None if self.decision.at is None else list(self.decision.at),
-            **{name: getattr(self, name) for name in ("samples", "repeats", "seed", "timing", "marks", "compile_time")},
+            **{name: getattr(self, name) for name in ("samples", "repeats", "seed", "timing", "marks")},
             "formats": list(self.formats),
             "table": dataclasses.asdict(self.table),
             "reference": dataclasses.asdict(self.reference),

@@ -20,7 +20,6 @@ MAX_CELLS = 1_000_000
 """Largest number of cells in a sweep; planning that many takes minutes."""
 COUNTS = ("samples", "repeats", "seed")
 """Settings that a sweep can vary besides plugin parameters and :data:`THETA`."""
-NOT_A_UNION = "sweep.union must be a list of sweeps"
 THETA = "theta0"
 """The axis of the point at which gradients are taken: ``theta0``, or ``theta0.2`` for one of its coordinates."""
 
@@ -80,28 +79,11 @@ def _check_theta(cells: Sequence[Cell]) -> None:
 
 def refuse_too_many(sweep: Mapping[str, Any], cells_per_point: int = 1) -> None:
     """Raise :class:`UserError` for a sweep of more than :data:`MAX_CELLS` cells."""
-    size = _size(sweep) * cells_per_point
+    size = math.prod(map(len, _factors(sweep))) * cells_per_point
     if size > MAX_CELLS:
         raise UserError(
             f"the sweep has {size} cells, and more than {MAX_CELLS} are not allowed: give it fewer values, or split it"
         )
-
-
-def _size(sweep: Mapping[str, Any]) -> int:
-    """Return the number of points of a sweep without expanding it."""
-    size = 1
-    for axis, value in sweep.items():
-        if axis == "product":
-            size *= _size(_mapping(value, "sweep.product"))
-        elif axis == "zip":
-            size *= max((len(_values(n, v)) for n, v in _flat(_mapping(value, "sweep.zip")).items()), default=1)
-        elif axis == "union":
-            size *= (
-                sum(_size(_mapping(part, "sweep.union")) for part in value) if isinstance(value, list | tuple) else 1
-            )
-        else:
-            size *= math.prod(len(_values(name, values)) for name, values in _flat({axis: value}).items())
-    return size
 
 
 def expand(sweep: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -114,20 +96,28 @@ def expand(sweep: Mapping[str, Any]) -> list[dict[str, Any]]:
     >>> expand({"union": [{"a": [1]}, {"b": [2]}]})
     [{'a': 1}, {'b': 2}]
     """
+    return [_join(combo) for combo in itertools.product(*_factors(sweep))]
+
+
+def _factors(sweep: Mapping[str, Any]) -> list[list[dict[str, Any]]]:
+    """Return the lists of points whose product is the sweep."""
     factors: list[list[dict[str, Any]]] = []
     for axis, value in sweep.items():
         if axis == "product":
-            factors.append(expand(_mapping(value, "sweep.product")))
+            factors += _factors(_mapping(value, "sweep.product"))
         elif axis == "zip":
             columns = _zipped(value)
             factors.append([dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)])
         elif axis == "union":
             if not isinstance(value, list | tuple):
-                raise UserError(NOT_A_UNION)
-            factors.append([point for part in value for point in expand(_mapping(part, "sweep.union"))])
+                raise UserError("sweep.union must be a list of sweeps")
+            parts = [_mapping(part, "sweep.union") for part in value]
+            for part in parts:
+                refuse_too_many(part)
+            factors.append([point for part in parts for point in expand(part)])
         else:
             factors.extend([{name: v} for v in _values(name, vs)] for name, vs in _flat({axis: value}).items())
-    return [_join(combo) for combo in itertools.product(*factors)]
+    return factors
 
 
 def _zipped(value: Any) -> dict[str, list[Any]]:
@@ -154,20 +144,7 @@ def swept(sweep: Mapping[str, Any]) -> list[str]:
     >>> swept({"a": [1, 2], "union": [{"b": [1]}, {"zip": {"a": [1], "c": [2]}}]})
     ['a', 'b', 'c']
     """
-    names: list[str] = []
-    for axis, value in sweep.items():
-        if axis == "product":
-            names += swept(_mapping(value, "sweep.product"))
-        elif axis == "union" and isinstance(value, list | tuple):
-            names += [name for part in value for name in swept(_mapping(part, "sweep.union"))]
-        elif axis == "union":
-            raise UserError(NOT_A_UNION)
-        elif axis == "zip":
-            names += _zipped(value)
-        else:
-            flat = _flat({axis: value})
-            names += [name for name in flat if _values(name, flat[name])]
-    return list(dict.fromkeys(names))
+    return list(dict.fromkeys(name for factor in _factors(sweep) for point in factor for name in point))
 
 
 def _mapping(value: Any, where: str) -> Mapping[str, Any]:

@@ -19,11 +19,11 @@ def capable_backends(program: Program, for_references: bool = False) -> list[Bac
             continue
         if (
             for_references and entry.plugin.reference_rank is None
-        ):  # checked first, since `incompatibility` may have to trace the program
+        ):  # checked first, since `refusal` may have to trace the program
             continue
         with suppress(Exception):  # a backend that fails here cannot run the program
             backend = _default(entry.plugin)
-            if backend.incompatibility(program) is None and backend.unavailable_reason() is None:
+            if backend.refusal(program) is None and backend.unavailable_reason() is None:
                 backends.append(backend)
     return sorted(backends, key=lambda backend: backend.reference_rank or 0) if for_references else backends
 

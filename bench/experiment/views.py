@@ -90,8 +90,6 @@ class Chart:
     join: bool = False
     failed: str = ""
     """The column that is true where a point has no value: a cross at the upper edge."""
-    labels: Literal["ends", "legend"] = "legend"
-    """Where series are named: at the ends of their lines, or in a legend."""
     across: int = 4
     """Most panels side by side."""
     height: float = 2.3

@@ -3,9 +3,8 @@
 Intervals are at 95%.
 
 Sources: Wilson 1927 (success rates), Hansen et al. 2016, *COCO performance assessment* (average runtime, ECDF with
-simulated restarts), Agarwal et al. 2021, *Deep RL at the edge of the statistical precipice* (interquartile mean,
-probability of improvement), Dahl et al. 2023, *AlgoPerf* (the integral of the performance profile), Efron 1979
-(bootstrap), Hesterberg 2015, *What teachers should know about the bootstrap* (its quantiles for few values). Ranks are
+simulated restarts), Agarwal et al. 2021, *Deep RL at the edge of the statistical precipice* (interquartile mean),
+Efron 1979 (bootstrap), Hesterberg 2015, *What teachers should know about the bootstrap* (its quantiles for few values). Ranks are
 SciPy's. The Wilson interval and Spearman's rho agree with SciPy's to 1e-14. SciPy's are not used because their last
 digits differ from stored results, SciPy rejects an interval without trials, and its rho is five times slower, which
 matters in a bootstrap. SciPy's bootstrap has no strata and does not skip resamples without a value.
@@ -141,21 +140,6 @@ def interquartile_mean(values: np.ndarray) -> float:
     edges = np.arange(n + 1) / n
     inside = np.clip(np.minimum(edges[1:], 0.75) - np.maximum(edges[:-1], 0.25), 0.0, None)
     return float(ordered @ inside / inside.sum())
-
-
-def improvement(ours: np.ndarray, theirs: np.ndarray) -> float:
-    """Return the share of paired values in which ours is smaller; a tie counts half."""
-    return float(np.mean((ours < theirs) + 0.5 * (ours == theirs)))
-
-
-def profile_score(ratios: np.ndarray, most: float = 4.0) -> float:
-    """Return the mean over tau in [1, most] of the share of problems whose ratio to the best is below tau.
-
-    >>> profile_score(np.array([1.0, 2.5, np.inf]))
-    0.5
-    """
-    gained = np.clip(most - np.maximum(np.where(np.isnan(ratios), np.inf, ratios), 1.0), 0.0, None)
-    return float(np.mean(gained) / (most - 1.0)) if np.size(ratios) else math.nan
 
 
 def ranks(values: np.ndarray) -> np.ndarray:

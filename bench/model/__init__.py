@@ -28,6 +28,7 @@ from bench.model.estimator import (
     columns,
     first_order,
     halves,
+    mean_difference,
     per_repeat,
     zeroth_order,
 )
@@ -36,8 +37,7 @@ from bench.model.integrator import Integrator
 from bench.model.known_solutions import Identified, KnownOptimum, KnownValue
 from bench.model.manifold import JointScene, difference, n_changes, retract, slope_by_changes
 from bench.model.ops import Array, LoopOps, Ops, State, stopped
-from bench.model.optimizer import Answer, Descent, Optimizer, Population
-from bench.model.optimizer import State as OptimizerState
+from bench.model.optimizer import Answer, Descent, Optimizer, OptimizerState, Population
 from bench.model.parameters import Plugin, param
 from bench.model.policy import Policy, PolicyRollout, PolicyScene, affine, uniform
 from bench.model.problem import Compilations, Jacobians, Problem, Trajectory, Usage
@@ -147,6 +147,7 @@ __all__ = [
     "halves",
     "load_module",
     "load_simulator",
+    "mean_difference",
     "n_changes",
     "param",
     "per_repeat",

@@ -42,7 +42,7 @@ class Backend(Plugin):
         """Return why this backend's own limits exclude the program, or None."""
         return None
 
-    def incompatibility(self, program: Program) -> str | None:
+    def refusal(self, program: Program) -> str | None:
         """Return why this backend cannot run the program, or None. Checks the scene's limits and the backend's own."""
         only = program.scene.backends
         if only and self.name not in only:

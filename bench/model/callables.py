@@ -29,6 +29,11 @@ class CallableScene(Scene):
     def simulator(self) -> Simulator:
         """Return the cost and its gradient as functions of batches ``(d, B)``; the same object at each call."""
 
+    @property
+    def exogenous(self) -> int:  # type: ignore[override]
+        """Number of the simulator's own normal numbers."""
+        return self.simulator().noise
+
     @abstractmethod
     def files(self) -> tuple[Path, ...]:
         """Return the source files of the cost. If one changes, the scene's cells run again."""

@@ -40,6 +40,8 @@ class Estimator(Plugin):
     """Whether the estimator is also unbiased for costs with jumps in theta."""
     diagnostics: ClassVar[tuple[str, ...]] = ()
     """Names of the arrays that :meth:`estimate_with_diagnostics` returns in addition, for example ``weight``."""
+    needs_noise_on_theta: ClassVar[bool] = False
+    """Whether it excludes noise on the actions of a policy."""
     needs_directions: ClassVar[bool] = False
     """Whether it uses each sample's noise as a direction in theta space, which needs at least d numbers per sample."""
     couples_samples: ClassVar[bool] = False
@@ -78,9 +80,11 @@ class Estimator(Plugin):
 
     def unsupported_reason(self, program: Program) -> str | None:
         """Return why this estimator's own limits exclude the program, or None."""
+        if self.needs_noise_on_theta and not program.noise_on_theta:
+            return f"{self.name} needs noise on theta, not on a policy's actions"
         return None
 
-    def incompatibility(self, program: Program, provides: frozenset[str], backend: str) -> str | None:
+    def refusal(self, program: Program, provides: frozenset[str], backend: str) -> str | None:
         """Return why the estimator cannot run on a program with the backend's capabilities ``provides``, or None."""
         missing = self.needs - provides
         if missing:
@@ -163,6 +167,14 @@ def zeroth_order(problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.n
     w = columns(noise)
     cost = problem.value(theta, w) - problem.value(theta, np.zeros((w.shape[0], 1)))
     return per_repeat(cost * problem.score(theta, w), noise)
+
+
+def mean_difference(problem: Problem, theta: np.ndarray, directions: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """Return the mean of (f(theta + sigma v) - f(theta - sigma v)) v / 2 sigma over directions ``(R, N, d)``, ``(R, d)``."""
+    s, centred = problem.sigma, problem.centred(columns(noise))
+    shift = s * columns(directions)
+    change = problem.displaced(shift, theta, centred) - problem.displaced(-shift, theta, centred)
+    return np.asarray(per_repeat(change * shift / (2.0 * s * s), noise).mean(axis=1))
 
 
 def best_gradient(problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:

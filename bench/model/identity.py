@@ -46,7 +46,7 @@ def parse_identity(text: str) -> tuple[str, dict[str, Any]]:
     if bracket:
         if not rest.endswith("]"):
             raise UserError(f"'{text}' is not a plugin: write name or name[parameter=value,...]")
-        for item in filter(None, _items(rest[:-1])):
+        for item in filter(None, split_items(rest[:-1])):
             key, equals, value = item.partition("=")
             if not equals:
                 raise UserError(f"'{item}' in '{text}' is not parameter=value")
@@ -59,10 +59,10 @@ def parse_identity(text: str) -> tuple[str, dict[str, Any]]:
     return name.strip(), raw
 
 
-def _items(text: str) -> list[str]:
+def split_items(text: str) -> list[str]:
     """Return the parts of a text between commas that are in no brackets.
 
-    >>> _items("horizon=50,policy=mlp[hidden=8,scale=1]")
+    >>> split_items("horizon=50,policy=mlp[hidden=8,scale=1]")
     ['horizon=50', 'policy=mlp[hidden=8,scale=1]']
     """
     parts, depth = [""], 0

@@ -48,7 +48,7 @@ SETTINGS: dict[str, tuple[str, Callable[[Any], Any]]] = {
 THREADS = "the threads of linear algebra"
 
 
-class State:
+class ProcessState:
     """The settings of this process at one moment, to be compared with later ones.
 
     With ``double_precision``, JAX computes in float64 from then on, whichever cell imports it. With ``single_thread``, libraries

@@ -8,9 +8,9 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from bench.model.parameters import Plugin
+from bench.model.parameters import Plugin, param
 
-State = dict[str, Any]
+OptimizerState = dict[str, Any]
 """The complete state of an optimizer between two steps: arrays and numbers by name, including ``theta (d,)``."""
 
 
@@ -43,7 +43,7 @@ class Optimizer(Plugin):
     needs: ClassVar[frozenset[str]] = frozenset({"gradient"})
     """The fields of :class:`Answer` that the optimizer uses in at least one step."""
 
-    def start(self, theta: np.ndarray) -> State:
+    def start(self, theta: np.ndarray) -> OptimizerState:
         """Return the state before the first step, starting from ``theta (d,)``."""
         return {"theta": np.array(theta, dtype=np.float64)}
 
@@ -52,15 +52,15 @@ class Optimizer(Plugin):
         return 0
 
     @abstractmethod
-    def ask(self, state: State, noise: np.ndarray) -> np.ndarray:
+    def ask(self, state: OptimizerState, noise: np.ndarray) -> np.ndarray:
         """Return the points to evaluate, ``(d, B)``, from standard normal ``noise (d, draws)``."""
 
-    def required_fields(self, state: State) -> frozenset[str]:
+    def required_fields(self, state: OptimizerState) -> frozenset[str]:
         """Return the fields of the answer that the next step uses; by default :attr:`needs`."""
         return self.needs
 
     @abstractmethod
-    def tell(self, state: State, theta: np.ndarray, answer: Answer) -> State:
+    def tell(self, state: OptimizerState, theta: np.ndarray, answer: Answer) -> OptimizerState:
         """Return the next state, given the answer at the points ``theta (d, B)``; the old state is not modified."""
 
 
@@ -68,17 +68,17 @@ class Optimizer(Plugin):
 class Descent(Optimizer):
     """An optimizer that takes each step from one gradient at its current theta."""
 
-    def ask(self, state: State, noise: np.ndarray) -> np.ndarray:
+    def ask(self, state: OptimizerState, noise: np.ndarray) -> np.ndarray:
         """Return the current theta, ``(d, 1)``."""
         return np.array(state["theta"][:, None])
 
-    def tell(self, state: State, theta: np.ndarray, answer: Answer) -> State:
+    def tell(self, state: OptimizerState, theta: np.ndarray, answer: Answer) -> OptimizerState:
         """Return the state after one :meth:`step`."""
         assert answer.gradient is not None
         return self.step(state, answer.gradient[:, 0])
 
     @abstractmethod
-    def step(self, state: State, gradient: np.ndarray) -> State:
+    def step(self, state: OptimizerState, gradient: np.ndarray) -> OptimizerState:
         """Return the state after one step along ``gradient (d,)``."""
 
 
@@ -87,3 +87,16 @@ class Population(Optimizer):
     """An optimizer that evaluates the costs of points sampled around a mean."""
 
     needs: ClassVar[frozenset[str]] = frozenset({"value"})
+
+    population: int = param(100, "points per iteration", low=2)
+
+    def draws(self, dim: int) -> int:
+        """Return the number of points."""
+        return self.population
+
+    @staticmethod
+    def best(theta: np.ndarray, answer: Answer, count: int) -> np.ndarray:
+        """Return the ``count`` points of lowest cost, ``(d, count)``; points without a finite cost rank last."""
+        assert answer.value is not None
+        cost = np.where(np.isfinite(answer.value), answer.value, np.inf)
+        return theta[:, np.argsort(cost, kind="stable")[:count]]

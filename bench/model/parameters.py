@@ -70,7 +70,7 @@ class Plugin(ABC):  # noqa: B024, each kind has its own abstract methods
 
     def __init_subclass__(cls, **arguments: Any) -> None:
         super().__init_subclass__(**arguments)
-        _require_annotations(cls)
+        _inherit(cls)
 
     def __new__(cls, *_: Any, **__: Any) -> Self:
         """Return a new instance; raises :class:`UserError` if the class or a base lacks ``@dataclass``."""
@@ -97,18 +97,25 @@ class Parameter:
     choices: tuple[str, ...] | None = None
 
 
-def _require_annotations(plugin: type[Plugin]) -> None:
-    """Raise TypeError if a class sets an inherited parameter without an annotation, which would not change its default."""
-    inherited = dataclasses.fields(plugin) if dataclasses.is_dataclass(plugin) else ()
+def _inherit(plugin: type[Plugin]) -> None:
+    """Let ``steps: int = 60`` change an inherited parameter's default only, with its meaning, unit and bounds.
+
+    Raises TypeError if a class sets an inherited parameter without an annotation, which would not change its default.
+    """
+    owners = [base for base in reversed(plugin.__mro__[1:]) if "__dataclass_fields__" in vars(base)]
+    inherited = {field.name: field for base in owners for field in dataclasses.fields(base)}
     own = vars(plugin).get("__annotations__", {})
-    for name, field in ((field.name, field) for field in inherited):
-        if name in vars(plugin) and name not in own:
-            value, annotation = vars(plugin)[name], field.type if isinstance(field.type, str) else field.type.__name__
-            given = f"param({value!r}, ...)" if isinstance(value, bool | int | float | str | None) else "..."
+    for name, field in inherited.items():
+        if name not in vars(plugin):
+            continue
+        value, annotation = vars(plugin)[name], field.type if isinstance(field.type, str) else field.type.__name__
+        if name not in own:
             raise TypeError(
                 f"{plugin.__name__}.{name} replaces a parameter without an annotation, so the parameter would keep its "
-                f"default {field.default!r}: write `{name}: {annotation} = {given}`"
+                f"default {field.default!r}: write `{name}: {annotation} = {value!r}`"
             )
+        if not isinstance(value, dataclasses.Field | property):
+            setattr(plugin, name, dataclasses.field(default=value, metadata=field.metadata))
 
 
 @remember

@@ -80,31 +80,9 @@ def policy_of(identity: str) -> Policy:
 
 
 class PolicyRollout(Rollout):
-    """The program of a :class:`PolicyScene`: random starts, substeps, and rollouts that may end early."""
+    """The program of a :class:`PolicyScene`: substeps, and rollouts that may end early."""
 
     scene: PolicyScene
-
-    @property
-    def exogenous(self) -> int:
-        """Number of normal numbers of the random start, the last rows of w."""
-        return self.scene.n_start
-
-    @property
-    def n_noise(self) -> int:
-        """n_w: one number per action, or d, plus the numbers of the random start."""
-        own = self.scene.controls * self.scene.n_u if self.action_noise else self.dim
-        return own + self.exogenous
-
-    def start(self, ops: Ops, theta: Array, w: Array) -> tuple[Array, State, tuple[Array, ...]]:
-        """Return theta plus its noise, the random initial state, and the noise on the actions, ``(horizon, n_u, B)``."""
-        scene, xp, n_own = self.scene, ops.xp, self.n_noise - self.exogenous
-        scanned: tuple[Array, ...] = ()
-        if self.action_noise:
-            scanned = (xp.reshape(w[:n_own], (scene.horizon, scene.n_u, w.shape[1])),)
-        else:
-            theta = theta + scene.sigma * w[:n_own]
-        state = scene.random_start(xp, w[n_own:]) if scene.n_start else scene.initial_state(xp, theta)
-        return theta, State(*(xp.broadcast_to(part, (part.shape[0], w.shape[1])) for part in state)), scanned
 
     def step(self, ops: Ops, state: State, u: Array) -> State:
         """Return the state after ``substeps`` steps of the integrator under ``u (n_u, B)``; unchanged after the end."""
@@ -133,6 +111,8 @@ class PolicyScene(MechanicalScene):
     program_type: ClassVar[type[Rollout] | None] = PolicyRollout
 
     noise: str = param("action", "whether noise is on the actions or on theta", choices=("action", "parameter"))
+    horizon: int = param(100, "number of control steps", "steps", positive=True)
+    dt: float = param(0.01, "length of a control step", "s", positive=True)
     policy: str = param("linear", "policy, as name or name[parameter=value,...]")
     substeps: int = param(1, "steps of the integrator per control step", positive=True)
 
@@ -147,6 +127,15 @@ class PolicyScene(MechanicalScene):
     @abstractmethod
     def observation(self, xp: Any, q: Array, v: Array) -> Array:
         """Return the inputs of the policy, ``(n_observations, B)``, each of order 1."""
+
+    @property
+    def exogenous(self) -> int:  # type: ignore[override]
+        """Number of normal numbers of the random start."""
+        return self.n_start
+
+    def starting_state(self, xp: Any, theta: Array, e: Array | None) -> State:
+        """Return the random state at t = 0, or the initial state of a scene without random starts."""
+        return self.random_start(xp, e) if self.n_start else self.initial_state(xp, theta)
 
     def random_start(self, xp: Any, e: Array) -> State:
         """Return the states at t = 0 from standard normal ``e (n_start, B)``; needed only if ``n_start`` is not 0."""

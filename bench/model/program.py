@@ -164,8 +164,8 @@ class Program(ABC):
 
     @property
     def exogenous(self) -> int:
-        """Number of the scene's own normal numbers, which follow the d numbers on theta."""
-        return 0
+        """Number of the scene's own normal numbers, the last rows of w."""
+        return self.scene.exogenous
 
     @property
     def n_noise(self) -> int:
@@ -309,21 +309,11 @@ class FunctionProgram(Program):
         assert isinstance(bound.scene, FunctionScene)
         return bound.scene.cost(ops.xp, own)
 
-    @property
-    def exogenous(self) -> int:
-        """Number of the scene's own normal numbers."""
-        return self.scene.exogenous if isinstance(self.scene, DisturbedScene) else 0
-
 
 class CallableProgram(Program):
     """The program of a scene whose cost is a user's own simulator, which no array namespace can run."""
 
     scene: CallableScene
-
-    @property
-    def exogenous(self) -> int:
-        """Number of the simulator's own normal numbers."""
-        return self.scene.simulator().noise
 
     def cost(self, ops: Ops, theta: Array, w: Array) -> Array:
         """Raise :class:`Unsupported`: only the backends of the scene can call the simulator."""
@@ -379,13 +369,9 @@ class Rollout(Program):
 
     @property
     def n_noise(self) -> int:
-        """n_w: for action noise one number per control; else d, plus the process-noise values."""
-        return self.scene.controls * self.scene.n_u if self.action_noise else self.dim + self.exogenous
-
-    @property
-    def exogenous(self) -> int:
-        """Number of the scene's process-noise values: one per step and control."""
-        return self.scene.horizon * self.scene.n_u if isinstance(self.scene, ProcessNoiseScene) else 0
+        """n_w: for action noise one number per control, else d; then the scene's own numbers."""
+        own = self.scene.controls * self.scene.n_u if self.action_noise else self.dim
+        return own + self.exogenous
 
     def cost(self, ops: Ops, theta: Array, w: Array) -> Array:
         """Return the sum of stage costs and terminal cost of each rollout, ``(B,)``."""
@@ -445,17 +431,19 @@ class Rollout(Program):
         """
         scene, xp = self.scene, ops.xp
         shape = (scene.horizon, scene.n_u, w.shape[1])
+        n_own = self.n_noise - self.exogenous
+        own, e = (w[:n_own], w[n_own:]) if self.exogenous else (w, None)
         scanned = []
         if self.action_noise:
-            scanned.append(scene.held(xp, xp.reshape(w, (scene.controls, *shape[1:]))))
+            scanned.append(scene.held(xp, xp.reshape(own, (scene.controls, *shape[1:]))))
         else:
-            theta = theta + scene.sigma * (w[: self.dim] if self.exogenous else w)
+            theta = theta + scene.sigma * own
         if isinstance(scene, ProcessNoiseScene):
-            scanned.append(scene.gust * xp.reshape(w[self.dim :], shape))
+            scanned.append(scene.gust * xp.reshape(e, shape))
         planned = scene.planned_controls(xp, theta)
         if planned is not None:
             scanned.insert(0, xp.broadcast_to(planned, shape))
-        start = scene.initial_state(xp, theta)
+        start = scene.starting_state(xp, theta, e)
         # theta (d, 1) yields a single column, but the scan's carry needs all B columns
         state = State(*(xp.broadcast_to(part, (part.shape[0], w.shape[1])) for part in start))
         return theta, state, tuple(scanned)

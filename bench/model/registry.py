@@ -23,7 +23,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -124,19 +124,7 @@ def entries() -> Table:
         with _protected(module):
             _load_module(table, kind, module, fatal.get(module, ""))
     for point in points:
-        try:
-            if point.module in fatal:
-                raise ImportError(fatal[point.module])
-            with _protected(point.module):
-                plugin = point.load()
-            if not (isinstance(plugin, type) and issubclass(plugin, Plugin) and plugin.kind):
-                raise TypeError(f"{point.value} is not a plugin class")
-        except KeyboardInterrupt:
-            raise
-        except BaseException as error:  # includes SystemExit: a plugin must not end the command
-            _add_unavailable(table, _kind_in_source(point.module), point.name, error)
-        else:
-            _add(table, plugin)
+        _load_point(table, "", point, fatal.get(point.module, ""))
     return table
 
 
@@ -179,16 +167,7 @@ def entries_with(kind: str, package: str) -> dict[str, Entry]:
     for _, module in _modules(importlib.import_module(package)):
         _load_module(table, kind, module, "")
     for point in sorted(entry_points(group=f"bench.{kind}"), key=lambda p: p.name):
-        try:
-            part = point.load()
-            if isinstance(part, ModuleType):
-                _add_members(table, kind, part)
-            elif isinstance(part, type) and issubclass(part, Plugin) and part.kind == kind:
-                _add(table, part)
-            else:
-                raise TypeError(f"{point.value} is not a plugin class of kind {kind}")
-        except Exception as error:
-            _add_unavailable(table, kind, point.name, error)
+        _load_point(table, kind, point, "")
     for name, entry in entries().get(kind, {}).items():
         if entry.plugin is None:
             table[kind].setdefault(name, entry)
@@ -233,6 +212,25 @@ def _load_module(table: Table, kind: str, path: str, fatal: str) -> None:
         _add_unavailable(table, kind if kind in table else _kind_in_source(path), path.rpartition(".")[2], error)
         return
     _add_members(table, kind, module)
+
+
+def _load_point(table: Table, kind: str, point: EntryPoint, fatal: str) -> None:
+    """Add the plugin class, or the classes of the module, that an entry point names."""
+    try:
+        if fatal:
+            raise ImportError(fatal)
+        with _protected(point.module):
+            part = point.load()
+        if isinstance(part, ModuleType):
+            _add_members(table, kind or _kind_in_source(point.module), part)
+        elif isinstance(part, type) and issubclass(part, Plugin) and part.kind:
+            _add(table, part)
+        else:
+            raise TypeError(f"{point.value} is not a plugin class")
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # includes SystemExit: a plugin must not end the command
+        _add_unavailable(table, kind or _kind_in_source(point.module), point.name, error)
 
 
 def _add_members(table: Table, kind: str, module: ModuleType) -> None:

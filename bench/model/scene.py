@@ -32,6 +32,8 @@ class Scene(Plugin):
     """Whether the cost is continuous in theta, provided that the contact law is continuous."""
     identifies: ClassVar[bool] = False
     """Whether theta consists of scene parameters to be identified, and the cost compares the motion with a record."""
+    exogenous: ClassVar[int] = 0
+    """Number of the scene's own normal numbers per rollout, the last rows of w. A property where parameters decide it."""
 
     sigma: float = param(0.1, "standard deviation of the Gaussian noise in J", positive=True)
     noise: str = param("parameter", "whether noise is on theta or on the actions of each step", choices=("parameter",))
@@ -73,9 +75,6 @@ class DisturbedScene(FunctionScene):
     ``J_sigma(theta) = E f(theta + sigma u, e)``: the mean over d normal numbers u and the scene's ``exogenous`` normal
     numbers e. Smoothing estimators do not shift e, and the score does not depend on it.
     """
-
-    exogenous: ClassVar[int]
-    """Number of the scene's own normal numbers per sample."""
 
     @abstractmethod
     def disturbed_cost(self, xp: Any, x: Array, e: Array) -> Array:
@@ -121,6 +120,10 @@ class MechanicalScene(Scene):
     @abstractmethod
     def initial_state(self, xp: Any, theta: Array) -> State:
         """Return the state at t = 0 for ``theta (d, B)``."""
+
+    def starting_state(self, xp: Any, theta: Array, e: Array | None) -> State:
+        """Return the state at t = 0 for ``theta (d, B)`` and the scene's own noise ``e (exogenous, B)``, None without it."""
+        return self.initial_state(xp, theta)
 
     @abstractmethod
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
@@ -199,6 +202,11 @@ class ProcessNoiseScene(MechanicalScene):
 
     noise: str = param("parameter", "sigma is the noise on theta; gusts are added to it", choices=("parameter",))
     gust: float = param(0.1, "standard deviation of the process noise on each control", low=0.0)
+
+    @property
+    def exogenous(self) -> int:  # type: ignore[override]
+        """Number of process-noise values: one per step and control."""
+        return self.horizon * self.n_u
 
     def __init_subclass__(cls, **arguments: Any) -> None:
         super().__init_subclass__(**arguments)

@@ -68,7 +68,7 @@ def run_child(job: Mapping[str, Any]) -> None:
         package.__path__ = [folder]
     for name in job["modules"]:
         os.write(pipe, b"\n")
-        state, functions, n_threads = isolation.State(), _functions(), threading.active_count()
+        state, functions, n_threads = isolation.ProcessState(), _functions(), threading.active_count()
         with contextlib.suppress(BaseException):  # the registry imports the module again and lists its error
             importlib.import_module(name)
         guard.exit_if_forked(pid)

@@ -9,7 +9,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
-from matplotlib.ticker import FixedLocator, FuncFormatter
+from matplotlib.ticker import FixedLocator
 
 from bench.experiment.columns import Column
 from bench.experiment.views import Chart, Mark, Style
@@ -35,8 +35,6 @@ LINE = 0.155
 """Height of a line of text in inches."""
 BOLD = 1.3
 """Width of a bold title relative to the same text elsewhere."""
-UPRIGHT = 1.15
-"""Height in inches of the titles of panels too narrow for them; these titles read upwards."""
 UNLIMITED = 1e9
 """Factor on a value at which the bar of an interval without an upper end stops, beyond every logarithmic axis."""
 BAND: dict[str, Any] = {"color": "#D55E00", "alpha": 0.12, "linewidth": 0}
@@ -52,7 +50,7 @@ def draw(chart: Chart, width: float | None = None) -> Figure:
     chart, places = _numbered(replace(chart, frame=chart.drawn(), chosen=()))
     panels = _panels(chart)
     if width is None:
-        width = NARROW if len(panels) == 1 and chart.kind in ("lines", "points") and chart.labels == "legend" else WIDTH
+        width = NARROW if len(panels) == 1 and chart.kind in ("lines", "points") else WIDTH
     styles = series_styles(chart)
     row_names = list(dict.fromkeys(chart.frame[chart.panel_row].astype(str))) if chart.panel_row else []
     across = len(panels) // len(row_names) if row_names else _across(chart, len(panels), width)
@@ -67,16 +65,13 @@ def draw(chart: Chart, width: float | None = None) -> Figure:
     heights = [_height(chart, part) for _, part in panels]
     room = 0.9 * (width - _label_width(chart, row_names, 1 if same else across, label_room)) / across
     titles = [_panel_title(chart, name, room) for name, _ in panels[: across if row_names else None]]
-    upright = bool(row_names) and max(map(_text_width, titles)) > room * 1.1
-    if upright:
-        titles = [_panel_title(chart, name, UPRIGHT) for name, _ in panels[:across]]
     titles += [""] * (len(panels) - len(titles))  # of rows of panels, only the first has titles
     title_heights = [
-        UPRIGHT if upright and i == 0 else LINE * max(title.count("\n") + 1 if title else 0 for title in part)
-        for i, part in enumerate(titles[i * across : (i + 1) * across] for i in range(down))
+        LINE * max(title.count("\n") + 1 if title else 0 for title in titles[i * across : (i + 1) * across])
+        for i in range(down)
     ]
     head = _Head(chart, width)
-    legend = [] if chart.labels == "ends" else _legend(chart, styles, width - 0.6)
+    legend = _legend(chart, styles, width - 0.6)
     bands = dict.fromkeys(mark.name for mark in chart.marks if mark.to is not None)
     legend += [Patch(label=plain(name), **BAND) for name in bands]
     legend += [Line2D([], [], label="Pareto front", **FRONT)] * chart.front
@@ -109,25 +104,23 @@ def draw(chart: Chart, width: float | None = None) -> Figure:
     axes = list(grid[: len(panels)])
     for place, (panel, (name, part), title) in enumerate(zip(axes, panels, titles, strict=True)):
         if title:
-            panel.set_title(title, loc="center" if upright else "left", fontsize=SIZE, rotation=90 if upright else 0)
+            panel.set_title(title, loc="left", fontsize=SIZE)
         draw_kind(chart, panel, name, part, styles)
         if chart.kind == "dots" and same and place % across:
             panel.tick_params(labelleft=False)
         if chart.kind in ("lines", "points"):
-            first, last = place % across == 0 or chart.own_scales, not stacked or place == len(panels) - 1
-            _label_axes(chart, panel, first, last)
+            panel.set_xlabel("" if stacked and place < len(panels) - 1 else axis_text(chart.x[0]))
+            panel.set_ylabel("" if place % across and shared else axis_text(chart.y[0]))
     if chart.kind in ("lines", "points"):
         _scale(chart, axes, panels)
         for panel in axes if places else ():
             panel.set_xlim(-0.3, len(places) - 0.7)
             panel.set_xticks(range(len(places)), list(map(plain, places)), rotation=30, ha="right")
             panel.set_xlabel("")
-        for panel, (name, part) in zip(axes, panels, strict=True):
+        for panel, (name, _) in zip(axes, panels, strict=True):
             _draw_marks(chart, panel, name)
-            if chart.labels == "ends":
-                _label_ends(chart, panel, part, styles, width / across)
     if shared and chart.kind in ("dots", "grid"):
-        _label_outer(chart, axes, across, row_names, upright)
+        _label_outer(chart, axes, across, row_names)
     if legend:
         figure.legend(
             handles=legend, loc="lower center", bbox_to_anchor=(0.5, 0), ncols=columns, frameon=False,
@@ -136,7 +129,7 @@ def draw(chart: Chart, width: float | None = None) -> Figure:
     return figure
 
 
-def _label_outer(chart: Chart, axes: Sequence[Axes], across: int, row_names: Sequence[str], upright: bool) -> None:
+def _label_outer(chart: Chart, axes: Sequence[Axes], across: int, row_names: Sequence[str]) -> None:
     """Label the axes of panels with common scales at the left and lower edge only, and name the rows of panels."""
     labels = [[text.get_text() for text in panel.get_yticklabels()] for panel in axes]
     equal_rows = all(texts == labels[0] for texts in labels)
@@ -153,8 +146,6 @@ def _label_outer(chart: Chart, axes: Sequence[Axes], across: int, row_names: Seq
         for place, panel in enumerate(axes):
             if place != len(axes) - 1 - across // 2:
                 panel.set_xlabel("")
-            if upright:
-                panel.tick_params(axis="x", rotation=90)
         figure = axes[0].figure.figure
         figure.supylabel(axis_text(chart.y[0]), fontsize=SIZE)
 
@@ -282,7 +273,7 @@ def _legend(chart: Chart, styles: dict[str, Style], width: float) -> list[Any]:
             [], [], color=style.colour, marker="s" if chart.shape else "" if bare and style.line != "none" else style.marker,
             linestyle=style.line if line else "none", linewidth=style.width, label=labels[name],
         )
-        for name, style in styles.items()
+        for name, style in styles.items() if name
     ]  # fmt: skip
     return colours + [
         Line2D([], [], color=GREY, marker=mark, markerfacecolor="none", linestyle="none", label=plain(name))
@@ -330,7 +321,7 @@ def _is_log(column: Column, values: Any) -> bool:
 
 def _draw_lines(chart: Chart, panel: Axes, name: str, part: pd.DataFrame, styles: dict[str, Style]) -> None:
     x, y = chart.x[0], chart.y[0]
-    log = _is_log(y, chart.frame[y.name])
+    log = _is_log(y, (part if chart.own_scales else chart.frame)[y.name])
     keys = [key for key in dict.fromkeys((chart.series, chart.line, chart.shape)) if key]
     shapes = _shapes(chart)
     groups = part.groupby(keys, sort=False) if keys else [(("",), part)]
@@ -385,27 +376,25 @@ def _mark(panel: Axes, x: np.ndarray, y: np.ndarray, limit: np.ndarray, **look: 
     panel.plot(x[limit], y[limit], linestyle="none", markerfacecolor="white", **look)
 
 
-def _label_axes(chart: Chart, panel: Axes, first: bool, last: bool) -> None:
-    if last:
-        panel.set_xlabel(axis_text(chart.x[0]))
-    if first:
-        panel.set_ylabel(axis_text(chart.y[0]))
-
-
 def _scale(chart: Chart, axes: Sequence[Axes], panels: Sequence[tuple[str, pd.DataFrame]]) -> None:
     """Set the scales of all panels: x per panel, y for all together unless the chart has scales per panel."""
-    x, y = chart.x[0], chart.y[0]
+    x = chart.x[0]
     few = all(part[x.name].nunique() <= 6 for _, part in panels)
     for panel, (_, part) in zip(axes, panels, strict=True):
-        rows = part if chart.own_scales else chart.frame
         _scale_x(panel, x, part[x.name].to_numpy(float), few)
-        if _is_log(y, chart.frame[y.name]):
-            low, high = _log_range(y, rows, [mark for mark in chart.marks if mark.axis == "y"])
-            log_axis(panel, "y", low, high, text=_values_text(y))
-            if y.above_one and high > 1:
-                panel.axhspan(1.0, high, zorder=0, **SHADE)
-        elif text := _values_text(y):
-            panel.yaxis.set_major_formatter(FuncFormatter(lambda value, _, text=text: text(value)))
+        _scale_values(chart, panel, "y", chart.y[0], part if chart.own_scales else chart.frame)
+
+
+def _scale_values(chart: Chart, panel: Axes, which: Literal["x", "y"], column: Column, rows: pd.DataFrame) -> None:
+    """Set the scale of the drawn quantity by its values in ``rows``, and shade the area above 1 where that means something."""
+    text = _values_text(column)
+    if _is_log(column, rows[column.name]):
+        low, high = _log_range(column, rows, [mark for mark in chart.marks if mark.axis == which])
+        log_axis(panel, which, low, high, text=text)
+        if column.above_one and high > 1:
+            (panel.axvspan if which == "x" else panel.axhspan)(1.0, high, zorder=0, **SHADE)
+    elif text:
+        (panel.xaxis if which == "x" else panel.yaxis).set_major_formatter(lambda value, _: text(value))
 
 
 def _log_range(column: Column, rows: pd.DataFrame, marks: Sequence[Mark] = ()) -> tuple[float, float]:
@@ -441,7 +430,7 @@ def _scale_x(panel: Axes, column: Column, values: np.ndarray, few: bool) -> None
     if few:
         panel.xaxis.set_major_locator(FixedLocator(list(values)))
     if text:
-        panel.xaxis.set_major_formatter(FuncFormatter(lambda value, _: text(value)))
+        panel.xaxis.set_major_formatter(lambda value, _: text(value))
 
 
 def _draw_marks(chart: Chart, panel: Axes, name: str) -> None:
@@ -460,49 +449,14 @@ def _draw_marks(chart: Chart, panel: Axes, name: str) -> None:
         elif low < mark.at < high:
             # a mark without a name is a quiet line, not to be taken for a series
             dash, shade = (next(dashes), "#595959") if mark.name else ("-", "#c0c0c0")
-            if mark.axis == "x":
-                panel.axvline(mark.at, zorder=1, color=shade, linewidth=0.9, linestyle=dash)
-                if mark.name:
-                    panel.text(
-                        mark.at, 0.985, plain(f" {mark.name}"), transform=panel.get_xaxis_transform(), va="top",
-                        fontsize=SIZE - 0.5, color="#404040",
-                    )  # fmt: skip
-            else:
-                panel.axhline(mark.at, zorder=1, color=shade, linewidth=0.9, linestyle=dash)
-                if mark.name:
-                    panel.text(
-                        0.005, mark.at, plain(mark.name), transform=panel.get_yaxis_transform(), va="bottom",
-                        fontsize=SIZE - 1, color="#404040",
-                    )  # fmt: skip
-
-
-def _label_ends(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str, Style], width: float) -> None:
-    """Name each series beside the last point of its line, in its colour, moved apart where names would overlap."""
-    x, y = chart.x[0].name, chart.y[0].name
-    labels = []
-    for series, points in part.groupby(chart.series, sort=False):
-        points = points[np.isfinite(points[y]) & ((points[y] > 0) | (panel.get_yscale() != "log"))]
-        if len(points):
-            last = points.sort_values(x, kind="stable").iloc[-1]
-            at = panel.transAxes.inverted().transform(panel.transData.transform((last[x], last[y])))[1]
-            labels.append((float(np.clip(at, 0.02, 0.98)), str(series)))
-    labels.sort()
-    gap = 1.15 * LINE / chart.height
-    places = [at for at, _ in labels]
-    for _ in range(200):  # move neighbours apart until no two overlap
-        moved = False
-        for i in range(len(places) - 1):
-            lack = gap - (places[i + 1] - places[i])
-            if lack > 1e-6:
-                places[i], places[i + 1], moved = places[i] - lack / 2, places[i + 1] + lack / 2, True
-        if not moved:
-            break
-    for place, (_, series) in zip(places, labels, strict=True):
-        style = styles[series]
-        panel.annotate(
-            plain(_clipped(style.meaning or series, 0.42 * width)), (1.015, place), xycoords="axes fraction",
-            va="center", ha="left", color=[0.75 * part for part in to_rgb(style.colour)], fontsize=SIZE, annotation_clip=False,
-        )  # fmt: skip
+            line = panel.axvline if mark.axis == "x" else panel.axhline
+            line(mark.at, zorder=1, color=shade, linewidth=0.9, linestyle=dash)
+            if mark.name:
+                place, align = ((mark.at, 0.985), "top") if mark.axis == "x" else ((0.005, mark.at), "bottom")
+                along = panel.get_xaxis_transform() if mark.axis == "x" else panel.get_yaxis_transform()
+                panel.text(
+                    *place, plain(f" {mark.name}"), transform=along, va=align, fontsize=SIZE - 0.5, color="#404040"
+                )
 
 
 # ---------------------------------------------------------------------------------------------------- dots
@@ -551,14 +505,7 @@ def _draw_dots(chart: Chart, panel: Axes, name: str, part: pd.DataFrame, styles:
     panel.grid(axis="y", color="#e4e4e4", linewidth=0.6)
     panel.set_axisbelow(True)
     panel.set_xlabel(axis_text(x))
-    text = _values_text(x)
-    if log:
-        marks = [mark for mark in chart.marks if mark.axis == "x"]
-        log_axis(panel, "x", *_log_range(x, values, marks), text=text)
-    elif text:
-        panel.xaxis.set_major_formatter(FuncFormatter(lambda value, _: text(value)))
-    if x.above_one and log and panel.get_xlim()[1] > 1:
-        panel.axvspan(1.0, panel.get_xlim()[1], zorder=0, **SHADE)
+    _scale_values(chart, panel, "x", x, values)
     _draw_marks(chart, panel, name)
 
 
@@ -577,7 +524,7 @@ def _draw_grid(
     norm = _norm(chart)
     every = _categories(y, chart.frame, downwards=True)  # the panels of a column have labels of one width
     panel_width = _inner_width(panel, _grid_labels(chart, y, every, width))
-    cell_width = panel_width / max(len(across), 1)
+    cell_width, cell_height = panel_width / max(len(across), 1), _height(chart, part) / max(len(down), 1)
     widest = max(map(width_in_inches, map(str, chart.frame[chart.cell])), default=0.0) if chart.cell else 0.0
     size = min(SIZE - 1, 0.8 * 72 * cell_width, SIZE * 0.92 * cell_width / max(widest, 0.1))
     for line in part.to_dict("records"):
@@ -601,8 +548,11 @@ def _draw_grid(
         if which == "x" and any("…" in label for label in labels) and max(map(width_in_inches, names)) < 1.6:
             labels = [plain(name) for name in names]  # short names read upwards rather than shortened
             panel.tick_params(axis="x", rotation=90)
-        few = _thinned(labels, which, panel, panel_width)
-        getattr(panel, f"set_{which}ticks")(few, [labels[i] for i in few])
+        step = 1
+        if column.kind == "number":  # of numbers that would overlap, each second or more is shown
+            needed = max(map(width_in_inches, labels)) + 0.08 if which == "x" else 0.8 * LINE
+            step = math.ceil(needed / (cell_width if which == "x" else cell_height))
+        getattr(panel, f"set_{which}ticks")(range(0, len(labels), step), labels[::step])
         if column.label or column.kind == "number":
             getattr(panel, f"set_{which}label")(axis_text(column))
     panel.tick_params(length=0)
@@ -647,24 +597,6 @@ def _inner_width(panel: Axes, labels: Sequence[str]) -> float:
     place, width = panel.get_subplotspec(), panel.figure.figure.get_size_inches()[0]
     across = place.get_gridspec().ncols if place is not None else 1
     return max(0.9 * (float(width) - max(map(width_in_inches, labels), default=0.0)) / across, 0.2)
-
-
-def _thinned(labels: Sequence[str], which: str, panel: Axes, panel_width: float) -> list[int]:
-    """Return the positions of the labels that are shown: all, or each second or more of numbers that would overlap."""
-    if not all(_is_number(label) for label in labels):
-        return list(range(len(labels)))
-    panel_height = panel.get_position().height * panel.figure.figure.get_size_inches()[1]
-    needed = sum(width_in_inches(label) + 0.08 for label in labels) if which == "x" else 0.8 * LINE * len(labels)
-    step = math.ceil(needed / (panel_width if which == "x" else panel_height))
-    return list(range(0, len(labels), max(step, 1)))
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
 
 
 def _category(value: Any) -> str:

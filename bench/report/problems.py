@@ -97,9 +97,10 @@ def distinguishing_columns(
 
 
 def varying_identity(rows: pd.DataFrame, swept: Sequence[str] = ()) -> list[str]:
-    """Return the identity and swept columns that vary; scene and estimator if none does."""
+    """Return the identity and swept columns that vary; scene and estimator if none does and there are any."""
     names = [name for name in dict.fromkeys((*IDENTITY, *swept)) if name in rows]
-    return [name for name in names if rows[name].nunique(dropna=False) > 1] or ["scene", "estimator"]
+    varying = [name for name in names if rows[name].nunique(dropna=False) > 1]
+    return varying or [name for name in ("scene", "estimator") if name in names]
 
 
 def problem_names(

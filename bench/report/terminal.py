@@ -12,11 +12,12 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from bench.report.labels import LONGEST, Labels
 from bench.report.text import number, one_line
 
 GAP = 2
 """Blanks between two columns."""
+LONGEST = 24
+"""Longest word, in characters, that is never broken."""
 KEPT = ("status",)
 """Columns that are left out last, after the first column."""
 MOST_NAMES = 24
@@ -40,39 +41,32 @@ def print_table(
 ) -> None:
     """Print a table of strings or numbers, as wide as the console at most.
 
-    Columns of numbers and the columns ``right`` are right-aligned and never wrapped. Long identity strings have short
-    labels, explained below the table. Where the table is too wide, columns with one value are stated once above it,
-    then text wraps, then columns are left out and named below it: first ``least_important`` in their order, then from
-    the right. The first column and the status stay longest.
+    Columns of numbers and the columns ``right`` are right-aligned and never wrapped. Where the table is too wide, columns
+    with one value are stated once above it, then text wraps, then columns are left out and named below it: first
+    ``least_important`` in their order, then from the right. The first column and the status stay longest.
     """
-    labels, names, places = Labels(), list(map(str, table)), range(table.shape[1])
+    names, places = list(map(str, table)), range(table.shape[1])
     kinds = [pd.api.types.is_numeric_dtype(kind) and not pd.api.types.is_bool_dtype(kind) for kind in table.dtypes]
-    texts = [[_text(value, kinds[i], labels) for value in table.iloc[:, i]] for i in places]
+    texts = [[_text(value, kinds[i]) for value in table.iloc[:, i]] for i in places]
     whole = [kinds[i] or names[i] in right for i in places]  # columns whose cells are not wrapped
     least = [_least(names[i], texts[i], whole[i]) for i in places]
     visible, constant, left_out = list(places), [], []
 
-    def spare(shown: Sequence[int]) -> int:
-        return console.width + GAP - sum(least[i] + GAP for i in shown)
+    def spare() -> int:
+        return console.width + GAP - sum(least[i] + GAP for i in visible)
 
-    if spare(visible) < 0 and len(table) > 1:
+    if spare() < 0 and len(table) > 1:
         constant = [i for i in visible[1:] if len(set(texts[i])) == 1]
         visible = [i for i in visible if i not in constant]
     ranks = {name: rank for rank, name in enumerate(least_important, -len(least_important))}
-    queue = sorted(reversed(visible[1:]), key=lambda i: (names[i] in KEPT, ranks.get(names[i], 0)))
-    while spare(visible) < 0 and queue:
-        left_out.append(queue.pop(0))
-        visible.remove(left_out[-1])
-    for i in reversed(list(left_out)):  # a narrow column may fit where a wide one did not
-        if spare([*visible, i]) >= 0:
-            visible = sorted([*visible, i])
-            left_out.remove(i)
+    for i in sorted(reversed(visible[1:]), key=lambda i: (names[i] in KEPT, ranks.get(names[i], 0))):
+        if spare() < 0:
+            left_out.append(i)
+            visible.remove(i)
     grid = Table(box=None, pad_edge=False, padding=(0, GAP, 0, 0), header_style="underline")
     for i in visible:
-        missing = max(0, cell_len(names[i]) - least[i])
-        is_wrapped = whole[i] and missing > spare(visible)
-        head = "\n".join(wrap(names[i], least[i])) if is_wrapped else names[i]
-        least[i] += 0 if is_wrapped else missing
+        head = "\n".join(wrap(names[i], least[i])) if whole[i] and spare() < cell_len(names[i]) else names[i]
+        least[i] = max(least[i], *map(cell_len, head.split("\n"))) if whole[i] else least[i]
         grid.add_column(Text(head), justify="right" if whole[i] else "left", no_wrap=whole[i], overflow="fold")
     for line in zip(*(texts[i] for i in visible), strict=True):
         grid.add_row(*map(Text, line))
@@ -80,8 +74,6 @@ def print_table(
     for text in filter(None, (title, facts)):
         console.print(Text(text), style="bold")
     console.print(grid)
-    for text in labels.key:
-        console.print(Text(text), style="dim")
     if left_out:
         listed = ", ".join(names[i] for i in sorted(left_out)[:MOST_NAMES])
         more = f" and {len(left_out) - MOST_NAMES} more" if len(left_out) > MOST_NAMES else ""
@@ -96,9 +88,9 @@ def _least(name: str, texts: Sequence[str], is_whole: bool) -> int:
     return max(cells if is_whole else min(cells, LONGEST), *map(cell_len, name.split()), 1)
 
 
-def _text(value: object, is_number: bool, labels: Labels) -> str:
+def _text(value: object, is_number: bool) -> str:
     if is_number and not isinstance(value, int | np.integer):
         return number(float(value), 3)  # type: ignore[arg-type]
     if pd.api.types.is_scalar(value) and pd.isna(value):
         return ""
-    return "\n".join(labels.short(one_line(line)) for line in str(value).split("\n"))
+    return "\n".join(map(one_line, str(value).split("\n")))

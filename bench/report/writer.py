@@ -33,7 +33,8 @@ def write(experiment: Experiment, views: Views, drawn: Sequence[tuple[Chart, Fig
     with styled():
         for chart, figure in drawn:
             charts += save(figure, experiment.directory / chart.name, experiment.formats, chart.plotted())
-    paths = write_all(experiment.directory, [(ANSWER, _answer(experiment, views, drawn[0][0].name if drawn else ""))])
+    answer = answer_json(experiment.name, experiment.question, views.headline, drawn[0][0].name if drawn else "")
+    paths = write_all(experiment.directory, [(ANSWER, answer)])
     for name in dict.fromkeys(table.name for table in views.tables):
         tables = [table for table in views.tables if table.name == name]
         paths += write_all(experiment.directory, table_files(tables, experiment.name))
@@ -57,10 +58,9 @@ def _is_telling(chart: Chart) -> bool:
     return len(frame) >= LEAST and (not is_line or frame[x].nunique() >= LEAST)
 
 
-def _answer(experiment: Experiment, views: Views, chart: str) -> str:
-    content = {
-        "experiment": experiment.name, "question": experiment.question, "answer": views.headline, "chart": chart
-    }  # fmt: skip
+def answer_json(experiment: str, question: str, answer: str, chart: str) -> str:
+    """Return the content of :data:`ANSWER`."""
+    content = {"experiment": experiment, "question": question, "answer": answer, "chart": chart}
     return json.dumps(content, indent=1, ensure_ascii=False) + "\n"
 
 

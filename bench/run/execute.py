@@ -85,15 +85,13 @@ def execute(experiment: Experiment, quiet: bool = True) -> Finished:
             file=sys.stderr,
         )
         _run(experiment, rest, store, quiet)
+    progress.print_others(experiment, planned, stored)
     return Finished(experiment, store, planned, time.time() - started)
 
 
 def _run(experiment: Experiment, planned: list[Planned], store: Store, quiet: bool) -> None:
     with progress.show_progress(experiment.name, planned, quiet) as shown:
-
-        def run(cells: list[Planned]) -> None:
-            runner.run(experiment, cells, store, shown.finished, shown.working)
-
+        run = runner.Runner(experiment, store, shown.finished, shown.working).run
         try:
             if experiment.execution.ladder:
                 climb(experiment, planned, store, run, quiet)

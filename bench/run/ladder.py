@@ -31,7 +31,7 @@ def climb(
     experiment: Experiment,
     planned: Sequence[Planned],
     store: Store,
-    run: Callable[[list[Planned]], None],
+    run: Callable[[Sequence[Planned]], None],
     quiet: bool = False,
 ) -> None:
     """Call ``run`` with the cells of one rung after the other, and print whether each passes unless ``quiet``."""

@@ -6,18 +6,18 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING
 
 from bench.engines.backend import EngineBackend
 from bench.errors import UserError
 from bench.experiment.cell import Cell
-from bench.experiment.defaults import completed_json, missing_parameters
+from bench.experiment.defaults import completed_json
 from bench.experiment.experiment import Experiment
 from bench.experiment.grid import COUNTS, cells
 from bench.experiment.study import study_of
 from bench.model import Backend, Plugin, guard
 from bench.model.parameters import remember
+from bench.run.record import version_of
 from bench.run.store import Store
 
 if TYPE_CHECKING:
@@ -40,10 +40,6 @@ class Planned:
     """Library versions of the stored row, if they differ from the installed ones."""
     machine: str = ""
     """The kind of machine that timed the stored row."""
-    by_older_code: bool = False
-    """Whether older code has stored the cell, so that it has to run again."""
-    added: tuple[str, ...] = ()
-    """Parameters added since the row of older code was stored, as ``plugin.parameter``."""
 
     @property
     def runs(self) -> bool:
@@ -60,10 +56,8 @@ def plan(experiment: Experiment, store: Store) -> list[Planned]:
     facts = zip(rows["status"], rows["versions"], rows["machine"], strict=True)
     stored = dict(zip(rows["key"], facts, strict=True))
     with guard.capture_output("a plugin"), guard.protect_process():
-        every = cells(experiment)
-        older = _rows_of_older_code(experiment, rows, {cell.key for cell in every})
-        mine = [cell for cell in every if _is_in_shard(cell, experiment.execution.shard)]
-        return [_planned(experiment, cell, stored, older) for cell in mine]
+        mine = [cell for cell in cells(experiment) if _is_in_shard(cell, experiment.execution.shard)]
+        return [_planned(experiment, cell, stored) for cell in mine]
 
 
 def _is_in_shard(cell: Cell, shard: tuple[int, int] | None) -> bool:
@@ -75,14 +69,10 @@ def _is_in_shard(cell: Cell, shard: tuple[int, int] | None) -> bool:
     return int(key, 16) % count == number - 1
 
 
-def _planned(
-    experiment: Experiment, cell: Cell, stored: dict[str, tuple[str, str, str]], older: dict[Identity, str]
-) -> Planned:
+def _planned(experiment: Experiment, cell: Cell, stored: dict[str, tuple[str, str, str]]) -> Planned:
     refusal = cell.refusal() or _refusal_of_study(experiment, cell)
     if cell.key not in stored:
-        text = older.get(_identity_of(cell)) if older else None
-        added = () if text is None else tuple(missing_parameters(json.loads(text)))
-        return Planned(cell, False, refusal, by_older_code=text is not None, added=added)
+        return Planned(cell, False, refusal)
     status, row_versions, machine = stored[cell.key]
     rules = experiment.execution
     is_current = rules.versions == "ignore" or status != "ok" or row_versions == versions(cell.backend)
@@ -92,23 +82,6 @@ def _planned(
     is_installed = status == "unavailable" and refusal is None
     timed = machine if cell.timing and status == "ok" and not again else ""
     return Planned(cell, not (again or is_installed), refusal, "" if is_current else row_versions, timed)
-
-
-def _rows_of_older_code(experiment: Experiment, rows: pd.DataFrame, keys: set[str]) -> dict[Identity, str]:
-    """Return the stored parameters (JSON) of the rows whose key is not in ``keys``, by cell identity.
-
-    A parameter missing from a row takes its present default. Successful rows are omitted if they are timed and the
-    experiment is not, or the reverse.
-    """
-    rows = rows[~rows["key"].isin(keys) & (rows["parameters"] != "")]
-    seconds = [name for name in experiment.columns.measured if experiment.columns.by_name[name].kind == "number"]
-    if seconds:
-        is_timed = rows.reindex(columns=seconds).notna().any(axis=1)
-        rows = rows[(is_timed == experiment.timing) | (rows["status"] != "ok")]
-    identities = zip(
-        rows["parameters"].map(completed_json), rows["samples"], rows["repeats"], rows["seed"], strict=True
-    )
-    return dict(zip(identities, rows["parameters"], strict=True))
 
 
 def requested_rows(experiment: Experiment, rows: pd.DataFrame) -> tuple[pd.DataFrame, str]:
@@ -182,11 +155,4 @@ def versions(backend: Backend) -> str:
 @remember
 def _versions(backend: type[Plugin]) -> str:
     names = dict.fromkeys(["numpy", *(r.partition("=")[2] or r.partition("=")[0] for r in backend.requires)])
-    return ";".join(f"{name}={_version(name)}" for name in names)
-
-
-def _version(name: str) -> str:
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return "?"
+    return ";".join(f"{name}={version_of(name) or '?'}" for name in names)

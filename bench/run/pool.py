@@ -27,7 +27,7 @@ from typing import IO, Any, Literal
 
 import psutil
 
-from bench.errors import STATUSES, StorageError, UserError, failure
+from bench.errors import STATUSES, StorageError, UserError, describe_exit, failure
 from bench.model import guard, registry
 from bench.run.reaper import MARK, Reaper, kill_marked_processes
 from bench.run.worker import Handler, command
@@ -426,11 +426,3 @@ def _result_in(content: Mapping[str, Any]) -> tuple[dict[str, Any], float]:
     if result["status"] not in STATUSES or not isinstance(result.get("reason", ""), str) or not 0 <= seconds < math.inf:
         raise ValueError("an answer has a status, a reason and a time")
     return result, seconds
-
-
-def describe_exit(code: int) -> str:
-    """Describe how a process ended, from its exit code; negative codes are signals."""
-    if code >= 0:
-        return f"the process ended with exit status {code}"
-    name = signal.Signals(-code).name
-    return f"killed by {name}" + (" (out of memory?)" if name == "SIGKILL" else "")

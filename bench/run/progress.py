@@ -6,7 +6,7 @@ import math
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
 from typing import TYPE_CHECKING, Any
@@ -132,25 +132,26 @@ def print_machines(planned: Sequence[Planned], launcher: str) -> None:
             )
 
 
+def print_others(experiment: Experiment, planned: Sequence[Planned], keys: Iterable[str]) -> None:
+    """Print how many rows of other settings are stored under the experiment's name, of the stored ``keys``."""
+    n_others = len(set(keys) - {item.cell.key for item in planned})
+    if n_others and experiment.execution.shard is None:
+        print(
+            f"bench: stored in '{experiment.directory}' with other settings: {n_others}; name=... chooses another folder",
+            file=sys.stderr,
+        )
+
+
 def print_plan(experiment: Experiment, planned: Sequence[Planned], rows: pd.DataFrame) -> None:
     """Print the number of cells, how many are stored, to run and refused, the reasons, and the expected time."""
     n_stored = sum(item.stored for item in planned)
     refusals = [item.refusal for item in planned if item.refusal is not None]
     runs = [item for item in planned if item.runs]
-    print(
-        f"{experiment.name}: {len(planned)} cells, {n_stored} stored, {len(runs)} to run{_older_code(runs)}, "
-        f"{len(refusals)} refused"
-    )
+    print(f"{experiment.name}: {len(planned)} cells, {n_stored} stored, {len(runs)} to run, {len(refusals)} refused")
+    print_others(experiment, planned, rows["key"])
     for reason, count in Counter(f"{status}: {reason}" for status, reason in refusals).most_common():
         print(f"  {count} {reason}")
     if runs:
         seconds = expected_seconds(runs, rows)
         known = f"about {seconds:.0f} s of one worker, without new references"
         print(f"expected time: {'not known before some cells have run' if math.isnan(seconds) else known}")
-
-
-def _older_code(runs: Sequence[Planned]) -> str:
-    """Return, in brackets, how many cells older code has stored, and the parameters added since; empty if none."""
-    count = sum(item.by_older_code for item in runs)
-    added = sorted({name for item in runs for name in item.added})
-    return f" ({count} stored by older code{', without ' if added else ''}{', '.join(added)})" if count else ""

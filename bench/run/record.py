@@ -41,7 +41,7 @@ def record(experiment: Experiment, rows: pd.DataFrame, words: list[str], seconds
         "duration_s": round(seconds, 3),
         "finished": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
         "python": platform.python_version(),
-        "versions": {name: _version(name) for name in LIBRARIES},
+        "versions": {name: version_of(name) for name in LIBRARIES},
         **_compilations(rows),
         "machine": {**machine(), "load_average_start": timing.load_at_start()},
         "git_commit": _commit(),
@@ -54,7 +54,8 @@ def record(experiment: Experiment, rows: pd.DataFrame, words: list[str], seconds
     return path
 
 
-def _version(name: str) -> str | None:
+def version_of(name: str) -> str | None:
+    """Return the version of an installed distribution, or None."""
     try:
         return version(name)
     except PackageNotFoundError:

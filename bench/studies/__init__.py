@@ -16,10 +16,14 @@ from bench.experiment.session import Session
 from bench.experiment.study import Study
 from bench.experiment.views import Views
 from bench.measure import noise, timing
+from bench.measure.reference import unseen_width
 from bench.model import Problem
 
 if TYPE_CHECKING:
     import pandas as pd
+
+FINE = 1e-3
+"""Spacing of a reference's points, in standard deviations, above which a remark states it: that of points in a plane."""
 
 
 @dataclass(frozen=True)
@@ -36,11 +40,25 @@ class StudyPackage(Study):
 
         found: Views = self._module("views").views(experiment, rows)
         drawn = [chart for chart in found.charts if len(chart.frame)]
-        return replace(found, charts=drawn, remarks=[*found.remarks, *reasons(rows)])
+        return replace(found, charts=drawn, remarks=[*found.remarks, *unseen_features(rows), *reasons(rows)])
 
     def _module(self, name: str) -> Any:
         package = next(c.__module__ for c in type(self).__mro__ if hasattr(sys.modules[c.__module__], "__path__"))
         return import_module(f"{package}.{name}")
+
+
+def unseen_features(rows: pd.DataFrame) -> list[str]:
+    """Return below which width references by quadrature in a plane may miss a feature of the cost, and in how many cells."""
+    from bench.report.text import counted
+
+    widths = rows.get("reference_method", rows["status"]).astype(str).map(unseen_width)
+    coarse = widths[widths > FINE]
+    if coarse.empty:
+        return []
+    return [
+        f"in {counted(len(coarse), 'cell')} the reference is from points up to {coarse.max():g} standard deviations of the noise apart: "
+        "it may miss a feature of the cost that is narrower"
+    ]
 
 
 def finite_status(reason: str, *values: Any) -> dict[str, str]:

@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from bench.measure.contacts import active_contacts, contact_names, engine_contacts, split
 from bench.model import ContactScene, EngineScene, ForceLaw, FrictionScene, Jacobians, Problem, Rollout, compose
-from bench.report.text import listed
 from bench.trace import equations
 from bench.trace.equations import Newton, solved_again, stepped
 
 REAL = ("gap", "penetration", "force", "force_peak", "sticking", "slipping")
-
-
 TOUCHES = "touches_"
 """Prefix of the columns of scenes with several contacts: 1 where the contact of that name acts."""
 
@@ -28,7 +23,6 @@ def contact_columns(problem: Problem, program: Rollout, path: Jacobians) -> dict
     count = len(path.states)
     columns = dict.fromkeys((*REAL, *equations.COLUMNS), np.full(count, np.nan))
     columns |= {"contacts": np.zeros(count, dtype=int), "switch": np.zeros(count, dtype=int)}
-    columns["switched"] = np.full(count, "", dtype=object)
     after = None
     if program.needs_root:
         after, solver = solved_again(program, path)
@@ -55,29 +49,11 @@ def contact_columns(problem: Problem, program: Rollout, path: Jacobians) -> dict
     return columns | {
         "contacts": touching.sum(axis=0),
         "switch": np.append(0, (mode[:, 1:] != mode[:, :-1]).any(axis=0).astype(int)),
-        "switched": np.array(["", *map(_switched, [names] * (count - 1), mode.T[:-1], mode.T[1:])], dtype=object),
         "gap": gap.min(axis=0),
         "penetration": np.maximum(0.0, -gap).max(axis=0),
         "force": total,
         "force_peak": np.fmax.accumulate(total),
     }
-
-
-VERBS = {(0, 1): "touch", (0, 2): "touch", (1, 0): "leave", (2, 0): "leave", (1, 2): "slip", (2, 1): "stick"}
-"""What a contact does between two modes: 0 apart, 1 touching, 2 slipping."""
-
-
-def _switched(names: Sequence[str], before: np.ndarray, after: np.ndarray) -> str:
-    """Return which contacts change between the modes of two states, in words; empty if none does."""
-    groups: dict[str, list[str]] = {}
-    for name, *pair in zip(names, before.tolist(), after.tolist(), strict=True):
-        if verb := VERBS.get((pair[0], pair[1])):
-            groups.setdefault(verb, []).append(name)
-    parts = [
-        f"{listed(some)} {verb}{'' if len(some) > 1 else 'es' if verb == 'touch' else 's'}"
-        for verb, some in groups.items()
-    ]
-    return ", ".join(parts)
 
 
 def _of_engine(problem: Problem, path: Jacobians) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -5,50 +5,52 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 
+from bench.trace.contacts import TOUCHES
 from bench.trace.spikes import LEVEL, MEASURES, Alignment, align, changes, spikes
 
 LISTED = 5
-"""Most switches and spikes that a line lists."""
+"""Most switches and spikes that a line lists, by step."""
 
 
 def report(table: pd.DataFrame, gradient_error: float) -> list[str]:
     """Return lines on contact, switches, the adjoints' gradient, and the spikes of each measure."""
-    facts = {"steps": len(table) - 1, "states in contact": int((table["contacts"] > 0).sum())}
-    facts |= {"contact switches": int(table["switch"].sum())}
-    sizes = {"penetration [m]": table["penetration"].max(), "force [N]": table["force"].max()}
-    values = [f"{name} {value}" for name, value in facts.items()]
-    values += [f"{name} up to {three_digits(value)}" for name, value in sizes.items() if np.isfinite(value)]
-    values.append(f"adjoints' gradient within {gradient_error:.1g} of the program's")
-    switched = table.get("switched", pd.Series("", table.index))
-    switches = [f"{step} {name}" for step, name in zip(table.get("step", table.index), switched, strict=True) if name]
-    listed = (
-        [f"switches, by step: {'; '.join(switches[:LISTED])}{' ...' * (len(switches) > LISTED)}"] if switches else []
-    )
-    return [", ".join(values), *listed, *verdict(table)]
+    switches = np.flatnonzero(table["switch"])
+    facts = {
+        "steps": len(table) - 1, "states in contact": int((table["contacts"] > 0).sum()),
+        "largest penetration [m]": table["penetration"].max(), "largest force [N]": table["force"].max(),
+        "relative error of the adjoints' gradient": gradient_error, "contact switches": len(switches),
+    }  # fmt: skip
+    values = [f"{name} {three_digits(value)}" for name, value in facts.items() if np.isfinite(value)]
+    touches = [
+        f"{name.removeprefix(TOUCHES)} {table[name].sum()}"
+        for name in table
+        if name.startswith(TOUCHES) and table[name].any()
+    ]
+    named = [f"states in contact, by contact: {', '.join(touches)}"] if touches else []
+    return [f"{', '.join(values)}{_at(switches)}", *named, *verdict(table)]
+
+
+def _at(steps: np.ndarray) -> str:
+    return f", at {', '.join(map(str, steps[:LISTED]))}{' ...' * (len(steps) > LISTED)}" if len(steps) else ""
 
 
 def verdict(table: pd.DataFrame) -> list[str]:
     """Return a line per measure: its range, its spikes, and whether they line up with contact switches."""
     lines = []
     for name, title in MEASURES.items():
-        norms, alignment, sizes = (
+        norms, found, sizes = (
             table[name].replace(np.inf, np.nan),
             align(table[name], table["switch"]),
             changes(table[name]),
         )
-        facts = [
-            f"{three_digits(norms.min())} to {three_digits(norms.max())}",
-            f"at most {three_digits(float(np.exp(sizes.max())))}x per step",
-        ]
-        if alignment.spikes:
-            facts.append(
-                f"{alignment.near} of {alignment.spikes} spikes within a step of a switch, {alignment.chance:.0%} by chance, "
-                f"p = {alignment.p_value:.2g}"
+        facts = f"{three_digits(norms.min())} to {three_digits(norms.max())}; at most {three_digits(np.exp(sizes.max()))}x per step"
+        if found.spikes:
+            at = sorted(np.flatnonzero(spikes(table[name])), key=lambda k: -sizes[k])
+            facts += (
+                f"; {found.near} of {found.spikes} spikes within a step of a switch, {found.chance:.0%} by chance, "
+                f"p = {found.p_value:.2g}{_at(np.array(at) + 1)}"
             )
-            at = sorted(np.flatnonzero(spikes(table[name])), key=lambda k: -sizes[k])[:LISTED]
-            near = [", ".join(dict.fromkeys(filter(None, table.get("switched", [])[k : k + 3]))) for k in at]
-            facts += [f"step {k + 1}: {n or 'no switch'}" for k, n in zip(at, near, strict=True)]
-        lines.append(f"{title}: {conclusion(alignment, int(table['switch'].sum()))} ({'; '.join(facts)})")
+        lines.append(f"{title}: {conclusion(found, int(table['switch'].sum()))} ({facts})")
     return lines
 
 

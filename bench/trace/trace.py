@@ -28,7 +28,7 @@ from bench.trace.contacts import contact_columns
 from bench.trace.states import per_state
 
 COLUMNS = (
-    "step", "time", "contacts", "switch", "switched", "gap", "penetration", "force", "force_peak", "sticking", "slipping",
+    "step", "time", "contacts", "switch", "gap", "penetration", "force", "force_peak", "sticking", "slipping",
     "solver_residual", "solver_iterations", "solver_mismatch", "jacobian_norm", "adjoint_norm", "cost_stage",
     "cost_terminal",
 )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Training of neural policies: environments, networks, windows, values and evaluation. JAX is imported when used."""
+"""Training of neural policies: environments, networks, windows and values."""
 
 import os
 

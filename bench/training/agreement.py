@@ -5,7 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+
 from bench.model.ops import Array
+from bench.training.windows import gains_to_go
 
 Parts = Callable[[Any, Array], tuple[Array, Array, Array]]
 """Gains ``(h, B)``, cuts ``(h, B)`` and log probabilities of the actions ``(h, B)``, from an actor and a key.
@@ -22,11 +27,6 @@ def cosine(parts: Parts, actor: Any, key: Array, copies: int) -> dict[str, Array
     where a denominator is not positive, the noise is larger than the gradient and the value is NaN. Copies share starts
     but no noise.
     """
-    import jax
-    import jax.numpy as jnp
-    from jax.flatten_util import ravel_pytree
-
-    from bench.training.windows import gains_to_go
 
     def both(key: Array) -> tuple[Array, Array]:
         keys = jax.random.split(key, copies // 2)

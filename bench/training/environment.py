@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-import copy
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
-from bench.errors import Unsupported
+import jax
+import jax.numpy as jnp
+
 from bench.model import ContactScene, ForceLaw, State
 from bench.model.ops import Array
 from bench.model.policy import PolicyScene
@@ -33,6 +36,7 @@ class Transition(NamedTuple):
     """Whether the episode ended before its time limit, so that no value follows, ``(B,)``."""
 
 
+@dataclass(frozen=True, eq=False)
 class Environment:
     """The episodes of a policy problem in JAX, as pure functions. Arrays are component-first and batch-last.
 
@@ -40,13 +44,9 @@ class Environment:
     state, and the selection of the start passes none back.
     """
 
-    def __init__(self, program: Any, ops: Any, dtype: str = "float64") -> None:
-        scene = program.scene
-        if not isinstance(scene, PolicyScene):
-            raise Unsupported(f"scene {scene.name} is not a policy problem: it has no observations and random starts")
-        if getattr(ops.xp, "__name__", "") != "jax.numpy":
-            raise Unsupported("training needs a backend with the operations of jax.numpy, such as jax, implicit or mjx")
-        self.program, self.ops, self.dtype = program, ops, dtype
+    program: Any
+    ops: Any
+    dtype: str = "float64"
 
     @property
     def scene(self) -> PolicyScene:
@@ -84,20 +84,14 @@ class Environment:
 
     def bind(self, parameters: Any) -> Environment:
         """Return the environment with other values of its float parameters, possibly traced."""
-        bound = copy.copy(self)
-        bound.program = self.program.bind(parameters)
-        return bound
+        return replace(self, program=self.program.bind(parameters))
 
     def normal(self, key: Array, shape: tuple[int, ...]) -> Array:
         """Return standard normal numbers in the precision of the environment."""
-        import jax
-
         return jax.random.normal(key, shape, self.dtype)
 
     def start(self, numbers: Array) -> Episodes:
         """Return episodes at their starts, from standard normal ``numbers (n_start, B)``."""
-        import jax.numpy as jnp
-
         if self.n_start:
             q, v = self.scene.random_start(self.ops.xp, numbers)
         else:
@@ -112,9 +106,6 @@ class Environment:
 
     def step(self, episodes: Episodes, action: Array, numbers: Array) -> Transition:
         """Return the transitions under ``action (n_u, B)``; ``numbers (n_start, B)`` give the starts after resets."""
-        import jax
-        import jax.numpy as jnp
-
         scene, xp, before = self.scene, self.ops.xp, episodes.state
         controls = scene.controls_of(xp, action)
         reward = -scene.stage_cost(xp, before.q, before.v, controls)
@@ -130,15 +121,29 @@ class Environment:
         state = State(*(jnp.where(ended, new, old) for new, old in zip(fresh, reached, strict=True)))
         return Transition(Episodes(state, jnp.where(ended, 0, age)), reached, reward, ended, terminated)
 
+    def returns(self, policy: Callable[[Array], Array], numbers: Array) -> Array:
+        """Return the undiscounted returns ``(B,)`` of episodes from starts ``numbers (n_start, B)`` to their first end.
+
+        ``policy`` gives actions ``(n_u, B)`` from observations ``(n_observations, B)``.
+        """
+
+        def step(carry: tuple[Episodes, Array, Array], _: Any) -> tuple[tuple[Episodes, Array, Array], None]:
+            episodes, total, over = carry
+            moved = self.step(episodes, policy(self.observe(episodes.state)), numbers)
+            total = total + jnp.where(over, 0.0, moved.reward)
+            return (moved.next, total, over | moved.ended), None
+
+        first = self.start(numbers)
+        carry = (first, jnp.zeros(numbers.shape[1], numbers.dtype), jnp.zeros(numbers.shape[1], dtype=bool))
+        (_, total, _), _ = jax.lax.scan(step, carry, None, length=self.length)
+        return total
+
     def contacts(self, state: State) -> tuple[Array, Array, Array]:
         """Return, per rollout ``(B,)``, closed contacts, largest penetration [m] and largest contact force [N].
 
         The force is NaN for a law without forces. Without contacts all are 0. The program of an engine says which contacts
         it has by ``contacts(state)``.
         """
-        import jax
-        import jax.numpy as jnp
-
         if hasattr(self.program, "contacts"):
             return self.program.contacts(jax.lax.stop_gradient(state))  # type: ignore[no-any-return]
 

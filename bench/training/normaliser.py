@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
+
 from bench.model.ops import Array
 
 FIRST_COUNT = 1e-4
@@ -22,8 +24,6 @@ class Normaliser(NamedTuple):
 
 def start(n: int, dtype: Any) -> Normaliser:
     """Return the normaliser before the first observation."""
-    import jax.numpy as jnp
-
     return Normaliser(jnp.asarray(FIRST_COUNT, dtype), jnp.zeros(n, dtype), jnp.ones(n, dtype))
 
 
@@ -39,8 +39,6 @@ def updated(known: Normaliser, observations: Array) -> Normaliser:
 
 def deviation(known: Normaliser) -> Array:
     """Return the standard deviations, ``(n,)``."""
-    import jax.numpy as jnp
-
     return jnp.sqrt(known.variance + FLOOR)
 
 

@@ -5,12 +5,17 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+import optax
+from jax.flatten_util import ravel_pytree
 
 from bench.model.trainer import Trainer
-from bench.training import evaluation
+from bench.training import agreement
 from bench.training.environment import Environment
 
 _compiled: dict[tuple[Any, ...], tuple[Callable[..., Any], float]] = {}
@@ -44,7 +49,7 @@ class Training:
         """Return the returns ``(B,)`` of the deterministic policy from starts ``numbers (n_start, B)``."""
 
         def evaluate(env: Environment, state: Any, numbers: Any) -> Any:
-            return evaluation.returns(env, lambda seen: self.trainer.action(env, state, seen), numbers)
+            return env.returns(lambda seen: self.trainer.action(env, state, seen), numbers)
 
         numbers = np.asarray(numbers, dtype=self.env.dtype)
         return np.asarray(self._call("returns", evaluate, state, numbers), dtype=np.float64)
@@ -53,13 +58,7 @@ class Training:
         """Return the cosines of :func:`agreement.cosine` at a first-order trainer's state, from ``copies`` per rollout."""
 
         def compare(env: Environment, state: Any, seed: Any) -> Any:
-            import jax
-
-            from bench.training import agreement
-
-            def parts(actor: Any, key: Any) -> Any:
-                return self.trainer.parts(env, state, actor, key)
-
+            parts = partial(self.trainer.parts, env, state)
             return agreement.cosine(parts, state.actor, jax.random.PRNGKey(seed), copies)
 
         cosines = self._call(f"agreement {copies}", compare, state, np.uint32(seed))
@@ -74,9 +73,6 @@ class Training:
         trainer: Any = dataclasses.replace(self.trainer, window=window)  # type: ignore[call-arg]
 
         def differentiate(env: Environment, state: Any, seed: Any) -> Any:
-            import jax
-            from jax.flatten_util import ravel_pytree
-
             def mean_return(actor: Any) -> Any:
                 key_start, key = jax.random.split(jax.random.PRNGKey(seed))
                 fresh = trainer.fresh(env, state, key_start)
@@ -92,8 +88,6 @@ class Training:
         """Return the loss that the next update logs, at the actor's parameters plus ``shift (d,)``."""
 
         def evaluate(env: Environment, state: Any, shift: Any) -> Any:
-            from jax.flatten_util import ravel_pytree
-
             theta, unflatten = ravel_pytree(state.actor)
             return self.trainer.update(env, state._replace(actor=unflatten(theta + shift)))[1]["loss"]
 
@@ -106,11 +100,6 @@ class Training:
         """
 
         def move(env: Environment, state: Any) -> Any:
-            import jax
-            import jax.numpy as jnp
-            import optax
-            from jax.flatten_util import ravel_pytree
-
             means = jax.tree.map(jnp.zeros_like, optax.tree.get(state.memory, "mu"))
             squares = jax.tree.map(lambda x: x + LARGE, means)
             memory = optax.tree.set(state.memory, mu=means, nu=squares)
@@ -124,8 +113,6 @@ class Training:
         return self._executable(name, function, arguments)(self.env.parameters(), *arguments)
 
     def _executable(self, name: str, function: Callable[..., Any], arguments: tuple[Any, ...]) -> Callable[..., Any]:
-        import jax
-
         shapes = tuple((np.shape(x), str(x.dtype)) for x in jax.tree.leaves(arguments))
         key = (self.env.structure, self.trainer, name, shapes)
         if key not in _compiled:

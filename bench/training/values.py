@@ -1,8 +1,11 @@
-"""Targets of a critic from a window of rewards: TD(lambda) returns and generalised advantages."""
+"""Targets of a critic from a window of rewards: TD(lambda) returns."""
 
 from __future__ import annotations
 
 from typing import Any
+
+import jax
+import jax.numpy as jnp
 
 from bench.model.ops import Array
 
@@ -12,10 +15,9 @@ def td_lambda(reward: Array, value: Array, ended: Array, discount: Any, decay: f
 
     ``G_t = r_t + gamma ((1 - lambda) V_t + lambda G_{t+1})``, where ``V_t`` is the value of the state that step t
     reached, 0 where none follows. After the window's last step, and after a step that ended an episode, the return is
-    ``r_t + gamma V_t`` (Sutton, Barto 2018, equation 12.9 in recursive form).
+    ``r_t + gamma V_t`` (Sutton, Barto 2018, equation 12.9 in recursive form). Less the values before each step these are generalised
+    advantages (Schulman et al. 2016, arXiv 1506.02438, equation 16).
     """
-    import jax
-    import jax.numpy as jnp
 
     def back(following: Array, at: tuple[Array, Array, Array]) -> tuple[Array, Array]:
         r, v, end = at
@@ -24,12 +26,3 @@ def td_lambda(reward: Array, value: Array, ended: Array, discount: Any, decay: f
 
     _, targets = jax.lax.scan(back, value[-1], (reward, value, ended), reverse=True)
     return targets
-
-
-def advantages(reward: Array, before: Array, value: Array, ended: Array, discount: Any, decay: float) -> Array:
-    """Return generalised advantages ``(h, B)`` (Schulman et al. 2016, arXiv 1506.02438, equation 16).
-
-    ``before (h, B)`` are the values of the states before each step, ``value (h, B)`` of the states that the steps
-    reached, 0 where none follows. The sum over later steps stops at the end of an episode.
-    """
-    return td_lambda(reward, value, ended, discount, decay) - before

@@ -5,8 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
+
 from bench.model.ops import Array, State
 from bench.training.environment import Environment, Episodes
+from bench.training.normaliser import normalised
 
 Policy = Callable[[Array, Array], Array]
 """Actions ``(n_u, B)`` of observations ``(n_observations, B)`` and standard normal noise ``(n_u, B)``."""
@@ -41,9 +45,6 @@ def rollout(
     et al. 2024, arXiv 2405.17784: adaptive horizons). A positive ``every`` cuts it after each ``every`` steps, as windows of
     that length do.
     """
-    import jax
-    import jax.numpy as jnp
-
     key_action, key_start = jax.random.split(key)
     count = first.age.shape[0]
     noise = env.normal(key_action, (length, env.n_actions, count))
@@ -72,18 +73,12 @@ def rollout(
 
 def _constant_where(is_cut: Array, episodes: Episodes) -> Episodes:
     """Return the same episodes, whose states have no derivative where ``is_cut``."""
-    import jax
-    import jax.numpy as jnp
-
     parts = [jnp.where(is_cut, jax.lax.stop_gradient(part), part) for part in episodes.state]
     return Episodes(State(*parts), episodes.age)
 
 
 def jacobian_norm(env: Environment, state: State, action: Array) -> Array:
     """Return the Frobenius norm of the derivative of the state after a control step by the state before it, ``(B,)``."""
-    import jax
-    import jax.numpy as jnp
-
     state, controls = jax.lax.stop_gradient((state, env.scene.controls_of(env.ops.xp, action)))
     split = state.q.shape[0]
     x = jnp.concatenate(state)
@@ -104,9 +99,6 @@ def gains(window: Window, values: Array, discount: Any, every: int = 0) -> Array
     With a positive ``every``, V is added after each ``every`` steps too, and the powers of gamma go on: where the rollout
     cuts the gradient there as well, the derivative of the sum is that of all its windows of that length.
     """
-    import jax
-    import jax.numpy as jnp
-
     step = jnp.arange(1, window.reward.shape[0] + 1)
     is_last = step == window.reward.shape[0]
     if every > 0:
@@ -123,8 +115,6 @@ def gains(window: Window, values: Array, discount: Any, every: int = 0) -> Array
 
 def gains_to_go(gained: Array, cut: Array) -> Array:
     """Return the sum of :func:`gains` from each step to the end of its part, ``(h, B)``."""
-    import jax
-    import jax.numpy as jnp
 
     def back(later: Array, at: tuple[Array, Array]) -> tuple[Array, Array]:
         return (at[0] + jnp.where(at[1], 0.0, later),) * 2
@@ -134,18 +124,12 @@ def gains_to_go(gained: Array, cut: Array) -> Array:
 
 def log_probability(actor: Any, known: Any, window: Window) -> Array:
     """Return the log densities of a window's actions under an actor, ``(h, B)``; states and actions are constants."""
-    import jax
-
-    from bench.training.normaliser import normalised
-
     seen, action = jax.lax.stop_gradient((normalised(known, flat(window.observation)), flat(window.action)))
     return actor.log_probability(seen, action).reshape(window.reward.shape)
 
 
 def flat(steps: Array) -> Array:
     """Return vectors of steps ``(h, n, B)`` as columns ``(n, h * B)``."""
-    import jax.numpy as jnp
-
     return jnp.moveaxis(steps, 1, 0).reshape(steps.shape[1], -1)
 
 

@@ -1,12 +1,9 @@
 """Brax: the scene's twin in the generalized pipeline, in a Python of its own."""
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
 
 from bench.engines.backend import EngineBackend
-from bench.model import Program, param
-
-from ..contacts.penalty import Penalty
+from bench.model import param
 
 
 @dataclass(frozen=True)
@@ -20,17 +17,10 @@ class Brax(EngineBackend):
 
     name = "brax"
     file = "../engines/brax.py"
-    helpers: ClassVar[tuple[str, ...]] = ("mujoco_twin.py",)
+    helpers = ("mujoco_twin.py",)
+    damping_mode = "clipped"
     solver_error = 1e-6
-    libraries: ClassVar[tuple[str, ...]] = ("brax", "jax", "mujoco", "mujoco-mjx", "numpy")
+    libraries = ("brax", "jax", "mujoco", "mujoco-mjx", "numpy")
 
-    dtype: str = param("float64", "floating-point type of the simulation", choices=("float64",))
     impedance: float = param(0.01, "share of other forces that a contact cancels", low=1e-3, high=0.9999)
     halvings: int = param(60, "most halvings of a step of the contact solver", positive=True)
-
-    def unsupported_twin(self, program: Program, model: dict[str, Any]) -> str | None:
-        """Return why Brax cannot run the program: a damper that pulls; or None."""
-        law = program.contact
-        if isinstance(law, Penalty) and law.damping and law.damping_mode != "clipped":
-            return f"brax's contacts never pull: it supports damping_mode=clipped only, not {law.damping_mode}"
-        return None

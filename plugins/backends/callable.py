@@ -1,7 +1,6 @@
 """Users' own simulators: costs and gradients from their functions."""
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -14,7 +13,7 @@ class CallableBackend(Backend):
 
     name = "callable"
     provides = Backend.provides | {"simulator"}
-    reference_rank: ClassVar[int | None] = 9
+    reference_rank = 9
 
     step: float = param(1e-5, "step of the central differences, in units of each input's scale", positive=True)
 

@@ -1,7 +1,6 @@
 """Drake: the scene's twin as a multibody plant with point contact, in a Python of its own."""
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 from bench.engines.backend import EngineBackend
 from bench.model import param
@@ -17,8 +16,7 @@ class Drake(EngineBackend):
 
     name = "drake"
     file = "../engines/drake.py"
-    libraries: ClassVar[tuple[str, ...]] = ("drake", "numpy")
+    libraries = ("drake", "numpy")
     own_contact = True
 
-    dtype: str = param("float64", "floating-point type of the simulation", choices=("float64",))
     dissipation: float = param(0.0, "Hunt and Crossley's dissipation of contacts", "s/m", low=0.0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -28,7 +28,7 @@ class Fused(Backend):
 
     name = "fused"
     uses = (fused,)
-    requires: ClassVar[tuple[str, ...]] = ("jax", "numba")
+    requires = ("jax", "numba")
     # surrogate gradients are not supported
     provides = Jax.provides - {"surrogate"}
 
@@ -140,33 +140,20 @@ class FusedProblem(JaxProblem):
         if not batch:
             return np.empty((rows, 0)), True
         source = _source(_Structure(self.program), function, self._dtype.name)
+        is_shared = theta.shape[1] == 1
         # contiguous, since the rows of a large batch are so far apart that each needs its own memory page
-        w, noise_row = self._flat(np.ascontiguousarray(w))
-        if theta.shape[1] == 1:
-            theta = np.repeat(theta, self.grain, axis=1)
-            column = 0
-        else:
-            column = 1
-        flat, row = self._flat(theta)
+        theta = np.ascontiguousarray(np.repeat(theta, self.grain, axis=1) if is_shared else theta, self._dtype)
+        w = np.ascontiguousarray(w, self._dtype)
+        column = (theta.reshape(-1), theta.shape[1], int(not is_shared))
         out = np.empty((rows, batch), self._dtype)
         arguments = (
-            self._parameters, source.constants, source.indices, source.length, flat, row, column, flat, row, column,
-            w, noise_row, out.reshape(-1), batch, rows, 0, batch,
+            self._parameters, source.constants, source.indices, source.length, *column, *column,
+            w.reshape(-1), batch, out.reshape(-1), batch, rows, 0, batch,
         )  # fmt: skip
         is_small, is_bounded = self._compiled(source.text)(*arguments)
         if not is_small:
             _, is_bounded = self._compiled(kernels.exact(source.text))(*arguments)
         return out.astype(np.float64, copy=False), is_bounded
-
-    def _flat(self, array: np.ndarray) -> tuple[np.ndarray, int]:
-        """Return a flat view of a 2-D array from its first entry, and the stride between rows in entries."""
-        array = np.asarray(array, dtype=self._dtype)
-        size = array.itemsize
-        if array.strides[1] != size or array.strides[0] % size or array.strides[0] < 0:
-            array = np.ascontiguousarray(array)
-        row = array.strides[0] // size
-        length = (array.shape[0] - 1) * row + array.shape[1] if array.shape[0] else 0
-        return np.lib.stride_tricks.as_strided(array, (length,), (size,)), row
 
     def _compiled(self, text: str) -> Any:
         kernel = kernels.compiled(text, self._dtype.name, self._measured, self.compilations)

@@ -1,14 +1,12 @@
 """Genesis: the scene's twin in its rigid solver, in a Python of its own."""
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
 from bench.engines.backend import EngineBackend
 from bench.model import Program, param
-
-from ..contacts.penalty import Penalty
 
 
 @dataclass(frozen=True)
@@ -21,16 +19,14 @@ class Genesis(EngineBackend):
 
     name = "genesis"
     file = "../engines/genesis.py"
-    libraries: ClassVar[tuple[str, ...]] = ("genesis-world", "torch", "numpy")
+    libraries = ("genesis-world", "torch", "numpy")
+    damping_mode = "clipped"
 
-    dtype: str = param("float64", "floating-point type of the simulation", choices=("float64",))
     impedance: float = param(3e-4, "share of other forces that a contact cancels", low=3e-4, high=0.99)
 
     def unsupported_twin(self, program: Program, model: dict[str, Any]) -> str | None:
-        """Return why Genesis cannot run the program: contacts that slide, several of them, or a damper that pulls; or None."""
-        law, contacts = program.contact, model["contacts"]
-        if isinstance(law, Penalty) and law.damping and law.damping_mode != "clipped":
-            return f"genesis' contacts never pull: it supports damping_mode=clipped only, not {law.damping_mode}"
+        """Return why Genesis cannot run the program: contacts that slide, or several of them; or None."""
+        contacts = model["contacts"]
         if len(contacts) > 1:
             return "genesis runs one contact per program"
         bodies = [model["bodies"][i] for contact in contacts for i in contact["bodies"] if i >= 0]

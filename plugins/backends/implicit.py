@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, ClassVar
+from typing import Any
 
 from bench.model import Array, Ops
 
@@ -27,9 +27,9 @@ class Implicit(Jax):
     """
 
     name = "implicit"
-    requires: ClassVar[tuple[str, ...]] = ("jax", "optimistix", "lineax")
+    requires = ("jax", "optimistix", "lineax")
     provides = Jax.provides | {"root"}
-    reference_rank: ClassVar[int | None] = 1
+    reference_rank = 1
 
     def ops(self) -> Ops:
         """Return JAX operations with a root finder.

@@ -6,7 +6,7 @@ import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -46,9 +46,9 @@ class Mjx(Jax):
 
     name = "mjx"
     uses = (mjcf, mjx_solver)
-    requires: ClassVar[tuple[str, ...]] = ("jax", "mujoco", "mujoco.mjx=mujoco-mjx")
+    requires = ("jax", "mujoco", "mujoco.mjx=mujoco-mjx")
     provides = Backend.provides | {"physics"}
-    reference_rank: ClassVar[int | None] = None
+    reference_rank = None
 
     mode: str = param("auto", "mode of differentiation; auto: the cheaper mode", choices=("auto", "reverse", "forward"))
     impedance: float = param(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -49,7 +49,7 @@ class Mujoco(Backend):
 
     name = "mujoco"
     uses = (mjcf,)
-    requires: ClassVar[tuple[str, ...]] = ("mujoco", "torch")
+    requires = ("mujoco", "torch")
     provides = Backend.provides | {"physics"}
 
     gradient: str = param(

@@ -1,12 +1,10 @@
 """Newton: the scene's twin in one of Newton's solvers, on Warp, in a Python of its own."""
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 from bench.engines.backend import EngineBackend
 from bench.model import Program, param
-
-from ..contacts.penalty import Penalty
 
 RIGID = {"provides": frozenset({"value", "score", "physics"}), "laws": ("impulse",), "own_contact": True}
 """What is different for ``solver=xpbd``: contacts are rigid, with the scene's restitution, and there are no gradients."""
@@ -26,7 +24,8 @@ class Newton(EngineBackend):
 
     name = "newton"
     file = "../engines/newton.py"
-    libraries: ClassVar[tuple[str, ...]] = ("newton", "warp-lang", "numpy")
+    libraries = ("newton", "warp-lang", "numpy")
+    damping_mode = "approach"
 
     dtype: str = param("float32", "floating-point type of the simulation", choices=("float32",))
     solver: str = param("featherstone", "Newton's solver", choices=("featherstone", "semi_implicit", "xpbd"))
@@ -37,10 +36,7 @@ class Newton(EngineBackend):
                 object.__setattr__(self, name, value)
 
     def unsupported_twin(self, program: Program, model: dict[str, Any]) -> str | None:
-        """Return why the solver cannot run the twin: a damper that acts while bodies part, hinges or links; or None."""
-        law = program.contact
-        if isinstance(law, Penalty) and law.damping and law.damping_mode != "approach":
-            return f"newton's contact damper acts on approach only: it supports damping_mode=approach, not {law.damping_mode}"
+        """Return why the solver cannot run the twin: hinges or links; or None."""
         has_links = any(body["joint"] != "slide" or body["parent"] >= 0 for body in model["bodies"])
         if self.solver != "featherstone" and has_links:
             return (

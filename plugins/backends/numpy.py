@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -16,7 +15,7 @@ class Numpy(Backend):
     """Gradients: central differences, 2 d rollouts each, error O(step^2); float64 or float32; no implicit equations."""
 
     name = "numpy"
-    reference_rank: ClassVar[int | None] = 3
+    reference_rank = 3
 
     step: float | None = param(
         None, "step of the central differences, in units of theta; null: 1e-6, and 5e-3 in float32", positive=True

@@ -1,12 +1,10 @@
 """Taichi: the scene's twin as a kernel of spheres on slides, in a Python of its own."""
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 from bench.engines.backend import EngineBackend
-from bench.model import Program, param
-
-from ..contacts.penalty import Penalty
+from bench.model import Program
 
 
 @dataclass(frozen=True)
@@ -15,14 +13,11 @@ class Taichi(EngineBackend):
 
     name = "taichi"
     file = "../engines/taichi.py"
-    libraries: ClassVar[tuple[str, ...]] = ("taichi", "numpy")
-
-    dtype: str = param("float64", "floating-point type of the simulation", choices=("float64",))
+    libraries = ("taichi", "numpy")
+    damping_mode = ""
 
     def unsupported_twin(self, program: Program, model: dict[str, Any]) -> str | None:
         """Return why the kernel cannot run the twin: hinges, linked bodies or damped contacts; or None."""
         if any(body["joint"] != "slide" or body["parent"] >= 0 for body in model["bodies"]):
             return "taichi's kernel has bodies on slides only, each attached to the world"
-        if isinstance(program.contact, Penalty) and program.contact.damping:
-            return "taichi's kernel has contacts without damping"
         return None

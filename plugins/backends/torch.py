@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -16,9 +16,9 @@ class Torch(Backend):
     """Gradients: reverse-mode autograd of the program on the CPU; float64 or float32; no implicit equations."""
 
     name = "torch"
-    requires: ClassVar[tuple[str, ...]] = ("torch",)
+    requires = ("torch",)
     provides = Backend.provides | {"surrogate"}
-    reference_rank: ClassVar[int | None] = 2
+    reference_rank = 2
 
     def compile(self, program: Program) -> Problem:
         return TorchProblem(program, self.dtype)

@@ -1,7 +1,7 @@
 """Implicit contact on the central path of the complementarity condition."""
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 from bench.model import Array, Contact, ImpulseLaw, Ops, State, param
 
@@ -17,8 +17,8 @@ class Complementarity(ImpulseLaw):
     """
 
     name = "complementarity"
-    smoothing: ClassVar[str] = "kappa"
-    needs_root: ClassVar[bool] = True
+    smoothing = "kappa"
+    needs_root = True
 
     kappa: float = param(1e-4, "central-path parameter, force times gap", "N m", positive=True)
     stiffness: float = param(float("inf"), "force per remaining penetration; inf: rigid", "N/m", positive=True)

@@ -1,7 +1,7 @@
 """A penalty spring with its clip smoothed."""
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 from bench.model import Array, ForceLaw, param
 
@@ -18,7 +18,7 @@ class Softplus(ForceLaw):
     """
 
     name = "softplus"
-    smoothing: ClassVar[str] = "beta"
+    smoothing = "beta"
 
     stiffness: float = param(1e3, "k, force per penetration", "N/m", positive=True)
     damping: float = param(0.0, "c, force per penetration rate", "N s/m", low=0.0)

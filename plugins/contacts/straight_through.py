@@ -1,7 +1,7 @@
 """Different contact laws in the forward and backward passes."""
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 from bench.plugins.contacts.penalty import Penalty
 from bench.plugins.contacts.softplus import Softplus
@@ -20,8 +20,8 @@ class StraightThrough(ForceLaw):
     """
 
     name = "straight_through"
-    smoothing: ClassVar[str] = "beta"
-    surrogate: ClassVar[bool] = True
+    smoothing = "beta"
+    surrogate = True
 
     forward: str = param("penalty", "law of the motion", choices=("penalty", "softplus"))
     backward: str = param("softplus", "law of the gradient", choices=("softplus", "penalty", "none"))

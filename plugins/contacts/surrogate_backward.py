@@ -1,7 +1,6 @@
 """Rigid contact in the forward pass, with the derivative of a softer one in the backward pass."""
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 from bench.plugins.contacts.complementarity import Complementarity
@@ -21,7 +20,7 @@ class SurrogateBackward(Complementarity):
     """
 
     name = "surrogate_backward"
-    surrogate: ClassVar[bool] = True
+    surrogate = True
 
     kappa: float = param(1e-6, "central-path parameter of the motion, force times gap", "N m", positive=True)
     soft_kappa: float = param(1e-2, "central-path parameter of the gradient, force times gap", "N m", positive=True)

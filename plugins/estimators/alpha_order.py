@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -31,7 +30,7 @@ class AlphaOrder(DiagnosticEstimator):
     name = "alpha_order"
     needs = frozenset({"value", "grad", "score"})
     unbiased = False
-    diagnostics: ClassVar[tuple[str, ...]] = ("alpha", "eps")
+    diagnostics = ("alpha", "eps")
 
     gamma: float | None = param(
         None,

@@ -1,7 +1,6 @@
 """First-order gradient with clipping."""
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -22,7 +21,7 @@ class Clipped(DiagnosticEstimator):
     name = "clipped"
     needs = frozenset({"grad"})
     unbiased = False
-    diagnostics: ClassVar[tuple[str, ...]] = ("cut",)
+    diagnostics = ("cut",)
 
     by: str = param("sample", "what is clipped", choices=("sample", "batch", "element"))
     limit: float | None = param(

@@ -1,11 +1,10 @@
 """Zeroth order with the linear part of the cost as a control variate."""
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
-from bench.model import Auxiliaries, DiagnosticEstimator, Problem, Program, columns, per_repeat, zeroth_order
+from bench.model import Auxiliaries, DiagnosticEstimator, Problem, columns, per_repeat, zeroth_order
 
 
 @dataclass(frozen=True)
@@ -20,9 +19,10 @@ class ControlVariate(DiagnosticEstimator):
     """
 
     name = "control_variate"
+    needs_noise_on_theta = True
     needs = frozenset({"value", "grad", "score"})
     unbiased_at_discontinuities = True
-    diagnostics: ClassVar[tuple[str, ...]] = ("coefficient",)
+    diagnostics = ("coefficient",)
 
     def estimate_with_diagnostics(
         self, problem: Problem, theta: np.ndarray, noise: np.ndarray
@@ -43,10 +43,6 @@ class ControlVariate(DiagnosticEstimator):
             for part, c in zip(parts, coefficients, strict=True)
         ]
         return np.concatenate(corrected, axis=1).mean(axis=1), {"coefficient": np.mean(coefficients, axis=0)}
-
-    def unsupported_reason(self, program: Program) -> str | None:
-        """Return the reason if noise is not on theta, since E[(g . w) w] is then not g; else None."""
-        return None if program.noise_on_theta else f"{self.name} needs noise on theta, not on a policy's actions"
 
 
 def _slope(control: np.ndarray, values: np.ndarray) -> np.ndarray:

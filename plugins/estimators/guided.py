@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.model import Estimator, Problem, columns, first_order, param, per_repeat
+from bench.model import Estimator, Problem, first_order, mean_difference, param
 
 
 @dataclass(frozen=True)
@@ -37,8 +37,4 @@ class Guided(Estimator):
         basis = basis * (sizes > 1e-9 * sizes.max(axis=1, keepdims=True))[..., None]
         w = rest[..., : problem.dim]
         inside = np.einsum("rkd,rke,rne->rnd", basis, basis, w)
-        s = problem.sigma
-        shift = s * columns(inside + np.sqrt(self.share) * (w - inside))
-        centred = problem.centred(columns(rest))
-        change = problem.displaced(shift, theta, centred) - problem.displaced(-shift, theta, centred)
-        return np.asarray(per_repeat(change * shift / (2.0 * s * s), rest).mean(axis=1))
+        return mean_difference(problem, theta, inside + np.sqrt(self.share) * (w - inside), rest)

@@ -1,7 +1,6 @@
 """Inverse-variance weighting of first and zeroth order."""
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -20,7 +19,7 @@ class InverseVariance(DiagnosticEstimator):
     name = "inverse_variance"
     needs = frozenset({"value", "grad", "score"})
     unbiased = False
-    diagnostics: ClassVar[tuple[str, ...]] = ("weight",)
+    diagnostics = ("weight",)
 
     def estimate_with_diagnostics(
         self, problem: Problem, theta: np.ndarray, noise: np.ndarray

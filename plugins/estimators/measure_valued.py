@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.model import Problem, Program, SampleMean
+from bench.model import Problem, SampleMean
 
 
 @dataclass(frozen=True)
@@ -18,6 +18,7 @@ class MeasureValued(SampleMean):
     """
 
     name = "measure_valued"
+    needs_noise_on_theta = True
     unbiased_at_discontinuities = True
 
     def terms(self, problem: Problem, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
@@ -32,7 +33,3 @@ class MeasureValued(SampleMean):
             moved[i] = -radius[i]
             rows.append(ahead - problem.value(theta, moved))
         return np.asarray(np.stack(rows) / (problem.sigma * np.sqrt(2.0 * np.pi)))
-
-    def unsupported_reason(self, program: Program) -> str | None:
-        """Return the reason if noise is not on theta, since each action would need its own differences; else None."""
-        return None if program.noise_on_theta else f"{self.name} needs noise on theta, not on a policy's actions"

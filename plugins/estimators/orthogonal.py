@@ -1,11 +1,10 @@
 """Zeroth order along orthogonal directions."""
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
-from bench.model import Estimator, Problem, Program, columns, param, per_repeat
+from bench.model import Estimator, Problem, Program, mean_difference, param
 
 
 @dataclass(frozen=True)
@@ -23,7 +22,7 @@ class Orthogonal(Estimator):
     name = "orthogonal"
     needs_directions = True
     unbiased_at_discontinuities = True
-    couples_samples: ClassVar[bool] = True
+    couples_samples = True
 
     lengths: str = param("drawn", "lengths of the directions", choices=("drawn", "fixed"))
 
@@ -37,14 +36,11 @@ class Orthogonal(Estimator):
         return program.noise_on_theta and super().declares_unbiased(program)
 
     def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
-        d, s = problem.dim, problem.sigma
+        d = problem.dim
         normal = noise[..., :d]
         v = np.concatenate([_rotated(normal[:, i : i + d]) for i in range(0, noise.shape[1], d)], axis=1)
         lengths = np.linalg.norm(normal, axis=2, keepdims=True) if self.lengths == "drawn" else np.sqrt(d)
-        shift = s * columns(lengths * v)
-        centred = problem.centred(columns(noise))
-        change = problem.displaced(shift, theta, centred) - problem.displaced(-shift, theta, centred)
-        return np.asarray(per_repeat(change * shift / (2.0 * s * s), noise).mean(axis=1))
+        return mean_difference(problem, theta, lengths * v, noise)
 
 
 def _rotated(normal: np.ndarray) -> np.ndarray:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.model import Estimator, Problem, Program, best_gradient, columns, param, per_repeat
+from bench.model import Estimator, Problem, Program, best_gradient, first_order, param
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class Planted(Estimator):
     def _base(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
         if self.base == "best":
             return best_gradient(problem, theta, noise)
-        return np.asarray(per_repeat(problem.grad(theta, columns(noise)), noise).mean(axis=1))
+        return np.asarray(first_order(problem, theta, noise).mean(axis=1))
 
     def _unit_errors(self, noise: np.ndarray, d: int) -> np.ndarray:
         """Return isotropic random vectors ``(R, d)`` with a root mean square length of 1."""

@@ -3,11 +3,10 @@
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
-from bench.model import Auxiliaries, DiagnosticEstimator, Problem, Program, columns, param, per_repeat
+from bench.model import Auxiliaries, DiagnosticEstimator, Problem, columns, param, per_repeat
 
 
 @dataclass(frozen=True)
@@ -30,10 +29,11 @@ class QuadraticModel(DiagnosticEstimator):
     """
 
     name = "quadratic_model"
+    needs_noise_on_theta = True
     needs_directions = True
     unbiased_at_discontinuities = True
-    couples_samples: ClassVar[bool] = True
-    diagnostics: ClassVar[tuple[str, ...]] = ("explained",)
+    couples_samples = True
+    diagnostics = ("explained",)
 
     block: int = param(256, "largest number of samples in one fit", low=4)
 
@@ -55,10 +55,6 @@ class QuadraticModel(DiagnosticEstimator):
         spread = f.var(axis=1) * count
         explained = 1.0 - np.divide(unexplained, spread, out=np.zeros_like(spread), where=spread > 0)
         return total / (count * problem.sigma), {"explained": explained}
-
-    def unsupported_reason(self, program: Program) -> str | None:
-        """Return the reason if noise is not on theta, since the model is then not one of theta; else None."""
-        return None if program.noise_on_theta else f"{self.name} needs noise on theta, not on a policy's actions"
 
 
 def _left_out(w: np.ndarray, f: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -3,11 +3,10 @@
 import math
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import ClassVar
 
 import numpy as np
 
-from bench.model import Estimator, Problem, Program, columns, per_repeat
+from bench.model import Estimator, Problem, Program, mean_difference
 
 BITS = 52
 """Binary digits of a coordinate: the centres of 2^52 equal intervals are numbers of double precision."""
@@ -31,7 +30,7 @@ class Sobol(Estimator):
     name = "sobol"
     needs_directions = True
     unbiased_at_discontinuities = True
-    couples_samples: ClassVar[bool] = True
+    couples_samples = True
 
     def declares_unbiased(self, program: Program) -> bool:
         """Return whether its expectation is grad J_sigma: for noise on theta."""
@@ -44,11 +43,7 @@ class Sobol(Estimator):
 
     def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Return the mean of central differences along the quasi-random directions, ``(R, d)``."""
-        s = problem.sigma
-        shift = s * columns(directions(noise[..., : problem.dim]))
-        centred = problem.centred(columns(noise))
-        change = problem.displaced(shift, theta, centred) - problem.displaced(-shift, theta, centred)
-        return np.asarray(per_repeat(change * shift / (2.0 * s * s), noise).mean(axis=1))
+        return mean_difference(problem, theta, directions(noise[..., : problem.dim]), noise)
 
 
 def directions(noise: np.ndarray) -> np.ndarray:

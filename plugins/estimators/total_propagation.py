@@ -1,7 +1,6 @@
 """First and zeroth order, weighted per time step."""
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -46,7 +45,7 @@ class TotalPropagation(DiagnosticEstimator):
     uses = (adjoint,)
     needs = frozenset({"value", "grad", "score"})
     unbiased = False
-    diagnostics: ClassVar[tuple[str, ...]] = ("weight",)
+    diagnostics = ("weight",)
 
     per: str = param("step", "the unit with a common weight", choices=("step", "control", "action"))
 

@@ -17,6 +17,7 @@ from bench.model import (
     adjoint,
     adjoint_gradient,
     columns,
+    first_order,
     param,
     per_repeat,
     slope_by_changes,
@@ -60,7 +61,7 @@ class Windowed(Estimator):
     def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
         program, w = problem.program, columns(noise)
         if not isinstance(program, Rollout) or (self.steps >= program.scene.horizon and self.cut is None):
-            return np.asarray(per_repeat(problem.grad(theta, w), noise).mean(axis=1))
+            return np.asarray(first_order(problem, theta, noise).mean(axis=1))
         path = slopes(problem, theta, w)
         problem.usage.gradients += w.shape[1]
         ends = self._ends(path)

@@ -6,7 +6,10 @@ from collections.abc import Callable
 from functools import cache
 from typing import Any
 
+import numpy as np
+
 from .graph import Graph, Node, Refused, reached
+from .trace import Tracer
 
 
 @cache
@@ -90,33 +93,7 @@ def pullback(graph: Graph, seeds: list[tuple[Node, Node]], wanted: Callable[[Nod
 
 def _pulled(graph: Graph, node: Node, which: int, cotangent: Node) -> Node:
     """Return the cotangent of argument number ``which`` of a node."""
-    jaxpr = _rule(node.op, node.data, len(node.args), which).jaxpr
-    known: dict[Any, Node] = dict(zip(jaxpr.invars, [*node.args, cotangent], strict=True))
-
-    def read(atom: Any) -> Node:
-        return graph.literal(atom.val) if hasattr(atom, "val") else known[atom]
-
-    _evaluate(graph, jaxpr, known, read, node)
-    return read(jaxpr.outvars[0])
-
-
-def _evaluate(graph: Graph, jaxpr: Any, known: dict[Any, Node], read: Callable[[Any], Node], node: Node) -> None:
-    for equation in jaxpr.eqns:
-        name, args = equation.primitive.name, [read(atom) for atom in equation.invars]
-        if name in ("jit", "pjit"):
-            inner = equation.params["jaxpr"].jaxpr
-            known.update(zip(inner.invars, args, strict=True))
-            _evaluate(graph, inner, known, read, node)
-            results = [read(atom) for atom in inner.outvars]
-        elif name == "convert_element_type":
-            boolean = str(equation.invars[0].aval.dtype) == "bool"
-            one, zero = graph.literal(1.0), graph.literal(0.0)
-            results = [graph.apply("select_n", args[0], zero, one) if boolean else args[0]]
-        elif name in ("copy", "broadcast_in_dim", "reshape"):
-            results = [args[0]]
-        elif node.op == "select_n" and name == "gt" and args[0] is node.args[0]:
-            results = [args[0]]  # the condition is Boolean already
-        else:
-            name = "add" if name == "add_any" else name
-            results = [graph.apply(name, *args, data=equation.params.get("y"))]
-        known.update(zip(equation.outvars, results, strict=True))
+    closed = _rule(node.op, node.data, len(node.args), which)
+    tracer = Tracer(graph, condition=node.args[0] if node.op == "select_n" else None)
+    (found,) = tracer.run(closed.jaxpr, closed.consts, [np.array(arg, dtype=object) for arg in (*node.args, cotangent)])
+    return tracer.nodes(found)[0]

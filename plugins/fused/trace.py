@@ -52,7 +52,7 @@ def traced(function: Callable[..., Any], shapes: dict[str, int]) -> Loop:
         jax.ShapeDtypeStruct((n,) if name == "parameter" else (n, 1), np.float64) for name, n in shapes.items()
     ]
     closed = jax.make_jaxpr(lambda *columns: function(**dict(zip(shapes, columns, strict=True))))(*arguments)
-    tracer = _Tracer()
+    tracer = Tracer(Graph())
     inputs = [_leaves(tracer.loop.graph, name, n) for name, n in shapes.items()]
     (cost,) = tracer.run(closed.jaxpr, closed.consts, inputs)
     tracer.loop.result = tracer.nodes(cost)[0]
@@ -76,16 +76,24 @@ def _shaped(items: Sequence[Any], parts: Sequence[np.ndarray]) -> list[np.ndarra
     return [_objects([next(at) for _ in range(part.size)], part.shape) for part in parts]
 
 
-class _Tracer:
-    """Evaluates jaxprs on arrays of nodes. Arrays of constants remain plain NumPy arrays."""
+class Tracer:
+    """Evaluates jaxprs on arrays of nodes. Arrays of constants remain plain NumPy arrays.
 
-    def __init__(self) -> None:
-        self.loop = Loop(Graph())
+    ``condition`` is Boolean already where a jaxpr compares it with a number.
+    """
+
+    def __init__(self, graph: Graph, condition: Node | None = None) -> None:
+        self.loop, self._condition = Loop(graph), condition
 
     def nodes(self, array: np.ndarray) -> list[Node]:
         """Return the entries of an array as nodes."""
         graph = self.loop.graph
         return [x if isinstance(x, Node) else graph.literal(x) for x in np.asarray(array).ravel()]
+
+    def _each(self, op: str, values: Sequence[np.ndarray], shape: tuple[int, ...], data: Any = None) -> np.ndarray:
+        """Return an operation on each entry of arrays, in the shape ``shape``."""
+        rows = [self.nodes(np.broadcast_to(value, shape)) for value in values]
+        return _objects([self.loop.graph.apply(op, *row, data=data) for row in zip(*rows, strict=True)], shape)
 
     def run(self, jaxpr: Any, consts: Sequence[Any], arguments: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Return the outputs of a jaxpr as arrays of nodes or constants."""
@@ -119,8 +127,10 @@ class _Tracer:
     def _elementwise(self, name: str, parameters: Any, values: list[np.ndarray], out: Any) -> np.ndarray:
         if name == "convert_element_type":
             return self._convert(values[0], out.dtype)
-        if name == "copy":
+        is_condition = name == "gt" and self._condition is not None and values[0].item() is self._condition
+        if name == "copy" or is_condition:
             return values[0]
+        name = "add" if name == "add_any" else name
         if name == "clamp":
             low, x, high = values
             return self._elementwise("min", {}, [self._elementwise("max", {}, [x, low], out), high], out)
@@ -132,10 +142,7 @@ class _Tracer:
                 return np.asarray(fold(*values), dtype=out.dtype)
         if len(values) > 3:
             raise Refused(f"{name} of more than two cases")
-        rows = [self.nodes(np.broadcast_to(value, out.shape)) for value in values]
-        data = parameters.get("y") if name == "integer_pow" else None
-        graph = self.loop.graph
-        return _objects([graph.apply(name, *row, data=data) for row in zip(*rows, strict=True)], out.shape)
+        return self._each(name, values, out.shape, parameters.get("y") if name == "integer_pow" else None)
 
     def _convert(self, value: np.ndarray, dtype: Any) -> np.ndarray:
         if value.dtype != object:
@@ -152,8 +159,7 @@ class _Tracer:
         rows = moved.reshape(-1, *moved.shape[len(axes) :])
         total: np.ndarray = rows[0]
         for row in rows[1:]:
-            pairs = zip(self.nodes(total), self.nodes(row), strict=True)
-            total = _objects([self.loop.graph.apply(op, a, b) for a, b in pairs], row.shape)
+            total = self._each(op, (total, row), row.shape)
         return total
 
     def _dot(self, dimensions: Any, left: np.ndarray, right: np.ndarray) -> np.ndarray:

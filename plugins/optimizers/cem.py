@@ -18,7 +18,6 @@ class Cem(Population):
 
     name = "cem"
 
-    population: int = param(100, "points per iteration", low=2)
     elites: int = param(20, "best points, to which the next normal is fitted", low=1)
     width: float = param(1.0, "initial standard deviation, in units of theta", positive=True)
     least: float = param(1e-6, "smallest standard deviation", low=0.0)
@@ -28,17 +27,12 @@ class Cem(Population):
         """Return the initial state: mean theta, standard deviation ``width``."""
         return super().start(theta) | {"deviation": np.full(len(theta), self.width)}
 
-    def draws(self, dim: int) -> int:
-        return self.population
-
     def ask(self, state: OptimizerState, noise: np.ndarray) -> np.ndarray:
         return np.asarray(state["theta"][:, None] + state["deviation"][:, None] * noise)
 
     def tell(self, state: OptimizerState, theta: np.ndarray, answer: Answer) -> OptimizerState:
         """Return mean and standard deviation of the elites as state; points without a finite cost rank last."""
-        assert answer.value is not None
-        cost = np.where(np.isfinite(answer.value), answer.value, np.inf)
-        elite = theta[:, np.argsort(cost, kind="stable")[: min(self.elites, theta.shape[1])]]
+        elite = self.best(theta, answer, self.elites)
         mean = elite.mean(axis=1)
         about = mean if self.spread == "new" else state["theta"]
         deviation = np.sqrt(((elite - about[:, None]) ** 2).mean(axis=1))

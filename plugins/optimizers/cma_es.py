@@ -50,7 +50,9 @@ class CmaEs(Population):
 
     name = "cma_es"
 
-    population: int | None = param(None, "points per iteration; null: 4 + 3 ln d", low=4)
+    population: int | None = param(  # type: ignore[assignment]
+        None, "points per iteration; null: 4 + 3 ln d", low=4
+    )
     width: float = param(0.3, "initial step size, in units of theta", positive=True)
 
     def start(self, theta: np.ndarray) -> OptimizerState:
@@ -68,12 +70,9 @@ class CmaEs(Population):
         return np.asarray(state["theta"][:, None] + state["sigma"] * moved)
 
     def tell(self, state: OptimizerState, theta: np.ndarray, answer: Answer) -> OptimizerState:
-        assert answer.value is not None
         d, i = theta.shape[0], state["iteration"] + 1
         k = constants(d, theta.shape[1])
-        cost = np.where(np.isfinite(answer.value), answer.value, np.inf)
-        best = theta[:, np.argsort(cost, kind="stable")[: k.weights.size]]
-        y = (best - state["theta"][:, None]) / state["sigma"]
+        y = (self.best(theta, answer, k.weights.size) - state["theta"][:, None]) / state["sigma"]
         step = y @ k.weights
         axes, lengths = state["axes"], state["lengths"]
         white = axes @ ((axes.T @ step) / lengths)

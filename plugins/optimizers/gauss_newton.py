@@ -1,7 +1,6 @@
 """Gauss-Newton with Levenberg's damping."""
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -19,7 +18,7 @@ class GaussNewton(Optimizer):
     """
 
     name = "gauss_newton"
-    needs: ClassVar[frozenset[str]] = frozenset({"residual", "jacobian"})
+    needs = frozenset({"residual", "jacobian"})
 
     damping: float = param(1e-3, "initial damping, relative to the diagonal of J'J", positive=True)
 

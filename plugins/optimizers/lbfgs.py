@@ -19,10 +19,10 @@ class Lbfgs(Searching):
 
     name = "lbfgs"
 
-    first: float = param(1.0, "longest trial step", positive=True)
-    shrink: float = param(0.5, "factor between two trial steps", positive=True, high=0.99)
-    slope: float = param(1e-4, "required share of the predicted descent (Armijo)", positive=True, high=1.0)
-    tries: int = param(16, "number of trial steps", positive=True)
+    first: float = 1.0
+    shrink: float = 0.5
+    slope: float = 1e-4
+    tries: int = 16
     memory: int = param(10, "stored pairs of steps and gradient differences", positive=True)
     first_move: float = param(0.1, "length of the first step", positive=True)
 

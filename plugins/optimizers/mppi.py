@@ -18,13 +18,9 @@ class Mppi(Population):
 
     name = "mppi"
 
-    population: int = param(100, "points per iteration", low=2)
     width: float = param(0.3, "standard deviation of the samples, in units of theta", positive=True)
     temperature: float = param(1.0, "increase of the cost at which a weight falls to 1/e", positive=True)
     relative: bool = param(True, "whether the temperature is in units of the standard deviation of the costs")
-
-    def draws(self, dim: int) -> int:
-        return self.population
 
     def ask(self, state: OptimizerState, noise: np.ndarray) -> np.ndarray:
         return np.asarray(state["theta"][:, None] + self.width * noise)

@@ -20,7 +20,6 @@ class Ppo(Population):
 
     name = "ppo"
 
-    population: int = param(100, "rollouts per iteration", low=2)
     width: float = param(0.3, "initial standard deviation, in units of theta", positive=True)
     rate: float = param(0.01, "step of Adam, in units of theta for means", positive=True)
     clip: float = param(0.2, "distance of a ratio from 1 at which the objective is clipped", positive=True, high=1.0)
@@ -33,9 +32,6 @@ class Ppo(Population):
         return {
             "theta": policy[0], "policy": policy, "mean": 0.0 * policy, "square": 0.0 * policy, "step": 0,
         }  # fmt: skip
-
-    def draws(self, dim: int) -> int:
-        return self.population
 
     def ask(self, state: OptimizerState, noise: np.ndarray) -> np.ndarray:
         mean, log_deviation = state["policy"]

@@ -2,7 +2,6 @@
 
 from abc import abstractmethod
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -17,7 +16,7 @@ class Searching(Optimizer):
     change. The batch of steps includes theta itself, so that all compared costs use the same noise.
     """
 
-    needs: ClassVar[frozenset[str]] = frozenset({"value", "gradient"})
+    needs = frozenset({"value", "gradient"})
 
     first: float = param(0.1, "longest trial step", positive=True)
     shrink: float = param(0.2, "factor between two trial steps", positive=True, high=0.99)

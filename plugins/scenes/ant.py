@@ -1,8 +1,7 @@
 """A robot with four spread legs of two joints, for physics engines only."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -23,15 +22,15 @@ class Ant(Legged):
     """
 
     name = "ant"
-    n_q: ClassVar[int] = 14
-    n_u: ClassVar[int] = 8
-    legs: ClassVar[tuple[str, ...]] = tuple(DIRECTIONS)
-    joints: ClassVar[tuple[str, ...]] = ("hip", "ankle")
-    torso: ClassVar[str] = 'type="sphere" size=".15"'
-    contact_values: ClassVar[Mapping[str, Any]] = {"stiffness": 1e4, "damping": 100.0, "damping_mode": "clipped"}
+    n_q = 14
+    n_u = 8
+    legs = tuple(DIRECTIONS)
+    joints = ("hip", "ankle")
+    torso = 'type="sphere" size=".15"'
+    contact_values = {"stiffness": 1e4, "damping": 100.0, "damping_mode": "clipped"}
 
     sigma: float = param(0.1, "standard deviation of the noise on the torques", "N m", positive=True)
-    horizon: int = param(30, "number of time steps", "steps", positive=True)
+    horizon: int = 30
     link: float = param(0.2, "length of a thigh; a shank is twice as long", "m", positive=True)
     damping: float = param(0.3, "damping of the joints", "N m s/rad", low=0.0)
     stiffness: float = param(4.0, "stiffness of the joints", "N m/rad", low=0.0)

@@ -1,8 +1,7 @@
 """One ball is pushed towards another. If it misses, the gradient is exactly zero."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -19,16 +18,15 @@ class Billiard(ContactScene):
     """
 
     name = "billiard"
-    continuous: ClassVar[bool] = True
-    neglected_effects: ClassVar[str] = "spin, friction, cushions, the third dimension"
-    n_q: ClassVar[int] = 4
-    n_u: ClassVar[int] = 2
-    n_contacts: ClassVar[int] = 1
-    contact_values: ClassVar[Mapping[str, Any]] = {"stiffness": 1e3, "beta": 50.0}
+    continuous = True
+    neglected_effects = "spin, friction, cushions, the third dimension"
+    n_q = 4
+    n_u = 2
+    n_contacts = 1
+    contact_values = {"stiffness": 1e3, "beta": 50.0}
 
     sigma: float = param(0.3, "standard deviation of the noise on u0", "N", positive=True)
-    horizon: int = param(300, "number of time steps", "steps", positive=True)
-    dt: float = param(0.01, "length of a time step", "s", positive=True)
+    horizon: int = 300
     mass: float = param(0.17, "mass of each ball", "kg", positive=True)
     radius: float = param(0.042, "radius of each ball", "m", positive=True)
     push: float = param(4.0, "force along x in the first step", "N")

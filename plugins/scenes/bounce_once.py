@@ -1,9 +1,8 @@
 """One elastic bounce without gravity: the smallest test of a contact gradient."""
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -22,16 +21,16 @@ class BounceOnce(EngineTwin, ContactScene):
     """
 
     name = "bounce_once"
-    continuous: ClassVar[bool] = True
-    neglected_effects: ClassVar[str] = "the horizontal motion (free, uncoupled), gravity, spin"
-    n_q: ClassVar[int] = 1
-    n_u: ClassVar[int] = 1
-    n_contacts: ClassVar[int] = 1
-    contact_values: ClassVar[Mapping[str, Any]] = {"stiffness": 1e4, "damping": 0.0}
+    continuous = True
+    neglected_effects = "the horizontal motion (free, uncoupled), gravity, spin"
+    n_q = 1
+    n_u = 1
+    n_contacts = 1
+    contact_values = {"stiffness": 1e4, "damping": 0.0}
 
     sigma: float = param(0.1, "standard deviation of the noise on theta", "m, m/s and N", positive=True)
-    horizon: int = param(480, "number of time steps", "steps", positive=True)
-    dt: float = param(1.0 / 480.0, "length of a time step", "s", positive=True)
+    horizon: int = 480
+    dt: float = 1.0 / 480.0
     mass: float = param(1.0, "mass of the ball", "kg", positive=True)
     radius: float = param(0.1, "radius of the ball", "m", positive=True)
     height: float = param(1.0 + 1.0 / 480.0, "initial height of the centre at theta", "m", positive=True)

@@ -1,9 +1,8 @@
 """A ball dropped on the ground: one stiff contact under gravity."""
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -23,16 +22,16 @@ class BouncingBall(EngineTwin, ContactScene):
     """
 
     name = "bouncing_ball"
-    continuous: ClassVar[bool] = True
-    neglected_effects: ClassVar[str] = "horizontal motion, spin, air, the ball's shape"
-    n_q: ClassVar[int] = 1
-    n_contacts: ClassVar[int] = 1
-    twin_difference: ClassVar[float] = 1e-3
-    contact_values: ClassVar[Mapping[str, Any]] = {"stiffness": 1e4}
+    continuous = True
+    neglected_effects = "horizontal motion, spin, air, the ball's shape"
+    n_q = 1
+    n_contacts = 1
+    twin_difference = 1e-3
+    contact_values = {"stiffness": 1e4}
 
     sigma: float = param(0.05, "standard deviation of the noise on height and velocity", "m and m/s", positive=True)
-    horizon: int = param(400, "number of time steps", "steps", positive=True)
-    dt: float = param(0.0025, "length of a time step", "s", positive=True)
+    horizon: int = 400
+    dt: float = 0.0025
     mass: float = param(1.0, "mass of the ball", "kg", positive=True)
     gravity: float = param(9.81, "gravitational acceleration", "m/s^2", positive=True)
     height: float = param(1.0, "initial height at theta", "m", positive=True)

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 from bench.model import CallableScene, load_simulator, param, simulator_files
 
@@ -17,7 +17,7 @@ class Callable(CallableScene):
 
     name = "callable"
     neglected_effects = "those that the simulator neglects"
-    backends: ClassVar[tuple[str, ...]] = ("callable",)
+    backends = ("callable",)
 
     cost: str = param("bench.model.simulator.example:cost", "the cost, as FILE:NAME or MODULE:NAME")
     theta: str = param("theta", "theta: a name in the file")

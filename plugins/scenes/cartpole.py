@@ -1,7 +1,7 @@
 """Balancing a pole on a cart: a feedback policy, for which noise on actions and noise on theta differ."""
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -21,13 +21,13 @@ class Cartpole(EngineTwin, MechanicalScene):
 
     name = "cartpole"
     neglected_effects = "the track's ends, friction, the pole's inertia about its tip"
-    continuous: ClassVar[bool] = True
-    n_q: ClassVar[int] = 2
-    n_u: ClassVar[int] = 1
+    continuous = True
+    n_q = 2
+    n_u = 1
 
     sigma: float = param(0.1, "standard deviation of the noise on each force, or on each gain", "N", positive=True)
-    horizon: int = param(50, "number of time steps", "steps", positive=True)
-    dt: float = param(0.02, "length of a time step", "s", positive=True)
+    horizon: int = 50
+    dt: float = 0.02
     noise: str = param("action", "whether noise is on the actions or on theta", choices=("action", "parameter"))
     cart_mass: float = param(1.0, "M", "kg", positive=True)
     pole_mass: float = param(0.1, "m", "kg", positive=True)

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 from bench.model import Array, PolicyScene, State, param, uniform
 
@@ -21,16 +21,16 @@ class CartpoleSwing(PolicyScene):
 
     name = "cartpole_swing"
     neglected_effects = "the track's ends, friction"
-    continuous: ClassVar[bool] = True
-    n_q: ClassVar[int] = 2
-    n_u: ClassVar[int] = 1
-    n_observations: ClassVar[int] = 5
-    n_start: ClassVar[int] = 8
+    continuous = True
+    n_q = 2
+    n_u = 1
+    n_observations = 5
+    n_start = 8
 
     sigma: float = param(0.3, "standard deviation of the noise on each action, or on each parameter", positive=True)
-    horizon: int = param(240, "number of control steps", "steps", positive=True)
-    dt: float = param(1 / 60, "length of a control step", "s", positive=True)
-    substeps: int = param(4, "steps of the integrator per control step", positive=True)
+    horizon: int = 240
+    dt: float = 1 / 60
+    substeps: int = 4
     cart_mass: float = param(1.0, "mass of the cart", "kg", positive=True)
     pole_mass: float = param(0.1, "m, mass of the pole", "kg", positive=True)
     length: float = param(0.5, "l, half the length of the pole", "m", positive=True)

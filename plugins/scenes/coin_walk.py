@@ -1,7 +1,7 @@
 """Eight steps up or down by coins whose odds depend on theta and on the place: discrete events in a row."""
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -24,9 +24,9 @@ class CoinWalk(EventScene, DisturbedScene):
 
     name = "coin_walk"
     neglected_effects = "inertia, the time between steps"
-    continuous: ClassVar[bool] = False
-    discrete: ClassVar[bool] = True
-    exogenous: ClassVar[int] = 8
+    continuous = False
+    discrete = True
+    exogenous = 8
 
     push: float = param(0.2, "x_0 at theta, in standard deviations of the coin's normal number")
     pull: float = param(0.15, "x_1 at theta, per step away from 0")

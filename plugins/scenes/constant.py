@@ -1,7 +1,7 @@
 """A constant cost: every nonzero estimate is noise of the estimator."""
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -14,7 +14,7 @@ class Constant(FunctionScene):
 
     name = "constant"
     neglected_effects = "dynamics"
-    continuous: ClassVar[bool] = True
+    continuous = True
 
     dimension: int = param(5, "d, length of theta", positive=True)
     value: float = param(3.0, "the cost")

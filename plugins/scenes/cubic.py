@@ -1,7 +1,7 @@
 """A cubic: the simplest cost whose smoothed gradient differs from its gradient."""
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -17,7 +17,7 @@ class Cubic(FunctionScene):
 
     name = "cubic"
     neglected_effects = "dynamics"
-    continuous: ClassVar[bool] = True
+    continuous = True
 
     dimension: int = param(5, "d, length of theta", positive=True)
 

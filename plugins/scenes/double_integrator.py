@@ -1,7 +1,7 @@
 """A mass pushed along a line: dynamics for which gradient and variance have closed forms."""
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -18,15 +18,15 @@ class DoubleIntegrator(EngineTwin, MechanicalScene):
 
     name = "double_integrator"
     neglected_effects = "contact, friction, effort in the cost"
-    continuous: ClassVar[bool] = True
-    open_loop: ClassVar[bool] = True
-    n_q: ClassVar[int] = 1
-    n_u: ClassVar[int] = 1
+    continuous = True
+    open_loop = True
+    n_q = 1
+    n_u = 1
 
     sigma: float = param(0.1, "standard deviation of the noise on each control", "m/s^2", positive=True)
     noise: str = param("action", "noise is on the actions", choices=("action",))
-    horizon: int = param(20, "number of time steps", "steps", positive=True)
-    dt: float = param(0.05, "length of a time step", "s", positive=True)
+    horizon: int = 20
+    dt: float = 0.05
     control: float = param(1.0, "control of every step at theta", "m/s^2")
 
     def theta0(self) -> np.ndarray:
@@ -66,8 +66,3 @@ class DoubleIntegrator(EngineTwin, MechanicalScene):
         """Return (c . theta - 1) c."""
         c = self.sensitivity(integrator)
         return None if c is None else (c @ self.theta0() - 1.0) * c
-
-    def first_order_variance(self, integrator: Plugin | None) -> float | None:
-        """Return the trace of the covariance of a sample's gradient, sigma^2 |c|^4."""
-        c = self.sensitivity(integrator)
-        return None if c is None else float(self.sigma**2 * (c @ c) ** 2)

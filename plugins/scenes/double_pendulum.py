@@ -1,7 +1,7 @@
 """A double pendulum: chaos without contact."""
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -19,12 +19,10 @@ class DoublePendulum(MechanicalScene):
 
     name = "double_pendulum"
     neglected_effects = "the rods' mass, friction, torques"
-    continuous: ClassVar[bool] = True
-    n_q: ClassVar[int] = 2
+    continuous = True
+    n_q = 2
 
     sigma: float = param(0.1, "standard deviation of the noise on the initial state", "rad and rad/s", positive=True)
-    horizon: int = param(100, "number of time steps", "steps", positive=True)
-    dt: float = param(0.01, "length of a time step", "s", positive=True)
     mass: float = param(0.1, "each point mass", "kg", positive=True)
     length: float = param(1.0, "length of each rod", "m", positive=True)
     gravity: float = param(9.81, "gravitational acceleration", "m/s^2")

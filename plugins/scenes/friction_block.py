@@ -1,8 +1,7 @@
 """A block dragged through stick and slip."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -26,29 +25,27 @@ class FrictionBlock(FrictionScene):
     """
 
     name = "friction_block"
-    continuous: ClassVar[bool] = True
-    neglected_effects: ClassVar[str] = (
-        "rotation and shape, a higher coefficient at rest, the second horizontal direction"
-    )
-    n_q: ClassVar[int] = 2
-    n_u: ClassVar[int] = 1
-    n_contacts: ClassVar[int] = 1
-    contact_values: ClassVar[Mapping[str, Any]] = {"stiffness": 1e5, "beta": 1e5}
+    continuous = True
+    neglected_effects = "rotation and shape, a higher coefficient at rest, the second horizontal direction"
+    n_q = 2
+    n_u = 1
+    n_contacts = 1
+    contact_values = {"stiffness": 1e5, "beta": 1e5}
 
     sigma: float = param(0.02, "standard deviation of the noise on V and a", "m/s and 1", positive=True)
-    horizon: int = param(1500, "number of time steps", "steps", positive=True)
-    dt: float = param(0.001, "length of a time step", "s", positive=True)
+    horizon: int = 1500
+    dt: float = 0.001
     mass: float = param(1.0, "m", "kg", positive=True)
     gravity: float = param(9.81, "g", "m/s^2", positive=True)
     friction: float = param(0.5, "mu, Coulomb coefficient", low=0.0)
-    slip_speed: float = param(0.005, "slip speed at which friction reaches tanh(1) of its limit", "m/s", positive=True)
+    slip_speed: float = 0.005
     spring: float = param(400.0, "k, stiffness of the spring", "N/m", positive=True)
     depth: float = param(9.81e-5, "penetration at the start", "m", low=0.0)
     pull: float = param(0.3, "V at theta", "m/s")
     jerk: float = param(1.0, "a at theta: amplitude of the end's speed over its mean")
     frequency: float = param(8.0, "w", "rad/s", positive=True)
     goal: float = param(1.0, "target x at the end", "m")
-    restitution: float = param(0.0, "restitution of impulse laws", low=0.0, high=1.0)
+    restitution: float = 0.0
 
     def theta0(self) -> np.ndarray:
         return np.array([self.pull, self.jerk])

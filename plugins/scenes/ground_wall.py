@@ -1,9 +1,8 @@
 """A thrown ball meets the ground and a wall: two contacts, with gravity."""
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -23,15 +22,15 @@ class GroundWall(ContactScene):
     """
 
     name = "ground_wall"
-    continuous: ClassVar[bool] = True
-    neglected_effects: ClassVar[str] = "spin, friction, air, the corner of ground and wall"
-    n_q: ClassVar[int] = 2
-    n_contacts: ClassVar[int] = 2
-    contact_values: ClassVar[Mapping[str, Any]] = {"stiffness": 1e4, "damping": 10.0, "damping_mode": "approach"}
+    continuous = True
+    neglected_effects = "spin, friction, air, the corner of ground and wall"
+    n_q = 2
+    n_contacts = 2
+    contact_values = {"stiffness": 1e4, "damping": 10.0, "damping_mode": "approach"}
 
     sigma: float = param(0.1, "standard deviation of the noise on the velocity", "m/s", positive=True)
-    horizon: int = param(288, "number of time steps", "steps", positive=True)
-    dt: float = param(0.6 / 288.0, "length of a time step", "s", positive=True)
+    horizon: int = 288
+    dt: float = 0.6 / 288.0
     mass: float = param(1.0, "mass of the ball", "kg", positive=True)
     radius: float = param(0.1, "radius of the ball", "m", positive=True)
     gravity: float = param(9.8, "gravitational acceleration", "m/s^2", low=0.0)

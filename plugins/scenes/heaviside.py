@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -18,7 +18,7 @@ class Heaviside(EventScene, FunctionScene):
 
     name = "heaviside"
     neglected_effects = "dynamics; represents a contact that occurs or not"
-    continuous: ClassVar[bool] = False
+    continuous = False
 
     theta: float = param(0.0, "where the gradient is estimated; the jump is at 0")
 

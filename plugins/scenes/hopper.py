@@ -1,8 +1,7 @@
 """Hopping on one leg: repeated landing and lift-off, under feedback."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -25,18 +24,18 @@ class Hopper(EngineTwin, ContactScene):
     """
 
     name = "hopper"
-    continuous: ClassVar[bool] = True
-    neglected_effects: ClassVar[str] = "forward motion and pitch, the leg's angle and end stops, limits of the actuator"
-    n_q: ClassVar[int] = 2
-    n_u: ClassVar[int] = 1
-    n_contacts: ClassVar[int] = 1
-    twin_difference: ClassVar[float] = 1e-3
-    contact_values: ClassVar[Mapping[str, Any]] = {"stiffness": 1e4}
+    continuous = True
+    neglected_effects = "forward motion and pitch, the leg's angle and end stops, limits of the actuator"
+    n_q = 2
+    n_u = 1
+    n_contacts = 1
+    twin_difference = 1e-3
+    contact_values = {"stiffness": 1e4}
 
     sigma: float = param(1.0, "standard deviation of the noise on the force of each step", "N", positive=True)
     noise: str = param("action", "noise is on the actions", choices=("action",))
-    horizon: int = param(1000, "number of time steps", "steps", positive=True)
-    dt: float = param(0.002, "length of a time step", "s", positive=True)
+    horizon: int = 1000
+    dt: float = 0.002
     body_mass: float = param(1.0, "M, mass of the body", "kg", positive=True)
     foot_mass: float = param(0.1, "mass of the foot", "kg", positive=True)
     leg: float = param(0.5, "rest length of the leg", "m", positive=True)
@@ -46,7 +45,7 @@ class Hopper(EngineTwin, ContactScene):
     drop: float = param(0.15, "initial height of the foot", "m", positive=True)
     target: float = param(0.7, "target energy height", "m", positive=True)
     effort: float = param(1e-5, "weight of the mean squared force", "m^2/N^2", low=0.0)
-    restitution: float = param(0.0, "restitution of impulse laws", low=0.0, high=1.0)
+    restitution: float = 0.0
 
     def theta0(self) -> np.ndarray:
         """Return 100 N s/m^2 and 400 N s/m^3, with which the default body hops a little below target."""

@@ -1,9 +1,8 @@
 """Running on one leg from random starts, under a neural policy."""
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 from bench.model import Array, FrictionScene, PolicyScene, State, param, uniform
 
@@ -35,21 +34,21 @@ class HopperRun(PolicyScene, FrictionScene):
 
     name = "hopper_run"
     neglected_effects = "size of the foot, end stops, the leg's own mass, speed limits of the actuators"
-    continuous: ClassVar[bool] = False
-    n_q: ClassVar[int] = 5
-    n_u: ClassVar[int] = 2
-    n_contacts: ClassVar[int] = 1
-    n_observations: ClassVar[int] = 10
-    n_start: ClassVar[int] = 10
-    contact_values: ClassVar[Mapping[str, Any]] = {"stiffness": 1e4}
+    continuous = False
+    n_q = 5
+    n_u = 2
+    n_contacts = 1
+    n_observations = 10
+    n_start = 10
+    contact_values = {"stiffness": 1e4}
 
     sigma: float = param(0.3, "standard deviation of the noise on each action, or on each parameter", positive=True)
-    horizon: int = param(240, "number of control steps", "steps", positive=True)
-    dt: float = param(1 / 60, "length of a control step", "s", positive=True)
-    substeps: int = param(8, "steps of the integrator per control step", positive=True)
-    restitution: float = param(0.0, "restitution of impulse laws", low=0.0, high=1.0)
+    horizon: int = 240
+    dt: float = 1 / 60
+    substeps: int = 8
+    restitution: float = 0.0
     friction: float = param(0.9, "Coulomb coefficient of the foot under a force law", low=0.0)
-    slip_speed: float = param(0.3, "slip speed at which friction reaches tanh(1) of its limit", "m/s", positive=True)
+    slip_speed: float = 0.3
     body_mass: float = param(4.0, "mass of the body", "kg", positive=True)
     inertia: float = param(0.3, "moment of inertia of the body", "kg m^2", positive=True)
     foot_mass: float = param(0.5, "mass of the foot", "kg", positive=True)

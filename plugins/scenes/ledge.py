@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -23,7 +23,7 @@ class Ledge(EventScene, FunctionScene):
 
     name = "ledge"
     neglected_effects = "dynamics; represents a contact that occurs or not, with another motion after it"
-    continuous: ClassVar[bool] = False
+    continuous = False
 
     height: float = param(1.0, "size of the jump at x = 0, if the edge is there")
     edge: float = param(0.3, "distance of the edge from 0")

@@ -1,7 +1,7 @@
 """A plane: every unbiased gradient estimator is exact on average."""
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -17,7 +17,7 @@ class Linear(FunctionScene):
 
     name = "linear"
     neglected_effects = "dynamics"
-    continuous: ClassVar[bool] = True
+    continuous = True
 
     dimension: int = param(5, "d, length of theta", positive=True)
     slope: float = param(2.0, "the largest of the slopes a_i")

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -20,15 +20,14 @@ class Lqr(KnownOptimum, KnownValue, MechanicalScene):
 
     name = "lqr"
     neglected_effects = "contact, limits"
-    continuous: ClassVar[bool] = True
-    open_loop: ClassVar[bool] = True
-    n_q: ClassVar[int] = 1
-    n_u: ClassVar[int] = 1
+    continuous = True
+    open_loop = True
+    n_q = 1
+    n_u = 1
 
     sigma: float = param(0.1, "standard deviation of the noise on each control", "m/s^2", positive=True)
     noise: str = param("action", "noise is on the actions", choices=("action",))
-    horizon: int = param(100, "number of time steps", "steps", positive=True)
-    dt: float = param(0.05, "length of a time step", "s", positive=True)
+    dt: float = 0.05
     start: float = param(1.0, "q at the start", "m")
     control: float = param(0.0, "control of every step at theta", "m/s^2")
     position: float = param(1.0, "weight of q^2", "1/m^2", low=0.0)

@@ -3,7 +3,7 @@
 import cmath
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -22,12 +22,10 @@ class MassSpring(Oscillator, DampedScene):
 
     name = "mass_spring"
     neglected_effects = "the centre of mass (moves uniformly)"
-    continuous: ClassVar[bool] = True
-    n_q: ClassVar[int] = 1
+    continuous = True
+    n_q = 1
 
     sigma: float = param(0.01, "standard deviation of the noise on stretch and rate", "m and m/s", positive=True)
-    horizon: int = param(100, "number of time steps", "steps", positive=True)
-    dt: float = param(0.01, "length of a time step", "s", positive=True)
     stiffness: float = param(50.0, "k of the spring", "N/m", low=0.0)
     damping: float = param(0.0, "c of the damper beside the spring", "N s/m", low=0.0)
     mass: float = param(1.0, "m, mass of each body", "kg", positive=True)
@@ -45,10 +43,6 @@ class MassSpring(Oscillator, DampedScene):
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
         return q[0] * q[0]
-
-    def energy(self, q: Array, v: Array) -> Array:
-        """Return k q^2 / 2 + (m / 2) v^2 / 2 with the reduced mass, ``(B,)`` [J]."""
-        return 0.5 * self.stiffness * q[0] * q[0] + 0.25 * self.mass * v[0] * v[0]
 
     def oscillator(self) -> tuple[float, float, float]:
         """Return stiffness 2 k / m [1/s^2], damping 2 c / m [1/s] and velocity factor, for transition matrices."""

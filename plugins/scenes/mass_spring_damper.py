@@ -1,7 +1,7 @@
 """A mass on a spring and a damper, released from rest: identifiable and unidentifiable parameters."""
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -19,14 +19,14 @@ class MassSpringDamper(Identified, MechanicalScene):
 
     name = "mass_spring_damper"
     neglected_effects = "dry friction, nonlinear stiffness"
-    continuous: ClassVar[bool] = True
-    n_q: ClassVar[int] = 1
-    n_u: ClassVar[int] = 1
-    unknowns: ClassVar[tuple[str, ...]] = ("mass", "stiffness", "damping")
+    continuous = True
+    n_q = 1
+    n_u = 1
+    unknowns = ("mass", "stiffness", "damping")
 
     sigma: float = param(0.1, "standard deviation of the noise on theta", "m", positive=True)
-    horizon: int = param(200, "number of time steps", "steps", positive=True)
-    dt: float = param(0.05, "length of a time step", "s", positive=True)
+    horizon: int = 200
+    dt: float = 0.05
     mass: float = param(1.0, "m", "kg", positive=True)
     stiffness: float = param(4.0, "k", "N/m", low=0.0)
     damping: float = param(0.4, "c", "N s/m", low=0.0)

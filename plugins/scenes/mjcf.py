@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from types import ModuleType
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -48,13 +48,12 @@ class Mjcf(PolicyScene, JointScene):
 
     name = "mjcf"
     neglected_effects = "the effects that its file neglects"
-    continuous: ClassVar[bool] = False  # the force of a contact with the engine's default impedance jumps at touch-down
-    requires: ClassVar[tuple[str, ...]] = ("mujoco",)
-    backends: ClassVar[tuple[str, ...]] = ("mujoco", "mjx")
+    continuous = False  # the force of a contact with the engine's default impedance jumps at touch-down
+    requires = ("mujoco",)
+    backends = ("mujoco", "mjx")
 
     sigma: float = param(0.05, "standard deviation of the noise on the controls, or on theta", positive=True)
-    horizon: int = param(10, "number of control steps", "steps", positive=True)
-    dt: float = param(0.01, "length of a control step", "s", positive=True)
+    horizon: int = 10
     substeps: int = param(2, "steps of the engine per control step", positive=True)
     file: str = param("quadruped.xml", "MJCF file; PACKAGE:FILE of an installed Python package, or a built-in robot")
     functions: str = param("", "Python file with observation and cost; empty: the MJCF file's name with .py")

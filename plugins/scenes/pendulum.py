@@ -1,7 +1,7 @@
 """Swinging up a pendulum: smooth nonlinear dynamics."""
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -18,15 +18,15 @@ class Pendulum(EngineTwin, MechanicalScene):
 
     name = "pendulum"
     neglected_effects = "the rod's mass, torque limits, contact"
-    continuous: ClassVar[bool] = True
-    open_loop: ClassVar[bool] = True
-    n_q: ClassVar[int] = 1
-    n_u: ClassVar[int] = 1
+    continuous = True
+    open_loop = True
+    n_q = 1
+    n_u = 1
 
     sigma: float = param(0.3, "standard deviation of the noise on each torque", "N m", positive=True)
     noise: str = param("action", "noise is on the actions", choices=("action",))
-    horizon: int = param(50, "number of time steps", "steps", positive=True)
-    dt: float = param(0.02, "length of a time step", "s", positive=True)
+    horizon: int = 50
+    dt: float = 0.02
     mass: float = param(1.0, "mass at the tip", "kg", positive=True)
     length: float = param(0.5, "length of the rod", "m", positive=True)
     gravity: float = param(9.81, "gravitational acceleration", "m/s^2")

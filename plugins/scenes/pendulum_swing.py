@@ -1,7 +1,7 @@
 """Swinging up a pendulum with a stage cost: a problem with a precisely known minimum."""
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -21,15 +21,15 @@ class PendulumSwing(MechanicalScene):
 
     name = "pendulum_swing"
     neglected_effects = "units, damping, torque limits, contact"
-    continuous: ClassVar[bool] = True
-    open_loop: ClassVar[bool] = True
-    n_q: ClassVar[int] = 1
-    n_u: ClassVar[int] = 1
+    continuous = True
+    open_loop = True
+    n_q = 1
+    n_u = 1
 
     sigma: float = param(0.3, "standard deviation of the noise on each torque", positive=True)
     noise: str = param("action", "noise is on the actions", choices=("action",))
-    horizon: int = param(200, "number of time steps", "steps", positive=True)
-    dt: float = param(0.05, "length of a time step", "s", positive=True)
+    horizon: int = 200
+    dt: float = 0.05
     torque: float = param(0.1, "torque of every step at theta")
     effort: float = param(1.0, "weight of the squared torque", low=0.0)
     terminal: float = param(20.0, "weight of the end state", low=0.0)

@@ -1,8 +1,7 @@
 """Momentum transfer through a stiff contact."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -19,26 +18,24 @@ class Pushing(EngineTwin, ZeroOrderHoldScene, DampedScene, ContactScene):
     """
 
     name = "pushing"
-    continuous: ClassVar[bool] = True
-    neglected_effects: ClassVar[str] = (
-        "rotation, friction, the second dimension, shapes (bodies are points with a rest distance)"
-    )
-    open_loop: ClassVar[bool] = True
-    n_q: ClassVar[int] = 2
-    n_u: ClassVar[int] = 1
-    n_contacts: ClassVar[int] = 1
-    twin_difference: ClassVar[float] = 1e-6
-    contact_values: ClassVar[Mapping[str, Any]] = {"stiffness": 1e3}
+    continuous = True
+    neglected_effects = "rotation, friction, the second dimension, shapes (bodies are points with a rest distance)"
+    open_loop = True
+    n_q = 2
+    n_u = 1
+    n_contacts = 1
+    twin_difference = 1e-6
+    contact_values = {"stiffness": 1e3}
 
     sigma: float = param(0.3, "standard deviation of the noise on each force", "N", positive=True)
     noise: str = param("action", "noise is on the actions", choices=("action",))
-    horizon: int = param(30, "number of time steps", "steps", positive=True)
-    dt: float = param(0.005, "length of a time step", "s", positive=True)
+    horizon: int = 30
+    dt: float = 0.005
     mass: float = param(0.1, "mass of each body", "kg", positive=True)
     velocity_factor: float = param(0.6, "factor on the velocities each step", low=0.0)
     push: float = param(0.1, "force of every step at theta", "N")
     speed: float = param(0.0, "initial and goal velocity of the first body", "m/s")
-    restitution: float = param(0.0, "restitution of impulse laws", low=0.0, high=1.0)
+    restitution: float = 0.0
 
     def theta0(self) -> np.ndarray:
         return np.full(self.controls, self.push)

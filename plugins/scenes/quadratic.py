@@ -1,7 +1,7 @@
 """A convex bowl in any dimension."""
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -18,7 +18,7 @@ class Quadratic(FunctionScene):
 
     name = "quadratic"
     neglected_effects = "dynamics"
-    continuous: ClassVar[bool] = True
+    continuous = True
 
     dimension: int = param(5, "d, length of theta", positive=True)
     condition: float = param(10.0, "largest curvature over the smallest", positive=True)

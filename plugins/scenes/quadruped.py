@@ -1,8 +1,7 @@
 """A walking robot with four legs of three joints, for physics engines only."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -24,22 +23,22 @@ class Quadruped(Legged):
     """
 
     name = "quadruped"
-    n_q: ClassVar[int] = 18
-    n_u: ClassVar[int] = 12
-    legs: ClassVar[tuple[str, ...]] = tuple(SIDES)
-    joints: ClassVar[tuple[str, ...]] = ("side", "hip", "knee")
-    torso: ClassVar[str] = 'type="box" size=".2 .1 .05"'
-    contact_values: ClassVar[Mapping[str, Any]] = {"stiffness": 2e4, "damping": 200.0, "damping_mode": "clipped"}
+    n_q = 18
+    n_u = 12
+    legs = tuple(SIDES)
+    joints = ("side", "hip", "knee")
+    torso = 'type="box" size=".2 .1 .05"'
+    contact_values = {"stiffness": 2e4, "damping": 200.0, "damping_mode": "clipped"}
 
     sigma: float = param(0.02, "standard deviation of the noise on the target angles", "rad", positive=True)
-    horizon: int = param(20, "number of time steps", "steps", positive=True)
-    mass: float = param(8.0, "mass of the torso", "kg", positive=True)
-    leg_mass: float = param(0.4, "mass of a thigh and of a shank", "kg", positive=True)
+    horizon: int = 20
+    mass: float = 8.0
+    leg_mass: float = 0.4
     link: float = param(0.2, "length of a thigh and of a shank", "m", positive=True)
     gain: float = param(60.0, "stiffness of the joints' control", "N m/rad", low=0.0)
     damping: float = param(2.0, "damping of the joints' control", "N m s/rad", low=0.0)
-    armature: float = param(0.05, "inertia of a motor, as seen from its joint", "kg m^2", low=0.0)
-    friction: float = param(0.6, "Coulomb coefficient", low=0.0)
+    armature: float = 0.05
+    friction: float = 0.6
     push: float = param(0.5, "initial forward velocity", "m/s")
     drift: float = param(0.3, "initial sideways velocity", "m/s")
     bend: float = param(0.6, "hip angle at theta; knees are bent by twice as much", "rad")

@@ -1,8 +1,7 @@
 """The quadruped pushes a block, for physics engines only."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -23,19 +22,19 @@ class QuadrupedPush(Quadruped):
     """
 
     name = "quadruped_push"
-    neglected_effects: ClassVar[str] = (
+    neglected_effects = (
         "joint limits, torque limits, self-collision, contacts other than the feet's and the torso's with the block, "
         "motion of the block other than along x"
     )
-    n_q: ClassVar[int] = 19
-    n_contacts: ClassVar[int] = 5
-    contact_values: ClassVar[Mapping[str, Any]] = {"stiffness": 1e4, "damping": 400.0, "damping_mode": "clipped"}
-    torso: ClassVar[str] = f'name="torso" {Quadruped.torso}'
+    n_q = 19
+    n_contacts = 5
+    contact_values = {"stiffness": 1e4, "damping": 400.0, "damping_mode": "clipped"}
+    torso = f'name="torso" {Quadruped.torso}'
 
     sigma: float = param(0.02, "standard deviation of the noise on the offsets", "rad", positive=True)
-    horizon: int = param(60, "number of time steps", "steps", positive=True)
-    push: float = param(0.0, "initial forward velocity", "m/s")
-    drift: float = param(0.0, "initial sideways velocity", "m/s")
+    horizon: int = 60
+    push: float = 0.0
+    drift: float = 0.0
     target: float = param(0.05, "target of the block", "m", positive=True)
     knots: int = param(3, "number of equal parts of the horizon, each with its own offsets", positive=True)
     lean: float = param(0.0, "offset of all hips at theta, which moves the torso forward", "rad")

@@ -1,7 +1,7 @@
 """A block that slides to rest: the friction identified from its distance depends on the time step."""
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -19,14 +19,14 @@ class SlidingBlock(Identified, MechanicalScene):
 
     name = "sliding_block"
     neglected_effects = "a higher coefficient at rest, friction that changes with speed"
-    continuous: ClassVar[bool] = True
-    n_q: ClassVar[int] = 1
-    unknowns: ClassVar[tuple[str, ...]] = ("friction",)
-    end_only: ClassVar[bool] = True
+    continuous = True
+    n_q = 1
+    unknowns = ("friction",)
+    end_only = True
 
     sigma: float = param(0.1, "standard deviation of the noise on the speed", "m/s", positive=True)
-    horizon: int = param(60, "number of time steps", "steps", positive=True)
-    dt: float = param(0.02, "length of a time step", "s", positive=True)
+    horizon: int = 60
+    dt: float = 0.02
     friction: float = param(0.3, "Coulomb coefficient", positive=True)
     gravity: float = param(9.81, "g", "m/s^2", positive=True)
     speed: float = param(3.0, "v0, at theta", "m/s", positive=True)

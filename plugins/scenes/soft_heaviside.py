@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -19,7 +19,7 @@ class SoftHeaviside(FunctionScene):
 
     name = "soft_heaviside"
     neglected_effects = "dynamics; represents a stiff contact that occurs or not"
-    continuous: ClassVar[bool] = True
+    continuous = True
 
     theta: float = param(0.0, "where the gradient is estimated; the ramp is around 0")
     nu: float = param(0.1, "width of the ramp", positive=True)

@@ -1,7 +1,7 @@
 """A spring and a damper fitted to a record of their motion: a cost with more local minima in longer records."""
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -20,14 +20,13 @@ class SpringRecord(KnownOptimum, MechanicalScene):
 
     name = "spring_record"
     neglected_effects = "noise in the record, an unknown mass or start (only k/m and c/m are identifiable)"
-    continuous: ClassVar[bool] = True
-    identifies: ClassVar[bool] = True
-    n_q: ClassVar[int] = 2
-    n_u: ClassVar[int] = 2
+    continuous = True
+    identifies = True
+    n_q = 2
+    n_u = 2
 
     sigma: float = param(0.1, "standard deviation of the noise on k and c", "1/s^2 and 1/s", positive=True)
-    horizon: int = param(100, "number of time steps", "steps", positive=True)
-    dt: float = param(0.05, "length of a time step", "s", positive=True)
+    dt: float = 0.05
     stiffness: float = param(4.0, "k of the record", "1/s^2", positive=True)
     damping: float = param(0.2, "c of the record", "1/s", low=0.0)
     guess: float = param(1.3, "k at theta over that of the record", positive=True)

@@ -1,7 +1,7 @@
 """Copies of x' = x + u under one matrix of gains: a policy with many gauge directions, which do not change the cost."""
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -20,12 +20,12 @@ class StaticGain(KnownOptimum, KnownValue, MechanicalScene):
 
     name = "static_gain"
     neglected_effects = "positions, coupling of the copies"
-    continuous: ClassVar[bool] = True
+    continuous = True
 
     sigma: float = param(0.1, "standard deviation of the noise on the gains, or on each control", positive=True)
     noise: str = param("parameter", "whether noise is on theta or on the actions", choices=("parameter", "action"))
-    horizon: int = param(10, "number of time steps", "steps", positive=True)
-    dt: float = param(1.0, "length of a time step", "s", positive=True)
+    horizon: int = 10
+    dt: float = 1.0
     copies: int = param(2, "length of x", low=1)
     gain: float = param(0.0, "every diagonal element of K at theta")
     effort: float = param(0.1, "weight of u'u", positive=True)

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -20,13 +20,13 @@ class StiffDecay(MechanicalScene):
 
     name = "stiff_decay"
     neglected_effects = "positions, a second time scale"
-    continuous: ClassVar[bool] = True
-    n_q: ClassVar[int] = 0
-    n_v: ClassVar[int | None] = 1
+    continuous = True
+    n_q = 0
+    n_v = 1
 
     sigma: float = param(0.1, "standard deviation of the noise on x_0", positive=True)
-    horizon: int = param(20, "number of time steps", "steps", positive=True)
-    dt: float = param(0.05, "length of a time step", "s", positive=True)
+    horizon: int = 20
+    dt: float = 0.05
     rate: float = param(-50.0, "growth rate, negative for decay", "1/s")
     start: float = param(1.0, "x_0 at theta")
 

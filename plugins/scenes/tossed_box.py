@@ -1,8 +1,7 @@
 """A box thrown on the ground, for physics engines only: four corners that slide, stick and bounce."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -18,15 +17,15 @@ class TossedBox(EngineScene):
     """
 
     name = "tossed_box"
-    continuous: ClassVar[bool] = True
-    neglected_effects: ClassVar[str] = "the third dimension, edges and faces (corners are small spheres)"
-    n_q: ClassVar[int] = 3
-    n_contacts: ClassVar[int] = 4
-    contact_values: ClassVar[Mapping[str, Any]] = {"stiffness": 1e4, "damping": 50.0, "damping_mode": "clipped"}
+    continuous = True
+    neglected_effects = "the third dimension, edges and faces (corners are small spheres)"
+    n_q = 3
+    n_contacts = 4
+    contact_values = {"stiffness": 1e4, "damping": 50.0, "damping_mode": "clipped"}
 
     sigma: float = param(0.1, "standard deviation of the noise on the initial velocity", "m/s and rad/s", positive=True)
-    horizon: int = param(250, "number of time steps", "steps", positive=True)
-    dt: float = param(0.002, "length of a time step", "s", positive=True)
+    horizon: int = 250
+    dt: float = 0.002
     mass: float = param(1.0, "mass of the box", "kg", positive=True)
     side: float = param(0.2, "length of a side", "m", positive=True)
     friction: float = param(0.5, "Coulomb coefficient", low=0.0)

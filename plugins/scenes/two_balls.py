@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -25,17 +25,17 @@ class TwoBalls(KnownOptimum, ContactScene):
     """
 
     name = "two_balls"
-    continuous: ClassVar[bool] = True
-    neglected_effects: ClassVar[str] = "spin, friction, the table's edges, further balls"
-    open_loop: ClassVar[bool] = True
-    n_q: ClassVar[int] = 4
-    n_u: ClassVar[int] = 2
-    n_contacts: ClassVar[int] = 1
+    continuous = True
+    neglected_effects = "spin, friction, the table's edges, further balls"
+    open_loop = True
+    n_q = 4
+    n_u = 2
+    n_contacts = 1
 
     sigma: float = param(0.1, "standard deviation of the noise on each force", "N", positive=True)
     noise: str = param("action", "noise is on the actions", choices=("action",))
-    horizon: int = param(120, "number of time steps", "steps", positive=True)
-    dt: float = param(1 / 120, "length of a time step", "s", positive=True)
+    horizon: int = 120
+    dt: float = 1 / 120
     radius: float = param(0.2, "radius of both balls", "m", positive=True)
     force: float = param(3.0, "both components of the force of every step at theta", "N")
     effort: float = param(0.1, "weight of the squared force", "m^2/(N^2 s)", positive=True)

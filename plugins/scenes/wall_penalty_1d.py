@@ -1,9 +1,8 @@
 """A point that hits a soft wall: the finite step size is enough to make a penalty gradient wrong."""
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -22,16 +21,15 @@ class WallPenalty1d(EngineTwin, ContactScene):
     """
 
     name = "wall_penalty_1d"
-    continuous: ClassVar[bool] = True
-    neglected_effects: ClassVar[str] = "gravity, the second and third dimension, shapes"
-    n_q: ClassVar[int] = 1
-    n_contacts: ClassVar[int] = 1
-    twin_difference: ClassVar[float] = 1e-3
-    contact_values: ClassVar[Mapping[str, Any]] = {"stiffness": 50.0, "damping": 1.0, "damping_mode": "linear"}
+    continuous = True
+    neglected_effects = "gravity, the second and third dimension, shapes"
+    n_q = 1
+    n_contacts = 1
+    twin_difference = 1e-3
+    contact_values = {"stiffness": 50.0, "damping": 1.0, "damping_mode": "linear"}
 
     sigma: float = param(0.1, "standard deviation of the noise on q0", "m", positive=True)
-    horizon: int = param(200, "number of time steps", "steps", positive=True)
-    dt: float = param(0.01, "length of a time step", "s", positive=True)
+    horizon: int = 200
     start: float = param(0.6, "q0 at theta", "m")
 
     def theta0(self) -> np.ndarray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 from bench.model import param
 
@@ -19,7 +19,7 @@ class Bptt(Neural):
     """
 
     name = "bptt"
-    first_order: ClassVar[bool] = True
+    first_order = True
 
     discount: float = param(1.0, "gamma, factor on the reward of the next control step", positive=True, high=1.0)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 from bench.model import param
 
@@ -23,20 +23,20 @@ class Ppo(ActorCritic):
     """
 
     name = "ppo"
-    revision: ClassVar[int] = 2
-    activation: ClassVar[str] = "tanh"
-    gain: ClassVar[float] = 0.01
+    revision = 2
+    activation = "tanh"
+    gain = 0.01
 
-    rollouts: int = param(8, "parallel rollouts", positive=True)
-    window: int = param(256, "h, control steps of a window", "steps", positive=True)
-    actor_rate: float = param(3e-4, "first learning rate of the actor", positive=True)
-    critic_rate: float = param(3e-4, "first learning rate of the critic", positive=True)
-    log_deviation: float = param(0.0, "initial log standard deviation of the actions")
-    clip: float = param(0.5, "norm at which gradients are clipped", positive=True)
-    beta1: float = param(0.9, "decay of Adam's mean gradient", low=0.0, high=0.999999)
-    beta2: float = param(0.999, "decay of Adam's mean square", low=0.0, high=0.999999)
-    passes: int = param(10, "passes over the states of a window", positive=True)
-    batches: int = param(32, "batches in a pass", positive=True)
+    rollouts: int = 8
+    window: int = 256
+    actor_rate: float = 3e-4
+    critic_rate: float = 3e-4
+    log_deviation: float = 0.0
+    clip: float = 0.5
+    beta1: float = 0.9
+    beta2: float = 0.999
+    passes: int = 10
+    batches: int = 32
     range: float = param(0.2, "distance of a ratio from 1 at which the objective is clipped", positive=True)
     entropy: float = param(0.0, "weight of the actions' log deviation in the objective", low=0.0)
 
@@ -76,7 +76,7 @@ class Ppo(ActorCritic):
         returns = normaliser.updated(state.returns, alone.reshape(1, -1))
         unit = normaliser.deviation(returns)[0]
         value, before = self.values_of(state, critic.network, window), critic.network(seen).reshape(window.reward.shape)
-        advantage = values.advantages(window.reward / unit, before, value, window.ended, self.discount, self.decay)
+        advantage = values.td_lambda(window.reward / unit, value, window.ended, self.discount, self.decay) - before
         old = state.actor.log_probability(seen, action)
 
         def loss(actor: Any, *batch: Any) -> Any:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 from bench.model import param
 
@@ -24,7 +24,7 @@ class Shac(ActorCritic):
     """
 
     name = "shac"
-    first_order: ClassVar[bool] = True
+    first_order = True
 
     follow: float = param(
         0.8, "share by which the target critic approaches the critic per update", positive=True, high=1.0

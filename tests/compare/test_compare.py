@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import subprocess
-from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -14,14 +13,12 @@ import pandas as pd
 import planted
 import pytest
 import yaml
-from helpers import experiment, loaded, small_rows
+from helpers import loaded, small_rows
 
 from bench import cli
 from bench.compare import cells, command, history, judging, report, sources, timings
-from bench.experiment import axes
 from bench.experiment.columns import Columns
 from bench.model import registry
-from bench.report.tables import csv
 from bench.run.tasks import blank_row
 from bench.studies.bias_variance.columns import COLUMNS
 
@@ -49,16 +46,12 @@ def of_study(name, *words):
     return made.columns, made.columns.typed(rows)
 
 
-def save(rows, directory, name="made_up", machine=MACHINE, parquet=True):
+def save(rows, directory, name="made_up"):
     """Rows as an experiment's directory."""
     place = directory / name
     place.mkdir(parents=True, exist_ok=True)
-    columns = sources.columns_of(rows["study"].iloc[0])
-    if parquet:
-        columns.typed(rows).to_parquet(place / "rows.parquet", index=False)
-    table = axes.table(replace(experiment(directory, name=name), columns=columns), columns.typed(rows))
-    (place / "table.csv").write_text(csv(table))
-    (place / "run.json").write_text(json.dumps({"machine": machine}))
+    sources.columns_of(rows["study"].iloc[0]).typed(rows).to_parquet(place / "rows.parquet", index=False)
+    (place / "run.json").write_text(json.dumps({"machine": MACHINE}))
     return directory
 
 
@@ -117,11 +110,7 @@ def test_cells_are_matched_by_all_their_parameters():
     """Labels leave out defaults and timed calls; the parameters do not. Their order does not matter."""
     columns, rows = of_study("bias_variance", "scenes=[quadratic]")
     _, other = of_study("bias_variance[timed_calls=7]", "scenes=[quadratic]")
-    before, after = (json.loads(r["parameters"][0])["study"]["timed_calls"] for r in (rows, other))
-    assert set(compared(rows, other, False, columns)["change"]) == {
-        f"gone, it was ok; the nearest cell after has bias_variance.timed_calls={after} instead of {before}",
-        f"new; the nearest cell before has bias_variance.timed_calls={before} instead of {after}",
-    }
+    assert set(compared(rows, other, False, columns)["change"]) == {"gone, it was ok", "new"}
     given = json.loads(rows["parameters"][0])
     turned = rows.assign(parameters=json.dumps(dict(reversed(given.items()))))
     assert list(compared(rows, turned, False, columns)["outcome"]) == ["same"]
@@ -314,10 +303,6 @@ def test_files_say_what_the_exit_status_says(tmp_path, capsys):
     out = tmp_path / "out"
     for other, failures in ((old, 0), (new, 1)):
         assert run(old, other, out=out) == failures
-        result = json.loads((out / "compare.json").read_text())
-        assert result["worse"] == bool(failures)
-        assert result["counts"]["worse"] == len(result["cells"]) == failures
-        assert sum(result["counts"].values()) == len(before)
         suites = ElementTree.parse(out / "compare.xml").getroot()
         assert int(suites.get("failures")) == len(suites.findall("./testsuite/testcase/failure")) == failures
         assert len(suites.findall("./testsuite/testcase")) == len(before)
@@ -348,7 +333,7 @@ def test_git_revisions_are_compared(tmp_path, monkeypatch, capsys):
     rows = given()
     for text in ("ok", "error"):
         rows.loc[good(given()), "status"] = text
-        save(rows, tmp_path / "results", parquet=False)
+        save(rows, tmp_path / "results")
         git("add", ".")
         git("commit", "-m", text)
     monkeypatch.chdir(tmp_path)
@@ -383,50 +368,31 @@ def test_bad_input_is_refused(words, said, tmp_path, monkeypatch, capsys):
 def test_results_kept_in_git_are_found_in_their_own_folder(tmp_path):
     before, after = given(), given()
     after.loc[good(after), ["bias", "bias_low", "bias_high"]] = [9.0, 8.0, 10.0]
-    old = save(before, tmp_path / "old" / "standard", parquet=False).parent
-    new = save(after, tmp_path / "new" / "standard", parquet=False).parent
+    old = save(before, tmp_path / "old" / "standard").parent
+    new = save(after, tmp_path / "new" / "standard").parent
     assert run(old, new, out=tmp_path / "out") == 1
     save(before, new)
     assert run(old, new, out=tmp_path / "out") == 0, "results of one's own come before those of the standard folder"
 
 
-def test_results_of_older_versions_are_refused(tmp_path, capsys):
+def test_rows_without_parameters_are_refused(tmp_path, capsys):
     new = save(given(), tmp_path / "new")
-    for name, parquet in (("table", False), ("rows", True)):
-        place = tmp_path / name / "made_up"
-        place.mkdir(parents=True)
-        older = given().drop(columns=["study", "parameters"])
-        older.to_parquet(place / "rows.parquet") if parquet else older.to_csv(place / "made_up.csv")
-        assert run(place, new, out=tmp_path / "out") == 2
-        assert "made by an older version" in capsys.readouterr().err
     both = pd.concat([given().assign(parameters="").iloc[:3], given()])
-    assert run(save(both, tmp_path / "both"), new, out=tmp_path / "out") == 0
-    assert "3 rows before were made by an older version and are left out" in capsys.readouterr().out
-
-
-def test_a_table_with_several_lines_per_cell_has_the_worst_verdict_of_each(tmp_path):
-    _, rows = of_study("gradient_check", "scenes=[pushing]")
-    rows = rows.assign(experiment="some")
-    fine, wrong = (
-        pd.concat([rows.assign(verdict=v) for v in some]) for some in (["kink"] * 3, ["jump", "zero", "kink"])
-    )
-    old, new = (save(r, tmp_path / n, "some", parquet=False) for r, n in ((fine, "old"), (wrong, "new")))
-    assert run(old, new, out=tmp_path / "out") == 1
-    assert "verdict kink to jump" in (tmp_path / "out" / "compare.csv").read_text()
+    assert run(save(both, tmp_path / "both"), new, out=tmp_path / "out") == 2
+    assert "have no parameters" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("study", list(registry.entries()["studies"]))
-@pytest.mark.parametrize("parquet", [pytest.param(True, marks=pytest.mark.slow), False])
-def test_results_of_every_study_are_compared(study, parquet, tmp_path):
-    """One of them gave no result: rows of every kind of column, from Parquet and from the committed table."""
+def test_results_of_every_study_are_compared(study, tmp_path):
+    """One of them gave no result: rows of every kind of column."""
     columns, rows = of_study(study, "scenes=[pushing,quadratic]")
     rows = rows.assign(
         experiment="some", **{column.name: 1.0 for column in columns.compared if column.kind == "number"}
     )
-    old = save(rows, tmp_path / "old", "some", parquet=parquet)
+    old = save(rows, tmp_path / "old", "some")
     assert run(old, old, out=tmp_path / "out") == 0
     rows.loc[0, "status"] = "error"
-    assert run(old, save(rows, tmp_path / "new", "some", parquet=parquet), out=tmp_path / "out") == 1
+    assert run(old, save(rows, tmp_path / "new", "some"), out=tmp_path / "out") == 1
     assert "error" in (tmp_path / "out" / "compare.html").read_text()
 
 
@@ -487,7 +453,6 @@ def test_a_gradient_that_a_release_of_an_engine_changes_is_told(tmp_path):
     assert cli.main(["history", *places, f"out={tmp_path / 'out'}"]) == 0
     table = pd.read_csv(tmp_path / "out" / "history.csv")
     assert list(table["moved"].round(5)) == [0.0, 0.00045]
-    assert "1 of 1 series changed" in (tmp_path / "out" / "history.md").read_text()
 
 
 @pytest.mark.parametrize(
@@ -510,8 +475,7 @@ def test_the_workflow_of_the_docs_runs_the_gate_as_it_is():
     assert list(scripts) == ["Before", "After", "Gate"]
     (line,) = (line for line in scripts["Gate"].splitlines() if "compare runs" in line)
     words = line.split("bench compare ")[1].partition(" || ")[0].split()
-    request = command._parse([word for word in words if not word.startswith("plugins=")])
-    assert (request.before, request.after) == ("runs/before", "runs/after")
+    assert words[:2] == ["runs/before", "runs/after"]
     assert scripts["Gate"].strip().endswith("exit $status")
-    for script, folder in (("Before", request.before), ("After", request.after)):
+    for script, folder in zip(("Before", "After"), words, strict=False):
         assert f"results_dir={folder}" in scripts[script]

@@ -425,7 +425,7 @@ class NoContacts(Pushing):
     """Bodies that touch, and no number of contacts."""
 
     name = "no_contacts"
-    n_contacts: ClassVar[int] = 0
+    n_contacts = 0
 
 
 @dataclass(frozen=True)
@@ -433,7 +433,7 @@ class WrongStateSize(DoubleIntegrator):
     """Two coordinates declared, and one given."""
 
     name = "wrong_state_size"
-    n_q: ClassVar[int] = 2
+    n_q = 2
 
 
 # -------------------------------------------------------------------------------- planted: contacts and integrators
@@ -796,8 +796,8 @@ def test_expected_failure_of_no_check_gets_the_nearest_name():
 
 def test_plugin_that_lacks_a_module_is_skipped():
     absent = dataclass(frozen=True)(type("Absent", (Cubic,), {"name": "absent", "requires": ("no_such_module",)}))
-    for item in items([absent]).values():
-        assert [(m.name, m.kwargs) for m in item.marks] == [("skip", {"reason": "not installed: no_such_module"})]
+    (item,) = items([absent]).values()
+    assert [(m.name, m.kwargs) for m in item.marks] == [("skip", {"reason": "not installed: no_such_module"})]
 
 
 def test_plugin_of_another_kind_needs_no_checks_of_its_own():

@@ -1,5 +1,6 @@
 """Every registered plugin passes the conformance kit: on few short programs, slowly on a design of crossings, or on all."""
 
+import contextlib
 import dataclasses
 import itertools
 from functools import cache
@@ -11,6 +12,7 @@ from pairwise import pairwise
 from bench import conformance
 from bench.conformance import check as results_of
 from bench.conformance import kit, parametrize
+from bench.conformance.kit import something_was_checked
 from bench.conformance.subjects import (
     all_programs,
     backends,
@@ -21,28 +23,45 @@ from bench.conformance.subjects import (
     sound_scenes,
 )
 from bench.conformance.subjects import programs as programs_of
-from bench.model import Backend, ContactScene, EngineScene, MechanicalScene, Plugin, compose, registry
+from bench.engines.backend import EngineBackend
+from bench.model import (
+    Backend,
+    ContactScene,
+    EngineScene,
+    ForceLaw,
+    ImpulseLaw,
+    MechanicalScene,
+    Plugin,
+    compose,
+    registry,
+)
+from bench.model.identity import changed, label
 
 STEPS = 50
 """Most steps of a rollout in the fast tests, and as in the slow ones where a scene declares to jump."""
 SHORT = 100
-"""Most steps of a rollout in the slow tests of backends that compile for seconds or run eagerly."""
+"""Most steps of a rollout in the crossings of backends that compile for seconds or run eagerly."""
 MOVED = 1e-9
 """Difference of costs of about 1 that is far more than rounding."""
 ENTRIES = [entry for table in registry.entries().values() for entry in table.values()]
 PLUGINS = [entry.plugin for entry in ENTRIES if entry.plugin is not None]
-ITEMS = parametrize(PLUGINS).mark.args[1]
+ITEMS = parametrize(plugin for plugin in PLUGINS if not issubclass(plugin, EngineBackend)).mark.args[1]
+"""Engines in environments of their own have ``tests/engines/test_engines_conform.py``."""
 GENERIC = {check.__name__ for check in kit._CHECKS[Plugin]}
 
 
-def kit_items(keep):
+def kept(keep):
     """The kit's items of registered plugins, beside those of any plugin, whose subject and name of check are to be kept."""
-    named = [(item, item.values[0], item.values[1].args[0].__name__) for item in ITEMS]
-    chosen = [item for item, subject, name in named if name not in GENERIC and keep(subject, name)]
-    return pytest.mark.parametrize(("plugin", "check"), chosen)
+    named = [(item, item.values[0], item.values[1].args[0].__name__) for item in ITEMS if item.values[1]]
+    return [item for item, subject, name in named if name not in GENERIC and keep(subject, name)]
 
 
-def is_long(plugin, check):
+def kit_items(keep):
+    """A test of each kept item."""
+    return pytest.mark.parametrize(("plugin", "check"), kept(keep))
+
+
+def is_long(plugin, check=""):
     """Whether a check takes long: of backends that compile each program for seconds or run it eagerly, and a few more.
 
     A rollout of ``hopper_run`` has 1,920 steps of the integrator, ``surrogate_backward`` solves two equations each step, and
@@ -96,23 +115,46 @@ def quiet_costs(program):
     return plain_backend().compile(program).value(theta, 0 * w)
 
 
+@cache
+def few_programs(plugin):
+    """One short program of each sort that a backend can run; one that takes long has one of each sort of contact law.
+
+    An engine that compiles for seconds has the smallest with contacts and the smallest without.
+    """
+    programs = [compose(shortened(program.scene), program.contact, program.integrator) for program in all_programs()]
+    if isinstance(plugin, Backend):
+        programs = [program for program in programs if can_run(plugin, program)]
+    if isinstance(plugin, Backend) and plugin.compiles and "physics" in plugin.provides:
+        programs.sort(key=lambda program: (program.contact is None, -program.scene.n_q))
+        return list({program.contact is None: program for program in programs}.values())
+    few = distinguishing_programs(programs)
+    return list({sort_of_law(program): program for program in reversed(few)}.values()) if is_long(plugin) else few
+
+
+def sort_of_law(program):
+    law = isinstance(program.contact, ForceLaw), isinstance(program.contact, ImpulseLaw), program.needs_root
+    return isinstance(program.scene, MechanicalScene), *law
+
+
 @pytest.fixture
-def few_programs(monkeypatch, check):
-    """Checks run one short program of each sort, or every fourth scene with contacts, and compare ``jax`` with ``numpy``."""
-    programs = distinguishing_programs(
-        compose(shortened(program.scene), program.contact, program.integrator) for program in all_programs()
-    )
+def on_few_programs(monkeypatch):
+    """Return what runs a check on one short program of each sort, or every fourth scene with contacts, and few backends."""
     touching = [scene for scene in sound_scenes() if isinstance(scene, ContactScene) and scene.continuous]
-    compared = check.args[0].__name__ == "backends_agree"
-
-    def few(scene):
-        programs = explicit_programs if compared else programs_of
-        return distinguishing_programs(programs(shortened(scene)))[: 1 if compared else None]
-
-    monkeypatch.setattr(conformance.backends, "all_programs", lambda: programs)
-    monkeypatch.setattr(conformance.scenes, "programs", few)
     monkeypatch.setattr(conformance.scenes, "backends", lambda: [b for b in backends() if b.name == "jax"])
     monkeypatch.setattr(conformance.contacts, "sound_scenes", lambda: list(map(shortened, touching[::4])))
+
+    def run(plugin, check):
+        compared = check.args[0].__name__ == "backends_agree"
+
+        def few(scene):
+            programs = explicit_programs if compared else programs_of
+            return distinguishing_programs(programs(shortened(scene)))[: 1 if compared else None]
+
+        monkeypatch.setattr(conformance.scenes, "programs", few)
+        monkeypatch.setattr(conformance.backends, "all_programs", lambda: few_programs(plugin))
+        check(plugin)
+
+    return run
 
 
 @pytest.mark.parametrize("entry", ENTRIES, ids=lambda entry: f"{entry.kind}-{entry.name}")
@@ -126,17 +168,40 @@ def is_short(plugin, check):
     return not is_long(plugin, check) and not is_repeated(plugin, check)
 
 
-@pytest.mark.usefixtures("few_programs")
 @kit_items(lambda plugin, check: is_short(plugin, check) and not is_varied(plugin))
-def test_registered_plugin_conforms(plugin, check):
-    check(plugin)
+def test_registered_plugin_conforms(plugin, check, on_few_programs):
+    on_few_programs(plugin, check)
+
+
+VARIED = kept(lambda plugin, check: is_short(plugin, check) and is_varied(plugin))
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("few_programs")
-@kit_items(lambda plugin, check: is_short(plugin, check) and is_varied(plugin))
-def test_registered_plugin_with_other_parameters_conforms(plugin, check):
-    check(plugin)
+@pytest.mark.parametrize("subject", dict.fromkeys(item.values[0] for item in VARIED), ids=label)
+def test_registered_plugin_with_other_parameters_conforms(subject, on_few_programs):
+    for plugin, check in (item.values for item in VARIED):
+        if plugin == subject:
+            with contextlib.suppress(pytest.skip.Exception):
+                on_few_programs(plugin, check)
+
+
+EVERYWHERE = {"mode", "integrator", "gradient", "differences"}
+"""Parameters of engines that act without contacts, which are all that the kit runs with other parameters than the defaults."""
+
+
+def is_left(plugin, check):
+    """Whether the slow set has a check that takes long: with other parameters than the defaults, gradients only."""
+    if not is_long(plugin, check) or check in ("value_agrees", "backends_agree", something_was_checked.__name__):
+        return False
+    if not is_varied(plugin) or check != "gradient_is_that_of_value":
+        return not is_varied(plugin)
+    return "physics" not in plugin.provides or bool(EVERYWHERE & set(changed(plugin)))
+
+
+@pytest.mark.slow
+@kit_items(is_left)
+def test_registered_plugin_that_takes_long_conforms(plugin, check, on_few_programs):
+    on_few_programs(plugin, check)
 
 
 # ----------------------------------------------------------------------------------------------- crossings, slow
@@ -157,19 +222,22 @@ def levels(program, backend):
 
 @pytest.fixture
 def designed_programs(monkeypatch, plugin, check):
-    """Costs on a backend are compared on the programs of the design; a backend that takes long runs few and short ones."""
+    """Costs on a backend are compared on the programs of the design; a backend that takes long runs short ones."""
     programs = all_programs()
     if is_long(plugin, check):
         programs = [program for program in programs if getattr(program.scene, "horizon", 0) <= SHORT]
-        monkeypatch.setattr(conformance.backends, "representative_programs", distinguishing_programs)
     if check.args[0].__name__ == "value_agrees":
         programs = [program for program in programs if levels(program, plugin) in design()]
     monkeypatch.setattr(conformance.backends, "all_programs", lambda: programs)
 
 
 def is_wider(plugin, check):
-    """Whether a check runs more or longer programs than in the fast tests."""
-    if check in ("value_agrees", "gradient_is_that_of_value"):
+    """Whether a check runs more or longer programs than those of one short program of each sort."""
+    if check == "value_agrees":
+        return not is_varied(plugin) and plugin.name != plain_backend().name
+    if is_long(plugin, check):
+        return False
+    if check == "gradient_is_that_of_value":
         return not is_varied(plugin) and plugin.name != plain_backend().name
     if check == "costs_are_finite":
         return isinstance(plugin, ContactScene)
@@ -179,18 +247,9 @@ def is_wider(plugin, check):
     return check == "continuity_in_rollouts_is_as_declared"
 
 
-def is_designed(plugin, check):
-    """Whether the slow set has a check: of plugins that take long, other parameters than the defaults have gradients only."""
-    if check == "backends_agree":
-        return False
-    if not is_long(plugin, check):
-        return is_wider(plugin, check)
-    return not is_varied(plugin) or (isinstance(plugin, Backend) and check == "gradient_is_that_of_value")
-
-
 @pytest.mark.slow
 @pytest.mark.usefixtures("designed_programs")
-@kit_items(is_designed)
+@kit_items(is_wider)
 def test_registered_plugin_conforms_on_more_programs(plugin, check):
     check(plugin)
 

@@ -314,12 +314,12 @@ def test_a_change_of_an_engines_file_changes_the_key(tmp_path):
 
 def test_programs_that_an_engine_does_not_run_are_refused():
     law = law_for(BouncingBall(), Penalty, {})
-    assert "replaces semi_implicit_euler, not rk4" in toy().incompatibility(compose(BouncingBall(), law, Rk4()))
+    assert "replaces semi_implicit_euler, not rk4" in toy().refusal(compose(BouncingBall(), law, Rk4()))
     taichi = registry.usable("backends", "taichi")()
-    assert "slides only" in taichi.incompatibility(program(Cartpole()))
+    assert "slides only" in taichi.refusal(program(Cartpole()))
     damped = compose(BouncingBall(), law_for(BouncingBall(), Penalty, {"damping": 1.0}), SemiImplicitEuler())
     newton = registry.usable("backends", "newton")()
-    assert "supports damping_mode=approach, not clipped" in newton.incompatibility(damped)
+    assert "runs damping_mode=approach only, not clipped" in newton.refusal(damped)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -342,17 +342,17 @@ def test_genesis_runs_contacts_only_where_its_friction_has_no_effect():
 @pytest.mark.parametrize("solver", ["semi_implicit", "xpbd"])
 def test_solvers_without_joint_coordinates_run_bodies_on_slides_only(solver):
     newton = registry.usable("backends", "newton")
-    assert f"{solver} solver has no joint coordinates" in newton(solver=solver).incompatibility(program(Cartpole()))
-    assert newton().incompatibility(program(Cartpole())) is None
+    assert f"{solver} solver has no joint coordinates" in newton(solver=solver).refusal(program(Cartpole()))
+    assert newton().refusal(program(Cartpole())) is None
 
 
 def test_a_rigid_solver_stands_for_impulses_and_has_no_gradients():
     newton = registry.usable("backends", "newton")
     rigid, spring = newton(solver="xpbd"), newton(solver="semi_implicit")
     impulse = compose(BouncingBall(), law_for(BouncingBall(), Impulse), SemiImplicitEuler())
-    assert rigid.incompatibility(impulse) is None
-    assert "replaces impulse, not penalty" in rigid.incompatibility(program(BouncingBall()))
-    assert "replaces penalty, not impulse" in spring.incompatibility(impulse)
+    assert rigid.refusal(impulse) is None
+    assert "replaces impulse, not penalty" in rigid.refusal(program(BouncingBall()))
+    assert "replaces penalty, not impulse" in spring.refusal(impulse)
     assert spring.provides - rigid.provides == {"grad"}
     assert newton().provides == spring.provides
     assert (

@@ -309,14 +309,11 @@ def test_alarm_of_someone_else_is_left_alone():
 
 
 @pytest.mark.slow
-def test_page_has_text_tables_and_charts(tmp_path):
+def test_files_are_text_tables_and_charts(tmp_path):
     report = bench.examine(bowl, [1.0, 0.5], grad=slope, sigma=[0.003, 0.1], **QUICK)
     names = {path.name for path in report.save(tmp_path / "out")}
-    assert {"report.html", "report.txt", "derivatives.csv", "steps.png", "lines.png", "sigmas.png"} <= names
-    page = (tmp_path / "out" / "report.html").read_text()
-    assert page.count("<svg") == 3
-    assert "Derivative: right. smooth" in page
-    assert "\n  theta[0] " in page  # a row keeps its columns
+    assert {"report.txt", "derivatives.csv", "sigmas.csv", "steps.png", "lines.png", "sigmas.png"} <= names
+    assert (tmp_path / "out" / "report.txt").read_text() == f"{report}\n"
 
 
 @pytest.fixture
@@ -382,7 +379,7 @@ def test_own_arithmetic_does_not_warn_and_the_cost_still_does(size):
         with pytest.raises(bench.UserError, match="divide by zero"):
             bench.examine(cost, [1.0], **QUICK)
         with np.errstate(divide="ignore"):
-            str(bench.examine(cost, [1.0], grad=lambda x: [size], twin=cost, twin_grad=lambda x: [np.inf], **QUICK))
+            str(bench.examine(cost, [1.0], grad=lambda x: [size], **QUICK))
 
 
 def test_command_takes_named_numbers(mysim, capsys):

@@ -1,12 +1,8 @@
-"""The examples on foreign simulators: short, and each ends in a report; what that finds is its own affair.
-
-Those whose libraries are missing are skipped; `make examples` builds an environment that has them all.
-"""
+"""The examples are short, and each ends in a report. Those whose libraries are missing are skipped."""
 
 import importlib.util
 import os
 import re
-import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -14,9 +10,9 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-EXAMPLES = sorted(path for path in (ROOT / "examples").glob("*.py") if path.stem != "table")
+EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 LIMIT = 1800
-"""Seconds; compilations have budgets of their own, and Brax has three engines."""
+"""Seconds; compilations have budgets of their own."""
 SHORT = """
 import runpy, sys
 import bench
@@ -46,19 +42,3 @@ def test_an_example_ends_in_a_report(path):
     done = subprocess.run(words, env=environment, capture_output=True, text=True, timeout=LIMIT)
     assert done.returncode == 0, done.stderr
     assert any(line.startswith(ENDS) for line in done.stdout.splitlines()), done.stdout
-
-
-def test_the_page_has_the_stored_table_of_all_examples():
-    table = runpy.run_path(str(ROOT / "examples" / "table.py"))
-    assert sorted(table["ORDER"]) == [path.stem for path in EXAMPLES]
-    stored = table["stored"]()
-    assert list(stored) == list(table["ORDER"])
-    assert all(len(row) == len(table["HEAD"]) for rows in stored.values() for row in rows)
-    page = (ROOT / "docs/examine.md").read_text()
-    assert page.partition(table["BEGIN"])[2].partition(table["END"])[0] == table["as_text"](stored)
-
-
-@pytest.mark.skipif(importlib.util.find_spec("pydrake") is not None, reason="needs an environment without Drake")
-def test_an_example_without_its_library_has_no_rows_and_names_it():
-    table = runpy.run_path(str(ROOT / "examples" / "table.py"))
-    assert table["rows"]("drake_ball") == ([], "not installed: pydrake")

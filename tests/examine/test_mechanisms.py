@@ -109,22 +109,13 @@ def test_a_small_jump_on_a_curved_line_is_found():
     assert [one.at for one in line.jumps] == pytest.approx([1.2345], abs=1e-5)
 
 
-def test_memory_overwritten_between_forward_and_backward_is_named_by_growth_or_by_a_second_gradient():
+def test_memory_overwritten_between_forward_and_backward_is_named_by_growth():
     grown = bench.examine(swing, START, grad=shared, horizons=[1, 2, 5, 20], **QUICK)
     assert (grown.status, grown.cause) == (1, "overwritten")
     assert [one.steps for one in grown.explained.growth] == [1, 2, 5, 20]
     errors = [one.error for one in grown.explained.growth]
     assert errors[0] < 1e-6 < errors[1] < errors[-1]
-    beside = bench.examine(swing, START, grad=shared, twin_grad=slope, **QUICK)
-    assert (beside.status, beside.cause) == (1, "overwritten")
-    assert "the second gradient is right" in beside.conclusion
     assert bench.examine(swing, START, grad=slope, horizons=[1, 20], **QUICK).status == 0
-
-
-def test_twins_that_differ_are_named():
-    report = bench.examine(swing, START, grad=slope, twin=lambda x: 1.01 * swing(x), **QUICK)
-    assert (report.status, report.cause) == (1, "twin")
-    assert bench.examine(swing, START, grad=slope, twin=lambda x: swing(x), **QUICK).status == 0
 
 
 # ------------------------------------------------------------------------------------- noise and precision

@@ -48,14 +48,6 @@ def test_ten_million_cells_are_refused_before_they_are_expanded(capsys, monkeypa
     assert "the sweep has 10360232 cells" in capsys.readouterr().err
 
 
-def test_the_size_of_a_sweep_is_known_without_expanding_it():
-    from bench.experiment.grid import _size, expand
-
-    for sweep in ({}, {"a": [1, 2], "b": 3}, {"zip": {"a": [1, 2], "b": [3, 4]}, "c": [1, 2]},
-                  {"union": [{"a": [1, 2]}, {"b": [1], "c": {"d": [1, 2, 3]}}]}, {"product": {"a": [1, 2], "b": [1, 2, 3]}}):  # fmt: skip
-        assert _size(sweep) == len(expand(sweep))
-
-
 @pytest.mark.parametrize(
     "columns", [["key"], ["key", "study"], ["key", "study", "parameters"], ["bias"], ["key", "scene", "status"]]
 )
@@ -163,7 +155,7 @@ ADDRESS = "is an address, and files are written on this machine"
     "words",
     [
         "plan results_dir={}", "plan compile_cache={}", "claims --quick results_dir={}", "compare a b out={}", "history a b out={}", "index {}",
-        "engines out={}", *(f"examine a.py:cost {key}={{}}" for key in ("baseline", "save", "markdown", "junit")),
+        "engines out={}", *(f"examine a.py:cost {key}={{}}" for key in ("baseline", "save")),
     ],
 )  # fmt: skip
 def test_no_file_is_written_to_an_address(words, tmp_path, monkeypatch, capsys):

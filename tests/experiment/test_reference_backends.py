@@ -69,6 +69,6 @@ def test_scene_names_its_backends():
         backends = ("numpy", "torch")
 
     program = compose(Plain())
-    assert Numpy().incompatibility(program) is None
-    assert Jax().incompatibility(program) == "scene cubic runs on numpy and torch only"
-    assert Jax().incompatibility(compose(Heaviside())) is None
+    assert Numpy().refusal(program) is None
+    assert Jax().refusal(program) == "scene cubic runs on numpy and torch only"
+    assert Jax().refusal(compose(Heaviside())) is None

@@ -18,7 +18,7 @@ from bench.model.parameters import build
 
 QUICK_S = 1.0
 """Rows whose cells took longer are left out, except the quickest one of an engine in another Python."""
-MOST = 4
+MOST = 2
 """Most rows of an experiment."""
 AXES = ("scene", "contact", "integrator", "backend", "estimator", "optimizer", "trainer")
 FAST = {"quick"}

@@ -16,7 +16,7 @@ from threadpoolctl import ThreadpoolController, threadpool_limits
 
 from bench.experiment.config import load
 from bench.model import registry
-from bench.model.isolation import State
+from bench.model.isolation import ProcessState
 from bench.run import tasks
 from bench.run.execute import execute
 
@@ -43,7 +43,7 @@ def unchanged():
 def test_a_changed_setting_is_named(kind):
     code, words = CHANGES[kind]
     with unchanged():
-        state = State(double_precision=True)
+        state = ProcessState(double_precision=True)
         assert state.changes() == []
         exec(code, {"np": np})
         changes = state.changes()
@@ -169,8 +169,8 @@ def test_a_worker_loads_no_file_that_its_cells_do_not_need(tmp_path):
 
 
 FRESH = """
-from bench.model.isolation import State
-state = State(double_precision=True)
+from bench.model.isolation import ProcessState
+state = ProcessState(double_precision=True)
 import jax
 assert jax.config.jax_enable_x64
 state.follow()
@@ -193,7 +193,7 @@ def test_cells_in_this_process_use_one_thread_and_its_own_number_comes_back():
 
     with threadpool_limits(2):
         before = counts()
-        state = State(single_thread=True)
+        state = ProcessState(single_thread=True)
         assert set(counts()) == {1}
         assert state.changes() == []
         state.close()

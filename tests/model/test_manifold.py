@@ -76,7 +76,7 @@ class Steered(Tumbling):
 def problem(scene, backend="mujoco", **values):
     law = Penalty(stiffness=2000.0, damping=10.0, damping_mode="clipped")
     made = registry.make("backends", backend, values or None)
-    assert made.incompatibility(compose(scene, law, SemiImplicitEuler())) is None
+    assert made.refusal(compose(scene, law, SemiImplicitEuler())) is None
     return made.compile(compose(scene, law, SemiImplicitEuler()))
 
 

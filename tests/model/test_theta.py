@@ -24,6 +24,7 @@ from classes import (
     Torch,
 )
 
+from bench.conformance import subjects
 from bench.errors import UserError
 from bench.measure.reference import certify
 from bench.model import Decision, Rollout, compose
@@ -54,6 +55,11 @@ CASES = {
     "quadratic": (Quadratic(sigma=SIGMA), None, ("condition",)),
 }  # fmt: skip
 """Scene, law, names of theta, and where."""
+BACKENDS = [
+    pytest.param(one, id=one.name, marks=[pytest.mark.slow] * (one.name == "fused"))
+    for one in subjects.backends()
+    if not {"physics", "simulator"} & one.provides
+]
 
 
 def program_of(scene, law, names, at=None):
@@ -97,6 +103,7 @@ def test_gradient_is_that_of_the_cost_by_the_parameters(case):
     check_gradient(case, Numpy())
 
 
+@pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("case", ["pushing at", "bouncing_ball"])
 def test_every_backend_has_the_gradient_by_the_parameters(case, backend):
     check_gradient(case, backend)
@@ -105,7 +112,7 @@ def test_every_backend_has_the_gradient_by_the_parameters(case, backend):
 def check_gradient(case, backend):
     """Compare costs and gradients of a batch with the cost and its differences of each column's own program."""
     program = program_of(*CASES[case])
-    if reason := backend.incompatibility(program):
+    if reason := backend.refusal(program):
         pytest.skip(reason)
     problem, theta = backend.compile(program), program.theta0
     w = np.array([[0.0, 1.0, -0.7], [0.0, 0.4, 1.3]])[: program.dim]
@@ -140,7 +147,7 @@ SOLVING = {
 """Scene, law, integrator and names of theta."""
 
 
-@pytest.mark.needs("root")
+@pytest.mark.parametrize("backend", [one for one in BACKENDS if "root" in one.values[0].provides])
 @pytest.mark.parametrize("case", [pytest.param(n, marks=[pytest.mark.slow] * (n != "law")) for n in SOLVING])
 def test_columns_of_a_batch_have_parameters_of_their_own_in_equations(case, backend):
     """A solver that takes columns one by one has to find each column's own parameters."""

@@ -132,9 +132,9 @@ class Loud(Fobg):
     name = "loud"
     def __post_init__(self):
         print("made\\x1b[2J")
-    def incompatibility(self, *given):
+    def refusal(self, *given):
         print("asked\\x07")
-        return super().incompatibility(*given)
+        return super().refusal(*given)
 '''
 
 

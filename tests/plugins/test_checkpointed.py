@@ -67,4 +67,4 @@ def test_backends_that_keep_something_else_share_no_executable():
 def test_a_plain_function_has_no_step_jacobians():
     plugin = registry.make("backends", "checkpointed", {"keep": "jacobians"})
     program = compose(registry.make("scenes", "quadratic"))
-    assert "needs time steps" in plugin.incompatibility(program)
+    assert "needs time steps" in plugin.refusal(program)

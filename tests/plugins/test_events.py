@@ -22,7 +22,6 @@ from classes import (
 from scipy import stats
 
 from bench.model import Decision, DisturbedScene, Events, EventScene, FunctionScene, compose, half_spaces
-from bench.studies.optimise.search import ScaledNoiseProblem
 
 LIMIT = 4.5
 """Standard errors within which a mean agrees with its expectation."""
@@ -121,14 +120,6 @@ def test_boundaries_that_end_at_each_other_are_right():
 
 def test_boundary_equals_first_order_without_a_jump():
     np.testing.assert_array_equal(*(estimates(e, Cubic(), repeats=3) for e in (Boundary(), Fobg())))
-
-
-def test_boundary_follows_scaled_noise():
-    scene = Ledge(sigma=0.4)
-    scaled = ScaledNoiseProblem(problem(scene), 0.25)
-    w = np.random.default_rng(0).standard_normal((4, 16, 2))
-    plain = Boundary().estimate(problem(Ledge(sigma=0.1)), scene.theta0(), w)
-    np.testing.assert_allclose(Boundary().estimate(scaled, scene.theta0(), w), plain, rtol=1e-9)
 
 
 # --------------------------------------------------------------------------------------- stochastic derivative

@@ -136,13 +136,13 @@ def test_an_operation_without_scalar_form_is_refused_by_name():
         registry.make("contacts", "complementarity"),
         registry.make("integrators", "semi_implicit_euler"),
     )
-    assert "no root finder" in str(backend.incompatibility(pushed))
+    assert "no root finder" in str(backend.refusal(pushed))
     surrogate = compose(
         registry.make("scenes", "pushing"),
         registry.make("contacts", "straight_through"),
         registry.make("integrators", "semi_implicit_euler"),
     )
-    assert "surrogate" in str(backend.incompatibility(surrogate))
+    assert "surrogate" in str(backend.refusal(surrogate))
 
 
 def test_sine_and_cosine_are_accurate_in_the_whole_range():

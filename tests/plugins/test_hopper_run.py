@@ -84,14 +84,6 @@ def test_energy_is_conserved_through_a_bounce_in_the_limit_of_short_steps():
     assert errors[1] < 0.02 * (values[0] - program.scene.gravity * 4.5 * 0.2)
 
 
-@pytest.mark.parametrize("stiffness", [1e3, 1e4])
-def test_the_foot_at_rest_sinks_by_the_weight_over_the_stiffness(stiffness):
-    program = program_of(law={"stiffness": stiffness, "damping": 200.0}, leg_damping=60.0, hip_stiffness=200.0)
-    last = steps(program, start_of(foot=0.0), 300)[-1]
-    assert -last.q[4, 0] == pytest.approx(4.5 * 9.81 / stiffness, rel=1e-6)
-    assert last.q[1, 0] - last.q[4, 0] == pytest.approx(0.5 - 4.0 * 9.81 / 1500.0, rel=1e-6)
-
-
 def test_friction_slows_a_sliding_foot_by_at_most_its_coefficient():
     scene = HopperRun()
     sliding = program_of().dynamics(LoopOps())

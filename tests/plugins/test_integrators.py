@@ -60,12 +60,6 @@ def gradient(problem):
 # -------------------------------------------------------------------------------------------------- mass_spring
 
 
-def radius(scene, integrator):
-    """Spectral radius of one step."""
-    step = integrator.transition(scene.dt, 2 * scene.stiffness / scene.mass, 0.0, scene.velocity_factor)
-    return np.abs(np.linalg.eigvals(step)).max()
-
-
 @pytest.mark.parametrize("damping", [0.0, 1.0, 10.0, 15.0], ids=["undamped", "damped", "critical", "overdamped"])
 @pytest.mark.parametrize("integrator", EXPLICIT, ids=named)
 def test_mass_spring_gradient(integrator, damping):

@@ -139,16 +139,6 @@ def test_gauss_newton_takes_back_a_bad_step():
     assert abs(state["theta"][0]) < 1e-6  # undamped steps diverge from |x| > 1.39
 
 
-def test_gauss_newton_where_only_a_ratio_is_known():
-    optimizer = GaussNewton()
-    state = optimizer.start(np.array([1.0, 1.0]))
-    for _ in range(60):
-        a, b = optimizer.ask(state, np.empty((2, 0)))[:, 0]
-        answer = Answer(residual=np.array([[a / b - 2.0]]), jacobian=np.array([[[1 / b], [-a / b**2]]]))
-        state = optimizer.tell(state, np.array([[a], [b]]), answer)
-    assert state["theta"][0] / state["theta"][1] == pytest.approx(2.0)
-
-
 def steps(optimizer, cost, slope, count):
     """Thetas from 1 on, ``(count + 1,)``. The residual of a least-squares method is the gradient, with derivative 1."""
     state = optimizer.start(np.ones(1))

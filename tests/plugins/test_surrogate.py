@@ -61,8 +61,8 @@ def test_a_surrogate_gradient_certifies_nothing(problems):
 
 def test_differences_cannot_give_a_surrogate_which_is_never_declared_unbiased():
     program = compose(Billiard(horizon=5), StraightThrough(), SemiImplicitEuler())
-    assert "surrogate" in Fobg().incompatibility(program, Numpy().provides, "numpy")
-    assert Fobg().incompatibility(program, Jax().provides, "jax") is None
+    assert "surrogate" in Fobg().refusal(program, Numpy().provides, "numpy")
+    assert Fobg().refusal(program, Jax().provides, "jax") is None
     assert not Fobg().declares_unbiased(program)
 
 

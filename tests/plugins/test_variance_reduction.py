@@ -67,15 +67,6 @@ def test_quadratic_model_is_fitted_without_the_sample_it_is_subtracted_from(samp
     np.testing.assert_allclose(values, expected, rtol=ROUNDING)
 
 
-def test_every_quasi_random_direction_is_normal_and_those_of_a_repeat_differ():
-    v = directions(drawn(3000, 8, 2))
-    for n in range(8):
-        for i in range(2):
-            assert stats.kstest(v[:, n, i], "norm").pvalue > UNLIKELY
-        assert abs(np.corrcoef(v[:, n].T)[0, 1]) < LIMIT / np.sqrt(3000)
-    assert (np.diff(np.sort(v, axis=1), axis=1) > 0).all()
-
-
 def test_a_repeats_directions_have_one_in_each_of_n_equal_parts_of_every_coordinate():
     v = directions(drawn(50, 64, 5))
     parts = np.sort(np.floor(stats.norm.cdf(v) * 64), axis=1)
@@ -86,13 +77,6 @@ def test_points_are_those_of_scipy():
     sequence = stats.qmc.Sobol(3, scramble=False).random_base2(5)
     np.testing.assert_array_equal(points(32, 3) / 2.0**52, sequence)
     np.testing.assert_array_equal(points(20, 3), points(32, 3)[:20])
-
-
-def test_quasi_random_directions_are_unbiased():
-    scene = Cubic(dimension=2, sigma=0.3)
-    values = estimates(Sobol(), scene, samples=16)
-    error = values.std(axis=0) / np.sqrt(len(values))
-    assert (np.abs(values.mean(axis=0) - scene.closed_form_gradient(None, None)) < LIMIT * error).all()
 
 
 def slope(estimator, scene, counts=(64, 256, 1024), repeats=128):

@@ -8,7 +8,6 @@ from classes import (
     ControlVariate,
     Cubic,
     InverseVariance,
-    MeasureValued,
     Numpy,
     Penalty,
     Reinforce,
@@ -17,7 +16,6 @@ from classes import (
     TotalPropagation,
     TwoBalls,
 )
-from scipy.special import ndtri
 
 from bench.model import compose
 
@@ -119,16 +117,6 @@ def test_control_variate_by_hand(halves):
         left = [v - slopes[n >= 5] * (c - g) for n, (v, c) in enumerate(zip(values, control, strict=True))]
         assert found[r] == pytest.approx(np.mean(left, axis=0), rel=1e-10)
         assert said["coefficient"][r] == pytest.approx(np.mean(slopes), rel=1e-10)
-
-
-def test_measure_valued_gradient_of_a_cubic():
-    """The gradient of the smoothed cubic is theta^2 + sigma^2: the radius is Rayleigh's, drawn here at even levels."""
-    problem = Numpy().compile(compose(Cubic(dimension=1, sigma=0.4)))
-    theta, count = problem.program.theta0, 100_000
-    levels = (np.arange(count) + 0.5) / count
-    noise = ndtri(levels)[None, :, None]
-    found = MeasureValued().estimate(problem, theta, noise)[0]
-    assert found == pytest.approx(theta**2 + 0.4**2, rel=1e-4)
 
 
 def test_the_default_sphere_smoothes_a_cubic_as_the_normal_does():

@@ -22,7 +22,7 @@ from bench.report import writer
 from bench.report.finish import views_of
 from bench.report.style import width_in_inches
 from bench.report.web import document
-from bench.report.web.data import encode
+from bench.report.web.data import encode, page_data
 from bench.run.store import Store
 from bench.studies.bias_variance.columns import COLUMNS
 
@@ -44,7 +44,9 @@ def page(rows, study=None, **given):
 
 
 def assembled(made, rows, views, drawn=()):
-    return "".join(document.blocks(made, rows, views, drawn, [["a=1"]] * len(rows), {}))
+    return "".join(
+        document.blocks(made.name, made.question, views, page_data(made, rows, views, [["a=1"]] * len(rows)), drawn)
+    )
 
 
 @pytest.fixture(scope="module")

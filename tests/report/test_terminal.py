@@ -10,7 +10,6 @@ from rich.console import Console
 
 from bench.experiment import config
 from bench.report import finish, terminal, writer
-from bench.report.labels import Labels
 from bench.report.views import newest_rows
 from bench.run.execute import store_of
 
@@ -44,10 +43,9 @@ def test_nothing_is_lost_where_there_is_room():
     table = pd.DataFrame({"estimator": ["fobg", LONG], "rel. RMSE": [0.0213, 12000.0], "samples": [16, 256]})
     assert printed(table, 80, "Errors") == [
         "Errors",
-        "estimator       rel. RMSE  samples",
-        "fobg               0.0213       16",
-        "alpha_order[a]     1.20e4      256",
-        "[a] delta=0.95, gamma=4, sharing=shared",
+        f"{'estimator':46}  rel. RMSE  samples",
+        f"{'fobg':46}     0.0213       16",
+        f"{LONG}     1.20e4      256",
     ]
 
 
@@ -59,8 +57,8 @@ def test_constant_columns_are_stated_once_and_the_least_important_left_out_first
     right = ["bias", "extra", "time"]
     lines = printed(table, 40, right=right)
     assert lines[0] == "contact: penalty"
-    assert lines[1].split() == ["scene", "bias", "time", "status"], "a narrow column fits where a wide one did not"
-    assert "Left out to fit 40 characters: extra." in " ".join(lines)
+    assert lines[1].split() == ["scene", "bias", "status"]
+    assert "Left out to fit 40 characters: extra, time." in " ".join(lines)
     assert "extra" in printed(table, 45, right=right, least_important=["bias", "time"])[1]
 
 
@@ -81,15 +79,6 @@ def test_missing_values_and_booleans():
 def test_two_columns_of_one_name_are_both_shown():
     table = pd.DataFrame([["a", 1, 2.5]], columns=["name", "value", "value"])
     assert printed(table, 80) == ["name  value  value", "a         1   2.50"]
-
-
-def test_equal_parameters_have_equal_letters_and_short_names_stay():
-    labels, given = Labels(), [LONG, "fobg", "reinforce[baseline=none]", LONG.replace("alpha_order", "other")]
-    assert [*map(labels.short, given)] == ["alpha_order[a]", "fobg", "reinforce[baseline=none]", "other[a]"]
-    assert labels.key == ["[a] delta=0.95, gamma=4, sharing=shared"]
-    many = Labels(longest=5)
-    assert [many.short(f"name[x={index}]") for index in (0, 25, 0, 26)] == ["name[a]", "name[b]", "name[a]", "name[c]"]
-    assert len({many.short(f"name[x={index}]") for index in range(800)}) == 800
 
 
 def test_columns_of_the_environment_count_in_a_pipe(monkeypatch):

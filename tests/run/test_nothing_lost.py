@@ -450,7 +450,7 @@ def test_a_backend_asked_for_references_moves_and_doubles_nothing(tmp_path, work
 
 
 def test_too_little_memory_is_one_line():
-    code = "import bench.__main__ as m\ndef fail(): raise MemoryError\nm.main = fail\nm.command()"
+    code = "import bench.cli, bench.__main__ as m\ndef fail(): raise MemoryError\nbench.cli.main = fail\nm.command()"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 1
     assert done.stderr.startswith("bench: not enough memory: ")

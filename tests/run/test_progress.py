@@ -1,7 +1,6 @@
 """The line of progress keeps bar, counts and time at 80 columns, and a run says what it is busy with."""
 
 import io
-import threading
 from types import SimpleNamespace
 
 import pytest
@@ -9,10 +8,9 @@ from rich.cells import cell_len
 from rich.console import Console
 
 from bench.experiment import config
-from bench.run import progress, runner
+from bench.run import progress
 from bench.run.execute import execute
 from bench.run.launchers import launcher
-from bench.run.references import References
 
 PUSHING = [
     "scenes=[pushing]", "scene.pushing.horizon=2", "backends=[numpy]", "estimators=[reinforce]", "samples=8", "repeats=4",
@@ -61,29 +59,6 @@ def test_a_run_says_after_5_s_which_reference_it_computes(monkeypatch, capsys):
         lines.working("reference of callable callable (2 of 12 references done)")
     said = capsys.readouterr().err.splitlines()
     assert said == ["mine: 0/12 cells; now reference of callable callable (2 of 12 references done)"] * 2
-
-
-def test_a_run_in_this_process_says_which_reference_it_is_busy_with(tmp_path, monkeypatch, capsys):
-    said = threading.Event()
-    compute, show = References._compute, progress.Lines.show
-
-    def busy(self, cell):
-        assert said.wait(60), "nothing is said while a reference is computed"
-        return compute(self, cell)
-
-    def counted(self):
-        show(self)
-        if threading.current_thread() is not threading.main_thread():
-            said.set()
-
-    monkeypatch.setattr(References, "_compute", busy)
-    monkeypatch.setattr(progress.Lines, "show", counted)
-    monkeypatch.setattr(progress, "FIRST_LINE_S", 0.0)
-    monkeypatch.setattr(runner, "REPEAT_S", 0.01)
-    execute(config.load([*PUSHING, f"results_dir={tmp_path}"]), quiet=False)
-    lines = capsys.readouterr().err.splitlines()
-    assert "custom: 0/1 cells; now reference of pushing" in lines[0]
-    assert "bench-progress" not in {thread.name for thread in threading.enumerate()}
 
 
 def test_references_are_counted_while_they_are_computed(tmp_path, monkeypatch):

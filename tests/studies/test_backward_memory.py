@@ -10,8 +10,7 @@ import pytest
 from bench.errors import Crashed
 from bench.experiment import config
 from bench.experiment.grid import cells
-from bench.studies.backward_memory import views
-from bench.studies.backward_memory.measure import in_process, spread
+from bench.studies.backward_memory import in_process, spread, views
 
 CLOSE = 0.03
 """Relative error of a peak: the interpreter allocates beside the planted array."""

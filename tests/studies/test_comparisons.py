@@ -15,7 +15,6 @@ from bench.studies.bias_variance.comparisons import (
     compare_errors,
     leaders,
     method_table,
-    most_often_first,
     ratio,
     verdict,
 )
@@ -85,7 +84,6 @@ def test_a_missing_interval_cannot_be_first_and_an_unresolved_reference_is_open(
     )
     assert set(methods.loc[methods["estimator"] == "fobg", "verdict"]) == {OPEN}
     assert list(compared["first"]) == ["reinforce", "reinforce"]
-    assert most_often_first(methods, compared) == "reinforce"
 
 
 def test_nan_errors_are_never_a_pass():

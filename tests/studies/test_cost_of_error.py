@@ -6,8 +6,9 @@ import math
 import numpy as np
 import pandas as pd
 import pytest
-from classes import Adam, CartpoleSwing, GradientDescent, Planted, Quadratic
+from classes import Adam, CartpoleSwing, GradientDescent, Numpy, Planted, Quadratic
 from dose_response import analysis, views
+from dose_response.batched import run_batched
 from dose_response.ground import BestGradient, scored_noise
 from dose_response.measure import compare, hypotheses_hash
 from dose_response.search import TARGETS, Method, Task, follow, run_searches, tune, unit_rate
@@ -15,7 +16,8 @@ from trees import ROOT
 
 import bench
 from bench.experiment import config
-from bench.studies.optimise.search import objective
+from bench.model import compose, slopes
+from bench.studies.optimise.measure import objective
 
 PAPER = ROOT / "examples" / "cost_of_error"
 D = 8
@@ -112,6 +114,48 @@ def test_searches_in_shared_calls_equal_separate_searches(bowl):
     together = run_searches(bowl, task, methods, [3, 4])
     apart = [follow(bowl, method, task, seed) for method, seed in zip(methods, [3, 4], strict=True)]
     assert [s.updates for s in together] == [s.updates for s in apart]
+
+
+def test_a_seed_that_fails_among_others_fails_alone():
+    problem = Numpy().compile(compose(Quadratic(), None, None))
+    asked = []
+
+    def search(seed):
+        def run(lane):
+            first = lane.value(np.full(lane.dim, float(seed)), np.zeros((lane.program.n_noise, 2)))
+            if seed == 1:
+                raise ZeroDivisionError("seed 1")
+            asked.append(seed)
+            return {
+                "cost": float(first[0]),
+                "again": float(lane.value(np.zeros(lane.dim), np.zeros((lane.program.n_noise, 1)))[0]),
+            }
+
+        return run
+
+    found = run_batched(problem, [search(seed) for seed in range(3)])
+    assert isinstance(found[1], ZeroDivisionError)
+    assert asked == [0, 2]
+    assert found[0]["cost"] != found[2]["cost"]
+    assert found[0]["again"] == found[2]["again"]
+
+
+def test_a_call_that_fails_for_one_seed_is_made_for_each_alone():
+    def search(width):
+        return lambda lane: {"cost": lane.value(np.zeros(lane.dim), np.zeros((width, 1)))}
+
+    problem = Numpy().compile(compose(Quadratic(), None, None))
+    good, bad = run_batched(problem, [search(problem.program.n_noise), search(problem.program.n_noise + 1)])
+    assert isinstance(good, dict)
+    assert isinstance(bad, BaseException)
+
+
+def test_step_jacobians_of_searches_that_share_batches():
+    """Without step Jacobians of the backend they are differences, in a shared problem too."""
+    problem = bench.problem("lqr[horizon=5]", backend="numpy")
+    theta, still = np.ones(5), np.zeros((5, 1))
+    (shared,) = run_batched(problem, [lambda lane: {"a": slopes(lane, theta, still).a}])
+    assert np.array_equal(shared["a"], slopes(problem, theta, still).a)
 
 
 def test_compare_splits_the_error_into_bias_and_spread():
@@ -230,7 +274,7 @@ def test_interval_of_a_median_covers_and_fewer_than_six_values_leave_it_open():
 
 
 def planted(scene, kind, dose, updates, problem=""):
-    return {"problem": f"{scene}{problem}", "scene": scene, "scene_class": "smooth", "kind": kind, "dose": dose, "target": 100.0,
+    return {"problem": f"{scene}{problem}", "scene": scene, "scene_class": "smooth", "kind": kind, "dose": dose, "error": dose, "target": 100.0,
             "median": updates}  # fmt: skip
 
 
@@ -251,6 +295,17 @@ def test_ratios_are_those_of_the_same_problem_and_missed_targets_count():
     both = compared(lines, "bias 0.9 / random error 1")
     assert (both["problems"], both["ratio"], both["ratio_low"], both["ratio_high"]) == (6, 3.0, 3.0, 3.0)
     assert both.equals(compared(lines, "bias 0.9 / random error 1", analysis.ALL))
+
+
+def test_equal_errors_are_compared_between_the_planted_sizes_that_reach_the_target():
+    """Updates 10 and 40 at .3 and 3 are 20 between them; an error of 5, and a size that misses, do not count."""
+    sizes = (0.3, 10.0), (3.0, 40.0), (10.0, math.inf)
+    lines = [planted(f"p{i}", analysis.RANDOM, *size) for i in range(6) for size in sizes]
+    lines += [planted(f"p{i}", "first order", math.sqrt(0.9), 60.0) for i in range(6)]
+    lines += [planted(f"p{i}", "first order", 5.0, 1e6) for i in range(6)]
+    table = pd.DataFrame(lines).assign(method="fobg", samples=1, rollouts_per_update=0, gradients_per_update=1)
+    found = compared(table, "first order / random error, equal error")
+    assert (found["ratio"], found["verdict"]) == (pytest.approx(3.0), "above 1")
 
 
 @pytest.mark.parametrize(("scenes", "verdict"), [(6, "above 1"), (5, "not known")])

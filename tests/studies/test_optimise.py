@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from classes import ExplicitEuler, Impulse, Lqr, Numpy, Penalty, Quadratic, SemiImplicitEuler, StaticGain, TwoBalls
+from classes import ExplicitEuler, Impulse, Lqr, Penalty, SemiImplicitEuler, StaticGain, TwoBalls
 from scipy.linalg import solve_discrete_lyapunov
 
 import bench
@@ -16,14 +16,12 @@ from bench.experiment.grid import cells
 from bench.experiment.study import study_of
 from bench.measure import performance
 from bench.measure.solve import solve
-from bench.model import Problem, compose, slopes
 from bench.report.views import newest_rows
 from bench.run.execute import store_of
 from bench.run.session import Session
 from bench.studies.optimise import aggregate
 from bench.studies.optimise import views as shown
-from bench.studies.optimise.batched import run_batched
-from bench.studies.optimise.search import compare_with_reference, scene_class
+from bench.studies.optimise.measure import compare_with_reference, scene_class
 
 STANDARD = Path(__file__).resolve().parents[2] / "results" / "standard"
 CHECKED = 1e-6
@@ -230,74 +228,6 @@ def measured(*words, folder):
     return study_of(experiment).measure(cell, Session(experiment))
 
 
-@pytest.mark.parametrize("optimizer", ["adam[rate=0.1]", "cem[population=20,elites=5]", "line_search"])
-def test_seeds_abreast_have_the_numbers_of_seeds_alone(tmp_path, optimizer, monkeypatch):
-    words = [
-        "scenes=[quadratic]", "backends=[numpy]", "estimators=[fobg]", f"optimizers=[{optimizer}]", "samples=4", "repeats=4",
-        "study=optimise[iterations=12,quality_samples=64,scored=smoothed,evaluations=16]", "timing=false", f"results_dir={tmp_path}",
-    ]  # fmt: skip
-    together = config.load([*words, "sweep.seed=[0,1,2,3]"])
-    calls = []
-    own = Problem._blocks
-    monkeypatch.setattr(Problem, "_blocks", lambda self, *args: (calls.append(args[0].__name__), own(self, *args))[1])
-    session = Session(together)
-    rows = [study_of(together).measure(cell, session) for cell in cells(together)]
-    one_batch = len(calls)
-    calls.clear()
-    alone = []
-    for seed in range(4):
-        experiment = config.load([*words, f"seed={seed}"])
-        (cell,) = cells(experiment)
-        alone.append(study_of(experiment).measure(cell, Session(experiment)))
-    assert [row["path_cost"] for row in rows] == [row["path_cost"] for row in alone]
-    assert [row["theta"] for row in rows] == [row["theta"] for row in alone]
-    assert [row["rollouts"] for row in rows] == [row["rollouts"] for row in alone]
-    assert len({tuple(row["path_cost"]) for row in rows}) == 4
-    assert one_batch < 0.5 * len(calls)
-
-
-def test_a_seed_that_fails_among_others_fails_alone():
-    problem = Numpy().compile(compose(Quadratic(), None, None))
-    asked = []
-
-    def search(seed):
-        def run(lane):
-            first = lane.value(np.full(lane.dim, float(seed)), np.zeros((lane.program.n_noise, 2)))
-            if seed == 1:
-                raise ZeroDivisionError("seed 1")
-            asked.append(seed)
-            return {
-                "cost": float(first[0]),
-                "again": float(lane.value(np.zeros(lane.dim), np.zeros((lane.program.n_noise, 1)))[0]),
-            }
-
-        return run
-
-    found = run_batched(problem, [search(seed) for seed in range(3)])
-    assert isinstance(found[1], ZeroDivisionError)
-    assert asked == [0, 2]
-    assert found[0]["cost"] != found[2]["cost"]
-    assert found[0]["again"] == found[2]["again"]
-
-
-def test_a_call_that_fails_for_one_seed_is_made_for_each_alone():
-    def search(width):
-        return lambda lane: {"cost": lane.value(np.zeros(lane.dim), np.zeros((width, 1)))}
-
-    problem = Numpy().compile(compose(Quadratic(), None, None))
-    good, bad = run_batched(problem, [search(problem.program.n_noise), search(problem.program.n_noise + 1)])
-    assert isinstance(good, dict)
-    assert isinstance(bad, BaseException)
-
-
-def test_step_jacobians_of_searches_that_share_batches():
-    """Without step Jacobians of the backend they are differences, in a shared problem too."""
-    problem = bench.problem("lqr[horizon=5]", backend="numpy")
-    theta, still = np.ones(5), np.zeros((5, 1))
-    (shared,) = run_batched(problem, [lambda lane: {"a": slopes(lane, theta, still).a}])
-    assert np.array_equal(shared["a"], slopes(problem, theta, still).a)
-
-
 def test_tables_charts_and_page(finished):
     folder, experiment = finished
     for name in (
@@ -331,7 +261,6 @@ def one(*words):
     ("words", "message"),
     [
         (["study=optimise", "optimizers=[gauss_newton]"], "gauss_newton needs jacobian and residual"),
-        (["study=optimise[target=10]", "scenes=[lqr]"], "target=10 is below the optimum 10.98868364 of scene lqr"),
         (["study=identify", "optimizers=[gauss_newton]"], "scene quadratic is a plain function"),
     ],
 )
@@ -346,8 +275,6 @@ def test_an_experiment_of_which_nothing_can_run_is_bad_input(words, message, tmp
 @pytest.mark.parametrize(
     ("words", "stopped"),
     [
-        (["study=optimise[target=0.5,quality=none]"], "target"),
-        (["study=optimise[patience=5,quality=none]", "optimizer.gradient_descent.rate=1e-18"], "plateau"),
         (["study=optimise[quality=none]", "optimizer.gradient_descent.rate=10"], "diverged"),
         (["study=optimise[quality=none,iterations=3]"], "budget"),
     ],
@@ -356,23 +283,6 @@ def test_what_ends_a_search(tmp_path, words, stopped):
     row = measured(*words, "samples=4", folder=tmp_path)
     assert row["stopped"] == stopped
     assert row["status"] == ("diverged" if stopped == "diverged" else "ok")
-
-
-def test_smaller_noise_is_that_of_a_smaller_sigma():
-    """The schedule's problem gives the estimates of a scene that has the smaller sigma."""
-    from bench.plugins.estimators.randomized_smoothing import RandomizedSmoothing
-    from bench.plugins.estimators.reinforce import Reinforce
-
-    from bench.studies.optimise.search import ScaledNoiseProblem
-
-    noise = np.random.default_rng(0).standard_normal((2, 16, 5))
-    for scene, policy in (("cubic", False), ("cartpole[horizon=5,sigma=0.4]", True)):
-        wide = bench.problem(scene if policy else "cubic[sigma=0.4]", backend="numpy")
-        narrow = bench.problem(scene.replace("0.4", "0.1") if policy else "cubic[sigma=0.1]", backend="numpy")
-        theta = wide.program.theta0
-        for estimator in (Reinforce(), RandomizedSmoothing()):
-            expected = estimator.estimate(narrow, theta, noise)
-            assert estimator.estimate(ScaledNoiseProblem(wide, 0.25), theta, noise) == pytest.approx(expected, rel=1e-6)
 
 
 def test_quality_subtracts_noise():
@@ -517,7 +427,7 @@ def test_the_effect_of_errors_needs_five_points_and_an_interval(monkeypatch):
     rho = pd.DataFrame(lines, columns=["scene_class", "points", "rho", "rho_low", "rho_high", "chance", "expected"])
     monkeypatch.setattr(aggregate, "quality_and_runtime", lambda *_: rho)
     monkeypatch.setattr(aggregate, "rank_correlations", lambda points: points)
-    found = aggregate.effects_of_error(None, 4.0)
+    found = aggregate.effects_of_error(None)
     assert found["verdict"].tolist() == found["expected"].tolist()
 
 

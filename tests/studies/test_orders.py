@@ -3,40 +3,49 @@
 import numpy as np
 import pytest
 
+import bench
 from bench.experiment import config
 from bench.experiment.grid import cells
 from bench.experiment.study import study_of
+from bench.measure import noise
+from bench.model import Answer, registry
 from bench.run.session import Session
 
-FIXED = ("scenes=[pendulum_swing[dt=0.02]]", "backends=[jax]", "samples=100", "name=order", "timing=false")
-"""200 steps of 0.02 s, 100 samples; each search takes 30 iterations."""
 
-
-def ends(*words):
-    """The rows of an experiment's cells, in order."""
-    made = config.load(list(words))
-    session = Session(made)
-    return [study_of(made).measure(cell, session) for cell in cells(made)]
-
-
-def final(seeds, *words, decay=1):
-    study = f"study=optimise[iterations=30,quality=none,budget=100000000,sigma_decay={decay}]"
-    rows = ends(*FIXED, study, f"sweep.seed={list(range(seeds))}".replace(" ", ""), *words)
-    return np.array([row["final_cost"] for row in rows])
+def descended(estimator, sigma, optimizer, seeds, iterations=30):
+    """The costs at w = 0 after so many steps of a pendulum's search, of which step i has gradients of noise sigma / i."""
+    estimator, optimizer, found = registry.make("estimators", estimator), registry.make("optimizers", *optimizer), []
+    for seed in range(seeds):
+        problem = bench.problem("pendulum_swing[dt=0.02]", backend="jax")
+        state, size = optimizer.start(problem.program.theta0), problem.program.n_noise
+        still = np.zeros((size, 1))
+        for i in range(1, iterations + 1):
+            noisy = bench.problem(f"pendulum_swing[dt=0.02,sigma={sigma / i}]", backend="jax")
+            width = optimizer.draws(problem.dim)
+            w = noise.draw(seed, "pendulum_swing", 1, 100, size, f"optimise: samples {i}")
+            points = optimizer.ask(
+                state, noise.draw(seed, "pendulum_swing", 1, width, problem.dim, f"optimise: points {i}")[0].T
+            )
+            needs = optimizer.required_fields(state)
+            value = problem.value(points, np.repeat(still, points.shape[1], axis=1)) if "value" in needs else None
+            gradient = estimator.estimate(noisy, points[:, 0], w).T if "gradient" in needs else None
+            state = optimizer.tell(state, points, Answer(value, gradient))
+        found.append(problem.value(state["theta"][:, None], still)[0])
+    return np.array(found)
 
 
 METHODS = {
-    "fobg": ("estimators=[fobg]", "scene.pendulum_swing.sigma=5", "optimizers=[gradient_descent[rate=0.01]]"),
-    "zeroth": ("estimators=[reinforce]", "scene.pendulum_swing.sigma=0.1", "optimizers=[gradient_descent[rate=0.015,decay=0.3]]"),
-    "cem": ("estimators=[fobg]", "optimizers=[cem[population=100,elites=20,width=2,spread=old]]"),
-}  # fmt: skip
+    "fobg": ("fobg", 5.0, ("gradient_descent", {"rate": 0.01})),
+    "zeroth": ("reinforce", 0.1, ("gradient_descent", {"rate": 0.015, "decay": 0.3})),
+    "cem": ("fobg", 1.0, ("cem", {"population": 100, "elites": 20, "width": 2.0, "spread": "old"})),
+}
 """sigma 5/i at rate .01; .1/i at .015/i^.3 with the baseline at w = 0; 20 elites of 100 from a width of 2."""
 
 
 @pytest.mark.slow
 def test_order_of_three_methods_at_fixed_steps():
     """901 to 904, 935 to 943 and 955 to 973 over 5 seeds; here the order holds in each of 10."""
-    found = {name: final(10, *words) for name, words in METHODS.items()}
+    found = {name: descended(*method, seeds=10) for name, method in METHODS.items()}
     assert (found["fobg"] < found["zeroth"]).all()
     assert (found["zeroth"] < found["cem"]).all()
     for name, (low, high) in {"fobg": (901, 904), "zeroth": (935, 943), "cem": (955, 973)}.items():
@@ -46,12 +55,10 @@ def test_order_of_three_methods_at_fixed_steps():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("estimator", "sigma", "low", "high"), [("fobg", 1.0, 874, 877), ("reinforce", 1.0, 899, 912)])
-def test_ends_with_backtracking(estimator, sigma, low, high):
+@pytest.mark.parametrize(("estimator", "low", "high"), [("fobg", 874, 877), ("reinforce", 899, 912)])
+def test_ends_with_backtracking(estimator, low, high):
     """30 steps with Armijo's rule, a gradient and a batch of costs each: gradients have sigma 1/(2 i - 1), about .5/i."""
-    study = "study=optimise[iterations=60,quality=none,budget=100000000,sigma_decay=1]"
-    words = [f"estimators=[{estimator}]", f"scene.pendulum_swing.sigma={sigma}", "optimizers=[line_search]"]
-    found = np.array([row["final_cost"] for row in ends(*FIXED, study, "sweep.seed=[0,1,2]", *words)])
+    found = descended(estimator, 1.0, ("line_search", {}), seeds=3, iterations=60)
     # other seeds, and not the same noise in the costs that are compared: by the range's own width
     assert low - (high - low) < found.min()
     assert found.max() < high + (high - low)
@@ -60,9 +67,16 @@ def test_ends_with_backtracking(estimator, sigma, low, high):
 @pytest.mark.slow
 def test_the_rate_moves_a_method_further_than_methods_are_apart():
     """At half its rate fobg ends behind the zeroth order, at twice its rate further still: one rate compares rates."""
-    zeroth = final(2, *METHODS["zeroth"]).max()
+    zeroth = descended(*METHODS["zeroth"], seeds=2).max()
     for rate in (0.005, 0.02):
-        assert final(2, *METHODS["fobg"][:2], f"optimizers=[gradient_descent[rate={rate}]]").min() > zeroth
+        assert descended("fobg", 5.0, ("gradient_descent", {"rate": rate}), seeds=2).min() > zeroth
+
+
+def ends(*words):
+    """The rows of an experiment's cells, in order."""
+    made = config.load(list(words))
+    session = Session(made)
+    return [study_of(made).measure(cell, session) for cell in cells(made)]
 
 
 @pytest.mark.slow

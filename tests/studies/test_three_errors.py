@@ -9,8 +9,7 @@ from bench.experiment import config
 from bench.experiment.grid import cells
 from bench.model import compose
 from bench.report.shown import Shown
-from bench.studies.three_errors import ThreeErrors, measure
-from bench.studies.three_errors.measure import difference_check
+from bench.studies.three_errors import ThreeErrors, _signs, difference_check
 from bench.studies.three_errors.views import FLOOR, OWN, PROGRAM, TRAP, traps, views
 
 COLUMNS = ThreeErrors.columns
@@ -105,4 +104,4 @@ def test_gradients_are_drawn_once_whatever_estimates_them_and_only_where_compare
 
 
 def test_rounding_has_no_sign():
-    assert list(measure._signs(np.array([-7e-16, 0.4, -1e-3]))) == [0.0, 1.0, -1.0]
+    assert list(_signs(np.array([-7e-16, 0.4, -1e-3]))) == [0.0, 1.0, -1.0]

@@ -137,14 +137,6 @@ def test_returns_at_equal_used_steps_are_those_of_the_last_evaluation_within_the
     assert summary.loc["shac", "equal"] == runs["curve_return"].iloc[0][0]
 
 
-def test_the_chart_of_logs_has_one_axis_of_steps_for_all_quantities():
-    experiment, rows = made_up()
-    chart = next(chart for chart in views(experiment, rows).charts if chart.name == "train_log")
-    assert set(chart.frame["quantity"]) == {"reward per step", "log10 of the gradient norm", "cosine with zeroth order"}
-    assert chart.across == 1
-    assert chart.frame["step"].max() == 1e6
-
-
 def test_a_return_above_another_by_less_than_noise_is_not_behind():
     best = np.array([-8.0, -7.0, -9.0, -8.5, -7.5])
     lines = pd.DataFrame({"final": [-9.0, -8.0], "returns": [best - 0.6, best], "group": "one"})

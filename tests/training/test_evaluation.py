@@ -8,7 +8,7 @@ from problems import cartpole_program
 
 from bench.errors import UserError
 from bench.model import LoopOps, State, compose, registry
-from bench.training import evaluation, fitting
+from bench.training import fitting
 from bench.training.environment import Environment
 
 ROUNDING = 1e-9
@@ -18,7 +18,7 @@ ROUNDING = 1e-9
 def test_returns_are_those_of_a_loop_in_numpy():
     env = Environment(cartpole_program(horizon=30), registry.make("backends", "jax").ops())
     numbers = np.random.default_rng(0).standard_normal((8, 5))
-    ours = evaluation.returns(env, lambda seen: 0.2 * seen[:1] - seen[4:], jnp.asarray(numbers))
+    ours = env.returns(lambda seen: 0.2 * seen[:1] - seen[4:], jnp.asarray(numbers))
     scene, program, ops = env.scene, env.program, LoopOps(np)
     state, total = scene.random_start(np, numbers), 0.0
     for _ in range(30):
@@ -47,7 +47,7 @@ def test_an_episode_counts_up_to_its_first_end():
 
     program = compose(Falls(horizon=50), None, registry.make("integrators", "semi_implicit_euler"))
     env = Environment(program, registry.make("backends", "jax").ops())
-    returns = evaluation.returns(env, lambda seen: 0.0 * seen[:1], jnp.zeros((8, 3)))
+    returns = env.returns(lambda seen: 0.0 * seen[:1], jnp.zeros((8, 3)))
     # at 1.1 m/s the cart passes 0.05 m in the third step of 1/60 s
     assert np.asarray(returns).tolist() == [-3.0] * 3
 
@@ -65,7 +65,7 @@ def test_a_scene_without_random_starts_has_returns():
 
     program = compose(Fixed(horizon=5), None, registry.make("integrators", "semi_implicit_euler"))
     env = Environment(program, registry.make("backends", "jax").ops())
-    returns = np.asarray(evaluation.returns(env, lambda seen: 0.0 * seen[:1], jnp.zeros((0, 3))))
+    returns = np.asarray(env.returns(lambda seen: 0.0 * seen[:1], jnp.zeros((0, 3))))
     assert returns.shape == (3,)
     assert np.isfinite(returns).all()
     assert len(set(returns.tolist())) == 1

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from problems import cartpole_program
 
-from bench.model import Rollout, State, registry
+from bench.model import State, registry
 from bench.training import windows
 from bench.training.environment import Environment, Episodes
 from bench.training.networks import Actor
@@ -176,13 +176,3 @@ def test_a_state_that_is_not_finite_ends_its_episode():
     moved = env.step(broken, jnp.zeros((1, 2)), jnp.ones((8, 2)))
     assert np.asarray(moved.terminated).tolist() == [False, True]
     assert np.isfinite(np.concatenate(moved.next.state)).all()
-
-
-def test_a_scene_without_observations_is_refused():
-    from bench.errors import Unsupported
-    from bench.model import compose
-
-    program = compose(registry.make("scenes", "pendulum"), None, registry.make("integrators", "rk4"))
-    assert isinstance(program, Rollout)
-    with pytest.raises(Unsupported, match="no observations and random starts"):
-        Environment(program, registry.make("backends", "jax").ops())

@@ -7,25 +7,21 @@ import importlib
 import importlib.util
 import sys
 from collections.abc import Iterable
-from difflib import get_close_matches
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from bench.errors import UserError, failure
+from bench.errors import UserError, failure, unknown
 from bench.model.simulator.clock import Clock
 from bench.model.simulator.simulator import LIBRARIES, Simulator
 from bench.model.simulator.tree import ParameterTree
-
-NEAREST = 5
-"""Most names that are listed beside an unknown one."""
 
 
 def load_attribute(text: str, module: ModuleType | None = None, what: str = "name", more: Iterable[str] = ()) -> Any:
     """Return the object ``FILE:NAME`` or ``MODULE:NAME``; a name without a file is looked up in ``module``.
 
     Raises :class:`UserError` if the file or name does not exist, or if the file cannot be imported. The error calls the name
-    ``what``, and lists the nearest names, also of ``more`` that the caller allows.
+    ``what``, and lists the names that the module defines, and ``more`` that the caller allows.
     """
     place, _, name = text.rpartition(":")
     if place:
@@ -35,25 +31,17 @@ def load_attribute(text: str, module: ModuleType | None = None, what: str = "nam
     value: Any = module
     for part in name.split("."):
         if not hasattr(value, part):
-            raise UserError(_unknown_name(f"{what} in {place}:" if place else what, name, module, more))
+            names = [key for key, own in vars(module).items() if not key.startswith("_") and _is_of(module, own)]
+            raise unknown(f"{what} in {place}:" if place else what, name, {*more, *names})
         value = getattr(value, part)
     return value
 
 
-def _unknown_name(where: str, name: str, module: ModuleType, more: Iterable[str]) -> str:
-    """Return the message on an unknown name, with the nearest names: functions that the module defines come first."""
-    public = {key: value for key, value in vars(module).items() if not key.startswith("_")}
-    own = [*more, *(key for key, value in public.items() if _is_defined_in(value, module))]
-    others = [key for key in public if key not in own]
-    near = [key for part in (own, others) for key in get_close_matches(name, part, NEAREST, 0.4)][:NEAREST]
-    shown = near or (own or others)[:NEAREST]
-    hint = f"; did you mean '{near[0]}'?" if near else ""
-    rest = len(own) + len(others) - len(shown)
-    return f"unknown {where} '{name}'{hint} (names: {', '.join(shown) or 'none'}{f', and {rest} more' if rest else ''})"
-
-
-def _is_defined_in(value: Any, module: ModuleType) -> bool:
-    return callable(value) and getattr(value, "__module__", None) == module.__name__
+def _is_of(module: ModuleType, value: Any) -> bool:
+    """Return whether a module defines a value, as opposed to a function or a module that it imports."""
+    return (
+        getattr(value, "__module__", None) == module.__name__ if callable(value) else not isinstance(value, ModuleType)
+    )
 
 
 def load_module(place: str) -> ModuleType:

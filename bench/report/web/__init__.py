@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Views
 from bench.report import reproduce
+from bench.report.web.data import page_data
 from bench.report.web.document import blocks
 from bench.run.files import write_whole
 from bench.run.rows import read_record
@@ -22,6 +23,7 @@ def write(
     """Write ``report.html`` from rows, what the study shows of them and its charts, with the facts of ``run.json``; return its path."""
     rows = rows.reset_index(drop=True)
     path = experiment.directory / "report.html"
-    text = blocks(experiment, rows, views, drawn, reproduce.commands(experiment, rows), read_record(path.parent))
+    data = page_data(experiment, rows, views, reproduce.commands(experiment, rows))
+    text = blocks(experiment.name, experiment.question, views, data, drawn, read_record(path.parent))
     write_whole(path, (block.encode() for block in text))
     return [path]

@@ -28,17 +28,28 @@ IN_SIGHT, FIRST = 5, 3
 def page_data(
     experiment: Experiment, rows: pd.DataFrame, views: Views, commands: Sequence[Sequence[str]]
 ) -> dict[str, Any]:
-    """Return the data of an experiment's page. ``commands`` are the words that run each row's cell.
-
-    The columns of the cells are functions that return them, since all columns of many cells need a lot of memory.
-    """
+    """Return the data of an experiment's page. ``commands`` are the words that run each row's cell."""
     arranged = arrange(experiment, rows.reset_index(drop=True))
     swept = [axis.column for axis in arranged.axes]
     cells = (arranged.rows if views.rows is None else views.rows).reset_index(drop=True)
     cells = cells.assign(**{name: arranged.rows[name].to_numpy() for name in swept if name not in cells})
     if "time_s" in cells:
         cells = cells.assign(unsteady=unsteady(cells).astype(float))
-    columns = _columns(experiment, views, cells, swept)
+    own = views.columns or [
+        c for c in experiment.columns.all if c.table and c.name not in COMMON and c.kind != "list" and c.name in cells
+        and (cells[c.name].nunique() > 1 if c.kind == "text" else cells[c.name].notna().any())
+    ]  # fmt: skip
+    return cells_data(cells, own, swept, commands)
+
+
+def cells_data(
+    cells: pd.DataFrame, own: Sequence[Column], swept: Sequence[str] = (), commands: Sequence[Sequence[str]] = ()
+) -> dict[str, Any]:
+    """Return cells as data: identity and swept columns, the columns ``own``, ``status`` and ``reason``.
+
+    The columns of the cells are functions that return them, since all columns of many cells need a lot of memory.
+    """
+    columns = _columns(own, cells, swept)
     filters = _filters(cells, columns, swept)
     identity = [name for name in dict.fromkeys((*IDENTITY, *swept)) if name in cells]
     flags = {column["flag"] for column in columns}
@@ -48,6 +59,7 @@ def page_data(
     words = [[line[i] if i < len(line) else "" for line in commands] for i in range(longest)]
     return {
         "count": len(cells),
+        "statuses": cells["status"].value_counts().to_dict(),
         "cells": {name: partial(encode, cells[name]) for name in cells if name in names},
         "columns": columns,
         "filters": filters,
@@ -56,16 +68,12 @@ def page_data(
     }
 
 
-def _columns(experiment: Experiment, views: Views, cells: pd.DataFrame, swept: Sequence[str]) -> list[dict[str, str]]:
+def _columns(own: Sequence[Column], cells: pd.DataFrame, swept: Sequence[str]) -> list[dict[str, str]]:
     """Return the columns of the table of cells: identity, the first results, status, the other results, the reason."""
     identity = [
         _column(name, name.replace("_", " "), "number" if pd.api.types.is_numeric_dtype(cells[name]) else "text")
         for name in varying_identity(cells, swept)
     ]
-    own = views.columns or [
-        c for c in experiment.columns.all if c.table and c.name not in COMMON and c.kind != "list" and c.name in cells
-        and (cells[c.name].nunique() > 1 if c.kind == "text" else cells[c.name].notna().any())
-    ]  # fmt: skip
     results = [_result(column, cells) for column in own]
     status, reason = (_column(name, name, "text") for name in ("status", "reason"))
     return [*identity[:IN_SIGHT], *results[:FIRST], status, *results[FIRST:], *identity[IN_SIGHT:], reason]

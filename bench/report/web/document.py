@@ -9,40 +9,36 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from html import escape
 from itertools import starmap
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
-import pandas as pd
 from matplotlib.figure import Figure
 
-from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Views
 from bench.report.cells import readable
 from bench.report.web import shell
-from bench.report.web.data import page_data
 
 HERE = Path(__file__).parent
 
 
 def blocks(
-    experiment: Experiment,
-    rows: pd.DataFrame,
+    title: str,
+    question: str,
     views: Views,
-    drawn: Sequence[tuple[Chart, Figure]],
-    commands: Sequence[Sequence[str]],
-    record: Mapping[str, Any],
+    data: Mapping[str, Any],
+    drawn: Sequence[tuple[Chart, Figure]] = (),
+    record: Mapping[str, Any] = MappingProxyType({}),
 ) -> Iterator[str]:
     """Yield the page as HTML in blocks, so that a long page is never in memory as one string.
 
-    ``commands`` are the words that run each row's cell, ``record`` is ``run.json``.
+    ``data`` are the cells, see :func:`~bench.report.web.data.cells_data`, and ``record`` is ``run.json``.
     """
-    counts = (rows if views.rows is None else views.rows)["status"].value_counts()
-    statuses = "".join(f'<li class="{escape(str(s))}"><b>{n}</b> {escape(str(s))}</li>' for s, n in counts.items())
-    data = page_data(experiment, rows, views, commands)
+    counts = [(data["count"], "cells"), *((n, str(status)) for status, n in data["statuses"].items())]
     parts = {
-        "title": escape(experiment.name),
-        "question": escape(experiment.question),
+        "title": escape(title),
+        "question": escape(question),
         "headline": escape(views.headline),
-        "counts": f"<li><b>{counts.sum()}</b> cells</li>{statuses}",
+        "counts": "".join(f'<li class="{escape(name)}"><b>{n}</b> {escape(name)}</li>' for n, name in counts),
         "answers": _answers(views),
         "charts": "\n".join(starmap(_chart, drawn)),
         "made": _made(record),
@@ -50,9 +46,9 @@ def blocks(
     }
     template = (HERE / "page.html").read_text()
     body = re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], template)
-    before, after = shell.document(experiment.name, body, [shell.script("page.js")]).split(place)
+    before, after = shell.document(title, body, [shell.script("page.js")]).split(place)
     yield before
-    yield from map(in_script, json_blocks(data))
+    yield from map(in_script, json_blocks(dict(data)))
     yield after
 
 

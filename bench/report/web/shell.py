@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Sequence
 from functools import cache
 from html import escape
 from pathlib import Path
@@ -52,22 +52,11 @@ def _digest(script: str) -> str:
     return base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
 
 
-def table(frame: pd.DataFrame, numbers: Collection[str] = (), marked: Mapping[str, str] | None = None) -> str:
-    """Return a frame of texts as an HTML table, in a box that scrolls sideways where the window is narrow.
-
-    The columns ``numbers`` are aligned to the right. A cell whose text is a key of ``marked`` has that class.
-    """
-    classes = dict(marked or {})
-    head = "".join(
-        f'<th scope="col"{_class("number" if name in numbers else "")}>{escape(str(name))}</th>' for name in frame
-    )
-    lines = []
-    for row in frame.astype(str).to_numpy():
-        cells = (
-            f"<td{_class(classes.get(text) or ('number' if name in numbers else ''))}>{_breakable(text)}</td>"
-            for name, text in zip(frame, row, strict=True)
-        )
-        lines.append(f"<tr>{''.join(cells)}</tr>")
+def table(frame: pd.DataFrame) -> str:
+    """Return a frame of texts as an HTML table, in a box that scrolls sideways where the window is narrow."""
+    head = "".join(f'<th scope="col">{escape(str(name))}</th>' for name in frame)
+    rows = frame.astype(str).to_numpy()
+    lines = [f"<tr>{''.join(f'<td>{_breakable(text)}</td>' for text in row)}</tr>" for row in rows]
     return (
         f'<div class="scroll" tabindex="0"><table><thead><tr>{head}</tr></thead>'
         f"<tbody>{''.join(lines)}</tbody></table></div>"
@@ -88,7 +77,3 @@ def drawing(figure: Figure, name: str, description: str) -> str:
 def script(name: str) -> str:
     """Return a script of this folder."""
     return _file(name)
-
-
-def _class(name: str) -> str:
-    return f' class="{escape(name)}"' if name else ""

@@ -2,30 +2,50 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 import os
 import pickle
+import socket
+import sys
 import time
-from collections import deque
-from collections.abc import Iterator, Sequence
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, ClassVar, cast
 
 from bench.errors import UserError, printable
 from bench.experiment.experiment import Experiment
-from bench.run.launchers.jobs import Job, Losses, import_path, pack, read_message, run_job, split, unavailable
-from bench.run.launchers.waiting import PAUSE_S, Patience, reach
+from bench.model import registry
+from bench.model.parameters import Plugin, build, param
+from bench.run.launchers.launcher import local_launcher, without_grid
 from bench.run.pool import Answer
 from bench.run.record import kind_of_machine
 from bench.run.tasks import Task
 
 TICK = 0.1
 """Seconds between checks of the jobs."""
+SILENT_S, PAUSE_S = 5.0, 0.5
+"""Seconds of a wait after which it is printed, and between its checks."""
 JOBS_PER_CORE = 2
 """Jobs sent per core: one runs, and another is ready to start."""
 MAX_LOSSES = 3
 """Number of losses of a node while it runs a task after which the task counts as crashed."""
+
+
+@dataclass(frozen=True)
+class RaySettings(Plugin):
+    """The settings ``ray.*`` of an experiment."""
+
+    kind: ClassVar[str] = "launchers"
+    name: ClassVar[str] = "ray"
+
+    address: str | None = param(None, "host and port of the cluster; null: RAY_ADDRESS, or a cluster of this machine")
+    cells: int = param(50, "most cells of a job", low=1)
+    cpus: float = param(1.0, "cores that a job reserves", low=1)
+    wait: float = param(60.0, "most seconds of a wait for the cluster", "s", low=1)
 
 
 @dataclass(eq=False)
@@ -34,7 +54,7 @@ class _SentJob:
 
     stream: Any
     unanswered: dict[int, Task]
-    node: str = ""
+    node: str
 
 
 class RayLauncher:
@@ -44,39 +64,48 @@ class RayLauncher:
     """
 
     def __init__(self, experiment: Experiment, timed: bool, kind: str) -> None:
+        self._settings = cast(RaySettings, build(RaySettings, experiment.execution.cluster))
+        self._address = self._settings.address or os.environ.get("RAY_ADDRESS")
+        n_cores = os.cpu_count() or 1
+        if not self._address and self._settings.cpus > n_cores:
+            raise UserError(
+                f"ray.cpus={self._settings.cpus:g} is more than the {n_cores} cores of this machine, on which a cluster is "
+                "started without ray.address"
+            )
         try:
             os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # Ray warns if this is unset
             import ray
         except ImportError as error:
-            raise unavailable("ray", error) from None
+            raise UserError(
+                f"launcher=ray is unavailable: {error}; pip install 'diffsim-bench[ray]' here and on the machines"
+            ) from None
         self._ray: Any = ray
         self._experiment, self._timed, self._kind = experiment, timed, kind
-        self._settings = experiment.execution.cluster
         self._jobs: list[_SentJob] = []
-        self._losses = Losses(MAX_LOSSES)
+        self._losses: Counter[int] = Counter()
         self._has_started_ray = False
 
     def __enter__(self) -> RayLauncher:
         if not self._ray.is_initialized():
-            address = self._settings["address"] or os.environ.get("RAY_ADDRESS")
-            if address and address not in ("auto", "local"):
-                reach(address, self._patience())
+            if self._address and self._address not in ("auto", "local"):
+                reach(self._address, self._settings.wait)
             try:
                 self._ray.init(
-                    address=address, log_to_driver=False, logging_level=logging.ERROR,
-                    runtime_env={"env_vars": {"PYTHONPATH": import_path()}},
+                    address=self._address, log_to_driver=False, logging_level=logging.ERROR,
+                    runtime_env={"env_vars": {"PYTHONPATH": _import_path()}},
                 )  # fmt: skip
             except Exception as error:
                 raise UserError(
-                    f"no Ray cluster at {address or 'this machine'}: {printable(error)[:300]}; start one: ray start --head"
+                    f"no Ray cluster at {self._address or 'this machine'}: {printable(error)[:300]}; start one: ray start --head"
                 ) from None
             self._has_started_ray = True
         try:
-            self._wait_for_cores()
+            wait_until(self._lack_of_cores, self._settings.wait)
         except BaseException:
             self.__exit__()
             raise
-        self._packed = self._ray.put(pack(self._experiment))
+        folder = self._experiment.results_dir.absolute()
+        self._packed = self._ray.put(pickle.dumps(replace(without_grid(self._experiment), results_dir=folder)))
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -87,19 +116,17 @@ class RayLauncher:
         if self._has_started_ray:
             self._ray.shutdown()
 
-    def _patience(self) -> Patience:
-        return Patience(self._settings["wait"], "ray.wait")
+    def _lack_of_cores(self) -> str:
+        """Return why no node has the cores of a job, or an empty string."""
+        most = max((float(node["Resources"].get("CPU", 0)) for node in self._alive.values()), default=0.0)
+        cpus = self._settings.cpus
+        lack = f"a job reserves ray.cpus={cpus:g} cores, and the largest node of the cluster has {most:g}"
+        return lack if most < cpus else ""
 
-    def _wait_for_cores(self) -> None:
-        """Wait until a node has the cores of a job; raises :class:`UserError` after the limit."""
-        patience, cpus = self._patience(), self._settings["cpus"]
-        while (most := self._most_cores()) < cpus:
-            patience.wait(f"a job reserves ray.cpus={cpus:g} cores, and the largest node of the cluster has {most:g}")
-            time.sleep(PAUSE_S)
-
-    def _most_cores(self) -> float:
-        """Return the number of cores of the largest node."""
-        return max((float(node["Resources"].get("CPU", 0)) for node in self._ray.nodes() if node["Alive"]), default=0.0)
+    @property
+    def _alive(self) -> dict[str, Any]:
+        """The nodes by id."""
+        return {node["NodeID"]: node for node in self._ray.nodes() if node["Alive"]}
 
     @property
     def current(self) -> list[Task]:
@@ -109,13 +136,11 @@ class RayLauncher:
     def run(self, groups: Sequence[Sequence[Task]]) -> Iterator[list[Answer]]:
         """Yield answers as they arrive, one per task, and empty lists while the caller has to wait."""
         nodes = self._nodes_of_one_kind() if self._timed else {}
-        n_slots = len(nodes) if self._timed else int(self._ray.cluster_resources().get("CPU", 1))
-        waiting = deque(split(groups, self._settings["cells"], JOBS_PER_CORE * n_slots))
-        patience: Patience | None = Patience(None)
+        n_slots = len(nodes) if self._timed else self._n_cores
+        waiting = deque(split(groups, self._settings.cells, JOBS_PER_CORE * n_slots))
         while waiting or self._jobs:
             if self._timed:
-                alive = {node["NodeID"] for node in self._ray.nodes() if node["Alive"]}
-                nodes = {node: cores for node, cores in nodes.items() if node in alive}
+                nodes = {node: cores for node, cores in nodes.items() if node in self._alive}
                 if waiting and not nodes:
                     raise UserError(
                         f"no node of the kind '{self._kind}' is left; run the same command again when there is one"
@@ -124,27 +149,26 @@ class RayLauncher:
                 for node in free[: len(waiting)]:
                     self._send(waiting.popleft(), nodes[node], node)
             else:
-                n_cores = int(self._ray.cluster_resources().get("CPU", 1))
-                while waiting and len(self._jobs) < JOBS_PER_CORE * n_cores:
-                    self._send(waiting.popleft(), self._settings["cpus"], "")
-            answers = self._collect(waiting)
-            if answers:
-                patience = None
-            elif patience is not None and self._ray.available_resources().get("CPU", 0) < self._settings["cpus"]:
-                patience.wait("all cores of the Ray cluster are in use")
-            yield answers
+                while waiting and len(self._jobs) < JOBS_PER_CORE * self._n_cores:
+                    self._send(waiting.popleft(), self._settings.cpus)
+            yield self._collect(waiting)
 
-    def _send(self, tasks: list[Task], cores: float, node: str) -> None:
-        options: dict[str, Any] = {"num_cpus": cores, "num_returns": "streaming", "max_retries": 0}
-        options["scheduling_strategy"] = "SPREAD"
-        if node:
-            from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+    @property
+    def _n_cores(self) -> int:
+        return int(self._ray.cluster_resources().get("CPU", 1))
 
-            options["scheduling_strategy"] = NodeAffinitySchedulingStrategy(node, soft=False)
-        send = self._ray.remote(_run_job).options(**options)
-        settings = {"tasks": pickle.dumps(tasks), "timed": self._timed, "kind": self._kind}
-        stream = send.remote(self._experiment.plugins, self._packed, settings)
+    def _send(self, tasks: list[Task], cores: float, node: str = "") -> None:
+        place = self._only_on(node) if node else "SPREAD"
+        job = self._ray.remote(_run_job).options(
+            num_cpus=cores, num_returns="streaming", max_retries=0, scheduling_strategy=place
+        )
+        stream = job.remote(self._experiment.plugins, self._packed, pickle.dumps(tasks), self._timed)
         self._jobs.append(_SentJob(stream, dict(enumerate(tasks)), node))
+
+    def _only_on(self, node: str) -> Any:
+        from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+        return NodeAffinitySchedulingStrategy(node, soft=False)
 
     def _collect(self, waiting: deque[list[Task]]) -> list[Answer]:
         """Return the answers that have arrived; the unanswered tasks of a lost job are put back into ``waiting``."""
@@ -155,29 +179,30 @@ class RayLauncher:
         ready, _ = self._ray.wait([job.stream for job in self._jobs], num_returns=len(self._jobs), timeout=TICK)
         for job in [job for job in self._jobs if any(job.stream is stream for stream in ready)]:
             try:
-                index, message = self._ray.get(next(job.stream))
+                index, answer = self._ray.get(next(job.stream))
             except self._ray.exceptions.RayTaskError as error:
                 raise UserError(f"a job on the cluster failed: {printable(error.cause)[:300]}") from None
             except (StopIteration, self._ray.exceptions.RayError) as error:
                 self._jobs.remove(job)
-                reason = "its job ended early" if isinstance(error, StopIteration) else type(error).__name__
-                answers += self._losses.requeue(list(job.unanswered.values()), waiting, reason)
+                tasks = list(job.unanswered.values())
+                self._losses.update(map(id, tasks[:1]))
+                if tasks and self._losses[id(tasks[0])] == MAX_LOSSES:
+                    cause = "its job ended early" if isinstance(error, StopIteration) else type(error).__name__
+                    reason = f"lost {MAX_LOSSES} times while it was running: {cause}"
+                    answers.append(Answer(tasks.pop(0), {"status": "crashed", "reason": reason}, 0.0))
+                if tasks:
+                    waiting.appendleft(tasks)
             else:
-                task = job.unanswered.pop(index, next(iter(job.unanswered.values())))
-                answers.append(read_message(task, message, self._kind))
+                answers.append(Answer(job.unanswered.pop(index), **answer))
         return answers
 
     def _nodes_of_one_kind(self) -> dict[str, float]:
         """Return the core counts, by node, of the nodes for timed cells: of the required kind, else of the first node's."""
-        from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
-
-        alive = {n["NodeID"]: n["Resources"].get("CPU", 0) for n in self._ray.nodes() if n["Alive"]}
+        cores = {name: float(node["Resources"].get("CPU", 0)) for name, node in self._alive.items()}
         requests = {
-            node: self._ray.remote(_kind_of_node)
-            .options(num_cpus=0, scheduling_strategy=NodeAffinitySchedulingStrategy(node, soft=False))
-            .remote()
-            for node, cores in alive.items()
-            if cores >= 1
+            node: self._ray.remote(_kind_of_node).options(num_cpus=0, scheduling_strategy=self._only_on(node)).remote()
+            for node, count in cores.items()
+            if count >= 1
         }
         kinds: dict[str, str] = {}
         for node, request in requests.items():
@@ -186,7 +211,7 @@ class RayLauncher:
         if not kinds:
             raise UserError("the Ray cluster has no node with a core")
         self._kind = self._kind or next(iter(kinds.values()))
-        nodes = {node: alive[node] for node, kind in kinds.items() if kind == self._kind}
+        nodes = {node: cores[node] for node, kind in kinds.items() if kind == self._kind}
         if not nodes:
             raise UserError(
                 f"the stored times are from '{self._kind}', and the cluster has {', '.join(sorted(set(kinds.values())))}: times "
@@ -195,10 +220,72 @@ class RayLauncher:
         return nodes
 
 
-def _run_job(folders: Any, experiment: bytes, settings: dict[str, Any]) -> Iterator[tuple[int, dict[str, Any]]]:
-    yield from run_job(Job(folders, experiment, **settings))
+def split(groups: Sequence[Sequence[Task]], max_tasks: int, n_slots: int) -> list[list[Task]]:
+    """Split groups into chunks of at most ``max_tasks`` tasks, smaller if slots would stay idle."""
+    n_tasks = sum(map(len, groups))
+    size = max(1, min(max_tasks, -(-n_tasks // max(1, n_slots))))
+    return [list(group[i : i + size]) for group in groups for i in range(0, len(group), size)]
+
+
+def _run_job(
+    folders: Sequence[Path], experiment: bytes, tasks: bytes, timed: bool
+) -> Iterator[tuple[int, dict[str, Any]]]:
+    """Run tasks on this machine; yields the index of each task and the fields of its answer.
+
+    Experiment and tasks are pickled, since their classes may come from ``folders``.
+    """
+    for folder in folders:
+        registry.add_folder(folder)
+    own: list[Task] = pickle.loads(tasks)
+    index = {id(task): i for i, task in enumerate(own)}
+    with local_launcher(pickle.loads(experiment), timed, n_workers=1) as launcher:
+        for a in itertools.chain.from_iterable(launcher.run([own])):
+            answer = {"result": a.result, "seconds": a.seconds, "output": a.output, "machine": kind_of_machine()}
+            yield index[id(a.item)], answer
 
 
 def _kind_of_node() -> str:
     """Return the kind of machine of the node; a separate function, since Ray does not accept a cached function."""
     return kind_of_machine()
+
+
+def _import_path() -> str:
+    """Return a PYTHONPATH of absolute paths, so that other machines with the same folders can import this package."""
+    inherited = os.environ.get("PYTHONPATH", "").split(os.pathsep)
+    package = Path(__file__).resolve().parents[3]
+    return os.pathsep.join(dict.fromkeys([str(package), *(str(Path(path).absolute()) for path in inherited if path)]))
+
+
+def wait_until(lack: Callable[[], str], limit_s: float) -> None:
+    """Wait until ``lack()``, the reason of the wait, is empty; raises :class:`UserError` with it after ``limit_s`` seconds."""
+    since, has_spoken = time.monotonic(), False
+    while reason := lack():
+        seconds = time.monotonic() - since
+        if seconds > limit_s:
+            raise UserError(f"{reason}; gave up after {limit_s:g} s (ray.wait)")
+        if seconds > SILENT_S and not has_spoken:
+            has_spoken = True
+            print(f"bench: {reason}: waiting, for at most {limit_s:g} s (ray.wait)", file=sys.stderr)
+        time.sleep(PAUSE_S)
+
+
+def reach(address: str, limit_s: float) -> None:
+    """Wait until a TCP connection to ``HOST:PORT`` is possible.
+
+    Raises :class:`UserError` for an unknown host, an address without a port, and after the limit.
+    """
+    host, _, port = address.rpartition("://")[2].rpartition(":")
+    if not host or not port.isdecimal() or not 0 < int(port) < 1 << 16:
+        raise UserError(f"ray.address={printable(address)} must be HOST:PORT, for example 10.0.0.1:6379")
+
+    def lack() -> str:
+        try:
+            socket.create_connection((host.strip("[]"), int(port)), timeout=1.0).close()
+        except (socket.gaierror, UnicodeError):
+            raise UserError(f"ray.address={printable(address)}: no host has that name") from None
+        except OSError as error:
+            cause = error.strerror or "no answer"
+            return f"no Ray cluster answers at {printable(address)} ({cause}); start one: ray start --head"
+        return ""
+
+    wait_until(lack, limit_s)

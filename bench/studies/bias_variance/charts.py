@@ -30,7 +30,7 @@ from bench.report.views import (
     rmse_interval,
 )
 from bench.studies.bias_variance.columns import COLUMNS
-from bench.studies.bias_variance.comparisons import FAILS, NO_RESULT, most_often_first
+from bench.studies.bias_variance.comparisons import FAILS, NO_RESULT
 from bench.studies.bias_variance.costs import ROLLOUTS, TIME, Cost
 from bench.studies.bias_variance.time_to_accuracy import SAMPLES, TARGETS
 
@@ -157,12 +157,12 @@ def _along(
     total = frame["series"].nunique()
     panels = [problem.title() for problem in drawn]
     shares = [f"{len(names)} of {total} estimators"] if len(names) < total else []
-    marks = _unstable(shown, axis, frame[frame["panel"].isin(panels) & frame["first"]], names)
+    marks = [Mark(f"beyond the {name}", value, math.inf) for name, value in shown.marks(axis).items()]
     x = Column("x", label=axis.title, format="setting")
     return Chart(
         "bias_variance_" + re.sub(r"\W", "_", axis.column), frame, [x], [RMSE, BIAS], series="series",
         line="line", panel="panel", styles=styles, marks=marks, failed="failed", across=len(drawn),
-        labels="ends" if len(drawn) <= 2 else "legend", height=2.7 if len(drawn) <= 2 else 2.1,
+        height=2.7 if len(drawn) <= 2 else 2.1,
         subtitle=", ".join(filter(None, [subtitle, *notes, *shares])), chosen=(("first", [True]), ("series", names), ("panel", panels)),
         text="Bars are 95% intervals. A hollow marker is the upper limit of a bias that is not distinguishable from 0.",
     )  # fmt: skip
@@ -179,42 +179,17 @@ def _lines(problem: ProblemRows) -> pd.DataFrame:
 
 
 def _main_series(frame: pd.DataFrame, methods: pd.DataFrame, comparisons: pd.DataFrame) -> list[str]:
-    """Return the estimators to print: the recommended one, then those that are first elsewhere, then distinct ones."""
-    main = most_often_first(methods, comparisons)
+    """Return the estimators to print: those that are most often first, then others, as far as distinct."""
     estimator = dict(zip(methods["method"], methods["estimator"], strict=True))
     wins = Counter(estimator[name] for name in comparisons["first"] if name)
-    present = list(dict.fromkeys(frame["series"]))
-    ranked = [name for name, _ in wins.most_common() if name in present and name != main]
-    plain = sorted((name for name in present if name not in (main, *ranked)), key=lambda name: "[" in name)
-    chosen: list[str] = [main] if main in present else []
-    for name in (*ranked, *plain):
-        if len(chosen) < SERIES and all(_distance(frame, name, other) >= DISTINCT for other in chosen):
+    names = sorted(frame["series"].unique(), key=lambda name: (-wins[name], "[" in name))
+    errors = np.log(frame.pivot_table("rmse_rel", ["panel", "x"], "series", aggfunc="first").reindex(columns=names))
+    chosen: list[str] = []
+    for name in names:
+        apart = errors[chosen].sub(errors[name], axis=0).abs().median()
+        if len(chosen) < SERIES and not (apart < math.log(DISTINCT)).any():
             chosen.append(name)
-    return chosen or present[:SERIES]
-
-
-def _distance(frame: pd.DataFrame, one: str, other: str) -> float:
-    """Return the median factor between the errors of two estimators at the same places."""
-    tables = [frame[frame["series"] == name].groupby(["panel", "x"])["rmse_rel"].first() for name in (one, other)]
-    with np.errstate(all="ignore"):
-        apart = np.abs(np.log(tables[0] / tables[1])).replace(np.inf, np.nan).dropna()
-    return float(np.exp(apart.median())) if len(apart) else math.inf
-
-
-def _unstable(shown: Arranged, axis: Axis, frame: pd.DataFrame, names: Sequence[str]) -> list[Mark]:
-    """Return the marks of an axis: a band where an estimator fails beyond a named value, else a line at that value.
-
-    The band is drawn in the panels where the first estimator's whole interval is above 1 at every value beyond the mark
-    and at none before it.
-    """
-    marks = []
-    for name, value in shown.marks(axis).items():
-        for panel, part in frame[frame["series"].isin(names[:1])].groupby("panel", sort=False):
-            bad = (part["rmse_low"] > 1) | part["failed"]
-            beyond = part["x"] > value
-            if beyond.any() and bad[beyond].all() and not bad[~beyond].any():
-                marks.append(Mark(f"beyond the {name}", value, math.inf, panel=str(panel)))
-    return marks or [Mark(name, value) for name, value in shown.marks(axis).items()]
+    return chosen
 
 
 def choose_problems(problems: Sequence[ProblemRows], room: int) -> tuple[list[ProblemRows], list[str]]:

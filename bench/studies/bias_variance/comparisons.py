@@ -6,7 +6,6 @@ A setting is a problem at one value of its swept axis. A method is an estimator,
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -186,15 +185,6 @@ def leaders(comparisons: pd.DataFrame, methods: pd.DataFrame) -> dict[str, list[
         near = [estimator for estimator, error in lines if not error > NEAR * row["value"]]
         result[row["setting"]] = list(dict.fromkeys(near))
     return result
-
-
-def most_often_first(methods: pd.DataFrame, comparisons: pd.DataFrame) -> str:
-    """Return the estimator that is most often first or tied with the first and certain to be better than zero there."""
-    working = set(methods.loc[methods["verdict"] == WORKS, ["estimator", "setting"]].itertuples(index=False, name=None))
-    wins = Counter(
-        (name, (name, place) in working) for place, names in leaders(comparisons, methods).items() for name in names
-    )
-    return max(map(str, methods["estimator"].unique()), key=lambda name: (wins[name, True], wins[name, False]))
 
 
 def verdicts_by_estimator(methods: pd.DataFrame) -> pd.DataFrame:

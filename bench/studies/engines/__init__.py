@@ -2,12 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import ClassVar
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Any, ClassVar
 
+import numpy as np
+
+from bench.engines.problem import EngineProblem
+from bench.experiment.cell import Cell
 from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, text
-from bench.model import param
-from bench.studies import StudyPackage
+from bench.experiment.session import Session
+from bench.measure import noise, statistics, timing
+from bench.model import Problem, param, zeroth_order
+from bench.studies import StudyPackage, finite_status, relative_error
+from bench.studies.bias_variance.columns import COLUMNS as ESTIMATES
+from bench.studies.three_errors import difference_check
+
+SUMMARY = ("reference_norm", "reference_se", "bias", "bias_low", "bias_high", "variance", "rmse_rel")
+"""Columns that are statistics of averaged gradients."""
 
 
 @dataclass(frozen=True)
@@ -24,17 +37,8 @@ class Engines(StudyPackage):
         Column("model_error_rel", "distance of the gradient from the gradient named in `model`, relative to its norm",
                label="model error", comparison=ComparisonRule("exact", "model error")),
         text("model", "what model_error_rel compares with: rigid contact in closed form, or the scene's own program"),
-        Column("reference_norm", "norm of the reference gradient of the engine's program"),
-        Column("reference_se", "standard error of the reference gradient"),
-        text("reference_method", "how the reference was computed"),
-        Column("bias", "norm of the bias of `samples` averaged gradients, corrected for its own noise",
-               comparison=ComparisonRule("interval", "bias")),
-        Column("bias_low", "lower end of its 95% interval"),
-        Column("bias_high", "upper end of its 95% interval"),
-        Column("variance", "trace of the covariance of `samples` averaged gradients",
-               comparison=ComparisonRule("spread", "variance")),
-        Column("rmse_rel", "root mean squared error of `samples` averaged gradients / reference_norm", label="RMSE, gradients"),
-        Column("zeroth_rmse_rel", "the same from `samples` costs with scores, without gradients", label="RMSE, costs only"),
+        *(ESTIMATES.by_name[name] for name in ("reference_norm", "reference_se", "reference_method", *SUMMARY[2:])),
+        Column("zeroth_rmse_rel", "rmse_rel from `samples` costs with scores, without gradients", label="RMSE, costs only"),
         Column("nan_share", "share of the gradients that are not finite", label="NaN share"),
         Column("gradient_s", "time of `batch` gradients, median", "s", label="gradients", measured=True, format="seconds"),
         Column("value_s", "time of `batch` costs, median", "s", label="costs", measured=True, format="seconds"),
@@ -55,3 +59,81 @@ class Engines(StudyPackage):
 
     batch: int = param(64, "gradients in a timed call", positive=True)
     timed_calls: int = param(3, "timed calls", positive=True)
+
+    def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
+        """Return one cell's results by column. Backends without gradients get the columns of costs only."""
+        problem = session.problem(cell)
+        program = problem.program
+        theta, has_gradient = program.theta0, "grad" in cell.backend.provides
+        result = _times(cell, problem, self, has_gradient)
+        truth = session.references.of(cell)
+        known, noted = truth.known(), truth.note or "the reference gradient is not finite"
+        status = finite_status(noted, truth.batches)
+        w = noise.shared(cell.seed, cell.scene.name, cell.repeats, cell.samples, program.n_noise)
+        zeroth = zeroth_order(problem, theta, w).mean(axis=1)
+        result |= {
+            "reference_method": truth.method, "device": problem.device,
+            "zeroth_rmse_rel": statistics.summarise(zeroth, known, cell.samples).rmse_rel,
+        }  # fmt: skip
+        remark = "computes no gradients"
+        if has_gradient:
+            check = difference_check(problem)
+            gradients = problem.grad(theta, w.reshape(-1, program.n_noise).T)
+            means = gradients.T.reshape(cell.repeats, cell.samples, -1).mean(axis=1)
+            summary = asdict(statistics.summarise(means, known, cell.samples))
+            result |= {
+                "gradient": check.gradient.tolist(),
+                "program_error_rel": relative_error(check.gradient, check.difference),
+                "difference_step": check.step,
+                "nan_share": float(1.0 - np.isfinite(gradients).all(axis=0).mean()),
+                **_model_error(cell, session, check.gradient), **{name: summary[name] for name in SUMMARY},
+            }  # fmt: skip
+            if status["status"] == "ok":
+                status = finite_status("some gradients are not finite", gradients, check.gradient)
+            remark = summary["note"]
+        status["reason"] = "; ".join(filter(None, (status["reason"], remark)))
+        if isinstance(problem, EngineProblem):
+            result["engine_settings"] = ";".join(f"{name}={value}" for name, value in problem.settings.items())
+        memory = problem.peak_memory_mb if isinstance(problem, EngineProblem) else timing.peak_memory_mb()
+        return status | result | {"memory_mb": memory}
+
+
+def _model_error(cell: Cell, session: Session, gradient: np.ndarray) -> dict[str, Any]:
+    """Return the distance from the gradient of rigid contact or, where it is unknown, of the scene's own program."""
+    expected, model = cell.program().physical_gradient(), "rigid contact"
+    if expected is None:
+        if not cell.ranked_backends:
+            return {"model": ""}
+        own = session.problems.of(cell.ranked_backends[0], cell)
+        expected = own.grad(own.program.theta0, np.zeros((own.program.n_noise, 1)))[:, 0]
+        model = "the scene's own program"
+    error = relative_error(gradient, expected)
+    return {"model": model, "model_gradient": expected.tolist(), "model_error_rel": error}
+
+
+def _times(cell: Cell, problem: Problem, study: Engines, has_gradient: bool) -> dict[str, Any]:
+    """Return the times of first and later calls, and the shares of a gradient's time outside the engine."""
+    theta, n_noise = problem.program.theta0, problem.program.n_noise
+    w = noise.shared(cell.seed, cell.scene.name, 1, study.batch, n_noise)[0].T
+    functions: dict[str, Callable[..., np.ndarray]] = {"value_s": problem.value}
+    if has_gradient:
+        functions["gradient_s"] = problem.grad
+    started = time.perf_counter()
+    for function in functions.values():
+        function(theta, w)
+    result = {"first_s": time.perf_counter() - started}
+    for name, function in functions.items():
+        before = _inside(problem)
+        started = time.perf_counter()
+        _, clock = timing.timed(lambda _, function=function: function(theta, w), study.timed_calls)  # type: ignore[misc]
+        elapsed = time.perf_counter() - started
+        result[name] = clock.median_s
+        if name == "gradient_s" and isinstance(problem, EngineProblem):
+            engine, pipe = (after - earlier for after, earlier in zip(_inside(problem), before, strict=True))
+            result |= {"pipe_share": pipe / elapsed, "pass_share": 1.0 - (engine + pipe) / elapsed}
+    return result
+
+
+def _inside(problem: Problem) -> tuple[float, float]:
+    """Return the seconds so far inside the engine's process and in pipes; 0 in this process."""
+    return (problem.engine_s, problem.pipe_s) if isinstance(problem, EngineProblem) else (0.0, 0.0)

@@ -54,7 +54,9 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     cells = with_limits(shown.rows)
     measured = cells["status"].isin(("ok", "nonfinite"))
     cells = cells.assign(level=np.where(measured, levels(cells), ""))
-    columns = experiment.columns.by_name | {"rmse_rel": shown.column("rmse_rel", limit="rmse_is_limit")}
+    columns = experiment.columns.by_name | {
+        "rmse_rel": shown.column("rmse_rel", label="RMSE, gradients", limit="rmse_is_limit")
+    }
     own, details = ([columns[name] for name in names] for names in (SHOWN, DETAILS))
     table = shown.cells([text("level", label="gradient"), *own], "gradients of physics engines", NOTES, rows=cells)
     charts = [_chart(cells[measured])] if measured.any() else []

@@ -13,7 +13,6 @@ from bench.experiment.columns import COMMON, Column, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Table, Views
 from bench.report.shown import Shown
-from bench.report.text import axis_value
 from bench.studies.growth import ORDERS, RATES
 
 STRONG = 20.0
@@ -31,6 +30,7 @@ VERDICT = (
     Column("rate", "rate of the best exponential", "1/s", low="rate_low", high="rate_high"),
     Column("odds", "likelihood of the exponential relative to the power law", label="exponential to power law"),
     text("lower", "the order whose variance is lower beyond doubt", label="lower variance"),
+    Column("zeroth_from", "horizon from which on that is the zeroth order", "s", label="from", format="setting"),
 )
 """The columns of the table with a line per problem."""
 VERDICT_NOTE = (
@@ -38,7 +38,7 @@ VERDICT_NOTE = (
     "exponential is at least 20 times as likely as the power law, and its rate is above 0. polynomial: the power law is as "
     "much more likely, or the more likely one where the Jacobian product does not grow, and its order is above 0. "
     "vanishing: the better curve falls by as much evidence. open: none of these. Intervals are of 95%. A variance is lower where the ranges over "
-    "repeats from 5% to 95% do not overlap."
+    "repeats from 5% to 95% do not overlap: first at every horizon, zeroth from a horizon on, else open."
 )
 NOTE = (
     "norm of one gradient: median and 5% to 95% of the noise samples. stretch, spectral: log of the largest singular value "
@@ -89,11 +89,9 @@ def verdict(rows: pd.DataFrame) -> dict[str, Any]:
     is_first = (rows["first_order_variance_high"] < rows["zeroth_order_variance_low"]).all()
     # the first of the longest horizons at all of which the zeroth order varies less
     start = horizons[np.logical_and.accumulate(zeroth[::-1])[::-1]].min(initial=math.inf)
-    lower = "first order at every horizon" if is_first else "open at the longest horizon"
-    is_crossed = math.isfinite(start)
-    return {"problem": rows["problem"].iloc[0], **fitted,
-            "lower": f"zeroth order from {axis_value(start)} s" if is_crossed else lower,
-            "zeroth_from": start if is_crossed else math.nan}  # fmt: skip
+    lower = "zeroth" if math.isfinite(start) else "first" if is_first else "open"
+    return {"problem": rows["problem"].iloc[0], **fitted, "lower": lower,
+            "zeroth_from": start if lower == "zeroth" else math.nan}  # fmt: skip
 
 
 def fit(horizons: np.ndarray, norms: np.ndarray, errors: np.ndarray, bounded: bool = False) -> dict[str, Any]:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import ClassVar
 
 from bench.experiment.cell import Cell
 from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, text
-from bench.model import Estimator, KnownOptimum, Optimizer, Plugin, param
-from bench.model.program import OWN
+from bench.model import Estimator, Optimizer, Plugin, param
 from bench.studies import StudyPackage
 
 
@@ -47,7 +45,7 @@ class Optimise(SearchStudy):
     timed: ClassVar[bool] = True
     columns: ClassVar[Columns] = Columns.of(
         text("optimizer", "identity string of the optimizer"),
-        text("stopped", "reason for the end of the search: budget, target, plateau or diverged"),
+        text("stopped", "reason for the end of the search: budget or diverged"),
         text("scene_class", "smooth, stiff (contact), chaotic (gradients vary more than costs), discontinuous or identification",
              label="class"),
         Column("iterations", "steps of the optimizer"),
@@ -71,34 +69,12 @@ class Optimise(SearchStudy):
         numbers("path_rollouts", "rollouts up to those iterations", table=False),
         numbers("path_gradients", "gradients up to those iterations", table=False),
         numbers("path_s", "time up to those iterations", "s", table=False, measured=True),
-        numbers("path_quality_iteration", "iterations at which the gradient's quality was measured", table=False),
-        numbers("path_quality_rmse_rel", "relative root mean squared error of the gradients at those iterations", table=False),
-        numbers("path_quality_cosine", "cosine between those gradients and the reference", table=False),
         numbers("theta", "the last theta", table=False),
     )  # fmt: skip
 
     budget: int = param(20_000, "rollouts that a search may spend, a gradient counting as gradient_cost", positive=True)
     gradient_cost: float = param(4.0, "rollouts that a gradient counts as in the budget", positive=True)
     iterations: int | None = param(None, "most iterations; null: as the budget allows", positive=True)
-    target: float | None = param(None, "cost at which a search has arrived; null: it goes on")
-    patience: int | None = param(
-        None, "iterations without a better cost after which a search ends; null: any", positive=True
-    )
     limit: float = param(1e3, "a search has diverged at a cost above this many times |J0| + 1", positive=True)
-    scored: str = param(
-        "plain", "objective on which paths are scored: f at w = 0, or its mean", choices=("plain", "smoothed")
-    )
-    evaluations: int = param(256, "rollouts of a smoothed objective", positive=True)
-    sigma_decay: float = param(0.0, "the noise at iteration i has sigma / i^sigma_decay", low=0.0)
-    quality: str = param("start", "where the gradient's quality is measured", choices=("none", "start", "path"))
+    quality: str = param("start", "where the gradient's quality is measured", choices=("none", "start"))
     quality_samples: int = param(4096, "gradients of the reference of the quality", low=64)
-
-    def unsupported_reason(self, cell: Cell) -> str | None:
-        """Return why a cell cannot be searched (no gradient, or a target below the optimum), or None."""
-        if missing := super().unsupported_reason(cell):
-            return missing
-        if self.target is not None and isinstance(cell.scene, KnownOptimum) and cell.decision == OWN:
-            optimum, how = cell.scene.optimum(cell.contact, cell.integrator) or (-math.inf, "")
-            if self.target < optimum:
-                return f"target={self.target:g} is below the optimum {optimum:.10g} of scene {cell.scene.name} ({how})"
-        return None

@@ -39,6 +39,8 @@ class RunSet:
     """
 
     rows: pd.DataFrame
+    gradient_cost: float = 4.0
+    """The rollouts that a gradient counts as where no times were measured."""
 
     @cached_property
     def tuning_seeds(self) -> tuple[int, ...]:
@@ -69,10 +71,10 @@ class RunSet:
         best = [(*key, tuning) for key, tuning in self.best_tunings.items()]
         return rows[pd.MultiIndex.from_frame(rows[["problem", "method", "tuning"]]).isin(best)]
 
-    def gradient_ratio(self, problem: str, default: float) -> float:
-        """Return the rollouts that take as long as one gradient: the median over searches, or ``default`` if untimed."""
-        ratios = self.rows.loc[self.rows["problem"] == problem, "gradient_ratio"].dropna()
-        return float(ratios.median()) if len(ratios) else default
+    def gradient_ratio(self, problem: str) -> float:
+        """Return the rollouts that take as long as one gradient: the median over searches, or what one counts as."""
+        ratios = self.rows.loc[self.rows["problem"] == problem, "gradient_ratio"]
+        return self.gradient_cost if ratios.isna().all() else float(ratios.median())
 
 
 def collect_runs(experiment: Experiment, rows: pd.DataFrame) -> RunSet:
@@ -88,7 +90,8 @@ def collect_runs(experiment: Experiment, rows: pd.DataFrame) -> RunSet:
     start, final = runs["start_cost"], runs["final_cost"]
     achievable = (start - best_known).where(start > best_known)
     score = ((start - final) / achievable).clip(0.0, 1.0).mask(runs["status"] != "ok", 0.0)
-    return RunSet(runs.assign(best_known=best_known, best_known_status=status, score=score))
+    searches = runs.assign(best_known=best_known, best_known_status=status, score=score)
+    return RunSet(searches, experiment.study.gradient_cost)  # type: ignore[attr-defined]
 
 
 def _is_tuned(axis: Axis, rows: pd.DataFrame) -> bool:
@@ -125,15 +128,14 @@ def _best_known_cost(rows: pd.DataFrame) -> tuple[pd.Series, pd.Series]:
 
 
 @remember
-def hits(runs: RunSet, default: float) -> pd.DataFrame:
+def hits(runs: RunSet) -> pd.DataFrame:
     """Return a line per search and target: the rollouts until it is reached, of the whole search if not, and whether.
 
-    Reached is where the regret J(theta_t) - J* is at most the first regret over the target. ``default``, here and below,
-    is the number of rollouts that a gradient counts as if no times were measured.
+    Reached is where the regret J(theta_t) - J* is at most the first regret over the target.
     """
     lines = []
     for row in runs.best_runs.to_dict("records"):
-        ratio = runs.gradient_ratio(row["problem"], default)
+        ratio = runs.gradient_ratio(row["problem"])
         spent = np.asarray(row["path_rollouts"], dtype=float) + ratio * np.asarray(row["path_gradients"], dtype=float)
         rounding = ROUNDING * max(abs(row["start_cost"] - row["best_known"]), 1e-300)
         regret = np.maximum(np.asarray(row["path_cost"], dtype=float) - row["best_known"], rounding)
@@ -144,10 +146,10 @@ def hits(runs: RunSet, default: float) -> pd.DataFrame:
 
 
 @remember
-def times_to_targets(runs: RunSet, default: float) -> pd.DataFrame:
+def times_to_targets(runs: RunSet) -> pd.DataFrame:
     """Return, per problem, method and target, successes with Wilson's interval and the average runtime in rollouts."""
     lines = []
-    for (problem, method, target), part in hits(runs, default).groupby(["problem", "method", "target"], sort=False):
+    for (problem, method, target), part in hits(runs).groupby(["problem", "method", "target"], sort=False):
         costs, reached = part["spent"].to_numpy(), part["reached"].to_numpy()
         low, high = performance.wilson(int(reached.sum()), len(reached))
         art_low, art_high = performance.runtime_interval(costs, reached)
@@ -160,12 +162,12 @@ def times_to_targets(runs: RunSet, default: float) -> pd.DataFrame:
     return pd.DataFrame(lines)
 
 
-def runtimes(runs: RunSet, default: float) -> pd.DataFrame:
+def runtimes(runs: RunSet) -> pd.DataFrame:
     """Return the rollouts of each search until each target, infinite if it is missed, and the weight of the search.
 
     The weights of a method add up to 1, in equal parts for its problems and targets.
     """
-    table = hits(runs, default)
+    table = hits(runs)
     weight = 1.0 / table.groupby(["problem", "method", "target"])["spent"].transform("size")
     total = weight.groupby(table["method"]).transform("sum")
     return table.assign(runtime=table["spent"].where(table["reached"], math.inf), weight=weight / total)
@@ -184,33 +186,23 @@ def share_of_targets(reached: pd.DataFrame) -> tuple[float, float]:
 
 
 @remember
-def summarise(runs: RunSet, default: float, baseline: str = "fobg") -> pd.DataFrame:
-    """Return, per method, the share of targets reached, the score, the chance to beat the baseline, and the profile.
+def summarise(runs: RunSet) -> pd.DataFrame:
+    """Return, per method, the share of targets reached and the score.
 
-    The score is an interquartile mean, its interval a bootstrap stratified by problem. ``improvement``, with Wilson's interval, is the
-    probability of a lower final cost than the first method whose estimator is ``baseline``, paired by problem and seed.
+    The score is an interquartile mean, its interval a bootstrap stratified by problem.
     """
-    reached = times_to_targets(runs, default)
-    fastest = reached.groupby(["problem", "target"])["art"].transform("min") if len(reached) else None
-    base = next((m for m in runs.rows["method"].unique() if m.partition(",")[0].partition("[")[0] == baseline), None)
-    lines = []
+    reached, lines = times_to_targets(runs), []
     for method, part in runs.best_runs.groupby("method", sort=False):
-        strata = [scores["score"].dropna().to_numpy() for _, scores in part.groupby("problem", sort=False)]
-        strata = [scores for scores in strata if len(scores)]
+        strata = [own.to_numpy() for _, own in part["score"].dropna().groupby(part["problem"], sort=False)]
         low, high = performance.bootstrap(strata, _pooled_score) if strata else (math.nan, math.nan)
-        better, better_low, better_high = _improvement(runs, str(method), base)
-        own = reached[reached["method"] == method]
-        times, (share, error) = own["art"], share_of_targets(own)
-        assert fastest is not None
-        ratios = (times / fastest[times.index]).to_numpy()
+        share, error = share_of_targets(reached[reached["method"] == method])
         cells = runs.rows[runs.rows["method"] == method]
         lines.append({
             "method": method, "problems": part["problem"].nunique(), "searches": len(part),
             "reached": share, "reached_low": max(0.0, share - performance.Z * error),
             "reached_high": min(1.0, share + performance.Z * error), "reached_se": error,
             "score": _pooled_score(strata), "score_low": low, "score_high": high,
-            "improvement": better, "improvement_low": better_low, "improvement_high": better_high,
-            "profile": performance.profile_score(ratios), "diverged": int((part["status"] == "diverged").sum()),
+            "diverged": int((part["status"] == "diverged").sum()),
             "tunings": int(cells["tuning"].nunique()), "median_score": float(cells["score"].median()),
         })  # fmt: skip
     return pd.DataFrame(lines)
@@ -220,48 +212,29 @@ def _pooled_score(strata: Sequence[np.ndarray]) -> float:
     return performance.interquartile_mean(np.concatenate(strata)) if strata else math.nan
 
 
-def _improvement(runs: RunSet, method: str, base: str | None) -> tuple[float, float, float]:
-    """Return the probability that a method's final cost is below the baseline's, with its interval; NaN without pairs."""
-    if base is None or method == base:
-        return math.nan, math.nan, math.nan
-    final = runs.best_runs
-    final = final.assign(final=final["final_cost"].where(final["status"] == "ok", math.inf))
-    wide = final.pivot_table(index=["problem", "seed"], columns="method", values="final", aggfunc="first", dropna=False)
-    both = wide[[method, base]].dropna()
-    strata = [part.to_numpy() for _, part in both.groupby(level="problem")]
-    if not strata:
-        return math.nan, math.nan, math.nan
-    share = float(np.mean([performance.improvement(part[:, 0], part[:, 1]) for part in strata]))
-    # if few pairs all agree, a bootstrap interval would be a single point; Wilson's is not
-    return share, *performance.wilson(round(share * len(both)), len(both))
-
-
 @remember
-def quality_and_runtime(runs: RunSet, default: float, factor: float = TARGETS[0]) -> pd.DataFrame:
-    """Return, per problem and method with an estimator, the gradient's quality at the start and the runtime to a target.
+def quality_and_runtime(runs: RunSet, factor: float = TARGETS[0]) -> pd.DataFrame:
+    """Return, per problem and method with an estimator, the gradient's error at the start and the runtime to a target.
 
     ``art`` is the average runtime, in rollouts, until the regret is the first regret / ``factor``.
     """
-    reached, lines = times_to_targets(runs, default).set_index(["problem", "method", "target"])["art"], []
-    for (problem, method), part in runs.best_runs.groupby(["problem", "method"], sort=False):
-        first = part.iloc[0]
-        if math.isfinite(first["quality_rmse_rel"]):
-            lines.append({
-                "problem": problem, "method": method, "scene_class": first["scene_class"],
-                **{name: float(part[f"quality_{name}"].median()) for name in ("rmse_rel", "cosine", "bias_share")},
-                "art": reached[problem, method, factor],
-            })  # fmt: skip
-    return pd.DataFrame(lines)
+    keys = ["problem", "method"]
+    found = runs.best_runs.groupby(keys, sort=False).agg(
+        scene_class=("scene_class", "first"), rmse_rel=("quality_rmse_rel", "median")
+    )
+    reached = times_to_targets(runs)
+    runtime = reached[reached["target"] == factor].set_index(keys)["art"]
+    return found.dropna(subset=["rmse_rel"]).join(runtime).reset_index()
 
 
 @remember
-def effects_of_error(runs: RunSet, default: float) -> pd.DataFrame:
+def effects_of_error(runs: RunSet) -> pd.DataFrame:
     """Return :func:`rank_correlations` of the errors and runtimes of :func:`quality_and_runtime`, with a verdict.
 
     Gradients with smaller errors reach the target ``sooner`` or ``later`` where the whole interval is on one side of 0, and
     a random order is seldom as good; else it is ``open``.
     """
-    rho = rank_correlations(quality_and_runtime(runs, default))
+    rho = rank_correlations(quality_and_runtime(runs))
     is_known = (rho["points"] >= FEWEST_POINTS) & (rho["chance"] <= CHANCE)
     sides = {"sooner": is_known & (rho["rho_low"] > 0), "later": is_known & (rho["rho_high"] < 0)}
     return rho.assign(verdict=np.select(list(sides.values()), list(sides), "open"))
@@ -291,14 +264,10 @@ def rank_correlations(points: pd.DataFrame) -> pd.DataFrame:
     :data:`FEWEST_POINTS` points.
     """
     lines = []
-    if points.empty:
-        return pd.DataFrame(columns=["scene_class", "rho", "rho_low", "rho_high", "chance", "points", "problems"])
     for name, part in points.groupby("scene_class", sort=False):
-        strata = []
-        for _, methods in part.groupby("problem", sort=False):
-            if len(methods) > 1:
-                ranks = [performance.ranks(methods[column].to_numpy()) for column in ("rmse_rel", "art")]
-                strata.append((np.stack(ranks, axis=1) - 1) / (len(methods) - 1))
+        groups = part.groupby("problem", sort=False)
+        scaled = (groups[["rmse_rel", "art"]].rank() - 1).div(groups["art"].transform("size") - 1, axis=0).dropna()
+        strata = [own.to_numpy() for _, own in scaled.groupby(part["problem"], sort=False)]
         pooled = np.concatenate(strata) if strata else np.empty((0, 2))
         enough = len(pooled) >= FEWEST_POINTS
         low, high = performance.spearman_interval(strata) if enough else (math.nan, math.nan)
@@ -307,4 +276,4 @@ def rank_correlations(points: pd.DataFrame) -> pd.DataFrame:
             "rho_low": low, "rho_high": high, "chance": performance.spearman_chance(strata) if enough else 1.0,
             "points": len(pooled), "problems": len(strata),
         })  # fmt: skip
-    return pd.DataFrame(lines)
+    return pd.DataFrame(lines, columns=["scene_class", "rho", "rho_low", "rho_high", "chance", "points", "problems"])

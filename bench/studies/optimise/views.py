@@ -28,23 +28,21 @@ REACHED = Column(
     "reached", label="targets reached", format="percent", low="reached_low", high="reached_high", log=False
 )
 SCORE = Column("score", low="score_low", high="score_high", digits=3, log=False)
-BETTER = Column("improvement", label="beats fobg", low="improvement_low", high="improvement_high")
-PROFILE, MEDIAN = Column("profile", log=False), Column("median_score", label="median over tunings", log=False)
+MEDIAN = Column("median_score", label="median over tunings", log=False)
 RUNTIME = Column(
     "art", label="average runtime", unit="rollouts", low="art_low", high="art_high", log=True,
     doc="expected rollouts per target reached: all rollouts of all searches over the searches that reached it",
 )  # fmt: skip
 RATE = Column("rate", label="searches that reach it", low="rate_low", high="rate_high")
 SPENT = Column("spent", label="rollouts", log=True)
-NOTES = (
+NOTE = (
     "targets reached: share of searches whose regret falls to 1/10, 1/100 and 1/1000 of the first, the mean over problems and "
     "targets. score: share of the way from the first cost to J*, interquartile mean over searches, with a bootstrap interval "
-    "stratified by problem. beats fobg: chance of a lower final cost, paired by problem and seed. profile: integral of the "
-    "share of targets reached within 1 to 4 times the best method's runtime. average runtime (aRT): expected rollouts per "
+    "stratified by problem. average runtime (aRT): expected rollouts per "
     "target reached, where a gradient counts as many rollouts as take its time: the rollouts of all searches over the number "
     "of searches that reached the target, inf if none did. Each method is shown at its best tuning on each problem, chosen by "
     "median final cost of {seeds}, next to the number of tunings and the median score over all of them. Methods without "
-    "an estimator (dashed in charts) are context.",
+    "an estimator (dashed in charts) are context."
 )
 EFFECT = (
     text("scene_class", label="class"), text("verdict"), Column("rho", low="rho_low", high="rho_high", log=False),
@@ -62,25 +60,18 @@ PAGE = (
 
 def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     """Return the tables and charts of the searches."""
-    runs, default = aggregate.collect_runs(experiment, rows), default_ratio(experiment)
+    runs = aggregate.collect_runs(experiment, rows)
     if not len(runs.rows):
-        every = Table(
-            "optimise", rows, [text("scene"), text("optimizer"), text("status")], data=table(experiment, rows)
-        )
-        return Views([every])
+        columns = [text("scene"), text("optimizer"), text("status")]
+        return Views([Table("optimise", rows, columns, data=table(experiment, rows))])
     name = short_names(runs.rows["method"].unique())
     cells = rows.assign(**{c: runs.rows[c] for c in ("problem", "method", "tuning", "best_known", "score")})
     cells = cells.fillna({"problem": "", "method": "", "tuning": ""}).astype({"score": float, "best_known": float})
     by_name = experiment.columns.by_name | {"best_known": Column("best_known", label="J*")}
     return Views(
-        tables(experiment, rows, runs, default, name), charts(runs, default, name), rows=cells,
+        tables(experiment, rows, runs, name), charts(runs, name), rows=cells,
         columns=[METHOD, *(by_name[column] for column in PAGE)],
     )  # fmt: skip
-
-
-def default_ratio(experiment: Experiment) -> float:
-    """Return the number of rollouts that a gradient counts as if no times were measured."""
-    return float(getattr(experiment.study, "gradient_cost", 4.0))
 
 
 def short_names(methods: Sequence[str]) -> Callable[[str], str]:
@@ -93,25 +84,24 @@ def short_names(methods: Sequence[str]) -> Callable[[str], str]:
 # --------------------------------------------------------------------------------------------------------- tables
 
 
-def tables(
-    experiment: Experiment, rows: pd.DataFrame, runs: RunSet, default: float, name: Callable[[str], str]
-) -> list[Table]:
+def tables(experiment: Experiment, rows: pd.DataFrame, runs: RunSet, name: Callable[[str], str]) -> list[Table]:
     """Return the tables of methods, of times to targets and of lowest costs."""
-    reached, summary = aggregate.times_to_targets(runs, default), aggregate.summarise(runs, default)
+    reached, summary = aggregate.times_to_targets(runs), aggregate.summarise(runs)
     methods = summary.sort_values(["reached", "score"], ascending=False, kind="stable")
     methods = methods.assign(
-        diverged_of=[f"{d} of {n}" for d, n in zip(methods["diverged"], methods["searches"], strict=True)],
-        name=methods["method"].map(name),
-    )
+        diverged_of=methods["diverged"].astype(str) + " of " + methods["searches"].astype(str),
+        name=methods["method"].map(name), verdict=np.where(aggregate.is_tied(methods), "first or tied", ""),
+    )  # fmt: skip
     key = "; ".join(f"{name(method)}: {method}" for method in runs.rows["method"].unique() if name(method) != method)
-    methods["verdict"] = np.where(aggregate.is_tied(methods), "first or tied", "")
-    first = runs.rows.drop_duplicates("problem")
-    effects = aggregate.effects_of_error(runs, default)
+    chosen = runs.tuning_seeds
+    seeds = f"seeds {', '.join(map(str, chosen))}, which do not score" if chosen else "the same seeds that score"
+    notes = [NOTE.format(seeds=seeds), *([f"{key}."] if key else [])]
+    effects = aggregate.effects_of_error(runs)
     return [
         Table(
             "optimise", methods,
-            [text("name", label="method"), REACHED, text("verdict"), SCORE, BETTER, PROFILE, Column("tunings", format="setting"), MEDIAN, text("diverged_of", label="diverged")],
-            "methods by the share of targets they reach", [*notes(runs), *([f"{key}."] if key else [])], terminal=True, page=True,
+            [text("name", label="method"), REACHED, text("verdict"), SCORE, Column("tunings", format="setting"), MEDIAN, text("diverged_of", label="diverged")],
+            "methods by the share of targets they reach", notes, terminal=True, page=True,
             data=table(experiment, rows),
         ),
         Table(
@@ -120,7 +110,7 @@ def tables(
             terminal=True,
         ),
         Table(
-            "optimise", first,
+            "optimise", runs.rows.drop_duplicates("problem"),
             [PROBLEM, text("scene_class", label="class"), Column("start_cost", label="J0", digits=6),
              Column("best_known", label="J*", digits=8), text("best_known_status", label="source of J*")],
             "Lowest costs", terminal=True,
@@ -130,13 +120,6 @@ def tables(
         Table("targets", reached, [], files=["csv"]),
         Table("summary", summary, [], files=["csv"]),
     ]  # fmt: skip
-
-
-def notes(runs: RunSet) -> list[str]:
-    """Return explanations of the tables' columns, with the seeds that chose the tunings."""
-    chosen = runs.tuning_seeds
-    seeds = f"seeds {', '.join(map(str, chosen))}, which do not score" if chosen else "the same seeds that score"
-    return [note.format(seeds=seeds) for note in NOTES]
 
 
 # --------------------------------------------------------------------------------------------------------- charts
@@ -159,10 +142,10 @@ def styles(methods: Sequence[str], name: Callable[[str], str] = str) -> dict[str
     return looks
 
 
-def charts(runs: RunSet, default: float, name: Callable[[str], str]) -> list[Chart]:
+def charts(runs: RunSet, name: Callable[[str], str]) -> list[Chart]:
     """Return the charts, the shares of targets reached first."""
     looks = styles(runs.rows["method"].unique(), name)
-    found = (_targets(runs, default), _progress(runs, default))
+    found = (_targets(runs), _progress(runs))
     return [
         replace(chart, frame=chart.frame.assign(method=chart.frame["method"].map(name)), series="method", styles=looks)
         for chart in found
@@ -170,9 +153,9 @@ def charts(runs: RunSet, default: float, name: Callable[[str], str]) -> list[Cha
     ]
 
 
-def _targets(runs: RunSet, default: float) -> Chart:
+def _targets(runs: RunSet) -> Chart:
     """Return the share of targets that each method reaches, the largest first."""
-    frame = aggregate.summarise(runs, default).sort_values("reached", ascending=False, kind="stable")
+    frame = aggregate.summarise(runs).sort_values("reached", ascending=False, kind="stable")
     return Chart(
         "targets", frame, [REACHED], [METHOD], "dots", height=0.24,
         subtitle=_where(runs, "targets: a tenth, a hundredth and a thousandth of the first regret"),
@@ -185,21 +168,23 @@ def _where(runs: RunSet, what: str) -> str:
     return f"{len(problems)} problems, {what}" if len(problems) > 1 else f"{problems[0]}, {what}"
 
 
-def _progress(runs: RunSet, default: float) -> Chart | None:
+def _progress(runs: RunSet) -> Chart | None:
     """Return the share of targets that single searches reach within a number of rollouts."""
-    times = aggregate.runtimes(runs, default)
+    times = aggregate.runtimes(runs)
     finite = times.loc[np.isfinite(times["runtime"]) & (times["runtime"] > 0), "runtime"]
     if finite.empty:
         return None
     grid = np.geomspace(finite.min() / 1.5, finite.max() * 1.2, STEPS)
-    lines = [
-        {"method": method, "spent": x, "share": float(part["weight"][part["runtime"] <= x].sum())}
+    shares = {
+        method: [float(part["weight"][part["runtime"] <= x].sum()) for x in grid]
         for method, part in times.groupby("method", sort=False)
-        for x in grid
-    ]
+    }
+    frame = pd.DataFrame(shares, index=pd.Index(grid, name="spent")).melt(
+        var_name="method", value_name="share", ignore_index=False
+    )
     share = Column("share", label="share of targets reached", format="percent", log=False)
     return Chart(
-        "runtimes", pd.DataFrame(lines), [SPENT], [share], labels="ends", height=2.6, panel="",
+        "runtimes", frame.reset_index(), [SPENT], [share], height=2.6, panel="",
         subtitle=_where(runs, "single searches, a gradient counts as its time in rollouts"),
         text="Where a line ends is the share of targets reached in the whole budget.",
     )  # fmt: skip

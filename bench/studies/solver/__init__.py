@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import ClassVar
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import numpy as np
 
 from bench.experiment.cell import Cell
 from bench.experiment.columns import Column, Columns, ComparisonRule, numbers
+from bench.experiment.session import Session
 from bench.model import param
 from bench.model.parameters import values
-from bench.studies import StudyPackage
+from bench.studies import StudyPackage, finite_status, first_batch, gradient_seconds, norm, relative_error
+
+ROUNDING = 1e-6
+"""Share of the gradient's norm up to which a coordinate of the converged gradient has no sign."""
 
 
 @dataclass(frozen=True)
@@ -42,3 +48,27 @@ class Solver(StudyPackage):
         if "iterations" in values(cell.backend):
             return None
         return f"backend {cell.backend.name} has no parameter iterations, the iterations of a constraint solver"
+
+    def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
+        """Return one cell's results by column: errors to the converged program at w = 0, and times [s]."""
+        backend: Any = cell.backend
+        problem, limit = session.problem(cell), session.problems.of(replace(backend, iterations=self.converged), cell)
+        w = first_batch(cell, problem.program.n_noise)
+        # both batches have the same shape, so that each program is compiled once
+        gradient, target = (one.grad(problem.program.theta0, np.zeros_like(w))[:, 0] for one in (problem, limit))
+        return {
+            **finite_status("a gradient is not finite", gradient, target), "iterations": backend.iterations,
+            "gradient": gradient.tolist(), "converged_gradient": target.tolist(),
+            **gradient_seconds(problem, w, self.timed_calls), **compare(gradient, target),
+        }  # fmt: skip
+
+
+def compare(gradient: np.ndarray, target: np.ndarray) -> dict[str, float]:
+    """Return norms, relative error, cosine, and the share of wrong signs among coordinates of ``target`` with a sign."""
+    has_sign = np.abs(target) > ROUNDING * norm(target)
+    return {
+        "gradient_norm": norm(gradient), "converged_norm": norm(target),
+        "gradient_error_rel": relative_error(gradient, target),
+        "gradient_cosine": float(gradient @ target) / (norm(gradient) * norm(target)),
+        "wrong_signs": float((np.sign(gradient) != np.sign(target))[has_sign].mean()),
+    }  # fmt: skip

@@ -29,10 +29,10 @@ LOOKS = {
 }
 """Looks of the colours, the worst first."""
 CAUSES = ("step", "law", "both", "unknown")
-GROWING = 1 + 1e-9
-"""Measured growth per step above which a state counts as growing: 1 plus rounding."""
 BEYOND = "•"
 """Mark of a cell whose stiffness is above the step's limit in theory."""
+MIXED = 0.05, 0.95
+"""Shares of right cells between which a law with an integrator is drawn, with its other integrators."""
 RESULTS = (
     "verdict", "cause", "relative_error", "cosine", "spectral_radius", "stiffness_limit", "first_bad_step", "truth",
 )  # fmt: skip
@@ -45,19 +45,12 @@ SHARE_NOTES = (
     "wrong by step: the step or its derivative is wrong and the law is right. by law: wrong at any step. by both, by unknown: "
     "the cause is not resolved. Shares are of the cells.",
 )
-LIMITS = (text("problem"), Column("dt", unit="s", format="setting"), *map(Column, ("theory", "stable", "unstable")))
-LIMIT_NOTES = (
-    "theory: stiffness at which the step's spectral radius on the oscillator exceeds 1, 0 if it always does, inf if never. A "
-    "contact is an oscillator while it lasts. stable, unstable: the largest stiffness of the grid below the first at which the "
-    "state diverges or, without contact, grows by more than 1e-9 per step, and that one.",
-)
 
 
 def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
-    """Return the tables of shares and of stability limits, and the map."""
+    """Return the tables of shares and of cells, and the map."""
     cells = cells_of(experiment, rows)
-    lines = limits(cells)
-    whole = Table("stability_map", lines, LIMITS, "stability limits [N/m]", LIMIT_NOTES, data=table(experiment, rows))
+    whole = Table("stability_map", table(experiment, rows), [], files=["csv"])
     if cells.empty:
         return Views([whole])
     shares = Table("stability_shares", shares_of(cells), SHARES, "How often each contact law and step gives the right gradient",
@@ -95,19 +88,6 @@ def shares_of(cells: pd.DataFrame) -> pd.DataFrame:
     )
 
 
-def limits(cells: pd.DataFrame) -> pd.DataFrame:
-    """Return the stability limits by problem and dt: in theory, and the stiffnesses of the grid next to the measured one."""
-    known = cells.dropna(subset=["stiffness", "stiffness_limit"]).sort_values("stiffness", kind="stable")
-    result = []
-    for key, part in known.groupby(["problem", "dt"], sort=False):
-        lost = (part["level"] == "diverged") | (part["growth_factor"] > GROWING)
-        stable, unstable = part.loc[~lost.cummax(), "stiffness"].max(), part.loc[lost, "stiffness"].min()
-        result.append([*key, part["stiffness_limit"].median(), stable, unstable])
-    return pd.DataFrame(result, columns=[column.name for column in LIMITS]).fillna(
-        {"stable": 0.0, "unstable": math.inf}
-    )
-
-
 def chart(cells: pd.DataFrame) -> Chart:
     """Return the map of the first variant of each scene, law and integrator."""
     missing = cells["stiffness"].isna()  # a law without stiffness is the same at each one
@@ -116,10 +96,15 @@ def chart(cells: pd.DataFrame) -> Chart:
     frame = pd.concat([cells[~missing], spread], ignore_index=True)
     frame = frame.sort_values("level", key=lambda names: names.map(list(LOOKS).index), kind="stable")
     frame = frame.drop_duplicates(["problem", "dt", "stiffness"]).sort_index()
-    first = frame.groupby(["integrator", "place"], sort=False)["problem"].transform("first")
+    frame = frame[frame["problem"] == frame.groupby(["integrator", "place"], sort=False)["problem"].transform("first")]
+    right = (frame["level"] == "right").groupby([frame["integrator"], frame["place"]]).transform("mean")
+    mixed = frame["place"].isin(frame["place"][right.between(*MIXED)])
+    frame = frame[mixed] if mixed.any() else frame
+    places = frame["place"].unique()
+    rows, height, which = ("integrator", 0.085, "") if len(places) > 1 else ("", 0.16, f"{places[0]}; ")
     dt, stiffness = replace(COMMON["dt"], label="time step"), COMMON["stiffness"]
     return Chart(
-        "stability_map", frame[frame["problem"] == first], [dt], [stiffness], "grid", level="level", styles=LOOKS, panel="place",
-        panel_row="integrator", cell="mark", height=0.085, subtitle=f"{BEYOND} beyond the stability limit in theory",
-        text="The worst verdict where backends disagree. Blank: not supported.",
+        "stability_map", frame, [dt], [stiffness], "grid", level="level", styles=LOOKS, panel="place" if rows else "integrator",
+        panel_row=rows, cell="mark", height=height, subtitle=f"{which}{BEYOND} beyond the stability limit in theory",
+        text="The worst verdict where backends disagree. Scenes and laws that are right everywhere or nowhere are in the table only.",
     )  # fmt: skip

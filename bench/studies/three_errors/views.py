@@ -43,7 +43,7 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     """Return a line per cell, the traps and the chart."""
     shown = Shown(experiment, rows, ["dt"], ["estimator"], PROGRAM)
     ends = {f"bias_rel_{end}": shown.rows[f"bias_{end}"] / shown.rows["reference_norm"] for end in ("low", "high")}
-    bias = shown.column("bias_rel", low="bias_rel_low", high="bias_rel_high")
+    bias = shown.column("bias_rel", label="estimator error", low="bias_rel_low", high="bias_rel_high")
     cells = shown.cells(
         [COMMON["dt"], *map(shown.column, RESULTS), bias], "program, model and estimator error", [NOTE],
         ("scene", "contact", "estimator"), shown.rows.assign(**ends),

@@ -64,15 +64,19 @@ def at_equal_steps(runs: pd.DataFrame) -> pd.DataFrame:
     return runs.assign(used=last, equal=returns)
 
 
-def summarise(runs: pd.DataFrame) -> pd.DataFrame:
+WINDOW = ("window_bias", "window_bias_low", "window_bias_high", "window_gradient")
+"""Columns of a run that are about its windows."""
+
+
+def summarise(runs: pd.DataFrame, by: Sequence[str] = ("problem", "method")) -> pd.DataFrame:
     """Return a line per problem and method, best first: interquartile mean of the final return over seeds, and medians."""
     lines = []
-    for (problem, method), part in at_equal_steps(runs).groupby(["problem", "method"], sort=False):
+    for key, part in at_equal_steps(runs).groupby(list(by), sort=False):
         final, equal = final_returns(part), final_returns(part, "equal")
         low, high = interval(final)
-        cosines = np.concatenate([np.asarray(c, float) for c in part["cosine"]]) if len(part) else np.empty(0)
-        lines.append({
-            "problem": problem, "method": method, "family": part["family"].iloc[0], "seeds": len(part),
+        cosines = np.concatenate([np.asarray(c, float) for c in part["cosine"]])
+        lines.append(dict(zip(by, key, strict=True)) | {
+            "family": part["family"].iloc[0], "seeds": len(part),
             "failed": int((part["status"] != "ok").sum()), "returns": final, "final": interquartile_mean(final), "final_low": low,
             "final_high": high, "worst": float(final.min()), "steps": float(part["steps"].max()), "used": float(part["used"].median()),
             "equal": interquartile_mean(equal), **dict(zip(("equal_low", "equal_high"), interval(equal), strict=True)),
@@ -80,6 +84,7 @@ def summarise(runs: pd.DataFrame) -> pd.DataFrame:
             "gradient_typical": float(part["gradient_typical"].median()),
             "gradient_peak": float(part["gradient_peak"].max()),
             "cosine": float(np.nanmean(cosines)) if np.isfinite(cosines).any() else math.nan,
+            **part[[*WINDOW]].median(),
         })  # fmt: skip
     frame = pd.DataFrame(lines)
     return frame.sort_values(["problem", "final"], ascending=[True, False], kind="stable").reset_index(drop=True)
@@ -128,50 +133,41 @@ def curves(runs: pd.DataFrame) -> pd.DataFrame:
 
     The cost is minus the return. A run that ended early keeps the cost of its untrained policy from there on.
     """
-    lines = []
+    parts = []
     for (problem, method), part in runs.groupby(["problem", "method"], sort=False):
-        count = max(part["curve_return"].map(len))
-        longest = part.loc[part["curve_return"].map(len).idxmax()]
-        costs = np.array([_filled(-np.asarray(row, float), count) for row in part["curve_return"]])
-        seconds = [np.asarray(row, float) for row in part["curve_s"] if len(row) == count]
-        middle = np.array([interquartile_mean(column) for column in costs.T])
-        ends = (
-            bootstrap_along([costs], lambda drawn: np.array([interquartile_mean(c) for c in drawn[0].T]))
-            if len(part) >= MIN_SEEDS
-            else [(math.nan, math.nan)] * count
-        )
-        for i in range(count):
-            lines.append({
-                "problem": problem, "method": method, "step": float(longest["curve_step"][i]),
-                "seconds": float(np.median([s[i] for s in seconds])) if seconds else math.nan,
-                "cost": middle[i], "cost_low": ends[i][0], "cost_high": ends[i][1],
-            })  # fmt: skip
-    return pd.DataFrame(lines, columns=["problem", "method", "step", "seconds", "cost", "cost_low", "cost_high"])
+        count = part["curve_return"].map(len)
+        whole = part[count == count.max()]
+        costs = np.array([_filled(-np.asarray(row, float), count.max()) for row in part["curve_return"]])
+        ends = np.full((count.max(), 2), math.nan)
+        if len(part) >= MIN_SEEDS:
+            ends = np.array(bootstrap_along([costs], lambda drawn: _middle(drawn[0])))
+        parts.append(pd.DataFrame({
+            "problem": problem, "method": method, "step": np.asarray(whole["curve_step"].iloc[0], float),
+            "seconds": np.median([np.asarray(row, float) for row in whole["curve_s"]], axis=0),
+            "cost": _middle(costs), "cost_low": ends[:, 0], "cost_high": ends[:, 1],
+        }))  # fmt: skip
+    return pd.concat(parts, ignore_index=True)
+
+
+def _middle(costs: np.ndarray) -> np.ndarray:
+    """Return the interquartile mean of each column."""
+    return np.array([interquartile_mean(column) for column in costs.T])
 
 
 def _filled(values: np.ndarray, count: int) -> np.ndarray:
     known = np.where(np.isfinite(values), values, values[0])
-    return np.append(known, np.full(count - len(known), values[0])) if len(known) < count else known
+    return np.append(known, np.full(count - len(known), values[0]))
 
 
 def windows(runs: pd.DataFrame) -> pd.DataFrame:
     """Return a line per problem, family and window with a run that ended, for families with several windows."""
+    keys = ["problem", "family", "window"]
     known = runs[runs["window"].notna() & runs["window_gradient"].notna()]
-    lines = []
-    for (problem, family, window), part in known.groupby(["problem", "family", "window"]):
-        if not (part["status"] == "ok").any():
-            continue
-        final = final_returns(part)
-        low, high = interval(final)
-        lines.append({
-            "problem": problem, "family": family, "window": window, "seeds": len(part), "returns": final,
-            **{name: float(part[name].median()) for name in ("window_bias", "window_bias_low", "window_bias_high")},
-            "window_gradient": float(part["window_gradient"].median()), "gradient_typical": float(part["gradient_typical"].median()),
-            "final": interquartile_mean(final), "final_low": low, "final_high": high,
-        })  # fmt: skip
-    frame = pd.DataFrame(lines)
-    if frame.empty:
-        return frame
+    has_ended = (known["status"] == "ok").groupby([known[key] for key in keys]).transform("any")
+    names = [*keys, "seeds", "returns", *WINDOW, "gradient_typical", "final", "final_low", "final_high"]
+    if not has_ended.any():
+        return pd.DataFrame(columns=names)
+    frame = summarise(known[has_ended], keys)[names].sort_values(keys, ignore_index=True)
     return frame[frame.groupby(["problem", "family"])["window"].transform("nunique") > 1]
 
 
@@ -183,19 +179,3 @@ def faults(runs: pd.DataFrame) -> pd.DataFrame:
         for fault in judge(row)
     ]
     return pd.DataFrame(lines, columns=["problem", "method", "seed", "code", "update", "value"])
-
-
-def logs(runs: pd.DataFrame, quantities: Sequence[str]) -> pd.DataFrame:
-    """Return a line per problem, method, quantity and log entry of the first seed, at its control steps."""
-    lines = []
-    for (problem, method), part in runs.groupby(["problem", "method"], sort=False):
-        row = part.sort_values("seed").iloc[0]
-        per_update = row["steps"] / row["updates"] if row["updates"] else math.nan
-        for quantity in quantities:
-            places = row["cosine_update" if quantity == "cosine" else "log_update"]
-            values = row[quantity if quantity == "cosine" else f"log_{quantity}"]
-            lines += [
-                (problem, method, quantity, place * per_update, value)
-                for place, value in zip(np.asarray(places, float), np.asarray(values, float), strict=False)
-            ]
-    return pd.DataFrame(lines, columns=["problem", "method", "quantity", "step", "value"])

@@ -8,7 +8,10 @@ import math
 import time
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+import optax
 
 from bench.experiment.cell import Cell
 from bench.experiment.session import Session
@@ -33,8 +36,6 @@ SETTLED = 0.01
 
 def measure(cell: Cell, session: Session, settings: Train) -> dict[str, Any]:
     """Return one cell's results by column."""
-    import jax
-
     trainer, backend = cell.parts["trainer"], cell.backend
     assert isinstance(trainer, Trainer)
     training = _training(cell, backend)
@@ -129,10 +130,6 @@ def slope_errors(exact: Training, state: Any) -> list[float]:
     own loss, with the same noise. Slopes are in units of their median over arrays: Adam does not depend on a common factor. NaN
     where differences of three lengths do not agree, so that the slope is not known; empty for an optimizer other than Adam.
     """
-    import jax
-    import jax.numpy as jnp
-    import optax
-
     if optax.tree.get(state.memory, "mu") is None:
         return []
     state = jax.tree.map(lambda x: x.astype("float64") if jnp.issubdtype(x.dtype, jnp.floating) else x, state)

@@ -1,17 +1,15 @@
-"""What the study of training shows: returns by trainer, windows by length, faults, and the log of each trainer."""
+"""What the study of training shows: returns by trainer, windows by length, and faults."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
 import pandas as pd
 
 from bench.experiment.axes import table
 from bench.experiment.columns import Column, text
 from bench.experiment.experiment import Experiment
-from bench.experiment.views import Chart, Style, Table, Views
-from bench.report.style import DEVIANT, VARIANTS, colour, marker
+from bench.experiment.views import Chart, Table, Views
 from bench.studies.train import aggregate
 from bench.studies.train.verdicts import MEANINGS
 
@@ -49,23 +47,6 @@ STEP, SECONDS = (
     Column("step", label="control steps", log=False),
     Column("seconds", label="training time [s]", log=False),
 )
-QUANTITIES = {
-    "reward": "reward per step",
-    "gradient_norm": "log10 of the gradient norm",
-    "gradient_largest": "log10 of its largest entry",
-    "cosine": "cosine with zeroth order",
-    "step_length": "step length",
-    "cut": "share of rollouts cut",
-    "contacts": "closed contacts",
-    "penetration": "penetration [m]",
-    "contact_force": "contact force [N]",
-}
-"""The quantities of the chart of logs, with their headings."""
-LOGARITHMIC = ("gradient_norm", "gradient_largest")
-"""Quantities that are drawn as their logarithms, since spikes are orders of magnitude high."""
-MAX_LOGS = 4
-"""Most trainers in the chart of logs, the best of each family."""
-LINES = (*VARIANTS, *DEVIANT)
 SEEDS = f"interquartile mean over seeds, with its 95% bootstrap interval from {aggregate.MIN_SEEDS} seeds on"
 NOTE = (
     f"final return: the mean undiscounted return of the deterministic policy from the same starts, {SEEDS}. A run that is not "
@@ -94,10 +75,11 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     runs = aggregate.runs_of(experiment, rows)
     data = table(experiment, rows)
     if runs.empty:
-        every = Table("train", rows, [text("scene"), text("trainer"), text("status")], data=data)
-        return Views([every])
+        return Views([Table("train", rows, [text("scene"), text("trainer"), text("status")], data=data)])
     summary, windows, faults = aggregate.summarise(runs), aggregate.windows(runs), aggregate.faults(runs)
-    summary = summary.assign(verdict=aggregate.ranked(summary, ["problem"])).drop(columns="returns")
+    summary = summary.assign(verdict=aggregate.ranked(summary, ["problem"])).drop(
+        columns=["returns", *aggregate.WINDOW]
+    )
     tables = [
         Table("train", summary, SUMMARY, "final return by trainer", [NOTE, VERDICTS], terminal=True, page=True, data=data,
               details=["compile_s", "gradient_typical", "gradient_peak"]),
@@ -105,86 +87,29 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     ]  # fmt: skip
     if len(windows):
         lines = windows.assign(verdict=aggregate.ranked(windows, ["problem", "family"])).drop(columns="returns")
-        tables.append(
-            Table(
-                "windows",
-                lines,
-                WINDOWS,
-                "Windows",
-                [WINDOW_NOTE],
-                terminal=True,
-                page=True,
-                details=["gradient_typical"],
-            )
-        )
+        tables.append(Table("windows", lines, WINDOWS, "Windows", [WINDOW_NOTE], terminal=True, page=True,
+                            details=["gradient_typical"]))  # fmt: skip
     if len(faults):
         notes = [FAULT_NOTE, *(f"- {code}: {MEANINGS[code]}" for code in faults["code"].unique())]
         tables.append(Table("faults", faults, FAULTS, "Faults in the logs", notes, page=True))
     cells = rows.assign(problem=runs["problem"], method=runs["method"]).fillna({"problem": "", "method": ""})
     by_name = experiment.columns.by_name
-    return Views(tables, _charts(runs, summary, windows), cells,
+    return Views(tables, _charts(runs, windows), cells,
                  [METHOD, *(by_name[name] for name in PAGE)])  # fmt: skip
 
 
-def _styles(summary: pd.DataFrame) -> dict[str, Style]:
-    """Return a colour and marker per trainer, and a line style per family."""
-    families = list(dict.fromkeys(summary["family"]))
-    return {
-        method: Style(colour(i), marker(i), LINES[families.index(family) % len(LINES)])
-        for i, (method, family) in enumerate(dict(zip(summary["method"], summary["family"], strict=True)).items())
-    }
-
-
-def _charts(runs: pd.DataFrame, summary: pd.DataFrame, windows: pd.DataFrame) -> list[Chart]:
-    looks = _styles(summary)
+def _charts(runs: pd.DataFrame, windows: pd.DataFrame) -> list[Chart]:
     frame = aggregate.curves(runs)
     cost = replace(COST, log=bool((frame["cost"] > 0).all()))
     curves = [
         Chart(
-            name, frame, [x], [cost], series="method", panel="problem", styles=looks, band=True,
+            name, frame.dropna(subset=[x.name]), [x], [cost], series="method", panel="problem", band=True,
             subtitle=f"cost: minus the return; {SEEDS}", text="A line per trainer, at its evaluations.",
         )
         for name, x in (("train", STEP), ("train_seconds", SECONDS))
     ]  # fmt: skip
-    curves = [curves[0], *(chart for chart in curves[1:] if np.isfinite(frame["seconds"]).any())]
-    charts = [*curves, *_logs(runs, summary, looks)]
-    if len(windows):
-        charts.append(_windows(windows))
-    return charts
-
-
-def _windows(windows: pd.DataFrame) -> Chart:
-    return Chart(
+    lengths = Chart(
         "windows", windows, [replace(WINDOW, log=True)], [FINAL, WINDOW_BIAS, WINDOW_GRADIENT], series="family", panel="problem",
         subtitle=f"final return: {SEEDS}", text="A point per length of window.",
     )  # fmt: skip
-
-
-def _logs(runs: pd.DataFrame, summary: pd.DataFrame, looks: dict[str, Style]) -> list[Chart]:
-    """Return a chart of the logs per problem: a panel per quantity over the same control steps."""
-    charts = []
-    for i, (problem, part) in enumerate(runs.groupby("problem", sort=False)):
-        frame = aggregate.logs(part, tuple(QUANTITIES)).dropna(subset=["value"])
-        size = frame["quantity"].isin(LOGARITHMIC)
-        frame = frame.assign(
-            value=np.where(size, np.log10(frame["value"].where(size & (frame["value"] > 0))), frame["value"])
-        )
-        frame = frame.dropna(subset=["value"])
-        varies = frame.groupby("quantity")["value"].agg(["min", "max"])
-        shown = [
-            name for name in QUANTITIES if name in varies.index and varies.loc[name, "min"] < varies.loc[name, "max"]
-        ]
-        frame = frame[frame["quantity"].isin(shown)]
-        if frame.empty:
-            continue
-        frame = frame.assign(quantity=frame["quantity"].map(QUANTITIES))
-        own = summary[summary["problem"] == problem]
-        methods = list(own.drop_duplicates("family")["method"])[:MAX_LOGS]
-        charts.append(Chart(
-            "train_log" if i == 0 else f"train_log_{i + 1}", frame, [STEP],
-            [Column("value", label=" ")], series="method", panel="quantity", styles={m: replace(s, marker="") for m, s in looks.items()},
-            chosen=[("method", methods)], own_scales=True, across=1, height=1.1,
-            subtitle=f"{problem}, first seed; an entry is the mean or largest value of its updates",
-            text="All quantities have the same axis of control steps, so that spikes can be compared.",
-        ))  # fmt: skip
-    return charts
+    return [*curves, lengths]

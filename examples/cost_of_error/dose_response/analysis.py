@@ -134,7 +134,8 @@ def ratios(lines: pd.DataFrame) -> pd.DataFrame:
 
     A missed target is infinite, and a problem on which both sides are missed has no ratio. Comparisons: of updates, by
     :data:`COMPARISONS`; of updates at a wrong rate with those at the best one; of rollouts, of the first with the zeroth order, each
-    at its cheapest number of samples; and of rollouts at the fewest samples that reach the target with the cheapest other number.
+    at its cheapest number of samples; of rollouts at the fewest samples that reach the target with the cheapest other number;
+    and of updates at equal error, the median over the samples of an order with planted random errors between the planted sizes.
     """
     result = []
     keys = ["scene_class", "target", "scene", "problem"]
@@ -164,6 +165,12 @@ def _sides(own: pd.DataFrame) -> Iterator[tuple[str, tuple[float, float]]]:
         costs = rollouts_to_target(part.sort_values("samples"), 1.0).to_numpy()
         if part["method"].nunique() == 1 and len(costs) > 1:
             yield f"fewest samples / others, {kind}", (costs[0], costs[1:].min())
+    planted = own[(own["kind"] == RANDOM) & np.isfinite(own["median"])].sort_values("error")
+    for kind, part in natural.groupby("kind"):
+        between = part[part["error"].between(planted["error"].min(), planted["error"].max())]
+        if len(between):
+            expected = np.interp(*map(np.log, (between["error"], planted["error"], planted["median"])))
+            yield f"{kind} / random error, equal error", (float((between["median"] / np.exp(expected)).median()), 1.0)
 
 
 def rollouts_to_target(lines: pd.DataFrame, charge: float) -> pd.Series:

@@ -16,7 +16,7 @@ from bench.experiment.session import Session
 from bench.measure import noise
 from bench.model import Estimator, Optimizer, Problem, best_gradient, zeroth_order
 from bench.run.files import make_directory, write_whole
-from bench.studies.optimise.search import known_optimum, objective
+from bench.studies.optimise.measure import known_optimum, objective
 
 from .search import Method, Task, run_searches, tune, unit_rate, with_rate
 

@@ -14,8 +14,9 @@ import numpy as np
 from bench.measure import noise
 from bench.model import Answer, Estimator, Optimizer, Problem
 from bench.model.parameters import parameters
-from bench.studies.optimise.batched import run_batched
-from bench.studies.optimise.search import advance, estimates, mean_costs, objective
+from bench.studies.optimise.measure import advance, estimates, mean_costs, objective
+
+from .batched import run_batched
 
 TARGETS = (10.0, 30.0, 100.0, 300.0, 1000.0)
 """Factors by which the regret of a search has to fall."""

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pandas as pd
 
 from bench.experiment.axes import table as csv_table
 from bench.experiment.columns import Column, text
 from bench.experiment.experiment import Experiment
-from bench.experiment.views import Chart, Style, Table, Views
+from bench.experiment.views import Chart, Mark, Style, Table, Views
 from bench.report.style import MARKERS, PALETTE, VARIANTS
 
 from . import analysis
@@ -22,6 +23,7 @@ STYLES = {
 }
 NATURAL = ((PALETTE[3], "P"), (PALETTE[5], "*"), (PALETTE[4], "h"), (PALETTE[7], "p"))
 """Colour and marker of each natural method, drawn as points."""
+VERDICTS = {"above 1": Style(PALETTE[2]), "below 1": Style(PALETTE[0]), "not known": Style("#767676")}
 CLASS, PROBLEMS, SCENES = (
     text("scene_class", label="class"),
     Column("problems", format="setting"),
@@ -53,16 +55,18 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     lines, beside = analysis.counted(table), analysis.reached(table)
     pairs = analysis.by_scene(analysis.ratios(lines))
     main = pairs[pairs["target"] == MAIN]
+    together = main[main["scene_class"] == analysis.ALL]
+    several = table["scene_class"].nunique() > 1
     tables = [
-        Table("pairs", main[main["scene_class"] == analysis.ALL], PAIRS[1:], "Ratios on the same problem", PAIR_NOTES,
+        Table("pairs", together, PAIRS[1:], "Ratios on the same problem", PAIR_NOTES,
               terminal=True, page=True, data=pairs),
-        Table("pairs", main[main["scene_class"] != analysis.ALL], PAIRS, "Ratios by class", PAIR_NOTES, page=True,
+        Table("pairs", main[(main["scene_class"] != analysis.ALL) & several], PAIRS, "Ratios by class", PAIR_NOTES, page=True,
               split="scene_class"),
         Table("dose_response", csv_table(experiment, rows), [], files=["csv"]),
         _problems(table),
     ]  # fmt: skip
     points = analysis.relative_times(lines[lines["scene_class"].isin(pairs["scene_class"])])
-    charts = [_chart(points, pairs)] if len(points) else []
+    charts = ([_chart(points, pairs)] if several else [_ratios(together)]) if len(points) else []
     if len(beside):  # then the question is what such methods take
         tables, charts = [_reached(beside), *tables[2:]], [_reached_chart(beside)]
     return Views([one for one in tables if len(one.frame)], charts)
@@ -96,6 +100,18 @@ def _chart(points: pd.DataFrame, pairs: pd.DataFrame) -> Chart:
         "A bar to the top: no upper end",
         text="Lines: planted errors. Points: natural methods, one per number of samples. Medians over scenes, with 95% "
         "intervals where there are six. The error is the median over ten thetas that all methods of a problem share.",
+    )  # fmt: skip
+
+
+def _ratios(pairs: pd.DataFrame) -> Chart:
+    """Return the ratios whose interval has an end: a row per comparison."""
+    frame = pairs[(pairs["ratio_low"] > 0) | np.isfinite(pairs["ratio_high"])]
+    frame = frame.assign(ratio_low=frame["ratio_low"].where(frame["ratio_low"] > 0), is_missed=np.isinf(frame["ratio"]))
+    return Chart(
+        "ratios", frame, [Column("ratio", label="times the updates", low="ratio_low", high="ratio_high", log=True)],
+        [text("comparison", label="")], "dots", series="verdict", styles=VERDICTS, marks=[Mark("the same", 1.0)], failed="is_missed",
+        height=0.28, subtitle=f"To 1/{MAIN:g} of the first regret, over the best gradient. Cross: half of the scenes miss it",
+        text="Medians over scenes with 95% intervals. Left of the line is fewer updates.",
     )  # fmt: skip
 
 

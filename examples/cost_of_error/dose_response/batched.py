@@ -13,7 +13,6 @@ import numpy as np
 
 from bench.errors import StorageError
 from bench.model import Problem
-from bench.studies.optimise.search import Wrapped
 
 Outcome = dict[str, Any] | BaseException
 """The columns that a search returns, or the exception that it raises."""
@@ -29,7 +28,7 @@ class Request:
     outcome: Outcome | None = None
 
 
-class Lane(Wrapped):
+class Lane(Problem):
     """A problem shared by several searches: each call waits until every search has made one, then all run as one batch.
 
     Each search has its own thread and its own lane. Only one thread runs at a time, always in the same order, so that
@@ -37,8 +36,8 @@ class Lane(Wrapped):
     """
 
     def __init__(self, inner: Problem, search: Callable[[Problem], dict[str, Any]]) -> None:
-        super().__init__(inner)
-        self._search = search
+        super().__init__(inner.program)
+        self._inner, self._search = inner, search
         self.device, self.provides = inner.device, inner.provides
         self._requests: SimpleQueue[Request] = SimpleQueue()
         self._answers: SimpleQueue[np.ndarray | BaseException] = SimpleQueue()
@@ -68,6 +67,21 @@ class Lane(Wrapped):
         if isinstance(answer, BaseException):
             raise answer
         return answer
+
+    _value = _grad = _score = None  # type: ignore[assignment]
+
+    @property
+    def gives_jacobians(self) -> bool:
+        """Whether the shared problem defines :meth:`jacobians`."""
+        return self._inner.gives_jacobians
+
+    def jacobians(self, theta: np.ndarray, w: np.ndarray) -> Any:
+        """Return the step Jacobians."""
+        return self._inner.jacobians(theta, w)
+
+    def trajectory(self, theta: np.ndarray, w: np.ndarray) -> Any:
+        """Return the states."""
+        return self._inner.trajectory(theta, w)
 
     def value(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         """Return costs ``(B,)``."""

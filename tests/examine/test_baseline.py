@@ -1,7 +1,6 @@
-"""For CI: exit statuses, baselines, summaries, and many costs in one command."""
+"""For CI: exit statuses, baselines and the fixture."""
 
 import json
-from xml.etree import ElementTree
 
 import pytest
 
@@ -63,9 +62,7 @@ def test_settings_of_the_command_line(sim, capsys):
         "tolerance=theta[0]:0.3",
         "atol=1e-9",
         "compile_budget=5s",
-        "twin=cost",
         "refined=cost",
-        "twin_grad=right",
     ]
     assert run(f"{sim}:cost", "grad=off", "calls=400", *settings) == 0
     assert "small error, within the tolerance" in capsys.readouterr().out
@@ -97,69 +94,6 @@ def test_another_file_is_no_baseline(tmp_path, text):
     path.write_text(text)
     with pytest.raises(UserError, match="baseline="):
         examined().compared(path)
-
-
-# -------------------------------------------------------------------------------------------- summaries
-
-
-def test_summaries_in_markdown_and_junit():
-    for report, kind in ((examined(), None), (examined(1.1), "failure"), (examined(calls=3), "error")):
-        case = ElementTree.fromstring(report.junit()).find("testsuite/testcase")
-        assert [child.tag for child in case if child.tag != "system-out"] == ([kind] if kind else [])
-        assert "| cost | result | cause |" in report.markdown()
-    assert "| wrong |" in examined(1.1).markdown()
-    assert "- next: follow theta[0]" in examined(1.1).markdown()
-    assert "| not decided | undecided |" in examined(calls=3).markdown()
-
-
-def test_names_cannot_break_the_summaries():
-    report = examined(1.1, name="a|b <script>\x01")
-    assert "a\\|b &lt;script>" in report.markdown()
-    assert ElementTree.fromstring(report.junit()).find("testsuite/testcase").get("name") == "a|b <script>?"
-
-
-def test_matrix_runs_many_costs_into_one_table(sim, tmp_path, capsys):
-    matrix = tmp_path / "matrix.toml"
-    matrix.write_text(
-        '[defaults]\ncalls = 400\n'
-        '[[cost]]\ncost = "sim.py:cost"\ngrad = "right"\n'
-        '[[cost]]\nname = "off"\ncost = "sim.py:cost"\ngrad = "off"\ntheta = [1.0, 2.0]\n'
-        '[[cost]]\nname = "tolerated"\ncost = "sim.py:cost"\ngrad = "off"\ntolerance = {"theta[0]" = 0.2}\n'
-        '[[cost]]\nname = "known"\ncost = "sim.py:kinked"\ngrad = "side"\nexpect = "kink"\ncalls = 1000\n'
-        '[[cost]]\nname = "short"\ncost = "sim.py:cost"\ngrad = "right"\ncalls = 3\n'
-    )  # fmt: skip
-    outputs = [f"markdown={tmp_path / 'summary.md'}", f"junit={tmp_path / 'examine.xml'}"]
-    assert run("--matrix", matrix, *outputs) == 1
-    out = capsys.readouterr().out
-    assert "5 costs: 3 right, 1 wrong, 1 not decided" in out
-    assert ElementTree.parse(tmp_path / "examine.xml").getroot().attrib == {
-        "name": "examine", "tests": "5", "failures": "1", "errors": "1",
-    }  # fmt: skip
-    assert "| known | as expected | kink |" in (tmp_path / "summary.md").read_text()
-
-
-def test_matrix_goes_on_after_bad_input(sim, tmp_path, capsys):
-    matrix = tmp_path / "matrix.toml"
-    matrix.write_text('[[cost]]\ncost = "sim.py:cots"\n[[cost]]\ncost = "sim.py:cost"\ngrad = "right"\ncalls = 300\n')
-    assert run("--matrix", matrix) == 2
-    assert "2 costs: 1 right, 1 bad input" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("", "needs one"),
-        ("[[cost]]\n", "has no cost"),
-        ("x = 1\n[[cost]]\ncost = 'sim.py:cost'\n", "unknown: x"),
-        ("[[cost]]\ncost = 'sim.py:cost'\ncall = 1\n", "did you mean 'calls'"),
-        ("[[cost\n", "is not TOML"),
-    ],
-)
-def test_matrix_files_that_are_wrong_say_why(sim, tmp_path, capsys, text, said):
-    matrix = tmp_path / "matrix.toml"
-    matrix.write_text(text)
-    assert run("--matrix", matrix) == 2
-    assert said in capsys.readouterr().err
 
 
 pytest_plugins = ["bench.examine.fixture"]
