@@ -46,7 +46,7 @@ def command() -> None:
         print("bench: not enough memory: give the process more (4 GB suffice for most runs)", file=sys.stderr)
         status = 1
     except Exception as error:  # a bug of this package, unless a plugin has changed the process
-        if outside := sorted(registry.imported()):
+        if outside := sorted(registry.IMPORTED):
             place = traceback.extract_tb(error.__traceback__)[-1]
             where = f"{printable(error)} ({place.filename}:{place.lineno})"
             print(

@@ -78,6 +78,7 @@ def remove_plugin_folders():
     before = registry.folders()
     yield
     registry._environment.clear()
+    registry.IMPORTED.clear()
     if tasks := sys.modules.get("bench.run.tasks"):
         tasks.RAN.clear()
     if registry.folders() != before:

@@ -68,6 +68,8 @@ Table = dict[str, dict[str, Entry]]
 _folders: list[Path] = []
 _environment: dict[str, str | None] = {}
 """Variables of the environment that imports from outside have changed, with their values before."""
+IMPORTED: set[str] = set()
+"""The modules from outside that this process has imported."""
 _only: frozenset[str] | None = None
 """The only modules from outside that are loaded; None for all."""
 
@@ -145,14 +147,6 @@ def environment() -> dict[str, str]:
     return {name: value for name, value in (os.environ | _environment).items() if value is not None}
 
 
-def imported() -> frozenset[str]:
-    """Return the modules from outside that this process has imported."""
-    packages = (*map(_package, _folders), *(point.module for point in entry_points(group=ENTRY_POINT_GROUP)))
-    return frozenset(
-        name for name in sys.modules if name.startswith(packages) and name not in packages[: len(_folders)]
-    )
-
-
 def _is_needed(package: str) -> bool:
     return any(name.startswith(f"{package}.") for name in _only or ())
 
@@ -204,6 +198,8 @@ def _load_module(table: Table, kind: str, path: str, fatal: str) -> None:
     try:
         if fatal:
             raise ImportError(fatal)
+        if not path.startswith("bench."):
+            IMPORTED.add(path)
         module = importlib.import_module(path)
     except KeyboardInterrupt:
         raise
@@ -219,6 +215,7 @@ def _load_point(table: Table, kind: str, point: EntryPoint, fatal: str) -> None:
     try:
         if fatal:
             raise ImportError(fatal)
+        IMPORTED.add(point.module)
         with _protected(point.module):
             part = point.load()
         if isinstance(part, ModuleType):

@@ -37,7 +37,7 @@ CHILD_CODE = (
 
 
 def find_fatal_modules(
-    modules: Sequence[str], packages: Mapping[str, Path], timeout_s: float | None = None
+    modules: Sequence[str], packages: Mapping[str, Path], timeout_s: float = TIMEOUT_S
 ) -> dict[str, str]:
     """Return the failure message of each module that ended, blocked or changed the trial process, by module name.
 
@@ -47,7 +47,7 @@ def find_fatal_modules(
         return {}
     remaining, fatal = list(modules), {}
     while remaining:
-        failures = _try_imports(remaining, packages, TIMEOUT_S if timeout_s is None else timeout_s)
+        failures = _try_imports(remaining, packages, timeout_s)
         if not failures:  # if the process did not start, the import itself must report the cause
             break
         fatal |= {name: failure for name, failure in zip(remaining, failures, strict=False) if failure}

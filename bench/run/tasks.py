@@ -71,7 +71,7 @@ class TaskHandler:
         self._session = Session(experiment)
         self._study = study_of(experiment)
         self._state = isolation.ProcessState(double_precision=True, single_thread=single_thread)
-        RAN.update(registry.imported())
+        RAN.update(registry.IMPORTED)
         self.is_tainted = False
         """Whether later items need a new process."""
 
