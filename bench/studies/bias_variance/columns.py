@@ -49,11 +49,6 @@ COLUMNS = Columns.ordered(
     Column("estimates_s", "seconds of all estimates together", "s", table=False, measured=True),
     Column("compilations", "number of programs compiled for the cell", table=False, measured=True),
     text("shapes", "hashes of the requested programs", table=False, measured=True),
-    Column("sample_zeros", "share of single samples whose gradient term is exactly 0; empty where an estimate is not a "
-           "mean of terms", table=False),
-    Column("sample_low", "5% quantile of the norm of a single sample's term, of at most 100,000", table=False),
-    Column("sample_median", "median of that norm", table=False),
-    Column("sample_high", "95% quantile of that norm", table=False),
     numbers("point", "theta at which the gradient is taken, by coordinate", table=False),
     numbers("mean_estimate", "mean estimate, signed, by coordinate of theta", table=False),
     numbers("reference_gradient", "reference gradient, signed, by coordinate of theta", table=False),

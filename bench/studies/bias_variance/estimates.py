@@ -6,9 +6,7 @@ with samples or repeats, and the result is the same to the last digit for any nu
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -18,27 +16,8 @@ from bench.measure import noise
 from bench.measure.timing import Pause
 from bench.model import Auxiliaries, Problem, SampleMean, columns, per_repeat
 
-MOST_NORMS = 100_000
-"""Most norms of single terms to store for their quantiles: the first ones of each repeat, equally many per repeat."""
 MOST_TERMS = 1 << 25
 """Most numbers in the terms of one call (256 MiB): d per sample. With more, fewer repeats or samples share a call."""
-QUANTILES = {"sample_low": 0.05, "sample_median": 0.5, "sample_high": 0.95}
-"""Columns with quantiles of the norm of a single term, and the quantile of each."""
-
-
-@dataclass
-class Terms:
-    """Sums over the terms of one repeat."""
-
-    rest: Any = 0.0
-    """The sum of (term - common centre), ``(d,)``."""
-    square: float = 0.0
-    """The sum of the squared norms of the same."""
-    count: int = 0
-    zeros: int = 0
-    """Number of terms that are exactly 0."""
-    norms: list[np.ndarray] = field(default_factory=list)
-    """Norms of the first terms."""
 
 
 class Estimates:
@@ -58,7 +37,8 @@ class Estimates:
             noise.shared(cell.seed, cell.scene.name, cell.repeats, cell.samples, self._width) if fits else None
         )
         self._centre: np.ndarray | None = None
-        self._terms: dict[int, Terms] = {}
+        self._terms: dict[int, tuple[Any, float]] = {}
+        """Per repeat, the sum of (term - common centre), ``(d,)``, and the sum of its squared norms."""
 
     def of(self, start: int, stop: int) -> np.ndarray:
         """Return the estimates of repeats ``start`` to ``stop - 1``, ``(stop - start, d)``."""
@@ -82,18 +62,9 @@ class Estimates:
     def sums(self) -> tuple[np.ndarray, np.ndarray] | None:
         """Per repeat, the sum of (term - common centre) and the sum of its squared norms; None without single terms."""
         ordered = [self._terms[repeat] for repeat in sorted(self._terms)]
-        return (np.array([one.rest for one in ordered]), np.array([one.square for one in ordered])) if ordered else None
-
-    @property
-    def singles(self) -> dict[str, float]:
-        """The share of samples whose term is exactly 0, and quantiles of a term's norm; NaN without finite single terms."""
-        repeats = [self._terms[repeat] for repeat in sorted(self._terms)]
-        norms = np.concatenate([part for repeat in repeats for part in repeat.norms]) if repeats else np.empty(0)
-        if not np.isfinite(norms).all() or not norms.size:
-            return dict.fromkeys(("sample_zeros", *QUANTILES), math.nan)
-        zeros = sum(repeat.zeros for repeat in repeats) / sum(repeat.count for repeat in repeats)
-        values = np.quantile(norms, list(QUANTILES.values()))
-        return {"sample_zeros": zeros, **dict(zip(QUANTILES, values.tolist(), strict=True))}
+        return (
+            (np.array([rest for rest, _ in ordered]), np.array([square for _, square in ordered])) if ordered else None
+        )
 
     def parts(self, repeat: int) -> Iterator[np.ndarray]:
         """Return an iterator over the noise of one repeat, in parts ``(n_w, b)``."""
@@ -119,11 +90,11 @@ class Estimates:
         with self.pause:
             for i, repeat in enumerate(range(start, start + len(block))):
                 if repeat not in self._terms:
-                    self._terms[repeat] = self._added(Terms(), split[i].T)
+                    self._terms[repeat] = self._added((0.0, 0.0), split[i].T)
         return result
 
     def _mean_of_parts(self, estimator: SampleMean, repeat: int) -> np.ndarray:
-        total, parts, found = np.zeros(self._problem.dim), self._draw_parts(repeat), Terms()
+        total, parts, found = np.zeros(self._problem.dim), self._draw_parts(repeat), (0.0, 0.0)
         while True:
             with self.pause:
                 part = next(parts, None)
@@ -133,22 +104,17 @@ class Estimates:
             self._check_shape(terms, (self._problem.dim, part.shape[1]))
             total += terms.sum(axis=1)
             with self.pause:
-                self._added(found, terms)
+                found = self._added(found, terms)
         self._terms.setdefault(repeat, found)
         return total / self._cell.samples
 
-    def _added(self, found: Terms, terms: np.ndarray) -> Terms:
-        """Add terms ``(d, b)`` to the sums of their repeat, and return the sums. The first batch's mean is the centre."""
+    def _added(self, found: tuple[Any, float], terms: np.ndarray) -> tuple[Any, float]:
+        """Return the sums of a repeat with further terms ``(d, b)``. The first batch's mean is the centre."""
         if self._centre is None:
             self._centre = terms.mean(axis=1)
-        room = max(1, MOST_NORMS // self._cell.repeats) - sum(map(len, found.norms))
         with np.errstate(all="ignore"):
             rest = terms - self._centre[:, None]
-            found.rest, found.square = found.rest + rest.sum(axis=1), found.square + float(np.vdot(rest, rest))
-            found.norms.append(np.linalg.norm(terms[:, : max(0, room)], axis=0))
-        found.zeros += int((terms == 0.0).all(axis=0).sum())
-        found.count += terms.shape[1]
-        return found
+            return found[0] + rest.sum(axis=1), found[1] + float(np.vdot(rest, rest))
 
     def _as_float64(self, result: Any) -> np.ndarray:
         if np.iscomplexobj(result):  # a cast would silently drop the imaginary part

@@ -67,7 +67,6 @@ def measure(cell: Cell, session: Session, study: BiasVariance) -> dict[str, Any]
         "device": problem.device,
         "compilations": session.compilations.made,
         "shapes": " ".join(sorted(session.compilations.shapes)),
-        **estimates.singles,
         "point": theta.tolist(),
         "mean_estimate": values.mean(axis=0).tolist(),
         "reference_gradient": truth.gradient.tolist(),
