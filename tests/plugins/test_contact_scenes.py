@@ -1,6 +1,5 @@
 """Scenes of several contact modes against published numbers, exact motions and the central path."""
 
-import dataclasses
 import math
 from dataclasses import dataclass
 from typing import ClassVar
@@ -22,24 +21,6 @@ from classes import (
 from bench.model import ContactScene, State, compose, param
 
 # ------------------------------------------------------------------------------------------------ ground_wall
-
-
-@pytest.mark.parametrize(
-    "scene",
-    [GroundWall(), GroundWall(horizon=960), GroundWall(velocity_x=-1.0, gravity=3.0, restitution=0.6, horizon=700)],
-    ids=["source", "many_bounces", "no_wall"],
-)
-def test_ground_wall_physical_gradient(scene):
-    """It is that of the physical cost, and the checked number; the kit compares it with programs of finer steps."""
-    found, eps = scene.physical_gradient(), 1e-5
-    for name, slope in zip(("velocity_x", "velocity_y"), found, strict=True):
-        after, before = (
-            dataclasses.replace(scene, **{name: getattr(scene, name) + step}).physical_cost() for step in (eps, -eps)
-        )
-        # a smooth function between events: eps^2 of truncation, 1e-15 / eps of rounding
-        assert slope == pytest.approx((after - before) / (2 * eps), rel=1e-6, abs=1e-8)
-    if scene == GroundWall():
-        assert found == pytest.approx([-3.16627, -0.21223], rel=1e-4)
 
 
 def test_ground_wall_has_no_physical_gradient_at_rest():

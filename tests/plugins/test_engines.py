@@ -160,28 +160,6 @@ def test_reference_of_an_engine_is_its_own():
 
 
 @pytest.mark.slow
-def test_twins_study_measures_writes_and_draws(tmp_path):
-    words = [
-        "+experiment=twins",
-        "scenes=[pendulum,cartpole,bounce_once,tossed_box]",
-        "backends=[jax,mujoco]",
-        "samples=2",
-    ]
-    assert main([*words, f"results_dir={tmp_path}"]) == 0
-    written = {path.name for path in (tmp_path / "twins").iterdir()}
-    assert {"twins.csv", "twins.md", "twins.png", "report.html"} <= written
-    rows = pd.read_parquet(tmp_path / "twins" / "rows.parquet").set_index(["scene", "backend"])
-    assert (rows.xs("jax", level="backend")["status"] == "unsupported").all()
-    assert rows.loc[("tossed_box", "mujoco"), "status"] == "unsupported"
-    for name in ("pendulum", "bounce_once"):
-        row = rows.loc[(name, "mujoco")]
-        assert row["status"] == "ok"
-        assert row["state_difference"] < 1e-9
-        assert row["gradient_difference_rel"] < 1e-6
-        assert row["gradient_s"] > 0
-
-
-@pytest.mark.slow
 def test_scene_for_engines_is_traced_by_engines_only(tmp_path, capsys):
     assert main(["trace", "tossed_box", f"results_dir={tmp_path}"]) == 0
     printed = capsys.readouterr()

@@ -12,8 +12,6 @@ from classes import (
     EventDriven,
     ExplicitEuler,
     Implicit,
-    ImplicitEuler,
-    ImplicitMidpoint,
     Impulse,
     Jax,
     MassSpring,
@@ -54,9 +52,6 @@ def gradient(problem):
     return problem.grad(problem.program.theta0, quiet(problem))[:, 0]
 
 
-# ------------------------------------------------------------------------------------- planted faults, and sources
-
-
 # -------------------------------------------------------------------------------------------------- mass_spring
 
 
@@ -66,27 +61,6 @@ def test_mass_spring_gradient(integrator, damping):
     scene = MassSpring(damping=damping)
     problem = compiled(scene, integrator, backend=Torch())
     assert gradient(problem) == pytest.approx(scene.closed_form_gradient(None, integrator), rel=1e-9)
-
-
-STABILITY = {
-    ExplicitEuler: lambda z: 1 + z,
-    ImplicitEuler: lambda z: 1 / (1 - z),
-    Midpoint: lambda z: 1 + z + z**2 / 2,
-    Rk4: lambda z: 1 + z + z**2 / 2 + z**3 / 6 + z**4 / 24,
-    ImplicitMidpoint: lambda z: (1 + z / 2) / (1 - z / 2),
-}
-
-
-@pytest.mark.parametrize("integrator", STABILITY, ids=named)
-def test_stability_functions_are_those_of_the_literature(integrator):
-    """The kit compares them with steps (Hairer, Lubich, Wanner 2006, I.1 and IX.1)."""
-    for z in (-0.7, 0.5j):
-        assert integrator().amplification(z) == pytest.approx(STABILITY[integrator](z), rel=1e-12)
-
-
-def test_verlet_turns_an_oscillator_by_its_known_angle():
-    turn = np.angle(np.linalg.eigvals(StormerVerlet().transition(0.5, 1.0, 0.0, 1.0)))
-    assert abs(turn) == pytest.approx(math.acos(1 - 0.5**2 / 2), rel=1e-9)
 
 
 # ---------------------------------------------------------------------------------------------- double_pendulum
@@ -163,6 +137,3 @@ def test_event_driven_comes_to_rest():
     end = scene.target - math.sqrt(problem.value(scene.theta0(), quiet(problem))[0])
     assert -scene.horizon * scene.gravity * scene.dt**2 / 2 < end <= 0
     assert np.abs(gradient(problem)).max() < 0.01
-
-
-# ---------------------------------------------------------------------------------------------------- implicit

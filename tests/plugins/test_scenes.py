@@ -15,7 +15,6 @@ from classes import (
     Penalty,
     Pushing,
     SemiImplicitEuler,
-    WallPenalty1d,
 )
 
 from bench.model import compose
@@ -44,25 +43,6 @@ def test_cartpole_is_balanced():
 def test_bouncing_ball_at_rest_has_no_physical_gradient():
     assert BouncingBall(restitution=0.0).physical_gradient() is None
     assert BouncingBall(restitution=0.5, horizon=4000).physical_gradient() is None
-
-
-# ----------------------------------------------------------------------------------------- wall_penalty_1d
-
-
-def exact(starts):
-    return np.array([WallPenalty1d(start=s).physical_gradient()[0] for s in starts])
-
-
-def test_wall_exact_gradient():
-    """The values published, and how the pieces meet."""
-    rebound = math.exp(-0.5 * math.pi / math.sqrt(49.75))
-    assert rebound == pytest.approx(0.800354, rel=1e-6)
-    assert exact([0.1, 0.3, 0.31, 1.0, 1.55, 2.1]) == pytest.approx([-rebound, -rebound, *[rebound] * 3, -1.0])
-    edges = WallPenalty1d().breakpoints()[0]
-    assert edges == pytest.approx((0.0, 0.305149, 1.554597, 2.0, 3.0), abs=1e-6)
-    below, above = exact([e - 1e-9 for e in edges[2:4]]), exact([e + 1e-9 for e in edges[2:4]])
-    assert below == pytest.approx(above, abs=1e-6)  # the derivative is continuous there, to the offset
-    assert WallPenalty1d(start=-0.1).physical_gradient() is None
 
 
 # ------------------------------------------------------------------------------------------------- pushing

@@ -58,16 +58,6 @@ def test_with_the_exact_value_the_optimal_gain_is_a_fixed_point_at_every_length(
     assert abs(bare[0, 0]) > 0.01 * size  # without the value it is none
 
 
-def test_nothing_crosses_the_end_of_a_window():
-    """Without a value the first window's gradient does not see costs that come after it."""
-    problem = bench.problem("lqr[horizon=8]", backend="numpy")
-    dear = bench.problem("lqr[horizon=8,end_position=1000]", backend="numpy")
-    noise, theta = np.zeros((1, 1, 8)), np.full(8, 0.3)
-    near, far = (Windowed(steps=4).estimate(p, theta, noise)[0] for p in (problem, dear))
-    assert near[:4] == pytest.approx(far[:4], rel=1e-12)
-    assert abs(near[4:] - far[4:]).max() > 0.1
-
-
 def test_learned_value_takes_most_of_the_bias():
     problem = bench.problem("lqr[horizon=20,sigma=1]", backend="numpy")
     noise = np.random.default_rng(0).standard_normal((16, 64, 20))

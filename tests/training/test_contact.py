@@ -61,7 +61,7 @@ def test_a_contact_law_that_solves_an_equation_trains_on_the_implicit_backend():
     assert np.isnan(float(log["contact_force"]))
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_shac_learns_to_run_by_hopping():
     """A fifth of the steps of results/standard/train_hopper, whose shac runs 4 m/s; falling over gives a return below 100."""
     backend = registry.make("backends", "jax", {"dtype": "float32"})
