@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
-from bench.errors import STATUSES, UserError, printable, unknown
+from bench.errors import STATUSES, UserError, local_path, printable, unknown
 from bench.experiment.experiment import Budget, Choice, Execution, Experiment, TableLayout
 from bench.experiment.grid import COUNTS, check_axes, parameter_name, refuse_too_many, swept
 from bench.experiment.overrides import LISTS_AS, TABLES, Values, check_file, quoted
@@ -335,11 +335,7 @@ def _study(text: Any) -> Study:
 def _folder(value: Any) -> Path:
     if not isinstance(value, str | Path) or not str(value).strip():
         raise UserError(f"results_dir={value!r} must be a folder")
-    if "://" in str(value):
-        raise UserError(
-            f"results_dir={printable(value)} is an address, and results are written to a folder of this machine"
-        )
-    return Path(value).expanduser()
+    return local_path("results_dir", value)
 
 
 ROWS = ("estimator", "backend")
@@ -373,7 +369,7 @@ def _compile_cache(value: Any) -> Path | None:
     if value is None:
         return None
     if str(value) != "default":
-        return Path(str(value)).expanduser().absolute()
+        return local_path("compile_cache", value).absolute()
     base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     return Path(base) / "diffsim-bench" / "jax"
 
