@@ -119,8 +119,8 @@ def _stop_on_signals() -> Iterator[None]:
     """Make SIGTERM and SIGHUP stop a command like Ctrl-C; further signals are ignored, and left to the parent process.
 
     No finished row is lost, since rows are on disk and workers end with their run. In a finaliser or a callback of the
-    garbage collector, Python prints the KeyboardInterrupt and continues: since ``INTERRUPTED`` is set, the run stops after
-    the current cell.
+    garbage collector, such as JAX's, Python would print the KeyboardInterrupt and continue: it is not printed there, and
+    since ``INTERRUPTED`` is set, the run stops after the current cell.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -133,6 +133,12 @@ def _stop_on_signals() -> Iterator[None]:
         INTERRUPTED.set()
         raise KeyboardInterrupt
 
+    def hide_interrupt(unraisable: sys.UnraisableHookArgs, /) -> None:
+        if not (unraisable.exc_type is KeyboardInterrupt and INTERRUPTED.is_set()):
+            previous_hook(unraisable)
+
+    previous_hook = sys.unraisablehook
+    sys.unraisablehook = hide_interrupt
     handlers = {name: signal.getsignal(name) for name in names}
     for name in names:
         if handlers[name] not in (signal.SIG_IGN, None):  # ignored signals stay ignored, as under nohup
@@ -141,6 +147,8 @@ def _stop_on_signals() -> Iterator[None]:
         yield
     finally:
         INTERRUPTED.clear()
+        if sys.unraisablehook is hide_interrupt:
+            sys.unraisablehook = previous_hook
         for name, handler in handlers.items():
             if signal.getsignal(name) is stop:
                 signal.signal(name, handler)
