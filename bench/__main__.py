@@ -33,7 +33,8 @@ def command() -> None:
     if not channel:
         os._exit(_watched())  # without waiting for threads
     from bench.cli import main
-    from bench.model import guard
+    from bench.errors import printable
+    from bench.model import guard, registry
 
     descriptor, parent = map(int, channel.split())
     os.set_inheritable(descriptor, False)
@@ -44,8 +45,15 @@ def command() -> None:
     except MemoryError:
         print("bench: not enough memory: give the process more (4 GB suffice for most runs)", file=sys.stderr)
         status = 1
-    except Exception:  # a bug of this package
-        traceback.print_exc()
+    except Exception as error:  # a bug of this package, unless a plugin has changed the process
+        if outside := sorted(registry.IMPORTED):
+            place = traceback.extract_tb(error.__traceback__)[-1]
+            where = f"{printable(error)} ({place.filename}:{place.lineno})"
+            print(
+                f"bench: {type(error).__name__}: {where}; imported from outside: {', '.join(outside)}", file=sys.stderr
+            )
+        else:
+            traceback.print_exc()
         status = 1
     guard.exit_if_forked(pid)
     for stream in (sys.stdout, sys.stderr):

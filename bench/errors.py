@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import sys
 import threading
 import traceback
 from collections.abc import Iterable
 from difflib import get_close_matches
+from pathlib import Path
 from typing import Literal, get_args
 
 if sys.platform == "win32":
@@ -59,6 +61,13 @@ def printable(text: object) -> str:
     if not line.isprintable():
         line = "".join(c if c.isprintable() else " " for c in line)
     return " ".join(line.split())
+
+
+def local_path(setting: str, value: object) -> Path:
+    """Return the path in a setting, with ~ expanded; raises :class:`UserError` for an address such as ``s3://results``."""
+    if re.match(r"\w+:/", str(value)):
+        raise UserError(f"{setting}={printable(value)} is an address, and files are written on this machine")
+    return Path(str(value)).expanduser()
 
 
 def unknown(what: str, given: object, allowed: Iterable[str], see: str = "") -> UserError:

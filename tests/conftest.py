@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from browser import CHROMIUM, MISSING, chromium
 
-from bench.model import isolation, registry, trial
+from bench.model import registry, trial
 
 QUICK = (
     "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false --xla_llvm_disable_expensive_passes=true "
@@ -77,7 +77,8 @@ def remove_plugin_folders():
     """Remove the plugin folders that a test added, with their plugins, and forget that their code has run."""
     before = registry.folders()
     yield
-    isolation.BY_IMPORTS.clear()
+    registry._environment.clear()
+    registry.IMPORTED.clear()
     if tasks := sys.modules.get("bench.run.tasks"):
         tasks.RAN.clear()
     if registry.folders() != before:

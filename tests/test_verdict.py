@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -114,6 +115,88 @@ def test_a_plugin_that_ends_the_process_gives_no_status(verb, tmp_path):
         status, said = status_of(tmp_path, verb, *VERBS[verb], f"plugins={tmp_path / 'mine'}")
         assert status == expected, said
         assert ("before a verdict" in said) == (expected == 3)
+
+
+ENDS_IMPORT = 'import os\nif "BENCH_TRIAL" not in os.environ: os._exit(0)\n'
+"""A plugin file that ends the process of a command that imports it."""
+
+
+@pytest.fixture(scope="module")
+def ending(tmp_path_factory):
+    """A folder with rows of a run, and a folder of plugins beside it that ends commands."""
+    folder = tmp_path_factory.mktemp("ending")
+    words = ["scenes=[quadratic]", "backends=[numpy]", "estimators=[fobg]", "samples=8", "repeats=4", "timing=false"]
+    assert main([*words, "workers=0", "--quiet", f"results_dir={folder / 'rows'}"]) == 0
+    (folder / "mine").mkdir()
+    (folder / "mine" / "ends.py").write_text(ENDS_IMPORT)
+    return folder
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["engines"],
+        *(
+            pytest.param(words.split(), marks=pytest.mark.slow)
+            for words in ("compare rows rows", "history rows rows", "claims --list")
+        ),
+    ],
+)
+def test_no_verb_answers_for_a_file_that_ends_its_process(words, ending):
+    status, said = status_of(ending, *words, f"plugins={ending / 'mine'}")
+    assert status == 3
+    assert "before a verdict" in said
+
+
+@pytest.mark.parametrize(
+    ("status", "words"),
+    [
+        (0, "compare rows rows"), (2, "compare rows nothing"), (2, "compare rows"), (0, "history rows rows"), (2, "history rows"),
+        (0, "index rows"), (2, "index nothing"), (2, "index --all"), (0, "claims --list"), (2, "claims nothing"), (0, "engines"),
+        (2, "engines install nothing"), (2, "engines --all"),
+    ],
+)  # fmt: skip
+def test_statuses_of_the_other_verbs(status, words, ending, monkeypatch):
+    monkeypatch.chdir(ending)
+    assert main(words.split()) == status
+
+
+RAISES = """
+import sys
+import bench.__main__ as command
+from bench.model import registry
+
+def main():
+    if sys.argv[2:]:
+        registry.add_folder(registry.Path(sys.argv[2]))
+        registry.entries()
+    {raises}
+
+command.main = main
+command.command()
+"""
+
+
+@pytest.mark.parametrize(
+    ("raises", "said"),
+    [("raise MemoryError", "bench: not enough memory"), pytest.param("1 / 0", "Traceback", marks=pytest.mark.slow)],
+)
+def test_a_command_without_memory_and_one_with_a_bug_end_with_1(raises, said, tmp_path):
+    done = subprocess.run([sys.executable, "-c", RAISES.format(raises=raises)], capture_output=True, text=True)
+    assert done.returncode == 1
+    assert said in done.stderr
+
+
+@pytest.mark.slow
+def test_an_error_beside_code_from_outside_names_it_in_a_line(tmp_path):
+    (tmp_path / "outside.py").write_text("")
+    code = RAISES.format(raises="1 / 0")
+    done = subprocess.run([sys.executable, "-c", code, "", str(tmp_path)], capture_output=True, text=True)
+    assert done.returncode == 1
+    assert "Traceback" not in done.stderr
+    assert re.search(
+        r"ZeroDivisionError: division by zero \(.*:\d+\); imported from outside: \w+\.outside", done.stderr
+    )
 
 
 FORKS = """if os.fork():

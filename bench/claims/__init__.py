@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 
 from bench.claims.claim import NOT_REPRODUCED, Claim, Figure, Outcome
-from bench.errors import printable
+from bench.errors import local_path, printable
 
 __all__ = ["Claim", "Figure", "Outcome", "main"]
 
@@ -27,7 +26,7 @@ def main(words: Sequence[str]) -> int:
         for line in tables.list_lines(selected):
             print(printable(line) if not line.startswith("  ") else f"  {printable(line)}")
         return 0
-    directory = Path(settings["results_dir"]).expanduser() / "claims"
+    directory = local_path("results_dir", settings["results_dir"]) / "claims"
     make_directory(directory)
     by_name = {name: results.read(directory, claim) for name, claim in claims.items()}
     for claim in selected:

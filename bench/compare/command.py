@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import pandas as pd
 
@@ -11,7 +10,7 @@ from bench.compare.cells import assumed_defaults, compare_cells
 from bench.compare.report import Comparison, show, write
 from bench.compare.sources import Results, read_results
 from bench.compare.timings import RUNS
-from bench.errors import UserError
+from bench.errors import UserError, local_path
 from bench.experiment.columns import Column
 from bench.experiment.words import parse_flag, parse_words
 
@@ -24,9 +23,9 @@ def main(words: Sequence[str]) -> int:
         raise UserError(
             "name two results: python -m bench compare BEFORE AFTER (directories, or revisions as REV or REV:PATH)"
         )
-    timings = bool(options) or parse_flag(settings, "timings")
+    timings, out = bool(options) or parse_flag(settings, "timings"), local_path("out", settings["out"])
     comparison = compare_results(names[0], names[1], timings, tuple(filter(None, settings["again"].split(","))))
-    show(comparison, write(comparison, Path(settings["out"]).expanduser()))
+    show(comparison, write(comparison, out))
     return int(comparison.worse)
 
 

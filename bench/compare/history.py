@@ -14,7 +14,7 @@ import pandas as pd
 from bench.compare.cells import rows_by_cell
 from bench.compare.judging import ROUNDING, Row, distance, rule_of, value
 from bench.compare.sources import Results, read_results
-from bench.errors import UserError
+from bench.errors import UserError, local_path
 from bench.experiment.columns import Column, text
 from bench.experiment.views import Chart, Mark, Table, Views
 from bench.experiment.words import parse_words
@@ -58,7 +58,8 @@ def main(words: Sequence[str]) -> int:
     names, settings, _ = parse_words(words, "history", {"out": "runs/history"})
     if len(names) < 2:
         raise UserError("name two results or more, the oldest first: python -m bench history DIR DIR ... [out=DIR]")
-    for path in write(compute_history(names, [*map(read_results, names)]), Path(settings["out"]).expanduser()):
+    out = local_path("out", settings["out"])
+    for path in write(compute_history(names, [*map(read_results, names)]), out):
         print(f"  {path}")
     return 0
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from bench.engines import environments, table
 from bench.engines.backend import EngineBackend
-from bench.errors import UserError, printable, unknown
+from bench.errors import UserError, local_path, printable, unknown
 from bench.model import registry
 
 USAGE = (
@@ -24,7 +24,7 @@ def main(words: Sequence[str]) -> int:
         if word.startswith("plugins="):
             registry.add_folder(Path(word.partition("=")[2]))
         elif word.startswith("out="):
-            out = Path(word.partition("=")[2])
+            out = local_path("out", word.partition("=")[2])
     names = [word for word in words if not word.startswith(("plugins=", "out=", "--"))]
     if strange := [word for word in words if word.startswith("--") and word != "--again"]:
         raise UserError(f"engines: unknown option {strange[0]} (allowed: --again): {USAGE}")

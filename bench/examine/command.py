@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.errors import UserError, unknown
+from bench.errors import UserError, local_path, unknown
 from bench.examine.examination import examine
 from bench.examine.report import Report
 from bench.model.simulator import imports
@@ -43,6 +43,8 @@ def run(words: Sequence[str]) -> Report:
     for key in settings:
         if key not in SETTINGS:
             raise unknown("setting of examine", key, SETTINGS)
+        if key in FILES:
+            local_path(key, settings[key])
     report = _examined(names[0], settings, QUIET not in words)
     print(_wrapped(str(report)))
     if "save" in settings:

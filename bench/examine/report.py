@@ -7,7 +7,7 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
-from bench.errors import UserError, unknown
+from bench.errors import UserError, local_path, unknown
 from bench.examine import baseline, text
 from bench.examine.findings import Findings
 
@@ -64,7 +64,7 @@ class Report(Findings):
 
         The compared report has status 0 where it is not worse than the baseline.
         """
-        path = Path(file).expanduser()
+        path = local_path("baseline", file)
         before = baseline.read_baseline(path)
         if before is None:
             baseline.write_baseline(path, self)
@@ -77,4 +77,4 @@ class Report(Findings):
         # importing charts and tables takes a second, which a report without files does not need
         from bench.examine import files
 
-        return files.write(self, Path(directory).expanduser())
+        return files.write(self, local_path("save", directory))

@@ -245,7 +245,8 @@ class Cell:
 
     def program(self) -> Program:
         """Compose the program; raises :class:`Unsupported` if the parts do not fit together."""
-        return compose(self.scene, self.contact, self.integrator, self.decision)
+        study = cast(Any, self.study)  # a Study, whose module imports this one
+        return compose(self.scene, self.contact, self.integrator, study.decision(self.decision))
 
     def refusal(self) -> tuple[str, str] | None:
         """Return status and reason if this cell cannot run, or None; an error raised by a plugin is a reason."""

@@ -10,10 +10,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
-from bench.errors import STATUSES, UserError, printable, unknown
+from bench.errors import STATUSES, UserError, local_path, printable, unknown
 from bench.experiment.experiment import Budget, Choice, Execution, Experiment, TableLayout
 from bench.experiment.grid import COUNTS, check_axes, parameter_name, refuse_too_many, swept
-from bench.experiment.overrides import LISTS_AS, Values, check_file, quoted
+from bench.experiment.overrides import LISTS_AS, TABLES, Values, check_file, quoted
 from bench.experiment.study import Study
 from bench.model import Decision, MechanicalScene, Plugin, guard, registry
 from bench.model.identity import parse_identity, split_items
@@ -193,12 +193,11 @@ def _to_hydra(override: str, config_dirs: Sequence[Path], values: Values) -> str
         return f"++{bare}={_quote_identities(value)}"
     if bare == "study":
         return f"study={_quote_identities(value)[1:-1]}"
-    if head in map(singular, kinds) or head in ("sweep", "marks", "ray"):
-        return f"++{bare}={value}"
-    if bare != head and (head not in ("reference", "table") or bare.count(".") > 1):
+    tables = {*map(singular, kinds), *TABLES}
+    if bare != head and (head not in tables or (head in ("reference", "table") and bare.count(".") > 1)):
         whole = bare.rpartition(".")[0]
         raise UserError(f"'{bare}' is not a setting: '{whole}' has no settings of its own")
-    return f"{bare}={value}"
+    return f"{'++' if head in tables else ''}{bare}={value}"
 
 
 def _refuse_unread(experiment: Experiment, overrides: Sequence[str]) -> None:
@@ -336,11 +335,7 @@ def _study(text: Any) -> Study:
 def _folder(value: Any) -> Path:
     if not isinstance(value, str | Path) or not str(value).strip():
         raise UserError(f"results_dir={value!r} must be a folder")
-    if "://" in str(value):
-        raise UserError(
-            f"results_dir={printable(value)} is an address, and results are written to a folder of this machine"
-        )
-    return Path(value).expanduser()
+    return local_path("results_dir", value)
 
 
 ROWS = ("estimator", "backend")
@@ -374,7 +369,7 @@ def _compile_cache(value: Any) -> Path | None:
     if value is None:
         return None
     if str(value) != "default":
-        return Path(str(value)).expanduser().absolute()
+        return local_path("compile_cache", value).absolute()
     base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     return Path(base) / "diffsim-bench" / "jax"
 

@@ -250,7 +250,7 @@ class _Expansion:
             return dataclasses.replace(decision, at=given[THETA])
         try:
             scene, contact, integrator = (parts.get(axis) for axis in ("scene", "contact", "integrator"))
-            at = compose(scene, contact, integrator, decision).theta0.tolist()  # type: ignore[arg-type]
+            at = compose(scene, contact, integrator, study_of(self._experiment).decision(decision)).theta0.tolist()  # type: ignore[arg-type]
         except (Unsupported, UserError):  # the cell reports the error in its row
             return decision
         for name, values in given.items():

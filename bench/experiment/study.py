@@ -13,6 +13,7 @@ from bench.experiment.columns import Columns
 from bench.experiment.experiment import Experiment
 from bench.experiment.session import Session
 from bench.experiment.views import Views
+from bench.model import Decision
 from bench.model.parameters import Plugin
 
 if TYPE_CHECKING:
@@ -44,6 +45,10 @@ class Study(Plugin):
 
     def parts(self, given: dict[str, Plugin | None]) -> dict[str, Plugin | None]:
         """Return a cell's plugins by axis, without plugins that do not affect its results; by default all of ``given``."""
+        return given
+
+    def decision(self, given: Decision) -> Decision:
+        """Return the part of theta that programs have; by default all of it."""
         return given
 
     def unsupported_reason(self, cell: Cell) -> str | None:

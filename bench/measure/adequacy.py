@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.fft import dct
+from scipy.linalg import toeplitz
 from scipy.special import chdtri, ndtri, stdtrit
 
 DRAWS = 2000
@@ -146,11 +147,10 @@ def variances(
     if min(length, free) < FEWEST or length * float(correlations @ correlations) <= chdtri(channels, LEVEL):
         return variance, "own size" if is_own else "stated", quantile
     gain, slopes = np.linalg.pinv(jacobian).reshape(r, length, channels), jacobian.reshape(length, channels, r)
-    apart = np.abs(np.arange(length)[:, None] - np.arange(length))
     total = np.zeros(r)
     for c, rho in enumerate(correlations):
         rho = min(max(rho + (1.0 + 4.0 * rho + per_channel * (1.0 + rho)) / length, 0.0), 0.99)
-        spread = gain[:, :, c] @ rho**apart
+        spread = gain[:, :, c] @ toeplitz(rho ** np.arange(length))
         # a fit absorbs part of slow noise, which lowers the variance of the residuals
         rest = length - float((spread * slopes[:, c].T).sum())
         size = power[c] / max(length - per_channel, 1.0) * length / max(rest, 0.5 * length)

@@ -24,11 +24,6 @@ class Information:
     names: tuple[str, ...]
     jacobian: np.ndarray
 
-    @property
-    def fisher(self) -> np.ndarray:
-        """The Fisher information of the logarithms, ``(p, p)``."""
-        return np.asarray(self.jacobian.T @ self.jacobian)
-
     @cached_property
     def rank(self) -> int:
         """Number of identifiable directions."""

@@ -38,11 +38,13 @@ def exit_if_forked(pid: int) -> None:
 
 @contextlib.contextmanager
 def protect_process() -> Iterator[None]:
-    """Restore the working folder after plugin code in the block, and exit processes that the plugin has forked.
+    """Restore the working folder and the import path after plugin code in the block, and exit processes that it has forked.
+
+    What the plugin has added to the import path follows it.
 
     Raises KeyboardInterrupt at the end if the plugin has swallowed one.
     """
-    pid, folder = os.getpid(), _working_folder()
+    pid, folder, path = os.getpid(), _working_folder(), [*sys.path]
     try:
         yield
     except KeyboardInterrupt:
@@ -52,6 +54,7 @@ def protect_process() -> Iterator[None]:
         exit_if_forked(pid)
         if folder and _working_folder() != folder:
             os.chdir(folder)
+        sys.path[:] = dict.fromkeys([*path, *sys.path])
     raise_pending_interrupt()
 
 

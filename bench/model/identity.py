@@ -51,7 +51,7 @@ def parse_identity(text: str) -> tuple[str, dict[str, Any]]:
             if not equals:
                 raise UserError(f"'{item}' in '{text}' is not parameter=value")
             try:
-                raw[key.strip()] = yaml.safe_load(value)
+                raw[key.strip()] = value if value.startswith("{") else yaml.safe_load(value)
             except (yaml.YAMLError, ValueError, RecursionError):  # ValueError: an invalid date
                 raise UserError(
                     f"'{value}' in '{printable(text)[:200]}' is not a value: write parameter=value"
@@ -67,7 +67,7 @@ def split_items(text: str) -> list[str]:
     """
     parts, depth = [""], 0
     for character in text:
-        depth += {"[": 1, "]": -1}.get(character, 0)
+        depth += {"[": 1, "{": 1, "]": -1, "}": -1}.get(character, 0)
         if character == "," and depth == 0:
             parts.append("")
         else:

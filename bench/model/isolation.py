@@ -9,14 +9,12 @@ from __future__ import annotations
 import os
 import random
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
+from contextlib import ExitStack
 from typing import Any
 
 import numpy as np
 from threadpoolctl import ThreadpoolController, threadpool_limits
-
-from bench.errors import printable
 
 JAX = (
     "jax_enable_x64", "jax_default_matmul_precision", "jax_numpy_dtype_promotion", "jax_default_prng_impl",
@@ -37,6 +35,8 @@ SETTINGS: dict[str, tuple[str, Callable[[Any], Any]]] = {
     "the seed of random": ("random", lambda _: random.getstate()),
     DRAWN: ("numpy", lambda _: _numpy_generator()),
     "the seed of torch": ("torch", lambda torch: torch.random.get_rng_state().numpy().tobytes()),
+    "the rounding of numbers": ("sys", lambda _: [x / k for x in (1.0, 1e-308) for k in (3.0, -3.0, 7.0)]),
+    "NumPy's print options": ("numpy", lambda numpy: numpy.get_printoptions()),
     "NumPy's error state": ("numpy", lambda numpy: numpy.geterr()),
     "SciPy's error state": ("scipy.special", lambda special: special.geterr()),
     "JAX's configuration": ("jax", lambda jax: {name: jax.config.values.get(name) for name in JAX}),
@@ -46,8 +46,6 @@ SETTINGS: dict[str, tuple[str, Callable[[Any], Any]]] = {
 }
 """The settings that are compared: their library, and how they are read."""
 THREADS = "the threads of linear algebra"
-BY_IMPORTS: list[str] = []
-"""Changes by files from outside while they were imported in this process."""
 
 
 class ProcessState:
@@ -110,20 +108,6 @@ def _read(name: str) -> Any:
         return read(sys.modules[library])
     except Exception as error:
         return repr(error)
-
-
-@contextmanager
-def named_changes(source: str) -> Iterator[None]:
-    """Print what code in the block changes on one line of stderr, and add it to :data:`BY_IMPORTS`."""
-    state = ProcessState()
-    try:
-        yield
-    finally:
-        changes = state.changes()
-        state.close()
-        if changes:
-            BY_IMPORTS.append(f"{'; '.join(changes)} (by {source})")
-            print(f"bench: {source} changed {printable('; '.join(changes))}", file=sys.stderr)
 
 
 def reduced_precision() -> bool:

@@ -13,13 +13,14 @@ import importlib
 import importlib.machinery
 import importlib.util
 import inspect
+import os
 import pkgutil
 import re
 import sys
 import types
 import typing
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
@@ -28,7 +29,7 @@ from types import ModuleType
 from typing import Any
 
 from bench.errors import UserError, printable, unknown
-from bench.model import guard, isolation, trial
+from bench.model import guard, trial
 from bench.model.parameters import Plugin, build, parameters, remember, singular
 
 CORE = "bench.studies"
@@ -65,6 +66,10 @@ class Entry:
 
 Table = dict[str, dict[str, Entry]]
 _folders: list[Path] = []
+_environment: dict[str, str | None] = {}
+"""Variables of the environment that imports from outside have changed, with their values before."""
+IMPORTED: set[str] = set()
+"""The modules from outside that this process has imported."""
 _only: frozenset[str] | None = None
 """The only modules from outside that are loaded; None for all."""
 
@@ -127,14 +132,19 @@ def entries() -> Table:
 
 @contextmanager
 def _protected(module: str) -> Iterator[None]:
-    """Name what the import of a module changes in this process, and quote what it prints."""
-    source = f"{module}, while it was imported,"
-    with ExitStack() as stack:
-        if not module.startswith("bench."):
-            stack.enter_context(isolation.named_changes(source))
-        stack.enter_context(guard.capture_output(source))
-        stack.enter_context(guard.protect_process())
-        yield
+    """Quote what the import of a module prints, and keep what it changes in the environment from new processes."""
+    before = dict(os.environ)
+    with guard.capture_output(f"{module}, while it was imported,"), guard.protect_process():
+        try:
+            yield
+        finally:
+            changed = {name for name in before | os.environ if before.get(name) != os.environ.get(name)}
+            _environment.update({name: before.get(name) for name in changed - _environment.keys()})
+
+
+def environment() -> dict[str, str]:
+    """Return the environment of new processes: without what imports from outside have changed in it."""
+    return {name: value for name, value in (os.environ | _environment).items() if value is not None}
 
 
 def _is_needed(package: str) -> bool:
@@ -188,6 +198,8 @@ def _load_module(table: Table, kind: str, path: str, fatal: str) -> None:
     try:
         if fatal:
             raise ImportError(fatal)
+        if not path.startswith("bench."):
+            IMPORTED.add(path)
         module = importlib.import_module(path)
     except KeyboardInterrupt:
         raise
@@ -203,6 +215,7 @@ def _load_point(table: Table, kind: str, point: EntryPoint, fatal: str) -> None:
     try:
         if fatal:
             raise ImportError(fatal)
+        IMPORTED.add(point.module)
         with _protected(point.module):
             part = point.load()
         if isinstance(part, ModuleType):

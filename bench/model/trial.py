@@ -1,7 +1,8 @@
-"""Imports plugin files from outside in a separate process first, so that a file that crashes cannot end a command.
+"""Imports plugin files from outside in a separate process first, so that no import can end or change a command.
 
-A crash, ``os._exit`` or an endless loop cannot be caught within its own process. A child process therefore imports each file,
-once in a command, and writes a byte before each: the last one is the file that has ended it.
+A crash, ``os._exit`` or an endless loop cannot be caught within its own process, and a replaced function or another error
+state would reach the rows of other plugins. A child process therefore imports each file, once in a command. It starts a line
+before each, so the last one is the file that has ended it, and writes what the import has changed.
 """
 
 from __future__ import annotations
@@ -14,18 +15,21 @@ import selectors
 import signal
 import subprocess
 import sys
-import time
+import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from bench.model import guard
+from bench.errors import printable
+from bench.model import guard, isolation
 
 TIMEOUT_S = 60.0
 """Time limit of the import of a file, in seconds."""
 MARK = "BENCH_TRIAL"
 """Environment variable of a trial process and all processes that it starts."""
+SHARED = ("bench", "builtins", "json", "math", "numpy", "os", "pandas", "pickle", "scipy")
+"""Packages whose functions a file must not replace."""
 CHILD_CODE = (
     "import json, sys; job = json.load(sys.stdin); sys.path[:] = job['path']; "
     "import bench.model.trial as trial; trial.run_child(job)"
@@ -33,26 +37,27 @@ CHILD_CODE = (
 
 
 def find_fatal_modules(
-    modules: Sequence[str], packages: Mapping[str, Path], timeout_s: float | None = None
+    modules: Sequence[str], packages: Mapping[str, Path], timeout_s: float = TIMEOUT_S
 ) -> dict[str, str]:
-    """Return the failure message of each module that ended or blocked the trial process, by module name.
+    """Return the failure message of each module that ended, blocked or changed the trial process, by module name.
 
     ``packages`` maps package names of plugin folders to the folders. A module that only raises an exception is not fatal.
     """
     if MARK in os.environ:  # a module of a plugin folder that adds folders itself would start trials without end
         return {}
-    remaining, fatal = list(modules), {}
+    remaining = list(modules)
+    fatal: dict[str, str] = {}
     while remaining:
-        n_started, failure = _try_imports(remaining, packages, TIMEOUT_S if timeout_s is None else timeout_s)
-        if not failure or not n_started:  # if the process did not start, the import itself must report the cause
+        failures = _try_imports(remaining, packages, timeout_s)
+        if not failures:  # if the process did not start, the import itself must report the cause
             break
-        fatal[remaining[n_started - 1]] = failure
-        remaining = remaining[n_started:]
+        fatal |= {name: failure for name, failure in zip(remaining, failures, strict=False) if failure}
+        remaining = remaining[len(failures) :]
     return fatal
 
 
 def run_child(job: Mapping[str, Any]) -> None:
-    """Run the trial process: import modules one by one, writing a byte to the pipe before each."""
+    """Run the trial process: import modules one by one, writing a line to the pipe for each."""
     os.environ[MARK] = "1"
     pid = os.getpid()
     pipe = os.dup(1)
@@ -63,17 +68,30 @@ def run_child(job: Mapping[str, Any]) -> None:
         sys.modules[name] = package = ModuleType(name)
         package.__path__ = [folder]
     for name in job["modules"]:
-        os.write(pipe, b".")
+        os.write(pipe, b"\n")
+        state, functions, n_threads = isolation.ProcessState(), _functions(), threading.active_count()
         with contextlib.suppress(BaseException):  # the registry imports the module again and lists its error
             importlib.import_module(name)
         guard.exit_if_forked(pid)
         guard.kill_children()
-    os.write(pipe, b"!")
+        now = _functions()
+        replaced = [key for key, function in functions.items() if now.get(key) is not function]
+        changes = [*state.changes(), *replaced[:1], *["the running threads"] * (threading.active_count() > n_threads)]
+        os.write(pipe, printable("; ".join(changes)).encode())
+        if changes:  # later files are imported in another process
+            break
+    os.write(pipe, b"\n!")
     os._exit(0)  # without waiting for threads that a plugin has left running
 
 
-def _try_imports(names: Sequence[str], packages: Mapping[str, Path], timeout_s: float) -> tuple[int, str]:
-    """Return the number of modules started in a trial process, and how the last one failed (empty if all passed)."""
+def _functions() -> dict[str, Any]:
+    """Return the functions and classes of the modules of :data:`SHARED` by their full names."""
+    modules = [(name, module) for name, module in sys.modules.items() if name.partition(".")[0] in SHARED and module]
+    return {f"{name}.{key}": part for name, module in modules for key, part in vars(module).items() if callable(part)}
+
+
+def _try_imports(names: Sequence[str], packages: Mapping[str, Path], timeout_s: float) -> list[str]:
+    """Return how each module that was started in a trial process failed, an empty text if it passed."""
     command = [sys.executable, "-c", CHILD_CODE]
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
     job = {
@@ -86,25 +104,28 @@ def _try_imports(names: Sequence[str], packages: Mapping[str, Path], timeout_s: 
             process.stdin.write(json.dumps(job).encode())
             process.stdin.close()
         except BrokenPipeError:
-            return 0, "did not start"
-        n_started, received = 0, b""
+            return []
+        output, cause = b"", ""
         try:
             with selectors.DefaultSelector() as selector:
                 selector.register(process.stdout, selectors.EVENT_READ)
-                deadline = time.monotonic() + timeout_s
-                while selector.select(max(0.0, deadline - time.monotonic())):
-                    received = os.read(process.stdout.fileno(), 4096)
-                    n_started += received.count(b".")
-                    if not received or received.endswith(b"!"):
+                while not output.endswith(b"\n!"):
+                    if not selector.select(timeout_s):
+                        cause = f"did not return within {timeout_s:g} s"
                         break
-                    deadline = time.monotonic() + timeout_s
-                else:
-                    return n_started, f"did not return within {timeout_s:g} s when it was imported"
+                    received = os.read(process.stdout.fileno(), 4096)
+                    if not received:
+                        break
+                    output += received
         finally:
             _terminate(process)
+    *changes, last = output.decode().split("\n")[1:] or [""]
+    failures = [f"changed {text} when it was imported" * bool(text) for text in changes]
+    if last == "!" or not output:
+        return failures
     code = process.returncode
-    cause = f"by {signal.Signals(-code).name}" if code < 0 else f"(exit status {code})"
-    return n_started, "" if received.endswith(b"!") else f"ended the process {cause} when it was imported"
+    cause = cause or f"ended the process {f'by {signal.Signals(-code).name}' if code < 0 else f'(exit status {code})'}"
+    return [*failures, f"{cause} when it was imported"]
 
 
 def _terminate(process: subprocess.Popen[bytes]) -> None:

@@ -14,7 +14,7 @@ from urllib.parse import quote
 
 import pandas as pd
 
-from bench.errors import UserError
+from bench.errors import UserError, local_path
 from bench.report.text import counted
 from bench.report.web import shell
 from bench.run.files import write_whole
@@ -142,6 +142,6 @@ def main(words: Sequence[str]) -> int:
     """Write the index of the folder in ``words``, by default ``results``, and return the exit status 0."""
     if len(words) > 1 or any(word.startswith("-") or "=" in word for word in words):
         raise UserError("name one folder of results: python -m bench index [DIR]")
-    path = write(Path(words[0] if words else "results").expanduser())
+    path = write(local_path("DIR", words[0] if words else "results"))
     print(f"  {path}")
     return 0

@@ -28,7 +28,7 @@ from typing import IO, Any, Literal
 import psutil
 
 from bench.errors import STATUSES, StorageError, UserError, describe_exit, failure
-from bench.model import guard
+from bench.model import guard, registry
 from bench.run.reaper import MARK, Reaper, kill_marked_processes
 from bench.run.worker import Handler, command
 
@@ -340,7 +340,7 @@ class Pool:
         process = subprocess.Popen(
             command(theirs.fileno()), pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL,
             stdout=output, stderr=output, start_new_session=True,
-            env=os.environ | {MARK: mark} | (SINGLE_THREAD if self._single_thread else {}),
+            env=registry.environment() | {MARK: mark} | (SINGLE_THREAD if self._single_thread else {}),
         )  # fmt: skip
         # a socket reports its end only when every copy of the other side is closed, including this copy
         theirs.close()

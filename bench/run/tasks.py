@@ -71,6 +71,7 @@ class TaskHandler:
         self._session = Session(experiment)
         self._study = study_of(experiment)
         self._state = isolation.ProcessState(double_precision=True, single_thread=single_thread)
+        RAN.update(registry.IMPORTED)
         self.is_tainted = False
         """Whether later items need a new process."""
 
@@ -99,7 +100,7 @@ class TaskHandler:
         RAN.update(item.outside)
         result = self._handle(item)
         remarks = []
-        if changes := [*isolation.BY_IMPORTS, *self._state.changes()]:
+        if changes := self._state.changes():
             remarks.append(f"settings changed in this process: {printable('; '.join(changes))}")
             if (
                 result.get("dtype", item.cell.backend.dtype) == "float64"

@@ -135,7 +135,8 @@ def test_a_name_that_nothing_reads_is_refused_with_the_nearest_one(capsys, word,
         (["plan", "+experiment=quick,twins"], "python -m bench +experiment=quick && python -m bench +experiment=twins"),
         (["stiffness_sweep", "samples=8"], "python -m bench +experiment=stiffness_sweep samples=8"),
         (["plan", "stiffness_sweep"], "write +experiment=stiffness_sweep"), (["plan", *BASE, "samples=[16,32]"], "write sweep.samples=[...]"),
-        (["plan", *BASE, "name=standard"], "name=standard is reserved"), (["plan", *BASE, "name=references"], "is reserved"),
+        *((["plan", *BASE, f"name={name}"], f"name={name} is reserved") for name in ("claims", "references", "standard", "trace")),
+        *((["plan", *BASE, f"plugins={none}"], f"plugins={none} names no folder; the current one is plugins=.") for none in ("", "''")),
         (["plan", *BASE, "scenes=[zzz]"], "python -m bench list scenes)"), (["check", "zzz"], "python -m bench list)"),
     ],
 )  # fmt: skip
@@ -145,6 +146,27 @@ def test_a_message_names_the_fix(capsys, words, said):
     assert said in line
     assert not ("zzz" in line and "did you mean" in line)
     assert len(line) < 400
+
+
+ADDRESS = "is an address, and files are written on this machine"
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "plan results_dir={}", "plan compile_cache={}", "claims --quick results_dir={}", "compare a b out={}", "history a b out={}", "index {}",
+        "engines out={}", *(f"examine a.py:cost {key}={{}}" for key in ("baseline", "save")),
+    ],
+)  # fmt: skip
+def test_no_file_is_written_to_an_address(words, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main([*words.format("s3://rows").split(), *BASE * words.startswith("plan")]) == 2
+    assert ADDRESS in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_empty_list_of_plugins_is_none():
+    assert load(["plugins=[]"]).plugins == load([]).plugins == ()
 
 
 def test_a_folder_with_an_accent_needs_no_quotes():

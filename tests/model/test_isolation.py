@@ -2,6 +2,7 @@
 
 import importlib
 import random
+import re
 import subprocess
 import sys
 from contextlib import contextmanager
@@ -10,11 +11,11 @@ import jax
 import numpy as np
 import pandas as pd
 import pytest
-from changes import CHANGES, plugin
+from changes import CHANGES, REPLACES, plugin
 from threadpoolctl import ThreadpoolController, threadpool_limits
 
 from bench.experiment.config import load
-from bench.model import isolation, registry
+from bench.model import registry
 from bench.model.isolation import ProcessState
 from bench.run import tasks
 from bench.run.execute import execute
@@ -87,7 +88,7 @@ def test_a_change_reaches_no_other_cell_of_a_worker(tmp_path):
 
 
 def test_in_this_process_cells_after_other_code_say_so(tmp_path):
-    """Cells of this package come first, so that each later cell names the code that ran before it."""
+    """Cells of this package come first, and every cell names the code that was imported or ran before it."""
     kinds = ["seed", "sqrt"]
     root, root_of_numpy = random.getstate(), np.sqrt
     try:
@@ -96,8 +97,9 @@ def test_in_this_process_cells_after_other_code_say_so(tmp_path):
     finally:
         random.setstate(root)
         np.sqrt = root_of_numpy
-    check_rows(rows, kinds, clean)
-    assert "also run code of" not in rows["reason"]["changes_seed"]
+    for name in ("fobg", "reinforce"):
+        assert rows["mean_estimate"][name].tobytes() == clean["mean_estimate"][name].tobytes()
+        assert "also run code of bench_folder_" in rows["reason"][name]
     later = rows["reason"]["changes_sqrt"]
     assert "this process has also run code of bench_folder_" in later
     assert "the seed of random" in later
@@ -106,13 +108,51 @@ def test_in_this_process_cells_after_other_code_say_so(tmp_path):
 IMPORTED = "import numpy as np\nnp.seterr(all='raise')\n"
 
 
-def test_a_change_by_an_import_is_named(tmp_path, capfd):
-    (tmp_path / "imported.py").write_text(IMPORTED)
+def test_new_processes_do_not_inherit_what_an_import_sets(tmp_path, monkeypatch):
+    for name in ("BENCH_OLD", "BENCH_NEW"):
+        monkeypatch.setenv(name, "before")
+    monkeypatch.delenv("BENCH_NEW")
+    (tmp_path / "sets.py").write_text("import os\nos.environ |= {'BENCH_OLD': 'after', 'BENCH_NEW': 'after'}\n")
     registry.add_folder(tmp_path)
-    with np.errstate():
-        registry.entries()
-    assert "imported, while it was imported, changed NumPy's error state" in capfd.readouterr().err
-    assert "NumPy's error state" in isolation.BY_IMPORTS[0]
+    registry.entries()
+    assert {name.rpartition(".")[2] for name in registry.IMPORTED} == {"sets"}
+    assert registry.environment()["BENCH_OLD"] == "before"
+    assert "BENCH_NEW" not in registry.environment()
+
+
+BY_IMPORT = """
+import os
+import bench.plugins.estimators.fobg as fobg
+import torch
+os.environ["JAX_ENABLE_X64"] = "0"
+torch.set_default_dtype(torch.float16)
+real = fobg.Fobg.terms
+fobg.Fobg.terms = lambda *given: 2.0 * real(*given)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("workers", [0, 1])
+def test_neighbours_of_plugins_that_change_the_process_are_equal_or_name_them(workers, tmp_path):
+    """All planted changes in one command, at work and by import. Workers load none of them: their rows are equal."""
+    clean = rows_of_run(tmp_path / "clean", "numpy", [], 1)
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    kinds = [*CHANGES, *REPLACES]
+    for kind in kinds:
+        (mine / f"{kind}.py").write_text(plugin(kind))
+    (mine / "by_import.py").write_text(BY_IMPORT)
+    names = ",".join(["fobg", *(f"changes_{kind}" for kind in kinds), "reinforce"])
+    words = [*WORDS, "backends=[numpy]", f"estimators=[{names}]", f"plugins=[{mine}]", f"results_dir={tmp_path}"]
+    done = subprocess.run(
+        [sys.executable, "-m", "bench", *words, f"workers={workers}"], capture_output=True, text=True, check=False
+    )
+    assert "Traceback" not in done.stderr
+    rows = pd.read_parquet(tmp_path / "changed" / "rows.parquet").set_index("estimator")
+    for name in ("fobg", "reinforce"):
+        is_equal = rows["mean_estimate"][name].tobytes() == clean["mean_estimate"][name].tobytes()
+        is_named = re.search(r"also run code of bench_folder_\w+\.by_import", rows["reason"][name])
+        assert (not is_named and is_equal) if workers else is_named
 
 
 def test_a_worker_loads_no_file_that_its_cells_do_not_need(tmp_path):

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 from bench.errors import UserError
 from bench.experiment.cell import Cell
 from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, text
-from bench.model import Identified, MechanicalScene, Optimizer, param
+from bench.model import Decision, Identified, MechanicalScene, Optimizer, param
 from bench.studies import StudyPackage
+
+START = "start."
+"""Prefix of entries of the initial state in theta."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +33,6 @@ class Identify(StudyPackage):
         Column("step_shift_bound", "the same in units of the Cramer-Rao bound"),
         Column("explained", "share of records that no test of the residuals contradicts, at 5% false alarms",
                label="explained", format="percent"),
-        Column("misfit", "share of records of a right model that contradict it as much as the first record"),
         text("contradictions", "tests that the first record's fit fails, each with its statistic in units of its edge"),
         Column("noise_size", "standard deviation of the residuals of the first record", "m"),
         text("interval_noise", "noise that the first record's intervals allow for: of stated size, own size (that of the residuals), or "
@@ -51,7 +53,6 @@ class Identify(StudyPackage):
         numbers("truth", "true values of the parameters; nan: a record of your own"),
         numbers("invariants", "identifiable products of powers of the parameters"),
         numbers("bound", "Cramer-Rao bound of the relative standard deviation of each invariant"),
-        numbers("fisher", "Fisher information of the logarithms, row by row", table=False),
         numbers("shooting", "the shooting methods: single, multiple, windows"),
         numbers("optimum", "by shooting method, share of fits whose optimizer has reached an optimum"),
         numbers("converged", "by shooting method, share of fits whose residuals are consistent with the noise",
@@ -65,15 +66,6 @@ class Identify(StudyPackage):
         numbers("coverage_low", "lower end of its 95% interval over records"),
         numbers("coverage_high", "upper end of its 95% interval over records"),
         numbers("hidden", "by shooting method, fits with more identifiable directions than the record has"),
-        numbers("scanned", "unknowns of a scan of the loss, each with every window", label="unknown"),
-        numbers("scan_unit", "unit of the unknown", label="unit"),
-        numbers("scan_low", "first value of the scan", format="setting", label="from"),
-        numbers("scan_high", "its last value", format="setting", label="to"),
-        numbers("scan_truth", "true value of the unknown", label="truth"),
-        numbers("scan_steps", "steps of the windows, the whole record first", format="setting", label="steps"),
-        numbers("minima", "local minima of the loss over the values of the scan", format="setting"),
-        numbers("minima_open", "the same if the last sample of a window, where the next one starts, is not compared", format="setting"),
-        numbers("scan_loss", "by scan and value, mean squared residual of the first record in units of the noise", table=False),
     )  # fmt: skip
 
     revision: ClassVar[int] = 3
@@ -88,17 +80,20 @@ class Identify(StudyPackage):
     windows: int = param(8, "windows of multiple shooting and of windows", low=2)
     iterations: int = param(40, "steps of the optimizer", positive=True)
     refine: int = param(1, "the records come from a step this many times shorter", positive=True)
-    scan: int = param(0, "values of each unknown at which the loss is scanned; 0: no scan", low=0, high=10_000)
-    span: float = param(2.0, "a scan covers the truth over this to the truth times this", low=1.0)
-    data: str | None = param(None, "CSV file with measurements of your own, a line per step; null: made from the truth")
-    measured: str | None = param(None, "what its columns measure, q0=angle*pi/180;v0=rate; null: all columns, in order")
+    record: str | None = param(
+        None, "CSV file with measurements of your own, a line per step; null: made from the truth"
+    )
+    measured: str | None = param(
+        None, "what its columns measure, {q0: angle*pi/180, v0: rate}; null: all columns, in order"
+    )
     time: str | None = param(None, "its time in s, an expression too, with which lines may be missing; null: all steps")
     interpolate: bool = param(False, "interpolate it linearly at the steps")
-    state: str | None = param(None, "initial state of the motion, q0=60*pi/180;v0=1; null: the scene's")
-    free: str | None = param(
-        None, "entries of the initial state that are unknown too, q0+v0; unknowns start.q0, start.v0"
-    )
-    terms: str | None = param(None, "accelerations that the model may lack, name=v*q**2;other=sign(v)*abs(q1)")
+    state: str | None = param(None, "initial state of the motion, {q0: 60*pi/180, v0: 1}; null: the scene's")
+    terms: str | None = param(None, "accelerations that the model may lack, {name: v*q**2, other: sign(v)*abs(q1)}")
+
+    def decision(self, given: Decision) -> Decision:
+        """Return theta without entries of the initial state, such as start.q0."""
+        return replace(given, names=tuple(name for name in given.names if not name.startswith(START)))
 
     def unsupported_reason(self, cell: Cell) -> str | None:
         """Return why a cell cannot be fitted (no motion, no unknowns, no NumPy steps, sampling, unusable data), or None."""
@@ -106,7 +101,7 @@ class Identify(StudyPackage):
         assert isinstance(optimizer, Optimizer)
         if not isinstance(scene, MechanicalScene):
             return f"scene {scene.name} is a plain function: it has no motion to record"
-        if not cell.decision.names and not isinstance(scene, Identified):
+        if not self.decision(cell.decision).names and not isinstance(scene, Identified):
             return f"scene {scene.name} names no unknowns: name parameters of it, theta=[..]"
         program = cell.program()
         if program.needs:

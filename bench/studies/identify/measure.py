@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -19,9 +19,9 @@ from bench.experiment.session import Session
 from bench.measure import adequacy, noise, performance
 from bench.measure.identification import Information, product
 from bench.model import Answer, Decision, Identified, LoopOps, MechanicalScene, Optimizer, Rollout, State, compose
-from bench.model.parameters import Parameter, named
+from bench.model.parameters import named
 from bench.studies import norm
-from bench.studies.identify import Identify
+from bench.studies.identify import START, Identify
 from bench.studies.identify.record import evaluate, expressions, read
 
 STEP = 1e-5
@@ -79,12 +79,6 @@ class Model:
         return np.append(theta, self._origin(theta[:, None])[list(self.free), 0])
 
     @property
-    def parameters(self) -> list[Parameter]:
-        """The declarations of the unknowns."""
-        parts = [*map(type, self.program.parts.values())]
-        return [named(parts, name) or Parameter(name, float, 0.0) for name in self.names]
-
-    @property
     def entries(self) -> list[str]:
         """The names of the entries of the state: q0, q1, v0, v1."""
         scene = self.program.scene
@@ -97,7 +91,7 @@ class Model:
         path, _ = self.motion(self.values[:, None])
         return np.asarray(np.maximum(np.abs(path[1:]).max(axis=(0, 2)), 1e-6))
 
-    def places(self, names: Iterable[str]) -> tuple[int, ...]:
+    def places(self, names: Collection[str]) -> tuple[int, ...]:
         """Return the indices of entries of the state; raises :class:`UserError` for an unknown one."""
         entries = self.entries
         for name in names:
@@ -201,17 +195,17 @@ def model_of(cell: Cell, refinement: int = 1) -> Model:
     assert isinstance(settings, Identify)
     scene = dataclasses.replace(own, dt=own.dt / refinement, horizon=own.horizon * refinement)
     role = own if isinstance(own, Identified) else None
-    names = cell.decision.names or (role.unknowns if role else ())
-    program = compose(scene, cell.contact, cell.integrator, Decision(tuple(names)))
+    names = settings.decision(cell.decision).names or tuple(role.unknowns if role else ())
+    program = compose(scene, cell.contact, cell.integrator, Decision(names))
     assert isinstance(program, Rollout)
     measured = (role and role.measured) or tuple(range(scene.n_q))
     first = own.horizon if role and role.end_only else 1
     steps = range(first * refinement, scene.horizon + 1, refinement)
     state = {entry: float(evaluate(text, {})) for entry, text in expressions(settings.state).items()}
-    model = Model(program, tuple(names), measured, tuple(steps), state)
-    starts = settings.free.split("+") if settings.free else []
-    free = model.places(starts)
-    return dataclasses.replace(model, names=(*names, *(f"start.{name}" for name in starts)), free=free).with_scales(
+    model = Model(program, names, measured, tuple(steps), state)
+    starts = tuple(name for name in cell.decision.names if name.startswith(START))
+    free = model.places([name.removeprefix(START) for name in starts])
+    return dataclasses.replace(model, names=(*names, *starts), free=free).with_scales(
         program.theta0 if cell.decision.at is None else np.array(cell.decision.at)
     )
 
@@ -221,23 +215,22 @@ def own_record(settings: Identify, model: Model) -> tuple[np.ndarray, Model]:
 
     Raises ValueError, with the number of the first line that cannot be used.
     """
-    path, scene, columns = settings.data, model.program.scene, expressions(settings.measured)
+    path, scene, columns = settings.record, model.program.scene, expressions(settings.measured)
     assert path is not None
     values, steps = read(path, columns, settings.time, scene.dt, settings.interpolate)
     measured = model.places(columns) or model.measured
     if len(values.columns) != len(measured):
         raise ValueError(
             f"{path} has {len(values.columns)} columns, scene {scene.name} is measured in {len(measured)} positions: name them, "
-            "measured=q0=angle*pi/180;v0=rate; numbers need decimal points"
+            "measured={{q0: angle*pi/180, v0: rate}}; numbers need decimal points"
         )
-    expected = steps if settings.time else model.steps
-    if len(steps) != len(expected) or not len(steps) or not {*steps} <= {*model.steps}:
+    times = tuple(steps.tolist()) if settings.time else model.steps
+    if len(times) != len(values) or not times or not {*times} <= {*model.steps}:
         raise ValueError(
-            f"{path} has {len(values)} lines{f' up to step {max(steps, default=0)}' * bool(settings.time)}, scene {scene.name} is "
+            f"{path} has {len(values)} lines up to step {max(steps, default=0)}, scene {scene.name} is "
             f"measured {len(model.steps)} times, up to step {model.steps[-1]}: set horizon"
         )
-    data = values.to_numpy().reshape(-1, 1)
-    return data, dataclasses.replace(model, measured=measured, steps=tuple(steps.tolist()))
+    return values.to_numpy().reshape(-1, 1), dataclasses.replace(model, measured=measured, steps=times)
 
 
 # ----------------------------------------------------------------------------------------------- shooting methods
@@ -358,7 +351,7 @@ def prepared(cell: Cell, settings: Identify) -> tuple[Model, np.ndarray | None]:
     model = model_of(cell)
     for text in expressions(settings.terms).values():
         evaluate(text, dict.fromkeys((*model.entries, "q", "v", "t"), np.zeros(2)))
-    if settings.data is None:
+    if settings.record is None:
         return model, None
     data, model = own_record(settings, model)
     return model, data
@@ -392,7 +385,7 @@ def measure(cell: Cell, session: Session, settings: Identify) -> dict[str, Any]:
         first, free = fit("single", sigma), len(data) - len(theta)
         if not is_noise_known and free < 1:
             raise Unsupported(
-                f"{settings.data} has {len(data)} measurements for {len(theta)} unknowns: state the noise, measurement=.."
+                f"{settings.record} has {len(data)} measurements for {len(theta)} unknowns: state the noise, measurement=.."
             )
         if not is_noise_known:
             sigma *= norm(first.residual) / math.sqrt(free) or 1.0
@@ -403,15 +396,12 @@ def measure(cell: Cell, session: Session, settings: Identify) -> dict[str, Any]:
     result: dict[str, Any] = {
         "status": "ok", "reason": "", "rank": known.rank, "condition": known.condition, "fits": data.shape[1],
         "unknowns": list(model.names), "truth": [math.nan] * len(theta) if is_own else theta.tolist(),
-        "invariants": known.labels, "bound": known.bound.tolist(), "fisher": known.fisher.ravel().tolist(),
+        "invariants": known.labels, "bound": known.bound.tolist(),
         **step_dependence(cell, model, theta, known, sigma),
         **_estimates(single, known, start[:, 0], is_noise_known, expressions(settings.terms)),
     }  # fmt: skip
     fits = [single, *(fit(shooting, sigma) for shooting in SHOOTING[1:] if has_windows)]
     lines = pd.DataFrame([_fit_statistics(one, known, is_own, is_noise_known) for one in fits])
-    if settings.scan:
-        scans = pd.DataFrame(scan(model, n_windows if has_windows else 1, data[:, :1], sigma, settings))
-        result |= scans.to_dict("list") | {"scan_loss": np.concatenate([*scans["scan_loss"]]).tolist()}
     result |= lines.to_dict("list")
     return result
 
@@ -439,54 +429,6 @@ class Fit:
         return np.asarray(own - later @ (np.linalg.pinv(later) @ own))
 
 
-def scan(model: Model, n_windows: int, data: np.ndarray, sigma: float, settings: Identify) -> Iterator[dict[str, Any]]:
-    """Yield the loss of one record ``data (m, 1)`` along each unknown and window, and how many local minima it has.
-
-    ``scan`` equally spaced values from the truth over ``span`` to the truth times ``span``, within the parameter's
-    declared bounds, with all other unknowns at the truth. The loss is the mean square of the residuals in units of the
-    noise, for the whole record and for independent windows: the fit's own, and others twice, four times, ... as long.
-    Windows start where fits start them, at the measurements. ``minima`` counts the grid's inner points whose loss is
-    below that of both neighbours; ``minima_open`` does it without the last sample of each window, see :class:`Fitting`.
-    """
-    counts = [1]
-    while n_windows > 1:
-        counts.insert(1, n_windows)
-        n_windows = n_windows // 2 if n_windows % 2 == 0 else 1
-    horizon, steps = model.program.scene.horizon, np.repeat(model.steps, len(model.measured))
-    flat = dataclasses.replace(model, scale=np.ones(len(model.names)))
-    for i, (value, parameter) in enumerate(zip(model.values, model.parameters, strict=True)):
-        ends = np.sort([value / settings.span, value * settings.span]) + (value == 0.0) * model.scale[i] * np.array(
-            [-1.0, 1.0]
-        )
-        low, high = np.clip(ends, parameter.low, parameter.high).tolist()
-        theta = np.repeat(model.values[:, None], settings.scan, axis=1)
-        theta[i] = np.linspace(low, high, settings.scan)
-        for count in counts:
-            fitting = Fitting(flat, "windows", count, sigma)
-            points = np.repeat(fitting.start(model.values[:, None], data), settings.scan, axis=1)
-            points[: len(theta)] = theta
-            with np.errstate(all="ignore"):
-                square = np.square(fitting.residuals(points, data))
-            inner = steps % (horizon // count) != 0
-            loss = square.mean(axis=0)
-            yield {
-                "scanned": model.names[i], "scan_unit": parameter.unit, "scan_low": low, "scan_high": high, "scan_truth": math.nan if settings.data else value,
-                "scan_steps": horizon // count, "minima": int(is_minimum(loss).sum()),
-                "minima_open": int(is_minimum(square[inner].mean(axis=0)).sum()) if inner.any() else math.nan,
-                "scan_loss": loss,
-            }  # fmt: skip
-
-
-def is_minimum(values: np.ndarray) -> np.ndarray:
-    """Return which values are below both of their neighbours; the first and the last are not.
-
-    >>> is_minimum(np.array([2.0, 1.0, 2.0, 2.0, 0.0, 1.0, 0.5])).nonzero()[0].tolist()
-    [1, 4]
-    """
-    inner = values[1:-1]
-    return np.concatenate([[False], (inner < values[:-2]) & (inner < values[2:]), [False]])
-
-
 def _estimates(
     fit: Fit, known: Information, start: np.ndarray, is_noise_known: bool, own: Mapping[str, str]
 ) -> dict[str, Any]:
@@ -500,7 +442,8 @@ def _estimates(
     names = list(dict.fromkeys([*known.labels, *known.names]))
     exponents = np.concatenate([invariants, np.eye(p)[[known.names.index(name) for name in names[rank:]]]])
     is_seen = (np.abs(exponents @ invariants.T) > SHARE).any(axis=1)
-    own_units = dict(zip(known.names, (one.unit for one in model.parameters), strict=True))
+    parts = [*map(type, model.program.parts.values())]
+    own_units = {name: (part.unit or "1") if (part := named(parts, name)) else "" for name in known.names}
     units = tuple(f"({unit})" if {*unit} & {*" /"} else unit or "1" for unit in own_units.values())
     # an unknown without a logarithm has an interval of its own values
     estimate, half, noise_kind = _products(theta, invariants), *_half_widths(fit, 0, known, is_noise_known)
@@ -513,7 +456,9 @@ def _estimates(
     nothing = [math.nan] * (len(names) - rank)
     result: dict[str, Any] = {
         "parameter": names, "estimate": [*estimate, *nothing], "estimate_low": [*low, *nothing],
-        "estimate_high": [*high, *nothing], "unit": [own_units.get(name) or product(units, row) for name, row in zip(names, exponents, strict=True)],
+        "estimate_high": [*high, *nothing], "unit": [
+            own_units.get(name, product(units, row)) for name, row in zip(names, exponents, strict=True)
+        ],
         "start": _products(start, exponents).tolist(), "interval_noise": noise_kind,
         "identifiable": ["yes" if k < rank else "product" if seen else "no" for k, seen in enumerate(is_seen)],
         "bias": [math.nan] * len(names), "biased": [], "term": [], "unnoticed": [], "errors": [],
@@ -538,7 +483,7 @@ def _estimates(
     return result | {
         "explained": float(np.mean([one.is_explained for one in verdicts])) + 0.0 * first.probability,  # nan: untested
         "contradictions": ", ".join(f"{name} ({value:.2g})" for name, value in first.contradictions.items()),
-        "noise_size": sigma * norm(residual[:, 0]) / math.sqrt(free), "misfit": first.probability,
+        "noise_size": sigma * norm(residual[:, 0]) / math.sqrt(free),
         "bias": [*unnoticed.max(axis=1, initial=0.0), *nothing] if effects.size else result["bias"],
         "biased": np.repeat(known.labels, len(effects)).tolist(), "term": [*first.reach] * rank,
         "unnoticed": unnoticed.ravel().tolist(), "errors": (biases * performance.Z / half[:, None]).ravel().tolist(),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import itertools
 import math
 import re
@@ -12,12 +11,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from bench.errors import UserError, unknown
+from bench.errors import UserError
 
-OPERATIONS: dict[type[ast.AST], np.ufunc] = {
-    ast.Add: np.add, ast.Sub: np.subtract, ast.Mult: np.multiply, ast.Div: np.divide, ast.Pow: np.power,
-    ast.USub: np.negative,
-}  # fmt: skip
 SLIP = 0.1
 """Distance over which the force of hysteresis rises, relative to the largest distance from 0."""
 OFF = 0.01
@@ -42,41 +37,26 @@ def evaluate(text: str, names: Mapping[str, Any]) -> Any:
     Raises :class:`UserError` for anything else.
 
     >>> evaluate("-2 * angle**2", {"angle": 3.0})
-    np.float64(-18.0)
+    -18.0
     """
-
-    def value(node: ast.AST) -> Any:
-        match node:
-            case ast.Constant(value=int() | float() as number):
-                return np.float64(number)
-            case ast.Name(id=name) if name in names:
-                return names[name]
-            case ast.Name(id="pi"):
-                return math.pi
-            case ast.UnaryOp(op=operation, operand=operand) if type(operation) in OPERATIONS:
-                return OPERATIONS[type(operation)](value(operand))
-            case ast.BinOp(left=left, op=operation, right=right) if type(operation) in OPERATIONS:
-                return OPERATIONS[type(operation)](value(left), value(right))
-            case ast.Call(func=ast.Name(id=name), args=[operand], keywords=[]) if name in FUNCTIONS:
-                return FUNCTIONS[name](value(operand))
-        raise unknown(f"name or operation in '{text}':", ast.unparse(node), [*names, *FUNCTIONS])
-
+    known = {**FUNCTIONS, "pi": math.pi, **names}
     try:
-        tree = ast.parse(text.strip(), mode="eval")
-    except SyntaxError:
-        raise UserError(f"'{text}' is not an expression: write numbers, names and operations, angle*pi/180") from None
-    with np.errstate(all="ignore"):
-        return value(tree.body)
+        if not re.fullmatch(r"([\w\s+*/()-]|\.(?![^\W\d]))+", text):
+            raise ValueError("not arithmetic")
+        with np.errstate(all="ignore"):
+            return 0.0 + pd.eval(text.strip(), engine="python", local_dict={}, global_dict={}, resolvers=[known])
+    except Exception as error:  # pandas raises errors of many types
+        raise UserError(f"'{text}': {error} (numbers, operations and {', '.join(sorted(known))})") from None
 
 
 def expressions(text: str | None) -> dict[str, str]:
     """Return expressions by name.
 
-    >>> expressions("q0=angle*pi/180;v0=rate")
+    >>> expressions("{q0: angle*pi/180, v0: rate}")
     {'q0': 'angle*pi/180', 'v0': 'rate'}
     """
-    parts = [part.partition("=") for part in (text or "").split(";") if part.strip()]
-    return {name.strip(): expression for name, _, expression in parts}
+    parts = [part.partition(":") for part in (text or "").strip("{ }").split(",") if part.strip()]
+    return {name.strip(): expression.strip() for name, _, expression in parts}
 
 
 def read(
@@ -87,9 +67,12 @@ def read(
     ``columns`` are expressions of the file's columns by name; empty: all but that of time. Lines before the first step are
     left out. Raises ValueError with the number of the first line that cannot be used.
     """
-    words = pd.read_csv(
-        path, header=None, dtype=str, keep_default_na=False, skip_blank_lines=False, skipinitialspace=True
-    )
+    try:
+        words = pd.read_csv(
+            path, header=None, dtype=str, keep_default_na=False, skip_blank_lines=False, skipinitialspace=True
+        )
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}".strip()) from None
     table = words.apply(pd.to_numeric, errors="coerce").add_prefix("c")
     if table.iloc[0].isna().all():
         table = table[1:].set_axis([re.sub(r"\W", "_", name.strip()) for name in words.iloc[0]], axis=1)

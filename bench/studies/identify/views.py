@@ -32,9 +32,8 @@ the 95% intervals miss the truth instead of 5%.
 """
 ESTIMATED = ("parameter", "estimate", "estimate_low", "estimate_high", "bias", "unit", "identifiable", "start")
 BIASED = ("biased", "term", "unnoticed", "errors")
-SCANNED = ("scanned", "scan_unit", "scan_low", "scan_high", "scan_truth", "scan_steps", "minima", "minima_open")
 """Columns with lists whose entries are lines of a table."""
-TEXTS = ("shooting", "parameter", "unit", "identifiable", "biased", "term", "scanned", "scan_unit")
+TEXTS = ("shooting", "parameter", "unit", "identifiable", "biased", "term")
 """Those with lists of words."""
 ESTIMATES = (
     "estimate: of the first record, by one rollout. low, high: its 95% interval. seen: whether the record identifies the parameter; product: "
@@ -58,13 +57,6 @@ NOTES = (
     "contain the truth less often than stated; precise, neither, and errors reach the bound. single: one rollout. multiple: windows whose ends must meet. "
     "windows: independent windows.",
 )
-SCANS = (
-    "steps: length of a window. minima: values of the scan at which the loss is below that at both neighbours; all other unknowns have their own "
-    "values, and windows start at the measurements. A count holds for its values: others, and for a chaotic record another "
-    "rounding, give another.",
-    "A window is compared with all samples after its start, its last one included, at which the next window starts. minima "
-    "open: the same windows if that sample is not compared.",
-)
 
 
 def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
@@ -76,10 +68,10 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     names = problem_names(shown, PARTS, rows=given)
     doubts = {
         "unfinished": [values[0] < 1.0 for values in given["optimum"]], "not explained": given["contradictions"] != "",
-        "untested": given["misfit"].isna(), "time step": given["step_shift_bound"] > MAX_STEP_SHIFT,
+        "untested": given["explained"].isna(), "time step": given["step_shift_bound"] > MAX_STEP_SHIFT,
     }  # fmt: skip
     given = given.assign(
-        scan=names, problem=names + (", " + given["optimizer"] if given["optimizer"].nunique() > 1 else ""),
+        problem=names + (", " + given["optimizer"] if given["optimizer"].nunique() > 1 else ""),
         doubt=[", ".join(name for name, holds in zip(doubts, row, strict=True) if holds) for row in zip(*doubts.values(), strict=True)],
     )  # fmt: skip
     kinds: dict[str, Any] = {"list": "number"} | dict.fromkeys(TEXTS, "text")
@@ -91,7 +83,7 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
 
     lines, found = fits_of(given), exploded(given, ["doubt"], ESTIMATED)
     hidden = exploded(given, [], BIASED).sort_values("errors", ascending=False, ignore_index=True)
-    split, scans = "problem" if len(given) > 1 else "", scanned(given)
+    split = "problem" if len(given) > 1 else ""
     tables = [
         Table(
             "identify", found,
@@ -113,14 +105,10 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
             "Fits", NOTES, terminal=True, page=True,
         ),
         *(Table(name, frame, [], files=["csv"]) for name, frame in (("estimates", found), ("unnoticed", hidden), ("fits", lines))),
-        *[Table(
-            "identify", scans.drop(columns=["loss"]), columns("problem", *SCANNED),
-            "Local minima of the loss along each unknown", SCANS, terminal=True, page=True,
-        )] * bool(len(scans)),
     ]  # fmt: skip
     if lines.empty:
         return Views(tables[:1])
-    return Views(tables, [*charts(lines, columns("error", "coverage")), *scan_charts(scans)])
+    return Views(tables, charts(lines, columns("error", "coverage")))
 
 
 def exploded(rows: pd.DataFrame, kept: Sequence[str], lists: Sequence[str]) -> pd.DataFrame:
@@ -156,48 +144,6 @@ def verdicts(lines: pd.DataFrame) -> np.ndarray:
         "precise": is_precise & (lines["coverage_high"] >= LEVEL),
     }
     return np.select(list(kinds.values()), list(kinds), "open")
-
-
-# ---------------------------------------------------------------------------------------------------------- scans
-
-
-def scanned(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return one line per problem, unknown and window of a scan; ``loss`` has a number per value of the unknown.
-
-    Rows that differ by optimizer or seed only have one scan each: the first is shown.
-    """
-    has_scan = rows["scan_steps"].map(lambda steps: np.ndim(steps) * np.size(steps)) > 0
-    rows = rows[has_scan].drop_duplicates("scan")
-    losses = [
-        part for _, row in rows.iterrows() for part in np.split(np.array(row["scan_loss"]), len(row["scan_steps"]))
-    ]
-    return exploded(rows.assign(problem=rows["scan"]), [], SCANNED).assign(loss=losses)
-
-
-def scan_charts(scans: pd.DataFrame) -> list[Chart]:
-    """Return a chart of the loss along each unknown: a panel per window with the number of its local minima, and the truth."""
-    charts_: list[Chart] = []
-    for (_, unknown), scan in scans.groupby(["problem", "scanned"], sort=False):
-        one = scan.iloc[0]
-        curves = [
-            pd.DataFrame({
-                "value": np.linspace(line["scan_low"], line["scan_high"], len(line["loss"])),
-                "loss": np.where(np.isfinite(line["loss"]), line["loss"], np.nan),
-                "window": f"windows of {line['scan_steps']} steps, local minima: {line['minima']:.0f}",
-            })
-            for line in scan.to_dict("records")
-        ]  # fmt: skip
-        place = sum(chart.x[0].label == unknown for chart in charts_)
-        charts_.append(Chart(
-            f"scan_{unknown}" + f"_{place + 1}" * (place > 0), pd.concat(curves, ignore_index=True),
-            [Column("value", label=unknown, unit=one["scan_unit"], log=False)],
-            [Column("loss", label="mean square of residual / noise", log=True)],
-            "lines", panel="window", across=3, height=1.9,
-            marks=[*([Mark("truth", one["scan_truth"])] * int(np.isfinite(one["scan_truth"]))), Mark("", 1.0, axis="y")],
-            subtitle="grey line: 1, the noise of a sample; the longest window is the whole record",
-            text="The loss along one unknown, all others at their own values. Windows start at the measurements.",
-        ))  # fmt: skip
-    return charts_
 
 
 # --------------------------------------------------------------------------------------------------------- charts
