@@ -26,7 +26,11 @@ def write(directory: Path, results: Results) -> list[Path]:
             drawn.append((chart, draw(chart)))
             save(drawn[-1][1], directory / chart.name, data=chart.plotted())
     figures, answer = tables.figures_table(results), tables.count_verdicts(results)
-    cells = figures.assign(status=figures["verdict"], reason=figures["limited_by"])
+    every = [figure for _, result in results for figure in result.figures or (tables.NOTHING,)]
+    cells = figures.assign(
+        measured=[*map(tables.measured_text, every)], resolution=[*map(tables.detectable_text, every)],
+        status=figures["agrees"].map({True: "agrees", False: "differs"}), reason=figures["limited_by"],
+    )  # fmt: skip
     views = Views([tables.claims_table(results)], headline=answer)
     content = {
         "claims.md": tables.markdown(results),

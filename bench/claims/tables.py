@@ -20,10 +20,12 @@ from bench.report.text import counted, duration, number
 Results = Sequence[tuple[type[Claim], ClaimResult]]
 TITLE = "Published claims, run again"
 FIGURE = (
-    text("claim"), text("figure"), text("published"), Column("measured", digits=4), text("agrees"),
-    Column("resolution", label="would fail at", format="percent"), text("lesson"),
+    text("claim"), text("figure"), text("published"), text("measured"), text("resolution", label="would fail at"),
+    text("verdict"), text("lesson"),
 )  # fmt: skip
 """Columns of the page's table of figures."""
+NOTHING = Figure("", "0", math.nan)
+"""Stands for the figures of a claim that has none, since its code failed."""
 ESTIMATORS = {
     **dict.fromkeys(("first", "pathwise", "coarse"), "fobg"), **dict.fromkeys(("zeroth", "score"), "reinforce"),
     "measure-valued": "measure_valued", "gauss": "randomized_smoothing", "sphere": "sphere_smoothing",
@@ -111,7 +113,7 @@ def figures_table(results: Results) -> pd.DataFrame:
             "verdict": result.verdict, "seconds": round(result.seconds, 2),
         }
         for claim, result in results
-        for figure in result.figures or (Figure("", "0", math.nan),)
+        for figure in result.figures or (NOTHING,)
     ]  # fmt: skip
     return pd.DataFrame(rows)
 

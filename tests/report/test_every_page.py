@@ -5,7 +5,6 @@ import re
 import pytest
 from helpers import experiment, row, small_rows, table
 
-import bench
 from bench.claims import page as claims_page
 from bench.claims.claim import NOT_REPRODUCED, REPRODUCED, Claim, Figure
 from bench.claims.results import ClaimResult
@@ -17,7 +16,7 @@ from bench.report.web.data import page_data
 
 TEXT, MARK = 4.5, 3.0
 """Contrasts that WCAG 2.2 asks for at level AA: of text, and of marks such as points and lines."""
-KINDS = ("study", "index", "claims", "examine")
+KINDS = ("study", "index", "claims")
 
 
 class Lesson(Claim):
@@ -65,11 +64,7 @@ def pages(tmp_path_factory):
     study.write_text(assembled(made, rows))
     (folder / "claims").mkdir()
     claims_page.write(folder / "claims", RESULTS)
-    report = bench.examine(
-        lambda x: float(x @ x), [1.0, 0.5], grad=lambda x: 2 * x, sigma=[0.1], progress=False, budget=2
-    )
-    report.save(folder / "examine")
-    paths = (study, index.write(folder), folder / "claims" / "claims.html", folder / "examine" / "report.html")
+    paths = (study, index.write(folder), folder / "claims" / "claims.html")
     return dict(zip(KINDS, paths, strict=True))
 
 
