@@ -42,9 +42,9 @@ class RecordingProblem(Problem):
         self.used.add(capability)
         return np.asarray(getattr(self._inner, capability)(theta, w))
 
-    value = partialmethod(_use, "value")  # type: ignore[assignment]
-    grad = partialmethod(_use, "grad")  # type: ignore[assignment]
-    score = partialmethod(_use, "score")  # type: ignore[assignment]
+    value = partialmethod(_use, "value")
+    grad = partialmethod(_use, "grad")
+    score = partialmethod(_use, "score")
     _value = _grad = _score = None  # type: ignore[assignment]
 
 
