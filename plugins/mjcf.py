@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.engines.backend import unsupported_model
+from bench.engines.backend import EngineBackend
 from bench.model import EngineTwin, MechanicalScene, Program, Unsupported
 
 from .contacts.penalty import Penalty
@@ -33,7 +33,7 @@ def unsupported_reason(backend: Any, program: Program) -> str | None:
     ``impedance``.
     """
     own = backend.integrator
-    if reason := unsupported_model(backend.name, program, f" {own}", MATCH[own], ("penalty",), "clipped"):
+    if reason := EngineBackend.unsupported_model(backend.name, program, f" {own}", MATCH[own], ("penalty",), "clipped"):
         return reason
     scene: Any = program.scene
     if scene.model_file() is not None:

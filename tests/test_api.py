@@ -7,6 +7,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -16,7 +17,7 @@ import yaml
 import bench
 import bench.model
 from bench.api import Settings, _override_words
-from bench.experiment import config, grid
+from bench.experiment import by_name, config, grid
 from bench.report.text import number
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -214,6 +215,13 @@ def test_bad_names_are_told_with_the_nearest_one(call, said, tmp_path, monkeypat
     monkeypatch.chdir(tmp_path)
     with pytest.raises(bench.UserError, match=said):
         call()
+
+
+def test_a_plugin_without_its_library_is_named(monkeypatch):
+    entry = SimpleNamespace(plugin=object, reason="not installed: jax; pip install jax")
+    monkeypatch.setattr(by_name.registry, "find", lambda *_: entry)
+    with pytest.raises(bench.Unsupported, match="scene 'heaviside' is not installed: jax; pip install jax"):
+        bench.problem("heaviside", backend="numpy")
 
 
 def test_what_cannot_work_is_unsupported():

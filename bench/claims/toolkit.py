@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, cast
 
 import numpy as np
 
 from bench.errors import Unsupported
 from bench.experiment.by_name import compile_problem, make
-from bench.model import Answer, Estimator, Optimizer, Problem, SampleMean, Scene
+from bench.model import Answer, Array, Estimator, FunctionScene, Optimizer, Problem, SampleMean, Scene
 from bench.model.identity import parse_identity
 
 used: set[tuple[str, str]] = set()
@@ -50,6 +51,16 @@ def native(scene: Scene | str, contact: str = "penalty") -> Problem:
         return problem(scene, contact, backend="fused")
     except Unsupported:
         return problem(scene, contact)
+
+
+def function(cost: Callable[[Any, Array], Array], start: Any, sigma: float, continuous: bool = True) -> FunctionScene:
+    """Return the scene of a plain cost ``cost(xp, x)`` at theta ``start``, with noise on theta."""
+    body = {
+        "name": cost.__name__, "continuous": continuous, "__doc__": cost.__doc__,
+        "theta0": lambda self: np.array(start, dtype=float), "cost": lambda self, xp, x: cost(xp, x),
+    }  # fmt: skip
+    scene: Any = dataclass(frozen=True)(type(cost.__name__, (FunctionScene,), body))
+    return cast(FunctionScene, scene(sigma=sigma))
 
 
 def terms(problem: Problem, estimator: Estimator, w: np.ndarray, theta: np.ndarray | None = None) -> np.ndarray:

@@ -6,7 +6,7 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Iterable, Iterator
-from functools import cache
+from functools import cache, partialmethod
 from typing import NamedTuple
 
 import numpy as np
@@ -37,23 +37,14 @@ class RecordingProblem(Problem):
         self._inner, self._allowed = inner, allowed
         self.used: set[str] = set()
 
-    def value(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """Return costs, if allowed."""
-        return self._use("value", theta, w)
-
-    def grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """Return gradients, if allowed."""
-        return self._use("grad", theta, w)
-
-    def score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """Return scores, if allowed."""
-        return self._use("score", theta, w)
-
     def _use(self, capability: str, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         require(capability in self._allowed, f"uses {capability}, which is not in needs")
         self.used.add(capability)
         return np.asarray(getattr(self._inner, capability)(theta, w))
 
+    value = partialmethod(_use, "value")
+    grad = partialmethod(_use, "grad")
+    score = partialmethod(_use, "score")
     _value = _grad = _score = None  # type: ignore[assignment]
 
 

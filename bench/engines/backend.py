@@ -74,7 +74,7 @@ class EngineBackend(Backend):
 
     def unsupported_reason(self, program: Program) -> str | None:
         """Return why the engine cannot run the program, or None."""
-        if reason := unsupported_model(self.name, program, "", self.integrator, self.laws, self.damping_mode):
+        if reason := self.unsupported_model(self.name, program, "", self.integrator, self.laws, self.damping_mode):
             return reason
         try:
             model = twin.read(program.scene.mjcf())  # type: ignore[attr-defined]
@@ -83,6 +83,32 @@ class EngineBackend(Backend):
             return self.unsupported_twin(program, model)
         except Unsupported as error:
             return str(error)
+
+    @staticmethod
+    def unsupported_model(
+        name: str, program: Program, own: str, integrator: str, laws: tuple[str, ...], damping_mode: str | None
+    ) -> str | None:
+        """Return why the engine ``name`` has no model of a program, or None.
+
+        Its integrator ``own`` replaces ``integrator``, its contacts replace ``laws`` with dampers of ``damping_mode``.
+        """
+        scene, law, step = program.scene, program.contact, program.integrator
+        if not isinstance(scene, EngineTwin) or not isinstance(scene, MechanicalScene):
+            return f"scene {scene.name} has no MJCF twin"
+        if program.decision.names:
+            return f"{name} does not differentiate by parameters of its model: theta={list(program.decision.names)}"
+        if step is None or step.name != integrator:
+            return (
+                f"{name} uses its own integrator{own}, which replaces {integrator}, not {step.name if step else 'none'}"
+            )
+        if law is None:
+            return None
+        if law.name not in laws:
+            return f"{name} uses its own contact model, which replaces {' and '.join(laws)}, not {law.name}"
+        mode = getattr(law, "damping_mode", "")
+        if damping_mode is None or mode == damping_mode or not getattr(law, "damping", 0.0):
+            return None
+        return f"{name} supports {f'damping_mode={damping_mode}' if damping_mode else 'no damping'} only, not {mode}"
 
     def unsupported_twin(self, program: Program, model: dict[str, Any]) -> str | None:
         """Return why the engine cannot run a program with the twin ``model`` of :func:`bench.engines.twin.read`, or None."""
@@ -109,27 +135,3 @@ class EngineBackend(Backend):
     def requirements(cls) -> Path:
         """Return the file of the engine's requirements, beside the engine's file."""
         return cls.files()[0].with_suffix(".txt")
-
-
-def unsupported_model(
-    name: str, program: Program, own: str, integrator: str, laws: tuple[str, ...], damping_mode: str | None
-) -> str | None:
-    """Return why the engine ``name`` has no model of a program, or None.
-
-    Its integrator ``own`` replaces ``integrator``, its contacts replace ``laws`` with dampers of ``damping_mode``.
-    """
-    scene, law, step = program.scene, program.contact, program.integrator
-    if not isinstance(scene, EngineTwin) or not isinstance(scene, MechanicalScene):
-        return f"scene {scene.name} has no MJCF twin"
-    if program.decision.names:
-        return f"{name} does not differentiate by parameters of its model: theta={list(program.decision.names)}"
-    if step is None or step.name != integrator:
-        return f"{name} uses its own integrator{own}, which replaces {integrator}, not {step.name if step else 'none'}"
-    if law is None:
-        return None
-    if law.name not in laws:
-        return f"{name} uses its own contact model, which replaces {' and '.join(laws)}, not {law.name}"
-    mode = getattr(law, "damping_mode", "")
-    if damping_mode is None or mode == damping_mode or not getattr(law, "damping", 0.0):
-        return None
-    return f"{name} supports {f'damping_mode={damping_mode}' if damping_mode else 'no damping'} only, not {mode}"

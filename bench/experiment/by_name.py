@@ -18,7 +18,7 @@ from bench.model import (
     registry,
 )
 from bench.model.identity import parse_identity
-from bench.model.parameters import build, parameters
+from bench.model.parameters import build, parameters, singular
 
 
 def make(kind: str, identity: str, defaults: Mapping[str, Any] | None = None) -> Any:
@@ -30,7 +30,7 @@ def make(kind: str, identity: str, defaults: Mapping[str, Any] | None = None) ->
     name, values = parse_identity(identity)
     plugin = registry.usable(kind, name)
     if reason := registry.find(kind, name).reason:
-        raise Unsupported(f"{kind} {name} is {reason}")
+        raise Unsupported(f"{singular(kind)} '{name}' is {reason}")
     declared = parameters(plugin)
     return build(plugin, {key: value for key, value in (defaults or {}).items() if key in declared} | values)
 

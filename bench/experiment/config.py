@@ -13,7 +13,7 @@ from typing import Any, cast
 from bench.errors import STATUSES, UserError, local_path, printable, unknown
 from bench.experiment.experiment import Budget, Choice, Execution, Experiment, TableLayout
 from bench.experiment.grid import COUNTS, check_axes, parameter_name, refuse_too_many, swept
-from bench.experiment.overrides import LISTS_AS, Values, check_file, quoted
+from bench.experiment.overrides import LISTS_AS, TABLES, Values, check_file, quoted
 from bench.experiment.study import Study
 from bench.model import Decision, MechanicalScene, Plugin, guard, registry
 from bench.model.identity import parse_identity, split_items
@@ -193,12 +193,11 @@ def _to_hydra(override: str, config_dirs: Sequence[Path], values: Values) -> str
         return f"++{bare}={_quote_identities(value)}"
     if bare == "study":
         return f"study={_quote_identities(value)[1:-1]}"
-    if head in map(singular, kinds) or head in ("sweep", "marks", "ray"):
-        return f"++{bare}={value}"
-    if bare != head and (head not in ("reference", "table") or bare.count(".") > 1):
+    tables = {*map(singular, kinds), *TABLES}
+    if bare != head and (head not in tables or (head in ("reference", "table") and bare.count(".") > 1)):
         whole = bare.rpartition(".")[0]
         raise UserError(f"'{bare}' is not a setting: '{whole}' has no settings of its own")
-    return f"{bare}={value}"
+    return f"{'++' if head in tables else ''}{bare}={value}"
 
 
 def _refuse_unread(experiment: Experiment, overrides: Sequence[str]) -> None:

@@ -39,13 +39,12 @@ from bench.model.manifold import JointScene, difference, n_changes, retract, slo
 from bench.model.ops import Array, LoopOps, Ops, State, stopped
 from bench.model.optimizer import Answer, Descent, Optimizer, OptimizerState, Population
 from bench.model.parameters import Plugin, param
-from bench.model.policy import Policy, PolicyRollout, PolicyScene, affine, uniform
-from bench.model.problem import Compilations, Jacobians, Problem, Trajectory, Usage
+from bench.model.policy import Policy, PolicyScene, affine, uniform
+from bench.model.problem import Compilations, Jacobians, Problem, Trajectory
 from bench.model.program import (
     SURROGATE,
     CallableProgram,
     Decision,
-    FunctionProgram,
     Program,
     Rollout,
     compose,
@@ -63,7 +62,6 @@ from bench.model.scene import (
     FunctionScene,
     MechanicalScene,
     Oscillator,
-    ProcessNoiseScene,
     Scene,
     ZeroOrderHoldScene,
     half_spaces,
@@ -96,7 +94,6 @@ __all__ = [
     "Events",
     "ForceLaw",
     "FrictionScene",
-    "FunctionProgram",
     "FunctionScene",
     "Identified",
     "ImpulseLaw",
@@ -113,11 +110,9 @@ __all__ = [
     "Oscillator",
     "Plugin",
     "Policy",
-    "PolicyRollout",
     "PolicyScene",
     "Population",
     "Problem",
-    "ProcessNoiseScene",
     "Program",
     "Rollout",
     "SampleMean",
@@ -128,7 +123,6 @@ __all__ = [
     "Trainer",
     "Trajectory",
     "Unsupported",
-    "Usage",
     "UserError",
     "ZeroOrderHoldScene",
     "adjoint",

@@ -19,7 +19,7 @@ from bench.model.dynamics import Dynamics
 from bench.model.integrator import Integrator
 from bench.model.ops import Array, Ops, State
 from bench.model.parameters import Plugin, traced
-from bench.model.scene import DisturbedScene, EngineScene, FunctionScene, MechanicalScene, ProcessNoiseScene, Scene
+from bench.model.scene import DisturbedScene, EngineScene, FunctionScene, MechanicalScene, Scene
 
 REVISION = 1
 """Raised when a stored number that this module decides moves."""
@@ -427,7 +427,7 @@ class Rollout(Program):
     def start(self, ops: Ops, theta: Array, w: Array) -> tuple[Array, State, tuple[Array, ...]]:
         """Return theta plus its noise, the initial state, and the control law's inputs, each ``(horizon, n_u, B)``.
 
-        The inputs are the open-loop controls, if any, then the noise on the actions or the gusts.
+        The inputs are the open-loop controls, if any, then the noise on the actions.
         """
         scene, xp = self.scene, ops.xp
         shape = (scene.horizon, scene.n_u, w.shape[1])
@@ -438,8 +438,6 @@ class Rollout(Program):
             scanned.append(scene.held(xp, xp.reshape(own, (scene.controls, *shape[1:]))))
         else:
             theta = theta + scene.sigma * own
-        if isinstance(scene, ProcessNoiseScene):
-            scanned.append(scene.gust * xp.reshape(e, shape))
         planned = scene.planned_controls(xp, theta)
         if planned is not None:
             scanned.insert(0, xp.broadcast_to(planned, shape))
@@ -449,7 +447,7 @@ class Rollout(Program):
         return theta, state, tuple(scanned)
 
     def control(self, ops: Ops, theta: Array, state: State, slices: tuple[Array, ...]) -> Array:
-        """Return u_t = plan + feedback + sigma w_t (or plus gusts, under process noise), ``(n_u, B)``."""
+        """Return u_t = plan + feedback + sigma w_t, ``(n_u, B)``."""
         scene, xp = self.scene, ops.xp
         parts = list(slices)
         if self.action_noise:

@@ -220,10 +220,10 @@ def _load_point(table: Table, kind: str, point: EntryPoint, fatal: str) -> None:
             part = point.load()
         if isinstance(part, ModuleType):
             _add_members(table, kind or _kind_in_source(point.module), part)
-        elif isinstance(part, type) and issubclass(part, Plugin) and part.kind:
+        elif isinstance(part, type) and issubclass(part, Plugin) and part.kind and kind in ("", part.kind):
             _add(table, part)
         else:
-            raise TypeError(f"{point.value} is not a plugin class")
+            raise TypeError(f"{point.value} is not a plugin class{kind and f' of kind {kind}'}")
     except KeyboardInterrupt:
         raise
     except BaseException as error:  # includes SystemExit: a plugin must not end the command

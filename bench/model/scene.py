@@ -192,29 +192,6 @@ class DampedScene(MechanicalScene):
 
 
 @dataclass(frozen=True)
-class ProcessNoiseScene(MechanicalScene):
-    """A role: process noise on every control of every step, in addition to the noise on theta.
-
-    ``u_t = plan + feedback + gust e_t`` with ``horizon * n_u`` normal numbers e, which follow the d numbers on theta.
-    J averages over both. Smoothing estimators do not shift e, and the score does not depend on it. The scene defines
-    the effect of u: a channel may be a wind force, or the relative error of a mass or stiffness in that step.
-    """
-
-    noise: str = param("parameter", "sigma is the noise on theta; gusts are added to it", choices=("parameter",))
-    gust: float = param(0.1, "standard deviation of the process noise on each control", low=0.0)
-
-    @property
-    def exogenous(self) -> int:  # type: ignore[override]
-        """Number of process-noise values: one per step and control."""
-        return self.horizon * self.n_u
-
-    def __init_subclass__(cls, **arguments: Any) -> None:
-        super().__init_subclass__(**arguments)
-        if not cls.n_u:
-            raise TypeError(f"{cls.__name__} has process noise on its controls: set n_u")
-
-
-@dataclass(frozen=True)
 class ZeroOrderHoldScene(MechanicalScene):
     """A role: each open-loop control, with its noise, is held constant over ``hold`` steps (zero-order hold).
 

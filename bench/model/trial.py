@@ -45,7 +45,8 @@ def find_fatal_modules(
     """
     if MARK in os.environ:  # a module of a plugin folder that adds folders itself would start trials without end
         return {}
-    remaining, fatal = list(modules), {}
+    remaining = list(modules)
+    fatal: dict[str, str] = {}
     while remaining:
         failures = _try_imports(remaining, packages, timeout_s)
         if not failures:  # if the process did not start, the import itself must report the cause

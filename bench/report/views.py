@@ -40,15 +40,8 @@ def attempted(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def newest_rows(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return each cell's newest row, its parameters completed with today's defaults.
-
-    After a plugin is edited, rows of its older versions remain stored. Rows that old versions of the package stored
-    without parameters are distinguished by their identity columns.
-    """
-    rows = completed_rows(rows)
-    bare = rows["parameters"] == ""
-    old = np.where(bare, rows.duplicated(list(IDENTITY), keep="last"), rows.duplicated(list(CELL), keep="last"))
-    return rows[~old.astype(bool)].reset_index(drop=True) if old.any() else rows
+    """Return each cell's newest row, its parameters completed with today's defaults: rows of older versions stay stored."""
+    return completed_rows(rows).drop_duplicates(list(CELL), keep="last", ignore_index=True)
 
 
 @dataclass(frozen=True, eq=False)

@@ -58,33 +58,14 @@ class Store:
         """Files with rows that are left out."""
         self._table = directory / "rows.parquet"
         self._pending = directory / "pending"
-        self._claim = self._pending / ".study"
 
     def prepare(self) -> None:
         """Create the directory, and check that it can be written."""
         probe = temporary(self._pending / "probe")
         self._in_pending(lambda: probe.write_text(""), f"results directory '{self.directory}' cannot be written")
         probe.unlink(missing_ok=True)
-        if self._study:
-            self._claim_directory()
-
-    def _claim_directory(self) -> None:
-        """Reserve the directory for this study before it has rows; raises :class:`UserError` if another study has it.
-
-        The claim is removed once rows are stored, since rows name their study.
-        """
-        with self._locked():
-            owner = self._claim.read_text(errors="replace") if self._claim.is_file() else ""
-            if owner not in ("", self._study):
-                raise UserError(
-                    f"a run of study {printable(owner)} has started in '{self.directory}', and this is study {self._study}: "
-                    "choose another folder with name=..., or remove that one"
-                )
-            if self._list_files() != self._files_read:
-                self.load()  # another run has stored rows since the files were read
-            self._in_pending(
-                lambda: replace_file(self._claim, self._study.encode()), f"'{self._claim}' cannot be created"
-            )
+        if self._study and self._list_files() != self._files_read:
+            self.load()  # another run has stored rows since the files were read
 
     @contextmanager
     def _locked(self) -> Iterator[bool]:
@@ -112,11 +93,6 @@ class Store:
                 yield is_locked
             finally:
                 path.unlink(missing_ok=True)
-
-    def _release_claim(self) -> None:
-        with suppress(OSError):
-            if self._claim.read_text(errors="replace") == self._study:
-                self._claim.unlink()
 
     def _refuse_other_studies(self, studies: Iterable[str]) -> None:
         """Raise :class:`UserError` if ``studies`` contains another study than this store's."""
@@ -151,8 +127,6 @@ class Store:
             if files:
                 self._fold(sort_rows(table, order), list(files))
             remove_stale(self._pending)
-            if self._table.exists():
-                self._release_claim()
         with suppress(OSError):  # the folder is not empty
             self._pending.rmdir()
 

@@ -35,10 +35,16 @@ class StudyPackage(Study):
         return self._module("measure").measure(cell, session, self)  # type: ignore[no-any-return]
 
     def views(self, experiment: Experiment, rows: pd.DataFrame) -> Views:
-        """Return the tables of the rows and the charts that are not empty, and why cells have no result."""
+        """Return the tables of the rows and the charts that are not empty, and why cells have no result.
+
+        Where a study has nothing to show, this is a file with the status of each cell.
+        """
+        from bench.report import generic
         from bench.report.writer import reasons
 
-        found: Views = self._module("views").views(experiment, rows)
+        found: Views | None = self._module("views").views(experiment, rows)
+        if found is None:
+            found = Views([replace(table, terminal=False) for table in generic.views(experiment, rows).tables])
         drawn = [chart for chart in found.charts if len(chart.frame)]
         return replace(found, charts=drawn, remarks=[*found.remarks, *unseen_features(rows), *reasons(rows)])
 

@@ -6,8 +6,7 @@ import numpy as np
 
 from bench.measure.contacts import active_contacts, contact_names, engine_contacts, split
 from bench.model import ContactScene, EngineScene, ForceLaw, FrictionScene, Jacobians, Problem, Rollout, compose
-from bench.trace import equations
-from bench.trace.equations import Newton, solved_again, stepped
+from bench.trace.equations import stepped
 
 REAL = ("gap", "penetration", "force", "force_peak", "sticking", "slipping")
 TOUCHES = "touches_"
@@ -15,18 +14,14 @@ TOUCHES = "touches_"
 
 
 def contact_columns(problem: Problem, program: Rollout, path: Jacobians) -> dict[str, np.ndarray]:
-    """Return the columns on contacts and on the equations of the steps, each ``(T + 1,)``; NaN where undefined.
+    """Return the columns on contacts, each ``(T + 1,)``; NaN where undefined.
 
     ``program`` is that of ``problem`` with the parameters of the rollout.
     """
     scene, law = program.scene, program.contact
     count = len(path.states)
-    columns = dict.fromkeys((*REAL, *equations.COLUMNS), np.full(count, np.nan))
+    columns = dict.fromkeys(REAL, np.full(count, np.nan))
     columns |= {"contacts": np.zeros(count, dtype=int), "switch": np.zeros(count, dtype=int)}
-    after = None
-    if program.needs_root:
-        after, solver = solved_again(program, path)
-        columns |= solver
     if isinstance(scene, EngineScene):
         touching, gap, force = _of_engine(problem, path)
         if not len(gap):
@@ -37,7 +32,7 @@ def contact_columns(problem: Problem, program: Rollout, path: Jacobians) -> dict
     else:
         state = split(scene, path.states.T)
         gap = scene.gap(np, state.q)
-        touching, force = _touching(program, scene, path, after)
+        touching, force = _touching(program, scene, path)
         names = contact_names(problem)
     mode = touching.astype(int)
     if isinstance(scene, FrictionScene) and scene.friction > 0:
@@ -65,9 +60,7 @@ def _of_engine(problem: Problem, path: Jacobians) -> tuple[np.ndarray, np.ndarra
     return touching, gap, np.append(force, np.full((len(force), 1), np.nan), axis=1)
 
 
-def _touching(
-    program: Rollout, scene: ContactScene, path: Jacobians, after: np.ndarray | None
-) -> tuple[np.ndarray, np.ndarray]:
+def _touching(program: Rollout, scene: ContactScene, path: Jacobians) -> tuple[np.ndarray, np.ndarray]:
     """Return which contacts act at each state, and their normal forces [N], both ``(n_contacts, T + 1)``.
 
     A state has the active contacts of the step that starts there, see :func:`bench.measure.contacts.active_contacts`.
@@ -82,24 +75,22 @@ def _touching(
         touching = active_contacts(program, states, controls)[..., 0].T
         force = law.force(np, gap, scene.gap_rate(np, *state)) + 0.0
         return np.append(touching, gap[:, -1:] < 0, axis=1), force
-    force = _impulse_forces(program, scene, path, after)
+    force = _impulse_forces(program, scene, path)
     touching = active_contacts(program, states, controls, force.T[..., None])[..., 0].T
     nothing = np.full((len(force), 1), np.nan)
     return np.append(touching, touching[:, -1:], axis=1), np.append(force, nothing, axis=1)
 
 
-def _impulse_forces(program: Rollout, scene: ContactScene, path: Jacobians, after: np.ndarray | None) -> np.ndarray:
+def _impulse_forces(program: Rollout, scene: ContactScene, path: Jacobians) -> np.ndarray:
     """Return normal forces ``(n_contacts, T)`` [N] whose impulses explain the difference from a step without the law.
 
     The forces lambda solve M^-1 J^T lambda dt = v_{k+1} - v_free by least squares, exactly where the normals of the
     contacts are independent.
     """
     q = split(scene, path.states[:-1].T).q
-    if after is None:
-        after = stepped(program, path, Newton())
     without_contact = compose(scene, None, program.integrator)
     assert isinstance(without_contact, Rollout)
-    jump = split(scene, after - stepped(without_contact, path, Newton())).v
+    jump = split(scene, stepped(program, path) - stepped(without_contact, path)).v
     units = np.eye(scene.n_contacts)[:, :, None] + np.zeros((1, 1, q.shape[1]))
     response = np.stack([scene.contact_acceleration(np, q, unit) for unit in units])
     inverse = np.linalg.pinv(np.nan_to_num(response.transpose(2, 1, 0)))

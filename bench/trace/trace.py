@@ -29,7 +29,7 @@ from bench.trace.states import per_state
 
 COLUMNS = (
     "step", "time", "contacts", "switch", "gap", "penetration", "force", "force_peak", "sticking", "slipping",
-    "solver_residual", "solver_iterations", "solver_mismatch", "jacobian_norm", "adjoint_norm", "cost_stage",
+    "jacobian_norm", "adjoint_norm", "cost_stage",
     "cost_terminal",
 )  # fmt: skip
 """Columns of every trace. Cost terms (``cost_NAME``), states (``q1``, ``v1``) and controls (``u1``) follow."""

@@ -319,7 +319,7 @@ def test_programs_that_an_engine_does_not_run_are_refused():
     assert "slides only" in taichi.refusal(program(Cartpole()))
     damped = compose(BouncingBall(), law_for(BouncingBall(), Penalty, {"damping": 1.0}), SemiImplicitEuler())
     newton = registry.usable("backends", "newton")()
-    assert "runs damping_mode=approach only, not clipped" in newton.refusal(damped)
+    assert "supports damping_mode=approach only, not clipped" in newton.refusal(damped)
 
 
 @dataclasses.dataclass(frozen=True)

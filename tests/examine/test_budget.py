@@ -117,25 +117,6 @@ def test_a_gradient_that_compiles_too_long_is_tried_once():
     assert len(tried) == 1
 
 
-COUNTED = """
-import jax, numpy as np, bench
-traced = []
-def cost(x):
-    traced.append(1)
-    return jax.numpy.sum(x**3)
-report = bench.examine(cost, np.array([1.0, 2.0]), grad="jax", progress=False, calls=600)
-print(report.status, len(traced))
-"""
-
-
-@pytest.mark.slow
-def test_jax_compiles_the_cost_twice_and_the_gradient_once_for_a_check():
-    """Alone, in a batch, and the gradient; in a process of its own, since other tests change JAX's configuration."""
-    pytest.importorskip("jax")
-    done = subprocess.run([sys.executable, "-c", COUNTED], capture_output=True, text=True, timeout=120, check=True)
-    assert done.stdout.split()[-2:] == ["0", "3"]
-
-
 def test_the_report_is_printed_on_sigterm(tmp_path):
     path, marker = tmp_path / "slow.py", tmp_path / "called"
     path.write_text(

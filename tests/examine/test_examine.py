@@ -16,7 +16,7 @@ from bench import cli
 from bench.errors import UserError
 from bench.examine import smoothing, text
 from bench.examine.lines import Break, LineScan, scan
-from bench.model.simulator import tree
+from bench.model.simulator import simulator, tree
 from bench.model.simulator.clock import Clock
 from bench.model.simulator.simulator import Simulator
 from bench.model.simulator.tree import ParameterTree
@@ -117,6 +117,12 @@ def test_right_gradient_passes_with_every_digit():
     report.assert_right()
     np.testing.assert_allclose(report.frame["difference"][:2], slope([1.0, 0.5]), rtol=1e-7)
     assert report.check.order == pytest.approx(2.0, abs=0.1)
+
+
+def test_a_library_that_is_not_installed_is_named(monkeypatch):
+    monkeypatch.setattr(simulator, "find_spec", lambda name: None)
+    with pytest.raises(UserError, match="grad=jax needs a library that is not installed: pip install jax"):
+        bench.examine(lambda x: x[0], [1.0], grad="jax")
 
 
 def test_gradient_that_raises_is_a_finding():

@@ -119,11 +119,6 @@ def test_rules_that_agree_at_once_are_still_refined(dim, least):
     assert found_at(bank.certified(ridge(bank.power(1), dim=dim), SAMPLES), "points") >= least
 
 
-def test_jumps_in_a_plane_that_no_breakpoint_lists_are_sampled():
-    case = ridge(bank.step(0.3, 1.0), dim=2, says=False)
-    assert bank.certified(case, SAMPLES).method.startswith("sampling[zeroth_order")
-
-
 def test_gradient_near_zero_is_known_absolutely():
     """Two effects that cancel to 1e-9: relative criteria would reject quadrature and spend every sample."""
     case = ridge(bank.wave(1.0), bank.power(1, -np.exp(-0.5) + 1e-9), bank.power(2), dim=2)
@@ -294,11 +289,6 @@ def test_small_spread_alone_certifies_nothing():
     assert found_at(found, "n") >= reference.LEAST_SAMPLES
     assert found.known().standard_error > 0.0
     assert bank.excess(case, found) <= 1.0
-
-
-def test_constant_gradient_takes_the_least_samples_and_no_fewer():
-    found = bank.certified(ridge(bank.power(1), dim=3), 1 << 18)
-    assert found_at(found, "n") == reference.LEAST_SAMPLES
 
 
 def test_tails_that_samples_do_not_show_are_part_of_the_error():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bench.measure import timing
-from bench.measure.timing import Pause, Timing
+from bench.measure.timing import Pause
 
 
 class Clock:
@@ -78,11 +78,6 @@ def test_pauses_add_up_and_are_no_time_of_a_call(ticking):
     _, found = timing.timed(call, 3, least_s=0.0, pause=pause)
     assert found.samples_s == (1.0, 1.0, 1.0)
     assert pause.seconds == 4 * 2 * 10.0
-
-
-def test_spread_is_relative():
-    assert Timing(4.0, 1.0).spread == 0.25
-    assert Timing(4.0, 1.0).calls == 1
 
 
 @pytest.mark.skipif(np.isnan(timing.peak_memory_mb()), reason="no peak of memory on this system")

@@ -107,7 +107,7 @@ def test_dropped_term_of_the_derivative_is_caught(dropped, monkeypatch):
     assert any(row["is_right"] is False for case in CASES for row in conformance.run(Engine(case), case))
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_elliptic_cone_in_reverse_agrees_with_differences_of_the_backends_own_costs():
     scene = TossedBox(horizon=120)
     law = law_for(scene, Penalty, {"damping_mode": "clipped"})

@@ -38,6 +38,6 @@ def test_the_first_control_is_that_of_the_best_plan_from_the_present_state(plann
     assert abs(first) > 3 * error
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_the_page_has_the_table_of_the_example():
     assert EXAMPLE["table"]() in (ROOT / "docs" / "controller.md").read_text()

@@ -20,7 +20,7 @@ import pytest
 from pairwise import pairwise
 
 from bench.cli import main
-from bench.errors import StorageError, UserError
+from bench.errors import StorageError
 from bench.run import files
 from bench.run import store as store_module
 from bench.run.launchers import launcher
@@ -464,14 +464,11 @@ def test_a_run_whose_rows_go_again_and_again_ends_with_their_number(tmp_path, ca
     assert "3 cells were run and have no row; 0 of 3 cells are stored" in capsys.readouterr().err
 
 
-def test_a_pipe_and_a_claim_in_other_characters_are_left_alone(tmp_path):
+def test_pipes_are_left_alone(tmp_path):
     store = Store(tmp_path, COLUMNS, "bias_variance")
     (tmp_path / "pending").mkdir()
     os.mkfifo(tmp_path / "pending" / "pipe.json")
     assert store.load().empty
-    for name in (".lock", ".study"):
-        os.mkfifo(tmp_path / "pending" / name)
+    os.mkfifo(tmp_path / "pending" / ".lock")
     store.prepare()
-    (tmp_path / "pending" / ".study").write_bytes(b"\xff\xfe")
-    with pytest.raises(UserError, match="has started"):
-        store.prepare()
+    store.compact()

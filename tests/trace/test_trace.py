@@ -1,4 +1,4 @@
-"""The trace of one rollout: adjoints, contacts, solver, the verdict on spikes, and the command."""
+"""The trace of one rollout: adjoints, contacts, the verdict on spikes, and the command."""
 
 from dataclasses import dataclass
 
@@ -15,7 +15,6 @@ from bench.measure.contacts import active_contacts, engine_contacts
 from bench.model import Decision, FrictionScene, Unsupported, compose
 from bench.report.draw import draw
 from bench.trace.chart import chart
-from bench.trace.equations import Newton
 from bench.trace.sentences import report, verdict
 from bench.trace.spikes import align
 from bench.trace.trace import COLUMNS, Trace, run, trace
@@ -90,7 +89,6 @@ def test_contacts_under_a_penalty_by_hand():
     norms = [np.linalg.norm(matrix, 2) for matrix in (free, touching, touching)]
     np.testing.assert_allclose(table["jacobian_norm"], [*norms, np.nan], rtol=1e-13)
     assert table["sticking"].isna().all()
-    assert table["solver_residual"].isna().all()
 
 
 @pytest.mark.slow
@@ -133,7 +131,7 @@ def test_a_spike_is_listed_with_the_switch_beside_it():
 
 
 @pytest.mark.slow
-def test_complementarity_forces_and_solver():
+def test_complementarity_forces():
     scene = Pushing(push=1.0)
     law = Complementarity(kappa=1e-8)
     table, _ = trace(compiled(scene, law, Implicit()), np.zeros((30, 1)))
@@ -143,18 +141,6 @@ def test_complementarity_forces_and_solver():
     # Bodies pushed together by 1 N at a velocity factor: the second needs half of it once both move alike.
     assert steps["force"].iloc[-1] == pytest.approx(0.5, rel=1e-3)
     assert list(table["contacts"]) == [1] * 31
-    assert steps["solver_residual"].max() < 1e-12
-    assert steps["solver_mismatch"].max() < 1e-12
-    assert (steps["solver_iterations"] >= 1).all()
-
-
-def test_newton_counts_the_iterations_of_each_column():
-    solver = Newton()
-    root = solver.root(lambda z, a: z * z - a, np.array([[1.0, 2.0]]), np.array([[4.0, 4.0]]))
-    np.testing.assert_allclose(np.asarray(root), [[2.0, 2.0]], rtol=1e-12)
-    # From 1: 2.5, 2.05, 2.0006, 2.00000009, then 2 to 2e-15 and a last step within tolerance; from 2: one, of 0.
-    assert list(solver.iterations[0]) == [6, 1]
-    assert solver.residuals[0].max() < 1e-12
 
 
 @dataclass(frozen=True)

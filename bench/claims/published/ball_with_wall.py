@@ -2,42 +2,32 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from scipy.optimize import brentq
 
 from bench.claims.claim import Claim, Figure, Outcome
-from bench.claims.toolkit import centre, estimator, expectation, problem, rule, stochastic_descent
-from bench.model import Array, FunctionScene, Problem, param
+from bench.claims.toolkit import centre, estimator, expectation, function, problem, rule, stochastic_descent
+from bench.model import Array, Problem
 
 GRAVITY, WALL, HEIGHT, SIGMA = 9.81, 0.06, 0.02, 0.1
 JUMPS = (0.69320, 1.19935)
 RUNS = 60
 
 
-@dataclass(frozen=True)
-class BallWithWall(FunctionScene):
+def ball_with_wall(xp: Any, x: Array) -> Array:
     """A ball thrown at speed 1 and angle x stops at a wall unless it clears it: f = -(distance reached)^2."""
+    angle = x[0]
+    reached = xp.sin(2 * angle) / GRAVITY
+    flight = WALL / xp.cos(angle)
+    height = flight * xp.sin(angle) - 0.5 * GRAVITY * flight * flight
+    stopped = (reached > WALL) & (height <= HEIGHT)
+    landed = xp.where(stopped, 0.0 * reached + WALL, reached)
+    return -landed * landed
 
-    name = "ball_with_wall"
-    continuous: ClassVar[bool] = False
-    start: float = param(0.1, "angle at theta", "rad")
 
-    def theta0(self) -> np.ndarray:
-        """Return the angle."""
-        return np.array([self.start])
-
-    def cost(self, xp: Any, x: Array) -> Array:
-        """Return the negative square of the distance to the landing point, or to the wall."""
-        angle = x[0]
-        reached = xp.sin(2 * angle) / GRAVITY
-        flight = WALL / xp.cos(angle)
-        height = flight * xp.sin(angle) - 0.5 * GRAVITY * flight * flight
-        stopped = (reached > WALL) & (height <= HEIGHT)
-        landed = xp.where(stopped, 0.0 * reached + WALL, reached)
-        return -landed * landed
+SCENE = function(ball_with_wall, [0.1], SIGMA, continuous=False)
 
 
 class ThrownBall(Claim):
@@ -61,7 +51,7 @@ class ThrownBall(Claim):
 
     def measure(self) -> Outcome:
         """Locate the jumps and kinks, integrate the gradients, and run the descents."""
-        at = problem(BallWithWall(sigma=SIGMA))
+        at = problem(SCENE)
         still = np.zeros((1, 1))
 
         def f(x: float) -> float:

@@ -10,26 +10,19 @@ from scipy.optimize import minimize_scalar
 from scipy.special import ndtr
 
 from bench.claims.claim import Claim, Figure, Outcome
-from bench.claims.toolkit import estimator, moments, problem
-from bench.model import Array, ContactScene, FunctionScene, State, param
+from bench.claims.toolkit import estimator, function, moments, problem
+from bench.model import Array, ContactScene, State, param
 
 KAPPA = 0.25
 """Central-path parameter of the contact [N m]."""
 
 
-@dataclass(frozen=True)
-class Kink(FunctionScene):
+def kink(xp: Any, x: Array) -> Array:
     """f = max(0, x): the gap of one contact after its force."""
+    return xp.where(x[0] > 0, x[0], 0.0 * x[0])
 
-    name = "kink"
 
-    def theta0(self) -> np.ndarray:
-        """Return the kink's place."""
-        return np.zeros(1)
-
-    def cost(self, xp: Any, x: Array) -> Array:
-        """Return the positive part."""
-        return xp.where(x[0] > 0, x[0], 0.0 * x[0])
+KINK = function(kink, [0.0], 0.1)
 
 
 @dataclass(frozen=True)
@@ -91,7 +84,7 @@ class CentralPath(Claim):
         # the chance that w > -a for the density 2 / (w^2 + 4)^1.5, by integrating it, not from its formula
         chance = _chance(a)
         closest = minimize_scalar(lambda s: np.abs(relaxed - ndtr(a / s)).max(), bounds=(1, 3), method="bounded")
-        at = problem(Kink(sigma=0.1))
+        at = problem(KINK)
         _, (first, first_error) = moments(at, estimator("fobg"))
         _, (zeroth, zeroth_error) = moments(at, estimator("reinforce"))
         figures = [

@@ -2,33 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from scipy.special import ndtr
 
 from bench.claims.claim import Claim, Figure, Outcome
-from bench.claims.toolkit import estimator, moments, problem
-from bench.model import Array, FunctionScene, param
+from bench.claims.toolkit import estimator, function, moments, problem
+from bench.model import Array
 
 
-@dataclass(frozen=True)
-class DryFriction(FunctionScene):
-    """A block at rest is pushed with force x. Its acceleration is x - mu sign(x) if |x| > mu, else 0."""
+def dry_friction(xp: Any, x: Array) -> Array:
+    """The acceleration of a block at rest, pushed with force x: x - sign(x) if |x| > 1, else 0."""
+    beyond = xp.abs(x[0]) - 1.0
+    return xp.sign(x[0]) * xp.where(beyond > 0, beyond, 0.0 * beyond)
 
-    name = "dry_friction"
-    mu: float = param(1.0, "largest friction force")
-    push: float = param(0.0, "force at theta")
 
-    def theta0(self) -> np.ndarray:
-        """Return the push."""
-        return np.array([self.push])
-
-    def cost(self, xp: Any, x: Array) -> Array:
-        """Return the acceleration."""
-        beyond = xp.abs(x[0]) - self.mu
-        return xp.sign(x[0]) * xp.where(beyond > 0, beyond, 0.0 * beyond)
+SCENE = function(dry_friction, [0.0], 1.0)
 
 
 class Sticking(Claim):
@@ -46,7 +36,7 @@ class Sticking(Claim):
 
     def measure(self) -> Outcome:
         """Compute the exact derivative, and integrate both orders over the noise."""
-        at = problem(DryFriction(sigma=1.0))
+        at = problem(SCENE)
         exact = float(at.grad(np.zeros(1), np.zeros((1, 1)))[0, 0])
         (first, first_error), _ = moments(at, estimator("fobg"))
         (zeroth, zeroth_error), _ = moments(at, estimator("reinforce"))

@@ -89,6 +89,8 @@ class ElasticPair(Claim):
             end = float(at.value(at.program.theta0, still)[0])
             if label != "without":
                 figures.append(Figure(f"place at the end, {label}", "1.200", end, spread=1e-9))
+            if label not in self.curves:
+                continue
             theta = np.stack([starts, *np.repeat(at.program.theta0[1:, None], starts.size, axis=1)])
             series[label] = at.value(theta, np.repeat(still, starts.size, axis=1))
         return Outcome(figures, series=series)

@@ -3,34 +3,24 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
 from bench.claims.claim import Claim, Figure, Outcome
-from bench.claims.toolkit import centre, expectation, problem, stochastic_descent
-from bench.model import Array, FunctionScene, param
+from bench.claims.toolkit import centre, expectation, function, problem, stochastic_descent
+from bench.model import Array
 
 SIGMA = 0.02
 
 
-@dataclass(frozen=True)
-class Pivot(FunctionScene):
+def pivot(xp: Any, x: Array) -> Array:
     """f = -sin^2 x up to |x| = pi/4 and 0 beyond: further is better, until the pivot falls."""
+    value = -(xp.sin(x[0]) ** 2)
+    return xp.where(xp.abs(x[0]) <= math.pi / 4, value, 0.0 * value)
 
-    name = "pivot"
-    continuous: ClassVar[bool] = False
-    start: float = param(0.1, "angle at theta", "rad")
 
-    def theta0(self) -> np.ndarray:
-        """Return the angle."""
-        return np.array([self.start])
-
-    def cost(self, xp: Any, x: Array) -> Array:
-        """Return the cost."""
-        value = -(xp.sin(x[0]) ** 2)
-        return xp.where(xp.abs(x[0]) <= math.pi / 4, value, 0.0 * value)
+SCENE = function(pivot, [0.1], SIGMA, continuous=False)
 
 
 class FallingPivot(Claim):
@@ -47,7 +37,7 @@ class FallingPivot(Claim):
 
     def measure(self) -> Outcome:
         """Integrate the missing part, and descend."""
-        at = problem(Pivot(sigma=SIGMA))
+        at = problem(SCENE)
 
         def means(x: float, count: int = 200_000) -> tuple[tuple[float, float], tuple[float, float]]:
             theta = np.array([x])

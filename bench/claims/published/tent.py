@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from bench.claims.claim import Claim, Figure, Outcome
-from bench.claims.toolkit import estimator, problem, spread, terms
-from bench.model import Array, FunctionScene, param
+from bench.claims.toolkit import estimator, function, problem, spread, terms
+from bench.model import Array, FunctionScene
 
 SAMPLES = 400_000
 AT_GAIN = 8 * SAMPLES
@@ -19,23 +18,16 @@ WEIGHED, MIXED = 2, 40_000
 """Steps at which the variance of the estimator ``inverse_variance`` is measured, and the number of its estimates."""
 
 
-@dataclass(frozen=True)
-class Tent(FunctionScene):
-    """x is mapped to 1 - |1 - 2 x| in each step, and f is the last value."""
+def tent(steps: int) -> FunctionScene:
+    """Return the last value of x after steps that map it to 1 - |1 - 2 x|."""
 
-    name = "tent"
-    steps: int = param(10, "iterations", positive=True)
-
-    def theta0(self) -> np.ndarray:
-        """Return the start."""
-        return np.array([0.3])
-
-    def cost(self, xp: Any, x: Array) -> Array:
-        """Return the last iterate."""
+    def cost(xp: Any, x: Array) -> Array:
         value = x[0]
-        for _ in range(self.steps):
+        for _ in range(steps):
             value = 1.0 - xp.abs(1.0 - 2.0 * value)
         return value
+
+    return function(cost, [0.3], 0.05)
 
 
 class Chaos(Claim):
@@ -59,7 +51,7 @@ class Chaos(Claim):
         draw = np.random.default_rng(19)
         found, figures = {}, []
         for steps in (1, 2, 5, 10, 14, 20):
-            at = problem(Tent(sigma=0.05, steps=steps))
+            at = problem(tent(steps))
             w = draw.standard_normal((1, AT_GAIN if steps == 20 else SAMPLES))
             pair = terms(at, first, w), terms(at, zeroth, w)
             found[steps] = [spread(values) for values in pair]
@@ -81,7 +73,7 @@ class Chaos(Claim):
         split = Figure("the same with the samples split", "8.0e9", v1 / half, v1 / half * (e0 / v0), spread=2e8)
         figures.append(split)
         # the same by the estimator that splits them, on fewer steps, where its weights are not too far from one half
-        at, mixture = problem(Tent(sigma=0.05, steps=WEIGHED)), estimator("inverse_variance")
+        at, mixture = problem(tent(WEIGHED)), estimator("inverse_variance")
         (v1, e1), (v0, e0) = (spread(terms(at, one, draw.standard_normal((1, SAMPLES)))) for one in (first, zeroth))
         ratio = v1 / (v0 + v1)
         expected = 2.0 * v0 * ratio

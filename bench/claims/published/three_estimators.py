@@ -2,47 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from bench.claims.claim import Claim, Figure, Outcome
-from bench.claims.toolkit import estimator, hermite, moments, problem, spread, terms
-from bench.model import Array, FunctionScene, param
+from bench.claims.toolkit import estimator, function, hermite, moments, problem, spread, terms
+from bench.model import FunctionScene
 
 
-@dataclass(frozen=True)
-class Shifted(FunctionScene):
-    """f = sum_i (x_i - k)^2 at theta = 1."""
-
-    name = "shifted_square"
-    shift: float = param(0.0, "k")
-    dimension: int = param(1, "length of theta", positive=True)
-
-    def theta0(self) -> np.ndarray:
-        """Return ones."""
-        return np.ones(self.dimension)
-
-    def cost(self, xp: Any, x: Array) -> Array:
-        """Return the sum of squares."""
-        return xp.sum((x - self.shift) ** 2, axis=0)
+def shifted(shift: float, dimension: int = 1) -> FunctionScene:
+    """Return f = sum_i (x_i - shift)^2 at theta = 1."""
+    return function(lambda xp, x: xp.sum((x - shift) ** 2, axis=0), np.ones(dimension), 1.0)
 
 
-@dataclass(frozen=True)
-class Wave(FunctionScene):
-    """f = cos(k x) at theta = 1."""
-
-    name = "wave"
-    frequency: float = param(1.0, "k")
-
-    def theta0(self) -> np.ndarray:
-        """Return 1."""
-        return np.ones(1)
-
-    def cost(self, xp: Any, x: Array) -> Array:
-        """Return the cosine."""
-        return xp.cos(self.frequency * x[0])
+def wave(frequency: float) -> FunctionScene:
+    """Return f = cos(frequency x) at theta = 1."""
+    return function(lambda xp, x: xp.cos(frequency * x[0]), [1.0], 1.0)
 
 
 class ThreeEstimators(Claim):
@@ -74,7 +50,7 @@ class ThreeEstimators(Claim):
             "measure-valued": estimator("measure_valued"),
         }
         for k, expected in ((-3.0, ("4", "495", "17.49")), (1.0, ("4", "15", "0"))):
-            at = problem(Shifted(sigma=1.0, shift=k))
+            at = problem(shifted(k))
             for (name, method), text in zip(methods.items(), expected, strict=True):
                 if name == "measure-valued":
                     # its Rayleigh variable is not a polynomial of the noise
@@ -86,14 +62,14 @@ class ThreeEstimators(Claim):
             figures.append(self._best_baseline(at, k, nodes, weights))
         waves = {}
         for k, text in ((1, "0.826"), (2, "4.40"), (4, "16"), (8, "64")):
-            at = problem(Wave(sigma=1.0, frequency=float(k)))
+            at = problem(wave(float(k)))
             waves[k] = [moments(at, method, count=100_000)[1] for method in methods.values()]
             (path, path_error), (score, score_error), _ = waves[k]
             relative = path_error / path + score_error / score
             figures.append(Figure(f"cos({k} x): pathwise / score", text, path / score, relative * path / score))
         draw = np.random.default_rng(6)
         for d in (2, 8):
-            at = problem(Shifted(sigma=1.0, dimension=d))
+            at = problem(shifted(0.0, d))
             w = draw.standard_normal((d, 400_000))
             theta = np.zeros(d)
             first, error = spread(terms(at, methods["pathwise"], w, theta)[:, :1])

@@ -2,37 +2,28 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from bench.claims.claim import Claim, Figure, Outcome
-from bench.claims.toolkit import problem
-from bench.model import Array, FunctionScene, param
+from bench.claims.toolkit import function, problem
+from bench.model import Array, FunctionScene
 
 EFFORT, VALUE, GAIN = 10.0, 3.701562, 0.270156
 
 
-@dataclass(frozen=True)
-class Window(FunctionScene):
-    """The controls of a short window of the plant x' = x + u from x = 1: f = sum (x^2 + 10 u^2) + value x_H^2."""
+def window(steps: int, value: float = 0.0) -> FunctionScene:
+    """Return the controls of a short window of the plant x' = x + u from x = 1: f = sum (x^2 + 10 u^2) + value x_H^2."""
 
-    name = "window"
-    steps: int = param(1, "H", positive=True)
-    value: float = param(0.0, "weight of the squared end state")
-
-    def theta0(self) -> np.ndarray:
-        """Return zero controls."""
-        return np.zeros(self.steps)
-
-    def cost(self, xp: Any, x: Array) -> Array:
-        """Return the window's cost."""
+    def cost(xp: Any, x: Array) -> Array:
         state, total = 1.0 + 0.0 * x[0], 0.0
-        for t in range(self.steps):
+        for t in range(steps):
             total = total + state * state + EFFORT * x[t] * x[t]
             state = state + x[t]
-        return total + self.value * state * state
+        return total + value * state * state
+
+    return function(cost, np.zeros(steps), 0.1)
 
 
 class Windows(Claim):
@@ -58,22 +49,21 @@ class Windows(Claim):
         series: dict[str, list[float]] = {"window": [], "excess": []}
         best = _infinite_horizon_cost(GAIN)
         for steps, (gain, excess) in enumerate(zip(gains, excesses, strict=True), 1):
-            plain = _first_gain(Window(steps=steps))
+            plain = _first_gain(steps)
             figures.append(Figure(f"gain of a window of {steps}", gain, plain, 1e-9))
             if excess:
                 off = _infinite_horizon_cost(plain) / best - 1
                 figures.append(Figure(f"excess cost of a window of {steps}", excess, off, 1e-9))
                 series["window"].append(steps)
                 series["excess"].append(off)
-            valued = _first_gain(Window(steps=steps, value=VALUE))
+            valued = _first_gain(steps, VALUE)
             figures.append(Figure(f"gain of a window of {steps} with the value", "0.270156", valued, 1e-7))
         return Outcome(figures, series=series)
 
 
-def _first_gain(scene: Window) -> float:
+def _first_gain(d: int, value: float = 0.0) -> float:
     """Return -u_0 of the optimal controls. The gradient is linear, so d + 1 gradients give the optimum."""
-    at = problem(scene)
-    d = scene.steps
+    at = problem(window(d, value))
     points = np.concatenate([np.zeros((d, 1)), np.eye(d)], axis=1)
     gradient = at.grad(points, np.zeros((d, d + 1)))
     hessian = gradient[:, 1:] - gradient[:, :1]

@@ -6,6 +6,7 @@ import io
 import sys
 from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -94,6 +95,8 @@ class Simulator:
         batch, self.fixed = _parse_batch(batch)
         if not (grad is None or callable(grad) or grad in LIBRARIES):
             raise unknown("grad", grad, (*LIBRARIES, "a function of theta"))
+        if isinstance(grad, str) and find_spec(grad) is None:
+            raise UserError(f"grad={grad} needs a library that is not installed: pip install {grad}")
         if batch in ("columns", "rows") and not layout.flat:
             raise UserError(
                 f"batch={batch} needs a theta that is one vector; this one is {', '.join(layout.names[:4])}"

@@ -79,7 +79,7 @@ def _answers(views: Views) -> str:
         return ""
     texts = readable(table)
     if table.split:
-        texts.insert(0, "", table.frame[table.split].to_numpy())
+        texts.insert(0, table.split.strip("_"), table.frame[table.split].to_numpy())
     return f'<section id="answers"><h2>{escape(table.title)}</h2>{shell.table(texts)}</section>'
 
 

@@ -183,7 +183,8 @@ def _main_series(frame: pd.DataFrame, methods: pd.DataFrame, comparisons: pd.Dat
     estimator = dict(zip(methods["method"], methods["estimator"], strict=True))
     wins = Counter(estimator[name] for name in comparisons["first"] if name)
     names = sorted(frame["series"].unique(), key=lambda name: (-wins[name], "[" in name))
-    errors = np.log(frame.pivot_table("rmse_rel", ["panel", "x"], "series", aggfunc="first").reindex(columns=names))
+    errors = frame.pivot_table("rmse_rel", ["panel", "x"], "series", aggfunc="first").reindex(columns=names)
+    errors = np.log(errors.where(errors > 0))
     chosen: list[str] = []
     for name in names:
         apart = errors[chosen].sub(errors[name], axis=0).abs().median()

@@ -59,11 +59,6 @@ class RequiredCost:
     times: float = 0.0
     """Interquartile range of the time of one estimate over its median; 0 for rollouts."""
 
-    @property
-    def is_at_fewest(self) -> bool:
-        """Whether the fewest samples measured suffice, so that fewer may do."""
-        return self.how == "at once"
-
 
 def required_cost(line: Curve, target: float, cost: Cost) -> RequiredCost:
     """Return the cost of a curve's estimator and backend to reach a relative RMSE of ``target``, with its 95% interval."""
@@ -81,7 +76,7 @@ def required_cost(line: Curve, target: float, cost: Cost) -> RequiredCost:
     if not math.isfinite(way.cost):
         return replace(way, beyond=low.cost if math.isfinite(low.cost) else low.beyond, times=times)
     least, most = low.cost, high.cost
-    if way.is_at_fewest:  # fewer samples may be enough, down to one
+    if way.how == "at once":  # fewer samples may be enough, down to one
         least = _cost_of_one_sample(rows, cost)
     down = max(0.0, math.log(way.cost / least)) if least > 0 else math.inf
     up = max(0.0, math.log(most / way.cost)) if math.isfinite(most) else math.inf
@@ -119,7 +114,7 @@ def lead(first: RequiredCost, second: RequiredCost, alike: bool = False) -> tupl
         return math.nan, second.beyond / first.cost * math.exp(-math.hypot(first.up, *noise)), math.inf
     factor = second.cost / first.cost
     low = math.hypot(*noise) if alike else math.hypot(first.up, second.down, *noise)
-    if not alike and first.is_at_fewest and first.down > 0:
+    if not alike and first.how == "at once" and first.down > 0:
         return math.nan, factor * math.exp(-low), math.inf
     high = math.hypot(*noise) if alike else math.hypot(first.down, second.up, *noise)
     return factor, factor * math.exp(-low), factor * math.exp(high)

@@ -6,10 +6,8 @@ from dataclasses import replace
 
 import pandas as pd
 
-from bench.experiment import axes
-from bench.experiment.columns import COMMON
 from bench.experiment.experiment import Experiment
-from bench.experiment.views import Table, Views
+from bench.experiment.views import Views
 from bench.report.text import counted
 from bench.report.views import arrange
 from bench.studies.bias_variance import charts, tables, time_to_accuracy
@@ -20,13 +18,12 @@ from bench.studies.bias_variance.costs import with_gradient_cost
 RESULTS = ("variance", "cosine", "rollouts", "gradients", "reference_method")
 
 
-def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
-    """Return the tables and charts of the rows."""
+def views(experiment: Experiment, rows: pd.DataFrame) -> Views | None:
+    """Return the tables and charts of the rows; None if no cell was run."""
     shown = arrange(experiment, with_gradient_cost(rows))
     methods = method_table(shown)
     if methods.empty:
-        columns = [COMMON[name] for name in ("scene", "contact", "backend", "estimator", "status")]
-        return Views([Table("bias_variance", rows, columns, data=axes.table(experiment, rows))])
+        return None
     errors = compare_errors(methods)
     best = time_to_accuracy.table(shown)
     comparisons = errors if best.empty else pd.concat([errors, time_to_accuracy.comparisons(best)], ignore_index=True)

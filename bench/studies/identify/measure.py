@@ -402,7 +402,8 @@ def measure(cell: Cell, session: Session, settings: Identify) -> dict[str, Any]:
     }  # fmt: skip
     fits = [single, *(fit(shooting, sigma) for shooting in SHOOTING[1:] if has_windows)]
     lines = pd.DataFrame([_fit_statistics(one, known, is_own, is_noise_known) for one in fits])
-    return result | lines.to_dict("list")
+    result |= lines.to_dict("list")
+    return result
 
 
 @dataclass(frozen=True)

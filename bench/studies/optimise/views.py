@@ -58,12 +58,11 @@ PAGE = (
 )  # fmt: skip
 
 
-def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
-    """Return the tables and charts of the searches."""
+def views(experiment: Experiment, rows: pd.DataFrame) -> Views | None:
+    """Return the tables and charts of the searches; None without any."""
     runs = aggregate.collect_runs(experiment, rows)
-    if not len(runs.rows):
-        columns = [text("scene"), text("optimizer"), text("status")]
-        return Views([Table("optimise", rows, columns, data=table(experiment, rows))])
+    if runs.rows.empty:
+        return None
     name = short_names(runs.rows["method"].unique())
     cells = rows.assign(**{c: runs.rows[c] for c in ("problem", "method", "tuning", "best_known", "score")})
     cells = cells.fillna({"problem": "", "method": "", "tuning": ""}).astype({"score": float, "best_known": float})
@@ -89,7 +88,6 @@ def tables(experiment: Experiment, rows: pd.DataFrame, runs: RunSet, name: Calla
     reached, summary = aggregate.times_to_targets(runs), aggregate.summarise(runs)
     methods = summary.sort_values(["reached", "score"], ascending=False, kind="stable")
     methods = methods.assign(
-        diverged_of=methods["diverged"].astype(str) + " of " + methods["searches"].astype(str),
         name=methods["method"].map(name), verdict=np.where(aggregate.is_tied(methods), "first or tied", ""),
     )  # fmt: skip
     key = "; ".join(f"{name(method)}: {method}" for method in runs.rows["method"].unique() if name(method) != method)
@@ -100,7 +98,7 @@ def tables(experiment: Experiment, rows: pd.DataFrame, runs: RunSet, name: Calla
     return [
         Table(
             "optimise", methods,
-            [text("name", label="method"), REACHED, text("verdict"), SCORE, Column("tunings", format="setting"), MEDIAN, text("diverged_of", label="diverged")],
+            [text("name", label="method"), REACHED, text("verdict"), SCORE, *(Column(name, format="setting") for name in ("tunings", "searches", "diverged")), MEDIAN],
             "methods by the share of targets they reach", notes, terminal=True, page=True,
             data=table(experiment, rows),
         ),

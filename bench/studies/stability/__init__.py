@@ -9,7 +9,6 @@ measured too, which detects instabilities that are too slow to show within the r
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -217,26 +216,26 @@ def _refined(cell: Cell, steps: int) -> Cell:
     return fine
 
 
-def _gradient_at(cell: Cell, steps: int) -> np.ndarray:
-    """Return the cell's gradient ``(d,)`` with its duration divided into ``steps`` steps."""
+def _gradient_at(cell: Cell, steps: int, span: float = 0.0) -> np.ndarray:
+    """Return the cell's gradient ``(d,)`` with its duration divided into ``steps`` steps; with a span, central differences.
+
+    Gradients are shared by all cells with the same fine program.
+    """
     fine = _refined(cell, steps)
-
-    def gradient() -> np.ndarray:
-        problem = fine.reference_backends[0].compile(fine.program())
-        return problem.grad(problem.program.theta0, np.zeros((problem.program.n_noise, 1)))[:, 0]
-
-    return _cached(fine.program_key, gradient)
-
-
-def _cached(key: str, compute: Callable[[], np.ndarray]) -> np.ndarray:
-    """Return the cached gradient of a key, computed at first use."""
+    key = fine.program_key, span
     if key not in _fine_gradients:
-        _fine_gradients[key] = compute()
+        problem = fine.reference_backends[0].compile(fine.program())
+        theta, still = problem.program.theta0, np.zeros((problem.program.n_noise, 1))
+        if span:
+            h = span * (float(np.abs(theta).max(initial=0.0)) or 1.0)
+            costs = [[problem.value(theta + s * e, still)[0] for s in (1, -1)] for e in h * np.eye(len(theta))]
+            _fine_gradients[key] = np.array([(after - before) / (2 * h) for after, before in costs])
+        else:
+            _fine_gradients[key] = problem.grad(theta, still)[:, 0]
     return _fine_gradients[key]
 
 
-_fine_gradients: dict[str, np.ndarray] = {}
-"""Gradients at fine steps by program key, shared by all cells with the same fine program."""
+_fine_gradients: dict[tuple[str, float], np.ndarray] = {}
 
 
 def compare(gradient: np.ndarray, truth: np.ndarray, inaccurate: float) -> dict[str, Any]:
@@ -294,22 +293,7 @@ def law_gradient(cell: Cell, limits: Stability) -> tuple[np.ndarray, np.ndarray]
     contact would not converge: it jumps with the time of the impact within its step, however small the step is.
     """
     steps = max(limits.fine_steps, limits.finer * rollout(cell.program()).scene.horizon)
-    return _differences(cell, steps, SPAN), _differences(cell, steps // 2, 2 * SPAN)
-
-
-def _differences(cell: Cell, steps: int, span: float) -> np.ndarray:
-    """Return central differences ``(d,)`` of the cell's cost, with its duration divided into ``steps`` steps."""
-    fine = _refined(cell, steps)
-
-    def differences() -> np.ndarray:
-        program = fine.program()
-        problem = fine.reference_backends[0].compile(program)
-        theta, still = program.theta0, np.zeros((program.n_noise, 1))
-        h = span * (float(np.abs(theta).max(initial=0.0)) or 1.0)
-        costs = [[problem.value(theta + s * e, still)[0] for s in (1, -1)] for e in h * np.eye(len(theta))]
-        return np.array([(after - before) / (2 * h) for after, before in costs])
-
-    return _cached(f"{fine.program_key} {span}", differences)
+    return _gradient_at(cell, steps, SPAN), _gradient_at(cell, steps // 2, 2 * SPAN)
 
 
 # --------------------------------------------------------------------------------------------------- theory

@@ -47,12 +47,12 @@ SHARE_NOTES = (
 )
 
 
-def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
-    """Return the tables of shares and of cells, and the map."""
+def views(experiment: Experiment, rows: pd.DataFrame) -> Views | None:
+    """Return the tables of shares and of cells, and the map; None without any."""
     cells = cells_of(experiment, rows)
-    whole = Table("stability_map", table(experiment, rows), [], files=["csv"])
     if cells.empty:
-        return Views([whole])
+        return None
+    whole = Table("stability_map", table(experiment, rows), [], files=["csv"])
     shares = Table("stability_shares", shares_of(cells), SHARES, "How often each contact law and step gives the right gradient",
                    SHARE_NOTES, terminal=True, page=True)  # fmt: skip
     columns = [experiment.columns.by_name[name] for name in RESULTS]

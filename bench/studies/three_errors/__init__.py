@@ -79,7 +79,12 @@ class ThreeErrors(StudyPackage):
         problem = session.problem(cell)
         check = difference_check(problem)
         truth = session.references.of(cell)
-        result = check.columns() | _against_physics(problem.program, check) | {"reference_method": truth.method}
+        result = {
+            "cost": check.cost, "gradient": check.gradient.tolist(), "program_norm": norm(check.gradient),
+            "program_error": norm(check.gradient - check.difference),
+            "program_error_rel": relative_error(check.gradient, check.difference), "difference_step": check.step,
+            "reference_method": truth.method, **_against_physics(problem.program, check),
+        }  # fmt: skip
         status = finite_status(truth.note or "the reference gradient is not finite", truth.batches)
         if status["status"] != "ok":
             return result | status
@@ -100,14 +105,6 @@ class DifferenceCheck:
     difference: np.ndarray
     """``(d,)``."""
     step: float
-
-    def columns(self) -> dict[str, Any]:
-        """Return the columns of cost, gradient and program error."""
-        return {
-            "cost": self.cost, "gradient": self.gradient.tolist(), "program_norm": norm(self.gradient),
-            "program_error": norm(self.gradient - self.difference),
-            "program_error_rel": relative_error(self.gradient, self.difference), "difference_step": self.step,
-        }  # fmt: skip
 
 
 def difference_check(problem: Problem, steps: np.ndarray = STEPS) -> DifferenceCheck:

@@ -70,18 +70,17 @@ PAGE = ("final_return", "first_return", "final_median", "updates", "steps", "tra
         "gradient_peak", "window_gradient", "window_bias")  # fmt: skip
 
 
-def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
-    """Return the tables and charts of the runs."""
+def views(experiment: Experiment, rows: pd.DataFrame) -> Views | None:
+    """Return the tables and charts of the runs; None without any."""
     runs = aggregate.runs_of(experiment, rows)
-    data = table(experiment, rows)
     if runs.empty:
-        return Views([Table("train", rows, [text("scene"), text("trainer"), text("status")], data=data)])
+        return None
     summary, windows, faults = aggregate.summarise(runs), aggregate.windows(runs), aggregate.faults(runs)
     summary = summary.assign(verdict=aggregate.ranked(summary, ["problem"])).drop(
         columns=["returns", *aggregate.WINDOW]
     )
     tables = [
-        Table("train", summary, SUMMARY, "final return by trainer", [NOTE, VERDICTS], terminal=True, page=True, data=data,
+        Table("train", summary, SUMMARY, "final return by trainer", [NOTE, VERDICTS], terminal=True, page=True, data=table(experiment, rows),
               details=["compile_s", "gradient_typical", "gradient_peak"]),
         Table("summary", summary, [], files=["csv"]),
     ]  # fmt: skip
