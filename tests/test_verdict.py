@@ -164,6 +164,7 @@ def test_statuses_of_the_other_verbs(status, words, ending, monkeypatch):
 RAISES = """
 import sys
 import bench.__main__ as command
+from bench import cli
 from bench.model import registry
 
 def main():
@@ -172,7 +173,7 @@ def main():
         registry.entries()
     {raises}
 
-command.main = main
+cli.main = main
 command.command()
 """
 

@@ -32,7 +32,7 @@ SHARED = ("bench", "builtins", "json", "math", "numpy", "os", "pandas", "pickle"
 """Packages whose functions a file must not replace."""
 CHILD_CODE = (
     "import json, sys; job = json.load(sys.stdin); sys.path[:] = job['path']; "
-    "import bench.model.trial as trial; trial.run_child(job)"
+    "import bench.run.execute; import bench.model.trial as trial; trial.run_child(job)"
 )
 
 
