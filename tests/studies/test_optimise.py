@@ -368,6 +368,16 @@ def test_few_seeds_or_nothing_tuned_use_all_seeds(finals):
     assert len(found.best_runs) == len(next(iter(finals.values())))
 
 
+def test_a_method_beats_the_baseline_in_the_share_of_pairs_that_it_wins():
+    """Two wins, a tie and two losses are a half, with Wilson's interval of five pairs; a failed search has lost."""
+    runs = searches({("fobg", ""): [3, 3, 3, 3, 3], ("other", ""): [1, 2, 3, 4, 5], ("failed", ""): [1, 1, 1, 1, 1]})
+    runs.rows.loc[runs.rows["method"] == "failed", "status"] = "diverged"
+    found = aggregate.improvement(runs)
+    assert found.loc["other"].tolist() == pytest.approx([0.5, *performance.wilson(2, 5)])
+    assert found["improvement"].isna().tolist() == [True, False, False]
+    assert found.loc["failed", "improvement"] == 0.0
+
+
 # ---------------------------------------------------------------------------------------------------- what is shown
 
 

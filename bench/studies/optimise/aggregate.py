@@ -187,11 +187,15 @@ def share_of_targets(reached: pd.DataFrame) -> tuple[float, float]:
 
 @remember
 def summarise(runs: RunSet) -> pd.DataFrame:
-    """Return, per method, the share of targets reached and the score.
+    """Return, per method, the share of targets reached, the score, the profile and the chance to beat the baseline.
 
-    The score is an interquartile mean, its interval a bootstrap stratified by problem.
+    The score is an interquartile mean, its interval a bootstrap stratified by problem. ``profile`` is the mean over tau in
+    [1, 4] of the share of targets reached within tau times the runtime of the best method.
     """
     reached, lines = times_to_targets(runs), []
+    slower = reached["art"] / reached.groupby(["problem", "target"])["art"].transform("min")
+    profiles = ((4.0 - slower.fillna(math.inf).clip(lower=1.0)) / 3.0).clip(lower=0.0).groupby(reached["method"]).mean()
+    better = improvement(runs)
     for method, part in runs.best_runs.groupby("method", sort=False):
         strata = [own.to_numpy() for _, own in part["score"].dropna().groupby(part["problem"], sort=False)]
         low, high = performance.bootstrap(strata, _pooled_score) if strata else (math.nan, math.nan)
@@ -202,10 +206,33 @@ def summarise(runs: RunSet) -> pd.DataFrame:
             "reached": share, "reached_low": max(0.0, share - performance.Z * error),
             "reached_high": min(1.0, share + performance.Z * error), "reached_se": error,
             "score": _pooled_score(strata), "score_low": low, "score_high": high,
-            "diverged": int((part["status"] == "diverged").sum()),
+            **better.loc[method], "profile": profiles[method], "diverged": int((part["status"] == "diverged").sum()),
             "tunings": int(cells["tuning"].nunique()), "median_score": float(cells["score"].median()),
         })  # fmt: skip
     return pd.DataFrame(lines)
+
+
+def improvement(runs: RunSet, baseline: str = "fobg") -> pd.DataFrame:
+    """Return, per method, the probability of a lower final cost than the first method whose estimator is ``baseline``.
+
+    Searches are paired by problem and seed, and problems count the same; a tie counts half. The interval is Wilson's: where few
+    pairs all agree, that of a bootstrap would be a single point. NaN for the baseline and without pairs.
+    """
+    final = runs.best_runs.assign(final=runs.best_runs["final_cost"].where(runs.best_runs["status"] == "ok", math.inf))
+    wide = final.pivot_table(index=["problem", "seed"], columns="method", values="final", aggfunc="first", dropna=False)
+    methods = runs.rows["method"].unique()
+    base = next((m for m in methods if m.partition(",")[0].partition("[")[0] == baseline), None)
+    lines = {}
+    for method in methods:
+        pairs = wide[[method, base]].dropna().to_numpy() if base not in (None, method) else np.empty((0, 2))
+        lines[method] = (math.nan, math.nan, math.nan)
+        if len(pairs):
+            wins = (pairs[:, 0] < pairs[:, 1]) + 0.5 * (pairs[:, 0] == pairs[:, 1])
+            problems = wide[[method, base]].dropna().index.get_level_values("problem")
+            share = float(pd.Series(wins).groupby(problems).mean().mean())
+            lines[method] = (share, *performance.wilson(round(share * len(pairs)), len(pairs)))
+    columns = ["improvement", "improvement_low", "improvement_high"]
+    return pd.DataFrame.from_dict(lines, orient="index", columns=columns)
 
 
 def _pooled_score(strata: Sequence[np.ndarray]) -> float:

@@ -28,6 +28,8 @@ REACHED = Column(
     "reached", label="targets reached", format="percent", low="reached_low", high="reached_high", log=False
 )
 SCORE = Column("score", low="score_low", high="score_high", digits=3, log=False)
+BETTER = Column("improvement", label="beats fobg", low="improvement_low", high="improvement_high")
+PROFILE = Column("profile", log=False)
 MEDIAN = Column("median_score", label="median over tunings", log=False)
 RUNTIME = Column(
     "art", label="average runtime", unit="rollouts", low="art_low", high="art_high", log=True,
@@ -38,7 +40,8 @@ SPENT = Column("spent", label="rollouts", log=True)
 NOTE = (
     "targets reached: share of searches whose regret falls to 1/10, 1/100 and 1/1000 of the first, the mean over problems and "
     "targets. score: share of the way from the first cost to J*, interquartile mean over searches, with a bootstrap interval "
-    "stratified by problem. average runtime (aRT): expected rollouts per "
+    "stratified by problem. beats fobg: chance of a lower final cost, paired by problem and seed. profile: integral of the "
+    "share of targets reached within 1 to 4 times the best method's runtime. average runtime (aRT): expected rollouts per "
     "target reached, where a gradient counts as many rollouts as take its time: the rollouts of all searches over the number "
     "of searches that reached the target, inf if none did. Each method is shown at its best tuning on each problem, chosen by "
     "median final cost of {seeds}, next to the number of tunings and the median score over all of them. Methods without "
@@ -98,7 +101,7 @@ def tables(experiment: Experiment, rows: pd.DataFrame, runs: RunSet, name: Calla
     return [
         Table(
             "optimise", methods,
-            [text("name", label="method"), REACHED, text("verdict"), SCORE, *(Column(name, format="setting") for name in ("tunings", "searches", "diverged")), MEDIAN],
+            [text("name", label="method"), REACHED, text("verdict"), SCORE, BETTER, PROFILE, *(Column(name, format="setting") for name in ("tunings", "searches", "diverged")), MEDIAN],
             "methods by the share of targets they reach", notes, terminal=True, page=True,
             data=table(experiment, rows),
         ),
