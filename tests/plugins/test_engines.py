@@ -163,7 +163,7 @@ def test_reference_of_an_engine_is_its_own():
 def test_scene_for_engines_is_traced_by_engines_only(tmp_path, capsys):
     assert main(["trace", "tossed_box", f"results_dir={tmp_path}"]) == 0
     printed = capsys.readouterr()
-    assert "by contact: corner1-1 " in printed.out
+    assert "by contact: corner-1-1 64, corner1-1 25" in printed.out
     assert "only engines run these scenes: backends=[mujoco]" in printed.err
     assert main(["trace", "tossed_box", "backends=[jax]", f"results_dir={tmp_path}"]) == 2
     assert "runs only in physics engines" in capsys.readouterr().err

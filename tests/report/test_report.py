@@ -423,7 +423,7 @@ def test_columns_and_rows_of_the_papers_table_can_be_chosen(tmp_path, capsys):
         ("table.columns=sigmas", "did you mean 'sigma'"),
         ("columns=sigmas", "did you mean 'sigma'"),
         ("table.rows=[backend]", "must contain estimator"),
-        ("table.row=[estimator]", "table.row"),
+        ("table.row=[estimator]", "did you mean 'rows'"),
     ):
         assert main(["plan", *words, word]) == 2
         assert said in capsys.readouterr().err
