@@ -138,15 +138,17 @@ def curves(runs: pd.DataFrame) -> pd.DataFrame:
         count = part["curve_return"].map(len)
         whole = part[count == count.max()]
         costs = np.array([_filled(-np.asarray(row, float), count.max()) for row in part["curve_return"]])
+        timed = [np.asarray(row, float) for row in whole["curve_s"] if len(row) == count.max()]
         ends = np.full((count.max(), 2), math.nan)
         if len(part) >= MIN_SEEDS:
             ends = np.array(bootstrap_along([costs], lambda drawn: _middle(drawn[0])))
         parts.append(pd.DataFrame({
             "problem": problem, "method": method, "step": np.asarray(whole["curve_step"].iloc[0], float),
-            "seconds": np.median([np.asarray(row, float) for row in whole["curve_s"]], axis=0),
+            "seconds": np.median(timed, axis=0) if timed else math.nan,
             "cost": _middle(costs), "cost_low": ends[:, 0], "cost_high": ends[:, 1],
         }))  # fmt: skip
-    return pd.concat(parts, ignore_index=True)
+    columns = ["problem", "method", "step", "seconds", "cost", "cost_low", "cost_high"]
+    return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=columns)
 
 
 def _middle(costs: np.ndarray) -> np.ndarray:
