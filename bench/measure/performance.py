@@ -4,7 +4,8 @@ Intervals are at 95%.
 
 Sources: Wilson 1927 (success rates), Hansen et al. 2016, *COCO performance assessment* (average runtime, ECDF with
 simulated restarts), Agarwal et al. 2021, *Deep RL at the edge of the statistical precipice* (interquartile mean,
-probability of improvement), Dahl et al. 2023, *AlgoPerf* (the integral of the performance profile), Efron 1979 (bootstrap), Hesterberg 2015, *What teachers should know about the bootstrap* (its quantiles for few values). Ranks are
+probability of improvement), Dahl et al. 2023, *AlgoPerf* (the integral of the performance profile), Efron 1979
+(bootstrap), Hesterberg 2015, *What teachers should know about the bootstrap* (its quantiles for few values). Ranks are
 SciPy's. The Wilson interval and Spearman's rho agree with SciPy's to 1e-14. SciPy's are not used because their last
 digits differ from stored results, SciPy rejects an interval without trials, and its rho is five times slower, which
 matters in a bootstrap. SciPy's bootstrap has no strata and does not skip resamples without a value.

@@ -1,5 +1,7 @@
 """Searches whose ends are known: the order of three methods at fixed steps, and what a collision's gradient teaches."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 
@@ -8,28 +10,32 @@ from bench.experiment import config
 from bench.experiment.grid import cells
 from bench.experiment.study import study_of
 from bench.measure import noise
-from bench.model import Answer, registry
+from bench.model import registry
 from bench.run.session import Session
+from bench.studies.optimise.measure import advance, estimates, mean_costs
+
+
+def drawn(seed, count, width, what):
+    return noise.draw(seed, "pendulum_swing", 1, count, width, f"optimise: {what}")
 
 
 def descended(estimator, sigma, optimizer, seeds, iterations=30):
     """The costs at w = 0 after so many steps of a pendulum's search, of which step i has gradients of noise sigma / i."""
     estimator, optimizer, found = registry.make("estimators", estimator), registry.make("optimizers", *optimizer), []
+    problem = bench.problem("pendulum_swing[dt=0.02]", backend="jax")
+    size = problem.program.n_noise
+    still = np.zeros((size, 1))
     for seed in range(seeds):
-        problem = bench.problem("pendulum_swing[dt=0.02]", backend="jax")
-        state, size = optimizer.start(problem.program.theta0), problem.program.n_noise
-        still = np.zeros((size, 1))
+        state = optimizer.start(problem.program.theta0)
         for i in range(1, iterations + 1):
             noisy = bench.problem(f"pendulum_swing[dt=0.02,sigma={sigma / i}]", backend="jax")
-            width = optimizer.draws(problem.dim)
-            w = noise.draw(seed, "pendulum_swing", 1, 100, size, f"optimise: samples {i}")
-            points = optimizer.ask(
-                state, noise.draw(seed, "pendulum_swing", 1, width, problem.dim, f"optimise: points {i}")[0].T
+            state = advance(
+                optimizer,
+                state,
+                drawn(seed, optimizer.draws(problem.dim), problem.dim, f"points {i}")[0].T,
+                partial(mean_costs, problem, w=still),
+                partial(estimates, noisy, estimator, w=drawn(seed, 100, size, f"samples {i}")),
             )
-            needs = optimizer.required_fields(state)
-            value = problem.value(points, np.repeat(still, points.shape[1], axis=1)) if "value" in needs else None
-            gradient = estimator.estimate(noisy, points[:, 0], w).T if "gradient" in needs else None
-            state = optimizer.tell(state, points, Answer(value, gradient))
         found.append(problem.value(state["theta"][:, None], still)[0])
     return np.array(found)
 

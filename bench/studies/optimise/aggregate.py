@@ -224,12 +224,10 @@ def improvement(runs: RunSet, baseline: str = "fobg") -> pd.DataFrame:
     base = next((m for m in methods if m.partition(",")[0].partition("[")[0] == baseline), None)
     lines = {}
     for method in methods:
-        pairs = wide[[method, base]].dropna().to_numpy() if base not in (None, method) else np.empty((0, 2))
         lines[method] = (math.nan, math.nan, math.nan)
-        if len(pairs):
-            wins = (pairs[:, 0] < pairs[:, 1]) + 0.5 * (pairs[:, 0] == pairs[:, 1])
-            problems = wide[[method, base]].dropna().index.get_level_values("problem")
-            share = float(pd.Series(wins).groupby(problems).mean().mean())
+        if base not in (None, method) and len(pairs := wide[[method, base]].dropna()):
+            wins = (pairs[method] < pairs[base]) + 0.5 * (pairs[method] == pairs[base])
+            share = float(wins.groupby(level="problem").mean().mean())
             lines[method] = (share, *performance.wilson(round(share * len(pairs)), len(pairs)))
     columns = ["improvement", "improvement_low", "improvement_high"]
     return pd.DataFrame.from_dict(lines, orient="index", columns=columns)

@@ -135,15 +135,15 @@ def curves(runs: pd.DataFrame) -> pd.DataFrame:
     """
     parts = []
     for (problem, method), part in runs.groupby(["problem", "method"], sort=False):
-        count = part["curve_return"].map(len)
-        whole = part[count == count.max()]
-        costs = np.array([_filled(-np.asarray(row, float), count.max()) for row in part["curve_return"]])
-        timed = [np.asarray(row, float) for row in whole["curve_s"] if len(row) == count.max()]
-        ends = np.full((count.max(), 2), math.nan)
+        lengths = part["curve_return"].map(len)
+        count = lengths.max()
+        costs = np.array([_filled(-np.asarray(row, float), count) for row in part["curve_return"]])
+        timed = [np.asarray(row, float) for row in part["curve_s"] if len(row) == count]
+        ends = np.full((count, 2), math.nan)
         if len(part) >= MIN_SEEDS:
             ends = np.array(bootstrap_along([costs], lambda drawn: _middle(drawn[0])))
         parts.append(pd.DataFrame({
-            "problem": problem, "method": method, "step": np.asarray(whole["curve_step"].iloc[0], float),
+            "problem": problem, "method": method, "step": np.asarray(part["curve_step"][lengths.idxmax()], float),
             "seconds": np.median(timed, axis=0) if timed else math.nan,
             "cost": _middle(costs), "cost_low": ends[:, 0], "cost_high": ends[:, 1],
         }))  # fmt: skip
