@@ -113,6 +113,8 @@ def test_plugins_import_only_public_names():
             assert family or name.split(".")[2] == path.parent.name, f"{path.name} imports {name} of another kind"
         elif name.startswith("bench.training."):
             assert path.parent.name == "trainers", f"{path.name} imports {name}, which is for trainers"
+        elif name.startswith("bench.claims."):
+            assert path.parent.name == "claims", f"{path.name} imports {name}, which is for claims"
         elif name.startswith("bench.engines.conformance."):
             assert path.stem.endswith("_conformance"), f"{path.name} imports {name}, which is for the conformance set"
         elif name.partition(".")[0] == "bench" and name.rpartition(".")[0] != "bench.engines.backend":

@@ -39,6 +39,8 @@ KINDS = (
     "scenes", "contacts", "integrators", "backends", "estimators", "optimizers", "policies", "trainers", "studies",
 )  # fmt: skip
 """The built-in kinds, in listing order. A plugin may declare another kind."""
+ON_DEMAND = "bench.plugins.claims"
+"""The built-in plugins of a kind that one command uses: :func:`entries_with` has them, other commands do not import them."""
 NOT_PLUGINS = ("engines", "robots")
 """Names of the folders with files that only the Pythons of engines import, and with models of robots."""
 ENTRY_POINT_GROUP = "bench.plugins"
@@ -116,6 +118,7 @@ def entries() -> Table:
     table: Table = {kind: {} for kind in KINDS}
     packages = {_package(path): path for path in _folders if _only is None or _is_needed(_package(path))}
     modules = [module for name in (*BUILT_IN, *packages) for module in _modules(importlib.import_module(name))]
+    modules = [part for part in modules if not part[1].startswith(ON_DEMAND)]
     points = sorted(entry_points(group=ENTRY_POINT_GROUP), key=lambda p: p.name)
     if _only is not None:
         modules = [part for part in modules if part[1].startswith(BUILT_IN) or part[1] in _only]
@@ -151,14 +154,13 @@ def _is_needed(package: str) -> bool:
     return any(name.startswith(f"{package}.") for name in _only or ())
 
 
-def entries_with(kind: str, package: str) -> dict[str, Entry]:
-    """Return all plugins of one kind by name: from a package, from entry points ``bench.KIND`` and from the registry.
+def entries_with(kind: str) -> dict[str, Entry]:
+    """Return all plugins of a kind on demand: built-in ones, those of entry points ``bench.KIND`` and of the registry.
 
-    For a kind that only one command uses, so that other commands do not import the package. An entry point names a
-    plugin class or a module with several.
+    An entry point names a plugin class or a module with several.
     """
     table: Table = {kind: {}}
-    for _, module in _modules(importlib.import_module(package)):
+    for _, module in _modules(importlib.import_module(f"bench.plugins.{kind}")):
         _load_module(table, kind, module, "")
     for point in sorted(entry_points(group=f"bench.{kind}"), key=lambda p: p.name):
         _load_point(table, kind, point, "")

@@ -9,8 +9,7 @@ import numpy as np
 
 from bench.claims.claim import Claim, Figure, Outcome
 from bench.claims.toolkit import exact_descent, plugin, problem
-from bench.errors import Unsupported
-from bench.model import Array, MechanicalScene, State
+from bench.model import Array, MechanicalScene, State, Unsupported
 
 STEPS, RATE, ITERATIONS = 480, 200.0, 500
 OPTIMUM = 0.311417
