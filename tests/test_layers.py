@@ -12,6 +12,7 @@ ROOT = Path(__file__).resolve().parents[1]
 BENCH = ROOT / "bench"
 LAYERS = [
     ["errors"],
+    ["simulator"],
     ["model"],
     ["engines"],
     ["measure", "plugins"],

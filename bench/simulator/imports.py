@@ -12,9 +12,9 @@ from types import ModuleType
 from typing import Any
 
 from bench.errors import UserError, failure, unknown
-from bench.model.simulator.clock import Clock
-from bench.model.simulator.simulator import LIBRARIES, Simulator
-from bench.model.simulator.tree import ParameterTree
+from bench.simulator.clock import Clock
+from bench.simulator.simulator import LIBRARIES, Simulator
+from bench.simulator.tree import ParameterTree
 
 
 def load_attribute(text: str, module: ModuleType | None = None, what: str = "name", more: Iterable[str] = ()) -> Any:

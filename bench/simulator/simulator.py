@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from bench.errors import UserError, failure, unknown
-from bench.model.simulator.clock import Clock, OutOfTime
-from bench.model.simulator.tree import ParameterTree, as_numpy
+from bench.simulator.clock import Clock, OutOfTime
+from bench.simulator.tree import ParameterTree, as_numpy
 
 BATCHES = ("loop", "vmap", "columns", "rows")
 """Batching modes of a cost: one theta per call, the library's vmap, arrays ``(d, B)``, arrays ``(B, d)``."""
