@@ -12,7 +12,7 @@ from collections import Counter
 
 import numpy as np
 
-from bench.measure.gradcheck import FAULTS
+from bench.gradient import FAULTS
 from bench.model import compose, registry
 from bench.studies.gradient_check import GradientCheck, measure
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bench.measure import gradcheck
+from bench import gradient as gradcheck
 from bench.model import compose, registry
 from bench.studies.gradient_check import GradientCheck
 from bench.studies.gradient_check.measure import complex_step, start

@@ -11,8 +11,8 @@ import pytest
 from bench import run
 from bench.cli import main
 from bench.experiment.columns import IDENTITY
+from bench.gradient import FAULTS, VERDICTS, judge
 from bench.measure import noise
-from bench.measure.gradcheck import FAULTS, VERDICTS, judge
 from bench.model import Problem, compose, registry
 from bench.run import store
 from bench.studies.gradient_check import GradientCheck, measure
