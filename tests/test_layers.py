@@ -16,7 +16,7 @@ LAYERS = [
     ["model"],
     ["engines"],
     ["measure", "plugins"],
-    ["training"],
+    ["training", "gradient"],
     ["experiment", "conformance"],
     ["run"],
     ["report"],

@@ -13,7 +13,7 @@ from collections import Counter
 import numpy as np
 from bench.plugins.studies.gradient_check import GradientCheck, measure
 
-from bench.measure.gradcheck import FAULTS
+from bench.gradient import FAULTS
 from bench.model import compose, registry
 
 SCENES = (

@@ -18,7 +18,7 @@ from bench.experiment import config
 from bench.experiment.axes import table
 from bench.experiment.columns import COMMON
 from bench.experiment.grid import cells
-from bench.measure.gradcheck import EPS
+from bench.gradient import EPS
 from bench.model import registry
 from bench.report import reproduce
 from bench.report.cells import readable

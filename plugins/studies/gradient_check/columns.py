@@ -1,7 +1,7 @@
 """The columns of the gradient check."""
 
 from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, text
-from bench.measure.gradcheck import VERDICTS
+from bench.gradient import VERDICTS
 
 COLUMNS = Columns.of(
     Column("untrusted", "number of checks that show a gradient not to be trusted"),

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 
 from bench.experiment.columns import IDENTITY
-from bench.measure.gradcheck import VERDICTS
+from bench.gradient import VERDICTS
 from bench.report.problems import problem_numbers
 from bench.report.text import counted, listed
 

@@ -11,9 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from bench import gradient as gradcheck
 from bench.experiment.cell import Cell
 from bench.experiment.session import Session
-from bench.measure import gradcheck, noise
+from bench.measure import noise
 from bench.measure.batches import in_columns
 from bench.measure.contacts import active_contacts, contact_names, engine_contacts
 from bench.measure.jumps import MissedSlope, jump_under_noise, missed_slope

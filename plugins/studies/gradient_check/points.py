@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from bench.measure.gradcheck import BROKEN, TRUSTED
+from bench.gradient import BROKEN, TRUSTED
 
 POINTS = ("start", "before", "at", "after", "noise")
 """``start`` is theta0. The next three are on a line through theta0: before, at and after a switch of contact mode. ``noise``

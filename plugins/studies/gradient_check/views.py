@@ -11,7 +11,7 @@ from bench.experiment.axes import with_axes
 from bench.experiment.columns import COMMON, Column, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Style, Table, Views
-from bench.measure.gradcheck import FAULTS, MEANING, TRUSTED, UNDECIDED, VERDICTS
+from bench.gradient import FAULTS, MEANING, TRUSTED, UNDECIDED, VERDICTS
 from bench.report.problems import axes_of, label_columns, problem_names
 from bench.report.style import PALETTE
 from bench.report.text import counted

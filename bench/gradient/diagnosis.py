@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from bench.examine.gradient import GradientStages
-from bench.examine.lines import LineScan, scan
-from bench.examine.rules import SUSPICIOUS
-from bench.examine.steps import changing_loop
-from bench.examine.subspace import choose
-from bench.measure.gradcheck import Check, FewSteps
+from bench.gradient import Check, FewSteps
+from bench.gradient.lines import LineScan, scan
+from bench.gradient.rules import SUSPICIOUS
+from bench.gradient.stages import GradientStages
+from bench.gradient.steps import changing_loop
+from bench.gradient.subspace import choose
 from bench.simulator.simulator import Simulator
 
 NEAR = 0.05

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from bench.measure.gradcheck import EPS, TRUSTED, VERDICTS, Options, check, most_severe, roughness
-from bench.measure.gradcheck.check import scales
+from bench.gradient import EPS, TRUSTED, VERDICTS, Options, check, most_severe, roughness
+from bench.gradient.check import scales
 
 THETA = np.array([0.3, 1.2, -0.7])
 UNIT = float(np.finfo(np.float64).eps)

@@ -15,8 +15,7 @@ from functools import partial
 
 import numpy as np
 
-from bench.examine.subspace import Group, Subspace, choose, locate
-from bench.measure.gradcheck import (
+from bench.gradient import (
     EPS,
     FAULTS,
     ROUNDS,
@@ -29,6 +28,7 @@ from bench.measure.gradcheck import (
     is_nothing,
     most_severe,
 )  # fmt: skip
+from bench.gradient.subspace import Group, Subspace, choose, locate
 from bench.simulator.clock import Clock, OutOfTime
 from bench.simulator.simulator import Simulator
 

@@ -5,7 +5,7 @@ import pytest
 from bench.plugins.studies.gradient_check import GradientCheck
 from bench.plugins.studies.gradient_check.measure import complex_step, start
 
-from bench.measure import gradcheck
+from bench import gradient as gradcheck
 from bench.model import compose, registry
 
 UNIT = float(np.finfo(float).eps)

@@ -18,7 +18,9 @@ from bench.simulator.simulator import Simulator
 
 Loops = dict[tuple[str, int], set[int]]
 """By file and line of a loop: the numbers of iterations of its runs."""
-SKIPPED = tuple(f"/{name}/" for name in ("jax", "jaxlib", "torch", "numpy", "bench/model", "bench/examine"))
+SKIPPED = tuple(
+    f"/{name}/" for name in ("jax", "jaxlib", "torch", "numpy", "bench/model", "bench/gradient", "bench/examine")
+)
 """Folders whose loops are those of a library, not of the program."""
 
 

@@ -14,8 +14,8 @@ from bench.plugins.studies.gradient_check.points import is_trusted
 from bench import run
 from bench.cli import main
 from bench.experiment.columns import IDENTITY
+from bench.gradient import FAULTS, VERDICTS, judge
 from bench.measure import noise
-from bench.measure.gradcheck import FAULTS, VERDICTS, judge
 from bench.model import Problem, compose, registry
 from bench.run import store
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from bench.measure.gradcheck import EPS, TRUSTED, Sample, check, judge, roughness
-from bench.measure.gradcheck.causes import Ratio, causes_of_ratios
+from bench.gradient import EPS, TRUSTED, Sample, check, judge, roughness
+from bench.gradient.causes import Ratio, causes_of_ratios
 
 SLOPE = 2.0
 WIDE = np.logspace(-2, -5, 7)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from bench.measure.gradcheck import verdicts
-from bench.measure.gradcheck.verdicts import FOLLOW, STEPS, Rule
+from bench.gradient import verdicts
+from bench.gradient.verdicts import FOLLOW, STEPS, Rule
 
 SMOOTHING = "estimate the gradient from costs (smoothing)"
 RULES = verdicts.RULES | {

@@ -3,7 +3,7 @@
 import false_alarms
 import pytest
 
-from bench.measure.gradcheck import FAULTS
+from bench.gradient import FAULTS
 
 
 @pytest.mark.slow

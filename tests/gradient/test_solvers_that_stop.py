@@ -4,7 +4,7 @@ import loose_solvers
 import numpy as np
 import pytest
 
-from bench.measure import gradcheck
+from bench import gradient as gradcheck
 
 DENSE = [
     (1.0, 1e-6, "wave", (0.756454357174736, 0.9358523798492928)),

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bench.measure.gradcheck import Check, Part, extremes
+from bench.gradient import Check, Part, extremes
 from bench.simulator.tree import ParameterTree
 
 MOST = 16
