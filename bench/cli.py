@@ -363,7 +363,7 @@ def _check(words: list[str]) -> int:
     from bench import conformance
     from bench.experiment.words import parse_words
     from bench.model import registry
-    from bench.model.simulator.clock import parse_duration
+    from bench.simulator.clock import parse_duration
 
     names, settings, _ = parse_words(words, "check", {"limit": f"{conformance.kit.LIMIT_S:g}"})
     limit = parse_duration(settings["limit"], "limit")

@@ -11,7 +11,7 @@ import pytest
 from trees import hearing_signals, processes_in, wait_for
 
 from bench.cli import main
-from bench.model.simulator.imports import load_module
+from bench.simulator.imports import load_module
 
 COST = """
 import ctypes, os, signal, sys, time

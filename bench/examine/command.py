@@ -15,8 +15,8 @@ import numpy as np
 from bench.errors import UserError, local_path, unknown
 from bench.examine.examination import examine
 from bench.examine.report import Report
-from bench.model.simulator import imports
-from bench.model.simulator.simulator import LIBRARIES
+from bench.simulator import imports
+from bench.simulator.simulator import LIBRARIES
 
 SETTINGS = (
     "theta", "grad", "sigma", "noise", "budget", "batch", "scale", "seed", "calls", "compile_budget", "tolerance", "atol",

@@ -15,7 +15,7 @@ from bench.examine.rules import SUSPICIOUS
 from bench.examine.steps import changing_loop
 from bench.examine.subspace import choose
 from bench.measure.gradcheck import Check, FewSteps
-from bench.model.simulator.simulator import Simulator
+from bench.simulator.simulator import Simulator
 
 NEAR = 0.05
 """Largest relative error of a gradient that small jumps may explain."""

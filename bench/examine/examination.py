@@ -20,9 +20,9 @@ from bench.examine.report import Report
 from bench.examine.rules import RULES, SUSPICIOUS
 from bench.examine.smoothing import FEWEST, PAIRS, Smoothed, directions, measure_smoothed
 from bench.measure.gradcheck import Check
-from bench.model.simulator.clock import Clock, OutOfTime, end_on_sigterm, parse_duration
-from bench.model.simulator.simulator import Simulator
-from bench.model.simulator.tree import ParameterTree
+from bench.simulator.clock import Clock, OutOfTime, end_on_sigterm, parse_duration
+from bench.simulator.simulator import Simulator
+from bench.simulator.tree import ParameterTree
 
 GENERATED_SUFFIX = re.compile(r"_[0-9a-f]{8}$")
 """Suffix of the generated name of a module that is loaded from a file."""

@@ -16,7 +16,7 @@ from bench.examine.lines import ALIKE, LineScan
 from bench.examine.rules import EXCUSABLE, RULES, SUSPICIOUS
 from bench.examine.smoothing import TARGET_ERROR, Method, Smoothed
 from bench.measure.gradcheck import FAULTS, TRUSTED, Check, Part, Sample
-from bench.model.simulator.simulator import Printed
+from bench.simulator.simulator import Printed
 
 if TYPE_CHECKING:
     import pandas as pd

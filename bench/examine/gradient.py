@@ -29,8 +29,8 @@ from bench.measure.gradcheck import (
     is_nothing,
     most_severe,
 )  # fmt: skip
-from bench.model.simulator.clock import Clock, OutOfTime
-from bench.model.simulator.simulator import Simulator
+from bench.simulator.clock import Clock, OutOfTime
+from bench.simulator.simulator import Simulator
 
 SINGLE_EPS = np.logspace(-1, -7, 13)
 """Steps of a check in single precision, relative to each input's scale: the best is near 5e-3."""

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.model.simulator.clock import Clock, OutOfTime
-from bench.model.simulator.simulator import Simulator
+from bench.simulator.clock import Clock, OutOfTime
+from bench.simulator.simulator import Simulator
 
 PAIRS = 4096
 """Most pairs of costs for one sigma."""

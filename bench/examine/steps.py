@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.model.simulator.simulator import Simulator
+from bench.simulator.simulator import Simulator
 
 Loops = dict[tuple[str, int], set[int]]
 """By file and line of a loop: the numbers of iterations of its runs."""

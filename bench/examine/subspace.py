@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bench.measure.gradcheck import Check, Part, extremes
-from bench.model.simulator.tree import ParameterTree
+from bench.simulator.tree import ParameterTree
 
 MOST = 16
 """Most components checked one by one."""

@@ -66,8 +66,8 @@ from bench.model.scene import (
     ZeroOrderHoldScene,
     half_spaces,
 )
-from bench.model.simulator import load_module, load_simulator, simulator_files
 from bench.model.trainer import Trainer
+from bench.simulator import load_module, load_simulator, simulator_files
 
 __all__ = [
     "SURROGATE",

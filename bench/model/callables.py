@@ -12,7 +12,7 @@ import numpy as np
 from bench.model.scene import Scene
 
 if TYPE_CHECKING:
-    from bench.model.simulator import Simulator
+    from bench.simulator import Simulator
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ class Callable(CallableScene):
     neglected_effects = "those that the simulator neglects"
     backends = ("callable",)
 
-    cost: str = param("bench.model.simulator.example:cost", "the cost, as FILE:NAME or MODULE:NAME")
+    cost: str = param("bench.simulator.example:cost", "the cost, as FILE:NAME or MODULE:NAME")
     theta: str = param("theta", "theta: a name in the file")
     grad: str = param("gradient", "jax, torch, or a function of theta in the file; empty for differences")
     batch: str = param("", "how the cost evaluates several thetas: loop, vmap, columns or rows; detected by default")

@@ -13,7 +13,7 @@ import pytest
 
 import bench
 from bench.errors import UserError
-from bench.model.simulator.clock import Clock, OutOfTime
+from bench.simulator.clock import Clock, OutOfTime
 
 THETA = [0.4, 0.3, 0.5]
 
@@ -145,8 +145,8 @@ def test_the_report_is_printed_on_sigterm(tmp_path):
 
 def test_time_lost_to_other_programs_is_not_charged(monkeypatch):
     lost = {"seconds": 0.0}
-    monkeypatch.setattr("bench.model.simulator.clock._run_delay", lambda: lost["seconds"])
-    monkeypatch.setattr("bench.model.simulator.clock.READ_INTERVAL_S", 0.0)
+    monkeypatch.setattr("bench.simulator.clock._run_delay", lambda: lost["seconds"])
+    monkeypatch.setattr("bench.simulator.clock.READ_INTERVAL_S", 0.0)
     clock = Clock(10.0)
     lost["seconds"] = 4.0
     assert clock.waited == pytest.approx(4.0)

@@ -16,10 +16,10 @@ from bench import cli
 from bench.errors import UserError
 from bench.examine import smoothing, text
 from bench.examine.lines import Break, LineScan, scan
-from bench.model.simulator import simulator, tree
-from bench.model.simulator.clock import Clock
-from bench.model.simulator.simulator import Simulator
-from bench.model.simulator.tree import ParameterTree
+from bench.simulator import simulator, tree
+from bench.simulator.clock import Clock
+from bench.simulator.simulator import Simulator
+from bench.simulator.tree import ParameterTree
 
 QUICK = {"progress": False, "budget": 20}
 

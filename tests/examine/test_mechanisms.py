@@ -13,8 +13,8 @@ from bench.errors import UserError
 from bench.examine import lines
 from bench.examine.findings import GroupSize
 from bench.examine.subspace import groups_of
-from bench.model.simulator.tree import ParameterTree
 from bench.report.text import number
+from bench.simulator.tree import ParameterTree
 
 QUICK = {"progress": False, "calls": 3000}
 START = [0.7, 0.3]

@@ -7,6 +7,9 @@ import shlex
 import numpy as np
 import pandas as pd
 import pytest
+from bench.plugins.studies.gradient_check import GradientCheck, measure
+from bench.plugins.studies.gradient_check.lines import by_point
+from bench.plugins.studies.gradient_check.points import is_trusted
 
 from bench import run
 from bench.cli import main
@@ -15,9 +18,6 @@ from bench.measure import noise
 from bench.measure.gradcheck import FAULTS, VERDICTS, judge
 from bench.model import Problem, compose, registry
 from bench.run import store
-from bench.studies.gradient_check import GradientCheck, measure
-from bench.studies.gradient_check.lines import by_point
-from bench.studies.gradient_check.points import is_trusted
 
 FLOAT64, FLOAT32 = (float(np.finfo(dtype).eps) for dtype in (np.float64, np.float32))
 

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
+from bench.plugins.studies.gradient_check import GradientCheck
+from bench.plugins.studies.gradient_check.measure import complex_step, start
 
 from bench.measure import gradcheck
 from bench.model import compose, registry
-from bench.studies.gradient_check import GradientCheck
-from bench.studies.gradient_check.measure import complex_step, start
 
 UNIT = float(np.finfo(float).eps)
 SEARCH = GradientCheck()

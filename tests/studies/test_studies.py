@@ -8,6 +8,10 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from bench.plugins.studies.gradient_check import views as gradient_check
+from bench.plugins.studies.gradient_check.lines import PER_COMPONENT
+from bench.plugins.studies.stability.views import cells_of
+from bench.plugins.studies.twins import views as twins
 
 import bench.report
 from bench.experiment import config
@@ -22,10 +26,6 @@ from bench.report.finish import views_of
 from bench.report.problems import problem_numbers
 from bench.report.views import arrange
 from bench.report.web.data import page_data
-from bench.studies.gradient_check import views as gradient_check
-from bench.studies.gradient_check.lines import PER_COMPONENT
-from bench.studies.stability.views import cells_of
-from bench.studies.twins import views as twins
 
 SPRUNG = '''
 from dataclasses import dataclass

@@ -1,0 +1,524 @@
+"""A user's cost and gradient as functions of batches of columns, with every call counted and timed."""
+
+from __future__ import annotations
+
+import io
+import sys
+from collections.abc import Callable
+from contextlib import redirect_stderr, redirect_stdout
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+
+from bench.errors import UserError, failure, unknown
+from bench.simulator.clock import Clock, OutOfTime
+from bench.simulator.tree import ParameterTree, as_numpy
+
+BATCHES = ("loop", "vmap", "columns", "rows")
+"""Batching modes of a cost: one theta per call, the library's vmap, arrays ``(d, B)``, arrays ``(B, d)``."""
+LIBRARIES = ("jax", "torch")
+"""Libraries that can differentiate a cost."""
+BLOCK = 16
+"""Columns per compiled batch: one size, so that it compiles once, and small, since a simulator may be expensive."""
+CHUNK = 256
+"""Columns per batch that is not compiled."""
+HELD = 4_000_000
+"""Most numbers in the thetas of one batch."""
+DISTINCT = 3
+"""Fewest costs that show that all costs have single precision: each is one in double precision once in 2^29."""
+SIMPLE_BITS = 12
+"""Costs with at most this many significant bits, such as 0.5, show nothing about the precision."""
+KEPT_LINES = 1000
+"""Most lines printed by the user's functions that are kept."""
+
+
+class Printed(io.TextIOBase):
+    """Collects what the user's functions print: the first lines, and the number of lines."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+        self.count = 0
+        self._partial = ""
+
+    def write(self, text: str) -> int:
+        """Collect text."""
+        *whole, self._partial = (self._partial + text).split("\n")
+        self.count += len(whole)
+        self.lines += whole[: KEPT_LINES - len(self.lines)]
+        return len(text)
+
+    def isatty(self) -> bool:
+        """Return False."""
+        return False
+
+
+def _guarded(function: Callable[..., Any], printed: Printed) -> Callable[..., Any]:
+    """Wrap a user's function: its printing is collected, and ``sys.exit`` raises RuntimeError.
+
+    A test must not pass because a simulator exits with status 0.
+    """
+
+    def call(*arguments: Any, **settings: Any) -> Any:
+        try:
+            if sys.stdout is printed:
+                return function(*arguments, **settings)
+            with redirect_stdout(printed), redirect_stderr(printed):
+                return function(*arguments, **settings)
+        except SystemExit as error:
+            code = "" if error.code is None else error.code
+            raise RuntimeError(f"it ended the process by sys.exit({code})") from None
+
+    return call
+
+
+class Simulator:
+    """A cost f(theta) or f(theta, w) and optionally its gradient, on NumPy batches with one sample per column.
+
+    ``noise`` is the length of w, 0 for a cost without its own noise. ``library`` is the library of the arrays that the
+    functions receive; by default that of ``grad`` or of theta. An exception in a call yields NaN, except in the
+    first call, where it becomes a :class:`UserError`.
+    """
+
+    def __init__(
+        self,
+        cost: Callable[..., Any],
+        layout: ParameterTree,
+        grad: str | Callable[..., Any] | None = None,
+        noise: int = 0,
+        batch: str | int | None = None,
+        clock: Clock | None = None,
+        library: str = "",
+    ) -> None:
+        if not callable(cost):
+            raise UserError(f"the cost is a function of theta, not {type(cost).__name__}")
+        batch, self.fixed = _parse_batch(batch)
+        if not (grad is None or callable(grad) or grad in LIBRARIES):
+            raise unknown("grad", grad, (*LIBRARIES, "a function of theta"))
+        if isinstance(grad, str) and find_spec(grad) is None:
+            raise UserError(f"grad={grad} needs a library that is not installed: pip install {grad}")
+        if batch in ("columns", "rows") and not layout.flat:
+            raise UserError(
+                f"batch={batch} needs a theta that is one vector; this one is {', '.join(layout.names[:4])}"
+            )
+        self.layout, self.noise, self.clock = layout, noise, clock or Clock(float("inf"))
+        self.notes: list[str] = []
+        """Notes for the user on how the cost is called."""
+        self.raised: dict[str, int] = {}
+        """Number of failed calls of the cost, after the first call, by exception."""
+        self.gradient_error = ""
+        """The first exception of the gradient, or an empty string."""
+        self.n_failed_gradients = 0
+        """Number of gradient calls that raised an exception."""
+        self.precision = "float64"
+        """Floating-point type of the cost: its own, or float32 where all its values have single precision."""
+        self.printed = Printed()
+        """What cost and gradient print."""
+        self.first_value = float("nan")
+        """The cost at theta, from the first call, with w = 0."""
+        self._cost = _guarded(cost, self.printed)
+        self._grad = _guarded(grad, self.printed) if callable(grad) else grad
+        self._shapes: set[Any] = set()
+        self._compiled: dict[str, tuple[Any, ...]] = {}
+        self._distinct: set[float] = set()
+        self._double = True
+        self.library = library or self._detect_library()
+        self.batch = self._detect_batch(batch)
+
+    # ------------------------------------------------------------------------------------------- columns
+
+    @property
+    def unit(self) -> float:
+        """Unit roundoff of the least precise floating-point type between theta and the cost."""
+        types = {self.precision, *(leaf.dtype for leaf in self.layout.leaves)}
+        return max(float(np.finfo(name).eps) if name != "bfloat16" else 2.0**-7 for name in types)
+
+    @property
+    def width(self) -> int:
+        """Number of thetas per call."""
+        if self.batch == "loop":
+            return 1
+        most = self.fixed or (BLOCK if self.library == "jax" else CHUNK)
+        return self.fixed or max(1, min(most, HELD // self.layout.vector.size))
+
+    @property
+    def has_single_precision(self) -> bool:
+        """Whether the cost returns float64 numbers that all have single precision, as from ``float(loss)``."""
+        return len(self._distinct) >= DISTINCT and all(float(np.float32(one)) == one for one in self._distinct)
+
+    @property
+    def has_gradient(self) -> bool:
+        """Whether the user has given a gradient or a library that differentiates the cost."""
+        return self._grad is not None
+
+    def costs(self, thetas: np.ndarray, w: np.ndarray | None = None) -> np.ndarray:
+        """Return the costs of ``thetas (d, B)`` with the noise ``w (n, B)``, ``(B,)``."""
+        return self._in_chunks(self._costs, "costs", thetas, w, ())
+
+    def gradients(self, thetas: np.ndarray, w: np.ndarray | None = None) -> np.ndarray:
+        """Return the simulator's gradients, ``(d, B)``; NaN where it raised an exception."""
+        return self._in_chunks(self._gradients, "gradients", thetas, w, (self.layout.vector.size,))
+
+    def _in_chunks(
+        self,
+        function: Callable[..., np.ndarray],
+        kind: str,
+        thetas: np.ndarray,
+        w: np.ndarray | None,
+        lead: tuple[int, ...],
+    ) -> np.ndarray:
+        count = thetas.shape[1]
+        out = np.full((*lead, count), np.nan)
+        # one gradient needs no batch, which would compute and compile more
+        is_single = kind == "gradients" and count == 1 and self._is_mapped
+        size = 1 if is_single else self.width
+        for start in range(0, count, size):
+            part = slice(start, min(start + size, count))
+            self.clock.check(part.stop - part.start)
+            columns: Any = part
+            n_columns = part.stop - part.start
+            if (self.library == "jax" or self.fixed) and size > 1:
+                columns = np.minimum(np.arange(part.start, part.start + size), part.stop - 1)
+                n_columns = size
+            is_first = (kind, n_columns) not in self._shapes
+            self._shapes.add((kind, n_columns))
+            began = self.clock.spent
+            with self.clock.interrupt_when_over(first=is_first):
+                results = function(thetas[:, columns], None if w is None else w[:, columns])
+            taken = max(self.clock.spent - began, 0.0)
+            self.clock.count(kind, part.stop - part.start, taken, warm=not is_first)
+            out[..., part] = results[..., : part.stop - part.start]
+            if kind == "costs" and len(self._distinct) < 16 * DISTINCT:
+                self._distinct.update(float(one) for one in out[part] if _is_telling(one))
+        return out
+
+    @property
+    def _is_mapped(self) -> bool:
+        return self.library == "jax" and self.batch == "vmap"
+
+    def _costs(self, thetas: np.ndarray, w: np.ndarray | None) -> np.ndarray:
+        try:
+            return np.asarray(self._values(thetas, w), dtype=np.float64)
+        except Exception as error:
+            self._count_error(error)
+            return np.full(thetas.shape[1], np.nan)
+
+    def _gradients(self, thetas: np.ndarray, w: np.ndarray | None) -> np.ndarray:
+        try:
+            gradients = self._slopes(thetas, w)
+        except UserError:
+            raise
+        except Exception as error:
+            self.gradient_error = self.gradient_error or failure(error)["reason"]
+            self.n_failed_gradients += 1
+            return np.full(thetas.shape, np.nan)
+        if np.iscomplexobj(gradients):
+            raise UserError("the gradient is complex: the gradient of a real cost of real numbers is real")
+        return np.asarray(gradients, dtype=np.float64)
+
+    def _count_error(self, error: Exception) -> None:
+        text = f"{type(error).__name__}: {error}"
+        self.raised[text] = self.raised.get(text, 0) + 1
+
+    # ------------------------------------------------------------------------------------------ calling convention
+
+    def _detect_library(self) -> str:
+        if isinstance(self._grad, str):
+            return self._grad
+        libraries = {leaf.library for leaf in self.layout.leaves} & set(LIBRARIES)
+        return libraries.pop() if libraries else "numpy"
+
+    def _build_theta(self, vector: Any) -> Any:
+        """Return a vector ``(d,)`` in the form in which the user's function receives theta."""
+        if self.library == "jax":
+            return self.layout.unflatten(vector, lambda part, leaf: part)
+        if self.library == "torch":
+            return self.layout.unflatten(vector, self._tensor)
+        return self.layout.unflatten(vector)
+
+    def _tensor(self, part: Any, leaf: Any) -> Any:
+        import torch
+
+        dtype = getattr(torch, leaf.dtype) if leaf.library == "torch" or self._double else torch.float32
+        return torch.as_tensor(part).to(dtype)
+
+    def _array(self, value: np.ndarray) -> Any:
+        """Convert an array to the library's array type."""
+        if self.library == "jax":
+            import jax.numpy as jnp
+
+            return jnp.array(value)
+        if self.library == "torch":
+            import torch
+
+            return torch.as_tensor(np.array(value)).to(torch.float64 if self._double else torch.float32)
+        return np.array(value)
+
+    def _call(self, theta: Any, w: Any) -> Any:
+        return self._cost(theta) if w is None else self._cost(theta, w)
+
+    def _detect_batch(self, batch: str | None) -> str:
+        """Return the cost's batching mode, detected by trial calls."""
+        vector = self.layout.vector
+        w = np.zeros(self.noise) if self.noise else None
+        if batch in ("columns", "rows"):
+            if not self._accepts(batch):
+                raise UserError(f"the cost does not accept batch={batch}: {self._batch_error}")
+            return batch
+        try:
+            value = self._call_once(vector, w)
+        except Exception as error:
+            problem = failure(error)["reason"]
+        else:
+            problem = f"it returned an array of shape {value.shape}"
+            if value.size == 1:
+                self._check_cost(value)
+                self.first_value = float(value.ravel()[0])
+                self._distinct |= {self.first_value} if _is_telling(self.first_value) else set()
+                return self._detect_vmap(vector, self.first_value, batch)
+        for layout in ("columns", "rows"):
+            if self.layout.flat and self._accepts(layout):
+                self.notes.append(f"the cost takes batches as {layout}")
+                return layout
+        raise UserError(f"the cost cannot be called at theta: {problem}. It must accept theta and return one number")
+
+    def _call_once(self, vector: np.ndarray, w: np.ndarray | None) -> np.ndarray:
+        """Return the cost of a single theta as an array, and note whether the cost modifies its argument."""
+        if self.library == "jax":
+            with self.clock.interrupt_when_over(first=True):
+                value = self._jax_values(vector[:, None], None if w is None else w[:, None], "loop")
+            self.clock.count("costs", 1, 0.0, warm=False)
+            return as_numpy(value)
+        theta = self._build_theta(self._array(vector))
+        try:
+            with self.clock.interrupt_when_over(first=True):
+                value = self._call(theta, None if w is None else self._array(w))
+        except RuntimeError as error:
+            if self.library != "torch" or "dtype" not in str(error) or not self._double:
+                raise
+            self._double = False
+            self.notes.append("theta is passed in float32, as the torch module requires")
+            return self._call_once(vector, w)
+        array = as_numpy(value)
+        self.clock.count("costs", 1, 0.0, warm=False)
+        self._shapes.add(("costs", 1))
+        if self._is_modified(theta, vector):
+            self.notes.append("the cost modifies its argument in place, so each call gets a copy")
+        return array
+
+    def _is_modified(self, theta: Any, vector: np.ndarray) -> bool:
+        """Return whether the cost has modified its argument."""
+        try:
+            return not np.array_equal(self.layout.flatten(theta, "theta"), self._rounded(vector))
+        except UserError:
+            return True
+
+    def _rounded(self, vector: np.ndarray) -> np.ndarray:
+        """Return a vector ``(d,)`` rounded to the floating-point type in which the cost receives it."""
+        return self.layout.flatten(self._build_theta(self._array(vector)), "theta")
+
+    def _check_cost(self, cost: np.ndarray) -> None:
+        """Record the precision of the cost's value; raises :class:`UserError` unless it is a real number."""
+        if cost.dtype.kind == "c":
+            raise UserError(f"the cost is complex ({cost.dtype}): it must be one real number")
+        if cost.dtype.kind == "O" and cost.size == 1 and cost.ravel()[0] is None:
+            raise UserError("the cost returned None: does it end with a return statement?")
+        if cost.dtype.kind not in "fiub" and str(cost.dtype) != "bfloat16":
+            raise UserError(f"the cost is of type {cost.dtype}: it must be one real number")
+        if cost.dtype.kind == "f" or str(cost.dtype) == "bfloat16":
+            self.precision = str(cost.dtype)
+
+    def _detect_vmap(self, vector: np.ndarray, value: float, batch: str | None) -> str:
+        """Return ``vmap`` if the library's vmap of the cost yields the same values, else ``loop``."""
+        if self.library == "jax" and batch in (None, "vmap"):
+            try:
+                columns = np.repeat(vector[:, None], BLOCK, axis=1)
+                w = np.zeros((self.noise, BLOCK)) if self.noise else None
+                with self.clock.interrupt_when_over(first=True):
+                    mapped = np.asarray(self._jax_values(columns, w, "vmap"), dtype=np.float64)
+                tolerance = 1e3 * self.unit * max(abs(value), 1.0)
+                if np.allclose(mapped, value, rtol=1e3 * self.unit, atol=tolerance, equal_nan=True):
+                    self._shapes.add(("costs", BLOCK))
+                    return "vmap"
+            except OutOfTime:
+                self.notes.append("compiling jax.vmap of the cost took longer than compile_budget")
+            except Exception as error:
+                if batch == "vmap":
+                    raise UserError(f"jax.vmap cannot map the cost: {failure(error)['reason']}") from None
+            self.notes.append("jax.vmap cannot map the cost, so thetas are evaluated one by one")
+            return "loop"
+        if batch == "vmap":
+            if self.library != "torch":
+                raise UserError("batch=vmap needs grad=jax or grad=torch: NumPy has no vmap")
+            return "vmap"
+        return "loop"
+
+    def _accepts(self, batch: str) -> bool:
+        """Return whether the cost accepts several thetas as columns or rows and returns one number per theta."""
+        dim = self.layout.vector.size
+        count = self.fixed or (5 if dim != 5 else 7)
+        thetas = np.repeat(self.layout.vector[:, None], count, axis=1)
+        w = np.zeros((self.noise, count)) if self.noise else None
+        self._batch_error = ""
+        try:
+            with self.clock.interrupt_when_over(first=True):
+                costs = as_numpy(self._call_batch(self._array(thetas), None if w is None else self._array(w), batch))
+        except Exception as error:
+            self._batch_error = failure(error)["reason"]
+            return False
+        self.clock.count("costs", count, 0.0, warm=False)
+        if costs.shape == (count,) and costs.dtype.kind in "fiub":
+            self.first_value = float(costs[0])
+        if costs.shape != (count,):
+            self._batch_error = f"{count} thetas gave an array of shape {costs.shape}, not {(count,)}"
+            return False
+        self._check_cost(costs)
+        return True
+
+    def _call_batch(self, thetas: Any, w: Any, batch: str) -> Any:
+        if batch == "rows":
+            return self._call(thetas.T, None if w is None else w.T)
+        return self._call(thetas, w)
+
+    # ------------------------------------------------------------------------------------------- values
+
+    def _values(self, thetas: np.ndarray, w: np.ndarray | None) -> Any:
+        if self.library == "jax":
+            return self._jax_values(thetas, w, self.batch)
+        if self.library == "torch":
+            import torch
+
+            with torch.no_grad():
+                return as_numpy(self._torch_values(self._array(thetas), None if w is None else self._array(w)))
+        if self.batch == "loop":
+            return [
+                float(
+                    as_numpy(
+                        self._call(self._build_theta(thetas[:, i]), None if w is None else w[:, i].copy())
+                    ).ravel()[0]
+                )
+                for i in range(thetas.shape[1])
+            ]
+        return as_numpy(self._call_batch(thetas.copy(), None if w is None else w.copy(), self.batch))
+
+    def _torch_values(self, thetas: Any, w: Any) -> Any:
+        """Return the costs as a tensor ``(B,)`` that is attached to the autograd graph."""
+        import torch
+
+        if self.batch in ("columns", "rows"):
+            return self._call_batch(thetas, w, self.batch)
+        if self.batch == "vmap":
+            mapped = torch.func.vmap(
+                lambda vector, *rest: self._call(self._build_theta(vector), *rest or (None,)).reshape(()),
+                in_dims=1,
+                randomness="same",
+            )
+            return mapped(thetas) if w is None else mapped(thetas, w)
+        columns = range(thetas.shape[1])
+        costs = [self._call(self._build_theta(thetas[:, i]), None if w is None else w[:, i]) for i in columns]
+        # torch would convert a Python number to single precision
+        doubles = [cost if torch.is_tensor(cost) else torch.as_tensor(cost, dtype=torch.float64) for cost in costs]
+        return torch.stack([cost.reshape(()) for cost in doubles])
+
+    def _jax_values(self, thetas: np.ndarray, w: np.ndarray | None, batch: str) -> Any:
+
+        compiled, _, eager, _ = self._jax_functions(batch)
+        return self._call_compiled(compiled, eager, thetas, w, batch)
+
+    def _jax_functions(self, batch: str) -> tuple[Any, ...]:
+        """Return cost and gradient for a batching mode: both compiled, then both as Python functions."""
+        import jax
+
+        if batch not in self._compiled:
+
+            def raw(vector: Any, *rest: Any) -> Any:
+                return self._call(self._build_theta(vector), *rest or (None,))
+
+            def one(vector: Any, *rest: Any) -> Any:
+                return jax.numpy.reshape(raw(vector, *rest), ())
+
+            def all_columns(columns: Any, *rest: Any) -> Any:
+                return self._call_batch(columns, rest[0] if rest else None, batch)
+
+            whole = raw if batch == "loop" else jax.vmap(one, in_axes=1) if batch == "vmap" else all_columns
+            summed = one if batch == "loop" else lambda columns, *rest: whole(columns, *rest).sum()
+            slope = jax.grad(summed)
+            self._compiled[batch] = jax.jit(whole), jax.jit(slope), whole, slope
+        return self._compiled[batch]
+
+    def _call_compiled(self, compiled: Any, eager: Any, thetas: np.ndarray, w: np.ndarray | None, batch: str) -> Any:
+        """Return a compiled function's values; one theta per call runs uncompiled if JAX cannot trace the function."""
+        import jax
+
+        arguments = [self._array(part) for part in (thetas, w) if part is not None]
+        if batch == "loop":
+            arguments = [part[:, 0] for part in arguments]
+        try:
+            result = compiled(*arguments)
+        except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError):
+            if batch != "loop":
+                raise
+            result = eager(*arguments)
+        if batch != "loop":
+            return np.asarray(result)
+        array = as_numpy(result)
+        # a cost is one number, of shape () or (1,); gradients are vectors
+        return array.reshape(1) if compiled is self._compiled["loop"][0] and array.size == 1 else array[..., None]
+
+    # ---------------------------------------------------------------------------------------- gradients
+
+    def _slopes(self, thetas: np.ndarray, w: np.ndarray | None) -> np.ndarray:
+        if callable(self._grad):
+            return self._user_slopes(thetas, w)
+        if self._grad == "jax":
+            mode = "loop" if self._is_mapped and thetas.shape[1] == 1 else self.batch
+            _, compiled, _, eager = self._jax_functions(mode)
+            return np.asarray(self._call_compiled(compiled, eager, thetas, w, mode))
+        return self._torch_slopes(thetas, w)
+
+    def _user_slopes(self, thetas: np.ndarray, w: np.ndarray | None) -> np.ndarray:
+        assert callable(self._grad)
+        if self.batch in ("columns", "rows"):
+            arguments = [self._array(part) for part in (thetas, w) if part is not None]
+            gradients = as_numpy(self._grad(*(part.T if self.batch == "rows" else part for part in arguments)))
+            gradients = gradients.T if self.batch == "rows" else gradients
+            if gradients.shape != thetas.shape:
+                raise UserError(
+                    f"the gradient of {thetas.shape[1]} thetas has shape {gradients.shape}, not {thetas.shape}"
+                )
+            return gradients
+        columns = []
+        for i in range(thetas.shape[1]):
+            arguments = [self._build_theta(self._array(thetas[:, i]))] + ([] if w is None else [self._array(w[:, i])])
+            columns.append(self.layout.flatten(self._grad(*arguments)))
+        return np.stack(columns, axis=1)
+
+    def _torch_slopes(self, thetas: np.ndarray, w: np.ndarray | None) -> np.ndarray:
+        import torch
+
+        leaf = self._array(thetas).requires_grad_()
+        total = self._torch_values(leaf, None if w is None else self._array(w)).sum()
+        if not total.requires_grad:
+            return np.zeros(thetas.shape)
+        (gradient,) = torch.autograd.grad(total, leaf, allow_unused=True)
+        return np.zeros(thetas.shape) if gradient is None else gradient.detach().cpu().numpy()
+
+
+def _parse_batch(batch: str | int | None) -> tuple[str | None, int]:
+    """Return the batching mode and its fixed width, 0 without one: ``columns``, ``columns:64``, ``64``."""
+    if batch is None:
+        return None, 0
+    mode, _, width = str(batch).partition(":")
+    if mode.isdigit() and not width:
+        mode, width = "", mode
+    if mode not in ("", *BATCHES) or (
+        width and not (width.isdigit() and int(width) > 1 and mode in ("", "columns", "rows"))
+    ):
+        raise unknown("batch", batch, (*BATCHES, "columns:WIDTH", "rows:WIDTH", "WIDTH"))
+    return mode or None, int(width or 0)
+
+
+def _is_telling(cost: float) -> bool:
+    """Return whether a cost has enough significant bits to show its precision."""
+    mantissa = np.frexp(cost)[0] * 2.0**SIMPLE_BITS
+    return bool(np.isfinite(cost) and mantissa != np.round(mantissa))
