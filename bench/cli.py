@@ -238,12 +238,11 @@ def _run(words: list[str]) -> int:
 def _execute(experiment: Experiment, words: Sequence[str]) -> Finished | int:
     """Run an experiment. Returns the finished run, or the exit status if it ended early."""
     from bench.experiment.grid import cells
-    from bench.run import runner
-    from bench.run.execute import execute, store_of
+    from bench.run.execute import Stopped, execute, store_of
 
     try:
         return execute(experiment, QUIET in words)
-    except (KeyboardInterrupt, runner.Stopped) as end:
+    except (KeyboardInterrupt, Stopped) as end:
         store = store_of(experiment)
         keys = {cell.key for cell in cells(experiment)}
         stored = int(store.load()["key"].isin(keys).sum())
