@@ -238,12 +238,11 @@ def _run(words: list[str]) -> int:
 def _execute(experiment: Experiment, words: Sequence[str]) -> Finished | int:
     """Run an experiment. Returns the finished run, or the exit status if it ended early."""
     from bench.experiment.grid import cells
-    from bench.run import runner
-    from bench.run.execute import execute, store_of
+    from bench.run.execute import Stopped, execute, store_of
 
     try:
         return execute(experiment, QUIET in words)
-    except (KeyboardInterrupt, runner.Stopped) as end:
+    except (KeyboardInterrupt, Stopped) as end:
         store = store_of(experiment)
         keys = {cell.key for cell in cells(experiment)}
         stored = int(store.load()["key"].isin(keys).sum())
@@ -527,10 +526,10 @@ VERBS = {
         "Exit status 1 when a claim is not reproduced.\n",
     ),
     "compare": Verb(
-        _main_of("bench.compare.command"), "compare BEFORE AFTER [--timings] [out=DIR]", "two results, cell by cell: 1 when something got worse",
+        _main_of("bench.compare.command"), "compare BEFORE AFTER [again=DIR,DIR] [out=DIR]", "two results, cell by cell: 1 when something got worse",
         "BEFORE and AFTER are directories, or git revisions as REV or REV:PATH. Accuracy decides, paired on equal noise;\n"
-        "times only with --timings, compared with the spread between runs: again=DIR,DIR names further runs of BEFORE.\n"
-        "Written to out=DIR (runs/compare): compare.csv, .md, .xml (JUnit) and .html.\n",
+        "times only with again=DIR,DIR, further runs of BEFORE, whose spread they are compared with.\n"
+        "Written to out=DIR (runs/compare): compare.csv, .md and .html.\n",
     ),
     "index": Verb(
         _main_of("bench.report.index"), "index [DIR]", "a page over all experiments of a results folder, with the state of each",

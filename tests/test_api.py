@@ -182,8 +182,8 @@ def test_compare_finds_what_got_worse(rows, results, tmp_path):
     assert " worse in: " in repr(comparison)
     assert " worse in: " in comparison._repr_html_()
     assert not bench.compare(results, results).worse
-    with pytest.raises(bench.UserError, match="add --timings"):
-        bench.compare(results, results, again=[results, results])
+    with pytest.raises(bench.UserError, match="needs 3 or more runs"):
+        bench.compare(results, results, again=[results])
 
 
 def test_settings_are_all_settings_of_the_command_line():

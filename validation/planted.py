@@ -93,7 +93,7 @@ def judged(scene, faults=FAULTS):
         return before
     parts = []
     for fault in faults:
-        table, _ = cells.compare_cells(before, rows(scene, fault)[1], columns, False)
+        table, _ = cells.compare_cells(before, rows(scene, fault)[1], columns)
         parts.append(table.assign(fault=fault))
     return pd.concat(parts)
 

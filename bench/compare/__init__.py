@@ -12,16 +12,14 @@ if TYPE_CHECKING:
 __all__ = ["compare"]
 
 
-def compare(
-    before: str | Path, after: str | Path, timings: bool = False, again: Sequence[str | Path] = ()
-) -> Comparison:
+def compare(before: str | Path, after: str | Path, again: Sequence[str | Path] = ()) -> Comparison:
     """Compare two results, cell by cell; ``print`` shows what got worse or better.
 
     ``before`` and ``after`` are directories of experiments or of one experiment, or git revisions as ``REV`` or
     ``REV:PATH``. ``comparison.to_frame()`` has one row per cell, and ``comparison.worse`` is true if some cell got
-    worse. With ``timings``, times are compared too, with the spread between the runs ``again`` of ``before``. Raises
+    worse. With ``again``, two or more further runs of ``before``, times are compared with the spread between runs. Raises
     :class:`bench.UserError` for results that cannot be read or compared.
     """
     from bench.compare.command import compare_results
 
-    return compare_results(str(before), str(after), timings, [*map(str, again)])
+    return compare_results(str(before), str(after), [*map(str, again)])

@@ -32,19 +32,19 @@ def both_sides(columns: Sequence[Column]) -> list[str]:
 
 
 def compare_cells(
-    before: pd.DataFrame, after: pd.DataFrame, columns: Columns, timed: bool, again: Sequence[pd.DataFrame] = ()
+    before: pd.DataFrame, after: pd.DataFrame, columns: Columns, again: Sequence[pd.DataFrame] = ()
 ) -> tuple[pd.DataFrame, list[str]]:
     """Return one line per cell of either side, with its identity and outcome, and remarks on times.
 
     Two rows are of one cell if all their parameters, samples, repeats and seed are equal. A parameter that a stored row
-    lacks has its present default. With ``timed``, times are judged too; ``again`` are further runs of before, which show
-    the spread between runs.
+    lacks has its present default. With ``again``, further runs of before, which show the spread between runs, times are
+    judged too.
     """
     judged = columns.compared
     old, new, *more = (rows_by_cell(rows) for rows in (before, after, *again))
     changes = {key: judge_cell(judged, old.get(key), new.get(key)) for key in dict.fromkeys([*old, *new])}
     remarks: list[str] = []
-    for column in judged if timed else ():
+    for column in judged if again else ():
         if rule_of(column).by == "time":
             was, now, *runs = (_succeeded(rows) for rows in (old, new, *more))
             of_column, of_times = timings.judge_times(column.name, rule_of(column).called, was, now, runs)

@@ -12,30 +12,27 @@ from bench.compare.sources import Results, read_results
 from bench.compare.timings import RUNS
 from bench.errors import UserError, local_path
 from bench.experiment.columns import Column
-from bench.experiment.words import parse_flag, parse_words
+from bench.experiment.words import parse_words
 
 
 def main(words: Sequence[str]) -> int:
     """Compare the two results named in ``words``. Returns 1 if something got worse. Raises :class:`UserError`."""
-    defaults = {"timings": "false", "again": "", "out": "runs/compare"}
-    names, settings, options = parse_words(words, "compare", defaults, ("--timings",))
+    names, settings, _ = parse_words(words, "compare", {"again": "", "out": "runs/compare"})
     if len(names) != 2:
         raise UserError(
             "name two results: python -m bench compare BEFORE AFTER (directories, or revisions as REV or REV:PATH)"
         )
-    timings, out = bool(options) or parse_flag(settings, "timings"), local_path("out", settings["out"])
-    comparison = compare_results(names[0], names[1], timings, tuple(filter(None, settings["again"].split(","))))
+    out = local_path("out", settings["out"])
+    comparison = compare_results(names[0], names[1], tuple(filter(None, settings["again"].split(","))))
     show(comparison, write(comparison, out))
     return int(comparison.worse)
 
 
-def compare_results(before: str, after: str, timings: bool = False, again: Sequence[str] = ()) -> Comparison:
-    """Compare the accuracy of the experiments that two results have in common, and their times with ``timings``.
+def compare_results(before: str, after: str, again: Sequence[str] = ()) -> Comparison:
+    """Compare the accuracy of the experiments that two results have in common, and their times with ``again``.
 
     ``again`` are further runs of ``before``, which show how much times differ between runs. Raises :class:`UserError`.
     """
-    if again and not timings:
-        raise UserError("again= names further runs for their times: add --timings")
     if again and len(again) + 1 < RUNS:
         raise UserError(
             f"the spread between runs needs {RUNS} or more runs of before: again= names {len(again)} besides the first"
@@ -54,8 +51,12 @@ def compare_results(before: str, after: str, timings: bool = False, again: Seque
             raise UserError(f"{name} is of study {one.study} in {before} and of study {two.study} in {after}")
         runs = [results[name].rows for results in more if name in results]
         judged |= {column.name: column for column in one.columns.compared}
-        table, of_times = compare_cells(one.rows, two.rows, one.columns, timings, runs)
-        own = [*default_remarks(one, two), *version_remarks(one.rows, two.rows), *machine_remarks(one, two, timings)]
+        table, of_times = compare_cells(one.rows, two.rows, one.columns, runs)
+        own = [
+            *default_remarks(one, two),
+            *version_remarks(one.rows, two.rows),
+            *machine_remarks(one, two, bool(again)),
+        ]
         remarks += [f"{name}: {remark}" for remark in (*own, *of_times)]
         parts.append(table.assign(experiment=name))
     return Comparison(f"{before} against {after}", pd.concat(parts, ignore_index=True), remarks, list(judged.values()))

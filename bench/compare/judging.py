@@ -6,9 +6,7 @@ The study names the rule of each column (:class:`bench.experiment.columns.Compar
   estimate changed if the mean or the variance differ by more than ROUNDING. It got worse or better if the root mean
   squared error changed by a factor of at least PAIRED, with both sides measured against the reference of *before*.
 - ``interval``: the two 95% intervals do not overlap.
-- ``spread``: the two 95% intervals do not overlap. If an interval is not stored, the ratio must leave the central 99% of
-  an F distribution with R - 1 degrees of freedom on both sides (normal estimates with one dominant component, the fewest
-  possible). In either case the change must also be at least EFFECT.
+- ``spread``: the two 95% intervals do not overlap, and the change is at least EFFECT.
 - ``exact``, for columns that are computed without noise: the value changed by a factor of at least EFFECT, and by more
   than ROUNDING.
 - ``vector``, for gradients that are computed without noise: it moved by more than ROUNDING of its norm.
@@ -33,8 +31,6 @@ EFFECT = 1.25
 """Smallest ratio at which a variance or a computed error counts as changed."""
 PAIRED = 1.01
 """Smallest ratio at which an error measured with the same noise counts as worse or better, not only as changed."""
-ALPHA = 0.01
-"""Significance level of the F test."""
 ROUNDING = 1e-6
 """Relative change that rounding on another machine may cause over a long rollout."""
 SIGMAS = 4.0
@@ -44,8 +40,7 @@ NOTES = (
     f"that moved by more than {ROUNDING:g} shows that the code changed. The cell is worse or better if the RMSE about the "
     f"reference of before changed by {PAIRED - 1:.0%} or more, otherwise changed.",
     "A bias is also worse or better if its 95% interval no longer overlaps the one before. A variance is also worse or "
-    f"better if it changed by a factor of {EFFECT:g} or more and its interval no longer overlaps (without stored "
-    "intervals, if the ratio fails an F test at 99%).",
+    f"better if it changed by a factor of {EFFECT:g} or more and its interval no longer overlaps.",
     f"Errors computed without noise count if they changed by a factor of {EFFECT:g} or more and by more than {ROUNDING:g}. "
     "Verdicts count by the order that their study gives them. A column for which neither more nor less is better counts "
     "as changed.",
@@ -77,30 +72,37 @@ def judge_cell(columns: Sequence[Column], old: Row | None, new: Row | None) -> l
         return [Change("worse" if old["status"] == "ok" else "changed", f"gone, it was {old['status']}", "gone")]
     if old["status"] != new["status"]:
         outcome = "worse" if old["status"] == "ok" else "better" if new["status"] == "ok" else "changed"
-        reason = f" ({new['reason']})" if isinstance(new.get("reason"), str) and new["reason"] else ""
+        reason = f" ({_remark(new)})" if _remark(new) else ""
         return [Change(outcome, f"status {old['status']} to {new['status']}{reason}", "no longer ok")]
     if old["status"] != "ok":
         return []
-    judged = [column for column in columns if rule_of(column).by != "time"]
-    pairs = [_pair(rule_of(column), old, new) for column in judged]
-    if any(pair is not None and pair.is_same for pair in pairs):
-        # only the reference can differ then, which makes the estimates neither better nor worse
-        judged = [column for column in judged if rule_of(column).by not in ("interval", "spread")]
-    return [change for column in judged if (change := judge(column, old, new)) is not None]
+    pairs = {column.name: _pair(rule_of(column), old, new) for column in columns}
+    # of equal estimates only the reference can differ, which makes them neither better nor worse
+    are_same = any(pair is not None and pair.is_same for pair in pairs.values())
+    changes = []
+    for column in columns:
+        rule = rule_of(column)
+        is_estimated = rule.by in ("interval", "spread")
+        if rule.by == "time" or (is_estimated and are_same):
+            continue
+        if rule.by == "paired":
+            pair = pairs[column.name]
+            change = _paired(column, pair, old, new) if pair else None
+        else:
+            change = RULES[rule.by](column, old, new)
+        if change is None:
+            continue
+        change = change._replace(subject=rule.called, outcome="changed" if rule.neutral else change.outcome)
+        if is_estimated and (remarks := [text for row in (old, new) if (text := _remark(row))]):
+            doubt = UNEXPLAINED if any(map(is_unexplained, remarks)) else "intervals doubtful"
+            change = change._replace(outcome="changed", text=f"{change.text}, {doubt}")
+        changes.append(change)
+    return changes
 
 
-def judge(column: Column, old: Row, new: Row) -> Change | None:
-    """Return the change of one judged column between two rows of status ok, or None if it did not change."""
-    rule = rule_of(column)
-    change = RULES[rule.by](column, old, new)
-    if change is None:
-        return None
-    change = change._replace(subject=rule.called, outcome="changed" if rule.neutral else change.outcome)
-    remarks = [str(row["reason"]) for row in (old, new) if isinstance(row.get("reason"), str) and row["reason"]]
-    if remarks and rule.by in ("interval", "spread"):
-        doubt = UNEXPLAINED if any(map(is_unexplained, remarks)) else "intervals doubtful"
-        return change._replace(outcome="changed", text=f"{change.text}, {doubt}")
-    return change
+def _remark(row: Row) -> str:
+    """Return the reason of a row; empty if there is none."""
+    return row["reason"] if isinstance(row.get("reason"), str) else ""
 
 
 class _Pair(NamedTuple):
@@ -139,12 +141,9 @@ def _pair(rule: ComparisonRule, old: Row, new: Row) -> _Pair | None:
     return _Pair(means, variances, references, scale)
 
 
-def _paired(column: Column, old: Row, new: Row) -> Change | None:
-    """Judge an error by the mean estimates on the same noise, or return None if a row does not store them."""
+def _paired(column: Column, pair: _Pair, old: Row, new: Row) -> Change | None:
+    """Judge an error by the mean estimates on the same noise."""
     rule = rule_of(column)
-    pair = _pair(rule, old, new)
-    if pair is None:
-        return None
     if pair.is_same:
         stem = rule.reference.partition("_")[0]  # of reference_gradient: its standard error is reference_se
         return _reference_change(pair, [value(row, f"{stem}_se") for row in (old, new)])
@@ -197,31 +196,13 @@ def _interval(column: Column, old: Row, new: Row) -> Change | None:
 
 def _spread(column: Column, old: Row, new: Row) -> Change | None:
     was, now = value(old, column.name), value(new, column.name)
-    if not (was > 0 and now > 0) or max(was, now) < EFFECT * min(was, now):
-        return None
-    if np.isfinite([value(row, end) for row in (old, new) for end in _ends(column)]).all():
-        return _size_change(column, old, new, _is_disjoint(column, old, new))
-    return _size_change(column, old, new, outside_f(now / was, value(old, "repeats"), value(new, "repeats")))
-
-
-def _ends(column: Column) -> tuple[str, str]:
-    return column.low or f"{column.name}_low", column.high or f"{column.name}_high"
+    is_large = was > 0 and now > 0 and max(was, now) >= EFFECT * min(was, now)
+    return _interval(column, old, new) if is_large else None
 
 
 def _is_disjoint(column: Column, old: Row, new: Row) -> bool:
-    low, high = _ends(column)
+    low, high = column.low or f"{column.name}_low", column.high or f"{column.name}_high"
     return value(new, low) > value(old, high) or value(new, high) < value(old, low)
-
-
-def outside_f(ratio: float, before: float, after: float) -> bool:
-    """Return whether a ratio of two variances fails the F test of equal variances at 99%.
-
-    ``before`` and ``after`` are the numbers of repeats that each variance was measured from.
-    """
-    from scipy.special import fdtri
-
-    low, high = (float(fdtri(after - 1, before - 1, p)) for p in (ALPHA / 2, 1 - ALPHA / 2))
-    return not low <= ratio <= high
 
 
 def _exact(column: Column, old: Row, new: Row) -> Change | None:
@@ -259,7 +240,7 @@ def _verdict(column: Column, old: Row, new: Row) -> Change | None:
 
 
 RULES: dict[str, Callable[[Column, Row, Row], Change | None]] = {
-    "paired": _paired, "interval": _interval, "spread": _spread, "exact": _exact, "vector": _vector, "verdict": _verdict,
+    "interval": _interval, "spread": _spread, "exact": _exact, "vector": _vector, "verdict": _verdict,
 }  # fmt: skip
 
 

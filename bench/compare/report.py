@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,7 +10,6 @@ from functools import cached_property
 from html import escape
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
 import pandas as pd
 
@@ -32,8 +30,6 @@ PRINTED = 30
 """Largest number of printed changes. The files contain all changes."""
 LISTED = 100
 """Largest number of changes in the Markdown file, which CI servers show above a run."""
-CONTROL = re.compile(r"[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
-"""Characters that XML 1.0 does not allow. Error messages of plugins may contain them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,14 +91,13 @@ def count_outcomes(table: pd.DataFrame) -> dict[str, int]:
 
 
 def write(comparison: Comparison, out: Path) -> list[Path]:
-    """Write ``compare`` as .csv, .md, .xml (JUnit) and .html. Raises :class:`StorageError` if that fails."""
+    """Write ``compare`` as .csv, .md and .html. Raises :class:`StorageError` if that fails."""
     make_directory(out)
     return write_all(
         out,
         {
             "compare.csv": comparison.to_frame().drop(columns="cell").to_csv(index=False, lineterminator="\n"),
             "compare.md": markdown(comparison),
-            "compare.xml": junit(comparison),
             "compare.html": page(comparison),
         },
     )
@@ -120,29 +115,6 @@ def markdown(comparison: Comparison) -> str:
     if len(listed) > LISTED:
         texts.append(f"And {len(listed) - LISTED} more in `compare.csv`.")
     return "\n\n".join([*texts, "\n".join(f"- {note}" for note in (*NOTES, timings.NOTE))]) + "\n"
-
-
-def junit(comparison: Comparison) -> str:
-    """Return JUnit XML with a suite per experiment and a test case per cell, which fails if the cell got worse."""
-
-    def element(parent: ElementTree.Element | None, tag: str, **facts: Any) -> ElementTree.Element:
-        safe = {name: CONTROL.sub("?", str(fact)) for name, fact in facts.items()}
-        return ElementTree.Element(tag, safe) if parent is None else ElementTree.SubElement(parent, tag, safe)
-
-    table = comparison.table.assign(cell=comparison.cells)
-    n_worse = count_outcomes(table)["worse"]
-    root = element(None, "testsuites", name=comparison.title, tests=len(table), failures=n_worse)
-    for name, part in table.groupby("experiment", sort=False):
-        n_worse = count_outcomes(part)["worse"]
-        suite = element(root, "testsuite", name=name, tests=len(part), failures=n_worse)
-        for row in part.to_dict("records"):
-            case = element(suite, "testcase", classname=name, name=row["cell"])
-            if row["outcome"] == "worse":
-                element(case, "failure", message=row["change"])
-            elif row["outcome"] != "same":
-                element(case, "system-out").text = CONTROL.sub("?", f"{row['outcome']}: {row['change']}")
-    ElementTree.indent(root)
-    return '<?xml version="1.0" encoding="UTF-8"?>\n' + ElementTree.tostring(root, encoding="unicode") + "\n"
 
 
 def show(comparison: Comparison, paths: Sequence[Path]) -> None:

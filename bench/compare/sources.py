@@ -117,7 +117,7 @@ def _read(folder: Path) -> tuple[str, Results]:
     if len(studies) != 1:
         raise UserError(f"the rows in '{path}' are of {len(studies)} studies ({', '.join(studies)})")
     columns = columns_of(studies[0])
-    rows = columns.typed(valid_rows(rows, columns, path)).reset_index(drop=True)
+    rows = valid_rows(rows, columns, [path] * len(rows))[0].reset_index(drop=True)
     label = str(rows["experiment"].iloc[0]) if "experiment" in rows and len(rows) else folder.name
     return label, Results(rows, studies[0], *_read_machine(folder))
 

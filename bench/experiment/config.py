@@ -13,7 +13,7 @@ from typing import Any, cast
 from bench.errors import STATUSES, UserError, local_path, printable, unknown
 from bench.experiment.experiment import Budget, Choice, Execution, Experiment, TableLayout
 from bench.experiment.grid import COUNTS, check_axes, parameter_name, refuse_too_many, swept
-from bench.experiment.overrides import LISTS_AS, TABLES, Values, check_file, quoted
+from bench.experiment.overrides import LISTS_AS, TABLES, check_file, quoted, with_ranges
 from bench.experiment.study import Study
 from bench.model import Decision, MechanicalScene, Plugin, guard, registry
 from bench.model.identity import parse_identity, split_items
@@ -76,10 +76,10 @@ def _composed(overrides: Sequence[str], config_dirs: Sequence[Path]) -> Experime
     if len(named) > 1:
         commands = " && ".join(f"python -m bench +experiment={name}" for name in named)
         raise UserError(f"one command runs one experiment with its sweep: {commands}")
-    parser, values = OverridesParser.create(), Values()
+    parser = OverridesParser.create()
     prepared = []
     for override in overrides:
-        hydra_override = _to_hydra(override, config_dirs, values)
+        hydra_override = _to_hydra(override, config_dirs)
         try:
             parser.parse_override(hydra_override)
         except (HydraException, ValueError, RecursionError):  # ValueError: a number of 5000 digits
@@ -98,7 +98,7 @@ def _composed(overrides: Sequence[str], config_dirs: Sequence[Path]) -> Experime
         lines = [str(part).strip().partition("\n")[0] for part in (error, error.__cause__) if part is not None]
         raise UserError(printable(": ".join(lines)).replace("override ++", "")[:1000]) from None
     assert isinstance(plain, dict)
-    settings = {str(k): values.restore(v) for k, v in plain.items()}
+    settings = {str(k): v for k, v in plain.items()}
     joined = _joined(experiment(settings), _as_list(settings["also"]), overrides, config_dirs)
     return replace(joined, answer=_answer(joined, overrides, config_dirs))
 
@@ -165,7 +165,7 @@ def _settings() -> frozenset[str]:
     return frozenset(yaml.safe_load((config_dir() / "config.yaml").read_text())) - {"defaults"}
 
 
-def _to_hydra(override: str, config_dirs: Sequence[Path], values: Values) -> str:
+def _to_hydra(override: str, config_dirs: Sequence[Path]) -> str:
     """Return an override in Hydra's syntax; experiments and plugin parameters need no ``+``."""
     if "=" not in override:
         if override in experiments(config_dirs):
@@ -175,7 +175,7 @@ def _to_hydra(override: str, config_dirs: Sequence[Path], values: Values) -> str
         raise UserError(f"'{override}': interpolations are not supported, give the value itself")
     key, _, value = override.partition("=")
     bare = key.lstrip("+~")
-    value = quoted(values.replace_in(bare, value))
+    value = quoted(with_ranges(bare, value))
     if bare in LAYOUT:
         bare = f"table.{bare}"
     head = bare.partition(".")[0]

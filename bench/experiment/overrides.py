@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +11,7 @@ from bench.experiment.grid import MAX_CELLS
 
 GLOBAL = "# @package _global_"
 """The first line of an experiment file, so that Hydra does not nest its settings."""
-NUMBER = r"[+-]?(?:0|[1-9]\d*)(?:\.\d+)?(?:[eE][+-]?\d+)?"
-LONG_LIST = re.compile(rf"\[\s*{NUMBER}(?:\s*,\s*{NUMBER}){{15,}}\s*\]")
-"""A list of at least 16 numbers, which Hydra's parser would read slowly."""
 RANGE = re.compile(r"range\(([^()]*)\)")
-PLACEHOLDER = "bench_values_"
 TABLES = ("sweep", "marks", "reference", "table", "ray")
 """Settings that are tables; the parameters of plugins are too."""
 LISTS_AS = "write key=value with lists as [a,b] and strings in quotes"
@@ -33,36 +28,18 @@ def quoted(value: str) -> str:
     return "'" + value + ("\\" if value.endswith("\\") else "") + "'"
 
 
-class Values:
-    """Long lists and ranges of a sweep, which pass Hydra as placeholders."""
+def with_ranges(key: str, value: str) -> str:
+    """Return the value of a setting with ranges in a sweep written out.
 
-    def __init__(self) -> None:
-        self._lists: dict[str, list[Any]] = {}
-
-    def replace_in(self, key: str, value: str) -> str:
-        """Return the value of a setting with long lists of numbers and ranges replaced by placeholders."""
-        if key.partition(".")[0] not in ("sweep", "theta0") or "'" in value or '"' in value:
-            return value
-        value = RANGE.sub(lambda match: self._placeholder(_range(key, match)), value)
-        return LONG_LIST.sub(lambda match: self._placeholder(_numbers(match[0])), value)
-
-    def restore(self, value: Any) -> Any:
-        """Return a configuration with the lists in place of their placeholders."""
-        if isinstance(value, Mapping):
-            return {name: self.restore(item) for name, item in value.items()}
-        if isinstance(value, list):
-            if len(value) == 1 and isinstance(value[0], str) and value[0] in self._lists:
-                return list(self._lists[value[0]])
-            return [self.restore(item) for item in value]
+    >>> with_ranges("sweep.seed", "range(0,6,2)")
+    '[0,2,4]'
+    """
+    if key.partition(".")[0] not in ("sweep", "theta0") or "'" in value or '"' in value:
         return value
-
-    def _placeholder(self, items: list[Any]) -> str:
-        name = f"{PLACEHOLDER}{len(self._lists)}"
-        self._lists[name] = items
-        return f"[{name}]"
+    return RANGE.sub(lambda match: f"[{','.join(map(str, _range(key, match)))}]", value)
 
 
-def _range(key: str, match: re.Match[str]) -> list[Any]:
+def _range(key: str, match: re.Match[str]) -> range:
     try:
         numbers = range(*(int(part) for part in match[1].split(",")))
     except (ValueError, TypeError):
@@ -72,11 +49,7 @@ def _range(key: str, match: re.Match[str]) -> list[Any]:
         ) from None
     if len(numbers) > MAX_CELLS:
         raise UserError(f"{key}={match[0]} has {len(numbers)} values, and more than {MAX_CELLS} are not allowed")
-    return list(numbers)
-
-
-def _numbers(text: str) -> list[Any]:
-    return [float(part) if set(part) & set(".eE") else int(part) for part in text[1:-1].split(",")]
+    return numbers
 
 
 def check_file(path: Path) -> None:

@@ -35,10 +35,3 @@ def parse_words(
         else:
             settings[key] = value
     return names, settings, given
-
-
-def parse_flag(settings: Mapping[str, str], name: str) -> bool:
-    """Return a setting that is ``true`` or ``false``. Raises :class:`UserError` for anything else."""
-    if settings[name] not in ("true", "false"):
-        raise unknown(f"value for {name}:", settings[name], ("true", "false"))
-    return settings[name] == "true"

@@ -58,6 +58,13 @@ def protect_process() -> Iterator[None]:
     raise_pending_interrupt()
 
 
+@contextlib.contextmanager
+def contained() -> Iterator[None]:
+    """Run code of plugins in the block: :func:`capture_output` and :func:`protect_process`."""
+    with capture_output("a plugin"), protect_process():
+        yield
+
+
 def raise_pending_interrupt() -> None:
     """Raise the KeyboardInterrupt that a plugin, a callback from C or a finaliser has swallowed, if any."""
     if INTERRUPTED.is_set():

@@ -11,7 +11,6 @@ import contextlib
 import importlib
 import json
 import os
-import selectors
 import signal
 import subprocess
 import sys
@@ -32,8 +31,9 @@ SHARED = ("bench", "builtins", "json", "math", "numpy", "os", "pandas", "pickle"
 """Packages whose functions a file must not replace."""
 CHILD_CODE = (
     "import json, sys; job = json.load(sys.stdin); sys.path[:] = job['path']; "
-    "import bench.run.execute; import bench.model.trial as trial; trial.run_child(job)"
+    "import bench.run.execute; from bench.model import trial; trial.run_child(job)"
 )
+"""The program of a trial process. It imports the runner first, so that replaced functions are noticed."""
 
 
 def find_fatal_modules(
@@ -57,10 +57,10 @@ def find_fatal_modules(
 
 
 def run_child(job: Mapping[str, Any]) -> None:
-    """Run the trial process: import modules one by one, writing a line to the pipe for each."""
+    """Run the trial process: import modules one by one, starting a line of output before each."""
     os.environ[MARK] = "1"
     pid = os.getpid()
-    pipe = os.dup(1)
+    output = os.dup(1)
     null = os.open(os.devnull, os.O_RDWR)
     for descriptor in (0, 1, 2):
         os.dup2(null, descriptor)
@@ -68,19 +68,21 @@ def run_child(job: Mapping[str, Any]) -> None:
         sys.modules[name] = package = ModuleType(name)
         package.__path__ = [folder]
     for name in job["modules"]:
-        os.write(pipe, b"\n")
+        os.write(output, b"\n")
         state, functions, n_threads = isolation.ProcessState(), _functions(), threading.active_count()
+        signal.setitimer(signal.ITIMER_REAL, job["timeout_s"])  # which ends this process
         with contextlib.suppress(BaseException):  # the registry imports the module again and lists its error
             importlib.import_module(name)
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
         guard.exit_if_forked(pid)
         guard.kill_children()
         now = _functions()
         replaced = [key for key, function in functions.items() if now.get(key) is not function]
         changes = [*state.changes(), *replaced[:1], *["the running threads"] * (threading.active_count() > n_threads)]
-        os.write(pipe, printable("; ".join(changes)).encode())
+        os.write(output, printable("; ".join(changes)).encode())
         if changes:  # later files are imported in another process
             break
-    os.write(pipe, b"\n!")
+    os.write(output, b"\n!")
     os._exit(0)  # without waiting for threads that a plugin has left running
 
 
@@ -92,46 +94,24 @@ def _functions() -> dict[str, Any]:
 
 def _try_imports(names: Sequence[str], packages: Mapping[str, Path], timeout_s: float) -> list[str]:
     """Return how each module that was started in a trial process failed, an empty text if it passed."""
-    command = [sys.executable, "-c", CHILD_CODE]
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
-    job = {
-        "path": sys.path,
-        "packages": {name: str(folder) for name, folder in packages.items()},
-        "modules": list(names),
-    }
-    with subprocess.Popen(command, start_new_session=True, **pipes) as process:  # type: ignore[call-overload]
+    job = {"path": sys.path, "packages": {name: str(folder) for name, folder in packages.items()}}
+    content = json.dumps(job | {"modules": list(names), "timeout_s": timeout_s}).encode()
+    with guard.temporary_file() as output:
+        process = subprocess.Popen(
+            [sys.executable, "-c", CHILD_CODE], stdin=subprocess.PIPE, stdout=output, stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )  # fmt: skip
         try:
-            process.stdin.write(json.dumps(job).encode())
-            process.stdin.close()
-        except BrokenPipeError:
-            return []
-        output, cause = b"", ""
-        try:
-            with selectors.DefaultSelector() as selector:
-                selector.register(process.stdout, selectors.EVENT_READ)
-                while not output.endswith(b"\n!"):
-                    if not selector.select(timeout_s):
-                        cause = f"did not return within {timeout_s:g} s"
-                        break
-                    received = os.read(process.stdout.fileno(), 4096)
-                    if not received:
-                        break
-                    output += received
+            process.communicate(content)
         finally:
-            _terminate(process)
-    *changes, last = output.decode().split("\n")[1:] or [""]
-    failures = [f"changed {text} when it was imported" * bool(text) for text in changes]
-    if last == "!" or not output:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+        lines = os.pread(output.fileno(), os.fstat(output.fileno()).st_size, 0).decode().split("\n")[1:]
+    failures = [f"changed {text} when it was imported" * bool(text) for text in lines[:-1]]
+    code = process.wait()
+    if not lines or lines[-1] == "!":
         return failures
-    code = process.returncode
-    cause = cause or f"ended the process {f'by {signal.Signals(-code).name}' if code < 0 else f'(exit status {code})'}"
+    cause = f"ended the process {f'by {signal.Signals(-code).name}' if code < 0 else f'(exit status {code})'}"
+    if code == -signal.SIGALRM:
+        cause = f"did not return within {timeout_s:g} s"
     return [*failures, f"{cause} when it was imported"]
-
-
-def _terminate(process: subprocess.Popen[bytes]) -> None:
-    """Wait up to 0.5 s for the process to exit, then kill it and the processes that it has started."""
-    with contextlib.suppress(subprocess.TimeoutExpired):
-        process.wait(0.5)
-    with contextlib.suppress(ProcessLookupError):
-        os.killpg(process.pid, signal.SIGKILL)
-    process.wait()

@@ -1,23 +1,36 @@
-"""Runs one experiment from its plan to its stored rows, for both the command line and Python."""
+"""Runs one experiment from its plan to its stored rows, for both the command line and Python.
+
+Cells run, their rows are stored, and then they are reported.
+"""
 
 from __future__ import annotations
 
+import itertools
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from bench.errors import StorageError, Unsupported, UserError
+from bench.experiment.cell import Cell
 from bench.experiment.defaults import completed_rows
 from bench.experiment.experiment import Experiment
 from bench.experiment.study import study_of
 from bench.measure import timing
-from bench.run import progress, runner
+from bench.model import Estimator, guard
+from bench.run import progress
 from bench.run.files import remove_stale
 from bench.run.ladder import climb
+from bench.run.launchers import launcher_of
+from bench.run.launchers.launcher import Launcher
 from bench.run.plan import Planned, plan
+from bench.run.pool import Answer
+from bench.run.record import kind_of_machine
+from bench.run.session import Session
 from bench.run.store import Store, sort_rows
+from bench.run.tasks import FAILED, Task, group_by_program, result_of, row_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -55,7 +68,7 @@ def execute(experiment: Experiment, quiet: bool = True) -> Finished:
     """Run the missing cells of an experiment and merge their rows into ``rows.parquet``.
 
     Cells whose rows are gone at the end, for example since the results folder was renamed or removed, are run again.
-    Raises :class:`runner.Stopped` after a failed cell in an experiment with ``on_error=stop`` and if rows are missing
+    Raises :class:`Stopped` after a failed cell in an experiment with ``on_error=stop`` and if rows are missing
     even so, KeyboardInterrupt if interrupted (every cell finished by then is stored), and :class:`UserError` if the study
     supports no cell.
     """
@@ -78,7 +91,7 @@ def execute(experiment: Experiment, quiet: bool = True) -> Finished:
             break
         missing = sum(not item.stored for item in rest)
         if is_last:
-            raise runner.Stopped(f"since {missing} cells were run and have no row")
+            raise Stopped(f"since {missing} cells were run and have no row")
         print(
             f"bench: {missing} of {len(planned)} cells were run and have no row in '{store.directory}': was it renamed or "
             "removed? They are run again",
@@ -91,7 +104,7 @@ def execute(experiment: Experiment, quiet: bool = True) -> Finished:
 
 def _run(experiment: Experiment, planned: list[Planned], store: Store, quiet: bool) -> None:
     with progress.show_progress(experiment.name, planned, quiet) as shown:
-        run = runner.Runner(experiment, store, shown.finished, shown.working).run
+        run = Runner(experiment, store, shown).run
         try:
             if experiment.execution.ladder:
                 climb(experiment, planned, store, run, quiet)
@@ -120,3 +133,112 @@ def _compact(store: Store, planned: Sequence[Planned]) -> None:
         store.compact([item.cell.key for item in planned])
     except StorageError as error:
         print(f"bench: {error}; no row is lost: those in 'pending' are read from there", file=sys.stderr)
+
+
+@dataclass
+class Runner:
+    """Runs the missing cells of an experiment: references on all workers, then cells, one at a time if they are timed."""
+
+    experiment: Experiment
+    store: Store
+    shown: progress.Progress
+
+    def run(self, planned: Sequence[Planned]) -> None:
+        """Store a row for every cell that has none.
+
+        Raises :class:`Stopped` after a failed cell if the experiment has ``on_error=stop``.
+        """
+        due = [item for item in planned if not item.stored]
+        kind = next((item.machine for item in planned if item.machine), "")
+        refused = [(i.cell, dict(zip(("status", "reason"), i.refusal, strict=True))) for i in due if i.refusal]
+        if refused:
+            self._finish([(cell, result | {"machine": kind_of_machine()}) for cell, result in refused])
+        cells = [item.cell for item in due if item.refusal is None]
+        with guard.contained():  # this calls backends, to find out which can compute references
+            references = self._missing_references(cells)
+        if not self.experiment.timing:
+            with launcher_of(self.experiment) as launcher:
+                self._measure(self._compute_references(cells, references, launcher), launcher)
+            return
+        if references:
+            with launcher_of(self.experiment) as launcher:
+                cells = self._compute_references(cells, references, launcher)
+        with launcher_of(self.experiment, timed=True, kind=kind) as launcher:
+            self._measure(cells, launcher)
+
+    def _missing_references(self, cells: list[Cell]) -> list[Cell]:
+        """Return one cell for each reference to compute; closed forms are computed when their cells are measured."""
+        if self.experiment.budget is None:
+            return []
+        references = Session(self.experiment).references
+        # reversed twice, so that the first cell of each key remains, in the planned order
+        first = {cell.reference_key: cell for cell in reversed(cells)}
+        return [cell for cell in reversed(first.values()) if not references.stored(cell) and not _has_closed_form(cell)]
+
+    def _compute_references(self, cells: list[Cell], references: list[Cell], launcher: Launcher) -> list[Cell]:
+        """Compute references and return the cells to measure; cells whose reference failed are stored with its status."""
+        tasks = [Task(_for_reference(cell), reference=True) for cell in references]
+        failed: dict[str, dict[str, Any]] = {}
+        for answer in itertools.chain.from_iterable(self._answers(tasks, launcher)):
+            if answer.result["status"] != "ok":
+                failed[answer.item.cell.reference_key] = result_of(answer, "its reference gradient: ")
+        if not failed:
+            return cells
+        self._finish([(cell, failed[cell.reference_key]) for cell in cells if cell.reference_key in failed])
+        return [cell for cell in cells if cell.reference_key not in failed]
+
+    def _measure(self, cells: list[Cell], launcher: Launcher) -> None:
+        for answers in self._answers([Task(cell) for cell in cells], launcher):
+            self._finish([(a.item.cell, result_of(a)) for a in answers])
+
+    def _answers(self, tasks: list[Task], launcher: Launcher) -> Iterator[list[Answer]]:
+        with guard.contained():
+            groups = group_by_program(tasks)
+        n_done = 0
+        for answers in launcher.run(groups):
+            guard.raise_pending_interrupt()
+            n_done += len(answers)
+            if answers:
+                yield answers
+            current = "; ".join(str(item) for item in launcher.current)
+            if tasks[0].reference:  # references are no cells, so the counts of cells stand still meanwhile
+                current += f" ({n_done} of {len(tasks)} references done)"
+            self.shown.working(current)
+
+    def _finish(self, results: list[tuple[Cell, dict[str, Any]]]) -> None:
+        """Store rows and report them; raises :class:`Stopped` if due."""
+        rows = [row_of(self.experiment, cell, result) for cell, result in results]
+        if rows:
+            self.store.append(*rows)
+        for row in rows:
+            self.shown.finished(row)
+        if self.experiment.execution.stop:
+            for row in rows:
+                if row["status"] in FAILED:
+                    raise _stopped_by(row)
+
+
+class Stopped(Exception):
+    """Raised when a run ends before its last cell: a cell failed in a run with ``on_error=stop``, or rows are missing."""
+
+
+def _stopped_by(row: dict[str, Any]) -> Stopped:
+    names = " ".join(str(row[name]) for name in ("scene", "backend", "estimator") if row.get(name))
+    return Stopped(f"after a failed cell ({names}: {row['status']}, {row['reason']})")
+
+
+def _for_reference(cell: Cell) -> Cell:
+    """Return the cell without its estimator, whose code the reference does not need, unless the estimator smooths J."""
+    with suppress(Exception):  # the error is reported when the cell is measured
+        if isinstance(cell.parts.get("estimator"), Estimator) and cell.smoothing() is None:
+            return cell.with_part("estimator", None)
+    return cell
+
+
+def _has_closed_form(cell: Cell) -> bool:
+    try:
+        return cell.program().closed_form_gradient() is not None
+    except KeyboardInterrupt:
+        raise
+    except BaseException:  # the error is reported when the cell is measured
+        return True

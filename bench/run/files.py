@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import fcntl
-import hashlib
 import os
-import platform
 import re
 import time
 import uuid
@@ -13,51 +11,40 @@ from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
 
-import psutil
-
 from bench.errors import StorageError
-from bench.model.parameters import remember
 
 STALE_S = 3600.0
-"""Age in seconds after which a half-written file of another machine is removed."""
-TEMPORARY = re.compile(r"\..+-bench-([0-9a-f]{8})-(\d+)-[0-9a-f]{32}")
-"""Names of files being written, with machine, process id and a random number."""
-
-
-def temporary(path: Path) -> Path:
-    """Return a hidden temporary path beside ``path``, with machine and process id in its name for :func:`remove_stale`."""
-    return path.with_name(f".{path.name[:100]}-bench-{_machine()}-{os.getpid()}-{uuid.uuid4().hex}")
-
-
-@remember
-def _machine() -> str:
-    """Return a name for the system in which process ids are unique: one boot of a machine, or one container."""
-    try:
-        system = Path("/proc/sys/kernel/random/boot_id").read_text() + os.readlink("/proc/self/ns/pid")
-    except OSError:
-        system = platform.node()
-    return hashlib.sha256(system.encode()).hexdigest()[:8]
+"""Age in seconds after which a half-written file is that of a killed run."""
+TEMPORARY = re.compile(r"\..+-bench-[0-9a-f]{32}")
+"""Names of files being written."""
 
 
 def remove_stale(directory: Path) -> None:
     """Remove the half-written files of killed runs from a directory, but not from its subdirectories."""
     with suppress(OSError):
         for path in directory.iterdir():
-            match = TEMPORARY.fullmatch(path.name)
-            if match is None:
-                continue
             with suppress(OSError):
-                gone = match[1] == _machine() and not psutil.pid_exists(int(match[2]))
-                if gone or time.time() - path.stat().st_mtime > STALE_S:
+                if TEMPORARY.fullmatch(path.name) and time.time() - path.stat().st_mtime > STALE_S:
                     path.unlink()
 
 
 def write_whole(path: Path, content: bytes | Iterable[bytes]) -> None:
     """Write a file completely or not at all; raises :class:`StorageError` if it cannot be written."""
+    part = path.with_name(f".{path.name[:100]}-bench-{uuid.uuid4().hex}")
     try:
-        replace_file(path, content)
-    except FileNotFoundError as error:
-        raise StorageError(f"'{path}' cannot be written: {error.strerror}") from None
+        with open(part, "wb") as file:
+            file.writelines([content] if isinstance(content, bytes) else content)
+            file.flush()
+            # the content must be on disk before the name points to it, or a power cut leaves an empty file
+            flush_to_disk(file.fileno())
+        os.replace(part, path)
+        sync_directory(path.parent)
+    except BaseException as error:  # also of code that makes the content
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            raise StorageError(f"'{path}' cannot be written: {error.strerror}") from None
+        raise
 
 
 def write_all(directory: Path, contents: Mapping[str, str] | Iterable[tuple[str, str | Iterable[str]]]) -> list[Path]:
@@ -78,27 +65,6 @@ def make_directory(path: Path) -> None:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise StorageError(f"'{path}' cannot be written: {error.strerror}") from None
-
-
-def replace_file(path: Path, content: bytes | Iterable[bytes]) -> None:
-    """Write like :func:`write_whole`, but raise FileNotFoundError if the directory has been removed meanwhile."""
-    part = temporary(path)
-    try:
-        with open(part, "wb") as file:
-            file.writelines([content] if isinstance(content, bytes) else content)
-            file.flush()
-            # the content must be on disk before the name points to it, or a power cut leaves an empty file
-            flush_to_disk(file.fileno())
-        os.replace(part, path)
-        sync_directory(path.parent)
-    except FileNotFoundError:
-        raise
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise StorageError(f"'{path}' cannot be written: {error.strerror}") from None
-    except BaseException:  # of code that makes the content
-        part.unlink(missing_ok=True)
-        raise
 
 
 def sync_directory(directory: Path) -> None:

@@ -55,7 +55,7 @@ def plan(experiment: Experiment, store: Store) -> list[Planned]:
     rows = store.load()
     facts = zip(rows["status"], rows["versions"], rows["machine"], strict=True)
     stored = dict(zip(rows["key"], facts, strict=True))
-    with guard.capture_output("a plugin"), guard.protect_process():
+    with guard.contained():
         mine = [cell for cell in cells(experiment) if _is_in_shard(cell, experiment.execution.shard)]
         return [_planned(experiment, cell, stored) for cell in mine]
 
@@ -93,7 +93,7 @@ def requested_rows(experiment: Experiment, rows: pd.DataFrame) -> tuple[pd.DataF
     if rows.empty:
         return rows, ""
     try:
-        with guard.capture_output("a plugin"), guard.protect_process():
+        with guard.contained():
             every = cells(experiment)
             keys = {cell.key for cell in every}
             is_requested = rows["key"].isin(keys).to_numpy(copy=True)

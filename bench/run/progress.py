@@ -12,7 +12,6 @@ from datetime import timedelta
 from typing import TYPE_CHECKING, Any
 
 from bench.errors import printable
-from bench.experiment.cell import Cell
 from bench.experiment.experiment import Experiment
 from bench.run import record
 from bench.run.plan import Planned, expected_seconds
@@ -31,56 +30,46 @@ NOT_FAILED = ("ok", "unsupported", "waiting")
 
 
 class Progress:
-    """Counts cells (done, failed, stored before), and shows counts and current tasks in a bar."""
+    """Counts cells (done, failed, stored before), and shows counts and current tasks: in a bar or, with ``lines``, every 10 s."""
 
-    def __init__(self, name: str, planned: Sequence[Planned], bars: rich.progress.Progress) -> None:
-        self._name, self._n_cells, self._bars = name, len(planned), bars
-        self._n_done = self._n_stored = sum(item.stored for item in planned)
+    def __init__(
+        self, name: str, planned: Sequence[Planned], bars: rich.progress.Progress, lines: bool = False
+    ) -> None:
+        self._name, self._n_cells, self._bars, self._lines = name, len(planned), bars, lines
+        self._n_done = sum(item.stored for item in planned)
         self._current = ""
         self._failed: Counter[str] = Counter()
         self._task = bars.add_task(
             printable(name), total=self._n_cells, completed=self._n_done, counts=self._counts(), current=""
         )
+        self._printed_at = time.monotonic() + FIRST_LINE_S - LINE_S
+        if lines and self._n_done:
+            print(f"{name}: {self._n_done} of {self._n_cells} cells are stored", file=sys.stderr)
 
-    def finished(self, cell: Cell, row: dict[str, Any]) -> None:
+    def finished(self, row: dict[str, Any]) -> None:
         """Count one cell that is finished and stored."""
         self._n_done += 1
         if row["status"] not in NOT_FAILED:
             self._failed[row["status"]] += 1
-        self.show()
+        self._show()
 
     def working(self, tasks: str) -> None:
         """Set the names of the tasks being worked on."""
         self._current = printable(tasks)
-        self.show()
+        self._show()
 
-    def show(self) -> None:
-        """Show the current state of the run."""
+    def _show(self) -> None:
         self._bars.update(self._task, completed=self._n_done, counts=self._counts(), current=self._current)
-
-    def _counts(self) -> str:
-        """Return the numbers of finished and of all cells, and of failed cells by status."""
-        return "".join([f"{self._n_done}/{self._n_cells}", *(f", {n} {status}" for status, n in self._failed.items())])
-
-
-class Lines(Progress):
-    """Prints a plain line every 10 s."""
-
-    def __init__(self, name: str, planned: Sequence[Planned], bars: rich.progress.Progress) -> None:
-        super().__init__(name, planned, bars)
-        self._printed_at = time.monotonic() + FIRST_LINE_S - LINE_S
-        if self._n_stored:
-            print(f"{name}: {self._n_stored} of {self._n_cells} cells are stored", file=sys.stderr)
-
-    def show(self) -> None:
-        """Print a line, unless the last one is less than 10 s old, or the run is younger than 5 s."""
-        super().show()
-        if time.monotonic() - self._printed_at > LINE_S:
+        if self._lines and time.monotonic() - self._printed_at > LINE_S:
             self._printed_at = time.monotonic()
             seconds = self._bars.tasks[0].time_remaining
             left = f"about {timedelta(seconds=round(seconds))} left" if seconds else ""
             parts = [f"{self._counts()} cells", left, self._current and f"now {self._current}"]
-            print(f"{self._name}: {'; '.join(part for part in parts if part)}", file=sys.stderr)
+            print(f"{self._name}: {'; '.join(filter(None, parts))}", file=sys.stderr)
+
+    def _counts(self) -> str:
+        """Return the numbers of finished and of all cells, and of failed cells by status."""
+        return "".join([f"{self._n_done}/{self._n_cells}", *(f", {n} {status}" for status, n in self._failed.items())])
 
 
 def bars_on(console: rich.console.Console, disable: bool = False) -> rich.progress.Progress:
@@ -106,7 +95,7 @@ def show_progress(name: str, planned: Sequence[Planned], quiet: bool = False) ->
     console = Console(stderr=True)
     shows_bar = console.is_terminal and not quiet
     with bars_on(console, disable=not shows_bar) as bars:
-        yield (Progress if shows_bar or quiet else Lines)(name, planned, bars)
+        yield Progress(name, planned, bars, lines=not (shows_bar or quiet))
 
 
 def print_versions(planned: Sequence[Planned], policy: str) -> None:

@@ -11,12 +11,12 @@ import io
 import json
 import math
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bench.errors import STATUSES, UserError, printable
+from bench.errors import STATUSES, StorageError, UserError, printable
 from bench.experiment.columns import Columns
 from bench.experiment.grid import expand, refuse_too_many
 
@@ -76,23 +76,11 @@ def read_parquet(path: Path, columns: Sequence[str] | None = None) -> pd.DataFra
     texts = [leaf.path for leaf in leaves if leaf.physical_type == "BYTE_ARRAY"]
     content.seek(0)
     table = pyarrow.parquet.read_table(content, columns=columns and list(columns), read_dictionary=texts)
-    if (size := sum(_text_bytes(chunk) for column in table.columns for chunk in column.chunks)) > most:
-        raise ValueError(f"{size} bytes of strings are more than a run writes")
     # a column is freed as soon as it is converted
     frame = table.to_pandas(split_blocks=True, self_destruct=True)
     if not all(isinstance(name, str) for name in frame):
         raise ValueError("a column has no name")
     return frame.assign(**{name: _shared(frame[name]) for name in texts if name in frame})
-
-
-def _text_bytes(items: Any) -> int:
-    """Return the bytes that the strings of an Arrow array take once each is copied, as for a list or a written file."""
-    import pyarrow.compute as pc
-
-    if hasattr(items, "dictionary"):
-        return pc.sum(pc.binary_length(items.dictionary).take(items.indices)).as_py() or 0
-    parts = items.flatten() if hasattr(items, "flatten") else []
-    return sum(map(_text_bytes, parts if isinstance(parts, list) else [parts]))
 
 
 def _shared(values: pd.Series) -> pd.Series:
@@ -108,65 +96,89 @@ def _shared(values: pd.Series) -> pd.Series:
     return pd.Series(pd.array(distinct[values.cat.codes.to_numpy()], dtype=dtype), index=values.index)
 
 
-def valid_rows(table: pd.DataFrame, columns: Columns, path: Path) -> pd.DataFrame:
-    """Return the rows whose values are of the right types and in range, and print how many others are left out."""
+def read_table(path: Path, columns: Columns) -> tuple[pd.DataFrame, set[Path]]:
+    """Return the valid rows of ``rows.parquet`` with typed columns, and the file if it has other rows too."""
+    try:
+        table = read_parquet(path)
+    except FileNotFoundError:
+        raise
+    except Exception as error:
+        raise _unreadable(path, "Parquet", error) from None
+    return valid_rows(table, columns, [path] * len(table))
+
+
+def read_small(paths: Sequence[Path], columns: Columns) -> tuple[pd.DataFrame, set[Path]]:
+    """Return the valid rows of small files as one table with typed columns, and the files that have other rows too."""
+    import pandas as pd
+
+    rows: list[dict[str, Any]] = []
+    files: list[Path] = []
+    for path in paths:
+        try:
+            content = json.loads(path.read_text())
+            if not all(row["key"] and isinstance(row["key"], str) for row in content):
+                raise ValueError("a row has a key")
+        except FileNotFoundError:
+            raise
+        except Exception as error:
+            raise _unreadable(path, "JSON rows", error) from None
+        rows += content
+        files += [path] * len(content)
+    return valid_rows(pd.DataFrame(rows, dtype=object), columns, files)
+
+
+def _unreadable(path: Path, kind: str, error: Exception) -> StorageError:
+    return StorageError(f"'{path}' cannot be read as {kind} ({printable(error)[:300]}); move it away to start afresh")
+
+
+def valid_rows(table: pd.DataFrame, columns: Columns, files: Sequence[Path]) -> tuple[pd.DataFrame, set[Path]]:
+    """Return the rows whose values are of the right types and in range, and the files of the others.
+
+    ``files`` has the file of each row. A line on stderr names each file with the number of rows that are left out.
+    """
+    import numpy as np
+
+    if len(table) and not ("key" in table and table["key"].map(lambda key: isinstance(key, str) and bool(key)).all()):
+        raise StorageError(f"'{files[0]}' has no keys, so its rows belong to no cell; move it away to start afresh")
+    reasons = _faults(table, columns)
+    spoilt = {files[place] for place in reasons}
+    for path in spoilt:
+        own = [place for place, file in enumerate(files) if file == path]
+        faulty = [number for number, place in enumerate(own) if place in reasons]
+        sentence = printable(
+            f"bench: '{path}', row {faulty[0] + 1}: {reasons[own[faulty[0]]]}; {len(faulty)} of {len(own)} rows are left out"
+        )
+        if sentence not in _reported:
+            _reported.add(sentence)
+            print(sentence, file=sys.stderr)
+    valid = table[~np.isin(np.arange(len(table)), list(reasons))] if reasons else table
+    return columns.typed(valid.infer_objects()), spoilt
+
+
+def _faults(table: pd.DataFrame, columns: Columns) -> dict[int, str]:
+    """Return why rows are left out, by place: values of a wrong type or out of range, or a missing value."""
     import numpy as np
 
     reasons: dict[int, str] = {}
-    for column in columns.all:
-        if (name := column.name) not in table:
-            continue
+    for name in table:
         values, (holds, rule) = table[name], _rule(name, columns)
-        if column.kind == "number":  # a column of another type is refused as a whole
-            is_valid: Any = _is_in_range(name, values.to_numpy(dtype=float)) if values.dtype.kind in "fiu" else True
-        elif column.kind == "text" and str(values.dtype) == "str" and name not in CHECKED_TEXTS:
+        column = columns.by_name.get(name)
+        if values.dtype.kind in "fiub" and (column is None or column.kind == "number"):
+            is_valid: Any = _is_in_range(name, values.to_numpy(dtype=float))
+        elif str(values.dtype) == "str" and name not in CHECKED_TEXTS and (column is None or column.kind == "text"):
             is_valid = ~(values.str.len() > MAX_TEXT).to_numpy(dtype=bool, na_value=False)
         else:
             is_valid = np.fromiter(map(holds, values), dtype=bool)
         for place in np.flatnonzero(~np.broadcast_to(is_valid, len(table))):
             value = printable(repr(values.iloc[place]))[:60]
-            reasons.setdefault(int(place), f"{name}={value} {rule}")
+            reasons.setdefault(int(place), f"{printable(name)[:60]}={value} {rule}")
     if "parameters" in table:
-        is_described = ~table["parameters"].isin(["", "{}", None])
+        is_described = ~table["parameters"].fillna("").isin(["", "{}"])
         for name in NEEDED:
             is_missing = table[name].isna() | (table[name].astype(str) == "") if name in table else True
-            missing = is_described & is_missing
-            for place in np.flatnonzero(missing):
+            for place in np.flatnonzero(is_described & is_missing):
                 reasons.setdefault(int(place), f"{name} is missing")
-    if not reasons:
-        return table
-    _report(path, reasons, len(table))
-    keep = np.ones(len(table), dtype=bool)
-    keep[list(reasons)] = False
-    return table[keep]
-
-
-def valid_small_rows(rows: list[dict[str, Any]], columns: Columns, path: Path) -> list[dict[str, Any]]:
-    """Return the rows of a small file whose values are right, and print how many others are left out."""
-    reasons = {place: reason for place, row in enumerate(rows) if (reason := _fault(row, columns))}
-    if reasons:
-        _report(path, reasons, len(rows))
-    return [row for place, row in enumerate(rows) if place not in reasons]
-
-
-def _report(path: Path, reasons: Mapping[int, str], n_rows: int) -> None:
-    first = min(reasons)
-    rest = f"{len(reasons)} of {n_rows} rows are left out"
-    sentence = printable(f"bench: '{path}', row {first + 1}: {reasons[first]}; {rest}")
-    if sentence not in _reported:
-        _reported.add(sentence)
-        print(sentence, file=sys.stderr)
-
-
-def _fault(row: dict[str, Any], columns: Columns) -> str:
-    """Return why a row of a small file is not a row, or an empty string."""
-    for name, value in row.items():
-        holds, rule = _rule(name, columns)
-        if not holds(value):
-            return f"{printable(name)[:60]}={printable(repr(value))[:60]} {rule}"
-    if row.get("parameters") in (None, "", "{}"):
-        return ""
-    return next((f"{name} is missing" for name in NEEDED if _is_missing(row.get(name)) or row[name] == ""), "")
+    return reasons
 
 
 def _rule(name: str, columns: Columns) -> tuple[Callable[[Any], bool], str]:

@@ -6,7 +6,6 @@ import json
 import math
 import subprocess
 from pathlib import Path
-from xml.etree import ElementTree
 
 import numpy as np
 import pandas as pd
@@ -17,7 +16,7 @@ from bench.plugins.studies.bias_variance.columns import COLUMNS
 from helpers import loaded, small_rows
 
 from bench import cli
-from bench.compare import cells, command, history, judging, report, sources, timings
+from bench.compare import cells, command, history, report, sources, timings
 from bench.experiment.columns import Columns
 from bench.model import registry
 from bench.run.tasks import blank_row
@@ -34,8 +33,8 @@ def given(calls=20, seed=1):
     return rows
 
 
-def compared(before, after, timings=False, columns: Columns = COLUMNS, again=()):
-    return cells.compare_cells(before, after, columns, timings, again)[0]
+def compared(before, after, columns: Columns = COLUMNS, again=()):
+    return cells.compare_cells(before, after, columns, again)[0]
 
 
 def of_study(name, *words):
@@ -79,7 +78,7 @@ def test_errors_without_noise_are_judged_beyond_rounding():
         ("program_error_rel", 0.11, None),
         ("program_error_rel", 0.01, "better"),
     ):
-        found = compared(before, before.assign(**{name: value}), False, columns)
+        found = compared(before, before.assign(**{name: value}), columns)
         assert set(found["outcome"]) - {"same"} == ({expected} if expected else set())
 
 
@@ -87,7 +86,7 @@ def test_growth_rates_that_are_apart_are_changed():
     columns, before = of_study("growth")
     before = before.assign(stretch_rate=1.0, stretch_low=0.9, stretch_high=1.1)
     after = before.assign(stretch_rate=2.0, stretch_low=1.8, stretch_high=2.2)
-    assert only(compared(before, after, False, columns), "changed") == "growth rate 1.00 to 2.00"
+    assert only(compared(before, after, columns), "changed") == "growth rate 1.00 to 2.00"
 
 
 VERDICTS = [
@@ -102,7 +101,7 @@ VERDICTS = [
 @pytest.mark.parametrize(("study", "was", "now", "outcome"), VERDICTS)
 def test_verdicts_are_judged_by_the_order_of_their_study(study, was, now, outcome):
     columns, rows = of_study(study)
-    found = compared(rows.assign(verdict=was), rows.assign(verdict=now), False, columns)
+    found = compared(rows.assign(verdict=was), rows.assign(verdict=now), columns)
     assert only(found, outcome) == f"verdict {was} to {now}"
 
 
@@ -110,11 +109,11 @@ def test_cells_are_matched_by_all_their_parameters():
     """Labels leave out defaults and timed calls; the parameters do not. Their order does not matter."""
     columns, rows = of_study("bias_variance", "scenes=[quadratic]")
     _, other = of_study("bias_variance[timed_calls=7]", "scenes=[quadratic]")
-    assert set(compared(rows, other, False, columns)["change"]) == {"gone, it was ok", "new"}
+    assert set(compared(rows, other, columns)["change"]) == {"gone, it was ok", "new"}
     given = json.loads(rows["parameters"][0])
     turned = rows.assign(parameters=json.dumps(dict(reversed(given.items()))))
-    assert list(compared(rows, turned, False, columns)["outcome"]) == ["same"]
-    assert len(compared(rows, rows.assign(seed=1), False, columns)) == 2
+    assert list(compared(rows, turned, columns)["outcome"]) == ["same"]
+    assert len(compared(rows, rows.assign(seed=1), columns)) == 2
 
 
 def without(rows, *names):
@@ -142,7 +141,7 @@ def test_cells_that_the_identity_columns_do_not_distinguish_are_named_by_their_p
         of_study(f"bias_variance[timed_calls={count}]", "scenes=[quadratic]") for count in (3, 7)
     )
     rows = pd.concat([one, two], ignore_index=True)
-    table = compared(rows, rows.assign(status="error"), False, columns).assign(experiment="some")
+    table = compared(rows, rows.assign(status="error"), columns).assign(experiment="some")
     names = report.cell_names(table)
     assert [name.rpartition(", ")[2] for name in names] == [f"bias_variance.timed_calls={count}" for count in (3, 7)]
 
@@ -155,9 +154,9 @@ def test_accuracy_beyond_the_intervals_is_a_change(factor, outcome, column):
     rows.loc[place, [column, f"{column}_low", f"{column}_high"]] = [2.0, 1.8, 2.2]
     after = rows.copy()
     after.loc[place, [column, f"{column}_low", f"{column}_high"]] *= factor
-    assert only(compared(rows, after, timings=False), outcome).startswith(column)
+    assert only(compared(rows, after), outcome).startswith(column)
     after.loc[place, "reason"] = "heavy tails"
-    assert "doubtful" in only(compared(rows, after, timings=False), "changed")
+    assert "doubtful" in only(compared(rows, after), "changed")
 
 
 def test_accuracy_within_the_intervals_is_none():
@@ -166,15 +165,7 @@ def test_accuracy_within_the_intervals_is_none():
     rows.loc[place, ["bias", "bias_low", "bias_high"]] = [2.0, 1.8, 2.2]
     after = rows.copy()
     after.loc[place, ["bias", "bias_low", "bias_high"]] = [2.3, 2.1, 2.5]
-    assert set(compared(rows, after, timings=False)["outcome"]) == {"same"}
-
-
-def test_variances_without_intervals_are_judged_by_an_f_test():
-    """Of equal variances at most 1% are reported as changed; fourfold ones of 64 repeats always are."""
-    generator = np.random.default_rng(0)
-    equal = generator.chisquare(63, (2000, 2)) / 63
-    assert np.mean([judging.outside_f(a / b, 64, 64) for a, b in equal]) < 0.015
-    assert np.mean([judging.outside_f(4 * a / b, 64, 64) for a, b in equal]) > 0.99
+    assert set(compared(rows, after)["outcome"]) == {"same"}
 
 
 # --------------------------------------------------------------------------------------------- paired estimates
@@ -246,7 +237,7 @@ def runs(count, seed=0, spread=0.1, cells=40):
     return made
 
 
-@pytest.mark.parametrize("again", [0, 3])
+@pytest.mark.parametrize("again", [2, 3])
 def test_times_of_unchanged_code_are_the_same_although_every_call_of_one_run_agrees(again):
     """As in load, a run is slower or faster as a whole, and each cell by itself; at most 1% of cells are alarms."""
     generator = np.random.default_rng(again)
@@ -259,23 +250,11 @@ def test_times_of_unchanged_code_are_the_same_although_every_call_of_one_run_agr
 
 
 @pytest.mark.parametrize(("factor", "outcome"), [(4.0, "worse"), (0.25, "better")])
-@pytest.mark.parametrize("again", [0, 3])
-def test_a_time_beyond_the_spread_between_runs_is_a_change_where_times_are_asked_for(factor, outcome, again):
-    before, after, *more = runs(2 + again, spread=0.05)
+def test_a_time_beyond_the_spread_between_runs_is_a_change_where_times_are_asked_for(factor, outcome):
+    before, after, *more = runs(5, spread=0.05)
     after.loc[0, "time_s"] *= factor
-    assert only(compared(before, after, True, again=more), outcome).startswith("time")
-    assert set(compared(before, after, False)["outcome"]) == {"same"}
-
-
-def test_a_slower_run_is_a_remark_with_two_runs_and_a_finding_with_more():
-    before, after, *more = runs(5, spread=0.02)
-    after["time_s"] *= 2
-    table, remarks = cells.compare_cells(before, after, COLUMNS, True)
-    assert set(table["outcome"]) == {"same"}
-    assert "2 times those before in the median. Two runs cannot show" in remarks[0]
-    table, remarks = cells.compare_cells(before, after, COLUMNS, True, more)
-    assert set(table["outcome"]) == {"worse"}
-    assert not remarks
+    assert only(compared(before, after, again=more), outcome).startswith("time")
+    assert set(compared(before, after)["outcome"]) == {"same"}
 
 
 @pytest.mark.parametrize(("was", "now", "outcome"), [("ok", "error", "worse"), ("timeout", "ok", "better"), ("error", "crashed", "changed")])  # fmt: skip
@@ -283,14 +262,14 @@ def test_a_status_that_changed_is_a_change(was, now, outcome):
     before, after = given(), given()
     place = good(before)
     before.loc[place, "status"], after.loc[place, "status"] = was, now
-    assert f"{was} to {now}" in only(compared(before, after, timings=True), outcome)
+    assert f"{was} to {now}" in only(compared(before, after), outcome)
 
 
 def test_cells_that_are_gone_or_new_are_reported():
     rows = given()
     place = good(rows)
-    assert "gone" in only(compared(rows, rows.drop(index=place), timings=True), "worse")
-    assert only(compared(rows.drop(index=place), rows, timings=True), "changed") == "new"
+    assert "gone" in only(compared(rows, rows.drop(index=place)), "worse")
+    assert only(compared(rows.drop(index=place), rows), "changed") == "new"
 
 
 # ------------------------------------------------------------------------------------------------------- command
@@ -303,12 +282,9 @@ def test_files_say_what_the_exit_status_says(tmp_path, capsys):
     out = tmp_path / "out"
     for other, failures in ((old, 0), (new, 1)):
         assert run(old, other, out=out) == failures
-        suites = ElementTree.parse(out / "compare.xml").getroot()
-        assert int(suites.get("failures")) == len(suites.findall("./testsuite/testcase/failure")) == failures
-        assert len(suites.findall("./testsuite/testcase")) == len(before)
         table = pd.read_csv(out / "compare.csv")
+        assert len(table) == len(before)
         assert (table["outcome"] == "worse").sum() == failures
-    assert "<badly>" in suites.find(".//failure").get("message")
     assert list(table.columns) == ["experiment", *cells.FIRST, *cells.both_sides(COLUMNS.compared), *cells.LAST]
     assert "status ok to error (it broke" in capsys.readouterr().out
     for name in ("compare.md", "compare.html"):
@@ -319,8 +295,8 @@ def test_further_runs_of_before_are_read(tmp_path):
     before, after, *more = runs(4, spread=0.02)
     after["time_s"] *= 9
     old, new, *again = (save(rows, tmp_path / str(i)) for i, rows in enumerate((before, after, *more)))
-    assert run(old, new, "--timings", out=tmp_path / "out") == 0
-    assert run(old, new, "--timings", f"again={again[0]},{again[1]}", out=tmp_path / "out") == 1
+    assert run(old, new, out=tmp_path / "out") == 0
+    assert run(old, new, f"again={again[0]},{again[1]}", out=tmp_path / "out") == 1
 
 
 @pytest.mark.slow
@@ -353,10 +329,8 @@ def test_git_revisions_are_compared(tmp_path, monkeypatch, capsys):
         (["no-such-thing", "."], "neither a directory nor a git revision"),
         (["--output=/tmp/x", "."], "unknown option of compare '--output=/tmp/x'"),
         ([".", "."], "no results"),
-        ([".", ".", "timing=true"], "did you mean 'timings'"),
-        ([".", ".", "timings=perhaps"], "allowed: false, true"),
-        ([".", ".", "again=a,b"], "add --timings"),
-        ([".", ".", "--timings", "again=a"], "needs 3 or more runs of before"),
+        ([".", ".", "agian=a"], "did you mean 'again'"),
+        ([".", ".", "again=a"], "needs 3 or more runs of before"),
     ],
 )
 def test_bad_input_is_refused(words, said, tmp_path, monkeypatch, capsys):
@@ -445,9 +419,9 @@ def test_a_gradient_that_a_release_of_an_engine_changes_is_told(tmp_path):
     rows = rows.assign(bias=0.0, program_error_rel=1e-5)
     before = rows.assign(gradient=[[1.0, -2.0]] * len(rows), versions="numpy=2;newton:newton=1.0.0")
     after = rows.assign(gradient=[[1.0, -2.001]] * len(rows), versions="numpy=2;newton:newton=1.8.0")
-    found = compared(before, after, False, columns)
+    found = compared(before, after, columns)
     assert only(found, "changed") == "gradient moved by 4.5e-4 of its norm"
-    assert set(compared(before, before, False, columns)["outcome"]) == {"same"}
+    assert set(compared(before, before, columns)["outcome"]) == {"same"}
     assert command.version_remarks(before, after) == ["other versions: newton:newton 1.0.0 to 1.8.0"]
     places = [str(save(r, tmp_path / name)) for name, r in (("a", before), ("b", after))]
     assert cli.main(["history", *places, f"out={tmp_path / 'out'}"]) == 0

@@ -78,10 +78,11 @@ def test_comparison_says_so():
     old = small_rows(backends=("jax",), estimators=("fobg",))
     new = doubted(old)
     column = COLUMNS.by_name["bias"]
-    change = judging.judge(column, old.iloc[0].to_dict(), new.iloc[0].to_dict())
+    (change,) = judging.judge_cell([column], old.iloc[0].to_dict(), new.iloc[0].to_dict())
     assert change.outcome == "changed"
     assert change.text.endswith(UNEXPLAINED)
-    assert judging.judge(column, old.iloc[0].to_dict(), new.assign(reason="").iloc[0].to_dict()).outcome == "worse"
+    (change,) = judging.judge_cell([column], old.iloc[0].to_dict(), new.assign(reason="").iloc[0].to_dict())
+    assert change.outcome == "worse"
 
 
 # ------------------------------------------------------------------------------------------ references near zero

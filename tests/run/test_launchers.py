@@ -86,26 +86,17 @@ def test_settings_of_launchers_are_checked(capsys, word, said):
     assert said in capsys.readouterr().err
 
 
-def test_a_wait_says_what_for_and_ends(capsys, monkeypatch):
-    monkeypatch.setattr(ray_launcher, "SILENT_S", 0.0)
-    monkeypatch.setattr(ray_launcher, "PAUSE_S", 0.02)
-    with pytest.raises(UserError, match=r"nothing moves; gave up after 0.05 s \(ray.wait\)"):
-        ray_launcher.wait_until(lambda: "nothing moves", 0.05)
-    assert capsys.readouterr().err == "bench: nothing moves: waiting, for at most 0.05 s (ray.wait)\n"
-
-
 @pytest.mark.parametrize(
     ("address", "said"),
     [
-        ("127.0.0.1:1", r"no Ray cluster answers at 127.0.0.1:1 \(Connection refused\); .*gave up after 0.1 s"),
-        ("no.such.host.invalid:6379", "no host has that name"), ("somewhere", "must be HOST:PORT"),
+        ("127.0.0.1:1", r"no Ray cluster answers at 127.0.0.1:1 \(.*Connection refused\); start one"),
+        ("no.such.host.invalid:6379", "no Ray cluster answers"), ("somewhere", "must be HOST:PORT"),
         ("127.0.0.1:70000", "must be HOST:PORT"),
     ],
 )  # fmt: skip
-def test_a_cluster_that_does_not_answer_is_not_waited_for_long(monkeypatch, address, said):
-    monkeypatch.setattr(ray_launcher, "PAUSE_S", 0.05)
+def test_a_cluster_that_does_not_answer_is_refused(address, said):
     with pytest.raises(UserError, match=said):
-        ray_launcher.reach(address, 0.1)
+        ray_launcher.reach(address)
 
 
 def test_a_cluster_without_the_cores_of_a_job_says_so():

@@ -17,7 +17,6 @@ from bench.cli import main
 from bench.errors import StorageError, UserError
 from bench.model.guard import temporary_file
 from bench.run import files
-from bench.run.files import TEMPORARY, remove_stale, temporary
 from bench.run.pool import MalformedMessage, Pool, ResourceLimits, _Worker
 from bench.run.store import Store
 
@@ -54,7 +53,7 @@ def test_a_study_that_came_and_went_meanwhile_is_seen(tmp_path):
     with pytest.raises(UserError, match="holds rows of study growth"):
         mine.prepare()
     other.compact()
-    assert [path.name for path in tmp_path.iterdir()] == ["rows.parquet"]
+    assert [path.name for path in tmp_path.glob("*.*")] == ["rows.parquet"]
 
 
 def test_a_file_without_keys_is_unreadable_and_never_overwritten(tmp_path):
@@ -77,10 +76,14 @@ def test_a_small_file_that_holds_no_rows_is_unreadable(tmp_path, content):
     assert json.loads(path.read_text()) == content
 
 
-def test_a_number_that_is_none_does_not_turn_into_a_missing_one(tmp_path):
+def test_a_number_that_is_none_does_not_turn_into_a_missing_one(tmp_path, capsys):
     pd.DataFrame([row() | {"bias": "large"}]).to_parquet(tmp_path / "rows.parquet")
-    with pytest.raises(StorageError, match="'bias' that are not numbers"):
-        Store(tmp_path, COLUMNS).compact()
+    before, store = (tmp_path / "rows.parquet").read_bytes(), Store(tmp_path, COLUMNS)
+    store.append(row("b"))
+    store.compact()
+    assert "row 1: bias='large' is negative, or is not a number; 1 of 1 rows are left out" in capsys.readouterr().err
+    (kept,) = tmp_path.glob("left_out-*")
+    assert kept.read_bytes() == before
 
 
 def test_a_row_dated_in_the_future_is_replaced_by_the_next_one(tmp_path, monkeypatch):
@@ -115,31 +118,17 @@ def test_a_count_that_no_run_has_written_wins_nothing(tmp_path, count):
 # ------------------------------------------------------------------------------------------------------------- files
 
 
-def test_half_written_files_of_dead_processes_go_and_those_of_living_ones_stay(tmp_path):
-    gone = subprocess.Popen([sys.executable, "-c", ""])
-    gone.wait()
-    mine, other = temporary(tmp_path / "a.png"), tmp_path / ".mine"
-    dead = mine.with_name(mine.name.replace(f"-{os.getpid()}-", f"-{gone.pid}-"))
-    far = mine.with_name(mine.name.replace("-bench-", "-bench-").replace(files._machine(), "0" * 8))
-    for path in (mine, dead, far, other):
-        assert path is other or TEMPORARY.fullmatch(path.name)
-        path.write_text("")
-    remove_stale(tmp_path)
-    assert set(tmp_path.iterdir()) == {mine, far, other}
-    os.utime(far, (0, 0))
-    remove_stale(tmp_path)
-    assert set(tmp_path.iterdir()) == {mine, other}
-
-
-def test_a_run_tidies_every_folder_that_it_writes_to(tmp_path):
-    gone = subprocess.Popen([sys.executable, "-c", ""])
-    gone.wait()
+def test_a_run_removes_the_half_written_files_of_killed_runs(tmp_path):
+    part = f".x-bench-{'0' * 32}"
     for place in ("custom", "custom/pending", "references"):
         (tmp_path / place).mkdir(parents=True, exist_ok=True)
-        left = temporary(tmp_path / place / "x")
-        left.with_name(left.name.replace(f"-{os.getpid()}-", f"-{gone.pid}-")).write_text("half")
+        for name in (part, f"{part[:-1]}1", ".mine"):
+            (tmp_path / place / name).write_text("half")
+        os.utime(tmp_path / place / part, (0, 0))
+        os.utime(tmp_path / place / ".mine", (0, 0))
     assert main([*FOBG, f"results_dir={tmp_path}"]) == 0
-    assert not [path for path in tmp_path.rglob(".*")]
+    assert len(list(tmp_path.rglob(".x-*1"))) == len(list(tmp_path.rglob(".mine"))) == 3
+    assert not list(tmp_path.rglob(part))
 
 
 def test_the_disk_is_told_to_empty_its_cache_where_fsync_does_not(tmp_path, monkeypatch):

@@ -30,7 +30,7 @@ def test_the_bar_of_a_terminal_is_one_line_of_its_width(width):
     bars = progress.bars_on(console)
     bar = progress.Progress("stiffness_sweep", planned(12, 600), bars)
     bar.working(LONG + "\x1b[31m")
-    bar.finished(None, {"status": "timeout"})
+    bar.finished({"status": "timeout"})
     (line,) = console.render_lines(bars.get_renderable(), pad=False)
     text = "".join(segment.text for segment in line)
     assert "13/612, 1 timeout" in text
@@ -40,13 +40,13 @@ def test_the_bar_of_a_terminal_is_one_line_of_its_width(width):
 
 
 def lines_of(name, cells):
-    return progress.Lines(name, cells, progress.bars_on(Console(file=io.StringIO()), disable=True))
+    return progress.Progress(name, cells, progress.bars_on(Console(file=io.StringIO()), disable=True), lines=True)
 
 
 def test_refused_and_stored_cells_are_counted_as_done(capsys):
     counted = lines_of("mine", planned(5, 20, n_refused=50))
     for status in ["unsupported"] * 50 + ["ok"] * 9 + ["error"]:
-        counted.finished(None, {"status": status})
+        counted.finished({"status": status})
     assert counted._counts() == "65/75, 1 error"
     assert capsys.readouterr().err == "mine: 5 of 75 cells are stored\n"
 

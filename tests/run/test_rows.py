@@ -160,13 +160,3 @@ def test_a_small_file_of_many_equal_values_is_not_read(tmp_path, monkeypatch):
     assert (tmp_path / "rows.parquet").stat().st_size < 30_000
     with pytest.raises(ValueError, match="more than a run writes"):
         rows.read_parquet(tmp_path / "rows.parquet")
-
-
-@pytest.mark.parametrize("items", ["text", "list", "binary", "table"])
-def test_equal_strings_of_a_small_file_are_not_copied(tmp_path, monkeypatch, items):
-    monkeypatch.setattr(rows, "ALWAYS_BYTES", 1 << 20)
-    text = "x" * 10_000
-    value = {"text": text, "list": [text], "binary": text.encode(), "table": {"text": text}}[items]
-    pq.write_table(pa.table({"key": ["k"] * 1000, "tags": [value] * 1000}), tmp_path / "rows.parquet")
-    with pytest.raises(ValueError, match="bytes of strings are more than a run writes"):
-        rows.read_parquet(tmp_path / "rows.parquet")

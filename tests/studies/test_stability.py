@@ -13,7 +13,8 @@ from bench.experiment import config
 from bench.experiment.grid import cells
 from bench.model import MechanicalScene, State, registry
 from bench.model.parameters import build
-from bench.run import runner, tasks
+from bench.run import progress, tasks
+from bench.run.execute import Runner
 from bench.run.plan import plan
 from bench.run.session import Session
 from bench.run.store import Store
@@ -43,7 +44,9 @@ def swept(tmp_path, integrator, *words):
         f"scene.mass_spring.horizon={HORIZON}", f"scene.mass_spring.dt={DT}", *words,
     )  # fmt: skip
     store = Store(given.directory, given.columns)
-    runner.Runner(given, store, lambda cell, row: None).run(plan(given, store))
+    planned = plan(given, store)
+    with progress.show_progress(given.name, planned, quiet=True) as shown:
+        Runner(given, store, shown).run(planned)
     return given, store.load().sort_values("stiffness").reset_index(drop=True)
 
 

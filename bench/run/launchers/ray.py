@@ -7,10 +7,9 @@ import logging
 import os
 import pickle
 import socket
-import sys
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -27,8 +26,8 @@ from bench.run.tasks import Task
 
 TICK = 0.1
 """Seconds between checks of the jobs."""
-SILENT_S, PAUSE_S = 5.0, 0.5
-"""Seconds of a wait after which it is printed, and between its checks."""
+ANSWER_S = 10.0
+"""Seconds in which a cluster answers."""
 JOBS_PER_CORE = 2
 """Jobs sent per core: one runs, and another is ready to start."""
 MAX_LOSSES = 3
@@ -45,7 +44,6 @@ class RaySettings(Plugin):
     address: str | None = param(None, "host and port of the cluster; null: RAY_ADDRESS, or a cluster of this machine")
     cells: int = param(50, "most cells of a job", low=1)
     cpus: float = param(1.0, "cores that a job reserves", low=1)
-    wait: float = param(60.0, "most seconds of a wait for the cluster", "s", low=1)
 
 
 @dataclass(eq=False)
@@ -88,7 +86,7 @@ class RayLauncher:
     def __enter__(self) -> RayLauncher:
         if not self._ray.is_initialized():
             if self._address and self._address not in ("auto", "local"):
-                reach(self._address, self._settings.wait)
+                reach(self._address)
             try:
                 self._ray.init(
                     address=self._address, log_to_driver=False, logging_level=logging.ERROR,
@@ -99,11 +97,9 @@ class RayLauncher:
                     f"no Ray cluster at {self._address or 'this machine'}: {printable(error)[:300]}; start one: ray start --head"
                 ) from None
             self._has_started_ray = True
-        try:
-            wait_until(self._lack_of_cores, self._settings.wait)
-        except BaseException:
+        if lack := self._lack_of_cores():
             self.__exit__()
-            raise
+            raise UserError(lack)
         folder = self._experiment.results_dir.absolute()
         self._packed = self._ray.put(pickle.dumps(replace(without_grid(self._experiment), results_dir=folder)))
         return self
@@ -256,36 +252,14 @@ def _import_path() -> str:
     return os.pathsep.join(dict.fromkeys([str(package), *(str(Path(path).absolute()) for path in inherited if path)]))
 
 
-def wait_until(lack: Callable[[], str], limit_s: float) -> None:
-    """Wait until ``lack()``, the reason of the wait, is empty; raises :class:`UserError` with it after ``limit_s`` seconds."""
-    since, has_spoken = time.monotonic(), False
-    while reason := lack():
-        seconds = time.monotonic() - since
-        if seconds > limit_s:
-            raise UserError(f"{reason}; gave up after {limit_s:g} s (ray.wait)")
-        if seconds > SILENT_S and not has_spoken:
-            has_spoken = True
-            print(f"bench: {reason}: waiting, for at most {limit_s:g} s (ray.wait)", file=sys.stderr)
-        time.sleep(PAUSE_S)
-
-
-def reach(address: str, limit_s: float) -> None:
-    """Wait until a TCP connection to ``HOST:PORT`` is possible.
-
-    Raises :class:`UserError` for an unknown host, an address without a port, and after the limit.
-    """
+def reach(address: str) -> None:
+    """Open a TCP connection to ``HOST:PORT`` and close it; raises :class:`UserError` if there is no such place, or no answer."""
     host, _, port = address.rpartition("://")[2].rpartition(":")
     if not host or not port.isdecimal() or not 0 < int(port) < 1 << 16:
         raise UserError(f"ray.address={printable(address)} must be HOST:PORT, for example 10.0.0.1:6379")
-
-    def lack() -> str:
-        try:
-            socket.create_connection((host.strip("[]"), int(port)), timeout=1.0).close()
-        except (socket.gaierror, UnicodeError):
-            raise UserError(f"ray.address={printable(address)}: no host has that name") from None
-        except OSError as error:
-            cause = error.strerror or "no answer"
-            return f"no Ray cluster answers at {printable(address)} ({cause}); start one: ray start --head"
-        return ""
-
-    wait_until(lack, limit_s)
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), timeout=ANSWER_S).close()
+    except (OSError, UnicodeError) as error:
+        raise UserError(
+            f"no Ray cluster answers at {printable(address)} ({printable(error)}); start one: ray start --head"
+        ) from None
