@@ -42,10 +42,6 @@ CASES = {
     ),
     "adam": (Adam(rate=0.02), lambda t, p: t.optim.Adam([p], lr=0.02)),
     "adam, clipped by norm": (Adam(rate=0.02, clip=1.0), lambda t, p: t.optim.Adam([p], lr=0.02)),
-    "adam, clipped by element": (
-        Adam(rate=0.02, clip=0.5, clip_by="element"),
-        lambda t, p: t.optim.Adam([p], lr=0.02),
-    ),
 }
 
 
@@ -58,29 +54,22 @@ def test_100_updates_are_those_of_torch(case):
     for gradient in gradients():
         parameter.grad = torch.tensor(gradient)
         if optimizer.clip is not None:
-            if optimizer.clip_by == "norm":
-                # not torch's own function, which divides by norm + 1e-6
-                parameter.grad *= min(1.0, optimizer.clip / float(np.linalg.norm(gradient)))
-            else:
-                torch.nn.utils.clip_grad_value_([parameter], optimizer.clip)
+            # not torch's own function, which divides by norm + 1e-6
+            parameter.grad *= min(1.0, optimizer.clip / float(np.linalg.norm(gradient)))
         method.step()
     assert path(optimizer, gradients()) == pytest.approx(parameter.detach().numpy(), rel=SAME)
 
 
-@pytest.mark.parametrize(("share", "move", "factor"), [(0.1, -1.754983, 0.169135), (0.2, -1.399810, 0.218643)])
-def test_cem_on_a_linear_cost(share, move, factor):
+@pytest.mark.parametrize(("share", "factor"), [(0.1, 0.169135), (0.2, 0.218643)])
+def test_cem_on_a_linear_cost(share, factor):
     """The mean moves by -sigma phi(z)/rho, the variance by 1 - z phi/rho - (phi/rho)^2 (z the quantile of rho)."""
-    z = norm.ppf(share)
-    assert move == pytest.approx(-norm.pdf(z) / share, abs=1e-6)
+    move = -norm.pdf(norm.ppf(share)) / share
     optimizer = Cem(population=SAMPLES, elites=int(share * SAMPLES), width=0.7)
     state = optimizer.start(np.array([2.0, 0.0]))
     points = optimizer.ask(state, np.random.default_rng(0).standard_normal((2, SAMPLES)))
     after = optimizer.tell(state, points, Answer(value=3.0 * points[0]))
     assert after["theta"] == pytest.approx([2.0 + 0.7 * move, 0.0], abs=LIMIT)
     assert (after["deviation"] / 0.7) ** 2 == pytest.approx([factor, 1.0], abs=LIMIT)
-    wide = Cem(population=SAMPLES, elites=int(share * SAMPLES), width=0.7, spread="old")
-    square = (wide.tell(state, points, Answer(value=3.0 * points[0]))["deviation"] / 0.7) ** 2
-    assert square[0] == pytest.approx(factor + move**2, abs=2 * LIMIT)
 
 
 def test_mppi_on_a_bowl():

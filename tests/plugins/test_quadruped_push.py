@@ -53,13 +53,3 @@ def test_in_contact_the_gradient_moves_the_block():
     np.testing.assert_allclose(gradient, differences(pushing, theta), rtol=0, atol=1e-4 * np.linalg.norm(gradient))
     moved = theta[:, None] - 0.02 * gradient / np.linalg.norm(gradient)
     assert pushing.value(moved, STILL)[0] < pushing.value(theta, STILL)[0] - 0.02
-
-
-@pytest.mark.parametrize("horizon", [1, 2, 50])
-def test_the_plan_fills_every_horizon(horizon):
-    """Left and right legs have the same targets."""
-    scene = QuadrupedPush(horizon=horizon)
-    theta = np.random.default_rng(0).standard_normal((12, 2))
-    plan = scene.planned_controls(np, theta)
-    assert plan.shape == (horizon, 12, 2)
-    np.testing.assert_allclose(plan[:, :3], plan[:, 3:6], rtol=0, atol=1e-12)
