@@ -21,10 +21,9 @@ from pathlib import Path
 from typing import cast
 
 from bench.errors import UserError
-from bench.examine import rules
 from bench.experiment.columns import COMMON, Column
 from bench.experiment.study import Study
-from bench.measure.gradcheck import verdicts
+from bench.gradient import rules, verdicts
 from bench.model import registry
 from bench.report.tables import escape_markdown
 from bench.run.files import write_whole

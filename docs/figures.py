@@ -20,14 +20,14 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from bench.plugins.studies.bias_variance import trust
+from bench.plugins.studies.gradient_check.points import is_trusted
 
 from bench.model import registry
 from bench.report import answer
 from bench.report.text import interval as text_of_interval
 from bench.report.text import number
 from bench.report.text import span as ends_of
-from bench.studies.bias_variance import trust
-from bench.studies.gradient_check.points import is_trusted
 from docs.results import PAPER, STANDARD, answer_of, rows_of, select, table_of
 
 MARK = re.compile(r"<!--=([\w./-]+|[^>\n]+\|.*?)-->(.*?)<!--/-->", re.DOTALL)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
+from bench.plugins.studies.bias_variance import comparisons
 
 import bench
 from bench.errors import UserError
@@ -19,7 +20,6 @@ from bench.model import registry
 from bench.report import answer
 from bench.report.views import arrange
 from bench.report.writer import ANSWER
-from bench.studies.bias_variance import comparisons
 
 ROOT = Path(__file__).resolve().parent.parent
 STANDARD = ROOT / "results" / "standard"
@@ -162,7 +162,7 @@ def select(rows: pd.DataFrame, **conditions: Any) -> pd.DataFrame:
 def comparison(experiment: str, results: Path = STANDARD) -> pd.DataFrame:
     """Return the relative RMSE of each setting of an estimator on each problem, with its 95% interval and verdict.
 
-    Verdicts are those of :mod:`bench.studies.bias_variance.comparisons`. ``best``: lowest,
+    Verdicts are those of :mod:`bench.plugins.studies.bias_variance.comparisons`. ``best``: lowest,
     or not distinguishable from the lowest. ``biased``: more than half of the squared error is bias.
     """
     loaded = config.load([f"experiment={experiment}", f"results_dir={results}"])

@@ -13,6 +13,7 @@ from types import ModuleType
 from typing import Any, cast
 
 import pandas as pd
+from bench.plugins.studies.bias_variance.comparisons import FAILS, OPEN
 
 import bench
 import bench.plugin
@@ -21,7 +22,6 @@ from bench.model import registry
 from bench.model.parameters import parameters
 from bench.report.tables import escape_markdown
 from bench.report.text import number
-from bench.studies.bias_variance.comparisons import FAILS, OPEN
 from docs.figures import without_marks
 from docs.results import Entry, comparison, entries_of
 

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from bench.plugins.studies.bias_variance import BiasVariance
+from bench.plugins.studies.bias_variance.columns import COLUMNS
 
 from bench.experiment import config
 from bench.experiment.columns import IDENTITY
@@ -17,8 +19,6 @@ from bench.model import registry
 from bench.model.identity import parse_identity
 from bench.model.parameters import parameters
 from bench.run.tasks import blank_row
-from bench.studies.bias_variance import BiasVariance
-from bench.studies.bias_variance.columns import COLUMNS
 
 NAMES = ("alpha_order", "finite_difference", "fobg", "inverse_variance", "randomized_smoothing", "reinforce")
 STIFFNESS = (1e1, 1e2, 1e3, 3e3, 1e4, 1e5, 1e6)

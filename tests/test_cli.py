@@ -8,10 +8,10 @@ import sys
 
 import pandas as pd
 import pytest
+from bench.plugins.studies.bias_variance.columns import COLUMNS
 
 from bench.cli import VERBS, main
 from bench.experiment.columns import IDENTITY
-from bench.studies.bias_variance.columns import COLUMNS
 
 TINY = [
     "scenes=[heaviside]", "backends=[numpy]", "estimators=[fobg,reinforce]", "samples=8", "repeats=4", "name=tiny",
@@ -45,7 +45,7 @@ def test_run_then_report_then_plan(tmp_path, capsys):
 
 
 def test_only_missing_cells_run_and_rows_are_kept(tmp_path, monkeypatch):
-    module = importlib.import_module("bench.studies.bias_variance.measure")
+    module = importlib.import_module("bench.plugins.studies.bias_variance.measure")
 
     measured = []
     real = module.measure

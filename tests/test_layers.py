@@ -16,11 +16,11 @@ LAYERS = [
     ["model"],
     ["engines"],
     ["measure", "plugins"],
-    ["training"],
+    ["training", "gradient"],
     ["experiment", "conformance"],
     ["run"],
     ["report"],
-    ["studies", "trace"],
+    ["trace"],
     ["compare", "examine", "claims"],
     ["notebook", "plugin"],
     ["api"],
@@ -105,15 +105,27 @@ def test_only_the_command_line_stands_on_the_command_line():
     assert importers == {"bench.__main__"}
 
 
+TOPS = {"studies": "report"}
+"""Kinds of plugins that stand on more than the contracts, and the highest room that they import."""
+
+
 def test_plugins_import_only_public_names():
     for path, name in [(file, found) for file in PLUGINS for found in imported(file)]:
-        if name.startswith("bench.plugins"):
+        kind = path.relative_to(ROOT / "plugins").parts[0]
+        if kind in TOPS and name.partition(".")[0] == "bench":
+            own = name.startswith(f"bench.plugins.{kind}")
+            assert own or (room(name) != "plugins" and HEIGHT[room(name)] <= HEIGHT[TOPS[kind]]), (
+                f"{path} imports {name}"
+            )
+        elif name.startswith("bench.plugins"):
             family = path.parent.name == "backends" or path.parent == ROOT / "plugins"
             family = family or (ROOT / "plugins" / f"{name.split('.')[2]}.py").is_file()  # a module that kinds share
             family = family or (path.parent.name, name.split(".")[2]) == ("trainers", "optimizers")  # both search
             assert family or name.split(".")[2] == path.parent.name, f"{path.name} imports {name} of another kind"
         elif name.startswith("bench.training."):
             assert path.parent.name == "trainers", f"{path.name} imports {name}, which is for trainers"
+        elif name.startswith("bench.claims."):
+            assert path.parent.name == "claims", f"{path.name} imports {name}, which is for claims"
         elif name.startswith("bench.engines.conformance."):
             assert path.stem.endswith("_conformance"), f"{path.name} imports {name}, which is for the conformance set"
         elif name.partition(".")[0] == "bench" and name.rpartition(".")[0] != "bench.engines.backend":

@@ -31,11 +31,11 @@ def tails(sets):
     """
     import bank
     from bench.plugins.backends.numpy import Numpy
+    from bench.plugins.studies.bias_variance.measure import summarise_diagnostics
 
     from bench.measure.statistics import Truth, summarise
     from bench.model import SampleMean, columns, compose, per_repeat, registry
     from bench.report.views import rmse_interval
-    from bench.studies.bias_variance.measure import summarise_diagnostics
 
     few = [
         ("fobg", {}), ("reinforce", {}), ("reinforce", {"baseline": "leave_one_out"}), ("control_variate", {}),

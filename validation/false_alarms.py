@@ -11,10 +11,10 @@ import sys
 from collections import Counter
 
 import numpy as np
+from bench.plugins.studies.gradient_check import GradientCheck, measure
 
-from bench.measure.gradcheck import FAULTS
+from bench.gradient import FAULTS
 from bench.model import compose, registry
-from bench.studies.gradient_check import GradientCheck, measure
 
 SCENES = (
     "pendulum", "double_pendulum", "cartpole", "mass_spring", "double_integrator", "stiff_decay", "quadratic",

@@ -9,7 +9,7 @@ from collections import Counter
 
 import numpy as np
 
-from bench.measure import gradcheck
+from bench import gradient as gradcheck
 
 MOST = 2000
 """Most iterations, since far from the given theta an iteration may run in a circle."""

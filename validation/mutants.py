@@ -38,16 +38,14 @@ OF_SCORES = "tests/model/test_scores.py"
 OF_WEIGHTS = "tests/plugins/test_weights.py"
 T, ST = "bench/measure/timing.py", "bench/run/store.py"
 GC, GD, GF, GK, GR, GS, GV = (
-    f"bench/measure/gradcheck/{name}.py"
-    for name in ("check", "direction", "few", "causes", "roughness", "sampling", "verdicts")
+    f"bench/gradient/{name}.py" for name in ("check", "direction", "few", "causes", "roughness", "sampling", "verdicts")
 )
 X = "plugins/estimators/"
 OF_TIMING = "tests/studies/test_flat.py tests/measure/test_timing.py"
 OF_STORE = "-m not\\ slow tests/run/test_store.py tests/run/test_nothing_lost.py"
-OF_CHECKS = "tests/measure/test_direction.py tests/measure/test_check.py"
-EL, EF, EX, ES, EG = (
-    f"bench/examine/{name}.py" for name in ("lines", "findings", "examination", "smoothing", "gradient")
-)
+OF_CHECKS = "tests/gradient/test_direction.py tests/gradient/test_check.py"
+EL, EG = "bench/gradient/lines.py", "bench/gradient/stages.py"
+EF, EX, ES = (f"bench/examine/{name}.py" for name in ("findings", "examination", "smoothing"))
 OF_PLAN, OF_MECHANISMS = "tests/examine/test_budget.py", "tests/examine/test_mechanisms.py"
 OF_UNRESOLVED = "tests/examine/test_unresolved.py"
 OF_HOLD = "tests/examine/test_verdicts_hold.py"
@@ -257,7 +255,7 @@ GROUPS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("SHORT_WINDOW = 4", "SHORT_WINDOW = 2"),
         ("RISE = 0.01", "RISE = 1e3"),
     ],
-    (GD, OF_CHECKS + " tests/measure/test_gradcheck.py"): [
+    (GD, OF_CHECKS + " tests/gradient/test_gradcheck.py"): [
         ("MIN_STEPS = 7", "MIN_STEPS = 16"),
     ],
     (GK, OF_CHECKS): [

@@ -19,11 +19,11 @@ import numpy as np
 import pandas as pd
 from bench.plugins.backends.jax import Jax
 from bench.plugins.estimators.fobg import Fobg
+from bench.plugins.studies.bias_variance.trust import SPREAD, WRONG
+from bench.plugins.studies.gradient_check.points import is_trusted
 
 from bench.cli import main as command
 from bench.model import FunctionScene, compose, param
-from bench.studies.bias_variance.trust import SPREAD, WRONG
-from bench.studies.gradient_check.points import is_trusted
 
 SAMPLES, REPEATS, SEEDS = 100, 32, (1, 2, 3)
 POINTS = 1 << 21

@@ -134,7 +134,7 @@ def verdict(figures: Sequence[Figure], reservation: str = "") -> str:
 class Claim(Plugin):
     """A published result, verified by a few figures. ``name`` is short, such as ``C1``.
 
-    Claims are plugins of the kind ``claims``: the files of ``bench/claims/published``, files in a folder ``plugins=DIR``,
+    Claims are plugins of the kind ``claims``: the files of ``plugins/claims``, files in a folder ``plugins=DIR``,
     and classes or modules that an entry point of the group ``bench.claims`` names.
     """
 

@@ -10,8 +10,6 @@ from bench.claims.claim import Claim
 from bench.errors import printable, unknown
 from bench.model import registry
 
-PUBLISHED = "bench.claims.published"
-"""The package of the built-in claims."""
 REQUIRED = ("lesson", "statement", "source", "learned")
 """Strings that every claim defines."""
 LESSONS = {
@@ -28,7 +26,7 @@ LESSONS = {
 
 def claims() -> dict[str, type[Claim]]:
     """Return all claims by name, sorted by lesson. A plugin that cannot be used is reported on stderr."""
-    entries = registry.entries_with("claims", PUBLISHED).values()
+    entries = registry.entries_with("claims").values()
     others = (entry for kind, table in registry.entries().items() if kind != "claims" for entry in table.values())
     for entry in (*entries, *others):
         if entry.plugin is None:

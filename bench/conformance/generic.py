@@ -40,9 +40,8 @@ def has_good_name(plugin: type[Plugin]) -> str:
     require(name.isidentifier() and name.islower(), f"'{name}' must have only lower-case letters, digits and '_'")
     kinds = registry.kinds()
     require(plugin.kind in kinds, f"kind '{plugin.kind}' is not one of {', '.join(kinds)}")
-    package = "bench" if plugin.kind == "studies" else "bench.plugins"
-    if module.startswith(f"{package}.{plugin.kind}."):
-        expected = f"{package}.{plugin.kind}.{name}"
+    if module.startswith(f"bench.plugins.{plugin.kind}."):
+        expected = f"bench.plugins.{plugin.kind}.{name}"
         require(module == expected, f"'{name}' is not the name of its file: {module}, not {expected}")
     return module
 

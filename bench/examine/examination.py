@@ -12,14 +12,13 @@ from typing import Any
 import numpy as np
 
 from bench.errors import UserError, unknown
-from bench.examine import diagnosis
 from bench.examine.findings import RELATIVE, GroupSize, Setup, Spent
-from bench.examine.gradient import GradientStages
-from bench.examine.lines import HALVINGS, PLACES, POINTS, LineScan, scan
 from bench.examine.report import Report
-from bench.examine.rules import RULES, SUSPICIOUS
 from bench.examine.smoothing import FEWEST, PAIRS, Smoothed, directions, measure_smoothed
-from bench.measure.gradcheck import Check
+from bench.gradient import Check, diagnosis
+from bench.gradient.lines import HALVINGS, PLACES, POINTS, LineScan, scan
+from bench.gradient.rules import RULES, SUSPICIOUS
+from bench.gradient.stages import GradientStages
 from bench.simulator.clock import Clock, OutOfTime, end_on_sigterm, parse_duration
 from bench.simulator.simulator import Simulator
 from bench.simulator.tree import ParameterTree

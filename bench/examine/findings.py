@@ -1,4 +1,4 @@
-"""The findings of an examination: facts, and the verdicts that follow from them by :data:`bench.examine.rules.RULES`."""
+"""The findings of an examination: facts, and the verdicts that follow from them by :data:`bench.gradient.rules.RULES`."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bench.examine.diagnosis import Explanation, grows
-from bench.examine.gradient import Repeats, recaused
-from bench.examine.lines import ALIKE, LineScan
-from bench.examine.rules import EXCUSABLE, RULES, SUSPICIOUS
 from bench.examine.smoothing import TARGET_ERROR, Method, Smoothed
-from bench.measure.gradcheck import FAULTS, TRUSTED, Check, Part, Sample
+from bench.gradient import FAULTS, TRUSTED, Check, Part, Sample
+from bench.gradient.diagnosis import Explanation, grows
+from bench.gradient.lines import ALIKE, LineScan
+from bench.gradient.rules import EXCUSABLE, RULES, SUSPICIOUS
+from bench.gradient.stages import Repeats, recaused
 from bench.simulator.simulator import Printed
 
 if TYPE_CHECKING:

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from bench.examine.findings import RIGHT, SEEN, UNSHOWN, WRONG, Findings
-from bench.examine.rules import RULES, SUSPICIOUS
 from bench.examine.smoothing import PAIRS
-from bench.measure.gradcheck import FAULTS, Check, Part
+from bench.gradient import FAULTS, Check, Part
+from bench.gradient.rules import RULES, SUSPICIOUS
 from bench.report.text import counted, duration, number, span
 
 SAME_FACTOR = 0.05

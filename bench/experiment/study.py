@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 class Study(Plugin):
     """Measures each cell, and says what to show of the rows: tables and charts, as data.
 
-    A study is registered like any plugin: as a folder under ``bench/studies``, in a plugin folder of the user, or by an
+    A study is registered like any plugin: as a file or package under ``plugins/studies``, in a plugin folder of the user, or by an
     entry point.
     """
 

@@ -1,9 +1,8 @@
 """The registry of plugins: finds plugins and reports whether they are available.
 
-Built-in plugins are the files under ``plugins/<kind>/`` and the folders under ``bench/studies/``. Others come from
-folders passed to :func:`add_folder` and from the entry-point group ``bench.plugins``, in which each entry names a
-plugin class. Importing a plugin must be fast: a plugin lists heavy libraries in ``requires`` and imports them only when
-it runs.
+Built-in plugins are the files and packages under ``plugins/<kind>/``. Others come from folders passed to
+:func:`add_folder` and from the entry-point group ``bench.plugins``, in which each entry names a plugin class. Importing
+a plugin must be fast: a plugin lists heavy libraries in ``requires`` and imports them only when it runs.
 """
 
 from __future__ import annotations
@@ -32,13 +31,14 @@ from bench.errors import UserError, printable, unknown
 from bench.model import guard, trial
 from bench.model.parameters import Plugin, build, parameters, remember, singular
 
-CORE = "bench.studies"
-"""The package of the built-in studies."""
-BUILT_IN = ("bench.plugins", CORE)
+BUILT_IN = "bench.plugins"
+"""The package of the built-in plugins."""
 KINDS = (
     "scenes", "contacts", "integrators", "backends", "estimators", "optimizers", "policies", "trainers", "studies",
 )  # fmt: skip
 """The built-in kinds, in listing order. A plugin may declare another kind."""
+ON_DEMAND = "bench.plugins.claims"
+"""The built-in plugins of a kind that one command uses: :func:`entries_with` has them, other commands do not import them."""
 NOT_PLUGINS = ("engines", "robots")
 """Names of the folders with files that only the Pythons of engines import, and with models of robots."""
 ENTRY_POINT_GROUP = "bench.plugins"
@@ -115,7 +115,8 @@ def entries() -> Table:
     """Return all plugins by kind and name."""
     table: Table = {kind: {} for kind in KINDS}
     packages = {_package(path): path for path in _folders if _only is None or _is_needed(_package(path))}
-    modules = [module for name in (*BUILT_IN, *packages) for module in _modules(importlib.import_module(name))]
+    modules = [module for name in (BUILT_IN, *packages) for module in _modules(importlib.import_module(name))]
+    modules = [part for part in modules if not part[1].startswith(ON_DEMAND)]
     points = sorted(entry_points(group=ENTRY_POINT_GROUP), key=lambda p: p.name)
     if _only is not None:
         modules = [part for part in modules if part[1].startswith(BUILT_IN) or part[1] in _only]
@@ -151,14 +152,13 @@ def _is_needed(package: str) -> bool:
     return any(name.startswith(f"{package}.") for name in _only or ())
 
 
-def entries_with(kind: str, package: str) -> dict[str, Entry]:
-    """Return all plugins of one kind by name: from a package, from entry points ``bench.KIND`` and from the registry.
+def entries_with(kind: str) -> dict[str, Entry]:
+    """Return all plugins of a kind on demand: built-in ones, those of entry points ``bench.KIND`` and of the registry.
 
-    For a kind that only one command uses, so that other commands do not import the package. An entry point names a
-    plugin class or a module with several.
+    An entry point names a plugin class or a module with several.
     """
     table: Table = {kind: {}}
-    for _, module in _modules(importlib.import_module(package)):
+    for _, module in _modules(importlib.import_module(f"bench.plugins.{kind}")):
         _load_module(table, kind, module, "")
     for point in sorted(entry_points(group=f"bench.{kind}"), key=lambda p: p.name):
         _load_point(table, kind, point, "")
@@ -179,7 +179,7 @@ def _modules(package: ModuleType) -> Iterator[tuple[str, str]]:
     """Yield (kind, full name) of each module in a package and its subfolders; the kind is the module's folder name."""
     for module in sorted(pkgutil.iter_modules(package.__path__), key=lambda m: m.name):
         name = f"{package.__name__}.{module.name}"
-        if module.name in NOT_PLUGINS and package.__name__ != CORE:
+        if module.name in NOT_PLUGINS and package.__name__.rpartition(".")[2] not in KINDS:
             continue
         if module.name in KINDS:
             yield from ((module.name, path) for _, path in _modules(importlib.import_module(name)))

@@ -235,7 +235,7 @@ def test_a_claim_in_a_plugin_folder_is_found(tmp_path, capsys):
     assert printed.out.count("two is two") == 2
     assert "'broken' cannot be used: import failed: ModuleNotFoundError" in printed.err
     assert "claim 'M3' does not define lesson" in printed.err
-    assert "'C1' cannot be used: the name is taken by bench.claims.published.step" in printed.err
+    assert "'C1' cannot be used: the name is taken by bench.plugins.claims.step" in printed.err
     assert cli.main(["claims", "M1", *place]) == 0
     assert "as stored" in capsys.readouterr().out
     assert cli.main(["claims", "--list", *place]) == 0

@@ -13,6 +13,7 @@ import pandas as pd
 import planted
 import pytest
 import yaml
+from bench.plugins.studies.bias_variance.columns import COLUMNS
 from helpers import loaded, small_rows
 
 from bench import cli
@@ -20,7 +21,6 @@ from bench.compare import cells, command, history, judging, report, sources, tim
 from bench.experiment.columns import Columns
 from bench.model import registry
 from bench.run.tasks import blank_row
-from bench.studies.bias_variance.columns import COLUMNS
 
 MACHINE = {"processor": "a chip", "cores": 2, "system": "Linux", "load_average": [0.1, 0.1, 0.1]}
 

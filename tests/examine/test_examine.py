@@ -15,7 +15,7 @@ import bench
 from bench import cli
 from bench.errors import UserError
 from bench.examine import smoothing, text
-from bench.examine.lines import Break, LineScan, scan
+from bench.gradient.lines import Break, LineScan, scan
 from bench.simulator import simulator, tree
 from bench.simulator.clock import Clock
 from bench.simulator.simulator import Simulator

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import bench
-from bench.examine.rules import RULES
+from bench.gradient.rules import RULES
 
 START = np.array([0.5, -1.0, 8.0])
 RANK = {"right": 0, "not shown": 1, "wrong": 2}

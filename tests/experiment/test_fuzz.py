@@ -4,12 +4,12 @@ import tempfile
 from pathlib import Path
 
 import pytest
+from bench.plugins.studies.bias_variance.columns import COLUMNS
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from bench.cli import main
 from bench.run.store import Store
-from bench.studies.bias_variance.columns import COLUMNS
 
 BASE = ["backends=[numpy]", "samples=4", "repeats=3", "workers=0", "reference.samples=4096", "name=fuzz", "--quiet"]
 

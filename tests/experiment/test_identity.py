@@ -5,6 +5,7 @@ import math
 from dataclasses import replace
 
 import pytest
+from bench.plugins.studies.bias_variance.columns import COLUMNS
 
 from bench.cli import main
 from bench.errors import UserError
@@ -12,7 +13,6 @@ from bench.experiment import config, grid
 from bench.experiment.keys import fingerprint
 from bench.run import plan, tasks
 from bench.run.store import Store
-from bench.studies.bias_variance.columns import COLUMNS
 
 PLAIN = ["scenes=[pushing]", "contacts=[penalty]", "backends=[numpy]", "estimators=[fobg,alpha_order]"]
 

@@ -9,6 +9,7 @@ import bank
 import numpy as np
 import pandas as pd
 import pytest
+from bench.plugins.studies import unseen_features
 from classes import Heaviside, Numpy
 
 from bench.measure import noise, reference
@@ -17,7 +18,6 @@ from bench.measure.jumps import largest_jump
 from bench.measure.quadrature import Integral
 from bench.measure.reference import BATCHES, certify
 from bench.model import compose
-from bench.studies import unseen_features
 
 EVERY = bank.cases()
 SAMPLES = 1 << 14

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from bench.plugins.studies.bias_variance.columns import COLUMNS
 from classes import (
     Cartpole,
     FiniteDifference,
@@ -20,7 +21,6 @@ from helpers import small_rows
 from bench.compare import judging
 from bench.measure.statistics import UNEXPLAINED, Truth, is_unexplained, summarise, variance_per_sample
 from bench.model import compose
-from bench.studies.bias_variance.columns import COLUMNS
 
 
 def rare_tails(repeats=64, samples=100):

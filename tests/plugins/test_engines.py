@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bench.plugins.backends import mujoco
+from bench.plugins.studies.bias_variance import BiasVariance
 from classes import (
     BounceOnce,
     BouncingBall,
@@ -32,7 +33,6 @@ from bench.experiment.cell import Cell
 from bench.experiment.experiment import Budget
 from bench.model import compose, registry
 from bench.plugins import mjcf
-from bench.studies.bias_variance import BiasVariance
 
 ROOT = Path(__file__).resolve().parents[2]
 for _name in ("mujoco", "mjx"):

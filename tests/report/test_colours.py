@@ -4,11 +4,11 @@ from itertools import combinations
 
 import numpy as np
 import pytest
+from bench.plugins.studies.optimise import views as searches
 from matplotlib.colors import to_rgb
 
 from bench.report.colours import estimator_order
 from bench.report.style import MARKERS, PALETTE, colour
-from bench.studies.optimise import views as searches
 
 DEUTERANOPIA = np.array(
     [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]]

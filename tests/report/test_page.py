@@ -11,6 +11,7 @@ from typing import ClassVar
 import numpy as np
 import pandas as pd
 import pytest
+from bench.plugins.studies.bias_variance.columns import COLUMNS
 from helpers import experiment, row, small_rows, stiffness_rows, table
 
 from bench import cli
@@ -24,7 +25,6 @@ from bench.report.style import width_in_inches
 from bench.report.web import document
 from bench.report.web.data import encode, page_data
 from bench.run.store import Store
-from bench.studies.bias_variance.columns import COLUMNS
 
 HOSTILE = (
     "<script>window.hacked=1</script>",

@@ -11,6 +11,10 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 import pytest
+from bench.plugins.studies.bias_variance import tables
+from bench.plugins.studies.bias_variance.charts import estimator_styles
+from bench.plugins.studies.bias_variance.columns import TABLE
+from bench.plugins.studies.bias_variance.comparisons import problems_by_axis
 from helpers import (
     BACKENDS,
     NAMES,
@@ -37,10 +41,6 @@ from bench.report.draw import draw
 from bench.report.figures import save, styled
 from bench.report.problems import split_by_problem
 from bench.run.store import Store
-from bench.studies.bias_variance import tables
-from bench.studies.bias_variance.charts import estimator_styles
-from bench.studies.bias_variance.columns import TABLE
-from bench.studies.bias_variance.comparisons import problems_by_axis
 
 
 @pytest.fixture

@@ -10,6 +10,7 @@ from multiprocessing.connection import Connection
 
 import pandas as pd
 import pytest
+from bench.plugins.studies.bias_variance.columns import COLUMNS
 from trees import hearing_signals, processes_in, wait_for
 
 from bench.cli import main
@@ -19,7 +20,6 @@ from bench.run import files
 from bench.run.files import TEMPORARY, remove_stale, temporary
 from bench.run.pool import MalformedMessage, Pool, ResourceLimits, _Worker
 from bench.run.store import Store
-from bench.studies.bias_variance.columns import COLUMNS
 
 TINY = ["scenes=[heaviside]", "backends=[numpy]", "samples=8", "repeats=4", "timing=false", "workers=0", "--quiet"]
 FOBG = [*TINY, "estimators=[fobg]"]

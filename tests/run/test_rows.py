@@ -8,6 +8,7 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from bench.plugins.studies.bias_variance.columns import COLUMNS
 from helpers import row, table
 
 from bench import load
@@ -17,7 +18,6 @@ from bench.report import index
 from bench.report.web import document
 from bench.run import rows
 from bench.run.store import Store
-from bench.studies.bias_variance.columns import COLUMNS
 
 DEEP = 1000
 PARTS = {

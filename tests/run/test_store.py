@@ -17,6 +17,7 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from bench.plugins.studies.bias_variance.columns import COLUMNS
 from pairwise import pairwise
 
 from bench.cli import main
@@ -25,7 +26,6 @@ from bench.run import files
 from bench.run import store as store_module
 from bench.run.launchers import launcher
 from bench.run.store import Store
-from bench.studies.bias_variance.columns import COLUMNS
 
 TINY = ["scenes=[heaviside]", "backends=[numpy]", "estimators=[fobg]", "samples=8", "repeats=4", "timing=false"]
 

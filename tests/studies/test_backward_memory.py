@@ -6,11 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 import pytest
+from bench.plugins.studies.backward_memory import in_process, spread, views
 
 from bench.errors import Crashed
 from bench.experiment import config
 from bench.experiment.grid import cells
-from bench.studies.backward_memory import in_process, spread, views
 
 CLOSE = 0.03
 """Relative error of a peak: the interpreter allocates beside the planted array."""

@@ -4,10 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from helpers import experiment, failed, row, table
-
-from bench.report.views import arrange
-from bench.studies.bias_variance.comparisons import (
+from bench.plugins.studies.bias_variance.comparisons import (
     FAILS,
     NO_RESULT,
     OPEN,
@@ -18,6 +15,9 @@ from bench.studies.bias_variance.comparisons import (
     ratio,
     verdict,
 )
+from helpers import experiment, failed, row, table
+
+from bench.report.views import arrange
 
 
 def cell(error, low, high, **values):

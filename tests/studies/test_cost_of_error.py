@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pandas as pd
 import pytest
+from bench.plugins.studies.optimise.measure import objective
 from classes import Adam, CartpoleSwing, GradientDescent, Numpy, Planted, Quadratic
 from dose_response import analysis, views
 from dose_response.batched import run_batched
@@ -17,7 +18,6 @@ from trees import ROOT
 import bench
 from bench.experiment import config
 from bench.model import compose, slopes
-from bench.studies.optimise.measure import objective
 
 PAPER = ROOT / "examples" / "cost_of_error"
 D = 8

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from bench.plugins.studies.engines.views import LEVELS, levels, with_limits
 
 import bench
 from bench.cli import main
@@ -16,7 +17,6 @@ from bench.report.views import newest_rows
 from bench.report.web.data import page_data
 from bench.run.execute import store_of
 from bench.run.plan import requested_rows
-from bench.studies.engines.views import LEVELS, levels, with_limits
 
 TOYS = Path(__file__).resolve().parents[1] / "engines" / "toys"
 

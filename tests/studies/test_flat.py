@@ -4,12 +4,12 @@ import dataclasses
 
 import numpy as np
 import pytest
+from bench.plugins.studies.bias_variance.estimates import Estimates
 
 from bench.experiment import config
 from bench.experiment.grid import cells
 from bench.measure import noise, statistics
 from bench.model import compose, registry
-from bench.studies.bias_variance.estimates import Estimates
 
 ROUNDED = 1e-12
 """Relative difference allowed between sums in one go and in parts."""
@@ -70,7 +70,7 @@ def test_terms_of_a_long_theta_are_computed_in_parts(most, largest, monkeypatch)
         return terms(self, problem, theta, w)
 
     monkeypatch.setattr(type(cell.estimator), "terms", counted)
-    monkeypatch.setattr("bench.studies.bias_variance.estimates.MOST_TERMS", most)
+    monkeypatch.setattr("bench.plugins.studies.bias_variance.estimates.MOST_TERMS", most)
     _, found = made(cell)
     np.testing.assert_allclose(found, expected, rtol=ROUNDED)
     assert max(sizes) == largest

@@ -5,14 +5,14 @@ import math
 import numpy as np
 import pandas as pd
 import pytest
+from bench.plugins.studies.growth import Growth, classify, products, rate
+from bench.plugins.studies.growth.views import fit
 from classes import DoubleIntegrator, Jax, SemiImplicitEuler
 
 from bench.experiment import config
 from bench.experiment.grid import cells
 from bench.model import Jacobians, compose
 from bench.report.cells import readable
-from bench.studies.growth import Growth, classify, products, rate
-from bench.studies.growth.views import fit
 
 COLUMNS = Growth.columns
 

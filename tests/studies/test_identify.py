@@ -9,6 +9,16 @@ import pandas as pd
 import pytest
 import wrong_models
 from bench.plugins.optimizers.gauss_newton import GaussNewton
+from bench.plugins.studies.identify import views as shown
+from bench.plugins.studies.identify.measure import (
+    Fitting,
+    count_windows,
+    information,
+    missing_terms,
+    model_of,
+    run_fits,
+)
+from bench.plugins.studies.identify.record import evaluate
 from scipy.integrate import solve_ivp
 
 import bench
@@ -22,16 +32,6 @@ from bench.model import Answer
 from bench.report.views import newest_rows
 from bench.run.execute import store_of
 from bench.run.plan import plan
-from bench.studies.identify import views as shown
-from bench.studies.identify.measure import (
-    Fitting,
-    count_windows,
-    information,
-    missing_terms,
-    model_of,
-    run_fits,
-)
-from bench.studies.identify.record import evaluate
 
 STANDARD = Path(__file__).resolve().parents[2] / "results" / "standard"
 SPRING = ("scenes=[mass_spring_damper]", "integrators=[rk4]")

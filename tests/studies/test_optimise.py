@@ -6,6 +6,9 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from bench.plugins.studies.optimise import aggregate
+from bench.plugins.studies.optimise import views as shown
+from bench.plugins.studies.optimise.measure import compare_with_reference, scene_class
 from classes import ExplicitEuler, Impulse, Lqr, Penalty, SemiImplicitEuler, StaticGain, TwoBalls
 from scipy.linalg import solve_discrete_lyapunov
 
@@ -19,9 +22,6 @@ from bench.measure.solve import solve
 from bench.report.views import newest_rows
 from bench.run.execute import store_of
 from bench.run.session import Session
-from bench.studies.optimise import aggregate
-from bench.studies.optimise import views as shown
-from bench.studies.optimise.measure import compare_with_reference, scene_class
 
 STANDARD = Path(__file__).resolve().parents[2] / "results" / "standard"
 CHECKED = 1e-6

@@ -4,6 +4,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from bench.plugins.studies.optimise.measure import advance, estimates, mean_costs
 
 import bench
 from bench.experiment import config
@@ -12,7 +13,6 @@ from bench.experiment.study import study_of
 from bench.measure import noise
 from bench.model import registry
 from bench.run.session import Session
-from bench.studies.optimise.measure import advance, estimates, mean_costs
 
 
 def drawn(seed, count, width, what):

@@ -6,6 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pandas as pd
 import pytest
+from bench.plugins.studies import stability
+from bench.plugins.studies.stability import Stability, views
 
 from bench.experiment import config
 from bench.experiment.grid import cells
@@ -15,8 +17,6 @@ from bench.run import runner, tasks
 from bench.run.plan import plan
 from bench.run.session import Session
 from bench.run.store import Store
-from bench.studies import stability
-from bench.studies.stability import Stability, views
 
 STIFFNESS = tuple(float(k) for k in np.logspace(1, 4, 13))
 HORIZON, DT = 40, 0.05

@@ -8,13 +8,17 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from bench.plugins.studies.gradient_check import views as gradient_check
+from bench.plugins.studies.gradient_check.lines import PER_COMPONENT
+from bench.plugins.studies.stability.views import cells_of
+from bench.plugins.studies.twins import views as twins
 
 import bench.report
 from bench.experiment import config
 from bench.experiment.axes import table
 from bench.experiment.columns import COMMON
 from bench.experiment.grid import cells
-from bench.measure.gradcheck import EPS
+from bench.gradient import EPS
 from bench.model import registry
 from bench.report import reproduce
 from bench.report.cells import readable
@@ -22,10 +26,6 @@ from bench.report.finish import views_of
 from bench.report.problems import problem_numbers
 from bench.report.views import arrange
 from bench.report.web.data import page_data
-from bench.studies.gradient_check import views as gradient_check
-from bench.studies.gradient_check.lines import PER_COMPONENT
-from bench.studies.stability.views import cells_of
-from bench.studies.twins import views as twins
 
 SPRUNG = '''
 from dataclasses import dataclass

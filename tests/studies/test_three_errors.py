@@ -3,14 +3,14 @@
 import numpy as np
 import pandas as pd
 import pytest
+from bench.plugins.studies.three_errors import ThreeErrors, _signs, difference_check
+from bench.plugins.studies.three_errors.views import FLOOR, OWN, PROGRAM, TRAP, traps, views
 from classes import BounceOnce, BouncingBall, Impulse, Jax, SemiImplicitEuler
 
 from bench.experiment import config
 from bench.experiment.grid import cells
 from bench.model import compose
 from bench.report.shown import Shown
-from bench.studies.three_errors import ThreeErrors, _signs, difference_check
-from bench.studies.three_errors.views import FLOOR, OWN, PROGRAM, TRAP, traps, views
 
 COLUMNS = ThreeErrors.columns
 NO_IMPACT = Impulse(time_of_impact=False)

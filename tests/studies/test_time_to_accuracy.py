@@ -5,15 +5,15 @@ import math
 
 import pandas as pd
 import pytest
+from bench.plugins.studies.bias_variance.costs import ROLLOUTS, TIME, with_gradient_cost
+from bench.plugins.studies.bias_variance.time_to_accuracy import limits, required_cost
+from bench.plugins.studies.bias_variance.time_to_accuracy import table as table_of
 from helpers import described_by
 
 from bench.cli import main
 from bench.experiment import config
 from bench.measure.statistics import UNEXPLAINED
 from bench.report.views import Curve, arrange
-from bench.studies.bias_variance.costs import ROLLOUTS, TIME, with_gradient_cost
-from bench.studies.bias_variance.time_to_accuracy import limits, required_cost
-from bench.studies.bias_variance.time_to_accuracy import table as table_of
 
 SAMPLES = (16, 64, 256)
 VARIANCE = 4.0

@@ -3,6 +3,8 @@
 import numpy as np
 import pandas as pd
 import pytest
+from bench.plugins.studies.train import aggregate
+from bench.plugins.studies.train.views import views
 
 import bench
 from bench.errors import UserError
@@ -10,8 +12,6 @@ from bench.experiment import config
 from bench.experiment.grid import cells
 from bench.report.cells import readable
 from bench.run.tasks import blank_row
-from bench.studies.train import aggregate
-from bench.studies.train.views import views
 
 BASE = ["study=train", "scenes=[cartpole_swing]", "integrators=[semi_implicit_euler]", "backends=[jax]", "samples=1"]
 FINAL = {"shac": -530.0, "shac[window=8]": -700.0, "ppo": -900.0}

@@ -1,9 +1,8 @@
 """The rule of when to trust a gradient: it is counted as it says."""
 
 import pandas as pd
+from bench.plugins.studies.bias_variance import trust
 from helpers import row, table
-
-from bench.studies.bias_variance import trust
 
 
 def rows():

@@ -4,10 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from bench.plugins.studies.train.measure import slope_errors
 
 from bench.experiment.by_name import make
 from bench.model import compose
-from bench.studies.train.measure import slope_errors
 from bench.training.environment import Environment
 from bench.training.run import Training
 

@@ -12,13 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from bench.plugins.studies.train.measure import slope_errors
+from bench.plugins.studies.train.verdicts import DISAGREES
 from bench.plugins.trainers.shac import Shac
 from problems import Untouched, cartpole_program, pressed_program
 from trees import ROOT
 
 from bench.model import Answer, registry
-from bench.studies.train.measure import slope_errors
-from bench.studies.train.verdicts import DISAGREES
 from bench.training.agreement import cosine
 from bench.training.environment import Environment
 from bench.training.networks import Actor

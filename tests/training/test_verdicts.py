@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from bench.plugins.studies.train.verdicts import MEANINGS, judge
 
 from bench.model.trainer import LOGGED
-from bench.studies.train.verdicts import MEANINGS, judge
 
 N = 100
 RNG = np.random.default_rng(0)

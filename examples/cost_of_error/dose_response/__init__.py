@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
+from bench.plugins.studies.optimise import SearchStudy
+
 from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, text
 from bench.model import param
-from bench.studies.optimise import SearchStudy
 
 REVISION = 1
 """Raised when a stored number moves: the stored rows belong to a revision and not to the content of these files."""

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from bench.plugins.studies.optimise.measure import known_optimum, objective
 from scipy.optimize import minimize
 
 from bench.errors import Unsupported
@@ -16,7 +17,6 @@ from bench.experiment.session import Session
 from bench.measure import noise
 from bench.model import Estimator, Optimizer, Problem, best_gradient, zeroth_order
 from bench.run.files import make_directory, write_whole
-from bench.studies.optimise.measure import known_optimum, objective
 
 from .search import Method, Task, run_searches, tune, unit_rate, with_rate
 

@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from bench.plugins.studies.optimise.measure import error_parts, fastest, scene_class
 
 from bench.errors import Unsupported
 from bench.experiment.cell import Cell
 from bench.experiment.session import Session
 from bench.measure import noise
 from bench.model import Estimator, Optimizer, Problem
-from bench.studies.optimise.measure import error_parts, fastest, scene_class
 
 from . import DoseResponse
 from .ground import Ground, ground_of, scored_noise

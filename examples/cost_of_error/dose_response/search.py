@@ -10,11 +10,11 @@ from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
+from bench.plugins.studies.optimise.measure import advance, estimates, mean_costs, objective
 
 from bench.measure import noise
 from bench.model import Answer, Estimator, Optimizer, Problem
 from bench.model.parameters import parameters
-from bench.studies.optimise.measure import advance, estimates, mean_costs, objective
 
 from .batched import run_batched
 

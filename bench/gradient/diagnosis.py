@@ -1,0 +1,220 @@
+"""Comparisons that explain a wrong gradient: a refined cost, other numbers of steps, and long lines."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from bench.gradient import Check, FewSteps
+from bench.gradient.lines import LineScan, scan
+from bench.gradient.rules import SUSPICIOUS
+from bench.gradient.stages import GradientStages
+from bench.gradient.steps import changing_loop
+from bench.gradient.subspace import choose
+from bench.simulator.simulator import Simulator
+
+NEAR = 0.05
+"""Largest relative error of a gradient that small jumps may explain."""
+FAR, FAR_JUMPS = 0.25, 0.5
+"""Largest relative error that larger jumps may explain, and their largest total height, as a share of the cost's change."""
+EXPLAINED = 30.0
+"""Largest error of a gradient on a line, in multiples of the jumps' total height over the length of the line. An adjoint that is
+solved separately reaches 25, since only the six largest jumps of a line are known."""
+SMALL_JUMPS = 0.05
+"""Largest total height of such jumps, as a share of the cost's change along the line."""
+FEWEST_JUMPS = 2
+"""Fewest jumps on the lines that count as jumps of adaptive steps."""
+SPREADS = (0.0, 0.05, 0.1, 0.2, 0.4)
+"""Distances from theta, in units of each input's scale, at which the loops of the program are compared."""
+ELSEWHERE = 2
+"""Number of other thetas at which the gradient is compared with a refined cost."""
+ALONG = 4
+"""Directions of these comparisons at each theta."""
+AROUND = 0.05
+"""Distance of these thetas, in units of each input's scale."""
+LONGER = 10.0
+"""Length of the line on which more jumps are searched, in multiples of the first line."""
+GROWTH = 1.5
+"""Least ratio of errors at the largest and at the first wrong number of steps that counts as growth."""
+
+
+@dataclass(frozen=True)
+class Horizon:
+    """The error of a gradient after a number of steps."""
+
+    steps: int
+    error: float
+    """Largest |gradient - difference|, relative to the largest difference, in units of each input's scale."""
+    uncertainty: float
+    """The error of the differences, relative to the largest."""
+
+
+@dataclass(frozen=True)
+class Gap:
+    """At one theta, the distances of the gradient and of the cost's own differences from those of a refined cost."""
+
+    gradient: float
+    own: float
+    size: float
+    """Norm of the refined cost's differences."""
+
+
+@dataclass
+class Explanation:
+    """What comparisons say about a wrong gradient."""
+
+    is_adaptive: bool | None = None
+    """Whether steps that depend on theta explain the error, by the jumps of the cost; None: not compared."""
+    steps: str | None = None
+    """The place of a loop whose length depends on theta, as ``ode.py:17``; empty without one, None: not searched."""
+    is_unexplained: bool = False
+    """Whether the error is so small that adaptive steps may explain it, and the budget ended before that was known."""
+    gaps: Sequence[Gap] = ()
+    """At theta and at others: how far gradient and cost are from the refined cost; empty without a refined cost."""
+    growth: Sequence[Horizon] = ()
+    """The error of the gradient by number of steps."""
+
+
+def refined_gaps(stages: GradientStages, refined: Callable[..., Any]) -> list[Gap]:
+    """Return the gaps at theta and at other thetas around it, along a few random directions each."""
+    other, scale, random = (
+        _simulator(stages, refined, None),
+        stages.scale,
+        np.random.default_rng([stages.seed, 0x676170]),
+    )
+    eps, size, gaps = float(np.cbrt(stages.simulator.unit)), stages.theta.size, []
+    for spread in (0.0, *[AROUND] * ELSEWHERE):
+        theta = stages.theta + spread * scale * random.standard_normal(size)
+        vectors = random.standard_normal((size, min(ALONG, size)))
+        vectors *= scale[:, None] / np.linalg.norm(vectors, axis=0)
+        at = np.concatenate([theta[:, None] + eps * vectors, theta[:, None] - eps * vectors], axis=1)
+        w = stages.same_noise(at.shape[1])
+        own, exact = (np.subtract(*np.split(costs, 2)) / (2 * eps) for costs in (stages.costs(at), other.costs(at, w)))
+        slopes = stages.gradient_at(theta) @ vectors
+        gaps.append(Gap(*(float(np.linalg.norm(values)) for values in (slopes - exact, own - exact, exact))))
+    return gaps
+
+
+def changing_steps(stages: GradientStages) -> str:
+    """Return the place of a loop of the cost whose length depends on theta, as ``ode.py:17``; empty where none is known."""
+    random = np.random.default_rng([stages.seed, 0x6C6F6F70])
+    moved = np.outer(stages.scale, SPREADS) * random.standard_normal((stages.theta.size, len(SPREADS)))
+    return changing_loop(stages.simulator, stages.theta[:, None] + moved, stages.w)
+
+
+def errors_by_horizon(stages: GradientStages, horizons: Sequence[int]) -> list[Horizon]:
+    """Return the error of the gradient after each number of steps, from few differences."""
+    result = []
+    simulator = stages.simulator
+    for steps in sorted(horizons):
+        grad = partial(simulator._grad, steps=steps) if callable(simulator._grad) else simulator._grad
+        other = _simulator(stages, partial(simulator._cost, steps=steps), grad)
+        gradient = other.gradients(stages.theta[:, None], stages.w)[:, 0]
+        space = choose(stages.layout, stages.scale, gradient, stages.seed, most=4)
+
+        def costs(thetas: np.ndarray, other: Simulator = other) -> np.ndarray:
+            return other.costs(thetas, stages.same_noise(thetas.shape[1]))
+
+        quick = FewSteps(
+            partial(space.costs, costs, width=other.width), space.origin(), space.scale, space.project(gradient),
+            float(costs(stages.theta[:, None])[0]), simulator.unit, stages.repeats.spread,
+        )  # fmt: skip
+        quick.run_round(other.width)
+        outcome = quick.check()
+        if outcome is None:
+            continue
+        program = np.array([part.program for part in outcome.parts]) * space.scale
+        differences = np.array([part.difference for part in outcome.parts]) * space.scale
+        doubts = np.array([part.uncertainty for part in outcome.parts]) * space.scale
+        size = float(np.abs(differences).max()) or 1.0
+        result.append(Horizon(steps, float(np.abs(program - differences).max() / size), float(doubts.max() / size)))
+    return result
+
+
+def grows(horizons: Sequence[Horizon], tolerance: float) -> bool:
+    """Return whether the gradient is right after few steps and its error grows with the number of steps."""
+    wrong = [one for one in horizons if one.error > tolerance + 2.0 * one.uncertainty]
+    if len(horizons) < 2 or not wrong or horizons[0] in wrong:
+        return False
+    last = horizons[-1]
+    return last in wrong and (len(wrong) == 1 or last.error > GROWTH * wrong[0].error)
+
+
+@np.errstate(all="ignore")
+def relative_error(outcome: Check) -> float:
+    """Return the norm of gradient minus differences over that of the differences, in units of each input's scale.
+
+    A discretisation changes all components by an amount of one size, which is large beside a small component.
+    """
+    parts = [part for part in outcome.parts if np.isfinite([part.program, part.difference]).all()]
+    single = [part for part in parts if part.component is not None]
+    scale = np.array([part.sample.scale for part in single])
+    differences = np.array([part.difference for part in single]) * scale
+    apart = np.array([part.program for part in single]) * scale - differences
+    size = float(np.linalg.norm(differences))
+    errors = [(float(np.linalg.norm(apart)), size)]
+    # a group or a direction has length 1 in these units
+    whole = [part for part in parts if part.component is None]
+    errors += [(abs(part.program - part.difference), max(abs(part.difference), size)) for part in whole]
+    return max(error / size if size > 0 else float("inf") for error, size in errors)
+
+
+def may_be_adaptive(outcome: Check) -> bool:
+    """Return whether a gradient is wrong by so little that adaptive steps may be the reason."""
+    return outcome.cause in SUSPICIOUS and relative_error(outcome) <= NEAR
+
+
+def is_adaptive(
+    stages: GradientStages, outcome: Check, lines: Sequence[LineScan], points: int, halvings: int, most: int
+) -> bool:
+    """Return whether the jumps of the cost explain the error of the gradient, as with adaptive steps.
+
+    A solver with adaptive steps has another discretisation error on either side of each change of its number of steps.
+    Its cost has a small jump there, and slopes between jumps that differ from the solution's slopes by about the height
+    of a jump over the distance between jumps. Reverse mode through such a solver holds the steps fixed, and an adjoint
+    that is solved separately has steps of its own, so these gradients differ by as much. Where few jumps are found
+    beside a small error, a line ten times as long is searched, as :func:`scan` does with ``points``, ``halvings`` and
+    ``most``. A larger error counts where the jumps on the first lines change the cost by more than the error does.
+    """
+    lines = [line for line in lines if np.isfinite(line.costs).all()]
+    error = relative_error(outcome)
+    if stages.gradient is None or not lines or error > FAR:
+        return False
+
+    if sum(len(line.jumps) for line in lines) < FEWEST_JUMPS and error <= NEAR:
+        first, noise = lines[0], max(outcome.noise, stages.repeats.spread)
+        reach, unit = LONGER * float(first.at[-1]), stages.simulator.unit
+        longer = scan(
+            partial(stages.costs_along, first.direction),
+            np.zeros(1),
+            np.ones(1),
+            noise,
+            reach,
+            points,
+            halvings,
+            most,
+            unit,
+        )
+        lines = [replace(longer, direction=first.direction)]
+    if sum(len(line.jumps) for line in lines) < FEWEST_JUMPS:
+        return False
+    rows = []
+    for line in lines:
+        step = 1e-3 * float(line.at[1] - line.at[0])
+        costs = stages.costs_along(line.direction, np.array([-step, step]))
+        apart = abs(float((costs[1] - costs[0]) / (2 * step) - line.direction @ stages.gradient))
+        rows.append((sum(jump.size for jump in line.jumps), np.abs(np.diff(line.costs)).sum(), apart * np.ptp(line.at)))
+    heights, changes, errors = np.array(rows).T
+    is_near = error <= NEAR and ((heights < SMALL_JUMPS * changes) & (errors <= EXPLAINED * heights)).any()
+    is_far = heights.sum() < FAR_JUMPS * changes.sum() and (errors <= heights).all()
+    return bool(is_near or is_far)
+
+
+def _simulator(stages: GradientStages, cost: Callable[..., Any], grad: Any) -> Simulator:
+    own = stages.simulator
+    batch = own.batch + (f":{own.fixed}" if own.fixed else "")
+    return Simulator(cost, stages.layout, grad, own.noise, batch, stages.clock, own.library)

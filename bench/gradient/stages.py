@@ -1,0 +1,548 @@
+"""The stages of a gradient check: what decides comes first, and each finished stage is kept when the next is cut off.
+
+1. The cost and its gradient at theta, once.
+2. Two costs per component, at one step: enough to detect a gradient that is 10% off.
+3. Repeated calls, which show whether the cost repeats and whether it depends on the call before.
+4. Nine steps per component, then all steps with random directions, then other thetas.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from bench.gradient import (
+    EPS,
+    FAULTS,
+    ROUNDS,
+    TRUSTED,
+    Check,
+    FewSteps,
+    Options,
+    Part,
+    check,
+    is_nothing,
+    most_severe,
+)  # fmt: skip
+from bench.gradient.subspace import Group, Subspace, choose, locate
+from bench.simulator.clock import Clock, OutOfTime
+from bench.simulator.simulator import Simulator
+
+SINGLE_EPS = np.logspace(-1, -7, 13)
+"""Steps of a check in single precision, relative to each input's scale: the best is near 5e-3."""
+NOISE_POINTS = 17
+"""Costs per direction that no step needs: the centre, and the points at which the noise is measured."""
+SCAN = 7 * 65
+"""Number of costs of a staircase search along one direction that is not clearly right."""
+ALL_STEPS, FEW_DRAWS, DRAWS = "all steps and random directions", "2 other thetas", "8 other thetas"
+"""Names of the later stages."""
+SMALL = 0.6
+"""Power of the unit roundoff: a relative difference between equal calls below it is a floor, not a fault."""
+MANY = 10_000
+"""Largest theta that is checked at 8 other thetas; a larger one at 2, since each call copies all its numbers."""
+OTHER_NOISE = 2
+"""Number of further draws of the simulator's own noise under which the gradient is checked along random directions."""
+ROUGH = 0.1
+"""Share of the cost's change over the widest step that noise between neighbouring thetas makes up where a cost is rough."""
+IN_CELL = 0.4
+"""Distance from a float32 number, in units of its last place, that float32 rounds away."""
+CELLS, DISTINCT_CELLS = 9, 6
+"""Number of neighbouring float32 thetas at which costs are compared, and fewest different costs of a cost in float32."""
+MOST_OF_IT = 0.9
+"""Share of the remaining budget after which a running stage is stopped."""
+SHARE = 0.8
+"""Largest share of the remaining budget of a stage, whatever is measured after it."""
+STATE = 0.1
+"""Largest share of the difference between histories by which a cost with equal histories differs."""
+
+
+@dataclass
+class Repeats:
+    """How far equal calls differ."""
+
+    spread: float = 0.0
+    """Largest difference between equal calls of the cost."""
+    of_gradient: float = 0.0
+    """Largest difference between equal calls of the gradient, relative to its norm."""
+    has_state: bool = False
+    """Whether the cost depends on the call before it, in a repeatable way."""
+    floor: float = 0.0
+    """Largest spread that only limits the accuracy of the check."""
+    floor_of_gradient: float = 0.0
+
+    @property
+    def is_small(self) -> bool:
+        """Whether these differences only limit the accuracy of the check."""
+        return self.spread <= self.floor and self.of_gradient <= self.floor_of_gradient
+
+
+class Store:
+    """Values by coordinates. A stored value is used once; the next request computes it again and compares."""
+
+    def __init__(self) -> None:
+        self._values: dict[bytes, np.ndarray] = {}
+        self._fresh: set[bytes] = set()
+        self.spread = 0.0
+        """Largest difference between two values of one key."""
+
+    def take(self, key: bytes) -> np.ndarray | None:
+        """Return a value that has not been used since it was computed or refreshed, or None."""
+        if key not in self._fresh:
+            return None
+        self._fresh.remove(key)
+        return self._values[key]
+
+    def put(self, key: bytes, value: np.ndarray) -> None:
+        """Store a computed value."""
+        if key in self._values:
+            with np.errstate(invalid="ignore"):
+                apart = np.abs(self._values[key] - value)
+            self.spread = max(self.spread, float(np.nan_to_num(apart).max(initial=0.0)))
+        self._values[key] = value
+
+    def refresh(self) -> None:
+        """Let every value be used once more."""
+        self._fresh = set(self._values)
+
+
+class GradientStages:
+    """Checks a simulator's gradient at theta, stage by stage, within the budget of its clock."""
+
+    def __init__(
+        self,
+        simulator: Simulator,
+        scale: np.ndarray,
+        clock: Clock,
+        seed: int,
+        w: np.ndarray | None,
+        random: np.random.Generator,
+    ) -> None:
+        self.simulator, self.scale, self.clock, self.seed, self.w = simulator, scale, clock, seed, w
+        self.layout, self.theta = simulator.layout, simulator.layout.vector
+        self.value = math.nan
+        self.gradient: np.ndarray | None = None
+        """The gradient at theta, ``(d,)``; None without a gradient, or where it failed."""
+        self.check: Check | None = None
+        """The outcome of the last finished stage."""
+        self.is_quick = True
+        """Whether only few steps per component were checked."""
+        self.is_complete = False
+        """Whether every chosen component and group was checked."""
+        self.is_failed = False
+        """Whether the gradient at theta raised an exception."""
+        self.more: list[Check] = []
+        """Checks under other draws of the simulator's own noise."""
+        self.located: dict[str, str] = {}
+        """By name of a wrong group: the numbers that cause its error."""
+        self.groups: list[Group] = []
+        """The groups of a large theta that are checked along one direction each."""
+        self.left_out: list[str] = []
+        self.repeats = Repeats(floor_of_gradient=simulator.unit**SMALL)
+        self._repeated = False  # whether calls were repeated within the budget
+        self.is_hidden_single = False
+        """Whether the cost has single precision, though it returns a float64."""
+        self._random = random
+        self._costs_store, self._gradients_store = Store(), Store()
+
+    # ------------------------------------------------------------------------------------------------ calls
+
+    def costs(self, thetas: np.ndarray, w: np.ndarray | None = None) -> np.ndarray:
+        """Return the costs ``(B,)`` of ``thetas (d, B)``, all under the same draw of the simulator's own noise."""
+        return self.simulator.costs(thetas, self.same_noise(thetas.shape[1], w))
+
+    def same_noise(self, count: int, w: np.ndarray | None = None) -> np.ndarray | None:
+        """Return one draw of the simulator's own noise for each of ``count`` thetas, ``(n, count)``; None without noise."""
+        w = self.w if w is None else w
+        return None if w is None else np.repeat(w, count, axis=1)
+
+    def thetas_along(self, direction: np.ndarray, t: np.ndarray) -> Iterator[np.ndarray]:
+        """Yield the thetas at theta + t * direction for ``t (n,)``, a batch at a time, since memory holds few large ones."""
+        width = max(self.simulator.width, 1)
+        for first in range(0, t.size, width):
+            yield self.theta[:, None] + direction[:, None] * t[first : first + width]
+
+    def costs_along(self, direction: np.ndarray, t: np.ndarray) -> np.ndarray:
+        """Return the costs ``(n,)`` at theta + t * direction for t of n numbers."""
+        return np.concatenate([self.costs(thetas) for thetas in self.thetas_along(direction, t.ravel())])
+
+    def gradient_at(self, theta: np.ndarray, w: np.ndarray | None = None) -> np.ndarray:
+        """Return the simulator's gradient at ``theta (d,)``."""
+        return np.asarray(self.simulator.gradients(theta[:, None], self.w if w is None else w)[:, 0])
+
+    def _stored_costs(self, space: Subspace, z: np.ndarray) -> np.ndarray:
+        keys = [column.tobytes() for column in np.ascontiguousarray(z.T)]
+        taken = [self._costs_store.take(key) for key in keys]
+        missing = [i for i, value in enumerate(taken) if value is None]
+        # batch by batch, so that an interrupted stage keeps its costs
+        width = self.simulator.width
+        for first in range(0, len(missing), width):
+            part = missing[first : first + width]
+            for i, value in zip(part, space.costs(self.costs, z[:, part], width), strict=True):
+                taken[i] = computed = np.asarray(value)
+                self._costs_store.put(keys[i], computed)
+        return np.array([float(value) for value in taken if value is not None])
+
+    def _stored_gradient(self, space: Subspace, z: np.ndarray) -> np.ndarray:
+        """Return the derivatives by the coordinates of a space at ``z (m,)``, ``(m,)``."""
+        key = z.tobytes()
+        value = self._gradients_store.take(key)
+        if value is None:
+            value = space.project(self.gradient_at(space.place(z[:, None])[:, 0]))
+            self._gradients_store.put(key, value)
+        return value
+
+    def _refresh(self) -> None:
+        """Let the next stage use every stored value once."""
+        for store in (self._costs_store, self._gradients_store):
+            store.refresh()
+
+    def integrate(self, direction: np.ndarray, start: float, end: float, panels: int) -> float:
+        """Return the integral of the gradient along ``theta + t * direction`` by Gauss-Legendre, 4 points per panel."""
+        x, weight = np.polynomial.legendre.leggauss(4)
+        edges = np.linspace(start, end, panels + 1)
+        half = np.diff(edges)[:, None] / 2
+        t, weights = ((edges[:-1, None] + half) + half * x).ravel(), (half * weight).ravel()
+        slopes = [
+            direction @ self.simulator.gradients(thetas, self.same_noise(thetas.shape[1]))
+            for thetas in self.thetas_along(direction, t)
+        ]
+        return float(weights @ np.concatenate(slopes))
+
+    # ------------------------------------------------------------------------------------------------ stages
+
+    def run(self, explain: Callable[[Check], bool] = lambda check: False) -> None:
+        """Run all stages that the budget allows; ``explain`` gets the outcome of a wrong gradient before it is named."""
+        try:
+            self._start()
+        except OutOfTime:
+            if math.isnan(self.value):
+                self.left_out.append("the cost at theta")
+            self.left_out.append("the gradient check")
+            return
+        if self.is_failed:
+            return
+        space = choose(self.layout, self.scale, self.gradient, self.seed)
+        self.groups = space.groups
+        if self.gradient is not None:
+            self._gradients_store.put(space.origin().tobytes(), space.project(self.gradient))
+            self._gradients_store.refresh()
+        try:
+            for stage in (partial(self._compare_quickly, space), self._repeat):
+                stage()
+                if self._has_hidden_single():
+                    self.simulator.precision, self.is_hidden_single = "float32", True
+                    self._compare_quickly(space)
+        except OutOfTime:
+            self.left_out.append("the check at more than one step")
+            return
+        if self.check is None:
+            return
+        self._check_in_stages(space, explain)
+        self._locate(space)
+        self._check_under_other_noise()
+
+    def _start(self) -> None:
+        """Compute the cost at theta, once more, and the gradient."""
+        simulator, clock = self.simulator, self.clock
+        clock.start_stage("the cost at theta")
+        self.value = simulator.first_value
+        if simulator.noise or simulator.batch != "loop" or math.isnan(self.value):
+            self.value = float(self.costs(self.theta[:, None])[0])
+        self.repeats.floor = simulator.unit**SMALL * (abs(self.value) if math.isfinite(self.value) else 0.0)
+        if not simulator.has_gradient:
+            return
+        clock.start_stage("first gradient")
+        gradient = self.gradient_at(self.theta)
+        self.is_failed = simulator.n_failed_gradients > 0
+        if not self.is_failed:
+            self.gradient = gradient
+
+    def _compare_quickly(self, space: Subspace) -> None:
+        """Compare the gradient with two costs per coordinate, and with more where the full steps do not fit."""
+        self.clock.start_stage("one step per component")
+        slope = None if self.gradient is None else space.project(self.gradient)
+        quick = FewSteps(
+            partial(self._stored_costs, space), space.origin(), space.scale, slope, self.value, self.simulator.unit,
+            self.repeats.spread,
+        )  # fmt: skip
+        try:
+            for _ in ROUNDS:
+                quick.run_round(self.simulator.width)
+                steps = self._plan(space.size, True)["more steps"]
+                if self.clock.can_afford(*self._cost_of(steps, space.size), share=SHARE):
+                    break
+        finally:
+            outcome = quick.check()
+            if outcome is not None:
+                self.check, self.is_quick = space.restore(outcome), True
+                self.is_complete = len(outcome.parts) == space.size
+
+    def _repeat(self) -> None:
+        """Repeat calls, after equal and after other thetas, and compare the results."""
+        self.clock.start_stage("repeating a call")
+        theta, other = self.theta, self.theta + 1e-3 * self.scale
+        calls, values = (theta, other, theta, theta, other, theta, theta), []  # the first one follows other thetas
+        try:
+            for at in calls:
+                values.append(float(self.costs(at[:, None])[0]))
+        except OutOfTime:
+            self.left_out.append("repeating a call")
+        self._repeat_gradient(other)
+        self.repeats.spread = self._costs_store.spread
+        for at in (theta, other):
+            same = [value for value, each in zip(values, calls, strict=False) if each is at] + [self.value] * (
+                at is theta
+            )
+            if len(same) > 1 and np.isfinite(same).all():
+                self.repeats.spread = max(self.repeats.spread, float(np.ptp(same)))
+        self._repeated = len(values) == len(calls)
+        if self._repeated and self.repeats.spread > 0:
+            after_theta, after_other = values[3::3], values[2::3]
+            is_alike = max(np.ptp(after_theta), np.ptp(after_other)) <= STATE * abs(after_theta[-1] - after_other[-1])
+            # last digits that vary at random are alike by chance
+            self.repeats.has_state = bool(is_alike and self.repeats.spread > self.repeats.floor)
+
+    def _repeat_gradient(self, other: np.ndarray) -> None:
+        """Compare the gradient with that of an equal call after one at ``other (d,)``."""
+        if self.gradient is None or not np.isfinite(self.gradient).all():
+            return
+        try:
+            self.gradient_at(other)
+            again = self.gradient_at(self.theta)
+        except OutOfTime:
+            self.left_out.append("repeating a gradient")
+            return
+        size = float(np.linalg.norm(self.gradient))
+        if size and np.isfinite(again).all():
+            self.repeats.of_gradient = float(np.linalg.norm(again - self.gradient)) / size
+
+    def _has_hidden_single(self) -> bool:
+        """Return whether a cost that returns float64 computes in float32: its values have single precision, or it reads
+        theta as float32.
+
+        A cost that reads theta as float32 is constant within one rounding cell of float32, and changes from each cell to
+        the next, unlike a staircase with wider treads.
+        """
+        if self.simulator.unit > float(np.finfo(np.float64).eps) or self.repeats.spread > 0.0:
+            return False
+        if self.simulator.has_single_precision:
+            return True
+        if not self._repeated:
+            return False
+        self.clock.start_stage("precision")
+        with np.errstate(all="ignore"):
+            rounded = self.theta.astype(np.float32)
+            first, ulp = rounded.astype(np.float64), np.spacing(np.abs(rounded)).astype(np.float64)
+        ulp = ulp * np.where(np.arange(first.size) % 3 == 1, -1.0, 1.0)
+
+        def costs(*units: float) -> np.ndarray:
+            return self.costs(first[:, None] + ulp[:, None] * np.array(units))
+
+        if not _are_equal(costs(0.0, IN_CELL)):
+            return False
+        cells = costs(*range(CELLS))
+        inside = costs(-IN_CELL, CELLS // 2 - IN_CELL, CELLS // 2 + IN_CELL)
+        is_constant = _are_equal(np.r_[cells[0], inside[0]]) and _are_equal(np.r_[cells[CELLS // 2], inside[1:]])
+        return is_constant and np.unique(cells).size >= DISTINCT_CELLS
+
+    def _plan(self, size: int, is_right: bool) -> dict[str, Options]:
+        """Return the stages after the quick one, from the cheapest to the full check."""
+        unit = self.simulator.unit
+        eps, few = (EPS, EPS[::2]) if unit < 1e-10 else (SINGLE_EPS, SINGLE_EPS)
+        base = Options(
+            components=size, directions=0, draws=0, eps=few, unit=unit, scanned=0, repeated=False, seed=self.seed,
+        )  # fmt: skip
+        whole = replace(base, eps=eps, directions=2)
+        # a wrong gradient is named by its ratios at other thetas first, and then searched for staircases
+        scanned = 4 if is_right else 0
+        stages = {"more steps": base, ALL_STEPS: replace(whole, scanned=scanned, repeated=self.repeats.spread == 0.0)}
+        if self.theta.size > MANY:
+            return stages | {FEW_DRAWS: replace(whole, draws=2, scanned=2)}
+        few_draws = replace(whole, eps=eps if is_right else few, draws=2, scanned=scanned)
+        return stages | {FEW_DRAWS: few_draws, DRAWS: replace(whole, draws=8, scanned=4)}
+
+    def _cost_of(self, options: Options, size: int) -> tuple[int, int]:
+        """Return the numbers of costs and gradients of a stage that no stored value makes cheaper."""
+        each = 2 * options.eps.size + NOISE_POINTS
+        here = (size + options.directions) * (2 if options.repeated else int(not options.draws))
+        costs = (here + options.draws * options.directions) * each
+        wrong = 0 if self.check is None else sum(part.verdict in FAULTS for part in self.check.parts)
+        if wrong and options.draws:
+            costs += min(4, options.draws) * wrong * each + 4 * options.draws * each
+        if wrong and options.scanned:
+            costs += min(wrong + options.directions, options.scanned) * SCAN
+        gradients = 0 if self.gradient is None else 3 + options.draws * (3 if wrong else 1)
+        return costs, gradients
+
+    def _check_in_stages(self, space: Subspace, explain: Callable[[Check], bool]) -> None:
+        self.clock.start_stage("checking the gradient")
+        assert self.check is not None
+
+        def fits(options: Options) -> bool:
+            return self.clock.can_afford(*self._cost_of(options, space.size), share=SHARE)
+
+        for name in self._plan(space.size, True):
+            plan = self._plan(space.size, self.check.trusted)
+            is_wrong = any(part.verdict in FAULTS for part in self.check.parts)
+            if name == ALL_STEPS and is_wrong:
+                explain(self.check)
+                continue  # the ratios at other thetas name the fault, and these stages also have all steps
+            if not fits(plan[name]):
+                self.left_out.append(name)
+                if name != FEW_DRAWS:
+                    break
+                continue
+            # a wrong gradient is named by few thetas first, so that the name does not depend on the time that is left
+            if name == FEW_DRAWS and not is_wrong and DRAWS in plan and fits(plan[DRAWS]):
+                continue
+            self._refresh()
+            self.clock.limit(MOST_OF_IT)
+            try:
+                self._run_stage(space, plan[name])
+            except OutOfTime:
+                self.left_out.append(name)
+                break
+            finally:
+                self.clock.limit(1.0)
+            if name == DRAWS:
+                self.left_out = [left for left in self.left_out if left != FEW_DRAWS]
+
+    def _run_stage(self, space: Subspace, options: Options) -> None:
+        outcome = self._check_once(space, options)
+        self.repeats.spread = max(self.repeats.spread, self._costs_store.spread)
+        self.repeats.of_gradient = max(self.repeats.of_gradient, self._spread_of_gradients(space))
+        if outcome.cause == "nondeterministic" and self.repeats.is_small and self.repeats.spread > 0.0:
+            self._refresh()
+            outcome = self._check_once(space, replace(options, repeated=False))
+        self.check, self.is_quick = space.restore(outcome), False
+
+    def _check_once(self, space: Subspace, options: Options, w: np.ndarray | None = None) -> Check:
+        def cost(z: np.ndarray) -> np.ndarray:
+            if w is None:
+                return self._stored_costs(space, z)
+            return space.costs(lambda thetas: self.costs(thetas, w), z, self.simulator.width)
+
+        def slope(z: np.ndarray) -> np.ndarray:
+            if w is None:
+                return self._stored_gradient(space, z)
+            return space.project(self.gradient_at(space.place(z[:, None])[:, 0], w))
+
+        outcome = check(
+            cost, slope if self.gradient is not None else None, space.origin(), replace(options, scale=space.scale)
+        )
+        if self.simulator.n_failed_gradients:
+            # a gradient that raises at other thetas is reported as such
+            outcome = recaused(
+                replace(outcome, draws=tuple(part for part in outcome.draws if np.isfinite(part.program)))
+            )
+        return _with_roughness(self._without_small_spread(space, _with_zeros(outcome)))
+
+    def _spread_of_gradients(self, space: Subspace) -> float:
+        """Return the largest difference between equal calls of the gradient, relative to its norm."""
+        slope = np.zeros(1) if self.gradient is None else np.nan_to_num(space.project(self.gradient))
+        size = float(np.linalg.norm(slope))
+        return self._gradients_store.spread / size if size else 0.0
+
+    def _without_small_spread(self, space: Subspace, outcome: Check) -> Check:
+        """Return a check without the verdict ``nondeterministic`` where only the last digits of the gradient differ."""
+        is_own = any(part.verdict == "nondeterministic" for part in outcome.parts)
+        if (
+            outcome.cause != "nondeterministic"
+            or is_own
+            or self._spread_of_gradients(space) > self.simulator.unit**SMALL
+        ):
+            return outcome
+        return recaused(outcome)
+
+    def _locate(self, space: Subspace) -> None:
+        """Find the numbers that cause the error of each wrong group."""
+        if self.check is None or self.gradient is None:
+            return
+        self.clock.start_stage("locating the error")
+        groups = {group.name: group for group in space.groups}
+        try:
+            for part in self.check.parts:
+                if part.name in groups and part.verdict in FAULTS and math.isfinite(part.program):
+                    group = groups[part.name]
+                    self.located[part.name], index = locate(
+                        self.layout, group, self.theta, self.gradient, self.costs, part.step,
+                        part.difference - part.program, part.uncertainty,
+                    )  # fmt: skip
+                    if index is not None and index not in space.components:
+                        self._check_number(index, part.verdict)
+        except OutOfTime:
+            self.left_out.append("the place of the error in its group")
+
+    def _check_number(self, index: int, verdict: str) -> None:
+        """Check a single number of theta, and add it to the check with a verdict if it is wrong.
+
+        Its error is a small part of the slope of its group, which may be within the tolerance.
+        """
+        assert self.check is not None
+        assert self.gradient is not None
+
+        def cost(z: np.ndarray) -> np.ndarray:
+            thetas = np.repeat(self.theta[:, None], z.shape[1], axis=1)
+            thetas[index] = z[0]
+            return self.costs(thetas)
+
+        one, unit = [index], self.simulator.unit
+        quick = FewSteps(
+            cost, self.theta[one], self.scale[one], self.gradient[one], self.value, unit, self.repeats.spread
+        )
+        for _ in ROUNDS:
+            quick.run_round()
+        outcome = quick.check()
+        if outcome is not None and outcome.cause in FAULTS:
+            added = replace(outcome.parts[0], component=index, verdict=verdict)
+            self.check = replace(self.check, parts=(added, *self.check.parts))
+
+    def _check_under_other_noise(self) -> None:
+        """Check the gradient along random directions under other draws of the simulator's own noise."""
+        if self.w is None or self.check is None or not self.check.trusted or self.is_quick:
+            return
+        space = choose(self.layout, self.scale, self.gradient, self.seed)
+        options = replace(self._plan(space.size, True)[ALL_STEPS], components=0, scanned=0, repeated=False)
+        if not self.clock.can_afford(*self._cost_of(options, 0), share=SHARE):
+            self.left_out.append("checks under other noise")
+            return
+        try:
+            for _ in range(OTHER_NOISE):
+                drawn = self._random.standard_normal((self.simulator.noise, 1))
+                self.more.append(space.restore(self._check_once(space, options, drawn)))
+        except OutOfTime:
+            self.left_out.append("checks under other noise")
+
+
+def _are_equal(values: np.ndarray) -> bool:
+    return bool(np.isfinite(values).all() and (values == values[0]).all())
+
+
+def _with_zeros(outcome: Check) -> Check:
+    """Return a check in which a derivative below the rounding of a cost that does not move is ``zero``."""
+    zeros = [p for p in outcome.parts if p.verdict in (*TRUSTED, "unsettled") and is_nothing(p.sample)]
+    if all(part.verdict == "zero" for part in zeros):
+        return outcome
+    return recaused(outcome, lambda part: replace(part, verdict="zero") if any(part is p for p in zeros) else part)
+
+
+def _with_roughness(outcome: Check) -> Check:
+    """Return a check with the cause ``rough`` where the cost varies as much between neighbours as over a wide step."""
+    samples = [part.sample for part in outcome.parts if outcome.cause == "unsettled"]
+    changes = [np.abs(sample.plus - sample.minus)[sample.finite].max(initial=0.0) for sample in samples]
+    is_rough = any(
+        sample.noise > ROUGH * change and sample.noise > 1e6 * sample.unit * abs(sample.centre)
+        for sample, change in zip(samples, changes, strict=True)
+    )
+    return replace(outcome, cause="rough") if is_rough else outcome
+
+
+def recaused(outcome: Check, replaced: Callable[[Part], Part] = lambda part: part) -> Check:
+    """Return a check with replaced parts and the cause that follows from its parts."""
+    parts, draws = tuple(map(replaced, outcome.parts)), tuple(map(replaced, outcome.draws))
+    causes = [part.verdict for part in parts] + [part.verdict for part in draws if part.verdict in FAULTS]
+    return replace(outcome, parts=parts, draws=draws, cause=most_severe(causes))

@@ -1,0 +1,183 @@
+"""Finds where the steps of a program depend on theta: a loop whose number of iterations differs between two thetas.
+
+Reverse mode holds such steps fixed and differences do not, so that they differ by the discretisation error. A program whose
+loops all have fixed lengths has no such excuse.
+"""
+
+from __future__ import annotations
+
+import dis
+import sys
+from pathlib import Path
+from types import CodeType, FrameType
+from typing import Any
+
+import numpy as np
+
+from bench.simulator.simulator import Simulator
+
+Loops = dict[tuple[str, int], set[int]]
+"""By file and line of a loop: the numbers of iterations of its runs."""
+SKIPPED = tuple(
+    f"/{name}/" for name in ("jax", "jaxlib", "torch", "numpy", "bench/model", "bench/gradient", "bench/examine")
+)
+"""Folders whose loops are those of a library, not of the program."""
+
+
+def changing_loop(simulator: Simulator, thetas: np.ndarray, w: np.ndarray | None) -> str:
+    """Return the place of a while loop whose length depends on theta, as ``ode.py:17``; empty where none is known.
+
+    A JAX program is read: a loop whose condition depends on theta. Other Python code runs under a trace at
+    ``thetas (d, n)``. Loops of compiled code are not seen.
+    """
+    place = _loop_of_jax(simulator, thetas[:, 0], w)
+    if place or simulator.library == "jax":
+        return place
+    return changed_loop([traced_loops(simulator, theta, w) for theta in thetas.T])
+
+
+def changed_loop(runs: list[Loops]) -> str:
+    """Return the place of a loop that ran in each of the runs, with other numbers of iterations; empty without one."""
+    for file, line in sorted(set.intersection(*(set(loops) for loops in runs))):
+        if any(loops[file, line] != runs[0][file, line] for loops in runs):
+            return f"{Path(file).name}:{line}"
+    return ""
+
+
+def traced_loops(simulator: Simulator, theta: np.ndarray, w: np.ndarray | None) -> Loops:
+    """Return the loops of one call of the cost at ``theta (d,)``, with the numbers of iterations of each run."""
+    loops: Loops = {}
+    spans: dict[CodeType, dict[int, int]] = {}
+
+    def enter(frame: FrameType, event: str, argument: Any) -> Any:
+        code = frame.f_code
+        if event != "call" or any(folder in code.co_filename for folder in SKIPPED):
+            return None
+        if code not in spans:
+            spans[code] = _loop_lines(code)
+        if not spans[code]:
+            return None
+        own, last, running = spans[code], frame.f_lineno, dict[int, int]()
+
+        def finish(line: int) -> None:
+            loops.setdefault((code.co_filename, line), set()).add(running.pop(line))
+
+        def follow(frame: FrameType, event: str, argument: Any) -> Any:
+            nonlocal last
+            line = frame.f_lineno
+            if event == "line" and line in own:
+                if line in running and not line <= last <= own[line]:
+                    finish(line)
+                running[line] = running.get(line, 0) + 1
+            if event == "return":
+                for line in list(running):
+                    finish(line)
+            last = frame.f_lineno
+            return follow
+
+        return follow
+
+    clock, before = simulator.clock, sys.gettrace()
+    clock.check(1)
+    with clock.interrupt_when_over():
+        sys.settrace(enter)
+        try:
+            simulator._costs(theta[:, None], w)
+        finally:
+            sys.settrace(before)
+    clock.count("costs", 1, 0.0, warm=False)
+    return loops
+
+
+def _loop_lines(code: CodeType) -> dict[int, int]:
+    """Return the last line of each while loop of a function by its first line.
+
+    A for loop runs over a list, whose length is often the number of contacts rather than of steps.
+    """
+    lines: dict[int, int] = {}
+    names: dict[int, str] = {}
+    line = code.co_firstlineno
+    spans: dict[int, int] = {}
+    for instruction in dis.get_instructions(code):
+        line = (instruction.positions and instruction.positions.lineno) or line
+        lines[instruction.offset], names[instruction.offset] = line, instruction.opname
+        target = instruction.argval
+        if "JUMP_BACKWARD" in instruction.opname and names.get(target, "FOR_ITER") != "FOR_ITER":
+            first = min(lines[target], line)
+            last = max(one for offset, one in lines.items() if offset >= target)
+            spans[first] = max(spans.get(first, first), last)
+    return spans
+
+
+# ------------------------------------------------------------------------------------------------------------- JAX
+
+
+def _loop_of_jax(simulator: Simulator, theta: np.ndarray, w: np.ndarray | None) -> str:
+    """Return the place of a while loop of a JAX program whose condition depends on theta; empty without one."""
+    if "jax" not in sys.modules:
+        return ""
+    import jax
+
+    def cost(vector: Any) -> Any:
+        given = (simulator._build_theta(vector),) if w is None else (simulator._build_theta(vector), w[:, 0])
+        return simulator._cost(*given)
+
+    try:
+        closed = jax.make_jaxpr(cost)(jax.numpy.asarray(theta))
+    except Exception:  # a program that JAX cannot read has no such loop
+        return ""
+    places: list[str] = []
+    _depends(closed.jaxpr, [True] * len(closed.jaxpr.invars), places)
+    return places[0] if places else ""
+
+
+def _depends(jaxpr: Any, given: list[bool], places: list[str]) -> list[bool]:
+    """Return which outputs of a JAX program depend on inputs that do, and append the places of while loops that do."""
+    known = {id(variable): one for variable, one in zip(jaxpr.invars, given, strict=True)}
+
+    def reads(variables: Any) -> list[bool]:
+        return [known.get(id(variable), False) for variable in variables]
+
+    for equation in jaxpr.eqns:
+        inputs, inner = reads(equation.invars), _programs(equation)
+        outputs = [any(inputs)] * len(equation.outvars)
+        if equation.primitive.name == "while":
+            first, second = equation.params["cond_nconsts"], equation.params["body_nconsts"]
+            carried = inputs[first + second :]
+            for _ in range(len(carried) + 1):
+                after = _depends(equation.params["body_jaxpr"].jaxpr, inputs[first : first + second] + carried, [])
+                carried = [a or b for a, b in zip(carried, after, strict=True)]
+            if any(_depends(equation.params["cond_jaxpr"].jaxpr, inputs[:first] + carried, [])):
+                places.append(_place(equation))
+            _depends(equation.params["body_jaxpr"].jaxpr, inputs[first : first + second] + carried, places)
+            outputs = carried
+        elif any(inputs):
+            for program in inner:
+                _depends(program, _fitted(inputs, len(program.invars)), places)
+        known |= {id(variable): one for variable, one in zip(equation.outvars, outputs, strict=True)}
+    return reads(jaxpr.outvars)
+
+
+def _fitted(inputs: list[bool], count: int) -> list[bool]:
+    """Return the inputs of an inner program: the last of the equation's, or all of them where their number differs."""
+    return inputs[-count:] if len(inputs) >= count else [True] * count
+
+
+def _programs(equation: Any) -> list[Any]:
+    """Return the inner programs of an equation, such as the branches of a condition."""
+    inner = []
+    for value in equation.params.values():
+        for one in value if isinstance(value, tuple | list) else [value]:
+            one = getattr(one, "jaxpr", one)
+            inner += [one] if hasattr(one, "eqns") else []
+    return inner
+
+
+def _place(equation: Any) -> str:
+    """Return the place of an equation in the user's code, as JAX summarises it."""
+    try:
+        from jax._src import source_info_util
+
+        return Path(source_info_util.summarize(equation.source_info).split(" ")[0]).name
+    except (ImportError, AttributeError):  # no public function names it
+        return "a while loop"

@@ -1,0 +1,1 @@
+"""Published results on gradients through simulators, a file per claim."""

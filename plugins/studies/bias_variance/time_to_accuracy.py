@@ -1,0 +1,287 @@
+"""Finds the method (estimator and backend) that reaches a relative error at the lowest cost, and its lead over the next.
+
+The mean square error of an estimate from N samples is bias^2 + v / N. Between two measured N the error is interpolated.
+Beyond the largest N it is extrapolated by that law, only to errors above the 95% limit of the bias, and only for
+estimators whose samples are independent. Else its cost is not known, but above that of the most samples measured, and
+for independent samples above v / N without bias: an order is stated where that decides it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from bench.experiment.axes import Axis
+from bench.experiment.columns import Column, text
+from bench.experiment.views import Table
+from bench.measure.statistics import is_unexplained
+from bench.model import registry
+from bench.report.problems import ProblemRows, split_by_problem
+from bench.report.text import number
+from bench.report.views import Arranged, Curve, estimator_curves
+
+from .costs import ROLLOUTS, TIME, Cost
+
+SAMPLES = Axis("samples", ("samples",))
+TARGETS = (0.1, 0.01)
+"""Target relative errors."""
+NOTES = (
+    "cost: of the cheapest estimate that reaches the error, in seconds without compilation, or in rollouts, where a "
+    "gradient counts as the rollouts that take as long (as measured at the most samples; as one where it was not). how: "
+    "`measured` between two sample counts, `at once` where the fewest samples already suffice (the cost is an upper "
+    "limit), `extrapolated` by RMSE^2 = bias^2 + v / N beyond the most samples measured, where the 95% limit of the bias "
+    "lies below the error asked for and samples are independent. fastest: the cheapest of known cost. factor: `at least` where the first suffices with the fewest "
+    "samples, or the next is not known and its lower limit decides: the cost of the most samples measured, or "
+    "of an unbiased estimate for independent samples. never: methods whose bias exceeds that "
+    "error. unknown: methods whose bias is not known to be below it, or is one that they declare not to have, and methods that "
+    "choose samples together or fit a model to them, whose error beyond the most samples is not known.",
+)
+
+
+@dataclass(frozen=True)
+class RequiredCost:
+    """The cost of a method to reach an error, or the reason why it is unknown."""
+
+    how: str
+    """``measured``, ``at once``, ``extrapolated``, ``never`` or ``unknown``."""
+    cost: float = math.nan
+    samples: float = math.nan
+    down: float = math.nan
+    """Log of cost over the lower end of its 95% interval; NaN where the variance has no interval."""
+    up: float = math.nan
+    """Log of the upper end over the cost; infinite where it is not certain that the error is reached."""
+    beyond: float = math.inf
+    """A cost that is not known exceeds this one: that of the most samples measured, or that of an estimate without bias.
+    Infinite without any result."""
+    times: float = 0.0
+    """Interquartile range of the time of one estimate over its median; 0 for rollouts."""
+
+
+def required_cost(line: Curve, target: float, cost: Cost) -> RequiredCost:
+    """Return the cost of a curve's estimator and backend to reach a relative RMSE of ``target``, with its 95% interval."""
+    rows = cost.known(line.rows).sort_index()
+    if rows.empty:
+        return RequiredCost("unknown")
+    is_coupled = couples_samples(line.estimator)
+    way = _required_cost(rows, target, cost, is_coupled)
+    last = rows.iloc[-1]
+    times = float(last["time_iqr_s"] / last["time_s"]) if cost is not ROLLOUTS else 0.0
+    if "variance_high" not in rows:
+        return replace(way, times=times)
+    ends = (_at_interval_end(rows, end) for end in ("low", "high"))
+    low, high = (_required_cost(end, target, cost, is_coupled) for end in ends)
+    if not math.isfinite(way.cost):
+        return replace(way, beyond=low.cost if math.isfinite(low.cost) else low.beyond, times=times)
+    least, most = low.cost, high.cost
+    if way.how == "at once":  # fewer samples may be enough, down to one
+        least = _cost_of_one_sample(rows, cost)
+    down = max(0.0, math.log(way.cost / least)) if least > 0 else math.inf
+    up = max(0.0, math.log(most / way.cost)) if math.isfinite(most) else math.inf
+    return replace(way, down=down, up=up, times=times)
+
+
+def couples_samples(estimator: str) -> bool:
+    """Return whether an estimator declares that its samples are not independent, so that v / N need not hold."""
+    entry = registry.entries()["estimators"].get(estimator)
+    return bool(getattr(entry and entry.plugin, "couples_samples", False))
+
+
+def _cost_of_one_sample(rows: pd.DataFrame, cost: Cost) -> float:
+    """Return the cost of an estimate from one sample, extrapolated linearly from the two smallest sample counts."""
+    n, price = rows.index.to_numpy(float)[:2], cost.of(rows).to_numpy(float)[:2]
+    slope = (price[1] - price[0]) / (n[1] - n[0]) if len(n) > 1 else price[0] / n[0]
+    return float(np.clip(price[0] - slope * (n[0] - 1.0), price[0] / n[0], price[0]))
+
+
+def _at_interval_end(rows: pd.DataFrame, end: str) -> pd.DataFrame:
+    """Return rows with variance and bias at an end of their 95% intervals; the bias is 0 unless distinguishable from 0."""
+    bias = rows[f"bias_{end}"].where(rows["bias_low"] > 0, 0.0)
+    error = np.hypot(bias, np.sqrt(rows[f"variance_{end}"])) / rows["reference_norm"]
+    return rows.assign(bias=bias, variance=rows[f"variance_{end}"], rmse_rel=error)
+
+
+def lead(first: RequiredCost, second: RequiredCost, alike: bool = False) -> tuple[float, float, float]:
+    """Return the ratio of the second cost to the first, and the ends of its 95% interval.
+
+    ``alike`` means the same estimator on two backends: only the noise of timing counts. Where only a lower limit is
+    known, the ratio is NaN and the upper end infinite.
+    """
+    noise = (first.times, second.times)
+    if second.how == "unknown":
+        return math.nan, second.beyond / first.cost * math.exp(-math.hypot(first.up, *noise)), math.inf
+    factor = second.cost / first.cost
+    low = math.hypot(*noise) if alike else math.hypot(first.up, second.down, *noise)
+    if not alike and first.how == "at once" and first.down > 0:
+        return math.nan, factor * math.exp(-low), math.inf
+    high = math.hypot(*noise) if alike else math.hypot(first.down, second.up, *noise)
+    return factor, factor * math.exp(-low), factor * math.exp(high)
+
+
+def _required_cost(rows: pd.DataFrame, target: float, cost: Cost, is_coupled: bool) -> RequiredCost:
+    n, error, price = (rows.index.to_numpy(float), rows["rmse_rel"].to_numpy(float), cost.of(rows).to_numpy(float))
+    if not (error <= target).any():
+        return _extrapolated_cost(rows.iloc[-1], n[-1], price[-1], target, is_coupled)
+    # more samples may cost less: the fixed cost of a call dominates small batches
+    ways = [RequiredCost("measured", price[i], n[i]) for i in range(1, len(n)) if error[i] <= target]
+    for i in range(1, len(n)):
+        if error[i] <= target < error[i - 1]:
+            share = math.log(error[i - 1] / target) / math.log(error[i - 1] / error[i])
+            samples, needed = (math.exp((1 - share) * math.log(v[i - 1]) + share * math.log(v[i])) for v in (n, price))
+            ways.append(RequiredCost("measured", needed, samples))
+    if error[0] <= target:
+        ways.append(RequiredCost("at once", price[0], n[0]))
+    return min(ways, key=lambda way: (way.cost, way.samples))
+
+
+def _extrapolated_cost(row: Any, samples: float, price: float, target: float, is_coupled: bool) -> RequiredCost:
+    """Extrapolate the cost from the row with most samples: v is N times its variance, and cost is proportional to N.
+
+    Coupled samples have no such law.
+    """
+    low, high, bias = (row[name] / row["reference_norm"] for name in ("bias_low", "bias_high", "bias"))
+    # an estimator without declared bias may only have heavy tails that the samples missed
+    if low >= target and not is_unexplained(str(row.get("reason", ""))):
+        return RequiredCost("never")
+    is_known = not is_coupled and high < target
+    certain_bias = bias if is_known and low > 0 else 0.0
+    needed = samples * row["variance"] / row["reference_norm"] ** 2 / (target**2 - certain_bias**2)
+    factor = 1.0 if is_coupled else max(needed / samples, 1.0)
+    if not is_known:
+        return RequiredCost("unknown", beyond=price * factor)
+    return RequiredCost("extrapolated", price * factor, samples * factor)
+
+
+def table(shown: Arranged) -> pd.DataFrame:
+    """Return a line per problem, kind of cost and target error; empty if samples were not swept."""
+    if shown.rows["samples"].nunique() < 2:
+        return pd.DataFrame()
+    costs = (("time", TIME), ("rollouts", ROLLOUTS))
+    timed = bool(np.isfinite(shown.rows["time_s"]).any())
+    entries = [
+        line(problem, target, kind, cost)
+        for problem in split_by_problem(shown, SAMPLES, ("scene",))
+        if problem.rows["x"].nunique() > 1
+        for kind, cost in costs[0 if timed else 1 :]
+        for target in TARGETS
+    ]
+    return pd.DataFrame(entries)
+
+
+def methods(problem: ProblemRows, target: float, cost: Cost) -> dict[str, RequiredCost]:
+    """Return each method's cost to reach an error. For time a method is an estimator on a backend, else an estimator."""
+    reached: dict[str, RequiredCost] = {}
+    for curve in estimator_curves(problem.rows, close=None):
+        name = curve.label if cost is ROLLOUTS else f"{curve.label} on {curve.rows['backend'].iloc[0]}"
+        needed = required_cost(curve, target, cost)
+        if name not in reached or order(needed) < order(reached[name]):
+            reached[name] = needed
+    return reached
+
+
+def order(needed: RequiredCost) -> tuple[float, float, bool]:
+    """Return a key that sorts known costs first, then those known to exceed the least, and failed methods last."""
+    return needed.cost if math.isfinite(needed.cost) else math.inf, needed.beyond, needed.how == "unknown"
+
+
+def estimator_of(method: str) -> str:
+    """Return the estimator of a method: ``fobg`` of ``fobg on jax``."""
+    return method.partition(" on ")[0]
+
+
+def line(problem: ProblemRows, target: float, kind: str, cost: Cost) -> dict[str, Any]:
+    """Return a line of the table: the cheapest method, the next (if possible of another estimator), and excluded ones."""
+    reached = methods(problem, target, cost)
+    ranked = sorted((r.cost, name) for name, r in reached.items() if math.isfinite(r.cost))
+    entry: dict[str, Any] = {
+        "fastest": "-",
+        "cost": math.nan,
+        "samples": math.nan,
+        "how": "-",
+        "next": "-",
+        "factor": math.nan,
+        "factor_low": math.nan,
+        "factor_high": math.nan,
+        "tied": (),
+    }
+    if ranked:
+        first = ranked[0][1]
+        best = reached[first]
+        entry |= {"fastest": first, "cost": best.cost, "samples": math.ceil(best.samples), "how": best.how}
+        entry |= _following(first, [name for _, name in ranked[1:]], reached)
+    else:
+        entry["how"] = "not known" if any(r.how == "unknown" for r in reached.values()) else "never"
+    out = {how: ", ".join(name for name, r in reached.items() if r.how == how) or "-" for how in ("never", "unknown")}
+    return {"problem": problem.title(), "relative error": target, "by": kind, **entry, **out}
+
+
+def _following(first: str, known: list[str], reached: dict[str, RequiredCost]) -> dict[str, Any]:
+    """Return the next method after the first, the factor between them, and the methods that may be as cheap.
+
+    A method whose cost is not known is the next if it may be cheaper than the next of known cost.
+    """
+    best = reached[first]
+    unknown = [name for name, r in reached.items() if r.how == "unknown" and math.isfinite(r.beyond)]
+    others = [name for name in (*known, *unknown) if estimator_of(name) != estimator_of(first)]
+    leads = {name: lead(best, reached[name]) for name in others}
+    tied = tuple(name for name in others if not leads[name][1] > 1.0)
+    if not others:
+        if not known:
+            return {}
+        leads = {known[0]: lead(best, reached[known[0]], alike=True)}
+        tied = tuple(name for name, factors in leads.items() if not factors[1] > 1.0)
+    ranked = [name for name in leads if name in known]
+    following = ranked[0] if ranked else min(leads, key=lambda name: leads[name][1])
+    factor, low, high = leads[following]
+    nearer = [name for name in leads if name in unknown and leads[name][1] < (low if math.isnan(factor) else factor)]
+    if nearer:
+        following = min(nearer, key=lambda name: leads[name][1])
+        factor, low, high = math.nan, min(low, leads[following][1]), math.inf
+    return {"next": following, "factor": factor, "factor_low": low, "factor_high": high, "tied": tied}
+
+
+def accuracy_table(best: pd.DataFrame) -> Table:
+    """Return the table of :func:`table` for readers."""
+    kinds = {"time": TIME, "rollouts": ROLLOUTS}
+    costs = [
+        kinds[kind].text(float(number(cost))) if math.isfinite(cost) else "-"
+        for kind, cost in zip(best["by"], best["cost"], strict=True)
+    ]
+    columns = [
+        text("problem"), Column("relative error", format="percent"), text("by"), text("fastest"), text("cost_text", label="cost"),
+        Column("samples", format="setting"), text("how"), text("next"),
+        Column("factor", low="factor_low", high="factor_high", note="factor_note"), text("never"), text("unknown"),
+    ]  # fmt: skip
+    return Table(
+        "time_to_accuracy", best.assign(cost_text=costs, factor_note=limits(best)), columns,
+        "the method that reaches an error at the lowest cost", NOTES, terminal=True, details=("never", "unknown"),
+        data=best.assign(tied=[", ".join(names) for names in best["tied"]]),
+    )  # fmt: skip
+
+
+def limits(table: pd.DataFrame) -> list[str]:
+    """Return the words for each factor without a value: ``at least 2.4``, or ``not known`` where the limit is below 1."""
+    factors = zip(table["factor"], table["factor_low"], table["factor_high"], strict=True)
+    return [
+        "" if not _is_limit(factor, high) else f"at least {number(low)}" if low > 1.0 else "not known"
+        for factor, low, high in factors
+    ]
+
+
+def _is_limit(factor: float, high: float) -> bool:
+    return math.isnan(factor) and high == math.inf
+
+
+def comparisons(best: pd.DataFrame) -> pd.DataFrame:
+    """Return the lines of the table of comparisons: who reaches an error first, and by what factor."""
+    return pd.DataFrame({
+        "problem": best["problem"], "axis": "", "at": math.nan,
+        "basis": [f"{by} to {target:.0%}" for by, target in zip(best["by"], best["relative error"], strict=True)],
+        "first": best["fastest"].where(best["fastest"] != "-", ""), "value": best["cost"],
+        "value_low": math.nan, "value_high": math.nan, "second": best["next"].where(best["next"] != "-", ""),
+        "factor": best["factor"], "factor_low": best["factor_low"], "factor_high": best["factor_high"],
+        "tied": best["tied"],
+    })  # fmt: skip

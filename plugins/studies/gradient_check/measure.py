@@ -1,0 +1,468 @@
+"""Compares the program's gradient with differences of its cost, at theta0 and on both sides of a contact switch."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import zlib
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from bench import gradient as gradcheck
+from bench.experiment.cell import Cell
+from bench.experiment.session import Session
+from bench.measure import noise
+from bench.measure.batches import in_columns
+from bench.measure.contacts import active_contacts, contact_names, engine_contacts
+from bench.measure.jumps import MissedSlope, jump_under_noise, missed_slope
+from bench.model import SURROGATE, ContactScene, EngineScene, ForceLaw, LoopOps, Problem, Rollout, Unsupported
+
+from .. import norm
+from . import GradientCheck
+from .points import is_trusted
+
+COLUMNS_AT_ONCE = 128
+"""Rollouts per evaluation. The number is fixed, so that a compiling backend compiles once."""
+COMPLEX_STEP = 1e-100
+"""Largest imaginary part of theta in a complex step; its square underflows beside every cost."""
+SAME_COST = 1e-3
+"""Relative difference between the costs of two array libraries: a chaotic rollout amplifies their rounding."""
+NEUTRAL = 1e-9
+"""Relative growth of the state per step up to which rounding may be the cause."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """One directional derivative to check: ``theta (d,)``, unit ``direction (d,)``, noise ``w (n_w,)``, and their labels."""
+
+    point: str
+    theta: np.ndarray
+    direction: np.ndarray
+    w: np.ndarray
+    number: int
+    """Number of the direction."""
+    sample: int
+    """0 without noise, 1 with it."""
+    switch: str = ""
+    """The contact switch that the place is at, in words."""
+
+
+def measure(cell: Cell, session: Session, search: GradientCheck) -> dict[str, Any]:
+    """Return one cell's results by column, except ``command``, from checks at theta0 and around contact switches."""
+    problem = session.problem(cell)
+    theta = problem.program.theta0
+    unit = float(np.finfo(cell.backend.dtype).eps)
+    drawn = noise.draw(cell.seed, cell.scene.name, 1, 1, problem.program.n_noise, "gradient check")[0, 0]
+    directions = noise.draw(cell.seed, cell.scene.name, 1, search.drawn, theta.size, "directions")[0]
+    whole = start(problem, theta, unit, search, cell.seed)
+    jump, at_jump = jump_under_noise(problem, theta, cell.seed, COLUMNS_AT_ONCE)
+    # a jump is a fault of its own, and the slope that it carries is no other one
+    missed = MissedSlope(0.0, at_jump) if jump.height else missed_slope(problem, theta, cell.seed, COLUMNS_AT_ONCE)
+    under_noise = "jump" if jump.height else "missed_slope" if missed.share else ""
+    at = at_jump if jump.height else missed.w
+    places, samples = examine(
+        problem, theta, drawn, directions, unit, search,
+        [Place("noise", theta, directions[0] / np.linalg.norm(directions[0]), at, 0, 1)] if under_noise else [],
+    )  # fmt: skip
+    checked = [_checked(place, *both, under_noise) for place, both in zip(places, samples, strict=True)]
+    points = [
+        *at_start(whole),
+        *(_settled(problem, point, place) for point, place in zip(checked, places, strict=True)),
+    ]
+    verdicts = [point.verdict for point in points]
+    best = [gradcheck.best(point.sample) for point in points]
+    errors = [float(point.sample.errors[i]) for point, i in zip(points, best, strict=True)]
+    severest = min(range(len(points)), key=lambda i: (gradcheck.VERDICTS.index(verdicts[i]), -errors[i]))
+    lost = all(verdict == "nonfinite" for verdict in verdicts)
+    parts = whole.components
+    remarks = [SURROGATE] if problem.program.surrogate else []
+    remarks += [] if whole.cause in PLAIN else [whole.sentence()]
+    distance = norm(at_jump) if jump.height else math.nan
+    if jump.height:
+        remarks.append(
+            f"the cost jumps by {jump.height:.3g}, {jump.height / jump.span:.2g} of its range, under noise of "
+            f"{distance:.2g} standard deviations: the mean of gradients misses jumps"
+        )
+    if missed.share:
+        remarks.append(
+            f"sampled gradients miss {missed.share:.2g} of the mean slope along a line through the noise, most of it near "
+            f"{norm(missed.w):.2g} standard deviations: a steep rise, or a far kink"
+        )
+    return {
+        "status": "nonfinite" if lost else "ok",
+        "reason": "no cost is finite" if lost else "; ".join([*remarks, *beyond_stability(cell)]),
+        "verdict": gradcheck.most_severe(verdicts),
+        "untrusted": sum(not is_trusted(point.point, point.verdict) for point in points),
+        "best_error": errors[severest],
+        "best_eps": float(gradcheck.EPS[best[severest]]),
+        "scale": scale_of(theta),
+        "taylor_order": whole.order,
+        "jump": jump.height,
+        "jump_share": jump.height / jump.span if jump.height else 0.0,
+        "jump_distance": distance,
+        "cost_noise": whole.noise,
+        "device": problem.device,
+        "component": [part.component for part in parts],
+        **{f"component_{name}": [getattr(part, name) for part in parts] for name in PER_COMPONENT},
+        "point": [point.point for point in points],
+        "sample": [point.noise for point in points],
+        "direction": [point.number for point in points],
+        "contact_switch": [point.switch for point in points],
+        "derivative_program": [point.sample.derivative for point in points],
+        "check_verdict": verdicts,
+        "check_error": errors,
+        "check_eps": [float(gradcheck.EPS[i]) for i in best],
+        "eps": gradcheck.EPS.tolist(),
+        "derivative_differences": _joined(point.sample.differences for point in points),
+        "relative_error": _joined(point.sample.errors for point in points),
+        "mode_minus": [mode for point in points for mode in point.minus],
+        "mode_plus": [mode for point in points for mode in point.plus],
+    }
+
+
+PER_COMPONENT = ("program", "difference", "uncertainty", "step", "ratio", "left", "right", "verdict")
+"""What is stored of each checked component."""
+PLAIN = ("smooth", "nonlinear", "zero", "mode_crossing")
+"""Verdicts on theta0 that need no remark."""
+
+
+@dataclass(frozen=True)
+class Point:
+    """One checked directional derivative and its verdict."""
+
+    point: str
+    """One of :data:`bench.plugins.studies.gradient_check.points.POINTS`."""
+    noise: int
+    """0 without noise, 1 with it."""
+    number: int
+    """Number of the direction, or -1 - i for component i."""
+    verdict: str
+    sample: gradcheck.Sample
+    minus: Sequence[str]
+    """Contact modes on the minus side, one per step of the differences."""
+    plus: Sequence[str]
+    """Contact modes on the plus side."""
+    switch: str = ""
+    """The contact switch that it is at, in words."""
+
+
+def start(problem: Problem, theta: np.ndarray, unit: float, search: GradientCheck, seed: int) -> gradcheck.Check:
+    """Check every component and random directions at ``theta (d,)`` and at other thetas near it, without noise.
+
+    ``unit`` is the unit roundoff of the program's arithmetic. Costs are evaluated in batches of a fixed width, so that
+    a compiling backend compiles once. A gradient is the last column of a batch whose first column is theta, because a
+    faulty backend may be right for a single column only.
+    """
+    still = np.zeros((problem.program.n_noise, COLUMNS_AT_ONCE))
+
+    def cost(thetas: np.ndarray) -> np.ndarray:
+        return in_columns(lambda part: problem.value(part, still), thetas, COLUMNS_AT_ONCE)
+
+    def gradient(at: np.ndarray) -> np.ndarray:
+        return problem.grad(np.stack([theta, at], axis=1), still[:, :2])[:, -1]
+
+    modes = contact_modes(problem)
+    named = None if modes is None else lambda thetas: modes(thetas, np.zeros((still.shape[0], thetas.shape[1])))
+    options = gradcheck.Options(directions=search.directions, draws=search.around, unit=unit, seed=seed)
+    return gradcheck.check(cost, gradient, theta, options, named, lambda at, along: tangent(problem, at, along))
+
+
+def tangent(problem: Problem, theta: np.ndarray, direction: np.ndarray, w: np.ndarray | None = None) -> float:
+    """Return the derivative at ``theta (d,)`` along ``direction (d,)`` by the backend's second method, else a complex step.
+
+    It is NaN where neither is possible.
+    """
+    if problem.program.surrogate:
+        return math.nan
+    noise_ = np.zeros((problem.program.n_noise, 1)) if w is None else w[:, None]
+    try:
+        return float(problem.second_gradient(theta, noise_)[:, 0] @ direction)
+    except Exception:  # unsupported, or a program that the second method cannot differentiate
+        return complex_step(problem, theta, direction, w)
+
+
+def complex_step(problem: Problem, theta: np.ndarray, direction: np.ndarray, w: np.ndarray | None = None) -> float:
+    """Return the derivative of the program at ``theta (d,)`` along ``direction (d,)`` by a complex step; NaN if invalid.
+
+    The imaginary part of the cost at theta + i h direction is h times the derivative, without cancellation (Squire and
+    Trapp 1998). It needs code that is analytic, so it is NaN for programs with contacts or equations to solve, or where
+    the real part is not the cost.
+    """
+    program = problem.program
+    if program.contact is not None or program.needs or program.surrogate or "physics" in problem.provides:
+        return math.nan
+    noise_ = np.zeros((program.n_noise, 1)) if w is None else w[:, None]
+    size = COMPLEX_STEP / max(float(np.abs(direction).max()), 1e-300)
+    try:
+        with np.errstate(all="ignore"):
+            value = program.cost(LoopOps(), theta[:, None] + 1j * size * direction[:, None], noise_.astype(complex))[0]
+            real = problem.value(theta, noise_)[0]
+    except Exception:  # code of a plugin that does not run on complex numbers
+        return math.nan
+    if not abs(complex(value).real - real) <= SAME_COST * abs(real):
+        return math.nan
+    return float(complex(value).imag / size)
+
+
+def at_start(whole: gradcheck.Check) -> list[Point]:
+    """Return the points at theta0: all components, and untrusted directions and thetas whose verdicts no component has."""
+    parts = list(whole.components)
+    seen = {part.verdict for part in parts}
+    parts += [
+        part for part in whole.parts if part.component is None and part.verdict not in (*gradcheck.TRUSTED, *seen)
+    ]
+    if whole.cause not in (*seen, *(part.verdict for part in parts)):
+        # the cause occurs only at other thetas, or in a second evaluation
+        parts += [replace(part, verdict=whole.cause) for part in (*whole.worst_parts, *whole.parts)[:1]]
+    return [Point("start", 0, _number(part), part.verdict, part.sample, *part.modes) for part in parts]
+
+
+def _number(part: gradcheck.Part) -> int:
+    return -1 - part.component if part.component is not None else int(part.name.rpartition(" ")[2])
+
+
+def _checked(place: Place, sample: gradcheck.Sample, sides: Sequence[tuple[str, str]], under_noise: str) -> Point:
+    minus, plus = zip(*sides, strict=True)
+    verdict = under_noise if place.point == "noise" else gradcheck.judge(sample).verdict
+    return Point(place.point, place.sample, place.number, verdict, sample, minus, plus, place.switch)
+
+
+def _settled(problem: Problem, point: Point, place: Place) -> Point:
+    """Return the point with the verdict from smaller steps or a complex step, if the usual steps leave it unsettled."""
+    if point.verdict != "unsettled":
+        return point
+    scale = scale_of(problem.program.theta0)
+
+    def cost(at: np.ndarray) -> np.ndarray:
+        both = np.concatenate([at, np.repeat(place.w[:, None], at.shape[1], axis=1)])
+        return in_columns(lambda part: problem.value(part[: len(at)], part[len(at) :]), both, COLUMNS_AT_ONCE)
+
+    finding = gradcheck.settle(
+        cost, place.theta, scale * place.direction, scale, point.sample,
+        lambda theta, vector: tangent(problem, theta, vector, place.w),
+    )  # fmt: skip
+    return point if finding is None else replace(point, verdict=finding.verdict)
+
+
+def beyond_stability(cell: Cell) -> list[str]:
+    """Return a remark if the integrator is unstable on the contact law's spring at this dt, else an empty list."""
+    scene, law, integrator = cell.scene, cell.contact, cell.integrator
+    spring = law.spring() if isinstance(law, ForceLaw) else None
+    if not isinstance(scene, ContactScene) or spring is None or integrator is None:
+        return []
+    first = scene.initial_state(np, scene.theta0()[:, None])
+    response = float(scene.contact(np).response(np, first.q).max())
+    factor = float(getattr(scene, "velocity_factor", 1.0))
+    matrix = integrator.transition(float(scene.dt), spring[0] * response, spring[1] * response, factor)
+    growth = float(np.abs(np.linalg.eigvals(matrix)).max())
+    if growth <= 1.0 + NEUTRAL:
+        return []
+    return [
+        f"the step is beyond the stability limit of the contact: each step in contact multiplies the state by up to "
+        f"{growth:.3g}; take a smaller dt"
+    ]
+
+
+def _joined(parts: Iterator[np.ndarray]) -> list[float]:
+    return [float(value) for part in parts for value in part]
+
+
+def scale_of(theta: np.ndarray) -> float:
+    """Return the natural scale of displacements of theta: its norm, but at least 1."""
+    return max(1.0, norm(theta))
+
+
+# ----------------------------------------------------------------------------------------------------- checks
+
+
+def examine(
+    problem: Problem,
+    theta: np.ndarray,
+    drawn: np.ndarray,
+    directions: np.ndarray,
+    unit: float,
+    search: GradientCheck,
+    more: Sequence[Place] = (),
+) -> tuple[list[Place], list[tuple[gradcheck.Sample, list[tuple[str, str]]]]]:
+    """Check directional derivatives at ``theta (d,)``, without noise and with ``drawn (n_w,)``, and at contact switches.
+
+    Derivatives at theta are along the first ``search.directions`` of ``directions (D, d)``. Switches are searched along
+    all directions, without noise, and checked along the first ``search.directions`` that meet one. ``more`` places are
+    checked too. Returns the places and, for each place, its costs and the contact modes on both sides at every eps. ``unit`` is the unit roundoff of
+    the program's arithmetic. All costs are one batch, which is evaluated twice.
+    """
+    directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    modes = contact_modes(problem)
+    still = np.zeros_like(drawn)
+    places = [
+        Place("start", theta, direction, w, number, sample)
+        for sample, w in enumerate((still, drawn))
+        for number, direction in enumerate(directions[: search.directions])
+    ]
+    if modes is not None:
+        met = (boundary(modes, theta, direction, still, number, search) for number, direction in enumerate(directions))
+        places += itertools.chain(*itertools.islice(filter(None, met), search.directions))
+    places += more
+    scale, count = scale_of(theta), gradcheck.EPS.size
+    thetas = np.concatenate([gradcheck.points(p.theta, scale * p.direction[:, None], unit) for p in places], axis=1)
+    each = thetas.shape[1] // len(places)
+    noises = np.repeat(np.stack([p.w for p in places], axis=1), each, axis=1)
+    first, second = (problem.value(thetas, noises).reshape(len(places), -1) for _ in range(2))
+    gradients = problem.grad(np.stack([p.theta for p in places], axis=1), np.stack([p.w for p in places], axis=1))
+    signatures = [""] * thetas.shape[1] if modes is None else modes(thetas, noises)
+    names = np.array(signatures, dtype=object).reshape(len(places), -1)
+    minus, plus = names[:, :count], names[:, count : 2 * count]
+    samples = gradcheck.samples(
+        first,
+        np.full(len(places), scale),
+        np.array([place.direction @ gradients[:, i] for i, place in enumerate(places)]),
+        unit,
+        crossing=minus != plus,
+        repeatable=np.asarray(gradcheck.repeats(first, second, unit).all(axis=1)),
+    )
+    sides = [list(zip(*both, strict=True)) for both in zip(minus, plus, strict=True)]
+    return places, list(zip(samples, sides, strict=True))
+
+
+def boundary(
+    modes: ContactModes, theta: np.ndarray, direction: np.ndarray, w: np.ndarray, number: int, search: GradientCheck
+) -> list[Place]:
+    """Return places before, at and after the contact switch nearest to theta along a direction; empty without a switch."""
+    scale = scale_of(theta)
+
+    def names(at: np.ndarray) -> list[str]:
+        return modes(theta[:, None] + at * direction[:, None], np.repeat(w[:, None], at.size, axis=1))
+
+    edge = switch(names, search.reach * scale)
+    if edge is None:
+        return []
+    inner, outer = edge
+    side = np.sign(outer - inner)
+    at = {"before": inner - side * search.aside * scale, "at": inner, "after": outer + side * search.aside * scale}
+    name = modes.switch(theta + inner * direction, theta + outer * direction, w)
+    return [
+        Place(point, theta + s * direction, direction, w, number, 0, name if point == "at" else "")
+        for point, s in at.items()
+    ]
+
+
+def switch(names: Callable[[np.ndarray], list[str]], reach: float) -> tuple[float, float] | None:
+    """Return the two arguments nearest to 0, within ``reach``, between which the name changes; None if it never does.
+
+    Each pass evaluates a grid of arguments and refines the interval of the first change, until its length is about the
+    floating-point spacing at ``reach``.
+    """
+    half = np.linspace(0.0, reach, COLUMNS_AT_ONCE // 2)
+    values = names(np.concatenate([half, -half]))
+    sides = ((1.0, values[: half.size]), (-1.0, values[half.size :]))
+    changes = [(_change(names_), sign) for sign, names_ in sides if _change(names_) is not None]
+    if not changes:
+        return None
+    index, sign = min(changes, key=lambda change: change[0] or 0)
+    assert index is not None
+    low, high = sign * half[index - 1], sign * half[index]
+    while abs(high - low) > 4.0 * np.spacing(reach):
+        grid_ = np.linspace(low, high, COLUMNS_AT_ONCE)
+        index = _change(names(grid_))
+        if index is None:
+            break
+        low, high = grid_[index - 1], grid_[index]
+    return float(low), float(high)
+
+
+def _change(names: Sequence[str]) -> int | None:
+    """Return the index of the first name that differs from name 0, or None."""
+    return next((i for i, name in enumerate(names) if name != names[0]), None)
+
+
+# ---------------------------------------------------------------------------------------------- contact modes
+
+
+@dataclass(frozen=True)
+class ContactModes:
+    """Names the contact modes of rollouts: the contacts that act in each step."""
+
+    touching: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    """Returns which contacts act, boolean ``(horizon, n_contacts, B)``, for ``theta (d, B)`` and ``w (n_w, B)``."""
+    names: tuple[str, ...]
+
+    def __call__(self, theta: np.ndarray, w: np.ndarray) -> list[str]:
+        """Return a short name of each rollout's mode."""
+        return [signature(column) for column in self._every(theta, w)]
+
+    def switch(self, inner: np.ndarray, outer: np.ndarray, w: np.ndarray) -> str:
+        """Return the first difference between the modes of two thetas ``(d,)``, in words; empty without one."""
+        before, after = self._every(np.stack([inner, outer], axis=1), np.repeat(w[:, None], 2, axis=1))
+        differences = np.argwhere((before != after).T)
+        if not len(differences):
+            return ""
+        step, contact = (int(i) for i in differences[0])
+        sides = ("touching", "apart") if before[contact, step] else ("apart", "touching")
+        return f"{self.names[contact]} in step {step} ({sides[0]} before, {sides[1]} after)"
+
+    def _every(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        """Return which contacts act, ``(B, n_contacts, horizon)``, from batches of a fixed width."""
+        both, d = np.concatenate([theta, w]), len(theta)
+        with np.errstate(all="ignore"):
+            found = in_columns(lambda part: self.touching(part[:d], part[d:]), both, COLUMNS_AT_ONCE)
+        return found.transpose(2, 1, 0)
+
+
+def contact_modes(problem: Problem) -> ContactModes | None:
+    """Return the function that names contact modes; None without contacts or if the states cannot be computed."""
+    program = problem.program
+    if not isinstance(program, Rollout) or not (program.scene.n_contacts or isinstance(program.scene, EngineScene)):
+        return None
+    try:
+        touching = _touching(problem)
+        touching(program.theta0[:, None], np.zeros((program.n_noise, COLUMNS_AT_ONCE)))
+        return ContactModes(touching, contact_names(problem))
+    except Unsupported:
+        return None
+
+
+def _touching(problem: Problem) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """Return the function of theta and noise that finds the active contacts, see :class:`ContactModes`."""
+    program = problem.program
+    assert isinstance(program, Rollout)
+    # engines and implicit steps need the backend; other programs are faster in NumPy
+    rollout = _backend_rollout if program.needs_root or "physics" in problem.provides else _numpy_rollout
+    if isinstance(program.scene, EngineScene):
+        contacts = engine_contacts(problem)
+        return lambda theta, w: contacts.touching(rollout(problem, theta, w)[0][:-1])
+    return lambda theta, w: active_contacts(program, *rollout(problem, theta, w))
+
+
+def _numpy_rollout(problem: Problem, theta: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return states ``(horizon + 1, n, B)`` and controls ``(horizon, n_u, B)`` of rollouts, computed in NumPy."""
+    theta = np.broadcast_to(theta, (theta.shape[0], w.shape[1]))
+    program = problem.program
+    assert isinstance(program, Rollout)
+    steps = list(program.steps(LoopOps(), theta, w))
+    return np.stack([np.concatenate(state) for state, _ in steps]), np.stack([u for _, u in steps[:-1]])
+
+
+def _backend_rollout(problem: Problem, theta: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the same states and controls as :func:`_numpy_rollout`, computed by the backend."""
+    theta = np.ascontiguousarray(np.broadcast_to(theta, (theta.shape[0], w.shape[1])))
+    return problem.trajectory(theta, w)
+
+
+def signature(contacts: np.ndarray) -> str:
+    """Return a short name of ``contacts (n_contacts, horizon)``: the steps in contact, ``12-18 30``, split by ``;``.
+
+    A name longer than 24 characters is truncated and ends in its checksum.
+    """
+    text = ";".join(_runs(row) for row in contacts)
+    return text if len(text) <= 24 else f"{text[:14]}..{zlib.crc32(text.encode()):08x}"
+
+
+def _runs(row: np.ndarray) -> str:
+    parts = []
+    for _, group in itertools.groupby(enumerate(np.flatnonzero(row)), key=lambda pair: pair[1] - pair[0]):
+        steps = [int(step) for _, step in group]
+        parts.append(str(steps[0]) if len(steps) == 1 else f"{steps[0]}-{steps[-1]}")
+    return " ".join(parts) or "-"

@@ -1,0 +1,140 @@
+"""What the gradient check shows: which gradients are the derivatives of their programs' costs, and how to repeat faults."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pandas as pd
+
+from bench.experiment.axes import with_axes
+from bench.experiment.columns import COMMON, Column, text
+from bench.experiment.experiment import Experiment
+from bench.experiment.views import Chart, Style, Table, Views
+from bench.gradient import FAULTS, MEANING, TRUSTED, UNDECIDED, VERDICTS
+from bench.report.problems import axes_of, label_columns, problem_names
+from bench.report.style import PALETTE
+from bench.report.text import counted
+from bench.report.views import Arranged, arrange
+from bench.report.writer import reasons
+
+from .lines import (
+    PROBLEM,
+    by_point,
+    component_table,
+    long_table,
+    untrusted,
+)
+from .points import POINTS
+
+KINDS: dict[str, tuple[tuple[str, ...], Style]] = {
+    "X": (FAULTS, Style(PALETTE[2], letter="X", meaning="X: not the derivative of its cost")),
+    "?": (UNDECIDED, Style("#bdbdbd", letter="?", meaning="?: undecided")),
+    "J": (("jump", "missed_slope"), Style(PALETTE[4], letter="J", meaning="J: the cost jumps or rises steeply here")),
+    "K": (("kink",), Style(PALETTE[5], letter="K", meaning="K: kink, at most a one-sided slope")),
+    "ok": (TRUSTED, Style("#cfe8df", letter="ok", meaning="ok: right")),
+}
+"""Verdicts and look of each letter in a cell, the worst first."""
+ERROR = Column("error", label="best error")
+EPS = Column("eps", label="best eps", digits=1)
+NOTE = (
+    "best error: |a - b| / max(1, |a|, |b|) between derivative and central difference, the smallest over all eps. Each line has "
+    "the largest of its directions, samples and backends. eps is relative to max(1, |theta|). verdict: the worst of a line's "
+    "checks. before and after are the study's `aside` from a switch of contact mode, at is on it. Below: commands that repeat faults."
+)
+
+
+def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
+    """Return the verdicts, a line per problem and point, the checks, the grid of verdicts, and how to repeat faults."""
+    shown = arrange(experiment, rows)
+    points = by_point(shown.rows)
+    names = problem_names(shown, PROBLEM, axes_of(shown, "horizon"), ("scene", "contact"))
+    points = points.assign(name=names.to_numpy()[points["row"].astype(int)])
+    faults = [
+        line
+        for command, part in untrusted(points).groupby("command", sort=False)
+        for line in (_tally(part), f"      {command}")
+    ]
+    tables = [
+        Table("gradient_verdicts", *_verdicts(points), title="Verdicts", files=[], page=True, terminal=True),
+        Table("gradient_check", *_lines(shown, points), data=long_table(with_axes(experiment, rows)),
+              title="gradients against differences of the cost", notes=[NOTE, *faults, *reasons(rows)]),
+        Table("gradient_components", component_table(rows), [], files=["csv"]),
+    ]  # fmt: skip
+    charts = [] if points.empty else [_grid(points)]
+    columns = [experiment.columns.by_name[name] for name in ("verdict", "best_error", "best_eps")]
+    switches = dict.fromkeys(f"contact switch: {name}" for names in rows["contact_switch"] for name in _switches(names))
+    return Views(tables, charts, shown.rows, columns, [*switches, *faults])
+
+
+# ------------------------------------------------------------------------------------------------------- tables
+
+
+def _tally(points: pd.DataFrame) -> str:
+    """Return the verdicts of some points, each with the points that have it: ``wrong_factor (start, at)``."""
+    at = points.groupby("verdict", sort=False)["point"]
+    return ", ".join(f"{verdict} ({', '.join(dict.fromkeys(names))})" for verdict, names in at)
+
+
+def _switches(names: Any) -> list[str]:
+    """Return the contact switches of a cell's checks, each once; NaN, in an older row, has none."""
+    return [] if isinstance(names, float) else list(dict.fromkeys(filter(None, names)))
+
+
+def _lines(shown: Arranged, points: pd.DataFrame) -> tuple[pd.DataFrame, list[Column]]:
+    """Return a line per problem, horizon, point and verdict with the worst error over backends and checks; the columns."""
+    always = (*PROBLEM, "horizon")
+    labels = [*always, *(name for name in label_columns(shown, PROBLEM, always=always) if name not in always)]
+    line = ["problem", "point", "verdict"]
+    frame = points.assign(
+        backends=points.groupby(line, sort=False)["backend"].transform(lambda names: ", ".join(dict.fromkeys(names))),
+        switch=[", ".join(_switches(names)) for names in points["contact_switch"].where(points["point"] == "at", math.nan)],
+        place=points["point"].map(POINTS.index),
+    )  # fmt: skip
+    frame = frame.sort_values("error", ascending=False, kind="stable").drop_duplicates(line)
+    frame = frame.sort_values(["problem", "place", "rank"], kind="stable")
+    heads = [COMMON.get(name, Column(name, format="setting")) for name in labels]
+    return frame, [*heads, *map(text, ("point", "backends", "verdict")), ERROR, EPS, text("switch")]
+
+
+def _verdicts(points: pd.DataFrame) -> tuple[pd.DataFrame, list[Column]]:
+    """Return a line per verdict: its meaning, the number of points, the largest error and the scenes; and the columns."""
+    lines = [
+        {"verdict": verdict, "meaning": MEANING[verdict], "trusted": _trusted(verdict, part),
+         "points": len(part), "error": part["error"].max(), "scenes": ", ".join(dict.fromkeys(part["scene"]))}
+        for verdict in VERDICTS if len(part := points[points["verdict"] == verdict])
+    ]  # fmt: skip
+    columns = [
+        *map(text, ("verdict", "meaning", "trusted")), Column("points", format="setting"),
+        Column("error", label="largest error"), text("scenes"),
+    ]  # fmt: skip
+    return pd.DataFrame(lines, columns=[column.name for column in columns]), columns
+
+
+def _trusted(verdict: str, points: pd.DataFrame) -> str:
+    if len(untrusted(points)):
+        return "no"
+    return "yes" if verdict in TRUSTED else "beside the switch"
+
+
+# ------------------------------------------------------------------------------------------------------- charts
+
+
+def _grid(points: pd.DataFrame) -> Chart:
+    """Return the main chart: the worst verdict of each problem at each horizon and point, over backends and checks."""
+    letters = {verdict: letter for letter, (verdicts, _) in KINDS.items() for verdict in verdicts}
+    names = {name: place for place, name in enumerate(dict.fromkeys(points["name"]))}
+    frame = points.assign(
+        letter=points["verdict"].map(letters), place=points["point"].map(POINTS.index), order=points["name"].map(names),
+        steps=[counted(int(horizon), "step") if horizon > 0 else "no steps" for horizon in points["horizon"]],
+    ).sort_values(["rank", "error"], ascending=[True, False], kind="stable")  # fmt: skip
+    frame = frame.drop_duplicates(["name", "horizon", "point"]).sort_values(
+        ["horizon", "place", "order"], kind="stable"
+    )
+    switches = "Blank: no switch of contact was found." if frame["point"].nunique() > 1 else ""
+    return Chart(
+        "gradient_check", frame, [text("point", label="")], [text("name", label="")], "grid",
+        panel="steps", level="letter", cell="letter", styles={letter: style for letter, (_, style) in KINDS.items()},
+        height=0.17, subtitle=switches,
+        text="The worst verdict over backends and checks: at the start, and before, at and after a switch of contact mode.",
+    )  # fmt: skip

@@ -1,0 +1,81 @@
+"""Measures whether a better gradient finds a better theta sooner: one search per problem, estimator, optimizer and seed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from bench.experiment.cell import Cell
+from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, text
+from bench.model import Estimator, Optimizer, Plugin, param
+
+from .. import StudyPackage
+
+
+@dataclass(frozen=True)
+class SearchStudy(StudyPackage):
+    """A study whose cells search with an optimizer."""
+
+    axes: ClassVar[tuple[str, ...]] = ("scene", "contact", "integrator", "backend", "estimator", "optimizer")
+
+    def parts(self, given: dict[str, Plugin | None]) -> dict[str, Plugin | None]:
+        """Return the plugins, without the estimator if the optimizer uses only costs: it then has no effect."""
+        optimizer = given.get("optimizer")
+        if isinstance(optimizer, Optimizer) and "gradient" not in optimizer.needs:
+            return given | {"estimator": None}
+        return given
+
+    def unsupported_reason(self, cell: Cell) -> str | None:
+        """Return what the optimizer needs and no part of the cell provides, or None."""
+        optimizer, estimator = cell.parts["optimizer"], cell.parts["estimator"]
+        assert isinstance(optimizer, Optimizer)
+        assert estimator is None or isinstance(estimator, Estimator)
+        available = {"value"} | ({"gradient"} if estimator is not None and estimator.gives_gradient else set())
+        missing = sorted(optimizer.needs - available)
+        if missing:
+            source = f"estimator {estimator.name}" if estimator is not None else f"scene {cell.scene.name}"
+            return f"optimizer {optimizer.name} needs {' and '.join(missing)}, which {source} does not provide"
+        return None
+
+
+@dataclass(frozen=True)
+class Optimise(SearchStudy):
+    """Searches for the best theta with each estimator and optimizer, and records the path."""
+
+    name = "optimise"
+    timed: ClassVar[bool] = True
+    columns: ClassVar[Columns] = Columns.of(
+        text("optimizer", "identity string of the optimizer"),
+        text("stopped", "reason for the end of the search: budget or diverged"),
+        text("scene_class", "smooth, stiff (contact), chaotic (gradients vary more than costs), discontinuous or identification",
+             label="class"),
+        Column("iterations", "steps of the optimizer"),
+        Column("rollouts", "rollouts of the search, without those that score its path"),
+        Column("gradients", "gradients of the search"),
+        Column("gradient_ratio", "measured time of a gradient over that of a rollout", measured=True),
+        Column("search_s", "time of the search, without compilation and scores", "s", measured=True, label="search",
+               format="seconds"),
+        Column("start_cost", "objective at the start"),
+        Column("final_cost", "objective at the last theta", comparison=ComparisonRule("exact", "final cost")),
+        Column("best_cost", "lowest objective on the path"),
+        Column("optimum", "least known cost J*, from before the search"),
+        text("optimum_status", "source of J*"),
+        Column("score", "share of the way from the start to J*, between 0 and 1; empty without J*"),
+        Column("quality_rmse_rel", "relative root mean squared error of the estimator's gradients at the start",
+               label="gradient's error, relative"),
+        Column("quality_cosine", "mean cosine between those gradients and the reference"),
+        Column("quality_bias_share", "share of bias in the squared error of those gradients", label="share of bias"),
+        numbers("path_iteration", "iterations at which the path is recorded", table=False),
+        numbers("path_cost", "objective at those iterations", table=False),
+        numbers("path_rollouts", "rollouts up to those iterations", table=False),
+        numbers("path_gradients", "gradients up to those iterations", table=False),
+        numbers("path_s", "time up to those iterations", "s", table=False, measured=True),
+        numbers("theta", "the last theta", table=False),
+    )  # fmt: skip
+
+    budget: int = param(20_000, "rollouts that a search may spend, a gradient counting as gradient_cost", positive=True)
+    gradient_cost: float = param(4.0, "rollouts that a gradient counts as in the budget", positive=True)
+    iterations: int | None = param(None, "most iterations; null: as the budget allows", positive=True)
+    limit: float = param(1e3, "a search has diverged at a cost above this many times |J0| + 1", positive=True)
+    quality: str = param("start", "where the gradient's quality is measured", choices=("none", "start"))
+    quality_samples: int = param(4096, "gradients of the reference of the quality", low=64)

@@ -1,0 +1,290 @@
+"""Runs one search: an optimizer chooses points, problem and estimator evaluate them, and the objective scores its path."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from bench.experiment.cell import Cell
+from bench.experiment.session import Session
+from bench.measure import noise
+from bench.measure.solve import solve
+from bench.model import Answer, Estimator, KnownOptimum, Optimizer, Problem, Rollout
+from bench.model.program import OWN
+from bench.run.files import make_directory, write_whole
+
+from . import Optimise
+
+MAX_POINTS = 300
+"""Most points of a path to store, about; they are denser in early iterations."""
+MAX_NEWTON_DIM = 1000
+"""Largest dimension of theta for which Newton's method computes the optimum."""
+
+
+def objective(problem: Problem, theta: np.ndarray, scored: np.ndarray) -> float:
+    """Return the mean cost at ``theta (d,)`` over some noise ``(n_w, M)``. Its rollouts are not counted."""
+    before = problem.usage.rollouts
+    cost = float(problem.value(theta, scored).mean())
+    problem.usage.rollouts = before
+    return cost
+
+
+def mean_costs(problem: Problem, points: np.ndarray, w: np.ndarray) -> np.ndarray:
+    """Return the mean costs ``(B,)`` of points ``(d, B)`` over the same noise ``(n_w, M)``."""
+    count = points.shape[1]
+    costs = problem.value(np.repeat(points, w.shape[1], axis=1), np.tile(w, (1, count)))
+    return np.asarray(costs.reshape(count, -1).mean(axis=1))
+
+
+def estimates(problem: Problem, estimator: Estimator | None, points: np.ndarray, w: np.ndarray) -> np.ndarray:
+    """Return an estimator's gradients ``(d, B)`` at points, all from the same noise ``(1, N, n_w)``."""
+    assert estimator is not None
+    return np.stack([estimator.estimate(problem, point, w)[0] for point in points.T], axis=1)
+
+
+def advance(
+    optimizer: Optimizer,
+    state: dict[str, Any],
+    normal: np.ndarray,
+    costs: Callable[[np.ndarray], np.ndarray],
+    gradients: Callable[[np.ndarray], np.ndarray],
+) -> dict[str, Any]:
+    """Return the optimizer's state after one more iteration: the points it asks for, and what it requires there."""
+    points = optimizer.ask(state, normal)
+    required = optimizer.required_fields(state)
+    value = costs(points) if "value" in required else None
+    gradient = gradients(points) if "gradient" in required else None
+    return optimizer.tell(state, points, Answer(value, gradient))
+
+
+def measure(cell: Cell, session: Session, settings: Optimise) -> dict[str, Any]:
+    """Search until the budget is spent or the cost has diverged; return the cell's results by column."""
+    problem = session.problem(cell)
+    optimum, how = known_optimum(cell, problem, session)
+    theta0 = np.array(problem.program.theta0, dtype=np.float64)
+    quality = gradient_quality(cell, problem, theta0, settings) if settings.quality != "none" else None
+    path, theta, stopped = follow_path(cell, problem, theta0, settings)
+    last = {name: values[-1] for name, values in path.items()}
+    cost, is_lost = path["cost"], stopped == "diverged"
+    start, final, stored = cost[0], cost[-1], stored_indices(cost)
+    score = float(np.clip((start - final) / (start - optimum), 0.0, 1.0)) if start > optimum else np.nan
+    return {
+        "status": "diverged" if is_lost else "ok",
+        "reason": f"the cost left {settings.limit:g} (|J0| + 1) or is not finite" if is_lost else "",
+        "stopped": stopped, "scene_class": scene_class(cell, problem),
+        "iterations": last["iteration"], "rollouts": last["rollouts"], "gradients": last["gradients"],
+        "gradient_ratio": gradient_ratio(problem, cell) if cell.timing and cell.parts["estimator"] else np.nan,
+        "search_s": last["s"], "start_cost": start, "final_cost": final, "best_cost": float(np.nanmin(cost)),
+        "optimum": optimum, "optimum_status": how, "score": 0.0 if is_lost and not np.isfinite(score) else score,
+        **{f"path_{name}": np.asarray(values)[stored].tolist() for name, values in path.items()},
+        "theta": theta.tolist(),
+        **{f"quality_{name}": value for name, value in (quality or {}).items()},
+    }  # fmt: skip
+
+
+def stored_indices(cost: Sequence[float]) -> np.ndarray:
+    """Return the indices of about :data:`MAX_POINTS` points of a path to store: log-spaced, with the last and lowest cost."""
+    if len(cost) <= MAX_POINTS:
+        return np.arange(len(cost))
+    spaced = np.unique(np.round(np.geomspace(1, len(cost), MAX_POINTS)).astype(int)) - 1
+    return np.unique(np.append(spaced, np.nanargmin(cost)))
+
+
+def follow_path(
+    cell: Cell, problem: Problem, theta0: np.ndarray, settings: Optimise
+) -> tuple[dict[str, list[Any]], np.ndarray, str]:
+    """Iterate until the budget is spent or the cost has diverged; return the path, its last theta, and which of both.
+
+    The path has lists with an entry per iteration: iteration, cost, rollouts, gradients and time ``s``.
+    """
+    optimizer, estimator, usage = cell.parts["optimizer"], cell.parts["estimator"], problem.usage
+    assert isinstance(optimizer, Optimizer)
+    assert estimator is None or isinstance(estimator, Estimator)
+    still = np.zeros((problem.program.n_noise, 1))
+
+    def step(state: dict[str, Any], iteration: int) -> dict[str, Any]:
+        def draw(count: int, width: int, what: str) -> np.ndarray:
+            return noise.draw(cell.seed, cell.scene.name, 1, count, width, f"optimise: {what} {iteration}")
+
+        return advance(
+            optimizer, state, draw(optimizer.draws(problem.dim), problem.dim, "points")[0].T,
+            lambda points: mean_costs(problem, points, still),
+            lambda points: estimates(problem, estimator, points, draw(cell.samples, len(still), "samples")),
+        )  # fmt: skip
+
+    state = optimizer.start(theta0)
+    step(state, 1)  # compiles, untimed
+    path: dict[str, list[Any]] = {}
+    usage.rollouts = usage.gradients = 0
+    most = settings.iterations if settings.iterations is not None else math.inf
+    iteration, seconds = 0, 0.0
+    while True:
+        cost = objective(problem, state["theta"], still)
+        point = {
+            "iteration": iteration, "cost": cost, "rollouts": usage.rollouts, "gradients": usage.gradients, "s": seconds,
+        }  # fmt: skip
+        for name, value in point.items():
+            path.setdefault(name, []).append(value)
+        if not np.isfinite(cost) or abs(cost) > settings.limit * (abs(path["cost"][0]) + 1.0):
+            return path, state["theta"], "diverged"
+        if usage.rollouts + settings.gradient_cost * usage.gradients >= settings.budget or iteration >= most:
+            return path, state["theta"], "budget"
+        iteration += 1
+        started = time.perf_counter()
+        state = step(state, iteration)
+        seconds += time.perf_counter() - started
+
+
+# ------------------------------------------------------------------------------------------------ the objective
+
+
+def known_optimum(cell: Cell, problem: Problem, session: Session) -> tuple[float, str]:
+    """Return J* and its source: the scene, or Newton's method, whose result is stored in a file; NaN if unknown."""
+    if isinstance(cell.scene, KnownOptimum) and cell.decision == OWN:
+        known = cell.scene.optimum(cell.contact, cell.integrator)
+        if known is not None:
+            return known
+    if problem.dim > MAX_NEWTON_DIM or not problem.program.continuous or "grad" not in cell.backend.provides:
+        return np.nan, "unknown"
+    path = session.experiment.results_dir / "references" / f"optimum_{cell.program_key}.json"
+    try:
+        stored = json.loads(path.read_text())
+        return float(stored["cost"]), str(stored["how"])
+    except (OSError, ValueError, KeyError, TypeError):
+        pass
+    solution = solve(problem)
+    if not np.isfinite(solution.cost):
+        return np.nan, "unknown"
+    digits = f"|gradient| {solution.gradient:.0e}, least curvature {solution.curvature:.1g}"
+    how = f"local optimum by Newton's method, {digits}" if solution.certified else f"lowest cost found, {digits}"
+    if solution.starts_at_saddle:
+        how += ", from a saddle at the start"
+    make_directory(path.parent)
+    write_whole(path, json.dumps({"cost": solution.cost, "how": how}).encode())
+    return solution.cost, how
+
+
+_classes: dict[str, str] = {}
+
+
+def scene_class(cell: Cell, problem: Problem) -> str:
+    """Return the class of a problem, by the reason that its gradients are difficult.
+
+    A problem without contacts whose gradients vary more than its zeroth-order terms is chaotic if it has time steps,
+    else stiff.
+    """
+    program = problem.program
+    if cell.decision.names or cell.scene.identifies:
+        return "identification"
+    if not program.continuous:
+        return "discontinuous"
+    if isinstance(program, Rollout) and program.scene.n_contacts:
+        return "stiff"
+    if cell.program_key not in _classes:
+        w = noise.draw(0, cell.scene.name, 1, 128, program.n_noise, "optimise: class")[0].T
+        with np.errstate(all="ignore"):
+            first = problem.grad(program.theta0, w).var(axis=1).sum()
+            cost = problem.value(program.theta0, w) - problem.value(program.theta0, 0.0 * w[:, :1])
+            zeroth = (cost * problem.score(program.theta0, w)).var(axis=1).sum()
+        _classes[cell.program_key] = (
+            "smooth" if first < zeroth else "chaotic" if isinstance(program, Rollout) else "stiff"
+        )
+    return _classes[cell.program_key]
+
+
+_ratios: dict[tuple[str, str], float] = {}
+
+
+def gradient_ratio(problem: Problem, cell: Cell) -> float:
+    """Return the time of a batch of gradients over the time of a batch of costs, each the fastest of some calls."""
+    key = (cell.program_key, cell.backend.name)
+    if key not in _ratios:
+        theta, w = problem.program.theta0, noise.draw(0, "ratio", 1, 128, problem.program.n_noise, "optimise: ratio")
+        _ratios[key] = fastest(problem.grad, theta, w[0].T) / fastest(problem.value, theta, w[0].T)
+    return _ratios[key]
+
+
+def fastest(
+    function: Callable[[np.ndarray, np.ndarray], Any], theta: np.ndarray, w: np.ndarray, calls: int = 5
+) -> float:
+    """Return the least time [s] of some calls after a first one that compiles."""
+    function(theta, w)
+    times = []
+    for _ in range(calls):
+        started = time.perf_counter()
+        function(theta, w)
+        times.append(time.perf_counter() - started)
+    return min(times)
+
+
+# ---------------------------------------------------------------------------------------------- gradient quality
+
+MAX_REFERENCE_SHARE = 0.5
+"""Largest share of a measured squared error that the reference's own error may cause."""
+
+_qualities: dict[tuple[Any, ...], dict[str, float]] = {}
+
+
+def gradient_quality(cell: Cell, problem: Problem, theta: np.ndarray, settings: Optimise) -> dict[str, float] | None:
+    """Return relative error, cosine and share of bias of the estimator's gradients at ``theta (d,)``.
+
+    Returns None without an estimator. The reference is the mean of many gradients or of many zeroth-order terms,
+    whichever vary less. Where the cost jumps or the backend has no gradients, it is the mean of zeroth-order terms.
+    """
+    estimator = cell.parts["estimator"]
+    if estimator is None:
+        return None
+    assert isinstance(estimator, Estimator)
+    key = (
+        cell.program_key, cell.backend, estimator, cell.samples, cell.repeats, settings.quality_samples, theta.tobytes(),
+    )  # fmt: skip
+    if key not in _qualities:
+        program, scene = problem.program, cell.scene.name
+        w = noise.draw(0, scene, 1, settings.quality_samples, program.n_noise, "optimise: reference")[0].T
+        with np.errstate(all="ignore"):
+            cost = problem.value(theta, w) - problem.value(theta, 0.0 * w[:, :1])
+            terms = cost * problem.score(theta, w)
+            if program.continuous and "grad" in cell.backend.provides:
+                first = problem.grad(theta, w)
+                terms = first if first.var(axis=1).sum() < terms.var(axis=1).sum() else terms
+        drawn = noise.draw(0, scene, max(cell.repeats, 2), cell.samples, program.n_noise, "optimise: quality")
+        _qualities[key] = compare_with_reference(estimator.estimate(problem, theta, drawn), terms)
+    return _qualities[key]
+
+
+def compare_with_reference(estimates: np.ndarray, terms: np.ndarray) -> dict[str, float]:
+    """Return relative RMSE, mean cosine and share of bias of estimates ``(R, d)`` against the mean of terms ``(d, M)``.
+
+    The noise of the reference and of the mean estimate is subtracted from the bias. All values are NaN if the reference
+    is too uncertain: its squared error exceeds :data:`MAX_REFERENCE_SHARE` of the measured squared error.
+    """
+    truth = terms.mean(axis=1)
+    reference_error = float(terms.var(axis=1, ddof=1).sum()) / terms.shape[1]
+    norm = float(np.linalg.norm(truth))
+    measured = float(((estimates - truth) ** 2).sum(axis=1).mean())
+    if not reference_error <= MAX_REFERENCE_SHARE * measured:
+        return dict.fromkeys(("rmse_rel", "cosine", "bias_share"), np.nan)
+    error, (bias, _, cosine) = measured - reference_error, error_parts(estimates, truth, reference_error)
+    return {
+        "rmse_rel": float(np.sqrt(error)) / norm if norm else np.nan,
+        "cosine": cosine,
+        "bias_share": min(bias / error, 1.0) if error else 0.0,
+    }
+
+
+def error_parts(estimates: np.ndarray, reference: np.ndarray, variance: float) -> tuple[float, float, float]:
+    """Return squared bias and squared spread of estimates ``(R, d)``, and their mean cosine with a reference ``(d,)``.
+
+    The noise of the mean estimate, and ``variance``, the squared standard error of the reference, are subtracted from the bias.
+    """
+    spread = float(estimates.var(axis=0, ddof=1).sum())
+    mean_error = estimates.mean(axis=0) - reference
+    bias = max(float(mean_error @ mean_error) - spread / len(estimates) - variance, 0.0)
+    sizes = np.linalg.norm(estimates, axis=1) * np.linalg.norm(reference)
+    cosines = np.divide(estimates @ reference, sizes, out=np.zeros(len(estimates)), where=sizes > 0)
+    return bias, spread, float(cosines.mean())

@@ -1,0 +1,192 @@
+"""What the study of searches shows: targets reached by method, regret along the paths, errors of gradients, and tuning."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+
+from bench.experiment.axes import table
+from bench.experiment.columns import Column, text
+from bench.experiment.experiment import Experiment
+from bench.experiment.views import Chart, Style, Table, Views
+from bench.report.colours import estimator_colour, estimator_marker
+from bench.report.style import DEVIANT, MARKERS, VARIANTS
+
+from . import aggregate
+from .aggregate import RunSet
+
+CONTEXT = tuple(zip(("#666666", "#8c8c8c", "#4d4d4d", "#767676"), (*VARIANTS[1:], *DEVIANT[:2]), strict=True))
+"""Grey and line style of each method without an estimator."""
+STEPS = 40
+"""Number of points of a drawn curve."""
+METHOD, PROBLEM = text("method"), text("problem")
+REACHED = Column(
+    "reached", label="targets reached", format="percent", low="reached_low", high="reached_high", log=False
+)
+SCORE = Column("score", low="score_low", high="score_high", digits=3, log=False)
+BETTER = Column("improvement", label="beats fobg", low="improvement_low", high="improvement_high")
+PROFILE = Column("profile", log=False)
+MEDIAN = Column("median_score", label="median over tunings", log=False)
+RUNTIME = Column(
+    "art", label="average runtime", unit="rollouts", low="art_low", high="art_high", log=True,
+    doc="expected rollouts per target reached: all rollouts of all searches over the searches that reached it",
+)  # fmt: skip
+RATE = Column("rate", label="searches that reach it", low="rate_low", high="rate_high")
+SPENT = Column("spent", label="rollouts", log=True)
+NOTE = (
+    "targets reached: share of searches whose regret falls to 1/10, 1/100 and 1/1000 of the first, the mean over problems and "
+    "targets. score: share of the way from the first cost to J*, interquartile mean over searches, with a bootstrap interval "
+    "stratified by problem. beats fobg: chance of a lower final cost, paired by problem and seed. profile: integral of the "
+    "share of targets reached within 1 to 4 times the best method's runtime. average runtime (aRT): expected rollouts per "
+    "target reached, where a gradient counts as many rollouts as take its time: the rollouts of all searches over the number "
+    "of searches that reached the target, inf if none did. Each method is shown at its best tuning on each problem, chosen by "
+    "median final cost of {seeds}, next to the number of tunings and the median score over all of them. Methods without "
+    "an estimator (dashed in charts) are context."
+)
+EFFECT = (
+    text("scene_class", label="class"), text("verdict"), Column("rho", low="rho_low", high="rho_high", log=False),
+    Column("points", format="setting"), Column("chance", label="chance of a random order"),
+)  # fmt: skip
+EFFECT_NOTES = (
+    "rho: rank correlation of the error of gradients at the start and the average runtime, ranked within each problem. sooner or "
+    "later: the whole 95% interval is on one side of 0, and a random order is at least as good with a probability of 5% at most.",
+)
+PAGE = (
+    "stopped", "scene_class", "final_cost", "best_known", "score", "rollouts", "gradients", "search_s", "quality_rmse_rel",
+    "quality_bias_share",
+)  # fmt: skip
+
+
+def views(experiment: Experiment, rows: pd.DataFrame) -> Views | None:
+    """Return the tables and charts of the searches; None without any."""
+    runs = aggregate.collect_runs(experiment, rows)
+    if runs.rows.empty:
+        return None
+    name = short_names(runs.rows["method"].unique())
+    cells = rows.assign(**{c: runs.rows[c] for c in ("problem", "method", "tuning", "best_known", "score")})
+    cells = cells.fillna({"problem": "", "method": "", "tuning": ""}).astype({"score": float, "best_known": float})
+    by_name = experiment.columns.by_name | {"best_known": Column("best_known", label="J*")}
+    return Views(
+        tables(experiment, rows, runs, name), charts(runs, name), rows=cells,
+        columns=[METHOD, *(by_name[column] for column in PAGE)],
+    )  # fmt: skip
+
+
+def short_names(methods: Sequence[str]) -> Callable[[str], str]:
+    """Return the function that shortens a method's name by its parameters in brackets, where that leaves it unique."""
+    short = {method: re.sub(r"\[[^\]]*\]", "", method) for method in methods}
+    counts = Counter(short.values())
+    return lambda method: short[method] if counts[short[method]] == 1 else method
+
+
+# --------------------------------------------------------------------------------------------------------- tables
+
+
+def tables(experiment: Experiment, rows: pd.DataFrame, runs: RunSet, name: Callable[[str], str]) -> list[Table]:
+    """Return the tables of methods, of times to targets and of lowest costs."""
+    reached, summary = aggregate.times_to_targets(runs), aggregate.summarise(runs)
+    methods = summary.sort_values(["reached", "score"], ascending=False, kind="stable")
+    methods = methods.assign(
+        name=methods["method"].map(name), verdict=np.where(aggregate.is_tied(methods), "first or tied", ""),
+    )  # fmt: skip
+    key = "; ".join(f"{name(method)}: {method}" for method in runs.rows["method"].unique() if name(method) != method)
+    chosen = runs.tuning_seeds
+    seeds = f"seeds {', '.join(map(str, chosen))}, which do not score" if chosen else "the same seeds that score"
+    notes = [NOTE.format(seeds=seeds), *([f"{key}."] if key else [])]
+    effects = aggregate.effects_of_error(runs)
+    return [
+        Table(
+            "optimise", methods,
+            [text("name", label="method"), REACHED, text("verdict"), SCORE, BETTER, PROFILE, *(Column(name, format="setting") for name in ("tunings", "searches", "diverged")), MEDIAN],
+            "methods by the share of targets they reach", notes, terminal=True, page=True,
+            data=table(experiment, rows),
+        ),
+        Table(
+            "optimise", reached.assign(regret=[f"1/{t:g}" for t in reached["target"]], name=reached["method"].map(name)),
+            [PROBLEM, text("name", label="method"), text("tuning"), text("regret"), RATE, RUNTIME], "Times to targets",
+            terminal=True,
+        ),
+        Table(
+            "optimise", runs.rows.drop_duplicates("problem"),
+            [PROBLEM, text("scene_class", label="class"), Column("start_cost", label="J0", digits=6),
+             Column("best_known", label="J*", digits=8), text("best_known_status", label="source of J*")],
+            "Lowest costs", terminal=True,
+        ),
+        *([Table("effect_of_error", effects, EFFECT, "Does a smaller error reach a tenth of the first regret sooner?", EFFECT_NOTES)]
+          if len(effects) else []),
+        Table("targets", reached, [], files=["csv"]),
+        Table("summary", summary, [], files=["csv"]),
+    ]  # fmt: skip
+
+
+# --------------------------------------------------------------------------------------------------------- charts
+
+
+def styles(methods: Sequence[str], name: Callable[[str], str] = str) -> dict[str, Style]:
+    """Return each method's style by its short name: its estimator's colour, or grey and dashed if it has none."""
+    looks: dict[str, Style] = {}
+    uses: Counter[str] = Counter()
+    for method in methods:
+        estimator = re.split(r"[\[,]", method)[0] if ", " in method else ""  # "estimator, optimizer"
+        turn = uses[estimator]
+        uses[estimator] += 1
+        grey, dashes = CONTEXT[turn % len(CONTEXT)]
+        looks[name(method)] = (
+            Style(estimator_colour(estimator), estimator_marker(estimator, turn), VARIANTS[turn % len(VARIANTS)])
+            if estimator
+            else Style(grey, MARKERS[turn % len(MARKERS)], dashes)
+        )
+    return looks
+
+
+def charts(runs: RunSet, name: Callable[[str], str]) -> list[Chart]:
+    """Return the charts, the shares of targets reached first."""
+    looks = styles(runs.rows["method"].unique(), name)
+    found = (_targets(runs), _progress(runs))
+    return [
+        replace(chart, frame=chart.frame.assign(method=chart.frame["method"].map(name)), series="method", styles=looks)
+        for chart in found
+        if chart is not None
+    ]
+
+
+def _targets(runs: RunSet) -> Chart:
+    """Return the share of targets that each method reaches, the largest first."""
+    frame = aggregate.summarise(runs).sort_values("reached", ascending=False, kind="stable")
+    return Chart(
+        "targets", frame, [REACHED], [METHOD], "dots", height=0.24,
+        subtitle=_where(runs, "targets: a tenth, a hundredth and a thousandth of the first regret"),
+        text="Bars are 95% intervals over seeds.",
+    )  # fmt: skip
+
+
+def _where(runs: RunSet, what: str) -> str:
+    problems = runs.rows["problem"].unique()
+    return f"{len(problems)} problems, {what}" if len(problems) > 1 else f"{problems[0]}, {what}"
+
+
+def _progress(runs: RunSet) -> Chart | None:
+    """Return the share of targets that single searches reach within a number of rollouts."""
+    times = aggregate.runtimes(runs)
+    finite = times.loc[np.isfinite(times["runtime"]) & (times["runtime"] > 0), "runtime"]
+    if finite.empty:
+        return None
+    grid = np.geomspace(finite.min() / 1.5, finite.max() * 1.2, STEPS)
+    shares = {
+        method: [float(part["weight"][part["runtime"] <= x].sum()) for x in grid]
+        for method, part in times.groupby("method", sort=False)
+    }
+    frame = pd.DataFrame(shares, index=pd.Index(grid, name="spent")).melt(
+        var_name="method", value_name="share", ignore_index=False
+    )
+    share = Column("share", label="share of targets reached", format="percent", log=False)
+    return Chart(
+        "runtimes", frame.reset_index(), [SPENT], [share], height=2.6, panel="",
+        subtitle=_where(runs, "single searches, a gradient counts as its time in rollouts"),
+        text="Where a line ends is the share of targets reached in the whole budget.",
+    )  # fmt: skip

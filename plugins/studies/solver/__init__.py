@@ -1,0 +1,75 @@
+"""How a gradient depends on the iterations of an engine's constraint solver: its error to the converged program."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import numpy as np
+
+from bench.experiment.cell import Cell
+from bench.experiment.columns import Column, Columns, ComparisonRule, numbers
+from bench.experiment.session import Session
+from bench.model import param
+from bench.model.parameters import values
+
+from .. import StudyPackage, finite_status, first_batch, gradient_seconds, norm, relative_error
+
+ROUNDING = 1e-6
+"""Share of the gradient's norm up to which a coordinate of the converged gradient has no sign."""
+
+
+@dataclass(frozen=True)
+class Solver(StudyPackage):
+    """Measures the error of a gradient to the gradient of the program with a converged constraint solver, and its time."""
+
+    name = "solver"
+    axes: ClassVar[tuple[str, ...]] = ("scene", "contact", "integrator", "backend")
+    columns: ClassVar[Columns] = Columns.of(
+        Column("iterations", "maximum iterations of the constraint solver"),
+        Column("gradient_norm", "norm of the gradient"),
+        Column("converged_norm", "norm of the converged program's gradient"),
+        Column("gradient_error_rel", "norm of (gradient - converged program's gradient) / converged_norm", label="error, relative",
+               comparison=ComparisonRule("exact", "error of the gradient")),
+        Column("gradient_cosine", "cosine between the gradient and the converged program's gradient", label="cosine"),
+        Column("wrong_signs", "share of coordinates whose sign is not that of the converged program's gradient", label="wrong signs",
+               comparison=ComparisonRule("exact", "wrong signs")),
+        Column("gradient_s", "time of the gradients of `samples` rollouts", "s", measured=True, label="gradients", format="seconds"),
+        Column("compile_s", "time of compiling the gradient", "s", measured=True, label="compilation", format="seconds"),
+        numbers("gradient", "gradient at w = 0, by coordinate of theta"),
+        numbers("converged_gradient", "the converged program's gradient at w = 0, by coordinate of theta"),
+    )  # fmt: skip
+    timed: ClassVar[bool] = True
+
+    converged: int = param(100, "iterations of the program that counts as converged", positive=True)
+    timed_calls: int = param(5, "calls timed", positive=True)
+
+    def unsupported_reason(self, cell: Cell) -> str | None:
+        """Return that the backend has no constraint solver whose iterations are a parameter, or None."""
+        if "iterations" in values(cell.backend):
+            return None
+        return f"backend {cell.backend.name} has no parameter iterations, the iterations of a constraint solver"
+
+    def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
+        """Return one cell's results by column: errors to the converged program at w = 0, and times [s]."""
+        backend: Any = cell.backend
+        problem, limit = session.problem(cell), session.problems.of(replace(backend, iterations=self.converged), cell)
+        w = first_batch(cell, problem.program.n_noise)
+        # both batches have the same shape, so that each program is compiled once
+        gradient, target = (one.grad(problem.program.theta0, np.zeros_like(w))[:, 0] for one in (problem, limit))
+        return {
+            **finite_status("a gradient is not finite", gradient, target), "iterations": backend.iterations,
+            "gradient": gradient.tolist(), "converged_gradient": target.tolist(),
+            **gradient_seconds(problem, w, self.timed_calls), **compare(gradient, target),
+        }  # fmt: skip
+
+
+def compare(gradient: np.ndarray, target: np.ndarray) -> dict[str, float]:
+    """Return norms, relative error, cosine, and the share of wrong signs among coordinates of ``target`` with a sign."""
+    has_sign = np.abs(target) > ROUNDING * norm(target)
+    return {
+        "gradient_norm": norm(gradient), "converged_norm": norm(target),
+        "gradient_error_rel": relative_error(gradient, target),
+        "gradient_cosine": float(gradient @ target) / (norm(gradient) * norm(target)),
+        "wrong_signs": float((np.sign(gradient) != np.sign(target))[has_sign].mean()),
+    }  # fmt: skip

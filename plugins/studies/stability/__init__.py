@@ -1,0 +1,359 @@
+"""The stability map: where a gradient is right, wrong or lost, over step size and stiffness.
+
+Each cell simulates one rollout without noise and compares its gradient with the truth for the same duration. The truth
+is the scene's physical gradient or, where it has none, the gradient of the same program at a much finer step. No
+estimator is used: the gradient is the backend's at w = 0. Where the motion is linear, the growth of the state is
+measured too, which detects instabilities that are too slow to show within the rollout.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import numpy as np
+
+from bench.experiment.cell import Cell
+from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, text
+from bench.experiment.session import Session
+from bench.model import (
+    ContactScene,
+    DampedScene,
+    Dynamics,
+    ForceLaw,
+    Integrator,
+    LoopOps,
+    Oscillator,
+    Rollout,
+    Trajectory,
+    Unsupported,
+    param,
+    rollout,
+)
+
+from .. import StudyPackage, norm
+
+NEGLIGIBLE = 1e-9
+"""Share of the truth's norm up to which one of its components counts as 0."""
+NEUTRAL = 1 + 1e-9
+"""Spectral radius, theoretical or measured, up to which a step counts as stable: 1 plus rounding."""
+REACH = np.logspace(-3, 4, 141)
+"""Values of dt^2 stiffness that the search for the stability limit tries."""
+
+
+WORST_FIRST = ("nonfinite", "diverged", "wrong_sign", "zero", "inaccurate", "unresolved", "ok")
+
+
+@dataclass(frozen=True)
+class Stability(StudyPackage):
+    """Measures where a program's gradient is right, inaccurate, of wrong sign, zero or lost, one rollout per cell."""
+
+    name = "stability"
+    columns: ClassVar[Columns] = Columns.of(
+        Column("first_bad_step", "first step at which the state diverged or was not finite"),
+        Column("growth_factor", "measured growth of the state per step, where the motion is linear"),
+        Column("spectral_radius", "of one step on the cell's oscillator, in theory"),
+        Column("stiffness_limit", "stiffness at which that radius leaves 1", "N/m"),
+        Column(
+            "relative_error",
+            "norm of (gradient - truth) / norm of the truth",
+            comparison=ComparisonRule("exact", "error"),
+        ),
+        Column("cosine", "cosine between gradient and truth"),
+        Column("grad_norm", "norm of the gradient"),
+        Column("truth_norm", "norm of the truth"),
+        Column("truth_error", "relative change of the truth on its last refinement"),
+        text("verdict", "ok, or what is wrong", comparison=ComparisonRule("verdict", "verdict", order=WORST_FIRST)),
+        text("truth", "how the truth was computed: physical or refined"),
+        text("cause", "of a finite but wrong gradient: step (or how it is differentiated), law, both or unknown"),
+        Column(
+            "step_error",
+            "distance from the law's own gradient, which is differences of its cost at a far finer step, / norm of the truth",
+        ),
+        Column("law_error", "distance of the law's own gradient from the truth / norm of the truth"),
+        numbers("state_at_first_bad_step", "the state at the first bad step"),
+    )
+
+    diverged: float = param(
+        10.0, "multiple of the initial scale beyond which a state component has diverged", positive=True
+    )
+    grown: float = param(
+        1.1, "growth over the rollout of a state that cannot grow, from which it has diverged", low=1.0
+    )
+    inaccurate: float = param(0.1, "relative error of the gradient above which it is wrong", positive=True)
+    fine_steps: int = param(
+        1 << 14, "fewest steps of the refined truth; half as many say how far it has converged", low=2
+    )
+    finer: int = param(4, "fewest steps of the refined truth to one of the cell's", positive=True)
+
+    @np.errstate(over="ignore", invalid="ignore")  # what overflows becomes a status
+    def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
+        """Return one cell's results by column, verdict included.
+
+        Raises :class:`Unsupported` if the program has no time steps, step states or truth.
+        """
+        program = rollout(cell.program())
+        problem, scene = session.problem(cell), program.scene
+        theta, still = program.theta0, np.zeros((problem.program.n_noise, 1))
+        gradient = problem.grad(theta, still)[:, 0]
+        trajectory = problem.trajectory(theta, still)
+        states, largest = trajectory.states[:, :, 0], bounds(program, trajectory, self.diverged)
+        growth = growth_factor(states) if isinstance(scene, Oscillator) else math.nan
+        result = {"status": "ok", "grad_norm": norm(gradient), "growth_factor": growth, **theory(cell)}
+        failure = first_bad_step(states, largest, growth, self)
+        if failure is not None:
+            step, verdict, description = failure
+            reason = f"state at step {step} of {scene.horizon} {description}"
+            result |= {"status": verdict, "verdict": verdict, "first_bad_step": step, "reason": reason}
+            return result | {"state_at_first_bad_step": states[step].tolist()}
+        if not np.isfinite(gradient).all():
+            return result | {
+                "status": "nonfinite",
+                "verdict": "nonfinite",
+                "reason": "the gradient of a finite rollout",
+            }
+        kind, truth, error = compute_truth(cell, self)
+        result |= {"truth": kind, "truth_norm": norm(truth), "truth_error": error}
+        resolved = self.inaccurate / 2
+        if not error <= resolved:
+            reason = f"halving the finest step moves the truth by {error:.1%}, more than {resolved:.0%}"
+            return result | {"verdict": "unresolved", "reason": reason}
+        result |= compare(gradient, truth, self.inaccurate)
+        return result if result["verdict"] == "ok" else result | cause_of(cell, kind, gradient, truth, self)
+
+
+# ---------------------------------------------------------------------------------------------- trajectories
+
+
+def first_bad_step(
+    states: np.ndarray, largest: np.ndarray, growth: float, limits: Stability
+) -> tuple[int, str, str] | None:
+    """Return the first bad step of ``states (T + 1, n)`` with its verdict and a description, or None without a bad step.
+
+    A step is bad if a component exceeds its ``largest`` value ``(n,)``, or if growth by the factor ``growth`` per step
+    has reached ``limits.grown``. The verdict is ``diverged`` or ``nonfinite``.
+    """
+    steps = len(states)
+    outside = ~(np.abs(states) <= largest).all(axis=1)
+    left = int(np.argmax([*outside, True]))
+    slow = math.ceil(math.log(limits.grown) / math.log(growth)) if growth > NEUTRAL else steps
+    step = min(left, slow)
+    if step >= steps:
+        return None
+    if not np.isfinite(states[step]).all():
+        return step, "nonfinite", "is not finite"
+    if slow < left:
+        return step, "diverged", f"has grown by {limits.grown - 1:.0%}, {growth - 1:.2g} a step"
+    beyond = limits.diverged * float((np.abs(states[step]) / largest).max())
+    return step, "diverged", f"is {beyond:.3g} times the initial scale"
+
+
+def growth_factor(states: np.ndarray) -> float:
+    """Return the growth factor per step of ``states (T + 1, n)`` with linear dynamics; NaN for fewer than three states.
+
+    It is the spectral radius of the linear map fitted by least squares to all pairs of consecutive states, each pair
+    scaled to the size of its first state (dynamic mode decomposition; Schmid 2010).
+    """
+    count = int(np.argmin([*np.isfinite(states).all(axis=1), False]))
+    if count < 3:
+        return math.nan
+    scaled = states[:count] / np.maximum(np.abs(states[:count]).max(axis=0), np.finfo(float).tiny)
+    size = np.linalg.norm(scaled[:-1], axis=1, keepdims=True)
+    moving = size[:, 0] > 0
+    before, after = (part[moving] / size[moving] for part in (scaled[:-1], scaled[1:]))
+    linear_map = np.linalg.lstsq(before, after, rcond=None)[0]
+    return float(np.abs(np.linalg.eigvals(linear_map)).max())
+
+
+def bounds(program: Rollout, trajectory: Trajectory, factor: float) -> np.ndarray:
+    """Return the largest allowed value of each state component, ``(n,)``: ``factor`` times its initial scale.
+
+    The scale of positions is the distance |q_0| + T |v_0|, where T is the duration. The scale of velocities is |v_0| +
+    sqrt(|a_0| distance), the speed after accelerating over that distance. Norms are maximum norms, and a scale of 0
+    counts as 1.
+    """
+    scene = program.scene
+    q, v = np.split(trajectory.states[0], [scene.n_q])
+    u = trajectory.controls[0]
+    a = Dynamics(LoopOps(), scene, program.contact).acceleration(q, v, u)
+    speed = float(np.abs(v).max(initial=0.0))
+    length = float(np.abs(q).max(initial=0.0)) + scene.horizon * scene.dt * speed
+    scales = [length or 1.0, speed + math.sqrt(float(np.abs(a).max(initial=0.0)) * length) or 1.0]
+    return factor * np.repeat(scales, [len(q), len(v)])
+
+
+# ---------------------------------------------------------------------------------------------------- truth
+
+
+def compute_truth(cell: Cell, limits: Stability) -> tuple[str, np.ndarray, float]:
+    """Return the kind of truth (``physical`` or ``refined``), the true gradient ``(d,)``, and its relative error."""
+    program = rollout(cell.program())
+    physical = program.physical_gradient()
+    if physical is not None:
+        return "physical", np.asarray(physical), 0.0
+    steps = max(limits.fine_steps, limits.finer * program.scene.horizon)
+    coarse, fine = _gradient_at(cell, steps // 2), _gradient_at(cell, steps)
+    change = norm(fine - coarse)
+    return "refined", fine, change / norm(fine) if change else 0.0
+
+
+def _refined(cell: Cell, steps: int) -> Cell:
+    """Return the cell with its duration divided into ``steps`` steps and the same numerical damping per second.
+
+    Raises :class:`Unsupported` if the dimension of theta depends on the horizon.
+    """
+    program = rollout(cell.program())
+    scene = program.scene
+    dt = scene.horizon * scene.dt / steps
+    values: dict[str, Any] = {"horizon": steps, "dt": dt}
+    if isinstance(scene, DampedScene):
+        values["velocity_factor"] = scene.velocity_factor ** (dt / scene.dt)
+    fine = cell.with_part("scene", replace(scene, **values))
+    if fine.program().dim != program.dim:
+        raise Unsupported(
+            f"theta of scene {scene.name} depends on the horizon, so a finer step has no comparable gradient"
+        )
+    return fine
+
+
+def _gradient_at(cell: Cell, steps: int, span: float = 0.0) -> np.ndarray:
+    """Return the cell's gradient ``(d,)`` with its duration divided into ``steps`` steps; with a span, central differences.
+
+    Gradients are shared by all cells with the same fine program.
+    """
+    fine = _refined(cell, steps)
+    key = fine.program_key, span
+    if key not in _fine_gradients:
+        problem = fine.reference_backends[0].compile(fine.program())
+        theta, still = problem.program.theta0, np.zeros((problem.program.n_noise, 1))
+        if span:
+            h = span * (float(np.abs(theta).max(initial=0.0)) or 1.0)
+            costs = [[problem.value(theta + s * e, still)[0] for s in (1, -1)] for e in h * np.eye(len(theta))]
+            _fine_gradients[key] = np.array([(after - before) / (2 * h) for after, before in costs])
+        else:
+            _fine_gradients[key] = problem.grad(theta, still)[:, 0]
+    return _fine_gradients[key]
+
+
+_fine_gradients: dict[tuple[str, float], np.ndarray] = {}
+
+
+def compare(gradient: np.ndarray, truth: np.ndarray, inaccurate: float) -> dict[str, Any]:
+    """Return verdict, relative error and cosine of a finite gradient.
+
+    The verdict is the first that applies. ``zero``: a component is exactly 0 where the truth's is not. ``wrong_sign``:
+    the directional derivative along the truth is negative. ``inaccurate``: the relative error exceeds that limit.
+    ``ok``: otherwise.
+    """
+    length, size, distance = norm(truth), norm(gradient), norm(gradient - truth)
+    error = distance / length if length else math.inf if distance else 0.0
+    cosine = float(gradient / size @ (truth / length)) if length and size else math.nan
+    is_zero = ((gradient == 0) & (np.abs(truth) > NEGLIGIBLE * length)).any()
+    verdict = "zero" if is_zero else "wrong_sign" if cosine < 0 else "ok" if error <= inaccurate else "inaccurate"
+    return {"verdict": verdict, "relative_error": error, "cosine": cosine}
+
+
+# ---------------------------------------------------------------------------------------------------- cause
+
+SPAN = 0.01
+"""Step in theta for central differences of the law's own cost, in units of theta's largest component (1 if that is 0).
+
+It is large enough to shift an impact by many fine steps, which averages out the effect of the impact's time within a
+step.
+"""
+
+
+def cause_of(cell: Cell, truth_kind: str, gradient: np.ndarray, truth: np.ndarray, limits: Stability) -> dict[str, Any]:
+    """Return why a gradient is wrong: ``cause``, and ``step_error`` and ``law_error`` in units of the truth's norm.
+
+    The law's own gradient is the gradient of the same law and integrator at a far smaller step. The step error is the
+    distance of the cell's gradient from the law's own, and the law error is the distance of the law's own gradient from
+    the truth. Their sum is at least the cell's error, so one of them is a cause. Without a contact law, or with a
+    refined truth, the cause is the step.
+    """
+    size = norm(truth)
+    if truth_kind != "physical" or cell.contact is None:
+        error = norm(gradient - truth) / size if size else math.inf
+        return {"cause": "step", "step_error": error, "law_error": 0.0}
+    if not size:
+        return {"cause": "unknown"}
+    fine, coarse = law_gradient(cell, limits)
+    step, law, change = (norm(part) / size for part in (gradient - fine, fine - truth, fine - coarse))
+    errors = {"step_error": step, "law_error": law}
+    if not change <= limits.inaccurate / 2:
+        return {"cause": "unknown"} | errors
+    causes = [name for name, error in (("step", step), ("law", law)) if error > limits.inaccurate]
+    return {"cause": "both" if len(causes) == 2 else causes[0] if causes else "step" if step >= law else "law"} | errors
+
+
+def law_gradient(cell: Cell, limits: Stability) -> tuple[np.ndarray, np.ndarray]:
+    """Return the gradient ``(d,)`` of the cell's law at a far smaller step, and the gradient with half as many steps.
+
+    Both are central differences of the cost over :data:`SPAN` (twice that for the second). A derivative through a
+    contact would not converge: it jumps with the time of the impact within its step, however small the step is.
+    """
+    steps = max(limits.fine_steps, limits.finer * rollout(cell.program()).scene.horizon)
+    return _gradient_at(cell, steps, SPAN), _gradient_at(cell, steps // 2, 2 * SPAN)
+
+
+# --------------------------------------------------------------------------------------------------- theory
+
+
+def theory(cell: Cell) -> dict[str, float]:
+    """Return ``spectral_radius`` of one step on the cell's oscillator, and ``stiffness_limit``, where it exceeds 1.
+
+    The limit has the unit of the column ``stiffness``. It is 0 for a step that is never stable, and infinite for one
+    that always is. The result is empty without an oscillator.
+    """
+    parameters = oscillator(cell)
+    if parameters is None:
+        return {}
+    assert cell.integrator is not None
+    stiffness, damping, factor = parameters
+    dt = float(rollout(cell.program()).scene.dt)
+    limit = stiffness_limit(cell.integrator, dt, damping, factor)
+    radius = spectral_radius(cell.integrator, dt, stiffness, damping, factor)
+    return {"spectral_radius": radius, "stiffness_limit": limit * cell.columns()["stiffness"] / stiffness}
+
+
+def oscillator(cell: Cell) -> tuple[float, float, float] | None:
+    """Return the cell's oscillator: stiffness [1/s^2] and damping [1/s] per unit of mass, and velocity factor; or None.
+
+    It is the scene's own ``oscillator()``, or else the scene in contact, if it has one contact with a spring law.
+    """
+    scene, law = cell.scene, cell.contact
+    if isinstance(scene, Oscillator):
+        stiffness, damping, factor = scene.oscillator()
+        return float(stiffness), float(damping), float(factor)
+    if not isinstance(scene, ContactScene) or not isinstance(law, ForceLaw) or scene.n_contacts != 1:
+        return None
+    start = scene.initial_state(np, scene.theta0()[:, None])
+    response = float(scene.gap_rate(np, start.q, scene.contact_acceleration(np, start.q, np.ones((1, 1))))[0, 0])
+    spring = law.spring()
+    factor = scene.velocity_factor if isinstance(scene, DampedScene) else 1.0
+    return None if spring is None else (spring[0] * response, spring[1] * response, float(factor))
+
+
+def spectral_radius(integrator: Integrator, dt: float, stiffness: float, damping: float, factor: float) -> float:
+    """Return the spectral radius of one step of length ``dt`` [s] on the oscillator."""
+    matrix = integrator.transition(dt, stiffness, damping, factor)
+    return float(np.abs(np.linalg.eigvals(matrix)).max())
+
+
+def stiffness_limit(integrator: Integrator, dt: float, damping: float, factor: float) -> float:
+    """Return the stiffness [1/s^2] where the step becomes unstable; 0 if always, inf if nowhere in :data:`REACH`."""
+
+    def unstable(reach: float) -> bool:
+        return spectral_radius(integrator, dt, reach / dt**2, damping, factor) > NEUTRAL
+
+    first = next((i for i, reach in enumerate(REACH) if unstable(reach)), None)
+    if first is None:
+        return math.inf
+    if first == 0:
+        return 0.0
+    low, high = REACH[first - 1], REACH[first]
+    for _ in range(40):
+        middle = math.sqrt(low * high)
+        low, high = (low, middle) if unstable(middle) else (middle, high)
+    return float(low) / dt**2

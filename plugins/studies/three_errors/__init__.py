@@ -1,0 +1,155 @@
+"""Measures program, model and estimator error of a gradient separately, and the forward error.
+
+Program error: distance of the program's gradient from central differences of the program's cost. Model error: distance
+from the gradient of the physics. Estimator error: bias of an estimator relative to the program's grad J_sigma. The
+three are independent, and a small forward error (error of the cost) implies none of them is small.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from bench.experiment.cell import Cell
+from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, text
+from bench.experiment.session import Session
+from bench.measure import noise, statistics
+from bench.model import Problem, Program
+
+from .. import StudyPackage, finite_status, norm, ratio, relative_error
+from ..bias_variance.columns import COLUMNS as ESTIMATES
+
+SUMMARY = (
+    "reference_norm", "reference_se", "bias", "bias_low", "bias_high", "bias_rel", "variance", "rmse_rel", "cosine",
+    "sign_agreement",
+)  # fmt: skip
+"""Columns that are statistics of the estimator."""
+ROUNDING = 1e-9
+"""Share of a gradient's norm up to which a coordinate counts as rounding error and its sign as 0."""
+STEPS = 10.0 ** -np.arange(1.0, 9.5, 0.5)
+"""Step sizes of the central differences, in the units of theta."""
+
+
+@dataclass(frozen=True)
+class ThreeErrors(StudyPackage):
+    """Measures program, model and estimator error of a gradient, and the forward error."""
+
+    name = "three_errors"
+    columns: ClassVar[Columns] = Columns.of(
+        Column("cost", "cost f at theta, without noise"),
+        Column("physical_cost", "cost of the physics at theta, without noise"),
+        Column("forward_error", "difference of cost and physical_cost"),
+        Column(
+            "forward_error_rel",
+            "forward_error relative to physical_cost",
+            label="forward error",
+            comparison=ComparisonRule("exact", "forward error"),
+        ),
+        Column("program_norm", "norm of the program's gradient"),
+        Column("program_error", "norm of (program's gradient - its best central difference)"),
+        Column(
+            "program_error_rel",
+            "program_error relative to the norm of that difference",
+            label="program error",
+            comparison=ComparisonRule("exact", "program error"),
+        ),
+        Column("difference_step", "step of the best central difference, in the units of theta"),
+        Column("physical_norm", "norm of the physics' gradient"),
+        Column("model_error", "norm of (program's gradient - physics' gradient)"),
+        Column(
+            "model_error_rel",
+            "model_error relative to physical_norm",
+            label="model error",
+            comparison=ComparisonRule("exact", "model error"),
+        ),
+        Column(
+            "model_cosine", "cosine between the program's gradient and the physics' gradient", label="cosine to physics"
+        ),
+        Column("model_signs", "share of coordinates in which both gradients have the same sign", label="right signs"),
+        *(ESTIMATES.by_name[name] for name in SUMMARY),
+        text("reference_method", "how the reference was computed"),
+        numbers("gradient", "the program's gradient, by coordinate of theta"),
+        numbers("physical_gradient", "the physics' gradient, by coordinate of theta"),
+    )
+
+    def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
+        """Return one cell's results by column: forward, program and model error at w = 0, and the bias of its estimator."""
+        problem = session.problem(cell)
+        check = difference_check(problem)
+        truth = session.references.of(cell)
+        result = {
+            "cost": check.cost, "gradient": check.gradient.tolist(), "program_norm": norm(check.gradient),
+            "program_error": norm(check.gradient - check.difference),
+            "program_error_rel": relative_error(check.gradient, check.difference), "difference_step": check.step,
+            "reference_method": truth.method, **_against_physics(problem.program, check),
+        }  # fmt: skip
+        status = finite_status(truth.note or "the reference gradient is not finite", truth.batches)
+        if status["status"] != "ok":
+            return result | status
+        w = noise.shared(cell.seed, cell.scene.name, cell.repeats, cell.samples, problem.program.n_noise)
+        estimates = np.asarray(cell.estimator.estimate(problem, problem.program.theta0, w), dtype=np.float64)
+        summary = asdict(statistics.summarise(estimates, truth.known(), cell.samples))
+        status = finite_status("", estimates, check.gradient) | {"reason": summary["note"]}
+        return result | {name: summary[name] for name in SUMMARY} | status
+
+
+@dataclass(frozen=True)
+class DifferenceCheck:
+    """A program's cost and gradient at theta0 without noise, and the central difference closest to the gradient."""
+
+    cost: float
+    gradient: np.ndarray
+    """``(d,)``."""
+    difference: np.ndarray
+    """``(d,)``."""
+    step: float
+
+
+def difference_check(problem: Problem, steps: np.ndarray = STEPS) -> DifferenceCheck:
+    """Compare the program's gradient with its best central difference over a sweep of step sizes, at w = 0.
+
+    Truncation errors and jumps dominate at large steps, rounding at small steps. All costs are one batch: one at theta,
+    and 2 d len(steps) for the differences.
+    """
+    theta = problem.program.theta0
+    shifts = (np.eye(theta.size)[:, None, :] * steps[:, None]).reshape(-1, theta.size).T
+    points = theta[:, None] + np.concatenate([np.zeros((theta.size, 1)), shifts, -shifts], axis=1)
+    costs = problem.value(points, np.zeros((problem.program.n_noise, points.shape[1])))
+    ahead, behind = costs[1:].reshape(2, theta.size, len(steps))
+    differences = (ahead - behind) / (2 * steps)
+    gradient = problem.grad(theta, np.zeros((problem.program.n_noise, 1)))[:, 0]
+    errors = np.linalg.norm(differences - gradient[:, None], axis=0)
+    # without the mask, np.argmin would return the index of a NaN
+    best = int(np.argmin(np.where(np.isfinite(errors), errors, np.inf)))
+    return DifferenceCheck(float(costs[0]), gradient, differences[:, best], float(steps[best]))
+
+
+def _against_physics(program: Program, check: DifferenceCheck) -> dict[str, Any]:
+    """Return the columns of forward and model error, as far as the scene has a physical cost and gradient.
+
+    ``model_cosine`` is the cosine between the program's and the physical gradient. ``model_signs`` is the share of
+    coordinates where their signs agree, among the coordinates where the physical gradient has a sign.
+    """
+    result: dict[str, Any] = {}
+    cost, physical = program.physical_cost(), program.physical_gradient()
+    if cost is not None:
+        error = abs(check.cost - cost)
+        result |= {"physical_cost": cost, "forward_error": error, "forward_error_rel": ratio(error, abs(cost))}
+    if physical is not None:
+        signs, physical_signs = _signs(check.gradient), _signs(physical)
+        has_sign = physical_signs != 0
+        result |= {
+            "physical_gradient": physical.tolist(), "physical_norm": norm(physical),
+            "model_error": norm(check.gradient - physical), "model_error_rel": relative_error(check.gradient, physical),
+            "model_cosine": ratio(float(check.gradient @ physical), norm(physical) * norm(check.gradient)),
+            "model_signs": float((signs == physical_signs)[has_sign].mean()) if has_sign.any() else math.nan,
+        }  # fmt: skip
+    return result
+
+
+def _signs(gradient: np.ndarray) -> np.ndarray:
+    """Return the signs of a gradient's coordinates, 0 where a coordinate is rounding error."""
+    return np.where(np.abs(gradient) > ROUNDING * norm(gradient), np.sign(gradient), 0.0)

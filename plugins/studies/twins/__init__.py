@@ -1,0 +1,90 @@
+"""Compares a physics engine's twin of a scene with the scene's own program: one rollout, its cost and its gradient.
+
+A difference is the model error between two programs with the same masses, springs and step. Each gradient may be exact
+for its own program. Times are for a batch of ``samples`` rollouts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from bench.experiment.cell import Cell
+from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, text
+from bench.experiment.session import Session
+from bench.measure import timing
+from bench.model import Unsupported, param, rollout
+
+from .. import StudyPackage, finite_status, first_batch, gradient_seconds, norm, relative_error
+
+
+@dataclass(frozen=True)
+class Twins(StudyPackage):
+    """Measures the difference between a physics engine's twin and the scene's own program, and the time of gradients."""
+
+    name = "twins"
+    timed: ClassVar[bool] = True
+    columns: ClassVar[Columns] = Columns.of(
+        Column("state_difference", "largest difference of states over time and coordinates", label="states"),
+        Column("state_difference_rel", "largest difference of states, each coordinate in units of its largest value",
+               label="states, relative",
+               comparison=ComparisonRule("exact", "difference of states")),
+        Column("cost", "cost of the twin"),
+        Column("own_cost", "cost of the scene's own program"),
+        Column("cost_difference_rel", "relative difference of the costs", label="cost, relative"),
+        Column("gradient_norm", "norm of the twin's gradient"),
+        Column("own_gradient_norm", "norm of the own program's gradient"),
+        Column("gradient_difference_rel", "relative difference of the gradients", label="gradient, relative",
+               comparison=ComparisonRule("exact", "difference of gradients")),
+        Column("gradient_cosine", "cosine between the gradients", label="cosine"),
+        Column("value_s", "time of the costs of `samples` rollouts", "s", measured=True, label="costs", format="seconds"),
+        Column("gradient_s", "time of the gradients of `samples` rollouts", "s", measured=True, label="gradients", format="seconds"),
+        Column("trace_s", "part of compile_s: tracing the Python code", "s", measured=True),
+        Column("lower_s", "part of compile_s: lowering the trace to the compiler's input", "s", measured=True),
+        Column("compile_s", "total time of compiling the gradient", "s", measured=True, label="compilation", format="seconds"),
+        text("own_backend", "backend of the scene's own program"),
+        numbers("gradient", "the twin's gradient, by coordinate of theta"),
+        numbers("own_gradient", "the own program's gradient, by coordinate of theta"),
+        numbers("path", "positions of the twin along the rollout", table=False),
+        numbers("own_path", "positions of the own program along the rollout", table=False),
+    )  # fmt: skip
+
+    timed_calls: int = param(5, "calls timed for costs and for gradients", positive=True)
+
+    def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
+        """Return one cell's results by column: differences at w = 0, and times of costs and gradients [s].
+
+        ``state_difference`` is the largest difference over time and coordinates, in the units of the coordinate.
+        ``state_difference_rel`` is in units of the coordinate's largest value. Raises :class:`Unsupported` if the backend
+        has no twin, or the scene no program of its own.
+        """
+        scene = rollout(cell.program()).scene
+        if "physics" not in cell.backend.provides:
+            raise Unsupported(f"backend {cell.backend.name} has no twin to compare: its steps are the scene's own")
+        if not cell.ranked_backends:
+            raise Unsupported(
+                f"scene {scene.name} exists only as an engine's model: it has no program of its own to compare with"
+            )
+        twin, own = session.problem(cell), session.problems.of(cell.ranked_backends[0], cell)
+        theta, still = twin.program.theta0, np.zeros((twin.program.n_noise, 1))
+        path, own_path = (problem.trajectory(theta, still).states[:, :, 0] for problem in (twin, own))
+        gradient, own_gradient = (problem.grad(theta, still)[:, 0] for problem in (twin, own))
+        cost, own_cost = (float(problem.value(theta, still)[0]) for problem in (twin, own))
+        difference, w = np.abs(path - own_path).max(axis=0), first_batch(cell, len(still))
+        return {
+            **finite_status("the engine's rollout or its gradient is not finite", path, gradient),
+            "own_backend": cell.ranked_backends[0].name,
+            "state_difference": float(difference.max()),
+            "state_difference_rel": float((difference / np.maximum(np.abs(own_path).max(axis=0), 1e-300)).max()),
+            "cost": cost, "own_cost": own_cost, "cost_difference_rel": abs(cost - own_cost) / abs(own_cost),
+            "gradient": gradient.tolist(), "own_gradient": own_gradient.tolist(),
+            "gradient_norm": norm(gradient), "own_gradient_norm": norm(own_gradient),
+            "gradient_difference_rel": relative_error(gradient, own_gradient),
+            "gradient_cosine": float(gradient @ own_gradient / (norm(gradient) * norm(own_gradient))),
+            "path": path[:, : scene.n_q].ravel().tolist(), "own_path": own_path[:, : scene.n_q].ravel().tolist(),
+            "value_s": timing.timed(lambda _: twin.value(theta, w), self.timed_calls)[1].median_s,
+            **gradient_seconds(twin, w, self.timed_calls),
+            "trace_s": twin.usage.trace_s, "lower_s": twin.usage.lower_s,
+        }  # fmt: skip
