@@ -5,7 +5,6 @@ import dataclasses
 import numpy as np
 import pytest
 from classes import (
-    BounceOnce,
     BouncingBall,
     DoublePendulum,
     EventDriven,
@@ -66,16 +65,6 @@ def test_event_driven_gradients_across_noise():
     starts = scene.theta0()[:, None] + scene.sigma * w
     exact = [dataclasses.replace(scene, height=h, velocity=v).physical_gradient() for h, v in starts.T]
     assert problem.grad(scene.theta0(), w) == pytest.approx(np.transpose(exact), rel=1e-8, abs=1e-10)
-
-
-@pytest.mark.parametrize("height", [1.0, pytest.param(1.0 + 1 / 480, marks=pytest.mark.slow)])
-def test_event_driven_bounce_without_gravity(height):
-    """Where the impact meets a step boundary too, which is a kink for force laws. The force of the first step acts at its middle."""
-    scene = BounceOnce(height=height)
-    found = gradient(compiled(scene, EventDriven(), Impulse(), Torch()))
-    end = scene.horizon * scene.dt
-    assert found == pytest.approx([-1.0, -end, -(end - scene.dt / 2) * scene.dt], rel=1e-9)
-    assert scene.physical_gradient() == pytest.approx(found, rel=scene.dt)
 
 
 def test_event_driven_without_impacts_is_stormer_verlet():

@@ -26,16 +26,6 @@ def sample(problem, count=6):
     return noise.draw(0, "policy", 1, count, problem.program.n_noise, "test")[0].T
 
 
-def test_a_network_with_one_unit_is_its_formula():
-    policy = policy_of("mlp[hidden=1]")
-    theta = np.array([0.5, -0.25, 0.1, 2.0, 0.3])[:, None]  # weights, bias, weight, bias
-    x = np.array([[0.4], [0.8]])
-    assert policy.act(np, theta, x)[0, 0] == pytest.approx(2.0 * np.tanh(0.5 * 0.4 - 0.25 * 0.8 + 0.1) + 0.3)
-    assert list(policy.shapes(2, 1).items()) == [
-        ("weight_0", (1, 2)), ("bias_0", (1,)), ("weight_1", (1, 1)), ("bias_1", (1,)),
-    ]  # fmt: skip
-
-
 @pytest.mark.parametrize("activation", ["elu", "relu"])
 def test_activations_far_from_zero_have_finite_values(activation):
     values = policy_of(f"mlp[hidden=4,activation={activation}]").act(

@@ -37,15 +37,6 @@ def test_the_block_has_no_gradient_without_contact():
     assert np.linalg.norm(problem().grad(pushing.program.theta0, STILL)) > 1e-2
 
 
-@pytest.mark.parametrize(("sigma", "low", "high"), [(0.02, 0.0, 0.0), (0.2, 0.15, 0.25)])
-def test_the_noise_decides_how_many_plans_touch(sigma, low, high):
-    pushing = problem(sigma=sigma)
-    w = np.random.default_rng(0).standard_normal((12, 1000))
-    block = pushing.trajectory(pushing.program.theta0, w).states[-1, 18]
-    assert low <= np.mean(block > 0) <= high
-    assert block.min() >= 0
-
-
 def test_in_contact_the_gradient_moves_the_block():
     pushing = problem(lean=0.2, **DOWN)
     theta = pushing.program.theta0
