@@ -10,6 +10,7 @@ from classes import (
     InverseVariance,
     Numpy,
     Penalty,
+    Reinforce,
     SemiImplicitEuler,
     SphereSmoothing,
     TotalPropagation,
@@ -65,6 +66,16 @@ def test_alpha_order_by_hand(halves):
 )  # fmt: skip
 def test_rare_caps_of_alpha_order_are_a_remark(method, alpha, doubtful):
     assert bool(method.remark({"alpha": {"median": alpha}, "eps": {"median": 1.0}})) == doubtful
+
+
+def test_leaving_one_out_by_hand(halves):
+    problem, theta, noise, *_ = halves
+    found = Reinforce(baseline="leave_one_out").estimate(problem, theta, noise)
+    for r in range(REPEATS):
+        costs = problem.value(theta, noise[r].T)
+        others = (costs.sum() - costs) / (SAMPLES - 1)
+        # sums of terms 10 times the result
+        assert found[r] == pytest.approx(((costs - others) * noise[r].T / 0.4).mean(axis=1), rel=1e-11)
 
 
 @pytest.mark.parametrize("by", ["sample", "element"])
