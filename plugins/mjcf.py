@@ -82,7 +82,7 @@ def _as_written(path: str, scene: MechanicalScene, backend: Any) -> Any:
 
     model = mujoco.MjModel.from_xml_path(path)
     option, bit = model.opt, mujoco.mjtDisableBit
-    option.timestep = scene.dt / getattr(scene, "substeps", 1)
+    option.timestep = scene.dt / scene.substeps
     option.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{backend.integrator.upper()}")
     option.solver = getattr(mujoco.mjtSolver, f"mjSOL_{backend.solver.upper()}")
     option.iterations, option.ls_iterations = backend.iterations, backend.ls_iterations

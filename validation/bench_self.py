@@ -1,48 +1,195 @@
-"""Measures the speed of the harness, compared with a NumPy loop and native code.
+"""Measures the speed of the harness, compared with a NumPy loop and native code: ``python validation/bench_self.py [FOLDER]``.
 
-``python validation/bench_self.py [quick=true] [results_dir=DIR]`` writes ``results_dir/bench_self/``; quick=true runs small
-sizes.
+Writes ``FOLDER/bench_self.json`` (by default in ``results/bench_self``), from which ``docs/speed.md`` is written. ``--quick``
+runs small sizes.
 """
 
+import argparse
+import itertools
+import json
+import math
 import os
+import resource
+import subprocess
 import sys
+import tempfile
+import time
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
-from speed import compilations, harness, rollouts, speed_rows
+import numpy as np
+from speed import loop, native
 
-from bench.errors import UserError
-from bench.experiment.config import config_dir
-from bench.experiment.words import parse_flag, parse_words
+from bench.experiment import config
+from bench.experiment.by_name import compile_problem
+from bench.experiment.grid import cells
+from bench.measure import noise, timing
+from bench.model import Compilations, blocks, registry
+from bench.run.execute import store_of
+from bench.run.record import machine
+from bench.run.tasks import blank_row
+
+SUBJECTS = (
+    ("jax", "penalty", "grad"), ("fused", "penalty", "grad"), ("torch", "penalty", "grad"), ("numpy", "penalty", "value"),
+    ("implicit", "complementarity", "grad"),
+)  # fmt: skip
+"""Backend, contact law and method of the rollouts of ``pushing`` that are timed."""
+SCENES = ("pushing", "pendulum", "cartpole", "double_pendulum", "hopper", "bounce_once")
+"""Scenes whose gradients ``fused`` and ``jax`` are compared on."""
+SWEPT = {"stiffness": (500.0, 1e3, 2e3), "beta": (5.0, 10.0, 20.0), "sigma": (0.15, 0.3, 0.6)}
+"""Values that differ in no shape, so that they compile nothing anew."""
+SIZES, QUICK = (1_000, 10_000, 100_000, 1_000_000), (64, 512)
+SECONDS, CALLS = 1.0, 100
+"""Least total time of the timed calls of one row [s], and largest number of repeats of each of its three calls."""
+LONGEST = 20.0
+"""Time per call [s] above which larger batches are skipped."""
+NATIVE_COLUMNS = 1024
+SMALL = ("scenes=[quadratic]", "backends=[numpy]", "estimators=[fobg]", "samples=16", "repeats=4")
+
+
+def problem(backend, contact="penalty", scene="pushing", **values):
+    """Compile a scene, ``pushing`` with 100 steps by default; ``values`` are of its law, and ``sigma`` of the scene."""
+    made = registry.make("scenes", scene, {"horizon": 100} if scene == "pushing" else {})
+    sigma = values.pop("sigma", made.sigma)
+    law = registry.make("contacts", contact, values) if getattr(made, "n_contacts", 0) else None
+    return compile_problem(replace(made, sigma=sigma), law, "semi_implicit_euler", backend)
+
+
+def batch(compiled, count):
+    """Return noise ``(n_w, count)``: at most 10,000 random columns, repeated."""
+    drawn = noise.shared(0, compiled.program.scene.name, 1, min(count, 10_000), compiled.program.n_noise)[0].T
+    return np.ascontiguousarray(np.tile(drawn, (1, -(-count // drawn.shape[1])))[:, :count])
+
+
+def microseconds(call, count):
+    """Return the time per rollout [us] of a call that runs ``count`` rollouts."""
+    _, clock = timing.timed(lambda _: call()[..., :1].copy(), 3, SECONDS, CALLS)
+    return clock.median_s / count * 1e6
+
+
+def measure_backends(sizes):
+    """Yield the time of every subject at every batch size, and the peak memory without noise and result."""
+    for backend, contact, method in SUBJECTS:
+        compiled = problem(backend, contact)
+        for count in sizes:
+            w = batch(compiled, count)
+            timing.reset_peak_memory()
+            each = microseconds(partial(getattr(compiled, method), compiled.program.theta0, w), count)
+            given = w.nbytes + 8 * count * (compiled.dim if method == "grad" else 1)
+            name = f"{backend} {method}, {contact}, {count:g} rollouts"
+            yield name, each, "us"
+            yield f"{name}: peak memory", timing.peak_memory_mb() - given / 2**20, "MB"
+            if each * count * 10e-6 > LONGEST:
+                break
+
+
+def measure_baselines(sizes):
+    """Yield the time of the same gradient in a NumPy loop and in native code, which is compared with ``jax``."""
+    compiled, rival = problem("jax"), problem("fused")
+    scene, theta = compiled.program.scene, compiled.program.theta0
+    stiffness = compiled.program.contact.stiffness
+    for count in sizes[:2]:
+        call = partial(loop.gradient, scene, stiffness, theta, batch(compiled, count))
+        yield f"plain NumPy loop with its adjoint, {count:g} rollouts", microseconds(call, count), "us"
+    kernel = native.gradient(scene, stiffness)
+    w = batch(compiled, QUICK[0])
+    expected = compiled.grad(theta, w)
+    difference = np.abs(kernel(theta, w) - expected).max() / np.abs(expected).max()
+    yield "native C kernel: largest relative difference", float(difference), ""
+    rival.threads = 1  # one thread like the kernel, since two threads may share a core
+    for count in sizes:
+        w = batch(compiled, count)
+        columns = blocks.block_size(count, NATIVE_COLUMNS, native.LANES, 1)
+        call = partial(blocks.evaluate, kernel, theta[:, None], w, columns, 1, (compiled.dim,))
+        each = microseconds(call, count)
+        yield f"native C kernel, one thread, {count:g} rollouts", each, "us"
+        ratio = microseconds(partial(rival.grad, theta, w), count) / each
+        yield f"fused on one thread over the C kernel, {count:g} rollouts", ratio, ""
+
+
+def compare_backends(scenes, sizes):
+    """Yield the ratio of the times of gradients by ``fused`` and by ``jax`` on the same cores."""
+    for scene, count in itertools.product(scenes, sizes):
+        problems = [problem(backend, scene=scene) for backend in ("fused", "jax")]
+        times = [microseconds(partial(p.grad, p.program.theta0, batch(p, count)), count) for p in problems]
+        yield f"fused over jax, {scene}, {count:g} rollouts", times[0] / times[1], ""
+
+
+def count_compilations():
+    """Yield the number of programs that a sweep compiles, and of its distinct shapes."""
+    compilations, points = Compilations(), list(itertools.product(*SWEPT.values()))
+    for point in points:
+        compiled = problem("jax", "softplus", **dict(zip(SWEPT, point, strict=True)))
+        compiled.compilations = compilations
+        w, theta = batch(compiled, 64), compiled.program.theta0
+        compiled.value(theta, w)
+        compiled.grad(theta, w)
+    what = f"compilations over {len(points)} values of {' x '.join(SWEPT)}"
+    yield what, compilations.made, ""
+    yield f"{what}: distinct shapes", len(compilations.shapes), ""
+
+
+def measure_commands(side, count):
+    """Yield the times of planning and resuming ``side``^2 cells, of ``list``, and of each of ``count`` small cells."""
+    with tempfile.TemporaryDirectory() as folder:
+        seeds, sigmas = (",".join(map(str, range(start, start + side))) for start in (0, 1))
+        words = [*SMALL, f"sweep.seed=[{seeds}]", f"sweep.sigma=[{sigmas}]", "name=many", f"results_dir={folder}"]
+        yield f"planning {side**2} cells", fastest("plan", *words), "s"
+        experiment = config.load(words)
+        store = store_of(experiment)
+        store.prepare()
+        store.append(*(blank_row(experiment, cell) | {"status": "ok"} for cell in cells(experiment)))
+        store.compact()
+        yield f"resuming {side**2} stored cells", fastest("plan", *words), "s"
+        before = processor_seconds()
+        fastest("list", calls=5)
+        yield "python -m bench list", (processor_seconds() - before) / 5, "s"
+        seeds = ",".join(map(str, range(count)))
+        words = [*SMALL, f"sweep.seed=[{seeds}]", "name=overhead", f"results_dir={folder}"]
+        fastest(*words, calls=1)
+        rows = store_of(config.load(words)).load().sort_values("stored_at")
+        timed = rows[rows["stored_at"] > rows["stored_at"].iloc[0]]
+        spent = rows["stored_at"].iloc[-1] - rows["stored_at"].iloc[0] - timed["estimates_s"].sum()
+        yield "overhead of a cell", 1e3 * spent / len(timed), "ms"
+
+
+def fastest(*words, calls=3):
+    """Return the seconds of the fastest of several calls of a command: other load only adds time."""
+    seconds = []
+    for _ in range(calls):
+        started = time.perf_counter()
+        subprocess.run([sys.executable, "-m", "bench", *words], check=True, capture_output=True)
+        seconds.append(time.perf_counter() - started)
+    return min(seconds)
+
+
+def processor_seconds():
+    """Return the processor seconds of all commands so far, with their processes: other load hardly changes them."""
+    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return usage.ru_utime + usage.ru_stime
 
 
 def main(words):
-    """Measure and print speeds, and write them. Returns 0. ``quick=true`` runs small sizes."""
-    names, settings, _ = parse_words(words, "bench_self", {"quick": "false", "results_dir": "results"})
-    if names:
-        raise UserError(f"bench_self takes quick=true|false and results_dir=FOLDER, not '{names[0]}'")
-    load_before = list(os.getloadavg()) if hasattr(os, "getloadavg") else None
-    rows = []
-    for row in measure(parse_flag(settings, "quick")):
-        print(f"{row.what}: {row.value:.3g} {row.unit}{row.note and f' ({row.note})'}", flush=True)
-        rows.append(row)
-    print(speed_rows.write(rows, Path(settings["results_dir"]).expanduser() / "bench_self", load_before))
-    return 0
-
-
-def measure(quick):
-    """Measure and yield every row of the table."""
-    import yaml
-
-    settings = yaml.safe_load((config_dir() / "bench_self.yaml").read_text())
-    yield from rollouts.measure_backends(settings, quick)
-    yield from rollouts.measure_baselines(settings, quick)
-    yield from rollouts.compare_backends(settings, quick)
-    yield from compilations.count_compilations(settings)
-    yield from harness.measure_commands(quick)
+    """Measure, print and write the speeds."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", nargs="?", type=Path, default=Path("results/bench_self"))
+    parser.add_argument("--quick", action="store_true", help="small sizes")
+    given = parser.parse_args(words)
+    load_before, lines = os.getloadavg(), []
+    for what, value, unit in itertools.chain(
+        measure_backends(QUICK if given.quick else SIZES),
+        measure_baselines(QUICK if given.quick else SIZES),
+        compare_backends(SCENES[: 1 if given.quick else None], QUICK[:1] if given.quick else (1_000, 100_000)),
+        count_compilations(),
+        measure_commands(*((5, 40) if given.quick else (100, 500))),
+    ):
+        print(f"{what}: {value:.3g} {unit}", flush=True)
+        lines.append({"what": what, "value": None if math.isnan(value) else value, "unit": unit})
+    given.folder.mkdir(parents=True, exist_ok=True)
+    record = {"machine": machine(), "load_average_before": load_before, "lines": lines}
+    (given.folder / "bench_self.json").write_text(json.dumps(record, indent=1) + "\n")
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main(sys.argv[1:]))
-    except UserError as error:
-        sys.exit(f"bench_self: {error}")
+    main(sys.argv[1:])

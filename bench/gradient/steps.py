@@ -82,7 +82,7 @@ def traced_loops(simulator: Simulator, theta: np.ndarray, w: np.ndarray | None) 
     with clock.interrupt_when_over():
         sys.settrace(enter)
         try:
-            simulator._costs(theta[:, None], w)
+            simulator._costs(*(part for part in (theta[:, None], w) if part is not None))
         finally:
             sys.settrace(before)
     clock.count("costs", 1, 0.0, warm=False)

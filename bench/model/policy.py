@@ -13,9 +13,8 @@ import numpy as np
 from bench.errors import Unsupported
 from bench.model import registry
 from bench.model.identity import parse_identity
-from bench.model.ops import Array, Ops, State
+from bench.model.ops import Array, State
 from bench.model.parameters import Plugin, build, param, parameters, remember
-from bench.model.program import Rollout
 from bench.model.scene import MechanicalScene
 
 
@@ -79,23 +78,6 @@ def policy_of(identity: str) -> Policy:
     return cast(Policy, build(plugin, {key: str(v) if key in strings else v for key, v in values.items()}))
 
 
-class PolicyRollout(Rollout):
-    """The program of a :class:`PolicyScene`: substeps, and rollouts that may end early."""
-
-    scene: PolicyScene
-
-    def step(self, ops: Ops, state: State, u: Array) -> State:
-        """Return the state after ``substeps`` steps of the integrator under ``u (n_u, B)``; unchanged after the end."""
-        after = state
-        for _ in range(self.scene.substeps):
-            after = self.substep(ops, after, u)
-        return self.stopped(ops.xp, state, after)
-
-    def substep(self, ops: Ops, state: State, u: Array) -> State:
-        """Return the state after one step of the integrator."""
-        return self.integrator.step(self.dynamics(ops), state, u, self.scene.dt / self.scene.substeps)
-
-
 @dataclass(frozen=True)
 class PolicyScene(MechanicalScene):
     """A role: the controls are a :class:`Policy` of observations, u_t = pi(theta, o(x_t)) + sigma w_t.
@@ -108,7 +90,6 @@ class PolicyScene(MechanicalScene):
     n_observations: ClassVar[int]
     n_start: ClassVar[int] = 0
     """Number of standard normal numbers that decide the start of one rollout."""
-    program_type: ClassVar[type[Rollout] | None] = PolicyRollout
 
     noise: str = param("action", "whether noise is on the actions or on theta", choices=("action", "parameter"))
     horizon: int = param(100, "number of control steps", "steps", positive=True)

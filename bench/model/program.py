@@ -397,8 +397,11 @@ class Rollout(Program):
         return bound, own, ops.xp.concat([no_noise, w[self.dim :]], axis=0) if self.exogenous else no_noise
 
     def step(self, ops: Ops, state: State, u: Array) -> State:
-        """Return the state after one integrator step under the control ``u (n_u, B)``."""
-        return self.integrator.step(self.dynamics(ops), state, u, self.scene.dt)
+        """Return the state after ``substeps`` integrator steps under ``u (n_u, B)``; unchanged after the end."""
+        after, n = state, self.scene.substeps
+        for _ in range(n):
+            after = self.integrator.step(self.dynamics(ops), after, u, self.scene.dt / n if n > 1 else self.scene.dt)
+        return self.stopped(ops.xp, state, after)
 
     def stopped(self, xp: Any, before: State, after: State) -> State:
         """Return the state ``after`` a step, or the state ``before`` it where the rollout had ended."""
@@ -531,7 +534,7 @@ def compose(
     if isinstance(scene, CallableScene):
         return CallableProgram(scene, contact, integrator, decision)
     if isinstance(scene, MechanicalScene):
-        return (scene.program_type or Rollout)(scene, contact, integrator, decision)
+        return Rollout(scene, contact, integrator, decision)
     raise Unsupported(
         f"scene {scene.name} is neither a FunctionScene, a CallableScene nor a MechanicalScene: derive it from one of these"
     )

@@ -18,11 +18,11 @@ import re
 import sys
 import types
 import typing
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache
-from importlib.metadata import EntryPoint, entry_points
+from functools import cache, partial
+from importlib.metadata import entry_points
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -124,10 +124,9 @@ def entries() -> Table:
     outside = [*(name for _, name in modules if not name.startswith(BUILT_IN)), *(point.module for point in points)]
     fatal = trial.find_fatal_modules(outside, packages) if _only is None else {}
     for kind, module in modules:
-        with _protected(module):
-            _load_module(table, kind, module, fatal.get(module, ""))
+        _load(table, kind, module, partial(importlib.import_module, module), fatal)
     for point in points:
-        _load_point(table, "", point, fatal.get(point.module, ""))
+        _load(table, "", point.module, point.load, fatal, point.name)
     return table
 
 
@@ -159,9 +158,9 @@ def entries_with(kind: str) -> dict[str, Entry]:
     """
     table: Table = {kind: {}}
     for _, module in _modules(importlib.import_module(f"bench.plugins.{kind}")):
-        _load_module(table, kind, module, "")
+        _load(table, kind, module, partial(importlib.import_module, module))
     for point in sorted(entry_points(group=f"bench.{kind}"), key=lambda p: p.name):
-        _load_point(table, kind, point, "")
+        _load(table, kind, point.module, point.load, name=point.name)
     for name, entry in entries().get(kind, {}).items():
         if entry.plugin is None:
             table[kind].setdefault(name, entry)
@@ -194,40 +193,34 @@ def _modules(package: ModuleType) -> Iterator[tuple[str, str]]:
                 yield folder.name, f"{space.__name__}.{module.name}"
 
 
-def _load_module(table: Table, kind: str, path: str, fatal: str) -> None:
+def _load(
+    table: Table,
+    kind: str,
+    module: str,
+    load: Callable[[], Any],
+    fatal: Mapping[str, str] | None = None,
+    name: str = "",
+) -> None:
+    """Add the plugin class, or the classes of the module, that ``load`` returns; what cannot be loaded with its error."""
+    name = name or module.rpartition(".")[2]
     try:
-        if fatal:
-            raise ImportError(fatal)
-        if not path.startswith("bench."):
-            IMPORTED.add(path)
-        module = importlib.import_module(path)
+        if message := (fatal or {}).get(module):
+            raise ImportError(message)
+        if not module.startswith("bench."):
+            IMPORTED.add(module)
+        with _protected(module):
+            part = load()
+            if isinstance(part, ModuleType):
+                _add_members(table, kind, part)
+            elif isinstance(part, type) and issubclass(part, Plugin) and part.kind and kind in ("", part.kind):
+                _add(table, part)
+            else:
+                value = f"{module}:{getattr(part, '__name__', part)}"
+                raise TypeError(f"{value} is not a plugin class{kind and f' of kind {kind}'}")
     except KeyboardInterrupt:
         raise
-    except BaseException as error:
-        # a broken plugin is listed with its error, so that it neither hides the others nor ends the command (sys.exit)
-        _add_unavailable(table, kind if kind in table else _kind_in_source(path), path.rpartition(".")[2], error)
-        return
-    _add_members(table, kind, module)
-
-
-def _load_point(table: Table, kind: str, point: EntryPoint, fatal: str) -> None:
-    """Add the plugin class, or the classes of the module, that an entry point names."""
-    try:
-        if fatal:
-            raise ImportError(fatal)
-        IMPORTED.add(point.module)
-        with _protected(point.module):
-            part = point.load()
-        if isinstance(part, ModuleType):
-            _add_members(table, kind or _kind_in_source(point.module), part)
-        elif isinstance(part, type) and issubclass(part, Plugin) and part.kind and kind in ("", part.kind):
-            _add(table, part)
-        else:
-            raise TypeError(f"{point.value} is not a plugin class{kind and f' of kind {kind}'}")
-    except KeyboardInterrupt:
-        raise
-    except BaseException as error:  # includes SystemExit: a plugin must not end the command
-        _add_unavailable(table, kind or _kind_in_source(point.module), point.name, error)
+    except BaseException as error:  # includes SystemExit: a plugin neither hides the others nor ends the command
+        _add_unavailable(table, kind if kind in table else _kind_in_source(module), name, error)
 
 
 def _add_members(table: Table, kind: str, module: ModuleType) -> None:

@@ -103,8 +103,6 @@ class MechanicalScene(Scene):
     """Whether theta is the sequence of controls, step by step."""
     contact_values: ClassVar[Mapping[str, Any]] = {}
     """Default values for parameters of the scene's contact laws; the user's values have priority."""
-    program_type: ClassVar[Any] = None
-    """The class of its programs, for a role whose rollouts need one of their own; None: :class:`~.program.Rollout`."""
 
     horizon: int = param(100, "number of time steps", "steps", positive=True)
     dt: float = param(0.01, "length of a time step", "s", positive=True)
@@ -143,6 +141,11 @@ class MechanicalScene(Scene):
     def controls(self) -> int:
         """Number of controls in a rollout: one per step, except in a :class:`ZeroOrderHoldScene`."""
         return self.horizon
+
+    @property
+    def substeps(self) -> int:
+        """Steps of the integrator per time step, under one control: 1, except in a scene with this parameter."""
+        return 1
 
     def held(self, xp: Any, values: Array) -> Array:
         """Return values per control, ``(controls, ...)``, repeated for each step, ``(horizon, ...)``."""

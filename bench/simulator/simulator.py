@@ -153,72 +153,65 @@ class Simulator:
 
     def costs(self, thetas: np.ndarray, w: np.ndarray | None = None) -> np.ndarray:
         """Return the costs of ``thetas (d, B)`` with the noise ``w (n, B)``, ``(B,)``."""
-        return self._in_chunks(self._costs, "costs", thetas, w, ())
+        return self._in_chunks("costs", thetas, w)
 
     def gradients(self, thetas: np.ndarray, w: np.ndarray | None = None) -> np.ndarray:
         """Return the simulator's gradients, ``(d, B)``; NaN where it raised an exception."""
-        return self._in_chunks(self._gradients, "gradients", thetas, w, (self.layout.vector.size,))
+        return self._in_chunks("gradients", thetas, w)
 
-    def _in_chunks(
-        self,
-        function: Callable[..., np.ndarray],
-        kind: str,
-        thetas: np.ndarray,
-        w: np.ndarray | None,
-        lead: tuple[int, ...],
-    ) -> np.ndarray:
+    def _in_chunks(self, kind: str, thetas: np.ndarray, w: np.ndarray | None) -> np.ndarray:
+        function = self._costs if kind == "costs" else self._gradients
         count = thetas.shape[1]
-        out = np.full((*lead, count), np.nan)
+        out = np.full(count if kind == "costs" else thetas.shape, np.nan)
         # one gradient needs no batch, which would compute and compile more
         is_single = kind == "gradients" and count == 1 and self._is_mapped
         size = 1 if is_single else self.width
         for start in range(0, count, size):
-            part = slice(start, min(start + size, count))
-            self.clock.check(part.stop - part.start)
-            columns: Any = part
-            n_columns = part.stop - part.start
-            if (self.library == "jax" or self.fixed) and size > 1:
-                columns = np.minimum(np.arange(part.start, part.start + size), part.stop - 1)
-                n_columns = size
-            is_first = (kind, n_columns) not in self._shapes
-            self._shapes.add((kind, n_columns))
+            n = min(size, count - start)
+            self.clock.check(n)
+            columns: Any = slice(start, start + n)
+            is_padded = (self.library == "jax" or self.fixed) and size > 1
+            if is_padded:
+                columns = np.minimum(np.arange(start, start + size), start + n - 1)
+            shape = kind, size if is_padded else n
+            is_first = shape not in self._shapes
+            self._shapes.add(shape)
             began = self.clock.spent
             with self.clock.interrupt_when_over(first=is_first):
-                results = function(thetas[:, columns], None if w is None else w[:, columns])
+                results = function(*(part[:, columns] for part in (thetas, w) if part is not None))
             taken = max(self.clock.spent - began, 0.0)
-            self.clock.count(kind, part.stop - part.start, taken, warm=not is_first)
-            out[..., part] = results[..., : part.stop - part.start]
+            self.clock.count(kind, n, taken, warm=not is_first)
+            out[..., start : start + n] = results[..., :n]
             if kind == "costs" and len(self._distinct) < 16 * DISTINCT:
-                self._distinct.update(float(one) for one in out[part] if _is_telling(one))
+                self._distinct.update(float(one) for one in results[:n] if _is_telling(one))
         return out
 
     @property
     def _is_mapped(self) -> bool:
         return self.library == "jax" and self.batch == "vmap"
 
-    def _costs(self, thetas: np.ndarray, w: np.ndarray | None) -> np.ndarray:
-        try:
-            return np.asarray(self._values(thetas, w), dtype=np.float64)
-        except Exception as error:
-            self._count_error(error)
-            return np.full(thetas.shape[1], np.nan)
+    # below, ``parts`` are the columns of theta and, if the cost has noise of its own, those of the noise
 
-    def _gradients(self, thetas: np.ndarray, w: np.ndarray | None) -> np.ndarray:
+    def _costs(self, *parts: np.ndarray) -> np.ndarray:
         try:
-            gradients = self._slopes(thetas, w)
+            return np.asarray(self._values(*parts), dtype=np.float64)
+        except Exception as error:
+            text = f"{type(error).__name__}: {error}"
+            self.raised[text] = self.raised.get(text, 0) + 1
+            return np.full(parts[0].shape[1], np.nan)
+
+    def _gradients(self, *parts: np.ndarray) -> np.ndarray:
+        try:
+            gradients = self._slopes(*parts)
         except UserError:
             raise
         except Exception as error:
             self.gradient_error = self.gradient_error or failure(error)["reason"]
             self.n_failed_gradients += 1
-            return np.full(thetas.shape, np.nan)
+            return np.full(parts[0].shape, np.nan)
         if np.iscomplexobj(gradients):
             raise UserError("the gradient is complex: the gradient of a real cost of real numbers is real")
         return np.asarray(gradients, dtype=np.float64)
-
-    def _count_error(self, error: Exception) -> None:
-        text = f"{type(error).__name__}: {error}"
-        self.raised[text] = self.raised.get(text, 0) + 1
 
     # ------------------------------------------------------------------------------------------ calling convention
 
@@ -254,19 +247,14 @@ class Simulator:
             return torch.as_tensor(np.array(value)).to(torch.float64 if self._double else torch.float32)
         return np.array(value)
 
-    def _call(self, theta: Any, w: Any) -> Any:
-        return self._cost(theta) if w is None else self._cost(theta, w)
-
     def _detect_batch(self, batch: str | None) -> str:
         """Return the cost's batching mode, detected by trial calls."""
-        vector = self.layout.vector
-        w = np.zeros(self.noise) if self.noise else None
         if batch in ("columns", "rows"):
             if not self._accepts(batch):
                 raise UserError(f"the cost does not accept batch={batch}: {self._batch_error}")
             return batch
         try:
-            value = self._call_once(vector, w)
+            value = self._call_once()
         except Exception as error:
             problem = failure(error)["reason"]
         else:
@@ -275,47 +263,51 @@ class Simulator:
                 self._check_cost(value)
                 self.first_value = float(value.ravel()[0])
                 self._distinct |= {self.first_value} if _is_telling(self.first_value) else set()
-                return self._detect_vmap(vector, self.first_value, batch)
+                return self._detect_vmap(batch)
         for layout in ("columns", "rows"):
             if self.layout.flat and self._accepts(layout):
                 self.notes.append(f"the cost takes batches as {layout}")
                 return layout
         raise UserError(f"the cost cannot be called at theta: {problem}. It must accept theta and return one number")
 
-    def _call_once(self, vector: np.ndarray, w: np.ndarray | None) -> np.ndarray:
-        """Return the cost of a single theta as an array, and note whether the cost modifies its argument."""
+    def _repeated(self, count: int) -> list[np.ndarray]:
+        """Return ``count`` columns of theta and, if the cost has noise of its own, of noise 0."""
+        thetas = np.repeat(self.layout.vector[:, None], count, axis=1)
+        return [thetas, np.zeros((self.noise, count))] if self.noise else [thetas]
+
+    def _call_once(self) -> np.ndarray:
+        """Return the cost of theta without noise as an array, and note whether the cost modifies its argument."""
+        parts = self._repeated(1)
         if self.library == "jax":
             with self.clock.interrupt_when_over(first=True):
-                value = self._jax_values(vector[:, None], None if w is None else w[:, None], "loop")
+                value = self._by_jax("cost", "loop", *parts)
             self.clock.count("costs", 1, 0.0, warm=False)
             return as_numpy(value)
-        theta = self._build_theta(self._array(vector))
+        vector, *own_noise = (self._array(part[:, 0]) for part in parts)
+        theta = self._build_theta(vector)
         try:
             with self.clock.interrupt_when_over(first=True):
-                value = self._call(theta, None if w is None else self._array(w))
+                value = self._cost(theta, *own_noise)
         except RuntimeError as error:
             if self.library != "torch" or "dtype" not in str(error) or not self._double:
                 raise
             self._double = False
             self.notes.append("theta is passed in float32, as the torch module requires")
-            return self._call_once(vector, w)
+            return self._call_once()
         array = as_numpy(value)
         self.clock.count("costs", 1, 0.0, warm=False)
         self._shapes.add(("costs", 1))
-        if self._is_modified(theta, vector):
+        if self._is_modified(theta):
             self.notes.append("the cost modifies its argument in place, so each call gets a copy")
         return array
 
-    def _is_modified(self, theta: Any, vector: np.ndarray) -> bool:
-        """Return whether the cost has modified its argument."""
+    def _is_modified(self, theta: Any) -> bool:
+        """Return whether the cost has modified its argument, which differs from theta in its floating-point type."""
+        fresh = self._build_theta(self._array(self.layout.vector))
         try:
-            return not np.array_equal(self.layout.flatten(theta, "theta"), self._rounded(vector))
+            return not np.array_equal(self.layout.flatten(theta, "theta"), self.layout.flatten(fresh, "theta"))
         except UserError:
             return True
-
-    def _rounded(self, vector: np.ndarray) -> np.ndarray:
-        """Return a vector ``(d,)`` rounded to the floating-point type in which the cost receives it."""
-        return self.layout.flatten(self._build_theta(self._array(vector)), "theta")
 
     def _check_cost(self, cost: np.ndarray) -> None:
         """Record the precision of the cost's value; raises :class:`UserError` unless it is a real number."""
@@ -328,14 +320,13 @@ class Simulator:
         if cost.dtype.kind == "f" or str(cost.dtype) == "bfloat16":
             self.precision = str(cost.dtype)
 
-    def _detect_vmap(self, vector: np.ndarray, value: float, batch: str | None) -> str:
+    def _detect_vmap(self, batch: str | None) -> str:
         """Return ``vmap`` if the library's vmap of the cost yields the same values, else ``loop``."""
         if self.library == "jax" and batch in (None, "vmap"):
             try:
-                columns = np.repeat(vector[:, None], BLOCK, axis=1)
-                w = np.zeros((self.noise, BLOCK)) if self.noise else None
                 with self.clock.interrupt_when_over(first=True):
-                    mapped = np.asarray(self._jax_values(columns, w, "vmap"), dtype=np.float64)
+                    mapped = np.asarray(self._by_jax("cost", "vmap", *self._repeated(BLOCK)), dtype=np.float64)
+                value = self.first_value
                 tolerance = 1e3 * self.unit * max(abs(value), 1.0)
                 if np.allclose(mapped, value, rtol=1e3 * self.unit, atol=tolerance, equal_nan=True):
                     self._shapes.add(("costs", BLOCK))
@@ -355,131 +346,117 @@ class Simulator:
 
     def _accepts(self, batch: str) -> bool:
         """Return whether the cost accepts several thetas as columns or rows and returns one number per theta."""
-        dim = self.layout.vector.size
-        count = self.fixed or (5 if dim != 5 else 7)
-        thetas = np.repeat(self.layout.vector[:, None], count, axis=1)
-        w = np.zeros((self.noise, count)) if self.noise else None
+        count = self.fixed or (5 if self.layout.vector.size != 5 else 7)
         self._batch_error = ""
         try:
             with self.clock.interrupt_when_over(first=True):
-                costs = as_numpy(self._call_batch(self._array(thetas), None if w is None else self._array(w), batch))
+                costs = as_numpy(self._call_batch(batch, *map(self._array, self._repeated(count))))
         except Exception as error:
             self._batch_error = failure(error)["reason"]
             return False
         self.clock.count("costs", count, 0.0, warm=False)
-        if costs.shape == (count,) and costs.dtype.kind in "fiub":
-            self.first_value = float(costs[0])
         if costs.shape != (count,):
             self._batch_error = f"{count} thetas gave an array of shape {costs.shape}, not {(count,)}"
             return False
+        if costs.dtype.kind in "fiub":
+            self.first_value = float(costs[0])
         self._check_cost(costs)
         return True
 
-    def _call_batch(self, thetas: Any, w: Any, batch: str) -> Any:
-        if batch == "rows":
-            return self._call(thetas.T, None if w is None else w.T)
-        return self._call(thetas, w)
+    def _call_batch(self, batch: str, *parts: Any) -> Any:
+        return self._cost(*(part.T if batch == "rows" else part for part in parts))
 
     # ------------------------------------------------------------------------------------------- values
 
-    def _values(self, thetas: np.ndarray, w: np.ndarray | None) -> Any:
+    def _values(self, thetas: np.ndarray, *w: np.ndarray) -> Any:
         if self.library == "jax":
-            return self._jax_values(thetas, w, self.batch)
+            return self._by_jax("cost", self.batch, thetas, *w)
         if self.library == "torch":
             import torch
 
             with torch.no_grad():
-                return as_numpy(self._torch_values(self._array(thetas), None if w is None else self._array(w)))
+                return as_numpy(self._torch_values(*map(self._array, (thetas, *w))))
         if self.batch == "loop":
-            return [
-                float(
-                    as_numpy(
-                        self._call(self._build_theta(thetas[:, i]), None if w is None else w[:, i].copy())
-                    ).ravel()[0]
-                )
+            calls = (
+                self._cost(self._build_theta(thetas[:, i]), *(part[:, i].copy() for part in w))
                 for i in range(thetas.shape[1])
-            ]
-        return as_numpy(self._call_batch(thetas.copy(), None if w is None else w.copy(), self.batch))
+            )
+            return [float(as_numpy(cost).ravel()[0]) for cost in calls]
+        return as_numpy(self._call_batch(self.batch, *(part.copy() for part in (thetas, *w))))
 
-    def _torch_values(self, thetas: Any, w: Any) -> Any:
+    def _torch_values(self, thetas: Any, *w: Any) -> Any:
         """Return the costs as a tensor ``(B,)`` that is attached to the autograd graph."""
         import torch
 
         if self.batch in ("columns", "rows"):
-            return self._call_batch(thetas, w, self.batch)
+            return self._call_batch(self.batch, thetas, *w)
         if self.batch == "vmap":
-            mapped = torch.func.vmap(
-                lambda vector, *rest: self._call(self._build_theta(vector), *rest or (None,)).reshape(()),
+            return torch.func.vmap(
+                lambda vector, *rest: self._cost(self._build_theta(vector), *rest).reshape(()),
                 in_dims=1,
                 randomness="same",
-            )
-            return mapped(thetas) if w is None else mapped(thetas, w)
+            )(thetas, *w)
         columns = range(thetas.shape[1])
-        costs = [self._call(self._build_theta(thetas[:, i]), None if w is None else w[:, i]) for i in columns]
+        costs = [self._cost(self._build_theta(thetas[:, i]), *(part[:, i] for part in w)) for i in columns]
         # torch would convert a Python number to single precision
         doubles = [cost if torch.is_tensor(cost) else torch.as_tensor(cost, dtype=torch.float64) for cost in costs]
         return torch.stack([cost.reshape(()) for cost in doubles])
 
-    def _jax_values(self, thetas: np.ndarray, w: np.ndarray | None, batch: str) -> Any:
+    def _jax_functions(self, batch: str) -> dict[str, Any]:
+        """Return cost and gradient for a batching mode as Python functions."""
+        import jax
 
-        compiled, _, eager, _ = self._jax_functions(batch)
-        return self._call_compiled(compiled, eager, thetas, w, batch)
+        def raw(vector: Any, *rest: Any) -> Any:
+            return self._cost(self._build_theta(vector), *rest)
 
-    def _jax_functions(self, batch: str) -> tuple[Any, ...]:
-        """Return cost and gradient for a batching mode: both compiled, then both as Python functions."""
+        def one(*parts: Any) -> Any:
+            return jax.numpy.reshape(raw(*parts), ())
+
+        if batch == "loop":
+            return {"cost": raw, "gradient": jax.grad(one)}
+        whole = jax.vmap(one, in_axes=1) if batch == "vmap" else lambda *parts: self._call_batch(batch, *parts)
+        return {"cost": whole, "gradient": jax.grad(lambda *parts: whole(*parts).sum())}
+
+    def _by_jax(self, what: str, batch: str, *parts: np.ndarray) -> np.ndarray:
+        """Return costs or gradients; one theta per call runs uncompiled if JAX cannot trace the function."""
         import jax
 
         if batch not in self._compiled:
-
-            def raw(vector: Any, *rest: Any) -> Any:
-                return self._call(self._build_theta(vector), *rest or (None,))
-
-            def one(vector: Any, *rest: Any) -> Any:
-                return jax.numpy.reshape(raw(vector, *rest), ())
-
-            def all_columns(columns: Any, *rest: Any) -> Any:
-                return self._call_batch(columns, rest[0] if rest else None, batch)
-
-            whole = raw if batch == "loop" else jax.vmap(one, in_axes=1) if batch == "vmap" else all_columns
-            summed = one if batch == "loop" else lambda columns, *rest: whole(columns, *rest).sum()
-            slope = jax.grad(summed)
-            self._compiled[batch] = jax.jit(whole), jax.jit(slope), whole, slope
-        return self._compiled[batch]
-
-    def _call_compiled(self, compiled: Any, eager: Any, thetas: np.ndarray, w: np.ndarray | None, batch: str) -> Any:
-        """Return a compiled function's values; one theta per call runs uncompiled if JAX cannot trace the function."""
-        import jax
-
-        arguments = [self._array(part) for part in (thetas, w) if part is not None]
-        if batch == "loop":
-            arguments = [part[:, 0] for part in arguments]
-        try:
-            result = compiled(*arguments)
-        except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError):
-            if batch != "loop":
-                raise
-            result = eager(*arguments)
+            eager = self._jax_functions(batch)
+            self._compiled[batch] = eager, {name: jax.jit(function) for name, function in eager.items()}
+        eager, compiled = self._compiled[batch]
+        arguments = [self._array(part) for part in parts]
         if batch != "loop":
-            return np.asarray(result)
-        array = as_numpy(result)
+            return np.asarray(compiled[what](*arguments))
+        arguments = [part[:, 0] for part in arguments]
+        try:
+            array = as_numpy(compiled[what](*arguments))
+        except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError):
+            array = as_numpy(eager[what](*arguments))
         # a cost is one number, of shape () or (1,); gradients are vectors
-        return array.reshape(1) if compiled is self._compiled["loop"][0] and array.size == 1 else array[..., None]
+        return array.reshape(1) if what == "cost" and array.size == 1 else array[..., None]
 
     # ---------------------------------------------------------------------------------------- gradients
 
-    def _slopes(self, thetas: np.ndarray, w: np.ndarray | None) -> np.ndarray:
+    def _slopes(self, thetas: np.ndarray, *w: np.ndarray) -> np.ndarray:
         if callable(self._grad):
-            return self._user_slopes(thetas, w)
+            return self._user_slopes(thetas, *w)
         if self._grad == "jax":
             mode = "loop" if self._is_mapped and thetas.shape[1] == 1 else self.batch
-            _, compiled, _, eager = self._jax_functions(mode)
-            return np.asarray(self._call_compiled(compiled, eager, thetas, w, mode))
-        return self._torch_slopes(thetas, w)
+            return self._by_jax("gradient", mode, thetas, *w)
+        import torch
 
-    def _user_slopes(self, thetas: np.ndarray, w: np.ndarray | None) -> np.ndarray:
+        leaf = self._array(thetas).requires_grad_()
+        total = self._torch_values(leaf, *map(self._array, w)).sum()
+        if not total.requires_grad:
+            return np.zeros(thetas.shape)
+        (gradient,) = torch.autograd.grad(total, leaf, allow_unused=True, materialize_grads=True)
+        return np.asarray(gradient.cpu().numpy())
+
+    def _user_slopes(self, thetas: np.ndarray, *w: np.ndarray) -> np.ndarray:
         assert callable(self._grad)
         if self.batch in ("columns", "rows"):
-            arguments = [self._array(part) for part in (thetas, w) if part is not None]
+            arguments = map(self._array, (thetas, *w))
             gradients = as_numpy(self._grad(*(part.T if self.batch == "rows" else part for part in arguments)))
             gradients = gradients.T if self.batch == "rows" else gradients
             if gradients.shape != thetas.shape:
@@ -487,21 +464,13 @@ class Simulator:
                     f"the gradient of {thetas.shape[1]} thetas has shape {gradients.shape}, not {thetas.shape}"
                 )
             return gradients
-        columns = []
-        for i in range(thetas.shape[1]):
-            arguments = [self._build_theta(self._array(thetas[:, i]))] + ([] if w is None else [self._array(w[:, i])])
-            columns.append(self.layout.flatten(self._grad(*arguments)))
+        columns = [
+            self.layout.flatten(
+                self._grad(self._build_theta(self._array(thetas[:, i])), *(self._array(part[:, i]) for part in w))
+            )
+            for i in range(thetas.shape[1])
+        ]
         return np.stack(columns, axis=1)
-
-    def _torch_slopes(self, thetas: np.ndarray, w: np.ndarray | None) -> np.ndarray:
-        import torch
-
-        leaf = self._array(thetas).requires_grad_()
-        total = self._torch_values(leaf, None if w is None else self._array(w)).sum()
-        if not total.requires_grad:
-            return np.zeros(thetas.shape)
-        (gradient,) = torch.autograd.grad(total, leaf, allow_unused=True)
-        return np.zeros(thetas.shape) if gradient is None else gradient.detach().cpu().numpy()
 
 
 def _parse_batch(batch: str | int | None) -> tuple[str | None, int]:

@@ -9,7 +9,7 @@ import bisect
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 
@@ -70,11 +70,7 @@ class Names(Sequence[str]):
     def __len__(self) -> int:
         return self._size
 
-    @overload
-    def __getitem__(self, index: int) -> str: ...
-    @overload
-    def __getitem__(self, index: slice) -> list[str]: ...
-    def __getitem__(self, index: int | slice) -> str | list[str]:
+    def __getitem__(self, index: Any) -> Any:
         if isinstance(index, slice):
             return [self[i] for i in range(*index.indices(self._size))]
         position = index + self._size if index < 0 else index
@@ -82,12 +78,6 @@ class Names(Sequence[str]):
             raise IndexError(index)
         leaf = self._leaves[bisect.bisect_right(self._starts, position) - 1]
         return leaf.entry(position - leaf.start)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Sequence) and list(self) == list(other)
-
-    def __hash__(self) -> int:
-        return id(self)
 
 
 class ParameterTree:

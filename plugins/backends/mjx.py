@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -15,6 +14,7 @@ from bench.model import (
     Backend,
     EngineTwin,
     Ops,
+    PolicyScene,
     Problem,
     Program,
     Rollout,
@@ -276,19 +276,12 @@ class MjxProgram(Rollout):
 
 
 def _stepped(program: Rollout, backend: Mjx) -> MjxProgram:
-    """Return the program stepped by MJX, with the starts, substeps and ends of its own class."""
-    return _stepped_class(type(program))(program, backend)
-
-
-@cache
-def _stepped_class(own: type[Rollout]) -> type[MjxProgram]:
-    if own is Rollout:
-        return MjxProgram
-    return type(f"Mjx{own.__name__}", (_MjxPolicyProgram, own), {})
+    """Return the program stepped by MJX, with the substeps and ends of rollouts with a policy."""
+    return (_MjxPolicyProgram if isinstance(program.scene, PolicyScene) else MjxProgram)(program, backend)
 
 
 class _MjxPolicyProgram(MjxProgram):
-    """A program with a policy, stepped by MJX. Its other base class gives the starts and the ends of rollouts."""
+    """A program with a policy, stepped by MJX."""
 
     def step(self, ops: Ops, state: State, u: Array) -> State:
         """Return the state after ``substeps`` MJX steps, compiled once, or the same state after the end."""

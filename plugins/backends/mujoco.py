@@ -86,23 +86,21 @@ class MujocoProblem(NumpyProblem):
         super().__init__(program, backend.dtype, backend.step)
         self._rolled = rollout(program)
         self._backend = backend
-        scene = self._rolled.scene
-        self._substeps = getattr(scene, "substeps", 1)
-        self._engine = Engine(mjcf.build(backend, program), self._substeps)
+        self._engine = Engine(mjcf.build(backend, program), self._rolled.scene.substeps)
         self._open_loop = self._rolled.is_open_loop
 
     def _value(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         states, _ = self._rollout(theta, w)
-        return np.asarray(recorded(self._rolled, states).cost(NumpyOps(), theta, w))
+        return np.asarray(Recorded(self._rolled, states).cost(NumpyOps(), theta, w))
 
     def _grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         if self._backend.gradient == "rollouts":
             return super()._grad(theta, w)
         path = self.jacobians(theta, w)
-        return _reverse(recorded(self._rolled, *path), theta, w, scored=False)
+        return _reverse(Recorded(self._rolled, *path), theta, w, scored=False)
 
     def _score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        return _reverse(recorded(self._rolled, self._rollout(theta, w)[0]), theta, w, scored=True)
+        return _reverse(Recorded(self._rolled, self._rollout(theta, w)[0]), theta, w, scored=True)
 
     def trajectory(self, theta: np.ndarray, w: np.ndarray) -> Trajectory:
         return Trajectory(*self._rollout(np.asarray(theta, dtype=np.float64).reshape(self.dim, -1), w))
@@ -148,7 +146,7 @@ class MujocoProblem(NumpyProblem):
 class Engine:
     """A MuJoCo model with one thread and one set of simulation data per core, and ``substeps`` steps per control."""
 
-    def __init__(self, model: Any, substeps: int = 1) -> None:
+    def __init__(self, model: Any, substeps: int) -> None:
         import mujoco
         from mujoco.rollout import Rollout
 
@@ -259,13 +257,6 @@ class Recorded(Rollout):
             after = retract(self.scene, xp, after, change)
         n_q = state.q.shape[0]
         return State(after[:n_q], after[n_q:])
-
-
-def recorded(program: Rollout, *path: np.ndarray) -> Rollout:
-    """Return a :class:`Recorded` program with the starts of the program's own class; arguments as there."""
-    own = type(program)
-    replayed: Any = Recorded if own is Rollout else type(f"Recorded{own.__name__}", (Recorded, own), {})
-    return replayed(program, *path)  # type: ignore[no-any-return]
 
 
 def _reverse(program: Program, theta: np.ndarray, w: np.ndarray, scored: bool) -> np.ndarray:

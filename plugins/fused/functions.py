@@ -9,37 +9,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from decimal import Decimal, localcontext
-from fractions import Fraction
 
 LIMIT = 1.6e6
 """Maximum angle [rad] of the fast sine and cosine."""
 
 
-def _half_pi() -> Fraction:
-    """Return pi / 2 to 60 digits, by Machin's formula pi / 4 = 4 atan(1/5) - atan(1/239)."""
-    with localcontext() as context:
-        context.prec = 70
-
-        def atan(n: int) -> Decimal:
-            power, total, k = Decimal(1) / n, Decimal(0), 0
-            while abs(power) > Decimal(10) ** -68:
-                total += (-power if k % 2 else power) / (2 * k + 1)
-                power, k = power / (n * n), k + 1
-            return total
-
-        return Fraction(2 * (4 * atan(5) - atan(239)))
-
-
-def _parts() -> list[float]:
-    """Return three floats that add up to pi / 2, the first two with 33 bits each."""
-    left, parts = _half_pi(), []
-    for bits in (33, 33, 53):
-        exponent = math.frexp(float(left))[1] - bits
-        part = float(round(left / Fraction(2) ** exponent) * Fraction(2) ** exponent)
-        parts.append(part)
-        left -= Fraction(part)
-    return parts
+HALF_PI = (1.5707963267341256, 6.077100506303966e-11, 2.0222662487959506e-21)
+"""Three floats that add up to pi / 2, the first two with 33 bits each."""
 
 
 def _series(first: int, last: int) -> str:
@@ -53,7 +29,7 @@ def _series(first: int, last: int) -> str:
 
 
 def _trigonometry() -> str:
-    p1, p2, p3 = _parts()
+    p1, p2, p3 = HALF_PI
     return f"""
 LIMIT = {LIMIT!r}
 

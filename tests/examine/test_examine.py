@@ -57,7 +57,7 @@ Pair = namedtuple("Pair", "left right")
 )
 def test_theta_is_taken_apart_and_put_together(theta, names):
     layout = ParameterTree(theta)
-    assert layout.names == names
+    assert list(layout.names) == names
     built = layout.unflatten(layout.vector + 1)
     assert type(built) is type(theta) or isinstance(theta, list)
     np.testing.assert_array_equal(layout.flatten(built), layout.vector + 1)

@@ -18,9 +18,6 @@ from bench.model.parameters import build
 
 QUICK_S = 1.0
 """Rows whose cells took longer are left out, except the quickest one of an engine in another Python."""
-MOST = 1
-"""Most rows of an experiment, beside one of each engine: golden cells have every plugin."""
-AXES = ("scene", "contact", "integrator", "backend", "estimator", "optimizer", "trainer")
 FAST = {"quick"}
 STORED = sorted(path.parent.name for path in ROOT.glob("results/standard/*/rows.parquet"))
 CASES = [pytest.param(name, False, id=name, marks=[pytest.mark.slow] * (name not in FAST)) for name in STORED]
@@ -51,15 +48,14 @@ def cell_of(row):
 
 
 def sampled(rows):
-    """Return the first quick row of each combination of plugins, at most ``MOST`` of them, and one of each engine."""
+    """Return a quick row, and one of each engine: golden cells have every plugin."""
     rows = rows[rows.status == "ok"]
-    axes = [axis for axis in AXES if axis in rows]
     is_engine = rows.backend.map(
         lambda name: issubclass(registry.find("backends", name.partition("[")[0]).plugin, EngineBackend)
     ).astype(bool)
-    quick = rows[(rows.wall_s < QUICK_S) & ~is_engine].groupby(axes).head(1)
+    quick = rows[(rows.wall_s < QUICK_S) & ~is_engine]
     engines = rows[is_engine].sort_values("wall_s").groupby("backend").head(1)
-    return pd.concat([quick.iloc[:: max(1, -(-len(quick) // MOST))], engines])
+    return pd.concat([quick.head(1), engines])
 
 
 @pytest.mark.parametrize(("name", "is_mjx"), CASES)

@@ -9,7 +9,6 @@ import pytest
 from bench import UserError
 from bench.model import (
     LoopOps,
-    MechanicalScene,
     State,
     ZeroOrderHoldScene,
     adjoint_gradient,
@@ -113,9 +112,3 @@ def test_a_feedback_law_cannot_be_held():
 
         class Closed(ZeroOrderHoldScene):
             n_q = 1
-
-
-def test_a_held_push_runs_as_a_plugin():
-    push = build(registry.usable("scenes", "pushing"), {"horizon": 12, "hold": 4})
-    assert push.theta0().shape == (3,)
-    assert isinstance(push, MechanicalScene)

@@ -130,14 +130,3 @@ def test_windows_and_traces_work_on_a_manifold():
     table, error = trace(p, np.zeros((p.program.n_noise, 1)))
     assert error < 1e-5
     assert {"q12", "v10"} <= set(table.columns)
-
-
-@pytest.mark.full
-def test_mjx_gives_the_same_jacobians_and_gradients():
-    pytest.importorskip("mujoco.mjx")
-    c, x = problem(Tumbling(horizon=6)), problem(Tumbling(horizon=6), "mjx", impedance=1e-4)
-    w = np.zeros((c.program.n_noise, 1))
-    ours, theirs = c.jacobians(c.program.theta0, w), x.jacobians(c.program.theta0, w)
-    np.testing.assert_allclose(theirs.states, ours.states, atol=1e-6)
-    np.testing.assert_allclose(theirs.a, ours.a, atol=1e-4)
-    np.testing.assert_allclose(x.grad(c.program.theta0, w), c.grad(c.program.theta0, w), rtol=1e-4, atol=1e-5)

@@ -1,12 +1,8 @@
 """Physics engines: their twins are the scenes' programs, their gradients are right, and what they cannot do is refused."""
 
-import dataclasses
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 from bench.plugins.backends import mujoco
 from bench.plugins.studies.bias_variance import BiasVariance
@@ -16,7 +12,6 @@ from classes import (
     Complementarity,
     DoublePendulum,
     Fobg,
-    Hopper,
     Jax,
     Mjx,
     Mujoco,
@@ -31,13 +26,12 @@ from classes import (
     WallPenalty1d,
 )
 
-from bench.cli import main
 from bench.conformance import backends, scenes
 from bench.conformance.kit import Failed
 from bench.conformance.subjects import distance, law_for, samples
 from bench.experiment.cell import Cell
 from bench.experiment.experiment import Budget
-from bench.model import Unsupported, compose, registry
+from bench.model import compose, registry
 from bench.plugins import mjcf
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -87,16 +81,6 @@ def test_twin_takes_its_numbers_from_the_scene(changed):
     theta, w = samples(of)
     engine, own = (backend.compile(of).value(theta, w) for backend in (Mujoco(), Numpy()))
     assert distance(engine, own) < 1e-2
-
-
-def test_chained_jacobians_agree_with_differences_of_whole_rollouts():
-    scene = TossedBox(horizon=150)
-    of = program(scene)
-    still = np.zeros((3, 1))
-    chain, rollouts = (
-        Mujoco(gradient=kind, impedance=0.9).compile(of).grad(scene.theta0(), still) for kind in ("chain", "rollouts")
-    )
-    assert distance(chain, rollouts) < 1e-5
 
 
 @pytest.mark.parametrize("engine", ENGINES, ids=repr)
@@ -156,49 +140,10 @@ def test_reference_of_an_engine_is_its_own():
     assert len({one.reference_key for one in (own, engine, other)}) == 3
 
 
-# --------------------------------------------------------------------------------------------------- commands
-
-
-@pytest.mark.slow
-def test_scene_for_engines_is_traced_by_engines_only(tmp_path, capsys):
-    assert main(["trace", "tossed_box", f"results_dir={tmp_path}"]) == 0
-    printed = capsys.readouterr()
-    assert "by contact: corner-1-1 64, corner1-1 25" in printed.out
-    assert "only engines run these scenes: backends=[mujoco]" in printed.err
-    assert main(["trace", "tossed_box", "backends=[jax]", f"results_dir={tmp_path}"]) == 2
-    assert "runs only in physics engines" in capsys.readouterr().err
-
-
-@pytest.mark.slow
-def test_without_the_library_everything_else_is_listed_and_runs(tmp_path):
-    words = ["scenes=[double_integrator]", "backends=[numpy,mujoco,mjx]", "estimators=[fobg]", "samples=4", "repeats=2",
-             "name=mine", f"results_dir={tmp_path}"]  # fmt: skip
-    hidden = "import sys; sys.modules['mujoco'] = None; from bench.cli import main; sys.exit(main(sys.argv[1:]))"
-    listed, ran = (
-        subprocess.run([sys.executable, "-c", hidden, *command], cwd=ROOT, capture_output=True, text=True)
-        for command in (["list", "mujoco", "mjx", "tossed_box"], words)
-    )
-    assert listed.returncode == 0, listed.stderr
-    assert "pip install mujoco mujoco-mjx" in listed.stdout
-    assert ran.returncode == 0, ran.stdout + ran.stderr
-    rows = pd.read_parquet(tmp_path / "mine" / "rows.parquet").set_index("backend")
-    assert rows["status"].to_dict() == {"numpy": "ok", "mujoco": "unavailable", "mjx": "unavailable"}
-    assert "pip install mujoco" in rows.loc["mjx", "reason"]
-
-
 def test_force_of_unscaled_edges_fails_the_kit(monkeypatch):
     monkeypatch.setattr(mjcf, "_cone_factor", lambda model: np.ones(model.npair))
     with pytest.raises(Failed, match=r"63\.97 \(10\)"):
         backends.frictional_contact_has_the_force_of_its_law(Mujoco())
-
-
-@pytest.mark.slow
-def test_rollout_that_stops_with_a_number_fails_the_kit(monkeypatch):
-    """MuJoCo stops at the first bad number: were that the end of the rollout, its cost would be a number."""
-    rolled = mujoco.Engine.rollout
-    monkeypatch.setattr(mujoco.Engine, "rollout", lambda *given: np.nan_to_num(rolled(*given)))
-    with pytest.raises(Failed, match="has a finite cost"):
-        backends.failed_rollouts_have_no_gradient(Mujoco())
 
 
 def test_gradient_of_a_failed_rollout_that_is_a_number_fails_the_kit(monkeypatch):
@@ -228,22 +173,3 @@ def test_engine_scene_that_jax_cannot_trace_fails_its_check():
     assert "parameters traced" in scenes.start_and_costs_are_traceable(Quadruped())
     with pytest.raises(Failed, match="JAX cannot trace it"):
         scenes.start_and_costs_are_traceable(Concrete())
-
-
-def test_a_backend_whose_refusals_need_the_model_builds_it():
-    @dataclasses.dataclass(frozen=True)
-    class Small(Mujoco):
-        """Runs one body only."""
-
-        name = "small"
-
-        def unsupported_reason(self, program):
-            reason = mjcf.unsupported_reason(self, program)
-            if reason is None and mjcf.build(self, program).nbody > 2:
-                return "one body only"
-            return reason
-
-    assert Small().unsupported_reason(program(Hopper())) == "one body only"
-    assert Small().unsupported_reason(program(BounceOnce())) is None
-    with pytest.raises(Unsupported, match="not rk4"):
-        mjcf.build(Small(), compose(BounceOnce(), program(BounceOnce()).contact, Rk4()))

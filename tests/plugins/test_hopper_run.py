@@ -1,11 +1,8 @@
 """The running hopper: conserved quantities, rest on the ground, rewards, and gradients around touch-down."""
 
-from functools import partial
-
 import jax
 import numpy as np
 import pytest
-from bench.plugins.scenes.hopper_run import HopperRun
 
 from bench.model import State, compose, registry
 from bench.model.ops import LoopOps
@@ -82,38 +79,3 @@ def test_energy_is_conserved_through_a_bounce_in_the_limit_of_short_steps():
         errors.append(max(abs(value - values[0]) for value in values))
     assert errors[1] < 0.6 * errors[0]  # first order: half
     assert errors[1] < 0.02 * (values[0] - program.scene.gravity * 4.5 * 0.2)
-
-
-def test_friction_slows_a_sliding_foot_by_at_most_its_coefficient():
-    scene = HopperRun()
-    sliding = program_of().dynamics(LoopOps())
-    state = start_of(foot=-0.01, speed=5.0)
-    pushed = sliding.acceleration(state.q, state.v, np.zeros((2, 1)))
-    assert pushed[3, 0] == pytest.approx(-scene.friction * 100.0 / scene.foot_mass)  # 1e4 N/m times 0.01 m
-
-
-def test_rewards_are_the_sum_of_their_terms_and_0_after_the_end():
-    scene = HopperRun()
-    u = np.array([[100.0], [0.0]])  # a saturated leg and no hip
-    cost = partial(scene.stage_cost, np)
-
-    def reward(z, pitch, speed=2.0):
-        return -cost(np.array([[0.0], [z], [pitch], [0.0], [0.0]]), np.array([[speed], [0], [0], [0], [0.0]]), u)[0]
-
-    assert reward(0.5, 0.0) == pytest.approx(2.0 + 0.2 + 1.0 - 0.1)
-    assert reward(5.0, 0.0) == pytest.approx(2.0 + 0.3 + 1.0 - 0.1)
-    assert reward(0.25, 0.0) == pytest.approx(2.0 - 200 * 0.05**2 + 1.0 - 0.1)
-    assert reward(0.5, np.pi / 6) == pytest.approx(2.0 + 0.2 - 0.1)
-    assert reward(0.19, 0.0) == 0.0
-    assert reward(0.5, 1.21) == 0.0
-
-
-def test_random_starts_are_in_the_air_and_inside_their_ranges():
-    state = HopperRun().random_start(np, np.random.default_rng(0).standard_normal((10, 1000)))
-    length = np.hypot(state.q[3] - state.q[0], state.q[4] - state.q[1])
-    np.testing.assert_allclose(length, 0.5)
-    assert 0 <= state.q[4].min() < 0.01
-    assert 0.19 < state.q[4].max() <= 0.2
-    assert np.abs(state.q[2]).max() <= 0.1
-    assert np.abs(state.v).max() <= 0.5
-    assert not HopperRun().has_ended(np, state.q, state.v).any()

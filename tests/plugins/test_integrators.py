@@ -1,36 +1,22 @@
 """Integrators and the smooth scenes that tell them apart: stability, order, energy, impacts, chaos."""
 
 import dataclasses
-import math
 
 import numpy as np
 import pytest
 from classes import (
-    BounceOnce,
     BouncingBall,
     DoublePendulum,
     EventDriven,
-    ExplicitEuler,
     Implicit,
     Impulse,
-    Jax,
-    MassSpring,
-    Midpoint,
     Numpy,
     Penalty,
-    Rk4,
-    SemiImplicitEuler,
     StormerVerlet,
     Torch,
 )
 
 from bench.model import compose
-
-EXPLICIT = [ExplicitEuler(), SemiImplicitEuler(), Midpoint(), Rk4(), StormerVerlet(), EventDriven()]
-
-
-def named(plugin):
-    return plugin.name
 
 
 def compiled(scene, integrator, law=None, backend=None):
@@ -52,17 +38,6 @@ def gradient(problem):
     return problem.grad(problem.program.theta0, quiet(problem))[:, 0]
 
 
-# -------------------------------------------------------------------------------------------------- mass_spring
-
-
-@pytest.mark.parametrize("damping", [0.0, 1.0, 10.0, 15.0], ids=["undamped", "damped", "critical", "overdamped"])
-@pytest.mark.parametrize("integrator", EXPLICIT, ids=named)
-def test_mass_spring_gradient(integrator, damping):
-    scene = MassSpring(damping=damping)
-    problem = compiled(scene, integrator, backend=Torch())
-    assert gradient(problem) == pytest.approx(scene.closed_form_gradient(None, integrator), rel=1e-9)
-
-
 # ---------------------------------------------------------------------------------------------- double_pendulum
 
 
@@ -81,22 +56,6 @@ def test_double_pendulum_acceleration_is_that_of_its_energy():
 
 # ------------------------------------------------------------------------------------------------- event_driven
 
-BOUNCES = [
-    pytest.param(BouncingBall(), marks=pytest.mark.slow),
-    BouncingBall(horizon=7, dt=1 / 7),
-    pytest.param(BouncingBall(horizon=300, dt=0.01, velocity=1.0), marks=pytest.mark.slow),
-    BouncingBall(horizon=120, dt=0.01, restitution=0.7, mass=3.0, velocity=-2.0),
-]
-
-
-@pytest.mark.parametrize("scene", BOUNCES, ids=lambda s: f"{s.horizon}x{s.dt:.3g}-e{s.restitution:g}-v{s.velocity:g}")
-@pytest.mark.parametrize("law", [Impulse(), Impulse(time_of_impact=False)], ids=["time_of_impact", "without"])
-def test_event_driven_gradient_is_the_physical_one(scene, law):
-    """Constant acceleration leaves no discretisation error, at any dt; the same for JAX and torch."""
-    for backend in (Jax(), Torch()):
-        problem = compiled(scene, EventDriven(), law, backend)
-        assert gradient(problem) == pytest.approx(scene.physical_gradient(), rel=1e-9)
-
 
 def test_event_driven_gradients_across_noise():
     """Each of 1,000 samples, among which impacts fall everywhere within a step."""
@@ -108,16 +67,6 @@ def test_event_driven_gradients_across_noise():
     assert problem.grad(scene.theta0(), w) == pytest.approx(np.transpose(exact), rel=1e-8, abs=1e-10)
 
 
-@pytest.mark.parametrize("height", [1.0, pytest.param(1.0 + 1 / 480, marks=pytest.mark.slow)])
-def test_event_driven_bounce_without_gravity(height):
-    """Where the impact meets a step boundary too, which is a kink for force laws. The force of the first step acts at its middle."""
-    scene = BounceOnce(height=height)
-    found = gradient(compiled(scene, EventDriven(), Impulse(), Torch()))
-    end = scene.horizon * scene.dt
-    assert found == pytest.approx([-1.0, -end, -(end - scene.dt / 2) * scene.dt], rel=1e-9)
-    assert scene.physical_gradient() == pytest.approx(found, rel=scene.dt)
-
-
 def test_event_driven_without_impacts_is_stormer_verlet():
     for scene, law in (
         (DoublePendulum(horizon=20), None),
@@ -126,14 +75,3 @@ def test_event_driven_without_impacts_is_stormer_verlet():
         event, plain = (compiled(scene, integrator, law) for integrator in (EventDriven(), StormerVerlet()))
         w = normal(event, 4)
         assert np.array_equal(event.value(scene.theta0(), w), plain.value(scene.theta0(), w))
-
-
-@pytest.mark.slow
-def test_event_driven_comes_to_rest():
-    """After infinitely many bounces, by 1.36 s, it lies on the ground but for a sinking of less than dt^2 g / 2 a step."""
-    scene = BouncingBall(horizon=640, restitution=0.5)
-    assert scene.physical_gradient() is None
-    problem = compiled(scene, EventDriven(), Impulse(), Torch())
-    end = scene.target - math.sqrt(problem.value(scene.theta0(), quiet(problem))[0])
-    assert -scene.horizon * scene.gravity * scene.dt**2 / 2 < end <= 0
-    assert np.abs(gradient(problem)).max() < 0.01

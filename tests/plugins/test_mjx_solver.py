@@ -3,12 +3,11 @@
 import numpy as np
 import pandas as pd
 import pytest
-from classes import Mjx, Numpy, Penalty, SemiImplicitEuler, TossedBox
+from classes import Numpy
 
 from bench.cli import main
-from bench.conformance.subjects import law_for
 from bench.engines import conformance
-from bench.model import compose, registry
+from bench.model import registry
 from bench.plugins import mjx_solver
 
 for _name in ("mujoco", "mjx"):
@@ -105,36 +104,3 @@ def test_dropped_term_of_the_derivative_is_caught(dropped, monkeypatch):
 
     monkeypatch.setattr(mjx_solver, "_cost_gradient", incomplete)
     assert any(row["is_right"] is False for case in CASES for row in conformance.run(Engine(case), case))
-
-
-@pytest.mark.full
-def test_elliptic_cone_in_reverse_agrees_with_differences_of_the_backends_own_costs():
-    scene = TossedBox(horizon=120)
-    law = law_for(scene, Penalty, {"damping_mode": "clipped"})
-    problem = Mjx(impedance=0.9, cone="elliptic", iterations=50, mode="reverse").compile(
-        compose(scene, law, SemiImplicitEuler())
-    )
-    theta, w = scene.theta0(), np.zeros((3, 16))
-    shifts = np.zeros((3, 16))
-    for i in range(3):
-        shifts[i, 2 * i : 2 * i + 2] = 1e-6, -1e-6
-    values = problem.value(theta[:, None] + shifts, w)
-    differences = (values[0:6:2] - values[1:6:2]) / 2e-6
-    np.testing.assert_allclose(problem.grad(theta, w)[:, 0], differences, rtol=1e-6)
-    assert problem.solver_residual(w) < 1e-8
-
-
-@pytest.mark.slow
-def test_study_of_the_solver_finds_the_wrong_sign_of_one_iteration(tmp_path):
-    words = ["study=solver", "scenes=[ant]", "backends=[mujoco,jax]", "backend.mujoco.impedance=0.9", "name=mine"]
-    words += ["sweep.iterations=[1,10,100]", "samples=1", "workers=0", "timing=false"]
-    assert main([*words, f"results_dir={tmp_path}"]) == 0
-    rows = pd.read_parquet(tmp_path / "mine" / "rows.parquet")
-    assert {"solver.png", "solver.md", "solver.csv"} <= {path.name for path in (tmp_path / "mine").iterdir()}
-    first, last = (rows[(rows["status"] == "ok") & (rows["iterations"] == n)].iloc[0] for n in (1, 100))
-    assert first["gradient"][1] == pytest.approx(-0.003658, abs=5e-7)
-    assert last["gradient"][1] == pytest.approx(0.003351, abs=5e-7)
-    assert first["wrong_signs"] == 0.25
-    assert last["wrong_signs"] == last["gradient_error_rel"] == 0
-    refused = rows[rows["status"] == "unsupported"]
-    assert refused["reason"].str.contains("no parameter iterations|runs only in physics engines").all()

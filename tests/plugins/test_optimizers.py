@@ -42,10 +42,6 @@ CASES = {
     ),
     "adam": (Adam(rate=0.02), lambda t, p: t.optim.Adam([p], lr=0.02)),
     "adam, clipped by norm": (Adam(rate=0.02, clip=1.0), lambda t, p: t.optim.Adam([p], lr=0.02)),
-    "adam, clipped by element": (
-        Adam(rate=0.02, clip=0.5, clip_by="element"),
-        lambda t, p: t.optim.Adam([p], lr=0.02),
-    ),
 }
 
 
@@ -58,29 +54,22 @@ def test_100_updates_are_those_of_torch(case):
     for gradient in gradients():
         parameter.grad = torch.tensor(gradient)
         if optimizer.clip is not None:
-            if optimizer.clip_by == "norm":
-                # not torch's own function, which divides by norm + 1e-6
-                parameter.grad *= min(1.0, optimizer.clip / float(np.linalg.norm(gradient)))
-            else:
-                torch.nn.utils.clip_grad_value_([parameter], optimizer.clip)
+            # not torch's own function, which divides by norm + 1e-6
+            parameter.grad *= min(1.0, optimizer.clip / float(np.linalg.norm(gradient)))
         method.step()
     assert path(optimizer, gradients()) == pytest.approx(parameter.detach().numpy(), rel=SAME)
 
 
-@pytest.mark.parametrize(("share", "move", "factor"), [(0.1, -1.754983, 0.169135), (0.2, -1.399810, 0.218643)])
-def test_cem_on_a_linear_cost(share, move, factor):
+@pytest.mark.parametrize(("share", "factor"), [(0.1, 0.169135), (0.2, 0.218643)])
+def test_cem_on_a_linear_cost(share, factor):
     """The mean moves by -sigma phi(z)/rho, the variance by 1 - z phi/rho - (phi/rho)^2 (z the quantile of rho)."""
-    z = norm.ppf(share)
-    assert move == pytest.approx(-norm.pdf(z) / share, abs=1e-6)
+    move = -norm.pdf(norm.ppf(share)) / share
     optimizer = Cem(population=SAMPLES, elites=int(share * SAMPLES), width=0.7)
     state = optimizer.start(np.array([2.0, 0.0]))
     points = optimizer.ask(state, np.random.default_rng(0).standard_normal((2, SAMPLES)))
     after = optimizer.tell(state, points, Answer(value=3.0 * points[0]))
     assert after["theta"] == pytest.approx([2.0 + 0.7 * move, 0.0], abs=LIMIT)
     assert (after["deviation"] / 0.7) ** 2 == pytest.approx([factor, 1.0], abs=LIMIT)
-    wide = Cem(population=SAMPLES, elites=int(share * SAMPLES), width=0.7, spread="old")
-    square = (wide.tell(state, points, Answer(value=3.0 * points[0]))["deviation"] / 0.7) ** 2
-    assert square[0] == pytest.approx(factor + move**2, abs=2 * LIMIT)
 
 
 def test_mppi_on_a_bowl():
@@ -93,22 +82,20 @@ def test_mppi_on_a_bowl():
 
 
 def test_slope_of_ppo_is_that_of_its_loss():
-    """The clipped surrogate as written in the paper, differentiated by torch at a policy that has moved from the old one."""
-    torch = pytest.importorskip("torch")
+    """The clipped surrogate as written in the paper, differentiated at a policy that has moved from the old one."""
     rng = np.random.default_rng(0)
     old, moved = (np.stack([rng.standard_normal(3), rng.uniform(-0.5, 0.5, 3)]) for _ in range(2))
     points = old[0][:, None] + np.exp(old[1])[:, None] * rng.standard_normal((3, 50))
     advantage = rng.standard_normal(50)
-    policy = torch.tensor(moved, requires_grad=True)
-    x, gain = torch.tensor(points), torch.tensor(advantage)
-    before, after = (
-        torch.distributions.Normal(p[0][:, None], torch.exp(p[1])[:, None]) for p in (torch.tensor(old), policy)
-    )
-    ratio = torch.exp(after.log_prob(x) - before.log_prob(x))
-    torch.minimum(ratio * gain, torch.clip(ratio, 0.8, 1.2) * gain).mean(dim=1).sum().backward()
-    assert (abs(ratio - 1) > 0.2).any()
-    assert (abs(ratio - 1) < 0.2).any()
-    assert Ppo().slope(moved, old, points, advantage) == pytest.approx(policy.grad.numpy(), rel=1e-10)
+
+    def loss(policy):
+        after, before = (norm.logpdf(points, p[0][:, None], np.exp(p[1])[:, None]) for p in (policy, old))
+        ratio = np.exp(after - before)
+        return np.minimum(ratio * advantage, np.clip(ratio, 0.8, 1.2) * advantage).mean(axis=1).sum()
+
+    shifts = 1e-6 * np.eye(6).reshape(6, 2, 3)
+    slope = [(loss(moved + shift) - loss(moved - shift)) / 2e-6 for shift in shifts]
+    assert Ppo().slope(moved, old, points, advantage).ravel() == pytest.approx(slope, rel=1e-7)
 
 
 def test_decay_of_the_rate():

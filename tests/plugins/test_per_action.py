@@ -3,33 +3,15 @@
 import numpy as np
 import pytest
 from bench.plugins.estimators.total_propagation import TotalPropagation, _weight
-from classes import BouncingBall, Cartpole, DoubleIntegrator, Numpy, Pushing, SemiImplicitEuler
+from classes import BouncingBall, Cartpole, Numpy, Pushing, SemiImplicitEuler
 
 from bench.model import compose
 
-DIFFERENCES = 1e-6
-"""Relative error of gradients from central differences."""
 PER_ACTION = TotalPropagation(per="action")
 
 
 def compiled(scene):
     return Numpy().compile(compose(scene, None, SemiImplicitEuler()))
-
-
-def test_open_loop_by_hand():
-    """With only an end cost the cost to come is the whole cost, less the mean over the other samples."""
-    problem = compiled(DoubleIntegrator(horizon=4, sigma=0.5))
-    theta, noise = problem.program.theta0, np.random.default_rng(3).standard_normal((2, 9, 4))
-    found, decided = PER_ACTION.estimate_with_diagnostics(problem, theta, noise)
-    for r in range(2):
-        cost, first = problem.value(theta, noise[r].T), problem.grad(theta, noise[r].T)
-        others = [np.delete(cost, n).mean() for n in range(9)]
-        zeroth = (cost - others) * noise[r].T / 0.5
-        for t in range(4):
-            weight = zeroth[t].var(ddof=1) / (zeroth[t].var(ddof=1) + first[t].var(ddof=1))
-            assert decided["weight"][r, t] == pytest.approx(weight, rel=DIFFERENCES)
-            expected = weight * first[t].mean() + (1 - weight) * zeroth[t].mean()
-            assert found[r, t] == pytest.approx(expected, rel=DIFFERENCES)
 
 
 @pytest.fixture(scope="module")

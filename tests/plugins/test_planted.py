@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 import pytest
-from bench.plugins.estimators.planted import Planted, direction
-from classes import Fobg, Heaviside, Quadratic
+from bench.plugins.estimators.planted import Planted
+from classes import Heaviside, Quadratic
 from dose_response.measure import compare
 from scipy.stats import f, kstest
 
@@ -42,16 +42,10 @@ def test_planted_bias_has_its_size_and_no_spread(bias):
 
 @pytest.mark.parametrize("angle", [30.0, 90.0, 120.0])
 def test_planted_rotation_has_its_angle_and_keeps_the_length(angle):
-    p = problem()
-    theta = p.program.theta0 + 1.0
-    exact = p.grad(theta, np.zeros((D, 1)))[:, 0]
-    turned = Planted(base="best", angle=angle).estimate(p, theta, drawn(repeats=1))[0]
-    assert np.linalg.norm(turned) == pytest.approx(np.linalg.norm(exact), rel=ROUNDING)
-    cosine = turned @ exact / (np.linalg.norm(turned) * np.linalg.norm(exact))
-    assert cosine == pytest.approx(math.cos(math.radians(angle)), abs=ROUNDING)
-    assert measured(Planted(base="best", angle=angle))["error"] == pytest.approx(
-        2 * math.sin(math.radians(angle / 2)), rel=1e-7
-    )
+    """The error of a rotation alone is 2 sin(angle / 2)."""
+    found = measured(Planted(base="best", angle=angle))
+    assert found["error"] == pytest.approx(2 * math.sin(math.radians(angle / 2)), rel=1e-7)
+    assert found["cosine"] == pytest.approx(math.cos(math.radians(angle)), abs=1e-7)
 
 
 @pytest.mark.parametrize("noise", [0.3, 3.0])
@@ -72,25 +66,6 @@ def test_heavy_tailed_errors_follow_an_f_distribution_whose_mean_is_the_stated_s
     # |t|^2 / d of a multivariate t vector is F(d, tails), with mean tails / (tails - 2)
     assert kstest(squares * tails / (tails - 2), f(D, tails).cdf).pvalue > UNLIKELY
     assert kstest(squares, f(D, 300).cdf).pvalue < UNLIKELY  # a normal error is told apart
-
-
-def test_errors_relative_to_the_start_grow_as_the_gradient_falls():
-    p = problem()
-    theta0 = p.program.theta0
-    near = 0.1 * theta0
-    exact = [p.grad(theta, np.zeros((D, 1)))[:, 0] for theta in (theta0, near)]
-    assert np.linalg.norm(exact[0]) > 5 * np.linalg.norm(exact[1])
-    found = Planted(base="best", bias=0.5, scale="start").estimate(p, near, drawn(repeats=1))[0] - exact[1]
-    np.testing.assert_allclose(found, 0.5 * np.linalg.norm(exact[0]) * direction(D), rtol=1e-7)
-
-
-def test_best_gradient_of_a_jump_comes_from_costs():
-    p = problem(Heaviside())
-    w = drawn(repeats=8, samples=4000, width=1)
-    mean = Planted(base="best").estimate(p, p.program.theta0, w).mean()
-    truth = p.program.closed_form_gradient()[0]
-    assert mean == pytest.approx(truth, rel=0.1)  # 10 standard errors of 32,000 samples
-    assert Fobg().estimate(p, p.program.theta0, w).mean() == 0.0
 
 
 def test_rotation_of_one_coordinate_is_refused():

@@ -37,15 +37,6 @@ def test_the_block_has_no_gradient_without_contact():
     assert np.linalg.norm(problem().grad(pushing.program.theta0, STILL)) > 1e-2
 
 
-@pytest.mark.parametrize(("sigma", "low", "high"), [(0.02, 0.0, 0.0), (0.2, 0.15, 0.25)])
-def test_the_noise_decides_how_many_plans_touch(sigma, low, high):
-    pushing = problem(sigma=sigma)
-    w = np.random.default_rng(0).standard_normal((12, 1000))
-    block = pushing.trajectory(pushing.program.theta0, w).states[-1, 18]
-    assert low <= np.mean(block > 0) <= high
-    assert block.min() >= 0
-
-
 def test_in_contact_the_gradient_moves_the_block():
     pushing = problem(lean=0.2, **DOWN)
     theta = pushing.program.theta0
@@ -53,13 +44,3 @@ def test_in_contact_the_gradient_moves_the_block():
     np.testing.assert_allclose(gradient, differences(pushing, theta), rtol=0, atol=1e-4 * np.linalg.norm(gradient))
     moved = theta[:, None] - 0.02 * gradient / np.linalg.norm(gradient)
     assert pushing.value(moved, STILL)[0] < pushing.value(theta, STILL)[0] - 0.02
-
-
-@pytest.mark.parametrize("horizon", [1, 2, 50])
-def test_the_plan_fills_every_horizon(horizon):
-    """Left and right legs have the same targets."""
-    scene = QuadrupedPush(horizon=horizon)
-    theta = np.random.default_rng(0).standard_normal((12, 2))
-    plan = scene.planned_controls(np, theta)
-    assert plan.shape == (horizon, 12, 2)
-    np.testing.assert_allclose(plan[:, :3], plan[:, 3:6], rtol=0, atol=1e-12)

@@ -7,8 +7,6 @@ import pytest
 from classes import (
     BounceOnce,
     BouncingBall,
-    Cartpole,
-    Cubic,
     DoubleIntegrator,
     Impulse,
     Jax,
@@ -26,26 +24,9 @@ def test_closed_forms_are_refused_where_they_do_not_hold():
     assert DoubleIntegrator().closed_form_gradient(None, None) is None
 
 
-def test_cubic_smoothing_shifts_the_gradient():
-    scene = Cubic(sigma=0.3)
-    difference = scene.closed_form_gradient(None, None) - scene.physical_gradient()
-    assert difference == pytest.approx(np.full(5, 0.09))
-
-
-def test_cartpole_is_balanced():
-    scene = Cartpole(horizon=500)
-    problem = Jax().compile(compose(scene, None, SemiImplicitEuler()))
-    theta, still = scene.theta0(), np.zeros((problem.program.n_noise, 1))
-    assert problem.value(theta, still)[0] < 1.0
-    assert problem.value(0 * theta, still)[0] > 10.0
-
-
 def test_bouncing_ball_at_rest_has_no_physical_gradient():
     assert BouncingBall(restitution=0.0).physical_gradient() is None
     assert BouncingBall(restitution=0.5, horizon=4000).physical_gradient() is None
-
-
-# ------------------------------------------------------------------------------------------------- pushing
 
 
 @pytest.mark.slow
