@@ -55,7 +55,7 @@ def chart(claim: type[Claim], result: ClaimResult) -> Chart | None:
     return Chart(
         claim.name, pd.concat(parts, ignore_index=True), [Column("x", label=claim.labels[0], log=is_log["x"])],
         [Column("y", label=claim.labels[1], low="low", high="high", log=is_log["y"])], "lines",
-        claim.learned, "series", styles=looks, marks=[Mark(label, value, axis=axis) for axis, value, label in claim.marks],
+        claim.learned.partition(". ")[0], "series", styles=looks, marks=[Mark(label, value, axis=axis) for axis, value, label in claim.marks],
         subtitle=f"{claim.name}, {claim.source.partition(';')[0]}: {result.verdict}",
     )  # fmt: skip
 

@@ -71,8 +71,6 @@ class Chart:
     """The column that separates lines of the same series, such as backends; by default ``series``."""
     panel: str = ""
     """The column with a panel per value."""
-    panel_row: str = ""
-    """The column with a row of panels per value; each value of ``panel`` is then a column of panels."""
     level: str = ""
     value: str = ""
     cell: str = ""
@@ -124,7 +122,7 @@ class Chart:
     def _names(self) -> list[str]:
         """Return the columns of the table that the chart needs."""
         axes = [name for c in (*self.x, *self.y) for name in (c.name, c.low, c.high, c.limit)]
-        names = [self.panel, self.panel_row, self.series, self.line, self.shape, self.level, self.value, self.cell,
+        names = [self.panel, self.series, self.line, self.shape, self.level, self.value, self.cell,
                  self.failed, *axes]  # fmt: skip
         return [name for name in dict.fromkeys(names) if name]
 

@@ -28,45 +28,15 @@ def commands(experiment: Experiment, rows: pd.DataFrame) -> list[list[str]]:
     """Return, per row, the words after :data:`HEAD` that rerun its cell, shell-quoted; empty if a plugin is missing."""
     folders = [shlex.quote(word) for word in plugin_folders(experiment.plugins)]
     known: dict[str, Plugin] = {}
-    codes, distinct = pd.factorize(rows["parameters"]) if "parameters" in rows else ([0] * len(rows), [""])
-    parsed = parse(pd.DataFrame({"parameters": distinct}))
-    every = [_Commands(known, given, folders, experiment.timing) for given in parsed]
-    facts = zip(codes, rows["key"], *(rows[name].tolist() for name in COUNTS), strict=True)
-    return [every[code].words(key, counts) for code, key, *counts in facts]
-
-
-class _Commands:
-    """The commands of rows with the same parameters, which differ in counts and in whether they are timed."""
-
-    def __init__(
-        self, known: dict[str, Plugin], given: Mapping[str, Any], folders: Sequence[str], is_timed: bool
-    ) -> None:
-        self._folders, self._is_timed = folders, is_timed
-        self._settings: dict[bool, tuple[list[str], list[str]]] = {}
-        try:
-            self._cell: Cell | None = cell_of(given, known)
-        except (UserError, KeyError):
-            self._cell = None
-
-    def words(self, key: str, counts: Sequence[float]) -> list[str]:
-        """Return the words that rerun the cell of a row, given its key and counts.
-
-        The parameters do not contain whether the cell was timed, but its key depends on it. The experiment's choice is
-        used if neither choice gives the row's key, because its plugins have changed since.
-        """
-        if self._cell is None:
-            return []
-        samples, repeats, seed = map(int, counts)
-        other = dataclasses.replace(self._cell, samples=samples, repeats=repeats, seed=seed, timing=not self._is_timed)
-        try:
-            is_timed = not self._is_timed if other.key == key else self._is_timed
-        except (UserError, KeyError):
-            return []
-        if is_timed not in self._settings:
-            before, after = _settings_around_counts(dataclasses.replace(self._cell, timing=is_timed))
-            self._settings[is_timed] = [*map(shlex.quote, before)], [*map(shlex.quote, after)]
-        before, after = self._settings[is_timed]
-        return [*self._folders, *before, f"samples={samples}", f"repeats={repeats}", f"seed={seed}", *after]
+    given = rows["parameters"] if "parameters" in rows else pd.Series("", index=rows.index)
+    parts = dict(zip(given.unique(), parse(pd.DataFrame({"parameters": given.unique()})), strict=True))
+    around = {text: _settings_around_counts(part, known, experiment.timing) for text, part in parts.items()}
+    result = []
+    for text, *counts in zip(given, *(rows[name] for name in COUNTS), strict=True):
+        before, after = around[text]
+        middle = [f"{name}={int(count)}" for name, count in zip(COUNTS, counts, strict=True)]
+        result.append([*folders, *before, *middle, *after] if before else [])
+    return result
 
 
 def cell_of(given: Mapping[str, Any], known: dict[str, Plugin]) -> Cell:
@@ -93,8 +63,17 @@ def cell_of(given: Mapping[str, Any], known: dict[str, Plugin]) -> Cell:
     )
 
 
-def _settings_around_counts(cell: Cell) -> tuple[list[str], list[str]]:
-    """Return the settings, as command-line words, of an experiment with only this cell: before its counts and after them."""
+def _settings_around_counts(
+    given: Mapping[str, Any], known: dict[str, Plugin], timing: bool
+) -> tuple[list[str], list[str]]:
+    """Return the settings, as shell words, of an experiment with only a row's cell: before its counts and after them.
+
+    Both are empty if a plugin is missing.
+    """
+    try:
+        cell = dataclasses.replace(cell_of(given, known), timing=timing)
+    except (UserError, KeyError):
+        return [], []
     before = [f"study={_identity(cell.study)}", *plugin_settings(cell)]
     after = theta_settings(cell)
     if cell.budget is not None:
@@ -104,7 +83,7 @@ def _settings_around_counts(cell: Cell) -> tuple[list[str], list[str]]:
                 after.append(f"reference.{name}={getattr(cell.budget, name)!r}")
     if isinstance(cell.study, Study) and cell.timing != cell.study.timed:
         after.append(f"timing={str(cell.timing).lower()}")
-    return before, after
+    return [*map(shlex.quote, before)], [*map(shlex.quote, after)]
 
 
 def plugin_settings(cell: Cell, without: Collection[str] = ()) -> list[str]:

@@ -29,21 +29,21 @@ class Damper(Claim):
     )
     source = "Zhong, Han, Brikis 2022, task 2; distances by an independent program"
     learned = "A stiff contact does not bias the first order; a force that jumps does, at any step."
-    labels = ("stiffness", "distance of first from zeroth order")
-    logarithmic = "xy"
+    labels = ("damper [N s/m], a thousandth of the stiffness", "distance of first from zeroth order")
     curves = {str(steps): f"{steps} steps" for steps in DISTANCES}
 
     def measure(self) -> Outcome:
         """Estimate both means with the same samples."""
-        figures, series = [], {"stiffness": list(STIFFNESSES)}
+        figures, series = [], {"damper": [0.0, *(stiffness / 1e3 for stiffness in STIFFNESSES)]}
         for steps, published in DISTANCES.items():
-            distances = []
+            without = _distance(1e4, 0.0, steps)
+            distances = [without[0]]
             for stiffness, text in zip(STIFFNESSES, published, strict=True):
                 distance, error = _distance(stiffness, stiffness / 1e3, steps)
                 label = f"distance at {stiffness:.0e} N/m, {steps} steps"
                 figures.append(Figure(label, text, distance, error, spread=SPREAD * float(text)))
                 distances.append(distance)
-            figures.append(Figure(f"without a damper, {steps} steps", "0.00", *_distance(1e4, 0.0, steps)))
+            figures.append(Figure(f"without a damper, {steps} steps", "0.00", *without))
             series[str(steps)] = distances
         figures.append(Figure("a damper of 30", "9.16", *_distance(1e4, 30.0, 288), spread=SPREAD * 9.16))
         finer = _distance(1e4, 10.0, 2880)

@@ -59,7 +59,7 @@ def test_twelve_estimators_stay_distinct_for_colour_blind_readers_too(eyes):
         assert apart(colour(a), colour(b), EYES[eyes]) > (30 if marker(a) == marker(b) else 8)
 
 
-def test_an_estimator_keeps_its_colour_in_searches_and_in_errors_and_what_sees_costs_only_is_grey_and_dashed():
+def test_an_estimator_keeps_its_colour_in_searches_and_in_errors():
     """fobg was blue in one experiment's searches, pink in another's."""
     found = searches.styles(
         ["cem[elites=8,population=40]", "fobg, adam", "fobg, line_search", "windowed[steps=5], adam"]
@@ -71,6 +71,4 @@ def test_an_estimator_keeps_its_colour_in_searches_and_in_errors_and_what_sees_c
     ):
         assert found[method].colour == colour(estimator_order().index(estimator))
     assert found["fobg, adam"].line != found["fobg, line_search"].line
-    context = found["cem[elites=8,population=40]"]
-    assert len(set(to_rgb(context.colour))) == 1
-    assert context.line != "-"
+    assert "cem[elites=8,population=40]" not in found, "a chart gives it a free colour"

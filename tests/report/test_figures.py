@@ -1,12 +1,10 @@
 """Equal figures are equal files, whatever the solver of layouts leaves in the last bits."""
 
 import numpy as np
-import pandas as pd
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from bench.experiment.views import Chart
 from bench.report import draw, figures, scales
 from bench.report.style import width_in_inches
 
@@ -53,8 +51,7 @@ def test_one_value_on_a_logarithmic_axis_has_its_label():
 
 def test_a_title_without_spaces_breaks_after_commas_and_slashes():
     name = "mjcf[action_scale=1,file=gymnasium:envs/mujoco/assets/half_cheetah.xml,substeps=5]"
-    chart = Chart("c", pd.DataFrame(), [], [])
-    lines = draw._panel_title(chart, name, 2.0).split("\n")
+    lines = draw._wrapped(name, 2.0).split("\n")
     assert "".join(lines) == name
     assert all(width_in_inches(line) <= 2.0 for line in lines)
-    assert draw._panel_title(chart, "two_balls, T=60", 2.0) == "two_balls, T=60"
+    assert draw._wrapped("two_balls, T=60", 2.0) == "two_balls, T=60"

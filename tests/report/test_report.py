@@ -305,7 +305,7 @@ def test_zipped_axes_do_not_split_problems():
     sweep = {"zip": {"stiffness": [1e2, 1e4], "dt": [0.01, 0.001]}}
     rows = table([row(stiffness=k, dt=h) for k, h in ((1e2, 0.01), (1e4, 0.001))])
     assert len(families(rows, "stiffness", sweep=sweep)) == 1
-    assert set(drawn(rows, ["stiffness", "dt"], sweep=sweep)) == {"bias_variance_stiffness", "bias_variance_dt"}
+    assert set(drawn(rows, ["stiffness", "dt"], sweep=sweep)) == {"bias_variance_stiffness"}
 
 
 def test_seeds_become_medians_of_those_that_are_ok():
@@ -530,8 +530,7 @@ def test_the_axis_of_zipped_parameters_names_all_of_them():
     sweep = {"zip": {"stiffness": [1e2, 1e4], "dt": [0.01, 0.001]}}
     rows = table([row(stiffness=k, dt=h) for k, h in ((1e2, 0.01), (1e4, 0.001))])
     figures = drawn(rows, (), sweep=sweep)
-    for name, other in (("stiffness", "dt"), ("dt", "stiffness")):
-        assert other in figures[f"bias_variance_{name}"].x[0].heading
+    assert "dt" in figures["bias_variance_stiffness"].x[0].heading
     shown = views.arrange(experiment(sweep=sweep), rows)
     assert [axis.title for axis in shown.axes] == ["stiffness [N/m], with dt", "dt [s], with stiffness"]
 

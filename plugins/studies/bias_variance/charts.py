@@ -69,9 +69,11 @@ def charts(
     styles = estimator_styles(shown.rows)
     subtitle = _conditions(shown)
     swept = shown.swept()
+    order = sorted(swept, key=lambda a: (-swept[a], a.column != "stiffness"))
     along = [
         _along(labelled, axis, methods, comparisons, styles, subtitle)
-        for axis in sorted(swept, key=lambda a: (-swept[a], a.column != "stiffness"))
+        for i, axis in enumerate(order)
+        if not any(axis.column in other.moves for other in order[:i])  # axes that step together have one chart
         if axis.column != "samples" or best.empty
     ]
     if not best.empty:

@@ -131,6 +131,10 @@ def _grid(points: pd.DataFrame) -> Chart:
     frame = frame.drop_duplicates(["name", "horizon", "point"]).sort_values(
         ["horizon", "place", "order"], kind="stable"
     )
+    if frame.groupby("name")["steps"].nunique().max() == 1:  # a ladder, from the first problem to the last
+        frame = frame.assign(name=frame["name"] + ", " + frame["steps"], steps="").sort_values(
+            ["order", "place"], kind="stable"
+        )
     switches = "Blank: no switch of contact was found." if frame["point"].nunique() > 1 else ""
     return Chart(
         "gradient_check", frame, [text("point", label="")], [text("name", label="")], "grid",

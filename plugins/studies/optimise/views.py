@@ -15,13 +15,11 @@ from bench.experiment.columns import Column, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Style, Table, Views
 from bench.report.colours import estimator_colour, estimator_marker
-from bench.report.style import DEVIANT, MARKERS, VARIANTS
+from bench.report.style import VARIANTS
 
 from . import aggregate
 from .aggregate import RunSet
 
-CONTEXT = tuple(zip(("#666666", "#8c8c8c", "#4d4d4d", "#767676"), (*VARIANTS[1:], *DEVIANT[:2]), strict=True))
-"""Grey and line style of each method without an estimator."""
 STEPS = 40
 """Number of points of a drawn curve."""
 METHOD, PROBLEM = text("method"), text("problem")
@@ -128,19 +126,16 @@ def tables(experiment: Experiment, rows: pd.DataFrame, runs: RunSet, name: Calla
 
 
 def styles(methods: Sequence[str], name: Callable[[str], str] = str) -> dict[str, Style]:
-    """Return each method's style by its short name: its estimator's colour, or grey and dashed if it has none."""
+    """Return the style of each method with an estimator by its short name: the estimator's colour."""
     looks: dict[str, Style] = {}
     uses: Counter[str] = Counter()
     for method in methods:
-        estimator = re.split(r"[\[,]", method)[0] if ", " in method else ""  # "estimator, optimizer"
-        turn = uses[estimator]
-        uses[estimator] += 1
-        grey, dashes = CONTEXT[turn % len(CONTEXT)]
-        looks[name(method)] = (
-            Style(estimator_colour(estimator), estimator_marker(estimator, turn), VARIANTS[turn % len(VARIANTS)])
-            if estimator
-            else Style(grey, MARKERS[turn % len(MARKERS)], dashes)
-        )
+        if ", " in method:  # "estimator, optimizer"
+            estimator = re.split(r"[\[,]", method)[0]
+            turn = uses[estimator]
+            uses[estimator] += 1
+            dashes = VARIANTS[turn % len(VARIANTS)]
+            looks[name(method)] = Style(estimator_colour(estimator), estimator_marker(estimator, turn), dashes)
     return looks
 
 

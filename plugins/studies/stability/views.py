@@ -101,10 +101,11 @@ def chart(cells: pd.DataFrame) -> Chart:
     mixed = frame["place"].isin(frame["place"][right.between(*MIXED)])
     frame = frame[mixed] if mixed.any() else frame
     places = frame["place"].unique()
-    rows, height, which = ("integrator", 0.085, "") if len(places) > 1 else ("", 0.16, f"{places[0]}; ")
+    which = f"{places[0]}; " if len(places) == 1 else ""
+    frame["panel"] = frame["integrator"] if which else frame["place"] + ", " + frame["integrator"]
     dt, stiffness = replace(COMMON["dt"], label="time step"), COMMON["stiffness"]
     return Chart(
-        "stability_map", frame, [dt], [stiffness], "grid", level="level", styles=LOOKS, panel="place" if rows else "integrator",
-        panel_row=rows, cell="mark", height=height, subtitle=f"{which}{BEYOND} beyond the stability limit in theory",
+        "stability_map", frame, [dt], [stiffness], "grid", level="level", styles=LOOKS, panel="panel",
+        cell="mark", height=0.16, subtitle=f"{which}{BEYOND} beyond the stability limit in theory",
         text="The worst verdict where backends disagree. Scenes and laws that are right everywhere or nowhere are in the table only.",
     )  # fmt: skip
