@@ -214,7 +214,7 @@ class RefusesEverything(UnusedScore):
 
     name = "refuses_everything"
 
-    def unsupported_reason(self, program):
+    def own_refusal(self, program):
         return "not this one"
 
 
@@ -830,7 +830,7 @@ class ABroken(Backend):
     provides = frozenset({"value", "grad", "score"}) | PROVIDES
     def compile(self, program):
         raise ZeroDivisionError("compile")
-    def unsupported_reason(self, program):
+    def own_refusal(self, program):
         raise ZeroDivisionError("reason")
 """
 
