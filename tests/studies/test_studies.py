@@ -11,7 +11,7 @@ import pytest
 from bench.plugins.studies.gradient_check import views as gradient_check
 from bench.plugins.studies.gradient_check.lines import PER_COMPONENT
 from bench.plugins.studies.stability.views import cells_of
-from bench.plugins.studies.twins import views as twins
+from bench.plugins.studies.twins import FLOOR
 
 import bench.report
 from bench.experiment import config
@@ -219,11 +219,11 @@ def test_twins_of_a_swept_scene_are_panels_of_their_own():
     away = [[0.0] * int(h) + [1e-3] for h in rows["horizon"]]
     rows = rows.assign(state_difference=1e-3, state_difference_rel=1e-3, path=away, own_path=own)
     rows["gradient_difference_rel"], rows["cost_difference_rel"], rows["gradient_s"] = [0.0, 2e-3, 1e-3, 1e-3], 0.0, 1.0
-    shown = twins.views(given, rows)
+    shown = given.study.views(given, rows)
     [chart], [lines] = shown.charts, shown.tables
     drawn = chart.plotted()
     assert list(dict.fromkeys(drawn["problem"])) == ["pendulum, horizon=2", "pendulum, horizon=3"], "the worst is first"
-    assert list(drawn["gradient_difference_rel"]) == [twins.FLOOR, 2e-3, 1e-3, 1e-3], "0 is at the lower edge"
+    assert list(drawn["gradient_difference_rel"]) == [FLOOR, 2e-3, 1e-3, 1e-3], "0 is at the lower edge"
     assert list(drawn["gradient_difference_rel_limit"]) == [True, False, False, False]
     assert list(readable(lines)["horizon [steps]"]) == ["2", "2", "3", "3"]
     table_ = table(given, rows)
