@@ -117,14 +117,6 @@ def test_a_swept_parameter_keeps_lines_of_the_gradient_check_apart():
     assert set(grid.frame["steps"]) == {""}, "one horizon is named with the problem"
 
 
-def test_the_long_table_keeps_its_columns_and_adds_swept_ones():
-    given, rows = checked("scenes=[mass_spring]", "sweep.mass_spring.damping=[0,1]")
-    found = gradient_check.views(given, rows).tables[1].data
-    assert list(found)[-4:] == ["verdict", "key", "damping", "study"]
-    assert len(found) == 2 * len(rows)
-    assert set(found["damping"]) == {0.0, 1.0}
-
-
 def test_untrusted_undecided_and_missing_gradients_come_first_and_are_never_right():
     given, rows = checked("scenes=[pendulum]", "sweep.horizon=[1,2]")
     rows["command"] = [f"python -m bench gradcheck {i}" for i in range(len(rows))]
