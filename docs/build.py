@@ -6,7 +6,7 @@ lines that differ, and exits with 1 if there are any.
 - ``results``: ``docs/answers.md``, from the answers in ``results/standard``, in the order of ``docs/results.md``.
 - ``columns``: ``docs/columns.md``, from the columns that each study declares.
 - ``figures``: the marked figures of all documents, from the rows in ``results/standard``: see :mod:`docs.figures`.
-- ``verdicts``: the tables of verdicts and causes of the checks of gradients, from their rules.
+- ``verdicts``: the lists of verdicts and causes of the checks of gradients, from their rules.
 - ``site``: the whole site as HTML, in ``build/site/html``. Only on request, since it needs Sphinx.
 """
 
@@ -166,19 +166,16 @@ RULE_MARKS = "<!-- verdicts -->\n", "<!-- end of verdicts -->"
 
 
 def rule_pages() -> dict[Path, str]:
-    """Return the documents with tables of verdicts and causes, written again."""
+    """Return the documents with lists of verdicts and causes, written again."""
     own = {cause: rule for cause, rule in rules.RULES.items() if verdicts.RULES.get(cause) != rule}
     return {DOCS / f"{name}.md": with_rules(DOCS / f"{name}.md", table)
             for name, table in (("gradcheck", verdicts.RULES), ("examine", own))}  # fmt: skip
 
 
 def with_rules(page: Path, table: Mapping[str, verdicts.Rule]) -> str:
-    """Return a document with a table of rules between :data:`RULE_MARKS`."""
+    """Return a document with a list of rules between :data:`RULE_MARKS`."""
     before, _, rest = page.read_text().partition(RULE_MARKS[0])
-    lines = ["| verdict | kind | meaning | next |", "|---|---|---|---|"]
-    for name, rule in table.items():
-        advice = rule.advice.format(names="the named inputs")
-        lines.append(f"| `{name}` | {rule.kind} | {cell_text(rule.meaning)} | {cell_text(advice)} |")
+    lines = [f"- `{name}` ({rule.kind}): {rule.meaning}" for name, rule in table.items()]
     return before + RULE_MARKS[0] + "\n".join(lines) + "\n" + RULE_MARKS[1] + rest.partition(RULE_MARKS[1])[2]
 
 

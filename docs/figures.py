@@ -119,14 +119,14 @@ ROLLOUTS = "first order / zeroth order, gradient "
 
 def dose_ratios(head: str, parts: dict[str, pd.DataFrame], names: dict[str, str]) -> str:
     """Return ratios to 1/100 as a Markdown table: a line per part, and a column per comparison, by its heading."""
-    lines = [f"| {head} | problems | scenes | {' | '.join(names)} |", f"|---|--:|--:|{'--:|' * len(names)}"]
+    lines = [f"| {head} | scenes | {' | '.join(names)} |", f"|---|--:|{'--:|' * len(names)}"]
     for label, part in parts.items():
         rows = part.query("target == 100").set_index("comparison").reindex(list(names.values()))
         cells = [
             "-" if np.isnan(row.ratio) else number(row.ratio) if row.scenes < LEAST_SCENES else
             text_of_interval(row.ratio, row.ratio_low, row.ratio_high, 1.0) for row in rows.itertuples()
         ]  # fmt: skip
-        lines.append(f"| {label} | {rows['problems'].max():.0f} | {rows['scenes'].max():.0f} | {' | '.join(cells)} |")
+        lines.append(f"| {label} | {rows['scenes'].max():.0f} | {' | '.join(cells)} |")
     return block(lines)
 
 
@@ -152,7 +152,6 @@ def dose_classes(names: dict[str, str]) -> str:
 
 
 DOSE_RUNS = {
-    "Adam": "dose_response",
     "Adam, 20 seeds": "dose_response_seeds",
     "Adam, neural policies": "dose_response_policy",
     "plain descent": "dose_response_descent",
