@@ -1,5 +1,6 @@
 """The text of README and docs, checked and run: links, commands, examples, and lists of what there is."""
 
+import json
 import os
 import re
 import shlex
@@ -137,9 +138,10 @@ def test_version_has_one_source():
     assert pyproject["tool"]["hatch"]["version"] == {"path": "bench/__init__.py"}
 
 
-def test_citation_and_changelog_have_the_version():
+def test_citation_changelog_and_switcher_have_the_version():
     assert yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"] == bench.__version__
     assert f"\n## {bench.__version__} (" in (ROOT / "CHANGELOG.md").read_text()
+    assert bench.__version__ in {entry["version"] for entry in json.loads((ROOT / "docs" / "switcher.json").read_text())}
 
 
 # ------------------------------------------------------------------------------------------------------ commands
