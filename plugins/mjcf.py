@@ -59,7 +59,7 @@ def build(backend: Any, program: Program) -> Any:
     if (path := scene.model_file()) is not None:
         return _as_written(str(path), scene, backend)
     model = mujoco.MjModel.from_xml_string(f'<mujoco><option gravity="0 0 0"/>{scene.mjcf()}</mujoco>')
-    expected = (scene.n_q, scene.n_q if scene.n_v is None else scene.n_v, scene.n_u)
+    expected = (scene.n_q, scene.n_v, scene.n_u)
     if (model.nq, model.nv, model.nu) != expected:
         raise ValueError(
             f"the twin of {scene.name} has (n_q, n_v, n_u) = {(model.nq, model.nv, model.nu)}, and the scene {expected}"

@@ -51,6 +51,7 @@ from bench.model.program import (
     rollout,
 )
 from bench.model.scene import (
+    AxisContactScene,
     ContactScene,
     DampedScene,
     DisturbedScene,
@@ -74,6 +75,7 @@ __all__ = [
     "Answer",
     "Array",
     "Auxiliaries",
+    "AxisContactScene",
     "Backend",
     "CallableProgram",
     "CallableScene",

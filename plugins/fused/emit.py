@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from .adjoint import active, pullback
+from .functions import helpers
 from .graph import Node, reached
 from .trace import Loop
 
@@ -110,9 +111,9 @@ class _Kernel:
         self._uniforms(everything)
         self._lanes(everything, forward, starts, backward)
         body = self.code.lines
-        helpers = _helpers(everything)
+        used = helpers({CALLS[node.op] for node in everything if node.op in CALLS})
         beyond = float(np.finfo(dtype).max) ** 0.25
-        text = HEAD.format(title=title, dtype=dtype, beyond=beyond, helpers=helpers, cache=cache)
+        text = HEAD.format(title=title, dtype=dtype, beyond=beyond, helpers=used, cache=cache)
         return text + _renumbered("\n".join("    " + line for line in body)) + "\n"
 
     def _needed(self, roots: Iterable[Node], carries: Iterable[int] = ()) -> list[int]:
@@ -485,10 +486,3 @@ CALLS = {
     "abs": "abs", "max": "max_", "min": "min_", "sign": "sign_", "sin": "sin_", "cos": "cos_", "rsqrt": "rsqrt_",
     "logistic": "logistic_", "floor": "np.floor", "ceil": "np.ceil", "rem": "math.fmod",
 }  # fmt: skip
-
-
-def _helpers(everything: list[Node]) -> str:
-    from .functions import HELPERS
-
-    used = {CALLS[node.op] for node in everything if node.op in CALLS}
-    return HELPERS.text(used)

@@ -8,7 +8,6 @@ below 2^20 are exact. A kernel reports larger angles and is then run again with 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 
 LIMIT = 1.6e6
 """Maximum angle [rad] of the fast sine and cosine."""
@@ -84,15 +83,9 @@ def cos_(x):
 FAST = _trigonometry()
 
 
-class HELPERS:
-    """The source of helper functions."""
-
-    @staticmethod
-    def text(used: Iterable[str]) -> str:
-        """Return the source of the functions named in ``used``."""
-        used = set(used)
-        angles = used & {"sin_", "cos_"}
-        if angles:
-            used.add("max_")
-        parts = [f'\n@njit(error_model="numpy")\ndef {name}{SIMPLE[name]}\n' for name in sorted(used & set(SIMPLE))]
-        return "\n".join([*parts, FAST] if angles else parts)
+def helpers(used: set[str]) -> str:
+    """Return the source of the helper functions named in ``used``."""
+    angles = bool(used & {"sin_", "cos_"})
+    names = sorted(SIMPLE.keys() & (used | {"max_"} if angles else used))
+    parts = [f'\n@njit(error_model="numpy")\ndef {name}{SIMPLE[name]}\n' for name in names]
+    return "\n".join([*parts, FAST] if angles else parts)

@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from bench.model import Array, ContactScene, EngineTwin, State, param
+from bench.model import Array, AxisContactScene, EngineTwin, State, param
 
 
 @dataclass(frozen=True)
-class BouncingBall(EngineTwin, ContactScene):
+class BouncingBall(EngineTwin, AxisContactScene):
     """A ball on a vertical line under gravity; q is the height of its lowest point.
 
     State (q, v); theta = (initial height, initial velocity), with parameter noise; f = (q_T - target)^2.
@@ -22,10 +22,10 @@ class BouncingBall(EngineTwin, ContactScene):
     """
 
     name = "bouncing_ball"
+    theta_names = ("height", "velocity")
     continuous = True
     neglected_effects = "horizontal motion, spin, air, the ball's shape"
     n_q = 1
-    n_contacts = 1
     twin_difference = 1e-3
     contact_values = {"stiffness": 1e4}
 
@@ -39,23 +39,11 @@ class BouncingBall(EngineTwin, ContactScene):
     target: float = param(0.5, "target height at the end", "m")
     restitution: float = param(1.0, "restitution of impulse laws and of the physical gradient", low=0.0, high=1.0)
 
-    def theta0(self) -> np.ndarray:
-        return np.array([self.height, self.velocity])
-
     def initial_state(self, xp: Any, theta: Array) -> State:
         return State(theta[0:1], theta[1:2])
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
         return 0.0 * q - self.gravity
-
-    def gap(self, xp: Any, q: Array) -> Array:
-        return q
-
-    def gap_rate(self, xp: Any, q: Array, v: Array) -> Array:
-        return v
-
-    def contact_acceleration(self, xp: Any, q: Array, force: Array) -> Array:
-        return force / self.mass
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
         return (q[0] - self.target) ** 2

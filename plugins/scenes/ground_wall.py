@@ -22,6 +22,7 @@ class GroundWall(ContactScene):
     """
 
     name = "ground_wall"
+    theta_names = ("velocity_x", "velocity_y")
     continuous = True
     neglected_effects = "spin, friction, air, the corner of ground and wall"
     n_q = 2
@@ -42,9 +43,6 @@ class GroundWall(ContactScene):
     velocity_y: float = param(-5.0, "initial velocity at theta, upwards", "m/s")
     target_x: float = param(-2.0, "x of the target", "m")
     target_y: float = param(1.5, "y of the target", "m")
-
-    def theta0(self) -> np.ndarray:
-        return np.array([self.velocity_x, self.velocity_y])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
         zero = 0.0 * theta[0]

@@ -21,6 +21,7 @@ class MassSpring(Oscillator, DampedScene):
     """
 
     name = "mass_spring"
+    theta_names = ("stretch", "rate")
     neglected_effects = "the centre of mass (moves uniformly)"
     continuous = True
     n_q = 1
@@ -31,9 +32,6 @@ class MassSpring(Oscillator, DampedScene):
     mass: float = param(1.0, "m, mass of each body", "kg", positive=True)
     stretch: float = param(0.1, "initial stretch at theta", "m")
     rate: float = param(0.0, "initial rate of the stretch at theta", "m/s")
-
-    def theta0(self) -> np.ndarray:
-        return np.array([self.stretch, self.rate])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
         return State(theta[0:1], theta[1:2])
