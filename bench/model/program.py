@@ -331,12 +331,8 @@ class Rollout(Program):
     @property
     def noise_on_theta(self) -> bool:
         """Whether noise is on theta: parameter noise, or action noise if theta is only the sequence of controls."""
-        return not self.action_noise or self.plans_controls
-
-    @property
-    def plans_controls(self) -> bool:
-        """Whether theta is the sequence of controls, and nothing else."""
-        return self.scene.open_loop and self._only_controls and not self._moves_start
+        plans_controls = self.scene.open_loop and self._only_controls and not self._moves_start
+        return not self.action_noise or plans_controls
 
     @property
     def is_open_loop(self) -> bool:

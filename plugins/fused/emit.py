@@ -136,10 +136,9 @@ class _Kernel:
         fixed, varying = wrt, f"{wrt}@"
         live = self._live_carries(fixed, varying)
 
-        def wanted_after(node: Node) -> bool:
-            return node.op == fixed or (node.op == "final" and node.data in live)
-
-        found = pullback(graph, [(loop.result, graph.literal(1.0))], wanted_after)
+        found = pullback(
+            graph, [(loop.result, graph.literal(1.0))], lambda n: n.op == fixed or (n.op == "final" and n.data in live)
+        )
         seeds = {node.data: ct for node, ct in found.items() if node.op == "final"}
         direct = {node: ct for node, ct in found.items() if node.op == fixed}
         if not loop.length:
@@ -249,7 +248,10 @@ class _Kernel:
         code.add(1, "theta_at = b * theta_column")
         code.add(1, "scored_at = b * scored_column")
         if backward and not self.covers(backward):
-            self._clear()
+            # the backward pass adds to the result
+            code.add(1, "for i in range(rows):")
+            code.add(2, f"for l in range({LANES}):")
+            code.add(3, "out[at(i * out_row + b + l)] = F(0.0)")
         # before the loop over time
         stores = [(f"c{i}", node) for i, node in starts.items()]
         stores += [(f"k{n.number}", n) for n in crossing]
@@ -311,12 +313,6 @@ class _Kernel:
             return False
         table = self.loop.indices[next(iter(backward.tables))]
         return np.array_equal(np.sort(table), np.arange(self.rows))
-
-    def _clear(self) -> None:
-        """Write zeros to the result, to which the backward pass adds."""
-        self.code.add(1, "for i in range(rows):")
-        self.code.add(2, f"for l in range({LANES}):")
-        self.code.add(3, "out[at(i * out_row + b + l)] = F(0.0)")
 
     def _reverse(self, backward: _Backward, history: dict[int, int], finals: dict[int, str],
                  kept_values: dict[int, str]) -> None:  # fmt: skip

@@ -27,16 +27,15 @@ def _series(first: int, last: int) -> str:
     return text
 
 
-def _trigonometry() -> str:
-    p1, p2, p3 = HALF_PI
-    return f"""
+P1, P2, P3 = HALF_PI
+FAST = f"""
 LIMIT = {LIMIT!r}
 
 
 @njit(error_model="numpy")
 def turned_(x, shift):
     k = np.rint(x * F({2 / math.pi!r}))
-    r = ((x - k * F({p1!r})) - k * F({p2!r})) - k * F({p3!r})
+    r = ((x - k * F({P1!r})) - k * F({P2!r})) - k * F({P3!r})
     z = r * r
     sine = r * {_series(1, 19)}
     cosine = {_series(0, 20)}
@@ -80,7 +79,6 @@ def cos_(x):
     return math.cos(x)
 """
 """Source of sine and cosine by the C library, for any angle."""
-FAST = _trigonometry()
 
 
 def helpers(used: set[str]) -> str:

@@ -1,12 +1,14 @@
 """A ball dropped on the ground: one stiff contact under gravity."""
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from bench.model import Array, AxisContactScene, EngineTwin, State, param
+
+from .. import bounces
+from ..bounces import bounced
 
 
 @dataclass(frozen=True)
@@ -23,6 +25,7 @@ class BouncingBall(EngineTwin, AxisContactScene):
 
     name = "bouncing_ball"
     theta_names = ("height", "velocity")
+    uses = (bounces,)
     continuous = True
     neglected_effects = "horizontal motion, spin, air, the ball's shape"
     n_q = 1
@@ -71,20 +74,5 @@ class BouncingBall(EngineTwin, AxisContactScene):
 
     def _rigid_end(self) -> tuple[float, np.ndarray] | None:
         """Return the height at T and its derivative by theta, ``(2,)``; None if the ball stops."""
-        g, end, e = self.gravity, self.horizon * self.dt, self.restitution
-        start = np.array([0.0, self.velocity, self.height])  # time, velocity and height after the last impact
-        slopes = np.array([[0.0, 0.0], [0.0, 1.0], [1.0, 0.0]])  # derivatives by theta
-        # a ball with more bounces than this counts as at rest
-        for _ in range(1000):
-            time, v, q = start
-            impact = math.sqrt(v * v + 2 * g * q)
-            if time + (v + impact) / g > end:
-                rest = end - time
-                slope = slopes[2] + slopes[1] * rest - (v - g * rest) * slopes[0]
-                return q + v * rest - 0.5 * g * rest**2, slope
-            if e * impact == 0.0:
-                return None
-            impact_slope = (v * slopes[1] + g * slopes[2]) / impact
-            slopes = np.array([slopes[0] + (slopes[1] + impact_slope) / g, e * impact_slope, [0.0, 0.0]])
-            start = np.array([time + (v + impact) / g, e * impact, 0.0])
-        return None
+        end, by_theta = self.horizon * self.dt, np.eye(2)
+        return bounced(self.height, self.velocity, self.gravity, self.restitution, end, *by_theta)

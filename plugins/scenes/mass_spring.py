@@ -1,7 +1,5 @@
 """Two masses on a stiff spring: stability and energy of every integrator."""
 
-import cmath
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -60,13 +58,11 @@ class MassSpring(Oscillator, DampedScene):
         """
         if self.velocity_factor != 1.0:
             return None
+        from scipy.linalg import expm
+
         stiffness, damping, _ = self.oscillator()
-        half, end = 0.5 * damping, self.horizon * self.dt
-        rate = cmath.sqrt(half * half - stiffness)  # imaginary if it oscillates
-        even = 0.5 * (cmath.exp((rate - half) * end) + cmath.exp((-rate - half) * end))
-        odd = 0.5 * (cmath.exp((rate - half) * end) - cmath.exp((-rate - half) * end))
-        odd = odd / rate if rate else end * math.exp(-half * end)
-        return self._gradient(np.array([(even + half * odd).real, complex(odd).real]))
+        system = np.array([[0.0, 1.0], [-stiffness, -damping]])
+        return self._gradient(expm(self.horizon * self.dt * system)[0])
 
     def _gradient(self, row: np.ndarray) -> np.ndarray:
         return np.asarray(2.0 * (row @ self.theta0()) * row)
