@@ -51,7 +51,6 @@ from bench.model.program import (
     rollout,
 )
 from bench.model.scene import (
-    AxisContactScene,
     ContactScene,
     DampedScene,
     DisturbedScene,
@@ -75,7 +74,6 @@ __all__ = [
     "Answer",
     "Array",
     "Auxiliaries",
-    "AxisContactScene",
     "Backend",
     "CallableProgram",
     "CallableScene",

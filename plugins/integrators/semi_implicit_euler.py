@@ -15,7 +15,6 @@ class SemiImplicitEuler(Integrator):
     """
 
     name = "semi_implicit_euler"
-    order = 1
     takes_impulses = True
     moves_with = "new"
 

@@ -6,7 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from bench.model import Array, AxisContactScene, ContactLaw, EngineTwin, ImpulseLaw, Plugin, State, param
+from bench.model import Array, ContactLaw, EngineTwin, ImpulseLaw, Plugin, State, param
+
+from .axis_contact import AxisContactScene
 
 
 @dataclass(frozen=True)

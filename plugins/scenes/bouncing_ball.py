@@ -5,10 +5,11 @@ from typing import Any
 
 import numpy as np
 
-from bench.model import Array, AxisContactScene, EngineTwin, State, param
+from bench.model import Array, EngineTwin, State, param
 
-from .. import bounces
-from ..bounces import bounced
+from . import bounces
+from .axis_contact import AxisContactScene
+from .bounces import bounced
 
 
 @dataclass(frozen=True)

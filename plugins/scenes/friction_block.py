@@ -3,7 +3,9 @@
 from dataclasses import dataclass
 from typing import Any
 
-from bench.model import Array, AxisContactScene, FrictionScene, State, param
+from bench.model import Array, FrictionScene, State, param
+
+from .axis_contact import AxisContactScene
 
 
 @dataclass(frozen=True)

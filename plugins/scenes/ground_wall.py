@@ -7,8 +7,8 @@ import numpy as np
 
 from bench.model import Array, ContactScene, State, param
 
-from .. import bounces
-from ..bounces import bounced
+from . import bounces
+from .bounces import bounced
 
 
 @dataclass(frozen=True)

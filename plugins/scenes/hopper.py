@@ -5,7 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from bench.model import Array, AxisContactScene, EngineTwin, State, param
+from bench.model import Array, EngineTwin, State, param
+
+from .axis_contact import AxisContactScene
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,9 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-from bench.model import Array, AxisContactScene, FrictionScene, PolicyScene, State, param, uniform
+from bench.model import Array, FrictionScene, PolicyScene, State, param, uniform
+
+from .axis_contact import AxisContactScene
 
 LEAN = math.pi / 6
 """Pitch at which the reward for an upright body is 0 [rad] (Xu et al. 2022)."""

@@ -168,5 +168,5 @@ def test_zeroth_order_per_action_has_the_policys_gradient_as_its_mean(policy, mo
 
 def test_actions_without_noise_of_their_own_are_refused():
     for scene, is_refused in ((Pushing(hold=3), True), (BouncingBall(), True), (Pushing(), False)):
-        reason = TotalPropagation(per="action").unsupported_reason(compose(scene, None, SemiImplicitEuler()))
+        reason = TotalPropagation(per="action").own_refusal(compose(scene, None, SemiImplicitEuler()))
         assert ("noise on the action" in str(reason)) == is_refused

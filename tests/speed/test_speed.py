@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from bench.plugins.backends import compiling, rows
+from bench.plugins.backends import rows
 from classes import Jax, Penalty, Pushing, SemiImplicitEuler, Softplus
 
 from bench import cli
@@ -129,23 +129,6 @@ def test_a_sweep_compiles_each_shape_once():
     assert compilations.made == len(compilations.shapes) == 2
 
 
-def test_the_executables_used_last_are_kept(monkeypatch):
-    monkeypatch.setattr(compiling, "_known", {})
-    monkeypatch.setattr(compiling, "KEPT", 3)
-    count = Compilations(None)
-
-    def power(n):
-        """x^n, compiled for each n."""
-        made = compiling.compiled(("power", n), lambda x: x**n + 0.5 * n, (np.ones(3),), False, count)
-        return np.asarray(made.call(2.0 * np.ones(3)))
-
-    for n in (1, 2, 3, 1, 4, 1):  # 2 was used longest ago when 4 comes
-        power(n)
-    assert count.made == 4
-    assert power(2) == pytest.approx(2.0**2 + 1.0)  # compiled again, the same numbers
-    assert count.made == 5
-
-
 @pytest.mark.slow
 def test_run_counts_compilations_and_keeps_compiled_programs(tmp_path):
     words = [
@@ -163,6 +146,8 @@ def test_run_counts_compilations_and_keeps_compiled_programs(tmp_path):
 
 @pytest.mark.slow
 def test_measured_compilation_is_not_taken_from_the_folder(tmp_path):
+    from bench.plugins.backends import compiling
+
     theta, w = np.zeros(6), np.zeros((6, 3))
     made = []
     for measured in (False, False, True):
