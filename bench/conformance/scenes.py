@@ -347,7 +347,7 @@ def state_has_declared_size(scene: MechanicalScene) -> str:
     """Verify that the initial state is ``q (n_q, B)`` and ``v (n_v, B)``."""
     require(hasattr(scene, "n_q"), "does not declare the length of q: set the class variable n_q")
     state = scene.initial_state(np, scene.theta0()[:, None])
-    n_v = scene.n_q if scene.n_v is None else scene.n_v
+    n_v = scene.n_v
     require(state.q.shape == (scene.n_q, 1), f"n_q = {scene.n_q}, but q has shape {state.q.shape} for one column")
     require(state.v.shape == (n_v, 1), f"v should have length {n_v}, but has shape {state.v.shape} for one column")
     return f"n_q = {scene.n_q}, n_v = {n_v}"
