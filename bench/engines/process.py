@@ -16,7 +16,6 @@ import signal
 import subprocess
 import tempfile
 import threading
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -36,21 +35,6 @@ EXIT_S = 5.0
 _running: dict[tuple[str, str], EngineProcess] = {}
 _keys = itertools.count()
 _lock = threading.Lock()
-
-
-@dataclass(frozen=True)
-class Reply:
-    """An engine's answer to a call."""
-
-    arrays: list[np.ndarray]
-    engine_s: float
-    """Seconds of the engine's own work."""
-    width: int
-    """Number of columns that the engine computed together."""
-    is_first: bool
-    """Whether it was the model's first call of this kind and width, which may have compiled."""
-    peak_memory_mb: float
-    """Largest resident memory of the engine's process so far."""
 
 
 class EngineProcess:
@@ -74,8 +58,6 @@ class EngineProcess:
         finally:
             for descriptor in given:
                 os.close(descriptor)
-        self.models: dict[int, str] = {}
-        """The device of each model that was built, by key."""
         guard.SPARED.add(self.process.pid)
 
     def call(self, header: dict[str, Any], arrays: list[np.ndarray]) -> tuple[dict[str, Any], list[np.ndarray]]:
@@ -118,15 +100,15 @@ class EngineModel:
         self.device = "cpu"
         self.settings: dict[str, str] = {}
         """The engine's settings that can change its last digits, by name."""
-        self.has_carry: bool | None = None
-        """Whether steps read and write numbers beside the states; None before the first call."""
         self.build_s = 0.0
         """Seconds of the last start of the engine, with its imports, and of building the model."""
 
-    def call(self, name: str, *arrays: np.ndarray) -> Reply:
-        """Return the result of ``start``, ``step``, ``rollout``, ``jacobians`` or ``pull``.
+    def call(self, name: str, *arrays: np.ndarray) -> tuple[dict[str, Any], list[np.ndarray]]:
+        """Return the answer to ``step``, ``rollout`` or ``jacobians``, and its arrays.
 
-        Raises :class:`Crashed` if the engine's process ends during the call, also in a second process.
+        The answer has the engine's ``seconds``, the ``width`` of its batches, ``peak_memory_mb``, and ``is_first``: whether
+        it was the model's first call of this kind and width, which may have compiled. Raises :class:`Crashed` if the
+        engine's process ends during the call, also in a second process.
         """
         with _lock:
             try:
@@ -139,32 +121,26 @@ class EngineModel:
                 reason = self._end()
                 raise Crashed(f"the process of engine {self._name} ended twice during {name}: {reason}") from error
 
-    def _call(self, name: str, arrays: tuple[np.ndarray, ...]) -> Reply:
-        process = _running.get(self._place)
-        if process is None:
-            process = _running[self._place] = EngineProcess(self._python, self._file)
-        while True:
-            if self._key not in process.models:
-                answer, _ = process.call({"call": "build", "model": self._key, "description": self._description}, [])
-                self._raise(answer)
-                process.models[self._key] = self.device = answer["device"]
-                self.settings = answer["settings"]
-                self.build_s, self.has_carry = answer["seconds"], answer["has_carry"]
-            answer, results = process.call({"call": name, "model": self._key}, list(arrays))
-            self._raise(answer)
-            if not answer.get("is_unknown"):
-                break
-            del process.models[self._key]
-        return Reply(results, answer["seconds"], answer["width"], answer["is_first"], answer["peak_memory_mb"])
+    def _call(self, name: str, arrays: tuple[np.ndarray, ...]) -> tuple[dict[str, Any], list[np.ndarray]]:
+        if self._place not in _running:
+            _running[self._place] = EngineProcess(self._python, self._file)
+        answer, results = self._ask({"call": name}, list(arrays))
+        if "is_unknown" in answer:  # not built yet, or dropped by its process
+            built, _ = self._ask({"call": "build", "description": self._description}, [])
+            self.device, self.settings, self.build_s = built["device"], built["settings"], built["seconds"]
+            answer, results = self._ask({"call": name}, list(arrays))
+        return answer, results
+
+    def _ask(self, request: dict[str, Any], arrays: list[np.ndarray]) -> tuple[dict[str, Any], list[np.ndarray]]:
+        answer, results = _running[self._place].call({**request, "model": self._key}, arrays)
+        if "error" in answer:
+            error = {"unsupported": Unsupported, "unavailable": Unavailable}.get(answer["kind"], EngineError)
+            raise error(f"engine {self._name}: {printable(answer['error'])} ({answer['places']})")
+        return answer, results
 
     def _end(self) -> str:
         process = _running.pop(self._place, None)
         return process.end() if process is not None else "it did not start"
-
-    def _raise(self, answer: dict[str, Any]) -> None:
-        if "error" in answer:
-            error = {"unsupported": Unsupported, "unavailable": Unavailable}.get(answer["kind"], EngineError)
-            raise error(f"engine {self._name}: {printable(answer['error'])} ({answer['places']})")
 
     @property
     def _place(self) -> tuple[str, str]:

@@ -19,7 +19,7 @@ from bench.cli import main
 from bench.conformance import backends, subjects
 from bench.conformance.kit import Failed
 from bench.conformance.subjects import law_for
-from bench.engines import environments, process, twin
+from bench.engines import environments, process, server, twin
 from bench.engines.process import close_engines
 from bench.errors import Crashed, Unsupported
 from bench.experiment.keys import fingerprint
@@ -75,7 +75,6 @@ def test_calls_are_counted_and_compilation_is_charged_once():
     first = problem.usage.compile_s
     problem.grad(problem.program.theta0, noise(problem))
     assert problem.usage.compile_s == first > 0
-    assert problem.n_calls == 5  # the first asks whether the engine has a carry
     assert problem.engine_s > 0
     assert problem.pipe_s > 0
     assert problem.peak_memory_mb > 10
@@ -170,7 +169,7 @@ from test_other_python import BouncingBall, noise, process, program, registry, t
 registry.add_folder(TOYS)
 problem = toy(fault="loop").compile(program(BouncingBall()))
 threading.Thread(target=lambda: problem.grad(problem.program.theta0, noise(problem)), daemon=True).start()
-while problem.n_calls < 1:
+while not problem.engine_s:
     time.sleep(0.05)
 print(next(iter(process._running.values())).process.pid, flush=True)
 time.sleep(100)
@@ -368,42 +367,22 @@ def test_only_an_engine_that_declares_an_error_of_its_solver_may_differ_by_it(mo
     assert [backends._allowed(toy(), of, 1e-9) for of, _ in allowed] == pytest.approx([error for _, error in allowed])
 
 
-# --------------------------------------------------------------------------------------------------------- carries
+def test_a_pull_gives_the_jacobians_of_the_controls():
+    class Pulled:
+        """Steps x + u^2 for forces u, with products of their derivatives."""
 
+        takes_forces = True
 
-def counted(scene, theta, w):
-    """Return the states of the toy that counts its steps, computed here."""
-    own = Numpy().compile(program(scene)).trajectory(theta, w)
-    q, v = np.split(own.states[0], 2)
-    states, law = [np.concatenate([q, v])], law_for(scene, Penalty, {})
-    for t, u in enumerate(own.controls if own.controls.shape[1] else np.zeros((scene.horizon, 1, w.shape[1]))):
-        force = law.stiffness * np.maximum(0.0, -scene.gap(np, q)) + u + t
-        v = v + scene.dt * (force / 1.0 - scene.gravity)
-        q = q + scene.dt * v
-        states.append(np.concatenate([q, v]))
-    return np.stack(states)
+        @staticmethod
+        def pull(x, force, slope):
+            return slope, 2 * force * slope[:1]
 
-
-def test_an_engine_has_numbers_beside_the_state():
-    scene = BouncingBall(horizon=60)
-    problem = toy(counts=True).compile(program(scene))
-    theta, w = problem.program.theta0, noise(problem)
-    np.testing.assert_allclose(problem.trajectory(theta, w).states, counted(scene, theta, w), rtol=1e-12)
-    assert (
-        np.abs(problem.trajectory(theta, w).states - toy().compile(program(scene)).trajectory(theta, w).states).max()
-        > 0.01
-    )
-    e = 1e-6 * np.eye(problem.dim)
-    differences = [(problem.value(theta + h, w) - problem.value(theta - h, w)) / 2e-6 for h in e]
-    np.testing.assert_allclose(problem.grad(theta, w), differences, atol=1e-5 * np.abs(differences).max())
-
-
-def test_a_pull_is_the_slope_times_the_step_jacobians():
-    problem, draw = toy().compile(program(BounceOnce())), np.random.default_rng(0)
-    x, u, slope = draw.standard_normal((2, 5)), draw.standard_normal((1, 5)), draw.standard_normal((2, 5))
-    jacobians, pulled = problem.call("jacobians", x, u), problem.call("pull", x, u, slope)
-    for jacobian, product in zip(jacobians, pulled, strict=True):
-        np.testing.assert_allclose(product, np.einsum("nmb,nb->mb", jacobian, slope), rtol=1e-12)
+    forces = {"constant": [0.5], "by_state": [[2.0, 3.0]], "by_control": [[4.0]]}
+    x, u = np.random.default_rng(0).standard_normal((2, 5)), np.ones((1, 5))
+    (a, b), _ = server.Controlled(Pulled(), forces).call("jacobians", x, u)
+    force = 2 * (0.5 + 2 * x[0] + 3 * x[1] + 4)
+    np.testing.assert_allclose(a, [[1 + 2 * force, 3 * force], [0 * force, 1 + 0 * force]])
+    np.testing.assert_allclose(b, [[4 * force], [0 * force]])
 
 
 def test_a_state_that_is_not_finite_does_not_reach_the_engine():
