@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import atexit
 import contextlib
-import fcntl
 import itertools
-import json
 import os
 import signal
 import subprocess
 import tempfile
 import threading
+from multiprocessing import Pipe
 from pathlib import Path
 from typing import Any
 
@@ -25,12 +24,12 @@ from bench.engines import server
 from bench.errors import Crashed, Unavailable, Unsupported, printable
 from bench.model import guard
 
-PIPE_BYTES = 1 << 20
-"""Capacity requested for a pipe: fewer system calls for large arrays."""
 TAIL = 2000
 """Bytes of an engine's last output that a message quotes."""
 EXIT_S = 5.0
-"""Seconds allowed for an engine to end after it has closed its pipe."""
+"""Seconds allowed for an engine to end after it has closed its connection."""
+CLOSED = (EOFError, OSError)
+"""Raised when an engine's process has ended."""
 
 _running: dict[tuple[str, str], EngineProcess] = {}
 _keys = itertools.count()
@@ -38,33 +37,24 @@ _lock = threading.Lock()
 
 
 class EngineProcess:
-    """The process of an engine's file in the Python ``python``. Output that it prints goes to a temporary file."""
+    """The process of an engine's file in the Python ``python``. Output that it prints goes to a temporary file.
+
+    It ends when its input, which this process holds open, is closed.
+    """
 
     def __init__(self, python: str, file: Path) -> None:
         self._output = tempfile.TemporaryFile()  # noqa: SIM115, it is closed with the process
-        (theirs_in, self._requests), (self._answers, theirs_out), (life, self._life) = (os.pipe() for _ in range(3))
-        given = (theirs_in, theirs_out, life)
-        for descriptor in (self._requests, self._answers):
-            with contextlib.suppress(OSError, AttributeError):
-                fcntl.fcntl(descriptor, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
-        words = [python, "-I", server.__file__, str(file), *map(str, given)]
+        self.connection, theirs = Pipe()
+        words, place = [python, "-I", server.__file__, str(file), str(theirs.fileno())], theirs.fileno()
         try:
             self.process = subprocess.Popen(
-                words, pass_fds=given, stdin=subprocess.DEVNULL, stdout=self._output, stderr=self._output
+                words, pass_fds=[place], stdin=subprocess.PIPE, stdout=self._output, stderr=self._output
             )
         except OSError as error:
-            self._close_descriptors()
             raise Unavailable(f"python={python} cannot be started: {error.strerror}") from error
         finally:
-            for descriptor in given:
-                os.close(descriptor)
+            theirs.close()
         guard.SPARED.add(self.process.pid)
-
-    def call(self, header: dict[str, Any], arrays: list[np.ndarray]) -> tuple[dict[str, Any], list[np.ndarray]]:
-        """Return the answer to a request; raises ``server.Closed`` if the process has ended."""
-        server.send(self._requests, header, arrays)
-        answer: tuple[dict[str, Any], list[np.ndarray]] = server.receive(self._answers)
-        return answer
 
     def end(self) -> str:
         """End the process, if it has not ended, and return how it ended, with its last output."""
@@ -78,16 +68,11 @@ class EngineProcess:
         return f"{text}; its last output: {output[-500:] or 'none'}"
 
     def kill(self) -> None:
-        """Kill the process and close its pipes."""
+        """Kill the process and close its connection."""
         self.process.kill()
-        self.process.wait()
+        self.process.communicate()
         guard.SPARED.discard(self.process.pid)
-        self._close_descriptors()
-
-    def _close_descriptors(self) -> None:
-        for descriptor in (self._requests, self._answers, self._life):
-            with contextlib.suppress(OSError):
-                os.close(descriptor)
+        self.connection.close()
         self._output.close()
 
 
@@ -113,11 +98,11 @@ class EngineModel:
         with _lock:
             try:
                 return self._call(name, arrays)
-            except server.Closed:
+            except CLOSED:
                 self._end()
             try:
                 return self._call(name, arrays)
-            except server.Closed as error:
+            except CLOSED as error:
                 reason = self._end()
                 raise Crashed(f"the process of engine {self._name} ended twice during {name}: {reason}") from error
 
@@ -132,7 +117,9 @@ class EngineModel:
         return answer, results
 
     def _ask(self, request: dict[str, Any], arrays: list[np.ndarray]) -> tuple[dict[str, Any], list[np.ndarray]]:
-        answer, results = _running[self._place].call({**request, "model": self._key}, arrays)
+        connection = _running[self._place].connection
+        connection.send(({**request, "model": self._key}, arrays))
+        answer, results = connection.recv()
         if "error" in answer:
             error = {"unsupported": Unsupported, "unavailable": Unavailable}.get(answer["kind"], EngineError)
             raise error(f"engine {self._name}: {printable(answer['error'])} ({answer['places']})")
@@ -159,17 +146,3 @@ def close_engines() -> None:
 
 atexit.register(close_engines)
 os.register_at_fork(after_in_child=_running.clear)  # a forked process starts engines of its own
-
-
-def run_python(python: str, program: str, *arguments: str, timeout: float = 60.0) -> Any:
-    """Return what a short program prints as JSON in another Python; raises :class:`Unavailable` where it fails."""
-    words = [python, "-I", "-c", program, *arguments]
-    try:
-        result = subprocess.run(words, capture_output=True, timeout=timeout, stdin=subprocess.DEVNULL)
-    except (OSError, subprocess.TimeoutExpired) as error:
-        raise Unavailable(f"it cannot be started ({printable(error)[:200]})") from error
-    try:
-        return json.loads(result.stdout)
-    except ValueError:
-        output = printable((result.stderr or result.stdout).decode(errors="replace"))[-200:]
-        raise Unavailable(f"it is not a working Python (its output: {output or 'none'})") from None

@@ -1,6 +1,6 @@
 """Runs in the Python of an engine's environment: answers calls of the engine's model over pipes. Requires only NumPy.
 
-A message is a header (JSON) followed by the bytes of its arrays. An engine's file defines a class ``Model``, built from the
+A message is a dictionary and a list of arrays. An engine's file defines a class ``Model``, built from the
 description of a program, with
 
 - ``step(x, u)``: the states ``(n, B)`` after one step from states x and controls ``u (m, B)``;
@@ -16,75 +16,25 @@ description of a program, with
 The file may import its libraries, and other files of its folder.
 """
 
+import contextlib
 import importlib.util
-import json
 import os
 import resource
 import signal
-import struct
 import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from multiprocessing.connection import Connection
 from typing import Any
 
 import numpy as np
 
-LENGTHS = struct.Struct(">QQ")
-"""The lengths in bytes of a message's header and of all its arrays."""
 KEPT = 4
 """Number of models that a server stores."""
 SETTINGS = ("OMP_NUM_THREADS", "XLA_FLAGS", "JAX_PLATFORMS", "CUDA_VISIBLE_DEVICES")
 """Environment variables that can change an engine's last digits."""
-
-
-class Closed(Exception):
-    """Raised when the other end of a pipe is closed."""
-
-
-def send(descriptor: int, header: dict[str, Any], arrays: Sequence[np.ndarray] = ()) -> None:
-    """Write a message: a header that JSON can encode, and arrays."""
-    arrays = [np.ascontiguousarray(array) for array in arrays]
-    text = json.dumps({**header, "arrays": [[array.dtype.str, array.shape] for array in arrays]}).encode()
-    parts: list[bytes | memoryview] = [LENGTHS.pack(len(text), sum(array.nbytes for array in arrays)) + text]
-    parts += [array.reshape(-1).view(np.uint8).data for array in arrays if array.size]
-    try:
-        for part in parts:
-            view = memoryview(part)
-            while view:
-                view = view[os.write(descriptor, view) :]
-    except OSError as error:
-        raise Closed from error
-
-
-def receive(descriptor: int) -> tuple[dict[str, Any], list[np.ndarray]]:
-    """Return the header and the arrays of the next message."""
-    length, n_bytes = LENGTHS.unpack(_read(descriptor, LENGTHS.size))
-    header = json.loads(bytes(_read(descriptor, length)))
-    content, arrays, start = _read(descriptor, n_bytes), [], 0
-    for kind, shape in header.pop("arrays"):
-        dtype, count = np.dtype(kind), int(np.prod(shape))
-        arrays.append(np.frombuffer(content, dtype, count, start).reshape(shape))
-        start += count * dtype.itemsize
-    return header, arrays
-
-
-def _read(descriptor: int, count: int) -> bytearray:
-    content = bytearray(count)
-    view = memoryview(content)
-    while view:
-        try:
-            n_read = os.readv(descriptor, [view])
-        except OSError as error:
-            raise Closed from error
-        if not n_read:
-            raise Closed
-        view = view[n_read:]
-    return content
-
-
-# --------------------------------------------------------------------------------------------------------- calls
 
 
 class Controlled:
@@ -150,16 +100,13 @@ class Controlled:
 # ------------------------------------------------------------------------------------------------------ the server
 
 
-def serve(file: str, requests: int, answers: int) -> None:
-    """Answer requests until the pipe is closed."""
+def serve(file: str, requests: Connection) -> None:
+    """Answer requests until the connection is closed."""
     models: dict[int, Any] = {}
     first_calls: set[tuple[int, str, int]] = set()
     module: Any = None
     while True:
-        try:
-            header, arrays = receive(requests)
-        except Closed:
-            return
+        header, arrays = requests.recv()
         started, name, key = time.perf_counter(), header["call"], int(header["model"])
         answer: dict[str, Any] = {}
         results: list[np.ndarray] = []
@@ -186,10 +133,7 @@ def serve(file: str, requests: int, answers: int) -> None:
             answer, results = {"error": f"{type(error).__name__}: {error}", "kind": kind, "places": places}, []
         answer["seconds"] = time.perf_counter() - started
         answer["peak_memory_mb"] = _peak_memory_mb()
-        try:
-            send(answers, answer, results)
-        except Closed:
-            return
+        requests.send((answer, results))
 
 
 def _settings(model: Any) -> dict[str, str]:
@@ -221,18 +165,18 @@ def _load(file: str) -> Any:
     return module
 
 
-def _end_with(life: int) -> None:
-    """End this process when the other end of the pipe ``life`` is closed, even during a call."""
-    os.read(life, 1)
+def _end_with_stdin() -> None:
+    """End this process when its input is closed, even during a call."""
+    sys.stdin.read()
     os._exit(0)
 
 
 def main() -> None:
-    """Serve the engine's file; the arguments are the file and the descriptors of requests, answers and life."""
-    file, requests, answers, life = sys.argv[1], *map(int, sys.argv[2:5])
+    """Serve the engine's file; the arguments are the file and the descriptor of its connection."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the run, which ends its engines
-    threading.Thread(target=_end_with, args=(life,), daemon=True).start()
-    serve(file, requests, answers)
+    threading.Thread(target=_end_with_stdin, daemon=True).start()
+    with contextlib.suppress(EOFError, OSError):
+        serve(sys.argv[1], Connection(int(sys.argv[2])))
     os._exit(0)
 
 

@@ -45,7 +45,7 @@ def write(names: Collection[str], out: Path, settings: Sequence[str] = ()) -> Pa
         backend = entry.plugin()
         reason = entry.reason or backend.unavailable_reason()
         usable += [] if reason else [name]
-        own = [{"reason": reason}] if reason else _conformance(name, backend, file)
+        own = [{"reason": reason}] if reason else conformance_rows(name, backend, file)
         rows += [{**row, "engine": name, "command": f"python -m bench engines table {name}"} for row in own]
     out.mkdir(parents=True, exist_ok=True)
     table = pd.DataFrame(rows, columns=list(COLUMNS))
@@ -58,14 +58,14 @@ def write(names: Collection[str], out: Path, settings: Sequence[str] = ()) -> Pa
     return page
 
 
-def _conformance(name: str, backend: Any, file: Path) -> list[dict[str, Any]]:
-    """Return the rows of an engine in the conformance set, run in its own Python."""
+def conformance_rows(name: str, backend: Any, file: Path, *cases: str) -> list[dict[str, Any]]:
+    """Return the rows of an engine in the named cases of the conformance set, or all, run in its own Python."""
     if not file.exists():
         return [{"reason": f"no file {file.name} for the conformance set"}]
     python, environment = sys.executable, {**os.environ, "PYTHONPATH": str(Path(runner.__file__).parents[3])}
     if isinstance(backend, EngineBackend):
         python, environment = backend.python or str(environments.python_of(name)), dict(os.environ)
-    words = [python, runner.__file__, str(file)]
+    words = [python, runner.__file__, str(file), *cases]
     try:
         done = subprocess.run(words, env=environment, capture_output=True, text=True, timeout=LIMIT_S)
         result = json.loads(done.stdout.splitlines()[-1])

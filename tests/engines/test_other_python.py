@@ -22,6 +22,7 @@ from bench.conformance.subjects import law_for
 from bench.engines import environments, process, server, twin
 from bench.engines.process import close_engines
 from bench.errors import Crashed, Unsupported
+from bench.experiment import by_name
 from bench.experiment.keys import fingerprint
 from bench.model import Problem, compose, registry
 
@@ -43,8 +44,9 @@ def toy(**values):
     return registry.usable("backends", "toy")(python=HERE, **values)
 
 
-def program(scene):
-    return compose(scene, law_for(scene, Penalty, {}) if scene.n_contacts else None, SemiImplicitEuler())
+def program(scene, law=Penalty):
+    own = law_for(scene, law) if isinstance(law, type) else law
+    return compose(scene, own if scene.n_contacts else None, SemiImplicitEuler())
 
 
 def noise(problem, columns=5):
@@ -311,16 +313,6 @@ def test_a_change_of_an_engines_file_changes_the_key(tmp_path):
     assert names[0] != names[1]
 
 
-def test_programs_that_an_engine_does_not_run_are_refused():
-    law = law_for(BouncingBall(), Penalty, {})
-    assert "replaces semi_implicit_euler, not rk4" in toy().refusal(compose(BouncingBall(), law, Rk4()))
-    taichi = registry.usable("backends", "taichi")()
-    assert "slides only" in taichi.refusal(program(Cartpole()))
-    damped = compose(BouncingBall(), law_for(BouncingBall(), Penalty, {"damping": 1.0}), SemiImplicitEuler())
-    newton = registry.usable("backends", "newton")()
-    assert "supports damping_mode=approach only, not clipped" in newton.refusal(damped)
-
-
 @dataclasses.dataclass(frozen=True)
 class Leaning(BounceOnce):
     """Its slide leans to the ground, so that friction would act on the contact."""
@@ -331,29 +323,37 @@ class Leaning(BounceOnce):
         return super().mjcf().replace('axis="0 0 1"', 'axis="1 0 1"')
 
 
-def test_genesis_runs_contacts_only_where_its_friction_has_no_effect():
-    genesis = registry.usable("backends", "genesis")()
-    scenes = (BounceOnce(), BouncingBall(), Pushing(), Hopper(), Cartpole())
-    assert [genesis.unsupported_reason(program(scene)) for scene in scenes] == [None] * 5
-    assert "along the slides of their bodies only" in genesis.unsupported_reason(program(Leaning()))
+@pytest.mark.parametrize(
+    ("engine", "scene", "law", "reason"),
+    [
+        ("taichi", Cartpole(), Penalty, "slides only"),
+        ("newton", Cartpole(), Penalty, None),
+        ("newton", BouncingBall(), Penalty(damping=1.0), "supports damping_mode=approach only, not clipped"),
+        ("newton[solver=semi_implicit]", Cartpole(), Penalty, "semi_implicit solver has no joint coordinates"),
+        ("newton[solver=semi_implicit]", BouncingBall(), Impulse, "replaces penalty, not impulse"),
+        ("newton[solver=xpbd]", Cartpole(), Penalty, "xpbd solver has no joint coordinates"),
+        ("newton[solver=xpbd]", BouncingBall(), Penalty, "replaces impulse, not penalty"),
+        ("newton[solver=xpbd]", BouncingBall(), Impulse, None),
+        ("genesis", Leaning(), Penalty, "along the slides of their bodies only"),
+        *(
+            ("genesis", scene, Penalty, None)
+            for scene in (BounceOnce(), BouncingBall(), Pushing(), Hopper(), Cartpole())
+        ),
+    ],
+)
+def test_programs_that_an_engine_does_not_run_are_refused(engine, scene, law, reason):
+    found = by_name.make("backends", engine).refusal(program(scene, law))
+    assert found is None if reason is None else reason in found
 
 
-@pytest.mark.parametrize("solver", ["semi_implicit", "xpbd"])
-def test_solvers_without_joint_coordinates_run_bodies_on_slides_only(solver):
-    newton = registry.usable("backends", "newton")
-    assert f"{solver} solver has no joint coordinates" in newton(solver=solver).refusal(program(Cartpole()))
-    assert newton().refusal(program(Cartpole())) is None
+def test_an_integrator_that_an_engine_does_not_replace_is_refused():
+    refused = toy().refusal(compose(BouncingBall(), law_for(BouncingBall(), Penalty, {}), Rk4()))
+    assert "replaces semi_implicit_euler, not rk4" in refused
 
 
-def test_a_rigid_solver_stands_for_impulses_and_has_no_gradients():
-    newton = registry.usable("backends", "newton")
-    rigid, spring = newton(solver="xpbd"), newton(solver="semi_implicit")
-    impulse = compose(BouncingBall(), law_for(BouncingBall(), Impulse), SemiImplicitEuler())
-    assert rigid.refusal(impulse) is None
-    assert "replaces impulse, not penalty" in rigid.refusal(program(BouncingBall()))
-    assert "replaces penalty, not impulse" in spring.refusal(impulse)
+def test_a_rigid_solver_has_no_gradients():
+    rigid, spring = (by_name.make("backends", f"newton[solver={name}]") for name in ("xpbd", "featherstone"))
     assert spring.provides - rigid.provides == {"grad"}
-    assert newton().provides == spring.provides
     assert (
         pickle.loads(pickle.dumps(rigid)).provides == dataclasses.replace(rigid, python=HERE).provides == rigid.provides
     )

@@ -114,14 +114,10 @@ def check(engine: Any, case: Case) -> list[dict[str, Any]]:
     except Exception as error:  # another engine's code may raise anything
         is_right = None if isinstance(error, NotImplementedError) else False
         return [row | {"is_right": is_right, "reason": f"{type(error).__name__}: {error}"}]
-    row["seconds"], row["reason"] = (
-        round(time.perf_counter() - started, 4),
-        getattr(engine, "differs", {}).get(case.name, ""),
-    )
-    row["against"] = "own differences" if row["reason"] else "the set"
-    return [
-        row | {"term": term} | _verdict(engine, case, term, result, row["reason"]) for term, result in results.items()
-    ]
+    differs = getattr(engine, "differs", {}).get(case.name, "")
+    row |= {"seconds": round(time.perf_counter() - started, 4), "reason": differs}
+    row["against"] = "own differences" if differs else "the set"
+    return [row | {"term": term} | _verdict(engine, case, term, result, differs) for term, result in results.items()]
 
 
 def _verdict(engine: Any, case: Case, term: str, result: Any, differs: str) -> dict[str, Any]:
