@@ -59,7 +59,10 @@ class Engine:
             plant.SetPositionsAndVelocities(context, np.concatenate([q[of_q], v[of_v]]))
             force = in_world(case, q, arms @ control)[of_v]
             plant.get_applied_generalized_force_input_port().FixValue(context, force)
-            after = plant.EvalUniquePeriodicDiscreteUpdate(context).get_vector(0).CopyToVector()
+            try:
+                after = plant.EvalUniquePeriodicDiscreteUpdate(context).get_vector(0).CopyToVector()
+            except RuntimeError as error:  # shapes whose contacts have no derivatives
+                raise NotImplementedError(str(error).partition(". ")[0]) from error
             q, v = np.split(np.array(after), [q.size])
             q, v = q[np.argsort(of_q)], v[np.argsort(of_v)]
         return case.cost(q, in_world(case, q, v, -1))

@@ -1,4 +1,4 @@
-"""Newton's Featherstone solver in the conformance set: a Warp tape per step, chained."""
+"""Newton's Featherstone solver in the conformance set: a Warp tape per step, run again before its backward pass."""
 
 import importlib.metadata
 import xml.etree.ElementTree as ElementTree
@@ -52,23 +52,25 @@ class Engine:
             solver.step(before, after, control, contacts, dt)
 
         def pull(slope):
+            tape.zero()
             seeds = [wp.array(np.float32(part)) for part in np.split(slope, [case.qpos.size])]
             tape.backward(grads=dict(zip((after.joint_q, after.joint_qd), seeds, strict=True)))
             by_state = [array.grad.numpy().astype(float) for array in (before.joint_q, before.joint_qd)]
-            return np.concatenate(by_state), arms.T @ control.joint_f.grad.numpy()
+            by_u = arms.T @ control.joint_f.grad.numpy()
+            tape.zero()  # the solver's matrices, which all steps share
+            return np.concatenate(by_state), by_u
 
         return np.concatenate([after.joint_q.numpy(), after.joint_qd.numpy()]).astype(float), pull
 
     def _path(self, case):
-        x, pulls = _turned(case, np.concatenate([case.qpos, case.qvel]), True), []
+        path = [_turned(case, np.concatenate([case.qpos, case.qvel]), True)]
         for u in case.controls:
-            x, pull = self._step(case, x, u)
-            pulls.append(pull)
-        return x, pulls
+            path.append(self._step(case, path[-1], u)[0])
+        return path
 
     def rollout(self, case):
         """Return the cost of a case."""
-        return self._cost(case, self._path(case)[0])
+        return self._cost(case, self._path(case)[-1])
 
     @staticmethod
     def _cost(case, x):
@@ -76,10 +78,10 @@ class Engine:
 
     def gradient(self, case):
         """Return the derivatives by state and controls."""
-        x, pulls = self._path(case)
-        slope, by_control = _differences(lambda end: self._cost(case, end), x), []
-        for pull in reversed(pulls):
-            slope, by_u = pull(slope)
+        *path, end = self._path(case)
+        slope, by_control = _differences(lambda x: self._cost(case, x), end), []
+        for x, u in zip(path[::-1], case.controls[::-1], strict=True):
+            slope, by_u = self._step(case, x, u)[1](slope)
             by_control.insert(0, by_u)
         start = np.concatenate([case.qpos, case.qvel])
         slope = _differences(lambda at: slope @ _turned(case, at, True), start)
