@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from bench.claims.claim import Claim, Figure, Outcome
+from bench.claims import Claim, Figure, Outcome
 from bench.claims.toolkit import exact_descent, native
-
-if TYPE_CHECKING:
-    from bench.model import Problem
-
 
 FITTED = 1e4
 """The penalty stiffness whose descent ends where the source's descent ends [N/m]."""
@@ -38,7 +34,6 @@ class Collision(Claim):
 
     def measure(self) -> Outcome:
         """Descend at rate 10 under each law."""
-        scene = "two_balls[horizon=480,dt=0.0020833333333333333]"
         cases = (
             ("with", "impulse", "1.395808"),
             ("without", "impulse[time_of_impact=false]", "2.001432"),
@@ -47,10 +42,9 @@ class Collision(Claim):
         figures: list[Figure] = []
         series: dict[str, Any] = {"iteration": list(range(0, 1001, 20))}
         for name, law, loss in cases:
-            values = _costs(native(scene, law))
-            figures.append(Figure(f"cost at the end, {name}", loss, float(values[-1])))
-            series[name] = values
-        tried = {k: float(_costs(native(scene, f"penalty[stiffness={k!r}]"))[-1]) for k in TRIED}
+            series[name] = _costs(law)
+            figures.append(Figure(f"cost at the end, {name}", loss, float(series[name][-1])))
+        tried = {k: float(_costs(f"penalty[stiffness={k!r}]")[-1]) for k in TRIED}
         ends = ", ".join(f"{end:.4f} at {k:g}" for k, end in tried.items())
         last = series["penalty"][-5:]
         return Outcome(
@@ -65,6 +59,7 @@ class Collision(Claim):
         )
 
 
-def _costs(at: Problem) -> np.ndarray:
+def _costs(law: str) -> np.ndarray:
     """Return the costs of every 20th of 1,000 steps of descent."""
+    at = native("two_balls[horizon=480,dt=0.0020833333333333333]", law)
     return exact_descent(at, np.full(960, 3.0), 10.0, 1000, 20)[1]

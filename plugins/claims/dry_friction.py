@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.special import ndtr
 
-from bench.claims.claim import Claim, Figure, Outcome
+from bench.claims import Claim, Figure, Outcome
 from bench.claims.toolkit import estimator, function, moments, problem
 from bench.model import Array
 
@@ -54,7 +54,4 @@ class Sticking(Claim):
                 spread=2e-3,
             ),
         ]
-        return Outcome(
-            figures,
-            series={"force": forces, "smooth": smooth},
-        )
+        return Outcome(figures, series={"force": forces, "smooth": smooth})

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from bench.claims.claim import Claim, Figure, Outcome
-from bench.claims.toolkit import exact_descent, plugin, problem
-from bench.model import Array, MechanicalScene, State, Unsupported
+from bench.claims import Claim, Figure, Outcome
+from bench.claims.toolkit import exact_descent, native, plugin
+from bench.model import Array, MechanicalScene, State
 
 STEPS, RATE, ITERATIONS = 480, 200.0, 500
 OPTIMUM = 0.311417
@@ -68,12 +68,8 @@ class ObliqueCollision(Claim):
         figures: list[Figure] = []
         series: dict[str, Any] = {"iteration": list(range(0, ITERATIONS + 1, EVERY))}
         for name, (law, integrator, end) in CASES.items():
-            try:
-                at = problem(scene, law, "fused", integrator)
-            except Unsupported:
-                at = problem(scene, law, "jax", integrator)
-            costs = exact_descent(at, at.program.theta0, RATE, ITERATIONS, EVERY)[1]
-            series[name] = costs
+            at = native(scene, law, integrator)
+            series[name] = costs = exact_descent(at, at.program.theta0, RATE, ITERATIONS, EVERY)[1]
             figures.append(Figure(f"cost at the end, {LABELS[name]}", end, costs[-1], spread=SHARE * float(end)))
         # the optimum is a bound: within 3% of it, or 10% above it
         figures.append(

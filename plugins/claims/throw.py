@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.claims.claim import Claim, Figure, Outcome
+from bench.claims import Claim, Figure, Outcome
 from bench.claims.toolkit import exact_descent, native
 
 SINGLE = 2 * 2.0**-24 * math.sqrt(288)
