@@ -85,7 +85,8 @@ class OtherObjective(Claim):
     statement = "iLQR swings a pendulum up in five iterations: 1856.154, 1202.106, 699.799, 423.583, 357.476, 357.297."
     source = "Suh et al. 2021, Bundled gradients, public result file"
     learned = "Say which objective was given and on which one it is scored; nobody can tell from the curve."
-    labels = ("iteration", "cost, at least 349.49")
+    labels = ("iteration", "cost above the least, 349.49")
+    logarithmic = "y"
     curves = {"given": "given weights 1/2 and 20", "scored": "given weights 1 and 1"}
 
     def measure(self) -> Outcome:
@@ -104,7 +105,7 @@ class OtherObjective(Claim):
                 "the curve solves with control weight 1/2 and terminal weight 20 and is scored with 1 and 1: it ends "
                 f"{given[-1] / scored[-1] - 1:.1%} above what the same method reaches when given the objective it is scored on"
             ),
-            series={"given": given, "scored": scored[:8]},
+            series={"given": np.array(given) - scored[-1], "scored": np.array(scored[:6]) - scored[-1]},
         )
 
 
