@@ -35,7 +35,6 @@ from bench.conformance.subjects import (
 from bench.engines.backend import EngineBackend
 from bench.gradient import EPS, FAULTS, TRUSTED, judge, sampled
 from bench.gradient.stages import SINGLE_EPS
-from bench.measure.batches import in_columns
 from bench.model import (
     Array,
     Backend,
@@ -181,15 +180,11 @@ def _findings(backend: Backend, program: Program, distant: float, dtype: str) ->
     theta = program.theta0[:, None] + distant * (theta - program.theta0[:, None])
     e, problem, d = rng("direction").standard_normal(theta.shape), backend.compile(program), len(theta)
 
-    def cost(at: np.ndarray) -> np.ndarray:
-        width = COLUMNS if backend.compiles else at.shape[1]
-        return in_columns(lambda part: problem.value(part[:d], part[d:]), at, width)
-
     with np.errstate(all="ignore"):
         gradient = problem.grad(theta, w)
         require(gradient.shape == theta.shape, f"{describe(program)}: shape {gradient.shape}, not {theta.shape}")
         found, *_ = sampled(
-            cost, np.concatenate([theta, w]), np.concatenate([e, 0.0 * w]), np.ones(COLUMNS), (gradient * e).sum(axis=0),
+            lambda at: problem.value(at[:d], at[d:]), np.concatenate([theta, w]), np.concatenate([e, 0.0 * w]), np.ones(COLUMNS), (gradient * e).sum(axis=0),
             float(np.finfo(_dtype(backend)).eps), EPS if dtype == "float64" else SINGLE_EPS,
         )  # fmt: skip
         findings = [judge(sample) for sample in found]
