@@ -24,6 +24,8 @@ OVERFLOWS = 1e100
 ALONG_THETA = 0.9999
 """Least cosine between theta and an error along theta."""
 CHAOS = "as in chaos: the last digits of theta change the cost as much as a wide step"
+WAITED = 0.05
+"""Least share of the time for which an examination waited for a processor that is stated."""
 HEADLINE = 200
 """Most characters of an exception in a headline."""
 MANY = 6
@@ -393,8 +395,10 @@ def _head(report: Findings) -> list[str]:
         f"rough by {number(rough)}" * (rough > 0), f"gradient: {report.gradient or 'none, only differences'}",
         f"batch: {report.batch}",
     ]  # fmt: skip
-    times = {"within the budget": spent.seconds, "first calls": spent.compile_s, "all": spent.elapsed, "a cost": spent.cost_s,
-             "a gradient": spent.gradient_s}  # fmt: skip
+    waited = spent.elapsed - spent.seconds - spent.compile_s
+    times = {"within the budget": spent.seconds, "first calls": spent.compile_s,
+             "waiting for a processor": waited if waited > WAITED * spent.elapsed else math.nan, "all": spent.elapsed,
+             "a cost": spent.cost_s, "a gradient": spent.gradient_s}  # fmt: skip
     each = [f"{what} {duration(seconds)}" for what, seconds in times.items() if math.isfinite(seconds)]
     counts = counted(spent.costs, "cost"), counted(spent.gradients, "gradient")
     return [
