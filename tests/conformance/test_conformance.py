@@ -211,7 +211,7 @@ class LastingBias(UnusedScore):
 class RefusesEverything(UnusedScore):
     """First-order, for programs that do not exist."""
 
-    def unsupported_reason(self, program):
+    def own_refusal(self, program):
         return "not this one"
 
 
@@ -727,7 +727,7 @@ class ABroken(Backend):
     provides = frozenset({"value", "grad", "score"}) | PROVIDES
     def compile(self, program):
         raise ZeroDivisionError("compile")
-    def unsupported_reason(self, program):
+    def own_refusal(self, program):
         raise ZeroDivisionError("reason")
 """
 

@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from bench.experiment.cell import Cell
-from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, text
+from bench.experiment.columns import Column, Columns, ComparisonRule, numbers
 from bench.experiment.session import Session
 from bench.gradient import sampled
 from bench.measure import noise, statistics
@@ -71,7 +71,7 @@ class ThreeErrors(StudyPackage):
         ),
         Column("model_signs", "share of coordinates in which both gradients have the same sign", label="right signs"),
         *(ESTIMATES.by_name[name] for name in SUMMARY),
-        text("reference_method", "how the reference was computed"),
+        *(ESTIMATES.by_name[name] for name in ("reference_method", "reference_spacing")),
         numbers("gradient", "the program's gradient, by coordinate of theta"),
         numbers("physical_gradient", "the physics' gradient, by coordinate of theta"),
     )
@@ -85,7 +85,8 @@ class ThreeErrors(StudyPackage):
             "cost": check.cost, "gradient": check.gradient.tolist(), "program_norm": norm(check.gradient),
             "program_error": norm(check.gradient - check.difference),
             "program_error_rel": relative_error(check.gradient, check.difference), "difference_step": check.step,
-            "reference_method": truth.method, **_against_physics(problem.program, check),
+            "reference_method": truth.method, "reference_spacing": truth.spacing,
+            **_against_physics(problem.program, check),
         }  # fmt: skip
         status = finite_status(truth.note or "the reference gradient is not finite", truth.batches)
         if status["status"] != "ok":
