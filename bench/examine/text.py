@@ -24,8 +24,6 @@ OVERFLOWS = 1e100
 ALONG_THETA = 0.9999
 """Least cosine between theta and an error along theta."""
 CHAOS = "as in chaos: the last digits of theta change the cost as much as a wide step"
-WAITED = 0.05
-"""Least share of the time for which an examination waited for a processor that is stated."""
 HEADLINE = 200
 """Most characters of an exception in a headline."""
 MANY = 6
@@ -397,7 +395,7 @@ def _head(report: Findings) -> list[str]:
     ]  # fmt: skip
     waited = spent.elapsed - spent.seconds - spent.compile_s
     times = {"within the budget": spent.seconds, "first calls": spent.compile_s,
-             "waiting for a processor": waited if waited > WAITED * spent.elapsed else math.nan, "all": spent.elapsed,
+             "waiting for a processor": waited if waited > 1.0 else math.nan, "all": spent.elapsed,
              "a cost": spent.cost_s, "a gradient": spent.gradient_s}  # fmt: skip
     each = [f"{what} {duration(seconds)}" for what, seconds in times.items() if math.isfinite(seconds)]
     counts = counted(spent.costs, "cost"), counted(spent.gradients, "gradient")
