@@ -16,7 +16,6 @@ from bench.experiment.session import Session
 from bench.experiment.study import Study
 from bench.experiment.views import Views
 from bench.measure import noise, timing
-from bench.measure.reference import unseen_width
 from bench.model import Problem
 
 if TYPE_CHECKING:
@@ -64,12 +63,12 @@ def unseen_features(rows: pd.DataFrame) -> list[str]:
     """Return below which width references by quadrature in a plane may miss a feature of the cost, and in how many cells."""
     from bench.report.text import counted
 
-    widths = rows.get("reference_method", rows["status"]).astype(str).map(unseen_width)
-    coarse = widths[widths > FINE]
+    spacing = rows.reindex(columns=["reference_spacing"])["reference_spacing"]
+    coarse = spacing[spacing > FINE]
     if coarse.empty:
         return []
     return [
-        f"in {counted(len(coarse), 'cell')} the reference is from points up to {coarse.max():g} standard deviations of the noise apart: "
+        f"in {counted(len(coarse), 'cell')} the reference is from points up to {coarse.max():.2g} standard deviations of the noise apart: "
         "it may miss a feature of the cost that is narrower"
     ]
 

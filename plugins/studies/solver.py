@@ -56,7 +56,7 @@ class Solver(StudyPackage):
     converged: int = param(100, "iterations of the program that counts as converged", positive=True)
     timed_calls: int = param(5, "calls timed", positive=True)
 
-    def unsupported_reason(self, cell: Cell) -> str | None:
+    def refusal(self, cell: Cell) -> str | None:
         """Return that the backend has no constraint solver whose iterations are a parameter, or None."""
         if "iterations" in values(cell.backend):
             return None

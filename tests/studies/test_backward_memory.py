@@ -135,5 +135,5 @@ def test_backends_without_gradients_are_refused():
     (cell,) = cells(given)
     blind = replace(cell.backend)
     object.__setattr__(blind, "provides", frozenset({"value"}))
-    assert given.study.unsupported_reason(cell) is None
-    assert "computes no gradients" in given.study.unsupported_reason(cell.with_part("backend", blind))
+    assert given.study.refusal(cell) is None
+    assert "computes no gradients" in given.study.refusal(cell.with_part("backend", blind))
