@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 
 from bench.experiment.axes import Axis
-from bench.experiment.columns import Column, text
+from bench.experiment.columns import Column, interval, text
 from bench.report.problems import ProblemRows, split_by_problem
 from bench.report.views import CATEGORIES, Arranged, Curve, attempted, estimator_curves, rmse_interval
 
@@ -35,9 +35,9 @@ COLUMNS = (
     Column("at", "its value", format="setting"),
     text("basis", "what is compared: the error at equal samples or rollouts, or the cost of reaching an error"),
     text("first", "the method with the lowest value"),
-    Column("value", "its value", low="value_low", high="value_high"),
+    interval("value", "its value"),
     text("second", "the next method, of another estimator where there is one"),
-    Column("factor", "the second value over the first", low="factor_low", high="factor_high"),
+    interval("factor", "the second value over the first"),
     text("tied", "methods that are not distinguishable from the first"),
 )
 """The columns of the table of comparisons."""
