@@ -41,6 +41,7 @@ COLUMNS = (
     text("tied", "methods that are not distinguishable from the first"),
 )
 """The columns of the table of comparisons."""
+VALUE, FACTOR = ([f"{name}{end}" for end in ("", "_low", "_high")] for name in ("value", "factor"))
 
 
 def problems_by_axis(shown: Arranged) -> list[tuple[Axis | None, ProblemRows]]:
@@ -150,25 +151,19 @@ def compare_errors(methods: pd.DataFrame) -> pd.DataFrame:
     lines = []
     for _, part in methods.groupby("setting", sort=False):
         good = part[np.isfinite(part["error"]) & np.isfinite(part["error_low"])].sort_values("error", kind="stable")
-        line: dict[str, Any] = part.iloc[0][["setting", "problem", "axis", "at"]].to_dict() | {
-            "basis": EQUAL_ROLLOUTS if part["axis"].iloc[0] == ROLLOUTS.column else EQUAL_SAMPLES, "first": "", "value": math.nan, "value_low": math.nan,
-            "value_high": math.nan, "second": "", "factor": math.nan, "factor_low": math.nan, "factor_high": math.nan,
-            "tied": (),
-        }  # fmt: skip
+        line = part.iloc[0][["setting", "problem", "axis", "at"]].to_dict() | {"first": "", "second": "", "tied": ()}
+        line["basis"] = EQUAL_ROLLOUTS if line["axis"] == ROLLOUTS.column else EQUAL_SAMPLES
         if len(good):
-            first, *others = (dict(row) for row in good.to_dict("records"))
+            first, *others = good.to_dict("records")
             factors = [(other, ratio(_interval(first), _interval(other))) for other in others]
-            line |= {"first": first["method"]} | dict(
-                zip(("value", "value_low", "value_high"), _interval(first), strict=True)
-            )
+            line |= {"first": first["method"]} | dict(zip(VALUE, _interval(first), strict=True))
             rivals = [item for item in factors if item[0]["estimator"] != first["estimator"]] or factors
             if rivals:
-                line |= {"second": rivals[0][0]["method"]}
-                line |= dict(zip(("factor", "factor_low", "factor_high"), rivals[0][1], strict=True))
+                line |= {"second": rivals[0][0]["method"]} | dict(zip(FACTOR, rivals[0][1], strict=True))
             line["tied"] = tuple(other["method"] for other, (_, low, _) in factors if not low > 1)
         lines.append(line)
     names = [name for c in COLUMNS for name in (c.name, c.low, c.high) if name]
-    return pd.DataFrame(lines, columns=["setting", *names])
+    return pd.DataFrame(lines, columns=["setting", *names]).astype(dict.fromkeys([*VALUE, *FACTOR], float))
 
 
 def _interval(row: Any) -> tuple[float, float, float]:

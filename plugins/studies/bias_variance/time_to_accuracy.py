@@ -266,13 +266,9 @@ def limits(table: pd.DataFrame) -> list[str]:
     """Return the words for each factor without a value: ``at least 2.4``, or ``not known`` where the limit is below 1."""
     factors = zip(table["factor"], table["factor_low"], table["factor_high"], strict=True)
     return [
-        "" if not _is_limit(factor, high) else f"at least {number(low)}" if low > 1.0 else "not known"
+        "" if not (math.isnan(factor) and high == math.inf) else f"at least {number(low)}" if low > 1.0 else "not known"
         for factor, low, high in factors
     ]
-
-
-def _is_limit(factor: float, high: float) -> bool:
-    return math.isnan(factor) and high == math.inf
 
 
 def comparisons(best: pd.DataFrame) -> pd.DataFrame:
