@@ -1,6 +1,6 @@
 """Builds MuJoCo models from scenes' MJCF twins, for backends of MuJoCo's engines, built in or a user's own.
 
-A backend's ``unsupported_reason`` may call :func:`unsupported_reason` and then inspect the model of :func:`build`.
+A backend's ``own_refusal`` may call :func:`refusal` and then inspect the model of :func:`build`.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ end of the step.
 """
 
 
-def unsupported_reason(backend: Any, program: Program) -> str | None:
+def refusal(backend: Any, program: Program) -> str | None:
     """Return why an engine cannot run the program, or None: no twin, another integrator, another contact law.
 
     The backend has parameters ``integrator``, ``solver``, ``cone``, ``iterations``, ``ls_iterations``, ``lean`` and
     ``impedance``.
     """
     own = backend.integrator
-    if reason := EngineBackend.unsupported_model(backend.name, program, f" {own}", MATCH[own], ("penalty",), "clipped"):
+    if reason := EngineBackend.model_refusal(backend.name, program, f" {own}", MATCH[own], ("penalty",), "clipped"):
         return reason
     scene: Any = program.scene
     if scene.model_file() is not None:
@@ -46,12 +46,12 @@ def unsupported_reason(backend: Any, program: Program) -> str | None:
 def build(backend: Any, program: Program) -> Any:
     """Return the twin as a ``mujoco.MjModel`` with the scene's time step, the law's springs and the backend's solver.
 
-    Raises :class:`Unsupported` with the reason of :func:`unsupported_reason`. The backend's own reasons, which may need
+    Raises :class:`Unsupported` with the reason of :func:`refusal`. The backend's own reasons, which may need
     the model, are not asked for.
     """
     import mujoco
 
-    if reason := unsupported_reason(backend, program):
+    if reason := refusal(backend, program):
         raise Unsupported(reason)
     scene, law = program.scene, program.contact
     assert isinstance(scene, MechanicalScene)

@@ -18,6 +18,7 @@ from bench.conformance.subjects import (
     ROUNDED,
     SAME,
     able_backend,
+    agree,
     available,
     backends,
     can_run,
@@ -87,8 +88,7 @@ def costs_are_finite(scene: Scene) -> str:
         require(np.isfinite(cost).all(), f"{describe(program)}: {(~np.isfinite(cost)).sum()} costs are not finite")
         other = problem.value(*with_changed_column(theta, w))
         kept = np.arange(COLUMNS) != 2
-        off = distance(other[kept], cost[kept])
-        require(off < ROUNDED, f"{describe(program)}: a column changes the cost of others")
+        agree(other[kept], cost[kept], ROUNDED, f"{describe(program)}: a column changes the cost of others")
     return f"{cost.mean():.4g} on average, {len(subjects)} programs"
 
 
@@ -122,8 +122,12 @@ def noise_is_where_declared(scene: Scene) -> str:
     require(program.n_noise == wanted, f"{program.n_noise} normal numbers for {program.dim} components of theta")
     (theta, w), problem = samples(program), able_backend(program).compile(program)
     shift = scene.sigma * w[: program.dim]
-    off = distance(problem.value(theta + shift, problem.centred(w)), problem.value(theta, w))
-    require(off < SAME, f"noise w and a step of sigma w in theta differ by {off:.1e}: theta and the controls differ")
+    off = agree(
+        problem.value(theta + shift, problem.centred(w)),
+        problem.value(theta, w),
+        SAME,
+        "noise w and a step of sigma w in theta differ: theta and the controls differ",
+    )
     return f"on theta, to {off:.0e}"
 
 

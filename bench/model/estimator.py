@@ -78,7 +78,7 @@ class Estimator(Plugin):
         """Return the smoothing whose gradient is the reference for this estimator's rows; None: J_sigma."""
         return None
 
-    def unsupported_reason(self, program: Program) -> str | None:
+    def own_refusal(self, program: Program) -> str | None:
         """Return why this estimator's own limits exclude the program, or None."""
         if self.needs_noise_on_theta and not program.noise_on_theta:
             return f"{self.name} needs noise on theta, not on a policy's actions"
@@ -97,7 +97,7 @@ class Estimator(Plugin):
         own = program.n_noise - program.exogenous
         if self.needs_directions and own < program.dim:
             return f"{self.name} needs {program.dim} normal numbers per sample, and the noise model has {own}"
-        return self.unsupported_reason(program)
+        return self.own_refusal(program)
 
 
 @dataclass(frozen=True)

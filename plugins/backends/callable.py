@@ -19,12 +19,12 @@ class CallableBackend(Backend):
 
     def compile(self, program: Program) -> Problem:
         """Return the simulator as a problem; raises :class:`Unsupported` for any other program."""
-        if reason := self.unsupported_reason(program):
+        if reason := self.own_refusal(program):
             raise Unsupported(reason)
         assert isinstance(program, CallableProgram)
         return CallableProblem(program, self.step)
 
-    def unsupported_reason(self, program: Program) -> str | None:
+    def own_refusal(self, program: Program) -> str | None:
         """Return why the program cannot run: it is not a user's own simulator, or single precision is set; or None."""
         if not isinstance(program, CallableProgram):
             return f"scene {program.scene.name} is not a user's own simulator"

@@ -36,7 +36,7 @@ class Fused(Backend):
         use_double_precision()
         return FusedProblem(program, JaxOps(), self.dtype, "reverse")
 
-    def unsupported_reason(self, program: Program) -> str | None:
+    def own_refusal(self, program: Program) -> str | None:
         """Return why the program cannot run, for example an operation without scalar form, or None."""
         if program.needs - self.provides:
             return None

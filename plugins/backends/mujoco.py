@@ -70,11 +70,11 @@ class Mujoco(Backend):
     def compile(self, program: Program) -> Problem:
         return MujocoProblem(program, self)
 
-    def unsupported_reason(self, program: Program) -> str | None:
+    def own_refusal(self, program: Program) -> str | None:
         """Return why the program cannot run: single precision, or a program without a twin; or None."""
         if self.dtype != "float64":
             return "MuJoCo computes in double precision"
-        return mjcf.unsupported_reason(self, program)
+        return mjcf.refusal(self, program)
 
 
 class MujocoProblem(NumpyProblem):

@@ -37,7 +37,7 @@ class Planted(Estimator):
         """Gradients; with ``base=best`` also costs and scores, which discontinuous costs need."""
         return frozenset({"grad"}) if self.base == "samples" else frozenset({"grad", "value", "score"})
 
-    def unsupported_reason(self, program: Program) -> str | None:
+    def own_refusal(self, program: Program) -> str | None:
         if self.angle and program.dim < 2:
             return f"{self.name}[angle={self.angle:g}] needs at least 2 coordinates, and theta has {program.dim}"
         return None

@@ -335,8 +335,8 @@ class Leaning(BounceOnce):
 def test_genesis_runs_contacts_only_where_its_friction_has_no_effect():
     genesis = registry.usable("backends", "genesis")()
     scenes = (BounceOnce(), BouncingBall(), Pushing(), Hopper(), Cartpole())
-    assert [genesis.unsupported_reason(program(scene)) for scene in scenes] == [None] * 5
-    assert "along the slides of their bodies only" in genesis.unsupported_reason(program(Leaning()))
+    assert [genesis.own_refusal(program(scene)) for scene in scenes] == [None] * 5
+    assert "along the slides of their bodies only" in genesis.own_refusal(program(Leaning()))
 
 
 @pytest.mark.parametrize("solver", ["semi_implicit", "xpbd"])

@@ -103,9 +103,9 @@ def test_what_the_points_of_a_plane_miss_is_below_the_width_that_remarks_state()
     )
     assert found.gradient == pytest.approx([0.2, 0.0], abs=1e-9)
     assert "narrower" not in found.note
-    rows = pd.DataFrame({"reference_method": [found.method, "closed_form"], "status": "ok"})
-    assert f"1 cell the reference is from points up to {found_at(found, 'spacing'):g} " in unseen_features(rows)[0]
-    assert not unseen_features(rows.assign(reference_method="quadrature[points=3,spacing=3e-05]"))
+    rows = pd.DataFrame({"reference_spacing": [found.spacing, math.nan]})
+    assert f"1 cell the reference is from points up to {found.spacing:.2g} " in unseen_features(rows)[0]
+    assert not unseen_features(rows.assign(reference_spacing=3e-5))
 
 
 def test_slow_convergence_at_a_pole_is_in_the_error():

@@ -130,7 +130,7 @@ def test_machine_code_is_kept_on_disk(tmp_path, monkeypatch):
 
 def test_an_operation_without_scalar_form_is_refused_by_name():
     backend = registry.make("backends", "fused")
-    assert "no scalar code for sort" in str(backend.unsupported_reason(compose(Sorted())))
+    assert "no scalar code for sort" in str(backend.own_refusal(compose(Sorted())))
     pushed = compose(
         registry.make("scenes", "pushing"),
         registry.make("contacts", "complementarity"),

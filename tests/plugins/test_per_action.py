@@ -34,6 +34,6 @@ def test_zeroth_order_per_action_has_the_policys_gradient_as_its_mean(policy, mo
 
 
 def test_actions_without_noise_of_their_own_are_refused():
-    assert "noise on the action" in PER_ACTION.unsupported_reason(compose(Pushing(hold=3), None, SemiImplicitEuler()))
-    assert "noise on the action" in PER_ACTION.unsupported_reason(compose(BouncingBall(), None, SemiImplicitEuler()))
-    assert PER_ACTION.unsupported_reason(compose(Pushing(), None, SemiImplicitEuler())) is None
+    assert "noise on the action" in PER_ACTION.own_refusal(compose(Pushing(hold=3), None, SemiImplicitEuler()))
+    assert "noise on the action" in PER_ACTION.own_refusal(compose(BouncingBall(), None, SemiImplicitEuler()))
+    assert PER_ACTION.own_refusal(compose(Pushing(), None, SemiImplicitEuler())) is None
