@@ -26,7 +26,7 @@ def test_whole_thetas_are_an_axis_whose_columns_are_the_coordinates_that_move():
         "theta0.0, with theta0.4",
         "theta0.4, with theta0.0",
     ]
-    assert with_axes(experiment, rows)["theta0.4"].tolist() == [2.0, 4.0]
+    assert with_axes(experiment.sweep, rows)["theta0.4"].tolist() == [2.0, 4.0]
 
 
 def test_one_coordinate_moves_and_the_others_stay():
@@ -41,7 +41,7 @@ def test_one_coordinate_moves_and_the_others_stay():
 def test_a_single_number_is_the_whole_theta_of_one_variable():
     words = ("scenes=[heaviside]", *BASE[1:], "sweep.theta0=[-1,0,0.5]")
     experiment, of = loaded(*words)
-    assert with_axes(experiment, rows_of(experiment, of))["theta0"].tolist() == [-1.0, 0.0, 0.5]
+    assert with_axes(experiment.sweep, rows_of(experiment, of))["theta0"].tolist() == [-1.0, 0.0, 0.5]
     # at the scene's own theta the closed form holds, elsewhere it is not claimed
     assert [cell.program().closed_form_gradient() is None for cell in of] == [True, False, True]
 

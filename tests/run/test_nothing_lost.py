@@ -17,7 +17,7 @@ from bench.cli import main
 from bench.errors import StorageError, UserError
 from bench.model.guard import temporary_file
 from bench.run import files
-from bench.run.pool import MalformedMessage, Pool, ResourceLimits, _Worker
+from bench.run.pool import Pool, ResourceLimits, _Worker
 from bench.run.store import Store
 
 TINY = ["scenes=[heaviside]", "backends=[numpy]", "samples=8", "repeats=4", "timing=false", "workers=0", "--quiet"]
@@ -244,10 +244,10 @@ def test_a_malformed_message_counts_as_a_crash_of_its_cell(content):
 
 @pytest.mark.parametrize("content", sorted(MALFORMED.keys() - {"noise", "length"}))
 def test_a_message_that_is_no_answer_is_malformed(content):
-    worker = _Worker(None, None, None, None, "", item="item", is_busy=True)
-    with pytest.raises(MalformedMessage):
+    worker = _Worker(None, None, None, None, "", item="item")
+    with pytest.raises((ValueError, LookupError, TypeError, RecursionError)):
         worker._read(MALFORMED[content][4:])
-    assert worker.is_busy
+    assert worker.item
 
 
 @pytest.mark.slow
@@ -271,7 +271,7 @@ def test_messages_before_a_malformed_one_still_count():
     with theirs:
         answer = b'{"event": "answer", "result": {"status": "ok"}, "seconds": 1.0}'
         theirs.sendall(framed(b'{"event": "started"}') + framed(answer) + b"garbage" * 10)
-        worker = _Worker(None, Connection(ours.detach()), temporary_file(), None, "", item="item", is_busy=True)
+        worker = _Worker(None, Connection(ours.detach()), temporary_file(), None, "", item="item")
         assert [one.item for one in worker.receive()] == ["item"]
         assert worker.fault == "sent a malformed message"
         worker.close()
