@@ -322,23 +322,6 @@ def test_git_revisions_are_compared(tmp_path, monkeypatch, capsys):
     assert "has no 'nowhere'" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["here"], "name two results"),
-        (["no-such-thing", "."], "neither a directory nor a git revision"),
-        (["--output=/tmp/x", "."], "unknown option of compare '--output=/tmp/x'"),
-        ([".", "."], "no results"),
-        ([".", ".", "agian=a"], "did you mean 'again'"),
-        ([".", ".", "again=a"], "needs 3 or more runs of before"),
-    ],
-)
-def test_bad_input_is_refused(words, said, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    assert cli.main(["compare", *words]) == 2
-    assert said in capsys.readouterr().err
-
-
 def test_results_kept_in_git_are_found_in_their_own_folder(tmp_path):
     before, after = given(), given()
     after.loc[good(after), ["bias", "bias_low", "bias_high"]] = [9.0, 8.0, 10.0]
@@ -427,15 +410,6 @@ def test_a_gradient_that_a_release_of_an_engine_changes_is_told(tmp_path):
     assert cli.main(["history", *places, f"out={tmp_path / 'out'}"]) == 0
     table = pd.read_csv(tmp_path / "out" / "history.csv")
     assert list(table["moved"].round(5)) == [0.0, 0.00045]
-
-
-@pytest.mark.parametrize(
-    ("words", "said"), [(["."], "name two results or more"), ([".", ".", "output=x"], "did you mean 'out'")]
-)
-def test_bad_input_to_history_is_refused(words, said, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    assert cli.main(["history", *words]) == 2
-    assert said in capsys.readouterr().err
 
 
 # ---------------------------------------------------------------------------------------------------- workflow
