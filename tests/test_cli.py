@@ -2,13 +2,13 @@
 
 import importlib
 import json
-import os
 import subprocess
 import sys
 
 import pandas as pd
 import pytest
 from bench.plugins.studies.bias_variance.columns import COLUMNS
+from trees import INHERITED
 
 from bench.cli import VERBS, main
 from bench.experiment.columns import IDENTITY
@@ -208,7 +208,6 @@ def test_a_thread_of_a_plugin_and_a_closed_stream_do_not_keep_a_command_waiting(
         cli.main = main
         command.command()
     """
-    inherited = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, sys.path))}
-    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=inherited, capture_output=True, timeout=500)
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=INHERITED, capture_output=True, timeout=500)
     assert done.returncode == 3
     assert done.stdout == b"all of it\n"

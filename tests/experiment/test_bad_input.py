@@ -57,6 +57,9 @@ REFUSED = {
     "sweep.seed=range(0,99999999)": "values, and more than", f"sweep.seed=[{MANY}] sweep.samples=[{MANY}] sweep.repeats=[{MANY}]": "the sweep has 10360232 cells",
     **{f"shard='{shard}'": "must be NUMBER/COUNT: of 64 shards, 1/64 to 64/64" for shard in ("0/64", "65/64", "3", "a/b", "1/0", "-1/4")},
     **{f"name={name}": f"name={name} is reserved" for name in ("claims", "references", "standard", "trace")},
+    "scenes=[quadratic] sweep.theta0.9=[1]": "theta has 5 coordinates", "scenes=[quadratic] sweep.theta0.0=[inf]": "must be finite",
+    "scenes=[quadratic] sweep.theta0.0=[[1,2]]": "one number at a time", "sweep.theta0=[one]": "theta0", "scenes=[quadratic] sweep.theta1=[1]": "did you mean 'theta0'",
+    "scenes=[quadratic] sweep.theta0=[[1,2]]": "theta0 has 2 values, theta of scene quadratic has 5",
     # the message names the fix
     "-m +experiment=quick,stiffness_sweep": "leave out --multirun",
     "plan +experiment=quick +experiment=twins": "python -m bench +experiment=quick && python -m bench +experiment=twins",

@@ -51,22 +51,6 @@ def test_theta_that_names_parameters_is_swept_too():
     assert thetas(*words) == [(2.0,), (3.0,)]
 
 
-@pytest.mark.parametrize(
-    ("word", "said"),
-    [
-        ("sweep.theta0.9=[1]", "theta has 5 coordinates"),
-        ("sweep.theta0.0=[inf]", "must be finite"),
-        ("sweep.theta0.0=[[1,2]]", "one number at a time"),
-        ("sweep.theta0=[[1,2]]", "theta0 has 2 values, theta of scene quadratic has 5"),
-        ("sweep.theta0=[one]", "theta0"),
-        ("sweep.theta1=[1]", "did you mean 'theta0'"),
-    ],
-)
-def test_an_impossible_theta_is_one_clear_sentence(word, said):
-    with pytest.raises(UserError, match=said):
-        loaded(*BASE, word)
-
-
 def test_whole_thetas_and_coordinates_do_not_mix():
     experiment, _ = loaded(*BASE, WRITTEN)
     mixed = {"theta0": [WHOLE[0]], "theta0.1": [3.0]}

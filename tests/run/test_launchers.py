@@ -7,6 +7,7 @@ import time
 
 import pandas as pd
 import pytest
+from trees import bench
 
 from bench.cli import main
 from bench.errors import UserError
@@ -62,10 +63,6 @@ WHERE = ("stored_at", "sequence", "wall_s", "experiment")
 def rows(folder):
     table = pd.read_parquet(folder / "rows.parquet").sort_values("key").reset_index(drop=True)
     return table.drop(columns=[*WHERE])
-
-
-def bench(*words, **more):
-    return subprocess.run([sys.executable, "-m", "bench", *words], capture_output=True, text=True, **more)
 
 
 # ---------------------------------------------------------------------------------------------------------- every day

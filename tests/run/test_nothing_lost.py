@@ -11,7 +11,7 @@ from multiprocessing.connection import Connection
 
 import pytest
 from bench.plugins.studies.bias_variance.columns import COLUMNS
-from trees import hearing_signals, processes_in, wait_for
+from trees import bench, hearing_signals, processes_in, wait_for
 
 from bench.cli import main
 from bench.errors import StorageError, UserError
@@ -390,21 +390,9 @@ def test_a_backend_asked_for_references_moves_and_doubles_nothing(tmp_path, work
         (tmp_path / name).mkdir()
     (tmp_path / "mine" / "moves.py").write_text(MOVES.format(elsewhere=str(tmp_path / "elsewhere")))
     words = ["scenes=[soft_heaviside]", *TINY[1:-2], f"workers={workers}", "reference.samples=4096", "results_dir=out"]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
-    done = subprocess.run(
-        [sys.executable, "-m", "bench", *words, f"plugins={tmp_path / 'mine'}", "estimators=[fobg]"],
-        cwd=tmp_path / "here", env=environment, capture_output=True, text=True,
-    )  # fmt: skip
+    done = bench(*words, f"plugins={tmp_path / 'mine'}", "estimators=[fobg]", folder=tmp_path / "here")
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("Written:") == 1
     assert (tmp_path / "here" / "out" / "custom" / "rows.parquet").exists()
     assert list((tmp_path / "here" / "out" / "references").glob("*.parquet"))
     assert not list((tmp_path / "elsewhere").iterdir())
-
-
-def test_too_little_memory_is_one_line():
-    code = "import bench.cli, bench.__main__ as m\ndef fail(): raise MemoryError\nbench.cli.main = fail\nm.command()"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert done.returncode == 1
-    assert done.stderr.startswith("bench: not enough memory: ")
-    assert len(done.stderr.splitlines()) == 1

@@ -17,6 +17,7 @@ import pandas as pd
 import pytest
 from bench.plugins.studies.bias_variance.columns import COLUMNS
 from pairwise import pairwise
+from trees import bench
 
 from bench.cli import main
 from bench.errors import StorageError
@@ -313,10 +314,6 @@ def test_directory_that_refuses(tmp_path, capsys, monkeypatch):
 
 
 # ---------------------------------------------------------------------------------------- kills and company
-
-
-def bench(*words):
-    return subprocess.run([sys.executable, "-m", "bench", *words], capture_output=True, text=True)
 
 
 def start(*words):
