@@ -173,7 +173,8 @@ def _compute(
         return _with_note(replace(quadrature, error=max(apart, quadrature.error)), note)
     # doubts about the samples are doubts about their error
     if not sampled.note and 0.0 < error < quadrature.error:
-        return _with_note(sampled, quadrature.note)
+        # tails may be too heavy for the spread of the samples to show, as at a pole in the plane
+        return _with_note(replace(sampled, error=max(sampled.error, apart)), quadrature.note)
     return _with_note(quadrature, sampled.note)
 
 
