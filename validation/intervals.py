@@ -4,7 +4,7 @@ Coverage is the share of simulated sets of estimates whose interval contains the
 columns count the remarks and the sets without one. Cells are the ridges of the bank with three estimators, every
 STRIDE-th of them and each with SETS sets. Without a STRIDE, ten times the sets are of a sum of sines with every estimator
 of the package, and of exp(x) and a hinge that 1 sample in 160 meets with some. No cell was used to choose a constant of the
-intervals. Biases and variances are from 262,144 independent samples, and the bias is 0 where the estimator declares it.
+intervals. Biases and variances are from 262,144 independent samples; a bias that is declared to be 0 is 0.
 """
 
 import json
@@ -129,7 +129,9 @@ def covered(cell, sets):
     draw = np.random.default_rng([7, theta.size, cell.repeats, cell.samples, len(cell.cost)])
     truth, is_unbiased = Truth.exact(cell.scene.truth()), method.declares_unbiased(problem.program)
     mean, variance = moments(cell, problem)
-    bias = 0.0 if is_unbiased else float(np.linalg.norm(mean - truth.mean))
+    # a scene may not declare its jumps, whose slopes first order misses
+    misses = isinstance(method, Fobg) and any("step" in piece.name for piece in cell.scene.pieces)
+    bias = float(np.linalg.norm(mean - truth.mean)) if misses or not is_unbiased else 0.0
     slack = ROUNDING * (1.0 + truth.norm)
     known = (bias, variance, variance * cell.samples, math.sqrt(variance + bias**2) / truth.norm)
     # terms that differ only by the rounding of a difference have variance 0
@@ -168,10 +170,10 @@ def main(sets=20, stride=0):
     table.loc[bank_rows, "repeats"] = 0
     table.loc[bank_rows, "estimator"] = table["estimator"].str.partition("[")[0]
     for (cost, estimator, repeats), rows in table.groupby(["cost", "estimator", "repeats"]):
-        plain = rows.loc[rows["plain"], names].mean().min()
+        plain = f"{rows.loc[rows['plain'], names].mean().min():.1%}" if rows["plain"].any() else "-"
         shares = " | ".join(f"{share:.1%}" for share in rows[names].mean())
         print(
-            f"| {cost} | `{estimator}` | {repeats or '16, 64'} | {len(rows)} | {shares} | {1 - rows['plain'].mean():.0%} | {plain:.1%} |"
+            f"| {cost} | `{estimator}` | {repeats or '16, 64'} | {len(rows)} | {shares} | {1 - rows['plain'].mean():.0%} | {plain} |"
         )
     plain = table[bank_rows & table["plain"]]
     print(f"{bank_rows.sum()} sets of the bank: {table.loc[bank_rows, names].mean().to_dict()}")
