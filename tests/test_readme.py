@@ -141,7 +141,9 @@ def test_version_has_one_source():
 def test_citation_changelog_and_switcher_have_the_version():
     assert yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"] == bench.__version__
     assert f"\n## {bench.__version__} (" in (ROOT / "CHANGELOG.md").read_text()
-    assert bench.__version__ in {entry["version"] for entry in json.loads((ROOT / "docs" / "switcher.json").read_text())}
+    assert bench.__version__ in {
+        entry["version"] for entry in json.loads((ROOT / "docs" / "switcher.json").read_text())
+    }
 
 
 # ------------------------------------------------------------------------------------------------------ commands
