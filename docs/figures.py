@@ -75,6 +75,7 @@ def speeds() -> dict[str, float]:
 
 
 BATCHES = ("1000", "10000", "100000", "1e+06")
+SCENES = ("pushing", "pendulum", "cartpole", "double_pendulum", "hopper")
 
 
 def speed(name: str) -> list[float]:
@@ -105,52 +106,27 @@ def rollouts_table() -> str:
     ])  # fmt: skip
 
 
-def scenes_table() -> str:
-    """Return the time of ``fused`` over that of ``jax`` by scene as a Markdown table."""
-    scenes = ("pushing", "pendulum", "cartpole", "double_pendulum", "hopper", "bounce_once")
-    head = ["| gradient, `fused` over `jax` on the same cores (target 0.33) | 1,000 | 100,000 |", "|---|--:|--:|"]
-    ratios = {scene: speed(f"fused over jax, {scene}, * rollouts") for scene in scenes}
-    return block(head + [f"| {scene} | " + " | ".join(map(number, values)) + " |" for scene, values in ratios.items()])
-
-
-def gpu_table() -> str:
-    """Return gradients per second, their agreement with the CPU and compile time by case as Markdown, in float64."""
-    rows = pd.read_csv(STANDARD / "gpu" / "gpu.csv").query("dtype == 'float64'")
-    keys = ["case", "backend"]
-    rates = rows.pivot(index=keys, columns="batch", values="gradients_per_s")[[1, 1024, 16384]]
-    most = rows.groupby(keys)[["agreement", "compile_s"]].max()
-    head = [
-        "| scene | backend | 1 | 1,024 | 16,384 | agreement | compiles [s] |",
-        "|---|---|--:|--:|--:|--:|--:|",
-    ]
-    return block(head + [
-        f"| {case} | `{backend}` | " + " | ".join(map(number, [*rates.loc[key], *most.loc[key]])) + " |"
-        for key in rows[keys].drop_duplicates().itertuples(index=False, name=None)
-        for case, backend in [key]
-    ])  # fmt: skip
-
-
 def dose(table: str, name: str = "dose_response") -> pd.DataFrame:
     """Return a table of a study of errors as stored."""
     return pd.read_csv(STANDARD / name / f"{table}.csv", keep_default_na=True)
 
 
 UPDATES = (
-    "random error 0.3", "random error 1", "random error 3", "random error 3 / 0.3", "bias 0.6", "bias 0.9", "bias 0.9 / random error 1",
+    "random error 0.3", "random error 1", "random error 3", "random error 3 / 0.3", "bias 0.9", "bias 0.9 / random error 1",
 )  # fmt: skip
 ROLLOUTS = "first order / zeroth order, gradient "
 
 
 def dose_ratios(head: str, parts: dict[str, pd.DataFrame], names: dict[str, str]) -> str:
     """Return ratios to 1/100 as a Markdown table: a line per part, and a column per comparison, by its heading."""
-    lines = [f"| {head} | problems | scenes | {' | '.join(names)} |", f"|---|--:|--:|{'--:|' * len(names)}"]
+    lines = [f"| {head} | scenes | {' | '.join(names)} |", f"|---|--:|{'--:|' * len(names)}"]
     for label, part in parts.items():
         rows = part.query("target == 100").set_index("comparison").reindex(list(names.values()))
         cells = [
             "-" if np.isnan(row.ratio) else number(row.ratio) if row.scenes < LEAST_SCENES else
             text_of_interval(row.ratio, row.ratio_low, row.ratio_high, 1.0) for row in rows.itertuples()
         ]  # fmt: skip
-        lines.append(f"| {label} | {rows['problems'].max():.0f} | {rows['scenes'].max():.0f} | {' | '.join(cells)} |")
+        lines.append(f"| {label} | {rows['scenes'].max():.0f} | {' | '.join(cells)} |")
     return block(lines)
 
 
@@ -176,7 +152,6 @@ def dose_classes(names: dict[str, str]) -> str:
 
 
 DOSE_RUNS = {
-    "Adam": "dose_response",
     "Adam, 20 seeds": "dose_response_seeds",
     "Adam, neural policies": "dose_response_policy",
     "plain descent": "dose_response_descent",
@@ -189,7 +164,7 @@ DOSE_RUNS = {
 def dose_runs() -> str:
     """Return the ratios over all problems of each experiment with planted errors as a Markdown table."""
     parts = {label: dose("pairs", name).query("scene_class == 'all classes'") for label, name in DOSE_RUNS.items()}
-    return dose_ratios("searches", parts, {name: name for name in UPDATES if name != "bias 0.6"})
+    return dose_ratios("searches", parts, {name: name for name in UPDATES})
 
 
 def windows_missed() -> str:
@@ -272,12 +247,12 @@ FIGURES: dict[str, str | Callable[[], str]] = {
     "trust-all-trusted": lambda: count(trusted(*FOUR)["trusted"]),
     "trust-all-wrong": lambda: count(trusted(*FOUR)["wrong"]),
     "trust-all-worst": lambda: str(trusted(*FOUR)["worst"]),
-    "speed-fused": lambda: span(speed("fused grad, penalty, * rollouts")),
-    "speed-jax": lambda: span(speed("jax grad, penalty, * rollouts")),
     "speed-cell": lambda: number(speeds()["overhead of a cell"]),
     "speed-rollouts": rollouts_table,
-    "speed-scenes": scenes_table,
-    "speed-gpu": gpu_table,
+    "speed-scenes": lambda: span(
+        [value for scene in SCENES for value in speed(f"fused over jax, {scene}, * rollouts")]
+    ),
+    "speed-bounce": lambda: span(speed("fused over jax, bounce_once, * rollouts")),
     "speed-one-thread": lambda: span(speed("fused on one thread over the C kernel, * rollouts")),
     "speed-agree": lambda: number(speeds()["native C kernel: largest relative difference"]),
     "speed-memory-fused": lambda: span(speed("fused grad, penalty, * rollouts: peak memory"), 3),

@@ -34,7 +34,7 @@ def test_run_then_report_then_plan(tmp_path, capsys):
     assert f"Page: {directory / 'report.html'}" in printed
 
     for path in directory.iterdir():
-        if path.name != "rows.parquet":
+        if path.is_file() and path.name != "rows.parquet":
             path.unlink()
     assert main(["report", *TINY, where, "sweep.sigma=[0.1,0.2]"]) == 0
     again = pd.read_csv(directory / "bias_variance.csv")

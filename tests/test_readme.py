@@ -1,5 +1,6 @@
 """The text of README and docs, checked and run: links, commands, examples, and lists of what there is."""
 
+import json
 import os
 import re
 import shlex
@@ -110,16 +111,17 @@ def test_installation_names_this_package():
 
 def test_every_scene_and_experiment_is_described():
     for name in registry.entries()["scenes"]:
-        assert f"| `{name}` |" in DOCS["experiments.md"]
+        assert re.search(rf"^\|[^|]* `{name}`", DOCS["experiments.md"], re.MULTILINE), name
     for name in config.experiments():
-        assert f"\n### {name}\n" in DOCS["answers.md"]
+        assert re.search(rf"^(### {name}$|- `{name}`: )", DOCS["answers.md"], re.MULTILINE), name
 
 
 def test_every_command_and_setting_is_described():
     for verb in cli.VERBS:
         assert f"\n## {verb}\n" in DOCS["commands.md"], verb
+    settings = DOCS["commands.md"].partition("\n## Settings\n")[2]
     for key in set(yaml.safe_load((config.config_dir() / "config.yaml").read_text())) - {"defaults"}:
-        assert re.search(rf"^\|.*`{key}`.*\|", DOCS["commands.md"], re.MULTILINE), key
+        assert re.search(rf"^[- ] .*`{key}`", settings, re.MULTILINE), key
 
 
 def test_architecture_names_every_package():
@@ -136,9 +138,12 @@ def test_version_has_one_source():
     assert pyproject["tool"]["hatch"]["version"] == {"path": "bench/__init__.py"}
 
 
-def test_citation_and_changelog_have_the_version():
+def test_citation_changelog_and_switcher_have_the_version():
     assert yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"] == bench.__version__
     assert f"\n## {bench.__version__} (" in (ROOT / "CHANGELOG.md").read_text()
+    assert bench.__version__ in {
+        entry["version"] for entry in json.loads((ROOT / "docs" / "switcher.json").read_text())
+    }
 
 
 # ------------------------------------------------------------------------------------------------------ commands

@@ -280,7 +280,6 @@ def features(sets):
     """References of costs with a narrow feature in 1, 2 and 3 to 10 dimensions, and of smooth costs, which need no remark."""
     import bank
 
-    from bench.measure.reference import unseen_width
     from bench.model import compose
 
     random = np.random.default_rng(11)
@@ -296,7 +295,7 @@ def features(sets):
             found = bank.certified(bank.Case("", compose(scene), truth), 1 << 16)
             is_off = found.is_finite and np.linalg.norm(found.gradient - truth) > 4 * found.known().standard_error
             silent = is_off and not found.note
-            results.append((is_off, bool(found.note), silent, silent and width > unseen_width(found.method)))
+            results.append((is_off, bool(found.note), silent, silent and not width <= found.spacing))
         off, noted, silent, wide = np.array(results).sum(axis=0)
         yield (
             f"{label}: {count}, off by more than 4 stated errors {off}, with a remark {noted}, off without {silent}, "

@@ -381,8 +381,7 @@ class _Examination:
                     measured, self.stages.repeats.spread, self.simulator.unit * (size if math.isfinite(size) else 0.0)
                 )
                 cost = partial(self.stages.costs_along, direction)
-                line = scan(cost, np.zeros(1), np.ones(1), rounding, 3.0, points, halvings, most, self.simulator.unit)
-                line = replace(line, direction=direction)
+                line = scan(cost, direction, rounding, 3.0, points, halvings, most, self.simulator.unit)
                 lines.append(replace(line, missed=self._missed_share(line, checked)))
         except OutOfTime:
             self.left_out.append("jumps and kinks on lines")
@@ -430,9 +429,7 @@ class _Examination:
             self.clock.start_stage(f"noise of sigma {level:g}")
             self.clock.limit(1.0 / (len(levels) - index))
             pairs = min(PAIRS, max(FEWEST, HELD // self.theta.size))
-            one = measure_smoothed(
-                self.simulator, self.theta, level, spread / level, plain, self.clock, self.seed, pairs
-            )
+            one = measure_smoothed(self.simulator, self.theta, level, spread, plain, self.clock, self.seed, pairs)
             self.clock.limit(1.0)
             if one is None:
                 self.left_out.append(f"noise of sigma {level:g}")

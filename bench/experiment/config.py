@@ -99,7 +99,7 @@ def _composed(overrides: Sequence[str], config_dirs: Sequence[Path]) -> Experime
         raise UserError(printable(": ".join(lines)).replace("override ++", "")[:1000]) from None
     assert isinstance(plain, dict)
     settings = {str(k): v for k, v in plain.items()}
-    joined = _joined(experiment(settings), _as_list(settings["also"]), overrides, config_dirs)
+    joined = _joined(from_settings(settings), _as_list(settings["also"]), overrides, config_dirs)
     return replace(joined, answer=_answer(joined, overrides, config_dirs))
 
 
@@ -256,7 +256,7 @@ DEFAULT_PLUGINS = {"optimizers": ["adam"]}
 """Plugins of kinds that are null in the configuration, unless the study has its own default."""
 
 
-def experiment(config: Mapping[str, Any]) -> Experiment:
+def from_settings(config: Mapping[str, Any]) -> Experiment:
     """Return the experiment of a composed configuration; raises :class:`UserError` if a setting is invalid."""
     extra = set(config) - _known_keys()
     if extra:

@@ -51,7 +51,7 @@ class Study(Plugin):
         """Return the part of theta that programs have; by default all of it."""
         return given
 
-    def unsupported_reason(self, cell: Cell) -> str | None:
+    def refusal(self, cell: Cell) -> str | None:
         """Return why the study cannot measure a cell, or None; called when a run is planned."""
         return None
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -188,18 +188,8 @@ def is_adaptive(
     if sum(len(line.jumps) for line in lines) < FEWEST_JUMPS and error <= NEAR:
         first, noise = lines[0], max(outcome.noise, stages.repeats.spread)
         reach, unit = LONGER * float(first.at[-1]), stages.simulator.unit
-        longer = scan(
-            partial(stages.costs_along, first.direction),
-            np.zeros(1),
-            np.ones(1),
-            noise,
-            reach,
-            points,
-            halvings,
-            most,
-            unit,
-        )
-        lines = [replace(longer, direction=first.direction)]
+        cost = partial(stages.costs_along, first.direction)
+        lines = [scan(cost, first.direction, noise, reach, points, halvings, most, unit)]
     if sum(len(line.jumps) for line in lines) < FEWEST_JUMPS:
         return False
     rows = []

@@ -123,7 +123,7 @@ def _identity_of(cell: Cell) -> Identity:
 
 
 def _refusal_of_study(experiment: Experiment, cell: Cell) -> tuple[str, str] | None:
-    reason = study_of(experiment).unsupported_reason(cell)
+    reason = study_of(experiment).refusal(cell)
     return None if reason is None else ("unsupported", reason)
 
 

@@ -388,9 +388,9 @@ class Moves(Numpy):
     name = "moves"
     def __post_init__(self):
         os.fork()
-    def unsupported_reason(self, *given):
+    def own_refusal(self, *given):
         os.chdir({elsewhere!r})
-        return super().unsupported_reason(*given)
+        return super().own_refusal(*given)
 """
 
 

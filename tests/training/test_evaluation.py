@@ -1,5 +1,7 @@
 """Returns of a policy, and environments."""
 
+from dataclasses import dataclass
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -30,8 +32,6 @@ def test_returns_are_those_of_a_loop_in_numpy():
 
 
 def test_an_episode_counts_up_to_its_first_end():
-    from dataclasses import dataclass
-
     @dataclass(frozen=True)
     class Falls(registry.usable("scenes", "cartpole_swing")):
         name = "falls"
@@ -53,8 +53,6 @@ def test_an_episode_counts_up_to_its_first_end():
 
 
 def test_a_scene_without_random_starts_has_returns():
-    from dataclasses import dataclass
-
     @dataclass(frozen=True)
     class Fixed(registry.usable("scenes", "cartpole_swing")):
         name = "fixed"

@@ -67,7 +67,7 @@ class BackwardMemory(StudyPackage):
         6, "measured calls: the range of six contains the median of their distribution with probability 97%", low=6
     )
 
-    def unsupported_reason(self, cell: Cell) -> str | None:
+    def refusal(self, cell: Cell) -> str | None:
         """Return that the backend computes no gradients, or None."""
         return None if "grad" in cell.backend.provides else f"backend {cell.backend.name} computes no gradients"
 

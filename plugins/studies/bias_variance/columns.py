@@ -51,6 +51,8 @@ COLUMNS = Columns.ordered(
     text("shapes", "hashes of the requested programs", table=False, measured=True),
     numbers("point", "theta at which the gradient is taken, by coordinate", table=False),
     numbers("mean_estimate", "mean estimate, signed, by coordinate of theta", table=False),
+    Column("reference_spacing", "average spacing of the points of a reference by quadrature, in standard deviations of the noise",
+           table=False),
     numbers("reference_gradient", "reference gradient, signed, by coordinate of theta", table=False),
     text("auxiliaries", "diagnostics that the estimator reports, such as a weight: JSON of mean, quantiles and share of exact zeros",
          table=False),

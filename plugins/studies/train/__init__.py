@@ -72,7 +72,7 @@ class Train(StudyPackage):
         250, "most entries of a stored log; an entry is the mean or largest value of its updates", low=10
     )
 
-    def unsupported_reason(self, cell: Cell) -> str | None:
+    def refusal(self, cell: Cell) -> str | None:
         """Return why a policy cannot be trained in a cell, or None."""
         if not isinstance(cell.parts["trainer"], Trainer):
             return "a trainer is needed: see `python -m bench list trainers`"
