@@ -38,10 +38,6 @@ class CallableProblem(Problem):
         super().__init__(program)
         self._simulator, self._step = program.scene.simulator(), step
 
-    def score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """Return u / sigma, the score of the noise on theta, ``(d, B)``."""
-        return self._score(theta, w)
-
     def _value(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         return self._simulator.costs(*self._split(theta, w))
 
@@ -63,9 +59,6 @@ class CallableProblem(Problem):
             up, down = self._simulator.costs(thetas + step, noise), self._simulator.costs(thetas - step, noise)
             rows.append((up - down) / (2 * step[i]))
         return np.stack(rows)
-
-    def _score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        return w[: self.dim] / self.sigma
 
     def _split(self, theta: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
         """Return theta plus its noise, ``(d, B)``, and the simulator's own noise ``(n, B)`` or None."""
