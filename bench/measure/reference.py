@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any, cast
@@ -59,7 +58,9 @@ class Reference:
     sampling error. ``error`` is the norm of the error that their spread does not show: the error of a deterministic
     method, or the effect of the tails. ``plain (d,)`` is the program's gradient at w = 0, and ``physical (d,)`` the
     gradient of the physics that the program approximates. Each is empty when unknown. ``note`` states what could not be
-    certified.
+    certified. ``spacing`` is the average spacing of the points of quadrature, in standard deviations of the noise. A
+    feature of the cost that is narrower may be missed. In one dimension most are found, as panels are halved where
+    costs change. It is NaN for other methods. ``samples`` is the number of samples, 0 for methods without samples.
     """
 
     batches: np.ndarray
@@ -68,6 +69,8 @@ class Reference:
     plain: np.ndarray = field(default_factory=lambda: np.empty(0))
     physical: np.ndarray = field(default_factory=lambda: np.empty(0))
     note: str = ""
+    spacing: float = math.nan
+    samples: int = 0
 
     @property
     def gradient(self) -> np.ndarray:
@@ -137,15 +140,6 @@ def revisions(program: Program, provides: frozenset[str]) -> dict[str, int]:
     return {name: REVISIONS[name] for name in names}
 
 
-def unseen_width(method: str) -> float:
-    """Return the width, in standard deviations, below which quadrature may miss a feature of the cost: the spacing of its points.
-
-    It is 0 for other methods. In one dimension most narrower features are found, as panels are halved where costs change.
-    """
-    found = re.search(r"quadrature\[.*spacing=([^],]+)", method)
-    return float(found[1]) if found else 0.0
-
-
 def _can_integrate(program: Program) -> bool:
     """Return whether quadrature can integrate over the noise."""
     return program.noise_on_theta and program.n_noise <= (1 if _unlisted_jumps(program) else 2)
@@ -160,7 +154,9 @@ def _compute(
         integral = integrate(problem, theta, min(QUADRATURE_POINTS, 64 * samples), COLUMNS)
         if integral is not None:
             method = f"quadrature[points={integral.points},spacing={integral.spacing:.2g}]"
-            quadrature = Reference(integral.gradient[None, :], method, integral.error, note=integral.note)
+            quadrature = Reference(
+                integral.gradient[None, :], method, integral.error, note=integral.note, spacing=integral.spacing
+            )
             if math.isnan(integral.error):
                 return replace(quadrature, method="quadrature[failed: the mean cost may not exist]")
             if integral.error <= TOLERANCE * np.linalg.norm(integral.gradient):
@@ -177,7 +173,8 @@ def _compute(
         return _with_note(replace(quadrature, error=max(apart, quadrature.error)), note)
     # doubts about the samples are doubts about their error
     if not sampled.note and 0.0 < error < quadrature.error:
-        return _with_note(sampled, quadrature.note)
+        # tails may be too heavy for the spread of the samples to show, as at a pole in the plane
+        return _with_note(replace(sampled, error=max(sampled.error, apart)), quadrature.note)
     return _with_note(quadrature, sampled.note)
 
 
@@ -251,7 +248,7 @@ def _sample(problem: Problem, theta: np.ndarray, provides: frozenset[str], sampl
     centre = problem.value(theta, still)
     orders: dict[str, Terms] = {}
     if problem.program.has_score_gradient:
-        orders["zeroth_order"] = lambda w: _antithetic(problem, theta, w, centre)
+        orders["zeroth_order"] = lambda w: _antithetic(problem, theta, (w, -w), centre)
     if problem.program.continuous and "grad" in provides:
         orders["first_order"] = lambda w: problem.grad(theta, w)
     pilot = draw_columns(problem, "pilot", columns, 0)
@@ -283,7 +280,7 @@ def _sample(problem: Problem, theta: np.ndarray, provides: frozenset[str], sampl
         return _with_note(reference, doubt)
     # a pilot of a heavy-tailed distribution underestimates its variance
     error = reference.known().standard_error
-    if 2.0 * spread["zeroth_order"] < _count(reference) * error**2:
+    if 2.0 * spread["zeroth_order"] < reference.samples * error**2:
         other = sample("zeroth_order")
         if other.is_finite and other.known().standard_error < error:
             return other
@@ -349,7 +346,7 @@ def _batches(
         note = note or f"all samples of the reference have the same gradient: events rarer than {rare:.1g} are not seen"
     # the spread does not show an error that all samples share, such as that of a backend's differences
     unseen = math.hypot(unseen, SHARED * math.sqrt(float(np.square(pilot).sum(axis=0).mean())))
-    return Reference(batches, f"sampling[{order},n={count * BATCHES}]", unseen, note=note)
+    return Reference(batches, f"sampling[{order},n={count * BATCHES}]", unseen, note=note, samples=count * BATCHES)
 
 
 def _cross_checked(
@@ -367,23 +364,16 @@ def _cross_checked(
     returns ``instead()``.
     """
     assumed = assumes_continuity(problem.program)
-    n_check = max(_count(reference) // 4, samples - _count(reference) if assumed else 0)
+    n_check = max(reference.samples // 4, samples - reference.samples if assumed else 0)
     centre = problem.value(theta, np.zeros((problem.program.n_noise, 1)))
     # a linear part of the cost, whose zeroth-order estimate is known, only adds noise to the comparison
     linear = reference.gradient if problem.noise_on_theta else np.zeros(problem.dim)
 
     def zeroth(w: np.ndarray) -> np.ndarray:
-        if not problem.program.exogenous:
-            return _antithetic(problem, theta, w, centre, linear)
         # the same own noise on both sides and in the baseline, so that only the noise on theta moves the terms
         own = problem.centred(w)
-        mirrored = 2.0 * own - w
-        baseline = problem.value(theta, own)
-        terms = sum((problem.value(theta, s) - baseline) * problem.score(theta, s) for s in (w, mirrored)) / 2.0
-        if not problem.noise_on_theta:
-            return np.asarray(terms)
-        step = problem.directions(w)
-        return np.asarray(terms - (linear @ step) * step + linear[:, None])
+        baseline = problem.value(theta, own) if problem.program.exogenous else centre
+        return _antithetic(problem, theta, (w, 2.0 * own - w), baseline, linear)
 
     check = np.concatenate(
         [
@@ -482,10 +472,6 @@ def _directions(effect: np.ndarray) -> np.ndarray:
     return np.column_stack([directions, effect / length]) if length and math.isfinite(length) else directions
 
 
-def _count(reference: Reference) -> int:
-    return int(reference.method.split("n=")[1].split(",")[0].rstrip("]"))
-
-
 def _with_note(reference: Reference, note: str) -> Reference:
     return replace(reference, note="; ".join(part for part in (note, reference.note) if part))
 
@@ -513,18 +499,22 @@ def draw_columns(problem: Problem, stream: str, count: int, block: int) -> np.nd
 
 
 def _antithetic(
-    problem: Problem, theta: np.ndarray, w: np.ndarray, centre: np.ndarray, linear: np.ndarray | None = None
+    problem: Problem,
+    theta: np.ndarray,
+    sides: tuple[np.ndarray, np.ndarray],
+    baseline: np.ndarray,
+    linear: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Return zeroth-order terms averaged over w and -w, with the cost at w = 0 as baseline, ``(d, B)``.
+    """Return zeroth-order terms ``(d, B)`` averaged over noise and its mirror image, ``sides``, with a baseline of the costs.
 
     For noise on theta, ``linear (d,)`` is the gradient of a linear part of the cost. Its terms are replaced by their
     mean, ``linear``, which changes no expectation.
     """
-    terms = ((problem.value(theta, s) - centre) * problem.score(theta, s) for s in (w, -w))
+    terms = ((problem.value(theta, s) - baseline) * problem.score(theta, s) for s in sides)
     mean = np.asarray(sum(terms) / 2)
     if linear is None or not linear.any():
         return mean
-    step = problem.directions(w)
+    step = problem.directions(sides[0])
     return np.asarray(mean - (linear @ step) * step + linear[:, None])
 
 

@@ -55,7 +55,7 @@ def over_ball(problem: Problem, provides: frozenset[str], radius: float, samples
         enough = error <= tolerance * np.linalg.norm(batches.mean(axis=0)) and count * BATCHES >= LEAST_SAMPLES
         if enough or 2 * count * BATCHES > samples or not math.isfinite(error):
             break
-    return Reference(batches, f"{name},sampling[{chosen},n={count * BATCHES}]")
+    return Reference(batches, f"{name},sampling[{chosen},n={count * BATCHES}]", samples=count * BATCHES)
 
 
 def _polar(problem: Problem, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -20,6 +20,9 @@ from bench.model import Backend
 from bench.run.files import make_directory, write_whole
 from bench.run.rows import read_parquet
 
+SCALARS = ("method", "error", "note", "spacing", "samples")
+"""Fields of a reference that are one value."""
+
 
 class References:
     """The reference gradients of one run."""
@@ -112,7 +115,7 @@ def save(reference: Reference, path: Path) -> None:
     ]
     table = pd.DataFrame(
         {"part": [name for name, _ in rows], "gradient": [list(row) for _, row in rows],
-         "method": reference.method, "error": reference.error, "note": reference.note}
+         **{name: getattr(reference, name) for name in SCALARS}}
     )  # fmt: skip
     buffer = io.BytesIO()
     table.to_parquet(buffer, index=False)
@@ -128,7 +131,6 @@ def load(path: Path) -> Reference | None:
         table = read_parquet(path)
         rows = {name: np.stack(list(part)) for name, part in table.groupby("part")["gradient"]}
         vectors = {name: rows[name][0] for name in ("plain", "physical") if name in rows}
-        method, error = str(table["method"][0]), float(table["error"][0])
-        return Reference(rows["batch"], method, error, **vectors, note=str(table["note"][0]))
+        return Reference(rows["batch"], **vectors, **table.loc[0, list(SCALARS)])
     except Exception:
         return None

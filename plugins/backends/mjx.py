@@ -69,9 +69,9 @@ class Mjx(Jax):
         ops = self.ops()
         return MjxProblem(MjxProgram(rollout(program), self), ops, self.dtype, self._direction(program))
 
-    def unsupported_reason(self, program: Program) -> str | None:
+    def own_refusal(self, program: Program) -> str | None:
         """Return why the program cannot run: it has no twin, or MJX cannot differentiate it; or None."""
-        if reason := mjcf.unsupported_reason(self, program):
+        if reason := mjcf.refusal(self, program):
             return reason
         scene = program.scene
         is_file = isinstance(scene, EngineTwin) and scene.model_file() is not None

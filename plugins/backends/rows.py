@@ -12,15 +12,12 @@ from typing import Any
 
 from bench.model import Array
 
+from ..fused.graph import FOLD
+from ..fused.trace import interpret
+
 MAX_ROWS = 16
 """Maximum number of rows of arrays that are split."""
-ELEMENTWISE = {
-    "abs", "acos", "acosh", "add", "and", "asin", "asinh", "atan", "atan2", "atanh", "cbrt", "ceil",
-    "convert_element_type", "cos", "cosh", "div", "eq", "erf", "exp", "exp2", "expm1", "floor", "ge", "gt",
-    "integer_pow", "is_finite", "le", "log", "log1p", "logistic", "lt", "max", "min", "mul", "ne", "neg", "not",
-    "or", "pow", "rem", "round", "rsqrt", "select_n", "sign", "sin", "sinh", "sqrt", "square", "sub", "tan",
-    "tanh", "xor",
-}  # fmt: skip
+ELEMENTWISE = FOLD.keys() - {"stop_gradient"} | {"cbrt", "convert_element_type", "exp2", "integer_pow", "round"}
 """Primitives that compute each element only from the elements at the same position."""
 
 
@@ -40,15 +37,8 @@ def join(value: Any) -> Array:
 
 def evaluate(jaxpr: Any, consts: Sequence[Any], arguments: Sequence[Any]) -> list[Any]:
     """Return the outputs of a jaxpr for arguments split into rows; ``(n, B)`` outputs with few rows are split too."""
-    known = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *arguments], strict=True))
-
-    def read(atom: Any) -> Any:
-        return atom.val if hasattr(atom, "val") else known[atom]
-
-    for equation in jaxpr.eqns:
-        values = [read(atom) for atom in equation.invars]
-        known.update(zip(equation.outvars, _apply(equation, values), strict=True))
-    return [split(value) if hasattr(value, "ndim") else value for value in map(read, jaxpr.outvars)]
+    values = interpret(jaxpr, consts, arguments, _apply)
+    return [split(value) if hasattr(value, "ndim") else value for value in values]
 
 
 def _apply(equation: Any, values: list[Any]) -> list[Any]:

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from .adjoint import active, pullback
+from .functions import helpers
 from .graph import Node, reached
 from .trace import Loop
 
@@ -39,7 +40,11 @@ def kernel(parameter, constant, index, horizon, theta, theta_row, theta_column, 
     """Fill columns start to stop of ``out``; return whether all angles were small enough for fast sine and cosine, and
     whether all slopes are below ``BEYOND``."""
 '''
-ARGUMENTS = ("theta", "scored", "noise")
+LOOKUPS = {"theta@", "scored@", "noise@"}
+TIMED = LOOKUPS | {"table", "carry", "adjoint"}
+"""Leaves that differ between steps."""
+WIDE = LOOKUPS | {"theta", "scored", "noise", "carry", "final", "adjoint", "total", "before"}
+"""Leaves that differ between lanes."""
 
 
 def source(loop: Loop, dtype: str, wrt: str | None, rows: int, title: str, cache: bool) -> str:
@@ -58,6 +63,13 @@ class _Code:
         self.lines.append("    " * depth + text)
 
 
+def _depends(known: dict[int, bool], leaves: set[str], node: Node) -> bool:
+    """Return whether a node depends on leaves of these kinds; ``known`` holds the answers so far by number."""
+    if node.number not in known:
+        known[node.number] = node.op in leaves or any(_depends(known, leaves, arg) for arg in node.args)
+    return known[node.number]
+
+
 class _Kernel:
     """Generates the body of a kernel, statement by statement."""
 
@@ -74,17 +86,11 @@ class _Kernel:
 
     def is_wide(self, node: Node) -> bool:
         """Return whether a node's value differs between lanes."""
-        if node.number not in self.wide:
-            leaves = (*ARGUMENTS, *(f"{name}@" for name in ARGUMENTS), "carry", "final", "adjoint", "total", "before")
-            self.wide[node.number] = node.op in leaves or any(self.is_wide(arg) for arg in node.args)
-        return self.wide[node.number]
+        return _depends(self.wide, WIDE, node)
 
     def is_timed(self, node: Node) -> bool:
         """Return whether a node's value differs between steps."""
-        if node.number not in self.timed:
-            leaves = ("table", "carry", "adjoint", *(f"{name}@" for name in ARGUMENTS))
-            self.timed[node.number] = node.op in leaves or any(self.is_timed(arg) for arg in node.args)
-        return self.timed[node.number]
+        return _depends(self.timed, TIMED, node)
 
     def text(self, dtype: str, title: str, cache: bool) -> str:
         """Return the source of the module."""
@@ -110,9 +116,9 @@ class _Kernel:
         self._uniforms(everything)
         self._lanes(everything, forward, starts, backward)
         body = self.code.lines
-        helpers = _helpers(everything)
+        used = helpers({CALLS[node.op] for node in everything if node.op in CALLS})
         beyond = float(np.finfo(dtype).max) ** 0.25
-        text = HEAD.format(title=title, dtype=dtype, beyond=beyond, helpers=helpers, cache=cache)
+        text = HEAD.format(title=title, dtype=dtype, beyond=beyond, helpers=used, cache=cache)
         return text + _renumbered("\n".join("    " + line for line in body)) + "\n"
 
     def _needed(self, roots: Iterable[Node], carries: Iterable[int] = ()) -> list[int]:
@@ -135,10 +141,9 @@ class _Kernel:
         fixed, varying = wrt, f"{wrt}@"
         live = self._live_carries(fixed, varying)
 
-        def wanted_after(node: Node) -> bool:
-            return node.op == fixed or (node.op == "final" and node.data in live)
-
-        found = pullback(graph, [(loop.result, graph.literal(1.0))], wanted_after)
+        found = pullback(
+            graph, [(loop.result, graph.literal(1.0))], lambda n: n.op == fixed or (n.op == "final" and n.data in live)
+        )
         seeds = {node.data: ct for node, ct in found.items() if node.op == "final"}
         direct = {node: ct for node, ct in found.items() if node.op == fixed}
         if not loop.length:
@@ -248,7 +253,10 @@ class _Kernel:
         code.add(1, "theta_at = b * theta_column")
         code.add(1, "scored_at = b * scored_column")
         if backward and not self.covers(backward):
-            self._clear()
+            # the backward pass adds to the result
+            code.add(1, "for i in range(rows):")
+            code.add(2, f"for l in range({LANES}):")
+            code.add(3, "out[at(i * out_row + b + l)] = F(0.0)")
         # before the loop over time
         stores = [(f"c{i}", node) for i, node in starts.items()]
         stores += [(f"k{n.number}", n) for n in crossing]
@@ -310,12 +318,6 @@ class _Kernel:
             return False
         table = self.loop.indices[next(iter(backward.tables))]
         return np.array_equal(np.sort(table), np.arange(self.rows))
-
-    def _clear(self) -> None:
-        """Write zeros to the result, to which the backward pass adds."""
-        self.code.add(1, "for i in range(rows):")
-        self.code.add(2, f"for l in range({LANES}):")
-        self.code.add(3, "out[at(i * out_row + b + l)] = F(0.0)")
 
     def _reverse(self, backward: _Backward, history: dict[int, int], finals: dict[int, str],
                  kept_values: dict[int, str]) -> None:  # fmt: skip
@@ -422,7 +424,7 @@ class _Kernel:
                 return f"{node.op}[at({node.data} * {node.op}_row + {node.op}_at + l)]"
             case "noise":
                 return f"noise[at({node.data} * noise_row + b + l)]"
-            case "theta@" | "scored@" | "noise@":
+            case op if op in LOOKUPS:
                 return f"{node.op[:-1]}[at({node.op[:-1]}{node.data} + l)]"
             case "div" if node.args[1].number in getattr(self, "reciprocals", {}):
                 return f"{args[0]} * {self.reciprocals[node.args[1].number]}"
@@ -485,10 +487,3 @@ CALLS = {
     "abs": "abs", "max": "max_", "min": "min_", "sign": "sign_", "sin": "sin_", "cos": "cos_", "rsqrt": "rsqrt_",
     "logistic": "logistic_", "floor": "np.floor", "ceil": "np.ceil", "rem": "math.fmod",
 }  # fmt: skip
-
-
-def _helpers(everything: list[Node]) -> str:
-    from .functions import HELPERS
-
-    used = {CALLS[node.op] for node in everything if node.op in CALLS}
-    return HELPERS.text(used)

@@ -9,7 +9,7 @@ from bench.experiment.session import Problems
 from bench.measure.reference import Reference
 from bench.model import compose
 from bench.run import references
-from bench.run.references import References, load, save
+from bench.run.references import SCALARS, References, load, save
 
 
 @pytest.fixture
@@ -55,11 +55,11 @@ def test_first_error_is_raised_where_none_can(made, monkeypatch):
 
 def test_stored_reference_is_the_same(tmp_path):
     batches = np.random.default_rng(0).standard_normal((64, 3))
-    reference = Reference(batches, "sampling[n=64]", 0.1, np.ones(3), np.zeros(3), "a note")
+    reference = Reference(batches, "sampling[n=64]", 0.1, np.ones(3), np.zeros(3), "a note", 0.04, 64)
     save(reference, tmp_path / "r.parquet")
     again = load(tmp_path / "r.parquet")
     assert np.array_equal(again.batches, batches)
-    assert (again.method, again.error, again.note) == ("sampling[n=64]", 0.1, "a note")
+    assert [getattr(again, name) for name in SCALARS] == ["sampling[n=64]", 0.1, "a note", 0.04, 64]
     assert again.known().standard_error == reference.known().standard_error > 0.1
     assert again.model_error == reference.model_error == pytest.approx(3**0.5)
 

@@ -64,29 +64,27 @@ def test_listed_breakpoints_are_panel_edges():
     assert bank.certified(elsewhere, SAMPLES).error > LISTED
 
 
-def test_stated_error_of_quadrature_counts_rounding():
-    """Costs of 1e6 have a rounding of 1e-10, whatever rules agree on."""
-    case = ridge(bank.Piece("far", lambda u: 1e6 + u, lambda u, s: 1.0), dim=1)
+@pytest.mark.parametrize(
+    ("pieces", "dim", "least", "most", "words"),
+    [
+        ([bank.power(1, 0.2), bank.bump(2.82, 1.8e-4, 3.0 / 1.8e-4)], 1, 0.0, 1e-9, ""),
+        ([bank.power(1, 0.2), bank.bump(2.0, 3e-5, 1e5)], 1, 0.0, 2e-8, ""),
+        ([bank.Piece("far", lambda u: 1e6 + u, lambda u, s: 1.0)], 1, 1e-10, 1e-6, ""),
+        ([bank.Piece("pole", lambda u: np.abs(u - 0.5) ** -0.9, lambda u, s: 3.2071)], 1, 0.0, 1.0, "1 / distance^0.9"),
+        ([bank.wave(1.0), bank.power(1, -np.exp(-0.5) + 1e-9), bank.power(2)], 2, 0.0, 1e-9, ""),
+        ([bank.power(1, 0.2), bank.bump(2.0, 1e-4, 3e4)], 2, 0.0, 10.0, "narrower than the spacing"),
+    ],
+    ids=["spike", "narrow spike", "rounding of 1e6", "pole", "effects that cancel", "ridge between points"],
+)  # fmt: skip
+def test_quadrature_states_an_error_that_holds(pieces, dim, least, most, words):
+    """No sample meets a spike; two halvings of equal panels show a fourteenth of the error at a pole."""
+    case = ridge(*pieces, dim=dim, sigma=1.0)
     found = bank.certified(case, SAMPLES)
     assert found.method.startswith("quadrature")
-    assert 1e-10 < found.error < 1e-6
-    assert abs(found.gradient[0] - case.truth[0]) < found.error
-
-
-@pytest.mark.parametrize(("width", "at"), [(1.8e-4, 2.82), (3e-5, 2.0)])
-def test_spike_that_no_sample_meets_is_resolved(width, at):
-    """Samples have the gradient .2 with no spread, and a rule with equal panels is off by up to the spike."""
-    case = ridge(bank.power(1, 0.2), bank.bump(at, width, 3.0 / width), dim=1, sigma=1.0)
-    found = bank.certified(case, SAMPLES)
     assert bank.excess(case, found) <= 1.0
-    assert found.error < LISTED * abs(case.truth[0])
-
-
-def test_ridge_between_the_points_of_a_plane_is_a_remark():
-    case = ridge(bank.power(1, 0.2), bank.bump(2.0, 1e-4, 3e4), dim=2, sigma=1.0)
-    found = bank.certified(case, SAMPLES)
-    assert "narrower than the spacing" in found.note
-    assert bank.excess(case, found) <= 1.0
+    assert least <= found.error < most
+    assert words in found.note
+    assert bool(words) == bool(found.note)
 
 
 def test_what_the_points_of_a_plane_miss_is_below_the_width_that_remarks_state():
@@ -103,29 +101,14 @@ def test_what_the_points_of_a_plane_miss_is_below_the_width_that_remarks_state()
     )
     assert found.gradient == pytest.approx([0.2, 0.0], abs=1e-9)
     assert "narrower" not in found.note
-    rows = pd.DataFrame({"reference_method": [found.method, "closed_form"], "status": "ok"})
-    assert f"1 cell the reference is from points up to {found_at(found, 'spacing'):g} " in unseen_features(rows)[0]
-    assert not unseen_features(rows.assign(reference_method="quadrature[points=3,spacing=3e-05]"))
-
-
-def test_slow_convergence_at_a_pole_is_in_the_error():
-    """d/du E|u + w - .5|^-.9 = 3.2071; two halvings of equal panels differ by a fourteenth of the error."""
-    case = ridge(bank.Piece("pole", lambda u: np.abs(u - 0.5) ** -0.9, lambda u, s: 3.2071), dim=1, sigma=1.0)
-    assert bank.excess(case, bank.certified(case, SAMPLES)) <= 1.0
+    rows = pd.DataFrame({"reference_spacing": [found.spacing, math.nan]})
+    assert f"1 cell the reference is from points up to {found.spacing:.2g} " in unseen_features(rows)[0]
+    assert not unseen_features(rows.assign(reference_spacing=3e-5))
 
 
 @pytest.mark.parametrize(("dim", "least"), [(1, 1 << 15), (2, 1 << 17)])
 def test_rules_that_agree_at_once_are_still_refined(dim, least):
     assert found_at(bank.certified(ridge(bank.power(1), dim=dim), SAMPLES), "points") >= least
-
-
-def test_gradient_near_zero_is_known_absolutely():
-    """Two effects that cancel to 1e-9: relative criteria would reject quadrature and spend every sample."""
-    case = ridge(bank.wave(1.0), bank.power(1, -np.exp(-0.5) + 1e-9), bank.power(2), dim=2)
-    found = bank.certified(case, SAMPLES)
-    assert found.method.startswith("quadrature")
-    assert found.error < 1e-9
-    assert bank.excess(case, found) <= 1.0
 
 
 def test_certificate_of_an_assumed_fact_states_what_its_check_resolves():
@@ -143,24 +126,29 @@ def test_certificate_of_an_assumed_fact_states_what_its_check_resolves():
     assert declared.error < 0.01 * assumed.error
 
 
-@pytest.mark.parametrize("power", [0.5, 0.55])
-def test_mean_that_does_not_exist_is_said(power):
-    """exp(a w^2) has a mean below a = 1/2 only."""
-    found = bank.certified(
-        ridge(bank.Piece("none", lambda u: np.exp(power * u**2), lambda u, s: math.nan), dim=1), SAMPLES
-    )
-    assert np.isnan(found.gradient).all()
-    assert "may not exist" in found.note
-
-
-@pytest.mark.parametrize(("order", "exists"), [(1.0, False), (0.5, True)])
-def test_pole_has_no_mean_and_a_root_has_one(order, exists):
-    """1/x with its pole 4 standard deviations away: samples got .318 +- .034."""
-    piece = bank.Piece("pole", lambda u: np.sign(u - 4.0) * np.abs(u - 4.0) ** -order, lambda u, s: math.nan)
-    case = bank.Case("pole", compose(bank.Ridge([piece], [np.eye(1)[0]], np.zeros(1), 1.0)), None)
-    found = bank.certified(case, 1 << 18)
-    assert np.isfinite(found.gradient).all() == exists
-    assert ("may not exist" in found.note) != exists
+@pytest.mark.parametrize(
+    ("cost", "dim", "is_finite", "words"),
+    [
+        (lambda u: np.exp(0.5 * u**2), 1, False, "may not exist"),
+        (lambda u: np.exp(0.55 * u**2), 1, False, "may not exist"),
+        (lambda u: 1.0 / (u - 4.0), 1, False, "may not exist"),
+        (lambda u: np.abs(u - 4.0) ** -0.5, 1, True, ""),
+        *((lambda u: np.sqrt(2.5 - u), dim, False, "not finite") for dim in (1, 2, 3)),
+        (lambda u: np.where(u > 0, np.nan, u), 3, False, "not finite"),
+        (lambda u: u + np.exp(np.exp(np.minimum(u - 7.0, 7.0))), 3, True, "may not exist"),
+        (lambda u: u + 1e280 * np.maximum(u - 9.0, 0.0), 3, False, "may not exist"),
+        (lambda u: 1.0 * (u > 6.0), 5, True, "not seen"),
+    ],
+)  # fmt: skip
+def test_mean_that_is_in_doubt_is_a_remark(cost, dim, is_finite, words):
+    """exp(a u^2) has a mean below a = 1/2 only; exp(exp(u - 7)) overflows at 13.6 deviations."""
+    with np.errstate(all="ignore"):
+        found = bank.certified(ridge(bank.Piece("", cost, lambda u, s: math.nan), dim=dim, sigma=1.0), SAMPLES)
+    assert found.is_finite == is_finite
+    assert words in found.note
+    assert bool(words) == bool(found.note)
+    # without what diverges: E exp(exp(u - 7)) u is .0023
+    assert not is_finite or found.known().standard_error < 0.1
 
 
 def test_huge_and_tiny_costs_have_references():
@@ -170,42 +158,6 @@ def test_huge_and_tiny_costs_have_references():
         plain = bank.certified(ridge(bank.power(1), bank.power(2, 0.3), dim=dim), SAMPLES)
         assert found.gradient / factor == pytest.approx(plain.gradient, rel=1e-7)
         assert 0.0 < found.known().standard_error / factor < 0.1
-
-
-def test_costs_that_are_not_finite_in_a_part_of_the_samples_are_a_remark():
-    """sqrt(2.5 - x): not a number beyond 2.5 standard deviations."""
-    with np.errstate(invalid="ignore"):
-        for dim in (1, 2, 3):
-            case = ridge(bank.Piece("root", lambda u: np.sqrt(2.5 - u), lambda u, s: math.nan), dim=dim, sigma=1.0)
-            found = bank.certified(case, SAMPLES)
-            assert np.isnan(found.gradient).all()
-            assert "not finite" in found.note
-
-
-@pytest.mark.parametrize("rare", [1.0, 1e280])
-def test_costs_that_diverge_beyond_all_samples_are_a_remark(rare):
-    """exp(exp(u - 7)) overflows at 13.6 deviations, and a bump 9 deviations away has a mean of 1e260."""
-    pieces = {
-        1.0: bank.Piece("twice exponential", lambda u: np.exp(np.exp(np.minimum(u - 7.0, 7.0))), lambda u, s: math.nan),
-        1e280: bank.Piece("rare", lambda u: 1e280 * np.maximum(u - 9.0, 0.0), lambda u, s: math.nan),
-    }
-    with np.errstate(all="ignore"):
-        found = bank.certified(ridge(bank.power(1), pieces[rare], sigma=1.0), 1 << 14)
-    assert found.is_finite == (rare == 1.0)
-    assert "may not exist" in found.note
-    if rare == 1.0:
-        # without what diverges: E exp(exp(u - 7)) u is .0023
-        assert found.known().standard_error < 0.1
-
-
-def test_rounding_of_single_precision_is_no_jump():
-    start, end = np.full((1, 2), -1.0), np.full((1, 2), 1.0)
-
-    def cost(x):
-        return (6.0 + np.sin(x[0].astype(np.float32))).astype(np.float32).astype(np.float64)
-
-    assert largest_jump(cost, start, end).height == 0.0
-    assert largest_jump(lambda x: cost(x) + (x[0] > 0.3), start, end).height == pytest.approx(1.0, rel=1e-4)
 
 
 # ------------------------------------------------------------------------------------------------- what is drawn
@@ -327,18 +279,6 @@ def test_check_says_what_it_could_resolve():
     assert found.note == ""
 
 
-def test_no_gradient_in_any_sample_is_said():
-    found = bank.certified(ridge(bank.step(6.0, 1.0), dim=5), 1 << 14)
-    assert "not seen" in found.note
-
-
-def test_rollouts_that_are_not_finite_fail():
-    case = ridge(bank.Piece("nan", lambda u: np.where(u > 0, np.nan, u), lambda u, s: 0.0))
-    found = bank.certified(case, 1 << 12)
-    assert "failed" in found.method
-    assert np.isnan(found.gradient).all()
-
-
 def test_closed_form_is_used_where_there_is_one():
     problem = Numpy().compile(compose(Heaviside()))
     assert certify(problem, Numpy.provides, SAMPLES, 0.005).method == "closed_form"
@@ -346,6 +286,11 @@ def test_closed_form_is_used_where_there_is_one():
 
 
 # ------------------------------------------------------------------------------------------------ jumps on lines
+
+
+def in_single(x):
+    """A cost in single precision."""
+    return (6.0 + np.sin(x[0].astype(np.float32))).astype(np.float32).astype(np.float64)
 
 
 @pytest.mark.parametrize(
@@ -357,13 +302,18 @@ def test_closed_form_is_used_where_there_is_one():
         (lambda x: 1e9 + np.sin(x[0]), 0.0),
         (lambda x: np.sqrt(np.abs(x[0])), 0.0),
         (lambda x: np.full(x.shape[1], np.nan), 0.0),
+        (in_single, 0.0),
+        (lambda x: in_single(x) + (x[0] > 0.3), 1.0),
+        # six parts in 1e11 of a line: its last change is a sixteenth of the one before
+        (lambda x: np.clip((x[0] - 0.37) / 1.2e-10, 0.0, 1.0), 0.0),
     ],
-    ids=["jump", "kink", "stiff", "rounding", "root", "nan"],
-)
+    ids=["jump", "kink", "stiff", "rounding", "root", "nan", "single", "jump in single", "steep ramp"],
+)  # fmt: skip
 def test_largest_jump(cost, jump):
     draw = np.random.default_rng(0)
     starts, ends = draw.standard_normal((2, 2, 8))
-    assert largest_jump(cost, starts, ends).height == pytest.approx(jump, rel=1e-6)
+    starts[0], ends[0] = -1.0, 1.0
+    assert largest_jump(cost, starts, ends).height == pytest.approx(jump, rel=1e-4)
 
 
 # ----------------------------------------------------------------------------------------------- which method it takes
@@ -378,26 +328,18 @@ def test_jumps_that_no_list_holds_are_not_for_a_rule_in_the_plane():
     assert bank.certified(plane, SAMPLES).method.startswith("sampling")
 
 
-@pytest.mark.parametrize(("spread", "chosen"), [(0.0, "quadrature"), (0.01, "sampling"), (9.0, "quadrature")])
-def test_samples_without_any_spread_do_not_outdo_a_rule(monkeypatch, spread, chosen):
-    """A coarse rule gives way to samples that leave less, and never to ones that all missed the event."""
-    batches = 1.0 + spread * np.linspace(-1.0, 1.0, BATCHES)[:, None]
-    monkeypatch.setattr(reference, "_sample", lambda *_: reference.Reference(batches, "sampling[n=64]", 0.0))
-    monkeypatch.setattr(reference, "integrate", lambda *_: Integral(np.array([1.0]), 0.5, 1, 1.0))
-    assert bank.certified(ridge(bank.power(1), dim=1), SAMPLES).method.startswith(chosen)
-
-
-def test_methods_that_disagree_state_the_disagreement_as_the_error(monkeypatch):
-    batches = 3.0 + 0.01 * np.linspace(-1.0, 1.0, BATCHES)[:, None]
-    monkeypatch.setattr(reference, "_sample", lambda *_: reference.Reference(batches, "sampling[n=64]", 0.0))
+@pytest.mark.parametrize(
+    ("mean", "spread", "chosen", "error"),
+    [(1.0, 0.0, "quadrature", 0.5), (1.0, 0.01, "sampling", 0.0), (1.3, 0.01, "sampling", 0.3), (1.0, 9.0, "quadrature", 0.5),
+     (3.0, 0.01, "quadrature", 2.0)],
+    ids=["no spread", "less spread", "off, less spread", "more spread", "disagree"],
+)  # fmt: skip
+def test_samples_replace_a_coarse_rule_that_they_agree_with(monkeypatch, mean, spread, chosen, error):
+    """Samples that leave less error do, never ones that all missed the event. A disagreement is the stated error."""
+    batches = mean + spread * np.linspace(-1.0, 1.0, BATCHES)[:, None]
+    monkeypatch.setattr(reference, "_sample", lambda *_: reference.Reference(batches, "sampling[n=64]"))
     monkeypatch.setattr(reference, "integrate", lambda *_: Integral(np.array([1.0]), 0.5, 1, 1.0))
     found = bank.certified(ridge(bank.power(1), dim=1), SAMPLES)
-    assert found.error == pytest.approx(2.0)
-    assert "disagree" in found.note
-
-
-def test_a_ramp_that_is_steep_and_resolved_is_no_jump():
-    """Six parts in 1e11 of the line wide: its last change is a sixteenth of the one before."""
-    start, end = np.zeros((1, 1)), np.ones((1, 1))
-    assert largest_jump(lambda x: np.clip((x[0] - 0.37) / 6e-11, 0.0, 1.0), start, end).height == 0.0
-    assert largest_jump(lambda x: 1.0 * (x[0] > 0.37), start, end).height == 1.0
+    assert found.method.startswith(chosen)
+    assert found.error == pytest.approx(error)
+    assert ("disagree" in found.note) == (mean == 3.0)

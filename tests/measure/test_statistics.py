@@ -109,13 +109,6 @@ def test_interval_of_two_error_sources_has_welchs_degrees(repeats, batches):
     assert summary.rmse_rel == pytest.approx(summary.rmse / abs(float(reference.mean())))
 
 
-def test_cosine_and_signs():
-    estimates = np.array([[1.0, 1.0, 5.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 0.0], [2.0, 0.0, 0.0]])
-    summary = summarise(estimates, Truth.exact(np.array([1.0, 0.0, 0.0])), 1)
-    assert summary.cosine == pytest.approx((1 / math.sqrt(27) - 1 + 0 + 1) / 4)
-    assert summary.sign_agreement == pytest.approx(0.5)  # only the first coordinate has a sign to agree with
-
-
 def test_unit_of_the_gradient_does_not_matter():
     rng = np.random.default_rng(9)
     estimates, batches = rng.standard_normal((16, 3)) + 1.0, rng.standard_normal((8, 3)) * 0.1
@@ -131,21 +124,48 @@ def test_unit_of_the_gradient_does_not_matter():
 # ---------------------------------------------------------------------------------------------------- edges
 
 
-def test_identical_estimates_have_the_width_of_the_rule_of_three():
-    # First-order gradients of a step: 0 every time, and wholly biased.
-    summary = summarise(np.zeros((64, 1)), Truth.exact(np.array([3.98942])), samples=256)
-    rare = 3 / (64 * 256)
-    assert summary.variance == summary.variance_low == 0.0
-    # one estimate is a mean of 256 samples, of which a share of 3 / (64 * 256) may be off by the gradient
-    assert summary.variance_high == pytest.approx(rare * 3.98942**2 / 256)
-    assert summary.variance_per_sample_high == pytest.approx(rare * 3.98942**2)
-    assert summary.bias == pytest.approx(3.98942)
-    assert summary.bias_low == pytest.approx(3.98942 * (1 - rare))
-    assert summary.bias_high == pytest.approx(3.98942 * (1 + rare))
-    assert not summary.indistinguishable
-    assert summary.cosine == summary.sign_agreement == 0.0
-    assert "identical" in summary.note
-    assert f"{3 / (64 * 256):.2g}" in summary.note
+NAN, RARE = math.nan, 3 / (64 * 256)
+SPIKE = np.where(np.arange(64) == 5, 3.0, 0.0)[:, None] * np.ones(2)
+CENTRED = np.random.default_rng(11).standard_normal((16, 2))
+ROUNDED = np.array([0.1, -7.0, 3.0]) * np.where(np.arange(12) % 2, 1 + 3e-16, 1 + 1e-16)[:, None]
+EDGES = {
+    # first-order gradients of a step: 0 every time; of the 256 samples of an estimate a share of 3 / (64 * 256) may be off
+    "step": (
+        np.zeros((64, 1)), [3.98942], 256,
+        dict(variance=0, variance_low=0, variance_high=RARE * 3.98942**2 / 256, variance_per_sample_high=RARE * 3.98942**2,
+             bias=3.98942, bias_low=3.98942 * (1 - RARE), bias_high=3.98942 * (1 + RARE), cosine=0, sign_agreement=0),
+        f"identical: the intervals allow for an event of the gradient's size, rarer than about {RARE:.2g} per sample",
+    ),
+    # the rule of three leaves 3 / (12 * 3) = 8% of the gradient
+    "rounding": (ROUNDED, [0.1, -7.0, 3.0], 3, dict(variance=0, bias_low=0), "identical"),
+    "7% off": (ROUNDED * 1.07, [0.1, -7.0, 3.0], 3, dict(bias_low=0), "identical"),
+    "zero": (np.zeros((4, 2)), [0, 0], 10, dict(bias=0, bias_low=0, bias_high=0, rmse=0, variance=0), "identical"),
+    "zero reference": (CENTRED, [0, 0], 1, dict(bias_rel=NAN, rmse_rel=NAN, cosine=NAN, sign_agreement=NAN), ""),
+    "one repeat": (np.array([[1.0, 2.0]]), [1, 0], 1, dict(variance=NAN, bias=NAN, bias_high=NAN, rmse=2), "1 repeat"),
+    "one that differs": (SPIKE, [1, 1], 1, dict(variance_low=0, variance_high=math.inf), "heavy tails"),
+    # only the first coordinate has a sign to agree with
+    "directions": (
+        np.array([[1.0, 1, 5], [-1, 0, 0], [0, 0, 0], [2, 0, 0]]), [1, 0, 0], 1,
+        dict(cosine=(1 / math.sqrt(27) - 1 + 0 + 1) / 4, sign_agreement=0.5), "only 4 repeats",
+    ),
+    **{
+        f"{bad}": (
+            np.where(np.arange(16).reshape(8, 2) == 7, bad, 1.0), [3, 4], 1,
+            {f.name: NAN for f in dataclasses.fields(Summary) if f.name != "note"} | dict(reference_norm=5, reference_se=0, finite_fraction=7 / 8),
+            "1 of 8 estimates are not finite",
+        )
+        for bad in (math.nan, math.inf, -math.inf)
+    },
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("edge", EDGES)
+def test_edges(edge):
+    estimates, truth, samples, fields, words = EDGES[edge]
+    summary = summarise(estimates, Truth.exact(np.array(truth, dtype=float)), samples)
+    assert {name: getattr(summary, name) for name in fields} == pytest.approx(fields, nan_ok=True)
+    assert words in summary.note
+    assert summary.indistinguishable == (summary.bias_low <= 0)
 
 
 def test_identical_estimates_against_a_sampled_reference_keep_its_error():
@@ -158,56 +178,8 @@ def test_identical_estimates_against_a_sampled_reference_keep_its_error():
     assert "identical" in summary.note
 
 
-def test_rounding_is_neither_bias_nor_spread():
-    reference = np.array([0.1, -7.0, 3.0])
-    estimates = np.tile(reference * (1 + 3e-16), (12, 1))
-    estimates[::2] *= 1 - 2e-16
-    summary = summarise(estimates, Truth.exact(reference), 3)
-    assert summary.indistinguishable
-    assert summary.variance == 0.0
-    assert "identical" in summary.note
-    # the rule of three leaves 3 / (12 * 3) = 8% of the gradient
-    for off, found in ((0.07, True), (0.1, False)):
-        biased = summarise(reference * (1 + off) + np.zeros((12, 3)), Truth.exact(reference), 3)
-        assert biased.indistinguishable == found
-
-
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-def test_estimates_that_are_not_finite_leave_only_what_does_not_rest_on_them(bad):
-    estimates = np.ones((8, 2))
-    estimates[3, 1] = bad
-    summary = summarise(estimates, Truth.exact(np.array([3.0, 4.0]), error=0.5), 1)
-    known = {"reference_norm": 5.0, "reference_se": 0.5, "finite_fraction": 7 / 8}
-    for field in dataclasses.fields(Summary):
-        value = getattr(summary, field.name)
-        if field.name in known:
-            assert value == pytest.approx(known[field.name])
-        elif field.name != "note":
-            assert math.isnan(value), field.name
-    assert summary.note == "1 of 8 estimates are not finite"
-
-
-def test_reference_of_zero_has_no_relative_columns():
-    summary = summarise(np.random.default_rng(11).standard_normal((16, 2)), Truth.exact(np.zeros(2)), 1)
-    for name in ("bias_rel", "rmse_rel", "cosine", "sign_agreement"):
-        assert math.isnan(getattr(summary, name))
-    assert summary.bias_high > 0.0
-    assert summary.rmse > 0.0
-
-
-def test_zero_everywhere():
-    summary = summarise(np.zeros((4, 2)), Truth.exact(np.zeros(2)), 10)
-    assert summary.bias == summary.bias_high == summary.rmse == summary.variance == 0.0
-    assert summary.indistinguishable
-
-
-def test_one_repeat_has_no_variance():
-    summary = summarise(np.array([[1.0, 2.0]]), Truth.exact(np.array([1.0, 0.0])), 1)
-    assert math.isnan(summary.variance)
-    assert math.isnan(summary.bias)
-    assert math.isnan(summary.bias_high)
-    assert summary.rmse == pytest.approx(2.0)
-    assert "1 repeat" in summary.note
+def test_a_bias_above_the_rule_of_three_is_one():
+    assert not summarise(ROUNDED * 1.1, Truth.exact(ROUNDED[1]), 3).indistinguishable
 
 
 @pytest.mark.parametrize("repeats", [2, 3, 4])
@@ -274,28 +246,20 @@ def test_terms_of_two_values_at_equal_distances_are_a_remark(share, least, most)
     assert np.mean(missed) < 0.1
 
 
-def test_one_repeat_that_differs_bounds_no_variance():
-    estimates = np.zeros((64, 2))
-    estimates[5] = 3.0
-    summary = summarise(estimates, Truth.exact(np.ones(2)), 1)
-    assert (summary.variance_low, summary.variance_high) == (0.0, math.inf)
-    assert "heavy tails" in summary.note
-
-
-def test_bad_input_is_refused_with_the_shapes():
-    truth = Truth.exact(np.zeros(3))
-    with pytest.raises(ValueError, match=r"\(R, 3\).*given \(4, 2\)"):
-        summarise(np.zeros((4, 2)), truth, 1)
-    with pytest.raises(ValueError, match=r"given \(0, 3\)"):
-        summarise(np.zeros((0, 3)), truth, 1)
-    with pytest.raises(ValueError, match="given 0"):
-        summarise(np.zeros((4, 3)), truth, 0)
-    with pytest.raises(ValueError, match="not finite"):
-        Truth.exact(np.array([1.0, np.nan]))
-    with pytest.raises(ValueError, match="K > 1"):
-        Truth.from_batches(np.zeros((1, 3)))
-    with pytest.raises(ValueError, match="vector"):
-        Truth.exact(np.zeros((2, 2)))
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda: summarise(np.zeros((4, 2)), Truth.exact(np.zeros(3)), 1), r"\(R, 3\).*given \(4, 2\)"),
+        (lambda: summarise(np.zeros((0, 3)), Truth.exact(np.zeros(3)), 1), r"given \(0, 3\)"),
+        (lambda: summarise(np.zeros((4, 3)), Truth.exact(np.zeros(3)), 0), "given 0"),
+        (lambda: Truth.exact(np.array([1.0, np.nan])), "not finite"),
+        (lambda: Truth.from_batches(np.zeros((1, 3))), "K > 1"),
+        (lambda: Truth.exact(np.zeros((2, 2))), "vector"),
+    ],
+)
+def test_bad_input_is_refused_with_the_shapes(call, words):
+    with pytest.raises(ValueError, match=words):
+        call()
 
 
 # -------------------------------------------------------------------------------------------------- coverage

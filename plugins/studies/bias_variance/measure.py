@@ -55,6 +55,7 @@ def measure(cell: Cell, session: Session, study: BiasVariance) -> dict[str, Any]
     result: dict[str, Any] = {
         "status": "ok",
         "reference_method": truth.method,
+        "reference_spacing": truth.spacing,
         "model_error": truth.model_error,
         "time_s": clock.median_s if clock else math.nan,
         "time_iqr_s": clock.iqr_s if clock else math.nan,

@@ -38,7 +38,7 @@ class Engines(StudyPackage):
         Column("model_error_rel", "distance of the gradient from the gradient named in `model`, relative to its norm",
                label="model error", comparison=ComparisonRule("exact", "model error")),
         text("model", "what model_error_rel compares with: rigid contact in closed form, or the scene's own program"),
-        *(ESTIMATES.by_name[name] for name in ("reference_norm", "reference_se", "reference_method", *SUMMARY[2:])),
+        *(ESTIMATES.by_name[name] for name in (*SUMMARY[:2], "reference_method", "reference_spacing", *SUMMARY[2:])),
         Column("zeroth_rmse_rel", "rmse_rel from `samples` costs with scores, without gradients", label="RMSE, costs only"),
         Column("nan_share", "share of the gradients that are not finite", label="NaN share"),
         Column("gradient_s", "time of `batch` gradients, median", "s", label="gradients", measured=True, format="seconds"),
@@ -73,7 +73,7 @@ class Engines(StudyPackage):
         w = noise.shared(cell.seed, cell.scene.name, cell.repeats, cell.samples, program.n_noise)
         zeroth = zeroth_order(problem, theta, w).mean(axis=1)
         result |= {
-            "reference_method": truth.method, "device": problem.device,
+            "reference_method": truth.method, "reference_spacing": truth.spacing, "device": problem.device,
             "zeroth_rmse_rel": statistics.summarise(zeroth, known, cell.samples).rmse_rel,
         }  # fmt: skip
         remark = "computes no gradients"
