@@ -28,7 +28,7 @@ from bench.report import answer
 from bench.report.text import interval as text_of_interval
 from bench.report.text import number
 from bench.report.text import span as ends_of
-from docs.results import PAPER, STANDARD, answer_of, rows_of, select, table_of
+from docs.results import PAPER, STANDARD, answer_of, rows_of, table_of
 
 MARK = re.compile(r"<!--=([\w./-]+|[^>\n]+\|.*?)-->(.*?)<!--/-->", re.DOTALL)
 SOURCE = re.compile(r"<!-- figures: (.*?) -->\n?")
@@ -45,21 +45,21 @@ def span(values: Any, digits: int = 2, suffix: str = "") -> str:
     return ends_of(float(np.min(values)), float(np.max(values)), digits, suffix)
 
 
-def count(value: float, zero: str = "0") -> str:
-    """Return a whole number with commas between thousands; ``zero`` replaces 0."""
-    return f"{int(value):,}" if value else zero
-
-
 @cache
-def trusted(*estimators: str) -> dict[str, Any]:
-    """Return the counts of the rule on the spread: cells, trusted cells, wrong ones among both, and the worst error."""
+def trusted(*estimators: str) -> dict[str, str]:
+    """Return the counts of the rule on the spread: cells, trusted cells and the wrong ones among them, other cells and the right
+    ones among them. ``worst`` is the largest error of a trusted cell.
+    """
     rows = trust.cells(STANDARD, estimators)
     keep, wrong = trust.spread(rows) < trust.SPREAD, rows["rmse_rel"] >= trust.WRONG
-    worst = number(rows.loc[keep, "rmse_rel"].max())
-    others, missed = (~keep).sum(), (~keep & ~wrong).sum()
-    return dict(
-        cells=len(rows), trusted=keep.sum(), wrong=(keep & wrong).sum(), worst=worst, others=others, missed=missed
-    )
+    counts = dict(cells=keep | ~keep, trusted=keep, wrong=keep & wrong, others=~keep, missed=~keep & ~wrong)
+    worst = {"worst": number(rows.loc[keep, "rmse_rel"].max())}
+    return {name: f"{keep.sum():,}" for name, keep in counts.items()} | worst
+
+
+def trust_figure(name: str, *estimators: str) -> Callable[[], str]:
+    """Return the function that gives a figure of :func:`trusted`."""
+    return lambda: trusted(*estimators)[name]
 
 
 def block(lines: list[str]) -> str:
@@ -191,7 +191,7 @@ def dose_unreached() -> str:
 
 def switch_verdicts(point: str, folder: str = "quadruped_check") -> list[str]:
     """Return the verdicts of all checks of a robot's gradient at a point: ``before``, ``at`` or ``after`` a switch."""
-    rows = select(rows_of(folder), scene="quadruped", status="ok")
+    rows = rows_of(folder).query("scene == 'quadruped' and status == 'ok'")
     pairs = (zip(row["point"], row["check_verdict"], strict=True) for _, row in rows.iterrows())
     return [verdict for every in pairs for name, verdict in every if name == point]
 
@@ -238,15 +238,8 @@ FIGURES: dict[str, str | Callable[[], str]] = {
     "dose-windows-missed": windows_missed,
     "dose-hash": lambda: ", ".join(sorted(set(rows_of("dose_response")["hypotheses"]) - {""})),
     "dose-costs": lambda: dose_classes({cost: f"{ROLLOUTS}{cost}" for cost in ("1", "2", "4", "measured")}),
-    "trust-cells": lambda: count(trusted("fobg")["cells"]),
-    "trust-trusted": lambda: count(trusted("fobg")["trusted"]),
-    "trust-worst": lambda: str(trusted("fobg")["worst"]),
-    "trust-others": lambda: count(trusted("fobg")["others"]),
-    "trust-missed": lambda: count(trusted("fobg")["missed"], "none"),
-    "trust-all-cells": lambda: count(trusted(*FOUR)["cells"]),
-    "trust-all-trusted": lambda: count(trusted(*FOUR)["trusted"]),
-    "trust-all-wrong": lambda: count(trusted(*FOUR)["wrong"]),
-    "trust-all-worst": lambda: str(trusted(*FOUR)["worst"]),
+    **{f"trust-{name}": trust_figure(name, "fobg") for name in ("cells", "trusted", "worst", "others", "missed")},
+    **{f"trust-all-{name}": trust_figure(name, *FOUR) for name in ("cells", "trusted", "wrong", "worst")},
     "speed-cell": lambda: number(speeds()["overhead of a cell"]),
     "speed-rollouts": rollouts_table,
     "speed-scenes": lambda: span(
@@ -257,7 +250,7 @@ FIGURES: dict[str, str | Callable[[], str]] = {
     "speed-agree": lambda: number(speeds()["native C kernel: largest relative difference"]),
     "speed-memory-fused": lambda: span(speed("fused grad, penalty, * rollouts: peak memory"), 3),
     "speed-memory-jax": lambda: span(speed("jax grad, penalty, * rollouts: peak memory"), 3),
-    "speed-compilations": lambda: count(speeds()["compilations over 27 values of stiffness x beta x sigma"]),
+    "speed-compilations": lambda: f"{speeds()['compilations over 27 values of stiffness x beta x sigma']:.0f}",
     "speed-plan": lambda: number(speeds()["planning 10000 cells"]),
     "speed-resume": lambda: number(speeds()["resuming 10000 stored cells"]),
     "speed-list": lambda: number(speeds()["python -m bench list"]),

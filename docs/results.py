@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 from bench.plugins.studies.bias_variance import comparisons
@@ -127,19 +126,6 @@ def answer_of(experiment: str, results: Path = STANDARD) -> str:
 def rows_of(experiment: str, results: Path = STANDARD) -> pd.DataFrame:
     """Return an experiment's stored rows, one per cell, with a column per swept axis."""
     return bench.load(results / experiment)
-
-
-def select(rows: pd.DataFrame, **conditions: Any) -> pd.DataFrame:
-    """Return the rows whose columns have the given values; a pair is the lowest and highest value of a range.
-
-    Raises LookupError if there is no such row.
-    """
-    for column, value in conditions.items():
-        keep = rows[column].between(*value) if isinstance(value, tuple) else rows[column] == value
-        rows = rows[keep]
-    if rows.empty:
-        raise LookupError(f"no rows with {conditions}")
-    return rows
 
 
 @cache

@@ -257,25 +257,17 @@ def score_gives_the_gradient(scene: Scene) -> str:
 
 
 @verifies(Scene)
-def physical_gradient_is_finite(scene: Scene) -> str:
-    """Verify that the physical gradient, if the scene declares one, has shape ``(d,)`` and is finite."""
-    gradient = scene.physical_gradient()
-    if gradient is None:
-        raise Skipped("has none")
-    require(gradient.shape == scene.theta0().shape, f"shape {gradient.shape}, not {scene.theta0().shape}")
-    require(np.isfinite(gradient).all(), f"{gradient} is not finite")
-    return f"norm {np.linalg.norm(gradient):.4g}"
-
-
-@verifies(Scene)
 def physical_gradient_is_the_limit(scene: Scene) -> str:
     """Verify that the cost's slope converges to the physical gradient as time steps get finer, under at least one law.
 
     Another law may converge to another slope, such as a spring that approximates a rigid impact. The check is skipped
     if the slopes converge under no law.
     """
-    if scene.physical_gradient() is None:
+    gradient = scene.physical_gradient()
+    if gradient is None:
         raise Skipped("has none")
+    require(gradient.shape == scene.theta0().shape, f"shape {gradient.shape}, not {scene.theta0().shape}")
+    require(np.isfinite(gradient).all(), f"{gradient} is not finite")
     apart: dict[str, float] = {}
     for law, integrator in _towards_physics(scene):
         ratios = []

@@ -393,8 +393,10 @@ def _head(report: Findings) -> list[str]:
         f"rough by {number(rough)}" * (rough > 0), f"gradient: {report.gradient or 'none, only differences'}",
         f"batch: {report.batch}",
     ]  # fmt: skip
-    times = {"within the budget": spent.seconds, "first calls": spent.compile_s, "all": spent.elapsed, "a cost": spent.cost_s,
-             "a gradient": spent.gradient_s}  # fmt: skip
+    waited = spent.elapsed - spent.seconds - spent.compile_s
+    times = {"within the budget": spent.seconds, "first calls": spent.compile_s,
+             "waiting for a processor": waited if waited > 1.0 else math.nan, "all": spent.elapsed,
+             "a cost": spent.cost_s, "a gradient": spent.gradient_s}  # fmt: skip
     each = [f"{what} {duration(seconds)}" for what, seconds in times.items() if math.isfinite(seconds)]
     counts = counted(spent.costs, "cost"), counted(spent.gradients, "gradient")
     return [

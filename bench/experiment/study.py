@@ -36,7 +36,7 @@ class Study(Plugin):
     timed: ClassVar[bool] = False
     """Whether its cells are timed by default: one at a time, with the machine to themselves."""
 
-    default_plugins: ClassVar[Mapping[str, Sequence[str]]] = {}
+    default_plugins: ClassVar[Mapping[str, Sequence[str]]] = {"optimizers": ("adam",)}
     """Names of the plugins of a kind that the configuration leaves null, such as ``optimizers``."""
 
     @abstractmethod

@@ -260,22 +260,12 @@ class _Checker:
         return scale
 
     def cost(self, thetas: np.ndarray) -> np.ndarray:
-        values = np.asarray(self._cost(thetas))
-        if np.iscomplexobj(values):
-            raise TypeError("the cost is complex; a check needs a real one")
-        if values.shape != (thetas.shape[1],):
-            raise ValueError(f"cost of {thetas.shape[1]} columns has shape {values.shape}, not {(thetas.shape[1],)}")
-        return values.astype(np.float64)
+        return _real("cost", self._cost(thetas), thetas.shape[1:])
 
     def gradient(self, theta: np.ndarray) -> np.ndarray:
         if self._gradient is None:
             return np.full(theta.size, np.nan)
-        result = np.asarray(self._gradient(theta.copy()))
-        if np.iscomplexobj(result):
-            raise TypeError("the gradient is complex; a check needs a real one")
-        if result.shape != theta.shape:
-            raise ValueError(f"the gradient has shape {result.shape}, not that of theta, {theta.shape}")
-        return result.astype(np.float64)
+        return _real("gradient", self._gradient(theta.copy()), theta.shape)
 
     def run(self) -> Check:
         theta, options = self.theta, self.options
@@ -476,6 +466,15 @@ class _Checker:
                 each for each, part in zip(right, parts, strict=True) if part.verdict in PLAINLY and part.program != 0.0
             ]
         return bool(right)
+
+
+def _real(name: str, values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Return values as float64; raises :class:`TypeError` for complex ones and :class:`ValueError` for another shape."""
+    if np.iscomplexobj(values):
+        raise TypeError(f"the {name} is complex; a check needs a real one")
+    if np.shape(values) != shape:
+        raise ValueError(f"the {name} has shape {np.shape(values)}, not {shape}")
+    return np.asarray(values, dtype=np.float64)
 
 
 def _with_verdict(part: Part, verdict: str, instead: Sequence[str]) -> Part:

@@ -127,9 +127,8 @@ def errors_by_horizon(stages: GradientStages, horizons: Sequence[int]) -> list[H
         outcome = quick.check()
         if outcome is None:
             continue
-        program = np.array([part.program for part in outcome.parts]) * space.scale
-        differences = np.array([part.difference for part in outcome.parts]) * space.scale
-        doubts = np.array([part.uncertainty for part in outcome.parts]) * space.scale
+        numbers = [(part.program, part.difference, part.uncertainty) for part in outcome.parts]
+        program, differences, doubts = np.array(numbers).T * space.scale
         size = float(np.abs(differences).max()) or 1.0
         result.append(Horizon(steps, float(np.abs(program - differences).max() / size), float(doubts.max() / size)))
     return result

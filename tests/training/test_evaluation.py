@@ -10,7 +10,7 @@ from problems import cartpole_program
 
 from bench.errors import UserError
 from bench.model import LoopOps, State, compose, registry
-from bench.training import fitting
+from bench.training import steps
 from bench.training.environment import Environment
 
 ROUNDING = 1e-9
@@ -71,5 +71,5 @@ def test_a_scene_without_random_starts_has_returns():
 
 def test_more_batches_than_states_are_refused():
     with pytest.raises(UserError, match="batches = 9, but a window has 8 states"):
-        fitting.batches_of(jax.random.PRNGKey(0), 8, passes=2, batches=9)
-    assert fitting.batches_of(jax.random.PRNGKey(0), 8, passes=2, batches=8).shape == (16, 1)
+        steps.batches_of(jax.random.PRNGKey(0), 8, passes=2, batches=9)
+    assert steps.batches_of(jax.random.PRNGKey(0), 8, passes=2, batches=8).shape == (16, 1)

@@ -18,7 +18,7 @@ from bench.measure import noise
 from bench.measure.batches import in_columns
 from bench.measure.contacts import active_contacts, contact_names, engine_contacts
 from bench.measure.jumps import MissedSlope, jump_under_noise, missed_slope
-from bench.model import SURROGATE, ContactScene, EngineScene, ForceLaw, LoopOps, Problem, Rollout, Unsupported
+from bench.model import SURROGATE, ContactScene, EngineScene, ForceLaw, LoopOps, Problem, Rollout, Unsupported, registry
 
 from .. import norm
 from . import GradientCheck
@@ -402,39 +402,22 @@ def contact_modes(problem: Problem) -> ContactModes | None:
     program = problem.program
     if not isinstance(program, Rollout) or not (program.scene.n_contacts or isinstance(program.scene, EngineScene)):
         return None
+    # engines and implicit steps need the backend; other programs are faster in NumPy
+    own = program.needs_root or "physics" in problem.provides
+    simulated = problem if own else registry.make("backends", "numpy").compile(program)
+
+    def touching(theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        theta = np.ascontiguousarray(np.broadcast_to(theta, (len(theta), w.shape[1])))
+        states, controls = simulated.trajectory(theta, w)
+        if isinstance(program.scene, EngineScene):
+            return engine_contacts(problem).touching(states[:-1])
+        return active_contacts(program, states, controls)
+
     try:
-        touching = _touching(problem)
         touching(program.theta0[:, None], np.zeros((program.n_noise, COLUMNS_AT_ONCE)))
         return ContactModes(touching, contact_names(problem))
     except Unsupported:
         return None
-
-
-def _touching(problem: Problem) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-    """Return the function of theta and noise that finds the active contacts, see :class:`ContactModes`."""
-    program = problem.program
-    assert isinstance(program, Rollout)
-    # engines and implicit steps need the backend; other programs are faster in NumPy
-    rollout = _backend_rollout if program.needs_root or "physics" in problem.provides else _numpy_rollout
-    if isinstance(program.scene, EngineScene):
-        contacts = engine_contacts(problem)
-        return lambda theta, w: contacts.touching(rollout(problem, theta, w)[0][:-1])
-    return lambda theta, w: active_contacts(program, *rollout(problem, theta, w))
-
-
-def _numpy_rollout(problem: Problem, theta: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return states ``(horizon + 1, n, B)`` and controls ``(horizon, n_u, B)`` of rollouts, computed in NumPy."""
-    theta = np.broadcast_to(theta, (theta.shape[0], w.shape[1]))
-    program = problem.program
-    assert isinstance(program, Rollout)
-    steps = list(program.steps(LoopOps(), theta, w))
-    return np.stack([np.concatenate(state) for state, _ in steps]), np.stack([u for _, u in steps[:-1]])
-
-
-def _backend_rollout(problem: Problem, theta: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the same states and controls as :func:`_numpy_rollout`, computed by the backend."""
-    theta = np.ascontiguousarray(np.broadcast_to(theta, (theta.shape[0], w.shape[1])))
-    return problem.trajectory(theta, w)
 
 
 def signature(contacts: np.ndarray) -> str:
