@@ -195,6 +195,14 @@ def test_an_error_far_above_all_variances_leaves_no_doubt_about_the_times():
     assert entry(*parts, width=50.0)["tied"] == ("slow",)
 
 
+def test_the_next_is_another_estimator_or_the_same_on_another_backend_by_time_alone():
+    parts = rows(), slower(2, backend="other")
+    assert list(entry(*parts, by="time", width=50.0)[["factor", "factor_low", "factor_high"]]) == pytest.approx(
+        [2.0] * 3
+    )
+    assert entry(*parts, slower(3, estimator="slow"), by="time", width=1.1)["next"] == "slow on b"
+
+
 def test_a_sweep_of_samples_in_which_a_scene_fails_has_its_report(tmp_path):
     words = [
         "scenes=[callable,quadratic]",
