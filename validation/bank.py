@@ -1,7 +1,8 @@
-"""Compares certified references with known gradients, on a bank of problems: `python validation/bank.py [SAMPLES]`.
+"""Compares certified references with known gradients, on a bank of problems: `python validation/bank.py [features [COUNT]]`.
 
 Ridges f(x) = sum_j g_j(a_j . x) have grad J = sum_j a_j dE[g_j]/du with one-dimensional Gaussian expectations of powers,
-hinges, steps, bumps, waves and exponentials.
+hinges, steps, bumps, waves and exponentials. With the word `features`, the costs are random: COUNT with a narrow feature in
+one and two dimensions, half as many in 3 to 10, and COUNT smooth ones. A reference is off by more than four stated errors.
 """
 
 import itertools
@@ -11,8 +12,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import pandas as pd
 from bench.plugins.backends.numpy import Numpy
+from scipy import special
 from scipy.special import ndtr
+from scipy.stats import norm
 
 from bench.measure.reference import certify
 from bench.model import FunctionScene, compose
@@ -25,9 +29,8 @@ SAMPLED = 4.0
 WORST = 3.0
 """Largest error of any reference, in units of the allowed error."""
 
-
-def density(z):
-    return math.exp(-z * z / 2) / math.sqrt(2 * math.pi)
+OFF = 4.0
+"""Stated errors beyond which the reference of a random cost counts as off."""
 
 
 @dataclass(frozen=True)
@@ -50,13 +53,13 @@ def ramp(at, c):
 
 
 def step(at, c):
-    return Piece(f"step({at:g},{c:g})", lambda u: c * (u > at), lambda u, s: c * density((u - at) / s) / s)
+    return Piece(f"step({at:g},{c:g})", lambda u: c * (u > at), lambda u, s: c * norm.pdf((u - at) / s) / s)
 
 
 def square(at, c):
     def slope(u, s):
         z = (u - at) / s
-        return 2 * c * s * (density(z) + z * float(ndtr(z)))
+        return 2 * c * s * (norm.pdf(z) + z * float(ndtr(z)))
 
     return Piece(f"hinge2({at:g},{c:g})", lambda u: c * np.maximum(u - at, 0) ** 2, slope)
 
@@ -134,11 +137,12 @@ class Ridge(Undeclared):
 
 @dataclass(frozen=True)
 class Case:
-    """A problem and its exact gradient ``truth``, shape (d,)."""
+    """A problem, its exact gradient ``truth``, shape (d,), and the width of its narrow feature in standard deviations."""
 
     label: str
     program: Program
     truth: np.ndarray
+    width: float = 0.0
 
 
 def combinations():
@@ -211,6 +215,99 @@ def undeclared():
         yield Case(f"undeclared jump d={dim} at {at:g} by {height:g}", compose(scene), scene.truth())
 
 
+# ----------------------------------------------------------------------------------------------- narrow features
+
+
+def slope_of(kind, k, m, width, radius):
+    """Return the derivative by m of E[g(|W - c|)] over W ~ N(0, I_k) with |c| = m; ``width`` is the power of a pole."""
+    if kind == "pole":
+        factor = 2 ** (-width / 2) * special.gamma((k - width) / 2) / special.gamma(k / 2)
+        return float(-m * width / k * factor * special.hyp1f1(width / 2 + 1, k / 2 + 1, -(m**2) / 2))
+    if kind != "shell":
+        v = 1 + width**2
+        return -((width / math.sqrt(v)) ** k) * math.exp(-(m**2) / (2 * v)) * m / v
+    # the density of the distance is that of a noncentral chi distribution
+    x, weight = special.roots_legendre(400)
+    low, high = max(radius - 8 * width, 0.0), radius + 8 * width
+    rho, order = (low + high) / 2 + (high - low) / 2 * x, k / 2 - 1
+    change = rho * special.ive(order + 1, rho * m) - m * special.ive(order, rho * m)
+    density = rho * (rho / m) ** order * np.exp(-((rho - m) ** 2) / 2) * change
+    return float((high - low) / 2 * weight @ (density * np.exp(-(((rho - radius) / width) ** 2) / 2)))
+
+
+def featured(kind, d, random):
+    """Return a scene of .2 x plus a feature, its gradient at 0, and the feature's width or power.
+
+    A feature is a function of the distance from a centre, or from a plane (a ridge), that many standard deviations from
+    theta: .5 to 3.2; a shell has this radius and its centre at .3 to 1. Widths are 3e-5 to .1, powers .1 to .9 of d.
+    """
+    k = 1 if kind == "ridge" else d
+    m, radius = random.uniform(0.5, 3.2), 0.0
+    if kind == "shell":
+        m, radius = random.uniform(0.3, 1.0), m
+    width = random.uniform(0.1, 0.9) * d if kind == "pole" else 10 ** random.uniform(math.log10(3e-5), -1)
+    axes = np.linalg.qr(random.standard_normal((d, d)))[0][:k]
+    centre = random.standard_normal(k)
+    centre *= m / np.linalg.norm(centre)
+    slope = slope_of(kind, k, m, width, radius)
+    height = 0.2 * 10 ** random.uniform(-0.5, 1.0) / abs(slope)
+    first = np.eye(d)[0]
+
+    def profile(u):
+        rho = np.linalg.norm(u - centre[:, None], axis=0)
+        return height * (rho**-width if kind == "pole" else np.exp(-(((rho - radius) / width) ** 2) / 2))
+
+    feature = Piece(kind, profile, lambda u, s: 0.0)
+    scene = Ridge([power(1, 0.2), feature], [first, axes], np.zeros(d), 1.0)
+    return scene, 0.2 * first - height * slope * axes.T @ centre / m, width
+
+
+def smooth(d, random):
+    """Return a scene of one to four waves, bumps, powers and exponentials along random lines, and its gradient."""
+    makers = (
+        lambda: wave(random.uniform(0.3, 2.0)), lambda: bump(random.normal(), random.uniform(0.5, 2.0), 1.0),
+        lambda: power(int(random.integers(2, 4))), lambda: growth(random.uniform(0.1, 0.7)),
+    )  # fmt: skip
+    pieces = [makers[random.integers(4)]() for _ in range(random.integers(1, 5))]
+    along = [v / np.linalg.norm(v) for v in random.standard_normal((len(pieces), d))]
+    scene = Ridge(pieces, along, random.standard_normal(d), 10 ** random.uniform(-2, 0))
+    return scene, scene.truth(), 0.0
+
+
+def random_cases(count):
+    """Yield a group and a case: ``count`` features in one and two dimensions, half as many in 3 to 10, and smooth costs."""
+    random = np.random.default_rng(11)
+    kinds = ("spike", "ridge", "pole", "shell")
+    groups = [(f"d = {d}: {kind}s", kind, (d,), count // 8) for d in (1, 2) for kind in kinds]
+    groups += [(f"d = 3 to 10: {kind}s", kind, range(3, 11), count // 16) for kind in kinds]
+    for group, kind, dims, number in [*groups, ("d = 1 to 10: smooth costs", "", range(1, 11), count)]:
+        for i in range(number):
+            d = dims[i % len(dims)]
+            scene, truth, width = featured(kind, d, random) if kind else smooth(d, random)
+            object.__setattr__(scene, "name", f"{group} {i}")  # noise is drawn by name
+            yield group, Case("", compose(scene), truth, width)
+
+
+def features(count=200):
+    """Print a table of random costs; return 1 if one in fewer than three dimensions is off without any warning."""
+    rows = []
+    for group, case in random_cases(count):
+        found = certified(case, 1 << 16)
+        is_off = found.is_finite and np.linalg.norm(found.gradient - case.truth) > OFF * found.known().standard_error
+        is_wide, is_noted = not case.width <= found.spacing, bool(found.note)
+        rows.append({
+            "costs": group, "cases": True, "off, wider than the spacing": is_off and is_wide and not is_noted,
+            "off, narrower": is_off and not is_wide and not is_noted, "off, with a remark": is_off and is_noted,
+            "right, with a remark": is_noted and not is_off,
+        })  # fmt: skip
+    table = pd.DataFrame(rows).groupby("costs", sort=False).sum()
+    print(table.to_string())
+    return int(table.loc[table.index.str.match("d = [12]:"), "off, wider than the spacing"].any())
+
+
+# ------------------------------------------------------------------------------------------------------- counts
+
+
 def certified(case, samples):
     """Return the certified reference of a case."""
     return certify(Numpy().compile(case.program), Numpy.provides, samples, TOLERANCE)
@@ -249,4 +346,4 @@ def main(samples=1 << 18):
 
 
 if __name__ == "__main__":
-    sys.exit(main(*(int(word) for word in sys.argv[1:2])))
+    sys.exit(features(*map(int, sys.argv[2:])) if sys.argv[1:2] == ["features"] else main())

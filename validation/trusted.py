@@ -5,6 +5,7 @@ Eighteen families have three or four scenes each. A cell is one scene and one se
 0.5 or more. The truth is a dense rule in one dimension, and 4 million pairs of costs in more.
 """
 
+import itertools
 import json
 import math
 import sys
@@ -23,6 +24,7 @@ from bench.plugins.studies.bias_variance.trust import SPREAD, WRONG
 from bench.plugins.studies.gradient_check.points import is_trusted
 
 from bench.cli import main as command
+from bench.measure.statistics import Truth, summarise
 from bench.model import FunctionScene, compose, param
 
 SAMPLES, REPEATS, SEEDS = 100, 32, (1, 2, 3)
@@ -53,6 +55,7 @@ class Given(FunctionScene):
 class Scene(NamedTuple):
     """A scene of a family, with its theta and noise."""
 
+    part: str
     family: str
     label: str
     cost: Callable[[Any, Any], Any]
@@ -259,50 +262,62 @@ def table(edges, values, width):
     return cost
 
 
+FAMILIES = {
+    "first": (
+        (edge, (2.0,), 0.2, (1.2, 1.0, 1.0), (1.7, 1.0, 1.0), (1.3, 5.0, 0.7)),
+        (ledge, (3.0,), 0.2, (1.2, 0.5)),
+        (ledge, (3.0,), 0.1, (1.5, 0.1)),
+        (ledge, (3.0,), 0.3, (1.7, 0.02)),
+        (gate, (0.4,), 0.3, (1.4, 1.6, 0.5), (1.9, 2.5, 5.0), (0.95, 1.0, 0.2)),
+        (latch, (0.8,), 0.2, (0.2, 20.0)),
+        (latch, (1.4,), 0.2, (0.0, 5.0)),
+        (latch, (0.7,), 0.2, (0.0, 1.0)),
+        (friction, (1.0,), 0.2, (0.3, 0.01), (0.1, 0.001)),
+        (friction, (2.0,), 0.2, (0.2, 0.1)),
+        (flight, (3.0, 2.0), 0.3, (2.0, 0.1)),
+        (flight, (2.0, 5.0), 0.3, (5.0, 0.05)),
+        (flight, (6.0, 6.0), 0.3, (0.0, 1.0)),
+        (contact, (1.0,), 0.1, (1e3, 0.3), (1e5, 0.75)),
+        (contact, (0.8,), 0.1, (1e4, 0.6)),
+        (chaos, (0.3,), 0.1, (3.9, 6), (3.9, 30), (3.57, 40)),
+        (saturation, (1.0,), 0.3, (0.5, 2.0), (5.0, 1.0), (0.1, 4.0)),
+        (plane, (0.5,) * 3, 1.0, (3, 2.0, 3.0)),
+        (plane, (0.5,) * 5, 1.0, (5, 2.5, 10.0)),
+        (plane, (0.5,) * 10, 1.0, (10, 3.0, 22.6)),
+    ),
+    "new": (
+        (switch, (0.0,), 1.0, (5.0, 0.7, 1e-5), (2.0, 1.5, 1e-6), (0.5, 0.2, 1e-4), (20.0, 2.2, 1e-5)),
+        (stop, (0.0,), 1.0, (2e4, 3.6), (3.12e4, 3.9), (1e3, 3.3), (50.0, 2.5)),
+        (corner, (0.0, 0.0), 1.0, (2.0, 2.0, 651.4), (1.0, 1.0, 5.0), (1.5, 0.5, 3.0), (2.5, 2.5, 2000.0)),
+        (relay, (0.6,), 0.1, (1.0, 0.1)),
+        (relay, (0.5,), 0.1, (3.0, 0.05), (1.0, 0.3)),
+        (relay, (1.5,), 0.1, (2.0, 0.2)),
+        (backlash, (1.0,), 0.2, (0.1, 0.1), (0.3, 0.1)),
+        (backlash, (0.6,), 0.2, (0.5, 0.3)),
+        (backlash, (2.0,), 0.2, (0.05, 0.2)),
+        (quantiser, (0.6,), 0.3, (0.25, 0.1)),
+        (quantiser, (0.4,), 0.3, (0.01, 0.5)),
+        (quantiser, (0.3,), 0.3, (1.0, 1.0)),
+        (quantiser, (0.2,), 0.3, (0.1, 5.0)),
+        (delay, (1.0,), 0.2, (1, 1.0), (5, 1.0), (20, 1.5)),
+        (delay, (0.8,), 0.2, (10, 2.0)),
+        (table, (0.0,), 1.0, ((0.5, 1.0), (0.0, 0.3, 0.1), 0.0), ((0.5, 1.0), (0.0, 0.3, 0.1), 0.2)),
+        (table, (0.0,), 1.0, ((1.2,), (0.0, 4.0), 1e-4), ((-0.4, 2.0), (0.0, 0.02, 3.0), 0.01)),
+    ),
+}
+"""By part, where `new` families were added when the rule was complete: cost, theta, noise, and arguments of each scene."""
+
+
 def scenes():
-    """Yield every scene, family by family."""
-    for at, height, drag in ((1.2, 1.0, 1.0), (1.7, 1.0, 1.0), (1.3, 5.0, 0.7)):
-        yield Scene("edge", f"at {at} by {height}, drag {drag}", edge(at, height, drag), (2.0,), 0.2)
-    for at, drop, sigma in ((1.2, 0.5, 0.2), (1.5, 0.1, 0.1), (1.7, 0.02, 0.3)):
-        yield Scene("ledge", f"at {at}, drop {drop}", ledge(at, drop), (3.0,), sigma)
-    for low, high, prize in ((1.4, 1.6, 0.5), (1.9, 2.5, 5.0), (0.95, 1.0, 0.2)):
-        yield Scene("gate", f"{low} to {high} for {prize}", gate(low, high, prize), (0.4,), 0.3)
-    for force, stiffness, theta in ((0.2, 20.0, 0.8), (0.0, 5.0, 1.4), (0.0, 1.0, 0.7)):
-        yield Scene("latch", f"force {force}, k {stiffness}, v {theta}", latch(force, stiffness), (theta,), 0.2)
-    for mu, width, theta in ((0.3, 0.01, 1.0), (0.1, 0.001, 1.0), (0.2, 0.1, 2.0)):
-        yield Scene("friction", f"mu {mu}, slip {width}, v {theta}", friction(mu, width), (theta,), 0.2)
-    for target, wind, theta in ((2.0, 0.1, (3.0, 2.0)), (5.0, 0.05, (2.0, 5.0)), (0.0, 1.0, (6.0, 6.0))):
-        yield Scene("free flight", f"to {target}, drag {wind}, v {theta}", flight(target, wind), theta, 0.3)
-    for stiffness, wall, theta in ((1e3, 0.3, 1.0), (1e4, 0.6, 0.8), (1e5, 0.75, 1.0)):
-        yield Scene("soft contact", f"k {stiffness:g}, wall {wall}, v {theta}", contact(stiffness, wall), (theta,), 0.1)
-    for rate, steps in ((3.9, 6), (3.9, 30), (3.57, 40)):
-        yield Scene("chaos", f"rate {rate}, {steps} steps", chaos(rate, steps), (0.3,), 0.1)
-    for limit, gain in ((0.5, 2.0), (5.0, 1.0), (0.1, 4.0)):
-        yield Scene("saturation", f"limit {limit}, gain {gain}", saturation(limit, gain), (1.0,), 0.3)
-    for dim, at, height in ((3, 2.0, 3.0), (5, 2.5, 10.0), (10, 3.0, 22.6)):
-        yield Scene("plane", f"d {dim}, at {at} by {height}", plane(dim, at, height), (0.5,) * dim, 1.0)
-    for height, at, width in ((5.0, 0.7, 1e-5), (2.0, 1.5, 1e-6), (0.5, 0.2, 1e-4), (20.0, 2.2, 1e-5)):
-        yield Scene("steep switch", f"{height} at {at} over {width}", switch(height, at, width), (0.0,), 1.0)
-    for stiffness, at in ((2e4, 3.6), (3.12e4, 3.9), (1e3, 3.3), (50.0, 2.5)):
-        yield Scene("far stop", f"k {stiffness:g} at {at}", stop(stiffness, at), (0.0,), 1.0)
-    for first, second, height in ((2.0, 2.0, 651.4), (1.0, 1.0, 5.0), (1.5, 0.5, 3.0), (2.5, 2.5, 2000.0)):
-        yield Scene("corner", f"{first}, {second} by {height}", corner(first, second, height), (0.0, 0.0), 1.0)
-    for gain, dead, theta in ((1.0, 0.1, 0.6), (3.0, 0.05, 0.5), (1.0, 0.3, 0.5), (2.0, 0.2, 1.5)):
-        yield Scene("relay", f"gain {gain}, dead {dead}, from {theta}", relay(gain, dead), (theta,), 0.1)
-    for gap, rate, theta in ((0.1, 0.1, 1.0), (0.3, 0.1, 1.0), (0.5, 0.3, 0.6), (0.05, 0.2, 2.0)):
-        yield Scene("backlash", f"gap {gap}, rate {rate}, {theta}", backlash(gap, rate), (theta,), 0.2)
-    for step, slope, theta in ((0.25, 0.1, 0.6), (0.01, 0.5, 0.4), (1.0, 1.0, 0.3), (0.1, 5.0, 0.2)):
-        yield Scene("quantiser", f"step {step}, slope {slope}, {theta}", quantiser(step, slope), (theta,), 0.3)
-    for steps, gain, theta in ((1, 1.0, 1.0), (5, 1.0, 1.0), (10, 2.0, 0.8), (20, 1.5, 1.0)):
-        yield Scene("delay", f"{steps} steps, gain {gain}", delay(steps, gain), (theta,), 0.2)
-    for edges, values, width in (
-        ((0.5, 1.0), (0.0, 0.3, 0.1), 0.0), ((0.5, 1.0), (0.0, 0.3, 0.1), 0.2), ((1.2,), (0.0, 4.0), 1e-4), ((-0.4, 2.0), (0.0, 0.02, 3.0), 0.01),
-    ):  # fmt: skip
-        yield Scene("table", f"{values} over {width}", table(edges, values, width), (0.0,), 1.0)
+    """Return every scene."""
+    return [
+        Scene(part, make.__name__, str(given), make(*given), theta, sigma)
+        for part, families in FAMILIES.items()
+        for make, theta, sigma, *every in families
+        for given in every
+    ]
 
 
-NEW = ("steep switch", "far stop", "corner", "relay", "backlash", "quantiser", "delay", "table")
-"""Families that were added when the rule was complete."""
 PLUGIN = '''"""The scenes of trusted.py as a plugin, so that `gradcheck` runs on them as a user runs it."""
 
 from dataclasses import dataclass
@@ -312,7 +327,7 @@ import trusted
 
 from bench.plugin import FunctionScene, param
 
-SCENES = list(trusted.scenes())
+SCENES = trusted.scenes()
 
 
 @dataclass(frozen=True)
@@ -332,22 +347,19 @@ class Counted(FunctionScene):
 
 
 def refused(seed, indices, folder):
-    """Return the verdicts with which the command `gradcheck` refuses scenes, by their number; empty for those it does not.
-
-    ``folder`` has the plugin.
-    """
-    every = list(scenes())
+    """Return by number why the command `gradcheck` refuses scenes, empty where it does not; ``folder`` has the plugin."""
+    every = scenes()
     with tempfile.TemporaryDirectory() as results:
         names = [f"counted[index={i},sigma={every[i].sigma}]" for i in indices]
         settings = ["backends=[jax]", "workers=0", f"seed={seed}", f"plugins={folder}", f"results_dir={results}"]
         command(["gradcheck", *names, *settings, "--quiet"])
         rows = pd.read_parquet(Path(results) / "gradcheck" / "rows.parquet")
-    verdicts = {}
-    for row in rows.to_dict("records"):
-        pairs = zip(row["point"], row["check_verdict"], strict=True)
-        bad = [f"{verdict} ({point})" for point, verdict in pairs if not is_trusted(point, verdict)]
-        verdicts[int(json.loads(row["parameters"])["scene"]["index"])] = ", ".join(dict.fromkeys(bad))
-    return verdicts
+    return {
+        json.loads(row.parameters)["scene"]["index"]: ", ".join(
+            f"{verdict} ({point})" for point, verdict in zip(row.point, row.check_verdict, strict=True) if not is_trusted(point, verdict)
+        )
+        for row in rows.itertuples()
+    }  # fmt: skip
 
 
 @cache
@@ -367,84 +379,40 @@ def truth(scene):
     return total / (PAIRS // PART)
 
 
-class Outcome(NamedTuple):
-    """What the rule says on one cell, and the relative RMSE of one estimate."""
-
-    spread: float
-    refused: str
-    rmse: float
-
-    @property
-    def trusted_without_search(self):
-        """Whether the spread alone trusts the cell."""
-        return self.spread < SPREAD
-
-    @property
-    def trusted(self):
-        """Whether the rule trusts the cell."""
-        return self.trusted_without_search and not self.refused
-
-    @property
-    def wrong(self):
-        """Whether one estimate is wrong by half of the gradient or more."""
-        return self.rmse >= WRONG
-
-
-def outcomes(index, scene, verdicts):
-    """Return the outcome of every seed of a scene, from its estimates and the verdicts by seed and number."""
+def outcomes(scene, seed):
+    """Return spread and relative RMSE of one estimate of a scene."""
     problem = Jax().compile(compose(Given(f"{scene.family} {scene.label}", scene.cost, scene.theta, scene.sigma)))
-    theta, known = np.array(scene.theta), truth(scene)
-    found = []
-    for seed, by_index in verdicts.items():
-        w = np.random.default_rng(seed).standard_normal((REPEATS, SAMPLES, theta.size))
-        estimates = np.asarray(Fobg().estimate(problem, theta, w))
-        mean = np.linalg.norm(estimates.mean(axis=0))
-        deviation = math.sqrt(float(estimates.var(axis=0, ddof=1).sum()))
-        rmse = math.sqrt(float(np.square(estimates - known).sum(axis=1).mean())) / float(np.linalg.norm(known))
-        found.append(Outcome(deviation / mean if mean else math.inf, by_index[index], rmse))
-    return found
+    known, theta = truth(scene), np.array(scene.theta)
+    w = np.random.default_rng(seed).standard_normal((REPEATS, SAMPLES, theta.size))
+    found = summarise(np.asarray(Fobg().estimate(problem, theta, w)), Truth.exact(known), SAMPLES)
+    return math.sqrt(found.variance) / found.grad_norm if found.grad_norm else math.inf, found.rmse_rel
 
 
-def main():
-    """Print a line per scene and the counts by part; return 1 if the rule trusts a wrong cell.
-
-    With the name of a part, as `new`, only its scenes are counted.
-    """
-    parts = {"first": [], "new": []}
-    chosen = []
-    for index, scene in enumerate(scenes()):
-        part = "new" if scene.family in NEW else "first"
-        if part in (sys.argv[1:] or parts):
-            chosen.append((index, scene, part))
+def main(*parts):
+    """Print a line per cell and the counts by part, by default of all parts; return 1 if the rule trusts a wrong cell."""
+    chosen = {index: scene for index, scene in enumerate(scenes()) if scene.part in (parts or FAMILIES)}
     with tempfile.TemporaryDirectory() as folder:
         (Path(folder) / "counted.py").write_text(PLUGIN)
-        indices = tuple(index for index, _, _ in chosen)
-        verdicts = {seed: refused(seed, indices, folder) for seed in SEEDS}
-    trusted_scenes = {part: set() for part in parts}
-    for index, scene, part in chosen:
-        found = outcomes(index, scene, verdicts)
-        parts[part] += found
-        trusted_scenes[part] |= {index} if any(o.trusted for o in found) else set()
-        print(
-            f"{scene.family:13}{scene.label:34}{part:13}"
-            + "  ".join(f"{o.spread:.2g} {o.refused or '-'} rmse {o.rmse:.2g} {'TRUSTED' if o.trusted else '-'}{' WRONG' if o.trusted and o.wrong else ''}" for o in found),
-            flush=True,
-        )  # fmt: skip
-    for name, cells in parts.items():
-        for rule, trusts in (("spread alone", Outcome.trusted_without_search), ("the rule", Outcome.trusted)):
-            trusted = [o for o in cells if trusts.fget(o)]
-            bad, missed = sum(o.wrong for o in trusted), sum(not o.wrong for o in cells if not trusts.fget(o))
-            print(
-                f"{name}: {rule} trusts {len(trusted)} of {len(cells)} cells, {bad} of them wrong, and leaves {missed} right ones"
-            )
-        n = len(trusted_scenes[name])
-        print(
-            f"{name}: cells of {n} scenes are trusted"
-            + (f"; no wrong one: below {100 * (1 - 0.05 ** (1 / n)):.0f}% by scene" if n else "")
-        )
-    return int(any(o.trusted and o.wrong for cells in parts.values() for o in cells))
+        verdicts = {seed: refused(seed, chosen, folder) for seed in SEEDS}
+    every = pd.DataFrame(
+        [
+            (*scene[:3], seed, verdicts[seed][index], *outcomes(scene, seed))
+            for index, scene in chosen.items()
+            for seed in SEEDS
+        ],
+        columns=["part", "family", "label", "seed", "refused", "spread", "rmse"],
+    )
+    every["wrong"] = every["rmse"] >= WRONG
+    every["spread alone"] = every["spread"] < SPREAD
+    every["with `gradcheck`"] = every["spread alone"] & (every["refused"] == "")
+    print(every.to_string())
+    for (part, cells), rule in itertools.product(every.groupby("part"), every.columns[-2:]):
+        trusted, bad, right = cells[cells[rule]], cells["wrong"] & cells[rule], ~cells["wrong"] & ~cells[rule]
+        n = len(trusted[["family", "label"]].drop_duplicates())
+        print(f"| {part} | {rule} | {len(trusted)} of {len(cells)} | {bad.sum()} | {right.sum()} |")
+        print(f"cells of {n} scenes; if none is wrong: below {100 * (1 - 0.05 ** (1 / max(n, 1))):.0f}% by scene")
+    return int((every["with `gradcheck`"] & every["wrong"]).any())
 
 
 if __name__ == "__main__":
-    sys.modules["trusted"] = sys.modules[__name__]
-    sys.exit(main())
+    sys.exit(main(*sys.argv[1:]))

@@ -173,7 +173,8 @@ def _compute(
         return _with_note(replace(quadrature, error=max(apart, quadrature.error)), note)
     # doubts about the samples are doubts about their error
     if not sampled.note and 0.0 < error < quadrature.error:
-        return _with_note(sampled, quadrature.note)
+        # tails may be too heavy for the spread of the samples to show, as at a pole in the plane
+        return _with_note(replace(sampled, error=max(sampled.error, apart)), quadrature.note)
     return _with_note(quadrature, sampled.note)
 
 
@@ -247,7 +248,7 @@ def _sample(problem: Problem, theta: np.ndarray, provides: frozenset[str], sampl
     centre = problem.value(theta, still)
     orders: dict[str, Terms] = {}
     if problem.program.has_score_gradient:
-        orders["zeroth_order"] = lambda w: _antithetic(problem, theta, w, centre)
+        orders["zeroth_order"] = lambda w: _antithetic(problem, theta, (w, -w), centre)
     if problem.program.continuous and "grad" in provides:
         orders["first_order"] = lambda w: problem.grad(theta, w)
     pilot = draw_columns(problem, "pilot", columns, 0)
@@ -369,17 +370,10 @@ def _cross_checked(
     linear = reference.gradient if problem.noise_on_theta else np.zeros(problem.dim)
 
     def zeroth(w: np.ndarray) -> np.ndarray:
-        if not problem.program.exogenous:
-            return _antithetic(problem, theta, w, centre, linear)
         # the same own noise on both sides and in the baseline, so that only the noise on theta moves the terms
         own = problem.centred(w)
-        mirrored = 2.0 * own - w
-        baseline = problem.value(theta, own)
-        terms = sum((problem.value(theta, s) - baseline) * problem.score(theta, s) for s in (w, mirrored)) / 2.0
-        if not problem.noise_on_theta:
-            return np.asarray(terms)
-        step = problem.directions(w)
-        return np.asarray(terms - (linear @ step) * step + linear[:, None])
+        baseline = problem.value(theta, own) if problem.program.exogenous else centre
+        return _antithetic(problem, theta, (w, 2.0 * own - w), baseline, linear)
 
     check = np.concatenate(
         [
@@ -505,18 +499,22 @@ def draw_columns(problem: Problem, stream: str, count: int, block: int) -> np.nd
 
 
 def _antithetic(
-    problem: Problem, theta: np.ndarray, w: np.ndarray, centre: np.ndarray, linear: np.ndarray | None = None
+    problem: Problem,
+    theta: np.ndarray,
+    sides: tuple[np.ndarray, np.ndarray],
+    baseline: np.ndarray,
+    linear: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Return zeroth-order terms averaged over w and -w, with the cost at w = 0 as baseline, ``(d, B)``.
+    """Return zeroth-order terms ``(d, B)`` averaged over noise and its mirror image, ``sides``, with a baseline of the costs.
 
     For noise on theta, ``linear (d,)`` is the gradient of a linear part of the cost. Its terms are replaced by their
     mean, ``linear``, which changes no expectation.
     """
-    terms = ((problem.value(theta, s) - centre) * problem.score(theta, s) for s in (w, -w))
+    terms = ((problem.value(theta, s) - baseline) * problem.score(theta, s) for s in sides)
     mean = np.asarray(sum(terms) / 2)
     if linear is None or not linear.any():
         return mean
-    step = problem.directions(w)
+    step = problem.directions(sides[0])
     return np.asarray(mean - (linear @ step) * step + linear[:, None])
 
 

@@ -23,7 +23,7 @@ def puck(at):
             x = x + 0.01 * v
         return (x - 2.0) ** 2 + xp.where(x > at, 1.0, 0.0)
 
-    return trusted.Scene("puck", f"edge at {at}", cost, (2.0,), 0.2)
+    return trusted.Scene("", "puck", f"edge at {at}", cost, (2.0,), 0.2)
 
 
 def search(scene):
@@ -41,12 +41,12 @@ def test_an_edge_that_the_noise_reaches_is_found(at):
     assert (2.0 + 0.2 * w[0]) * slope == pytest.approx(at, abs=1e-6)
 
 
-@pytest.mark.parametrize("name", [key for key in SEEN if key[0] in ("free flight", "saturation")], ids=str)
+@pytest.mark.parametrize("name", [key for key in SEEN if key[0] in ("flight", "saturation")], ids=str)
 def test_a_continuous_cost_has_no_jump(name):
     assert search(SEEN[name])[0].height == 0.0
 
 
-FAR = "1.9 to 2.5 for 5.0"
+FAR = "(1.9, 2.5, 5.0)"
 """A gate 4.2 standard deviations away."""
 
 

@@ -330,8 +330,9 @@ def test_jumps_that_no_list_holds_are_not_for_a_rule_in_the_plane():
 
 @pytest.mark.parametrize(
     ("mean", "spread", "chosen", "error"),
-    [(1.0, 0.0, "quadrature", 0.5), (1.0, 0.01, "sampling", 0.0), (1.0, 9.0, "quadrature", 0.5), (3.0, 0.01, "quadrature", 2.0)],
-    ids=["no spread", "less spread", "more spread", "disagree"],
+    [(1.0, 0.0, "quadrature", 0.5), (1.0, 0.01, "sampling", 0.0), (1.3, 0.01, "sampling", 0.3), (1.0, 9.0, "quadrature", 0.5),
+     (3.0, 0.01, "quadrature", 2.0)],
+    ids=["no spread", "less spread", "off, less spread", "more spread", "disagree"],
 )  # fmt: skip
 def test_samples_replace_a_coarse_rule_that_they_agree_with(monkeypatch, mean, spread, chosen, error):
     """Samples that leave less error do, never ones that all missed the event. A disagreement is the stated error."""

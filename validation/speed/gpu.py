@@ -4,41 +4,35 @@
     python validation/speed/gpu.py --out FOLDER --seconds 500  # the rows: FOLDER/gpu.csv
     python validation/speed/gpu.py --draw FOLDER               # their chart: FOLDER/gpu.png
 
-Each program of one shape compiles in a process of its own, ``--jobs`` at once, and a lock lets one of them use the
-device. A row is written as soon as it is measured. Rows come in the order of their worth, and at the end of
-``--seconds`` the remaining ones are written as not measured. Required are jax, mujoco, mujoco-mjx, gymnasium's model
-files and what ``import bench`` needs, but not hydra.
+Programs compile in processes of their own, ``--jobs`` at once, and a lock lets one of them use the device. A row is written
+as soon as it is measured. Rows come in the order of their worth, until ``--seconds`` have passed. Required are jax, mujoco,
+mujoco-mjx, gymnasium's model files and what ``import bench`` needs, but not hydra.
 """
 
 import argparse
-import contextlib
-import csv
-import fcntl
 import json
+import multiprocessing
 import os
+import platform
 import resource
-import signal
-import subprocess
 import sys
-import tempfile
 import time
-from dataclasses import dataclass
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 
-ROOT = Path(__file__).parents[2]
 REFERENCE = Path(__file__).with_name("gpu_reference.json")
-SCRATCH = Path(os.environ.get("BENCH_GPU_SCRATCH") or tempfile.mkdtemp())
-"""Folder of the lock and of marks of processes that compile, shared with the processes of units."""
 COLUMNS = (
     "case", "backend", "dtype", "device", "batch", "gradients_per_s", "call_s", "spread", "calls", "with_transfer_s",
-    "compile_s", "trace_s", "compiling", "temporary_mib", "peak_mib", "host_mib", "agreement", "finite", "status", "at_s",
+    "compile_s", "trace_s", "temporary_mib", "peak_mib", "host_mib", "agreement", "finite", "status", "at_s",
 )  # fmt: skip
 COMPARED, PROJECTIONS = 4, 8
 """Samples whose gradients are compared with the CPU's, and random directions on which they are projected."""
-SECONDS, CALLS, LONGEST = 0.5, 20, 15.0
-"""Least total time [s] and largest number of a row's timed calls, and the time of a call above which larger batches wait."""
+SECONDS, CALLS = 0.5, 20
+"""Least total time [s] and largest number of a row's timed calls."""
 GYMNASIUM = "gymnasium:envs/mujoco/assets"
 HUMANOID = '''"""The task of gymnasium's humanoid: run forward (Humanoid-v5, without contact cost and end)."""
 
@@ -52,8 +46,7 @@ def stage_cost(xp, q, v, u):
 '''
 
 
-@dataclass(frozen=True)
-class Unit:
+class Unit(NamedTuple):
     """What one process measures: a case in one precision, at some batches."""
 
     case: str
@@ -90,20 +83,20 @@ def units(options):
             for name in (*SCENES, *ROBOTS)
         ]
     cases, batches = options.cases.split(","), [COMPARED, *map(int, options.batches.split(","))]
-    chosen = [Unit(*key(u), tuple(b for b in u.batches if b in batches)) for u in order if u.case in cases]
+    chosen = [Unit(*u[:3], tuple(b for b in u.batches if b in batches)) for u in order if u.case in cases]
     return [unit for unit in chosen if unit.batches]
 
 
 # --------------------------------------------------------------------------------------------------- one process
 
 
-def problem(unit):
-    """Compile the unit's scene on its backend."""
+def problem(unit, folder):
+    """Compile the unit's scene on its backend; ``folder`` has the humanoid's task."""
     from bench.experiment.by_name import compile_problem
 
     name, _, values = unit.backend.rstrip("]").partition("[")
     values = ",".join(filter(None, [values, f"dtype={unit.dtype}"]))
-    scene = ROBOTS[unit.case][0].format(humanoid=SCRATCH / "humanoid.py") if unit.case in ROBOTS else unit.case
+    scene = ROBOTS[unit.case][0].format(humanoid=folder / "humanoid.py") if unit.case in ROBOTS else unit.case
     return compile_problem(scene, "penalty", "semi_implicit_euler", f"{name}[{values}]")
 
 
@@ -131,108 +124,67 @@ def agreement(unit, gradients):
     return float(np.abs(found - expected).max() / np.abs(expected).max())
 
 
-@contextlib.contextmanager
-def alone():
-    """Hold the device: no other process of this program times or writes meanwhile."""
-    with open(SCRATCH / "lock", "w") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        yield
-
-
-def write(folder, row):
-    """Append a row and wait until it is on the disk."""
-    path = folder / "gpu.csv"
-    is_new = not path.exists()
-    with open(path, "a", newline="") as file:
-        writer = csv.DictWriter(file, COLUMNS)
-        if is_new:
-            writer.writeheader()
-        writer.writerow({name: f"{value:.4g}" if isinstance(value, float) else value for name, value in row.items()})
-        file.flush()
-        os.fsync(file.fileno())
+def append(table, row):
+    """Append a row to a CSV file."""
+    pd.DataFrame([row], columns=COLUMNS).to_csv(
+        table, mode="a", header=not table.exists(), index=False, float_format="%.4g"
+    )
 
 
 def timed(call, seconds=SECONDS):
     """Return the seconds of calls, at least one and at least ``seconds`` in sum if they are short."""
     times = []
-    while not times or (len(times) < CALLS and sum(times) < seconds) or (len(times) < 3 and times[0] < LONGEST / 3):
+    while not times or (len(times) < CALLS and sum(times) < seconds):
         started = time.perf_counter()
         call()
         times.append(time.perf_counter() - started)
     return np.array(times)
 
 
-def key(unit):
-    """Return what names a unit in the rows."""
-    return unit.case, unit.backend, unit.dtype
-
-
-def predecessor(folder, unit, batch):
-    """Return the seconds expected of a call, by the largest smaller batch; 0 if none is known or it took below 1 s."""
-    if not (folder / "gpu.csv").exists():
-        return 0.0
-    with open(folder / "gpu.csv", newline="") as file:
-        rows = [row for row in csv.DictReader(file) if row["status"] == "ok"]
-    known = {
-        int(row["batch"]): float(row["call_s"])
-        for row in rows
-        if (row["case"], row["backend"], row["dtype"]) == key(unit) and int(row["batch"]) < batch
-    }
-    largest = max(known, default=0)
-    return known[largest] * batch / largest if largest and known[largest] > 1.0 else 0.0
-
-
-def work(unit, folder, began, whole, reference):
+def work(unit, options, lock, began):
     """Measure a unit's rows. With ``whole``, or on a GPU, a batch is one program; else the backend splits it into blocks."""
     import jax
 
-    given = problem(unit)
-    if reference:
+    given = problem(unit, options.out)
+    if options.reference:
         gradients = given.grad(given.program.theta0, drawn(given, COMPARED))
-        with alone():
+        with lock:
             kept = json.loads(REFERENCE.read_text()) if REFERENCE.is_file() else {}
             kept[unit.case] = projected(gradients).tolist()
             lines = [f"{json.dumps(name)}: {json.dumps(rows)}" for name, rows in kept.items()]
             REFERENCE.write_text("{\n" + ",\n".join(lines) + "\n}\n")
         return
-    platform = "cpu" if unit.backend == "fused" else jax.default_backend()
-    whole = unit.backend != "fused" and (whole or platform != "cpu")
+    device = "cpu" if unit.backend == "fused" else jax.default_backend()
+    whole = unit.backend != "fused" and (options.whole or device != "cpu")
     for batch in unit.batches:
-        row = dict(zip(COLUMNS, (*key(unit), platform, batch), strict=False))
+        row = dict(zip(COLUMNS, (*unit[:3], device, batch), strict=False))
         try:
-            if (expected := predecessor(folder, unit, batch)) > LONGEST:
-                raise TimeoutError(f"about {expected:.0f} s per call expected")
-            row |= measured(given, unit, batch, whole)
+            row |= measured(given, unit, batch, whole, lock)
         except Exception as error:
             row |= {"status": f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"}
-        with alone():
-            write(folder, row | {"at_s": time.time() - began})
+        with lock:
+            append(options.out / "gpu.csv", row | {"at_s": time.time() - began})
 
 
-def measured(given, unit, batch, whole):
+def measured(given, unit, batch, whole, lock):
     """Return the numbers of one batch."""
     import jax
 
     theta, w = given.program.theta0, drawn(given, batch)
     numbers = {}
-    others, mark = len(list(SCRATCH.glob("compiling-*"))), SCRATCH / f"compiling-{os.getpid()}"
-    mark.touch()
-    try:
-        if whole:
-            from bench.plugins.backends.compiling import compiled
+    if whole:
+        from bench.plugins.backends.compiling import compiled
 
-            arguments = (given._parameters, theta.reshape(-1, 1).astype(given._dtype), w.astype(given._dtype))
-            program = compiled((*key(unit), batch), given._cost_gradient, arguments, True, given.compilations)
-            numbers |= {"compile_s": sum(program.seconds), "trace_s": program.seconds[0]}
-            if analysis := program.call.memory_analysis():
-                numbers["temporary_mib"] = analysis.temp_size_in_bytes / 2**20
-        else:
-            given.reset_usage()
-            gradients = given.grad(theta, w)
-            numbers |= {"compile_s": given.usage.compile_s, "trace_s": given.usage.trace_s}
-    finally:
-        mark.unlink()
-    with alone():
+        arguments = (given._parameters, theta.reshape(-1, 1).astype(given._dtype), w.astype(given._dtype))
+        program = compiled((*unit[:3], batch), given._cost_gradient, arguments, True, given.compilations)
+        numbers |= {"compile_s": sum(program.seconds), "trace_s": program.seconds[0]}
+        if analysis := program.call.memory_analysis():
+            numbers["temporary_mib"] = analysis.temp_size_in_bytes / 2**20
+    else:
+        given.reset_usage()
+        gradients = given.grad(theta, w)
+        numbers |= {"compile_s": given.usage.compile_s, "trace_s": given.usage.trace_s}
+    with lock:
         if whole:
             gradients = np.asarray(program.call(*arguments), dtype=float)
             placed = jax.device_put(arguments)
@@ -249,7 +201,6 @@ def measured(given, unit, batch, whole):
         "call_s": middle,
         "spread": (high - low) / middle,
         "calls": len(times),
-        "compiling": others,
         "host_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         "agreement": agreement(unit, gradients),
         "finite": float(np.isfinite(gradients).all(axis=0).mean()),
@@ -259,8 +210,6 @@ def measured(given, unit, batch, whole):
 
 def draw(folder):
     """Draw gradients per second against the batch, a panel per case."""
-    import pandas as pd
-
     from bench.experiment.columns import Column
     from bench.experiment.views import Chart
     from bench.report.draw import draw as drawn_chart
@@ -280,35 +229,17 @@ def draw(folder):
 # ------------------------------------------------------------------------------------------------- all processes
 
 
-def started(unit, options, began):
-    """Start the process of a unit."""
-    words = [unit.case, unit.backend, unit.dtype, ",".join(map(str, unit.batches)), str(began)]
-    flags = [flag for flag, given in (("--whole", options.whole), ("--reference", options.reference)) if given]
-    environment = os.environ | {
-        "PYTHONPATH": os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")])),
-        "XLA_PYTHON_CLIENT_PREALLOCATE": "false",  # several processes share the device's memory
-        "MUJOCO_GL": "disable",
-        "BENCH_GPU_SCRATCH": str(SCRATCH),
-    }
-    if options.device == "cpu":
-        environment["JAX_PLATFORMS"] = "cpu"
-    command = [sys.executable, __file__, "--out", str(options.out), *flags, "--unit", *words]
-    log = open(options.out / "log.txt", "ab")  # noqa: SIM115, the process writes to it
-    return subprocess.Popen(command, env=environment, stdout=log, stderr=log, start_new_session=True)
+def machine():
+    """Return the device and the versions."""
+    import jax
+    import jaxlib
+    import mujoco
 
-
-def machine(options):
-    """Return the device and the versions, from a process of its own: this one must hold no memory of the device."""
-    code = (
-        "import jax, jaxlib, mujoco, numpy, json; d = jax.devices()[0]; print(json.dumps(dict(platform=d.platform,"
-        " device=d.device_kind, jax=jax.__version__, jaxlib=jaxlib.__version__, mujoco=mujoco.__version__,"
-        " numpy=numpy.__version__)))"
-    )
-    environment = os.environ | {"MUJOCO_GL": "disable"} | ({"JAX_PLATFORMS": "cpu"} if options.device == "cpu" else {})
-    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=120)
-    if done.returncode:
-        raise SystemExit(f"JAX or MuJoCo does not start:\n{done.stderr[-2000:]}")
-    return {**json.loads(done.stdout.splitlines()[-1]), "cores": os.cpu_count(), "python": sys.version.split()[0]}
+    device, libraries = jax.devices()[0], (jax, jaxlib, mujoco, np)
+    return {
+        "platform": device.platform, "device": device.device_kind, **{each.__name__: each.__version__ for each in libraries},
+        "cores": os.cpu_count(), "python": platform.python_version(),
+    }  # fmt: skip
 
 
 def main():
@@ -323,45 +254,42 @@ def main():
     parser.add_argument("--whole", action="store_true", help="a batch is one program on the CPU too")
     parser.add_argument("--reference", action="store_true", help=f"write {REFERENCE.name} instead of rows")
     parser.add_argument("--draw", type=Path, help="draw the rows of a folder")
-    parser.add_argument("--unit", nargs=5, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.draw:
         draw(options.draw)
         return
-    if options.unit:
-        case, backend, dtype, batches, began = options.unit
-        unit = Unit(case, backend, dtype, tuple(map(int, batches.split(","))))
-        work(unit, options.out, float(began), options.whole, options.reference)
-        return
-    began = time.time()
-    options.out = options.out.resolve()
+    began, options.out = time.time(), options.out.resolve()
     options.out.mkdir(parents=True, exist_ok=True)
-    (SCRATCH / "humanoid.py").write_text(HUMANOID)
-    about = machine(options)
+    (options.out / "humanoid.py").write_text(HUMANOID)
+    os.environ |= {"XLA_PYTHON_CLIENT_PREALLOCATE": "false", "MUJOCO_GL": "disable"}  # the processes share the memory
+    os.environ |= {"JAX_PLATFORMS": "cpu"} if options.device == "cpu" else {}
+    sys.path.append(
+        str(Path(__file__).parents[2])
+    )  # processes have the same path, so the package need not be installed
+    context = multiprocessing.get_context("spawn")
+    # a process of its own, since this one must hold no memory of the device
+    with ProcessPoolExecutor(1, context) as pool:
+        about = pool.submit(machine).result()
     print(about, flush=True)
     (options.out / "machine.json").write_text(json.dumps(about, indent=1) + "\n")
     if about["platform"] == "cpu" and options.device == "gpu":
         raise SystemExit("JAX sees no GPU")
-    waiting = units(options)
-    running = {}
-    try:
-        while (waiting or running) and time.time() - began < options.seconds:
-            while waiting and len(running) < options.jobs:
-                unit = waiting.pop(0)
-                running[started(unit, options, began)] = unit
-            time.sleep(0.2)
-            for process in [p for p in running if p.poll() is not None]:
-                unit = running.pop(process)
-                print(f"{time.time() - began:6.1f} s  {unit}  exit {process.returncode}", flush=True)
-    finally:
-        for process, unit in running.items():
-            os.killpg(process.pid, signal.SIGKILL)
-            process.wait()
-            print(f"{time.time() - began:6.1f} s  {unit}  stopped at the end of the time", flush=True)
-        for unit in waiting:
-            print(f"          {unit}  not started", flush=True)
-        if (options.out / "gpu.csv").exists():
-            print((options.out / "gpu.csv").read_text())
+    waiting, running, lock = units(options), {}, context.Lock()
+    while (waiting or running) and time.time() - began < options.seconds:
+        while waiting and len(running) < options.jobs:
+            unit = waiting.pop(0)
+            process = context.Process(target=work, args=(unit, options, lock, began))
+            process.start()
+            running[process] = unit
+        time.sleep(0.2)
+        for process in [p for p in running if not p.is_alive()]:
+            print(f"{time.time() - began:6.1f} s  {running.pop(process)}  exit {process.exitcode}", flush=True)
+    for process, unit in running.items():
+        process.kill()
+        print(f"{unit}  stopped at the end of the time")
+    for unit in waiting:
+        print(f"{unit}  not started")
+    print((options.out / "gpu.csv").read_text() if (options.out / "gpu.csv").exists() else "")
 
 
 if __name__ == "__main__":
