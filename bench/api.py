@@ -106,7 +106,7 @@ def run(experiment: str | Sequence[str] = (), **settings: Unpack[Settings]) -> p
     resolved = config.load(words)
     finished = execute(resolved)
     rows = finish(finished, words)[0] if resolved.execution.shard is None else finished.rows()
-    return with_axes(resolved, rows).reset_index(drop=True)
+    return with_axes(resolved.sweep, rows).reset_index(drop=True)
 
 
 def _override_words(key: str, value: Any) -> list[str]:
@@ -146,7 +146,7 @@ def load(directory: str | Path) -> pd.DataFrame:
     """
     import pandas as pd
 
-    from bench.experiment import axes
+    from bench.experiment.axes import with_axes
     from bench.experiment.columns import Columns
     from bench.experiment.defaults import completed_rows
     from bench.experiment.study import Study
@@ -161,9 +161,7 @@ def load(directory: str | Path) -> pd.DataFrame:
         rows = Store(directory, study.plugin.columns).load()  # without rows that the study cannot have stored
     if rows.empty:
         raise UserError(f"no rows are stored in '{directory}': run an experiment first, its folder is results_dir/name")
-    rows = completed_rows(newest_rows(rows))
-    swept_axes = axes.axes(recorded_sweep(directory), rows)
-    return rows.assign(**{axis.column: axes.values_of(axis, rows) for axis in swept_axes if axis.column not in rows})
+    return with_axes(recorded_sweep(directory), completed_rows(newest_rows(rows)))
 
 
 def list_plugins(*names: str, plugins: str | Path | Sequence[str | Path] = ()) -> pd.DataFrame:

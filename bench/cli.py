@@ -389,7 +389,7 @@ def _split_scenes(words: Sequence[str], verb: str) -> tuple[list[str], list[str]
     """
     scenes = list(itertools.takewhile(lambda word: "=" not in word.partition("[")[0] and word[0] != "-", words))
     settings = list(words[len(scenes) :])
-    if not scenes and not any(word.lstrip("+").startswith("scenes=") for word in settings):
+    if not scenes and not _is_given("scenes", settings):
         raise UserError(
             f"name a scene: python -m bench {verb} SCENE ... [key=value ...]; all: python -m bench list scenes"
         )
@@ -413,7 +413,7 @@ def _gradcheck(words: list[str]) -> int:
     experiment = _with_engine(["experiment=gradient_check", *scenes, "name=gradcheck"], settings)
     plugins = [choice.entry.plugin for choice in experiment.choices["scene"]]
     horizons = [word for word in words if _sets_horizon(word)]
-    is_swept = any(word.startswith("sweep.horizon=") for word in settings)
+    is_swept = _is_given("sweep.horizon", settings)
     own = {
         int(parameters(plugin)["horizon"].default) for plugin in plugins if plugin and "horizon" in parameters(plugin)
     }
@@ -457,7 +457,7 @@ def _trace(words: list[str]) -> int:
 
     scenes, settings = _split_scenes(words, "trace")
     experiment = _with_engine(scenes, settings)
-    for rollout in trace.run(experiment, any(word.startswith("seed=") for word in settings)):
+    for rollout in trace.run(experiment, _is_given("seed", settings)):
         paths = trace.write(rollout, experiment.results_dir, experiment.formats)
         print(f"\n{printable(rollout.title)}")
         for sentence in rollout.report():

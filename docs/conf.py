@@ -11,7 +11,7 @@ from docutils.utils.math import latex2mathml
 import bench
 
 HERE = Path(__file__).parent
-HOOKS = tomllib.loads((HERE.parent / "pyproject.toml").read_text())["tool"]["hatch"]["metadata"]["hooks"]
+ADDRESSES = tomllib.loads((HERE.parent / "pyproject.toml").read_text())["tool"]["hatch"]["metadata"]["hooks"]["custom"]
 
 project = "bench"
 author = "The bench authors"
@@ -35,12 +35,13 @@ html_title = "bench: which gradient can I trust?"
 html_static_path = [str(HERE / "site.css"), str(HERE / "site.js")]
 html_css_files = ["site.css"]
 html_js_files = ["site.js"]
+html_extra_path = [str(HERE / "switcher.json")]
 html_copy_source = False
 html_show_sourcelink = False
 html_show_search_summary = False  # it needs a server
 html_sidebars: dict[str, list[str]] = {"index": []}
 html_theme_options = {
-    "github_url": HOOKS["custom"]["repository"],  # no link while it is empty
+    "github_url": ADDRESSES["repository"],  # no link while it is empty
     "logo": {"text": "bench"},
     "header_links_before_dropdown": 5,
     "collapse_navigation": True,
@@ -53,6 +54,12 @@ html_theme_options = {
     "pygments_light_style": "a11y-high-contrast-light",
     "pygments_dark_style": "a11y-high-contrast-dark",
 }
+if ADDRESSES["site"]:  # the switcher of versions needs a server
+    html_theme_options |= {
+        "navbar_end": ["version-switcher", "theme-switcher", "navbar-icon-links"],
+        "switcher": {"json_url": f"{ADDRESSES['site']}/switcher.json", "version_match": version},
+        "check_switcher": False,
+    }
 
 
 def escape_bars(app: Any, what: str, name: str, value: Any, options: Any, lines: list[str]) -> None:

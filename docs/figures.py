@@ -28,7 +28,7 @@ from bench.report import answer
 from bench.report.text import interval as text_of_interval
 from bench.report.text import number
 from bench.report.text import span as ends_of
-from docs.results import PAPER, STANDARD, answer_of, rows_of, select, table_of
+from docs.results import PAPER, STANDARD, answer_of, rows_of, table_of
 
 MARK = re.compile(r"<!--=([\w./-]+|[^>\n]+\|.*?)-->(.*?)<!--/-->", re.DOTALL)
 SOURCE = re.compile(r"<!-- figures: (.*?) -->\n?")
@@ -45,21 +45,21 @@ def span(values: Any, digits: int = 2, suffix: str = "") -> str:
     return ends_of(float(np.min(values)), float(np.max(values)), digits, suffix)
 
 
-def count(value: float, zero: str = "0") -> str:
-    """Return a whole number with commas between thousands; ``zero`` replaces 0."""
-    return f"{int(value):,}" if value else zero
-
-
 @cache
-def trusted(*estimators: str) -> dict[str, Any]:
-    """Return the counts of the rule on the spread: cells, trusted cells, wrong ones among both, and the worst error."""
+def trusted(*estimators: str) -> dict[str, str]:
+    """Return the counts of the rule on the spread: cells, trusted cells and the wrong ones among them, other cells and the right
+    ones among them. ``worst`` is the largest error of a trusted cell.
+    """
     rows = trust.cells(STANDARD, estimators)
     keep, wrong = trust.spread(rows) < trust.SPREAD, rows["rmse_rel"] >= trust.WRONG
-    worst = number(rows.loc[keep, "rmse_rel"].max())
-    others, missed = (~keep).sum(), (~keep & ~wrong).sum()
-    return dict(
-        cells=len(rows), trusted=keep.sum(), wrong=(keep & wrong).sum(), worst=worst, others=others, missed=missed
-    )
+    counts = dict(cells=keep | ~keep, trusted=keep, wrong=keep & wrong, others=~keep, missed=~keep & ~wrong)
+    worst = {"worst": number(rows.loc[keep, "rmse_rel"].max())}
+    return {name: f"{keep.sum():,}" for name, keep in counts.items()} | worst
+
+
+def trust_figure(name: str, *estimators: str) -> Callable[[], str]:
+    """Return the function that gives a figure of :func:`trusted`."""
+    return lambda: trusted(*estimators)[name]
 
 
 def block(lines: list[str]) -> str:
@@ -75,6 +75,7 @@ def speeds() -> dict[str, float]:
 
 
 BATCHES = ("1000", "10000", "100000", "1e+06")
+SCENES = ("pushing", "pendulum", "cartpole", "double_pendulum", "hopper")
 
 
 def speed(name: str) -> list[float]:
@@ -105,52 +106,27 @@ def rollouts_table() -> str:
     ])  # fmt: skip
 
 
-def scenes_table() -> str:
-    """Return the time of ``fused`` over that of ``jax`` by scene as a Markdown table."""
-    scenes = ("pushing", "pendulum", "cartpole", "double_pendulum", "hopper", "bounce_once")
-    head = ["| gradient, `fused` over `jax` on the same cores (target 0.33) | 1,000 | 100,000 |", "|---|--:|--:|"]
-    ratios = {scene: speed(f"fused over jax, {scene}, * rollouts") for scene in scenes}
-    return block(head + [f"| {scene} | " + " | ".join(map(number, values)) + " |" for scene, values in ratios.items()])
-
-
-def gpu_table() -> str:
-    """Return gradients per second, their agreement with the CPU and compile time by case as Markdown, in float64."""
-    rows = pd.read_csv(STANDARD / "gpu" / "gpu.csv").query("dtype == 'float64'")
-    keys = ["case", "backend"]
-    rates = rows.pivot(index=keys, columns="batch", values="gradients_per_s")[[1, 1024, 16384]]
-    most = rows.groupby(keys)[["agreement", "compile_s"]].max()
-    head = [
-        "| scene | backend | 1 | 1,024 | 16,384 | agreement | compiles [s] |",
-        "|---|---|--:|--:|--:|--:|--:|",
-    ]
-    return block(head + [
-        f"| {case} | `{backend}` | " + " | ".join(map(number, [*rates.loc[key], *most.loc[key]])) + " |"
-        for key in rows[keys].drop_duplicates().itertuples(index=False, name=None)
-        for case, backend in [key]
-    ])  # fmt: skip
-
-
 def dose(table: str, name: str = "dose_response") -> pd.DataFrame:
     """Return a table of a study of errors as stored."""
     return pd.read_csv(STANDARD / name / f"{table}.csv", keep_default_na=True)
 
 
 UPDATES = (
-    "random error 0.3", "random error 1", "random error 3", "random error 3 / 0.3", "bias 0.6", "bias 0.9", "bias 0.9 / random error 1",
+    "random error 0.3", "random error 1", "random error 3", "random error 3 / 0.3", "bias 0.9", "bias 0.9 / random error 1",
 )  # fmt: skip
 ROLLOUTS = "first order / zeroth order, gradient "
 
 
 def dose_ratios(head: str, parts: dict[str, pd.DataFrame], names: dict[str, str]) -> str:
     """Return ratios to 1/100 as a Markdown table: a line per part, and a column per comparison, by its heading."""
-    lines = [f"| {head} | problems | scenes | {' | '.join(names)} |", f"|---|--:|--:|{'--:|' * len(names)}"]
+    lines = [f"| {head} | scenes | {' | '.join(names)} |", f"|---|--:|{'--:|' * len(names)}"]
     for label, part in parts.items():
         rows = part.query("target == 100").set_index("comparison").reindex(list(names.values()))
         cells = [
             "-" if np.isnan(row.ratio) else number(row.ratio) if row.scenes < LEAST_SCENES else
             text_of_interval(row.ratio, row.ratio_low, row.ratio_high, 1.0) for row in rows.itertuples()
         ]  # fmt: skip
-        lines.append(f"| {label} | {rows['problems'].max():.0f} | {rows['scenes'].max():.0f} | {' | '.join(cells)} |")
+        lines.append(f"| {label} | {rows['scenes'].max():.0f} | {' | '.join(cells)} |")
     return block(lines)
 
 
@@ -176,7 +152,6 @@ def dose_classes(names: dict[str, str]) -> str:
 
 
 DOSE_RUNS = {
-    "Adam": "dose_response",
     "Adam, 20 seeds": "dose_response_seeds",
     "Adam, neural policies": "dose_response_policy",
     "plain descent": "dose_response_descent",
@@ -189,7 +164,7 @@ DOSE_RUNS = {
 def dose_runs() -> str:
     """Return the ratios over all problems of each experiment with planted errors as a Markdown table."""
     parts = {label: dose("pairs", name).query("scene_class == 'all classes'") for label, name in DOSE_RUNS.items()}
-    return dose_ratios("searches", parts, {name: name for name in UPDATES if name != "bias 0.6"})
+    return dose_ratios("searches", parts, {name: name for name in UPDATES})
 
 
 def windows_missed() -> str:
@@ -216,7 +191,7 @@ def dose_unreached() -> str:
 
 def switch_verdicts(point: str, folder: str = "quadruped_check") -> list[str]:
     """Return the verdicts of all checks of a robot's gradient at a point: ``before``, ``at`` or ``after`` a switch."""
-    rows = select(rows_of(folder), scene="quadruped", status="ok")
+    rows = rows_of(folder).query("scene == 'quadruped' and status == 'ok'")
     pairs = (zip(row["point"], row["check_verdict"], strict=True) for _, row in rows.iterrows())
     return [verdict for every in pairs for name, verdict in every if name == point]
 
@@ -263,26 +238,19 @@ FIGURES: dict[str, str | Callable[[], str]] = {
     "dose-windows-missed": windows_missed,
     "dose-hash": lambda: ", ".join(sorted(set(rows_of("dose_response")["hypotheses"]) - {""})),
     "dose-costs": lambda: dose_classes({cost: f"{ROLLOUTS}{cost}" for cost in ("1", "2", "4", "measured")}),
-    "trust-cells": lambda: count(trusted("fobg")["cells"]),
-    "trust-trusted": lambda: count(trusted("fobg")["trusted"]),
-    "trust-worst": lambda: str(trusted("fobg")["worst"]),
-    "trust-others": lambda: count(trusted("fobg")["others"]),
-    "trust-missed": lambda: count(trusted("fobg")["missed"], "none"),
-    "trust-all-cells": lambda: count(trusted(*FOUR)["cells"]),
-    "trust-all-trusted": lambda: count(trusted(*FOUR)["trusted"]),
-    "trust-all-wrong": lambda: count(trusted(*FOUR)["wrong"]),
-    "trust-all-worst": lambda: str(trusted(*FOUR)["worst"]),
-    "speed-fused": lambda: span(speed("fused grad, penalty, * rollouts")),
-    "speed-jax": lambda: span(speed("jax grad, penalty, * rollouts")),
+    **{f"trust-{name}": trust_figure(name, "fobg") for name in ("cells", "trusted", "worst", "others", "missed")},
+    **{f"trust-all-{name}": trust_figure(name, *FOUR) for name in ("cells", "trusted", "wrong", "worst")},
     "speed-cell": lambda: number(speeds()["overhead of a cell"]),
     "speed-rollouts": rollouts_table,
-    "speed-scenes": scenes_table,
-    "speed-gpu": gpu_table,
+    "speed-scenes": lambda: span(
+        [value for scene in SCENES for value in speed(f"fused over jax, {scene}, * rollouts")]
+    ),
+    "speed-bounce": lambda: span(speed("fused over jax, bounce_once, * rollouts")),
     "speed-one-thread": lambda: span(speed("fused on one thread over the C kernel, * rollouts")),
     "speed-agree": lambda: number(speeds()["native C kernel: largest relative difference"]),
     "speed-memory-fused": lambda: span(speed("fused grad, penalty, * rollouts: peak memory"), 3),
     "speed-memory-jax": lambda: span(speed("jax grad, penalty, * rollouts: peak memory"), 3),
-    "speed-compilations": lambda: count(speeds()["compilations over 27 values of stiffness x beta x sigma"]),
+    "speed-compilations": lambda: f"{speeds()['compilations over 27 values of stiffness x beta x sigma']:.0f}",
     "speed-plan": lambda: number(speeds()["planning 10000 cells"]),
     "speed-resume": lambda: number(speeds()["resuming 10000 stored cells"]),
     "speed-list": lambda: number(speeds()["python -m bench list"]),

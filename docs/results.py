@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 from bench.plugins.studies.bias_variance import comparisons
@@ -36,8 +35,6 @@ class Entry:
     folder: Path
     answer: str = ""
     chart: Path | None = None
-    joined: str = ""
-    """The experiment that has this one's cells too, by its setting ``also``."""
 
     @property
     def page(self) -> str:
@@ -84,21 +81,7 @@ class Entry:
 
 def entries_of(results: Path) -> list[Entry]:
     """Return every experiment with its answer, in alphabetical order; those not run yet have none."""
-    joined = joined_experiments(results)
-    return [
-        replace(entry_of(*experiment), joined=joined.get(experiment[2].name, "")) for experiment in experiments(results)
-    ]
-
-
-@cache
-def experiments(results: Path) -> list[tuple[str, str, Path]]:
-    """Return the name, question and folder of every experiment."""
-    return [(name, experiment.question, experiment.directory) for name, experiment in loaded(results).items()]
-
-
-def joined_experiments(results: Path) -> dict[str, str]:
-    """Return, by an experiment's folder, the name of the one that has its cells too."""
-    return {other.directory.name: name for name, experiment in loaded(results).items() for other in experiment.also}
+    return [entry_of(name, own.question, own.directory) for name, own in loaded(results).items()]
 
 
 @cache
@@ -143,19 +126,6 @@ def answer_of(experiment: str, results: Path = STANDARD) -> str:
 def rows_of(experiment: str, results: Path = STANDARD) -> pd.DataFrame:
     """Return an experiment's stored rows, one per cell, with a column per swept axis."""
     return bench.load(results / experiment)
-
-
-def select(rows: pd.DataFrame, **conditions: Any) -> pd.DataFrame:
-    """Return the rows whose columns have the given values; a pair is the lowest and highest value of a range.
-
-    Raises LookupError if there is no such row.
-    """
-    for column, value in conditions.items():
-        keep = rows[column].between(*value) if isinstance(value, tuple) else rows[column] == value
-        rows = rows[keep]
-    if rows.empty:
-        raise LookupError(f"no rows with {conditions}")
-    return rows
 
 
 @cache

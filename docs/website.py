@@ -23,11 +23,9 @@ from bench.model.parameters import parameters
 from bench.report.tables import escape_markdown
 from bench.report.text import number
 from docs.figures import without_marks
-from docs.results import Entry, comparison, entries_of
+from docs.results import ROOT, STANDARD, Entry, comparison, entries_of
 
-ROOT = Path(__file__).resolve().parent.parent
 DOCS = ROOT / "docs"
-STANDARD = ROOT / "results" / "standard"
 
 PAGES: Mapping[str, str] = {
     "start": "README.md",

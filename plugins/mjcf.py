@@ -1,6 +1,6 @@
 """Builds MuJoCo models from scenes' MJCF twins, for backends of MuJoCo's engines, built in or a user's own.
 
-A backend's ``unsupported_reason`` may call :func:`unsupported_reason` and then inspect the model of :func:`build`.
+A backend's ``own_refusal`` may call :func:`refusal` and then inspect the model of :func:`build`.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ end of the step.
 """
 
 
-def unsupported_reason(backend: Any, program: Program) -> str | None:
+def refusal(backend: Any, program: Program) -> str | None:
     """Return why an engine cannot run the program, or None: no twin, another integrator, another contact law.
 
     The backend has parameters ``integrator``, ``solver``, ``cone``, ``iterations``, ``ls_iterations``, ``lean`` and
     ``impedance``.
     """
     own = backend.integrator
-    if reason := EngineBackend.unsupported_model(backend.name, program, f" {own}", MATCH[own], ("penalty",), "clipped"):
+    if reason := EngineBackend.model_refusal(backend.name, program, f" {own}", MATCH[own], ("penalty",), "clipped"):
         return reason
     scene: Any = program.scene
     if scene.model_file() is not None:
@@ -46,12 +46,12 @@ def unsupported_reason(backend: Any, program: Program) -> str | None:
 def build(backend: Any, program: Program) -> Any:
     """Return the twin as a ``mujoco.MjModel`` with the scene's time step, the law's springs and the backend's solver.
 
-    Raises :class:`Unsupported` with the reason of :func:`unsupported_reason`. The backend's own reasons, which may need
+    Raises :class:`Unsupported` with the reason of :func:`refusal`. The backend's own reasons, which may need
     the model, are not asked for.
     """
     import mujoco
 
-    if reason := unsupported_reason(backend, program):
+    if reason := refusal(backend, program):
         raise Unsupported(reason)
     scene, law = program.scene, program.contact
     assert isinstance(scene, MechanicalScene)
@@ -59,7 +59,7 @@ def build(backend: Any, program: Program) -> Any:
     if (path := scene.model_file()) is not None:
         return _as_written(str(path), scene, backend)
     model = mujoco.MjModel.from_xml_string(f'<mujoco><option gravity="0 0 0"/>{scene.mjcf()}</mujoco>')
-    expected = (scene.n_q, scene.n_q if scene.n_v is None else scene.n_v, scene.n_u)
+    expected = (scene.n_q, scene.n_v, scene.n_u)
     if (model.nq, model.nv, model.nu) != expected:
         raise ValueError(
             f"the twin of {scene.name} has (n_q, n_v, n_u) = {(model.nq, model.nv, model.nu)}, and the scene {expected}"
@@ -171,9 +171,7 @@ class Contacts:
     def touching(self, states: np.ndarray) -> np.ndarray:
         """Return which contacts act in the step from each state ``(T, n, B)``: boolean ``(T, n_contacts, B)``."""
         result = np.zeros((len(states), len(self._pairs), states.shape[-1]), dtype=bool)
-        for (t, column), q in self._positions(states):
-            self._data.qpos[:] = q
-            self._mujoco.mj_kinematics(self._model, self._data)
+        for t, column in self._placed(states):
             self._mujoco.mj_collision(self._model, self._data)
             for contact, _ in self._active():
                 result[t, contact, column] = True
@@ -182,9 +180,7 @@ class Contacts:
     def gaps(self, states: np.ndarray) -> np.ndarray:
         """Return the distance at which each contact would act, negative where it does, ``(T, n_contacts, B)`` [m]."""
         result = np.full((len(states), len(self._pairs), states.shape[-1]), np.nan)
-        for (t, column), q in self._positions(states):
-            self._data.qpos[:] = q
-            self._mujoco.mj_kinematics(self._model, self._data)
+        for t, column in self._placed(states):
             for i, pair in enumerate(self._pairs):
                 result[t, i, column] = self._mujoco.mj_geomDistance(self._model, self._data, *pair, FAR, None)
         return result
@@ -193,8 +189,7 @@ class Contacts:
         """Return the normal forces at the start of steps from ``(T, n, B)``, ``(T, n_contacts, B)`` [N]."""
         result = np.zeros((len(states), len(self._pairs), states.shape[-1]))
         force = np.zeros(6)
-        for (t, column), q in self._positions(states):
-            self._data.qpos[:], self._data.qvel[:] = q, states[t, self._model.nq :, column]
+        for t, column in self._placed(states):
             self._data.ctrl[:] = controls[t, :, column]
             self._mujoco.mj_forward(self._model, self._data)
             for contact, i in self._active():
@@ -202,11 +197,12 @@ class Contacts:
                 result[t, contact, column] += force[0]
         return result
 
-    def _positions(self, states: np.ndarray) -> Iterator[tuple[tuple[int, int], np.ndarray]]:
-        """Yield step, column and positions of each finite state."""
-        every = np.ascontiguousarray(np.moveaxis(states[:, : self._model.nq], 1, -1))
-        for t, column in np.argwhere(np.isfinite(every).all(axis=-1)).tolist():
-            yield (t, column), every[t, column]
+    def _placed(self, states: np.ndarray) -> Iterator[tuple[int, int]]:
+        """Set the simulation data to each state with finite positions, and yield its step and column."""
+        for t, column in np.argwhere(np.isfinite(states[:, : self._model.nq]).all(axis=1)).tolist():
+            self._data.qpos[:], self._data.qvel[:] = np.split(states[t, :, column], [self._model.nq])
+            self._mujoco.mj_kinematics(self._model, self._data)
+            yield t, column
 
     def _active(self) -> list[tuple[int, int]]:
         """Return the contacts that act, each with its number among the engine's, in the simulation data."""

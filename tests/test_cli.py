@@ -2,13 +2,13 @@
 
 import importlib
 import json
-import os
 import subprocess
 import sys
 
 import pandas as pd
 import pytest
 from bench.plugins.studies.bias_variance.columns import COLUMNS
+from trees import INHERITED
 
 from bench.cli import VERBS, main
 from bench.experiment.columns import IDENTITY
@@ -34,7 +34,7 @@ def test_run_then_report_then_plan(tmp_path, capsys):
     assert f"Page: {directory / 'report.html'}" in printed
 
     for path in directory.iterdir():
-        if path.name != "rows.parquet":
+        if path.is_file() and path.name != "rows.parquet":
             path.unlink()
     assert main(["report", *TINY, where, "sweep.sigma=[0.1,0.2]"]) == 0
     again = pd.read_csv(directory / "bias_variance.csv")
@@ -101,63 +101,12 @@ def test_identity_columns_tell_cells_apart(tmp_path):
     assert set(table["contact"]) == {"impulse", "impulse[time_of_impact=false]", "softplus[smooths=clip]", "softplus"}
 
 
-BAD = [
-    (["+experiment=stifness_sweep"], ["stifness_sweep", "'stiffness_sweep'"]),
-    (["scenes=[pushng]"], ["pushng", "'pushing'"]),
-    (["scenes=[]"], ["scenes is empty"]),
-    (["sweep.stifness=[1e3]"], ["stifness", "'stiffness'"]),
-    (["sweep.stiffness=[abc]"], ["stiffness", "must be a number"]),
-    (["sweep.stiffness=[-1]"], ["penalty.stiffness=-1", "greater than 0"]),
-    (["samples=0"], ["samples=0", "at least 1"]),
-    (["scene.pushing.mas=0.2"], ["mas", "'mass'"]),
-    (["scene.pushing.mass=heavy"], ["pushing.mass='heavy'", "a number"]),
-    (["scene.pushing=3"], ["scene.pushing=3", "parameter"]),
-    (["estimators=[reinforce[baseline=center]"], ["reinforce"]),
-    (["estimators=['reinforce[baseline=centre]']"], ["centre", "'center'"]),
-    (["name=../up"], ["name='../up'"]),
-    (["nonsense=1"], ["nonsense", "allowed"]),
-    (["rum"], ["rum", "'run'"]),
-    (["list", "fbog"], ["fbog", "'fobg'"]),
-    (["sweep={zip: {sigma: [0.1], horizon: [3, 4]}}"], ["equally long"]),
-    (["reference.samples=1"], ["reference.samples"]),
-    (["hydra.run.dir=/tmp"], ["Hydra"]),
-    (["-m", "+experiment=quick,stiffness_sweep"], ["multirun"]),
-    (["theta=[mas]"], ["'mas'", "'mass'"]),
-    (["theta=[mass]", "theta0=[1,2]"], ["theta0 has 2 values", "has 1"]),
-    (["theta0=[nan]"], ["theta0"]),
-    (["plugins=nowhere_at_all"], ["nowhere_at_all", "not a folder"]),
-    (["formats=[gif]"], ["gif", "png"]),
-    (["study='stability[diverge=3]'"], ["diverge", "'diverged'"]),
-    (["--config-dir", "nowhere_at_all", "+experiment=quick"], ["nowhere_at_all", "experiment"]),
-]
-
-
-@pytest.mark.parametrize(("words", "said"), BAD, ids=[" ".join(words) for words, _ in BAD])
-def test_bad_input(words, said, tmp_path, capsys):
-    extra = [] if words[0] in ("list", "check") else [f"results_dir={tmp_path / 'out'}"]
-    assert main([*words, *extra]) == 2
-    answer = capsys.readouterr()
-    assert answer.out == ""
-    message = answer.err.strip()
-    assert message.startswith("bench: ")
-    assert "Traceback" not in message
-    assert len(message.splitlines()) == 1
-    for part in said:
-        assert part in message
-    assert not (tmp_path / "out").exists()
-
-
 def test_results_directory_that_cannot_be_made(tmp_path, capsys):
     blocker = tmp_path / "file"
     blocker.write_text("mine")
     assert main([*TINY, f"results_dir={blocker}"]) == 2
     assert "cannot be written" in capsys.readouterr().err
     assert blocker.read_text() == "mine"
-
-
-def test_report_without_rows(tmp_path, capsys):
-    assert main(["report", *TINY, f"results_dir={tmp_path}"]) == 2
-    assert "no rows" in capsys.readouterr().err
 
 
 def test_help_names_the_experiments_and_fits_80_columns(capsys):
@@ -170,21 +119,6 @@ def test_help_names_the_experiments_and_fits_80_columns(capsys):
     assert [name for name in ("check ", "gradcheck ", "examine ", "trace ", "compare ") if f"\n  {name}" in family] == [
         "check ", "gradcheck ", "examine ", "trace "
     ]  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    ("words", "right"),
-    [
-        (["check", "mysim.py:cost"], "examine mysim.py:cost"),
-        (["gradcheck", "mysim.py:cost", "backends=[jax]"], "examine mysim.py:cost"),
-        (["gradcheck", "fobg"], "check fobg"),
-        (["examine", "pushing[horizon=3]", "theta=1"], "gradcheck pushing[horizon=3]"),
-        (["examine", "fobg"], "check fobg"),
-    ],
-)
-def test_the_subject_of_another_command_is_sent_there(words, right, capsys):
-    assert main(words) == 2
-    assert capsys.readouterr().err.strip().endswith(f"python -m bench {right}")
 
 
 def test_a_swept_axis_of_the_command_line_replaces_that_of_the_file(capsys):
@@ -210,14 +144,6 @@ def test_list_takes_a_kind(capsys):
     assert main(["list", "scenes"]) == 0
     kinds = [line for line in capsys.readouterr().out.splitlines() if line and not line.startswith(" ")]
     assert kinds == ["scenes"]
-
-
-@pytest.mark.parametrize("verb", ["gradcheck", "trace"])
-def test_a_scene_has_to_be_named(verb, capsys):
-    assert main([verb]) == 2
-    message = capsys.readouterr().err
-    assert "name a scene" in message
-    assert "python -m bench list scenes" in message
 
 
 @pytest.mark.slow
@@ -282,7 +208,6 @@ def test_a_thread_of_a_plugin_and_a_closed_stream_do_not_keep_a_command_waiting(
         cli.main = main
         command.command()
     """
-    inherited = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, sys.path))}
-    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=inherited, capture_output=True, timeout=500)
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=INHERITED, capture_output=True, timeout=500)
     assert done.returncode == 3
     assert done.stdout == b"all of it\n"

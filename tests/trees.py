@@ -41,6 +41,16 @@ class Tree:
         )
 
 
+INHERITED = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, sys.path))}
+"""The environment of commands in another folder."""
+
+
+def bench(*words, folder=None):
+    """Run ``python -m bench`` with these arguments in a folder."""
+    command = [sys.executable, "-m", "bench", *map(str, words)]
+    return subprocess.run(command, cwd=folder, env=INHERITED, capture_output=True, text=True, timeout=500)
+
+
 DEFAULT_SIGNALS = """
 import os, signal, sys
 for name in ("SIGINT", "SIGTERM", "SIGHUP"):

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 
 from bench.claims.claim import NOT_REPRODUCED, Claim, Figure, Outcome
-from bench.errors import local_path, printable
+from bench.errors import local_path
 
 __all__ = ["Claim", "Figure", "Outcome", "main"]
 
@@ -23,24 +23,21 @@ def main(words: Sequence[str]) -> int:
     claims = discovery.claims()
     selected = discovery.select(claims, names, "--quick" in options)
     if "--list" in options:
-        for line in tables.list_lines(selected):
-            print(printable(line) if not line.startswith("  ") else f"  {printable(line)}")
+        print("\n".join(tables.list_lines(selected)))
         return 0
     directory = local_path("results_dir", settings["results_dir"]) / "claims"
     make_directory(directory)
+    # the page also shows stored results of claims that this command does not name
     by_name = {name: results.read(directory, claim) for name, claim in claims.items()}
     for claim in selected:
         result = None if "--again" in options else by_name[claim.name]
         is_stored = result is not None
         if result is None:
             print(f"{claim.name} ...", file=sys.stderr, flush=True)
-            result = results.measure(claim)
+            result = by_name[claim.name] = results.measure(claim)
             results.store(directory, result)
-        for line in tables.result_lines(claim, result, is_stored):
-            print(line, flush=True)
-        by_name[claim.name] = result
-    # the page also shows stored results of claims that this command did not name
-    shown = [(claim, result) for name, claim in claims.items() if (result := by_name[name]) is not None]
+        print("\n".join(tables.result_lines(claim, result, is_stored)), flush=True)
+    shown = [(claims[name], result) for name, result in by_name.items() if result is not None]
     if shown:
         for path in page.write(directory, shown):
             print(f"  {path}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import sys
 from collections.abc import Mapping, Sequence
 
@@ -42,12 +41,12 @@ def claims() -> dict[str, type[Claim]]:
     return {claim.name: claim for claim in sorted(complete, key=_position)}
 
 
-def _position(claim: type[Claim]) -> tuple[int, str, int]:
+def _position(claim: type[Claim]) -> tuple[int, str, str, int]:
     """Return the sorting key of a claim: its lesson, then the letters and the number of its name."""
     lessons = list(LESSONS)
     lesson = lessons.index(claim.lesson) if claim.lesson in lessons else len(lessons)
-    letters, number = re.match(r"(\D*)(\d*)", claim.name).groups()  # type: ignore[union-attr]
-    return lesson, letters, int(number or 0)
+    letters = claim.name.rstrip("0123456789")
+    return lesson, claim.lesson, letters, int(claim.name[len(letters) :] or 0)
 
 
 def select(claims: Mapping[str, type[Claim]], names: Sequence[str], quick: bool) -> list[type[Claim]]:

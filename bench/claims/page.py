@@ -9,7 +9,7 @@ from bench.claims.tables import Results
 from bench.experiment.views import Views
 from bench.report.draw import draw
 from bench.report.figures import save, styled
-from bench.report.tables import csv
+from bench.report.tables import csv_blocks
 from bench.report.web.data import cells_data
 from bench.report.web.document import blocks
 from bench.report.writer import ANSWER, answer_json
@@ -34,8 +34,8 @@ def write(directory: Path, results: Results) -> list[Path]:
     views = Views([tables.claims_table(results)], headline=answer)
     content = {
         "claims.md": tables.markdown(results),
-        "claims.csv": csv(figures),
-        "claims.html": "".join(blocks(tables.TITLE, QUESTION, views, cells_data(cells, tables.FIGURE), drawn)),
+        "claims.csv": csv_blocks(figures),
+        "claims.html": blocks(tables.TITLE, QUESTION, views, cells_data(cells, tables.FIGURE), drawn),
         ANSWER: answer_json("claims", QUESTION, answer, drawn[0][0].name if drawn else ""),
     }
-    return write_all(directory, content)
+    return write_all(directory, content.items())

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterator, Sequence
+from itertools import groupby
 
 import numpy as np
 import pandas as pd
@@ -11,6 +13,7 @@ import pandas as pd
 from bench.claims.claim import VERDICTS, Claim, Figure
 from bench.claims.discovery import LESSONS
 from bench.claims.results import FAILED, ClaimResult
+from bench.errors import printable
 from bench.experiment.columns import Column, text
 from bench.experiment.views import Chart, Mark, Style, Table
 from bench.report.colours import estimator_colour, estimator_marker
@@ -80,11 +83,10 @@ def detectable_text(figure: Figure) -> str:
 
 def insensitive_text(figures: Sequence[Figure]) -> str:
     """Return a sentence on how many figures cannot detect an error of 5%, and why; empty if all can."""
-    limits = [figure.limitation for figure in figures if figure.limitation]
-    if not limits:
-        return ""
-    reasons = ", ".join(f"{limits.count(limit)} for {limit}" for limit in dict.fromkeys(limits))
-    return f"{len(limits)} of {counted(len(figures), 'figure')} cannot detect an error of 5%: {reasons}"
+    limits = Counter(figure.limitation for figure in figures if figure.limitation)
+    reasons = ", ".join(f"{count} for {limit}" for limit, count in limits.items())
+    of_all = f"{limits.total()} of {counted(len(figures), 'figure')}"
+    return f"{of_all} cannot detect an error of 5%: {reasons}" if limits else ""
 
 
 def readable_figures(figures: Sequence[Figure]) -> pd.DataFrame:
@@ -118,27 +120,18 @@ def figures_table(results: Results) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def by_lesson(results: Results) -> Iterator[tuple[str, str, Results]]:
-    """Yield each lesson, in order, with its summary and its claims."""
-    names = dict.fromkeys([*LESSONS, *(claim.lesson for claim, _ in results)])
-    for lesson in names:
-        own = [(claim, result) for claim, result in results if claim.lesson == lesson]
-        if own:
-            yield lesson, LESSONS.get(lesson, ""), own
-
-
 def count_verdicts(results: Results) -> str:
     """Return the number of claims per verdict, as text."""
-    tally = [(verdict, sum(result.verdict == verdict for _, result in results)) for verdict in (*VERDICTS, FAILED)]
-    counts = ", ".join(f"{count} {verdict}" for verdict, count in tally if count)
+    tally = Counter(result.verdict for _, result in results)
+    counts = ", ".join(f"{tally[verdict]} {verdict}" for verdict in (*VERDICTS, FAILED) if tally[verdict])
     return f"{counted(len(results), 'claim')}: {counts}"
 
 
 def markdown(results: Results) -> str:
     """Return the verdicts and figures as Markdown, by lesson."""
     parts = [f"# {TITLE}\n\n{count_verdicts(results)}\n"]
-    for lesson, summary, own in by_lesson(results):
-        parts.append(f"## {lesson}\n\n{summary}\n")
+    for lesson, own in groupby(results, lambda item: item[0].lesson):
+        parts.append(f"## {lesson}\n\n{LESSONS.get(lesson, '')}\n")
         for claim, result in own:
             parts.append(f"### {claim.name}: {result.verdict}\n\n{claim.statement} ({claim.source})\n")
             if result.figures:
@@ -159,9 +152,9 @@ def claims_table(results: Results) -> Table:
         (claim.lesson, claim.name, result.verdict, f"{claim.statement} ({claim.source})", result.remark)
         for claim, result in results
     ]
-    columns = [text("lesson"), text("claim"), text("verdict"), text("statement"), text("remark")]
-    frame = pd.DataFrame(lines, columns=[column.name for column in columns])
-    return Table("claims", frame, columns[1:], "Claims", page=True, split="lesson")
+    names = ["lesson", "claim", "verdict", "statement", "remark"]
+    frame = pd.DataFrame(lines, columns=names)
+    return Table("claims", frame, [*map(text, names[1:])], "Claims", page=True, split="lesson")
 
 
 def result_lines(claim: type[Claim], result: ClaimResult, is_stored: bool) -> Iterator[str]:
@@ -180,8 +173,8 @@ def result_lines(claim: type[Claim], result: ClaimResult, is_stored: bool) -> It
 
 def list_lines(claims: Sequence[type[Claim]]) -> Iterator[str]:
     """Yield the lines of ``--list``."""
-    for lesson in dict.fromkeys(claim.lesson for claim in claims):
-        yield f"{lesson}: {LESSONS.get(lesson, '')}"
-        for claim in claims:
-            if claim.lesson == lesson:
-                yield f"  {claim.name:<4} {'quick' if claim.quick else '     '}  {claim.statement} ({claim.source})"
+    for lesson, own in groupby(claims, lambda claim: claim.lesson):
+        yield printable(f"{lesson}: {LESSONS.get(lesson, '')}")
+        for claim in own:
+            quick = "quick" if claim.quick else "     "
+            yield f"  {claim.name:<4} {quick}  {printable(f'{claim.statement} ({claim.source})')}"

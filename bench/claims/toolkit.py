@@ -45,12 +45,12 @@ def problem(
     return compile_problem(scene, contact, integrator, backend, make=plugin)
 
 
-def native(scene: Scene | str, contact: str = "penalty") -> Problem:
+def native(scene: Scene | str, contact: str = "penalty", integrator: str = "semi_implicit_euler") -> Problem:
     """Compile a scene for thousands of small calls: as a native loop, or with JAX if the native library is missing."""
     try:
-        return problem(scene, contact, backend="fused")
+        return problem(scene, contact, "fused", integrator)
     except Unsupported:
-        return problem(scene, contact)
+        return problem(scene, contact, "jax", integrator)
 
 
 def function(cost: Callable[[Any, Array], Array], start: Any, sigma: float, continuous: bool = True) -> FunctionScene:
@@ -63,7 +63,7 @@ def function(cost: Callable[[Any, Array], Array], start: Any, sigma: float, cont
     return cast(FunctionScene, scene(sigma=sigma))
 
 
-def terms(problem: Problem, estimator: Estimator, w: np.ndarray, theta: np.ndarray | None = None) -> np.ndarray:
+def terms(problem: Problem, estimator: Estimator, w: np.ndarray, theta: np.ndarray | float | None = None) -> np.ndarray:
     """Return single-sample estimates ``(B, d)`` at ``theta``, by default ``theta0``, for noise ``w (n_w, B)``."""
     at = problem.program.theta0 if theta is None else np.atleast_1d(theta)
     return estimator.estimate(problem, at, w.T[:, None, :])
@@ -83,27 +83,14 @@ def hermite(count: int = 40) -> tuple[np.ndarray, np.ndarray]:
     return nodes[None], weights / weights.sum()
 
 
-def expectation(function: Callable[[np.ndarray], np.ndarray], count: int = 400_000) -> tuple[float, float]:
-    """Return E function(w) for one standard normal variable, and its error: the difference from a rule with other nodes.
-
-    ``function`` maps ``(1, B)`` to ``(B,)``. If it jumps, the error is about the weight of one node times the jump.
-    """
-    values = []
-    for n in (count, round(0.7 * count) | 1):
-        nodes, weights = rule(n)
-        values.append(float(function(nodes) @ weights))
-    return values[0], abs(values[0] - values[1])
-
-
 def moments(
     problem: Problem, estimator: Estimator, theta: np.ndarray | float | None = None, count: int = 400_000
 ) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return mean and per-sample variance of an estimator with one noise variable, each with its quadrature error."""
-    at = problem.program.theta0 if theta is None else np.atleast_1d(np.asarray(theta, dtype=float))
     results = []
     for n in (count, round(0.7 * count) | 1):
         nodes, weights = rule(n)
-        values = terms(problem, estimator, nodes, at)[:, 0]
+        values = terms(problem, estimator, nodes, theta)[:, 0]
         mean = float(values @ weights)
         results.append((mean, float((values - mean) ** 2 @ weights)))
     (mean, variance), (other_mean, other_variance) = results
@@ -124,20 +111,15 @@ def centre(values: np.ndarray) -> tuple[float, float]:
 
 def descend(
     step: Callable[[np.ndarray, int], np.ndarray], start: np.ndarray, rate: float, iterations: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the last point of gradient descent and the path ``(iterations + 1, ...)``. ``step(theta, i)`` is the gradient.
-
-    The optimizer ``gradient_descent`` takes the steps.
-    """
+) -> np.ndarray:
+    """Return the path ``(iterations + 1, ...)`` of the optimizer ``gradient_descent``; ``step(theta, i)`` is the gradient."""
     optimizer: Optimizer = plugin("optimizers", f"gradient_descent[rate={rate!r}]")
-    theta = np.array(start, dtype=float)
-    path, state = [theta.copy()], optimizer.start(theta.ravel())
+    path, state = [np.array(start, dtype=float)], optimizer.start(np.ravel(start))
     for i in range(iterations):
-        gradient = np.asarray(step(theta, i), dtype=float).reshape(-1, 1)
-        state = optimizer.tell(state, theta.reshape(-1, 1), Answer(gradient=gradient))
-        theta = state["theta"].reshape(theta.shape)
-        path.append(theta.copy())
-    return theta, np.array(path)
+        gradient = np.asarray(step(path[-1], i), dtype=float).reshape(-1, 1)
+        state = optimizer.tell(state, path[-1].reshape(-1, 1), Answer(gradient=gradient))
+        path.append(state["theta"].reshape(path[-1].shape))
+    return np.array(path)
 
 
 def exact_descent(
@@ -145,25 +127,19 @@ def exact_descent(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the last point ``(d,)`` of descent on the gradient without noise, and the cost of every so many steps."""
     still = np.zeros((problem.program.n_noise, 1))
-    end, path = descend(lambda theta, _: problem.grad(theta, still)[:, 0], start, rate, iterations)
+    path = descend(lambda theta, _: problem.grad(theta, still)[:, 0], start, rate, iterations)
     points = path[::every].T
-    return end, problem.value(points, np.repeat(still, points.shape[1], axis=1))
+    return path[-1], problem.value(points, np.repeat(still, points.shape[1], axis=1))
 
 
 def stochastic_descent(
-    problem: Problem,
-    zeroth: bool,
-    start: float,
-    rate: float,
-    iterations: int,
-    seed: int,
-    runs: int = 20,
-    samples: int = 50,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Descend on one variable in ``runs`` independent runs. Returns the last points ``(runs,)`` and the paths.
+    problem: Problem, zeroth: bool, start: float, rate: float, iterations: int, seed: int
+) -> np.ndarray:
+    """Descend on one variable in 20 independent runs. Returns their last points ``(20,)``.
 
-    A step uses the mean of ``samples`` terms of ``fobg`` or, with ``zeroth``, of ``reinforce``.
+    A step uses the mean of 50 terms of ``fobg`` or, with ``zeroth``, of ``reinforce``.
     """
+    runs, samples = 20, 50
     noise = np.random.default_rng(seed).standard_normal((iterations, 1, runs * samples))
     method = estimator("reinforce" if zeroth else "fobg")
     assert isinstance(method, SampleMean)
@@ -177,4 +153,5 @@ def stochastic_descent(
             values = np.concatenate([method.terms(problem, at[None], w)[0] for at, w in zip(theta, parts, strict=True)])
         return np.asarray(values.reshape(runs, samples).mean(axis=1))
 
-    return descend(step, np.full(runs, start), rate, iterations)
+    ends: np.ndarray = descend(step, np.full(runs, start), rate, iterations)[-1]
+    return ends

@@ -59,8 +59,7 @@ def main(words: Sequence[str]) -> int:
     if len(names) < 2:
         raise UserError("name two results or more, the oldest first: python -m bench history DIR DIR ... [out=DIR]")
     out = local_path("out", settings["out"])
-    for path in write(compute_history(names, [*map(read_results, names)]), out):
-        print(f"  {path}")
+    print("Written:", *write(compute_history(names, [*map(read_results, names)]), out), sep="\n  ")
     return 0
 
 

@@ -184,31 +184,19 @@ def value(row: Row, name: str) -> float:
     return float(row.get(name, math.nan))
 
 
-def _size_change(column: Column, old: Row, new: Row, is_changed: bool) -> Change | None:
-    was, now = value(old, column.name), value(new, column.name)
-    text = f"{rule_of(column).called} {number(was, 3)} to {number(now, 3)}"
-    return Change("worse" if now > was else "better", text) if is_changed else None
-
-
-def _interval(column: Column, old: Row, new: Row) -> Change | None:
-    return _size_change(column, old, new, _is_disjoint(column, old, new))
-
-
-def _spread(column: Column, old: Row, new: Row) -> Change | None:
-    was, now = value(old, column.name), value(new, column.name)
-    is_large = was > 0 and now > 0 and max(was, now) >= EFFECT * min(was, now)
-    return _interval(column, old, new) if is_large else None
-
-
-def _is_disjoint(column: Column, old: Row, new: Row) -> bool:
+def _size(column: Column, old: Row, new: Row) -> Change | None:
+    """Judge a number by its interval, by its factor, or by both (``spread``)."""
+    rule, was, now = rule_of(column), value(old, column.name), value(new, column.name)
     low, high = column.low or f"{column.name}_low", column.high or f"{column.name}_high"
-    return value(new, low) > value(old, high) or value(new, high) < value(old, low)
-
-
-def _exact(column: Column, old: Row, new: Row) -> Change | None:
-    was, now = value(old, column.name), value(new, column.name)
-    is_changed = abs(now - was) > ROUNDING and max(was, now) >= EFFECT * min(was, now)
-    return _size_change(column, old, new, is_changed)
+    is_apart = value(new, low) > value(old, high) or value(new, high) < value(old, low)
+    is_large = max(was, now) >= EFFECT * min(was, now)
+    is_changed = {
+        "interval": is_apart,
+        "spread": is_apart and is_large and was > 0 and now > 0,
+        "exact": is_large and abs(now - was) > ROUNDING,
+    }
+    text = f"{rule.called} {number(was, 3)} to {number(now, 3)}"
+    return Change("worse" if now > was else "better", text) if is_changed[rule.by] else None
 
 
 def distance(column: Column, old: Row, new: Row) -> float:
@@ -240,7 +228,7 @@ def _verdict(column: Column, old: Row, new: Row) -> Change | None:
 
 
 RULES: dict[str, Callable[[Column, Row, Row], Change | None]] = {
-    "interval": _interval, "spread": _spread, "exact": _exact, "vector": _vector, "verdict": _verdict,
+    "interval": _size, "spread": _size, "exact": _size, "vector": _vector, "verdict": _verdict,
 }  # fmt: skip
 
 

@@ -129,9 +129,7 @@ def show(comparison: Comparison, paths: Sequence[Path]) -> None:
         terminal.print_table(console, listed.head(PRINTED), least_important=("experiment",))
     if len(listed) > PRINTED:
         console.print(f"and {len(listed) - PRINTED} more in the files")
-    print("\nWritten:")
-    for path in paths:
-        print(f"  {path}")
+    print("\nWritten:", *paths, sep="\n  ")
 
 
 def _worst_first(table: pd.DataFrame) -> pd.DataFrame:

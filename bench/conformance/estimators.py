@@ -124,7 +124,7 @@ def skip_if_plain(estimator: Estimator, oracle: Oracle) -> None:
 
 def usable(estimator: Estimator, candidates: Iterable[Oracle]) -> Iterator[Oracle]:
     """Return the oracles that the estimator supports."""
-    return (oracle for oracle in candidates if estimator.unsupported_reason(oracle.problem.program) is None)
+    return (oracle for oracle in candidates if estimator.own_refusal(oracle.problem.program) is None)
 
 
 def draw_noise(oracle: Oracle, repeats: int, count: int, *key: str | int) -> np.ndarray:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import os
+import multiprocessing
 import pickle
-import subprocess
 import sys
+from concurrent.futures import ProcessPoolExecutor
 from functools import cache
+from pathlib import Path
 
-from bench.conformance.kit import require, variants, verifies
-from bench.conformance.subjects import available
+from bench.conformance.kit import Failed, require, variants, verifies
 from bench.model import Plugin, registry
 from bench.model.parameters import build, check, parameters
 
@@ -61,49 +61,28 @@ def declares_parameters(plugin: type[Plugin]) -> str:
 @verifies(Plugin)
 def survives_spawned_process(plugin: type[Plugin]) -> str:
     """Verify that every variant equals its copy that was pickled into a spawned process and back."""
-    registered = tuple(p for kind in registry.kinds() for p in available(kind))
-    fault = _round_trips(registered if plugin in registered else (plugin,))[plugin]
-    require(not fault, fault)
+    own = list(variants(plugin).values())
+    try:
+        text = pickle.dumps(own)
+    except Exception as error:
+        raise Failed(f"cannot be pickled: {error}") from error
+    try:
+        reply = _spawned().submit(_echo, registry.folders(), text).result()
+    except Exception as error:
+        raise Failed(f"cannot be unpickled in a spawned process: {type(error).__name__}: {error}") from error
+    require(pickle.loads(reply) == own, "returns from a spawned process as a different value")
     return "pickled there and back"
 
 
 @cache
-def _round_trips(plugins: tuple[type[Plugin], ...]) -> dict[type[Plugin], str]:
-    """Return the fault of each plugin when pickled into a spawned process and back; empty if the copy is equal."""
-    faults = dict.fromkeys(plugins, "")
-    sent: dict[type[Plugin], bytes] = {}
-    for plugin in plugins:
-        try:
-            sent[plugin] = pickle.dumps(list(variants(plugin).values()))
-        except Exception as error:
-            faults[plugin] = f"cannot be pickled: {error}"
-    child = subprocess.run(
-        [sys.executable, "-c", "from bench.conformance.generic import _echo; _echo()"],
-        input=pickle.dumps((registry.folders(), list(sent.values()))),
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
-        capture_output=True,
-    )
-    if child.returncode:
-        raise RuntimeError(child.stderr.decode(errors="replace").strip().rpartition("\n")[2])
-    replies = pickle.loads(child.stdout)
-    for plugin, reply in zip(sent, replies, strict=True):
-        if isinstance(reply, str):
-            faults[plugin] = f"cannot be unpickled in a spawned process: {reply}"
-        elif pickle.loads(reply) != list(variants(plugin).values()):
-            faults[plugin] = "returns from a spawned process as a different value"
-    return faults
+def _spawned() -> ProcessPoolExecutor:
+    """Return the process in which plugins are unpickled; it starts at the first."""
+    return ProcessPoolExecutor(1, multiprocessing.get_context("spawn"))
 
 
-def _echo() -> None:
-    """Unpickle each item of the list on standard input, and pickle it to standard output; runs in the spawned process."""
-    folders, texts = pickle.load(sys.stdin.buffer)
+def _echo(folders: tuple[Path, ...], text: bytes) -> bytes:
+    """Unpickle a text, and pickle the result; runs in the spawned process."""
     for folder in folders:
         registry.add_folder(folder)
-    replies: list[bytes | str] = []
-    for text in texts:
-        try:
-            with contextlib.redirect_stdout(sys.stderr):
-                replies.append(pickle.dumps(pickle.loads(text)))
-        except Exception as error:
-            replies.append(f"{type(error).__name__}: {error}")
-    sys.stdout.buffer.write(pickle.dumps(replies))
+    with contextlib.redirect_stdout(sys.stderr):
+        return pickle.dumps(pickle.loads(text))

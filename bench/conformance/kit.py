@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import signal
 import sys
 import threading
 import time
@@ -19,6 +18,7 @@ from bench.errors import failure, unknown
 from bench.model import Plugin, registry
 from bench.model.identity import identity
 from bench.model.parameters import build, parameters
+from bench.simulator.clock import Clock, OutOfTime
 
 
 @dataclass(frozen=True)
@@ -37,10 +37,6 @@ class Failed(Exception):
 
 class Skipped(Exception):
     """Raised when a check does not apply to the plugin."""
-
-
-class OutOfTime(BaseException):
-    """Raised in a check that has reached its time limit. A BaseException, since a plugin may catch Exception."""
 
 
 Check = Callable[[Any], str]
@@ -117,7 +113,7 @@ def _results(
             _show(f"\r\033[Kcheck {index + 1} of {len(items)}: {name} {function.__name__}")
         started = time.perf_counter()
         try:
-            with _time_limit(limit, f"fail  {name} {function.__name__}"):
+            with _time_limit(limit, f"fail  {name} {function.__name__}") if limit else contextlib.nullcontext():
                 result = _outcome(function, subject, name)
         except OutOfTime:
             close_engines()  # an interrupted call leaves its answer in the pipe
@@ -136,29 +132,21 @@ def _show(text: str) -> None:
 
 
 @contextlib.contextmanager
-def _time_limit(limit: float | None, label: str) -> Iterator[None]:
+def _time_limit(limit: float, label: str) -> Iterator[None]:
     """Raise :class:`OutOfTime` in the block after ``limit`` seconds; end the process if compiled code does not return."""
-    if limit is None or threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def stop(*_: Any) -> None:
-        raise OutOfTime
 
     def end() -> None:
         sys.stdout.flush()
         print(f"{label}: compiled code did not return within {limit + GRACE_S:g} s: the run ends here", flush=True)
         os._exit(1)
 
-    before, last = signal.signal(signal.SIGALRM, stop), threading.Timer(limit + GRACE_S, end)
+    last = threading.Timer(limit + GRACE_S, end)
     last.daemon = True
     last.start()
-    signal.setitimer(signal.ITIMER_REAL, limit)
     try:
-        yield
+        with Clock(limit).interrupt_when_over():
+            yield
     finally:
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
-        signal.signal(signal.SIGALRM, before)
         last.cancel()
 
 

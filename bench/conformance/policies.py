@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from bench.conformance.kit import Skipped, require, verifies
-from bench.conformance.subjects import DIFFERENCED, ROUNDED, available, distance, rng
+from bench.conformance.subjects import ROUNDED, agree, available, rng
+from bench.gradient import Options, check
 from bench.model import Policy
 
 INPUTS, OUTPUTS, COLUMNS = 3, 2, 5
@@ -14,8 +15,6 @@ MANY = 40
 """Number of columns in which every unit of a network is active somewhere."""
 ACTIVE = 0.75
 """Least share of the parameters that must move a control."""
-STEP = 1e-6
-"""Relative step of the central differences."""
 
 
 def _subject(policy: Policy, columns: int = COLUMNS) -> tuple[np.ndarray, np.ndarray]:
@@ -43,13 +42,16 @@ def shared_theta_acts_like_columns(policy: Policy) -> str:
     shared = policy.act(np, theta[:, :1], observations)
     repeated = policy.act(np, np.repeat(theta[:, :1], COLUMNS, axis=1), observations)
     require(shared.shape == (OUTPUTS, COLUMNS), f"controls are {shared.shape}, not {(OUTPUTS, COLUMNS)}")
-    off = distance(shared, repeated)
-    require(off < ROUNDED, f"a shared theta and its copies differ by {off:.1e}")
+    off = agree(shared, repeated, ROUNDED, "a shared theta and its copies differ")
     changed = observations.copy()
     changed[:, 2] += 1.0
     others = np.arange(COLUMNS) != 2
-    off = distance(policy.act(np, theta, changed)[:, others], policy.act(np, theta, observations)[:, others])
-    require(off < ROUNDED, "a column changes the controls of others")
+    off = agree(
+        policy.act(np, theta, changed)[:, others],
+        policy.act(np, theta, observations)[:, others],
+        ROUNDED,
+        "a column changes the controls of others",
+    )
     return f"to {off:.0e}"
 
 
@@ -63,16 +65,14 @@ def derivatives_agree(policy: Policy) -> str:
 
     jax.config.update("jax_enable_x64", True)
     theta, observations = _subject(policy, MANY)
-    theta, weights = theta[:, :1], rng("weights").standard_normal((OUTPUTS, MANY))
+    weights = rng("weights").standard_normal((OUTPUTS, MANY))
 
-    def total(theta: np.ndarray) -> float:
-        return float((weights * policy.act(np, theta, observations)).sum())
+    def cost(thetas: np.ndarray) -> np.ndarray:
+        return np.array([(weights * policy.act(np, theta[:, None], observations)).sum() for theta in thetas.T])
 
-    exact = np.asarray(jax.grad(lambda theta: (weights * policy.act(jnp, theta, observations)).sum())(theta))[:, 0]
-    steps = STEP * np.eye(len(theta))[:, :, None]
-    differences = np.array([(total(theta + step) - total(theta - step)) / (2 * STEP) for step in steps])
-    off = float(np.abs(exact - differences).max() / np.abs(differences).max())
-    require(off < DIFFERENCED, f"the derivatives differ from differences by {off:.1e}")
-    share = float(np.mean(differences != 0))  # a rectified unit may be inactive at every observation
+    exact = jax.grad(lambda theta: (weights * policy.act(jnp, theta[:, None], observations)).sum())
+    found = check(cost, lambda theta: np.asarray(exact(theta)), theta[:, 0], Options(components=len(theta), draws=0))
+    require(found.trusted, found.sentence())
+    share = np.mean([part.verdict != "zero" for part in found.components])  # a rectified unit may be always inactive
     require(share > ACTIVE, f"only {share:.0%} of {len(theta)} parameters move a control")
-    return f"{len(theta)} parameters, to {off:.0e}"
+    return f"{len(theta)} parameters, {found.cause}"

@@ -18,6 +18,7 @@ from bench.conformance.subjects import (
     ROUNDED,
     SAME,
     able_backend,
+    agree,
     available,
     backends,
     can_run,
@@ -87,8 +88,7 @@ def costs_are_finite(scene: Scene) -> str:
         require(np.isfinite(cost).all(), f"{describe(program)}: {(~np.isfinite(cost)).sum()} costs are not finite")
         other = problem.value(*with_changed_column(theta, w))
         kept = np.arange(COLUMNS) != 2
-        off = distance(other[kept], cost[kept])
-        require(off < ROUNDED, f"{describe(program)}: a column changes the cost of others")
+        agree(other[kept], cost[kept], ROUNDED, f"{describe(program)}: a column changes the cost of others")
     return f"{cost.mean():.4g} on average, {len(subjects)} programs"
 
 
@@ -122,8 +122,12 @@ def noise_is_where_declared(scene: Scene) -> str:
     require(program.n_noise == wanted, f"{program.n_noise} normal numbers for {program.dim} components of theta")
     (theta, w), problem = samples(program), able_backend(program).compile(program)
     shift = scene.sigma * w[: program.dim]
-    off = distance(problem.value(theta + shift, problem.centred(w)), problem.value(theta, w))
-    require(off < SAME, f"noise w and a step of sigma w in theta differ by {off:.1e}: theta and the controls differ")
+    off = agree(
+        problem.value(theta + shift, problem.centred(w)),
+        problem.value(theta, w),
+        SAME,
+        "noise w and a step of sigma w in theta differ: theta and the controls differ",
+    )
     return f"on theta, to {off:.0e}"
 
 
@@ -253,25 +257,17 @@ def score_gives_the_gradient(scene: Scene) -> str:
 
 
 @verifies(Scene)
-def physical_gradient_is_finite(scene: Scene) -> str:
-    """Verify that the physical gradient, if the scene declares one, has shape ``(d,)`` and is finite."""
-    gradient = scene.physical_gradient()
-    if gradient is None:
-        raise Skipped("has none")
-    require(gradient.shape == scene.theta0().shape, f"shape {gradient.shape}, not {scene.theta0().shape}")
-    require(np.isfinite(gradient).all(), f"{gradient} is not finite")
-    return f"norm {np.linalg.norm(gradient):.4g}"
-
-
-@verifies(Scene)
 def physical_gradient_is_the_limit(scene: Scene) -> str:
     """Verify that the cost's slope converges to the physical gradient as time steps get finer, under at least one law.
 
     Another law may converge to another slope, such as a spring that approximates a rigid impact. The check is skipped
     if the slopes converge under no law.
     """
-    if scene.physical_gradient() is None:
+    gradient = scene.physical_gradient()
+    if gradient is None:
         raise Skipped("has none")
+    require(gradient.shape == scene.theta0().shape, f"shape {gradient.shape}, not {scene.theta0().shape}")
+    require(np.isfinite(gradient).all(), f"{gradient} is not finite")
     apart: dict[str, float] = {}
     for law, integrator in _towards_physics(scene):
         ratios = []
@@ -343,7 +339,7 @@ def state_has_declared_size(scene: MechanicalScene) -> str:
     """Verify that the initial state is ``q (n_q, B)`` and ``v (n_v, B)``."""
     require(hasattr(scene, "n_q"), "does not declare the length of q: set the class variable n_q")
     state = scene.initial_state(np, scene.theta0()[:, None])
-    n_v = scene.n_q if scene.n_v is None else scene.n_v
+    n_v = scene.n_v
     require(state.q.shape == (scene.n_q, 1), f"n_q = {scene.n_q}, but q has shape {state.q.shape} for one column")
     require(state.v.shape == (n_v, 1), f"v should have length {n_v}, but has shape {state.v.shape} for one column")
     return f"n_q = {scene.n_q}, n_v = {n_v}"

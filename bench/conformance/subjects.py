@@ -226,6 +226,13 @@ def distance(actual: np.ndarray, expected: np.ndarray) -> float:
     return float(np.abs(actual - expected).max() / scale)
 
 
+def agree(actual: np.ndarray, expected: np.ndarray, tolerance: float, what: str) -> float:
+    """Return :func:`distance`; raises :class:`Failed` with ``what`` and the distance unless it is below the tolerance."""
+    off = distance(actual, expected)
+    require(off < tolerance, f"{what}: off by {off:.1e}")
+    return off
+
+
 def standard_errors(difference: np.ndarray, error: np.ndarray, tolerance: np.ndarray | float) -> np.ndarray:
     """Return the excess of ``difference (d,)`` over a tolerance for rounding, in standard errors ``error (d,)``.
 

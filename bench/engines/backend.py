@@ -54,7 +54,7 @@ class EngineBackend(Backend):
 
     def compile(self, program: Program) -> Problem:
         """Return the program as a problem; the engine is started when it is first called."""
-        if reason := self.unsupported_reason(program):
+        if reason := self.own_refusal(program):
             raise Unsupported(reason)
         if reason := self.unavailable_reason():
             raise Unavailable(reason)
@@ -72,20 +72,20 @@ class EngineBackend(Backend):
         except Unavailable:
             return {}
 
-    def unsupported_reason(self, program: Program) -> str | None:
+    def own_refusal(self, program: Program) -> str | None:
         """Return why the engine cannot run the program, or None."""
-        if reason := self.unsupported_model(self.name, program, "", self.integrator, self.laws, self.damping_mode):
+        if reason := self.model_refusal(self.name, program, "", self.integrator, self.laws, self.damping_mode):
             return reason
         try:
             model = twin.read(program.scene.mjcf())  # type: ignore[attr-defined]
             if not self.has_friction and any(contact["friction"] for contact in model["contacts"]):
                 return f"{self.name} runs contacts without friction only"
-            return self.unsupported_twin(program, model)
+            return self.twin_refusal(program, model)
         except Unsupported as error:
             return str(error)
 
     @staticmethod
-    def unsupported_model(
+    def model_refusal(
         name: str, program: Program, own: str, integrator: str, laws: tuple[str, ...], damping_mode: str | None
     ) -> str | None:
         """Return why the engine ``name`` has no model of a program, or None.
@@ -110,7 +110,7 @@ class EngineBackend(Backend):
             return None
         return f"{name} supports {f'damping_mode={damping_mode}' if damping_mode else 'no damping'} only, not {mode}"
 
-    def unsupported_twin(self, program: Program, model: dict[str, Any]) -> str | None:
+    def twin_refusal(self, program: Program, model: dict[str, Any]) -> str | None:
         """Return why the engine cannot run a program with the twin ``model`` of :func:`bench.engines.twin.read`, or None."""
         return None
 

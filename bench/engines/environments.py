@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import subprocess
@@ -9,12 +10,13 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from bench.engines.process import run_python
-from bench.errors import Unavailable, UserError
+from bench.errors import Unavailable, UserError, printable
 from bench.model.parameters import remember
 
 FOLDER = "BENCH_ENGINES"
 """Environment variable with the folder that contains the environments."""
+LIMIT_S = 60.0
+"""Seconds allowed for a Python to state its versions."""
 VERSIONS = """
 import importlib.metadata, json, platform, sys
 found = {"python": platform.python_version()}
@@ -46,10 +48,15 @@ def library_versions(python: str, libraries: tuple[str, ...]) -> dict[str, str]:
 
     Raises :class:`Unavailable` if it is not a Python.
     """
-    versions = run_python(python, VERSIONS, *libraries)
-    if not isinstance(versions, dict):
-        raise Unavailable("it is not a working Python")
-    return {str(name): str(version) for name, version in versions.items()}
+    words = [python, "-I", "-c", VERSIONS, *libraries]
+    try:
+        done = subprocess.run(words, capture_output=True, timeout=LIMIT_S, stdin=subprocess.DEVNULL)
+        return {str(name): str(version) for name, version in json.loads(done.stdout).items()}
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise Unavailable(f"it cannot be started ({printable(error)[:200]})") from error
+    except ValueError:
+        output = printable((done.stderr or done.stdout).decode(errors="replace"))[-200:]
+        raise Unavailable(f"it is not a working Python (its output: {output or 'none'})") from None
 
 
 def missing(engine: str, python: str | None, libraries: Sequence[str]) -> str | None:

@@ -8,15 +8,13 @@ from __future__ import annotations
 
 import atexit
 import contextlib
-import fcntl
 import itertools
-import json
 import os
 import signal
 import subprocess
 import tempfile
 import threading
-from dataclasses import dataclass
+from multiprocessing import Pipe
 from pathlib import Path
 from typing import Any
 
@@ -26,63 +24,37 @@ from bench.engines import server
 from bench.errors import Crashed, Unavailable, Unsupported, printable
 from bench.model import guard
 
-PIPE_BYTES = 1 << 20
-"""Capacity requested for a pipe: fewer system calls for large arrays."""
 TAIL = 2000
 """Bytes of an engine's last output that a message quotes."""
 EXIT_S = 5.0
-"""Seconds allowed for an engine to end after it has closed its pipe."""
+"""Seconds allowed for an engine to end after it has closed its connection."""
+CLOSED = (EOFError, OSError)
+"""Raised when an engine's process has ended."""
 
 _running: dict[tuple[str, str], EngineProcess] = {}
 _keys = itertools.count()
 _lock = threading.Lock()
 
 
-@dataclass(frozen=True)
-class Reply:
-    """An engine's answer to a call."""
-
-    arrays: list[np.ndarray]
-    engine_s: float
-    """Seconds of the engine's own work."""
-    width: int
-    """Number of columns that the engine computed together."""
-    is_first: bool
-    """Whether it was the model's first call of this kind and width, which may have compiled."""
-    peak_memory_mb: float
-    """Largest resident memory of the engine's process so far."""
-
-
 class EngineProcess:
-    """The process of an engine's file in the Python ``python``. Output that it prints goes to a temporary file."""
+    """The process of an engine's file in the Python ``python``. Output that it prints goes to a temporary file.
+
+    It ends when its input, which this process holds open, is closed.
+    """
 
     def __init__(self, python: str, file: Path) -> None:
         self._output = tempfile.TemporaryFile()  # noqa: SIM115, it is closed with the process
-        (theirs_in, self._requests), (self._answers, theirs_out), (life, self._life) = (os.pipe() for _ in range(3))
-        given = (theirs_in, theirs_out, life)
-        for descriptor in (self._requests, self._answers):
-            with contextlib.suppress(OSError, AttributeError):
-                fcntl.fcntl(descriptor, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
-        words = [python, "-I", server.__file__, str(file), *map(str, given)]
+        self.connection, theirs = Pipe()
+        words, place = [python, "-I", server.__file__, str(file), str(theirs.fileno())], theirs.fileno()
         try:
             self.process = subprocess.Popen(
-                words, pass_fds=given, stdin=subprocess.DEVNULL, stdout=self._output, stderr=self._output
+                words, pass_fds=[place], stdin=subprocess.PIPE, stdout=self._output, stderr=self._output
             )
         except OSError as error:
-            self._close_descriptors()
             raise Unavailable(f"python={python} cannot be started: {error.strerror}") from error
         finally:
-            for descriptor in given:
-                os.close(descriptor)
-        self.models: dict[int, str] = {}
-        """The device of each model that was built, by key."""
+            theirs.close()
         guard.SPARED.add(self.process.pid)
-
-    def call(self, header: dict[str, Any], arrays: list[np.ndarray]) -> tuple[dict[str, Any], list[np.ndarray]]:
-        """Return the answer to a request; raises ``server.Closed`` if the process has ended."""
-        server.send(self._requests, header, arrays)
-        answer: tuple[dict[str, Any], list[np.ndarray]] = server.receive(self._answers)
-        return answer
 
     def end(self) -> str:
         """End the process, if it has not ended, and return how it ended, with its last output."""
@@ -96,16 +68,11 @@ class EngineProcess:
         return f"{text}; its last output: {output[-500:] or 'none'}"
 
     def kill(self) -> None:
-        """Kill the process and close its pipes."""
+        """Kill the process and close its connection."""
         self.process.kill()
-        self.process.wait()
+        self.process.communicate()
         guard.SPARED.discard(self.process.pid)
-        self._close_descriptors()
-
-    def _close_descriptors(self) -> None:
-        for descriptor in (self._requests, self._answers, self._life):
-            with contextlib.suppress(OSError):
-                os.close(descriptor)
+        self.connection.close()
         self._output.close()
 
 
@@ -118,53 +85,49 @@ class EngineModel:
         self.device = "cpu"
         self.settings: dict[str, str] = {}
         """The engine's settings that can change its last digits, by name."""
-        self.has_carry: bool | None = None
-        """Whether steps read and write numbers beside the states; None before the first call."""
         self.build_s = 0.0
         """Seconds of the last start of the engine, with its imports, and of building the model."""
 
-    def call(self, name: str, *arrays: np.ndarray) -> Reply:
-        """Return the result of ``start``, ``step``, ``rollout``, ``jacobians`` or ``pull``.
+    def call(self, name: str, *arrays: np.ndarray) -> tuple[dict[str, Any], list[np.ndarray]]:
+        """Return the answer to ``step``, ``rollout`` or ``jacobians``, and its arrays.
 
-        Raises :class:`Crashed` if the engine's process ends during the call, also in a second process.
+        The answer has the engine's ``seconds``, the ``width`` of its batches, ``peak_memory_mb``, and ``is_first``: whether
+        it was the model's first call of this kind and width, which may have compiled. Raises :class:`Crashed` if the
+        engine's process ends during the call, also in a second process.
         """
         with _lock:
             try:
                 return self._call(name, arrays)
-            except server.Closed:
+            except CLOSED:
                 self._end()
             try:
                 return self._call(name, arrays)
-            except server.Closed as error:
+            except CLOSED as error:
                 reason = self._end()
                 raise Crashed(f"the process of engine {self._name} ended twice during {name}: {reason}") from error
 
-    def _call(self, name: str, arrays: tuple[np.ndarray, ...]) -> Reply:
-        process = _running.get(self._place)
-        if process is None:
-            process = _running[self._place] = EngineProcess(self._python, self._file)
-        while True:
-            if self._key not in process.models:
-                answer, _ = process.call({"call": "build", "model": self._key, "description": self._description}, [])
-                self._raise(answer)
-                process.models[self._key] = self.device = answer["device"]
-                self.settings = answer["settings"]
-                self.build_s, self.has_carry = answer["seconds"], answer["has_carry"]
-            answer, results = process.call({"call": name, "model": self._key}, list(arrays))
-            self._raise(answer)
-            if not answer.get("is_unknown"):
-                break
-            del process.models[self._key]
-        return Reply(results, answer["seconds"], answer["width"], answer["is_first"], answer["peak_memory_mb"])
+    def _call(self, name: str, arrays: tuple[np.ndarray, ...]) -> tuple[dict[str, Any], list[np.ndarray]]:
+        if self._place not in _running:
+            _running[self._place] = EngineProcess(self._python, self._file)
+        answer, results = self._ask({"call": name}, list(arrays))
+        if "is_unknown" in answer:  # not built yet, or dropped by its process
+            built, _ = self._ask({"call": "build", "description": self._description}, [])
+            self.device, self.settings, self.build_s = built["device"], built["settings"], built["seconds"]
+            answer, results = self._ask({"call": name}, list(arrays))
+        return answer, results
+
+    def _ask(self, request: dict[str, Any], arrays: list[np.ndarray]) -> tuple[dict[str, Any], list[np.ndarray]]:
+        connection = _running[self._place].connection
+        connection.send(({**request, "model": self._key}, arrays))
+        answer, results = connection.recv()
+        if "error" in answer:
+            error = {"unsupported": Unsupported, "unavailable": Unavailable}.get(answer["kind"], EngineError)
+            raise error(f"engine {self._name}: {printable(answer['error'])} ({answer['places']})")
+        return answer, results
 
     def _end(self) -> str:
         process = _running.pop(self._place, None)
         return process.end() if process is not None else "it did not start"
-
-    def _raise(self, answer: dict[str, Any]) -> None:
-        if "error" in answer:
-            error = {"unsupported": Unsupported, "unavailable": Unavailable}.get(answer["kind"], EngineError)
-            raise error(f"engine {self._name}: {printable(answer['error'])} ({answer['places']})")
 
     @property
     def _place(self) -> tuple[str, str]:
@@ -183,17 +146,3 @@ def close_engines() -> None:
 
 atexit.register(close_engines)
 os.register_at_fork(after_in_child=_running.clear)  # a forked process starts engines of its own
-
-
-def run_python(python: str, program: str, *arguments: str, timeout: float = 60.0) -> Any:
-    """Return what a short program prints as JSON in another Python; raises :class:`Unavailable` where it fails."""
-    words = [python, "-I", "-c", program, *arguments]
-    try:
-        result = subprocess.run(words, capture_output=True, timeout=timeout, stdin=subprocess.DEVNULL)
-    except (OSError, subprocess.TimeoutExpired) as error:
-        raise Unavailable(f"it cannot be started ({printable(error)[:200]})") from error
-    try:
-        return json.loads(result.stdout)
-    except ValueError:
-        output = printable((result.stderr or result.stdout).decode(errors="replace"))[-200:]
-        raise Unavailable(f"it is not a working Python (its output: {output or 'none'})") from None

@@ -1,16 +1,12 @@
 """Runs in the Python of an engine's environment: answers calls of the engine's model over pipes. Requires only NumPy.
 
-A message is a header (JSON) followed by the bytes of its arrays. An engine's file defines a class ``Model``, built from the
+A message is a dictionary and a list of arrays. An engine's file defines a class ``Model``, built from the
 description of a program, with
 
 - ``step(x, u)``: the states ``(n, B)`` after one step from states x and controls ``u (m, B)``;
 - ``jacobians(x, u)``: its derivatives ``(n, n, B)`` by x and ``(n, m, B)`` by u, or ``pull(x, u, slope)``: the derivatives
   ``(n, B)`` by x and ``(m, B)`` by u of the sum of ``slope * step(x, u)``, which repeats the step under a tape of its own;
   one is made from the other; neither if the engine has no derivatives;
-- ``rollout(x, u)``, optional: the states ``(T + 1, n, B)`` under controls ``(T, m, B)``, otherwise T steps;
-- ``start(x)``, optional, for engines with numbers beside (q, v) that a step reads and writes, such as caches: their first
-  values ``(k, B)``. Then ``step(x, u, carry)`` returns states and carry, ``rollout(x, u, carry)`` states and carries
-  ``(T + 1, k, B)``, and derivatives get the carry before ``slope`` and are derivatives at constant carry;
 - ``takes_forces``, optional: whether u are the generalised forces ``(n_q, B)`` of motors, springs and dampers, in place of
   the controls;
 - ``widths``, optional: the batch sizes B that it can compute, otherwise all;
@@ -20,192 +16,97 @@ description of a program, with
 The file may import its libraries, and other files of its folder.
 """
 
+import contextlib
 import importlib.util
-import json
 import os
 import resource
 import signal
-import struct
 import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from multiprocessing.connection import Connection
 from typing import Any
 
 import numpy as np
 
-LENGTHS = struct.Struct(">QQ")
-"""The lengths in bytes of a message's header and of all its arrays."""
 KEPT = 4
 """Number of models that a server stores."""
 SETTINGS = ("OMP_NUM_THREADS", "XLA_FLAGS", "JAX_PLATFORMS", "CUDA_VISIBLE_DEVICES")
 """Environment variables that can change an engine's last digits."""
 
 
-class Closed(Exception):
-    """Raised when the other end of a pipe is closed."""
-
-
-def send(descriptor: int, header: dict[str, Any], arrays: Sequence[np.ndarray] = ()) -> None:
-    """Write a message: a header that JSON can encode, and arrays."""
-    arrays = [np.ascontiguousarray(array) for array in arrays]
-    text = json.dumps({**header, "arrays": [[array.dtype.str, array.shape] for array in arrays]}).encode()
-    parts: list[bytes | memoryview] = [LENGTHS.pack(len(text), sum(array.nbytes for array in arrays)) + text]
-    parts += [array.reshape(-1).view(np.uint8).data for array in arrays if array.size]
-    try:
-        for part in parts:
-            view = memoryview(part)
-            while view:
-                view = view[os.write(descriptor, view) :]
-    except OSError as error:
-        raise Closed from error
-
-
-def receive(descriptor: int) -> tuple[dict[str, Any], list[np.ndarray]]:
-    """Return the header and the arrays of the next message."""
-    length, n_bytes = LENGTHS.unpack(_read(descriptor, LENGTHS.size))
-    header = json.loads(bytes(_read(descriptor, length)))
-    content, arrays, start = _read(descriptor, n_bytes), [], 0
-    for kind, shape in header.pop("arrays"):
-        dtype, count = np.dtype(kind), int(np.prod(shape))
-        arrays.append(np.frombuffer(content, dtype, count, start).reshape(shape))
-        start += count * dtype.itemsize
-    return header, arrays
-
-
-def _read(descriptor: int, count: int) -> bytearray:
-    content = bytearray(count)
-    view = memoryview(content)
-    while view:
-        try:
-            n_read = os.readv(descriptor, [view])
-        except OSError as error:
-            raise Closed from error
-        if not n_read:
-            raise Closed
-        view = view[n_read:]
-    return content
-
-
-# --------------------------------------------------------------------------------------------------------- calls
-
-
-def call(model: Any, name: str, arrays: list[np.ndarray]) -> tuple[list[np.ndarray], int]:
-    """Return the arrays that a call of the model results in, and the width of its batches."""
-    functions: dict[str, Callable[..., list[np.ndarray]]] = {
-        "start": _start,
-        "step": _step,
-        "rollout": _rollout,
-        "jacobians": _jacobians,
-        "pull": _pull,
-    }
-    function = functions[name]
-    n_columns = arrays[0].shape[-1]
-    widths = sorted(getattr(model, "widths", None) or [n_columns])
-    width = next((width for width in widths if width >= n_columns), widths[-1])
-    blocks = []
-    for start in range(0, n_columns, width):
-        part = [array[..., start : start + width] for array in arrays]
-        missing = width - part[0].shape[-1]
-        padded = [
-            np.concatenate([x, np.repeat(x[..., -1:], missing, axis=-1)], axis=-1) if missing else x for x in part
-        ]
-        valid = np.all([np.isfinite(x).reshape(-1, width).all(axis=0) for x in padded], axis=0)
-        if not valid.all():  # engines raise errors or hang where numbers are not finite
-            padded = [np.where(valid, x, 0.0) for x in padded]
-        results = function(model, *(np.ascontiguousarray(x) for x in padded))
-        kept = [np.where(valid, np.asarray(x, dtype=np.float64), np.nan) for x in results]
-        blocks.append([x[..., : width - missing] for x in kept])
-    return [np.concatenate(parts, axis=-1) for parts in zip(*blocks, strict=True)], width
-
-
-def _start(model: Any, x: np.ndarray) -> list[np.ndarray]:
-    return [model.start(x) if hasattr(model, "start") else np.empty((0, x.shape[1]))]
-
-
-def _step(model: Any, x: np.ndarray, u: np.ndarray, *carry: np.ndarray) -> list[np.ndarray]:
-    after = model.step(x, u, *carry)
-    return list(after) if carry else [after]
-
-
-def _rollout(model: Any, x: np.ndarray, u: np.ndarray, *carry: np.ndarray) -> list[np.ndarray]:
-    if hasattr(model, "rollout"):
-        path = model.rollout(x, u, *carry)
-        return list(path) if carry else [path]
-    path = [[x, *carry]]
-    for control in u:
-        x, *carried = path[-1]
-        path.append([np.array(part, dtype=np.float64) for part in _step(model, x, control, *carried)])
-    return [np.stack(parts) for parts in zip(*path, strict=True)]
-
-
-def _jacobians(model: Any, x: np.ndarray, u: np.ndarray, *carry: np.ndarray) -> list[np.ndarray]:
-    if hasattr(model, "jacobians"):
-        return list(model.jacobians(x, u, *carry))
-    if not hasattr(model, "pull"):
-        raise NotImplementedError("this engine has no derivatives")
-    rows = []
-    for i in range(len(x)):
-        slope = np.zeros_like(x)
-        slope[i] = 1.0
-        rows.append([np.array(part, dtype=np.float64) for part in model.pull(x, u, *carry, slope)])
-    return [np.stack(parts) for parts in zip(*rows, strict=True)]
-
-
-def _pull(model: Any, x: np.ndarray, u: np.ndarray, *rest: np.ndarray) -> list[np.ndarray]:
-    if hasattr(model, "pull"):
-        return list(model.pull(x, u, *rest))
-    *carry, slope = rest
-    return [np.einsum("ijb,ib->jb", part, slope) for part in _jacobians(model, x, u, *carry)]
-
-
-class _Forced:
-    """A model of controls from a model of generalised forces: constant + by_state x + by_control u."""
+class Controlled:
+    """An engine's model with controls u for inputs: its forces, where it takes these, are constant + by_state x + by_control u."""
 
     def __init__(self, model: Any, forces: dict[str, Any]) -> None:
         self._model = model
-        self.widths, self.device = getattr(model, "widths", None), getattr(model, "device", "cpu")
-        self.settings = getattr(model, "settings", {})
-        n = len(forces["constant"])
-        self._constant = np.reshape(np.array(forces["constant"], dtype=np.float64), (n, 1))
-        self._by_state = np.reshape(np.array(forces["by_state"], dtype=np.float64), (n, 2 * n))
-        self._by_control = np.reshape(np.array(forces["by_control"], dtype=np.float64), (n, -1))
-        if hasattr(model, "jacobians") or hasattr(model, "pull"):
-            self.jacobians, self.pull = self._jacobians, self._pull
-        if hasattr(model, "start"):
-            self.start = model.start
+        self.device, self.settings = str(getattr(model, "device", "cpu")), _settings(model)
+        self._forces = [np.array(forces[name], dtype=np.float64) for name in ("constant", "by_state", "by_control")]
+        self._takes_forces = getattr(model, "takes_forces", False)
 
-    def _force(self, x: np.ndarray, u: np.ndarray) -> Any:
-        return self._constant + self._by_state @ x + self._by_control @ u
+    def call(self, name: str, x: np.ndarray, u: np.ndarray) -> tuple[list[np.ndarray], int]:
+        """Return the arrays that a call results in, and the width of its batches."""
+        function: Callable[[np.ndarray, np.ndarray], list[np.ndarray]] = getattr(self, name)
+        n_columns = x.shape[-1]
+        widths = sorted(getattr(self._model, "widths", None) or [n_columns])
+        width = next((width for width in widths if width >= n_columns), widths[-1])
+        blocks = []
+        for start in range(0, n_columns, width):
+            columns = np.minimum(np.arange(start, start + width), n_columns - 1)
+            part = [array[..., columns] for array in (x, u)]
+            valid = np.all([np.isfinite(array).reshape(-1, width).all(axis=0) for array in part], axis=0)
+            # engines raise errors or hang where numbers are not finite
+            results = function(*(np.ascontiguousarray(np.where(valid, array, 0.0)) for array in part))
+            kept = [np.where(valid, np.asarray(result, dtype=np.float64), np.nan) for result in results]
+            blocks.append([result[..., : n_columns - start] for result in kept])
+        return [np.concatenate(parts, axis=-1) for parts in zip(*blocks, strict=True)], width
 
-    def step(self, x: np.ndarray, u: np.ndarray, *carry: np.ndarray) -> Any:
+    def step(self, x: np.ndarray, u: np.ndarray) -> list[np.ndarray]:
         """Return the states after one step under the controls u."""
-        return self._model.step(x, self._force(x, u), *carry)
+        return [np.array(self._model.step(x, self._input(x, u)), dtype=np.float64)]
 
-    def _pull(self, x: np.ndarray, u: np.ndarray, *rest: np.ndarray) -> list[np.ndarray]:
-        by_state, by_force = (np.asarray(part) for part in _pull(self._model, x, self._force(x, u), *rest))
-        return [by_state + self._by_state.T @ by_force, self._by_control.T @ by_force]
+    def rollout(self, x: np.ndarray, u: np.ndarray) -> list[np.ndarray]:
+        """Return the states ``(T + 1, n, B)`` under controls ``(T, m, B)``."""
+        path = [x]
+        for control in u:
+            path += self.step(path[-1], control)
+        return [np.stack(path)]
 
-    def _jacobians(self, x: np.ndarray, u: np.ndarray, *carry: np.ndarray) -> list[np.ndarray]:
-        a, b = (np.asarray(part, dtype=np.float64) for part in _jacobians(self._model, x, self._force(x, u), *carry))
-        by_state = a + np.einsum("ifb,fj->ijb", b, self._by_state)
-        return [by_state, np.einsum("ifb,fj->ijb", b, self._by_control)]
+    def jacobians(self, x: np.ndarray, u: np.ndarray) -> list[np.ndarray]:
+        """Return the derivatives of a step by the states and by the controls."""
+        force = self._input(x, u)
+        if hasattr(self._model, "jacobians"):
+            a, b = self._model.jacobians(x, force)
+        elif hasattr(self._model, "pull"):
+            slopes = [np.broadcast_to(row[:, None], x.shape).copy() for row in np.eye(len(x))]
+            pulled = [
+                [np.array(part, dtype=np.float64) for part in self._model.pull(x, force, slope)] for slope in slopes
+            ]
+            a, b = map(np.stack, zip(*pulled, strict=True))
+        else:
+            raise NotImplementedError("this engine has no derivatives")
+        if not self._takes_forces:
+            return [a, b]
+        _, by_state, by_control = self._forces
+        return [a + np.einsum("ifb,fj->ijb", b, by_state), np.einsum("ifb,fj->ijb", b, by_control)]
+
+    def _input(self, x: np.ndarray, u: np.ndarray) -> Any:
+        constant, by_state, by_control = self._forces
+        return constant[:, None] + by_state @ x + by_control @ u if self._takes_forces else u
 
 
 # ------------------------------------------------------------------------------------------------------ the server
 
 
-def serve(file: str, requests: int, answers: int) -> None:
-    """Answer requests until the pipe is closed."""
+def serve(file: str, requests: Connection) -> None:
+    """Answer requests until the connection is closed."""
     models: dict[int, Any] = {}
     first_calls: set[tuple[int, str, int]] = set()
     module: Any = None
     while True:
-        try:
-            header, arrays = receive(requests)
-        except Closed:
-            return
+        header, arrays = requests.recv()
         started, name, key = time.perf_counter(), header["call"], int(header["model"])
         answer: dict[str, Any] = {}
         results: list[np.ndarray] = []
@@ -213,21 +114,16 @@ def serve(file: str, requests: int, answers: int) -> None:
             if module is None:
                 module = _load(file)
             if name == "build":
-                models[key] = module.Model(header["description"])
-                if getattr(models[key], "takes_forces", False):
-                    models[key] = _Forced(models[key], header["description"]["forces"])
-                answer["device"] = str(getattr(models[key], "device", "cpu"))
-                answer["settings"] = _settings(models[key])
-                answer["has_carry"] = hasattr(models[key], "start")
+                models[key] = Controlled(module.Model(header["description"]), header["description"]["forces"])
+                answer |= {"device": models[key].device, "settings": models[key].settings}
                 while len(models) > KEPT:
                     del models[next(iter(models))]
             elif key not in models:
                 answer["is_unknown"] = True
             else:
                 models[key] = models.pop(key)
-                results, width = call(models[key], name, arrays)
-                answer["is_first"] = (key, name, width) not in first_calls
-                answer["width"] = width
+                results, width = models[key].call(name, *arrays)
+                answer |= {"width": width, "is_first": (key, name, width) not in first_calls}
                 first_calls.add((key, name, width))
         except Exception as error:
             kind = "unsupported" if isinstance(error, NotImplementedError) else "error"
@@ -237,10 +133,7 @@ def serve(file: str, requests: int, answers: int) -> None:
             answer, results = {"error": f"{type(error).__name__}: {error}", "kind": kind, "places": places}, []
         answer["seconds"] = time.perf_counter() - started
         answer["peak_memory_mb"] = _peak_memory_mb()
-        try:
-            send(answers, answer, results)
-        except Closed:
-            return
+        requests.send((answer, results))
 
 
 def _settings(model: Any) -> dict[str, str]:
@@ -272,18 +165,18 @@ def _load(file: str) -> Any:
     return module
 
 
-def _end_with(life: int) -> None:
-    """End this process when the other end of the pipe ``life`` is closed, even during a call."""
-    os.read(life, 1)
+def _end_with_stdin() -> None:
+    """End this process when its input is closed, even during a call."""
+    sys.stdin.read()
     os._exit(0)
 
 
 def main() -> None:
-    """Serve the engine's file; the arguments are the file and the descriptors of requests, answers and life."""
-    file, requests, answers, life = sys.argv[1], *map(int, sys.argv[2:5])
+    """Serve the engine's file; the arguments are the file and the descriptor of its connection."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the run, which ends its engines
-    threading.Thread(target=_end_with, args=(life,), daemon=True).start()
-    serve(file, requests, answers)
+    threading.Thread(target=_end_with_stdin, daemon=True).start()
+    with contextlib.suppress(EOFError, OSError):
+        serve(sys.argv[1], Connection(int(sys.argv[2])))
     os._exit(0)
 
 

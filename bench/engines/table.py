@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import inspect
 import json
 import os
@@ -11,6 +10,8 @@ import sys
 from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
+
+import pandas as pd
 
 from bench.engines import environments
 from bench.engines.backend import EngineBackend
@@ -43,75 +44,71 @@ def write(names: Collection[str], out: Path, settings: Sequence[str] = ()) -> Pa
             continue
         backend = entry.plugin()
         reason = entry.reason or backend.unavailable_reason()
-        if not reason:
-            usable.append(name)
-            rows += _conformance(name, backend, file)
-        else:
-            rows.append({"engine": name, "reason": reason})
+        usable += [] if reason else [name]
+        own = [{"reason": reason}] if reason else conformance_rows(name, backend, file)
+        rows += [{**row, "engine": name, "command": f"python -m bench engines table {name}"} for row in own]
     out.mkdir(parents=True, exist_ok=True)
-    with (out / "engines.csv").open("w", newline="") as table:
-        writer = csv.DictWriter(table, COLUMNS)
-        writer.writeheader()
-        writer.writerows({**row, "command": _command(row["engine"])} for row in rows)
+    table = pd.DataFrame(rows, columns=list(COLUMNS))
+    table.to_csv(out / "engines.csv", index=False)
     words = [f"+experiment={GRADIENTS}", f"backends=[{','.join(usable)}]", f"results_dir={out}", *settings]
     subprocess.run([sys.executable, "-m", "bench", *words], check=False)
     gradients = out / GRADIENTS / "engines.md"
     page = out / "engines.md"
-    page.write_text(_page(rows) + (f"\n{gradients.read_text()}" if gradients.exists() else ""))
+    page.write_text(_page(table) + (f"\n{gradients.read_text()}" if gradients.exists() else ""))
     return page
 
 
-def _command(engine: str) -> str:
-    return f"python -m bench engines table {engine}"
-
-
-def _conformance(name: str, backend: Any, file: Path) -> list[dict[str, Any]]:
-    """Return the rows of an engine in the conformance set, run in its own Python."""
+def conformance_rows(name: str, backend: Any, file: Path, *cases: str) -> list[dict[str, Any]]:
+    """Return the rows of an engine in the named cases of the conformance set, or all, run in its own Python."""
     if not file.exists():
-        return [{"engine": name, "reason": f"no file {file.name} for the conformance set"}]
+        return [{"reason": f"no file {file.name} for the conformance set"}]
     python, environment = sys.executable, {**os.environ, "PYTHONPATH": str(Path(runner.__file__).parents[3])}
     if isinstance(backend, EngineBackend):
         python, environment = backend.python or str(environments.python_of(name)), dict(os.environ)
-    words = [python, runner.__file__, str(file)]
+    words = [python, runner.__file__, str(file), *cases]
     try:
         done = subprocess.run(words, env=environment, capture_output=True, text=True, timeout=LIMIT_S)
         result = json.loads(done.stdout.splitlines()[-1])
     except (OSError, subprocess.TimeoutExpired, IndexError, ValueError) as error:
-        return [{"engine": name, "reason": f"the conformance set failed ({printable(error)[:200]})"}]
+        return [{"reason": f"the conformance set failed ({printable(error)[:200]})"}]
     versions = "; ".join(f"{library} {version}" for library, version in result["versions"].items())
-    return [{"engine": name, "versions": versions, **row} for row in result["rows"]]
+    return [{"versions": versions, **row} for row in result["rows"]]
 
 
-def _page(rows: list[dict[str, Any]]) -> str:
-    """Return the page: versions and commands by engine, then digits by case and engine, the worst term's, with its fault."""
-    engines = list(dict.fromkeys(row["engine"] for row in rows))
-    lines = [
-        "# Conformance of physics engines",
-        "",
-        "| engine | versions | right | not right | command |",
-        "|---|---|--:|--:|---|",
-    ]
-    for engine in engines:
-        own = [row for row in rows if row["engine"] == engine]
-        state = next((row["versions"] for row in own if row.get("versions")), own[0].get("reason", ""))
-        counts = [sum(row.get("is_right") is verdict for row in own) for verdict in (True, False)]
-        lines.append(f"| {engine} | {printable(state)} | {counts[0]} | {counts[1]} | `{_command(engine)}` |")
-    run = [engine for engine in engines if any("case" in row for row in rows if row["engine"] == engine)]
-    lines += ["", f"| case | {' | '.join(run)} |", f"|---|{'---|' * len(run)}"]
-    for case in sorted({row["case"] for row in rows if "case" in row}):
-        cells = [_cell([row for row in rows if row.get("case") == case and row["engine"] == engine]) for engine in run]
-        lines.append(f"| {case} | {' | '.join(cells)} |")
-    return "\n".join([*lines, ""])
+def _page(table: pd.DataFrame) -> str:
+    """Return the page: a line per engine, a table of cases by engines, and the reasons for what is missing in it."""
+    table = table.fillna("")
+    engines = [
+        [name, own["versions"].max(), *((own["is_right"] == verdict).sum() for verdict in (True, False)),
+         f"{own[own['seconds'] != ''].drop_duplicates('case')['seconds'].sum():.1f}", f"`{own['command'].iloc[0]}`"]
+        for name, own in table.groupby("engine", sort=False)
+    ]  # fmt: skip
+    run = table[table["case"] != ""]
+    cells = {key: _cell(rows) for key, rows in run.groupby(["case", "engine"])}
+    columns = run["engine"].unique()
+    cases = [[case, *(cells.get((case, name), "") for name in columns)] for case in sorted(run["case"].unique())]
+    reasons = table[table["reason"] != ""].drop_duplicates(["engine", "case"]).groupby(["engine", "reason"])["case"]
+    notes = [f"- {name}, {', '.join(filter(None, of)) or 'all'}: {printable(why)[:160]}" for (name, why), of in reasons]
+    return "\n".join([
+        "# Conformance of physics engines", "",
+        *_markdown(["engine", "versions", "right", "not right", "seconds", "command"], engines), "",
+        "The fewest digits of a case's derivatives. own: compared with the engine's own differences.", "",
+        *_markdown(["case", *columns], cases), "", *notes, "",
+    ])  # fmt: skip
 
 
-def _cell(rows: list[dict[str, Any]]) -> str:
-    """Return the fewest digits of a case's terms, which terms are wrong, and the fault that they look like."""
-    judged = [row for row in rows if row["is_right"] is not None]
-    if not judged:
-        return rows[0]["reason"] or "cannot tell"
-    wrong = [row for row in judged if not row["is_right"]]
-    faults = {row["looks_like"] for row in wrong} - {""}
-    words = f"wrong: {', '.join(row['term'] for row in wrong)}" + (f" ({'; '.join(sorted(faults))})" if faults else "")
-    digits = f"{min(row['digits'] or 0.0 for row in judged):.1f}"
-    own = ", own differences" if judged[0]["against"] != "the set" else ""
-    return f"{digits} {words if wrong else own}".strip().replace(" ,", ",")
+def _markdown(heads: Sequence[str], rows: Sequence[Sequence[Any]]) -> list[str]:
+    return [f"| {' | '.join(map(str, row))} |" for row in (heads, ["---"] * len(heads), *rows)]
+
+
+def _cell(rows: pd.DataFrame) -> str:
+    """Return the fewest digits of a case's terms, which terms are wrong, and the faults that they look like."""
+    judged = rows[rows["is_right"] != ""]
+    digits = judged["digits"][judged["digits"] != ""]
+    if digits.empty:
+        return "-" if judged.empty else "error"
+    wrong = judged[judged["is_right"] == False]  # noqa: E712
+    faults = sorted({*wrong["looks_like"]} - {""})
+    words = [f"{digits.min():.1f}", "own" if "own differences" in {*judged["against"]} else ""]
+    words += [f"wrong: {', '.join(wrong['term'])}"] * (not wrong.empty) + [f"({'; '.join(faults)})"] * bool(faults)
+    return " ".join(filter(None, words))

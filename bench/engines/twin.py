@@ -5,22 +5,14 @@ from __future__ import annotations
 import xml.etree.ElementTree as ElementTree
 from typing import Any
 
+import numpy as np
+
 from bench.errors import Unsupported
 
 KNOWN = {
-    "option",
-    "worldbody",
-    "contact",
-    "actuator",
-    "tendon",
-    "geom",
-    "body",
-    "joint",
-    "inertial",
-    "pair",
-    "motor",
+    "mujoco", "option", "worldbody", "contact", "actuator", "tendon", "geom", "body", "joint", "inertial", "pair", "motor",
     "fixed",
-}
+}  # fmt: skip
 """The elements of twins."""
 JOINT = {"name", "type", "axis", "damping", "stiffness"}
 """The attributes of their joints."""
@@ -41,14 +33,14 @@ def read(mjcf: str) -> dict[str, Any]:
     Raises :class:`Unsupported` for a twin with other elements, or a body with other than one slide or hinge.
     """
     root = ElementTree.fromstring(f"<mujoco>{mjcf}</mujoco>")
-    if strange := sorted({node.tag for node in root.iter()} - KNOWN - {"mujoco"}):
+    if strange := sorted({node.tag for node in root.iter()} - KNOWN):
         raise Unsupported(f"the twin has {', '.join(strange)}, which this engine's models do not have")
     bodies: list[dict[str, Any]] = []
     geoms: dict[str | None, int] = {}
     joints: dict[str | None, int] = {}
     springs: list[tuple[float, float, float, dict[int, float]]] = []
     option = root.find("option")
-    gravity = _numbers(option.get("gravity", "0 0 -9.81")) if option is not None else [0.0, 0.0, 0.0]
+    gravity = [0.0, 0.0, 0.0] if option is None else _numbers(option, "gravity", "0 0 -9.81")
     world = root.find("worldbody")
     assert world is not None
     grounds = [geom for geom in world.findall("geom") if geom.get("type") == "plane"]
@@ -66,20 +58,13 @@ def read(mjcf: str) -> dict[str, Any]:
         index = len(bodies)
         joints[joint.get("name")] = index
         springs.append((float(joint.get("stiffness", "0")), float(joint.get("damping", "0")), 0.0, {index: 1.0}))
-        radius = 0.0 if geom is None else float(geom.get("size", "0").split()[0])
-        centre = [0.0, 0.0, 0.0] if geom is None else _numbers(geom.get("pos", "0 0 0"))
-        mass = (
-            float(inertial.get("mass", "0"))
-            if inertial is not None
-            else float(geom.get("mass", "0"))
-            if geom is not None
-            else 0.0
-        )
-        ball = 0.4 * mass * radius**2
-        inertia = _numbers(inertial.get("diaginertia", "0 0 0")) if inertial is not None else [ball, ball, ball]
-        com = _numbers(inertial.get("pos", "0 0 0")) if inertial is not None else centre
+        radius, centre = _numbers(geom, "size", "0")[0], _numbers(geom, "pos", "0 0 0")
+        mass = _numbers(geom if inertial is None else inertial, "mass", "0")[0]
+        com, inertia = centre, [0.4 * mass * radius**2] * 3
+        if inertial is not None:
+            com, inertia = _numbers(inertial, "pos", "0 0 0"), _numbers(inertial, "diaginertia", "0 0 0")
         bodies.append({
-            "parent": parent, "joint": joint.get("type"), "axis": _numbers(joint.get("axis", "0 0 1")),
+            "parent": parent, "joint": joint.get("type"), "axis": _numbers(joint, "axis", "0 0 1"),
             "mass": mass, "com": com, "inertia": inertia, "radius": radius, "centre": centre,
         })  # fmt: skip
         if geom is not None:
@@ -99,7 +84,7 @@ def read(mjcf: str) -> dict[str, Any]:
     contacts = [
         {
             "bodies": [geoms[pair.get("geom1")], geoms[pair.get("geom2")]],
-            "friction": _numbers(pair.get("friction", "0"))[0] if pair.get("condim") != "1" else 0.0,
+            "friction": _numbers(pair, "friction", "0")[0] if pair.get("condim") != "1" else 0.0,
         }
         for pair in root.findall("contact/pair")
     ]
@@ -116,16 +101,13 @@ def read(mjcf: str) -> dict[str, Any]:
 def _forces(
     n: int, springs: list[tuple[float, float, float, dict[int, float]]], motors: list[dict[int, float]]
 ) -> dict[str, Any]:
-    constant, by_state = [0.0] * n, [[0.0] * (2 * n) for _ in range(n)]
     by_control = [[motor.get(i, 0.0) for motor in motors] for i in range(n)]
-    for stiffness, damping, length, arms in springs:
-        for i, arm in arms.items():
-            constant[i] += arm * stiffness * length
-            for j, other in arms.items():
-                by_state[i][j] -= arm * stiffness * other
-                by_state[i][n + j] -= arm * damping * other
-    return {"constant": constant, "by_state": by_state, "by_control": by_control}
+    arms = np.array([[arm.get(i, 0.0) for i in range(n)] for *_, arm in springs])
+    stiffness, damping, length = np.array([spring[:3] for spring in springs]).T
+    by_state = -np.hstack([(arms.T * factor) @ arms for factor in (stiffness, damping)])
+    return {"constant": ((stiffness * length) @ arms).tolist(), "by_state": by_state.tolist(), "by_control": by_control}
 
 
-def _numbers(text: str) -> list[float]:
-    return [float(word) for word in text.split()]
+def _numbers(node: ElementTree.Element | None, name: str, default: str) -> list[float]:
+    """Return an attribute's numbers, or the default's where it or the element is missing."""
+    return [float(word) for word in (default if node is None else node.get(name, default)).split()]

@@ -107,9 +107,9 @@ def examine(
         scales = layout.scales()
     setup = Setup(
         levels=_levels(sigma, layout),
-        scale=scales if scale is None else _positive(layout.spread(scale, "scale", 1.0), "scale", "size"),
-        rtol=_tolerance(layout, tolerance, "tolerance", TOLERANCE),
-        atol=_tolerance(layout, atol, "atol", 0.0),
+        scale=scales if scale is None else _by_input(layout, scale, "scale", 1.0, is_positive=True),
+        rtol=_by_input(layout, tolerance, "tolerance", TOLERANCE),
+        atol=_by_input(layout, atol, "atol", 0.0),
         allow_zero=_allowed(layout, allow_zero),
         seed=seed,
         horizons=tuple(int(steps) for steps in horizons),
@@ -163,16 +163,12 @@ def _levels(sigma: Any, layout: ParameterTree) -> list[tuple[float, np.ndarray]]
     return [(float(one.max()), one) for one in every]
 
 
-def _positive(given: np.ndarray, what: str, meaning: str) -> np.ndarray:
-    if not (np.isfinite(given).all() and (given > 0).all()):
-        raise UserError(f"{what} is the {meaning} of each input: numbers above 0")
-    return given
-
-
-def _tolerance(layout: ParameterTree, given: Any, what: str, default: float) -> np.ndarray:
+def _by_input(layout: ParameterTree, given: Any, what: str, default: float, is_positive: bool = False) -> np.ndarray:
+    """Return a number per input ``(d,)``; raises :class:`UserError` for numbers below 0, or for 0 where ``is_positive``."""
     values = layout.spread(given, what, default)
-    if not (np.isfinite(values).all() and (values >= 0).all()):
-        raise UserError(f"{what}={given} is not valid: give a number of at least 0, or one per input")
+    if not (np.isfinite(values).all() and (values >= 0).all() and (values.all() or not is_positive)):
+        least = "above" if is_positive else "of at least"
+        raise UserError(f"{what}={given} is not valid: give a number {least} 0, or one per input")
     return values
 
 
@@ -234,12 +230,11 @@ class _Examination:
         self.left_out += stages.left_out
         checked = stages.check
         is_wrong = checked is not None and checked.cause in SUSPICIOUS
-        has_gradient = stages.gradient is not None
-        if refined is not None and is_wrong and has_gradient:
+        if refined is not None and is_wrong and stages.gradient is not None:
             self._explain("gaps", "the refined cost", lambda: diagnosis.refined_gaps(stages, refined))
         if setup.horizons:
             self._explain("growth", "horizons", lambda: diagnosis.errors_by_horizon(stages, setup.horizons))
-        can_go_on = not (stages.gradient is None and simulator.has_gradient) and not stages.is_failed
+        can_go_on = stages.gradient is not None or not simulator.has_gradient
         if checked is not None and is_wrong and can_go_on and explained.is_adaptive is None:
             explained.is_adaptive = self._compare_along_lines(checked)
         explained.is_unexplained = (
@@ -249,7 +244,6 @@ class _Examination:
         smoothed = self._measure_noise(checked) if can_go_on else []
         if clock.is_terminated:
             self.left_out.append("everything after SIGTERM")
-        gradient_s = clock.per_gradient() if simulator.has_gradient else math.nan
         return Report(
             **named,
             names=self.layout.names,
@@ -261,7 +255,8 @@ class _Examination:
             repeats=stages.repeats,
             setup=setup,
             spent=Spent(
-                clock.costs, clock.gradients, clock.spent, clock.compile_s, clock.elapsed, clock.per_cost(), gradient_s,
+                clock.costs, clock.gradients, clock.spent, clock.compile_s, clock.elapsed, clock.per_cost(),
+                clock.per_gradient(),
                 clock.budget, clock.calls,
             ),
             check=checked,
@@ -277,7 +272,10 @@ class _Examination:
             elsewhere=simulator.gradient_error if not stages.is_failed else "",
             n_failed=simulator.n_failed_gradients,
             printed=simulator.printed,
-            notes=[*simulator.notes, *self._exceptions()],
+            notes=[
+                *simulator.notes,
+                *(f"the cost raised {n} times: {text}" for text, n in list(simulator.raised.items())[:3]),
+            ],
             left_out=self.left_out,
         )  # fmt: skip
 
@@ -295,9 +293,6 @@ class _Examination:
             )
             sizes[group.name] = GroupSize(group.last - group.first, allowed, whole)
         return sizes
-
-    def _exceptions(self) -> list[str]:
-        return [f"the cost raised {count} times: {text}" for text, count in list(self.simulator.raised.items())[:3]]
 
     def _attempt(self, what: str, function: Callable[[], Any]) -> Any:
         """Return a function's result, or None where the budget ends."""
@@ -381,8 +376,7 @@ class _Examination:
                     measured, self.stages.repeats.spread, self.simulator.unit * (size if math.isfinite(size) else 0.0)
                 )
                 cost = partial(self.stages.costs_along, direction)
-                line = scan(cost, np.zeros(1), np.ones(1), rounding, 3.0, points, halvings, most, self.simulator.unit)
-                line = replace(line, direction=direction)
+                line = scan(cost, direction, rounding, 3.0, points, halvings, most, self.simulator.unit)
                 lines.append(replace(line, missed=self._missed_share(line, checked)))
         except OutOfTime:
             self.left_out.append("jumps and kinks on lines")
@@ -430,9 +424,7 @@ class _Examination:
             self.clock.start_stage(f"noise of sigma {level:g}")
             self.clock.limit(1.0 / (len(levels) - index))
             pairs = min(PAIRS, max(FEWEST, HELD // self.theta.size))
-            one = measure_smoothed(
-                self.simulator, self.theta, level, spread / level, plain, self.clock, self.seed, pairs
-            )
+            one = measure_smoothed(self.simulator, self.theta, level, spread, plain, self.clock, self.seed, pairs)
             self.clock.limit(1.0)
             if one is None:
                 self.left_out.append(f"noise of sigma {level:g}")

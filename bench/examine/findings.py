@@ -501,20 +501,20 @@ class Findings:
     @property
     def frame(self) -> pd.DataFrame:
         """The table of :meth:`derivative_rows`."""
-        import pandas as pd
-
-        return pd.DataFrame(self.derivative_rows())
+        return _frame(self.derivative_rows())
 
     @property
     def sigmas(self) -> pd.DataFrame:
         """The table of :meth:`sigma_rows`."""
-        import pandas as pd
-
-        return pd.DataFrame(self.sigma_rows())
+        return _frame(self.sigma_rows())
 
     @property
     def breaks(self) -> pd.DataFrame:
         """The table of :meth:`break_rows`."""
-        import pandas as pd
+        return _frame(self.break_rows(), ["line", "kind", "at", "size", *self.names[:SHOWN]])
 
-        return pd.DataFrame(self.break_rows(), columns=["line", "kind", "at", "size", *self.names[:SHOWN]])
+
+def _frame(rows: list[dict[str, Any]], columns: list[str] | None = None) -> pd.DataFrame:
+    import pandas as pd
+
+    return pd.DataFrame(rows, columns=columns)

@@ -112,13 +112,13 @@ def measure_smoothed(
     simulator: Simulator,
     theta: np.ndarray,
     sigma: float,
-    scale: np.ndarray,
+    spread: np.ndarray,
     plain: np.ndarray | None,
     clock: Clock,
     seed: int = 0,
     pairs: int = PAIRS,
 ) -> Smoothed | None:
-    """Return the gradient's bias and the methods' costs under noise ``sigma * scale * u`` on theta.
+    """Return the gradient's bias and the methods' costs under noise ``spread * u`` on theta, called ``sigma``.
 
     None where the time is too short for :data:`FEWEST` pairs. ``plain (d,)`` is the gradient at theta without noise, if
     it is known to be right. At most ``pairs`` pairs are drawn.
@@ -128,8 +128,8 @@ def measure_smoothed(
     size, result = FEWEST, None
     try:
         while size <= pairs:
-            drawn.append(_draw(simulator, theta, sigma * scale, random, size if result is None else size // 2))
-            result = _summary(sigma, scale, np.concatenate(drawn, axis=1), plain, simulator, clock)
+            drawn.append(_draw(simulator, theta, spread, random, size if result is None else size // 2))
+            result = _summary(sigma, spread, np.concatenate(drawn, axis=1), plain, simulator, clock)
             if size >= FIRM and result.error <= ENOUGH * result.norm and result.decided:
                 break
             size *= 2
@@ -153,7 +153,7 @@ def _draw(
 
 def _summary(
     sigma: float,
-    scale: np.ndarray,
+    spread: np.ndarray,
     drawn: np.ndarray,
     plain: np.ndarray | None,
     simulator: Simulator,
@@ -162,10 +162,10 @@ def _summary(
     # SciPy's distributions are slow to import, and only this function needs them
     from bench.measure.statistics import Truth, summarise
 
-    size, pairs = scale.size, drawn.shape[1]
+    size, pairs = spread.size, drawn.shape[1]
     # an input without noise has no smoothed derivative
-    noisy = scale > 0
-    spread, dim = (sigma * scale)[noisy], int(noisy.sum())
+    noisy = spread > 0
+    spread, dim = spread[noisy], int(noisy.sum())
     u, d = drawn[:size][noisy], drawn[size]
     up, down = drawn[size + 1 : 2 * size + 1][noisy], drawn[2 * size + 1 :][noisy]
     plain = None if plain is None else plain[noisy]

@@ -14,6 +14,7 @@ from bench.examine.findings import RIGHT, SEEN, UNSHOWN, WRONG, Findings
 from bench.examine.smoothing import PAIRS
 from bench.gradient import FAULTS, Check, Part
 from bench.gradient.rules import RULES, SUSPICIOUS
+from bench.gradient.stages import is_rough
 from bench.report.text import counted, duration, number, span
 
 SAME_FACTOR = 0.05
@@ -22,6 +23,7 @@ OVERFLOWS = 1e100
 """Size of a derivative from which on one that is not a number is an overflow."""
 ALONG_THETA = 0.9999
 """Least cosine between theta and an error along theta."""
+CHAOS = "as in chaos: the last digits of theta change the cost as much as a wide step"
 HEADLINE = 200
 """Most characters of an exception in a headline."""
 MANY = 6
@@ -154,7 +156,7 @@ def check_facts(report: Findings, check: Check) -> list[str]:
     if check.cause == "kink":
         return [f"{report.label(worst)}: slopes {number(worst.left, 4)} and {number(worst.right, 4)}"]
     if check.cause not in FAULTS or not report.gradient:
-        return [report.label(worst)]
+        return [report.label(worst), CHAOS * (check.cause == "unsettled" and is_rough(worst.sample))]
     facts = [size_of(report, worst), f"and {len(parts) - 1} more" if len(parts) > 1 else ""]
     if check.cause == "nan_gradient":
         return [*facts, _where_not_a_number(report, check)]
@@ -191,6 +193,8 @@ def _where_not_a_number(report: Findings, check: Check) -> str:
     sizes = [abs(part.program) for part in (*check.parts, *check.draws) if math.isfinite(part.program)]
     if np.isinf(check.gradient).any() or max(sizes, default=0.0) > OVERFLOWS:
         return "it overflows"
+    if any(is_rough(part.sample) for part in check.parts):
+        return f"it overflows, {CHAOS}"
     n_bad = len(check.draws) - len(good)
     at_theta = "" if np.isfinite(check.gradient).all() else "at theta and "
     return f"{at_theta}at {n_bad} of {counted(len(check.draws), 'direction')} at other thetas" if check.draws else ""
@@ -389,8 +393,10 @@ def _head(report: Findings) -> list[str]:
         f"rough by {number(rough)}" * (rough > 0), f"gradient: {report.gradient or 'none, only differences'}",
         f"batch: {report.batch}",
     ]  # fmt: skip
-    times = {"within the budget": spent.seconds, "first calls": spent.compile_s, "all": spent.elapsed, "a cost": spent.cost_s,
-             "a gradient": spent.gradient_s}  # fmt: skip
+    waited = spent.elapsed - spent.seconds - spent.compile_s
+    times = {"within the budget": spent.seconds, "first calls": spent.compile_s,
+             "waiting for a processor": waited if waited > 1.0 else math.nan, "all": spent.elapsed,
+             "a cost": spent.cost_s, "a gradient": spent.gradient_s}  # fmt: skip
     each = [f"{what} {duration(seconds)}" for what, seconds in times.items() if math.isfinite(seconds)]
     counts = counted(spent.costs, "cost"), counted(spent.gradients, "gradient")
     return [

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any
@@ -14,7 +14,7 @@ from bench.experiment.experiment import Experiment
 from bench.experiment.grid import COUNTS, THETA, applies, expand, is_theta_axis, parameter_name, swept
 from bench.experiment.parameters import NOT_PLUGINS, as_number, flatten, parse, swept_columns
 from bench.model import Plugin, registry
-from bench.model.parameters import Parameter, build, parameters
+from bench.model.parameters import build, parameters
 
 if TYPE_CHECKING:
     import numpy as np
@@ -56,10 +56,9 @@ def values_of(axis: Axis, rows: pd.DataFrame) -> np.ndarray:
         return np.asarray(rows[axis.column], dtype=float)
     table = flatten(rows)
     values = pd.Series(np.nan, index=range(len(rows)))
-    for name in axis.names:
-        for column, mask in swept_columns(name, table).items():
-            numbers = table[column].map(as_number) if table[column].dtype == object else table[column]
-            values = values.fillna(numbers.where(mask).reset_index(drop=True))
+    for column, mask in _places(axis.names, table):
+        numbers = table[column].map(as_number) if table[column].dtype == object else table[column]
+        values = values.fillna(numbers.where(mask).reset_index(drop=True))
     return np.asarray(values, dtype=float)
 
 
@@ -69,15 +68,19 @@ def shown_by(view: str, axis: Axis, rows: pd.DataFrame) -> np.ndarray:
 
     table = flatten(rows)
     shown = np.zeros(len(rows), dtype=bool)
-    for name in axis.names:
-        for column, mask in swept_columns(name, table).items():
-            group, _, parameter = column.partition(".")
-            if group == "contact":
-                of_law = {
-                    law: smoothing_of(law) if view == "smoothing" else view for law in table["contact.name"].dropna()
-                }
-                shown |= (mask & (table["contact.name"].map(of_law) == parameter)).to_numpy(bool)
+    for column, mask in _places(axis.names, table):
+        group, _, parameter = column.partition(".")
+        if group == "contact":
+            laws = table["contact.name"]
+            names = laws.map(smoothing_of, na_action="ignore") if view == "smoothing" else view
+            shown |= (mask & laws.notna() & (names == parameter)).to_numpy(bool)
     return shown
+
+
+def _places(names: Iterable[str], table: pd.DataFrame) -> Iterator[tuple[str, pd.Series]]:
+    """Yield the columns of flattened parameters that names in a sweep refer to, each with a mask of its rows."""
+    for name in names:
+        yield from swept_columns(name, table).items()
 
 
 def smoothing_of(law: str) -> str:
@@ -126,7 +129,7 @@ def _has_value(name: str, table: pd.DataFrame) -> np.ndarray:
     """Return, per row of flattened parameters, 1 where a name in the sweep has a value and 0 elsewhere."""
     import numpy as np
 
-    values = [mask & table[column].notna() for column, mask in swept_columns(name, table).items()]
+    values = [mask & table[column].notna() for column, mask in _places([name], table)]
     return np.any(values, axis=0).astype(int) if values else np.zeros(len(table), dtype=int)
 
 
@@ -160,30 +163,24 @@ def _zipped_names(sweep: Mapping[str, Any]) -> list[frozenset[str]]:
 def _unit_and_doc(names: Iterable[str], table: pd.DataFrame) -> tuple[str, str]:
     """Return unit and meaning of a parameter, as its plugins declare them; empty strings if their units differ."""
     meanings = {}
-    for name in names:
-        for column, mask in swept_columns(name, table).items():
-            axis, _, parameter = column.partition(".")
-            for plugin in table.loc[mask, f"{axis}.name"].unique() if f"{axis}.name" in table else ():
-                declared = declared_parameters(registry.kind_of(axis), plugin).get(parameter)
-                if declared is not None:
-                    meanings[declared.unit] = declared.doc
+    for column, mask in _places(names, table):
+        axis, _, parameter = column.partition(".")
+        for plugin in table.loc[mask, f"{axis}.name"].unique() if f"{axis}.name" in table else ():
+            entry = registry.entries().get(registry.kind_of(axis), {}).get(plugin)
+            declared = parameters(entry.plugin).get(parameter) if entry and entry.plugin else None
+            if declared is not None:
+                meanings[declared.unit] = declared.doc
     return next(iter(meanings.items())) if len(meanings) == 1 else ("", "")
 
 
-def declared_parameters(kind: str, name: str) -> Mapping[str, Parameter]:
-    """Return the parameters that a plugin declares, by name; empty if it is not installed."""
-    entry = registry.entries().get(kind, {}).get(name)
-    return parameters(entry.plugin) if entry is not None and entry.plugin is not None else {}
-
-
-def with_axes(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:
-    """Return rows with a numeric column added for every swept axis that is not a column already."""
-    return rows.assign(**{a.column: values_of(a, rows) for a in axes(experiment.sweep, rows) if a.column not in rows})
+def with_axes(sweep: Mapping[str, Any], rows: pd.DataFrame) -> pd.DataFrame:
+    """Return rows with a numeric column added for every axis of a sweep that is not a column already."""
+    return rows.assign(**{a.column: values_of(a, rows) for a in axes(sweep, rows) if a.column not in rows})
 
 
 def table(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:
     """Return rows with the columns of the CSV: the study's table, the swept axes, ``study`` and ``parameters``."""
-    wide = with_axes(experiment, rows)
+    wide = with_axes(experiment.sweep, rows)
     extra = [name for name in wide if name not in rows]
     wide = wide.reindex(columns=[*experiment.columns.table, *extra, "study", "parameters"])
     texts = [name for name in experiment.columns.of_kind("text") if name in wide]

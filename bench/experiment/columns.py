@@ -88,6 +88,11 @@ class Column:
         return f"{label} [{self.unit}]" if self.unit and self.format != "seconds" else label
 
 
+def interval(name: str, doc: str = "", unit: str = "", **more: Any) -> Column:
+    """Return a column of numbers whose 95% intervals end in the columns ``<name>_low`` and ``<name>_high``."""
+    return Column(name, doc, unit, low=f"{name}_low", high=f"{name}_high", **more)
+
+
 def text(name: str, doc: str = "", **more: Any) -> Column:
     """Return a column of strings."""
     return Column(name, doc, kind="text", **more)

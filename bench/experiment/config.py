@@ -17,7 +17,7 @@ from bench.experiment.overrides import LISTS_AS, TABLES, check_file, quoted, wit
 from bench.experiment.study import Study
 from bench.model import Decision, MechanicalScene, Plugin, guard, registry
 from bench.model.identity import parse_identity, split_items
-from bench.model.parameters import build, coerce, parameters, remember, singular
+from bench.model.parameters import Parameter, build, check, coerce, parameters, remember, singular
 
 SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 RESERVED = ("claims", "references", "standard", "trace")
@@ -99,7 +99,7 @@ def _composed(overrides: Sequence[str], config_dirs: Sequence[Path]) -> Experime
         raise UserError(printable(": ".join(lines)).replace("override ++", "")[:1000]) from None
     assert isinstance(plain, dict)
     settings = {str(k): v for k, v in plain.items()}
-    joined = _joined(experiment(settings), _as_list(settings["also"]), overrides, config_dirs)
+    joined = _joined(from_settings(settings), _as_list(settings["also"]), overrides, config_dirs)
     return replace(joined, answer=_answer(joined, overrides, config_dirs))
 
 
@@ -252,11 +252,9 @@ def _quote_identities(value: str) -> str:
 
 FORMATS = ("png", "svg", "pdf")
 LAUNCHERS = ("local", "ray")
-DEFAULT_PLUGINS = {"optimizers": ["adam"]}
-"""Plugins of kinds that are null in the configuration, unless the study has its own default."""
 
 
-def experiment(config: Mapping[str, Any]) -> Experiment:
+def from_settings(config: Mapping[str, Any]) -> Experiment:
     """Return the experiment of a composed configuration; raises :class:`UserError` if a setting is invalid."""
     extra = set(config) - _known_keys()
     if extra:
@@ -270,15 +268,9 @@ def experiment(config: Mapping[str, Any]) -> Experiment:
         registry.add_folder(Path(str(folder)))
     study = _study(config["study"])
     axes = {axis: registry.kind_of(axis) for axis in study.axes}
-    named = {
-        **config,
-        **{
-            kind: list(study.default_plugins.get(kind, DEFAULT_PLUGINS[kind]))
-            for kind in DEFAULT_PLUGINS
-            if config[kind] is None
-        },
+    choices = {
+        axis: [_choice(kind, item) for item in _at_least_one(config, kind, study)] for axis, kind in axes.items()
     }
-    choices = {axis: [_choice(kind, item) for item in _at_least_one(named, kind)] for axis, kind in axes.items()}
     values = {axis: _mapping(config, axis) for axis in axes}
     for axis, kind in axes.items():
         for plugin, given in values[axis].items():
@@ -375,13 +367,10 @@ def _compile_cache(value: Any) -> Path | None:
 
 
 def _execution(config: Mapping[str, Any]) -> Execution:
-    workers = config["workers"]
-    if workers is not None and coerce(int, workers, "workers") < 0:
-        raise UserError(f"workers={workers} must be at least 0, or null for the number of cores")
     launcher = _one_of("launcher", config["launcher"], LAUNCHERS)
     memory = _amount("memory", config["memory"], BYTES, "4g, 500m")
     return Execution(
-        workers=None if workers is None else coerce(int, workers, "workers"),
+        workers=check(Parameter("workers", int | None, None, low=0), config["workers"], "workers"),
         timeout=_amount("timeout", config["timeout"], SECONDS, "600, 10m"),
         memory=None if memory is None else math.ceil(memory),
         stop=_one_of("on_error", config["on_error"], ("continue", "stop")) == "stop",
@@ -438,10 +427,9 @@ def _mapping(config: Mapping[str, Any], key: str, allowed: Collection[str] = ())
     return {str(k): v for k, v in value.items()}
 
 
-def _at_least_one(config: Mapping[str, Any], kind: str) -> list[Any]:
-    value = config.get(kind)
-    items = value if isinstance(value, list) else [value]
-    if not items or value is None:
+def _at_least_one(config: Mapping[str, Any], kind: str, study: Study) -> list[Any]:
+    items = _as_list(study.default_plugins.get(kind) if config.get(kind) is None else config[kind])
+    if not items:
         raise UserError(f"{kind} is empty: give at least one: python -m bench list {kind}")
     return items
 

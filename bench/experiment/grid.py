@@ -6,6 +6,7 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Mapping, Sequence
+from functools import cache
 from typing import Any
 
 from bench.errors import Unsupported, UserError, unknown
@@ -210,8 +211,6 @@ class _Expansion:
 
     def __init__(self, experiment: Experiment) -> None:
         self._experiment = experiment
-        self._axes: dict[tuple[type[Plugin], tuple[str, ...]], list[tuple[str, str]]] = {}
-        self._plugins: dict[tuple[int, str], Plugin] = {}
 
     def cell(self, point: Mapping[str, Any], choices: Mapping[str, Choice]) -> Cell:
         """Return the cell of these choices at a point of the sweep."""
@@ -280,7 +279,7 @@ class _Expansion:
         plugin = choice.entry.plugin
         if plugin is None:
             raise UserError(f"{group} '{choice.entry.name}' cannot be used: {choice.entry.reason}")
-        axes = self._axes_of(plugin, tuple(point))
+        axes = _axes_of(plugin, tuple(point))
         for axis, parameter in axes:
             if axis in used:
                 raise UserError(
@@ -288,21 +287,18 @@ class _Expansion:
                     f"write sweep.{used[axis]}.{parameter} or sweep.{plugin.name}.{parameter}"
                 )
             used[axis] = plugin.name
-        key = (id(choice), repr([point[axis] for axis, _ in axes] + [given]))
-        if key not in self._plugins:
-            values = {k: v for k, v in (given or {}).items() if k in parameters(plugin)}
-            # later values replace earlier ones: the scene's contact values, settings, identity string, sweep
-            values |= self._experiment.values.get(group, {}).get(plugin.name, {})
-            values |= dict(choice.values) | {parameter: point[axis] for axis, parameter in axes}
-            self._plugins[key] = _build(plugin, sorted(values.items()))
-        return self._plugins[key]
+        values = {k: v for k, v in (given or {}).items() if k in parameters(plugin)}
+        # later values replace earlier ones: the scene's contact values, settings, identity string, sweep
+        values |= self._experiment.values.get(group, {}).get(plugin.name, {})
+        values |= dict(choice.values) | {parameter: point[axis] for axis, parameter in axes}
+        return _build(plugin, sorted(values.items()))
 
-    def _axes_of(self, plugin: type[Plugin], names: tuple[str, ...]) -> list[tuple[str, str]]:
-        """Return the axes that are parameters of the plugin, each with the parameter's name."""
-        if (plugin, names) not in self._axes:
-            pairs = [(name, _applies(name, plugin)) for name in names if name not in COUNTS]
-            self._axes[plugin, names] = [(axis, parameter) for axis, parameter in pairs if parameter is not None]
-        return self._axes[plugin, names]
+
+@cache
+def _axes_of(plugin: type[Plugin], names: tuple[str, ...]) -> list[tuple[str, str]]:
+    """Return the axes that are parameters of the plugin, each with the parameter's name."""
+    pairs = [(name, _applies(name, plugin)) for name in names if name not in COUNTS]
+    return [(axis, parameter) for axis, parameter in pairs if parameter is not None]
 
 
 _built: dict[tuple[type[Plugin], str], Plugin] = {}

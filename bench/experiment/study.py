@@ -36,7 +36,7 @@ class Study(Plugin):
     timed: ClassVar[bool] = False
     """Whether its cells are timed by default: one at a time, with the machine to themselves."""
 
-    default_plugins: ClassVar[Mapping[str, Sequence[str]]] = {}
+    default_plugins: ClassVar[Mapping[str, Sequence[str]]] = {"optimizers": ("adam",)}
     """Names of the plugins of a kind that the configuration leaves null, such as ``optimizers``."""
 
     @abstractmethod
@@ -51,7 +51,7 @@ class Study(Plugin):
         """Return the part of theta that programs have; by default all of it."""
         return given
 
-    def unsupported_reason(self, cell: Cell) -> str | None:
+    def refusal(self, cell: Cell) -> str | None:
         """Return why the study cannot measure a cell, or None; called when a run is planned."""
         return None
 

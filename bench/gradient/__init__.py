@@ -3,7 +3,7 @@
 from .check import Check, Options, Part, check, extremes, settle
 from .direction import EPS, FINE, Finding, Sample, best, judge
 from .few import ROUNDS, FewSteps, is_nothing
-from .sampling import order, points, repeats, samples
+from .sampling import order, sampled
 from .verdicts import BROKEN, FAULTS, MEANING, TRUSTED, UNDECIDED, VERDICTS, most_severe
 
 __all__ = [
@@ -29,8 +29,6 @@ __all__ = [
     "judge",
     "most_severe",
     "order",
-    "points",
-    "repeats",
-    "samples",
+    "sampled",
     "settle",
 ]  # fmt: skip

@@ -13,7 +13,7 @@ import numpy as np
 from . import roughness
 from .causes import Ratio, causes_of_ratios
 from .direction import EPS, FINE, GUARD, Finding, Sample, judge
-from .sampling import order, points, repeats, samples
+from .sampling import Modes, order, repeats, sampled
 from .verdicts import FAULTS, MEANING, TRUSTED, most_severe
 
 Cost = Callable[[np.ndarray], np.ndarray]
@@ -22,8 +22,6 @@ Gradient = Callable[[np.ndarray], np.ndarray]
 """The gradient at one theta: ``(d,)`` to ``(d,)``."""
 Tangent = Callable[[np.ndarray, np.ndarray], float]
 """A derivative at a theta along a direction, both ``(d,)``, from the cost's code but not from its gradient; NaN if unknown."""
-Modes = Callable[[np.ndarray], Sequence[str]]
-"""Names of the contact modes of columns: ``(d, B)`` to ``B`` strings."""
 AGREES = 1e-3
 """Relative difference of the gradient from a tangent up to which they agree: on a chaotic rollout, both have errors."""
 MATTERS = 1e3
@@ -200,9 +198,8 @@ def settle(
     cost: Cost, theta: np.ndarray, vector: np.ndarray, length: float, sample: Sample, tangent: Tangent | None
 ) -> Finding | None:
     """Return the finding on an unsettled direction from smaller steps or from the tangent; None if it stays unsettled."""
-    values = cost(points(theta[:, None], vector[:, None], sample.unit, FINE)).reshape(1, -1)
-    one = np.array([[length], [sample.derivative], [sample.doubt]])
-    (fine,) = samples(values, one[0], one[1], sample.unit, FINE, doubts=one[2])
+    length_, derivative, doubt = np.array([[length], [sample.derivative], [sample.doubt]])
+    (fine,), *_ = sampled(cost, theta, vector[:, None], length_, derivative, sample.unit, FINE, doubts=doubt)
     better = judge(fine)
     if better.verdict != "unsettled":
         return better
@@ -263,22 +260,12 @@ class _Checker:
         return scale
 
     def cost(self, thetas: np.ndarray) -> np.ndarray:
-        values = np.asarray(self._cost(thetas))
-        if np.iscomplexobj(values):
-            raise TypeError("the cost is complex; a check needs a real one")
-        if values.shape != (thetas.shape[1],):
-            raise ValueError(f"cost of {thetas.shape[1]} columns has shape {values.shape}, not {(thetas.shape[1],)}")
-        return values.astype(np.float64)
+        return _real("cost", self._cost(thetas), thetas.shape[1:])
 
     def gradient(self, theta: np.ndarray) -> np.ndarray:
         if self._gradient is None:
             return np.full(theta.size, np.nan)
-        result = np.asarray(self._gradient(theta.copy()))
-        if np.iscomplexobj(result):
-            raise TypeError("the gradient is complex; a check needs a real one")
-        if result.shape != theta.shape:
-            raise ValueError(f"the gradient has shape {result.shape}, not that of theta, {theta.shape}")
-        return result.astype(np.float64)
+        return _real("gradient", self._gradient(theta.copy()), theta.shape)
 
     def run(self) -> Check:
         theta, options = self.theta, self.options
@@ -334,29 +321,23 @@ class _Checker:
         """
         if not lines:
             return []
-        eps, count = self.options.eps, len(lines)
         thetas, gradients, vectors = (
             np.stack(columns, axis=1) for columns in zip(*((o.theta, o.gradient, o.vector) for o in lines), strict=True)
         )
         lengths = np.array([line.length for line in lines])
-        at = points(thetas, vectors, self.unit, eps)
-        values = self.cost(at).reshape(count, -1)
-        repeatable = np.ones(count, bool)
-        if twice and self.options.repeated:
-            # in reverse order, which exposes columns that depend on their neighbours
-            again = self.cost(at[:, ::-1])[::-1].reshape(count, -1)
-            repeatable = np.asarray(repeats(values, again, self.unit).all(axis=1))
-        minus, plus = self._sides(at, count)
         with np.errstate(invalid="ignore"):
             program = np.where(vectors != 0.0, vectors * gradients, 0.0).sum(axis=0) / lengths
         if self._gradient is None:
-            program = np.zeros(count)
+            program = np.zeros(len(lines))
         # a component this much smaller than the others may be only their rounding, unless it is exactly 0
         whole = np.abs(np.nan_to_num(gradients, posinf=0.0, neginf=0.0)) * self.scale[:, None]
         doubts = np.where(program != 0.0, np.sqrt(self.unit) * whole.max(axis=0) / lengths, 0.0)
         if doubt is not None:
             doubts += np.abs(vectors).T @ np.nan_to_num(doubt, nan=0.0, posinf=0.0) / lengths
-        measured = samples(values, lengths, program, self.unit, eps, minus != plus, repeatable, doubts)
+        measured, minus, plus = sampled(
+            self.cost, thetas, vectors, lengths, program, self.unit, self.options.eps, self._modes,
+            twice and self.options.repeated, doubts,
+        )  # fmt: skip
         if self._gradient is None:
             measured = [replace(s, derivative=judge(s).difference) for s in measured]
         findings = [judge(sample) for sample in measured]
@@ -394,15 +375,6 @@ class _Checker:
                 least = 8.0 * self.unit * float(np.abs(values).max())
                 self._rates.append(roughness.stopping_rate(values, 2.0 * reach, least))
         return apart <= EXPLAINED * max(self._rates)
-
-    def _sides(self, at: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the contact modes on the minus side and on the plus side, each ``(M, K)``: directions by steps."""
-        eps = self.options.eps.size
-        if self._modes is None:
-            return np.full((count, eps), ""), np.full((count, eps), "")
-        columns = at.reshape(at.shape[0], count, -1)[:, :, : 2 * eps].reshape(at.shape[0], -1)
-        names = np.array(self._modes(columns), dtype=object).reshape(count, 2 * eps)
-        return names[:, :eps], names[:, eps:]
 
     def _with_staircases(
         self, lines: Sequence[_Line], measured: list[Sample], findings: list[Finding]
@@ -494,6 +466,15 @@ class _Checker:
                 each for each, part in zip(right, parts, strict=True) if part.verdict in PLAINLY and part.program != 0.0
             ]
         return bool(right)
+
+
+def _real(name: str, values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Return values as float64; raises :class:`TypeError` for complex ones and :class:`ValueError` for another shape."""
+    if np.iscomplexobj(values):
+        raise TypeError(f"the {name} is complex; a check needs a real one")
+    if np.shape(values) != shape:
+        raise ValueError(f"the {name} has shape {np.shape(values)}, not {shape}")
+    return np.asarray(values, dtype=np.float64)
 
 
 def _with_verdict(part: Part, verdict: str, instead: Sequence[str]) -> Part:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -127,9 +127,8 @@ def errors_by_horizon(stages: GradientStages, horizons: Sequence[int]) -> list[H
         outcome = quick.check()
         if outcome is None:
             continue
-        program = np.array([part.program for part in outcome.parts]) * space.scale
-        differences = np.array([part.difference for part in outcome.parts]) * space.scale
-        doubts = np.array([part.uncertainty for part in outcome.parts]) * space.scale
+        numbers = [(part.program, part.difference, part.uncertainty) for part in outcome.parts]
+        program, differences, doubts = np.array(numbers).T * space.scale
         size = float(np.abs(differences).max()) or 1.0
         result.append(Horizon(steps, float(np.abs(program - differences).max() / size), float(doubts.max() / size)))
     return result
@@ -188,18 +187,8 @@ def is_adaptive(
     if sum(len(line.jumps) for line in lines) < FEWEST_JUMPS and error <= NEAR:
         first, noise = lines[0], max(outcome.noise, stages.repeats.spread)
         reach, unit = LONGER * float(first.at[-1]), stages.simulator.unit
-        longer = scan(
-            partial(stages.costs_along, first.direction),
-            np.zeros(1),
-            np.ones(1),
-            noise,
-            reach,
-            points,
-            halvings,
-            most,
-            unit,
-        )
-        lines = [replace(longer, direction=first.direction)]
+        cost = partial(stages.costs_along, first.direction)
+        lines = [scan(cost, first.direction, noise, reach, points, halvings, most, unit)]
     if sum(len(line.jumps) for line in lines) < FEWEST_JUMPS:
         return False
     rows = []

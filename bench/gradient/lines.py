@@ -90,8 +90,7 @@ class LineScan:
 
 
 def scan(
-    cost: Callable[[np.ndarray], np.ndarray],
-    theta: np.ndarray,
+    along: Callable[[np.ndarray], np.ndarray],
     direction: np.ndarray,
     noise: float,
     reach: float = 3.0,
@@ -100,15 +99,11 @@ def scan(
     most: int = PLACES,
     unit: float = float(np.finfo(np.float64).eps),
 ) -> LineScan:
-    """Return a scan of ``cost``, ``(d, B)`` to ``(B,)``, along ``theta + t * direction`` for t from -reach to +reach.
+    """Return a scan of the cost ``along(t)``, ``(n,)`` to ``(n,)``, on ``theta + t * direction`` for t from -reach to +reach.
 
-    ``theta`` and ``direction`` are ``(d,)``. ``noise`` is the size of the cost's rounding errors at theta, and ``unit``
-    the unit roundoff, from which they follow elsewhere. At most ``most`` places are searched for breaks.
+    ``noise`` is the size of the cost's rounding errors at theta, and ``unit`` the unit roundoff, from which they follow
+    elsewhere. At most ``most`` places are searched for breaks.
     """
-
-    def along(t: np.ndarray) -> np.ndarray:
-        return cost(theta[:, None] + direction[:, None] * t.ravel()).reshape(t.shape)
-
     t = np.linspace(-reach, reach, points)
     f = along(t)
     finite = f[np.isfinite(f)]
@@ -152,7 +147,7 @@ def _locate_breaks(
     turns, widths = [_second_difference(values)], [width]
     bends = [turns[0] / width]  # changes of slope: over all five points, as a kink may not be in the middle of three
     for _ in range(halvings):
-        between = along(np.stack([centre - width / 2, centre + width / 2], axis=1))
+        between = along(np.concatenate([centre - width / 2, centre + width / 2])).reshape(2, -1).T
         five = np.stack([values[:, 0], between[:, 0], values[:, 1], between[:, 1], values[:, 2]], axis=1)
         changes = np.abs(five[:, :-2] - 2 * five[:, 1:-1] + five[:, 2:])
         best = np.argmax(np.nan_to_num(changes, nan=-1.0), axis=1)
@@ -197,7 +192,7 @@ def _confirmed(
     away = np.arange(1, SIDES + 1)
     at = np.array([one.at for one in breaks])[:, None]
     step = np.array(widths)[:, None] * WIDER
-    sides = along(np.concatenate([at - step * away, at + step * away], axis=1)).reshape(len(breaks), 2, SIDES)
+    sides = along(np.concatenate([at - step * away, at + step * away], axis=1).ravel()).reshape(len(breaks), 2, SIDES)
     confirmed = []
     for one, both, width in zip(breaks, sides, step[:, 0], strict=True):
         bends = np.abs(np.diff(both, 2, axis=1)).max()

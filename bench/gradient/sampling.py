@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -9,6 +10,8 @@ import numpy as np
 from .direction import EPS, Sample
 from .roughness import POINTS, noise, offsets, scatter
 
+Modes = Callable[[np.ndarray], Sequence[str]]
+"""Names of the contact modes of columns: ``(d, B)`` to ``B`` strings."""
 LAST_DIGITS = 8
 """Rounding units by which the results of two equal calls may differ: threads add up in any order."""
 
@@ -36,39 +39,41 @@ def points(theta: np.ndarray, vectors: np.ndarray, unit: float, eps: np.ndarray 
     return np.asarray(moved.reshape(theta.shape[0], -1))
 
 
-def samples(
-    values: np.ndarray,
+def sampled(
+    cost: Callable[[np.ndarray], np.ndarray],
+    theta: np.ndarray,
+    vectors: np.ndarray,
     lengths: np.ndarray,
     derivatives: np.ndarray,
     unit: float,
     eps: np.ndarray = EPS,
-    crossing: np.ndarray | None = None,
-    repeatable: np.ndarray | None = None,
+    modes: Modes | None = None,
+    twice: bool = False,
     doubts: np.ndarray | None = None,
-) -> list[Sample]:
-    """Return a sample per direction, from the costs ``values (M, S)`` at :func:`points`.
+) -> tuple[list[Sample], np.ndarray, np.ndarray]:
+    """Return a sample per column of ``vectors (d, M)``, and the contact modes on the minus and plus sides, ``(M, K)`` each.
 
     A displacement of 1 along direction m has the length ``lengths[m]``, in the unit by which ``derivatives[m]`` is
-    taken.
+    taken. With ``twice``, costs are computed again in reverse order, which exposes columns that depend on their neighbours.
     """
-    count = eps.size
+    count, at = eps.size, points(theta, vectors, unit, eps)
+    values = cost(at).reshape(lengths.size, -1)
+    again = cost(at[:, ::-1])[::-1].reshape(values.shape) if twice else values
+    repeatable = np.all(repeats(values, again, unit), axis=1)
+    sides = at.reshape(len(at), lengths.size, -1)[:, :, : 2 * count].reshape(len(at), -1)
+    names = np.array([""] * sides.shape[1] if modes is None else modes(sides), dtype=object).reshape(lengths.size, -1)
+    minus_modes, plus_modes = names[:, :count], names[:, count:]
     result = []
     for m, row in enumerate(values):
         with np.errstate(over="ignore", invalid="ignore"):
-            minus, centre, plus = row[:count], float(row[2 * count]), row[count : 2 * count]
             measured = noise(row[2 * count + 1 :].reshape(2, POINTS))
             sample = Sample(
-                eps * lengths[m], minus, centre, plus,
-                derivative=float(derivatives[m]),
-                crossing=np.zeros(count, bool) if crossing is None else crossing[m],
-                repeatable=True if repeatable is None else bool(repeatable[m]),
-                scale=float(lengths[m]),
-                unit=unit,
-                noise=measured,
-                doubt=0.0 if doubts is None else float(doubts[m]),
+                eps * lengths[m], row[:count], float(row[2 * count]), row[count : 2 * count], float(derivatives[m]),
+                minus_modes[m] != plus_modes[m], bool(repeatable[m]), float(lengths[m]), unit, measured,
+                0.0 if doubts is None else float(doubts[m]),
             )  # fmt: skip
             result.append(replace(sample, noise=max(measured, scatter(sample.step, sample.differences))))
-    return result
+    return result, minus_modes, plus_modes
 
 
 def order(sample: Sample) -> float:

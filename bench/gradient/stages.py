@@ -24,10 +24,12 @@ from bench.gradient import (
     FewSteps,
     Options,
     Part,
+    Sample,
     check,
     is_nothing,
     most_severe,
 )  # fmt: skip
+from bench.gradient.roughness import FINE
 from bench.gradient.subspace import Group, Subspace, choose, locate
 from bench.simulator.clock import Clock, OutOfTime
 from bench.simulator.simulator import Simulator
@@ -531,14 +533,19 @@ def _with_zeros(outcome: Check) -> Check:
 
 
 def _with_roughness(outcome: Check) -> Check:
-    """Return a check with the cause ``rough`` where the cost varies as much between neighbours as over a wide step."""
+    """Return a check with the cause ``rough`` where the cost varies as much between neighbours as over a wide step.
+
+    Where the gradient itself says that neighbours differ by as much, as in chaos, it is not blamed.
+    """
     samples = [part.sample for part in outcome.parts if outcome.cause == "unsettled"]
-    changes = [np.abs(sample.plus - sample.minus)[sample.finite].max(initial=0.0) for sample in samples]
-    is_rough = any(
-        sample.noise > ROUGH * change and sample.noise > 1e6 * sample.unit * abs(sample.centre)
-        for sample, change in zip(samples, changes, strict=True)
-    )
-    return replace(outcome, cause="rough") if is_rough else outcome
+    is_blamed = any(is_rough(one) and abs(one.derivative) * FINE * one.scale < one.noise for one in samples)
+    return replace(outcome, cause="rough") if is_blamed else outcome
+
+
+def is_rough(sample: Sample) -> bool:
+    """Return whether the cost varies as much between neighbouring thetas as over a wide step."""
+    change = np.abs(sample.plus - sample.minus)[sample.finite].max(initial=0.0)
+    return bool(sample.noise > ROUGH * change and sample.noise > 1e6 * sample.unit * abs(sample.centre))
 
 
 def recaused(outcome: Check, replaced: Callable[[Part], Part] = lambda part: part) -> Check:

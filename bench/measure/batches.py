@@ -13,7 +13,6 @@ def in_columns(function: Callable[[np.ndarray], np.ndarray], w: np.ndarray, colu
     The last part is padded with copies of its last column, whose results are dropped.
     """
     count = w.shape[1]
-    n_missing = -count % columns
-    padded = np.concatenate([w, np.repeat(w[:, -1:], n_missing, axis=1)], axis=1) if n_missing else w
+    padded = np.pad(w, ((0, 0), (0, -count % columns)), mode="edge")
     parts = [function(padded[:, i : i + columns]) for i in range(0, padded.shape[1], columns)]
     return np.concatenate(parts, axis=-1)[..., :count]

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from bench.model.manifold import difference, n_changes, retract, slope_by_changes
 from bench.model.ops import LoopOps, State
 from bench.model.problem import Jacobians, Problem
-from bench.model.program import Program, Rollout, rollout
+from bench.model.program import Rollout, rollout
 from bench.model.scene import MechanicalScene
 
 REVISION = 1
@@ -67,9 +67,6 @@ def slopes(problem: Problem, theta: np.ndarray, w: np.ndarray) -> Slopes:
     def end(x: np.ndarray) -> np.ndarray:
         return np.asarray(scene.terminal_cost(np, *_split(program, x)))
 
-    def back(x: np.ndarray) -> np.ndarray | None:
-        return scene.feedback(np, np.tile(noisy, (1, horizon)), *_split(program, x))
-
     def by_state(function: Callable[[np.ndarray], np.ndarray], x: np.ndarray) -> np.ndarray:
         if n_changes(scene) == len(x):
             return _central_differences(function, x)
@@ -87,8 +84,9 @@ def slopes(problem: Problem, theta: np.ndarray, w: np.ndarray) -> Slopes:
     )
     is_shared = np.ndim(theta) == 1 and program.action_noise
     feedback_x = _feedback_slopes(scene, path, noisy[:, :1] if is_shared else noisy)
-    if feedback_x is None and back(before) is not None:
-        feedback_x = np.stack([_unflatten(row, horizon) for row in by_state(back, before)], axis=1)  # type: ignore[arg-type]
+    if feedback_x is None and not program.is_open_loop:
+        rows = by_state(lambda x: _feedback(program, noisy, x), before)
+        feedback_x = np.stack([_unflatten(row, horizon) for row in rows], axis=1)
     return Slopes(path.states, path.a, path.b, cost, cost_x, cost_u, feedback_x, noisy)
 
 
@@ -118,7 +116,7 @@ def by_actions(path: Slopes, cut: Cut | None = None) -> tuple[np.ndarray, np.nda
 def by_theta(problem: Problem, path: Slopes, by_control: np.ndarray, adjoint: np.ndarray) -> np.ndarray:
     """Return the gradient ``(d, B)`` from derivatives by action ``(T, m, B)`` and by initial state ``(k, B)``."""
     program = rollout(problem.program)
-    scene, horizon = program.scene, len(path.a)
+    scene = program.scene
     if scene.open_loop:
         each = by_control.reshape(scene.controls, -1, *by_control.shape[1:])
         result = each.sum(axis=1).reshape(program.dim, -1)
@@ -127,12 +125,13 @@ def by_theta(problem: Problem, path: Slopes, by_control: np.ndarray, adjoint: np
     x = _flatten(path.states[:-1])
     flat = _flatten(by_control)
 
-    def back(theta: np.ndarray) -> np.ndarray | None:
-        return scene.feedback(np, np.tile(theta, (1, horizon)), *_split(program, x))
-
     if path.feedback_x is not None:
         along = scene.pullback(path.theta, np.moveaxis(path.states[:-1], 1, 0), np.moveaxis(by_control, 1, 0))
-        result = result + (_theta_differences(back, path.theta, flat) if along is None else along[0])
+        result = result + (
+            _theta_differences(lambda theta: _feedback(program, theta, x), path.theta, flat)
+            if along is None
+            else along[0]
+        )
     first = path.states[0]
 
     def initial(theta: np.ndarray) -> np.ndarray:
@@ -173,14 +172,11 @@ def _difference_jacobians(program: Rollout, theta: np.ndarray, w: np.ndarray) ->
         with np.errstate(all="ignore"):
             return np.concatenate(program.step(ops, State(*_split(program, x)), u))
 
-    a = np.stack(
-        [_unflatten(row, len(controls)) for row in _central_differences(lambda x: after(x, u), before)], axis=1
-    )
-    if not u.shape[0]:
-        return Jacobians(states, controls, a, np.zeros((*a.shape[:2], 0, a.shape[3])))
-    b = np.stack(
-        [_unflatten(row, len(controls)) for row in _central_differences(lambda c: after(before, c), u)], axis=1
-    )
+    def by(function: Callable[[np.ndarray], np.ndarray], x: np.ndarray) -> np.ndarray:
+        return np.stack([_unflatten(row, len(controls)) for row in _central_differences(function, x)], axis=1)
+
+    a = by(lambda x: after(x, u), before)
+    b = by(lambda c: after(before, c), u) if len(u) else np.zeros((*a.shape[:2], 0, a.shape[3]))
     return Jacobians(states, controls, a, b)
 
 
@@ -221,9 +217,13 @@ def _theta_differences(
     return result
 
 
-def _split(program: Program, x: np.ndarray) -> State:
-    n_q = rollout(program).scene.n_q
-    return State(x[:n_q], x[n_q:])
+def _split(program: Rollout, x: np.ndarray) -> State:
+    return State(*np.split(x, [program.scene.n_q]))
+
+
+def _feedback(program: Rollout, theta: np.ndarray, x: np.ndarray) -> Any:
+    """Return the feedback in the states ``x (n, T * B)`` under ``theta (d, B)``, ``(n_u, T * B)``; None without it."""
+    return program.scene.feedback(np, np.tile(theta, (1, x.shape[1] // theta.shape[1])), *_split(program, x))
 
 
 def _flatten(values: np.ndarray) -> np.ndarray:

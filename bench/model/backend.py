@@ -38,7 +38,7 @@ class Backend(Plugin):
     def compile(self, program: Program) -> Problem:
         """Return the program compiled as a problem."""
 
-    def unsupported_reason(self, program: Program) -> str | None:
+    def own_refusal(self, program: Program) -> str | None:
         """Return why this backend's own limits exclude the program, or None."""
         return None
 
@@ -52,4 +52,4 @@ class Backend(Plugin):
             return f"{part.name} solves an equation each step, and backend {self.name} has no root finder"
         if not program.needs <= self.provides:
             return f"{program.scene.name} runs only in physics engines, and backend {self.name} is not one"
-        return self.unsupported_reason(program)
+        return self.own_refusal(program)

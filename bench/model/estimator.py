@@ -44,6 +44,8 @@ class Estimator(Plugin):
     """Whether it excludes noise on the actions of a policy."""
     needs_directions: ClassVar[bool] = False
     """Whether it uses each sample's noise as a direction in theta space, which needs at least d numbers per sample."""
+    smooths_theta: ClassVar[bool] = False
+    """Whether it smooths over theta, also where the noise is on a policy's actions, and so has another target there."""
     couples_samples: ClassVar[bool] = False
     """Whether its directions are chosen together or a model is fitted to them, so that the variance may fall faster than 1/N."""
     gives_gradient: ClassVar[bool] = True
@@ -68,7 +70,8 @@ class Estimator(Plugin):
     def declares_unbiased(self, program: Program) -> bool:
         """Return whether the estimator declares that its expectation is grad J_sigma of the program."""
         derivative = program.continuous and not program.surrogate
-        return self.unbiased and self.target == "smoothed" and (derivative or self.unbiased_at_discontinuities)
+        is_target = self.target == "smoothed" and (program.noise_on_theta or not self.smooths_theta)
+        return self.unbiased and is_target and (derivative or self.unbiased_at_discontinuities)
 
     def remark(self, diagnostics: Mapping[str, Mapping[str, float]]) -> str:
         """Return a doubt about intervals, from mean, quantiles and share of zeros of each diagnostic; empty if none."""
@@ -78,7 +81,7 @@ class Estimator(Plugin):
         """Return the smoothing whose gradient is the reference for this estimator's rows; None: J_sigma."""
         return None
 
-    def unsupported_reason(self, program: Program) -> str | None:
+    def own_refusal(self, program: Program) -> str | None:
         """Return why this estimator's own limits exclude the program, or None."""
         if self.needs_noise_on_theta and not program.noise_on_theta:
             return f"{self.name} needs noise on theta, not on a policy's actions"
@@ -97,7 +100,7 @@ class Estimator(Plugin):
         own = program.n_noise - program.exogenous
         if self.needs_directions and own < program.dim:
             return f"{self.name} needs {program.dim} normal numbers per sample, and the noise model has {own}"
-        return self.unsupported_reason(program)
+        return self.own_refusal(program)
 
 
 @dataclass(frozen=True)

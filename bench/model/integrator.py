@@ -22,6 +22,8 @@ class Integrator(Plugin):
     """Order of the global error in dt on smooth dynamics."""
     takes_impulses: ClassVar[bool] = False
     """Whether a step can apply an :class:`ImpulseLaw`."""
+    moves_with: ClassVar[str] = ""
+    """The velocity that moves the position, for a step with one acceleration, at its start: ``new`` or ``old``."""
     needs_root: ClassVar[bool] = False
     """Whether a step solves an equation, so that only backends with ``root`` can run it."""
 

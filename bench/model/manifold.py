@@ -6,6 +6,7 @@ and derivatives by states are derivatives by changes.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -39,41 +40,40 @@ class JointScene(EngineScene):
         if strange := [joint for joint in joints if joint not in SIZES]:
             raise TypeError(f"{cls.__name__} has the joint {strange[0]!r}: allowed are {', '.join(SIZES)}")
         if joints:
-            cls.n_q, cls.n_v = (sum(SIZES[joint][i] for joint in cls.joints) for i in (0, 1))
+            cls.n_q, cls.n_v = (sum(SIZES[joint][i] for joint in cls.joints) for i in (0, 1))  # type: ignore[assignment, method-assign]
 
     def retract(self, xp: Any, q: Array, change: Array) -> Array:
         """Return the positions ``(n_q, B)`` at a change ``(n_v, B)`` from q; exact to second order in the change."""
-        parts, at, by = [], 0, 0
-        for joint in self.joints:
-            if joint == "free":
-                parts.append(q[at : at + 3] + change[by : by + 3])
-                at, by = at + 3, by + 3
-            if joint in ("free", "ball"):
-                half = change[by : by + 3] / 2
-                moved = _times(xp, q[at : at + 4], [1.0 + 0.0 * half[0], *half])
-                parts.append(moved / xp.sqrt(xp.sum(moved * moved, axis=0)))
-                at, by = at + 4, by + 3
-            else:
-                parts.append(q[at : at + 1] + change[by : by + 1])
-                at, by = at + 1, by + 1
+        parts = []
+        for is_turn, at, by in self._pieces():
+            if not is_turn:
+                parts.append(q[at] + change[by])
+                continue
+            half = change[by] / 2
+            moved = _times(xp, q[at], [1.0 + 0.0 * half[0], *half])
+            parts.append(moved / xp.sqrt(xp.sum(moved * moved, axis=0)))
         return xp.concat(parts)
 
     def difference(self, xp: Any, q: Array, start: Array) -> Array:
         """Return the change ``(n_v, B)`` from the positions ``start`` to q ``(n_q, B)``; exact to second order."""
-        parts, at = [], 0
-        for joint in self.joints:
-            if joint == "free":
-                parts.append(q[at : at + 3] - start[at : at + 3])
-                at += 3
-            if joint in ("free", "ball"):
-                w, x, y, z = start[at : at + 4]
-                turn = _times(xp, xp.stack([w, -x, -y, -z]), q[at : at + 4])
-                parts.append(2 * turn[1:] / turn[:1])
-                at += 4
-            else:
-                parts.append(q[at : at + 1] - start[at : at + 1])
-                at += 1
+        parts = []
+        for is_turn, at, _ in self._pieces():
+            if not is_turn:
+                parts.append(q[at] - start[at])
+                continue
+            w, x, y, z = start[at]
+            turn = _times(xp, xp.stack([w, -x, -y, -z]), q[at])
+            parts.append(2 * turn[1:] / turn[:1])
         return xp.concat(parts)
+
+    def _pieces(self) -> Iterator[tuple[bool, slice, slice]]:
+        """Yield, for each position vector or quaternion, whether it is a quaternion, and its entries of q and of v."""
+        at = by = 0
+        kinds = [kind for joint in self.joints for kind in (("place", "ball") if joint == "free" else (joint,))]
+        for kind in kinds:
+            n_q, n_v = (3, 3) if kind == "place" else SIZES[kind]
+            yield kind == "ball", slice(at, at + n_q), slice(by, by + n_v)
+            at, by = at + n_q, by + n_v
 
 
 def _times(xp: Any, a: Any, b: Any) -> Array:
@@ -84,21 +84,16 @@ def _times(xp: Any, a: Any, b: Any) -> Array:
     ])  # fmt: skip
 
 
-def n_velocities(scene: MechanicalScene) -> int:
-    """Return the length of v."""
-    return scene.n_q if scene.n_v is None else scene.n_v
-
-
 def n_changes(scene: MechanicalScene) -> int:
     """Return the length of a change of the state (q, v)."""
-    return n_velocities(scene) + (n_velocities(scene) if isinstance(scene, JointScene) else scene.n_q)
+    return scene.n_v + (scene.n_v if isinstance(scene, JointScene) else scene.n_q)
 
 
 def retract(scene: MechanicalScene, xp: Any, x: Array, change: Array) -> Array:
     """Return the state ``(n, B)`` at a change ``(n_changes, B)`` from the state x ``(n, B)``."""
     if not isinstance(scene, JointScene):
         return x + change
-    n_q, n_v = scene.n_q, n_velocities(scene)
+    n_q, n_v = scene.n_q, scene.n_v
     return xp.concat([scene.retract(xp, x[:n_q], change[:n_v]), x[n_q:] + change[n_v:]])
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,15 +13,20 @@ Array = Any
 """An array of the backend's library: NumPy, torch or JAX."""
 
 
-class Ops(Protocol):
-    """The operations that a backend provides to model code."""
+class LoopOps:
+    """The operations that a backend provides to model code: here a Python loop, and no root finder.
 
-    @property
-    def xp(self) -> Any:
-        """Array namespace following the Python array API standard (numpy, torch via array-api-compat, jax.numpy)."""
+    ``xp`` is an array namespace following the Python array API standard: numpy, torch via array-api-compat, jax.numpy.
+    """
+
+    def __init__(self, xp: Any = np) -> None:
+        self.xp = xp
 
     def scan(self, step: Callable[[Any, Any], Any], carry: Any, xs: Any, length: int) -> Any:
         """Return the last carry of ``carry = step(carry, x)`` over the leading axis of the leaves of ``xs``."""
+        for t in range(length):
+            carry = step(carry, tuple(x[t] for x in xs))
+        return carry
 
     def root(self, residual: Callable[[Array, Any], Array], guess: Array, args: Any) -> Array:
         """Return ``z (n, B)`` with ``residual(z, args) = 0``, whose column b must depend on column b of z only.
@@ -29,28 +34,11 @@ class Ops(Protocol):
         The derivative is computed by the implicit-function theorem. Raises :class:`Unsupported` on backends without
         ``root``.
         """
-
-
-class LoopOps:
-    """Operations of a backend without a root finder, for any array namespace: ``scan`` is a Python loop.
-
-    :meth:`root` raises :class:`Unsupported`.
-    """
-
-    def __init__(self, xp: Any = np) -> None:
-        self.xp = xp
-
-    def scan(self, step: Callable[[Any, Any], Any], carry: Any, xs: Any, length: int) -> Any:
-        """Return the last carry of a Python loop over the leading axis of ``xs``."""
-        for t in range(length):
-            carry = step(carry, tuple(x[t] for x in xs))
-        return carry
-
-    def root(self, residual: Callable[[Array, Any], Array], guess: Array, args: Any) -> Array:
-        """Raise :class:`Unsupported`: only backends that provide ``root`` solve equations."""
         raise Unsupported(NO_ROOT)
 
 
+Ops = LoopOps
+"""The type of the operations of any backend, with or without ``root``."""
 NO_ROOT = "a step solves an equation, and this backend has no root finder: use a backend that provides root (see `python -m bench list backends`)"
 
 

@@ -143,7 +143,10 @@ class PolicyScene(MechanicalScene):
         """
         if not registry.installed("jax"):
             return None
-        total, by_state = _product(self, theta.shape, states.shape, by_theta)(theta, states, weights)
+        import jax
+
+        jax.config.update("jax_enable_x64", True)
+        total, by_state = _product(self, by_theta)(theta, states, weights)
         return np.asarray(total), np.asarray(by_state)
 
 
@@ -156,12 +159,9 @@ def uniform(xp: Any, e: Array) -> Array:
     return xp.exp(-0.5 * (e[:half] ** 2 + e[half:] ** 2))
 
 
-_products: dict[tuple[Any, ...], Callable[..., Any]] = {}
-"""Compiled vector-Jacobian products of policies, by scene and the shapes of theta and states."""
-
-
-def _product(scene: PolicyScene, theta: tuple[int, ...], states: tuple[int, ...], by_theta: bool) -> Callable[..., Any]:
-    """Return the compiled product of :meth:`PolicyScene.pullback` for arrays of these shapes."""
+@remember
+def _product(scene: PolicyScene, by_theta: bool) -> Callable[..., Any]:
+    """Return the vector-Jacobian product of :meth:`PolicyScene.pullback`, compiled by JAX for each shape."""
     import jax
     import jax.numpy as jnp
 
@@ -182,8 +182,4 @@ def _product(scene: PolicyScene, theta: tuple[int, ...], states: tuple[int, ...]
         total, by_state = jax.lax.scan(step, jnp.zeros_like(theta), steps)
         return total, jnp.moveaxis(by_state, 0, 1)
 
-    jax.config.update("jax_enable_x64", True)
-    key = (scene, theta, states, by_theta)
-    if key not in _products:
-        _products[key] = jax.jit(product)
-    return _products[key]
+    return jax.jit(product)

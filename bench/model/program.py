@@ -331,19 +331,14 @@ class Rollout(Program):
     @property
     def noise_on_theta(self) -> bool:
         """Whether noise is on theta: parameter noise, or action noise if theta is only the sequence of controls."""
-        return not self.action_noise or self.plans_controls
-
-    @property
-    def plans_controls(self) -> bool:
-        """Whether theta is the sequence of controls, and nothing else."""
-        return self.scene.open_loop and self._only_controls and not self._moves_start
+        plans_controls = self.scene.open_loop and self._only_controls and not self._moves_start
+        return not self.action_noise or plans_controls
 
     @property
     def is_open_loop(self) -> bool:
         """Whether the control law does not depend on the state."""
-        scene = self.scene
-        n_v = scene.n_q if scene.n_v is None else scene.n_v
-        return scene.feedback(np, np.zeros((self.dim, 1)), np.zeros((scene.n_q, 1)), np.zeros((n_v, 1))) is None
+        theta, q, v = (np.zeros((n, 1)) for n in (self.dim, self.scene.n_q, self.scene.n_v))
+        return self.scene.feedback(np, theta, q, v) is None
 
     @property
     def has_score_gradient(self) -> bool:
@@ -482,7 +477,7 @@ class Rollout(Program):
         return cost + scene.terminal_cost(xp, state.q, state.v), logp
 
 
-class _VaryingOps:
+class _VaryingOps(Ops):
     """Operations for a program whose named parameters differ between columns.
 
     A residual reads parameters from the scene and the law, with the values of all columns. A solver that processes
@@ -490,13 +485,8 @@ class _VaryingOps:
     """
 
     def __init__(self, ops: Ops, places: list[tuple[Plugin, str]]) -> None:
-        self._ops = ops
-        self._places = places
-
-    @property
-    def xp(self) -> Any:
-        """The array namespace."""
-        return self._ops.xp
+        super().__init__(ops.xp)
+        self._ops, self._places = ops, places
 
     def scan(self, step: Callable[[Any, Any], Any], carry: Any, xs: Any, length: int) -> Any:
         """Return the last carry of the backend's ``scan``."""

@@ -34,9 +34,16 @@ class Scene(Plugin):
     """Whether theta consists of scene parameters to be identified, and the cost compares the motion with a record."""
     exogenous: ClassVar[int] = 0
     """Number of the scene's own normal numbers per rollout, the last rows of w. A property where parameters decide it."""
+    theta_names: ClassVar[tuple[str, ...]] = ()
+    """Names of the parameters that are theta, in place of :meth:`theta0`; in an open-loop scene, those of every control."""
 
     sigma: float = param(0.1, "standard deviation of the Gaussian noise in J", positive=True)
     noise: str = param("parameter", "whether noise is on theta or on the actions of each step", choices=("parameter",))
+
+    def __init_subclass__(cls, **arguments: Any) -> None:
+        super().__init_subclass__(**arguments)
+        if "theta_names" in vars(cls):
+            cls.theta0 = _named_theta  # type: ignore[assignment, method-assign]
 
     @abstractmethod
     def theta0(self) -> np.ndarray:
@@ -57,6 +64,12 @@ class Scene(Plugin):
     def physical_cost(self) -> float | None:
         """Return f of the physics (rigid contact, dt -> 0) at :meth:`theta0`, without noise, or None."""
         return None
+
+
+def _named_theta(scene: Scene) -> np.ndarray:
+    """Return the values of the scene's :attr:`~Scene.theta_names`, once per control of an open loop, ``(d,)``."""
+    values = np.array([getattr(scene, name) for name in scene.theta_names])
+    return np.tile(values, scene.controls) if isinstance(scene, MechanicalScene) and scene.open_loop else values
 
 
 @dataclass(frozen=True)
@@ -94,8 +107,6 @@ class MechanicalScene(Scene):
     """
 
     n_q: ClassVar[int]
-    n_v: ClassVar[int | None] = None
-    """Length of v; None: n_q. A scene with n_q = 0 and n_v = 1 is first-order: v' = acceleration(v)."""
     n_u: ClassVar[int] = 0
     n_contacts: ClassVar[int] = 0
     """Number of contacts; more than 0 only in a :class:`ContactScene` or an :class:`EngineScene`."""
@@ -115,9 +126,20 @@ class MechanicalScene(Scene):
                 "and contact_acceleration, or from EngineScene if only an engine computes its contacts"
             )
 
+    @property
+    def n_v(self) -> int:
+        """Length of v: n_q by default. A scene with n_q = 0 and n_v = 1 is first-order: v' = acceleration(v)."""
+        return self.n_q
+
     @abstractmethod
     def initial_state(self, xp: Any, theta: Array) -> State:
         """Return the state at t = 0 for ``theta (d, B)``."""
+
+    @staticmethod
+    def at_rest(xp: Any, theta: Array, *q: Any) -> State:
+        """Return the state with the positions ``q``, one number each, and without velocity, for ``theta (d, B)``."""
+        zero = 0.0 * theta[0]
+        return State(xp.stack([zero + x for x in q]), xp.stack([zero] * len(q)))
 
     def starting_state(self, xp: Any, theta: Array, e: Array | None) -> State:
         """Return the state at t = 0 for ``theta (d, B)`` and the scene's own noise ``e (exogenous, B)``, None without it."""

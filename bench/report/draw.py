@@ -34,6 +34,8 @@ WIDTH, NARROW = 7.16, 3.5
 """Figure widths in inches: two columns of a paper, or one."""
 LINE = 0.155
 """Height of a line of text in inches."""
+ENTRY = 0.142
+"""Height of a line of the legend in inches."""
 BOLD = 1.3
 """Width of a bold title relative to the same text elsewhere."""
 AXIS = 0.45
@@ -153,8 +155,8 @@ def _frame(figure: Figure, layout: ConstrainedLayoutEngine, chart: Chart, legend
     texts = [str(handle.get_label()) for handle in legend]
     columns = _legend_columns(texts, width)
     # one column if any label is broken
-    lines = math.ceil(len(legend) / columns) + sum(text.count("\n") for text in texts)
-    below = 0.05 + LINE * 1.12 * lines if legend else 0.0
+    broken = sum(text.count("\n") for text in texts)
+    below = 0.09 + ENTRY * math.ceil(len(legend) / columns) + LINE * broken if legend else 0.0
     height = head + body + below
     figure.set_size_inches(width, height)
     layout.set(rect=(0.005, below / height, 0.99, 1 - (below + head) / height))

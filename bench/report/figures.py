@@ -11,7 +11,7 @@ from typing import Any
 
 import matplotlib
 import pandas as pd
-from matplotlib.figure import Figure, SubFigure
+from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
 from PIL import Image
 
@@ -75,7 +75,7 @@ def inline_svg(figure: Figure, name: str) -> str:
 
 
 def _settle(figure: Figure) -> None:
-    """Compute the layout once, and round the places of subfigures and axes to a hundredth of a pixel or less.
+    """Compute the layout once, and round the places of axes to a hundredth of a pixel or less.
 
     The solver of constrained layouts orders its variables by their addresses in memory, so its results differ between runs
     in the last bits. Where a text is half a pixel from its neighbours, that would move it by a pixel.
@@ -84,11 +84,6 @@ def _settle(figure: Figure) -> None:
         figure.set_dpi(DPI)
         figure.draw_without_rendering()
         figure.set_layout_engine("none")
-    parts: list[Figure | SubFigure] = [figure]
-    for part in parts:
-        parts += part.subfigs
-    for part in parts[1:]:
-        part.bbox_relative.set_points(part.bbox_relative.get_points().round(PLACES))  # type: ignore[union-attr]
     for axes in figure.axes:
         axes.set_position(Bbox(axes.get_position(original=True).get_points().round(PLACES)))
 

@@ -13,8 +13,6 @@ PALETTE = ("#0072B2", "#000000", "#D55E00", "#009E73", "#CC79A7", "#C88031", "#3
 MARKERS = "osD^vPX*"
 VARIANTS = ("-", (0, (4, 1.5)), (0, (1, 1.2)))
 """Line styles of one estimator's parameter variants."""
-DEVIANT = ((0, (6, 1.5, 1, 1.5)), (0, (6, 1.5, 1, 1.5, 1, 1.5)), (0, (2, 2)))
-"""Line styles of backends whose numbers differ from the first backend's."""
 MARKS = ((0, (3, 2)), (0, (1, 1.5)), (0, (5, 1, 1, 1)))
 """Line styles of marked values on an axis."""
 GREY = "#404040"

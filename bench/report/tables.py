@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
-from types import MappingProxyType
+from collections.abc import Iterator
 
 import pandas as pd
 
@@ -16,22 +15,17 @@ WHOLE = ("horizon", "samples", "repeats", "dim", "seed")
 """Columns of whole numbers, which pandas would write with a decimal point."""
 
 
-def csv(table: pd.DataFrame) -> str:
-    """Return a table as CSV with all digits of every number."""
-    return "".join(csv_blocks(table))
-
-
 def csv_blocks(table: pd.DataFrame) -> Iterator[str]:
-    """Yield :func:`csv` in blocks of lines, so that a long table is never in memory as one string."""
+    """Yield a table as CSV with all digits of every number, in blocks: a long one is never in memory as one string."""
     whole = [name for name in WHOLE if name in table and (table[name].dropna() % 1 == 0).all()]
     for start in range(0, max(len(table), 1), BLOCK):
         block = table.iloc[start : start + BLOCK].astype(dict.fromkeys(whole, "Int64"))
         yield str(block.to_csv(index=False, header=start == 0, lineterminator="\n"))
 
 
-def plain_markdown(table: pd.DataFrame, heads: Mapping[str, str] = MappingProxyType({})) -> str:
-    """Return a table of strings in Markdown; ``heads`` replaces the names of some columns."""
-    out = ["| " + " | ".join(heads.get(name, name) for name in table) + " |", "|" + "---|" * table.shape[1]]
+def plain_markdown(table: pd.DataFrame) -> str:
+    """Return a table of strings in Markdown."""
+    out = ["| " + " | ".join(table) + " |", "|" + "---|" * table.shape[1]]
     out += ["| " + " | ".join(map(escape_markdown, map(str, row))) + " |" for row in table.fillna("").to_numpy()]
     return "\n".join(out)
 

@@ -30,8 +30,8 @@ VIEWS_OF_LAWS = ("stiffness", "smoothing")
 """Columns that repeat a parameter of the contact law, which may be swept under its own name."""
 CELL = ("study", "parameters", "samples", "repeats", "seed")
 """The columns that identify a cell."""
-EXACT, CLOSE = 1e-6, 1e-2
-"""Largest relative differences between backends whose numbers count as equal, and as nearly equal."""
+CLOSE = 1e-2
+"""Largest relative difference between backends whose numbers count as equal."""
 
 
 def attempted(rows: pd.DataFrame) -> pd.DataFrame:
@@ -122,12 +122,12 @@ class Curve:
 
     estimator: str
     params: str
-    backends: Mapping[str, bool]
-    """The merged backends: True if their numbers are equal, False if they are only nearly equal."""
+    backends: tuple[str, ...]
+    """The merged backends."""
     rows: pd.DataFrame
     """The first backend's rows, indexed by ``x`` in increasing order."""
-    seconds: Mapping[str, float]
-    """Median time [s] of one estimate on each backend."""
+    seconds: float
+    """Median time [s] of one estimate on the fastest of the backends; NaN if none is timed."""
 
     @cached_property
     def at(self) -> dict[float, dict[str, Any]]:
@@ -155,43 +155,29 @@ def estimator_curves(rows: pd.DataFrame, close: float | None = CLOSE) -> list[Cu
     several = rows["dtype"].nunique() > 1
     tidy = rows.drop_duplicates([*RUN, "x"], keep="last").sort_values("x", kind="stable").set_index("x")
     parts: dict[Any, pd.DataFrame] = dict(list(tidy.groupby(list(RUN), sort=False)))
-    every: dict[tuple[str, str], dict[str, _Run]] = {}
+    every: dict[tuple[str, str], dict[str, pd.DataFrame]] = {}
     for estimator, params, backend, dtype in rows[list(RUN)].drop_duplicates().itertuples(index=False, name=None):
         name = f"{backend} {dtype}" if several else str(backend)
-        every.setdefault((estimator, params), {})[name] = _Run(parts[estimator, params, backend, dtype])
+        every.setdefault((estimator, params), {})[name] = parts[estimator, params, backend, dtype]
     result = []
     for (estimator, params), runs in every.items():
         while runs:
-            first, mine = next(iter(runs.items()))
-            alike = [n for n, run in runs.items() if n == first or (close is not None and _agree(mine, run, close))]
-            exact = {name: name == first or _agree(mine, runs[name], EXACT) for name in alike}
-            backends = dict(sorted(exact.items(), key=lambda item: not item[1]))
-            seconds = {name: float(runs[name].rows["time_s"].median()) for name in backends}
-            result.append(Curve(str(estimator), str(params), backends, mine.rows, seconds))
-            runs = {name: run for name, run in runs.items() if name not in backends}
+            first = next(iter(runs.values()))
+            alike = {
+                n: run for n, run in runs.items() if run is first or (close is not None and _agree(first, run, close))
+            }
+            times = [float(run["time_s"].median()) for run in alike.values()]
+            seconds = min((time for time in times if time > 0), default=math.nan)
+            result.append(Curve(estimator, params, tuple(alike), first, seconds))
+            runs = {name: run for name, run in runs.items() if name not in alike}
     return result
 
 
-@dataclass(frozen=True, eq=False)
-class _Run:
-    """One estimator on one backend along ``x``."""
-
-    rows: pd.DataFrame
-
-    @cached_property
-    def ends(self) -> list[tuple[float, str]]:
-        return list(zip(self.rows.index, self.rows["status"], strict=True))
-
-    @cached_property
-    def numbers(self) -> np.ndarray:
-        return np.asarray(self.rows[["rmse", "variance", "bias_high", "bias"]], dtype=float)
-
-
-def _agree(a: _Run, b: _Run, tolerance: float) -> bool:
+def _agree(a: pd.DataFrame, b: pd.DataFrame, tolerance: float) -> bool:
     """Return whether two backends have the same status at every ``x``, and numbers within a relative tolerance."""
-    if a.ends != b.ends:
+    if not a["status"].equals(b["status"]):
         return False
-    x, y = a.numbers, b.numbers
+    x, y = (run[["rmse", "variance", "bias_high", "bias"]].to_numpy(float) for run in (a, b))
     with np.errstate(invalid="ignore"):
         margin = tolerance * np.fmax(np.abs(x), np.abs(y))[:, [0, 1, 2, 2]]
         alike = (x == y) | (np.isnan(x) & np.isnan(y)) | (np.abs(x - y) <= margin)
@@ -220,12 +206,6 @@ def unsteady(rows: Any) -> Any:
 def is_bias_resolved(row: Any) -> Any:
     """Return whether the bias is distinguishable from 0: of one row, or of each row of a table."""
     return row["bias_low"] > 0
-
-
-def relative(row: Any, column: str) -> float:
-    """Return a column of a row in units of |grad J|; NaN if |grad J| is 0."""
-    norm = row["reference_norm"]
-    return float(row[column] / norm) if norm > 0 else math.nan
 
 
 def rmse_interval(row: Any) -> tuple[Any, Any]:

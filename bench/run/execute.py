@@ -120,7 +120,7 @@ def _refuse_without_supported_cells(experiment: Experiment, planned: Sequence[Pl
         return
     study = study_of(experiment)
     try:
-        reasons = dict.fromkeys(study.unsupported_reason(item.cell) for item in planned)
+        reasons = dict.fromkeys(study.refusal(item.cell) for item in planned)
     except (Unsupported, UserError):
         return  # a cell without a program reports the reason in its row
     if reasons and None not in reasons:

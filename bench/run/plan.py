@@ -70,7 +70,9 @@ def _is_in_shard(cell: Cell, shard: tuple[int, int] | None) -> bool:
 
 
 def _planned(experiment: Experiment, cell: Cell, stored: dict[str, tuple[str, str, str]]) -> Planned:
-    refusal = cell.refusal() or _refusal_of_study(experiment, cell)
+    refusal = cell.refusal()
+    if refusal is None and (reason := study_of(experiment).refusal(cell)) is not None:
+        refusal = ("unsupported", reason)
     if cell.key not in stored:
         return Planned(cell, False, refusal)
     status, row_versions, machine = stored[cell.key]
@@ -120,11 +122,6 @@ def requested_rows(experiment: Experiment, rows: pd.DataFrame) -> tuple[pd.DataF
 def _identity_of(cell: Cell) -> Identity:
     parameters = json.dumps(cell.parameters, separators=(",", ":"))
     return completed_json(parameters), float(cell.samples), float(cell.repeats), float(cell.seed)
-
-
-def _refusal_of_study(experiment: Experiment, cell: Cell) -> tuple[str, str] | None:
-    reason = study_of(experiment).unsupported_reason(cell)
-    return None if reason is None else ("unsupported", reason)
 
 
 def expected_seconds(runs: Sequence[Planned], rows: pd.DataFrame) -> float:

@@ -18,7 +18,7 @@ import subprocess
 import time
 import uuid
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
@@ -48,6 +48,8 @@ EXIT_S = 5.0
 """Seconds allowed for the rest of a message to arrive, and for a process to end after it has closed its connection."""
 MAX_MESSAGE = 1 << 30
 """Bytes of the longest valid message."""
+LOST = "closed its connection"
+"""The fault of a worker that has ended."""
 MAX_FAILED_STARTS = 3
 """Number of consecutive workers killed during their start after which the run ends with an error."""
 SINGLE_THREAD = {
@@ -86,10 +88,6 @@ class Answer:
 # ---------------------------------------------------------------------------------------------------------- a worker
 
 
-class MalformedMessage(Exception):
-    """Raised when the bytes that arrived are not a message."""
-
-
 @dataclass(eq=False)
 class _Worker:
     process: subprocess.Popen[bytes]
@@ -103,9 +101,7 @@ class _Worker:
     queue: deque[Any] = field(default_factory=deque)
     """Items to send to the worker."""
     item: Any = None
-    """The item that it works on."""
-    is_busy: bool = False
-    """Whether it works on an item."""
+    """The item that it works on; None while it waits."""
     since: float = field(default_factory=time.monotonic)
     """Monotonic time in seconds at which the item was sent or, once its imports are done, was started."""
     is_ready: bool = False
@@ -145,7 +141,7 @@ class _Worker:
         try:
             self.connection.send_bytes(message)
         except OSError:
-            self.fault = "closed its connection"
+            self.fault = LOST
 
     def send_next(self) -> Answer | None:
         """Send the next item of the queue; returns an answer with the failure if the item cannot be pickled."""
@@ -154,7 +150,7 @@ class _Worker:
             message = pickle.dumps(item)
         except Exception as error:
             return Answer(item, dict(failure(error)), 0.0)
-        self.item, self.is_busy, self.is_prepared, self.since = item, True, False, time.monotonic()
+        self.item, self.is_prepared, self.since = item, False, time.monotonic()
         self.send(message)
         return None
 
@@ -177,36 +173,37 @@ class _Worker:
             while not self.fault and self.connection.poll():
                 answers += self._read(self.connection.recv_bytes(MAX_MESSAGE))
         except (EOFError, ConnectionError):
-            self.fault = "closed its connection"
-        except (MalformedMessage, OSError):  # it is too long, or its rest did not arrive
+            self.fault = LOST
+        except StorageError:
+            raise
+        except Exception:  # no message, or it is too long, or its rest did not arrive
             self.fault = "sent a malformed message"
         return answers
 
     def _read(self, message: bytes) -> list[Answer]:
-        """Return the answers in a message, one or none; raises :class:`MalformedMessage` and :class:`StorageError`."""
-        try:
-            content = json.loads(message)
-            match content["event"]:
-                case "hello":
-                    self.send(self.first_message)
-                    return []
-                case "ready":
-                    self.is_ready = True
-                    return []
-                case "started":
-                    self.since, self.is_prepared = time.monotonic(), True
-                    return []
-                case "storage":
-                    raise StorageError(content["reason"])
-                case "answer" if self.is_busy:
-                    result, seconds = _result_in(content)
-                case _:
-                    raise MalformedMessage
-        except (ValueError, LookupError, TypeError, RecursionError) as error:
-            raise MalformedMessage from error
-        self.is_done, self.is_busy, self.pace = content.get("is_last") is True, False, seconds
-        self.n_answered += 1
-        return [Answer(self.item, result, seconds, self.take_output())]
+        """Return the answers in a message, one or none; raises :class:`StorageError`, and any error if it is malformed."""
+        content = json.loads(message)
+        match content["event"]:
+            case "hello":
+                self.send(self.first_message)
+            case "ready":
+                self.is_ready = True
+            case "started":
+                self.since, self.is_prepared = time.monotonic(), True
+            case "storage":
+                raise StorageError(content["reason"])
+            case "answer" if self.item is not None:
+                result, seconds = dict(content["result"]), float(content["seconds"])
+                is_text = isinstance(result.get("reason", ""), str)
+                if result["status"] not in STATUSES or not is_text or not 0 <= seconds < math.inf:
+                    raise ValueError("an answer has a status, a reason and a time")
+                item, self.item, self.pace = self.item, None, seconds
+                self.is_done = content.get("is_last") is True
+                self.n_answered += 1
+                return [Answer(item, result, seconds, self.take_output())]
+            case event:
+                raise ValueError(f"unknown event {event}")
+        return []
 
     def kill(self) -> None:
         """Kill the worker and all processes that it has started."""
@@ -283,16 +280,16 @@ class Pool:
 
     @property
     def _busy(self) -> list[_Worker]:
-        return [worker for worker in self._workers if worker.is_busy or worker.queue]
+        return [worker for worker in self._workers if worker.item is not None or worker.queue]
 
     @property
     def current(self) -> list[Any]:
         """The items being worked on."""
-        return [worker.item for worker in self._workers if worker.is_busy]
+        return [worker.item for worker in self._workers if worker.item is not None]
 
     def _assign(self, waiting: deque[deque[Any]]) -> list[Answer]:
         """Assign work to every idle worker, and start more workers while groups are waiting; returns failures to send."""
-        for worker in [worker for worker in self._workers if not worker.queue and not worker.is_busy]:
+        for worker in [worker for worker in self._workers if not worker.queue and worker.item is None]:
             place = next((i for i, group in enumerate(waiting) if self._may_run(worker, group)), None)
             if place is not None:
                 worker.queue = waiting[place]
@@ -309,7 +306,7 @@ class Pool:
                 self._workers.append(worker)
         answers: list[Answer] = []
         for worker in self._workers:
-            while worker.queue and worker.is_ready and not worker.is_busy:
+            while worker.queue and worker.is_ready and worker.item is None:
                 worker.outside = worker.outside or self._outside(worker.queue[0])
                 if (answer := worker.send_next()) is not None:
                     answers.append(answer)
@@ -365,9 +362,10 @@ class Pool:
         if not worker.is_ready and (self._n_failed_starts == MAX_FAILED_STARTS or not was_killed):
             raise UserError(f"a worker cannot start: {reason}; last output: {output or 'none'}")
         rest = worker.queue  # the items behind the failed item have not run
-        if worker.is_busy and kind != "done":
+        if worker.item is not None and kind != "done":
             item, seconds = worker.item, time.monotonic() - worker.since
-            if self._may_retry(worker, item, kind):
+            # an earlier item or another program may have killed the worker, and earlier items may have used the memory
+            if id(item) not in self._crashed and kind != "timeout" and (kind != "memory" or worker.n_answered):
                 self._crashed.add(id(item))
                 self._retries.append(deque([item, *rest]))
                 return answers
@@ -383,24 +381,15 @@ class Pool:
         worker.close()
         self._workers.remove(worker)
 
-    def _may_retry(self, worker: _Worker, item: Any, kind: str) -> bool:
-        """Return whether to retry an item in a new worker before the worker's death counts as the item's result.
-
-        An earlier item or another program may have killed the worker, and earlier items may have used the memory.
-        """
-        if id(item) in self._crashed or kind == "timeout":
-            return False
-        return kind != "memory" or worker.n_answered > 0
-
     def _check(self, worker: _Worker) -> tuple[Literal["crashed", "stopped", "timeout", "memory", "done"], str] | None:
         """Return why a worker has to be replaced, as a kind and a reason; None if it can continue."""
         if worker.is_done:
             return "done", "a plugin has changed its process"
-        now, is_lost = time.monotonic(), worker.fault == "closed its connection"
+        now = time.monotonic()
         if not worker.fault and now < worker.checked + TICK:
             return None
         worker.checked, code = now, worker.process.poll()
-        if code is None and is_lost:
+        if code is None and worker.fault == LOST:
             with suppress(subprocess.TimeoutExpired):
                 code = worker.process.wait(EXIT_S)
         if code is not None:
@@ -418,11 +407,3 @@ class Pool:
             if worker.usage.status() == psutil.STATUS_STOPPED:
                 return "stopped", "stopped by a signal"
         return None
-
-
-def _result_in(content: Mapping[str, Any]) -> tuple[dict[str, Any], float]:
-    """Return the result in an answer and its seconds; raises ValueError, TypeError or LookupError if it is malformed."""
-    result, seconds = dict(content["result"]), float(content["seconds"])
-    if result["status"] not in STATUSES or not isinstance(result.get("reason", ""), str) or not 0 <= seconds < math.inf:
-        raise ValueError("an answer has a status, a reason and a time")
-    return result, seconds

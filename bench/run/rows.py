@@ -12,7 +12,7 @@ import json
 import math
 import sys
 from collections.abc import Callable, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -197,7 +197,7 @@ def _rule(name: str, columns: Columns) -> tuple[Callable[[Any], bool], str]:
     if column.kind == "text":
         return _is_text, f"is not a string of at most {MAX_TEXT:,} characters"
     if name in columns.vectors:
-        return _is_vector, "is not a list of numbers"
+        return partial(_is_list, has_texts=False), "is not a list of numbers"
     return _is_list, "is not a list of numbers or strings"
 
 
@@ -224,23 +224,15 @@ def _is_text(value: Any) -> bool:
     return True
 
 
-def _is_list(value: Any) -> bool:
-    """Return whether a value is a flat list of numbers or strings, or missing."""
-    import numpy as np
-
-    if isinstance(value, np.ndarray):
-        return value.ndim == 1 and (value.dtype.kind in "fiub" or all(_is_scalar(item) for item in value))
-    return _is_missing(value) or (isinstance(value, list | tuple) and all(map(_is_scalar, value)))
-
-
-def _is_vector(value: Any) -> bool:
-    """Return whether a value is a list of numbers, or missing."""
+def _is_list(value: Any, has_texts: bool = True) -> bool:
+    """Return whether a value is a flat list of numbers or, with ``has_texts``, of strings too; or missing."""
     import numpy as np
 
     if isinstance(value, np.ndarray) and value.dtype.kind in "fiub":
         return value.ndim == 1
-    items = value if isinstance(value, list | tuple | np.ndarray) else ()
-    return _is_list(value) and not any(isinstance(item, str) for item in items)
+    if isinstance(value, list | tuple | np.ndarray):
+        return all(_is_scalar(item) and (has_texts or not isinstance(item, str)) for item in value)
+    return _is_missing(value)
 
 
 def _is_scalar(value: Any) -> bool:
@@ -281,7 +273,7 @@ def _is_part(axis: str, part: Any) -> bool:
 
 
 def _is_value(value: Any) -> bool:
-    return _is_scalar(value) or (isinstance(value, list) and all(map(_is_scalar, value)))
+    return _is_scalar(value) or (isinstance(value, list) and _is_list(value))
 
 
 def _is_number(value: Any) -> bool:

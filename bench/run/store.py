@@ -174,9 +174,8 @@ def sort_rows(table: pd.DataFrame, keys: Sequence[str]) -> pd.DataFrame:
 
 
 def _attempts() -> Iterator[None]:
-    """Yield for each attempt, for 60 s, with growing random pauses in between."""
-    until, pause = time.monotonic() + PATIENCE_S, MAX_PAUSE_S / 64
+    """Yield for each attempt, for 60 s, with random pauses in between."""
+    until = time.monotonic() + PATIENCE_S
     while time.monotonic() < until:
         yield
-        time.sleep(random.uniform(0.0, pause))
-        pause = min(2 * pause, MAX_PAUSE_S)
+        time.sleep(random.uniform(0.0, MAX_PAUSE_S))

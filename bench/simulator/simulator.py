@@ -122,7 +122,8 @@ class Simulator:
         self._compiled: dict[str, tuple[Any, ...]] = {}
         self._distinct: set[float] = set()
         self._double = True
-        self.library = library or self._detect_library()
+        known = sorted({leaf.library for leaf in layout.leaves} & set(LIBRARIES))
+        self.library = library or (grad if isinstance(grad, str) else (known or ["numpy"])[0])
         self.batch = self._detect_batch(batch)
 
     # ------------------------------------------------------------------------------------------- columns
@@ -214,12 +215,6 @@ class Simulator:
         return np.asarray(gradients, dtype=np.float64)
 
     # ------------------------------------------------------------------------------------------ calling convention
-
-    def _detect_library(self) -> str:
-        if isinstance(self._grad, str):
-            return self._grad
-        libraries = {leaf.library for leaf in self.layout.leaves} & set(LIBRARIES)
-        return libraries.pop() if libraries else "numpy"
 
     def _build_theta(self, vector: Any) -> Any:
         """Return a vector ``(d,)`` in the form in which the user's function receives theta."""

@@ -4,9 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 
+from bench.experiment.by_name import make
 from bench.measure.contacts import active_contacts, contact_names, engine_contacts, split
-from bench.model import ContactScene, EngineScene, ForceLaw, FrictionScene, Jacobians, Problem, Rollout, compose
-from bench.trace.equations import stepped
+from bench.model import (
+    ContactScene,
+    EngineScene,
+    ForceLaw,
+    FrictionScene,
+    Jacobians,
+    LoopOps,
+    Problem,
+    Rollout,
+    compose,
+)
 
 REAL = ("gap", "penetration", "force", "force_peak", "sticking", "slipping")
 TOUCHES = "touches_"
@@ -90,8 +100,17 @@ def _impulse_forces(program: Rollout, scene: ContactScene, path: Jacobians) -> n
     q = split(scene, path.states[:-1].T).q
     without_contact = compose(scene, None, program.integrator)
     assert isinstance(without_contact, Rollout)
-    jump = split(scene, stepped(program, path) - stepped(without_contact, path)).v
+    jump = split(scene, _stepped(program, path) - _stepped(without_contact, path)).v
     units = np.eye(scene.n_contacts)[:, :, None] + np.zeros((1, 1, q.shape[1]))
     response = np.stack([scene.contact_acceleration(np, q, unit) for unit in units])
     inverse = np.linalg.pinv(np.nan_to_num(response.transpose(2, 1, 0)))
     return np.asarray((inverse @ jump.T[:, :, None])[:, :, 0].T / scene.dt)
+
+
+def _stepped(program: Rollout, path: Jacobians) -> np.ndarray:
+    """Return the state after each step of ``path``, ``(n, T)``, computed with the steps as batch columns."""
+    import jax.numpy as jnp
+
+    ops = make("backends", "implicit").ops() if program.needs_root else LoopOps(jnp)
+    before, u = jnp.asarray(path.states[:-1].T), jnp.asarray(path.controls.T)
+    return np.concatenate([np.asarray(part) for part in program.step(ops, split(program.scene, before), u)])

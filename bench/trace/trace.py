@@ -25,7 +25,6 @@ from bench.run.session import Session
 from bench.trace import sentences
 from bench.trace.adjoints import adjoints
 from bench.trace.contacts import contact_columns
-from bench.trace.states import per_state
 
 COLUMNS = (
     "step", "time", "contacts", "switch", "gap", "penetration", "force", "force_peak", "sticking", "slipping",
@@ -134,6 +133,11 @@ def trace(problem: Problem, w: np.ndarray) -> tuple[pd.DataFrame, float]:
     controls = {f"u{i + 1}": per_state(path.controls[:, i]) for i in range(scene.n_u)}
     table = pd.DataFrame({name: columns[name] for name in [*COLUMNS, *extra]} | states | controls)
     return table, _gradient_error(gradient, problem.grad(theta, w)[:, 0])
+
+
+def per_state(values: Any) -> np.ndarray:
+    """Return values of the steps ``(T,)`` extended to the states, ``(T + 1,)``, with NaN for the last state."""
+    return np.append(np.asarray(values, dtype=np.float64), np.nan)
 
 
 def _gradient_error(gradient: np.ndarray, expected: np.ndarray) -> float:

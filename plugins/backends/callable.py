@@ -19,12 +19,12 @@ class CallableBackend(Backend):
 
     def compile(self, program: Program) -> Problem:
         """Return the simulator as a problem; raises :class:`Unsupported` for any other program."""
-        if reason := self.unsupported_reason(program):
+        if reason := self.own_refusal(program):
             raise Unsupported(reason)
         assert isinstance(program, CallableProgram)
         return CallableProblem(program, self.step)
 
-    def unsupported_reason(self, program: Program) -> str | None:
+    def own_refusal(self, program: Program) -> str | None:
         """Return why the program cannot run: it is not a user's own simulator, or single precision is set; or None."""
         if not isinstance(program, CallableProgram):
             return f"scene {program.scene.name} is not a user's own simulator"
@@ -37,10 +37,6 @@ class CallableProblem(Problem):
     def __init__(self, program: CallableProgram, step: float) -> None:
         super().__init__(program)
         self._simulator, self._step = program.scene.simulator(), step
-
-    def score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """Return u / sigma, the score of the noise on theta, ``(d, B)``."""
-        return self._score(theta, w)
 
     def _value(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         return self._simulator.costs(*self._split(theta, w))
@@ -63,9 +59,6 @@ class CallableProblem(Problem):
             up, down = self._simulator.costs(thetas + step, noise), self._simulator.costs(thetas - step, noise)
             rows.append((up - down) / (2 * step[i]))
         return np.stack(rows)
-
-    def _score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        return w[: self.dim] / self.sigma
 
     def _split(self, theta: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
         """Return theta plus its noise, ``(d, B)``, and the simulator's own noise ``(n, B)`` or None."""

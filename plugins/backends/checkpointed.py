@@ -41,7 +41,7 @@ class Checkpointed(Jax):
         use_double_precision()
         return _CheckpointedOps(self.levels if self.keep == "states" else 0)
 
-    def unsupported_reason(self, program: Program) -> str | None:
+    def own_refusal(self, program: Program) -> str | None:
         if self.keep != "jacobians":
             return None
         if not isinstance(program, Rollout):

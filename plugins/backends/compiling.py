@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 from bench.model import Compilations
@@ -91,17 +92,13 @@ def _use(folder: str | None) -> None:
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
 
-_listening = False
 _loaded = 0
 """Number of programs that JAX has loaded from the folder."""
 
 
+@cache
 def _listen() -> None:
-    """Register a listener for programs that JAX loads from the folder."""
-    global _listening
-    if _listening:
-        return
-    _listening = True
+    """Register a listener for programs that JAX loads from the folder, once per process."""
     from jax import monitoring
 
     def record(event: str, **facts: Any) -> None:

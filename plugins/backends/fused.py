@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
 from typing import Any
 
 import numpy as np
 
-from bench.model import Array, Backend, LoopOps, Problem, Program
+from bench.model import Array, Backend, Problem, Program
 
 from .. import fused
 from ..fused import emit, kernels, trace
 from ..fused.graph import Refused
-from .jax import Jax, JaxOps, JaxProblem, use_double_precision
+from .jax import Jax, JaxOps, JaxProblem, loop, use_double_precision
 
 
 @dataclass(frozen=True)
@@ -36,7 +35,7 @@ class Fused(Backend):
         use_double_precision()
         return FusedProblem(program, JaxOps(), self.dtype, "reverse")
 
-    def unsupported_reason(self, program: Program) -> str | None:
+    def own_refusal(self, program: Program) -> str | None:
         """Return why the program cannot run, for example an operation without scalar form, or None."""
         if program.needs - self.provides:
             return None
@@ -45,37 +44,17 @@ class Fused(Backend):
         use_double_precision()
         try:
             for function in ("value", "grad"):
-                _source(_Structure(program), function, self.dtype)
+                _source(program, function, self.dtype)
         except Refused as error:
             return f"backend {self.name} has no scalar code for {error}"
         return None
 
 
-class _PlainOps(LoopOps):
+class _PlainOps(JaxOps):
     """Operations of jax.numpy with a plain lax.scan."""
 
-    def __init__(self) -> None:
-        import jax.numpy
-
-        super().__init__(jax.numpy)
-
     def scan(self, step: Any, carry: Any, xs: Any, length: int) -> Any:
-        import jax
-
-        return jax.lax.scan(lambda state, x: (step(state, x), None), carry, xs, length)[0]
-
-
-class _Structure:
-    """A cache key for a program, equal to the keys of all programs with the same structure."""
-
-    def __init__(self, program: Program) -> None:
-        self.program, self.key = program, program.structure
-
-    def __hash__(self) -> int:
-        return hash(self.key)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Structure) and self.key == other.key
+        return loop(step, carry, xs, length, recomputes=False)
 
 
 @dataclass(frozen=True)
@@ -88,9 +67,18 @@ class _Source:
     indices: np.ndarray
 
 
-@cache
-def _source(structure: _Structure, function: str, dtype: str) -> _Source:
-    program = structure.program
+_sources: dict[tuple[Any, ...], _Source] = {}
+"""By the program's structure, function and type."""
+
+
+def _source(program: Program, function: str, dtype: str) -> _Source:
+    key = (program.structure, function, dtype)
+    if key not in _sources:
+        _sources[key] = _traced(program, function, dtype)
+    return _sources[key]
+
+
+def _traced(program: Program, function: str, dtype: str) -> _Source:
 
     def cost(parameter: Array, theta: Array, noise: Array) -> Array:
         return program.bind(parameter).cost(_PlainOps(), theta, noise)
@@ -100,14 +88,11 @@ def _source(structure: _Structure, function: str, dtype: str) -> _Source:
 
     shapes = {"parameter": len(program.parameters()), "theta": program.dim, "noise": program.n_noise}
     wrt = {"value": None, "grad": "theta", "score": "scored"}[function]
-    loop = (
-        trace.traced(log_probability, shapes | {"scored": program.dim})
-        if wrt == "scored"
-        else trace.traced(cost, shapes)
-    )
-    text = emit.source(loop, dtype, wrt, program.dim, f"{function} of {program.scene.name}", cache=False)
-    flat = [np.concatenate(part) if part else np.zeros(1) for part in (loop.constants, loop.indices)]
-    return _Source(text, loop.length, flat[0].astype(dtype), flat[1].astype(np.int64))
+    scored = {"scored": program.dim}
+    rollout = trace.traced(log_probability, shapes | scored) if wrt == "scored" else trace.traced(cost, shapes)
+    text = emit.source(rollout, dtype, wrt, program.dim, f"{function} of {program.scene.name}", cache=False)
+    flat = [np.concatenate(part) if part else np.zeros(1) for part in (rollout.constants, rollout.indices)]
+    return _Source(text, rollout.length, flat[0].astype(dtype), flat[1].astype(np.int64))
 
 
 class FusedProblem(JaxProblem):
@@ -139,7 +124,7 @@ class FusedProblem(JaxProblem):
             return result[:, :batch], is_bounded
         if not batch:
             return np.empty((rows, 0)), True
-        source = _source(_Structure(self.program), function, self._dtype.name)
+        source = _source(self.program, function, self._dtype.name)
         is_shared = theta.shape[1] == 1
         # contiguous, since the rows of a large batch are so far apart that each needs its own memory page
         theta = np.ascontiguousarray(np.repeat(theta, self.grain, axis=1) if is_shared else theta, self._dtype)

@@ -24,7 +24,7 @@ class Genesis(EngineBackend):
 
     impedance: float = param(3e-4, "share of other forces that a contact cancels", low=3e-4, high=0.99)
 
-    def unsupported_twin(self, program: Program, model: dict[str, Any]) -> str | None:
+    def twin_refusal(self, program: Program, model: dict[str, Any]) -> str | None:
         """Return why Genesis cannot run the program: contacts that slide, or several of them; or None."""
         contacts = model["contacts"]
         if len(contacts) > 1:

@@ -108,12 +108,6 @@ FEW = 8
 """Columns per block from that length on: theta, per column, and its derivative fit a core's cache."""
 
 
-def _platform() -> str:
-    import jax
-
-    return str(jax.default_backend())
-
-
 def _numbers(program: Program) -> int:
     """Return an estimate of the numbers stored per rollout gradient: carries, controls, gradients, theta and noise."""
     stored = 2 * program.dim + program.n_noise
@@ -133,10 +127,12 @@ class JaxProblem(Problem):
     grain = 128
 
     def __init__(self, program: Program, ops: Ops, dtype: str, mode: str) -> None:
+        import jax
+
         super().__init__(program)
         self._ops, self._dtype, self._mode = ops, np.dtype(dtype), mode
         self._parameters = program.parameters().astype(self._dtype)
-        self.device = _platform()
+        self.device = str(jax.default_backend())
         if self.device == "cpu":
             self.fit_blocks(_numbers(program) * self._dtype.itemsize)
             if program.dim >= LARGE:

@@ -14,7 +14,6 @@ from bench.model import (
     Backend,
     EngineTwin,
     Ops,
-    PolicyScene,
     Problem,
     Program,
     Rollout,
@@ -68,11 +67,11 @@ class Mjx(Jax):
 
     def compile(self, program: Program) -> Problem:
         ops = self.ops()
-        return MjxProblem(_stepped(rollout(program), self), ops, self.dtype, self._direction(program))
+        return MjxProblem(MjxProgram(rollout(program), self), ops, self.dtype, self._direction(program))
 
-    def unsupported_reason(self, program: Program) -> str | None:
+    def own_refusal(self, program: Program) -> str | None:
         """Return why the program cannot run: it has no twin, or MJX cannot differentiate it; or None."""
-        if reason := mjcf.unsupported_reason(self, program):
+        if reason := mjcf.refusal(self, program):
             return reason
         scene = program.scene
         is_file = isinstance(scene, EngineTwin) and scene.model_file() is not None
@@ -221,6 +220,17 @@ class MjxProgram(Rollout):
         return bound
 
     def step(self, ops: Ops, state: State, u: Array) -> State:
+        """Return the state after ``substeps`` MJX steps per column, compiled once, or the same state after the end."""
+        import jax
+
+        n = self.scene.substeps
+        if n == 1:
+            after = self._advanced(state, u)
+        else:
+            after, _ = jax.lax.scan(lambda at, _: (self._advanced(at, u), None), state, length=n)
+        return self.stopped(ops.xp, state, after)
+
+    def _advanced(self, state: State, u: Array) -> State:
         """Return the state after one MJX step per column; NaN beyond MuJoCo's limit, at which MuJoCo would stop."""
         import jax.numpy as jnp
 
@@ -273,21 +283,3 @@ class MjxProgram(Rollout):
                 after = column(state.q[:, 0], state.v[:, 0], u[:, 0])
                 return jax.tree.map(lambda leaf: leaf[..., None], after)
             return jax.vmap(column, in_axes=-1, out_axes=-1)(state.q, state.v, u)
-
-
-def _stepped(program: Rollout, backend: Mjx) -> MjxProgram:
-    """Return the program stepped by MJX, with the substeps and ends of rollouts with a policy."""
-    return (_MjxPolicyProgram if isinstance(program.scene, PolicyScene) else MjxProgram)(program, backend)
-
-
-class _MjxPolicyProgram(MjxProgram):
-    """A program with a policy, stepped by MJX."""
-
-    def step(self, ops: Ops, state: State, u: Array) -> State:
-        """Return the state after ``substeps`` MJX steps, compiled once, or the same state after the end."""
-        import jax
-
-        one = super().step
-        scene: Any = self.scene
-        after, _ = jax.lax.scan(lambda at, _: (one(ops, at, u), None), state, length=scene.substeps)
-        return self.stopped(ops.xp, state, after)

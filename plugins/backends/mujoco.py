@@ -70,11 +70,11 @@ class Mujoco(Backend):
     def compile(self, program: Program) -> Problem:
         return MujocoProblem(program, self)
 
-    def unsupported_reason(self, program: Program) -> str | None:
+    def own_refusal(self, program: Program) -> str | None:
         """Return why the program cannot run: single precision, or a program without a twin; or None."""
         if self.dtype != "float64":
             return "MuJoCo computes in double precision"
-        return mjcf.unsupported_reason(self, program)
+        return mjcf.refusal(self, program)
 
 
 class MujocoProblem(NumpyProblem):
@@ -97,7 +97,7 @@ class MujocoProblem(NumpyProblem):
         if self._backend.gradient == "rollouts":
             return super()._grad(theta, w)
         path = self.jacobians(theta, w)
-        return _reverse(Recorded(self._rolled, *path), theta, w, scored=False)
+        return _reverse(Recorded(self._rolled, path.states, path), theta, w, scored=False)
 
     def _score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         return _reverse(Recorded(self._rolled, self._rollout(theta, w)[0]), theta, w, scored=True)
@@ -233,27 +233,20 @@ class Recorded(Rollout):
     pass lambda_t = A_t^T lambda_{t+1} + ..., including feedback and stage costs.
     """
 
-    def __init__(
-        self,
-        program: Rollout,
-        states: np.ndarray,
-        controls: np.ndarray | None = None,
-        a: np.ndarray | None = None,
-        b: np.ndarray | None = None,
-    ) -> None:
+    def __init__(self, program: Rollout, states: np.ndarray, path: Jacobians | None = None) -> None:
         super().__init__(program.scene, program.contact, program.integrator, program.decision)
-        self._states, self._controls, self._a, self._b = states, controls, a, b
+        self._states, self._path = states, path
         self._times: Iterator[int] = iter(range(len(states) - 1))
 
     def step(self, ops: Ops, state: State, u: Array) -> State:
         """Return the next recorded state, linearised if there are Jacobians. The recorded rollout can run only once."""
         t, xp = next(self._times), ops.xp
         after = xp.asarray(self._states[t + 1])
-        if self._a is not None and self._b is not None and self._controls is not None:
+        if self._path is not None:
             moved = difference(self.scene, xp, xp.concat([state.q, state.v]), xp.asarray(self._states[t]))
-            change = xp.sum(xp.asarray(self._a[t]) * moved[None], axis=1)
-            pushed = u - xp.asarray(self._controls[t])
-            change = change + xp.sum(xp.asarray(self._b[t]) * pushed[None], axis=1)
+            change = xp.sum(xp.asarray(self._path.a[t]) * moved[None], axis=1)
+            pushed = u - xp.asarray(self._path.controls[t])
+            change = change + xp.sum(xp.asarray(self._path.b[t]) * pushed[None], axis=1)
             after = retract(self.scene, xp, after, change)
         n_q = state.q.shape[0]
         return State(after[:n_q], after[n_q:])

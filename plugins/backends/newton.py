@@ -35,7 +35,7 @@ class Newton(EngineBackend):
             for name, value in RIGID.items():
                 object.__setattr__(self, name, value)
 
-    def unsupported_twin(self, program: Program, model: dict[str, Any]) -> str | None:
+    def twin_refusal(self, program: Program, model: dict[str, Any]) -> str | None:
         """Return why the solver cannot run the twin: hinges or links; or None."""
         has_links = any(body["joint"] != "slide" or body["parent"] >= 0 for body in model["bodies"])
         if self.solver != "featherstone" and has_links:

@@ -61,7 +61,7 @@ class NumpyProblem(Problem):
 
     def _grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         # usage counts gradients here, not rollouts: the cost of a gradient in rollouts is measured separately
-        return self._differences(lambda moved, w: self._value(moved, w), theta, w)
+        return self._differences(self._value, theta, w)
 
     def _score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         self.usage.rollouts += 2 * self.dim * w.shape[1]

@@ -12,6 +12,8 @@ from typing import Any
 
 from bench.model import Array
 
+from ..fused.trace import interpret
+
 MAX_ROWS = 16
 """Maximum number of rows of arrays that are split."""
 ELEMENTWISE = {
@@ -40,15 +42,8 @@ def join(value: Any) -> Array:
 
 def evaluate(jaxpr: Any, consts: Sequence[Any], arguments: Sequence[Any]) -> list[Any]:
     """Return the outputs of a jaxpr for arguments split into rows; ``(n, B)`` outputs with few rows are split too."""
-    known = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *arguments], strict=True))
-
-    def read(atom: Any) -> Any:
-        return atom.val if hasattr(atom, "val") else known[atom]
-
-    for equation in jaxpr.eqns:
-        values = [read(atom) for atom in equation.invars]
-        known.update(zip(equation.outvars, _apply(equation, values), strict=True))
-    return [split(value) if hasattr(value, "ndim") else value for value in map(read, jaxpr.outvars)]
+    values = interpret(jaxpr, consts, arguments, _apply)
+    return [split(value) if hasattr(value, "ndim") else value for value in values]
 
 
 def _apply(equation: Any, values: list[Any]) -> list[Any]:

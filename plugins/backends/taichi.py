@@ -16,7 +16,7 @@ class Taichi(EngineBackend):
     libraries = ("taichi", "numpy")
     damping_mode = ""
 
-    def unsupported_twin(self, program: Program, model: dict[str, Any]) -> str | None:
+    def twin_refusal(self, program: Program, model: dict[str, Any]) -> str | None:
         """Return why the kernel cannot run the twin: hinges, linked bodies or damped contacts; or None."""
         if any(body["joint"] != "slide" or body["parent"] >= 0 for body in model["bodies"]):
             return "taichi's kernel has bodies on slides only, each attached to the world"

@@ -1,1 +1,1 @@
-"""Published results on gradients through simulators, a file per claim."""
+"""Published results on gradients through simulators, a file per claim or few alike."""

@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from bench.claims.claim import Claim, Figure, Outcome
+from bench.claims import Claim, Figure, Outcome
 from bench.claims.toolkit import problem
 
 SOURCE = "Zhong, Han, Brikis 2022, arXiv 2207.05060, task 1"
 NAMES = ("df/dy0", "df/dvy0", "df/du0")
+
+
+def _starts(height: np.ndarray | float) -> np.ndarray:
+    """Return the source's start, at other heights."""
+    return np.stack([height, np.full_like(height, -2.0), np.zeros_like(height)])
 
 
 class TimeOfImpact(Claim):
@@ -32,17 +37,19 @@ class TimeOfImpact(Claim):
         still = np.zeros((3, 1))
         step = 1 / 480
         heights = np.linspace(1 - 4 * step, 1 + 8 * step, 97)
-        theta = np.stack([heights, np.full_like(heights, -2.0), np.zeros_like(heights)])
         figures, series = [], {"height": heights}
-        for name, law in (("with", "impulse"), ("without", "impulse[time_of_impact=false]")):
+        cases = (
+            ("with", "impulse", ("-1.000", "-1.000", "-0.0021")),
+            ("without", "impulse[time_of_impact=false]", ("1.000", "-0.09583", "-0.0002")),
+        )
+        for name, law, exact in cases:
             at = problem("bounce_once", law)
             # 1 + 1/480 is half way between two boundaries; a start 2/480 m higher meets the ground one step later
-            off, late = (at.grad(np.array([1 + n * step, -2.0, 0.0]), still)[:, 0] for n in (1, 3))
-            exact = {"with": ("-1.000", "-1.000", "-0.0021"), "without": ("1.000", "-0.09583", "-0.0002")}[name]
+            off, late = (at.grad(_starts(1 + n * step), still)[:, 0] for n in (1, 3))
             figures += [
                 Figure(f"{part}, {name}", text, float(x)) for part, text, x in zip(NAMES, exact, late, strict=True)
             ]
-            series[name] = at.value(theta, np.zeros((3, heights.size)))
+            series[name] = at.value(_starts(heights), np.zeros((3, heights.size)))
         return Outcome(
             figures,
             reservation=(
@@ -74,11 +81,10 @@ class PenaltyPhase(Claim):
         for parts, published in ((480, coarse), (48000, fine)):
             errors = []
             heights = 1.0 + 2.0 / parts * np.arange(256) / 256
-            theta = np.stack([heights, np.full_like(heights, -2.0), np.zeros_like(heights)])
             for k, text in zip(series["k"], published, strict=True):
                 scene = f"bounce_once[horizon={parts},dt={1 / parts!r}]"
                 at = problem(scene, f"penalty[stiffness={k!r}]", backend="jax[mode=forward]")
-                slope = at.grad(theta, np.zeros((3, 256)))[0]
+                slope = at.grad(_starts(heights), np.zeros((3, 256)))[0]
                 errors.append(float(np.sqrt(np.mean((slope + 1) ** 2))))
                 figures.append(Figure(f"k = {k:g}, dt = 1/{parts}", text, errors[-1]))
             series[str(parts)] = errors

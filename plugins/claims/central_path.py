@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
+from scipy.integrate import quad
 from scipy.optimize import minimize_scalar
 from scipy.special import ndtr
 
-from bench.claims.claim import Claim, Figure, Outcome
+from bench.claims import Claim, Figure, Outcome
 from bench.claims.toolkit import estimator, function, moments, problem
-from bench.model import Array, ContactScene, State, param
+from bench.model import Array
 
-KAPPA = 0.25
-"""Central-path parameter of the contact [N m]."""
+KAPPA, RADIUS = 0.25, 0.1
+"""Central-path parameter of the contact [N m], and the radius of the ball [m]."""
 
 
 def kink(xp: Any, x: Array) -> Array:
@@ -23,45 +23,6 @@ def kink(xp: Any, x: Array) -> Array:
 
 
 KINK = function(kink, [0.0], 0.1)
-
-
-@dataclass(frozen=True)
-class Pressed(ContactScene):
-    """A unit mass at the height theta, at rest, over one step of 1 s with a floor at 0; f is its height after the step."""
-
-    name = "pressed"
-    n_q: ClassVar[int] = 1
-    n_contacts: ClassVar[int] = 1
-    horizon: int = param(1, "steps", positive=True)
-    dt: float = param(1.0, "step", "s", positive=True)
-
-    def theta0(self) -> np.ndarray:
-        """Return the floor's height."""
-        return np.zeros(1)
-
-    def initial_state(self, xp: Any, theta: Array) -> State:
-        """Return the mass at rest at theta."""
-        return State(theta, 0.0 * theta)
-
-    def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        """Return 0."""
-        return 0.0 * q
-
-    def gap(self, xp: Any, q: Array) -> Array:
-        """Return the height."""
-        return q
-
-    def gap_rate(self, xp: Any, q: Array, v: Array) -> Array:
-        """Return the velocity."""
-        return v
-
-    def contact_acceleration(self, xp: Any, q: Array, force: Array) -> Array:
-        """Return the force over the unit mass."""
-        return force
-
-    def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
-        """Return the height."""
-        return q[0]
 
 
 class CentralPath(Claim):
@@ -78,11 +39,16 @@ class CentralPath(Claim):
     def measure(self) -> Outcome:
         """Compare the relaxed derivative with the chance under that noise, and the kink's variances."""
         a = np.linspace(-8, 8, 801)
-        # kappa dt^2 / m is the c of the formulas, here 1/4, so that heights are in units of a half
-        pressed = problem(Pressed(), f"complementarity[kappa={KAPPA!r}]", backend="implicit")
-        relaxed = pressed.grad(np.sqrt(KAPPA) * a[None], np.zeros((pressed.program.n_noise, a.size)))[0]
+        # a ball at rest over one step: kappa dt^2 / m is the c of the formulas, here 1/4, so that gaps are in units of a half
+        at_rest = problem(
+            f"bounce_once[horizon=1,dt=1.0,radius={RADIUS}]",
+            f"complementarity[kappa={KAPPA!r},stiffness=inf]",
+            backend="implicit",
+        )
+        heights = RADIUS + np.sqrt(KAPPA) * a
+        relaxed = at_rest.grad(np.stack([heights, 0 * a, 0 * a]), np.zeros((3, a.size)))[0]
         # the chance that w > -a for the density 2 / (w^2 + 4)^1.5, by integrating it, not from its formula
-        chance = _chance(a)
+        chance = np.array([quad(lambda w: 2 / (w * w + 4) ** 1.5, -x, np.inf, epsabs=1e-13)[0] for x in a])
         closest = minimize_scalar(lambda s: np.abs(relaxed - ndtr(a / s)).max(), bounds=(1, 3), method="bounded")
         at = problem(KINK)
         _, (first, first_error) = moments(at, estimator("fobg"))
@@ -96,13 +62,4 @@ class CentralPath(Claim):
             Figure("first-order sd at the kink, 500 samples", "0.02236", (first / 500) ** 0.5, first_error / 20),
             Figure("zeroth-order sd at the kink, 500 samples", "0.0500", (zeroth / 500) ** 0.5, zeroth_error / 20),
         ]
-        return Outcome(
-            figures,
-            series={"a": a[::8], "relaxed": relaxed[::8], "gauss": ndtr(a / closest.x)[::8]},
-        )
-
-
-def _chance(a: np.ndarray) -> np.ndarray:
-    from scipy.integrate import quad
-
-    return np.array([quad(lambda w: 2 / (w * w + 4) ** 1.5, -x, np.inf, epsabs=1e-13)[0] for x in a])
+        return Outcome(figures, series={"a": a[::8], "relaxed": relaxed[::8], "gauss": ndtr(a / closest.x)[::8]})

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bench.claims.claim import Claim, Figure, Outcome
+from bench.claims import Claim, Figure, Outcome
 from bench.claims.toolkit import estimator, native, terms
 
 SAMPLES = 80_000

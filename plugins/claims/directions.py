@@ -6,11 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from bench.claims.claim import Claim, Figure, Outcome
+from bench.claims import Claim, Figure, Outcome
 from bench.claims.toolkit import centre, estimator, problem
 
 D, REPEATS = 20, {20: 16_000, 100: 16_000, 400: 4000}
 """Number of variables, and of estimates per number of samples."""
+NAMES = {"gauss": "randomized_smoothing", "sphere": "sphere_smoothing"}
 CHUNK = 2000
 """Number of estimates per batch."""
 
@@ -43,20 +44,19 @@ class Directions(Claim):
             noise = [draw.standard_normal((CHUNK, count, D)) for _ in range(REPEATS[count] // CHUNK)]
             for sigma in (0.1, 3.0) if count == 20 else (0.1,):
                 at = problem(f"linear[dimension={D},sigma={sigma}]", backend="numpy")
-                for (name, key), text in zip(
-                    (("randomized_smoothing", "gauss"), ("sphere_smoothing", "sphere")), texts, strict=True
-                ):
-                    error = self._error(at, estimator(name), noise)
+                for (key, name), text in zip(NAMES.items(), texts, strict=True):
+                    error = _error(at, estimator(name), noise)
                     figures.append(Figure(f"{name}, N = {count}, sigma = {sigma:g}", text, *error))
                     if sigma == 0.1:
                         series[key].append(error)
         at = problem(f"linear[dimension={D}]", backend="numpy")
-        exact = self._error(at, estimator("finite_difference"), [draw.standard_normal((8, 20, D))])
+        exact = _error(at, estimator("finite_difference"), [draw.standard_normal((8, 20, D))])
         figures.append(Figure("finite_difference, N = 20", "0.0", exact[0], spread=1e-15))
         return Outcome(figures, series=series)
 
-    def _error(self, at: Any, method: Any, noise: list[np.ndarray]) -> tuple[float, float]:
-        """Return the mean squared error over the squared norm of the gradient, with its standard error."""
-        truth = at.program.closed_form_gradient()
-        values = np.concatenate([method.estimate(at, at.program.theta0, part) for part in noise])
-        return centre(((values - truth) ** 2).sum(axis=1) / (truth**2).sum())
+
+def _error(at: Any, method: Any, noise: list[np.ndarray]) -> tuple[float, float]:
+    """Return the mean squared error over the squared norm of the gradient, with its standard error."""
+    truth = at.program.closed_form_gradient()
+    values = np.concatenate([method.estimate(at, at.program.theta0, part) for part in noise])
+    return centre(((values - truth) ** 2).sum(axis=1) / (truth**2).sum())

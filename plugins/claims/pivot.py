@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from bench.claims.claim import Claim, Figure, Outcome
-from bench.claims.toolkit import centre, expectation, function, problem, stochastic_descent
+from bench.claims import Claim, Figure, Outcome
+from bench.claims.toolkit import centre, estimator, function, moments, problem, stochastic_descent
 from bench.model import Array
 
 SIGMA = 0.02
@@ -37,14 +37,10 @@ class FallingPivot(Claim):
 
     def measure(self) -> Outcome:
         """Integrate the missing part, and descend."""
-        at = problem(SCENE)
+        at, orders = problem(SCENE), (estimator("fobg"), estimator("reinforce[baseline=none]"))
 
-        def means(x: float, count: int = 200_000) -> tuple[tuple[float, float], tuple[float, float]]:
-            theta = np.array([x])
-            return (
-                expectation(lambda w: at.grad(theta, w)[0], count),
-                expectation(lambda w: at.value(theta, w) * w[0] / SIGMA, count),
-            )
+        def means(x: float, count: int = 200_000) -> list[tuple[float, float]]:
+            return [moments(at, order, x, count)[0] for order in orders]
 
         figures = []
         for text, x, label in (("-0.7586", 0.74, "0.74"), ("-4.453", 0.76, "0.76"), ("-9.974", math.pi / 4, "pi/4")):
@@ -52,16 +48,13 @@ class FallingPivot(Claim):
             figures.append(
                 Figure(f"first-order mean less the gradient at {label}", text, first - truth, error + truth_error)
             )
-        fallen, _ = stochastic_descent(at, False, 0.1, 0.01, 500, seed=4)
-        stopped, _ = stochastic_descent(at, True, 0.1, 0.01, 500, seed=44)
+        fallen = stochastic_descent(at, False, 0.1, 0.01, 500, seed=4)
+        stopped = stochastic_descent(at, True, 0.1, 0.01, 500, seed=44)
         figures += [
             Figure("end of the first-order descent", "0.843", *centre(fallen), spread=0.002),
             Figure("cost there", "0.0", float(at.value(fallen[None], np.zeros((1, fallen.size))).max())),
             Figure("end of the zeroth-order descent", "0.74", *centre(stopped), spread=0.02),
         ]
         grid = np.linspace(0.6, 0.9, 61)
-        both = [means(x, 20_000) for x in grid]
-        return Outcome(
-            figures,
-            series={"x": grid, "first": [a[0] for a, _ in both], "truth": [b[0] for _, b in both]},
-        )
+        first, truth = np.array([means(x, 20_000) for x in grid])[:, :, 0].T
+        return Outcome(figures, series={"x": grid, "first": first, "truth": truth})

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from bench.claims.claim import Claim, Figure, Outcome
+from bench.claims import Claim, Figure, Outcome
 from bench.claims.toolkit import estimator, problem, spread, terms
-
-if TYPE_CHECKING:
-    from bench.model import Problem
-
+from bench.model import Problem
 
 SMOOTHED, COARSE, FINE = 20_000, 20_000, 4096
 """Samples of each variance."""
@@ -20,13 +17,10 @@ TAILS = 0.25
 """Relative error of a variance of 1,000 samples above which a few samples dominate it."""
 
 
-def sampled(
-    at: Problem, count: int, seed: int, zeroth: str = "reinforce"
-) -> tuple[tuple[float, float], tuple[float, float]]:
+def sampled(at: Problem, count: int, seed: int) -> list[tuple[float, float]]:
     """Return the variances of first- and zeroth-order terms, each with its standard error."""
     w = np.random.default_rng(seed).standard_normal((at.program.n_noise, count))
-    first, other = (terms(at, estimator(name), w) for name in ("fobg", zeroth))
-    return spread(first, 20), spread(other, 20)
+    return [spread(terms(at, estimator(name), w), 20) for name in ("fobg", "reinforce")]
 
 
 def source_error(values: tuple[float, float], count: int) -> float:
@@ -55,31 +49,23 @@ class SmoothedPush(Claim):
 
     def measure(self) -> Outcome:
         """Sample both orders at the published sharpnesses."""
-        first = {"1e2": "10.82", "1.27e4": "10.77", "2.8e4": "15.99", "6.4e4": "3.9e5"}
-        zeroth = {"1e2": "2970", "1.27e4": "2959", "2.8e4": "2967", "6.4e4": "2368"}
+        published = {
+            "1e2": ("10.82", "2970"), "1.27e4": ("10.77", "2959"), "2.8e4": ("15.99", "2967"), "6.4e4": ("3.9e5", "2368")
+        }  # fmt: skip
         figures: list[Figure] = []
-        series: dict[str, list[Any]] = {"beta": [], "first": [], "zeroth": []}
-        seeds = []
-        for beta in first:
+        series: dict[str, list[Any]] = {"beta": [float(beta) for beta in published], "first": [], "zeroth": []}
+        for beta, (first, zeroth) in published.items():
             at = problem("pushing[sigma=0.3]", f"softplus[stiffness=1e5,beta={float(beta)!r}]")
-            (v1, e1), (v0, e0) = sampled(at, SMOOTHED, 16)
-            once = source_error((v1, e1), SMOOTHED), source_error((v0, e0), SMOOTHED)
-            series["beta"].append(float(beta))
-            series["first"].append((v1, e1))
-            series["zeroth"].append((v0, e0))
-            figures.append(Figure(f"zeroth order, beta = {beta}", zeroth[beta], v0, e0, spread=once[1]))
+            one, none = sampled(at, SMOOTHED, 16)
+            series["first"].append(one)
+            series["zeroth"].append(none)
+            figures.append(Figure(f"zeroth order, beta = {beta}", zeroth, *none, spread=source_error(none, SMOOTHED)))
             if beta == "6.4e4":
                 seeds = [sampled(at, 1000, seed)[0][0] for seed in range(12)]
-                figures.append(
-                    Figure(
-                        "first order, beta = 6.4e4, median of 12 seeds of 1,000",
-                        first[beta],
-                        float(np.median(seeds)),
-                        factor=30.0,
-                    )
-                )
+                what = f"first order, beta = {beta}, median of 12 seeds of 1,000"
+                figures.append(Figure(what, first, float(np.median(seeds)), factor=30.0))
             else:
-                figures.append(Figure(f"first order, beta = {beta}", first[beta], v1, e1, spread=once[0]))
+                figures.append(Figure(f"first order, beta = {beta}", first, *one, spread=source_error(one, SMOOTHED)))
         low, high = min(seeds), max(seeds)
         return Outcome(
             figures,
@@ -115,27 +101,23 @@ class StiffPush(Claim):
         """Sample with the published step, then with a step 20 times finer, each control held over 20 steps."""
         values = "velocity_factor=0.998,push=0.1,sigma=0.1"
         finer = f"velocity_factor={0.998 ** (1 / 20)!r},push=0.1,sigma=0.1,horizon=4000,hold=20,dt=0.00025"
-        coarse = {10.0: "46", 100.0: "7e2", 300.0: "4e4", 1000.0: "1e10"}
-        fine = {10.0: "44", 100.0: "6e2", 300.0: "1e4", 1000.0: "2e7"}
-        figures: list[Figure] = []
-        series: dict[str, list[Any]] = {"k": list(coarse), "coarse": [], "fine": [], "zeroth": []}
-        for k, text in coarse.items():
+        published = {10.0: ("46", "44"), 100.0: ("7e2", "6e2"), 300.0: ("4e4", "1e4"), 1000.0: ("1e10", "2e7")}
+        figures, finer_figures = [], []
+        series: dict[str, list[Any]] = {"k": list(published), "coarse": [], "fine": [], "zeroth": []}
+        for k, (coarse, fine) in published.items():
             at = problem(f"pushing[{values},horizon=200,dt=0.005]", f"penalty[stiffness={k!r}]")
-            (v1, e1), (v0, e0) = sampled(at, COARSE, 17)
-            series["coarse"].append((v1, e1))
-            series["zeroth"].append((v0, e0))
-            figures.append(_heavy(f"first order, k = {k:g}", text, v1, e1, COARSE))
-            once = source_error((v0, e0), COARSE)
-            figures.append(Figure(f"zeroth order, k = {k:g}", "1.3e7", v0, e0, spread=once))
-        for k, text in fine.items():
+            one, none = sampled(at, COARSE, 17)
+            series["coarse"].append(one)
+            series["zeroth"].append(none)
+            figures.append(_heavy(f"first order, k = {k:g}", coarse, one, COARSE))
+            figures.append(Figure(f"zeroth order, k = {k:g}", "1.3e7", *none, spread=source_error(none, COARSE)))
             at = problem(f"pushing[{finer}]", f"penalty[stiffness={k!r}]")
             w = np.random.default_rng(171).standard_normal((200, FINE))
-            v1, e1 = spread(terms(at, estimator("fobg"), w), 16)
-            series["fine"].append((v1, e1))
-            figures.append(_heavy(f"first order, k = {k:g}, step 20 times finer", text, v1, e1, FINE))
+            series["fine"].append(spread(terms(at, estimator("fobg"), w), 16))
+            finer_figures.append(_heavy(f"first order, k = {k:g}, step 20 times finer", fine, series["fine"][-1], FINE))
         ratio = series["coarse"][-1][0] / series["fine"][-1][0]
         return Outcome(
-            figures,
+            figures + finer_figures,
             reservation=(
                 f"at k = 1000 the variance falls {ratio:.0f}-fold when the step alone is refined, so {np.log10(ratio):.1f} of "
                 "its decades are the step's; both numbers there have tails that no seed settles, and are compared by a factor"
@@ -144,8 +126,9 @@ class StiffPush(Claim):
         )
 
 
-def _heavy(what: str, text: str, measured: float, error: float, count: int) -> Figure:
+def _heavy(what: str, text: str, values: tuple[float, float], count: int) -> Figure:
     """Return a figure that is compared by the errors of both sides, or by a factor if heavy tails dominate the error."""
+    measured, error = values
     if error * math.sqrt(count / 1000) < TAILS * measured:
-        return Figure(what, text, measured, error, spread=source_error((measured, error), count))
+        return Figure(what, text, measured, error, spread=source_error(values, count))
     return Figure(what, text, measured, error, factor=10.0)

@@ -5,8 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from scipy.optimize import bisect
+from scipy.special import ndtr
 
-from bench.claims.claim import Claim, Figure, Outcome
+from bench.claims import Claim, Figure, Outcome
 from bench.claims.toolkit import centre, estimator, moments, problem
 
 SIGMA, NU = 0.1, 0.005
@@ -37,10 +39,7 @@ class Ramp(Claim):
             at = problem(f"soft_heaviside[nu={nu!r},sigma={SIGMA}]")
             return float(np.log(moments(at, first)[1][0] / moments(at, zeroth)[1][0]))
 
-        low, high = 0.1, 0.2
-        for _ in range(14):
-            middle = (low + high) / 2
-            low, high = (middle, high) if gap(middle) > 0 else (low, middle)
+        crossing = bisect(gap, 0.1, 0.2, xtol=6e-6)
         at = problem(f"soft_heaviside[nu={NU},sigma={SIGMA}]")
         draw = np.random.default_rng(2)
         batches = 40_000
@@ -48,44 +47,38 @@ class Ramp(Claim):
         parts = [at.grad(np.zeros(1), draw.standard_normal((1, 100 * batches))) == 0 for _ in range(5)]
         missed = np.concatenate([part.reshape(batches, 100).all(axis=1) for part in parts])
         figures = [
-            Figure("crossing of the variances, in sigma", "1.517", (low + high) / 2 / SIGMA, (high - low) / SIGMA),
+            Figure("crossing of the variances, in sigma", "1.517", crossing / SIGMA, 6e-5),
             Figure("chance that 100 samples all have gradient 0", "0.1334", *centre(missed.astype(float))),
         ]
-        for count, expected in ((1, ("2.05", "1.49")), (100, ("0.754", "0.210")), (1000, ("0.251", "0.068"))):
-            figures += self._errors(at, draw, count, expected)
+        for count, *expected in ((1, "2.05", "1.49"), (100, "0.754", "0.210"), (1000, "0.251", "0.068")):
+            figures += _errors(at, draw, count, expected)
         widths = np.geomspace(0.02, 4, 15) * SIGMA
         problems = [problem(f"soft_heaviside[nu={float(nu)!r},sigma={SIGMA}]") for nu in widths]
-        return Outcome(
-            figures,
-            series={
-                "width": (widths / SIGMA),
-                "first": [moments(one, first, count=40_000)[1][0] for one in problems],
-                "zeroth": [moments(one, zeroth, count=40_000)[1][0] for one in problems],
-            },
+        curves = {
+            name: [moments(one, order, count=40_000)[1][0] for one in problems]
+            for name, order in (("first", first), ("zeroth", zeroth))
+        }
+        return Outcome(figures, series={"width": widths / SIGMA} | curves)
+
+
+def _errors(at: Any, draw: np.random.Generator, count: int, expected: list[str]) -> list[Figure]:
+    """Return mean absolute errors over 1,000 random theta in [-1, 1]. The source drew them once, which is its spread."""
+    theta = np.linspace(-1, 1, 1000)
+    truth = (ndtr((NU / 2 - theta) / SIGMA) - ndtr((-NU / 2 - theta) / SIGMA)) * 2 / NU
+    base = at.value(theta[None], np.zeros((1, 1000)))[:, None]
+    every = np.repeat(theta, count)[None]
+    errors = []
+    for _ in range(max(4, 4000 // count)):
+        w = draw.standard_normal((1, 1000 * count))
+        cost = at.value(every, w).reshape(1000, count) - base
+        means = at.grad(every, w).reshape(1000, count), cost * w.reshape(1000, count) / SIGMA
+        errors.append([np.abs(mean.mean(axis=1) - truth).mean() for mean in means])
+    return [
+        Figure(
+            f"{name}-order mean absolute error, {count} samples",
+            text,
+            *centre(values),
+            2 * float(np.std(values, ddof=1)),
         )
-
-    def _errors(self, at: Any, draw: np.random.Generator, count: int, expected: tuple[str, str]) -> list[Figure]:
-        """Return mean absolute errors over 1,000 random theta in [-1, 1]. The source drew them once, which is its spread."""
-        from scipy.special import ndtr
-
-        repeats = max(4, 4000 // count)
-        theta = np.linspace(-1, 1, 1000)
-        truth = (ndtr((NU / 2 - theta) / SIGMA) - ndtr((-NU / 2 - theta) / SIGMA)) * 2 / NU
-        found: dict[str, list[float]] = {"first": [], "zeroth": []}
-        for _ in range(repeats):
-            w = draw.standard_normal((1, 1000 * count))
-            every = np.repeat(theta, count)[None]
-            gradient = at.grad(every, w)[0].reshape(1000, count).mean(axis=1)
-            base = at.value(theta[None], np.zeros((1, 1000)))
-            cost = at.value(every, w).reshape(1000, count) - base[:, None]
-            score = (cost * w.reshape(1000, count) / SIGMA).mean(axis=1)
-            found["first"].append(float(np.abs(gradient - truth).mean()))
-            found["zeroth"].append(float(np.abs(score - truth).mean()))
-        figures = []
-        for (name, values), published in zip(found.items(), expected, strict=True):
-            mean, error = centre(np.array(values))
-            once = float(np.std(values, ddof=1))
-            figures.append(
-                Figure(f"{name}-order mean absolute error, {count} samples", published, mean, error, 2 * once)
-            )
-        return figures
+        for name, text, values in zip(("first", "zeroth"), expected, np.transpose(errors), strict=True)
+    ]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bench.claims.claim import Claim, Figure, Outcome
+from bench.claims import Claim, Figure, Outcome
 from bench.claims.toolkit import native
 
 PUBLISHED = {0.1: "1.26", 0.05: "0.61", 0.02: "0.145", 0.01: "0.149", 1e-3: "0.012", 1e-4: "4.5e-4"}
@@ -40,15 +40,8 @@ class SoftWall(Claim):
             error, less = _mean_error(dt, every), _mean_error(dt, every[: STARTS // 2])
             grids = [_mean_error(dt, np.linspace(0.0, 1.0, count)) for count in GRIDS]
             errors.append(error)
-            figures.append(
-                Figure(
-                    f"mean error at a step of {dt:g}",
-                    text,
-                    error,
-                    abs(error - less),
-                    spread=max(abs(grid - error) for grid in grids),
-                )
-            )
+            spread = max(abs(grid - error) for grid in grids)
+            figures.append(Figure(f"mean error at a step of {dt:g}", text, error, abs(error - less), spread))
         few = _mean_error(0.02, np.linspace(0.0, 1.0, 149))
         return Outcome(
             figures,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bench.claims.claim import Claim, Figure, Outcome
+from bench.claims import Claim, Figure, Outcome
 from bench.claims.toolkit import estimator, moments, problem
 
 
@@ -41,11 +41,8 @@ class Step(Claim):
             Figure("zeroth-order variance at 0.1 without a baseline", "54.08", bare, bare_error),
         ]
         thetas = np.linspace(-0.3, 0.3, 25)
-        return Outcome(
-            figures,
-            series={
-                "theta": thetas,
-                "first": [moments(at, first, x, 4000)[0][0] for x in thetas],
-                "zeroth": [moments(at, zeroth, x, 4000)[0][0] for x in thetas],
-            },
-        )
+        curves = {
+            name: [moments(at, order, x, 4000)[0][0] for x in thetas]
+            for name, order in (("first", first), ("zeroth", zeroth))
+        }
+        return Outcome(figures, series={"theta": thetas} | curves)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.claims.claim import Claim, Figure, Outcome
+from bench.claims import Claim, Figure, Outcome
 from bench.claims.toolkit import estimator, function, problem, spread, terms
 from bench.model import Array, FunctionScene
 
@@ -49,29 +49,28 @@ class Chaos(Claim):
         """Sample both orders at several horizons."""
         first, zeroth = estimator("fobg"), estimator("reinforce")
         draw = np.random.default_rng(19)
-        found, figures = {}, []
-        for steps in (1, 2, 5, 10, 14, 20):
+        series: dict[str, list[Any]] = {"steps": [1, 2, 5, 10, 14, 20], "first": [], "zeroth": []}
+        figures = []
+        for steps in series["steps"]:
             at = problem(tent(steps))
             w = draw.standard_normal((1, AT_GAIN if steps == 20 else SAMPLES))
-            pair = terms(at, first, w), terms(at, zeroth, w)
-            found[steps] = [spread(values) for values in pair]
-            if steps in (10, 20):
-                (v1, e1), (v0, e0) = found[steps]
-                figures.append(
-                    Figure(f"first-order variance, T = {steps}", {10: "1.05e6", 20: "1.10e12"}[steps], v1, e1)
-                )
-                figures.append(Figure(f"zeroth-order variance, T = {steps}", "70", v0, e0))
-                figures.append(
-                    Figure(f"size of every gradient, T = {steps}", f"{2.0**steps:.1f}", float(np.abs(pair[0]).max()))
-                )
-        (v1, e1), (v0, e0) = found[20]
+            gradients = terms(at, first, w)
+            (v1, e1), (v0, e0) = spread(gradients), spread(terms(at, zeroth, w))
+            series["first"].append((v1, e1))
+            series["zeroth"].append((v0, e0))
+            if text := {10: "1.05e6", 20: "1.10e12"}.get(steps):
+                figures += [
+                    Figure(f"first-order variance, T = {steps}", text, v1, e1),
+                    Figure(f"zeroth-order variance, T = {steps}", "70", v0, e0),
+                    Figure(f"size of every gradient, T = {steps}", f"{2.0**steps:.1f}", float(np.abs(gradients).max())),
+                ]
         # weights in inverse proportion to the variances, whose covariance is far below both
-        mixed = v1 * v0 / (v1 + v0)
-        figures.append(Figure("gain of the best mixture, T = 20", "1.6e10", v1 / mixed, v1 / mixed * (e0 / v0)))
-        half = 2 * v1 * 2 * v0 / (2 * v1 + 2 * v0)
-        # half of 1.6e10, whose last digit leaves 5e8 open
-        split = Figure("the same with the samples split", "8.0e9", v1 / half, v1 / half * (e0 / v0), spread=2e8)
-        figures.append(split)
+        for what, text, mixed, slack in (
+            ("gain of the best mixture, T = 20", "1.6e10", v1 * v0 / (v1 + v0), 0.0),
+            # half of 1.6e10, whose last digit leaves 5e8 open
+            ("the same with the samples split", "8.0e9", 2 * v1 * 2 * v0 / (2 * v1 + 2 * v0), 2e8),
+        ):
+            figures.append(Figure(what, text, v1 / mixed, v1 / mixed * (e0 / v0), slack))
         # the same by the estimator that splits them, on fewer steps, where its weights are not too far from one half
         at, mixture = problem(tent(WEIGHED)), estimator("inverse_variance")
         (v1, e1), (v0, e0) = (spread(terms(at, one, draw.standard_normal((1, SAMPLES)))) for one in (first, zeroth))
@@ -81,19 +80,6 @@ class Chaos(Claim):
         each = np.concatenate([mixture.estimate(at, at.program.theta0, noise) for noise in noises])
         measured, error = spread(1000**0.5 * each)
         error = float(np.hypot(error, expected * (e0 / v0 + (1.0 - ratio) * e1 / v1)))
-        figures.append(
-            Figure(
-                f"variance of inverse_variance, T = {WEIGHED}, over that of the best mixture",
-                "1.000",
-                measured / expected,
-                error / expected,
-            )
-        )
-        return Outcome(
-            figures,
-            series={
-                "steps": list(found),
-                "first": [v[0] for v in found.values()],
-                "zeroth": [v[1] for v in found.values()],
-            },
-        )
+        what = f"variance of inverse_variance, T = {WEIGHED}, over that of the best mixture"
+        figures.append(Figure(what, "1.000", measured / expected, error / expected))
+        return Outcome(figures, series=series)

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
-from bench.claims.claim import Claim, Figure, Outcome
+from bench.claims import Claim, Figure, Outcome
 from bench.claims.toolkit import estimator, function, hermite, moments, problem, spread, terms
 from bench.model import FunctionScene
 
@@ -34,32 +32,33 @@ class ThreeEstimators(Claim):
     learned = "No estimator is best: roughness costs the first order, dimension the score."
     labels = ("frequency k of cos(k x)", "variance of one sample")
     logarithmic = "xy"
-    curves = {
-        "pathwise": "pathwise",
-        "score": "score",
-        "measure-valued": "measure-valued",
-    }
+    curves = {name: name for name in ("pathwise", "score", "measure-valued")}
 
     def measure(self) -> Outcome:
         """Integrate exactly on polynomials, by a fine rule on waves, and sample in more dimensions."""
         figures = []
-        nodes, weights = hermite()
         methods = {
             "pathwise": estimator("fobg"),
             "score": estimator("reinforce[baseline=none]"),
             "measure-valued": estimator("measure_valued"),
         }
-        for k, expected in ((-3.0, ("4", "495", "17.49")), (1.0, ("4", "15", "0"))):
+        nodes, weights = hermite()
+        for k, *expected, best_text in (
+            (-3.0, "4.000", "495.000", "17.49", "134.0"),
+            (1.0, "4.000", "15.000", "0.000", "6.00"),
+        ):
             at = problem(shifted(k))
             for (name, method), text in zip(methods.items(), expected, strict=True):
                 if name == "measure-valued":
                     # its Rayleigh variable is not a polynomial of the noise
                     _, (variance, error) = moments(at, method)
                 else:
-                    values = terms(at, method, nodes)[:, 0]
-                    variance, error = float(values**2 @ weights - (values @ weights) ** 2), 1e-9
-                figures.append(Figure(f"{name}, k = {k:g}", _exact(text), variance, error))
-            figures.append(self._best_baseline(at, k, nodes, weights))
+                    variance, error = _variance(terms(at, method, nodes)[:, 0], weights), 1e-9
+                figures.append(Figure(f"{name}, k = {k:g}", text, variance, error))
+            cost, score = at.value(np.ones(1), nodes), nodes[0]
+            best = (cost * score**2) @ weights / (score**2 @ weights)
+            what = f"score with the best constant baseline, k = {k:g}"
+            figures.append(Figure(what, best_text, _variance((cost - best) * score, weights), 1e-9))
         waves = {}
         for k, text in ((1, "0.826"), (2, "4.40"), (4, "16"), (8, "64")):
             at = problem(wave(float(k)))
@@ -71,35 +70,15 @@ class ThreeEstimators(Claim):
         for d in (2, 8):
             at = problem(shifted(0.0, d))
             w = draw.standard_normal((d, 400_000))
-            theta = np.zeros(d)
-            first, error = spread(terms(at, methods["pathwise"], w, theta)[:, :1])
-            figures.append(Figure(f"sum of {d} squares, pathwise, per coordinate", "4.0", first, error))
-            score, error = spread(terms(at, methods["score"], w, np.ones(d))[:, :1])
-            # at theta = 1 with k = 0: 30 + 22 (D - 1) + 4 (D - 1)^2
-            figures.append(
-                Figure(
-                    f"sum of {d} squares, score, per coordinate",
-                    _exact(str(30 + 22 * (d - 1) + 4 * (d - 1) ** 2)),
-                    score,
-                    error,
-                )
-            )
+            # at theta = 1 with k = 0 the score has 30 + 22 (D - 1) + 4 (D - 1)^2
+            exact = f"{30 + 22 * (d - 1) + 4 * (d - 1) ** 2}.000"
+            for name, text, theta in (("pathwise", "4.0", np.zeros(d)), ("score", exact, np.ones(d))):
+                values = spread(terms(at, methods[name], w, theta)[:, :1])
+                figures.append(Figure(f"sum of {d} squares, {name}, per coordinate", text, *values))
         return Outcome(
-            figures,
-            series={"k": list(waves), **{n: [v[i] for v in waves.values()] for i, n in enumerate(methods)}},
-        )
-
-    def _best_baseline(self, at: Any, k: float, nodes: np.ndarray, weights: np.ndarray) -> Figure:
-        """Return the score estimator's variance with the constant baseline that minimises it."""
-        cost, score = at.value(np.ones(1), nodes), nodes[0]
-        best = (cost * score**2) @ weights / (score**2 @ weights)
-        values = (cost - best) * score
-        variance = float(values**2 @ weights - (values @ weights) ** 2)
-        return Figure(
-            f"score with the best constant baseline, k = {k:g}", {-3.0: "134.0", 1.0: "6.00"}[k], variance, 1e-9
+            figures, series={"k": list(waves), **{n: [v[i] for v in waves.values()] for i, n in enumerate(methods)}}
         )
 
 
-def _exact(text: str) -> str:
-    """Return an integer of the source's formula as text with enough digits to be exact."""
-    return text if "." in text else f"{text}.000"
+def _variance(values: np.ndarray, weights: np.ndarray) -> float:
+    return float(values**2 @ weights - (values @ weights) ** 2)

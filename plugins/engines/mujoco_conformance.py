@@ -7,8 +7,6 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from bench.engines.conformance import differences
-
 TERMS = ("qpos", "qvel", "controls", "parameter")
 
 
@@ -58,4 +56,4 @@ class Engine:
 
     def gradient(self, case: Any) -> dict[str, np.ndarray]:
         """Return the derivatives, by differences."""
-        return {term: differences(self, case, term)[0] for term in TERMS}
+        return {term: case.differences(self, term)[0] for term in TERMS}

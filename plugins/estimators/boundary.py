@@ -38,6 +38,6 @@ class Boundary(SampleMean):
             total = total + np.exp(-0.5 * limit**2) / np.sqrt(2.0 * np.pi) * slope * jump
         return np.asarray(total)
 
-    def unsupported_reason(self, program: Program) -> str | None:
+    def own_refusal(self, program: Program) -> str | None:
         missing = undeclared_jumps(program)
         return None if missing is None else f"{self.name} needs all jumps of the cost: {missing}"

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.model import Estimator, Problem, Program, mean_difference, param
+from bench.model import Estimator, Problem, mean_difference, param
 
 
 @dataclass(frozen=True)
@@ -21,6 +21,7 @@ class Orthogonal(Estimator):
 
     name = "orthogonal"
     needs_directions = True
+    smooths_theta = True
     unbiased_at_discontinuities = True
     couples_samples = True
 
@@ -30,10 +31,6 @@ class Orthogonal(Estimator):
     def unbiased(self) -> bool:  # type: ignore[override]
         """True for drawn lengths."""
         return self.lengths == "drawn"
-
-    def declares_unbiased(self, program: Program) -> bool:
-        """Return whether its expectation is grad J_sigma: for drawn lengths and noise on theta."""
-        return program.noise_on_theta and super().declares_unbiased(program)
 
     def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
         d = problem.dim

@@ -37,7 +37,7 @@ class Planted(Estimator):
         """Gradients; with ``base=best`` also costs and scores, which discontinuous costs need."""
         return frozenset({"grad"}) if self.base == "samples" else frozenset({"grad", "value", "score"})
 
-    def unsupported_reason(self, program: Program) -> str | None:
+    def own_refusal(self, program: Program) -> str | None:
         if self.angle and program.dim < 2:
             return f"{self.name}[angle={self.angle:g}] needs at least 2 coordinates, and theta has {program.dim}"
         return None
@@ -45,7 +45,8 @@ class Planted(Estimator):
     def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Return the gradients with their errors, ``(R, d)``; ValueError if too few samples remain for the base."""
         spare = self._spare(problem.program) if self.noise else 0
-        if noise.shape[1] <= spare and not (noise.shape[1] == spare and self._is_exact(problem.program)):
+        is_exact = self.base == "best" and problem.program.continuous
+        if noise.shape[1] < spare + (not is_exact):
             raise ValueError(f"the planted noise needs {spare + 1} samples, got {noise.shape[1]}")
         own, used = noise[:, : noise.shape[1] - spare], noise[:, noise.shape[1] - spare :]
         g = self._base(problem, theta, own)
@@ -65,9 +66,6 @@ class Planted(Estimator):
         if self.noise:
             result = result + self.noise * size * self._unit_errors(used, problem.dim)
         return np.asarray(result)
-
-    def _is_exact(self, program: Program) -> bool:
-        return self.base == "best" and program.continuous
 
     def _spare(self, program: Program) -> int:
         """Return the number of samples whose normal numbers make the random error."""

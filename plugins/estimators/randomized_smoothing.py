@@ -19,6 +19,7 @@ class RandomizedSmoothing(SampleMean):
 
     name = "randomized_smoothing"
     needs_directions = True
+    smooths_theta = True
     unbiased_at_discontinuities = True
 
     variant: str = param("antithetic", "central or forward difference", choices=("antithetic", "forward"))
@@ -46,7 +47,7 @@ class RandomizedSmoothing(SampleMean):
         if self.smoothing(program) is not None:
             return True
         is_other = self.radius is not None and self.radius != program.scene.sigma
-        return program.noise_on_theta and not is_other and super().declares_unbiased(program)
+        return not is_other and super().declares_unbiased(program)
 
     def smoothing(self, program: Program) -> Smoothing | None:
         if self.reference == "sigma" or self.radius is None or not program.noise_on_theta:

@@ -29,14 +29,11 @@ class Sobol(Estimator):
 
     name = "sobol"
     needs_directions = True
+    smooths_theta = True
     unbiased_at_discontinuities = True
     couples_samples = True
 
-    def declares_unbiased(self, program: Program) -> bool:
-        """Return whether its expectation is grad J_sigma: for noise on theta."""
-        return program.noise_on_theta and super().declares_unbiased(program)
-
-    def unsupported_reason(self, program: Program) -> str | None:
+    def own_refusal(self, program: Program) -> str | None:
         if program.dim > MOST:
             return f"{self.name} has directions of at most {MOST:,} coordinates, and theta has {program.dim:,}"
         return None

@@ -37,7 +37,7 @@ class StochasticDerivative(SampleMean):
             total = total + weight * (problem.value(theta, changed) - cost)
         return np.asarray(total)
 
-    def unsupported_reason(self, program: Program) -> str | None:
+    def own_refusal(self, program: Program) -> str | None:
         scene = program.scene
         if not (isinstance(scene, EventScene) and scene.discrete):
             return f"{self.name} needs a scene that declares discrete events, and {scene.name} does not"

@@ -80,11 +80,11 @@ class TotalPropagation(DiagnosticEstimator):
         by_action = first.reshape(zeroth.shape)
         weight = _weight(zeroth.var(axis=3, ddof=1), by_action.var(axis=3, ddof=1))[..., None]
         mixed = (weight * by_action + (1 - weight) * zeroth).reshape(first.shape)
-        # theta does not move the initial state here, see unsupported_reason
+        # theta does not move the initial state here, see own_refusal
         result = per_repeat(by_theta(problem, path, mixed, start), noise).mean(axis=1)
         return result, {"weight": np.moveaxis(weight[..., 0], 2, 0).reshape(repeats, -1)}
 
-    def unsupported_reason(self, program: Program) -> str | None:
+    def own_refusal(self, program: Program) -> str | None:
         """Return the reason if ``per=action`` lacks noise on every action, or theta acts otherwise; else None."""
         if self.per != "action":
             return None

@@ -51,7 +51,7 @@ class Windowed(Estimator):
     )
     ridge: float = param(1e-3, "ridge penalty of the fitted value, per sample", positive=True)
 
-    def unsupported_reason(self, program: Program) -> str | None:
+    def own_refusal(self, program: Program) -> str | None:
         if self.terminal == "exact" and not isinstance(program.scene, KnownValue | FunctionScene):
             return f"{self.name}[terminal=exact] needs a scene that knows its cost-to-go, and {program.scene.name} does not"
         if program.decision.names and isinstance(program, Rollout):

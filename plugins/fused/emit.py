@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from .adjoint import active, pullback
+from .functions import helpers
 from .graph import Node, reached
 from .trace import Loop
 
@@ -110,9 +111,9 @@ class _Kernel:
         self._uniforms(everything)
         self._lanes(everything, forward, starts, backward)
         body = self.code.lines
-        helpers = _helpers(everything)
+        used = helpers({CALLS[node.op] for node in everything if node.op in CALLS})
         beyond = float(np.finfo(dtype).max) ** 0.25
-        text = HEAD.format(title=title, dtype=dtype, beyond=beyond, helpers=helpers, cache=cache)
+        text = HEAD.format(title=title, dtype=dtype, beyond=beyond, helpers=used, cache=cache)
         return text + _renumbered("\n".join("    " + line for line in body)) + "\n"
 
     def _needed(self, roots: Iterable[Node], carries: Iterable[int] = ()) -> list[int]:
@@ -135,10 +136,9 @@ class _Kernel:
         fixed, varying = wrt, f"{wrt}@"
         live = self._live_carries(fixed, varying)
 
-        def wanted_after(node: Node) -> bool:
-            return node.op == fixed or (node.op == "final" and node.data in live)
-
-        found = pullback(graph, [(loop.result, graph.literal(1.0))], wanted_after)
+        found = pullback(
+            graph, [(loop.result, graph.literal(1.0))], lambda n: n.op == fixed or (n.op == "final" and n.data in live)
+        )
         seeds = {node.data: ct for node, ct in found.items() if node.op == "final"}
         direct = {node: ct for node, ct in found.items() if node.op == fixed}
         if not loop.length:
@@ -248,7 +248,10 @@ class _Kernel:
         code.add(1, "theta_at = b * theta_column")
         code.add(1, "scored_at = b * scored_column")
         if backward and not self.covers(backward):
-            self._clear()
+            # the backward pass adds to the result
+            code.add(1, "for i in range(rows):")
+            code.add(2, f"for l in range({LANES}):")
+            code.add(3, "out[at(i * out_row + b + l)] = F(0.0)")
         # before the loop over time
         stores = [(f"c{i}", node) for i, node in starts.items()]
         stores += [(f"k{n.number}", n) for n in crossing]
@@ -310,12 +313,6 @@ class _Kernel:
             return False
         table = self.loop.indices[next(iter(backward.tables))]
         return np.array_equal(np.sort(table), np.arange(self.rows))
-
-    def _clear(self) -> None:
-        """Write zeros to the result, to which the backward pass adds."""
-        self.code.add(1, "for i in range(rows):")
-        self.code.add(2, f"for l in range({LANES}):")
-        self.code.add(3, "out[at(i * out_row + b + l)] = F(0.0)")
 
     def _reverse(self, backward: _Backward, history: dict[int, int], finals: dict[int, str],
                  kept_values: dict[int, str]) -> None:  # fmt: skip
@@ -485,10 +482,3 @@ CALLS = {
     "abs": "abs", "max": "max_", "min": "min_", "sign": "sign_", "sin": "sin_", "cos": "cos_", "rsqrt": "rsqrt_",
     "logistic": "logistic_", "floor": "np.floor", "ceil": "np.ceil", "rem": "math.fmod",
 }  # fmt: skip
-
-
-def _helpers(everything: list[Node]) -> str:
-    from .functions import HELPERS
-
-    used = {CALLS[node.op] for node in everything if node.op in CALLS}
-    return HELPERS.text(used)

@@ -8,7 +8,6 @@ below 2^20 are exact. A kernel reports larger angles and is then run again with 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 
 LIMIT = 1.6e6
 """Maximum angle [rad] of the fast sine and cosine."""
@@ -28,16 +27,15 @@ def _series(first: int, last: int) -> str:
     return text
 
 
-def _trigonometry() -> str:
-    p1, p2, p3 = HALF_PI
-    return f"""
+P1, P2, P3 = HALF_PI
+FAST = f"""
 LIMIT = {LIMIT!r}
 
 
 @njit(error_model="numpy")
 def turned_(x, shift):
     k = np.rint(x * F({2 / math.pi!r}))
-    r = ((x - k * F({p1!r})) - k * F({p2!r})) - k * F({p3!r})
+    r = ((x - k * F({P1!r})) - k * F({P2!r})) - k * F({P3!r})
     z = r * r
     sine = r * {_series(1, 19)}
     cosine = {_series(0, 20)}
@@ -81,18 +79,11 @@ def cos_(x):
     return math.cos(x)
 """
 """Source of sine and cosine by the C library, for any angle."""
-FAST = _trigonometry()
 
 
-class HELPERS:
-    """The source of helper functions."""
-
-    @staticmethod
-    def text(used: Iterable[str]) -> str:
-        """Return the source of the functions named in ``used``."""
-        used = set(used)
-        angles = used & {"sin_", "cos_"}
-        if angles:
-            used.add("max_")
-        parts = [f'\n@njit(error_model="numpy")\ndef {name}{SIMPLE[name]}\n' for name in sorted(used & set(SIMPLE))]
-        return "\n".join([*parts, FAST] if angles else parts)
+def helpers(used: set[str]) -> str:
+    """Return the source of the helper functions named in ``used``."""
+    angles = bool(used & {"sin_", "cos_"})
+    names = sorted(SIMPLE.keys() & (used | {"max_"} if angles else used))
+    parts = [f'\n@njit(error_model="numpy")\ndef {name}{SIMPLE[name]}\n' for name in names]
+    return "\n".join([*parts, FAST] if angles else parts)

@@ -76,6 +76,21 @@ def _shaped(items: Sequence[Any], parts: Sequence[np.ndarray]) -> list[np.ndarra
     return [_objects([next(at) for _ in range(part.size)], part.shape) for part in parts]
 
 
+def interpret(
+    jaxpr: Any, consts: Sequence[Any], arguments: Sequence[Any], apply: Callable[[Any, list[Any]], list[Any]]
+) -> list[Any]:
+    """Return the outputs of a jaxpr of which ``apply(equation, values)`` evaluates each equation."""
+    known = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *arguments], strict=True))
+
+    def read(atom: Any) -> Any:
+        return atom.val if hasattr(atom, "val") else known[atom]
+
+    for equation in jaxpr.eqns:
+        values = [read(atom) for atom in equation.invars]
+        known.update(zip(equation.outvars, apply(equation, values), strict=True))
+    return [read(atom) for atom in jaxpr.outvars]
+
+
 class Tracer:
     """Evaluates jaxprs on arrays of nodes. Arrays of constants remain plain NumPy arrays.
 
@@ -97,19 +112,10 @@ class Tracer:
 
     def run(self, jaxpr: Any, consts: Sequence[Any], arguments: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Return the outputs of a jaxpr as arrays of nodes or constants."""
-        known = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*map(np.asarray, consts), *arguments], strict=True))
+        return [*map(np.asarray, interpret(jaxpr, consts, arguments, self._apply))]
 
-        def read(atom: Any) -> np.ndarray:
-            return np.asarray(atom.val) if hasattr(atom, "val") else known[atom]
-
-        for equation in jaxpr.eqns:
-            values = [read(atom) for atom in equation.invars]
-            outputs = self._apply(equation, values)
-            known.update(zip(equation.outvars, outputs, strict=True))
-        return [read(atom) for atom in jaxpr.outvars]
-
-    def _apply(self, equation: Any, values: list[np.ndarray]) -> list[np.ndarray]:
-        name, parameters = equation.primitive.name, equation.params
+    def _apply(self, equation: Any, given: list[Any]) -> list[np.ndarray]:
+        name, parameters, values = equation.primitive.name, equation.params, [*map(np.asarray, given)]
         if name in ("jit", "pjit"):
             return self.run(parameters["jaxpr"].jaxpr, parameters["jaxpr"].consts, values)
         if name == "scan":

@@ -15,7 +15,7 @@ class ExplicitEuler(Integrator):
     """
 
     name = "explicit_euler"
-    order = 1
+    moves_with = "old"
 
     def step(self, dynamics: Dynamics, state: State, u: Array, dt: float) -> State:
         v = dynamics.carried(state.v) + dt * dynamics.acceleration(state.q, state.v, u)

@@ -15,8 +15,8 @@ class SemiImplicitEuler(Integrator):
     """
 
     name = "semi_implicit_euler"
-    order = 1
     takes_impulses = True
+    moves_with = "new"
 
     def step(self, dynamics: Dynamics, state: State, u: Array, dt: float) -> State:
         v = dynamics.carried(state.v) + dt * dynamics.acceleration(state.q, state.v, u)

@@ -3,8 +3,6 @@
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from bench.model import Array, ContactScene, State, param
 
 
@@ -18,6 +16,7 @@ class Billiard(ContactScene):
     """
 
     name = "billiard"
+    theta_names = ("start",)
     continuous = True
     neglected_effects = "spin, friction, cushions, the third dimension"
     n_q = 4
@@ -32,13 +31,9 @@ class Billiard(ContactScene):
     push: float = param(4.0, "force along x in the first step", "N")
     start: float = param(1.0, "u0 at theta, the force along y in the first step", "N")
 
-    def theta0(self) -> np.ndarray:
-        return np.array([self.start])
-
     def initial_state(self, xp: Any, theta: Array) -> State:
         """Return the balls at rest on the x axis, centres 0.175 m apart."""
-        zero = 0.0 * theta[0]
-        return State(xp.stack([zero - 0.375, zero, zero - 0.2, zero]), xp.stack([zero, zero, zero, zero]))
+        return self.at_rest(xp, theta, -0.375, 0.0, -0.2, 0.0)
 
     def planned_controls(self, xp: Any, theta: Array) -> Array:
         """Return (push, u0) in the first step and 0 afterwards."""

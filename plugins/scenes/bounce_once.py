@@ -6,11 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from bench.model import Array, ContactLaw, ContactScene, EngineTwin, ImpulseLaw, Plugin, State, param
+from bench.model import Array, ContactLaw, EngineTwin, ImpulseLaw, Plugin, State, param
+
+from .axis_contact import AxisContactScene
 
 
 @dataclass(frozen=True)
-class BounceOnce(EngineTwin, ContactScene):
+class BounceOnce(EngineTwin, AxisContactScene):
     """A ball flies at constant speed to the ground and back; q is the height of its centre.
 
     State (q, v); theta = (y0, vy0, u0), initial height and velocity and a vertical force during the first step only,
@@ -21,11 +23,11 @@ class BounceOnce(EngineTwin, ContactScene):
     """
 
     name = "bounce_once"
+    theta_names = ("height", "velocity", "force")
     continuous = True
     neglected_effects = "the horizontal motion (free, uncoupled), gravity, spin"
     n_q = 1
     n_u = 1
-    n_contacts = 1
     contact_values = {"stiffness": 1e4, "damping": 0.0}
 
     sigma: float = param(0.1, "standard deviation of the noise on theta", "m, m/s and N", positive=True)
@@ -36,9 +38,6 @@ class BounceOnce(EngineTwin, ContactScene):
     height: float = param(1.0 + 1.0 / 480.0, "initial height of the centre at theta", "m", positive=True)
     velocity: float = param(-2.0, "initial velocity at theta, upwards", "m/s")
     force: float = param(0.0, "force during the first step at theta, upwards", "N")
-
-    def theta0(self) -> np.ndarray:
-        return np.array([self.height, self.velocity, self.force])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
         return State(theta[0:1], theta[1:2])
@@ -54,12 +53,6 @@ class BounceOnce(EngineTwin, ContactScene):
 
     def gap(self, xp: Any, q: Array) -> Array:
         return q - self.radius
-
-    def gap_rate(self, xp: Any, q: Array, v: Array) -> Array:
-        return v
-
-    def contact_acceleration(self, xp: Any, q: Array, force: Array) -> Array:
-        return force / self.mass
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
         return q[0]
@@ -82,8 +75,8 @@ class BounceOnce(EngineTwin, ContactScene):
         This assumes that no sample starts inside the ground, which is 9 standard deviations away with the default
         theta.
         """
-        semi_implicit = integrator is not None and integrator.name == "semi_implicit_euler"
-        if not (semi_implicit and isinstance(contact, ImpulseLaw) and contact.finds_time_of_impact()):
+        is_semi_implicit = getattr(integrator, "moves_with", "") == "new"
+        if not (is_semi_implicit and isinstance(contact, ImpulseLaw) and contact.finds_time_of_impact()):
             return None
         slope = self._free_slope()
         spread = self.sigma * float(np.linalg.norm(slope))

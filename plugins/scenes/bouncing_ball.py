@@ -1,16 +1,19 @@
 """A ball dropped on the ground: one stiff contact under gravity."""
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from bench.model import Array, ContactScene, EngineTwin, State, param
+from bench.model import Array, EngineTwin, State, param
+
+from . import bounces
+from .axis_contact import AxisContactScene
+from .bounces import bounced
 
 
 @dataclass(frozen=True)
-class BouncingBall(EngineTwin, ContactScene):
+class BouncingBall(EngineTwin, AxisContactScene):
     """A ball on a vertical line under gravity; q is the height of its lowest point.
 
     State (q, v); theta = (initial height, initial velocity), with parameter noise; f = (q_T - target)^2.
@@ -22,10 +25,11 @@ class BouncingBall(EngineTwin, ContactScene):
     """
 
     name = "bouncing_ball"
+    theta_names = ("height", "velocity")
+    uses = (bounces,)
     continuous = True
     neglected_effects = "horizontal motion, spin, air, the ball's shape"
     n_q = 1
-    n_contacts = 1
     twin_difference = 1e-3
     contact_values = {"stiffness": 1e4}
 
@@ -39,23 +43,11 @@ class BouncingBall(EngineTwin, ContactScene):
     target: float = param(0.5, "target height at the end", "m")
     restitution: float = param(1.0, "restitution of impulse laws and of the physical gradient", low=0.0, high=1.0)
 
-    def theta0(self) -> np.ndarray:
-        return np.array([self.height, self.velocity])
-
     def initial_state(self, xp: Any, theta: Array) -> State:
         return State(theta[0:1], theta[1:2])
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
         return 0.0 * q - self.gravity
-
-    def gap(self, xp: Any, q: Array) -> Array:
-        return q
-
-    def gap_rate(self, xp: Any, q: Array, v: Array) -> Array:
-        return v
-
-    def contact_acceleration(self, xp: Any, q: Array, force: Array) -> Array:
-        return force / self.mass
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
         return (q[0] - self.target) ** 2
@@ -83,20 +75,5 @@ class BouncingBall(EngineTwin, ContactScene):
 
     def _rigid_end(self) -> tuple[float, np.ndarray] | None:
         """Return the height at T and its derivative by theta, ``(2,)``; None if the ball stops."""
-        g, end, e = self.gravity, self.horizon * self.dt, self.restitution
-        start = np.array([0.0, self.velocity, self.height])  # time, velocity and height after the last impact
-        slopes = np.array([[0.0, 0.0], [0.0, 1.0], [1.0, 0.0]])  # derivatives by theta
-        # a ball with more bounces than this counts as at rest
-        for _ in range(1000):
-            time, v, q = start
-            impact = math.sqrt(v * v + 2 * g * q)
-            if time + (v + impact) / g > end:
-                rest = end - time
-                slope = slopes[2] + slopes[1] * rest - (v - g * rest) * slopes[0]
-                return q + v * rest - 0.5 * g * rest**2, slope
-            if e * impact == 0.0:
-                return None
-            impact_slope = (v * slopes[1] + g * slopes[2]) / impact
-            slopes = np.array([slopes[0] + (slopes[1] + impact_slope) / g, e * impact_slope, [0.0, 0.0]])
-            start = np.array([time + (v + impact) / g, e * impact, 0.0])
-        return None
+        end, by_theta = self.horizon * self.dt, np.eye(2)
+        return bounced(self.height, self.velocity, self.gravity, self.restitution, end, *by_theta)

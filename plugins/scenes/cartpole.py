@@ -40,8 +40,7 @@ class Cartpole(EngineTwin, MechanicalScene):
         return np.array([-3.0, -40.0, -4.0, -8.0])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        zero = 0.0 * theta[0]
-        return State(xp.stack([zero, zero + self.angle]), xp.stack([zero, zero]))
+        return self.at_rest(xp, theta, 0.0, self.angle)
 
     def feedback(self, xp: Any, theta: Array, q: Array, v: Array) -> Array:
         """Return -K (x, a, x', a')."""

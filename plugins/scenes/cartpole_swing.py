@@ -38,8 +38,7 @@ class CartpoleSwing(PolicyScene):
     force: float = param(10.0, "largest force on the cart", "N", positive=True)
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        zero = 0.0 * theta[0]
-        return State(xp.stack([zero, zero - math.pi]), xp.stack([zero, zero]))
+        return self.at_rest(xp, theta, 0.0, -math.pi)
 
     def random_start(self, xp: Any, e: Array) -> State:
         u = uniform(xp, e) - 0.5

@@ -23,6 +23,7 @@ class CoinWalk(EventScene, DisturbedScene):
     """
 
     name = "coin_walk"
+    theta_names = ("push", "pull")
     neglected_effects = "inertia, the time between steps"
     continuous = False
     discrete = True
@@ -32,9 +33,6 @@ class CoinWalk(EventScene, DisturbedScene):
     pull: float = param(0.15, "x_1 at theta, per step away from 0")
     goal: float = param(3.0, "place where the steps should end", "steps")
     effort: float = param(2.0, "weight of the squared push", low=0.0)
-
-    def theta0(self) -> np.ndarray:
-        return np.array([self.push, self.pull])
 
     def disturbed_cost(self, xp: Any, x: Array, e: Array) -> Array:
         q = 0.0 * x[0] + 0.0 * e[0]

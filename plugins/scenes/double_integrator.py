@@ -17,6 +17,7 @@ class DoubleIntegrator(EngineTwin, MechanicalScene):
     """
 
     name = "double_integrator"
+    theta_names = ("control",)
     neglected_effects = "contact, friction, effort in the cost"
     continuous = True
     open_loop = True
@@ -29,13 +30,9 @@ class DoubleIntegrator(EngineTwin, MechanicalScene):
     dt: float = 0.05
     control: float = param(1.0, "control of every step at theta", "m/s^2")
 
-    def theta0(self) -> np.ndarray:
-        return np.full(self.horizon, self.control)
-
     def initial_state(self, xp: Any, theta: Array) -> State:
         """Return the state at rest at 0."""
-        zero = 0.0 * theta[:1]
-        return State(zero, zero)
+        return self.at_rest(xp, theta, 0.0)
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
         return u
@@ -57,10 +54,8 @@ class DoubleIntegrator(EngineTwin, MechanicalScene):
 
     def sensitivity(self, integrator: Plugin | None) -> np.ndarray | None:
         """Return c = d q_N / d u, ``(horizon,)``, or None for an integrator without a formula here."""
-        steps = {"semi_implicit_euler": 0, "explicit_euler": 1}
-        if integrator is None or integrator.name not in steps:
-            return None
-        return np.asarray(self.dt**2 * (self.horizon - steps[integrator.name] - np.arange(self.horizon)))
+        late = {"new": 0, "old": 1}.get(getattr(integrator, "moves_with", ""))
+        return None if late is None else np.asarray(self.dt**2 * (self.horizon - late - np.arange(self.horizon)))
 
     def closed_form_gradient(self, contact: ContactLaw | None, integrator: Plugin | None) -> np.ndarray | None:
         """Return (c . theta - 1) c."""

@@ -3,13 +3,13 @@
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from bench.model import Array, FrictionScene, State, param
+
+from .axis_contact import AxisContactScene
 
 
 @dataclass(frozen=True)
-class FrictionBlock(FrictionScene):
+class FrictionBlock(AxisContactScene, FrictionScene):
     """A block on the ground is dragged by a spring whose other end is pulled in jerks; q = (x, z).
 
     The spring's end is at p(t) = V (t - a sin(w t) / w): its mean speed is V, and for a = 1 it is at rest once per
@@ -25,11 +25,13 @@ class FrictionBlock(FrictionScene):
     """
 
     name = "friction_block"
+    theta_names = ("pull", "jerk")
     continuous = True
     neglected_effects = "rotation and shape, a higher coefficient at rest, the second horizontal direction"
     n_q = 2
     n_u = 1
-    n_contacts = 1
+    gap_axis = 1
+    slip_axis = 0
     contact_values = {"stiffness": 1e5, "beta": 1e5}
 
     sigma: float = param(0.02, "standard deviation of the noise on V and a", "m/s and 1", positive=True)
@@ -47,12 +49,8 @@ class FrictionBlock(FrictionScene):
     goal: float = param(1.0, "target x at the end", "m")
     restitution: float = 0.0
 
-    def theta0(self) -> np.ndarray:
-        return np.array([self.pull, self.jerk])
-
     def initial_state(self, xp: Any, theta: Array) -> State:
-        zero = 0.0 * theta[0]
-        return State(xp.stack([zero, zero - self.depth]), xp.stack([zero, zero]))
+        return self.at_rest(xp, theta, 0.0, -self.depth)
 
     def planned_controls(self, xp: Any, theta: Array) -> Array:
         time = self.dt * xp.astype(xp.arange(self.horizon), theta.dtype)[:, None]
@@ -60,23 +58,6 @@ class FrictionBlock(FrictionScene):
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
         return xp.stack([self.spring * (u[0] - q[0]) / self.mass, 0.0 * v[1] - self.gravity])
-
-    def gap(self, xp: Any, q: Array) -> Array:
-        return q[1:2]
-
-    def gap_rate(self, xp: Any, q: Array, v: Array) -> Array:
-        """Return z'."""
-        return v[1:2]
-
-    def contact_acceleration(self, xp: Any, q: Array, force: Array) -> Array:
-        return xp.stack([0.0 * force[0], force[0] / self.mass])
-
-    def slip(self, xp: Any, q: Array, v: Array) -> Array:
-        """Return x'."""
-        return v[0:1]
-
-    def friction_acceleration(self, xp: Any, q: Array, force: Array) -> Array:
-        return xp.stack([force[0] / self.mass, 0.0 * force[0]])
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
         """Return half the squared distance of the block from the goal on the ground."""

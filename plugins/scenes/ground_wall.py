@@ -1,12 +1,14 @@
 """A thrown ball meets the ground and a wall: two contacts, with gravity."""
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from bench.model import Array, ContactScene, State, param
+
+from . import bounces
+from .bounces import bounced
 
 
 @dataclass(frozen=True)
@@ -22,6 +24,8 @@ class GroundWall(ContactScene):
     """
 
     name = "ground_wall"
+    theta_names = ("velocity_x", "velocity_y")
+    uses = (bounces,)
     continuous = True
     neglected_effects = "spin, friction, air, the corner of ground and wall"
     n_q = 2
@@ -42,9 +46,6 @@ class GroundWall(ContactScene):
     velocity_y: float = param(-5.0, "initial velocity at theta, upwards", "m/s")
     target_x: float = param(-2.0, "x of the target", "m")
     target_y: float = param(1.5, "y of the target", "m")
-
-    def theta0(self) -> np.ndarray:
-        return np.array([self.velocity_x, self.velocity_y])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
         zero = 0.0 * theta[0]
@@ -79,38 +80,8 @@ class GroundWall(ContactScene):
     def _rigid_end(self) -> tuple[tuple[float, float], tuple[float, float]] | None:
         """Return (x, dx/dvx) and (y, dy/dvy) at T; None if the ball stops."""
         end, e = self.horizon * self.dt, self.restitution
-        from_wall = _bounced(self.wall - self.radius - self.start_x, -self.velocity_x, 0.0, e, end)
-        from_ground = _bounced(self.start_y - self.radius, self.velocity_y, self.gravity, e, end)
+        from_wall = bounced(self.wall - self.radius - self.start_x, -self.velocity_x, 0.0, e, end, 0.0, 1.0)
+        from_ground = bounced(self.start_y - self.radius, self.velocity_y, self.gravity, e, end, 0.0, 1.0)
         if from_wall is None or from_ground is None:
             return None
         return (self.wall - self.radius - from_wall[0], from_wall[1]), (self.radius + from_ground[0], from_ground[1])
-
-
-def _bounced(gap: float, velocity: float, gravity: float, e: float, end: float) -> tuple[float, float] | None:
-    """Return the gap at ``end`` and its derivative by the initial velocity; None after infinitely many impacts.
-
-    A fall from gap s at velocity v lasts t with s + v t = g t^2 / 2 and ends at speed w = sqrt(v^2 + 2 g s), with
-    dt = t dv / w and dw = v dv / w.
-    """
-    remaining, slope, delay = (
-        end,
-        1.0,
-        0.0,
-    )  # remaining time; derivatives of velocity and of the time of the last impact
-    for _ in range(1000):
-        impact = math.sqrt(velocity**2 + 2 * gravity * gap)
-        fall = _fall_time(gap, velocity, gravity, impact)
-        if fall > remaining:
-            reached = gap + velocity * remaining - 0.5 * gravity * remaining**2
-            return reached, slope * remaining - (velocity - gravity * remaining) * delay
-        if e * impact == 0.0:
-            return None
-        delay += fall * slope / impact
-        gap, velocity, slope, remaining = 0.0, e * impact, e * slope * velocity / impact, remaining - fall
-    return None
-
-
-def _fall_time(gap: float, velocity: float, gravity: float, impact: float) -> float:
-    if gravity > 0.0:
-        return (velocity + impact) / gravity
-    return -gap / velocity if velocity < 0.0 else math.inf

@@ -17,13 +17,11 @@ class Heaviside(EventScene, FunctionScene):
     """
 
     name = "heaviside"
+    theta_names = ("theta",)
     neglected_effects = "dynamics; represents a contact that occurs or not"
     continuous = False
 
     theta: float = param(0.0, "where the gradient is estimated; the jump is at 0")
-
-    def theta0(self) -> np.ndarray:
-        return np.array([self.theta])
 
     def cost(self, xp: Any, x: Array) -> Array:
         """Return the step, with derivative 0."""

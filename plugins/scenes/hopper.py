@@ -5,11 +5,13 @@ from typing import Any
 
 import numpy as np
 
-from bench.model import Array, ContactScene, EngineTwin, State, param
+from bench.model import Array, EngineTwin, State, param
+
+from .axis_contact import AxisContactScene
 
 
 @dataclass(frozen=True)
-class Hopper(EngineTwin, ContactScene):
+class Hopper(EngineTwin, AxisContactScene):
     """A body on a spring-damper leg with a point foot hops on the spot; q = (body height z, foot height y).
 
     With the compression c = rest length - (z - y) the leg pushes body and foot apart with k c + b c' + u. The policy
@@ -28,7 +30,8 @@ class Hopper(EngineTwin, ContactScene):
     neglected_effects = "forward motion and pitch, the leg's angle and end stops, limits of the actuator"
     n_q = 2
     n_u = 1
-    n_contacts = 1
+    gap_axis = 1
+    contact_mass = "foot_mass"
     twin_difference = 1e-3
     contact_values = {"stiffness": 1e4}
 
@@ -52,8 +55,7 @@ class Hopper(EngineTwin, ContactScene):
         return np.array([100.0, 400.0])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
-        zero = 0.0 * theta[0]
-        return State(xp.stack([zero + self.drop + self.leg, zero + self.drop]), xp.stack([zero, zero]))
+        return self.at_rest(xp, theta, self.drop + self.leg, self.drop)
 
     def feedback(self, xp: Any, theta: Array, q: Array, v: Array) -> Array:
         """Return c z' (theta_0 + theta_1 (target - h))."""
@@ -63,15 +65,6 @@ class Hopper(EngineTwin, ContactScene):
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
         push = self.leg_stiffness * self._compression(q) + self.leg_damping * (v[1] - v[0]) + u[0]
         return xp.stack([push / self.body_mass - self.gravity, -push / self.foot_mass - self.gravity])
-
-    def gap(self, xp: Any, q: Array) -> Array:
-        return q[1:2]
-
-    def gap_rate(self, xp: Any, q: Array, v: Array) -> Array:
-        return v[1:2]
-
-    def contact_acceleration(self, xp: Any, q: Array, force: Array) -> Array:
-        return xp.stack([0.0 * force[0], force[0] / self.foot_mass])
 
     def mjcf(self) -> str:
         return f"""

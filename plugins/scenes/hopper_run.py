@@ -6,6 +6,8 @@ from typing import Any
 
 from bench.model import Array, FrictionScene, PolicyScene, State, param, uniform
 
+from .axis_contact import AxisContactScene
+
 LEAN = math.pi / 6
 """Pitch at which the reward for an upright body is 0 [rad] (Xu et al. 2022)."""
 RAISED = 0.3
@@ -15,7 +17,7 @@ SUNK = 200.0
 
 
 @dataclass(frozen=True)
-class HopperRun(PolicyScene, FrictionScene):
+class HopperRun(PolicyScene, AxisContactScene, FrictionScene):
     """A planar body on one springy leg with a point foot runs forward (after Thompson and Raibert 1990).
 
     q = (x, z, pitch) of the body and (x, z) of the foot. The leg joins the body's centre to the foot. With its length l
@@ -37,7 +39,9 @@ class HopperRun(PolicyScene, FrictionScene):
     continuous = False
     n_q = 5
     n_u = 2
-    n_contacts = 1
+    gap_axis = 4
+    slip_axis = 3
+    contact_mass = "foot_mass"
     n_observations = 10
     n_start = 10
     contact_values = {"stiffness": 1e4}
@@ -66,8 +70,7 @@ class HopperRun(PolicyScene, FrictionScene):
 
     def initial_state(self, xp: Any, theta: Array) -> State:
         """Return the state at rest and upright, with the foot 0.1 m above the ground."""
-        zero = 0.0 * theta[0]
-        return State(xp.stack([zero, zero + 0.1 + self.leg, zero, zero, zero + 0.1]), xp.stack([zero] * 5))
+        return self.at_rest(xp, theta, 0.0, 0.1 + self.leg, 0.0, 0.0, 0.1)
 
     def random_start(self, xp: Any, e: Array) -> State:
         u = uniform(xp, e)
@@ -93,23 +96,6 @@ class HopperRun(PolicyScene, FrictionScene):
             -force_x / self.body_mass, -force_z / self.body_mass - self.gravity, -turn / self.inertia,
             force_x / self.foot_mass, force_z / self.foot_mass - self.gravity,
         ])  # fmt: skip
-
-    def gap(self, xp: Any, q: Array) -> Array:
-        return q[4:5]
-
-    def gap_rate(self, xp: Any, q: Array, v: Array) -> Array:
-        return v[4:5]
-
-    def contact_acceleration(self, xp: Any, q: Array, force: Array) -> Array:
-        zero = 0.0 * force[0]
-        return xp.stack([zero, zero, zero, zero, force[0] / self.foot_mass])
-
-    def slip(self, xp: Any, q: Array, v: Array) -> Array:
-        return v[3:4]
-
-    def friction_acceleration(self, xp: Any, q: Array, force: Array) -> Array:
-        zero = 0.0 * force[0]
-        return xp.stack([zero, zero, zero, force[0] / self.foot_mass, zero])
 
     def has_ended(self, xp: Any, q: Array, v: Array) -> Array:
         return (q[1] < self.low) | (xp.abs(q[2]) > self.tilt)

@@ -19,6 +19,7 @@ class Lqr(KnownOptimum, KnownValue, MechanicalScene):
     """
 
     name = "lqr"
+    theta_names = ("control",)
     neglected_effects = "contact, limits"
     continuous = True
     open_loop = True
@@ -36,12 +37,8 @@ class Lqr(KnownOptimum, KnownValue, MechanicalScene):
     end_position: float = param(10.0, "weight of q^2 at the end", "1/m^2", low=0.0)
     end_speed: float = param(1.0, "weight of v^2 at the end", "s^2/m^2", low=0.0)
 
-    def theta0(self) -> np.ndarray:
-        return np.full(self.horizon, self.control)
-
     def initial_state(self, xp: Any, theta: Array) -> State:
-        zero = 0.0 * theta[:1]
-        return State(zero + self.start, zero)
+        return self.at_rest(xp, theta, self.start)
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
         return u
@@ -54,7 +51,7 @@ class Lqr(KnownOptimum, KnownValue, MechanicalScene):
 
     def optimum(self, contact: ContactLaw | None, integrator: Plugin | None) -> tuple[float, str] | None:
         """Return x0'P x0 for semi-implicit Euler, None for other integrators."""
-        if integrator is None or integrator.name != "semi_implicit_euler":
+        if getattr(integrator, "moves_with", "") != "new":
             return None
         return float(self.start**2 * _values(self)[0][0, 0]), "Riccati recursion"
 

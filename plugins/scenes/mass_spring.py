@@ -1,7 +1,5 @@
 """Two masses on a stiff spring: stability and energy of every integrator."""
 
-import cmath
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,6 +19,7 @@ class MassSpring(Oscillator, DampedScene):
     """
 
     name = "mass_spring"
+    theta_names = ("stretch", "rate")
     neglected_effects = "the centre of mass (moves uniformly)"
     continuous = True
     n_q = 1
@@ -31,9 +30,6 @@ class MassSpring(Oscillator, DampedScene):
     mass: float = param(1.0, "m, mass of each body", "kg", positive=True)
     stretch: float = param(0.1, "initial stretch at theta", "m")
     rate: float = param(0.0, "initial rate of the stretch at theta", "m/s")
-
-    def theta0(self) -> np.ndarray:
-        return np.array([self.stretch, self.rate])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
         return State(theta[0:1], theta[1:2])
@@ -62,13 +58,11 @@ class MassSpring(Oscillator, DampedScene):
         """
         if self.velocity_factor != 1.0:
             return None
+        from scipy.linalg import expm
+
         stiffness, damping, _ = self.oscillator()
-        half, end = 0.5 * damping, self.horizon * self.dt
-        rate = cmath.sqrt(half * half - stiffness)  # imaginary if it oscillates
-        even = 0.5 * (cmath.exp((rate - half) * end) + cmath.exp((-rate - half) * end))
-        odd = 0.5 * (cmath.exp((rate - half) * end) - cmath.exp((-rate - half) * end))
-        odd = odd / rate if rate else end * math.exp(-half * end)
-        return self._gradient(np.array([(even + half * odd).real, complex(odd).real]))
+        system = np.array([[0.0, 1.0], [-stiffness, -damping]])
+        return self._gradient(expm(self.horizon * self.dt * system)[0])
 
     def _gradient(self, row: np.ndarray) -> np.ndarray:
         return np.asarray(2.0 * (row @ self.theta0()) * row)

@@ -3,8 +3,6 @@
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from bench.model import Array, Identified, MechanicalScene, State, param
 
 
@@ -18,6 +16,7 @@ class MassSpringDamper(Identified, MechanicalScene):
     """
 
     name = "mass_spring_damper"
+    theta_names = ("start",)
     neglected_effects = "dry friction, nonlinear stiffness"
     continuous = True
     n_q = 1
@@ -33,9 +32,6 @@ class MassSpringDamper(Identified, MechanicalScene):
     force: float = param(0.0, "amplitude of the force sin t", "N")
     start: float = param(1.0, "x at the start, at theta", "m")
     hold: float = param(0.0, "target x", "m")
-
-    def theta0(self) -> np.ndarray:
-        return np.array([self.start])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
         return State(theta[:1], 0.0 * theta[:1])

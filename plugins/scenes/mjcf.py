@@ -123,7 +123,7 @@ class Mjcf(PolicyScene, JointScene):
         return len(self.robot.q)
 
     @property
-    def n_v(self) -> int:  # type: ignore[override]
+    def n_v(self) -> int:
         """Length of the velocities."""
         return len(self.robot.v)
 

@@ -3,8 +3,6 @@
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from bench.model import Array, EngineTwin, MechanicalScene, State, param
 
 
@@ -17,6 +15,7 @@ class Pendulum(EngineTwin, MechanicalScene):
     """
 
     name = "pendulum"
+    theta_names = ("torque",)
     neglected_effects = "the rod's mass, torque limits, contact"
     continuous = True
     open_loop = True
@@ -34,12 +33,8 @@ class Pendulum(EngineTwin, MechanicalScene):
     torque: float = param(2.0, "torque of every step at theta", "N m")
     effort: float = param(1e-3, "cost per squared torque and second", "1/(N^2 m^2 s)", low=0.0)
 
-    def theta0(self) -> np.ndarray:
-        return np.full(self.horizon, self.torque)
-
     def initial_state(self, xp: Any, theta: Array) -> State:
-        zero = 0.0 * theta[:1]
-        return State(zero, zero)
+        return self.at_rest(xp, theta, 0.0)
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
         inertia = self.mass * self.length * self.length

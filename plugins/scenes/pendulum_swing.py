@@ -20,6 +20,7 @@ class PendulumSwing(MechanicalScene):
     """
 
     name = "pendulum_swing"
+    theta_names = ("torque",)
     neglected_effects = "units, damping, torque limits, contact"
     continuous = True
     open_loop = True
@@ -34,12 +35,8 @@ class PendulumSwing(MechanicalScene):
     effort: float = param(1.0, "weight of the squared torque", low=0.0)
     terminal: float = param(20.0, "weight of the end state", low=0.0)
 
-    def theta0(self) -> np.ndarray:
-        return np.full(self.horizon, self.torque)
-
     def initial_state(self, xp: Any, theta: Array) -> State:
-        zero = 0.0 * theta[:1]
-        return State(zero, zero)
+        return self.at_rest(xp, theta, 0.0)
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
         """Return -sin q + u."""

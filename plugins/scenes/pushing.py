@@ -3,8 +3,6 @@
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from bench.model import Array, ContactScene, DampedScene, EngineTwin, State, ZeroOrderHoldScene, param
 
 
@@ -18,6 +16,7 @@ class Pushing(EngineTwin, ZeroOrderHoldScene, DampedScene, ContactScene):
     """
 
     name = "pushing"
+    theta_names = ("push",)
     continuous = True
     neglected_effects = "rotation, friction, the second dimension, shapes (bodies are points with a rest distance)"
     open_loop = True
@@ -36,9 +35,6 @@ class Pushing(EngineTwin, ZeroOrderHoldScene, DampedScene, ContactScene):
     push: float = param(0.1, "force of every step at theta", "N")
     speed: float = param(0.0, "initial and goal velocity of the first body", "m/s")
     restitution: float = 0.0
-
-    def theta0(self) -> np.ndarray:
-        return np.full(self.controls, self.push)
 
     def initial_state(self, xp: Any, theta: Array) -> State:
         zero = 0.0 * theta[0]

@@ -3,8 +3,6 @@
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from bench.model import Array, Identified, MechanicalScene, State, param
 
 
@@ -18,6 +16,7 @@ class SlidingBlock(Identified, MechanicalScene):
     """
 
     name = "sliding_block"
+    theta_names = ("speed",)
     neglected_effects = "a higher coefficient at rest, friction that changes with speed"
     continuous = True
     n_q = 1
@@ -31,9 +30,6 @@ class SlidingBlock(Identified, MechanicalScene):
     gravity: float = param(9.81, "g", "m/s^2", positive=True)
     speed: float = param(3.0, "v0, at theta", "m/s", positive=True)
     goal: float = param(2.0, "target x at the end", "m")
-
-    def theta0(self) -> np.ndarray:
-        return np.array([self.speed])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
         """Return position 0 and the speed in theta."""

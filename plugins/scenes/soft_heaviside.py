@@ -18,14 +18,12 @@ class SoftHeaviside(FunctionScene):
     """
 
     name = "soft_heaviside"
+    theta_names = ("theta",)
     neglected_effects = "dynamics; represents a stiff contact that occurs or not"
     continuous = True
 
     theta: float = param(0.0, "where the gradient is estimated; the ramp is around 0")
     nu: float = param(0.1, "width of the ramp", positive=True)
-
-    def theta0(self) -> np.ndarray:
-        return np.array([self.theta])
 
     def cost(self, xp: Any, x: Array) -> Array:
         """Return the ramp from -1 to 1."""

@@ -36,8 +36,7 @@ class SpringRecord(KnownOptimum, MechanicalScene):
 
     def initial_state(self, xp: Any, theta: Array) -> State:
         """Return both motions at rest at 1."""
-        zero = 0.0 * theta[:2]
-        return State(zero + 1.0, zero)
+        return self.at_rest(xp, theta, 1.0, 1.0)
 
     def planned_controls(self, xp: Any, theta: Array) -> Array:
         return xp.zeros((self.horizon, 1, 1), dtype=theta.dtype) + theta

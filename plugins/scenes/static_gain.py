@@ -65,20 +65,16 @@ class StaticGain(KnownOptimum, KnownValue, MechanicalScene):
         return self.end * xp.sum(v * v, axis=0)
 
     def optimum(self, contact: ContactLaw | None, integrator: Plugin | None) -> tuple[float, str] | None:
-        """Return the minimum cost over one constant gain k in [-2, 0], by a grid search refined eight times."""
-        cost = self.cost_of(np.linspace(-2.0, 0.0, 201))
-        low, high = np.linspace(-2.0, 0.0, 201)[[max(int(cost.argmin()) - 1, 0), min(int(cost.argmin()) + 1, 200)]]
-        for _ in range(8):
-            k = np.linspace(low, high, 101)
-            best = int(self.cost_of(k).argmin())
-            low, high = k[max(best - 1, 0)], k[min(best + 1, 100)]
-        return float(self.copies * self.cost_of(np.array([0.5 * (low + high)]))[0]), "grid search over a constant gain"
+        """Return the minimum cost over one constant gain k in [-2, 0]."""
+        from scipy.optimize import minimize_scalar
 
-    def cost_of(self, k: np.ndarray) -> np.ndarray:
-        """Return the cost of one copy under u = k x, a geometric sum, for an array of gains k."""
-        factor = (1.0 + self.dt * k) ** 2
-        powers = factor[None] ** np.arange(self.horizon + 1)[:, None]
-        return np.asarray((1.0 + self.effort * k * k) * powers[:-1].sum(axis=0) + self.end * powers[-1])
+        found = minimize_scalar(self.cost_of, bounds=(-2.0, 0.0), method="bounded", options={"xatol": 1e-12})
+        return self.copies * float(found.fun), "search over a constant gain"
+
+    def cost_of(self, k: float) -> float:
+        """Return the cost of one copy under u = k x, a geometric sum."""
+        powers = (1.0 + self.dt * k) ** (2 * np.arange(self.horizon + 1))
+        return float((1.0 + self.effort * k * k) * powers[:-1].sum() + self.end * powers[-1])
 
     def cost_to_go(self, q: np.ndarray, v: np.ndarray, step: int) -> np.ndarray:
         """Return p x'x, ``(B,)``, with the p of ``step`` from the scalar Riccati recursion."""

@@ -19,6 +19,7 @@ class StiffDecay(MechanicalScene):
     """
 
     name = "stiff_decay"
+    theta_names = ("start",)
     neglected_effects = "positions, a second time scale"
     continuous = True
     n_q = 0
@@ -29,9 +30,6 @@ class StiffDecay(MechanicalScene):
     dt: float = 0.05
     rate: float = param(-50.0, "growth rate, negative for decay", "1/s")
     start: float = param(1.0, "x_0 at theta")
-
-    def theta0(self) -> np.ndarray:
-        return np.array([self.start])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
         """Return no position and x_0 as velocity."""

@@ -25,6 +25,7 @@ class TwoBalls(KnownOptimum, ContactScene):
     """
 
     name = "two_balls"
+    theta_names = ("force", "force")
     continuous = True
     neglected_effects = "spin, friction, the table's edges, further balls"
     open_loop = True
@@ -40,13 +41,9 @@ class TwoBalls(KnownOptimum, ContactScene):
     force: float = param(3.0, "both components of the force of every step at theta", "N")
     effort: float = param(0.1, "weight of the squared force", "m^2/(N^2 s)", positive=True)
 
-    def theta0(self) -> np.ndarray:
-        return np.full(2 * self.horizon, self.force)
-
     def initial_state(self, xp: Any, theta: Array) -> State:
         """Return the balls at rest at (-2, -2) and (-1, -1)."""
-        zero = 0.0 * theta[0]
-        return State(xp.stack([zero - 2.0, zero - 2.0, zero - 1.0, zero - 1.0]), xp.stack([zero] * 4))
+        return self.at_rest(xp, theta, -2.0, -2.0, -1.0, -1.0)
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
         """Return the force on the first ball; both have a mass of 1 kg."""

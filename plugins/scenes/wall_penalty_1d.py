@@ -6,11 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from bench.model import Array, ContactScene, EngineTwin, State, param
+from bench.model import Array, EngineTwin, State, param
+
+from .axis_contact import AxisContactScene
 
 
 @dataclass(frozen=True)
-class WallPenalty1d(EngineTwin, ContactScene):
+class WallPenalty1d(EngineTwin, AxisContactScene):
     """A point of mass 1 at q0 > 0 moves at velocity -1 into a wall at q = 0, which pushes with -v - 50 q, unclipped.
 
     State (q, v); theta = q0 (d = 1), with parameter noise; f = |q_T - 1| with T = horizon dt = 2 s. The wall is a
@@ -21,19 +23,16 @@ class WallPenalty1d(EngineTwin, ContactScene):
     """
 
     name = "wall_penalty_1d"
+    theta_names = ("start",)
     continuous = True
     neglected_effects = "gravity, the second and third dimension, shapes"
     n_q = 1
-    n_contacts = 1
     twin_difference = 1e-3
     contact_values = {"stiffness": 50.0, "damping": 1.0, "damping_mode": "linear"}
 
     sigma: float = param(0.1, "standard deviation of the noise on q0", "m", positive=True)
     horizon: int = 200
     start: float = param(0.6, "q0 at theta", "m")
-
-    def theta0(self) -> np.ndarray:
-        return np.array([self.start])
 
     def initial_state(self, xp: Any, theta: Array) -> State:
         """Return position q0, moving towards the wall at 1 m/s."""
@@ -42,12 +41,6 @@ class WallPenalty1d(EngineTwin, ContactScene):
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
         """Return zero: only the wall pushes."""
         return 0.0 * v
-
-    def gap(self, xp: Any, q: Array) -> Array:
-        return q
-
-    def gap_rate(self, xp: Any, q: Array, v: Array) -> Array:
-        return v
 
     def contact_acceleration(self, xp: Any, q: Array, force: Array) -> Array:
         """Return the acceleration away from the wall, for mass 1."""

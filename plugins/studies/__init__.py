@@ -1,4 +1,4 @@
-"""The built-in studies, one package each: what to measure per cell, and the tables, charts and page to write."""
+"""The built-in studies: what to measure per cell, and the tables, charts and page to write."""
 
 from __future__ import annotations
 
@@ -27,7 +27,10 @@ FINE = 1e-3
 
 @dataclass(frozen=True)
 class StudyPackage(Study):
-    """A study whose package has modules ``measure`` and ``views`` with a function of that name, imported at first use."""
+    """A built-in study: a file with ``measure`` and ``show``, or a package with modules ``measure`` and ``views``.
+
+    These modules have a function of that name, and are imported at first use.
+    """
 
     def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
         """Return one cell's results by column."""
@@ -41,11 +44,15 @@ class StudyPackage(Study):
         from bench.report import generic
         from bench.report.writer import reasons
 
-        found: Views | None = self._module("views").views(experiment, rows)
+        found = self.show(experiment, rows)
         if found is None:
             found = Views([replace(table, terminal=False) for table in generic.views(experiment, rows).tables])
         drawn = [chart for chart in found.charts if len(chart.frame)]
         return replace(found, charts=drawn, remarks=[*found.remarks, *unseen_features(rows), *reasons(rows)])
+
+    def show(self, experiment: Experiment, rows: pd.DataFrame) -> Views | None:
+        """Return the tables of the rows and the charts; None without any."""
+        return self._module("views").views(experiment, rows)  # type: ignore[no-any-return]
 
     def _module(self, name: str) -> Any:
         package = next(c.__module__ for c in type(self).__mro__ if hasattr(sys.modules[c.__module__], "__path__"))

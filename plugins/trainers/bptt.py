@@ -28,49 +28,33 @@ class Bptt(Neural):
 
     def update(self, env: Any, state: Run) -> tuple[Run, dict[str, Any]]:
         import jax
-        import jax.numpy as jnp
-        import optax
 
-        from bench.training import normaliser, steps, windows
+        from bench.training import normaliser, windows
 
         key, key_window = jax.random.split(state.key)
 
         def loss(actor: Any) -> tuple[Any, Any]:
-            window = self._window(env, state, actor, key_window)
-            return -self._gains(window).mean(), window
+            gained, window = self._episodes(env, state, actor, key_window)
+            return -gained.mean(), window
 
-        (cost, window), gradient = jax.value_and_grad(loss, has_aux=True)(state.actor)
-        change, memory = self.actor_optimizer(env).update(gradient, state.memory)
-        actor = optax.apply_updates(state.actor, change)
-        log = {
-            "loss": cost, "deviation": jnp.exp(actor.log_deviation).mean(),
-            **windows.log_of(window), **steps.step_log(gradient, change, actor),
-        }  # fmt: skip
+        actor, memory, window, log = self.descended(env, state, loss)
         known = normaliser.updated(state.normaliser, windows.flat(window.observation))
-        return Run(actor, memory, known, state.episodes, key), log
+        return Run(actor, memory, known, state.episodes, key), log | windows.log_of(window)
 
     def parts(self, env: Any, state: Run, actor: Any, key: Any) -> tuple[Any, Any, Any]:
         from bench.training import windows
 
-        window = self._window(env, state, actor, key)
-        return self._gains(window), window.cut, windows.log_probability(actor, state.normaliser, window)
+        gained, window = self._episodes(env, state, actor, key)
+        return gained, window.cut, windows.log_probability(actor, state.normaliser, window)
 
-    def _gains(self, window: Any) -> Any:
+    def _episodes(self, env: Any, state: Run, actor: Any, key: Any) -> tuple[Any, Any]:
+        """Return the gains of new episodes, and their window."""
+        import jax
         import jax.numpy as jnp
 
         from bench.training import windows
 
-        return windows.gains(window, jnp.zeros_like(window.reward), self.discount)
-
-    def _window(self, env: Any, state: Run, actor: Any, key: Any) -> Any:
-        import jax
-
-        from bench.training import normaliser, windows
-
         key_start, key_noise = jax.random.split(key)
-
-        def policy(observation: Any, noise: Any) -> Any:
-            return actor.sample(normaliser.normalised(state.normaliser, observation), noise)
-
-        first = env.start(env.normal(key_start, (env.scene.n_start, self.rollouts)))
-        return windows.rollout(env, policy, first, env.length, key_noise)[1]
+        first = self.fresh(env, state, key_start).episodes
+        _, window = self.rolled(env, state, actor, first, env.length, key_noise)
+        return windows.gains(window, jnp.zeros_like(window.reward), self.discount), window

@@ -66,14 +66,42 @@ class Neural(Trainer):
         key, key_actor, key_start = jax.random.split(jax.random.PRNGKey(seed), 3)
         layers = [env.n_observations, self.hidden, self.hidden, env.n_actions]
         actor = Actor(key_actor, layers, env.dtype, self.log_deviation, activation=self.activation, gain=self.gain)
-        episodes = env.start(env.normal(key_start, (env.n_start, self.rollouts)))
         known = normaliser.start(env.n_observations, env.dtype)
-        return Run(actor, self.actor_optimizer(env).init(actor), known, episodes, key)
+        return self.fresh(env, Run(actor, self.actor_optimizer(env).init(actor), known, None, key), key_start)
 
-    def fresh(self, env: Any, state: Any, key: Any) -> Any:
+    def fresh(self, env: Any, state: Run, key: Any) -> Run:
         return state._replace(episodes=env.start(env.normal(key, (env.n_start, self.rollouts))))
 
     def action(self, env: Any, state: Any, observation: Any) -> Any:
         from bench.training import normaliser
 
         return state.actor.mean(normaliser.normalised(state.normaliser, observation))
+
+    def rolled(
+        self, env: Any, state: Run, actor: Any, first: Any, length: int, key: Any, *cuts: Any
+    ) -> tuple[Any, Any]:
+        """Return the episodes after ``length`` control steps of an actor, and the window, see ``bench.training.windows``."""
+        from bench.training import normaliser, windows
+
+        def policy(observation: Any, noise: Any) -> Any:
+            return actor.sample(normaliser.normalised(state.normaliser, observation), noise)
+
+        return windows.rollout(env, policy, first, length, key, *cuts)
+
+    def descended(self, env: Any, state: Run, loss: Any) -> tuple[Any, Any, Any, dict[str, Any]]:
+        """Return the actor and its memory after a step on ``loss(actor)``, what else the loss returns, and the step's log."""
+        import jax
+        import jax.numpy as jnp
+        import optax
+
+        from bench.training import steps
+
+        (cost, more), gradient = jax.value_and_grad(loss, has_aux=True)(state.actor)
+        change, memory = self.actor_optimizer(env).update(gradient, state.memory)
+        actor = optax.apply_updates(state.actor, change)
+        log = {
+            "loss": cost,
+            "deviation": jnp.exp(actor.log_deviation).mean(),
+            **steps.step_log(gradient, change, actor),
+        }
+        return actor, memory, more, log

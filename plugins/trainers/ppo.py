@@ -63,7 +63,7 @@ class Ppo(ActorCritic):
         import jax
         import jax.numpy as jnp
 
-        from bench.training import fitting, normaliser, values, windows
+        from bench.training import normaliser, steps, windows
 
         assert state.critic is not None
         critic = state.critic
@@ -72,23 +72,23 @@ class Ppo(ActorCritic):
         observation, action = windows.flat(window.observation), windows.flat(window.action)
         seen = normaliser.normalised(state.normaliser, observation)
         # rewards are in standard deviations of the returns so far, without the critic's values, whose errors would grow
-        alone = values.td_lambda(window.reward, jnp.zeros_like(window.reward), window.ended, self.discount, 1.0)
+        alone = windows.td_lambda(window.reward, jnp.zeros_like(window.reward), window.ended, self.discount, 1.0)
         returns = normaliser.updated(state.returns, alone.reshape(1, -1))
         unit = normaliser.deviation(returns)[0]
         value, before = self.values_of(state, critic.network, window), critic.network(seen).reshape(window.reward.shape)
-        advantage = values.td_lambda(window.reward / unit, value, window.ended, self.discount, self.decay) - before
+        advantage = windows.td_lambda(window.reward / unit, value, window.ended, self.discount, self.decay) - before
         old = state.actor.log_probability(seen, action)
 
         def loss(actor: Any, *batch: Any) -> Any:
             seen, action, old, better = batch
             return self.surrogate(actor, seen, action, old, (better - better.mean()) / (better.std() + 1e-8))
 
-        actor, memory, log = fitting.fit(
+        actor, memory, log = steps.fit(
             self.actor_optimizer(env), loss, state.actor, state.memory, (seen, action, old, advantage.reshape(-1)),
             self.passes, self.batches, key_actor,
         )  # fmt: skip
-        network, critic_memory, fitted = fitting.fit(
-            self.critic_optimizer(env), fitting.squared_error, critic.network, critic.memory,
+        network, critic_memory, fitted = steps.fit(
+            self.critic_optimizer(env), steps.squared_error, critic.network, critic.memory,
             (seen, (advantage + before).reshape(-1)), self.passes, self.batches, key_critic,
         )  # fmt: skip
         log = {name: entries[0] for name, entries in log.items()} | {

@@ -34,10 +34,9 @@ class Shac(ActorCritic):
 
     def update(self, env: Any, state: Run) -> tuple[Run, dict[str, Any]]:
         import jax
-        import jax.numpy as jnp
         import optax
 
-        from bench.training import fitting, normaliser, steps, values, windows
+        from bench.training import normaliser, steps, windows
 
         assert state.critic is not None
         critic = state.critic
@@ -49,21 +48,15 @@ class Shac(ActorCritic):
             cost = -windows.gains(window, value, self.discount).mean()
             return cost - self.entropy * actor.log_deviation.sum(), (episodes, window, value)
 
-        (cost, (episodes, window, value)), gradient = jax.value_and_grad(loss, has_aux=True)(state.actor)
-        change, memory = self.actor_optimizer(env).update(gradient, state.memory)
-        actor = optax.apply_updates(state.actor, change)
-
-        targets = values.td_lambda(window.reward, value, window.ended, self.discount, self.decay)
+        actor, memory, (episodes, window, value), log = self.descended(env, state, loss)
+        targets = windows.td_lambda(window.reward, value, window.ended, self.discount, self.decay)
         seen = windows.flat(window.observation)
-        network, critic_memory, fitted = fitting.fit(
-            self.critic_optimizer(env), fitting.squared_error, critic.network, critic.memory,
+        network, critic_memory, fitted = steps.fit(
+            self.critic_optimizer(env), steps.squared_error, critic.network, critic.memory,
             (normaliser.normalised(state.normaliser, seen), targets.reshape(-1)), self.passes, self.batches, key_critic,
         )  # fmt: skip
         target = optax.incremental_update(network, critic.target, self.follow)
-        log = {
-            "loss": cost, "value_loss": fitted["loss"][-self.batches :].mean(), "deviation": jnp.exp(actor.log_deviation).mean(),
-            **windows.log_of(window), **steps.step_log(gradient, change, actor),
-        }  # fmt: skip
+        log |= {"value_loss": fitted["loss"][-self.batches :].mean(), **windows.log_of(window)}
         known = normaliser.updated(state.normaliser, seen)
         return Run(actor, memory, known, episodes, key, Critic(network, target, critic_memory)), log
 

@@ -47,25 +47,38 @@ from bench.model import (
     registry,
 )
 
+PLANTED: dict[type[Plugin], set[str]] = {}
+"""By plugin with a fault: the checks that have to fail."""
+
+
+def planted(*checks):
+    """Return a decorator of a plugin that the checks have to refuse; it is named after its class."""
+
+    def register(plugin):
+        plugin.name = re.sub("(?<!^)(?=[A-Z])", "_", plugin.__name__).lower()
+        PLANTED[dataclass(frozen=True)(plugin)] = set(checks)
+        return plugin
+
+    return register
+
+
 # ------------------------------------------------------------------------------------------- planted: estimators
 
 
-@dataclass(frozen=True)
+@planted("bias_is_as_declared")
 class WrongSign(SampleMean):
     """First-order, with the wrong sign."""
 
-    name = "wrong_sign"
     needs = frozenset({"grad"})
 
     def terms(self, problem, theta, w):
         return -problem.grad(theta, w)
 
 
-@dataclass(frozen=True)
+@planted("bias_is_as_declared", "bias_across_jumps_is_as_declared")
 class SigmaForSigmaSquared(SampleMean):
     """Zeroth-order, f sigma w / sigma^2 with a sigma for the sigma^2."""
 
-    name = "sigma_for_sigma_squared"
     unbiased_at_discontinuities = True
 
     def terms(self, problem, theta, w):
@@ -73,11 +86,10 @@ class SigmaForSigmaSquared(SampleMean):
         return cost * problem.sigma * w / problem.sigma
 
 
-@dataclass(frozen=True)
+@planted("uses_every_sample")
 class SecondHalfIsTheFirst(SampleMean):
     """First-order, using the first half of the noise twice."""
 
-    name = "second_half_is_the_first"
     needs = frozenset({"grad"})
 
     def terms(self, problem, theta, w):
@@ -88,39 +100,33 @@ class SecondHalfIsTheFirst(SampleMean):
         return super().estimate(problem, theta, np.concatenate([half, half], axis=1))
 
 
-@dataclass(frozen=True)
+@planted("repeats_are_independent")
 class RepeatsAreTheFirst(SecondHalfIsTheFirst):
     """First-order, with the noise of repeat 0 in every repeat."""
-
-    name = "repeats_are_the_first"
 
     def estimate(self, problem, theta, noise):
         return SampleMean.estimate(self, problem, theta, np.broadcast_to(noise[:1], noise.shape))
 
 
-@dataclass(frozen=True)
+@planted("variance_falls_as_one_over_n")
 class SixteenSamples(SecondHalfIsTheFirst):
     """First-order, from the first 16 samples whatever their number."""
-
-    name = "sixteen_samples"
 
     def estimate(self, problem, theta, noise):
         return SampleMean.estimate(self, problem, theta, noise[:, :16])
 
 
-@dataclass(frozen=True)
+@planted("variance_falls_as_one_over_n")
 class UndeclaredCoupling(Sobol):
     """Zeroth-order along quasi-random directions, which it does not declare."""
 
-    name = "undeclared_coupling"
     couples_samples: ClassVar[bool] = False
 
 
-@dataclass(frozen=True)
+@planted("bias_is_as_declared")
 class OwnSampleInBaseline(Estimator):
     """Zeroth-order, with a batch mean as baseline that counts the sample itself."""
 
-    name = "own_sample_in_baseline"
     needs = frozenset({"value", "score"})
     unbiased_at_discontinuities = True
 
@@ -130,11 +136,10 @@ class OwnSampleInBaseline(Estimator):
         return ((f - f.mean(axis=1, keepdims=True))[..., None] * score).mean(axis=1)
 
 
-@dataclass(frozen=True)
+@planted("bias_under_action_feedback")
 class OpenLoopScore(SampleMean):
     """Zeroth-order, with the score of an open-loop control under feedback too."""
 
-    name = "open_loop_score"
     needs = frozenset({"value", "score"})
     unbiased_at_discontinuities = True
 
@@ -143,64 +148,58 @@ class OpenLoopScore(SampleMean):
         return cost * (0 * problem.score(theta, w) + w[: problem.dim] / problem.sigma)
 
 
-@dataclass(frozen=True)
+@planted("shape_and_repeatability")
 class OwnNoise(SampleMean):
     """First-order, at noise of its own."""
 
-    name = "own_noise"
     needs = frozenset({"grad"})
 
     def terms(self, problem, theta, w):
         return problem.grad(theta, np.random.default_rng().standard_normal(w.shape))
 
 
-@dataclass(frozen=True)
+@planted("needs_are_truthful")
 class UndeclaredValue(SampleMean):
     """First-order, and it looks at costs without saying so."""
 
-    name = "undeclared_value"
     needs = frozenset({"grad"})
 
     def terms(self, problem, theta, w):
         return problem.grad(theta, w) + 0 * problem.value(theta, w)
 
 
-@dataclass(frozen=True)
+@planted("needs_are_truthful")
 class UnusedScore(SecondHalfIsTheFirst):
     """First-order, and it asks for scores it never uses."""
 
-    name = "unused_score"
     needs = frozenset({"grad", "score"})
 
     def estimate(self, problem, theta, noise):
         return SampleMean.estimate(self, problem, theta, noise)
 
 
-@dataclass(frozen=True)
+@planted("bias_across_jumps_is_as_declared")
 class ClaimsJumps(UnusedScore):
     """First-order, and it claims to be right across jumps."""
 
-    name = "claims_jumps"
     needs = frozenset({"grad"})
     unbiased_at_discontinuities = True
 
 
-@dataclass(frozen=True)
+@planted("bias_across_jumps_is_as_declared")
 class DeniesJumps(SampleMean):
     """Zeroth-order, and it denies being right across jumps."""
 
-    name = "denies_jumps"
     needs = frozenset({"value", "score"})
 
     def terms(self, problem, theta, w):
         return problem.value(theta, w) * problem.score(theta, w)
 
 
-@dataclass(frozen=True)
+@planted("bias_is_as_declared")
 class LastingBias(UnusedScore):
     """First-order, two and a half times as large however many samples there are."""
 
-    name = "lasting_bias"
     needs = frozenset({"grad"})
     unbiased = False
 
@@ -208,13 +207,11 @@ class LastingBias(UnusedScore):
         return 2.5 * problem.grad(theta, w)
 
 
-@dataclass(frozen=True)
+@planted("something_was_checked")
 class RefusesEverything(UnusedScore):
     """First-order, for programs that do not exist."""
 
-    name = "refuses_everything"
-
-    def unsupported_reason(self, program):
+    def own_refusal(self, program):
         return "not this one"
 
 
@@ -231,11 +228,10 @@ class Faulty(Numpy):
         return self.faulty(program, self.dtype, 1e-6 if self.dtype == "float64" else 5e-3)
 
 
-@dataclass(frozen=True)
+@planted("gradient_is_that_of_value")
 class ClaimsSurrogates(Faulty):
     """Declares surrogate gradients and returns derivatives by differences."""
 
-    name = "claims_surrogates"
     provides = Numpy.provides | {"surrogate"}
     faulty = NumpyProblem
 
@@ -249,11 +245,10 @@ class SofterProblem(NumpyProblem):
         return NumpyProblem(program, self._dtype.name, self._step)._grad(theta, w)
 
 
-@dataclass(frozen=True)
+@planted("gradient_is_that_of_value")
 class HalfStiffnessGradient(Faulty):
     """Gradients of a contact half as stiff."""
 
-    name = "half_stiffness_gradient"
     faulty = SofterProblem
 
 
@@ -264,11 +259,10 @@ class HomeProblem(NumpyProblem):
         return super()._grad(near, w)
 
 
-@dataclass(frozen=True)
+@planted("gradient_is_that_of_value")
 class GradientOfItsOwnTheta(Faulty):
     """Gradients that are right only near the scene's own theta."""
 
-    name = "gradient_of_its_own_theta"
     faulty = HomeProblem
 
 
@@ -277,11 +271,10 @@ class ForgetfulProblem(NumpyProblem):
         return np.broadcast_to(w.sum(axis=0) / self.sigma, (self.dim, w.shape[1]))
 
 
-@dataclass(frozen=True)
+@planted("score_is_that_of_actions")
 class WrongScore(Faulty):
     """Scores that leave out the states a policy acted on."""
 
-    name = "wrong_score"
     faulty = ForgetfulProblem
 
 
@@ -291,27 +284,23 @@ class LeakyProblem(NumpyProblem):
         return cost + 1e-3 * cost.mean()
 
 
-@dataclass(frozen=True)
+@planted("columns_are_independent", "value_agrees")
 class LeakyColumns(Faulty):
     """Costs that mix a little of the batch into every column."""
 
-    name = "leaky_columns"
     faulty = LeakyProblem
 
 
-@dataclass(frozen=True)
+@planted("root_is_differentiated_implicitly")
 class ClaimsRoot(Numpy):
     """Claims to solve equations."""
 
-    name = "claims_root"
     provides = Backend.provides | {"root"}
 
 
-@dataclass(frozen=True)
+@planted("single_precision_is_finite")
 class DoubleAnyway(Numpy):
     """Float64 whatever the dtype."""
-
-    name = "double_anyway"
 
     def compile(self, program):
         return NumpyProblem(program, "float64", 1e-6)
@@ -320,68 +309,56 @@ class DoubleAnyway(Numpy):
 # ----------------------------------------------------------------------------------------------- planted: scenes
 
 
-@dataclass(frozen=True)
+@planted("closed_form_is_right")
 class WrongClosedForm(Quadratic):
     """A bowl whose stated gradient is 5% too long."""
-
-    name = "wrong_closed_form"
 
     def closed_form_gradient(self, contact, integrator):
         return 1.05 * super().closed_form_gradient(contact, integrator)
 
 
-@dataclass(frozen=True)
+@planted("continuity_is_as_declared")
 class ClaimsContinuity(Heaviside):
     """A step that claims to be continuous."""
 
-    name = "claims_continuity"
     continuous = True
 
 
-@dataclass(frozen=True)
+@planted("continuity_is_as_declared")
 class ClaimsAJump(Cubic):
     """A cubic that claims to jump."""
 
-    name = "claims_a_jump"
     continuous = False
 
 
-@dataclass(frozen=True)
+@planted("continuity_is_as_declared")
 class JumpsElsewhere(Cubic):
     """A cubic with a step 7 sigma from theta, that claims to be continuous."""
-
-    name = "jumps_elsewhere"
 
     def cost(self, xp, x):
         return super().cost(xp, x) + xp.where(x[0] > self.theta0()[0] + 7.0 * self.sigma, 1.0, 0.0)
 
 
-@dataclass(frozen=True)
+@planted("physical_gradient_is_the_limit")
 class WrongPhysics(MassSpring):
     """A physical gradient that is finite, of the right shape, and half as long again in one coordinate."""
-
-    name = "wrong_physics"
 
     def physical_gradient(self):
         gradient = super().physical_gradient()
         return None if gradient is None else gradient * [1.0, 1.5]
 
 
-@dataclass(frozen=True)
+@planted("closed_form_is_right")
 class ClaimsControls(DoubleIntegrator):
     """A theta that is twice the controls, with the gradient of one that is the controls."""
-
-    name = "claims_controls"
 
     def planned_controls(self, xp, theta):
         return 2.0 * super().planned_controls(xp, theta)
 
 
-@dataclass(frozen=True)
+@planted("costs_are_finite")
 class MixedColumns(FunctionScene):
     """A cost that depends on the whole batch."""
-
-    name = "mixed_columns"
 
     def theta0(self):
         return np.ones(2)
@@ -390,70 +367,59 @@ class MixedColumns(FunctionScene):
         return xp.sum(x * x, axis=0) - xp.mean(x)
 
 
-@dataclass(frozen=True)
+@planted("backends_agree")
 class NumpyOnly(MixedColumns):
     """A cost that only NumPy can evaluate."""
-
-    name = "numpy_only"
 
     def cost(self, xp, x):
         return np.square(np.array(x)).sum(axis=0)
 
 
-@dataclass(frozen=True)
+@planted("contact_geometry_is_consistent")
 class PullsTogether(Pushing):
     """Bodies that a contact force pulls together."""
-
-    name = "pulls_together"
 
     def contact_acceleration(self, xp, q, force):
         return -super().contact_acceleration(xp, q, force)
 
 
-@dataclass(frozen=True)
+@planted("contact_geometry_is_consistent")
 class WrongGapRate(Pushing):
     """A gap rate that forgets one of the bodies."""
-
-    name = "wrong_gap_rate"
 
     def gap_rate(self, xp, q, v):
         return v[1:2]
 
 
-@dataclass(frozen=True)
+@planted("contact_geometry_is_consistent")
 class NoContacts(Pushing):
     """Bodies that touch, and no number of contacts."""
 
-    name = "no_contacts"
     n_contacts = 0
 
 
-@dataclass(frozen=True)
+@planted("state_has_declared_size")
 class WrongStateSize(DoubleIntegrator):
     """Two coordinates declared, and one given."""
 
-    name = "wrong_state_size"
     n_q = 2
 
 
 # -------------------------------------------------------------------------------- planted: contacts and integrators
 
 
-@dataclass(frozen=True)
+@planted("pushes_in_contact", "force_grows_with_penetration")
 class Attracts(ForceLaw):
     """A spring that pulls bodies into each other."""
-
-    name = "attracts"
 
     def force(self, xp, gap, gap_rate):
         return xp.where(gap < 0, 1e3 * gap, 0.0 * gap)
 
 
-@dataclass(frozen=True)
+@planted("does_not_push_from_afar")
 class SmoothsNothing(Penalty):
     """A penalty pushing from afar, with a smoothing parameter that changes nothing."""
 
-    name = "smooths_nothing"
     smoothing: ClassVar[str] = "beta"
 
     beta: float = param(100.0, "unused", positive=True)
@@ -462,21 +428,19 @@ class SmoothsNothing(Penalty):
         return super().force(xp, gap, gap_rate) + 0.1
 
 
-@dataclass(frozen=True)
+@planted("continuity_in_rollouts_is_as_declared")
 class SecretJump(Penalty):
     """A damper that sets in at once, and a claim to be continuous."""
 
-    name = "secret_jump"
     continuous = True  # type: ignore[assignment]
 
     damping: float = param(1.0, "force per penetration rate", "N s/m", low=0.0)
 
 
-@dataclass(frozen=True)
+@planted("impulse_keeps_momentum")
 class OneSided(ImpulseLaw):
     """Pushes only the first body."""
 
-    name = "one_sided"
     continuous = False
 
     def impulse(self, ops, contact, before, free, dt):
@@ -487,37 +451,31 @@ class OneSided(ImpulseLaw):
         return type(free)(0.0 * change, change)
 
 
-@dataclass(frozen=True)
+@planted("error_falls_with_declared_order")
 class WrongOrder(SemiImplicitEuler):
     """A first-order integrator that claims second order."""
 
-    name = "wrong_order"
     order = 2
 
 
-@dataclass(frozen=True)
+@planted("takes_impulses_is_truthful")
 class DropsImpulses(ExplicitEuler):
     """Claims to take impulses, and drops them."""
 
-    name = "drops_impulses"
     takes_impulses = True
 
 
-@dataclass(frozen=True)
+@planted("amplification_is_that_of_the_step")
 class WrongStabilityFunction(Midpoint):
     """A second-order step that states the factor of a first-order one."""
-
-    name = "wrong_stability_function"
 
     def amplification(self, z):
         return 1 + z
 
 
-@dataclass(frozen=True)
+@planted("transition_is_that_of_the_step")
 class ForgetsTheFactor(SemiImplicitEuler):
     """States a matrix without the velocity factor."""
-
-    name = "forgets_the_factor"
 
     def transition(self, dt, stiffness, damping, factor):
         return super().transition(dt, stiffness, damping, 1.0)
@@ -532,9 +490,9 @@ class NotADataclass(Cubic):
     name = "not_a_dataclass"
 
 
-@dataclass(frozen=True)
+@planted("has_docstring")
 class Undocumented(Cubic):
-    name = "undocumented"
+    pass
 
 
 @dataclass(frozen=True)
@@ -544,101 +502,40 @@ class BadName(Cubic):
     name = "Bad name"
 
 
-@dataclass(frozen=True)
+@planted("declares_parameters")
 class BareField(Cubic):
     """A parameter without a meaning."""
-
-    name = "bare_field"
 
     width: float = 1.0
 
 
-@dataclass(frozen=True)
+@planted("builds")
 class Unfinished(Scene):
     """A scene without a single method."""
 
-    name = "unfinished"
 
-
-@dataclass(frozen=True)
+@planted("something_was_checked")
 class NothingApplies(Plugin):
     """A scene by its kind, of a class that no check of scenes knows."""
 
     kind: ClassVar[str] = "scenes"
-    name = "nothing_applies"
 
 
-@dataclass(frozen=True)
+@planted("declares_parameters")
 class RefusedDefault(Cubic):
     """A default outside its own bounds."""
-
-    name = "refused_default"
 
     width: float = param(-1.0, "width", positive=True)
 
 
-def _local():
-    @dataclass(frozen=True)
+def local():
+    @planted("survives_spawned_process")
     class Unpicklable(Cubic):
         """A class that no other process can find."""
 
-        name = "unpicklable"
 
-    return Unpicklable
-
-
-PLANTED = {
-    WrongSign: {"bias_is_as_declared"},
-    SigmaForSigmaSquared: {"bias_is_as_declared", "bias_across_jumps_is_as_declared"},
-    SecondHalfIsTheFirst: {"uses_every_sample"},
-    RepeatsAreTheFirst: {"repeats_are_independent"},
-    SixteenSamples: {"variance_falls_as_one_over_n"},
-    UndeclaredCoupling: {"variance_falls_as_one_over_n"},
-    OwnSampleInBaseline: {"bias_is_as_declared"},
-    OpenLoopScore: {"bias_under_action_feedback"},
-    OwnNoise: {"shape_and_repeatability"},
-    UndeclaredValue: {"needs_are_truthful"},
-    UnusedScore: {"needs_are_truthful"},
-    ClaimsJumps: {"bias_across_jumps_is_as_declared"},
-    DeniesJumps: {"bias_across_jumps_is_as_declared"},
-    LastingBias: {"bias_is_as_declared"},
-    RefusesEverything: {"something_was_checked"},
-    HalfStiffnessGradient: {"gradient_is_that_of_value"},
-    ClaimsSurrogates: {"gradient_is_that_of_value"},
-    GradientOfItsOwnTheta: {"gradient_is_that_of_value"},
-    WrongScore: {"score_is_that_of_actions"},
-    LeakyColumns: {"columns_are_independent", "value_agrees"},
-    ClaimsRoot: {"root_is_differentiated_implicitly"},
-    DoubleAnyway: {"single_precision_is_finite"},
-    WrongClosedForm: {"closed_form_is_right"},
-    ClaimsContinuity: {"continuity_is_as_declared"},
-    ClaimsAJump: {"continuity_is_as_declared"},
-    JumpsElsewhere: {"continuity_is_as_declared"},
-    WrongPhysics: {"physical_gradient_is_the_limit"},
-    ClaimsControls: {"closed_form_is_right"},
-    MixedColumns: {"costs_are_finite"},
-    NumpyOnly: {"backends_agree"},
-    PullsTogether: {"contact_geometry_is_consistent"},
-    WrongGapRate: {"contact_geometry_is_consistent"},
-    NoContacts: {"contact_geometry_is_consistent"},
-    WrongStateSize: {"state_has_declared_size"},
-    Attracts: {"pushes_in_contact", "force_grows_with_penetration"},
-    SmoothsNothing: {"does_not_push_from_afar"},
-    SecretJump: {"continuity_in_rollouts_is_as_declared"},
-    OneSided: {"impulse_keeps_momentum"},
-    WrongOrder: {"error_falls_with_declared_order"},
-    DropsImpulses: {"takes_impulses_is_truthful"},
-    WrongStabilityFunction: {"amplification_is_that_of_the_step"},
-    ForgetsTheFactor: {"transition_is_that_of_the_step"},
-    NotADataclass: {"is_frozen_dataclass"},
-    Undocumented: {"has_docstring"},
-    BadName: {"has_good_name"},
-    BareField: {"declares_parameters"},
-    RefusedDefault: {"declares_parameters"},
-    Unfinished: {"builds"},
-    NothingApplies: {"something_was_checked"},
-    _local(): {"survives_spawned_process"},
-}
+local()
+PLANTED |= {NotADataclass: {"is_frozen_dataclass"}, BadName: {"has_good_name"}}
 
 
 @pytest.fixture
@@ -830,7 +727,7 @@ class ABroken(Backend):
     provides = frozenset({"value", "grad", "score"}) | PROVIDES
     def compile(self, program):
         raise ZeroDivisionError("compile")
-    def unsupported_reason(self, program):
+    def own_refusal(self, program):
         raise ZeroDivisionError("reason")
 """
 

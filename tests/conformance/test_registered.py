@@ -1,6 +1,5 @@
 """Every registered plugin passes the conformance kit: on few short programs, slowly on a design of crossings, or on all."""
 
-import contextlib
 import dataclasses
 import itertools
 from functools import cache
@@ -35,7 +34,7 @@ from bench.model import (
     compose,
     registry,
 )
-from bench.model.identity import changed, label
+from bench.model.identity import changed
 
 STEPS = 50
 """Most steps of a rollout in the fast tests, and as in the slow ones where a scene declares to jump."""
@@ -53,12 +52,16 @@ GENERIC = {check.__name__ for check in kit._CHECKS[Plugin]}
 def kept(keep):
     """The kit's items of registered plugins, beside those of any plugin, whose subject and name of check are to be kept."""
     named = [(item, item.values[0], item.values[1].args[0].__name__) for item in ITEMS if item.values[1]]
-    return [item for item, subject, name in named if name not in GENERIC and keep(subject, name)]
+    return [each for each in named if each[2] not in GENERIC and keep(*each[1:])]
 
 
-def kit_items(keep):
+def kit_items(keep, is_slow=lambda subject, name: False):
     """A test of each kept item."""
-    return pytest.mark.parametrize(("plugin", "check"), kept(keep))
+    items = [
+        pytest.param(*item.values, id=item.id, marks=[pytest.mark.slow] * bool(is_slow(subject, name)))
+        for item, subject, name in kept(keep)
+    ]
+    return pytest.mark.parametrize(("plugin", "check"), items)
 
 
 def is_long(plugin, check=""):
@@ -163,44 +166,23 @@ def test_registered_plugin_loads_and_is_well_formed(entry):
     assert [result for result in results_of(entry.plugin, GENERIC) if result.outcome != "pass"] == []
 
 
-def is_short(plugin, check):
-    """Whether a check runs on few short programs without taking long."""
-    return not is_long(plugin, check) and not is_repeated(plugin, check)
-
-
-@kit_items(lambda plugin, check: is_short(plugin, check) and not is_varied(plugin))
-def test_registered_plugin_conforms(plugin, check, on_few_programs):
-    on_few_programs(plugin, check)
-
-
-VARIED = kept(lambda plugin, check: is_short(plugin, check) and is_varied(plugin))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("subject", dict.fromkeys(item.values[0] for item in VARIED), ids=label)
-def test_registered_plugin_with_other_parameters_conforms(subject, on_few_programs):
-    for plugin, check in (item.values for item in VARIED):
-        if plugin == subject:
-            with contextlib.suppress(pytest.skip.Exception):
-                on_few_programs(plugin, check)
-
-
 EVERYWHERE = {"mode", "integrator", "gradient", "differences"}
 """Parameters of engines that act without contacts, which are all that the kit runs with other parameters than the defaults."""
 
 
-def is_left(plugin, check):
-    """Whether the slow set has a check that takes long: with other parameters than the defaults, gradients only."""
-    if not is_long(plugin, check) or check in ("value_agrees", "backends_agree", something_was_checked.__name__):
+def is_run(plugin, check):
+    """Whether a check runs on few short programs: of those that take long with other parameters, gradients only."""
+    if not is_long(plugin, check):
+        return not is_repeated(plugin, check)
+    if check in ("value_agrees", "backends_agree", something_was_checked.__name__):
         return False
     if not is_varied(plugin) or check != "gradient_is_that_of_value":
         return not is_varied(plugin)
     return "physics" not in plugin.provides or bool(EVERYWHERE & set(changed(plugin)))
 
 
-@pytest.mark.slow
-@kit_items(is_left)
-def test_registered_plugin_that_takes_long_conforms(plugin, check, on_few_programs):
+@kit_items(is_run, lambda plugin, check: is_long(plugin, check) or is_varied(plugin))
+def test_registered_plugin_conforms(plugin, check, on_few_programs):
     on_few_programs(plugin, check)
 
 

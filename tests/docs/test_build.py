@@ -21,7 +21,7 @@ def test_a_stale_document_is_listed_with_its_lines_and_not_written(tmp_path, mon
     assert page.read_text().startswith("# Rows")
 
 
-def test_answers_stand_under_their_question_and_name_experiments_without_rows(tmp_path, monkeypatch):
+def test_answers_stand_under_their_question_and_experiments_without_rows_last(tmp_path, monkeypatch):
     (tmp_path / "quick").mkdir()
     (tmp_path / "quick" / "chart.png").write_bytes(b"")
     record = {"question": "Why?", "answer": "First <b>. Second.", "chart": "chart"}
@@ -30,8 +30,10 @@ def test_answers_stand_under_their_question_and_name_experiments_without_rows(tm
     index = tmp_path / "results.md"
     index.write_text("| question | experiments |\n|---|---|\n| Does it work? | [all](answers.md#quick) |\n")
     text = build.answers_page(index, tmp_path)
-    assert "`python -m bench +experiment=twins` (no stored results)" in text.partition("\n## What else")[2]
+    assert text.endswith(
+        "\n## Without stored results\n\n- `twins`: How far are the engines' trajectories and gradients from the scenes' own, and what do they cost?\n"
+    )
     assert (
-        "## Does it work?\n\n### quick\n\n*Does the whole path work on this machine?*\n\n![quick](quick/chart.png)\n\n"
-        "First &lt;b&gt;. Second.\n\n" in text
+        "## Does it work?\n\n### quick\n\n*Does the whole path work on this machine?* [Data](quick)\n\n![quick](quick/chart.png)\n\nFirst &lt;b&gt;. Second.\n\n"
+        in text
     )

@@ -19,9 +19,10 @@ from bench.cli import main
 from bench.conformance import backends, subjects
 from bench.conformance.kit import Failed
 from bench.conformance.subjects import law_for
-from bench.engines import environments, process, twin
+from bench.engines import environments, process, server, twin
 from bench.engines.process import close_engines
 from bench.errors import Crashed, Unsupported
+from bench.experiment import by_name
 from bench.experiment.keys import fingerprint
 from bench.model import Problem, compose, registry
 
@@ -43,8 +44,9 @@ def toy(**values):
     return registry.usable("backends", "toy")(python=HERE, **values)
 
 
-def program(scene):
-    return compose(scene, law_for(scene, Penalty, {}) if scene.n_contacts else None, SemiImplicitEuler())
+def program(scene, law=Penalty):
+    own = law_for(scene, law) if isinstance(law, type) else law
+    return compose(scene, own if scene.n_contacts else None, SemiImplicitEuler())
 
 
 def noise(problem, columns=5):
@@ -75,7 +77,6 @@ def test_calls_are_counted_and_compilation_is_charged_once():
     first = problem.usage.compile_s
     problem.grad(problem.program.theta0, noise(problem))
     assert problem.usage.compile_s == first > 0
-    assert problem.n_calls == 5  # the first asks whether the engine has a carry
     assert problem.engine_s > 0
     assert problem.pipe_s > 0
     assert problem.peak_memory_mb > 10
@@ -170,7 +171,7 @@ from test_other_python import BouncingBall, noise, process, program, registry, t
 registry.add_folder(TOYS)
 problem = toy(fault="loop").compile(program(BouncingBall()))
 threading.Thread(target=lambda: problem.grad(problem.program.theta0, noise(problem)), daemon=True).start()
-while problem.n_calls < 1:
+while not problem.engine_s:
     time.sleep(0.05)
 print(next(iter(process._running.values())).process.pid, flush=True)
 time.sleep(100)
@@ -312,16 +313,6 @@ def test_a_change_of_an_engines_file_changes_the_key(tmp_path):
     assert names[0] != names[1]
 
 
-def test_programs_that_an_engine_does_not_run_are_refused():
-    law = law_for(BouncingBall(), Penalty, {})
-    assert "replaces semi_implicit_euler, not rk4" in toy().refusal(compose(BouncingBall(), law, Rk4()))
-    taichi = registry.usable("backends", "taichi")()
-    assert "slides only" in taichi.refusal(program(Cartpole()))
-    damped = compose(BouncingBall(), law_for(BouncingBall(), Penalty, {"damping": 1.0}), SemiImplicitEuler())
-    newton = registry.usable("backends", "newton")()
-    assert "supports damping_mode=approach only, not clipped" in newton.refusal(damped)
-
-
 @dataclasses.dataclass(frozen=True)
 class Leaning(BounceOnce):
     """Its slide leans to the ground, so that friction would act on the contact."""
@@ -332,29 +323,37 @@ class Leaning(BounceOnce):
         return super().mjcf().replace('axis="0 0 1"', 'axis="1 0 1"')
 
 
-def test_genesis_runs_contacts_only_where_its_friction_has_no_effect():
-    genesis = registry.usable("backends", "genesis")()
-    scenes = (BounceOnce(), BouncingBall(), Pushing(), Hopper(), Cartpole())
-    assert [genesis.unsupported_reason(program(scene)) for scene in scenes] == [None] * 5
-    assert "along the slides of their bodies only" in genesis.unsupported_reason(program(Leaning()))
+@pytest.mark.parametrize(
+    ("engine", "scene", "law", "reason"),
+    [
+        ("taichi", Cartpole(), Penalty, "slides only"),
+        ("newton", Cartpole(), Penalty, None),
+        ("newton", BouncingBall(), Penalty(damping=1.0), "supports damping_mode=approach only, not clipped"),
+        ("newton[solver=semi_implicit]", Cartpole(), Penalty, "semi_implicit solver has no joint coordinates"),
+        ("newton[solver=semi_implicit]", BouncingBall(), Impulse, "replaces penalty, not impulse"),
+        ("newton[solver=xpbd]", Cartpole(), Penalty, "xpbd solver has no joint coordinates"),
+        ("newton[solver=xpbd]", BouncingBall(), Penalty, "replaces impulse, not penalty"),
+        ("newton[solver=xpbd]", BouncingBall(), Impulse, None),
+        ("genesis", Leaning(), Penalty, "along the slides of their bodies only"),
+        *(
+            ("genesis", scene, Penalty, None)
+            for scene in (BounceOnce(), BouncingBall(), Pushing(), Hopper(), Cartpole())
+        ),
+    ],
+)
+def test_programs_that_an_engine_does_not_run_are_refused(engine, scene, law, reason):
+    found = by_name.make("backends", engine).refusal(program(scene, law))
+    assert found is None if reason is None else reason in found
 
 
-@pytest.mark.parametrize("solver", ["semi_implicit", "xpbd"])
-def test_solvers_without_joint_coordinates_run_bodies_on_slides_only(solver):
-    newton = registry.usable("backends", "newton")
-    assert f"{solver} solver has no joint coordinates" in newton(solver=solver).refusal(program(Cartpole()))
-    assert newton().refusal(program(Cartpole())) is None
+def test_an_integrator_that_an_engine_does_not_replace_is_refused():
+    refused = toy().refusal(compose(BouncingBall(), law_for(BouncingBall(), Penalty, {}), Rk4()))
+    assert "replaces semi_implicit_euler, not rk4" in refused
 
 
-def test_a_rigid_solver_stands_for_impulses_and_has_no_gradients():
-    newton = registry.usable("backends", "newton")
-    rigid, spring = newton(solver="xpbd"), newton(solver="semi_implicit")
-    impulse = compose(BouncingBall(), law_for(BouncingBall(), Impulse), SemiImplicitEuler())
-    assert rigid.refusal(impulse) is None
-    assert "replaces impulse, not penalty" in rigid.refusal(program(BouncingBall()))
-    assert "replaces penalty, not impulse" in spring.refusal(impulse)
+def test_a_rigid_solver_has_no_gradients():
+    rigid, spring = (by_name.make("backends", f"newton[solver={name}]") for name in ("xpbd", "featherstone"))
     assert spring.provides - rigid.provides == {"grad"}
-    assert newton().provides == spring.provides
     assert (
         pickle.loads(pickle.dumps(rigid)).provides == dataclasses.replace(rigid, python=HERE).provides == rigid.provides
     )
@@ -368,42 +367,22 @@ def test_only_an_engine_that_declares_an_error_of_its_solver_may_differ_by_it(mo
     assert [backends._allowed(toy(), of, 1e-9) for of, _ in allowed] == pytest.approx([error for _, error in allowed])
 
 
-# --------------------------------------------------------------------------------------------------------- carries
+def test_a_pull_gives_the_jacobians_of_the_controls():
+    class Pulled:
+        """Steps x + u^2 for forces u, with products of their derivatives."""
 
+        takes_forces = True
 
-def counted(scene, theta, w):
-    """Return the states of the toy that counts its steps, computed here."""
-    own = Numpy().compile(program(scene)).trajectory(theta, w)
-    q, v = np.split(own.states[0], 2)
-    states, law = [np.concatenate([q, v])], law_for(scene, Penalty, {})
-    for t, u in enumerate(own.controls if own.controls.shape[1] else np.zeros((scene.horizon, 1, w.shape[1]))):
-        force = law.stiffness * np.maximum(0.0, -scene.gap(np, q)) + u + t
-        v = v + scene.dt * (force / 1.0 - scene.gravity)
-        q = q + scene.dt * v
-        states.append(np.concatenate([q, v]))
-    return np.stack(states)
+        @staticmethod
+        def pull(x, force, slope):
+            return slope, 2 * force * slope[:1]
 
-
-def test_an_engine_has_numbers_beside_the_state():
-    scene = BouncingBall(horizon=60)
-    problem = toy(counts=True).compile(program(scene))
-    theta, w = problem.program.theta0, noise(problem)
-    np.testing.assert_allclose(problem.trajectory(theta, w).states, counted(scene, theta, w), rtol=1e-12)
-    assert (
-        np.abs(problem.trajectory(theta, w).states - toy().compile(program(scene)).trajectory(theta, w).states).max()
-        > 0.01
-    )
-    e = 1e-6 * np.eye(problem.dim)
-    differences = [(problem.value(theta + h, w) - problem.value(theta - h, w)) / 2e-6 for h in e]
-    np.testing.assert_allclose(problem.grad(theta, w), differences, atol=1e-5 * np.abs(differences).max())
-
-
-def test_a_pull_is_the_slope_times_the_step_jacobians():
-    problem, draw = toy().compile(program(BounceOnce())), np.random.default_rng(0)
-    x, u, slope = draw.standard_normal((2, 5)), draw.standard_normal((1, 5)), draw.standard_normal((2, 5))
-    jacobians, pulled = problem.call("jacobians", x, u), problem.call("pull", x, u, slope)
-    for jacobian, product in zip(jacobians, pulled, strict=True):
-        np.testing.assert_allclose(product, np.einsum("nmb,nb->mb", jacobian, slope), rtol=1e-12)
+    forces = {"constant": [0.5], "by_state": [[2.0, 3.0]], "by_control": [[4.0]]}
+    x, u = np.random.default_rng(0).standard_normal((2, 5)), np.ones((1, 5))
+    (a, b), _ = server.Controlled(Pulled(), forces).call("jacobians", x, u)
+    force = 2 * (0.5 + 2 * x[0] + 3 * x[1] + 4)
+    np.testing.assert_allclose(a, [[1 + 2 * force, 3 * force], [0 * force, 1 + 0 * force]])
+    np.testing.assert_allclose(b, [[4 * force], [0 * force]])
 
 
 def test_a_state_that_is_not_finite_does_not_reach_the_engine():

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import textwrap
 import time
+from functools import partial
 
 import mechanisms
 import numpy as np
@@ -15,6 +16,7 @@ import bench
 from bench.errors import UserError
 from bench.simulator.clock import Clock, OutOfTime
 
+examine = partial(bench.examine, progress=False)
 THETA = [0.4, 0.3, 0.5]
 
 
@@ -29,8 +31,8 @@ def grad(x):
 @pytest.mark.parametrize("calls", [8, 15, 29, 79, 243, 700])
 def test_a_gradient_10_percent_off_never_reads_like_a_right_one(calls):
     """8 calls: one cost, one gradient, and two costs per component."""
-    right = bench.examine(cost, THETA, grad=grad, progress=False, calls=calls)
-    wrong = bench.examine(cost, THETA, grad=lambda x: 1.1 * grad(x), progress=False, calls=calls)
+    right = examine(cost, THETA, grad=grad, calls=calls)
+    wrong = examine(cost, THETA, grad=lambda x: 1.1 * grad(x), calls=calls)
     assert (right.status, right.derivative) == (0, "right")
     assert (wrong.status, wrong.derivative) == (1, "wrong")
     for report in (right, wrong):
@@ -40,7 +42,7 @@ def test_a_gradient_10_percent_off_never_reads_like_a_right_one(calls):
 
 def test_fewer_calls_than_components_decide_nothing():
     for calls in range(1, 8):
-        report = bench.examine(cost, THETA, grad=grad, progress=False, calls=calls)
+        report = examine(cost, THETA, grad=grad, calls=calls)
         assert (report.status, report.cause) == (3, "undecided"), calls
         assert re.search(r"[0-2] of 3 components", str(report))
     assert "calls=14" in report.advice
@@ -70,15 +72,13 @@ def test_verdicts_do_not_depend_on_load(now, fault, steps, slope, settings):
 
     if fault == "overwritten":
         settings = {**settings, "horizons": [1, 2, 5, 20]}
-    reports = [
-        bench.examine(swinging(seconds), [0.7, 0.3], grad=grad, progress=False, **settings) for seconds in (1e-4, 4e-4)
-    ]
+    reports = [examine(swinging(seconds), [0.7, 0.3], grad=grad, **settings) for seconds in (1e-4, 4e-4)]
     assert len({(report.status, report.cause) for report in reports}) == 1
     assert reports[0].status == (fault != "right")
 
 
 def test_sigma_that_was_not_measured_is_not_decided():
-    report = bench.examine(cost, THETA, grad=grad, sigma=0.1, progress=False, calls=60)
+    report = examine(cost, THETA, grad=grad, sigma=0.1, calls=60)
     assert (report.status, report.cause, report.derivative) == (3, "unmeasured", "right")
     assert "sigma 0.10: not measured" in report.noise_answer
     assert "no sigma" not in str(report)
@@ -98,7 +98,7 @@ def test_first_calls_have_a_budget_of_their_own(now):
 
         return call
 
-    report = bench.examine(compiling(cost, "cost"), THETA, grad=compiling(grad, "grad"), progress=False, budget=0.3)
+    report = examine(compiling(cost, "cost"), THETA, grad=compiling(grad, "grad"), budget=0.3)
     assert report.status == 0
     assert compiled == ["cost", "grad"]
     assert report.spent.compile_s == pytest.approx(0.8, abs=0.01)
@@ -112,7 +112,7 @@ def test_a_gradient_that_compiles_too_long_is_tried_once():
         tried.append(1)
         time.sleep(60)
 
-    report = bench.examine(cost, THETA, grad=hangs, progress=False, budget=5, compile_budget=0.2)
+    report = examine(cost, THETA, grad=hangs, budget=5, compile_budget=0.2)
     assert (report.status, report.cause) == (3, "undecided")
     assert len(tried) == 1
 
@@ -161,7 +161,7 @@ def test_time_lost_to_other_programs_is_not_charged(monkeypatch):
 @pytest.mark.parametrize("calls", [0, -1, 2.5])
 def test_calls_is_a_whole_number(calls):
     with pytest.raises(UserError, match="is not a number of calls"):
-        bench.examine(cost, THETA, progress=False, calls=calls)
+        examine(cost, THETA, calls=calls)
 
 
 def test_a_gradient_that_is_right_at_one_theta_is_said_to_be_right_there_only():
@@ -170,8 +170,8 @@ def test_a_gradient_that_is_right_at_one_theta_is_said_to_be_right_there_only():
     def stale(x):
         return np.cos(np.array([0.3, 0.7]))
 
-    few = bench.examine(lambda x: float(np.sin(x).sum()), [0.3, 0.7], grad=stale, calls=30, progress=False)
+    few = examine(lambda x: float(np.sin(x).sum()), [0.3, 0.7], grad=stale, calls=30)
     assert "at this theta only" in few.conclusion
     assert "other thetas around this one (calls)" in str(few)
-    many = bench.examine(lambda x: float(np.sin(x).sum()), [0.3, 0.7], grad=stale, progress=False)
+    many = examine(lambda x: float(np.sin(x).sum()), [0.3, 0.7], grad=stale)
     assert many.cause == "stale_gradient"

@@ -7,6 +7,7 @@ import signal
 import time
 import warnings
 from collections import namedtuple
+from functools import partial
 
 import numpy as np
 import pytest
@@ -21,7 +22,7 @@ from bench.simulator.clock import Clock
 from bench.simulator.simulator import Simulator
 from bench.simulator.tree import ParameterTree
 
-QUICK = {"progress": False, "budget": 20}
+examine = partial(bench.examine, progress=False, budget=20)
 
 
 def bowl(x):
@@ -78,9 +79,9 @@ def test_gradients_are_matched_by_name_whatever_their_order():
     np.testing.assert_array_equal(layout.flatten({"mass": 20.0, "speed": 10.0}), [10.0, 20.0])
     with pytest.raises(UserError, match=r"has shape mass .*, spin"):
         layout.flatten({"mass": 20.0, "spin": 10.0})
-    report = bench.examine(
+    report = examine(
         lambda p: p["speed"] ** 2 * p["mass"], {"speed": 1.0, "mass": 2.0},
-        grad=lambda p: {"mass": p["speed"] ** 2, "speed": 2 * p["speed"] * p["mass"]}, **QUICK,
+        grad=lambda p: {"mass": p["speed"] ** 2, "speed": 2 * p["speed"] * p["mass"]}
     )  # fmt: skip
     assert report.status == 0, str(report)
 
@@ -93,7 +94,7 @@ def test_list_of_numbers_of_any_library_is_a_vector():
 
 
 def test_cost_that_takes_its_argument_apart_is_given_another_each_time():
-    report = bench.examine(lambda p: p.pop("mass") ** 2, {"mass": 2.0}, **QUICK)
+    report = examine(lambda p: p.pop("mass") ** 2, {"mass": 2.0})
     assert report.status == 0
     assert "modifies its argument in place" in str(report)
 
@@ -112,7 +113,7 @@ def test_scale_of_zero_is_that_of_its_array():
 
 
 def test_right_gradient_passes_with_every_digit():
-    report = bench.examine(bowl, [1.0, 0.5], grad=slope, sigma=[0.003], **QUICK)
+    report = examine(bowl, [1.0, 0.5], grad=slope, sigma=[0.003])
     assert (report.status, report.cause) == (0, "smooth")
     report.assert_right()
     np.testing.assert_allclose(report.frame["difference"][:2], slope([1.0, 0.5]), rtol=1e-7)
@@ -129,7 +130,7 @@ def test_gradient_that_raises_is_a_finding():
     def broken(x):
         raise FloatingPointError("no tape")
 
-    report = bench.examine(bowl, [1.0, 0.5], grad=broken, **QUICK)
+    report = examine(bowl, [1.0, 0.5], grad=broken)
     assert (report.status, report.cause) == (1, "raised")
     assert "no tape" in str(report)
 
@@ -138,10 +139,7 @@ def test_gradient_that_raises_is_a_finding():
 
 
 def test_lines_find_jump_and_kink_where_they_are():
-    def cost(x):
-        return (x[0] > 0.37) * 0.2 + abs(x[0] + 0.81) + np.sin(3 * x[0])
-
-    line = scan(cost, np.zeros(1), np.ones(1), noise=1e-15)
+    line = scan(lambda t: (t > 0.37) * 0.2 + abs(t + 0.81) + np.sin(3 * t), np.ones(1), noise=1e-15)
     assert [(b.kind, round(b.at, 3)) for b in line.breaks] == [("kink", -0.81), ("jump", 0.37)]
     assert line.jumps[0].size == pytest.approx(0.2, rel=1e-3)
 
@@ -162,25 +160,25 @@ def test_a_tread_is_the_height_of_four_equal_jumps_at_even_distances(places, hei
 
 
 def test_kink_has_its_change_of_slope_and_rounding_has_no_breaks():
-    line = scan(lambda x: 3.0 * abs(x[0] - 0.4) + x[0] ** 2, np.zeros(1), np.ones(1), noise=1e-15)
+    line = scan(lambda t: 3.0 * abs(t - 0.4) + t**2, np.ones(1), noise=1e-15)
     assert [(b.kind, round(b.at, 3)) for b in line.breaks] == [("kink", 0.4)]
     assert line.kinks[0].size == pytest.approx(6.0, rel=1e-2)
     rough = np.random.default_rng(0)
-    assert not scan(lambda x: 1e-9 * rough.standard_normal(x.shape[1]), np.zeros(1), np.ones(1), noise=1e-9).breaks
+    assert not scan(lambda t: 1e-9 * rough.standard_normal(t.size), np.ones(1), noise=1e-9).breaks
 
 
 def test_treads_that_a_gradient_misses_are_named_though_they_are_small():
     def cost(x):
         return float(np.sin(x[0]) * x[1] + 2e-4 * np.floor(1000 * x[0] + 0.5))
 
-    report = bench.examine(cost, [0.5, 0.7], grad=lambda x: [np.cos(x[0]) * x[1], np.sin(x[0])], **QUICK)
+    report = examine(cost, [0.5, 0.7], grad=lambda x: [np.cos(x[0]) * x[1], np.sin(x[0])])
     assert (report.derivative, report.cause, report.status) == ("right", "staircase", 1)
     assert "at even distances" in report.noise_answer
 
 
 @pytest.fixture(scope="module")
 def right():
-    return bench.examine(bowl, [1.0, 0.5], grad=slope, **QUICK)
+    return examine(bowl, [1.0, 0.5], grad=slope)
 
 
 def jumpy(missed, *heights):
@@ -219,9 +217,7 @@ def test_bias_at_a_jump_is_that_of_the_closed_form():
     """f = x^2 + 1[x > 0]: grad J = 2 theta + pdf(theta / sigma) / sigma, of which each gradient sees 2 theta."""
     theta, sigma = 0.1, 0.2
     missed = math.exp(-0.5 * (theta / sigma) ** 2) / math.sqrt(2 * math.pi) / sigma
-    report = bench.examine(
-        lambda x: x[0] ** 2 + (x[0] > 0), [theta], grad=lambda x: 2 * x, sigma=sigma, batch="columns", **QUICK
-    )
+    report = examine(lambda x: x[0] ** 2 + (x[0] > 0), [theta], grad=lambda x: 2 * x, sigma=sigma, batch="columns")
     (found,) = report.smoothed
     assert abs(found.norm - (2 * theta + missed)) < 4 * found.error
     assert found.bias_low <= missed <= found.bias_high
@@ -238,15 +234,15 @@ def test_batches_are_told_from_the_result():
         assert x.shape == (2, x.shape[1])
         return (x**2).sum(axis=0)
 
-    report = bench.examine(columns, [1.0, 2.0], **QUICK)
+    report = examine(columns, [1.0, 2.0])
     assert (report.status, report.batch) == (0, "columns")
 
     def rows(x):
         assert x.shape[1] == 2
         return (x**2).sum(axis=1)
 
-    assert bench.examine(rows, [1.0, 2.0], **QUICK).batch == "rows"
-    assert bench.examine(bowl, [1.0, 2.0], **QUICK).batch == "loop"
+    assert examine(rows, [1.0, 2.0]).batch == "rows"
+    assert examine(bowl, [1.0, 2.0]).batch == "loop"
 
 
 @pytest.mark.parametrize(
@@ -261,12 +257,12 @@ def test_batches_are_told_from_the_result():
 )
 def test_bad_settings_say_what_is_allowed(settings, match):
     with pytest.raises(UserError, match=match):
-        bench.examine(bowl, [1.0, 0.5], **{**QUICK, **settings})
+        examine(bowl, [1.0, 0.5], **settings)
 
 
 def test_cost_that_cannot_be_called_is_bad_input():
     with pytest.raises(UserError, match="cannot be called at theta: KeyError"):
-        bench.examine(lambda p: p["mass"], {"weight": 1.0}, **QUICK)
+        examine(lambda p: p["mass"], {"weight": 1.0})
 
 
 def test_budget_bounds_everything(now):
@@ -305,7 +301,7 @@ def test_alarm_of_someone_else_is_left_alone():
 
     signal.signal(signal.SIGALRM, mine)
     try:
-        assert bench.examine(bowl, [1.0, 0.5], grad=slope, sigma=None, **QUICK).status == 0
+        assert examine(bowl, [1.0, 0.5], grad=slope, sigma=None).status == 0
         assert signal.getsignal(signal.SIGALRM) is mine
     finally:
         signal.signal(signal.SIGALRM, signal.SIG_DFL)
@@ -316,7 +312,7 @@ def test_alarm_of_someone_else_is_left_alone():
 
 @pytest.mark.slow
 def test_files_are_text_tables_and_charts(tmp_path):
-    report = bench.examine(bowl, [1.0, 0.5], grad=slope, sigma=[0.003, 0.1], **QUICK)
+    report = examine(bowl, [1.0, 0.5], grad=slope, sigma=[0.003, 0.1])
     names = {path.name for path in report.save(tmp_path / "out")}
     assert {"report.txt", "derivatives.csv", "sigmas.csv", "steps.png", "lines.png", "sigmas.png"} <= names
     assert (tmp_path / "out" / "report.txt").read_text() == f"{report}\n"
@@ -383,9 +379,9 @@ def test_own_arithmetic_does_not_warn_and_the_cost_still_does(size):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         with pytest.raises(bench.UserError, match="divide by zero"):
-            bench.examine(cost, [1.0], **QUICK)
+            examine(cost, [1.0])
         with np.errstate(divide="ignore"):
-            str(bench.examine(cost, [1.0], grad=lambda x: [size], **QUICK))
+            str(examine(cost, [1.0], grad=lambda x: [size]))
 
 
 def test_command_takes_named_numbers(mysim, capsys):
@@ -433,7 +429,7 @@ def test_size_of_a_gradient_is_without_the_share_of_its_noise():
 
 def test_cost_that_is_constant_between_jumps_is_no_right_gradient():
     """Its derivative is 0 wherever it exists, as a check of one theta would say."""
-    report = bench.examine(lambda x: np.floor(20 * x[0]) / 20, [1.01], sigma=0.1, **QUICK)
+    report = examine(lambda x: np.floor(20 * x[0]) / 20, [1.01], sigma=0.1)
     assert (report.status, report.cause) == (1, "staircase")
     assert "staircase: the cost is constant between" in str(report)
 
@@ -452,7 +448,7 @@ def test_gradient_is_usable_only_where_the_whole_interval_of_its_bias_is_below_t
 
 def test_jumps_off_the_grid_of_steps_are_seen_by_the_integral():
     """A slope of 1 made of jumps every 1e-4, beside one of 1 that the gradient has."""
-    report = bench.examine(lambda x: x[0] + np.floor(1e4 * x[0]) / 1e4, [1.00005], grad=lambda x: [1.0], **QUICK)
+    report = examine(lambda x: x[0] + np.floor(1e4 * x[0]) / 1e4, [1.00005], grad=lambda x: [1.0])
     assert report.status == 1
 
 
@@ -467,7 +463,7 @@ def test_cost_that_ends_the_process_beside_theta_is_not_trusted():
             raise SystemExit(0)
         return x[0] ** 2
 
-    assert bench.examine(leaves, [1.0], grad=lambda x: 2 * x, **QUICK).cause == "nonfinite"
+    assert examine(leaves, [1.0], grad=lambda x: 2 * x).cause == "nonfinite"
 
 
 def test_file_that_ends_the_process_is_bad_input(tmp_path, capsys):

@@ -14,7 +14,7 @@ from bench.plugins.studies.gradient_check.points import is_trusted
 from bench import run
 from bench.cli import main
 from bench.experiment.columns import IDENTITY
-from bench.gradient import FAULTS, VERDICTS, judge
+from bench.gradient import FAULTS, VERDICTS
 from bench.measure import noise
 from bench.model import Problem, compose, registry
 from bench.run import store
@@ -57,11 +57,10 @@ def verdicts(problem, unit=FLOAT64):
     scene = problem.program.scene
     drawn = noise.draw(0, scene.name, 1, 1, problem.program.n_noise, "test")[0, 0]
     directions = noise.draw(0, scene.name, 1, SEARCH.drawn, problem.dim, "test directions")[0]
-    places, found = measure.examine(problem, problem.program.theta0, drawn, directions, unit, SEARCH)
     told = {}
-    for place, (sample, _) in zip(places, found, strict=True):
-        told.setdefault(place.point, []).append(judge(sample).verdict)
-    return {point: set(names) for point, names in told.items()}
+    for _, point in measure.examine(problem, problem.program.theta0, drawn, directions, unit, SEARCH):
+        told.setdefault(point.point, set()).add(point.verdict)
+    return told
 
 
 @pytest.fixture(scope="module")

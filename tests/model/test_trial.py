@@ -1,16 +1,13 @@
 """A plugin file that ends the process that imports it is listed, and ends nothing else."""
 
-import os
 import subprocess
 import sys
 
 import pytest
+from trees import INHERITED, bench
 
 from bench.errors import failure, printable
 from bench.model import registry, trial
-
-INHERITED = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, sys.path))}
-"""For commands in another folder."""
 
 GOOD = "from bench.model import SampleMean\n"
 FATAL = {
@@ -60,9 +57,7 @@ def test_listed_with_what_happened_and_the_others_are_listed_too(folder):
     (folder / "waits.py").write_text(
         "import threading, time\nthreading.Thread(target=time.sleep, args=(600,)).start()\n"
     )
-    command = [sys.executable, "-m", "bench", "list", "estimators", f"plugins={folder}"]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, sys.path))}
-    done = subprocess.run(command, capture_output=True, text=True, timeout=500, env=environment)  # waits for no thread
+    done = bench("list", "estimators", f"plugins={folder}")  # waits for no thread
     assert done.returncode == 0, done.stderr
     for name, (_, said) in FATAL.items():
         (line,) = [line for line in done.stdout.splitlines() if line.startswith(f"  {name} ")]
@@ -144,8 +139,7 @@ def test_what_plugins_print_reaches_no_terminal_raw(tmp_path):
     place = f"plugins={tmp_path}"
     words = ["estimators=[loud]", "scenes=[heaviside]", "backends=[numpy]", place, f"results_dir={tmp_path}"]
     for verb in (["list", place], ["plan", *words]):
-        command = [sys.executable, "-m", "bench", *verb]
-        done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=INHERITED)
+        done = bench(*verb, folder=tmp_path)
         assert done.returncode == 0, done.stderr
         assert not [c for c in done.stdout + done.stderr if ord(c) < 32 and c != "\n"]
         assert "loud, while it was imported, printed: [31mred at import" in done.stderr

@@ -5,10 +5,11 @@ import math
 import numpy as np
 import pytest
 
-from bench.model import compose, registry
+from bench.model import Compilations, compose, registry
 
 pytest.importorskip("jax")
 
+from bench.plugins.backends import compiling
 from bench.plugins.backends.checkpointed import _nested
 
 BATCH = 256
@@ -68,3 +69,20 @@ def test_a_plain_function_has_no_step_jacobians():
     plugin = registry.make("backends", "checkpointed", {"keep": "jacobians"})
     program = compose(registry.make("scenes", "quadratic"))
     assert "needs time steps" in plugin.refusal(program)
+
+
+def test_the_executables_used_last_are_kept(monkeypatch):
+    monkeypatch.setattr(compiling, "_known", {})
+    monkeypatch.setattr(compiling, "KEPT", 3)
+    count = Compilations(None)
+
+    def power(n):
+        """x^n, compiled for each n."""
+        made = compiling.compiled(("power", n), lambda x: x**n + 0.5 * n, (np.ones(3),), False, count)
+        return np.asarray(made.call(2.0 * np.ones(3)))
+
+    for n in (1, 2, 3, 1, 4, 1):  # 2 was used longest ago when 4 comes
+        power(n)
+    assert count.made == 4
+    assert power(2) == pytest.approx(2.0**2 + 1.0)  # compiled again, the same numbers
+    assert count.made == 5

@@ -123,7 +123,7 @@ def test_lean_changes_no_number():
     ids=lambda value: value if isinstance(value, str) else "",
 )  # fmt: skip
 def test_what_an_engine_cannot_do_is_refused(engine, of, reason):
-    assert reason in engine.unsupported_reason(of)
+    assert reason in engine.own_refusal(of)
 
 
 def test_scene_for_engines_is_refused_elsewhere():

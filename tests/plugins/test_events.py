@@ -143,15 +143,15 @@ def test_one_coin_has_the_weights_of_its_source(sign, at):
 
 def test_undeclared_jumps_are_refused_with_the_reason():
     integrator = SemiImplicitEuler()
-    assert Boundary().unsupported_reason(compose(Pushing(), Penalty(), integrator)) is None
-    assert "impulse may jump" in Boundary().unsupported_reason(compose(Pushing(), Impulse(), integrator))
+    assert Boundary().own_refusal(compose(Pushing(), Penalty(), integrator)) is None
+    assert "impulse may jump" in Boundary().own_refusal(compose(Pushing(), Impulse(), integrator))
     named = compose(Ledge(), decision=Decision(("height",)))
-    assert "its own theta" in Boundary().unsupported_reason(named)
+    assert "its own theta" in Boundary().own_refusal(named)
     jumping = dataclasses.make_dataclass("Jumping", [], bases=(Cubic,), frozen=True, namespace={"continuous": False})
-    assert "declares no events" in Boundary().unsupported_reason(compose(jumping()))
+    assert "declares no events" in Boundary().own_refusal(compose(jumping()))
     surrogate = SimpleNamespace(name="soft", continuous=True)
     program = SimpleNamespace(scene=Heaviside(), contact=surrogate, surrogate=True)
-    assert "soft is a surrogate" in Boundary().unsupported_reason(program)
+    assert "soft is a surrogate" in Boundary().own_refusal(program)
     for scene in (Heaviside(), Cubic()):
-        assert "declares discrete events" in StochasticDerivative().unsupported_reason(compose(scene))
-    assert StochasticDerivative().unsupported_reason(compose(CoinWalk())) is None
+        assert "declares discrete events" in StochasticDerivative().own_refusal(compose(scene))
+    assert StochasticDerivative().own_refusal(compose(CoinWalk())) is None

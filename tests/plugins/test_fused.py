@@ -12,7 +12,7 @@ from bench.model import Compilations, FunctionScene, compose, param, registry
 
 pytest.importorskip("numba")
 
-from bench.plugins.backends.fused import _source, _Structure
+from bench.plugins.backends.fused import _source
 from bench.plugins.fused import functions, kernels
 
 SAME = 1e-12
@@ -97,7 +97,7 @@ def test_a_cost_that_overflows_has_no_gradient_finite_as_its_slope_may_be(pushin
 def test_what_is_remembered_of_a_block_begins_at_zero_without_a_loop_over_time_too():
     """Without carries nothing was stored before the passes, and the mark of large slopes was whatever lay in memory."""
     program = compose(registry.make("scenes", "quadratic"))
-    text = _source(_Structure(program), "grad", "float64").text
+    text = _source(program, "grad", "float64").text
     place = re.search(r"lane\[(\d+) \+ l\] = lane\[\1 \+ l\] if abs", text)
     assert place
     assert f"lane[{place[1]} + l] = F(0.0)" in text
@@ -130,7 +130,7 @@ def test_machine_code_is_kept_on_disk(tmp_path, monkeypatch):
 
 def test_an_operation_without_scalar_form_is_refused_by_name():
     backend = registry.make("backends", "fused")
-    assert "no scalar code for sort" in str(backend.unsupported_reason(compose(Sorted())))
+    assert "no scalar code for sort" in str(backend.own_refusal(compose(Sorted())))
     pushed = compose(
         registry.make("scenes", "pushing"),
         registry.make("contacts", "complementarity"),

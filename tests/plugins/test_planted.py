@@ -69,6 +69,6 @@ def test_heavy_tailed_errors_follow_an_f_distribution_whose_mean_is_the_stated_s
 
 
 def test_rotation_of_one_coordinate_is_refused():
-    reason = Planted(angle=30.0).unsupported_reason(problem(Heaviside()).program)
+    reason = Planted(angle=30.0).own_refusal(problem(Heaviside()).program)
     assert reason is not None
     assert "at least 2 coordinates" in reason

@@ -114,7 +114,7 @@ def test_too_few_samples_are_an_error_that_says_how_many_are_needed():
 
 def test_unsupported_programs_are_refused_with_a_reason():
     policy = bench.problem("cartpole", backend="numpy").program
-    assert "noise on theta" in QuadraticModel().unsupported_reason(policy)
+    assert "noise on theta" in QuadraticModel().own_refusal(policy)
     assert not Sobol().declares_unbiased(policy)
     wide = compose(Linear(dimension=21202))
-    assert "21,201 coordinates" in Sobol().unsupported_reason(wide)
+    assert "21,201 coordinates" in Sobol().own_refusal(wide)

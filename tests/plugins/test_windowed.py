@@ -84,8 +84,8 @@ def test_stiff_steps_end_a_window():
 
 
 def test_refusals():
-    assert "knows its cost-to-go" in Windowed(terminal="exact").unsupported_reason(
+    assert "knows its cost-to-go" in Windowed(terminal="exact").own_refusal(
         bench.problem("pendulum", backend="numpy").program
     )
     named = bench.problem("pushing", backend="numpy", theta=("mass",)).program
-    assert "theta must be the scene's own" in Windowed().unsupported_reason(named)
+    assert "theta must be the scene's own" in Windowed().own_refusal(named)

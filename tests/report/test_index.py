@@ -98,16 +98,6 @@ def test_every_text_of_answer_and_record_is_literal(folder, browser):
     assert browser.said == browser.requests == []
 
 
-def test_a_foreign_page_puts_nothing_into_the_index(folder, browser):
-    """Its finding used to be copied as it was."""
-    browser.open(index.write(folder))
-    browser.do("new Promise((done) => setTimeout(done, 300))")
-    assert browser.page.url.endswith("index.html"), "a refresh left the page"
-    assert browser.do("document.querySelectorAll('main meta, main style, main b, [style]').length") == 0
-    assert browser.do("document.querySelector('h1').checkVisibility()")
-    assert "banner" not in browser.do("document.documentElement.textContent")
-
-
 @pytest.mark.parametrize(("words", "said"), [(["nowhere"], "is not a folder"), (["."], "no experiments"), (["a", "b"], "name one folder")])  # fmt: skip
 def test_bad_input_is_refused(words, said, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
@@ -115,8 +105,13 @@ def test_bad_input_is_refused(words, said, tmp_path, monkeypatch, capsys):
     assert said in capsys.readouterr().err
 
 
-def test_the_index_opens_without_a_complaint(folder, browser):
+def test_the_index_opens_without_a_complaint_and_takes_nothing_from_a_foreign_page(folder, browser):
     browser.open(index.write(folder))
+    browser.do("new Promise((done) => setTimeout(done, 300))")
+    assert browser.page.url.endswith("index.html"), "a refresh left the page"
+    assert browser.do("document.querySelectorAll('main meta, main style, main b, [style]').length") == 0
+    assert browser.do("document.querySelector('h1').checkVisibility()")
+    assert "banner" not in browser.do("document.documentElement.textContent")
     assert browser.do("document.querySelectorAll('article').length === 4")
     assert (
         browser.do("Promise.all([...document.images].map((one) => one.decode())).then(() => document.images.length)")

@@ -22,7 +22,7 @@ from bench.model import registry
 from bench.report import writer
 from bench.report.finish import views_of
 from bench.report.style import width_in_inches
-from bench.report.web import document
+from bench.report.web import document, shell
 from bench.report.web.data import encode, page_data
 from bench.run.store import Store
 
@@ -97,6 +97,12 @@ def test_every_row_is_in_the_page_with_its_status_and_reason():
     for name in ("scene", "estimator", "status", "reason", "backend"):
         assert column(found, name) == list(rows[name])
     assert np.allclose(column(found, "stiffness"), rows["stiffness"])
+
+
+def test_names_may_break_within_their_settings_and_intervals_may_not():
+    found = shell.table(pd.DataFrame({"name": ["one[a=1,b=2]"], "value": ["0.95 [0.94, 0.96]"]}))
+    assert "one[<wbr>a=1,<wbr>b=2]" in found
+    assert "0.95 [0.94, 0.96]" in found
 
 
 def test_numbers_keep_six_digits_and_missing_ones_are_null():

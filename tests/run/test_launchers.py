@@ -7,6 +7,7 @@ import time
 
 import pandas as pd
 import pytest
+from trees import bench
 
 from bench.cli import main
 from bench.errors import UserError
@@ -64,26 +65,7 @@ def rows(folder):
     return table.drop(columns=[*WHERE])
 
 
-def bench(*words, **more):
-    return subprocess.run([sys.executable, "-m", "bench", *words], capture_output=True, text=True, **more)
-
-
 # ---------------------------------------------------------------------------------------------------------- every day
-
-
-@pytest.mark.parametrize(
-    ("word", "said"),
-    [
-        ("launcher=rai", "did you mean 'ray'"), ("ray.cell=3", "unknown parameter of launcher ray 'cell'; did you mean 'cells'"),
-        ("ray.cells=0", "ray.cells=0 must be at least 1"), ("ray.cells=x", "ray.cells='x' must be a whole number"),
-        ("ray=3", "must be a table"),
-    ],
-)  # fmt: skip
-def test_settings_of_launchers_are_checked(capsys, word, said):
-    launcher = word.partition(".")[0].partition("=")[0]
-    words = [] if launcher == "launcher" else [f"launcher={launcher}"]
-    assert main(["plan", *WORDS, "estimators=[fobg]", *words, word]) == 2
-    assert said in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -112,22 +94,10 @@ def test_a_cluster_without_the_cores_of_a_job_says_so():
     assert "ray.cpus=4 cores, and the largest node of the cluster has 2" in launcher._lack_of_cores()
 
 
-def test_more_cores_than_this_machine_has_are_refused_when_planned(capsys, monkeypatch):
-    monkeypatch.delenv("RAY_ADDRESS", raising=False)
-    assert main(["plan", *WORDS, "estimators=[fobg]", "launcher=ray", "ray.cpus=4096"]) == 2
-    assert "ray.cpus=4096 is more than the" in capsys.readouterr().err
-
-
 def test_a_launcher_whose_library_is_absent_says_how_to_get_it(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     assert main([*WORDS, "estimators=[fobg]", "launcher=ray", f"results_dir={tmp_path}"]) == 2
     assert "pip install 'diffsim-bench[ray]'" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("shard", ["0/64", "65/64", "3", "a/b", "1/0", "-1/4"])
-def test_a_shard_that_is_none_is_refused(capsys, shard):
-    assert main(["plan", *WORDS, "estimators=[fobg]", f"shard='{shard}'"]) == 2
-    assert "must be NUMBER/COUNT: of 64 shards, 1/64 to 64/64" in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -1,7 +1,6 @@
 """A plugin that writes in place into the arrays it gets changes no number of another cell."""
 
 import dataclasses
-import os
 
 import numpy as np
 import pandas as pd
@@ -11,7 +10,6 @@ from bench.experiment.config import load
 from bench.experiment.grid import cells
 from bench.measure import noise
 from bench.run.execute import execute
-from bench.run.pool import Pool, ResourceLimits
 from bench.run.session import Session
 
 WAYS = {
@@ -85,34 +83,6 @@ def test_writing_in_place_changes_no_other_cell(tmp_path, workers):
     numbers = plain.select_dtypes("number").columns.drop(["wall_s", "stored_at", "sequence"])
     pd.testing.assert_frame_equal(plain[numbers], after[numbers], check_exact=True)
     assert (own["status"] == "ok").all(), own["reason"].tolist()
-
-
-@pytest.mark.slow
-def test_a_worker_that_ran_foreign_code_gets_no_other_group():
-    """Items are numbers: tens run the same code from outside, and 0 to 9 run none."""
-    groups = [[10, 11], [1, 2], [20], [12], [3]]
-    with Pool(
-        1, Handler, None, ResourceLimits(), outside=lambda item: frozenset([str(item // 10)] if item > 9 else [])
-    ) as pool:
-        answers = [answer for some in pool.run(groups) for answer in some]
-    place = {answer.item: answer.result["pid"] for answer in answers}
-    assert sorted(place) == [1, 2, 3, 10, 11, 12, 20]
-    assert place[10] == place[11] == place[12]
-    assert place[10] not in (place[1], place[20], place[3])
-    assert place[20] != place[3]
-
-
-class Handler:
-    """Tells the process that handles an item."""
-
-    def __init__(self, argument):
-        pass
-
-    def prepare(self, item):
-        pass
-
-    def __call__(self, item):
-        return {"status": "ok", "pid": os.getpid()}
 
 
 def test_every_caller_has_arrays_of_its_own(tmp_path):

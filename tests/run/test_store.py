@@ -14,11 +14,10 @@ import time
 
 import numpy as np
 import pandas as pd
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 from bench.plugins.studies.bias_variance.columns import COLUMNS
 from pairwise import pairwise
+from trees import bench
 
 from bench.cli import main
 from bench.errors import StorageError
@@ -68,17 +67,6 @@ def test_rows_come_back_to_the_last_bit(tmp_path):
         assert np.isnan(table[5])
         store.compact()
     assert files_in(tmp_path / "s") == ["rows.parquet"]
-
-
-def test_newest_row_of_a_key_wins_wherever_it_lies(tmp_path):
-    store = Store(tmp_path, COLUMNS)
-    store.append(row(1, bias=1.0))
-    store.compact()
-    store.append(row(1, bias=2.0))
-    assert list(store.load()["bias"]) == [2.0]
-    store.append(row(1, bias=3.0))
-    store.compact()
-    assert list(store.load()["bias"]) == [3.0]
 
 
 def test_rows_stay_in_the_order_of_their_file_whenever_they_were_stored(tmp_path):
@@ -151,14 +139,6 @@ def test_compaction_cut_short_at_any_step_loses_nothing(tmp_path, monkeypatch, s
     store.compact()
     assert keys(store) == [1, 2, 3, 4]
     assert len(pd.read_parquet(tmp_path / "rows.parquet")) == 4
-
-
-def test_two_columns_of_one_name_are_refused(tmp_path):
-    frame = pd.DataFrame([row(1)])
-    parts = [pa.array(frame["key"]), pa.array([1.0]), pa.array([2.0])]
-    pq.write_table(pa.Table.from_arrays(parts, ["key", "bias", "bias"]), tmp_path / "rows.parquet")
-    with pytest.raises(StorageError, match=r"cannot be read as Parquet .*bias"):
-        Store(tmp_path, COLUMNS).load()
 
 
 @pytest.mark.slow
@@ -334,10 +314,6 @@ def test_directory_that_refuses(tmp_path, capsys, monkeypatch):
 
 
 # ---------------------------------------------------------------------------------------- kills and company
-
-
-def bench(*words):
-    return subprocess.run([sys.executable, "-m", "bench", *words], capture_output=True, text=True)
 
 
 def start(*words):

@@ -117,6 +117,14 @@ def by_samples(estimator, rollouts, gradients=0.0, scale=1.0):
     ]  # fmt: skip
 
 
+@pytest.mark.parametrize(("gradients", "rollouts"), [(1, 2), (0, 1)])
+def test_gradients_and_costs_of_one_rollout_per_sample_are_compared_at_equal_samples(gradients, rollouts):
+    cells = [*by_samples("a", 1 - gradients, gradients), *by_samples("b", rollouts, scale=3.0)]
+    _, compared = made(*cells, sweep={"samples": [64, 128]})
+    assert compared["at"].tolist() == [64, 128]
+    assert set(compared["basis"]) == {"relative RMSE at equal samples"}
+
+
 def test_costs_of_several_rollouts_per_sample_are_compared_at_equal_rollouts():
     """At equal samples `b` has 1 / 1.2 of the error of `a`, at equal rollouts 1.18 times."""
     cells = [*by_samples("a", 1), *by_samples("b", 2, scale=1 / 1.2)]
@@ -125,20 +133,6 @@ def test_costs_of_several_rollouts_per_sample_are_compared_at_equal_rollouts():
         ["rollouts", 128.0, "relative RMSE at equal rollouts", "a", "b"]
     ]
     assert compared["factor"].iloc[0] == pytest.approx(math.sqrt(2) / 1.2)
-
-
-def test_gradients_are_compared_at_equal_samples():
-    cells = [*by_samples("a", 0, 1), *by_samples("b", 2, scale=3.0)]
-    _, compared = made(*cells, sweep={"samples": [64, 128]})
-    assert set(compared["basis"]) == {"relative RMSE at equal samples"}
-
-
-def test_costs_of_one_rollout_per_sample_are_compared_at_each_number_of_samples():
-    _, compared = made(*by_samples("a", 1), *by_samples("b", 1, scale=3.0), sweep={"samples": [64, 128]})
-    assert compared["at"].tolist() == [64, 128]
-
-
-# ------------------------------------------------------------------------- a second way, from the committed rows
 
 
 def test_a_far_larger_error_does_not_share_the_first_place_of_an_error_that_is_not_sure():

@@ -219,43 +219,6 @@ def test_problems_that_the_best_gradient_solves_in_a_few_updates_do_not_count():
     assert known["hard"] == "the best gradient misses the target"
 
 
-# ---------------------------------------------------------------------------------------------------- costs only
-
-
-def searches_of(problem, **methods):
-    """Return lines as of ``analysis.searches``: by method its kind, evaluations of an update, and updates to each target."""
-    return [
-        {
-            "row": f"{problem} {method}", "problem": problem, "scene_class": "smooth", "kind": kind, "method": method,
-            "target": target, "times": np.asarray(times, dtype=float), "median": float(np.median(times)),
-            "rollouts_per_update": rollouts, "gradients_per_update": gradients,
-        }
-        for method, (kind, rollouts, gradients, by_target) in methods.items()
-        for target, times in zip((10.0, 100.0), by_target, strict=True)
-    ]  # fmt: skip
-
-
-LOST = [[math.inf] * 3] * 2
-
-
-def test_methods_that_use_only_costs_stand_beside_the_best_gradient():
-    best = ("best gradient", 0, 1, [[2, 2, 2], [4, 4, 4]])
-    table = pd.DataFrame(
-        searches_of("easy", **{"best gradient": best, "cem[population=40]": ("costs only", 40, 0, [[1, 1, 1], [2, 3, 5]])})
-        + searches_of("hard", **{
-            "best gradient": best, "cem[population=40]": ("costs only", 40, 0, [[9, 9, 9], [math.inf, 9, math.inf]]),
-            "fobg": ("first order", 0, 64, LOST),
-        })
-    )  # fmt: skip
-    known = analysis.reached(table)
-    cem = known[(known["method"] == "cem") & (known["problem"] == "easy")].iloc[0]
-    assert (cem["fewest"], cem["evaluations"], cem["most"], cem["hits"], cem["runs"]) == (80.0, 120.0, 200.0, 3, 3)
-    wide = views._reached(known).frame.set_index("problem")
-    assert wide.loc["easy", "cem"] == 120.0
-    assert np.isnan(wide.loc["hard", "cem"])
-    assert np.isnan(wide.loc["hard", "fobg"])
-
-
 # ------------------------------------------------------------------------------------------------ without a model
 
 
@@ -326,31 +289,6 @@ def test_verdicts_without_an_effect_are_wrong_in_at_most_5_percent():
     ])  # fmt: skip
     wrong = analysis.by_scene(known).query("scene_class == 'smooth'")["verdict"].ne("not known").mean()
     assert wrong <= 0.05 + 3 * math.sqrt(0.05 * 0.95 / 400)
-
-
-def test_orders_are_compared_at_their_cheapest_number_of_samples():
-    times = {"rollout_s": 1.0, "gradient_s": 3.0}
-    lines = pd.DataFrame([
-        planted("s", kind, math.nan, updates) | times | {"method": method, "samples": n, "rollouts_per_update": n * (kind != "first order"),
-                                                         "gradients_per_update": n * (kind == "first order")}
-        for kind, method, n, updates in (("first order", "fobg", 4, 30.0), ("first order", "fobg", 16, 10.0),
-                                         ("zeroth order", "reinforce", 4, math.inf), ("zeroth order", "reinforce", 64, 5.0))
-    ])  # fmt: skip
-    found = analysis.ratios(lines).set_index("comparison")["ratio"]
-    assert found["first order / zeroth order, gradient 1"] == 120 / 320
-    assert found["first order / zeroth order, gradient measured"] == 360 / 320
-    assert found["fewest samples / others, first order"] == 120 / 160
-
-
-def test_a_ratio_beyond_the_budget_has_only_a_lower_end():
-    """Of eight problems five miss the target with the larger error: the median is infinite, and the least ratio is 27 / 17."""
-    missed = [planted(f"p{i}", analysis.RANDOM, 3.0, math.inf if i < 5 else 20.0 + i) for i in range(8)]
-    small = [planted(f"p{i}", analysis.RANDOM, 0.3, math.inf if i < 2 else 10.0 + i) for i in range(8)]
-    lines = pd.DataFrame(small + missed)
-    points = analysis.relative_times(lines.assign(method="", samples=256, error=lines["dose"], floor=10.0)).set_index(
-        "size"
-    )
-    assert (points.loc[0.3, "time_high"], points.loc[3.0, "is_missed"]) == (math.inf, True)
 
 
 def test_planted_errors_alone_have_a_report_that_compares_no_orders(run):

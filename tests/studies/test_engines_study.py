@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from bench.plugins.studies.engines.views import LEVELS, levels, with_limits
+from bench.plugins.studies.engines.views import LEVELS, levels
 
 import bench
 from bench.cli import main
@@ -85,23 +85,6 @@ def test_levels_of_a_gradient(expected, changes):
     }  # fmt: skip
     assert levels(pd.DataFrame([good | changes])) == [expected]
     assert expected in LEVELS
-
-
-def test_an_error_below_that_of_its_reference_is_shown_as_a_limit():
-    """It was shown as 0, which its definition gives where the reference's error exceeds all of the distance."""
-    row = {"repeats": 8, "reference_norm": 1.0, "bias_low": 0.0, "variance": 0.04}
-    rows = pd.DataFrame(
-        [
-            row | {"rmse_rel": 0.2, "bias_high": 0.05, "reference_se": 0.02},
-            row | {"rmse_rel": 0.0, "bias_high": 0.30, "reference_se": 0.20},
-            row | {"rmse_rel": 0.0, "bias_high": 0.90, "reference_se": 0.60},
-        ]
-    )
-    shown = with_limits(rows)
-    assert list(shown["rmse_is_limit"]) == [False, True, True]
-    assert shown["rmse_rel"].iloc[0] == 0.2
-    assert 0.5 < shown["rmse_rel"].iloc[1] < 1.0
-    assert np.isnan(shown["rmse_rel"].iloc[2])
 
 
 def test_the_page_shows_the_limit_that_the_table_shows():

@@ -1,20 +1,14 @@
-"""Products of step Jacobians against closed forms, and the growth study end to end."""
+"""Products of step Jacobians against closed forms, and verdicts on planted norms."""
 
 import math
 
 import numpy as np
-import pandas as pd
 import pytest
-from bench.plugins.studies.growth import Growth, classify, products, rate
+from bench.plugins.studies.growth import classify, products, rate
 from bench.plugins.studies.growth.views import fit
 from classes import DoubleIntegrator, Jax, SemiImplicitEuler
 
-from bench.experiment import config
-from bench.experiment.grid import cells
 from bench.model import Jacobians, compose
-from bench.report.cells import readable
-
-COLUMNS = Growth.columns
 
 
 def constant(matrix, horizon, batch=3):
@@ -106,52 +100,3 @@ def test_at_most_one_power_law_in_twenty_counts_as_exploding(count):
         noise = spread * rng.standard_normal((500, count))
         found = [fit(horizons, horizons**order * np.exp(n), np.zeros(count))["verdict"] for n in noise]
         assert found.count("exploding") <= 500 * 0.05 + 3 * math.sqrt(500 * 0.05 * 0.95)
-
-
-def grown(*words):
-    """Two scenes of 2 and 3 states over five horizons: norms of one rise like t^2, of the other like e^t."""
-    given = config.load(
-        ["study=growth", "scenes=[bouncing_ball,hopper]", "integrators=[rk4]", "estimators=[fobg]",
-         "sweep.horizon=[10,20,50,100,200]", *words]
-    )  # fmt: skip
-    values = {"bouncing_ball": [10.0, 0.1], "hopper": [1e3, 1.0, 1e-15]}
-    lines = []
-    for cell in cells(given):
-        row, t = cell.columns(), 0.1 * cell.scene.horizon
-        norm = t**2 if row["scene"] == "bouncing_ball" else math.exp(t)
-        lines.append(COLUMNS.blank() | row | {
-            "status": "ok", "dt": 0.1, "time_horizon": t, "gradient_median": norm, "gradient_low": norm / 2,
-            "gradient_quarter": norm / 1.1, "gradient_three_quarters": norm * 1.1, "gradient_high": 2 * norm,
-            "finite_fraction": 1.0, "growth": "exploding", "spectral_rate": 0.1, "spectral_low": 0.05, "spectral_high": 0.2,
-            "lags": [1, 10], "gain": [1.0, 5.0], "gain_low": [0.5, 2.0], "gain_high": [2.0, 9.0], "gain_of": "states",
-            "singular_values": values[row["scene"]],
-            **{f"first_order_variance{end}": t for end in ("", "_low", "_high")},
-            **{f"zeroth_order_variance{end}": 3.0 for end in ("", "_low", "_high")},
-        })  # fmt: skip
-    return given, given.columns.typed(pd.DataFrame(lines))
-
-
-def test_charts_and_tables_of_planted_rows():
-    given, rows = grown()
-    shown = given.study.views(given, rows)
-    (norms,) = shown.charts
-    assert norms.panel_notes == {"bouncing_ball": "polynomial", "hopper": "exploding"}
-    assert list(norms.frame["row"]) == list(range(10))
-    answers, table = map(readable, shown.tables)
-    assert list(answers["verdict"]) == ["polynomial", "exploding"]
-    assert list(answers["lower variance"]) == ["zeroth"] * 2
-    assert list(answers["from [s]"]) == ["5"] * 2
-    assert (answers["order"][0], answers["rate [1/s]"][1]) == ("2.0 [2.0, 2.0]", "1.0 [1.0, 1.0]")
-    assert table["spectral [1/s]"][0] == "1.0 [0.50, 2.0]", "per second, at steps of 0.1 s"
-
-
-def test_ranges_of_variances_that_overlap_and_lost_horizons_are_open():
-    given, rows = grown()
-    rows["first_order_variance_low"], rows["first_order_variance_high"] = 0.0, 1e9
-    lost = rows["horizon"] > 50
-    rows.loc[lost, ["gradient_median", "gradient_quarter"]] = math.nan
-    rows.loc[lost, "status"] = "nonfinite"
-    shown = given.study.views(given, rows)
-    assert list(shown.tables[0].frame["verdict"]) == ["open", "open"]
-    assert list(shown.tables[0].frame["lower"]) == ["open"] * 2
-    assert len(shown.tables[1].frame) == len(rows)

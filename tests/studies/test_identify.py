@@ -26,7 +26,6 @@ from bench.cli import main
 from bench.errors import Unsupported
 from bench.experiment import config
 from bench.experiment.grid import cells
-from bench.experiment.study import study_of
 from bench.measure.identification import Information, product
 from bench.model import Answer
 from bench.report.views import newest_rows
@@ -355,18 +354,16 @@ def test_fits_stop_where_they_have_converged():
 
 def test_fits_take_gauss_newton_unless_another_optimizer_is_named():
     """A record of one's own, fitted by the default of other studies, ended elsewhere and the model was blamed."""
-    chosen = config.load(["study=identify", "backends=[numpy]", "samples=1", *SPRING])
-    assert [str(choice) for choice in chosen.choices["optimizer"]] == ["gauss_newton"]
-    chosen = config.load(["study=identify", "optimizers=[adam]", "backends=[numpy]", "samples=1", *SPRING])
-    assert [str(choice) for choice in chosen.choices["optimizer"]] == ["adam"]
-    assert [str(choice) for choice in config.load(["study=optimise"]).choices["optimizer"]] == ["adam"]
+    for words, chosen in (
+        (["study=identify"], "gauss_newton"),
+        (["study=identify", "optimizers=[adam]"], "adam"),
+        (["study=optimise"], "adam"),
+    ):
+        assert [str(choice) for choice in config.load([*words, *SPRING]).choices["optimizer"]] == [chosen]
 
 
 def test_number_of_windows():
-    assert count_windows(200, 8) == 8
-    assert count_windows(7, 8) == 1
-    assert count_windows(12, 8) == 6
-    assert count_windows(1, 8) == 1
+    assert [count_windows(horizon, 8) for horizon in (200, 7, 12, 1)] == [8, 1, 6, 1]
 
 
 # ------------------------------------------------------------------------------------- models that do not explain
@@ -473,25 +470,6 @@ def test_levenberg_marquardt_needs_as_few_evaluations_as_minpack_on_rosenbrock()
 # ---------------------------------------------------------------------------------------------------- what is shown
 
 
-@pytest.fixture(scope="module")
-def standard():
-    """The standard experiment, its rows and its views."""
-    given = config.load(["experiment=identify", f"results_dir={STANDARD}"])
-    rows = newest_rows(store_of(given).load())
-    return given, rows, study_of(given).views(given, rows)
-
-
-def test_chart_and_tables_have_the_rows(standard):
-    _, rows, views = standard
-    estimates, _, parameters, fits, *_ = views.tables
-    assert estimates.title == "Estimates"
-    assert len(fits.frame) == 22
-    assert len(parameters.frame) == len(rows)
-    printed = views.charts[0]
-    assert len(printed.frame) == 44
-    assert printed.frame["failed"].sum() == 2 * (fits.frame["converged"] == 0).sum() > 0
-
-
 def planted(**columns):
     """The verdicts on four cases with rk4 and four with another integrator, some columns replaced."""
     n = 8
@@ -524,13 +502,16 @@ def test_interval_of_the_error_covers():
     assert np.mean((low <= 1.0) & (high >= 1.0)) == pytest.approx(0.95, abs=0.0104)
 
 
-def test_own_measurements_have_no_coverage_to_show(standard):
+def test_own_measurements_have_no_coverage_to_show():
     """With a record of one's own the truth is unknown: neither error nor coverage is drawn, and no fit counts as lost."""
-    given, rows, _ = standard
+    given = config.load(["experiment=identify", f"results_dir={STANDARD}"])
+    rows = newest_rows(store_of(given).load())
+    drawn = given.study.views(given, rows).charts[0].frame
+    assert drawn["failed"].sum() == (drawn["converged"] == 0).sum() > 0
     gone = {
         name: [[math.nan] * len(v) for v in rows[name]]
         for name in ("error", "coverage", "coverage_low", "coverage_high")
     }
-    views = study_of(given).views(given, rows.assign(**gone))
+    views = given.study.views(given, rows.assign(**gone))
     assert "precise" not in set(views.tables[3].frame["verdict"])
     assert not views.charts

@@ -1,7 +1,7 @@
 """The stability map: verdicts, boundaries against theory, and the files made from them."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
@@ -200,45 +200,6 @@ def test_limits_hold_what_is_known():
     assert limit("rk4") == pytest.approx(8.0, rel=1e-6)  # |R(iz)| = 1 at z = 2 sqrt 2
     assert limit("explicit_euler") == limit("midpoint") == 0.0
     assert limit("implicit_euler") == limit("implicit_midpoint") == math.inf
-
-
-def test_tables_and_charts_of_two_step_sizes(tmp_path):
-    given, rows = swept(tmp_path, "semi_implicit_euler")
-    coarse = rows.assign(dt=2 * DT, horizon=HORIZON / 2, stiffness_limit=rows["stiffness_limit"] / 4)
-    coarse["parameters"] = coarse["parameters"].str.replace(f'"dt":{DT}', f'"dt":{2 * DT}')
-    both = pd.concat([rows, coarse], ignore_index=True)
-    given = replace(given, sweep={**given.sweep, "dt": [DT, 2 * DT]})
-    shown = views.views(given, both)
-    answers, _ = shown.tables
-    (line,) = answers.frame.to_dict("records")
-    wrong = both["verdict"].isin(["inaccurate", "wrong_sign", "zero"])
-    assert line["cells"] == len(both)
-    assert line["by step"] == pytest.approx(wrong.mean())
-    assert line["right"] + line["wrong"] + line["diverged"] == pytest.approx(1.0)
-    chart = shown.charts[0].frame
-    assert len(chart) == len(both)
-    beyond = chart["stiffness"] > chart["dt"].map({DT: 2 / DT**2, 2 * DT: 2 / DT**2 / 4})
-    assert list(chart["mark"] == views.BEYOND) == list(beyond)
-    assert set(chart.loc[chart["verdict"] == "diverged", "level"]) == {"diverged"}
-    assert list(both["verdict"][chart["row"]]) == list(chart["verdict"])
-
-
-def classed(*entries):
-    """Cells of maps as views has them: scene, law and integrator, class, cause, and how many."""
-    return pd.DataFrame(
-        [entry[:4] for entry in entries for _ in range(entry[4])], columns=["scene_name", "step", "level", "cause"]
-    )
-
-
-def test_shares_are_those_of_the_cells_and_the_best_of_a_scene_comes_first():
-    cells = classed(
-        ("spring", "one", "right", "", 1), ("spring", "one", "diverged", "", 3), ("spring", "two", "right", "", 3),
-        ("spring", "two", "wrong", "step", 1), ("ball", "one", "wrong", "law", 3), ("ball", "one", "wrong", "", 1),
-    )  # fmt: skip
-    shares = views.shares_of(cells)
-    assert list(shares["step"]) == ["two", "one", "one"]
-    assert list(shares["right"]) == [0.75, 0.25, 0.0]
-    assert list(shares["by unknown"]) == [0.0, 0.0, 0.25]
 
 
 def test_backends_that_disagree_show_the_worse_verdict_and_no_verdict_is_no_finding(tmp_path):

@@ -11,7 +11,7 @@ import pytest
 from bench.plugins.studies.gradient_check import views as gradient_check
 from bench.plugins.studies.gradient_check.lines import PER_COMPONENT
 from bench.plugins.studies.stability.views import cells_of
-from bench.plugins.studies.twins import views as twins
+from bench.plugins.studies.twins import FLOOR
 
 import bench.report
 from bench.experiment import config
@@ -117,14 +117,6 @@ def test_a_swept_parameter_keeps_lines_of_the_gradient_check_apart():
     assert set(grid.frame["steps"]) == {""}, "one horizon is named with the problem"
 
 
-def test_the_long_table_keeps_its_columns_and_adds_swept_ones():
-    given, rows = checked("scenes=[mass_spring]", "sweep.mass_spring.damping=[0,1]")
-    found = gradient_check.views(given, rows).tables[1].data
-    assert list(found)[-4:] == ["verdict", "key", "damping", "study"]
-    assert len(found) == 2 * len(rows)
-    assert set(found["damping"]) == {0.0, 1.0}
-
-
 def test_untrusted_undecided_and_missing_gradients_come_first_and_are_never_right():
     given, rows = checked("scenes=[pendulum]", "sweep.horizon=[1,2]")
     rows["command"] = [f"python -m bench gradcheck {i}" for i in range(len(rows))]
@@ -219,11 +211,11 @@ def test_twins_of_a_swept_scene_are_panels_of_their_own():
     away = [[0.0] * int(h) + [1e-3] for h in rows["horizon"]]
     rows = rows.assign(state_difference=1e-3, state_difference_rel=1e-3, path=away, own_path=own)
     rows["gradient_difference_rel"], rows["cost_difference_rel"], rows["gradient_s"] = [0.0, 2e-3, 1e-3, 1e-3], 0.0, 1.0
-    shown = twins.views(given, rows)
+    shown = given.study.views(given, rows)
     [chart], [lines] = shown.charts, shown.tables
     drawn = chart.plotted()
     assert list(dict.fromkeys(drawn["problem"])) == ["pendulum, horizon=2", "pendulum, horizon=3"], "the worst is first"
-    assert list(drawn["gradient_difference_rel"]) == [twins.FLOOR, 2e-3, 1e-3, 1e-3], "0 is at the lower edge"
+    assert list(drawn["gradient_difference_rel"]) == [FLOOR, 2e-3, 1e-3, 1e-3], "0 is at the lower edge"
     assert list(drawn["gradient_difference_rel_limit"]) == [True, False, False, False]
     assert list(readable(lines)["horizon [steps]"]) == ["2", "2", "3", "3"]
     table_ = table(given, rows)

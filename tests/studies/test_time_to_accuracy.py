@@ -180,14 +180,6 @@ def test_the_table_names_the_fastest_and_a_factor_only_where_its_interval_exclud
         assert (found["factor_low"] > 1.0, found["tied"]) == (not tied, tied)
 
 
-@pytest.mark.parametrize("order", [1, -1])
-def test_rollouts_are_those_of_the_cheapest_backend(order):
-    """A backend that fails, as one that differences across a jump, takes nothing from the estimator."""
-    found = entry(*[rows(), rows(backend="other", status="nonfinite")][::order])
-    assert (found["fastest"], found["how"]) == ("e", "extrapolated")
-    assert found["cost"] == pytest.approx(800.0)
-
-
 def test_nothing_is_told_where_samples_are_not_swept():
     assert table(rows()[:1]).empty
 
@@ -201,14 +193,6 @@ def test_an_error_far_above_all_variances_leaves_no_doubt_about_the_times():
     )
     # by rollouts both costs are upper limits: one sample of either may do
     assert entry(*parts, width=50.0)["tied"] == ("slow",)
-
-
-def test_the_next_is_another_estimator_or_the_same_on_another_backend_by_time_alone():
-    parts = rows(), slower(2, backend="other")
-    assert list(entry(*parts, by="time", width=50.0)[["factor", "factor_low", "factor_high"]]) == pytest.approx(
-        [2.0] * 3
-    )
-    assert entry(*parts, slower(3, estimator="slow"), by="time", width=1.1)["next"] == "slow on b"
 
 
 def test_a_sweep_of_samples_in_which_a_scene_fails_has_its_report(tmp_path):

@@ -1,5 +1,7 @@
 """Returns of a policy, and environments."""
 
+from dataclasses import dataclass
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,7 +10,7 @@ from problems import cartpole_program
 
 from bench.errors import UserError
 from bench.model import LoopOps, State, compose, registry
-from bench.training import fitting
+from bench.training import steps
 from bench.training.environment import Environment
 
 ROUNDING = 1e-9
@@ -30,8 +32,6 @@ def test_returns_are_those_of_a_loop_in_numpy():
 
 
 def test_an_episode_counts_up_to_its_first_end():
-    from dataclasses import dataclass
-
     @dataclass(frozen=True)
     class Falls(registry.usable("scenes", "cartpole_swing")):
         name = "falls"
@@ -53,8 +53,6 @@ def test_an_episode_counts_up_to_its_first_end():
 
 
 def test_a_scene_without_random_starts_has_returns():
-    from dataclasses import dataclass
-
     @dataclass(frozen=True)
     class Fixed(registry.usable("scenes", "cartpole_swing")):
         name = "fixed"
@@ -73,5 +71,5 @@ def test_a_scene_without_random_starts_has_returns():
 
 def test_more_batches_than_states_are_refused():
     with pytest.raises(UserError, match="batches = 9, but a window has 8 states"):
-        fitting.batches_of(jax.random.PRNGKey(0), 8, passes=2, batches=9)
-    assert fitting.batches_of(jax.random.PRNGKey(0), 8, passes=2, batches=8).shape == (16, 1)
+        steps.batches_of(jax.random.PRNGKey(0), 8, passes=2, batches=9)
+    assert steps.batches_of(jax.random.PRNGKey(0), 8, passes=2, batches=8).shape == (16, 1)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bench.training.values import td_lambda
+from bench.training.windows import td_lambda
 
 ROUNDING = 1e-12
 """Relative error allowed to float64 sums of a few terms."""

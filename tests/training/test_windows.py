@@ -36,18 +36,6 @@ def actor():
 
 
 @pytest.mark.slow
-def test_the_gradient_of_a_window_agrees_with_central_differences(actor):
-    env, key = environment(), jax.random.PRNGKey(2)
-    objective = jax.jit(lambda a: window_return(env, a, 5, key)[0])
-    gradient = jax.grad(objective)(actor)
-    rng, step = np.random.default_rng(3), 1e-6
-    direction = jax.tree.map(lambda x: jnp.asarray(rng.standard_normal(x.shape)), actor)
-    ends = [objective(jax.tree.map(lambda x, d, s=sign: x + s * step * d, actor, direction)) for sign in (1, -1)]
-    along = sum(jnp.vdot(g, d) for g, d in zip(jax.tree.leaves(gradient), jax.tree.leaves(direction), strict=True))
-    assert float(ends[0] - ends[1]) / (2 * step) == pytest.approx(float(along), rel=DIFFERENCE)
-
-
-@pytest.mark.slow
 def test_the_gradient_of_a_window_is_that_of_fobg_on_the_whole_program():
     """Without discount and value, a window as long as the horizon has the cost of the sweep's own program."""
     steps, count, sigma = 5, 6, 0.3

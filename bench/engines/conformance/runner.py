@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib.util
 import json
+import runpy
 import sys
 import time
 from pathlib import Path
@@ -48,16 +48,15 @@ class Case:
 
     def tangent(self) -> np.ndarray:
         """Return the derivative of qpos by a velocity times time, ``(n_q, n_v)``: quaternions turn in their body's frame."""
-        blocks, i = [], 0
-        while i < len(self.qpos):
-            w, x, y, z = self.qpos[i : i + 4] if i in self.data["quaternions"] else (0.0,) * 4
-            turn = np.array([[-x, -y, -z], [w, -z, y], [z, w, -x], [-y, x, w]]) / 2
-            blocks.append((i, turn if i in self.data["quaternions"] else np.eye(1)))
-            i += len(blocks[-1][1])
-        result, column = np.zeros((i, self.qvel.size)), 0
-        for row, block in blocks:
-            result[row : row + block.shape[0], column : column + block.shape[1]] = block
-            column += block.shape[1]
+        result, row, column = np.zeros((self.qpos.size, self.qvel.size)), 0, 0
+        while row < len(result):
+            block = np.eye(1)
+            if row in self.data["quaternions"]:
+                w, x, y, z = self.qpos[row : row + 4]
+                block = np.array([[-x, -y, -z], [w, -z, y], [z, w, -x], [-y, x, w]]) / 2
+            end, last = row + len(block), column + block.shape[1]
+            result[row:end, column:last] = block
+            row, column = end, last
         return result
 
     def moved(self, term: str, change: np.ndarray) -> Case:
@@ -70,38 +69,36 @@ class Case:
             qpos[i : i + 4] /= np.linalg.norm(qpos[i : i + 4])
         return dataclasses.replace(self, qpos=qpos)
 
+    def differences(self, engine: Any, term: str) -> tuple[np.ndarray, float]:
+        """Return the derivative by central differences of the engine's own costs, and its uncertainty.
+
+        Each component takes the neighbouring steps of the ladder whose extrapolated differences agree best. Their disagreement
+        is the uncertainty, or the disagreement at a smaller step if that is larger for its step: rounding grows as 1 / step. Steps
+        at which a cost no longer changes do not count.
+        """
+        basis = np.eye(self.qvel.size if term == "qpos" else getattr(self, term).size)
+        steps = LADDER * (1.0 if term == "qpos" else max(1.0, np.abs(getattr(self, term)).max(initial=0.0)))
+
+        def cost(change: np.ndarray) -> float:
+            return float(engine.rollout(self.moved(term, change)))
+
+        slopes = np.array([[(cost(h * e) - cost(-h * e)) / (2 * h) for e in basis] for h in steps])
+        better = (10 * slopes[1:] - slopes[:-1]) / 9  # the ladder's factor is the root of 10, the error of order 2
+        gaps = np.abs(np.diff(better, axis=0)) * steps[2:, None]
+        gaps = np.maximum.accumulate(gaps[::-1])[::-1] / steps[2:, None]
+        gaps[(slopes[2:] == 0) & slopes.any(axis=0)] = np.inf
+        best = gaps.argmin(axis=0)[None]
+        return np.take_along_axis(better[1:], best, 0)[0], float(np.take_along_axis(gaps, best, 0).max(initial=0.0))
+
 
 def cases(*names: str) -> list[Case]:
     """Return the named cases, or all."""
-    files = [FOLDER / f"{name}.json" for name in names] or sorted(FOLDER.glob("*.json"))
-    return [_case(file.stem, json.loads(file.read_text())) for file in files]
-
-
-def _case(name: str, data: dict[str, Any]) -> Case:
-    given = (data["qpos"], data["qvel"], data["controls"], data["parameter"]["value"])
-    return Case(name, data, *(np.array(part, dtype=float) for part in given))
-
-
-def differences(engine: Any, case: Case, term: str) -> tuple[np.ndarray, float]:
-    """Return the derivative by central differences of the engine's own costs, and its uncertainty.
-
-    Each component takes the neighbouring steps of the ladder whose extrapolated differences agree best. Their disagreement
-    is the uncertainty, or the disagreement at a smaller step if that is larger for its step: rounding grows as 1 / step. Steps
-    at which a cost no longer changes do not count.
-    """
-    basis = np.eye(case.qvel.size if term == "qpos" else getattr(case, term).size)
-    steps = LADDER * (1.0 if term == "qpos" else max(1.0, np.abs(getattr(case, term)).max(initial=0.0)))
-
-    def cost(change: np.ndarray) -> float:
-        return float(engine.rollout(case.moved(term, change)))
-
-    slopes = np.array([[(cost(h * e) - cost(-h * e)) / (2 * h) for e in basis] for h in steps])
-    better = (10 * slopes[1:] - slopes[:-1]) / 9  # the ladder's factor is the root of 10, the error of order 2
-    gaps = np.abs(np.diff(better, axis=0)) * steps[2:, None]
-    gaps = np.maximum.accumulate(gaps[::-1])[::-1] / steps[2:, None]
-    gaps[(slopes[2:] == 0) & slopes.any(axis=0)] = np.inf
-    best = gaps.argmin(axis=0)[None]
-    return np.take_along_axis(better[1:], best, 0)[0], float(np.take_along_axis(gaps, best, 0).max(initial=0.0))
+    result = []
+    for file in [FOLDER / f"{name}.json" for name in names] or sorted(FOLDER.glob("*.json")):
+        data = json.loads(file.read_text())
+        given = (data["qpos"], data["qvel"], data["controls"], data["parameter"]["value"])
+        result.append(Case(file.stem, data, *(np.array(part, dtype=float) for part in given)))
+    return result
 
 
 def check(engine: Any, case: Case) -> list[dict[str, Any]]:
@@ -109,53 +106,44 @@ def check(engine: Any, case: Case) -> list[dict[str, Any]]:
 
     A case in ``engine.differs``, with its reason, is compared with the engine's own differences.
     """
+    row: dict[str, Any] = {"case": case.name, "term": "all", "is_right": None, "digits": None, "looks_like": ""}
+    row |= {"against": "", "seconds": None, "reason": ""}
     started = time.perf_counter()
     try:
         results = {"value": engine.rollout(case), **engine.gradient(case)}
     except Exception as error:  # another engine's code may raise anything
         is_right = None if isinstance(error, NotImplementedError) else False
-        return [_row(case, "all", is_right, reason=f"{type(error).__name__}: {error}")]
-    seconds, differs = round(time.perf_counter() - started, 4), getattr(engine, "differs", {}).get(case.name, "")
-    rows = []
-    for term, result in results.items():
-        result, faults = np.ravel(np.array(result, dtype=float)), {}
-        if term == "qpos" and result.size > case.qvel.size:
-            result = result @ case.tangent()
-        if not differs:
-            expected, doubt, faults = case.data["expected"][term], case.data["certainty"][term], case.data["faults"]
-        elif term != "value":
-            expected, doubt = differences(engine, case, term)
-        else:
-            expected, doubt = case.data["expected"][term], np.inf
-        if result.size != np.size(expected):
-            rows.append(_row(case, term, False, reason=f"{result.size} numbers instead of {np.size(expected)}"))
-            continue
-        off = float(np.abs(result - np.ravel(expected)).max(initial=0.0))
-        scale, margin = np.abs(expected).max(initial=1e-9), DOUBTS * doubt
-        is_right = bool(off <= getattr(engine, "tolerance", 1e-6) * scale + margin)
-        looks_like = [
-            fault
-            for fault, numbers in faults.items()
-            if not is_right and np.abs(result - np.ravel(numbers.get(term, np.inf))).max(initial=0.0) <= EXPLAINED * off
-        ]
-        digits = round(float(-np.log10(max(off / scale, 1e-16))), 1) if np.isfinite(off) else None
-        verdict = is_right if margin <= UNCERTAIN * scale else None
-        against = "own differences" if differs else "the set"
-        rows.append(_row(case, term, verdict, digits, " or ".join(looks_like), against, seconds, differs))
-    return rows
+        return [row | {"is_right": is_right, "reason": f"{type(error).__name__}: {error}"}]
+    differs = getattr(engine, "differs", {}).get(case.name, "")
+    row |= {"seconds": round(time.perf_counter() - started, 4), "reason": differs}
+    row["against"] = "own differences" if differs else "the set"
+    return [row | {"term": term} | _verdict(engine, case, term, result, differs) for term, result in results.items()]
 
 
-def _row(
-    case: Case,
-    term: str,
-    is_right: bool | None,
-    digits: float | None = None,
-    looks_like: str = "",
-    against: str = "",
-    seconds: float | None = None,
-    reason: str = "",
-) -> dict[str, Any]:
-    return {**locals(), "case": case.name}
+def _verdict(engine: Any, case: Case, term: str, result: Any, differs: str) -> dict[str, Any]:
+    """Return whether a value or derivative is right, its digits of agreement, and the faults that it looks like."""
+    result, faults = np.ravel(np.array(result, dtype=float)), {}
+    if term == "qpos" and result.size > case.qvel.size:
+        result = result @ case.tangent()
+    expected, doubt = case.data["expected"][term], np.inf
+    if not differs:
+        doubt, faults = case.data["certainty"][term], case.data["faults"]
+    elif term != "value":
+        expected, doubt = case.differences(engine, term)
+    if result.size != np.size(expected):
+        return {"is_right": False, "seconds": None, "reason": f"{result.size} numbers instead of {np.size(expected)}"}
+
+    def distance(numbers: Any) -> float:
+        return float(np.abs(result - np.ravel(numbers)).max(initial=0.0))
+
+    off, scale, margin = distance(expected), np.abs(expected).max(initial=1e-9), DOUBTS * doubt
+    is_right = bool(off <= getattr(engine, "tolerance", 1e-6) * scale + margin)
+    near = [name for name, fault in faults.items() if distance(fault.get(term, np.inf)) <= EXPLAINED * off]
+    return {
+        "is_right": is_right if margin <= UNCERTAIN * scale else None,
+        "digits": round(float(-np.log10(max(off / scale, 1e-16))), 1) if np.isfinite(off) else None,
+        "looks_like": "" if is_right else " or ".join(near),
+    }
 
 
 def run(engine: Any, *names: str) -> list[dict[str, Any]]:
@@ -165,16 +153,12 @@ def run(engine: Any, *names: str) -> list[dict[str, Any]]:
 
 def main(path: str, *names: str) -> None:
     """Print the rows of the class ``Engine`` of a file, and then, with its versions, as JSON in the last line."""
-    spec = importlib.util.spec_from_file_location("engine", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.path.insert(0, str(Path(path).parent))
-    spec.loader.exec_module(module)
-    engine = module.Engine()
-    rows = run(engine, *names)
-    for row in rows:
-        print(*row.values(), sep="\t")
+    sys.path.append(str(Path(path).parent))  # last: a file may have the name of a library
+    engine, rows = runpy.run_path(path)["Engine"](), []
+    for case in cases(*names):
+        for row in check(engine, case):
+            print(*row.values(), sep="\t", flush=True)
+            rows.append(row)
     print(json.dumps({"versions": getattr(engine, "versions", {}), "rows": rows}))
 
 

@@ -65,7 +65,7 @@ def table(frame: pd.DataFrame) -> str:
 
 def _breakable(text: str) -> str:
     """Return a text as HTML that may also break within a name and its settings."""
-    return re.sub(r"[,\[](?=\S)|_(?=[a-z]{6})", r"\g<0><wbr>", escape(text))
+    return re.sub(r"(?<=\S)[,\[](?=\S)|_(?=[a-z]{6})", r"\g<0><wbr>", escape(text))
 
 
 def drawing(figure: Figure, name: str, description: str) -> str:

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 
 from bench.experiment.axes import table as csv_table
-from bench.experiment.columns import Column, text
+from bench.experiment.columns import Column, interval, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Mark, Style, Table, Views
 from bench.report.style import MARKERS, PALETTE, VARIANTS
@@ -31,7 +31,7 @@ CLASS, PROBLEMS, SCENES = (
 )
 PAIRS = (
     CLASS, text("comparison"), PROBLEMS, SCENES, Column("above", label="above 1", format="setting"),
-    Column("ratio", low="ratio_low", high="ratio_high", boundary=1.0), text("verdict"),
+    interval("ratio", boundary=1.0), text("verdict"),
 )  # fmt: skip
 PAIR_NOTES = (
     "Ratios of updates, or of rollouts between orders and samples, on the same problem, to 1/100 of the first regret. One size: over "
@@ -93,7 +93,7 @@ def _chart(points: pd.DataFrame, pairs: pd.DataFrame) -> Chart:
     sizes = pairs[pairs["target"] == MAIN].groupby("scene_class")[["problems", "scenes"]].max()
     return Chart(
         "cost_of_error", points.sort_values("method", kind="stable"), [Column("error", label="relative error", log=True)],
-        [Column("time", label="updates / best gradient's", low="time_low", high="time_high", log=True)],
+        [interval("time", label="updates / best gradient's", log=True)],
         kind="lines", series="method", panel="scene_class", styles=STYLES | looks, failed="is_missed", across=3, height=2.0,
         panel_notes={row.Index: f"{row.problems} problems of {row.scenes} scenes" for row in sizes.itertuples()},
         subtitle=f"To 1/{MAIN:g} of the first regret, each method at its best rate. Cross: half of the scenes miss it. "
@@ -108,7 +108,7 @@ def _ratios(pairs: pd.DataFrame) -> Chart:
     frame = pairs[(pairs["ratio_low"] > 0) | np.isfinite(pairs["ratio_high"])]
     frame = frame.assign(ratio_low=frame["ratio_low"].where(frame["ratio_low"] > 0), is_missed=np.isinf(frame["ratio"]))
     return Chart(
-        "ratios", frame, [Column("ratio", label="times the updates", low="ratio_low", high="ratio_high", log=True)],
+        "ratios", frame, [interval("ratio", label="times the updates", log=True)],
         [text("comparison", label="")], "dots", series="verdict", styles=VERDICTS, marks=[Mark("the same", 1.0)], failed="is_missed",
         height=0.28, subtitle=f"To 1/{MAIN:g} of the first regret, over the best gradient. Cross: half of the scenes miss it",
         text="Medians over scenes with 95% intervals. Left of the line is fewer updates.",

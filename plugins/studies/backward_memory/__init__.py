@@ -16,7 +16,7 @@ import numpy as np
 
 from bench.errors import Crashed
 from bench.experiment.cell import Cell
-from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, text
+from bench.experiment.columns import Column, Columns, ComparisonRule, interval, numbers, text
 from bench.experiment.session import Session
 from bench.model import param, registry
 
@@ -45,12 +45,11 @@ class BackwardMemory(StudyPackage):
     name = "backward_memory"
     axes: ClassVar[tuple[str, ...]] = ("scene", "contact", "integrator", "backend")
     columns: ClassVar[Columns] = Columns.of(
-        Column("memory_mb", "largest resident memory during `samples` gradients beyond the memory before, median over calls",
-               "MiB", label="memory", low="memory_mb_low", high="memory_mb_high", measured=True),
+        interval("memory_mb", "largest resident memory during `samples` gradients beyond the memory before, median over calls",
+               "MiB", label="memory", measured=True),
         Column("memory_mb_low", "smallest of the calls: lower end of the interval", "MiB", measured=True),
         Column("memory_mb_high", "largest of the calls: upper end of the interval", "MiB", measured=True),
-        Column("gradient_s", "processor time of `samples` gradients on one thread, median over calls", "s", label="gradients",
-               low="gradient_s_low", high="gradient_s_high", measured=True, format="seconds"),
+        interval("gradient_s", "processor time of `samples` gradients on one thread, median over calls", "s", label="gradients", measured=True, format="seconds"),
         Column("gradient_s_low", "smallest of the calls: lower end of the interval", "s", measured=True),
         Column("gradient_s_high", "largest of the calls: upper end of the interval", "s", measured=True),
         Column("process_mb", "resident memory before the gradients: libraries, compiled program, theta and noise", "MiB",
@@ -67,7 +66,7 @@ class BackwardMemory(StudyPackage):
         6, "measured calls: the range of six contains the median of their distribution with probability 97%", low=6
     )
 
-    def unsupported_reason(self, cell: Cell) -> str | None:
+    def refusal(self, cell: Cell) -> str | None:
         """Return that the backend computes no gradients, or None."""
         return None if "grad" in cell.backend.provides else f"backend {cell.backend.name} computes no gradients"
 

@@ -50,7 +50,8 @@ def measured(cell: Cell, calls: int, cache: Path | None) -> dict[str, Any]:
     seconds, peaks, before = [], [], []
     for _ in range(calls):
         gc.collect()
-        _trim()
+        with suppress(AttributeError, OSError):  # glibc only
+            ctypes.CDLL(None).malloc_trim(0)
         timing.reset_peak_memory()
         before.append(timing.peak_memory_mb())
         started = time.process_time()
@@ -58,9 +59,3 @@ def measured(cell: Cell, calls: int, cache: Path | None) -> dict[str, Any]:
         seconds.append(time.process_time() - started)
         peaks.append(timing.peak_memory_mb() - before[-1])
     return {"gradient": gradient.tolist(), "seconds": seconds, "peaks": peaks, "before": before}
-
-
-def _trim() -> None:
-    """Return freed memory of the C library to the system (glibc only)."""
-    with suppress(AttributeError, OSError):
-        ctypes.CDLL(None).malloc_trim(0)

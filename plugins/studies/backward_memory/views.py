@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from bench.experiment import grid
-from bench.experiment.columns import Column, text
+from bench.experiment.columns import interval, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Table, Views
 from bench.report.shown import Shown
@@ -23,11 +23,11 @@ SHOWN = ("memory_mb", "gradient_s", "process_mb", "gradient_error_rel")
 LINES = (
     text("problem"),
     text("method"),
-    Column("memory_mb", unit="MiB", label="memory", low="memory_mb_low", high="memory_mb_high", limit="is_small"),
-    Column("less", label="times less memory", low="less_low", high="less_high"),
-    Column("gradient_s", label="gradients", low="gradient_s_low", high="gradient_s_high", format="seconds"),
-    Column("longer", label="times the time", low="longer_low", high="longer_high"),
-    Column("order", "p in memory ~ T^p", label="order of memory", low="order_low", high="order_high"),
+    interval("memory_mb", unit="MiB", label="memory", limit="is_small"),
+    interval("less", label="times less memory"),
+    interval("gradient_s", label="gradients", format="seconds"),
+    interval("longer", label="times the time"),
+    interval("order", "p in memory ~ T^p", label="order of memory"),
 )
 """The columns of the table with a line per problem and method."""
 NOTE = (

@@ -1,6 +1,6 @@
 """The columns of the main table, which users' scripts rely on."""
 
-from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, text
+from bench.experiment.columns import Column, Columns, ComparisonRule, interval, numbers, text
 
 TABLE = (
     "experiment", "scene", "contact", "integrator", "backend", "estimator", "estimator_params", "noise",
@@ -16,13 +16,11 @@ COLUMNS = Columns.ordered(
     Column("reference_norm", "norm of the reference gradient"),
     text("reference_method", "how the reference was computed: closed_form, quadrature or sampling, with its settings"),
     Column("reference_se", "standard error of the reference, as the root of the trace of its covariance"),
-    Column("bias", "norm of the bias, corrected for its own noise", comparison=ComparisonRule("interval", "bias"),
-           low="bias_low", high="bias_high"),
+    interval("bias", "norm of the bias, corrected for its own noise", comparison=ComparisonRule("interval", "bias")),
     Column("bias_low", "lower end of its 95% interval; 0 where the bias is not distinguishable from 0"),
     Column("bias_high", "upper end of its 95% interval"),
     Column("bias_rel", "bias / reference_norm"),
-    Column("variance", "trace of the covariance of one estimate", comparison=ComparisonRule("spread", "variance"),
-           low="variance_low", high="variance_high"),
+    interval("variance", "trace of the covariance of one estimate", comparison=ComparisonRule("spread", "variance")),
     Column("variance_low", "lower end of its 95% interval", table=False),
     Column("variance_high", "upper end of its 95% interval", table=False),
     Column("variance_per_sample", "variance of one sample's term, from all terms where an estimate is a mean of terms, "

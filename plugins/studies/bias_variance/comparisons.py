@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 
 from bench.experiment.axes import Axis
-from bench.experiment.columns import Column, text
+from bench.experiment.columns import Column, interval, text
 from bench.report.problems import ProblemRows, split_by_problem
 from bench.report.views import CATEGORIES, Arranged, Curve, attempted, estimator_curves, rmse_interval
 
@@ -35,12 +35,13 @@ COLUMNS = (
     Column("at", "its value", format="setting"),
     text("basis", "what is compared: the error at equal samples or rollouts, or the cost of reaching an error"),
     text("first", "the method with the lowest value"),
-    Column("value", "its value", low="value_low", high="value_high"),
+    interval("value", "its value"),
     text("second", "the next method, of another estimator where there is one"),
-    Column("factor", "the second value over the first", low="factor_low", high="factor_high"),
+    interval("factor", "the second value over the first"),
     text("tied", "methods that are not distinguishable from the first"),
 )
 """The columns of the table of comparisons."""
+VALUE, FACTOR = ([f"{name}{end}" for end in ("", "_low", "_high")] for name in ("value", "factor"))
 
 
 def problems_by_axis(shown: Arranged) -> list[tuple[Axis | None, ProblemRows]]:
@@ -92,7 +93,7 @@ def method_table(shown: Arranged) -> pd.DataFrame:
                     "verdict": verdict(row["status"], error, low, high), "status": row["status"],
                     "remark": row["reason"], "bias_share": (row["bias_low"] / row["rmse"]) ** 2 if error > 0 else math.nan,
                     "evaluations": (row["rollouts"] + row["gradients"]) / (x if along_samples else row["samples"]),
-                    "time_s": min((t for t in curve.seconds.values() if t > 0), default=math.nan),
+                    "time_s": curve.seconds,
                 })  # fmt: skip
     return pd.DataFrame(lines)
 
@@ -150,25 +151,19 @@ def compare_errors(methods: pd.DataFrame) -> pd.DataFrame:
     lines = []
     for _, part in methods.groupby("setting", sort=False):
         good = part[np.isfinite(part["error"]) & np.isfinite(part["error_low"])].sort_values("error", kind="stable")
-        line: dict[str, Any] = part.iloc[0][["setting", "problem", "axis", "at"]].to_dict() | {
-            "basis": EQUAL_ROLLOUTS if part["axis"].iloc[0] == ROLLOUTS.column else EQUAL_SAMPLES, "first": "", "value": math.nan, "value_low": math.nan,
-            "value_high": math.nan, "second": "", "factor": math.nan, "factor_low": math.nan, "factor_high": math.nan,
-            "tied": (),
-        }  # fmt: skip
+        line = part.iloc[0][["setting", "problem", "axis", "at"]].to_dict() | {"first": "", "second": "", "tied": ()}
+        line["basis"] = EQUAL_ROLLOUTS if line["axis"] == ROLLOUTS.column else EQUAL_SAMPLES
         if len(good):
-            first, *others = (dict(row) for row in good.to_dict("records"))
+            first, *others = good.to_dict("records")
             factors = [(other, ratio(_interval(first), _interval(other))) for other in others]
-            line |= {"first": first["method"]} | dict(
-                zip(("value", "value_low", "value_high"), _interval(first), strict=True)
-            )
+            line |= {"first": first["method"]} | dict(zip(VALUE, _interval(first), strict=True))
             rivals = [item for item in factors if item[0]["estimator"] != first["estimator"]] or factors
             if rivals:
-                line |= {"second": rivals[0][0]["method"]}
-                line |= dict(zip(("factor", "factor_low", "factor_high"), rivals[0][1], strict=True))
+                line |= {"second": rivals[0][0]["method"]} | dict(zip(FACTOR, rivals[0][1], strict=True))
             line["tied"] = tuple(other["method"] for other, (_, low, _) in factors if not low > 1)
         lines.append(line)
     names = [name for c in COLUMNS for name in (c.name, c.low, c.high) if name]
-    return pd.DataFrame(lines, columns=["setting", *names])
+    return pd.DataFrame(lines, columns=["setting", *names]).astype(dict.fromkeys([*VALUE, *FACTOR], float))
 
 
 def _interval(row: Any) -> tuple[float, float, float]:

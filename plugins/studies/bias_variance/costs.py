@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -47,18 +46,16 @@ def with_gradient_cost(rows: pd.DataFrame) -> pd.DataFrame:
     The ratio is seconds per gradient over seconds per rollout, from the fastest row that uses only gradients and the
     fastest that uses only rollouts, at the largest number of samples with both. Without such rows it is NaN.
     """
-    keys = [name for name in PROGRAM if name in rows]
-    program = rows.groupby(keys, dropna=False).ngroup()
-    known = (rows["status"] == "ok") & (rows["time_s"] > 0)
-    ratios: dict[Any, float] = {}
-    narrow = rows.loc[known, ["samples", "gradients", "rollouts", "time_s"]]
-    for place, part in narrow.groupby(program[known]):
-        first = part[(part["gradients"] > 0) & (part["rollouts"] <= 0.01 * part["gradients"])]
-        zeroth = part[(part["gradients"] == 0) & (part["rollouts"] > 0)]
-        both = sorted(set(first["samples"]) & set(zeroth["samples"]))
-        if both:
-            a, b = (table[table["samples"] == both[-1]] for table in (first, zeroth))
-            ratios[place] = (a["time_s"] / a["gradients"]).min() / (b["time_s"] / b["rollouts"]).min()
+    program = rows.groupby([name for name in PROGRAM if name in rows], dropna=False).ngroup()
+    known = rows[(rows["status"] == "ok") & (rows["time_s"] > 0)]
+    gradients, rollouts = known["gradients"], known["rollouts"]
+
+    def least(seconds: pd.Series) -> pd.Series:
+        return seconds.groupby([program, rows["samples"]]).min()
+
+    first = least((known["time_s"] / gradients)[(gradients > 0) & (rollouts <= 0.01 * gradients)])
+    zeroth = least((known["time_s"] / rollouts)[(gradients == 0) & (rollouts > 0)])
+    ratios = (first / zeroth).dropna().sort_index().groupby(level=0).last()
     return rows.assign(**{RATIO: program.map(ratios).astype(float)})
 
 

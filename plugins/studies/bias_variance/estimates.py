@@ -78,13 +78,10 @@ class Estimates:
 
     def _estimate_batch(self, start: int, block: np.ndarray) -> np.ndarray:
         result, self.diagnostics[start] = self._estimator.estimate_with_diagnostics(self._problem, self._theta, block)
-        result = self._as_float64(result)
-        self._check_shape(result, (block.shape[0], self._problem.dim))
-        return result
+        return self._checked(result, block.shape[0], self._problem.dim)
 
     def _mean_of_batch(self, estimator: SampleMean, start: int, block: np.ndarray) -> np.ndarray:
-        terms = self._as_float64(estimator.terms(self._problem, self._theta, columns(block)))
-        self._check_shape(terms, (self._problem.dim, block.shape[0] * block.shape[1]))
+        terms = self._terms_of(estimator, columns(block))
         split = per_repeat(terms, block)
         result: np.ndarray = split.mean(axis=1)
         with self.pause:
@@ -100,8 +97,7 @@ class Estimates:
                 part = next(parts, None)
             if part is None:
                 break
-            terms = self._as_float64(estimator.terms(self._problem, self._theta, part))
-            self._check_shape(terms, (self._problem.dim, part.shape[1]))
+            terms = self._terms_of(estimator, part)
             total += terms.sum(axis=1)
             with self.pause:
                 found = self._added(found, terms)
@@ -116,11 +112,14 @@ class Estimates:
             rest = terms - self._centre[:, None]
             return found[0] + rest.sum(axis=1), found[1] + float(np.vdot(rest, rest))
 
-    def _as_float64(self, result: Any) -> np.ndarray:
+    def _terms_of(self, estimator: SampleMean, w: np.ndarray) -> np.ndarray:
+        return self._checked(estimator.terms(self._problem, self._theta, w), self._problem.dim, w.shape[1])
+
+    def _checked(self, result: Any, *shape: int) -> np.ndarray:
+        """Return a result in float64; raises an error if it is complex or has another shape."""
         if np.iscomplexobj(result):  # a cast would silently drop the imaginary part
             raise TypeError(f"{self._estimator.name} returned complex numbers; gradients are real")
-        return np.asarray(result, dtype=np.float64)
-
-    def _check_shape(self, result: np.ndarray, shape: tuple[int, ...]) -> None:
+        result = np.asarray(result, dtype=np.float64)
         if result.shape != shape:
             raise ValueError(f"{self._estimator.name} returned shape {result.shape}, not {shape}")
+        return result  # type: ignore[no-any-return]

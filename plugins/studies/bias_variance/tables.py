@@ -13,7 +13,7 @@ import pandas as pd
 from bench.errors import unknown
 from bench.experiment import axes
 from bench.experiment.axes import Axis
-from bench.experiment.columns import IDENTITY, Column, text
+from bench.experiment.columns import IDENTITY, Column, interval, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.parameters import number_problems
 from bench.experiment.views import Table
@@ -122,8 +122,8 @@ def _pivot(axis: Axis | None, problem: ProblemRows, apart: bool) -> Table:
             line |= {f"x{i}{end}": value for end, value in _pivot_cell(curve.at.get(x), others).items()}
         lines.append(line)
     columns = [
-        Column(
-            f"x{i}", label=axis_value(x) if axis is not None else "relative RMSE", low=f"x{i}_low", high=f"x{i}_high",
+        interval(
+            f"x{i}", label=axis_value(x) if axis is not None else "relative RMSE",
             emphasis=f"x{i}_best", note=f"x{i}_note",
         )
         for i, x in enumerate(values)
@@ -202,10 +202,7 @@ def ranking(methods: pd.DataFrame) -> Table:
     columns = [
         ESTIMATOR,
         *(Column(str(name), format="setting") for name in counts),
-        *(
-            Column(f"p{i}", label=problem, low=f"p{i}_low", high=f"p{i}_high", note=f"p{i}_note")
-            for i, problem in enumerate(problems)
-        ),
+        *(interval(f"p{i}", label=problem, note=f"p{i}_note") for i, problem in enumerate(problems)),
     ]
     notes = (
         f"Sorted by the worst case. Relative RMSE [95% interval] at equal {_basis(methods)}; where a problem was swept, the largest along "

@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 
 from bench.experiment.axes import Axis
-from bench.experiment.columns import Column, text
+from bench.experiment.columns import Column, interval, text
 from bench.experiment.views import Table
 from bench.measure.statistics import is_unexplained
 from bench.model import registry
@@ -253,7 +253,7 @@ def accuracy_table(best: pd.DataFrame) -> Table:
     columns = [
         text("problem"), Column("relative error", format="percent"), text("by"), text("fastest"), text("cost_text", label="cost"),
         Column("samples", format="setting"), text("how"), text("next"),
-        Column("factor", low="factor_low", high="factor_high", note="factor_note"), text("never"), text("unknown"),
+        interval("factor", note="factor_note"), text("never"), text("unknown"),
     ]  # fmt: skip
     return Table(
         "time_to_accuracy", best.assign(cost_text=costs, factor_note=limits(best)), columns,
@@ -266,13 +266,9 @@ def limits(table: pd.DataFrame) -> list[str]:
     """Return the words for each factor without a value: ``at least 2.4``, or ``not known`` where the limit is below 1."""
     factors = zip(table["factor"], table["factor_low"], table["factor_high"], strict=True)
     return [
-        "" if not _is_limit(factor, high) else f"at least {number(low)}" if low > 1.0 else "not known"
+        "" if not (math.isnan(factor) and high == math.inf) else f"at least {number(low)}" if low > 1.0 else "not known"
         for factor, low, high in factors
     ]
-
-
-def _is_limit(factor: float, high: float) -> bool:
-    return math.isnan(factor) and high == math.inf
 
 
 def comparisons(best: pd.DataFrame) -> pd.DataFrame:

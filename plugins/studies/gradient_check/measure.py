@@ -18,7 +18,7 @@ from bench.measure import noise
 from bench.measure.batches import in_columns
 from bench.measure.contacts import active_contacts, contact_names, engine_contacts
 from bench.measure.jumps import MissedSlope, jump_under_noise, missed_slope
-from bench.model import SURROGATE, ContactScene, EngineScene, ForceLaw, LoopOps, Problem, Rollout, Unsupported
+from bench.model import SURROGATE, ContactScene, EngineScene, ForceLaw, LoopOps, Problem, Rollout, Unsupported, registry
 
 from .. import norm
 from . import GradientCheck
@@ -36,18 +36,39 @@ NEUTRAL = 1e-9
 
 @dataclass(frozen=True)
 class Place:
-    """One directional derivative to check: ``theta (d,)``, unit ``direction (d,)``, noise ``w (n_w,)``, and their labels."""
+    """Where one directional derivative is checked: ``theta (d,)``, unit ``direction (d,)``, noise ``w (n_w,)``, and labels."""
 
     point: str
+    """One of :data:`bench.plugins.studies.gradient_check.points.POINTS`."""
     theta: np.ndarray
     direction: np.ndarray
     w: np.ndarray
     number: int
     """Number of the direction."""
-    sample: int
+    sample: int = 0
     """0 without noise, 1 with it."""
     switch: str = ""
     """The contact switch that the place is at, in words."""
+
+
+@dataclass(frozen=True)
+class Point:
+    """One checked directional derivative and its verdict."""
+
+    point: str
+    """One of :data:`bench.plugins.studies.gradient_check.points.POINTS`."""
+    noise: int
+    """0 without noise, 1 with it."""
+    number: int
+    """Number of the direction, or -1 - i for component i."""
+    verdict: str
+    sample: gradcheck.Sample
+    minus: Sequence[str]
+    """Contact modes on the minus side, one per step of the differences."""
+    plus: Sequence[str]
+    """Contact modes on the plus side."""
+    switch: str = ""
+    """The contact switch that it is at, in words."""
 
 
 def measure(cell: Cell, session: Session, search: GradientCheck) -> dict[str, Any]:
@@ -63,15 +84,9 @@ def measure(cell: Cell, session: Session, search: GradientCheck) -> dict[str, An
     missed = MissedSlope(0.0, at_jump) if jump.height else missed_slope(problem, theta, cell.seed, COLUMNS_AT_ONCE)
     under_noise = "jump" if jump.height else "missed_slope" if missed.share else ""
     at = at_jump if jump.height else missed.w
-    places, samples = examine(
-        problem, theta, drawn, directions, unit, search,
-        [Place("noise", theta, directions[0] / np.linalg.norm(directions[0]), at, 0, 1)] if under_noise else [],
-    )  # fmt: skip
-    checked = [_checked(place, *both, under_noise) for place, both in zip(places, samples, strict=True)]
-    points = [
-        *at_start(whole),
-        *(_settled(problem, point, place) for point, place in zip(checked, places, strict=True)),
-    ]
+    reached = [Place("noise", theta, directions[0] / np.linalg.norm(directions[0]), at, 0, 1)] if under_noise else []
+    found = examine(problem, theta, drawn, directions, unit, search, reached)
+    points = [*at_start(whole), *(_settled(problem, *each, under_noise) for each in found)]
     verdicts = [point.verdict for point in points]
     best = [gradcheck.best(point.sample) for point in points]
     errors = [float(point.sample.errors[i]) for point, i in zip(points, best, strict=True)]
@@ -127,26 +142,6 @@ PER_COMPONENT = ("program", "difference", "uncertainty", "step", "ratio", "left"
 """What is stored of each checked component."""
 PLAIN = ("smooth", "nonlinear", "zero", "mode_crossing")
 """Verdicts on theta0 that need no remark."""
-
-
-@dataclass(frozen=True)
-class Point:
-    """One checked directional derivative and its verdict."""
-
-    point: str
-    """One of :data:`bench.plugins.studies.gradient_check.points.POINTS`."""
-    noise: int
-    """0 without noise, 1 with it."""
-    number: int
-    """Number of the direction, or -1 - i for component i."""
-    verdict: str
-    sample: gradcheck.Sample
-    minus: Sequence[str]
-    """Contact modes on the minus side, one per step of the differences."""
-    plus: Sequence[str]
-    """Contact modes on the plus side."""
-    switch: str = ""
-    """The contact switch that it is at, in words."""
 
 
 def start(problem: Problem, theta: np.ndarray, unit: float, search: GradientCheck, seed: int) -> gradcheck.Check:
@@ -224,27 +219,23 @@ def _number(part: gradcheck.Part) -> int:
     return -1 - part.component if part.component is not None else int(part.name.rpartition(" ")[2])
 
 
-def _checked(place: Place, sample: gradcheck.Sample, sides: Sequence[tuple[str, str]], under_noise: str) -> Point:
-    minus, plus = zip(*sides, strict=True)
-    verdict = under_noise if place.point == "noise" else gradcheck.judge(sample).verdict
-    return Point(place.point, place.sample, place.number, verdict, sample, minus, plus, place.switch)
-
-
-def _settled(problem: Problem, point: Point, place: Place) -> Point:
-    """Return the point with the verdict from smaller steps or a complex step, if the usual steps leave it unsettled."""
+def _settled(problem: Problem, place: Place, point: Point, under_noise: str) -> Point:
+    """Return the point with its verdict under noise, or from smaller steps or a tangent if the usual steps leave it unsettled."""
+    if place.point == "noise":
+        return replace(point, verdict=under_noise)
     if point.verdict != "unsettled":
         return point
-    scale = scale_of(problem.program.theta0)
-
-    def cost(at: np.ndarray) -> np.ndarray:
-        both = np.concatenate([at, np.repeat(place.w[:, None], at.shape[1], axis=1)])
-        return in_columns(lambda part: problem.value(part[: len(at)], part[len(at) :]), both, COLUMNS_AT_ONCE)
-
+    scale, d = scale_of(problem.program.theta0), place.theta.size
     finding = gradcheck.settle(
-        cost, place.theta, scale * place.direction, scale, point.sample,
-        lambda theta, vector: tangent(problem, theta, vector, place.w),
+        _cost(problem, d), np.r_[place.theta, place.w], np.r_[scale * place.direction, 0.0 * place.w], scale, point.sample,
+        lambda at, vector: tangent(problem, at[:d], vector[:d], at[d:]),
     )  # fmt: skip
     return point if finding is None else replace(point, verdict=finding.verdict)
+
+
+def _cost(problem: Problem, d: int) -> Callable[[np.ndarray], np.ndarray]:
+    """Return the cost of columns of theta and noise, ``(d + n_w, B)`` to ``(B,)``, in batches of a fixed width."""
+    return lambda at: in_columns(lambda part: problem.value(part[:d], part[d:]), at, COLUMNS_AT_ONCE)
 
 
 def beyond_stability(cell: Cell) -> list[str]:
@@ -286,13 +277,12 @@ def examine(
     unit: float,
     search: GradientCheck,
     more: Sequence[Place] = (),
-) -> tuple[list[Place], list[tuple[gradcheck.Sample, list[tuple[str, str]]]]]:
+) -> list[tuple[Place, Point]]:
     """Check directional derivatives at ``theta (d,)``, without noise and with ``drawn (n_w,)``, and at contact switches.
 
     Derivatives at theta are along the first ``search.directions`` of ``directions (D, d)``. Switches are searched along
     all directions, without noise, and checked along the first ``search.directions`` that meet one. ``more`` places are
-    checked too. Returns the places and, for each place, its costs and the contact modes on both sides at every eps. ``unit`` is the unit roundoff of
-    the program's arithmetic. All costs are one batch, which is evaluated twice.
+    checked too. ``unit`` is the unit roundoff of the program's arithmetic. All costs are evaluated twice.
     """
     directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     modes = contact_modes(problem)
@@ -306,25 +296,21 @@ def examine(
         met = (boundary(modes, theta, direction, still, number, search) for number, direction in enumerate(directions))
         places += itertools.chain(*itertools.islice(filter(None, met), search.directions))
     places += more
-    scale, count = scale_of(theta), gradcheck.EPS.size
-    thetas = np.concatenate([gradcheck.points(p.theta, scale * p.direction[:, None], unit) for p in places], axis=1)
-    each = thetas.shape[1] // len(places)
-    noises = np.repeat(np.stack([p.w for p in places], axis=1), each, axis=1)
-    first, second = (problem.value(thetas, noises).reshape(len(places), -1) for _ in range(2))
-    gradients = problem.grad(np.stack([p.theta for p in places], axis=1), np.stack([p.w for p in places], axis=1))
-    signatures = [""] * thetas.shape[1] if modes is None else modes(thetas, noises)
-    names = np.array(signatures, dtype=object).reshape(len(places), -1)
-    minus, plus = names[:, :count], names[:, count : 2 * count]
-    samples = gradcheck.samples(
-        first,
-        np.full(len(places), scale),
-        np.array([place.direction @ gradients[:, i] for i, place in enumerate(places)]),
-        unit,
-        crossing=minus != plus,
-        repeatable=np.asarray(gradcheck.repeats(first, second, unit).all(axis=1)),
+    d, scale = theta.size, scale_of(theta)
+    thetas, along, noises = (
+        np.stack([getattr(p, name) for p in places], axis=1) for name in ("theta", "direction", "w")
     )
-    sides = [list(zip(*both, strict=True)) for both in zip(minus, plus, strict=True)]
-    return places, list(zip(samples, sides, strict=True))
+    slopes = [direction @ gradient for direction, gradient in zip(along.T, problem.grad(thetas, noises).T, strict=True)]
+    samples, minus, plus = gradcheck.sampled(
+        _cost(problem, d), np.concatenate([thetas, noises]), np.concatenate([scale * along, 0.0 * noises]),
+        np.full(len(places), scale), np.array(slopes), unit,
+        modes=None if modes is None else lambda at: modes(at[:d], at[d:]), twice=True,
+    )  # fmt: skip
+    points = [
+        Point(at.point, at.sample, at.number, gradcheck.judge(sample).verdict, sample, left, right, at.switch)
+        for at, sample, left, right in zip(places, samples, minus, plus, strict=True)
+    ]
+    return list(zip(places, points, strict=True))
 
 
 def boundary(
@@ -416,39 +402,22 @@ def contact_modes(problem: Problem) -> ContactModes | None:
     program = problem.program
     if not isinstance(program, Rollout) or not (program.scene.n_contacts or isinstance(program.scene, EngineScene)):
         return None
+    # engines and implicit steps need the backend; other programs are faster in NumPy
+    own = program.needs_root or "physics" in problem.provides
+    simulated = problem if own else registry.make("backends", "numpy").compile(program)
+
+    def touching(theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        theta = np.ascontiguousarray(np.broadcast_to(theta, (len(theta), w.shape[1])))
+        states, controls = simulated.trajectory(theta, w)
+        if isinstance(program.scene, EngineScene):
+            return engine_contacts(problem).touching(states[:-1])
+        return active_contacts(program, states, controls)
+
     try:
-        touching = _touching(problem)
         touching(program.theta0[:, None], np.zeros((program.n_noise, COLUMNS_AT_ONCE)))
         return ContactModes(touching, contact_names(problem))
     except Unsupported:
         return None
-
-
-def _touching(problem: Problem) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-    """Return the function of theta and noise that finds the active contacts, see :class:`ContactModes`."""
-    program = problem.program
-    assert isinstance(program, Rollout)
-    # engines and implicit steps need the backend; other programs are faster in NumPy
-    rollout = _backend_rollout if program.needs_root or "physics" in problem.provides else _numpy_rollout
-    if isinstance(program.scene, EngineScene):
-        contacts = engine_contacts(problem)
-        return lambda theta, w: contacts.touching(rollout(problem, theta, w)[0][:-1])
-    return lambda theta, w: active_contacts(program, *rollout(problem, theta, w))
-
-
-def _numpy_rollout(problem: Problem, theta: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return states ``(horizon + 1, n, B)`` and controls ``(horizon, n_u, B)`` of rollouts, computed in NumPy."""
-    theta = np.broadcast_to(theta, (theta.shape[0], w.shape[1]))
-    program = problem.program
-    assert isinstance(program, Rollout)
-    steps = list(program.steps(LoopOps(), theta, w))
-    return np.stack([np.concatenate(state) for state, _ in steps]), np.stack([u for _, u in steps[:-1]])
-
-
-def _backend_rollout(problem: Problem, theta: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the same states and controls as :func:`_numpy_rollout`, computed by the backend."""
-    theta = np.ascontiguousarray(np.broadcast_to(theta, (theta.shape[0], w.shape[1])))
-    return problem.trajectory(theta, w)
 
 
 def signature(contacts: np.ndarray) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 from scipy.special import stdtrit
 
-from bench.experiment.columns import COMMON, Column, text
+from bench.experiment.columns import COMMON, Column, interval, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Table, Views
 from bench.report.shown import Shown
@@ -27,8 +27,8 @@ PROBLEM = ("scene", "contact", "integrator", "backend")
 VERDICT = (
     text("problem"),
     text("verdict", "what the norms do along the horizon"),
-    Column("order", "order of the best power law", low="order_low", high="order_high"),
-    Column("rate", "rate of the best exponential", "1/s", low="rate_low", high="rate_high"),
+    interval("order", "order of the best power law"),
+    interval("rate", "rate of the best exponential", "1/s"),
     Column("odds", "likelihood of the exponential relative to the power law", label="exponential to power law"),
     text("lower", "the order whose variance is lower beyond doubt", label="lower variance"),
     Column("zeroth_from", "horizon from which on that is the zeroth order", "s", label="from", format="setting"),

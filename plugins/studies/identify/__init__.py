@@ -96,7 +96,7 @@ class Identify(StudyPackage):
         """Return theta without entries of the initial state, such as start.q0."""
         return replace(given, names=tuple(name for name in given.names if not name.startswith(START)))
 
-    def unsupported_reason(self, cell: Cell) -> str | None:
+    def refusal(self, cell: Cell) -> str | None:
         """Return why a cell cannot be fitted (no motion, no unknowns, no NumPy steps, sampling, unusable data), or None."""
         scene, optimizer = cell.scene, cell.parts["optimizer"]
         assert isinstance(optimizer, Optimizer)

@@ -83,8 +83,7 @@ class Model:
     def entries(self) -> list[str]:
         """The names of the entries of the state: q0, q1, v0, v1."""
         scene = self.program.scene
-        n_v = scene.n_q if scene.n_v is None else scene.n_v
-        return [f"q{i}" for i in range(scene.n_q)] + [f"v{i}" for i in range(n_v)]
+        return [f"q{i}" for i in range(scene.n_q)] + [f"v{i}" for i in range(scene.n_v)]
 
     @cached_property
     def unit(self) -> np.ndarray:

@@ -25,7 +25,7 @@ class SearchStudy(StudyPackage):
             return given | {"estimator": None}
         return given
 
-    def unsupported_reason(self, cell: Cell) -> str | None:
+    def refusal(self, cell: Cell) -> str | None:
         """Return what the optimizer needs and no part of the cell provides, or None."""
         optimizer, estimator = cell.parts["optimizer"], cell.parts["estimator"]
         assert isinstance(optimizer, Optimizer)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import time
+import timeit
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -214,12 +215,7 @@ def fastest(
 ) -> float:
     """Return the least time [s] of some calls after a first one that compiles."""
     function(theta, w)
-    times = []
-    for _ in range(calls):
-        started = time.perf_counter()
-        function(theta, w)
-        times.append(time.perf_counter() - started)
-    return min(times)
+    return min(timeit.repeat(lambda: function(theta, w), number=1, repeat=calls))
 
 
 # ---------------------------------------------------------------------------------------------- gradient quality

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from bench.experiment.axes import table
-from bench.experiment.columns import Column, text
+from bench.experiment.columns import Column, interval, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Style, Table, Views
 from bench.report.colours import estimator_colour, estimator_marker
@@ -23,18 +23,16 @@ from .aggregate import RunSet
 STEPS = 40
 """Number of points of a drawn curve."""
 METHOD, PROBLEM = text("method"), text("problem")
-REACHED = Column(
-    "reached", label="targets reached", format="percent", low="reached_low", high="reached_high", log=False
-)
-SCORE = Column("score", low="score_low", high="score_high", digits=3, log=False)
-BETTER = Column("improvement", label="beats fobg", low="improvement_low", high="improvement_high")
+REACHED = interval("reached", label="targets reached", format="percent", log=False)
+SCORE = interval("score", digits=3, log=False)
+BETTER = interval("improvement", label="beats fobg")
 PROFILE = Column("profile", log=False)
 MEDIAN = Column("median_score", label="median over tunings", log=False)
-RUNTIME = Column(
-    "art", label="average runtime", unit="rollouts", low="art_low", high="art_high", log=True,
+RUNTIME = interval(
+    "art", label="average runtime", unit="rollouts", log=True,
     doc="expected rollouts per target reached: all rollouts of all searches over the searches that reached it",
 )  # fmt: skip
-RATE = Column("rate", label="searches that reach it", low="rate_low", high="rate_high")
+RATE = interval("rate", label="searches that reach it")
 SPENT = Column("spent", label="rollouts", log=True)
 NOTE = (
     "targets reached: share of searches whose regret falls to 1/10, 1/100 and 1/1000 of the first, the mean over problems and "
@@ -47,7 +45,7 @@ NOTE = (
     "an estimator (dashed in charts) are context."
 )
 EFFECT = (
-    text("scene_class", label="class"), text("verdict"), Column("rho", low="rho_low", high="rho_high", log=False),
+    text("scene_class", label="class"), text("verdict"), interval("rho", log=False),
     Column("points", format="setting"), Column("chance", label="chance of a random order"),
 )  # fmt: skip
 EFFECT_NOTES = (

@@ -16,6 +16,7 @@ import numpy as np
 from bench.experiment.cell import Cell
 from bench.experiment.columns import Column, Columns, ComparisonRule, numbers
 from bench.experiment.session import Session
+from bench.gradient import sampled
 from bench.measure import noise, statistics
 from bench.model import Problem, Program
 
@@ -112,20 +113,19 @@ class DifferenceCheck:
 def difference_check(problem: Problem, steps: np.ndarray = STEPS) -> DifferenceCheck:
     """Compare the program's gradient with its best central difference over a sweep of step sizes, at w = 0.
 
-    Truncation errors and jumps dominate at large steps, rounding at small steps. All costs are one batch: one at theta,
-    and 2 d len(steps) for the differences.
+    Truncation errors and jumps dominate at large steps, rounding at small steps. All costs are one batch.
     """
-    theta = problem.program.theta0
-    shifts = (np.eye(theta.size)[:, None, :] * steps[:, None]).reshape(-1, theta.size).T
-    points = theta[:, None] + np.concatenate([np.zeros((theta.size, 1)), shifts, -shifts], axis=1)
-    costs = problem.value(points, np.zeros((problem.program.n_noise, points.shape[1])))
-    ahead, behind = costs[1:].reshape(2, theta.size, len(steps))
-    differences = (ahead - behind) / (2 * steps)
-    gradient = problem.grad(theta, np.zeros((problem.program.n_noise, 1)))[:, 0]
+    theta, n_noise = problem.program.theta0, problem.program.n_noise
+    gradient = problem.grad(theta, np.zeros((n_noise, 1)))[:, 0]
+    samples, *_ = sampled(
+        lambda at: problem.value(at, np.zeros((n_noise, at.shape[1]))), theta, np.eye(theta.size), np.ones(theta.size),
+        gradient, float(np.finfo(np.float64).eps), steps,
+    )  # fmt: skip
+    differences = np.array([sample.differences for sample in samples])
     errors = np.linalg.norm(differences - gradient[:, None], axis=0)
     # without the mask, np.argmin would return the index of a NaN
     best = int(np.argmin(np.where(np.isfinite(errors), errors, np.inf)))
-    return DifferenceCheck(float(costs[0]), gradient, differences[:, best], float(steps[best]))
+    return DifferenceCheck(samples[0].centre, gradient, differences[:, best], float(steps[best]))
 
 
 def _against_physics(program: Program, check: DifferenceCheck) -> dict[str, Any]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from bench.experiment.cell import Cell
-from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, text
+from bench.experiment.columns import Column, Columns, ComparisonRule, interval, numbers, text
 from bench.model import Trainer, param
 from bench.model.policy import PolicyScene
 from bench.model.trainer import LOGGED
@@ -24,8 +24,7 @@ class Train(StudyPackage):
     columns: ClassVar[Columns] = Columns.of(
         text("trainer", "identity string of the trainer"),
         Column("first_return", "mean return of the deterministic policy before the first update"),
-        Column("final_return", "mean return of the deterministic policy after the last update", low="final_return_low",
-               high="final_return_high", digits=3, log=False, comparison=ComparisonRule("interval", "final return", neutral=True)),
+        interval("final_return", "mean return of the deterministic policy after the last update", digits=3, log=False, comparison=ComparisonRule("interval", "final return", neutral=True)),
         Column("final_return_low", "lower end of its 95% interval over starts"),
         Column("final_return_high", "upper end of its 95% interval over starts"),
         Column("final_median", "median return over starts after the last update", digits=3, log=False),
@@ -39,8 +38,7 @@ class Train(StudyPackage):
         Column("gradient_peak", "largest norm of the actor's gradient over updates", label="largest gradient"),
         Column("window_gradient", "norm of the gradient of whole episodes that is cut into windows, each of which ends in the "
                "critic's value, halfway through the run"),
-        Column("window_bias", "bias of that gradient: its distance from the gradient without cuts, relative to the latter",
-               low="window_bias_low", high="window_bias_high", label="bias of the windows"),
+        interval("window_bias", "bias of that gradient: its distance from the gradient without cuts, relative to the latter", label="bias of the windows"),
         Column("window_bias_low", "lower end of its 95% interval over independent batches of rollouts"),
         Column("window_bias_high", "upper end of its 95% interval"),
         numbers("slope_errors", "relative error of the gradient along which an update moves, in a random direction in each array of the "
@@ -72,7 +70,7 @@ class Train(StudyPackage):
         250, "most entries of a stored log; an entry is the mean or largest value of its updates", low=10
     )
 
-    def unsupported_reason(self, cell: Cell) -> str | None:
+    def refusal(self, cell: Cell) -> str | None:
         """Return why a policy cannot be trained in a cell, or None."""
         if not isinstance(cell.parts["trainer"], Trainer):
             return "a trainer is needed: see `python -m bench list trainers`"

@@ -16,6 +16,7 @@ import optax
 from bench.experiment.cell import Cell
 from bench.experiment.session import Session
 from bench.measure import noise
+from bench.measure.performance import Z
 from bench.measure.statistics import Sampling, bias_interval
 from bench.model import Trainer
 from bench.model.trainer import LOGGED
@@ -27,8 +28,6 @@ from .verdicts import FINITE
 
 MEANS = frozenset({"loss", "reward", "value_loss", "cut", "used", "contacts", "step_length", "deviation"})
 """Quantities whose mean an entry of a stored log has; it has the largest value of the others, so that no peak is lost."""
-Z = 1.959963984540054
-"""The 0.975 quantile of the standard normal distribution."""
 LENGTHS = (1e-6, 1e-7, 1e-8)
 """Changes of parameters in central differences in float64, short enough for episodes with contact."""
 SETTLED = 0.01

@@ -89,7 +89,13 @@ def judge(run: Mapping[str, Any]) -> list[Verdict]:
     check(
         "opposed", len(cosines) >= MIN_CHECKS and mean_interval(cosines)[2] < 0, cosines.mean() if len(cosines) else 0.0
     )
-    _check_return(run, check)
+    mean, low, high = (np.asarray(run[f"curve_return{end}"], dtype=float) for end in ("", "_low", "_high"))
+    if np.isfinite(mean).any():
+        # the last return is far below the best one, whatever the loss does
+        best = int(np.nanargmax(mean))
+        lost = mean[best] - mean[-1]
+        is_lost = high[-1] < low[best] and lost > LOST * (mean[best] - mean[0])
+        check("falls", is_lost, lost, run["curve_update"][best])
     reward, depth = log["reward"], log["penetration"]
     if len(depth) >= 3 * tenth and tenth > 1 and depth[:tenth].mean() > 0:
         factor = depth[-tenth:].mean() / depth[:tenth].mean()
@@ -113,16 +119,6 @@ def _known(values: Any) -> np.ndarray:
     """Return the entries of a stored list that are not NaN."""
     numbers = series(values)
     return np.asarray(numbers[~np.isnan(numbers)])
-
-
-def _check_return(run: Mapping[str, Any], check: Any) -> None:
-    """Check that the last return is not far below the best one, whatever the loss does."""
-    mean, low, high = (np.asarray(run[f"curve_return{end}"], dtype=float) for end in ("", "_low", "_high"))
-    if not np.isfinite(mean).any():
-        return
-    best = int(np.nanargmax(mean))
-    lost, risen = mean[best] - mean[-1], mean[best] - mean[0]
-    check("falls", high[-1] < low[best] and lost > LOST * risen, lost, run["curve_update"][best])
 
 
 def _rises(run: Mapping[str, Any], since: float) -> bool:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pandas as pd
 
 from bench.experiment.axes import table
-from bench.experiment.columns import Column, text
+from bench.experiment.columns import Column, interval, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Table, Views
 
@@ -15,21 +15,19 @@ from . import aggregate
 from .verdicts import MEANINGS
 
 PROBLEM, METHOD, VERDICT = text("problem"), text("method", label="trainer"), text("verdict")
-FINAL = Column("final", label="final return", low="final_low", high="final_high", digits=3, log=False)
+FINAL = interval("final", label="final return", digits=3, log=False)
 SUMMARY = (
     PROBLEM, METHOD, FINAL, VERDICT, Column("worst", label="worst seed", digits=3), Column("seeds", format="setting"),
     Column("failed", label="not finite", format="setting"), Column("steps", unit="steps", label="control steps", digits=3),
     Column("used", label="used steps", digits=3),
-    Column("equal", label="at equal used steps", low="equal_low", high="equal_high", digits=3, log=False),
+    interval("equal", label="at equal used steps", digits=3, log=False),
     Column("train_s", label="training", format="seconds"), Column("compile_s", label="compilation", format="seconds"),
     Column("gradient_typical", label="gradient norm"), Column("gradient_peak", label="largest gradient"),
     Column("cosine", label="cosine"),
 )  # fmt: skip
 WINDOW = Column("window", label="window", unit="steps", format="setting")
 WINDOW_GRADIENT = Column("window_gradient", label="norm of the windows' gradient")
-WINDOW_BIAS = Column(
-    "window_bias", label="bias of the windows' gradient", low="window_bias_low", high="window_bias_high"
-)
+WINDOW_BIAS = interval("window_bias", label="bias of the windows' gradient")
 WINDOWS = (
     PROBLEM, text("family", label="trainer"), WINDOW,
     WINDOW_GRADIENT, replace(WINDOW_BIAS, label="its bias"),
@@ -43,7 +41,7 @@ FAULTS = (
     Column("update", format="setting"),
     Column("value"),
 )
-COST = Column("cost", label="cost of an episode", low="cost_low", high="cost_high")
+COST = interval("cost", label="cost of an episode")
 STEP, SECONDS = (
     Column("step", label="control steps", log=False),
     Column("seconds", label="training time [s]", log=False),

@@ -15,4 +15,3 @@ class Toy(EngineBackend):
 
     fault: str = param("", "no_contact, or what happens when Jacobians are computed: exit, loop, memory or raise")
     marker: str = param("", "file of a fault that happens once, in the third call; empty: it happens in each call")
-    counts: bool = param(False, "whether a number beside the state counts the steps, and pushes the mass upwards")

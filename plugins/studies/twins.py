@@ -7,17 +7,37 @@ for its own program. Times are for a batch of ``samples`` rollouts.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from bench.experiment.cell import Cell
 from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, text
+from bench.experiment.experiment import Experiment
 from bench.experiment.session import Session
+from bench.experiment.views import Chart, Mark, Views
 from bench.measure import timing
 from bench.model import Unsupported, param, rollout
 
-from .. import StudyPackage, finite_status, first_batch, gradient_seconds, norm, relative_error
+from . import StudyPackage, finite_status, first_batch, gradient_seconds, norm, relative_error
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+FLOOR = 1e-17
+"""Smallest difference that is drawn; smaller ones, 0 included, are drawn here as upper limits."""
+ROUNDING = 1e-6
+"""Relative difference above which a twin's states or gradient count as different. Accumulated rounding is smaller."""
+DIFFERENCES = ("gradient_difference_rel", "state_difference_rel", "cost_difference_rel")
+SHOWN = (
+    "state_difference", "state_difference_rel", "cost_difference_rel", "gradient_difference_rel", "gradient_cosine",
+    "value_s", "gradient_s", "compile_s",
+)  # fmt: skip
+NOTES = (
+    "Differences between the engine's twin and the scene's own program at theta without noise. Difference of states: the "
+    "largest over the rollout; relative: in units of the coordinate's largest value. Times are of one batch of `samples` "
+    "rollouts; compilation is of the gradient.",
+)
 
 
 @dataclass(frozen=True)
@@ -88,3 +108,19 @@ class Twins(StudyPackage):
             **gradient_seconds(twin, w, self.timed_calls),
             "trace_s": twin.usage.trace_s, "lower_s": twin.usage.lower_s,
         }  # fmt: skip
+
+    def show(self, experiment: Experiment, rows: pd.DataFrame) -> Views:
+        """Return the table with a line per scene and engine, and the chart of differences, the largest first."""
+        from bench.report.shown import Shown, floored
+
+        shown = Shown(experiment, rows)
+        own = [shown.column(name, digits=3) for name in SHOWN]
+        cells = shown.cells(own, "engines compared with the scenes' own programs", NOTES)
+        worst = shown.good.groupby("problem")["gradient_difference_rel"].transform("max")
+        frame = floored(shown.good.loc[worst.sort_values(ascending=False, kind="stable").index], FLOOR, DIFFERENCES)
+        chart = Chart(
+            "twins", frame, [shown.column(name, limit=f"{name}_limit", log=True) for name in DIFFERENCES],
+            [text("problem", label="")], "dots", series="method", marks=[Mark("rounding up to here", ROUNDING)], height=0.3,
+            text="One dot per problem and engine. Left of the dashed line a difference is accumulated rounding.",
+        )  # fmt: skip
+        return Views([cells], [chart])

@@ -3,18 +3,30 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from bench.experiment.cell import Cell
 from bench.experiment.columns import Column, Columns, ComparisonRule, numbers
+from bench.experiment.experiment import Experiment
 from bench.experiment.session import Session
+from bench.experiment.views import Chart, Mark, Views
 from bench.model import param
 from bench.model.parameters import values
 
-from .. import StudyPackage, finite_status, first_batch, gradient_seconds, norm, relative_error
+from . import StudyPackage, finite_status, first_batch, gradient_seconds, norm, relative_error
 
+if TYPE_CHECKING:
+    import pandas as pd
+
+FLOOR = 1e-16
+"""Smallest relative error that is drawn; smaller ones, 0 included, are drawn here as upper limits."""
+SHOWN = ("solver_residual", "gradient_error_rel", "gradient_cosine", "wrong_signs", "gradient_s", "compile_s")
+NOTES = (
+    "Gradients at theta without noise, compared with the gradient of the same program with a converged solver. The residual "
+    "of the solver is relative to the forces of a step. Times are of one batch of `samples` rollouts.",
+)
 ROUNDING = 1e-6
 """Share of the gradient's norm up to which a coordinate of the converged gradient has no sign."""
 
@@ -44,7 +56,7 @@ class Solver(StudyPackage):
     converged: int = param(100, "iterations of the program that counts as converged", positive=True)
     timed_calls: int = param(5, "calls timed", positive=True)
 
-    def unsupported_reason(self, cell: Cell) -> str | None:
+    def refusal(self, cell: Cell) -> str | None:
         """Return that the backend has no constraint solver whose iterations are a parameter, or None."""
         if "iterations" in values(cell.backend):
             return None
@@ -62,6 +74,22 @@ class Solver(StudyPackage):
             "gradient": gradient.tolist(), "converged_gradient": target.tolist(),
             **gradient_seconds(problem, w, self.timed_calls), **compare(gradient, target),
         }  # fmt: skip
+
+    def show(self, experiment: Experiment, rows: pd.DataFrame) -> Views:
+        """Return the table with a line per scene, engine and iterations, and the chart of errors."""
+        from bench.report.shown import Shown, floored
+
+        shown = Shown(experiment, rows)
+        own = [shown.column(name, digits=3) for name in SHOWN]
+        cells = shown.cells(own, "gradients along the iterations of the constraint solver", NOTES, ("scene", "backend"))
+        iterations = shown.column("iterations", label="iterations of the solver", log=True)
+        error = shown.column("gradient_error_rel", label="relative error", limit="gradient_error_rel_limit", log=True)
+        chart = Chart(
+            "solver", floored(shown.good, FLOOR, [error.name]), [iterations], [error], series="method", panel="problem",
+            marks=[Mark("as large as the gradient", 1.0, axis="y")],
+            text="The error is the distance from the gradient of the program with a converged solver.",
+        )  # fmt: skip
+        return Views([cells], [chart])
 
 
 def compare(gradient: np.ndarray, target: np.ndarray) -> dict[str, float]:
