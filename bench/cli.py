@@ -99,7 +99,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     except BrokenPipeError:
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115, the reader is closed, and writing at exit would fail
-        return 0
+        return 128 + signal.SIGPIPE
     except OSError as error:
         where = f"'{printable(error.filename)}': " if error.filename else ""
         print(f"bench: {where}{error.strerror or printable(error)}", file=sys.stderr)

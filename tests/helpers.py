@@ -18,6 +18,10 @@ from bench.experiment.grid import cells
 from bench.model import registry
 from bench.model.identity import parse_identity
 from bench.model.parameters import parameters
+from bench.report import writer
+from bench.report.finish import views_of
+from bench.report.web import document
+from bench.report.web.data import page_data
 from bench.run.tasks import blank_row
 
 NAMES = ("alpha_order", "finite_difference", "fobg", "inverse_variance", "randomized_smoothing", "reinforce")
@@ -251,3 +255,10 @@ class Springy(ContactScene):
         """Height squared."""
         return q[0] ** 2
 '''
+
+
+def page(made, rows, views=None):
+    """Return the page of an experiment's rows, with the drawings of its views."""
+    views = views_of(made, rows) if views is None else views
+    data = page_data(made, rows, views, [["a=1"]] * len(rows))
+    return "".join(document.blocks(made.name, made.question, views, data, writer.drawings(made, views)))

@@ -1,6 +1,7 @@
 """A command that judges says its verdict, or its status is 3: code that ends the process does not answer for it."""
 
 import json
+import os
 import re
 import signal
 import subprocess
@@ -241,3 +242,15 @@ def test_a_file_named_like_a_library_is_loaded_beside_it(tmp_path):
     assert load_module(str(tmp_path / "json.py")).OWN == 1
     assert json.dumps([1]) == "[1]"
     assert sys.modules["json"] is json
+
+
+def test_a_verdict_that_nobody_read_is_no_zero(tmp_path):
+    """``examine ... | head -1`` under ``pipefail``: the wrong gradient ended with 0."""
+    (tmp_path / "c.py").write_text(COST.format(end="pass"))
+    command = [sys.executable, "-m", "bench", "examine", "c.py:cost", "grad=c.py:grad"]
+    reading, writing = os.pipe()
+    os.close(reading)
+    try:
+        assert subprocess.run(command, cwd=tmp_path, stdout=writing, stderr=subprocess.DEVNULL).returncode == 141
+    finally:
+        os.close(writing)

@@ -92,7 +92,7 @@ def _page(table: pd.DataFrame) -> str:
     return "\n".join([
         "# Conformance of physics engines", "",
         *_markdown(["engine", "versions", "right", "not right", "seconds", "command"], engines), "",
-        "The fewest digits of a case's derivatives. own: compared with the engine's own differences.", "",
+        "The fewest digits of a case's derivatives. own: compared with the engine's own differences. -: not run. ?: cannot tell.", "",
         *_markdown(["case", *columns], cases), "", *notes, "",
     ])  # fmt: skip
 
@@ -105,8 +105,10 @@ def _cell(rows: pd.DataFrame) -> str:
     """Return the fewest digits of a case's terms, which terms are wrong, and the faults that they look like."""
     judged = rows[rows["is_right"] != ""]
     digits = judged["digits"][judged["digits"] != ""]
+    if judged.empty:
+        return "?" if (rows["digits"] != "").any() else "-"
     if digits.empty:
-        return "-" if judged.empty else "error"
+        return "error"
     wrong = judged[judged["is_right"] == False]  # noqa: E712
     faults = sorted({*wrong["looks_like"]} - {""})
     words = [f"{digits.min():.1f}", "own" if "own differences" in {*judged["against"]} else ""]

@@ -259,11 +259,6 @@ def from_settings(config: Mapping[str, Any]) -> Experiment:
     extra = set(config) - _known_keys()
     if extra:
         raise unknown("setting", sorted(extra)[0], _known_keys(), "--help")
-    name = "" if config["name"] is None else str(config["name"])
-    if not SAFE_NAME.fullmatch(name) or ".." in name:
-        raise UserError(f"name={name!r} must consist of letters, digits, '.', '_' and '-', since it names a folder")
-    if name in RESERVED:
-        raise UserError(f"name={name} is reserved for a folder of results_dir that is not an experiment")
     for folder in _as_list(config["plugins"]):
         registry.add_folder(Path(str(folder)))
     study = _study(config["study"])
@@ -271,14 +266,6 @@ def from_settings(config: Mapping[str, Any]) -> Experiment:
     choices = {
         axis: [_choice(kind, item) for item in _at_least_one(config, kind, study)] for axis, kind in axes.items()
     }
-    values = {axis: _mapping(config, axis) for axis in axes}
-    for axis, kind in axes.items():
-        for plugin, given in values[axis].items():
-            entry = registry.find(kind, plugin)
-            if not isinstance(given, Mapping):
-                raise UserError(f"{axis}.{plugin}={given!r} names no parameter: write {axis}.{plugin}.parameter=value")
-            if entry.plugin is not None:
-                build(entry.plugin, given)
     if config["reference"] is None:
         raise UserError(
             "reference=null: the study decides whether there is one; reference.samples=... limits its samples"
@@ -286,13 +273,13 @@ def from_settings(config: Mapping[str, Any]) -> Experiment:
     timing, sweep = config["timing"], _mapping(config, "sweep")
     refuse_too_many(sweep)
     return Experiment(
-        name=name,
+        name=_name(config),
         study=study,
         columns=study.columns,
         timing=study.timed if timing is None else coerce(bool, timing, "timing"),
         execution=_execution(config),
         choices=choices,
-        values=values,
+        values={axis: _values(config, axis, kind) for axis, kind in axes.items()},
         sweep=sweep,
         decision=_decision(config),
         results_dir=_folder(config["results_dir"]),
@@ -306,6 +293,27 @@ def from_settings(config: Mapping[str, Any]) -> Experiment:
         plugins=registry.folders(),
         **{key: _count(config, key) for key in COUNTS},
     )
+
+
+def _name(config: Mapping[str, Any]) -> str:
+    name = "" if config["name"] is None else str(config["name"])
+    if not SAFE_NAME.fullmatch(name) or ".." in name:
+        raise UserError(f"name={name!r} must consist of letters, digits, '.', '_' and '-', since it names a folder")
+    if name in RESERVED:
+        raise UserError(f"name={name} is reserved for a folder of results_dir that is not an experiment")
+    return name
+
+
+def _values(config: Mapping[str, Any], axis: str, kind: str) -> dict[str, Any]:
+    """Return the parameters set for the plugins of an axis, by plugin; raises :class:`UserError` if one is invalid."""
+    values = _mapping(config, axis)
+    for plugin, given in values.items():
+        entry = registry.find(kind, plugin)
+        if not isinstance(given, Mapping):
+            raise UserError(f"{axis}.{plugin}={given!r} names no parameter: write {axis}.{plugin}.parameter=value")
+        if entry.plugin is not None:
+            build(entry.plugin, given)
+    return values
 
 
 def _count(config: Mapping[str, Any], key: str) -> Any:

@@ -10,7 +10,7 @@ RULES = verdicts.RULES | {
     "raised": Rule("fault", "the gradient could not be computed"),
     "rough": Rule(
         "fault", "the cost changes as much between neighbouring thetas as over a wide step",
-        "look for a seed or hash taken from theta, or chaos",
+        "look for a seed or hash taken from theta",
     ),
     "overwritten": Rule(
         "fault", "memory is overwritten between forward and backward, or a term acts only later",

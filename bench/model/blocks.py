@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
@@ -93,28 +92,10 @@ def evaluate(
 
 
 def _run_blocks(block: Callable[[int], None], starts: Sequence[int], threads: int) -> None:
-    """Call ``block`` with each start, in this thread and in ``threads - 1`` others."""
-    queue = deque(starts)
-
-    def work() -> None:
-        while queue:
-            try:
-                start = queue.popleft()
-            except IndexError:  # another thread has taken the last block
-                return
-            block(start)
-
-    helpers = min(threads, len(starts)) - 1
+    """Call ``block`` with each start, in this thread or in ``threads`` others."""
     # one pool per process: a forked child inherits the pool but not its threads
-    futures = [_pool(threads - 1, os.getpid()).submit(work) for _ in range(helpers)] if helpers > 0 else []
-    try:
-        work()
-    finally:
-        queue.clear()
-        # a task that has not started can be cancelled: the queue is empty
-        errors = [future.exception() for future in futures if not future.cancel()]
-    for error in filter(None, errors):
-        raise error
+    run = _pool(threads, os.getpid()).map if threads > 1 else map
+    list(run(block, starts))
 
 
 def _pad(part: np.ndarray, columns: int) -> np.ndarray:

@@ -42,7 +42,7 @@ class Scene(Plugin):
 
     def __init_subclass__(cls, **arguments: Any) -> None:
         super().__init_subclass__(**arguments)
-        if "theta_names" in vars(cls):
+        if "theta_names" in vars(cls) and "theta0" not in vars(cls):
             cls.theta0 = _named_theta  # type: ignore[assignment, method-assign]
 
     @abstractmethod

@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import wraps
 from typing import Any
 
 import numpy as np
 
-from bench.model import Array, Ops, Problem, Program, Rollout, adjoint, adjoint_gradient, param, slopes
+from bench.model import Ops, Problem, Program, Rollout, adjoint, adjoint_gradient, param, slopes
 
 from .jax import Jax, JaxOps, JaxProblem, loop, use_double_precision
 
@@ -81,19 +80,10 @@ class _CheckpointedProblem(JaxProblem):
 
     def __init__(self, program: Program, backend: Checkpointed) -> None:
         super().__init__(program, backend.ops(), backend.dtype, backend.mode)
-        self._keep, self._levels = backend.keep, backend.levels
+        self.variant = (backend.keep, backend.levels)
 
     def _grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        if self._keep != "jacobians":
+        if self.variant[0] != "jacobians":
             return super()._grad(theta, w)
         shared = theta[:, 0] if theta.shape[1] == 1 else theta
         return np.asarray(adjoint_gradient(self, slopes(self, shared, w)))
-
-    def _run(self, function: Callable[..., Any], theta: np.ndarray, w: np.ndarray) -> Any:
-        @wraps(function)
-        def named(*arguments: Array) -> Any:
-            return function(*arguments)
-
-        # executables are shared by the name of their function
-        named.__name__ = f"{function.__name__}_{self._keep}_{self._levels}"
-        return super()._run(named, theta, w)

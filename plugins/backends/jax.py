@@ -125,6 +125,8 @@ class JaxProblem(Problem):
     """
 
     grain = 128
+    variant: Any = None
+    """What else distinguishes the executables of a subclass."""
 
     def __init__(self, program: Program, ops: Ops, dtype: str, mode: str) -> None:
         import jax
@@ -210,7 +212,8 @@ class JaxProblem(Problem):
 
         args = (self._parameters, theta.astype(self._dtype, copy=False), w.astype(self._dtype, copy=False))
         solver = type(self._ops) if self.program.needs_root else None
-        key = (solver, self.program.structure, function.__name__, self._mode, self._dtype, theta.shape, w.shape)
+        what = (solver, self.variant, function.__name__, self._mode, self._dtype)
+        key = (*what, self.program.structure, theta.shape, w.shape)
         executable = compiled(key, function, args, self._measured, self.compilations)
         if key not in self._charged:
             self._charged.add(key)

@@ -27,7 +27,7 @@ from bench.model import (
 )
 
 from .. import mjcf
-from .numpy import NumpyOps, NumpyProblem
+from .numpy import NumpyProblem
 from .torch import TorchOps
 
 SHORTER = 0.03
@@ -91,7 +91,7 @@ class MujocoProblem(NumpyProblem):
 
     def _value(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         states, _ = self._rollout(theta, w)
-        return np.asarray(Recorded(self._rolled, states).cost(NumpyOps(), theta, w))
+        return np.asarray(Recorded(self._rolled, states).cost(self._ops, theta, w))
 
     def _grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         if self._backend.gradient == "rollouts":
@@ -124,12 +124,11 @@ class MujocoProblem(NumpyProblem):
 
     def _rollout(self, theta: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return states ``(horizon + 1, n, B)`` and controls ``(horizon, n_u, B)``; NaN after the engine has stopped."""
-        ops = NumpyOps()
-        moved, state, scanned = self._rolled.start(ops, theta, w)
+        moved, state, scanned = self._rolled.start(self._ops, theta, w)
         horizon = self._rolled.scene.horizon
 
         def control(t: int) -> np.ndarray:
-            return np.asarray(self._rolled.control(ops, moved, state, tuple(x[t] for x in scanned)))
+            return np.asarray(self._rolled.control(self._ops, moved, state, tuple(x[t] for x in scanned)))
 
         if self._open_loop:
             controls = np.stack([control(t) for t in range(horizon)])

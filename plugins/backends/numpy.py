@@ -27,15 +27,6 @@ class Numpy(Backend):
         return NumpyProblem(program, self.dtype, step)
 
 
-class NumpyOps(LoopOps):
-    """Operations of NumPy with a Python loop and without ``root``."""
-
-    def __init__(self) -> None:
-        import array_api_compat.numpy
-
-        super().__init__(array_api_compat.numpy)
-
-
 class NumpyProblem(Problem):
     """A program run by NumPy."""
 
@@ -43,7 +34,7 @@ class NumpyProblem(Problem):
 
     def __init__(self, program: Program, dtype: str, step: float) -> None:
         super().__init__(program)
-        self._ops, self._dtype, self._step = NumpyOps(), np.dtype(dtype), step
+        self._ops, self._dtype, self._step = LoopOps(), np.dtype(dtype), step
         self._bound = program.bind([self._dtype.type(p) for p in program.parameters()])
 
     def _value(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:

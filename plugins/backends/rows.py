@@ -12,17 +12,12 @@ from typing import Any
 
 from bench.model import Array
 
+from ..fused.graph import FOLD
 from ..fused.trace import interpret
 
 MAX_ROWS = 16
 """Maximum number of rows of arrays that are split."""
-ELEMENTWISE = {
-    "abs", "acos", "acosh", "add", "and", "asin", "asinh", "atan", "atan2", "atanh", "cbrt", "ceil",
-    "convert_element_type", "cos", "cosh", "div", "eq", "erf", "exp", "exp2", "expm1", "floor", "ge", "gt",
-    "integer_pow", "is_finite", "le", "log", "log1p", "logistic", "lt", "max", "min", "mul", "ne", "neg", "not",
-    "or", "pow", "rem", "round", "rsqrt", "select_n", "sign", "sin", "sinh", "sqrt", "square", "sub", "tan",
-    "tanh", "xor",
-}  # fmt: skip
+ELEMENTWISE = FOLD.keys() - {"stop_gradient"} | {"cbrt", "convert_element_type", "exp2", "integer_pow", "round"}
 """Primitives that compute each element only from the elements at the same position."""
 
 

@@ -20,7 +20,7 @@ class Model:
         axes = [ti.Vector(list(np.array(body["axis"]) / np.linalg.norm(body["axis"]))) for body in bodies]
         centres = [ti.Vector(body["centre"]) for body in bodies]
         radii = [body["radius"] for body in bodies]
-        pairs = [contact["bodies"] for contact in program["contacts"]]
+        pairs = [sorted(contact["bodies"]) for contact in program["contacts"]]  # the ground, -1, comes first
         up = ti.Vector([0.0, 0.0, 1.0])
 
         @ti.kernel
@@ -34,9 +34,6 @@ class Model:
                     if ti.static(i < 0):
                         gap = (centres[j] + axes[j] * x[j, c]).dot(up) - radii[j]
                         force[j] += stiffness * ti.max(-gap, 0.0) * axes[j].dot(up)
-                    elif ti.static(j < 0):
-                        gap = (centres[i] + axes[i] * x[i, c]).dot(up) - radii[i]
-                        force[i] += stiffness * ti.max(-gap, 0.0) * axes[i].dot(up)
                     else:
                         away = centres[j] + axes[j] * x[j, c] - centres[i] - axes[i] * x[i, c]
                         normal = away / away.norm()

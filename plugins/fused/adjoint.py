@@ -8,23 +8,19 @@ from typing import Any
 
 import numpy as np
 
-from .graph import Graph, Node, Refused, reached
-from .trace import Tracer
+from .graph import Graph, Node, reached
+from .trace import LOGICAL, Tracer
 
 
 @cache
-def _rule(op: str, data: Any, count: int, which: int) -> Any:
+def _rule(op: str, count: int, which: int) -> Any:
     """Return JAX's pullback of an operation to argument number ``which``, as a jaxpr of (arguments, cotangent)."""
     import jax
     from jax import lax
 
     def function(*args: Any) -> Any:
-        if op == "integer_pow":
-            return lax.integer_pow(args[0], data)
         if op == "select_n":
             return lax.select_n(args[0] > 0.5, *args[1:])
-        if op not in SMOOTH:
-            raise Refused(f"the derivative of {op}")
         return getattr(lax, op)(*args)
 
     def pulled(*args: Any) -> Any:
@@ -39,15 +35,7 @@ def _rule(op: str, data: Any, count: int, which: int) -> Any:
     return jax.make_jaxpr(pulled)(*[shape] * (count + 1))
 
 
-SMOOTH = frozenset({
-    "abs", "acos", "acosh", "add", "asin", "asinh", "atan", "atan2", "atanh", "cos", "cosh", "div", "erf", "exp",
-    "expm1", "log", "log1p", "logistic", "max", "min", "mul", "neg", "pow", "rem", "rsqrt", "sin", "sinh", "sqrt",
-    "stop_gradient", "sub", "tan", "tanh",
-})  # fmt: skip
-"""Operations that JAX differentiates, under their names in jax.lax."""
-FLAT = frozenset({
-    "and", "ceil", "eq", "floor", "ge", "gt", "is_finite", "le", "lt", "ne", "not", "or", "sign", "stop_gradient", "xor",
-})  # fmt: skip
+FLAT = LOGICAL | {"ceil", "floor", "sign", "stop_gradient"}
 """Operations whose derivative is 0 wherever it exists."""
 
 
@@ -93,7 +81,7 @@ def pullback(graph: Graph, seeds: list[tuple[Node, Node]], wanted: Callable[[Nod
 
 def _pulled(graph: Graph, node: Node, which: int, cotangent: Node) -> Node:
     """Return the cotangent of argument number ``which`` of a node."""
-    closed = _rule(node.op, node.data, len(node.args), which)
+    closed = _rule(node.op, len(node.args), which)
     tracer = Tracer(graph, condition=node.args[0] if node.op == "select_n" else None)
     (found,) = tracer.run(closed.jaxpr, closed.consts, [np.array(arg, dtype=object) for arg in (*node.args, cotangent)])
     return tracer.nodes(found)[0]

@@ -40,7 +40,11 @@ def kernel(parameter, constant, index, horizon, theta, theta_row, theta_column, 
     """Fill columns start to stop of ``out``; return whether all angles were small enough for fast sine and cosine, and
     whether all slopes are below ``BEYOND``."""
 '''
-ARGUMENTS = ("theta", "scored", "noise")
+LOOKUPS = {"theta@", "scored@", "noise@"}
+TIMED = LOOKUPS | {"table", "carry", "adjoint"}
+"""Leaves that differ between steps."""
+WIDE = LOOKUPS | {"theta", "scored", "noise", "carry", "final", "adjoint", "total", "before"}
+"""Leaves that differ between lanes."""
 
 
 def source(loop: Loop, dtype: str, wrt: str | None, rows: int, title: str, cache: bool) -> str:
@@ -59,6 +63,13 @@ class _Code:
         self.lines.append("    " * depth + text)
 
 
+def _depends(known: dict[int, bool], leaves: set[str], node: Node) -> bool:
+    """Return whether a node depends on leaves of these kinds; ``known`` holds the answers so far by number."""
+    if node.number not in known:
+        known[node.number] = node.op in leaves or any(_depends(known, leaves, arg) for arg in node.args)
+    return known[node.number]
+
+
 class _Kernel:
     """Generates the body of a kernel, statement by statement."""
 
@@ -75,17 +86,11 @@ class _Kernel:
 
     def is_wide(self, node: Node) -> bool:
         """Return whether a node's value differs between lanes."""
-        if node.number not in self.wide:
-            leaves = (*ARGUMENTS, *(f"{name}@" for name in ARGUMENTS), "carry", "final", "adjoint", "total", "before")
-            self.wide[node.number] = node.op in leaves or any(self.is_wide(arg) for arg in node.args)
-        return self.wide[node.number]
+        return _depends(self.wide, WIDE, node)
 
     def is_timed(self, node: Node) -> bool:
         """Return whether a node's value differs between steps."""
-        if node.number not in self.timed:
-            leaves = ("table", "carry", "adjoint", *(f"{name}@" for name in ARGUMENTS))
-            self.timed[node.number] = node.op in leaves or any(self.is_timed(arg) for arg in node.args)
-        return self.timed[node.number]
+        return _depends(self.timed, TIMED, node)
 
     def text(self, dtype: str, title: str, cache: bool) -> str:
         """Return the source of the module."""
@@ -419,7 +424,7 @@ class _Kernel:
                 return f"{node.op}[at({node.data} * {node.op}_row + {node.op}_at + l)]"
             case "noise":
                 return f"noise[at({node.data} * noise_row + b + l)]"
-            case "theta@" | "scored@" | "noise@":
+            case op if op in LOOKUPS:
                 return f"{node.op[:-1]}[at({node.op[:-1]}{node.data} + l)]"
             case "div" if node.args[1].number in getattr(self, "reciprocals", {}):
                 return f"{args[0]} * {self.reciprocals[node.args[1].number]}"

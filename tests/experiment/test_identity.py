@@ -111,26 +111,21 @@ def test_other_versions_are_reported_and_rerun_when_asked(tmp_path, capsys, monk
     assert "2 stored, 0 to run" in capsys.readouterr().out
 
 
-def test_failed_rows_stay_until_they_are_retried(tmp_path, capsys):
+def test_failed_rows_run_when_they_are_retried_and_unavailable_ones_once_they_can(tmp_path, capsys):
     words = [*TINY, "estimators=[fobg,inverse_variance]", "samples=1", f"results_dir={tmp_path}"]
+    store = Store(tmp_path / "tiny", COLUMNS)
+
+    def planned(*more):
+        capsys.readouterr()
+        assert main(["plan", *words, *more]) == 0
+        return capsys.readouterr().out
+
     assert main(words) == 1
-    capsys.readouterr()
-    assert main(["plan", *words]) == 0
-    assert "2 stored, 0 to run" in capsys.readouterr().out
-    assert main(["plan", *words, "retry=[error]"]) == 0
-    assert "1 stored, 1 to run" in capsys.readouterr().out
-
-
-def test_what_was_unavailable_runs_once_it_is_installed(tmp_path, capsys):
-    words = [*TINY, f"results_dir={tmp_path}"]
-    assert main(words) == 0
-    rows = Store(tmp_path / "tiny", COLUMNS).load().iloc[0].to_dict()
-    Store(tmp_path / "tiny", COLUMNS).append(
-        {k: v for k, v in rows.items() if k not in COLUMNS.of_kind("list")} | {"status": "unavailable"}
-    )
-    capsys.readouterr()
-    assert main(["plan", *words]) == 0
-    assert "1 stored, 1 to run" in capsys.readouterr().out
+    assert "2 stored, 0 to run" in planned()
+    assert "1 stored, 1 to run" in planned("retry=[error]")
+    ok = store.load().query("status == 'ok'").iloc[0].drop(COLUMNS.of_kind("list")).to_dict()
+    store.append(ok | {"status": "unavailable"})
+    assert "1 stored, 1 to run" in planned()
 
 
 # ------------------------------------------------------------------------------------------ experiments that join

@@ -3,16 +3,14 @@
 import re
 
 import pytest
-from helpers import experiment, row, small_rows, table
+from helpers import experiment, page, row, small_rows, table
 
 from bench.claims import page as claims_page
 from bench.claims.claim import NOT_REPRODUCED, REPRODUCED, Claim, Figure
 from bench.claims.results import ClaimResult
 from bench.model import registry
-from bench.report import index, writer
-from bench.report.finish import views_of
-from bench.report.web import document, shell
-from bench.report.web.data import page_data
+from bench.report import index
+from bench.report.web import shell
 
 TEXT, MARK = 4.5, 3.0
 """Contrasts that WCAG 2.2 asks for at level AA: of text, and of marks such as points and lines."""
@@ -43,15 +41,6 @@ RESULTS = [
 ]
 
 
-def assembled(made, rows):
-    """The page of rows with its drawings."""
-    views = views_of(made, rows)
-    drawn = writer.drawings(made, views)
-    return "".join(
-        document.blocks(made.name, made.question, views, page_data(made, rows, views, [["a=1"]] * len(rows)), drawn)
-    )
-
-
 @pytest.fixture(scope="module")
 def pages(tmp_path_factory):
     """The path of a page of each kind."""
@@ -61,7 +50,7 @@ def pages(tmp_path_factory):
     study.parent.mkdir()
     rows = small_rows()
     rows.to_parquet(study.parent / "rows.parquet")
-    study.write_text(assembled(made, rows))
+    study.write_text(page(made, rows))
     (folder / "claims").mkdir()
     claims_page.write(folder / "claims", RESULTS)
     paths = (study, index.write(folder), folder / "claims" / "claims.html")
@@ -130,7 +119,7 @@ def test_charts_have_the_contrast_of_level_aa(dark, browser, tmp_path):
     ]  # fmt: skip
     made = experiment(sweep={"stiffness": [1.0, 10.0]}, marks={"stiffness": {"limit": 5.0}})
     path = tmp_path / "report.html"
-    path.write_text(assembled(made, table(rows)))
+    path.write_text(page(made, table(rows)))
     browser.size(1280, 4000, dark)
     browser.open(path)
     ground = browser.do("getComputedStyle(document.body).backgroundColor")

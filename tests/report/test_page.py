@@ -8,6 +8,7 @@ import shlex
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
+import helpers
 import numpy as np
 import pandas as pd
 import pytest
@@ -19,11 +20,10 @@ from bench.experiment.columns import Column, Columns
 from bench.experiment.study import Study
 from bench.experiment.views import Chart, Views
 from bench.model import registry
-from bench.report import writer
 from bench.report.finish import views_of
 from bench.report.style import width_in_inches
-from bench.report.web import document, shell
-from bench.report.web.data import encode, page_data
+from bench.report.web import shell
+from bench.report.web.data import encode
 from bench.run.store import Store
 
 HOSTILE = (
@@ -40,13 +40,7 @@ def page(rows, study=None, **given):
     made = experiment(**given)
     if study is not None:
         made = replace(made, study=study, columns=study.columns)
-    return assembled(made, rows, views_of(made, rows))
-
-
-def assembled(made, rows, views, drawn=()):
-    return "".join(
-        document.blocks(made.name, made.question, views, page_data(made, rows, views, [["a=1"]] * len(rows)), drawn)
-    )
+    return helpers.page(made, rows, replace(views_of(made, rows), charts=[]))
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +49,7 @@ def text():
     made, rows = experiment(), small_rows()
     along = views_of(made, stiffness_rows()).charts[0]
     shown = replace(views_of(made, rows), charts=[along, replace(along, name="other")])
-    return assembled(made, rows, shown, writer.drawings(made, shown))
+    return helpers.page(made, rows, shown)
 
 
 def data_of(text):
@@ -232,7 +226,7 @@ def test_20000_cells_open_within_three_seconds_of_processor_time_and_are_saved_a
     rows = stiffness_rows()
     rows = pd.concat([rows] * -(-20_000 // len(rows)), ignore_index=True)
     path = tmp_path / "report.html"
-    path.write_text(assembled(experiment(), rows, Views()))
+    path.write_text(helpers.page(experiment(), rows, Views()))
     session = browser.page.context.new_cdp_session(browser.page)
     session.send("Performance.enable", {"timeDomain": "threadTicks"})
     browser.size(1280, 900)
@@ -370,7 +364,7 @@ def test_hostile_names_are_shown_as_they_are_and_do_nothing(browser, tmp_path):
     frame = pd.DataFrame({"x": [1.0, 2.0, 3.0] * len(HOSTILE), "name": sorted(HOSTILE * 3)})
     chart = Chart("hostile", frame, [Column("x")], [Column("x")], series="name", panel="name", text=HOSTILE[1])
     views = replace(views_of(made, every), charts=[chart])
-    path.write_text(assembled(made, every, views, writer.drawings(made, views)))
+    path.write_text(helpers.page(made, every, views))
     browser.open(path)
     browser.do("select(page.count - 1)")
     assert browser.do("window.hacked === undefined")

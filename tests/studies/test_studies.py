@@ -159,28 +159,25 @@ def mapped(*words):
     return given, rows.assign(verdict="ok", truth="physical", growth_factor=1.0)
 
 
-def test_maps_are_apart_by_parameters_and_their_titles_say_defaults():
-    given, rows = mapped(
-        "scenes=[mass_spring]", "sweep.stiffness=[10,100]", "sweep.zip.dt=[0.1,0.05]", "sweep.zip.horizon=[10,20]",
-        "sweep.mass_spring.damping=[0,1,10]",
-    )  # fmt: skip
+@pytest.mark.parametrize(
+    ("words", "maps"),
+    [
+        (["scenes=[mass_spring]", "sweep.zip.dt=[0.1,0.05]", "sweep.zip.horizon=[10,20]", "sweep.mass_spring.damping=[0,1]"],
+         ["mass_spring, damping=0", "mass_spring, damping=1"]),
+        # a swept number that equals a stiffness
+        (["scenes=[mass_spring]", "sweep.mass_spring.damping=[10,100]"], ["mass_spring, damping=10", "mass_spring, damping=100"]),
+        # sigma has a column of its own, and so is in no identity string
+        (["scenes=['mass_spring[sigma=0.1]','mass_spring[sigma=0.2]']"], ["mass_spring, sigma=0.1", "mass_spring, sigma=0.2"]),
+    ],
+)  # fmt: skip
+def test_maps_are_apart_by_parameters(words, maps):
+    given, rows = mapped("sweep.stiffness=[10,100]", *words)
+    cells = cells_of(given, rows)
+    assert list(dict.fromkeys(cells["problem"])) == maps
+    for _, part in cells.groupby(["problem", "dt"]):
+        assert sorted(part["stiffness"]) == [10.0, 100.0]
     [first] = given.study.views(given, rows).charts
-    assert dict(cells_of(given, rows)["problem"].value_counts()) == {f"mass_spring, damping={d}": 4 for d in (0, 1, 10)}
-    assert list(first.frame["problem"]) == ["mass_spring, damping=0"] * 4
-
-
-def test_maps_of_scenes_that_no_label_tells_apart_are_apart():
-    """sigma has a column of its own, and so is in no identity string."""
-    given, rows = mapped("scenes=['mass_spring[sigma=0.1]','mass_spring[sigma=0.2]']", "sweep.stiffness=[10,100]")
-    assert rows["scene"].nunique() == 1
-    every = cells_of(given, rows)
-    assert list(dict.fromkeys(every["problem"])) == ["mass_spring, sigma=0.1", "mass_spring, sigma=0.2"]
-
-
-def test_a_stiffness_that_equals_another_swept_number_stays_on_its_map():
-    given, rows = mapped("scenes=[mass_spring]", "sweep.stiffness=[10,100]", "sweep.mass_spring.damping=[10,100]")
-    for _, part in cells_of(given, rows).groupby("problem"):
-        assert list(part["stiffness"]) == [10.0, 100.0]
+    assert set(first.frame["problem"]) == {maps[0]}
 
 
 def test_a_share_is_not_named_after_a_parameter_that_varies_in_it():

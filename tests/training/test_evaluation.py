@@ -31,6 +31,13 @@ def test_returns_are_those_of_a_loop_in_numpy():
     np.testing.assert_allclose(ours, total, rtol=ROUNDING)
 
 
+def at_rest(scene, n_start):
+    """The returns of three rollouts of a scene without actions, from starts of zeros."""
+    program = compose(scene, None, registry.make("integrators", "semi_implicit_euler"))
+    env = Environment(program, registry.make("backends", "jax").ops())
+    return np.asarray(env.returns(lambda seen: 0.0 * seen[:1], jnp.zeros((n_start, 3))))
+
+
 def test_an_episode_counts_up_to_its_first_end():
     @dataclass(frozen=True)
     class Falls(registry.usable("scenes", "cartpole_swing")):
@@ -45,11 +52,9 @@ def test_an_episode_counts_up_to_its_first_end():
         def stage_cost(self, xp, q, v, u):
             return 1.0 + 0.0 * v[0]
 
-    program = compose(Falls(horizon=50), None, registry.make("integrators", "semi_implicit_euler"))
-    env = Environment(program, registry.make("backends", "jax").ops())
-    returns = env.returns(lambda seen: 0.0 * seen[:1], jnp.zeros((8, 3)))
+    returns = at_rest(Falls(horizon=50), 8)
     # at 1.1 m/s the cart passes 0.05 m in the third step of 1/60 s
-    assert np.asarray(returns).tolist() == [-3.0] * 3
+    assert returns.tolist() == [-3.0] * 3
 
 
 def test_a_scene_without_random_starts_has_returns():
@@ -61,9 +66,7 @@ def test_a_scene_without_random_starts_has_returns():
         def initial_state(self, xp, theta):
             return State(0.0 * theta[:1] + xp.asarray([[0.0], [3.0]]), 0.0 * theta[:1] + xp.asarray([[0.0], [0.0]]))
 
-    program = compose(Fixed(horizon=5), None, registry.make("integrators", "semi_implicit_euler"))
-    env = Environment(program, registry.make("backends", "jax").ops())
-    returns = np.asarray(env.returns(lambda seen: 0.0 * seen[:1], jnp.zeros((0, 3))))
+    returns = at_rest(Fixed(horizon=5), 0)
     assert returns.shape == (3,)
     assert np.isfinite(returns).all()
     assert len(set(returns.tolist())) == 1

@@ -102,31 +102,29 @@ def fit(horizons: np.ndarray, norms: np.ndarray, errors: np.ndarray, bounded: bo
     grow, which leaves the power law if the norms do not contradict it. The ratio of likelihoods of two least-squares fits
     with equally many parameters is (residual_1 / residual_2)^(n/2).
     """
-    errors, places = np.maximum(errors, ROUNDING), {"order": np.log(horizons), "rate": horizons}
-    found = {
-        f"{name}{end}": value for name, at in places.items() for end, value in _slope(at, np.log(norms), errors).items()
-    }
-    residuals = [found.pop(f"{name}_residual") for name in places]
-    odds = (residuals[0] / residuals[1]) ** (len(norms) / 2) if len(norms) >= FEWEST else math.nan
+    places, logarithms, errors = (np.log(horizons), horizons), np.log(norms), np.maximum(errors, ROUNDING)
+    (*order, power), (*rate, exponential) = (_slope(at, logarithms, errors) for at in places)
+    odds = (power / exponential) ** (len(norms) / 2) if len(norms) >= FEWEST else math.nan
     verdict = "open"
-    if odds >= STRONG and found["rate_low"] > 0:
+    if odds >= STRONG and rate[1] > 0:
         verdict = "exploding"
-    elif (odds >= STRONG and found["rate_high"] < 0) or (odds <= 1 / STRONG and found["order_high"] < 0):
+    elif (odds >= STRONG and rate[2] < 0) or (odds <= 1 / STRONG and order[2] < 0):
         verdict = "vanishing"
-    elif found["order_low"] > 0 and (odds <= 1 / STRONG or (odds <= 1 and bounded)):
+    elif order[1] > 0 and (odds <= 1 / STRONG or (odds <= 1 and bounded)):
         verdict = "polynomial"
-    return {"verdict": verdict, "odds": odds, **found}
+    names = (f"{name}{end}" for name in ("order", "rate") for end in ("", "_low", "_high"))
+    return {"verdict": verdict, "odds": odds, **dict(zip(names, (*order, *rate), strict=True))}
 
 
-def _slope(places: np.ndarray, logarithms: np.ndarray, errors: np.ndarray) -> dict[str, float]:
+def _slope(places: np.ndarray, logarithms: np.ndarray, errors: np.ndarray) -> tuple[float, ...]:
     """Return the slope of a line with its 95% interval (Student's t), and the sum of squared residuals and errors."""
-    count, names = len(places), ("", "_low", "_high", "_residual")
+    count = len(places)
     if count < 3 or np.ptp(places) == 0:
-        return dict.fromkeys(names, math.nan)
+        return (math.nan,) * 4
     away = places - places.mean()
     slope = float(away @ logarithms / (away @ away))
     start = float(logarithms.mean() - slope * places.mean())
     left = logarithms - start - slope * places
     residual = float(left @ left + errors @ errors)
     reach = float(stdtrit(count - 2, 0.975)) * math.sqrt(residual / (count - 2) / float(away @ away))
-    return dict(zip(names, (slope, slope - reach, slope + reach, residual), strict=True))
+    return slope, slope - reach, slope + reach, residual
