@@ -3,27 +3,19 @@
 Prints a table of the bugs, the claims that were run and those that fail. A bug that no claim notices ends with status 1.
 """
 
-import contextlib
-import json
-import subprocess
+import multiprocessing
 import sys
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from unittest import mock
 
 from bench.plugins.contacts.complementarity import Complementarity
 from bench.plugins.contacts.impulse import Impulse
-from bench.plugins.estimators.inverse_variance import InverseVariance
+from bench.plugins.estimators.inverse_variance import InverseVariance, halves
 
 from bench.claims import discovery, results
 from bench.claims.claim import NOT_REPRODUCED
 from bench.model import DiagnosticEstimator, Problem, SampleMean, State, registry
-
-
-@contextlib.contextmanager
-def changed(owner, name, wrapper):
-    """Replace a method by ``wrapper(original, self, *arguments)``."""
-    original = getattr(owner, name)
-    with mock.patch.object(owner, name, lambda self, *a, **k: wrapper(original, self, *a, **k)):
-        yield
 
 
 def scaled(factor):
@@ -32,22 +24,14 @@ def scaled(factor):
 
 
 def halved_kappa(original, self, ops, contact, before, free, dt):
-    import copy
-
-    twin = copy.copy(self)
-    object.__setattr__(twin, "kappa", self.kappa / 2)
-    return original(twin, ops, contact, before, free, dt)
+    return original(replace(self, kappa=self.kappa / 2), ops, contact, before, free, dt)
 
 
 def swapped_weights(original, self, problem, theta, noise):
-    from bench.plugins.estimators import inverse_variance
-
-    plain = inverse_variance.halves
-    with mock.patch.object(inverse_variance, "halves", plain):
-        first, zeroth = plain(problem, theta, noise)
-        v1, v0 = first.var(axis=1, ddof=1), zeroth.var(axis=1, ddof=1)
-        weight = v1 / (v0 + v1)
-        return weight * first.mean(axis=1) + (1 - weight) * zeroth.mean(axis=1), {"weight": weight}
+    first, zeroth = halves(problem, theta, noise)
+    v1, v0 = first.var(axis=1, ddof=1), zeroth.var(axis=1, ddof=1)
+    weight = v1 / (v0 + v1)
+    return weight * first.mean(axis=1) + (1 - weight) * zeroth.mean(axis=1), {"weight": weight}
 
 
 def early_impact(original, self, ops, contact, before, free, dt):
@@ -104,25 +88,11 @@ BUGS = dict(_bugs())
 """Bugs by name."""
 
 
-def failing(bug):
-    """Return the claims that are run under a bug, and those that are then not reproduced.
-
-    The bug is planted in a process of its own: a program that was compiled without the bug would run without it.
-    """
-    claims = BUGS[bug][3]
-    command = [sys.executable, __file__, "--process", bug]
-    result = subprocess.run(command, capture_output=True, text=True, check=False)
-    if result.returncode:
-        raise RuntimeError(f"the process with the bug '{bug}' failed: {result.stderr[-2000:]}")
-    verdicts = json.loads(result.stdout.splitlines()[-1])
-    return list(claims), [claim for claim in claims if verdicts[claim] == NOT_REPRODUCED]
-
-
 def verdicts(bug):
     """Return the verdict of each claim that is run under a bug, or its error; nothing may have been compiled before."""
     owner, name, wrapper, claims = BUGS[bug]
-    found = {}
-    with changed(owner, name, wrapper):
+    original, found = getattr(owner, name), {}
+    with mock.patch.object(owner, name, lambda self, *a, **k: wrapper(original, self, *a, **k)):
         for claim in claims:
             try:
                 found[claim] = results.measure(discovery.claims()[claim]).verdict
@@ -131,14 +101,18 @@ def verdicts(bug):
     return found
 
 
+def failing(bugs):
+    """Yield each bug, the claims that are run under it, and those that are then not reproduced."""
+    # a process for each bug: a program that was compiled without the bug would run without it
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), max_tasks_per_child=1) as pool:
+        for bug, found in zip(bugs, pool.map(verdicts, bugs), strict=True):
+            yield bug, list(found), [claim for claim, verdict in found.items() if verdict == NOT_REPRODUCED]
+
+
 def main(bugs):
     """Print a line per bug; return 1 if a bug passes every claim that is run."""
-    if bugs[:1] == ["--process"]:
-        print(json.dumps(verdicts(bugs[1])))
-        return 0
     missed = 0
-    for bug in bugs or BUGS:
-        claims, failed = failing(bug)
+    for bug, claims, failed in failing(bugs or BUGS):
         missed += not failed
         print(f"| {bug} | {', '.join(claims)} | {', '.join(failed) or 'none'} |", flush=True)
     return int(missed > 0)
