@@ -87,11 +87,11 @@ def unknown(what: str, given: object, allowed: Iterable[str], see: str = "") -> 
 
 
 def failure(error: BaseException) -> dict[str, str]:
-    """Return the row fields ``status`` and ``reason`` for an exception: its message and the last 3 traceback frames."""
+    """Return the row fields ``status`` and ``reason`` for an exception: its message and the last 5 traceback frames."""
     for kind, status in ((Unsupported, "unsupported"), (Unavailable, "unavailable"), (Crashed, "crashed")):
         if isinstance(error, kind):
             return {"status": status, "reason": printable(error)}
-    frames = traceback.extract_tb(error.__traceback__, limit=-3)
+    frames = traceback.extract_tb(error.__traceback__, limit=-5)
     lines = [f"{os.path.basename(frame.filename)}:{frame.lineno} in {frame.name}" for frame in reversed(frames)]
     return {"status": "error", "reason": f"{type(error).__name__}: {printable(error)[:1000]} ({' < '.join(lines)})"}
 

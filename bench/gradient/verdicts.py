@@ -63,16 +63,16 @@ RULES = {
         ("expect={cause}",),
     ),
     "saturated": Rule(
-        "right", "right: exactly 0, though wider differences are not: the input is clipped or has no effect here", "",
+        "right", "exactly 0, though wider differences are not: the input is clipped or has no effect here", "",
         ("sigma=SIGMA",),
     ),
     "rounding": Rule(
-        "right", "right; small steps have larger errors than the arithmetic explains, as with a loose solver tolerance", "",
+        "right", "small steps have larger errors than the arithmetic explains, as with a loose solver tolerance", "",
         ("sigma=SIGMA",),
     ),
-    "mode_crossing": Rule("right", "right; the two sides of wide differences have different contacts", "", ("sigma=SIGMA",)),
-    "nonlinear": Rule("right", "right; wide differences show the curvature of the cost", "", ("sigma=SIGMA",)),
-    "smooth": Rule("right", "right at every useful step", "", ("sigma=SIGMA",)),
+    "mode_crossing": Rule("right", "the two sides of wide differences have different contacts", "", ("sigma=SIGMA",)),
+    "nonlinear": Rule("right", "wide differences show the curvature of the cost", "", ("sigma=SIGMA",)),
+    "smooth": Rule("right", "the same at every useful step", "", ("sigma=SIGMA",)),
     "zero": Rule("right", "gradient and differences are exactly zero"),
 }  # fmt: skip
 """Each verdict, the worst first."""
