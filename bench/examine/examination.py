@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -116,7 +117,12 @@ def examine(
     )
     if expect and expect not in RULES:
         raise unknown("expect", expect, RULES)
-    named = {"name": name or _function_name(cost), "gradient": _function_name(grad), "expect": expect}
+    named = {
+        "name": name or _function_name(cost),
+        "gradient": _function_name(grad),
+        "expect": expect,
+        "takes_steps": all(_takes_steps(function) for function in (cost, grad) if callable(function)),
+    }
     cost, grad, refined = map(_with_own_warnings, (cost, grad, refined))
     clock.start_stage("first call")
     # a cost of huge or infinite numbers overflows in the differences too, where a warning would tell nothing
@@ -194,6 +200,14 @@ def _with_own_warnings(function: Any) -> Any:
             return function(*arguments, **settings)
 
     return call
+
+
+def _takes_steps(function: Callable[..., Any]) -> bool:
+    try:
+        inspect.signature(function).bind_partial(steps=1)
+    except (TypeError, ValueError):  # a built-in function may have no signature
+        return False
+    return True
 
 
 def _function_name(function: Any) -> str:

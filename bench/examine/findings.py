@@ -99,6 +99,11 @@ class Setup:
         """The given values of sigma."""
         return [level for level, _ in self.levels]
 
+    def spread(self, level: float) -> tuple[float, float]:
+        """Return the smallest and the largest standard deviation above 0 of a sigma, which tables call ``level``."""
+        each = next((spread[spread > 0] for one, spread in self.levels if one == level), np.array([level]))
+        return float(each.min()), float(each.max())
+
     @property
     def reach(self) -> float:
         """One standard deviation on the lines: the largest sigma, or without one a share of the scale of each input."""
@@ -182,6 +187,8 @@ class Findings:
     """Differences from the baseline."""
     is_as_before: bool = False
     """Whether there is a baseline and nothing is worse."""
+    takes_steps: bool = False
+    """Whether cost and gradient take ``steps``, a number of steps."""
 
     # ------------------------------------------------------------------------------------------ the derivative
 
@@ -268,6 +275,25 @@ class Findings:
         return [one for one in checks if one is not None and not one.trusted]
 
     @cached_property
+    def failures(self) -> list[tuple[float, str, float]]:
+        """Where the cost is not a number or raises an exception: distance in units of the scales, name, displacement.
+
+        The nearest place is first.
+        """
+        ways = [
+            (self.label(part), sign * part.sample.step, costs, 1.0 / part.sample.scale)
+            for part in (self.check.parts if self.check else ())
+            for sign, costs in ((-1.0, part.sample.minus), (1.0, part.sample.plus))
+        ]
+        ways += [
+            (f"t on line {index + 1}", line.at, line.costs, float(np.linalg.norm(line.direction / self.setup.scale)))
+            for index, line in enumerate(self.lines)
+        ]
+        return sorted(
+            (abs(at) * length, name, at) for name, t, costs, length in ways for at in t[~np.isfinite(costs)].tolist()
+        )
+
+    @cached_property
     def derivative_cause(self) -> str:
         """The cause of the first problem with the derivative at theta, or the verdict on a right one."""
         check, explained, repeats = self.settled, self.explained, self.repeats
@@ -290,6 +316,9 @@ class Findings:
             return "undecided" if is_open else cause
         if not check.components or not self.is_complete:
             return "undecided"
+        # no larger step is left than that with the best central difference
+        if self.failures and self.failures[0][0] <= self.unit ** (1 / 3):
+            return "nonfinite"
         if self.gradient and self.unresolved:
             return "unresolved"
         is_still = not self.moves_around
@@ -397,7 +426,7 @@ class Findings:
         if self.noise_cause not in ("", "unmeasured"):
             return "not shown" if RULES[self.noise_cause].kind == "open" else "NOT usable"
         if self.noise_cause or not self.smoothed:
-            return {RIGHT: "not measured", UNSHOWN: "not shown"}.get(self.derivative, "not usable")
+            return "not measured"
         return "usable" if all(math.isfinite(one.bias) and one.known for one in self.smoothed) else "not shown"
 
     # ----------------------------------------------------------------------------------------------------- both

@@ -55,9 +55,20 @@ def noise_problems(report: Findings) -> list[str]:
         fact = missed_text(report) if report.missed and cause in ("staircase", "jumps") else ""
         if one is not None:
             bias = f"a bias of {span(*one.bias_percent)}%" if one.known else one.remark or "not distinguishable from 0"
-            fact = f"grad J at sigma {number(one.sigma)} after {one.pairs} pairs: {bias}"
-        found.append(_sentence(cause, [fact]))
+            fact = f"grad J at sigma {sigma_text(report, one.sigma)} after {one.pairs} pairs: {bias}"
+        found.append(_sentence(cause, [fact, _why_biased(report) if cause == "biased" else ""]))
     return found
+
+
+def _why_biased(report: Findings) -> str:
+    if report.derivative_cause in (*SUSPICIOUS, "disconnected", "overwritten", "stale_gradient"):
+        return "the gradient is wrong at theta already"
+    return "" if report.derivative == UNSHOWN else "as at a jump, which no gradient sees"
+
+
+def sigma_text(report: Findings, level: float) -> str:
+    """Return a sigma as a number, or as the smallest and largest one where it differs by input."""
+    return span(*report.setup.spread(level))
 
 
 def _sentence(cause: str, facts: Sequence[str]) -> str:
@@ -72,29 +83,31 @@ def conclusion(report: Findings) -> str:
     facts = [agreement(report) if report.derivative == RIGHT else "by differences the cost has one here"]
     facts += ["at few steps"] if report.is_quick else []
     facts += [] if report.check is None or report.check.draws else ["at this theta only"]
-    return f"Derivative: {report.derivative}. {_sentence(report.derivative_cause, facts)}"
+    small = [part for part in report.small_errors if part.component is not None] or report.small_errors
+    off = max(map(_distance, small), default=0.0)
+    within = " within the tolerance" * bool(small) + f", off by up to {number(100 * off)}%" * (0.0 < off < math.inf)
+    return f"Derivative: {report.derivative}{within}. {_sentence(report.derivative_cause, facts)}"
 
 
 def noise_answer(report: Findings) -> str:
     """Return the answer about the gradient under noise in one line; empty without a gradient."""
     if not report.gradient:
         return ""
-    sigmas = ", ".join(map(number, report.setup.sigmas))
+    sigmas = ", ".join(sigma_text(report, one) for one in report.setup.sigmas)
     where = f"Under noise of sigma {sigmas}" if sigmas else "Around theta" if report.noise_cause else "Under noise"
-    derivative = f"the derivative at theta is {report.derivative}"
     if report.noise_cause not in ("", "unmeasured"):
         reason = noise_problems(report)[0]
     elif report.use == "usable":
         largest = max((one.bias_percent[1] for one in report.smoothed if one.known), default=0.0)
         reason = f"The bias of the mean gradient is below {number(max(largest, 1e-3))}%"
-        reason += "" if report.derivative == RIGHT else f", though {derivative}"
+        reason += "" if report.derivative == RIGHT else f", though the derivative at theta is {report.derivative}"
     elif report.smoothed and not report.noise_cause:
         is_known = all(one.known for one in report.smoothed)
         reason = "a gradient there is not a number" if is_known else "no draw moves the cost"
-    elif report.derivative != RIGHT:
-        reason = derivative
+    elif not sigmas:
+        reason = "no sigma is given"
     else:
-        reason = "the budget ended" if sigmas else "no sigma is given"
+        reason = "the gradient raised an exception" if report.error else "the budget ended"
     return f"{where}: {report.use}. {reason}"
 
 
@@ -132,6 +145,8 @@ def derivative_facts(report: Findings) -> list[str]:
         "unresolved": [size_of(report, part) for part in report.unresolved[:1]],
         "rough": [f"by {number(report.settled.noise if report.settled else math.nan)}"],
     }
+    if cause == "nonfinite" and (place := _where_cost_fails(report)):
+        return [place]
     if cause in own:
         return own[cause]
     if not report.wrong_checks:
@@ -145,6 +160,15 @@ def derivative_facts(report: Findings) -> list[str]:
         here = explained.gaps[0]
         facts.append(f"from the refined cost {number(100 * here.gradient / (here.size or math.nan))}%")
     return facts
+
+
+def _where_cost_fails(report: Findings) -> str:
+    if not math.isfinite(report.cost):
+        return f"the cost at theta itself is {as_text(report.cost)}"
+    if not report.failures:
+        return ""
+    _, name, at = next((place for place in report.failures if place[1] in report.names), report.failures[0])
+    return f"nearest at {name} {'+' if at > 0 else '-'} {number(abs(at))}"
 
 
 def check_facts(report: Findings, check: Check) -> list[str]:
@@ -253,8 +277,11 @@ def relative(report: Findings, spread: float) -> str:
 def warnings(report: Findings) -> list[str]:
     """Return the warnings: findings that are not problems but deserve attention."""
     cause, repeats, small = report.cause, report.repeats, report.small_errors
-    verb = "as" if report.is_expected else "which excuses no wrong gradient, as" if report.expect == cause else "not"
-    found = [f"the cause is {cause}, {verb} expected ({report.expect})"] if report.expect else []
+    found = []
+    if report.expect == cause and not report.is_expected:
+        found.append(f"expect={cause} does not excuse a wrong gradient")
+    elif report.expect:
+        found.append(f"the cause is {cause}, {'as' if report.is_expected else 'not'} expected ({report.expect})")
     if small and report.derivative == RIGHT:
         found.append(
             f"small error, within the tolerance: {size_of(report, small[0])}, in {counted(len(small), 'derivative')}"
@@ -272,6 +299,8 @@ def warnings(report: Findings) -> list[str]:
         found.append(
             f"the gradient raised an exception {report.n_failed} times away from theta: {shortened(report.elsewhere)}"
         )
+    if report.derivative_cause != "nonfinite" and (place := _where_cost_fails(report)):
+        found.append(f"the cost is not a number or raises an exception, {place}")
     if report.printed.count:
         lines = counted(report.printed.count, "line")
         found.append(f"cost and gradient printed {lines}; the first: {shortened(report.printed.lines[0])}")
@@ -281,13 +310,13 @@ def warnings(report: Findings) -> list[str]:
 
 
 def advice(report: Findings) -> str:
-    """Return the next step, with the settings that take it."""
+    """Return the next step, and on lines of their own the commands with the settings that take it."""
     cause, spent, explained = report.cause, report.spent, report.explained
     has_refined = bool(explained.gaps)
     given = {
         "{more}": not report.left_out and all(one.pairs >= PAIRS for one in report.smoothed),
         "sigma": not report.gradient or bool(report.setup.levels),
-        "horizons": bool(explained.growth),
+        "horizons": bool(explained.growth) or not report.takes_steps,
         "refined": has_refined or (cause == "undecided" and not report.wrong_checks),
         "expect": cause == "adaptive" and not has_refined,
     }
@@ -297,8 +326,10 @@ def advice(report: Findings) -> str:
     settings = [s.format(more=more, cause=cause) for s in RULES[cause].settings if not given.get(s.partition("=")[0])]
     parts = named_parts(report, report.wrong_checks[0])[:3] if report.wrong_checks else []
     names = ", ".join(report.located.get(part.name, report.label(part)) for part in parts) or "the cost"
-    first = [again(report, setting) for setting in settings[:1]]
-    return ", or ".join([*filter(None, [RULES[cause].advice.format(names=names)]), *first, *settings[1:]])
+    prose = RULES[cause].advice.format(names=names)
+    if not report.command:
+        return ", or ".join(filter(None, [prose, *settings]))
+    return "\n  ".join([prose or "run" * bool(settings), *(again(report, setting) for setting in settings)])
 
 
 def again(report: Findings, setting: str) -> str:
@@ -341,11 +372,11 @@ def write(report: Findings) -> str:
         list(filter(None, answers)), scope, _head(report),
         table("The derivative, by the program and by differences:", derivatives, ("left", "right", "order")),
         table("The error of the gradient after fewer or more steps:", steps),
-        table(f"Lines through theta, +-3 sigma (sigma = {number(report.setup.reach)} {unit}):", report.line_rows()),
+        table(f"Lines through theta, +-3 sigma (sigma = {sigma_text(report, report.setup.reach)} {unit}):", report.line_rows()),
         table("Jumps and kinks on these lines, at t in sigma:", report.break_rows()),
         table(f"With noise of sigma {unit}, J = E cost; samples, calls and seconds are for an error of 10%:", report.sigma_rows(),
               ("remark",)),
-        [f"sigma {number(one.sigma)}: {one.remark}" for one in report.smoothed if one.remark],
+        [f"sigma {sigma_text(report, one.sigma)}: {one.remark}" for one in report.smoothed if one.remark],
         ["The gradient's exception:", f"  {error}"] if len(error) > HEADLINE else [],
     ]  # fmt: skip
     return "\n\n".join("\n".join(part) for part in parts if part)
@@ -363,7 +394,7 @@ def _checked(report: Findings) -> str:
         }  # fmt: skip
         facts += [counted(count, what) for what, count in counts.items() if count]
         facts[-1] += " at other thetas" * bool(report.check.draws)
-    return ", ".join([*facts, *(f"sigma {number(one.sigma)}" for one in report.smoothed)])
+    return ", ".join([*facts, *(f"sigma {sigma_text(report, one.sigma)}" for one in report.smoothed)])
 
 
 def _unchecked(report: Findings) -> list[str]:

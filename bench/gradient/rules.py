@@ -38,7 +38,7 @@ RULES = verdicts.RULES | {
     "jumps": Rule(
         "noise", "the gradient is right at theta, and misses jumps around it that no gradient sees", SMOOTHING
     ),
-    "biased": Rule("noise", "the mean of the gradients misses a part of grad J, as at a jump, which no gradient sees", SMOOTHING),
+    "biased": Rule("noise", "the mean of the gradients misses a part of grad J", SMOOTHING),
     "spread": Rule(
         "open", "the gradients vary too widely to show whether their mean is grad J within 10%", SMOOTHING, ("{more}",)
     ),

@@ -54,7 +54,7 @@ def test_exit_statuses(sim, capsys):
     assert run(f"{sim}:kinked", "grad=side", "calls=1000", "expect=kink") == 0
     out = capsys.readouterr()
     assert "the cause is kink, as expected" in out.out
-    assert f"next: choose a theta beside it, or python -m bench examine {sim}:kinked grad=side" in out.out
+    assert f"next: choose a theta beside it\n  python -m bench examine {sim}:kinked grad=side" in out.out
 
 
 def test_settings_of_the_command_line(sim, capsys):

@@ -1,0 +1,97 @@
+"""What the report says: answers rest on what was measured, and commands can be pasted."""
+
+import math
+from functools import partial
+
+import numpy as np
+import pytest
+
+import bench
+from bench import cli
+
+examine = partial(bench.examine, progress=False, calls=3000)
+THETA = [1.0, 2.0]
+
+
+def cost(x):
+    return float(x[0] ** 2 + 3 * x[1])
+
+
+def gradient(x, factor=1.0):
+    return [2 * factor * x[0], 3.0]
+
+
+def wrong(x):
+    return gradient(x, 1.5)
+
+
+def with_steps(x, steps=5):
+    return cost(x)
+
+
+def wrong_with_steps(x, steps=5):
+    return wrong(x)
+
+
+@pytest.mark.parametrize("settings", [{}, {"sigma": 0.1, "calls": 200}])
+def test_noise_that_was_not_measured_gets_no_answer(settings):
+    report = examine(cost, THETA, grad=wrong, **settings)
+    assert (report.derivative, report.use) == ("wrong", "not measured")
+    assert "is wrong" not in report.noise_answer
+
+
+def test_the_bias_of_a_wrong_gradient_is_not_blamed_on_a_jump():
+    report = examine(cost, THETA, grad=wrong, sigma=0.1)
+    assert report.noise_cause == "biased"
+    assert "jump" not in report.noise_answer
+
+
+@pytest.mark.parametrize("is_raised", [True, False])
+@pytest.mark.parametrize(("edge", "status", "cause"), [(1e-3, 0, "smooth"), (1e-6, 3, "nonfinite")])
+def test_a_cost_that_fails_near_theta_is_reported(edge, status, cause, is_raised):
+    def failing(x):
+        if x[0] > 1.0 + edge:
+            if is_raised:
+                raise ValueError("the solver diverged")
+            return math.nan
+        return cost(x)
+
+    report = examine(failing, THETA, grad=gradient)
+    assert (report.status, report.cause) == (status, cause)
+    said = report.problems if status else report.warnings
+    assert any("nearest at theta[0] + " in text for text in said)
+
+
+def test_a_cost_without_a_value_at_theta_blames_no_input():
+    report = examine(lambda x: math.nan, THETA, grad=gradient)
+    assert report.status == 3
+    assert "the cost at theta itself is NaN" in report.conclusion
+    assert "theta[0]" not in report.conclusion
+
+
+@pytest.mark.parametrize(("name", "has_steps"), [("cost", False), ("with_steps", True)])
+def test_proposed_commands_are_lines_of_their_own(name, has_steps, capsys):
+    place = f"{__file__}:{name}"
+    slope = "wrong_with_steps" if has_steps else "wrong"
+    cli.main(["examine", place, "theta=1,2", f"grad={slope}", "calls=3000", "--quiet"])
+    lines = [line.strip() for line in capsys.readouterr().out.splitlines() if "python -m bench" in line]
+    assert all(line.startswith("python -m bench examine ") for line in lines)
+    assert any(line.endswith("horizons=1,2,5") for line in lines) == has_steps
+
+
+def test_sigma_by_input_is_a_range():
+    report = examine(lambda x: float(x @ x), np.ones(4), grad=lambda x: 2 * x, sigma=[[0.02, 0.02, 20.0, 0.05]])
+    assert "Under noise of sigma 0.020 to 20:" in report.noise_answer
+    assert "sigma 20" not in str(report)
+
+
+def test_an_error_within_the_tolerance_is_in_the_headline():
+    report = examine(cost, THETA, grad=partial(gradient, factor=1.04), tolerance=0.1)
+    assert report.status == 0
+    assert report.conclusion.startswith("Derivative: right within the tolerance, off by up to 4.0%.")
+
+
+def test_an_expected_cause_that_excuses_nothing_is_said_plainly():
+    report = examine(cost, THETA, grad=wrong, expect="wrong_factor")
+    assert report.status == 1
+    assert "expect=wrong_factor does not excuse a wrong gradient" in report.warnings
