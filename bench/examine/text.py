@@ -167,7 +167,8 @@ def _where_cost_fails(report: Findings) -> str:
         return f"the cost at theta itself is {as_text(report.cost)}"
     if not report.failures:
         return ""
-    _, name, at = next((place for place in report.failures if place[1] in report.names), report.failures[0])
+    inputs = [report.label(part) for part in (report.check.components if report.check else ())]
+    _, name, at = next((place for place in report.failures if place[1] in inputs), report.failures[0])
     return f"nearest at {name} {'+' if at > 0 else '-'} {number(abs(at))}"
 
 
