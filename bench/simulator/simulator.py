@@ -207,7 +207,11 @@ class Simulator:
         except UserError:
             raise
         except Exception as error:
-            self.gradient_error = self.gradient_error or failure(error)["reason"]
+            reason = failure(error)["reason"]
+            if isinstance(self._grad, str) and not self.clock.gradients:
+                advice = f"write it with {self._grad} alone, or give grad=FUNCTION"
+                raise UserError(f"{self._grad} cannot differentiate the cost: {advice} ({reason})") from None
+            self.gradient_error = self.gradient_error or reason
             self.n_failed_gradients += 1
             return np.full(parts[0].shape, np.nan)
         if np.iscomplexobj(gradients):

@@ -93,6 +93,47 @@ def test_list_of_numbers_of_any_library_is_a_vector():
         layout.flatten([np.float32(3)])
 
 
+MATRIX = np.arange(1.0, 7.0).reshape(2, 3)
+
+
+@pytest.mark.parametrize(
+    ("theta", "turned", "said"),
+    [
+        (MATRIX, lambda g: g.T, r"shape \(3, 2\), and theta has shape \(2, 3\): is it transposed\?"),
+        (MATRIX, lambda g: g.T.tolist(), r"shape \(3, 2\), and theta has shape \(2, 3\): is it transposed\?"),
+        ({"w": MATRIX}, lambda g: {"w": g["w"].T}, r"shape w \(3, 2\), and theta has shape w \(2, 3\): is it trans"),
+        (np.ones(4), lambda g: g[:, None], r"shape \(4, 1\), and theta has shape \(4,\)$"),
+        (np.ones(4), lambda g: g.reshape(2, 2), r"shape \(2, 2\), and theta has shape \(4,\)$"),
+        (MATRIX, lambda g: g.tolist(), ""),
+        (MATRIX, lambda g: g.ravel(), ""),
+        (MATRIX.tolist(), lambda g: np.array(g), ""),
+        ([MATRIX, 2.0], lambda g: tuple(g), ""),
+        ({"w": MATRIX}, lambda g: g["w"], ""),
+        (2.0, lambda g: [[g]], ""),
+    ],
+)
+def test_gradient_has_the_shape_of_theta(theta, turned, said):
+    layout = ParameterTree(theta)
+
+    def cost(x):
+        return float(layout.flatten(x) @ layout.flatten(x))
+
+    def grad(x):
+        return turned(layout.unflatten(2 * layout.flatten(x)))
+
+    if said:
+        with pytest.raises(UserError, match=f"the gradient has {said}"):
+            examine(cost, theta, grad=grad, calls=60)
+    else:
+        assert examine(cost, theta, grad=grad, calls=60).status == 0
+
+
+@pytest.mark.parametrize("library", ["jax", "torch"])
+def test_a_library_that_cannot_differentiate_the_cost_is_bad_input(library):
+    with pytest.raises(UserError, match=rf"{library} cannot differentiate the cost: .* or give grad=FUNCTION \("):
+        examine(lambda x: np.sin(np.asarray(x)).sum(), [1.0, 2.0], grad=library)
+
+
 def test_cost_that_takes_its_argument_apart_is_given_another_each_time():
     report = examine(lambda p: p.pop("mass") ** 2, {"mass": 2.0})
     assert report.status == 0
