@@ -272,6 +272,7 @@ def warnings(report: Findings) -> list[str]:
         found.append(
             f"the gradient raised an exception {report.n_failed} times away from theta: {shortened(report.elsewhere)}"
         )
+    found += [f"{name} changes theta in place: each call gets a copy" for name in report.changing]
     if report.printed.count:
         lines = counted(report.printed.count, "line")
         found.append(f"cost and gradient printed {lines}; the first: {shortened(report.printed.lines[0])}")

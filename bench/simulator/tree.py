@@ -215,6 +215,15 @@ class ParameterTree:
         return [] if isinstance(value, Mapping) or _named_fields(value) else [part for _, part in leaves]
 
 
+def numbers(value: Any) -> np.ndarray:
+    """Return all numbers of a structure as a vector, in its order, without a copy of a single array; empty without numbers."""
+    try:
+        parts = [as_numpy(part).ravel() for _, part in _arrays(value)]
+        return parts[0] if len(parts) == 1 else np.concatenate(parts)
+    except (UserError, ValueError):
+        return np.empty(0)
+
+
 def _stacked(value: Any) -> np.ndarray:
     """Return an array, or a list of arrays of one shape, as one array; an empty one for other structures."""
     try:

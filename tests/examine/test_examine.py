@@ -137,7 +137,37 @@ def test_a_library_that_cannot_differentiate_the_cost_is_bad_input(library):
 def test_cost_that_takes_its_argument_apart_is_given_another_each_time():
     report = examine(lambda p: p.pop("mass") ** 2, {"mass": 2.0})
     assert report.status == 0
-    assert "modifies its argument in place" in str(report)
+    assert "warning: the cost changes theta in place" in str(report)
+
+
+def shifted(x):
+    x[0] += 1.0
+    return x[0] - 1.0
+
+
+def halved(x):
+    x["a"] /= 2
+    return {"a": 4.0 * x["a"]}
+
+
+@pytest.mark.parametrize(
+    ("cost", "theta", "settings", "names"),
+    [
+        (lambda x: float(x[0] ** 2), [1.0], {"grad": lambda x: np.multiply(x, 2, out=x)}, ["the gradient"]),
+        (lambda x: float(x["a"] @ x["a"]), {"a": np.ones(2)}, {"grad": halved}, ["the gradient"]),
+        (shifted, [1.0], {"grad": lambda x: [1.0]}, ["the cost"]),
+        (shifted, [1.0], {"grad": np.ones_like, "batch": "columns"}, ["the cost"]),
+        (shifted, [1.0], {"grad": lambda x: np.multiply(x, 0, out=x) + 1}, ["the cost", "the gradient"]),
+        (lambda x: shifted(x) if x[0] > 1.0 else x[0], [1.0], {"grad": lambda x: [1.0]}, ["the cost"]),
+        (lambda x: x[0], [1.0], {"grad": lambda x: [1.0]}, []),
+    ],
+)
+def test_changes_of_theta_are_named_and_change_no_verdict(cost, theta, settings, names):
+    report = examine(cost, theta, calls=60, **settings)
+    assert report.status == 0, str(report)
+    assert [text for text in report.warnings if "in place" in text] == [
+        f"{name} changes theta in place: each call gets a copy" for name in names
+    ]
 
 
 def test_theta_that_would_fill_the_memory_is_bad_input(monkeypatch):
