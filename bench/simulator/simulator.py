@@ -264,8 +264,13 @@ class Simulator:
             value = self._call_once()
         except Exception as error:
             problem = failure(error)["reason"]
+            is_misread = isinstance(error, TypeError | AttributeError | LookupError)
+            advice = (
+                "It must accept theta and return one number" if is_misread else "Give a theta at which it has a value"
+            )
         else:
             problem = f"it returned an array of shape {value.shape}"
+            advice = "It must accept theta and return one number"
             if value.size == 1:
                 self._check_cost(value)
                 self.first_value = float(value.ravel()[0])
@@ -275,7 +280,7 @@ class Simulator:
             if self.layout.flat and self._accepts(layout):
                 self.notes.append(f"the cost takes batches as {layout}")
                 return layout
-        raise UserError(f"the cost cannot be called at theta: {problem}. It must accept theta and return one number")
+        raise UserError(f"the cost cannot be called at theta: {problem}. {advice}")
 
     def _repeated(self, count: int) -> list[np.ndarray]:
         """Return ``count`` columns of theta and, if the cost has noise of its own, of noise 0."""

@@ -336,6 +336,18 @@ def test_cost_that_cannot_be_called_is_bad_input():
         examine(lambda p: p["mass"], {"weight": 1.0})
 
 
+@pytest.mark.parametrize(
+    ("error", "advice"),
+    [(RuntimeError("contact solver diverged"), "Give a theta at"), (TypeError("no"), "It must accept")],
+)
+def test_advice_on_a_cost_that_raises_depends_on_what_it_raises(error, advice):
+    def cost(x):
+        raise error
+
+    with pytest.raises(UserError, match=rf"cannot be called at theta: {type(error).__name__}: .*\. {advice}"):
+        examine(cost, [1.0])
+
+
 def test_budget_bounds_everything(now):
     def slow(x):
         now[0] += 0.02
@@ -432,6 +444,7 @@ def test_command_gives_text_and_status(mysim, capsys, words, status, said):
         (["{}:nothing"], "the cost returned None"),
         (["{}:cost", "sigma=0"], "numbers above 0"),
         (["{}:cost", "theta=1"], "index 1 is out of bounds"),
+        (["{0}:leaves", "save={0}/folder"], "cannot be written"),
     ],
 )
 def test_command_says_what_is_wrong_with_its_words(mysim, capsys, words, said):
