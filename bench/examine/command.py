@@ -15,6 +15,7 @@ import numpy as np
 from bench.errors import UserError, local_path, unknown
 from bench.examine.examination import examine
 from bench.examine.report import Report
+from bench.run.files import make_directory
 from bench.simulator import imports
 from bench.simulator.simulator import LIBRARIES
 
@@ -87,6 +88,8 @@ def _examined(cost: str, settings: Mapping[str, str], progress: bool) -> Report:
     values: dict[str, Any] = {
         key: PARSERS[key](value, key, module) if key in PARSERS else value for key, value in given.items()
     }
+    if "save" in settings:  # a folder that cannot be written is an error before the examination, not after it
+        make_directory(local_path("save", settings["save"]))
     report = examine(function, name=cost, progress=progress, **values)
     words = " ".join(f"{key}={value}" for key, value in settings.items() if key != "expect")
     report = replace(report, command=f"python -m bench examine {cost} {words}".strip())

@@ -286,6 +286,7 @@ class _Examination:
             elsewhere=simulator.gradient_error if not stages.is_failed else "",
             n_failed=simulator.n_failed_gradients,
             printed=simulator.printed,
+            changing=sorted(simulator.changing),
             notes=[
                 *simulator.notes,
                 *(f"the cost raised {n} times: {text}" for text, n in list(simulator.raised.items())[:3]),

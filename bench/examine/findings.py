@@ -176,6 +176,8 @@ class Findings:
     n_failed: int
     """Number of gradient calls that raised an exception."""
     printed: Printed
+    changing: Sequence[str]
+    """Which of the functions change theta in place."""
     notes: Sequence[str]
     left_out: Sequence[str]
     """The parts of the examination that the budget did not allow."""

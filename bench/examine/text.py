@@ -15,6 +15,7 @@ from bench.examine.smoothing import PAIRS
 from bench.gradient import FAULTS, Check, Part
 from bench.gradient.rules import RULES, SUSPICIOUS
 from bench.gradient.stages import is_rough
+from bench.gradient.subspace import GROUPS, MOST
 from bench.report.text import counted, duration, number, span
 
 SAME_FACTOR = 0.05
@@ -302,6 +303,7 @@ def warnings(report: Findings) -> list[str]:
         )
     if report.derivative_cause != "nonfinite" and (place := _where_cost_fails(report)):
         found.append(f"the cost is not a number or raises an exception, {place}")
+    found += [f"{name} changes theta in place: each call gets a copy" for name in report.changing]
     if report.printed.count:
         lines = counted(report.printed.count, "line")
         found.append(f"cost and gradient printed {lines}; the first: {shortened(report.printed.lines[0])}")
@@ -321,9 +323,11 @@ def advice(report: Findings) -> str:
         "refined": has_refined or (cause == "undecided" and not report.wrong_checks),
         "expect": cause == "adaptive" and not has_refined,
     }
-    more = (
-        f"calls={int(2 * spent.calls)}" if math.isfinite(spent.calls) else f"budget={max(2 * spent.budget, 60.0):.0f}s"
-    )
+    # two costs per component or group, and the repeated calls; where no cost was timed, the first calls bound its time
+    n_costs = 2 * min(report.theta.size, MOST + GROUPS) + 7
+    each = spent.cost_s if math.isfinite(spent.cost_s) else spent.compile_s
+    seconds = max(2 * spent.budget, 60.0, n_costs * each)
+    more = f"calls={int(2 * spent.calls)}" if math.isfinite(spent.calls) else f"budget={seconds:.0f}s"
     settings = [s.format(more=more, cause=cause) for s in RULES[cause].settings if not given.get(s.partition("=")[0])]
     parts = named_parts(report, report.wrong_checks[0])[:3] if report.wrong_checks else []
     names = ", ".join(report.located.get(part.name, report.label(part)) for part in parts) or "the cost"

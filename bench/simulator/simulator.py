@@ -13,7 +13,7 @@ import numpy as np
 
 from bench.errors import UserError, failure, unknown
 from bench.simulator.clock import Clock, OutOfTime
-from bench.simulator.tree import ParameterTree, as_numpy
+from bench.simulator.tree import ParameterTree, as_numpy, numbers
 
 BATCHES = ("loop", "vmap", "columns", "rows")
 """Batching modes of a cost: one theta per call, the library's vmap, arrays ``(d, B)``, arrays ``(B, d)``."""
@@ -51,25 +51,6 @@ class Printed(io.TextIOBase):
     def isatty(self) -> bool:
         """Return False."""
         return False
-
-
-def _guarded(function: Callable[..., Any], printed: Printed) -> Callable[..., Any]:
-    """Wrap a user's function: its printing is collected, and ``sys.exit`` raises RuntimeError.
-
-    A test must not pass because a simulator exits with status 0.
-    """
-
-    def call(*arguments: Any, **settings: Any) -> Any:
-        try:
-            if sys.stdout is printed:
-                return function(*arguments, **settings)
-            with redirect_stdout(printed), redirect_stderr(printed):
-                return function(*arguments, **settings)
-        except SystemExit as error:
-            code = "" if error.code is None else error.code
-            raise RuntimeError(f"it ended the process by sys.exit({code})") from None
-
-    return call
 
 
 class Simulator:
@@ -116,15 +97,42 @@ class Simulator:
         """What cost and gradient print."""
         self.first_value = float("nan")
         """The cost at theta, from the first call, with w = 0."""
-        self._cost = _guarded(cost, self.printed)
-        self._grad = _guarded(grad, self.printed) if callable(grad) else grad
+        self.changing: set[str] = set()
+        """Which of the user's functions change theta in place: ``the cost``, ``the gradient``."""
+        self._cost = self._guarded(cost, "the cost")
+        self._grad = self._guarded(grad, "the gradient") if callable(grad) else grad
         self._shapes: set[Any] = set()
         self._compiled: dict[str, tuple[Any, ...]] = {}
         self._distinct: set[float] = set()
         self._double = True
         known = sorted({leaf.library for leaf in layout.leaves} & set(LIBRARIES))
         self.library = library or (grad if isinstance(grad, str) else (known or ["numpy"])[0])
+        self.batch = ""
         self.batch = self._detect_batch(batch)
+
+    def _guarded(self, function: Callable[..., Any], name: str) -> Callable[..., Any]:
+        """Wrap a user's function: printing is collected, changes of theta are noted, ``sys.exit`` raises RuntimeError.
+
+        A test must not pass because a simulator exits with status 0.
+        """
+
+        def call(theta: Any, *arguments: Any, **settings: Any) -> Any:
+            # arrays of JAX never change, and inside of vmap they have no numbers
+            is_compared = name not in self.changing and self.library != "jax" and self.batch != "vmap"
+            before = numbers(theta).copy() if is_compared else None
+            try:
+                if sys.stdout is self.printed:
+                    return function(theta, *arguments, **settings)
+                with redirect_stdout(self.printed), redirect_stderr(self.printed):
+                    return function(theta, *arguments, **settings)
+            except SystemExit as error:
+                code = "" if error.code is None else error.code
+                raise RuntimeError(f"it ended the process by sys.exit({code})") from None
+            finally:
+                if before is not None and not np.array_equal(before, numbers(theta)):
+                    self.changing.add(name)
+
+        return call
 
     # ------------------------------------------------------------------------------------------- columns
 
@@ -207,7 +215,11 @@ class Simulator:
         except UserError:
             raise
         except Exception as error:
-            self.gradient_error = self.gradient_error or failure(error)["reason"]
+            reason = failure(error)["reason"]
+            if isinstance(self._grad, str) and not self.clock.gradients:
+                advice = f"write it with {self._grad} alone, or give grad=FUNCTION"
+                raise UserError(f"{self._grad} cannot differentiate the cost: {advice} ({reason})") from None
+            self.gradient_error = self.gradient_error or reason
             self.n_failed_gradients += 1
             return np.full(parts[0].shape, np.nan)
         if np.iscomplexobj(gradients):
@@ -252,8 +264,13 @@ class Simulator:
             value = self._call_once()
         except Exception as error:
             problem = failure(error)["reason"]
+            is_misread = isinstance(error, TypeError | AttributeError | LookupError)
+            advice = (
+                "It must accept theta and return one number" if is_misread else "Give a theta at which it has a value"
+            )
         else:
             problem = f"it returned an array of shape {value.shape}"
+            advice = "It must accept theta and return one number"
             if value.size == 1:
                 self._check_cost(value)
                 self.first_value = float(value.ravel()[0])
@@ -263,7 +280,7 @@ class Simulator:
             if self.layout.flat and self._accepts(layout):
                 self.notes.append(f"the cost takes batches as {layout}")
                 return layout
-        raise UserError(f"the cost cannot be called at theta: {problem}. It must accept theta and return one number")
+        raise UserError(f"the cost cannot be called at theta: {problem}. {advice}")
 
     def _repeated(self, count: int) -> list[np.ndarray]:
         """Return ``count`` columns of theta and, if the cost has noise of its own, of noise 0."""
@@ -271,7 +288,7 @@ class Simulator:
         return [thetas, np.zeros((self.noise, count))] if self.noise else [thetas]
 
     def _call_once(self) -> np.ndarray:
-        """Return the cost of theta without noise as an array, and note whether the cost modifies its argument."""
+        """Return the cost of theta without noise as an array."""
         parts = self._repeated(1)
         if self.library == "jax":
             with self.clock.interrupt_when_over(first=True):
@@ -279,10 +296,9 @@ class Simulator:
             self.clock.count("costs", 1, 0.0, warm=False)
             return as_numpy(value)
         vector, *own_noise = (self._array(part[:, 0]) for part in parts)
-        theta = self._build_theta(vector)
         try:
             with self.clock.interrupt_when_over(first=True):
-                value = self._cost(theta, *own_noise)
+                value = self._cost(self._build_theta(vector), *own_noise)
         except RuntimeError as error:
             if self.library != "torch" or "dtype" not in str(error) or not self._double:
                 raise
@@ -292,17 +308,7 @@ class Simulator:
         array = as_numpy(value)
         self.clock.count("costs", 1, 0.0, warm=False)
         self._shapes.add(("costs", 1))
-        if self._is_modified(theta):
-            self.notes.append("the cost modifies its argument in place, so each call gets a copy")
         return array
-
-    def _is_modified(self, theta: Any) -> bool:
-        """Return whether the cost has modified its argument, which differs from theta in its floating-point type."""
-        fresh = self._build_theta(self._array(self.layout.vector))
-        try:
-            return not np.array_equal(self.layout.flatten(theta, "theta"), self.layout.flatten(fresh, "theta"))
-        except UserError:
-            return True
 
     def _check_cost(self, cost: np.ndarray) -> None:
         """Record the precision of the cost's value; raises :class:`UserError` unless it is a real number."""

@@ -102,6 +102,7 @@ class ParameterTree:
         if not start:
             raise UserError("theta has no numbers: give an array, or a dict of arrays, theta={'mass': 1.0}")
         self.vector = np.concatenate(values)
+        self._whole = _stacked(theta).shape
         if start > MAX_SIZE:
             raise UserError(
                 f"theta has {start:,} numbers and at most {MAX_SIZE:,} can be examined: give fewer, or a part of them"
@@ -184,22 +185,25 @@ class ParameterTree:
 
         Raises :class:`UserError` if it has another structure or size.
         """
+        whole = _stacked(value)
+        # a vector of all numbers fits every structure
+        if whole.size == self.vector.size and (whole.ndim < 2 or whole.shape == self._whole):
+            return whole.ravel()
         try:
             leaves = [(path, as_numpy(part)) for path, part in _arrays(value)]
         except UserError:
             leaves = []
         parts = self._reorder(value, leaves)
-        sizes = [leaf.size for leaf in self.leaves]
-        total = sum(part.size for part in parts)
-        # a list of single numbers is a vector, for numbers from any library
-        flat = len(parts) == 1 or (len(self.leaves) == 1 and _is_structure(value))
-        if total == self.vector.size and ([part.size for part in parts] == sizes or flat):
+        sizes = [leaf.shape if leaf.size > 1 else leaf.size for leaf in self.leaves]
+        if [part.shape if part.size > 1 else part.size for part in parts] == sizes:
             return np.concatenate([part.ravel() for part in parts])
         numeric = leaves and all(part.dtype.kind in "biufc" for _, part in leaves)
-        shapes = ", ".join(f"{path} {part.shape}".strip() for path, part in leaves)
+        shapes = str(whole.shape) if whole.size else ", ".join(f"{path} {part.shape}".strip() for path, part in leaves)
         given = f"has shape {shapes}" if numeric else f"is {type(value).__name__} {value!r}"[:200]
         expected = ", ".join(f"{leaf.path} {leaf.shape}".strip() for leaf in self.leaves)
-        raise UserError(f"{what} {given}, and theta has shape {expected}")
+        turned = zip([whole, *parts], [self._whole, *(leaf.shape for leaf in self.leaves)], strict=False)
+        hint = ": is it transposed?" if any(part.ndim > 1 and part.T.shape == shape for part, shape in turned) else ""
+        raise UserError(f"{what} {given}, and theta has shape {expected}{hint}")
 
     def _reorder(self, value: Any, leaves: list[tuple[str, np.ndarray]]) -> list[np.ndarray]:
         """Return the arrays in theta's order, matched by path if possible, since some libraries sort dict keys."""
@@ -209,6 +213,27 @@ class ParameterTree:
             return [named[path] for path in paths]
         # a structure with other names than theta's contains other numbers
         return [] if isinstance(value, Mapping) or _named_fields(value) else [part for _, part in leaves]
+
+
+def numbers(value: Any) -> np.ndarray:
+    """Return all numbers of a structure as a vector, in its order, without a copy of a single array; empty without numbers."""
+    try:
+        parts = [as_numpy(part).ravel() for _, part in _arrays(value)]
+        return parts[0] if len(parts) == 1 else np.concatenate(parts)
+    except (UserError, ValueError):
+        return np.empty(0)
+
+
+def _stacked(value: Any) -> np.ndarray:
+    """Return an array, or a list of arrays of one shape, as one array; an empty one for other structures."""
+    try:
+        if _is_structure(value) and not _named_fields(value):
+            return np.stack([_stacked(part) for part in value])
+        array = as_numpy(value)
+    except (UserError, ValueError, RecursionError):
+        return np.empty(0)
+    is_array = array.dtype.kind in "biufc" and not _named_fields(value)
+    return array.reshape(() if array.size == 1 else array.shape) if is_array else np.empty(0)
 
 
 def as_numpy(value: Any) -> np.ndarray:

@@ -48,6 +48,22 @@ def test_fewer_calls_than_components_decide_nothing():
     assert "calls=14" in report.advice
 
 
+@pytest.mark.parametrize(("budget", "size"), [(20, 2), (1, 2), (20, 100)])
+def test_the_proposed_budget_suffices_for_a_slow_cost(now, budget, size):
+    def slow(x):
+        now[0] += 20.0
+        return float(x @ x)
+
+    def gradient(x):
+        now[0] += 60.0
+        return 2 * x
+
+    report = examine(slow, np.ones(size), grad=gradient, budget=budget)
+    assert report.cause == "undecided"
+    (proposed,) = re.findall(r"budget=(\d+)s", report.advice)
+    assert examine(slow, np.ones(size), grad=gradient, budget=float(proposed)).derivative == "right"
+
+
 def pendulum_gradients():
     """Yield gradients of a pendulum by their fault: shared memory, 0.2% off, and none, since one step shares nothing."""
     yield "overwritten", 20, lambda x, steps: mechanisms.swinging(x, steps, shared=True, slope=True)

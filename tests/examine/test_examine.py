@@ -93,10 +93,81 @@ def test_list_of_numbers_of_any_library_is_a_vector():
         layout.flatten([np.float32(3)])
 
 
+MATRIX = np.arange(1.0, 7.0).reshape(2, 3)
+
+
+@pytest.mark.parametrize(
+    ("theta", "turned", "said"),
+    [
+        (MATRIX, lambda g: g.T, r"shape \(3, 2\), and theta has shape \(2, 3\): is it transposed\?"),
+        (MATRIX, lambda g: g.T.tolist(), r"shape \(3, 2\), and theta has shape \(2, 3\): is it transposed\?"),
+        ({"w": MATRIX}, lambda g: {"w": g["w"].T}, r"shape w \(3, 2\), and theta has shape w \(2, 3\): is it trans"),
+        (np.ones(4), lambda g: g[:, None], r"shape \(4, 1\), and theta has shape \(4,\)$"),
+        (np.ones(4), lambda g: g.reshape(2, 2), r"shape \(2, 2\), and theta has shape \(4,\)$"),
+        (MATRIX, lambda g: g.tolist(), ""),
+        (MATRIX, lambda g: g.ravel(), ""),
+        (MATRIX.tolist(), lambda g: np.array(g), ""),
+        ([MATRIX, 2.0], lambda g: tuple(g), ""),
+        ({"w": MATRIX}, lambda g: g["w"], ""),
+        (2.0, lambda g: [[g]], ""),
+    ],
+)
+def test_gradient_has_the_shape_of_theta(theta, turned, said):
+    layout = ParameterTree(theta)
+
+    def cost(x):
+        return float(layout.flatten(x) @ layout.flatten(x))
+
+    def grad(x):
+        return turned(layout.unflatten(2 * layout.flatten(x)))
+
+    if said:
+        with pytest.raises(UserError, match=f"the gradient has {said}"):
+            examine(cost, theta, grad=grad, calls=60)
+    else:
+        assert examine(cost, theta, grad=grad, calls=60).status == 0
+
+
+@pytest.mark.parametrize("library", ["jax", "torch"])
+def test_a_library_that_cannot_differentiate_the_cost_is_bad_input(library):
+    with pytest.raises(UserError, match=rf"{library} cannot differentiate the cost: .* or give grad=FUNCTION \("):
+        examine(lambda x: np.sin(np.asarray(x)).sum(), [1.0, 2.0], grad=library)
+
+
 def test_cost_that_takes_its_argument_apart_is_given_another_each_time():
     report = examine(lambda p: p.pop("mass") ** 2, {"mass": 2.0})
     assert report.status == 0
-    assert "modifies its argument in place" in str(report)
+    assert "warning: the cost changes theta in place" in str(report)
+
+
+def shifted(x):
+    x[0] += 1.0
+    return x[0] - 1.0
+
+
+def halved(x):
+    x["a"] /= 2
+    return {"a": 4.0 * x["a"]}
+
+
+@pytest.mark.parametrize(
+    ("cost", "theta", "settings", "names"),
+    [
+        (lambda x: float(x[0] ** 2), [1.0], {"grad": lambda x: np.multiply(x, 2, out=x)}, ["the gradient"]),
+        (lambda x: float(x["a"] @ x["a"]), {"a": np.ones(2)}, {"grad": halved}, ["the gradient"]),
+        (shifted, [1.0], {"grad": lambda x: [1.0]}, ["the cost"]),
+        (shifted, [1.0], {"grad": np.ones_like, "batch": "columns"}, ["the cost"]),
+        (shifted, [1.0], {"grad": lambda x: np.multiply(x, 0, out=x) + 1}, ["the cost", "the gradient"]),
+        (lambda x: shifted(x) if x[0] > 1.0 else x[0], [1.0], {"grad": lambda x: [1.0]}, ["the cost"]),
+        (lambda x: x[0], [1.0], {"grad": lambda x: [1.0]}, []),
+    ],
+)
+def test_changes_of_theta_are_named_and_change_no_verdict(cost, theta, settings, names):
+    report = examine(cost, theta, calls=60, **settings)
+    assert report.status == 0, str(report)
+    assert [text for text in report.warnings if "in place" in text] == [
+        f"{name} changes theta in place: each call gets a copy" for name in names
+    ]
 
 
 def test_theta_that_would_fill_the_memory_is_bad_input(monkeypatch):
@@ -265,6 +336,18 @@ def test_cost_that_cannot_be_called_is_bad_input():
         examine(lambda p: p["mass"], {"weight": 1.0})
 
 
+@pytest.mark.parametrize(
+    ("error", "advice"),
+    [(RuntimeError("contact solver diverged"), "Give a theta at"), (TypeError("no"), "It must accept")],
+)
+def test_advice_on_a_cost_that_raises_depends_on_what_it_raises(error, advice):
+    def cost(x):
+        raise error
+
+    with pytest.raises(UserError, match=rf"cannot be called at theta: {type(error).__name__}: .*\. {advice}"):
+        examine(cost, [1.0])
+
+
 def test_budget_bounds_everything(now):
     def slow(x):
         now[0] += 0.02
@@ -361,6 +444,7 @@ def test_command_gives_text_and_status(mysim, capsys, words, status, said):
         (["{}:nothing"], "the cost returned None"),
         (["{}:cost", "sigma=0"], "numbers above 0"),
         (["{}:cost", "theta=1"], "index 1 is out of bounds"),
+        (["{0}:leaves", "save={0}/folder"], "cannot be written"),
     ],
 )
 def test_command_says_what_is_wrong_with_its_words(mysim, capsys, words, said):
