@@ -24,6 +24,7 @@ from bench.conformance.subjects import (
     stepping,
 )
 from bench.model import Estimator, FunctionScene, MechanicalScene, Problem, SampleMean, compose
+from bench.model.estimator import require_shape
 from bench.model.identity import identity
 from bench.model.parameters import parameters
 
@@ -167,7 +168,7 @@ def estimates(estimator: Estimator, oracle: Oracle, noise: np.ndarray, problem: 
     """Return estimates ``(R, d)``; raises :class:`Failed` if the shape is wrong or a number is not finite."""
     problem = problem or oracle.problem
     result = np.asarray(estimator.estimate(problem, problem.program.theta0, noise))
-    require(result.shape == (noise.shape[0], problem.dim), f"shape {result.shape}, not {(noise.shape[0], problem.dim)}")
+    require_shape(estimator, "(R, d)", result, (noise.shape[0], problem.dim))
     require(np.isfinite(result).all(), f"{(~np.isfinite(result)).sum()} numbers are not finite on {oracle.label}")
     return result
 

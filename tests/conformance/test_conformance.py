@@ -583,6 +583,15 @@ def test_a_sound_estimator_passes_though_a_difference_straddles_a_jump():
     assert "of up to 20 dimensions" in results[0].detail
 
 
+def test_a_wrong_shape_is_named_with_the_file_and_the_shape_of_terms():
+    class Row(Mirrored):
+        def terms(self, problem, theta, w):
+            return problem.grad(theta, w)[:1].T
+
+    (result,) = check(Row, {"shape_and_repeatability"})
+    assert "mirrored in test_conformance.py returned shape (56, 1), not (d, B) = (2, 56)" in result.detail
+
+
 def test_line_per_check_and_exit_status(capsys):
     assert main(["cubic", "explicit_euler"]) == 0
     *lines, empty, summary = capsys.readouterr().out.splitlines()
