@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, TypedDict, Unpack
 
 import numpy as np
 
-from bench.errors import Unsupported, UserError, failure, unknown
+from bench.errors import Unsupported, UserError, failure
 from bench.experiment.by_name import compile_problem, make
 from bench.model import Backend, Decision, Estimator, Integrator, Problem, Scene, registry
 from bench.model.identity import label, text_of
@@ -193,7 +193,7 @@ def matching_plugins(names: Sequence[str]) -> registry.Table:
     known = {name for entries in table.values() for name in entries}
     for name in names:
         if name not in known and name not in kinds:
-            raise unknown("plugin or kind", name, {*known, *table}, "list")
+            raise registry.unknown_plugin("plugin or kind", name, {*known, *table}, "list")
     selected = {kinds[name] for name in names if name in kinds}
     return {
         kind: {name: e for name, e in entries.items() if not names or kind in selected or name in names}

@@ -370,7 +370,7 @@ def _check(words: list[str]) -> int:
     plugins = {name for table in registry.entries().values() for name in table}
     for name in names:
         if name not in plugins:
-            raise unknown("plugin", name, plugins, "list")
+            raise registry.unknown_plugin("plugin", name, plugins, "list")
     return conformance.main(names, limit)
 
 

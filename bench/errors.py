@@ -22,6 +22,8 @@ Status = Literal["ok", "nonfinite", "diverged", "timeout", "crashed", "unsupport
 STATUSES: tuple[str, ...] = get_args(Status)
 MAX_LISTED = 80
 """Number of characters of a list of names that is not cut."""
+FOLDER = "bench_folder_"
+"""Start of the name of a plugin folder's package, which :func:`printable` leaves out."""
 INTERRUPTED = threading.Event()
 """Set while a KeyboardInterrupt is pending, since plugin code may swallow the exception before it is handled."""
 
@@ -60,7 +62,7 @@ def printable(text: object) -> str:
         line = "(a message that cannot be printed)"
     if not line.isprintable():
         line = "".join(c if c.isprintable() else " " for c in line)
-    return " ".join(line.split())
+    return re.sub(rf"{FOLDER}\w{{8}}\.", "", " ".join(line.split()))
 
 
 def local_path(setting: str, value: object) -> Path:

@@ -12,6 +12,7 @@ from functools import cache
 from pathlib import Path
 
 from bench.conformance.kit import Failed, require, variants, verifies
+from bench.errors import printable
 from bench.model import Plugin, registry
 from bench.model.parameters import build, check, parameters
 
@@ -43,7 +44,7 @@ def has_good_name(plugin: type[Plugin]) -> str:
     if module.startswith(f"bench.plugins.{plugin.kind}."):
         expected = f"bench.plugins.{plugin.kind}.{name}"
         require(module == expected, f"'{name}' is not the name of its file: {module}, not {expected}")
-    return module
+    return printable(module)
 
 
 @verifies(Plugin)

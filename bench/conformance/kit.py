@@ -14,7 +14,7 @@ from typing import Any
 
 from bench.engines.backend import EngineBackend
 from bench.engines.process import close_engines
-from bench.errors import failure, unknown
+from bench.errors import failure, printable, unknown
 from bench.model import Plugin, registry
 from bench.model.identity import identity
 from bench.model.parameters import build, parameters
@@ -259,7 +259,7 @@ def _outcome(function: Check, subject: Any, name: str) -> CheckResult:
         outcome, detail = "fail", str(reason)
     except (Exception, SystemExit) as error:
         outcome, detail = "fail", failure(error)["reason"]
-    return CheckResult(name, function.__name__, outcome, " ".join(detail.split()))
+    return CheckResult(name, function.__name__, outcome, printable(detail))
 
 
 def _remembered(function: Check, subject: Any, name: str) -> str:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import inspect
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
@@ -133,7 +135,17 @@ class SampleMean(Estimator):
 
     def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Return the mean of the terms over the samples of each repeat, ``(R, d)``."""
-        return np.asarray(per_repeat(self.terms(problem, theta, columns(noise)), noise).mean(axis=1))
+        w = columns(noise)
+        terms = np.asarray(self.terms(problem, theta, w))
+        require_shape(self, "(d, B)", terms, (problem.dim, w.shape[1]))
+        return np.asarray(per_repeat(terms, noise).mean(axis=1))
+
+
+def require_shape(estimator: Estimator, meaning: str, result: np.ndarray, shape: tuple[int, ...]) -> None:
+    """Raise ValueError, with the estimator's file, unless a result has the shape whose ``meaning`` is ``(d, B)``."""
+    if result.shape != shape:
+        file = Path(inspect.getfile(type(estimator))).name
+        raise ValueError(f"{estimator.name} in {file} returned shape {result.shape}, not {meaning} = {shape}")
 
 
 def columns(noise: np.ndarray) -> np.ndarray:

@@ -16,9 +16,10 @@ import os
 import pkgutil
 import re
 import sys
+import traceback
 import types
 import typing
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache, partial
@@ -27,7 +28,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from bench.errors import UserError, printable, unknown
+from bench.errors import FOLDER, UserError, printable, unknown
 from bench.model import guard, trial
 from bench.model.parameters import Plugin, build, parameters, remember, singular
 
@@ -107,7 +108,7 @@ def is_restricted() -> bool:
 
 def _package(path: Path) -> str:
     """Return the folder's package name, which is unique and the same in every process, so that plugins can be pickled."""
-    return f"bench_folder_{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"
+    return f"{FOLDER}{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"
 
 
 @remember
@@ -134,7 +135,7 @@ def entries() -> Table:
 def _protected(module: str) -> Iterator[None]:
     """Quote what the import of a module prints, and keep what it changes in the environment from new processes."""
     before = dict(os.environ)
-    with guard.capture_output(f"{module}, while it was imported,"), guard.protect_process():
+    with guard.capture_output(f"{printable(module)}, while it was imported,"), guard.protect_process():
         try:
             yield
         finally:
@@ -220,7 +221,7 @@ def _load(
     except KeyboardInterrupt:
         raise
     except BaseException as error:  # includes SystemExit: a plugin neither hides the others nor ends the command
-        _add_unavailable(table, kind if kind in table else _kind_in_source(module), name, error)
+        _add_unavailable(table, kind if kind in table else _kind_in_source(module), name, error, module)
 
 
 def _add_members(table: Table, kind: str, module: ModuleType) -> None:
@@ -230,7 +231,9 @@ def _add_members(table: Table, kind: str, module: ModuleType) -> None:
             own = isinstance(plugin, type) and str(plugin.__module__).startswith(module.__name__)
             concrete = own and issubclass(plugin, Plugin) and plugin.kind and plugin.name != ""
         except Exception as error:
-            _add_unavailable(table, kind if kind in table else "estimators", name, error, "cannot be used")
+            _add_unavailable(
+                table, kind if kind in table else "estimators", name, error, module.__name__, "cannot be used"
+            )
             continue
         if concrete:
             _add(table, plugin)
@@ -245,11 +248,22 @@ def _kind_in_source(path: str) -> str:
     return next((kind for kind in kinds if kind in KINDS), "estimators")
 
 
-def _add_unavailable(table: Table, kind: str, name: str, error: BaseException, problem: str = "import failed") -> None:
-    message = printable(error)[:MAX_REASON_CHARACTERS]
+def _add_unavailable(
+    table: Table, kind: str, name: str, error: BaseException, module: str, problem: str = "import failed"
+) -> None:
+    message = printable(error)[:MAX_REASON_CHARACTERS] + _place(error, str(module))
     while name in table[kind]:  # do not replace an entry of the same name
         name += " (another)"
     table[kind][name] = Entry(kind, name, None, f"{problem}: {type(error).__name__}: {message}")
+
+
+def _place(error: BaseException, module: str) -> str:
+    """Return the file of a module, and the line that raised the error, in brackets; a syntax error has them already."""
+    file = f"{module.rpartition('.')[2]}.py"
+    frames = traceback.extract_tb(error.__traceback__)
+    lines = [f":{frame.lineno}" for frame in frames if Path(frame.filename).name == file]
+    is_needed = lines or (module.startswith(FOLDER) and not isinstance(error, SyntaxError))
+    return f" ({file}{(lines or [''])[-1]})" if is_needed else ""
 
 
 def _add(table: Table, plugin: type[Plugin]) -> None:
@@ -259,7 +273,7 @@ def _add(table: Table, plugin: type[Plugin]) -> None:
     try:
         faults = _faults(plugin)
     except Exception as error:
-        _add_unavailable(table, kind, where, error, "cannot be used")
+        _add_unavailable(table, kind, where, error, plugin.__module__, "cannot be used")
         return
     if faults:
         # listed by its full class path: its own name may be invalid, and classes of several files may share a name
@@ -267,7 +281,7 @@ def _add(table: Table, plugin: type[Plugin]) -> None:
         return
     taken = kind_entries.get(plugin.name)
     if taken is not None and taken.plugin is not plugin:
-        by = taken.plugin and f"{taken.plugin.__module__}.{taken.plugin.__qualname__}"
+        by = taken.plugin and printable(f"{taken.plugin.__module__}.{taken.plugin.__qualname__}")
         kind_entries[f"{plugin.name} of {where}"] = Entry(
             kind, plugin.name, None, f"the name is taken by {by or taken.name}"
         )
@@ -316,8 +330,14 @@ def find(kind: str, name: str) -> Entry:
         restrict(None)  # a parameter of another plugin may name it
     table = entries().get(kind, {})
     if name not in table:
-        raise unknown(singular(kind), name, table, f"list {kind}")
+        raise unknown_plugin(singular(kind), name, table, f"list {kind}")
     return table[name]
+
+
+def unknown_plugin(what: str, name: str, known: Iterable[str], see: str) -> UserError:
+    """Return the error for an unknown plugin, with the reasons of all plugins that could not be loaded."""
+    failed = [f"{e.name}: {e.reason}" for table in entries().values() for e in table.values() if e.plugin is None]
+    return UserError("; ".join([str(unknown(what, name, known, see)), *failed]))
 
 
 def usable(kind: str, name: str) -> type[Plugin]:

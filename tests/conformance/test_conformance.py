@@ -75,6 +75,16 @@ class WrongSign(SampleMean):
         return -problem.grad(theta, w)
 
 
+@planted("bias_is_as_declared")
+class WrongInManyDimensions(SampleMean):
+    """First-order, off by 30% where theta has more than five numbers."""
+
+    needs = frozenset({"grad"})
+
+    def terms(self, problem, theta, w):
+        return problem.grad(theta, w) * (1.3 if theta.size > 5 else 1.0)
+
+
 @planted("bias_is_as_declared", "bias_across_jumps_is_as_declared")
 class SigmaForSigmaSquared(SampleMean):
     """Zeroth-order, f sigma w / sigma^2 with a sigma for the sigma^2."""
@@ -553,6 +563,33 @@ def few_programs(monkeypatch):
 def test_planted_fault_is_caught(plugin):
     failed = {result.check: result.detail for result in check(plugin, PLANTED[plugin]) if result.outcome == "fail"}
     assert PLANTED[plugin] <= failed.keys(), failed
+
+
+@dataclass(frozen=True)
+class Mirrored(SampleMean):
+    """First-order, the mean of the gradients at w and -w."""
+
+    name = "mirrored"
+    needs = frozenset({"grad"})
+
+    def terms(self, problem, theta, w):
+        return (problem.grad(theta, w) + problem.grad(theta, -w)) / 2
+
+
+def test_a_sound_estimator_passes_though_a_difference_straddles_a_jump():
+    results = check(Mirrored, {"bias_is_as_declared", "bias_across_jumps_is_as_declared"})
+    assert {result.outcome for result in results} == {"pass"}
+    assert "bias 21.4 on coin_walk[sigma=0.1]" in results[1].detail
+    assert "of up to 20 dimensions" in results[0].detail
+
+
+def test_a_wrong_shape_is_named_with_the_file_and_the_shape_of_terms():
+    class Row(Mirrored):
+        def terms(self, problem, theta, w):
+            return problem.grad(theta, w)[:1].T
+
+    (result,) = check(Row, {"shape_and_repeatability"})
+    assert "mirrored in test_conformance.py returned shape (56, 1), not (d, B) = (2, 56)" in result.detail
 
 
 def test_line_per_check_and_exit_status(capsys):

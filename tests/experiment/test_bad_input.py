@@ -266,6 +266,25 @@ def test_a_bad_plugin_is_listed_with_its_reason_and_disables_nothing_else(tmp_pa
             del sys.modules[name]
 
 
+def test_an_unknown_plugin_is_answered_with_the_files_that_failed(tmp_path, capsys):
+    (tmp_path / "raises.py").write_text("import os\n\nraise RuntimeError('boom')\n")
+    (tmp_path / "wrong.py").write_text("x = = 2\n")
+    (tmp_path / "bare.py").write_text(
+        HEAD.replace("@dataclass(frozen=True)\n", "").replace('"mine"', '"bare"\n    gain: float = 1.0')
+    )
+    for words in (["plan", *BASE, "estimators=[mine]"], ["check", "mine"], ["list", "mine"]):
+        assert main([*words, f"plugins={tmp_path}"]) == 2
+        said = capsys.readouterr().err
+        assert "unknown" in said
+        assert "raises: import failed: RuntimeError: boom (raises.py:3)" in said
+        assert "SyntaxError: invalid syntax (wrong.py, line 1)" in said
+        assert "is not a dataclass" in said
+        assert "(bare.py)" in said
+        assert "bench_folder_" not in said
+    assert main(["list", "estimators", f"plugins={tmp_path}"]) == 0
+    assert "bench_folder_" not in "".join(capsys.readouterr())
+
+
 def test_an_estimator_that_exits_ends_its_own_cell_in_this_process_too(tmp_path, capsys):
     text = HEAD.replace("return problem.grad(theta, w)", "sys.exit(0)")
     (tmp_path / "mine.py").write_text(text)

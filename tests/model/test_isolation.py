@@ -99,9 +99,9 @@ def test_in_this_process_cells_after_other_code_say_so(tmp_path):
         np.sqrt = root_of_numpy
     for name in ("fobg", "reinforce"):
         assert rows["mean_estimate"][name].tobytes() == clean["mean_estimate"][name].tobytes()
-        assert "also run code of bench_folder_" in rows["reason"][name]
+        assert "also run code of s" in rows["reason"][name]
     later = rows["reason"]["changes_sqrt"]
-    assert "this process has also run code of bench_folder_" in later
+    assert "this process has also run code of s" in later
     assert "the seed of random" in later
 
 

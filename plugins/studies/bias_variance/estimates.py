@@ -15,6 +15,7 @@ from bench.experiment.cell import Cell
 from bench.measure import noise
 from bench.measure.timing import Pause
 from bench.model import Auxiliaries, Problem, SampleMean, columns, per_repeat
+from bench.model.estimator import require_shape
 
 MOST_TERMS = 1 << 25
 """Most numbers in the terms of one call (256 MiB): d per sample. With more, fewer repeats or samples share a call."""
@@ -78,7 +79,7 @@ class Estimates:
 
     def _estimate_batch(self, start: int, block: np.ndarray) -> np.ndarray:
         result, self.diagnostics[start] = self._estimator.estimate_with_diagnostics(self._problem, self._theta, block)
-        return self._checked(result, block.shape[0], self._problem.dim)
+        return self._checked(result, "(R, d)", block.shape[0], self._problem.dim)
 
     def _mean_of_batch(self, estimator: SampleMean, start: int, block: np.ndarray) -> np.ndarray:
         terms = self._terms_of(estimator, columns(block))
@@ -113,13 +114,12 @@ class Estimates:
             return found[0] + rest.sum(axis=1), found[1] + float(np.vdot(rest, rest))
 
     def _terms_of(self, estimator: SampleMean, w: np.ndarray) -> np.ndarray:
-        return self._checked(estimator.terms(self._problem, self._theta, w), self._problem.dim, w.shape[1])
+        return self._checked(estimator.terms(self._problem, self._theta, w), "(d, B)", self._problem.dim, w.shape[1])
 
-    def _checked(self, result: Any, *shape: int) -> np.ndarray:
+    def _checked(self, result: Any, meaning: str, *shape: int) -> np.ndarray:
         """Return a result in float64; raises an error if it is complex or has another shape."""
         if np.iscomplexobj(result):  # a cast would silently drop the imaginary part
             raise TypeError(f"{self._estimator.name} returned complex numbers; gradients are real")
         result = np.asarray(result, dtype=np.float64)
-        if result.shape != shape:
-            raise ValueError(f"{self._estimator.name} returned shape {result.shape}, not {shape}")
+        require_shape(self._estimator, meaning, result, shape)
         return result  # type: ignore[no-any-return]
