@@ -29,6 +29,8 @@ DISTINCT = 3
 """Fewest costs that show that all costs have single precision: each is one in double precision once in 2^29."""
 SIMPLE_BITS = 12
 """Costs with at most this many significant bits, such as 0.5, show nothing about the precision."""
+COMPARED = 10_000_000
+"""Numbers of theta in all calls up to which each call is searched for changes of theta."""
 KEPT_LINES = 1000
 """Most lines printed by the user's functions that are kept."""
 
@@ -119,6 +121,7 @@ class Simulator:
         def call(theta: Any, *arguments: Any, **settings: Any) -> Any:
             # arrays of JAX never change, and inside of vmap they have no numbers
             is_compared = name not in self.changing and self.library != "jax" and self.batch != "vmap"
+            is_compared = is_compared and self.clock.used * self.layout.vector.size < COMPARED
             before = numbers(theta).copy() if is_compared else None
             try:
                 if sys.stdout is self.printed:
