@@ -20,6 +20,8 @@ from bench.report.web import shell
 from bench.run.files import write_whole
 from bench.run.rows import read_object, read_parquet
 
+YEAR_3000 = 32503680000.0
+"""Seconds since 1970 that no run has stored."""
 GOOD = ("ok", "unsupported", "unavailable", "waiting")
 """Statuses that do not count as failures: the cell has a result, or was refused with a reason."""
 MARKERS = ("rows.parquet", "run.json", "answer.json")
@@ -117,7 +119,7 @@ def _state(path: Path, record: dict[str, Any]) -> tuple[str, str]:
             table = read_parquet(path, ["status", "stored_at"])
             counts = table["status"].value_counts().to_dict()
             newest = float(pd.to_numeric(table["stored_at"], errors="coerce").max())
-            if newest >= 0:
+            if 0 <= newest < YEAR_3000:
                 when = time.strftime("newest row of %Y-%m-%d %H:%M UTC", time.gmtime(newest))
         except Exception as error:  # any error in the file is reported on the page
             return f'<span class="bad">rows.parquet cannot be read: {escape(str(error)[:200])}</span>', ""
