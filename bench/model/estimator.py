@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import inspect
+import sys
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -144,8 +144,9 @@ class SampleMean(Estimator):
 def require_shape(estimator: Estimator, meaning: str, result: np.ndarray, shape: tuple[int, ...]) -> None:
     """Raise ValueError, with the estimator's file, unless a result has the shape whose ``meaning`` is ``(d, B)``."""
     if result.shape != shape:
-        file = Path(inspect.getfile(type(estimator))).name
-        raise ValueError(f"{estimator.name} in {file} returned shape {result.shape}, not {meaning} = {shape}")
+        file = getattr(sys.modules.get(type(estimator).__module__), "__file__", None)
+        where = f" in {Path(file).name}" if file else ""  # a notebook's class has no file
+        raise ValueError(f"{estimator.name}{where} returned shape {result.shape}, not {meaning} = {shape}")
 
 
 def columns(noise: np.ndarray) -> np.ndarray:

@@ -583,13 +583,16 @@ def test_a_sound_estimator_passes_though_a_difference_straddles_a_jump():
     assert "of up to 20 dimensions" in results[0].detail
 
 
-def test_a_wrong_shape_is_named_with_the_file_and_the_shape_of_terms():
+@pytest.mark.parametrize(("module", "where"), [(__name__, " in test_conformance.py"), ("notebook", "")])
+def test_a_wrong_shape_is_named_with_the_file_and_the_shape_of_terms(module, where):
     class Row(Mirrored):
+        __module__ = module
+
         def terms(self, problem, theta, w):
             return problem.grad(theta, w)[:1].T
 
     (result,) = check(Row, {"shape_and_repeatability"})
-    assert "mirrored in test_conformance.py returned shape (56, 1), not (d, B) = (2, 56)" in result.detail
+    assert f"mirrored{where} returned shape (56, 1), not (d, B) = (2, 56)" in result.detail
 
 
 def test_line_per_check_and_exit_status(capsys):
