@@ -32,6 +32,12 @@ def test_ten_thousand_near_equal_configurations_have_as_many_keys():
     assert len({cell.key for cell in found}) == 10_000
 
 
+def test_two_parameters_of_a_plugin_with_the_same_value_are_two_cells():
+    """A cell with a bias of .3 was taken for the one with a noise of .3, and never ran."""
+    both = "sweep.union=[{planted.noise: [0.3]}, {planted.bias: [0.3]}]"
+    assert len({cell.key for cell in cells("estimators=[planted]", both)}) == 2
+
+
 def test_the_same_value_written_otherwise_is_the_same_cell():
     written = ["1", "1.0", "1e0", "10e-1"]
     assert len({cells(f"scene.pushing.mass={value}")[0].key for value in written}) == 1
