@@ -22,7 +22,7 @@ class Case:
     theta: Any
     grad: Any
     causes: tuple[str, ...] = ()
-    """Correct names of the planted fault; empty for a correct gradient."""
+    """Correct names of the planted fault, ``refused`` if JAX has no gradient; empty for a correct gradient."""
     settings: dict[str, Any] = field(default_factory=dict)
 
 
@@ -231,7 +231,7 @@ def jax_cases():
     yield Case("stop_gradient on contact", lambda x: push(x, jax.lax.stop_gradient), at, "jax", ("missing_term",))
     yield Case("stop_gradient on theta", lambda x: push(jax.lax.stop_gradient(x)), at, "jax", ("disconnected",))
     yield Case("wrong custom_vjp", lambda x: wrong(x).sum(), at, "jax", ("wrong_factor",))
-    yield Case("float(x) in the loop", lambda x: push(x) + float(x[0]), at, "jax", ("raised",))
+    yield Case("float(x) in the loop", lambda x: push(x) + float(x[0]), at, "jax", ("refused",))
 
     yield Case("pushing", push, at, "jax")
     yield Case("stiff, implicit", lambda x: jnp.sum((x / 1001.0) ** 2) * 1e6 + jnp.sum(x), at, "jax")
