@@ -33,6 +33,7 @@ from bench.conformance.subjects import (
     with_changed_column,
 )
 from bench.engines.backend import EngineBackend
+from bench.engines.problem import Replayed
 from bench.gradient import EPS, FAULTS, TRUSTED, judge, sampled
 from bench.gradient.stages import SINGLE_EPS
 from bench.model import (
@@ -235,24 +236,12 @@ def score_is_that_of_actions(backend: Backend) -> str:
     return "; ".join(details) or "w / sigma"
 
 
-class _Replayed(Rollout):
-    """A program whose states are given."""
-
-    def __init__(self, program: Rollout, states: np.ndarray) -> None:
-        super().__init__(program.scene, program.contact, program.integrator, program.decision)
-        self._next = iter(states[1:])
-
-    def step(self, ops: Any, state: State, u: Array) -> State:
-        """Return the next given state."""
-        return State(*np.split(next(self._next), [self.scene.n_q]))
-
-
 def _along_own_states(backend: Backend, problem: Problem, theta: np.ndarray, w: np.ndarray) -> Program:
     """Return the program, for a physics engine with the engine's states: actions follow from these."""
     has_states = type(problem).trajectory is not Problem.trajectory
     if "physics" not in backend.provides or not has_states or not isinstance(problem.program, Rollout):
         return problem.program
-    return _Replayed(problem.program, problem.trajectory(theta, w).states)
+    return Replayed(problem.program, problem.trajectory(theta, w).states)
 
 
 @verifies(Backend)

@@ -80,7 +80,7 @@ class EngineProblem(Problem):
     def _value(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         states = self.trajectory(theta, w).states
         with np.errstate(all="ignore"):
-            cost = _Replayed(self._rolled, states).cost(_OPS, theta, w)
+            cost = Replayed(self._rolled, states).cost(_OPS, theta, w)
         return np.where(np.isfinite(states).all(axis=(0, 1)), cost, np.nan)
 
     def _grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
@@ -93,7 +93,7 @@ class EngineProblem(Problem):
         states, steps = self.trajectory(theta, w).states, SCORE_STEP * np.maximum(1.0, np.abs(theta))
 
         def log_probability(scored: np.ndarray) -> np.ndarray:
-            return np.asarray(_Replayed(self._rolled, states).log_probability(_OPS, theta, scored, w))
+            return np.asarray(Replayed(self._rolled, states).log_probability(_OPS, theta, scored, w))
 
         with np.errstate(all="ignore"):
             changes = [np.where(row[:, None], steps, 0.0) for row in np.eye(self.dim)]
@@ -117,7 +117,7 @@ class EngineProblem(Problem):
         return results
 
 
-class _Replayed(Rollout):
+class Replayed(Rollout):
     """A program whose steps return recorded states ``(T + 1, n, B)``. It can run only once."""
 
     def __init__(self, program: Rollout, states: np.ndarray) -> None:
