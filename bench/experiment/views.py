@@ -96,8 +96,6 @@ class Chart:
     """Whether a line joins the Pareto front of a panel: the points that no other beats in x and y, smaller being better."""
     band: bool = False
     """Whether intervals are drawn as bands and not as bars."""
-    shape: str = ""
-    """The column whose values have a marker each, where ``series`` has the colours."""
     chosen: Sequence[tuple[str, Sequence[Any]]] = ()
     """What is drawn of the table: columns with the values to keep, in this order."""
     own_scales: bool = False
@@ -122,7 +120,7 @@ class Chart:
     def _names(self) -> list[str]:
         """Return the columns of the table that the chart needs."""
         axes = [name for c in (*self.x, *self.y) for name in (c.name, c.low, c.high, c.limit)]
-        names = [self.panel, self.series, self.line, self.shape, self.level, self.value, self.cell,
+        names = [self.panel, self.series, self.line, self.level, self.value, self.cell,
                  self.failed, *axes]  # fmt: skip
         return [name for name in dict.fromkeys(names) if name]
 

@@ -188,7 +188,7 @@ def _grey(chart: Chart) -> str:
 
 
 def _legend(chart: Chart, styles: dict[str, Style], width: float) -> list[Any]:
-    """Return the handles of the legend: series or levels, shapes, the front, and named values and ranges of the axes."""
+    """Return the handles of the legend: series or levels, the front, and named values and ranges of the axes."""
     labels = {name: _wrapped(style.meaning or name, width - 0.6) for name, style in styles.items() if name}
     handles: list[Any] = []
     if chart.kind == "grid":
@@ -200,23 +200,15 @@ def _legend(chart: Chart, styles: dict[str, Style], width: float) -> list[Any]:
         bare = is_line and keys and chart.frame.groupby(keys).size().min() > MANY
         for name, label in labels.items():
             style = styles[name]
-            mark = "s" if chart.shape else "" if bare and style.line != "none" else style.marker
+            mark = "" if bare and style.line != "none" else style.marker
             line: Any = style.line if is_line else "none"
             handles.append(
                 Line2D([], [], color=style.colour, marker=mark, linestyle=line, linewidth=style.width, label=label)
             )
-    hollow: dict[str, Any] = {"color": GREY, "markerfacecolor": "none", "linestyle": "none"}
-    handles += [Line2D([], [], marker=mark, label=plain(name), **hollow) for name, mark in _shapes(chart).items()]
     handles += [Line2D([], [], label="Pareto front", **FRONT)] * chart.front
     ranges = dict.fromkeys(mark.name for mark in chart.marks if mark.to is not None)
     handles += [Line2D([], [], label=plain(name), **look) for name, look in _mark_looks(chart).items() if name]
     return handles + [Patch(label=plain(name), **BAND) for name in ranges]
-
-
-def _shapes(chart: Chart) -> dict[str, str]:
-    """Return a marker for each value of the column of shapes."""
-    names = dict.fromkeys(chart.frame[chart.shape].astype(str)) if chart.shape else {}
-    return {name: MARKERS[i % len(MARKERS)] for i, name in enumerate(names)}
 
 
 def _legend_columns(labels: Sequence[str], width: float) -> int:
@@ -319,8 +311,7 @@ def _draw_marks(chart: Chart, panel: Axes, name: str) -> None:
 def _draw_lines(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str, Style]) -> None:
     x, y = chart.x[0], chart.y[0]
     log = _is_log(y, (part if chart.own_scales else chart.frame)[y.name])
-    keys = [key for key in dict.fromkeys((chart.series, chart.line, chart.shape)) if key]
-    shapes = _shapes(chart)
+    keys = [key for key in dict.fromkeys((chart.series, chart.line)) if key]
     for order, (key, points) in enumerate(part.groupby(keys, sort=False) if keys else [(("",), part)]):
         style = styles[str(key[0]) if chart.series else ""]
         is_line, is_number = chart.kind == "lines", pd.api.types.is_numeric_dtype(points[x.name])
@@ -328,7 +319,6 @@ def _draw_lines(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str,
         values, low, high, limit = _values(points, y, log)
         places = points[x.name].to_numpy()
         mark = style.marker if not is_line or len(points) <= MANY or style.line == "none" else ""
-        mark = shapes[str(points[chart.shape].iloc[0])] if chart.shape else mark
         common: dict[str, Any] = {"color": style.colour, "zorder": 3 + 0.01 * order}
         panel.plot(places, values, linestyle=style.line if is_line else "none", linewidth=style.width, **common)
         if mark:

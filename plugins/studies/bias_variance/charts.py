@@ -55,6 +55,7 @@ BIAS = Column(
 )  # fmt: skip
 SECONDS = replace(COLUMNS.by_name["time_s"], label="time of one estimate", log=True)
 ROLLOUTS_SPENT = Column("rollouts_", label="rollouts of one estimate, a gradient at its measured cost", log=True)
+FASTEST = "each estimator on its fastest backend"
 ESTIMATOR = text("series", label="")
 
 
@@ -238,7 +239,7 @@ def _speed_accuracy(shown: Arranged, best: pd.DataFrame, styles: Mapping[str, St
     return Chart(
         "speed_accuracy" if timed else "rollouts_accuracy", frame, [x], [RMSE], series="series",
         panel="panel", styles=styles, marks=marks, across=3, height=2.0,
-        subtitle=", ".join(filter(None, [subtitle, "each estimator on its fastest backend"])),
+        subtitle=", ".join(filter(None, [subtitle, FASTEST])),
         text="Only estimates that no other of the same estimator beats in both error and cost are drawn.",
     )  # fmt: skip
 
@@ -252,16 +253,15 @@ def _on_fastest(rows: pd.DataFrame, cost: Cost) -> pd.DataFrame:
 
 
 def _error_and_cost(shown: Arranged, styles: Mapping[str, Style], subtitle: str) -> Chart:
-    """Return error against time where samples were not swept: a dot per estimator and backend, by problem."""
+    """Return error against time where samples were not swept: a dot per estimator, by problem."""
     rows = TIME.known(shown.rows)
+    rows = rows.loc[rows.groupby(["problem_", "series"], sort=False)["time_s"].idxmin()]
     problems = list(dict.fromkeys(rows["problem_"]))
-    step = max(1, math.ceil(len(problems) / 6))
-    chosen = problems[::step]
+    chosen = problems[:: math.ceil(len(problems) / 3)] if problems else []
     shares = [f"{len(chosen)} of {counted(len(problems), 'problem')}"] if len(chosen) < len(problems) else []
     return Chart(
-        "speed_accuracy", rows, [SECONDS], [RMSE], "points", series="series", shape="backend", panel="problem_",
-        styles=styles, across=3, height=1.9, subtitle=", ".join(filter(None, [subtitle, *shares])),
-        chosen=(("problem_", chosen),), front=True,
+        "speed_accuracy", rows[rows["problem_"].isin(chosen)], [SECONDS], [RMSE], "points", series="series", panel="problem_",
+        styles=styles, across=3, height=1.9, subtitle=", ".join(filter(None, [subtitle, *shares, FASTEST])), front=True,
     )  # fmt: skip
 
 
