@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
@@ -16,7 +15,7 @@ import pandas as pd
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import LogNorm, Normalize, to_hex, to_rgb
+from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
@@ -54,7 +53,6 @@ MANY = 12
 
 def draw(chart: Chart, width: float | None = None) -> Figure:
     """Return the chart as a figure of a width in inches: by default two columns of a paper, or one for a single panel."""
-    chart = replace(chart, frame=chart.drawn(), chosen=())
     panels = [(str(name), part) for name, part in chart.frame.groupby(chart.panel, sort=False)] if chart.panel else []
     panels = panels or [("", chart.frame)]
     is_plot = chart.kind in ("lines", "points")
@@ -405,7 +403,7 @@ def _draw_grid(
     size = min(SIZE - 1, 0.8 * 72 * room, SIZE * 0.92 * room / max(widest, 0.1))
     for line in part.to_dict("records"):
         at = names.index(_category(line[x.name])), place[_category(line[y.name])]
-        face = styles[str(line[chart.level])].colour if chart.level else _shade(chart, float(line[chart.value]))
+        face = styles[str(line[chart.level])].colour if chart.level else _shade(float(line[chart.shade]))
         panel.add_patch(Rectangle((at[0] - 0.5, at[1] - 0.5), 1, 1, facecolor=face, edgecolor="white", linewidth=0.8))
         text = plain(str(line[chart.cell])) if chart.cell else ""
         panel.text(*at, text, ha="center", va="center", color=ink_on(face), fontsize=size)
@@ -442,15 +440,9 @@ def _categories(column: Column, rows: pd.DataFrame, downwards: bool = False) -> 
     return list(map(str, values))
 
 
-def _shade(chart: Chart, value: float) -> str:
-    """Return the colour of a cell by its number: darker is larger."""
-    if not math.isfinite(value):
-        return "#f0f0f0"
-    values = chart.frame[chart.value]
-    values = values[np.isfinite(values)]
-    lowest, highest = chart.value_range or (values.min(), values.max())
-    kind = LogNorm if chart.value_range or is_logarithmic(values) else Normalize
-    return to_hex(colormaps["YlOrBr"](0.08 + 0.84 * float(kind(lowest, highest, clip=True)(value))))
+def _shade(share: float) -> str:
+    """Return the colour of a cell by a number from 0 to 1: darker is larger."""
+    return to_hex(colormaps["YlOrBr"](0.08 + 0.84 * share)) if math.isfinite(share) else "#f0f0f0"
 
 
 def ink_on(ground: str) -> str:

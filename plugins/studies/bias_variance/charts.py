@@ -21,6 +21,7 @@ from bench.report.style import colour, marker
 from bench.report.text import counted, number
 from bench.report.views import (
     Arranged,
+    Curve,
     attempted,
     estimator_curves,
     estimator_label,
@@ -161,25 +162,26 @@ def _along(
     total = frame["series"].nunique()
     panels = [problem.title() for problem in drawn]
     shares = [f"{len(names)} of {total} estimators"] if len(names) < total else []
+    for column, kept in (("series", names), ("panel", panels)):
+        frame = frame[frame[column].isin(kept)]
+        frame = frame.iloc[frame[column].map(kept.index).argsort(kind="stable")]
     marks = [Mark(f"beyond the {name}", value, math.inf) for name, value in shown.marks(axis).items()]
     x = Column("x", label=axis.title, format="setting")
     return Chart(
         "bias_variance_" + re.sub(r"\W", "_", axis.column), frame, [x], [RMSE, BIAS], series="series",
-        line="line", panel="panel", styles=styles, marks=marks, failed="failed", across=len(drawn),
+        panel="panel", styles=styles, marks=marks, failed="failed", across=len(drawn),
         height=2.7 if len(drawn) <= 2 else 2.1,
-        subtitle=", ".join(filter(None, [subtitle, *notes, *shares])), chosen=(("first", [True]), ("series", names), ("panel", panels)),
+        subtitle=", ".join(filter(None, [subtitle, *notes, *shares])),
         text="Bars are 95% intervals. A hollow marker is the upper limit of a bias that is not distinguishable from 0.",
     )  # fmt: skip
 
 
 def _lines(problem: ProblemRows) -> pd.DataFrame:
-    """Return the points of a problem: of each estimator the first of the backends that agree, and the others."""
-    parts: list[pd.DataFrame] = []
-    seen: set[str] = set()
+    """Return the points of a problem: of each estimator the first of the backends that agree."""
+    curves: dict[str, Curve] = {}
     for curve in estimator_curves(problem.rows, 0.03):
-        parts.append(curve.rows.reset_index().assign(panel=problem.title(), first=curve.label not in seen))
-        seen.add(curve.label)
-    return pd.concat(parts, ignore_index=True)
+        curves.setdefault(curve.label, curve)
+    return pd.concat([curve.rows.reset_index().assign(panel=problem.title()) for curve in curves.values()])
 
 
 def _main_series(frame: pd.DataFrame, methods: pd.DataFrame, comparisons: pd.DataFrame) -> list[str]:
@@ -279,10 +281,10 @@ def _estimators(methods: pd.DataFrame) -> Chart:
     marks = frame["status"].where(frame["verdict"] == NO_RESULT, "").mask(frame["verdict"] == FAILS, " fails")
     return Chart(
         "estimators",
-        frame.assign(panel=frame["estimator"].map(families), series=frame["estimator"], value=error.clip(1e-3, 1e3).where(known),
+        frame.assign(panel=frame["estimator"].map(families), series=frame["estimator"], shade=(np.log10(error.clip(1e-2, 1e2)) / 4 + 0.5).where(known),
                      cell=error.map(number).where(known, marks)),
-        [text("problem", label="")], [ESTIMATOR], "grid", panel="panel", value="value",
-        cell="cell", across=1, height=0.2, value_range=(1e-2, 1e2),
+        [text("problem", label="")], [ESTIMATOR], "grid", panel="panel", shade="shade",
+        cell="cell", across=1, height=0.2,
         subtitle="relative RMSE of one estimate, sorted by the worst case; above 1 the zero estimate is better",
     )  # fmt: skip
 
