@@ -127,7 +127,7 @@ FILES = {
     b"samples: 4\n---\nsamples: 5\n": "but found another document",
     b"1: 4\n": "line 2: 1 is not a setting",
     b"~: 4\n": "Incompatible key type",
-    b"sweep: " + b"[" * 5000 + b"\n": "is nested too deeply",
+    b"sweep: " + b"[" * 1000 + b"\n": "is nested too deeply",
     b"smaples: 4\n": "did you mean 'samples'?",
     b"samples: ${seed}\n": "must be a whole number",
 }

@@ -77,12 +77,14 @@ def check_rows(rows, kinds, clean):
         assert rows["status"][f"changes_{kind}"] in ("ok", "error")
 
 
-def test_a_change_reaches_no_other_cell_of_a_worker(tmp_path):
-    kinds = ["x64", "seterr", "np_draw", "norm", "own_method"]
-    clean = rows_of_run(tmp_path / "clean", "jax", [], 1)
-    rows = rows_of_run(tmp_path / "dirty", "jax", kinds, 1)
+@pytest.mark.parametrize(
+    ("backend", "kinds"), [("jax", ["x64"]), ("numpy", ["seterr", "np_draw", "norm", "own_method"])]
+)
+def test_a_change_reaches_no_other_cell_of_a_worker(tmp_path, backend, kinds):
+    clean = rows_of_run(tmp_path / "clean", backend, [], 1)
+    rows = rows_of_run(tmp_path / "dirty", backend, kinds, 1)
     check_rows(rows, kinds, clean)
-    assert rows["dtype"].eq("float32").sum() == 1
+    assert rows["dtype"].eq("float32").sum() == (backend == "jax")
     assert not rows["reason"].str.contains("also run").any()
 
 
@@ -121,8 +123,9 @@ def test_new_processes_do_not_inherit_what_an_import_sets(tmp_path, monkeypatch)
 
 def test_a_worker_loads_no_file_that_its_cells_do_not_need(tmp_path):
     """The change by the import of another plugin is in no row."""
-    mine = tmp_path / "run" / "mine"
-    rows_of_run(tmp_path / "run", "numpy", ["seed"], 0)
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    (mine / "seed.py").write_text(plugin("seed"))
     (mine / "imported.py").write_text(IMPORTED)
     words = [*WORDS, "backends=[numpy]", "estimators=[fobg,changes_seed]", "workers=1", f"results_dir={tmp_path}"]
     with np.errstate():
