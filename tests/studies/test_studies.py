@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 from bench.plugins.studies.gradient_check import views as gradient_check
 from bench.plugins.studies.gradient_check.lines import PER_COMPONENT
-from bench.plugins.studies.stability.views import cells_of
+from bench.plugins.studies.stability import cells_of
 from bench.plugins.studies.twins import FLOOR
 
 import bench.report
