@@ -21,6 +21,8 @@ from bench.model import Problem
 if TYPE_CHECKING:
     import pandas as pd
 
+PARTS = ("scene", "contact", "integrator", "backend")
+"""Parts of the grid that identify a program: the axes of a study without estimators."""
 FINE = 1e-3
 """Spacing of a reference's points, in standard deviations, above which a remark states it: that of points in a plane."""
 

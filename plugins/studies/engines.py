@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from bench.model import Problem, param, zeroth_order
 from bench.report.style import PALETTE
 from bench.report.text import number
 
-from . import StudyPackage, finite_status, relative_error
+from . import PARTS, StudyPackage, finite_status, relative_error
 from .bias_variance.columns import COLUMNS as ESTIMATES
 from .three_errors import difference_check
 
@@ -69,9 +69,9 @@ class Engines(StudyPackage):
     """Measures whether an engine's gradient is right, its bias and variance, and what it costs."""
 
     name = "engines"
-    axes = ("scene", "contact", "integrator", "backend")
+    axes = PARTS
     timed = True
-    columns: ClassVar[Columns] = Columns.of(
+    columns = Columns.of(
         Column("program_error_rel", "distance of the gradient from its best central difference, relative to that difference",
                label="program error", comparison=ComparisonRule("exact", "program error")),
         Column("difference_step", "step of the best central difference, in the units of theta"),

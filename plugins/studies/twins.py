@@ -7,7 +7,7 @@ for its own program. Times are for a batch of ``samples`` rollouts.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -45,8 +45,8 @@ class Twins(StudyPackage):
     """Measures the difference between a physics engine's twin and the scene's own program, and the time of gradients."""
 
     name = "twins"
-    timed: ClassVar[bool] = True
-    columns: ClassVar[Columns] = Columns.of(
+    timed = True
+    columns = Columns.of(
         Column("state_difference", "largest difference of states over time and coordinates", label="states"),
         Column("state_difference_rel", "largest difference of states, each coordinate in units of its largest value",
                label="states, relative",

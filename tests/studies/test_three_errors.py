@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from bench.plugins.studies.three_errors import FLOOR, OWN, PROGRAM, TRAP, _signs, difference_check, traps
+from bench.plugins.studies.three_errors import FLOOR, OWN, PARTS, TRAP, _signs, difference_check, traps
 from classes import BounceOnce, BouncingBall, Impulse, Jax, SemiImplicitEuler
 from helpers import unmeasured
 
@@ -70,7 +70,7 @@ def test_a_trap_is_exact_convergent_and_turned_away_or_no_nearer_at_every_step(c
     values = {"program_error_rel": [1e-12, 1e-13], "model_cosine": [-0.5, -0.4], "forward_error_rel": [0.4, 0.1]}
     values |= {"model_error_rel": [1.5, 0.5]}
     given, typed = unmeasured(*words, "estimators=[fobg]", **(values | change))
-    assert len(traps(Shown(given, typed, ["dt"], ["estimator"], PROGRAM))) == 3 * trapped
+    assert len(traps(Shown(given, typed, ["dt"], ["estimator"], PARTS))) == 3 * trapped
     found = given.study.show(given, typed)
     assert (set(found.charts[0].frame["series"]) == {OWN, TRAP}) == trapped
 

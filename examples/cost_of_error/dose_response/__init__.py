@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 from bench.plugins.studies.optimise import SearchStudy
 
@@ -19,7 +18,7 @@ class DoseResponse(SearchStudy):
     """Searches with gradients of known error at their best rate, and counts the updates until the regret has fallen."""
 
     name = "dose_response"
-    columns: ClassVar[Columns] = Columns.of(
+    columns = Columns.of(
         text("optimizer", "identity string of the optimizer"),
         text("scene_class", "smooth, stiff (contact), chaotic (gradients vary more than costs), discontinuous or identification",
              label="class"),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 from bench.experiment.cell import Cell
 from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, text
@@ -31,7 +31,7 @@ class GradientCheck(StudyPackage):
     """Checks the program's gradient against differences of its cost, at theta0 and around a contact switch."""
 
     name = "gradient_check"
-    columns: ClassVar[Columns] = Columns.of(
+    columns = Columns.of(
         Column("untrusted", "number of checks that show a gradient not to be trusted"),
         Column("best_error", "smallest relative error over all steps, of the worst check"),
         Column("best_eps", "step of that error, in units of the natural scale"),

@@ -21,6 +21,7 @@ from bench.measure.jumps import MissedSlope, jump_under_noise, missed_slope
 from bench.model import SURROGATE, ContactScene, EngineScene, ForceLaw, LoopOps, Problem, Rollout, Unsupported, registry
 
 from .. import norm
+from ..stability import spectral_radius
 from . import GradientCheck, is_trusted
 
 COLUMNS_AT_ONCE = 128
@@ -243,8 +244,7 @@ def beyond_stability(cell: Cell) -> list[str]:
     first = scene.initial_state(np, scene.theta0()[:, None])
     response = float(scene.contact(np).response(np, first.q).max())
     factor = float(getattr(scene, "velocity_factor", 1.0))
-    matrix = integrator.transition(float(scene.dt), spring[0] * response, spring[1] * response, factor)
-    growth = float(np.abs(np.linalg.eigvals(matrix)).max())
+    growth = spectral_radius(integrator, float(scene.dt), spring[0] * response, spring[1] * response, factor)
     if growth <= 1.0 + NEUTRAL:
         return []
     return [

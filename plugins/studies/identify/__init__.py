@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 from bench.errors import UserError
 from bench.experiment.cell import Cell
 from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, text
 from bench.model import Decision, Identified, MechanicalScene, Optimizer, param
 
-from .. import StudyPackage
+from .. import PARTS, StudyPackage
 
 START = "start."
 """Prefix of entries of the initial state in theta."""
@@ -22,9 +20,9 @@ class Identify(StudyPackage):
     """Fits parameters of a scene to noisy records of its motion, and compares the fits with the Cramer-Rao bound."""
 
     name = "identify"
-    axes: ClassVar[tuple[str, ...]] = ("scene", "contact", "integrator", "backend", "optimizer")
-    default_plugins: ClassVar[Mapping[str, Sequence[str]]] = {"optimizers": ("gauss_newton",)}
-    columns: ClassVar[Columns] = Columns.of(
+    axes = (*PARTS, "optimizer")
+    default_plugins = {"optimizers": ("gauss_newton",)}
+    columns = Columns.of(
         text("optimizer", "identity string of the optimizer"),
         Column("rank", "directions of the parameters that the record sees"),
         Column("condition", "largest singular value of the information over the smallest that is seen",
@@ -69,7 +67,7 @@ class Identify(StudyPackage):
         numbers("hidden", "by shooting method, fits with more identifiable directions than the record has"),
     )  # fmt: skip
 
-    revision: ClassVar[int] = 3
+    revision = 3
 
     measurement: float | None = param(
         None,

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 from bench.experiment.cell import Cell
 from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, text
 from bench.model import Estimator, Optimizer, Plugin, param
 
-from .. import StudyPackage
+from .. import PARTS, StudyPackage
 
 
 @dataclass(frozen=True)
 class SearchStudy(StudyPackage):
     """A study whose cells search with an optimizer."""
 
-    axes: ClassVar[tuple[str, ...]] = ("scene", "contact", "integrator", "backend", "estimator", "optimizer")
+    axes = (*PARTS, "estimator", "optimizer")
 
     def parts(self, given: dict[str, Plugin | None]) -> dict[str, Plugin | None]:
         """Return the plugins, without the estimator if the optimizer uses only costs: it then has no effect."""
@@ -43,8 +42,8 @@ class Optimise(SearchStudy):
     """Searches for the best theta with each estimator and optimizer, and records the path."""
 
     name = "optimise"
-    timed: ClassVar[bool] = True
-    columns: ClassVar[Columns] = Columns.of(
+    timed = True
+    columns = Columns.of(
         text("optimizer", "identity string of the optimizer"),
         text("stopped", "reason for the end of the search: budget or diverged"),
         text("scene_class", "smooth, stiff (contact), chaotic (gradients vary more than costs), discontinuous or identification",

@@ -21,6 +21,8 @@ from bench.run.files import make_directory, write_whole
 
 from . import Optimise
 
+PATH = ("iteration", "cost", "rollouts", "gradients", "s")
+"""What is recorded along a path."""
 MAX_POINTS = 300
 """Most points of a path to store, about; they are denser in early iterations."""
 MAX_NEWTON_DIM = 1000
@@ -120,17 +122,14 @@ def follow_path(
 
     state = optimizer.start(theta0)
     step(state, 1)  # compiles, untimed
-    path: dict[str, list[Any]] = {}
+    path: dict[str, list[Any]] = {name: [] for name in PATH}
     usage.rollouts = usage.gradients = 0
     most = settings.iterations if settings.iterations is not None else math.inf
     iteration, seconds = 0, 0.0
     while True:
         cost = objective(problem, state["theta"], still)
-        point = {
-            "iteration": iteration, "cost": cost, "rollouts": usage.rollouts, "gradients": usage.gradients, "s": seconds,
-        }  # fmt: skip
-        for name, value in point.items():
-            path.setdefault(name, []).append(value)
+        for name, value in zip(PATH, (iteration, cost, usage.rollouts, usage.gradients, seconds), strict=True):
+            path[name].append(value)
         if not np.isfinite(cost) or abs(cost) > settings.limit * (abs(path["cost"][0]) + 1.0):
             return path, state["theta"], "diverged"
         if usage.rollouts + settings.gradient_cost * usage.gradients >= settings.budget or iteration >= most:
@@ -217,12 +216,10 @@ def gradient_ratio(problem: Problem, cell: Cell) -> float:
     return _ratios[key]
 
 
-def fastest(
-    function: Callable[[np.ndarray, np.ndarray], Any], theta: np.ndarray, w: np.ndarray, calls: int = 5
-) -> float:
-    """Return the least time [s] of some calls after a first one that compiles."""
+def fastest(function: Callable[[np.ndarray, np.ndarray], Any], theta: np.ndarray, w: np.ndarray) -> float:
+    """Return the least time [s] of five calls after a first one that compiles."""
     function(theta, w)
-    return min(timeit.repeat(lambda: function(theta, w), number=1, repeat=calls))
+    return min(timeit.repeat(lambda: function(theta, w), number=1, repeat=5))
 
 
 # ---------------------------------------------------------------------------------------------- gradient quality

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 from bench.experiment.cell import Cell
 from bench.experiment.columns import Column, Columns, ComparisonRule, interval, numbers, text
@@ -11,7 +10,7 @@ from bench.model import Trainer, param
 from bench.model.policy import PolicyScene
 from bench.model.trainer import LOGGED
 
-from .. import StudyPackage
+from .. import PARTS, StudyPackage
 
 
 @dataclass(frozen=True)
@@ -19,9 +18,9 @@ class Train(StudyPackage):
     """Trains a policy with each trainer and seed; records returns along the run and a log of every update."""
 
     name = "train"
-    axes: ClassVar[tuple[str, ...]] = ("scene", "contact", "integrator", "backend", "trainer")
-    timed: ClassVar[bool] = True
-    columns: ClassVar[Columns] = Columns.of(
+    axes = (*PARTS, "trainer")
+    timed = True
+    columns = Columns.of(
         text("trainer", "identity string of the trainer"),
         Column("first_return", "mean return of the deterministic policy before the first update"),
         interval("final_return", "mean return of the deterministic policy after the last update", digits=3, log=False, comparison=ComparisonRule("interval", "final return", neutral=True)),
