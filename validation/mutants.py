@@ -181,8 +181,7 @@ GROUPS: dict[tuple[str, str], list[tuple[str, str]]] = {
     (ST, OF_STORE): [
         ("self._sequence += 1", "pass"),
         ("duplicated(keep=\"last\")", "duplicated(keep=\"first\")"),
-        ("na_position=\"first\"", "na_position=\"last\""),
-        ("[\"sequence\", \"stored_at\"], kind", "[\"stored_at\", \"sequence\"], kind"),
+        ("sequence.sort_values(", "sequence.sort_values(ascending=False, "),
         ("between(0, MAX_SEQUENCE), 0.0)", "notna(), 0.0)"),
         ("return table[~is_older].reset_index(drop=True) if is_older.any() else table", "return table"),
         ("        if self._sequence is None:\n            self.load()\n        assert self._sequence is not None", "        self._sequence = self._sequence or 0"),

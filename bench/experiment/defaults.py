@@ -70,8 +70,6 @@ def _completed_json(text: str, folders: tuple[Path, ...]) -> str:
 
 def completed_rows(rows: pd.DataFrame) -> pd.DataFrame:
     """Return rows with the column ``parameters`` completed, so that rows stored before and after a change agree."""
-    if "parameters" not in rows:
-        return rows
     texts = {text: completed_json(text) for text in rows["parameters"].unique()}
     if all(text is new or text == new for text, new in texts.items()):
         return rows
