@@ -105,6 +105,11 @@ def mean_interval(values: np.ndarray) -> tuple[float, float, float]:
     return mean, mean - reach, mean + reach
 
 
+def all_noise(cell: Cell, width: int) -> np.ndarray:
+    """Return the noise of all rollouts of a cell, ``(repeats, samples, width)``."""
+    return np.asarray(noise.shared(cell.seed, cell.scene.name, cell.repeats, cell.samples, width))
+
+
 def first_batch(cell: Cell, width: int) -> np.ndarray:
     """Return the noise of the first ``samples`` rollouts of a cell, ``(width, samples)``."""
     return np.ascontiguousarray(noise.shared(cell.seed, cell.scene.name, 1, cell.samples, width)[0].T)

@@ -16,10 +16,9 @@ from bench.experiment.columns import COMMON, Column, Columns, ComparisonRule, in
 from bench.experiment.experiment import Experiment
 from bench.experiment.session import Session
 from bench.experiment.views import Chart, Table, Views
-from bench.measure import noise
 from bench.model import Jacobians, Problem, Rollout, columns, param
 
-from . import PARTS, StudyPackage, mean_interval, norm
+from . import PARTS, StudyPackage, all_noise, mean_interval, norm
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -116,7 +115,7 @@ class Growth(StudyPackage):
         """
         problem = session.problem(cell)
         program, theta = problem.program, problem.program.theta0
-        w = columns(noise.shared(cell.seed, cell.scene.name, cell.repeats, cell.samples, program.n_noise))
+        w = columns(all_noise(cell, program.n_noise))
         first, centre = problem.grad(theta, w), problem.value(theta, np.zeros((w.shape[0], 1)))
         zeroth = (problem.value(theta, w) - centre) * problem.score(theta, w)
         good = np.isfinite(first).all(axis=0) & np.isfinite(zeroth).all(axis=0)

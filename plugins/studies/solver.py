@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bench.experiment.cell import Cell
-from bench.experiment.columns import Column, Columns, ComparisonRule, numbers
+from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, seconds
 from bench.experiment.experiment import Experiment
 from bench.experiment.session import Session
 from bench.experiment.views import Chart, Mark, Views
@@ -46,8 +46,8 @@ class Solver(StudyPackage):
         Column("gradient_cosine", "cosine between the gradient and the converged program's gradient", label="cosine"),
         Column("wrong_signs", "share of coordinates whose sign is not that of the converged program's gradient", label="wrong signs",
                comparison=ComparisonRule("exact", "wrong signs")),
-        Column("gradient_s", "time of the gradients of `samples` rollouts", "s", measured=True, label="gradients", format="seconds"),
-        Column("compile_s", "time of compiling the gradient", "s", measured=True, label="compilation", format="seconds"),
+        seconds("gradient_s", "time of the gradients of `samples` rollouts", "gradients"),
+        seconds("compile_s", "time of compiling the gradient", "compilation"),
         numbers("gradient", "gradient at w = 0, by coordinate of theta"),
         numbers("converged_gradient", "the converged program's gradient at w = 0, by coordinate of theta"),
     )  # fmt: skip

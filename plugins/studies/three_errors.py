@@ -19,11 +19,11 @@ from bench.experiment.experiment import Experiment
 from bench.experiment.session import Session
 from bench.experiment.views import Chart, Style, Table, Views
 from bench.gradient import sampled
-from bench.measure import noise, statistics
+from bench.measure import statistics
 from bench.model import Problem, Program
 from bench.report.style import PALETTE
 
-from . import PARTS, StudyPackage, finite_status, norm, ratio, relative_error
+from . import PARTS, StudyPackage, all_noise, finite_status, norm, ratio, relative_error
 from .bias_variance.columns import COLUMNS as ESTIMATES
 
 if TYPE_CHECKING:
@@ -123,7 +123,7 @@ class ThreeErrors(StudyPackage):
         status = finite_status(truth.note or "the reference gradient is not finite", truth.batches)
         if status["status"] != "ok":
             return result | status
-        w = noise.shared(cell.seed, cell.scene.name, cell.repeats, cell.samples, problem.program.n_noise)
+        w = all_noise(cell, problem.program.n_noise)
         estimates = np.asarray(cell.estimator.estimate(problem, problem.program.theta0, w), dtype=np.float64)
         summary = asdict(statistics.summarise(estimates, truth.known(), cell.samples))
         status = finite_status("", estimates, check.gradient) | {"reason": summary["note"]}

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from bench.plugins.studies.optimise import SearchStudy
 
-from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, text
+from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, seconds, several, text
 from bench.model import param
 
 REVISION = 1
@@ -40,16 +40,17 @@ class DoseResponse(SearchStudy):
         Column("gradients_per_update", "gradients of an update"),
         Column("tuning_rollouts", "costs of all searches that choose the rate"),
         Column("tuning_gradients", "gradients of all searches that choose the rate"),
-        Column("rollout_s", "time of a cost in a batch of 256", "s", format="seconds", measured=True, untimed=True),
-        Column("gradient_s", "time of a gradient in a batch of 256", "s", format="seconds", measured=True, untimed=True),
+        seconds("rollout_s", "time of a cost in a batch of 256", untimed=True),
+        seconds("gradient_s", "time of a gradient in a batch of 256", untimed=True),
         text("hypotheses", "hash of the file of hypotheses at the time of the measurement"),
-        numbers("updates", "updates to 1/10, 1/30, 1/100, 1/300 and 1/1000 of the first regret, `runs` each; empty: missed",
-                table=False),
-        numbers("best_rates", "rate of each target, chosen on seeds that do not score", table=False),
-        numbers("is_inside", "whether the rate of each target is inside the grid of rates", table=False),
-        numbers("rates", "rates tried", table=False),
-        numbers("rate_updates", "median updates to each target at each rate", table=False),
-        numbers("path_errors", "relative error at each of the ten thetas", table=False),
+        *several(numbers, {
+            "updates": "updates to 1/10, 1/30, 1/100, 1/300 and 1/1000 of the first regret, `runs` each; empty: missed",
+            "best_rates": "rate of each target, chosen on seeds that do not score",
+            "is_inside": "whether the rate of each target is inside the grid of rates",
+            "rates": "rates tried",
+            "rate_updates": "median updates to each target at each rate",
+            "path_errors": "relative error at each of the ten thetas",
+        }, table=False),
     )  # fmt: skip
 
     iterations: int = param(200, "most updates of a search", positive=True)

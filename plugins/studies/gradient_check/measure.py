@@ -6,7 +6,7 @@ import itertools
 import math
 import zlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -42,11 +42,11 @@ class Place:
     """One of :data:`bench.plugins.studies.gradient_check.POINTS`."""
     number: int
     """Number of the direction, or -1 - i for component i."""
-    noise: int = 0
+    noise: int
     """0 without noise, 1 with it."""
-    theta: np.ndarray = field(default_factory=lambda: np.empty(0))
-    direction: np.ndarray = field(default_factory=lambda: np.empty(0))
-    w: np.ndarray = field(default_factory=lambda: np.empty(0))
+    theta: np.ndarray
+    direction: np.ndarray
+    w: np.ndarray
     switch: str = ""
     """The contact switch that the place is at, in words."""
 
@@ -208,7 +208,9 @@ def at_start(whole: gradcheck.Check) -> list[Point]:
     if whole.cause not in (*seen, *(part.verdict for part in parts)):
         # the cause occurs only at other thetas, or in a second evaluation
         parts += [replace(part, verdict=whole.cause) for part in (*whole.worst_parts, *whole.parts)[:1]]
-    return [Point(Place("start", _number(part)), part.verdict, part.sample, *part.modes) for part in parts]
+    none = np.empty(0)
+    places = [Place("start", _number(part), 0, none, none, none) for part in parts]
+    return [Point(at, part.verdict, part.sample, *part.modes) for at, part in zip(places, parts, strict=True)]
 
 
 def _number(part: gradcheck.Part) -> int:

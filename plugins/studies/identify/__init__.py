@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 from bench.errors import UserError
 from bench.experiment.cell import Cell
-from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, text
+from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, several, text
 from bench.model import Decision, Identified, MechanicalScene, Optimizer, param
 
 from .. import PARTS, StudyPackage
@@ -48,12 +48,14 @@ class Identify(StudyPackage):
         numbers("term", "the term"),
         numbers("unnoticed", "the largest bias that it causes while 5% of records do not show it", label="unseen bias"),
         numbers("errors", "this bias in standard errors", label="in standard errors"),
-        numbers("unknowns", "names of the parameters"),
-        numbers("truth", "true values of the parameters; nan: a record of your own"),
-        numbers("invariants", "identifiable products of powers of the parameters"),
-        numbers("bound", "Cramer-Rao bound of the relative standard deviation of each invariant"),
-        numbers("shooting", "the shooting methods: single, multiple, windows"),
-        numbers("optimum", "by shooting method, share of fits whose optimizer has reached an optimum"),
+        *several(numbers, {
+            "unknowns": "names of the parameters",
+            "truth": "true values of the parameters; nan: a record of your own",
+            "invariants": "identifiable products of powers of the parameters",
+            "bound": "Cramer-Rao bound of the relative standard deviation of each invariant",
+            "shooting": "the shooting methods: single, multiple, windows",
+            "optimum": "by shooting method, share of fits whose optimizer has reached an optimum",
+        }),
         numbers("converged", "by shooting method, share of fits whose residuals are consistent with the noise",
                 label="share of fits that converge", low="converged_low", high="converged_high"),
         numbers("converged_low", "lower end of its 95% interval"),

@@ -19,7 +19,7 @@ from bench.model import Answer, Estimator, KnownOptimum, Optimizer, Problem, Rol
 from bench.model.program import OWN
 from bench.run.files import make_directory, write_whole
 
-from . import Optimise
+from . import Optimise, search_parts
 
 PATH = ("iteration", "cost", "rollouts", "gradients", "s")
 """What is recorded along a path."""
@@ -69,8 +69,8 @@ def measure(cell: Cell, session: Session, settings: Optimise) -> dict[str, Any]:
     """Search until the budget is spent or the cost has diverged; return the cell's results by column."""
     problem = session.problem(cell)
     optimum, how = known_optimum(cell, problem, session)
-    theta0 = np.array(problem.program.theta0, dtype=np.float64)
-    quality = gradient_quality(cell, problem, theta0, settings) if settings.quality != "none" else None
+    theta0 = problem.program.theta0
+    quality = {} if settings.quality == "none" else gradient_quality(cell, problem, theta0, settings)
     path, theta, stopped = follow_path(cell, problem, theta0, settings)
     last = {name: values[-1] for name, values in path.items()}
     cost, is_lost = path["cost"], stopped == "diverged"
@@ -86,7 +86,7 @@ def measure(cell: Cell, session: Session, settings: Optimise) -> dict[str, Any]:
         "optimum": optimum, "optimum_status": how, "score": 0.0 if is_lost and not np.isfinite(score) else score,
         **{f"path_{name}": np.asarray(values)[stored].tolist() for name, values in path.items()},
         "theta": theta.tolist(),
-        **{f"quality_{name}": value for name, value in (quality or {}).items()},
+        **{f"quality_{name}": value for name, value in quality.items()},
     }  # fmt: skip
 
 
@@ -105,9 +105,7 @@ def follow_path(
 
     The path has lists with an entry per iteration: iteration, cost, rollouts, gradients and time ``s``.
     """
-    optimizer, estimator, usage = cell.parts["optimizer"], cell.parts["estimator"], problem.usage
-    assert isinstance(optimizer, Optimizer)
-    assert estimator is None or isinstance(estimator, Estimator)
+    (optimizer, estimator), usage = search_parts(cell), problem.usage
     still = np.zeros((problem.program.n_noise, 1))
 
     def step(state: dict[str, Any], iteration: int) -> dict[str, Any]:
@@ -230,16 +228,15 @@ MAX_REFERENCE_SHARE = 0.5
 _qualities: dict[tuple[Any, ...], dict[str, float]] = {}
 
 
-def gradient_quality(cell: Cell, problem: Problem, theta: np.ndarray, settings: Optimise) -> dict[str, float] | None:
+def gradient_quality(cell: Cell, problem: Problem, theta: np.ndarray, settings: Optimise) -> dict[str, float]:
     """Return relative error, cosine and share of bias of the estimator's gradients at ``theta (d,)``.
 
-    Returns None without an estimator. The reference is the mean of many gradients or of many zeroth-order terms,
+    Empty without an estimator. The reference is the mean of many gradients or of many zeroth-order terms,
     whichever vary less. Where the cost jumps or the backend has no gradients, it is the mean of zeroth-order terms.
     """
-    estimator = cell.parts["estimator"]
+    _, estimator = search_parts(cell)
     if estimator is None:
-        return None
-    assert isinstance(estimator, Estimator)
+        return {}
     key = (
         cell.program_key, cell.backend, estimator, cell.samples, cell.repeats, settings.quality_samples, theta.tobytes(),
     )  # fmt: skip
