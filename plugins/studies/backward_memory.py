@@ -14,7 +14,7 @@ import time
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -28,7 +28,7 @@ from bench.experiment.views import Chart, Table, Views
 from bench.measure import timing
 from bench.model import Compilations, param, registry
 
-from . import StudyPackage, finite_status, first_batch, relative_error
+from . import PARTS, StudyPackage, finite_status, first_batch, relative_error
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -82,8 +82,8 @@ class BackwardMemory(StudyPackage):
     """Measures the peak memory and the time of a batch of gradients on each backend, each cell in its own process."""
 
     name = "backward_memory"
-    axes: ClassVar[tuple[str, ...]] = ("scene", "contact", "integrator", "backend")
-    columns: ClassVar[Columns] = Columns.of(
+    axes = PARTS
+    columns = Columns.of(
         interval("memory_mb", "largest resident memory during `samples` gradients beyond the memory before, median over calls",
                "MiB", label="memory", measured=True),
         Column("memory_mb_low", "smallest of the calls: lower end of the interval", "MiB", measured=True),
@@ -99,7 +99,7 @@ class BackwardMemory(StudyPackage):
         numbers("gradient", "mean gradient of the batch, by coordinate of theta",
                 comparison=ComparisonRule("vector", "gradient")),
     )  # fmt: skip
-    timed: ClassVar[bool] = True
+    timed = True
 
     calls: int = param(
         6, "measured calls: the range of six contains the median of their distribution with probability 97%", low=6

@@ -5,13 +5,13 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from bench.engines.problem import EngineProblem
 from bench.experiment.cell import Cell
-from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, text
+from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, seconds, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.session import Session
 from bench.experiment.views import Chart, Style, Views
@@ -20,7 +20,7 @@ from bench.model import Problem, param, zeroth_order
 from bench.report.style import PALETTE
 from bench.report.text import number
 
-from . import StudyPackage, finite_status, relative_error
+from . import PARTS, StudyPackage, all_noise, finite_status, relative_error
 from .bias_variance.columns import COLUMNS as ESTIMATES
 from .three_errors import difference_check
 
@@ -69,9 +69,9 @@ class Engines(StudyPackage):
     """Measures whether an engine's gradient is right, its bias and variance, and what it costs."""
 
     name = "engines"
-    axes = ("scene", "contact", "integrator", "backend")
+    axes = PARTS
     timed = True
-    columns: ClassVar[Columns] = Columns.of(
+    columns = Columns.of(
         Column("program_error_rel", "distance of the gradient from its best central difference, relative to that difference",
                label="program error", comparison=ComparisonRule("exact", "program error")),
         Column("difference_step", "step of the best central difference, in the units of theta"),
@@ -81,10 +81,9 @@ class Engines(StudyPackage):
         *(ESTIMATES.by_name[name] for name in (*SUMMARY[:2], "reference_method", "reference_spacing", *SUMMARY[2:])),
         Column("zeroth_rmse_rel", "rmse_rel from `samples` costs with scores, without gradients", label="RMSE, costs only"),
         Column("nan_share", "share of the gradients that are not finite", label="NaN share"),
-        Column("gradient_s", "time of `batch` gradients, median", "s", label="gradients", measured=True, format="seconds"),
-        Column("value_s", "time of `batch` costs, median", "s", label="costs", measured=True, format="seconds"),
-        Column("first_s", "time of the first gradients and costs, with starts and compilation", "s", label="first call",
-               measured=True, format="seconds"),
+        seconds("gradient_s", "time of `batch` gradients, median", "gradients"),
+        seconds("value_s", "time of `batch` costs, median", "costs"),
+        seconds("first_s", "time of the first gradients and costs, with starts and compilation", "first call"),
         Column("pipe_share", "share of gradient_s outside the engine's process: pipes and copies", label="pipe", measured=True),
         Column("pass_share", "share of gradient_s in this process: costs, policy and adjoint pass", label="harness",
                measured=True),
@@ -110,7 +109,7 @@ class Engines(StudyPackage):
         truth = session.references.of(cell)
         known, noted = truth.known(), truth.note or "the reference gradient is not finite"
         status = finite_status(noted, truth.batches)
-        w = noise.shared(cell.seed, cell.scene.name, cell.repeats, cell.samples, program.n_noise)
+        w = all_noise(cell, program.n_noise)
         zeroth = zeroth_order(problem, theta, w).mean(axis=1)
         result |= {
             "reference_method": truth.method, "reference_spacing": truth.spacing, "device": problem.device,

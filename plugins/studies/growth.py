@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -16,10 +16,9 @@ from bench.experiment.columns import COMMON, Column, Columns, ComparisonRule, in
 from bench.experiment.experiment import Experiment
 from bench.experiment.session import Session
 from bench.experiment.views import Chart, Table, Views
-from bench.measure import noise
 from bench.model import Jacobians, Problem, Rollout, columns, param
 
-from . import StudyPackage, mean_interval, norm
+from . import PARTS, StudyPackage, all_noise, mean_interval, norm
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -34,8 +33,6 @@ FEWEST = 5
 
 QUANTILES = {"low": 0.05, "quarter": 0.25, "median": 0.5, "three_quarters": 0.75, "high": 0.95}
 """Quantiles over noise samples, stored for heavy-tailed quantities."""
-PROBLEM = ("scene", "contact", "integrator", "backend")
-"""Parts of the grid that identify a problem. It is drawn along the horizon and the axes that step with it."""
 ORDERS = {"first_order": "first-order", "zeroth_order": "zeroth-order"}
 RATES = {"stretch": "largest singular value", "spectral": "spectral radius"}
 MEDIAN: dict[str, Any] = {"label": "norm of one gradient", "low": "gradient_low", "high": "gradient_high"}
@@ -69,7 +66,7 @@ class Growth(StudyPackage):
     """Measures norms of sampled gradients, products of step Jacobians, and variances of first- and zeroth-order terms."""
 
     name = "growth"
-    columns: ClassVar[Columns] = Columns.of(
+    columns = Columns.of(
         Column("time_horizon", "duration of the rollout", "s", label="horizon", format="setting"),
         *(
             Column(f"gradient_{name}", f"norm of one sample's gradient, {q:.0%} quantile",
@@ -118,7 +115,7 @@ class Growth(StudyPackage):
         """
         problem = session.problem(cell)
         program, theta = problem.program, problem.program.theta0
-        w = columns(noise.shared(cell.seed, cell.scene.name, cell.repeats, cell.samples, program.n_noise))
+        w = columns(all_noise(cell, program.n_noise))
         first, centre = problem.grad(theta, w), problem.value(theta, np.zeros((w.shape[0], 1)))
         zeroth = (problem.value(theta, w) - centre) * problem.score(theta, w)
         good = np.isfinite(first).all(axis=0) & np.isfinite(zeroth).all(axis=0)
@@ -148,7 +145,7 @@ class Growth(StudyPackage):
 
         from bench.report.shown import Shown
 
-        shown = Shown(experiment, rows, along=["horizon"], method=(), problem=PROBLEM)
+        shown = Shown(experiment, rows, along=["horizon"], method=(), problem=PARTS)
         per_second = {
             f"{name}_{end}": shown.rows[f"{name}_{end}"] / shown.rows["dt"] for name in RATES for end in ("rate", "low", "high")
         }  # fmt: skip

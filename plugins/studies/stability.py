@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -82,7 +82,7 @@ class Stability(StudyPackage):
     """Measures where a program's gradient is right, inaccurate, of wrong sign, zero or lost, one rollout per cell."""
 
     name = "stability"
-    columns: ClassVar[Columns] = Columns.of(
+    columns = Columns.of(
         Column("first_bad_step", "first step at which the state diverged or was not finite"),
         Column("growth_factor", "measured growth of the state per step, where the motion is linear"),
         Column("spectral_radius", "of one step on the cell's oscillator, in theory"),

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,11 +19,11 @@ from bench.experiment.experiment import Experiment
 from bench.experiment.session import Session
 from bench.experiment.views import Chart, Style, Table, Views
 from bench.gradient import sampled
-from bench.measure import noise, statistics
+from bench.measure import statistics
 from bench.model import Problem, Program
 from bench.report.style import PALETTE
 
-from . import StudyPackage, finite_status, norm, ratio, relative_error
+from . import PARTS, StudyPackage, all_noise, finite_status, norm, ratio, relative_error
 from .bias_variance.columns import COLUMNS as ESTIMATES
 
 if TYPE_CHECKING:
@@ -48,8 +48,6 @@ WRONG = 0.1
 """Smallest model error of a wrong gradient."""
 FLOOR = 1e-16
 """Smallest error that is drawn; smaller ones, 0 included, are drawn here as upper limits."""
-PROGRAM = ("scene", "contact", "integrator", "backend")
-"""Parts of the grid that identify a program, which is the same at every time step."""
 RESULTS = ("forward_error_rel", "program_error_rel", "model_error_rel", "model_cosine", "model_signs")
 OWN, PHYSICS, TRAP = "program error", "model error", "model error of a trap"
 STYLES = {
@@ -73,7 +71,7 @@ class ThreeErrors(StudyPackage):
     """Measures program, model and estimator error of a gradient, and the forward error."""
 
     name = "three_errors"
-    columns: ClassVar[Columns] = Columns.of(
+    columns = Columns.of(
         Column("cost", "cost f at theta, without noise"),
         Column("physical_cost", "cost of the physics at theta, without noise"),
         Column("forward_error", "difference of cost and physical_cost"),
@@ -125,7 +123,7 @@ class ThreeErrors(StudyPackage):
         status = finite_status(truth.note or "the reference gradient is not finite", truth.batches)
         if status["status"] != "ok":
             return result | status
-        w = noise.shared(cell.seed, cell.scene.name, cell.repeats, cell.samples, problem.program.n_noise)
+        w = all_noise(cell, problem.program.n_noise)
         estimates = np.asarray(cell.estimator.estimate(problem, problem.program.theta0, w), dtype=np.float64)
         summary = asdict(statistics.summarise(estimates, truth.known(), cell.samples))
         status = finite_status("", estimates, check.gradient) | {"reason": summary["note"]}
@@ -135,7 +133,7 @@ class ThreeErrors(StudyPackage):
         """Return a line per cell, the traps and the chart."""
         from bench.report.shown import Shown
 
-        shown = Shown(experiment, rows, ["dt"], ["estimator"], PROGRAM)
+        shown = Shown(experiment, rows, ["dt"], ["estimator"], PARTS)
         ends = {f"bias_rel_{end}": shown.rows[f"bias_{end}"] / shown.rows["reference_norm"] for end in ("low", "high")}
         bias = shown.column("bias_rel", label="estimator error", low="bias_rel_low", high="bias_rel_high")
         cells = shown.cells(
@@ -166,7 +164,7 @@ class DifferenceCheck:
     step: float
 
 
-def difference_check(problem: Problem, steps: np.ndarray = STEPS) -> DifferenceCheck:
+def difference_check(problem: Problem) -> DifferenceCheck:
     """Compare the program's gradient with its best central difference over a sweep of step sizes, at w = 0.
 
     Truncation errors and jumps dominate at large steps, rounding at small steps. All costs are one batch.
@@ -175,13 +173,13 @@ def difference_check(problem: Problem, steps: np.ndarray = STEPS) -> DifferenceC
     gradient = problem.grad(theta, np.zeros((n_noise, 1)))[:, 0]
     samples, *_ = sampled(
         lambda at: problem.value(at, np.zeros((n_noise, at.shape[1]))), theta, np.eye(theta.size), np.ones(theta.size),
-        gradient, float(np.finfo(np.float64).eps), steps,
+        gradient, float(np.finfo(np.float64).eps), STEPS,
     )  # fmt: skip
     differences = np.array([sample.differences for sample in samples])
     errors = np.linalg.norm(differences - gradient[:, None], axis=0)
     # without the mask, np.argmin would return the index of a NaN
     best = int(np.argmin(np.where(np.isfinite(errors), errors, np.inf)))
-    return DifferenceCheck(samples[0].centre, gradient, differences[:, best], float(steps[best]))
+    return DifferenceCheck(samples[0].centre, gradient, differences[:, best], float(STEPS[best]))
 
 
 def _against_physics(program: Program, check: DifferenceCheck) -> dict[str, Any]:
@@ -248,7 +246,7 @@ def _dumbbells(shown: Shown, trapped: pd.DataFrame) -> Chart:
     rows = along_steps(shown)
     scene = problem_names(shown.arranged, ["scene"], shown.over or shown.arranged.axes, ["scene"], rows)
     # a law is named by what distinguishes it on its scene
-    laws = [problem_names(shown.arranged, PROGRAM[1:], shown.over, ["contact"], own) for _, own in rows.groupby(scene)]
+    laws = [problem_names(shown.arranged, PARTS[1:], shown.over, ["contact"], own) for _, own in rows.groupby(scene)]
     rows = rows.assign(panel=scene, law=pd.concat(laws)).drop_duplicates(["panel", "law"]).sort_index()
     errors = stacked(rows, {OWN: "program_error_rel", PHYSICS: "model_error_rel"}, "error")
     errors = floored(errors.sort_values("row", kind="stable"), FLOOR, ["error"]).dropna(subset=["error"])

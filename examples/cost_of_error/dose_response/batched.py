@@ -23,6 +23,7 @@ class Lane(Problem):
         super().__init__(inner.program)
         self._inner, self._search = inner, search
         self.device, self.provides = inner.device, inner.provides
+        self.jacobians, self.trajectory = inner.jacobians, inner.trajectory  # type: ignore[method-assign]
         self._requests: SimpleQueue[Any] = SimpleQueue()
         self._answers: SimpleQueue[Any] = SimpleQueue()
         self.result: Any = None
@@ -63,14 +64,6 @@ class Lane(Problem):
     def gives_jacobians(self) -> bool:
         """Whether the shared problem defines :meth:`jacobians`."""
         return self._inner.gives_jacobians
-
-    def jacobians(self, theta: np.ndarray, w: np.ndarray) -> Any:
-        """Return the step Jacobians."""
-        return self._inner.jacobians(theta, w)
-
-    def trajectory(self, theta: np.ndarray, w: np.ndarray) -> Any:
-        """Return the states."""
-        return self._inner.trajectory(theta, w)
 
 
 def run_batched(problem: Problem, searches: Sequence[Callable[[Problem], Any]]) -> list[Any]:

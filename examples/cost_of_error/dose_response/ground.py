@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from bench.plugins.studies.optimise import search_parts
 from bench.plugins.studies.optimise.measure import known_optimum, objective, stored_in
 from scipy.optimize import minimize
 
@@ -66,8 +67,7 @@ def scored_noise(problem: Problem, scene: str) -> np.ndarray:
 
 def ground_of(cell: Cell, problem: Problem, session: Session, settings: Any) -> Ground:
     """Return the problem's optimum and common path, from a file beside the references or computed and stored."""
-    optimizer = cell.parts["optimizer"]
-    assert isinstance(optimizer, Optimizer)
+    optimizer, _ = search_parts(cell)
     key = hashed(cell.program_key, fingerprint(cell.study), fingerprint(optimizer), fingerprint(cell.backend))
     found = stored_in(session, f"path_{key}.json", lambda: _compute(cell, problem, session, settings, optimizer))
     arrays = {name: np.array(found[name]) for name in ("thetas", "gradients", "variances")}
@@ -76,7 +76,7 @@ def ground_of(cell: Cell, problem: Problem, session: Session, settings: Any) -> 
 
 def _compute(cell: Cell, problem: Problem, session: Session, settings: Any, optimizer: Optimizer) -> dict[str, Any]:
     scored = scored_noise(problem, cell.scene.name)
-    theta0 = np.array(problem.program.theta0, dtype=np.float64)
+    theta0 = problem.program.theta0
     start = objective(problem, theta0, scored)
     optimum, how = _optimum(cell, problem, session, scored)
     if not start - optimum > 1e-9 * (abs(start) + abs(optimum)):
@@ -120,7 +120,7 @@ def _optimum(cell: Cell, problem: Problem, session: Session, scored: np.ndarray)
         optimum, how = known_optimum(cell, problem, session)
         if np.isfinite(optimum):
             return optimum, how
-    theta0 = np.array(problem.program.theta0, dtype=np.float64)
+    theta0 = problem.program.theta0
     w = noise.draw(0, cell.scene.name, 1, PRECISE, problem.program.n_noise, "dose_response: optimum")
 
     def cost(theta: np.ndarray) -> float:

@@ -77,7 +77,7 @@ def _noise(seed: int, scene: str, samples: int, width: int, iteration: int) -> n
 def follow(problem: Problem, method: Method, task: Task, seed: int, keep: bool = False) -> Search:
     """Search until the last target, divergence or the number of updates; ``keep`` returns theta at every update."""
     optimizer, width = method.optimizer, problem.program.n_noise
-    state = optimizer.start(np.array(problem.program.theta0, dtype=np.float64))
+    state = optimizer.start(problem.program.theta0)
     updates, lowest, thetas, i = [math.inf] * len(TARGETS), math.inf, [], 0
     problem.usage.rollouts = problem.usage.gradients = 0
     first = task.start - task.optimum

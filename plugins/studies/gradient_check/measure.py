@@ -6,7 +6,7 @@ import itertools
 import math
 import zlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,7 @@ from bench.measure.jumps import MissedSlope, jump_under_noise, missed_slope
 from bench.model import SURROGATE, ContactScene, EngineScene, ForceLaw, LoopOps, Problem, Rollout, Unsupported, registry
 
 from .. import norm
+from ..stability import spectral_radius
 from . import GradientCheck, is_trusted
 
 COLUMNS_AT_ONCE = 128
@@ -41,11 +42,11 @@ class Place:
     """One of :data:`bench.plugins.studies.gradient_check.POINTS`."""
     number: int
     """Number of the direction, or -1 - i for component i."""
-    noise: int = 0
+    noise: int
     """0 without noise, 1 with it."""
-    theta: np.ndarray = field(default_factory=lambda: np.empty(0))
-    direction: np.ndarray = field(default_factory=lambda: np.empty(0))
-    w: np.ndarray = field(default_factory=lambda: np.empty(0))
+    theta: np.ndarray
+    direction: np.ndarray
+    w: np.ndarray
     switch: str = ""
     """The contact switch that the place is at, in words."""
 
@@ -207,7 +208,9 @@ def at_start(whole: gradcheck.Check) -> list[Point]:
     if whole.cause not in (*seen, *(part.verdict for part in parts)):
         # the cause occurs only at other thetas, or in a second evaluation
         parts += [replace(part, verdict=whole.cause) for part in (*whole.worst_parts, *whole.parts)[:1]]
-    return [Point(Place("start", _number(part)), part.verdict, part.sample, *part.modes) for part in parts]
+    none = np.empty(0)
+    places = [Place("start", _number(part), 0, none, none, none) for part in parts]
+    return [Point(at, part.verdict, part.sample, *part.modes) for at, part in zip(places, parts, strict=True)]
 
 
 def _number(part: gradcheck.Part) -> int:
@@ -243,8 +246,7 @@ def beyond_stability(cell: Cell) -> list[str]:
     first = scene.initial_state(np, scene.theta0()[:, None])
     response = float(scene.contact(np).response(np, first.q).max())
     factor = float(getattr(scene, "velocity_factor", 1.0))
-    matrix = integrator.transition(float(scene.dt), spring[0] * response, spring[1] * response, factor)
-    growth = float(np.abs(np.linalg.eigvals(matrix)).max())
+    growth = spectral_radius(integrator, float(scene.dt), spring[0] * response, spring[1] * response, factor)
     if growth <= 1.0 + NEUTRAL:
         return []
     return [

@@ -19,8 +19,10 @@ from bench.model import Answer, Estimator, KnownOptimum, Optimizer, Problem, Rol
 from bench.model.program import OWN
 from bench.run.files import make_directory, write_whole
 
-from . import Optimise
+from . import Optimise, search_parts
 
+PATH = ("iteration", "cost", "rollouts", "gradients", "s")
+"""What is recorded along a path."""
 MAX_POINTS = 300
 """Most points of a path to store, about; they are denser in early iterations."""
 MAX_NEWTON_DIM = 1000
@@ -67,8 +69,8 @@ def measure(cell: Cell, session: Session, settings: Optimise) -> dict[str, Any]:
     """Search until the budget is spent or the cost has diverged; return the cell's results by column."""
     problem = session.problem(cell)
     optimum, how = known_optimum(cell, problem, session)
-    theta0 = np.array(problem.program.theta0, dtype=np.float64)
-    quality = gradient_quality(cell, problem, theta0, settings) if settings.quality != "none" else None
+    theta0 = problem.program.theta0
+    quality = {} if settings.quality == "none" else gradient_quality(cell, problem, theta0, settings)
     path, theta, stopped = follow_path(cell, problem, theta0, settings)
     last = {name: values[-1] for name, values in path.items()}
     cost, is_lost = path["cost"], stopped == "diverged"
@@ -84,7 +86,7 @@ def measure(cell: Cell, session: Session, settings: Optimise) -> dict[str, Any]:
         "optimum": optimum, "optimum_status": how, "score": 0.0 if is_lost and not np.isfinite(score) else score,
         **{f"path_{name}": np.asarray(values)[stored].tolist() for name, values in path.items()},
         "theta": theta.tolist(),
-        **{f"quality_{name}": value for name, value in (quality or {}).items()},
+        **{f"quality_{name}": value for name, value in quality.items()},
     }  # fmt: skip
 
 
@@ -103,9 +105,7 @@ def follow_path(
 
     The path has lists with an entry per iteration: iteration, cost, rollouts, gradients and time ``s``.
     """
-    optimizer, estimator, usage = cell.parts["optimizer"], cell.parts["estimator"], problem.usage
-    assert isinstance(optimizer, Optimizer)
-    assert estimator is None or isinstance(estimator, Estimator)
+    (optimizer, estimator), usage = search_parts(cell), problem.usage
     still = np.zeros((problem.program.n_noise, 1))
 
     def step(state: dict[str, Any], iteration: int) -> dict[str, Any]:
@@ -120,17 +120,14 @@ def follow_path(
 
     state = optimizer.start(theta0)
     step(state, 1)  # compiles, untimed
-    path: dict[str, list[Any]] = {}
+    path: dict[str, list[Any]] = {name: [] for name in PATH}
     usage.rollouts = usage.gradients = 0
     most = settings.iterations if settings.iterations is not None else math.inf
     iteration, seconds = 0, 0.0
     while True:
         cost = objective(problem, state["theta"], still)
-        point = {
-            "iteration": iteration, "cost": cost, "rollouts": usage.rollouts, "gradients": usage.gradients, "s": seconds,
-        }  # fmt: skip
-        for name, value in point.items():
-            path.setdefault(name, []).append(value)
+        for name, value in zip(PATH, (iteration, cost, usage.rollouts, usage.gradients, seconds), strict=True):
+            path[name].append(value)
         if not np.isfinite(cost) or abs(cost) > settings.limit * (abs(path["cost"][0]) + 1.0):
             return path, state["theta"], "diverged"
         if usage.rollouts + settings.gradient_cost * usage.gradients >= settings.budget or iteration >= most:
@@ -217,12 +214,10 @@ def gradient_ratio(problem: Problem, cell: Cell) -> float:
     return _ratios[key]
 
 
-def fastest(
-    function: Callable[[np.ndarray, np.ndarray], Any], theta: np.ndarray, w: np.ndarray, calls: int = 5
-) -> float:
-    """Return the least time [s] of some calls after a first one that compiles."""
+def fastest(function: Callable[[np.ndarray, np.ndarray], Any], theta: np.ndarray, w: np.ndarray) -> float:
+    """Return the least time [s] of five calls after a first one that compiles."""
     function(theta, w)
-    return min(timeit.repeat(lambda: function(theta, w), number=1, repeat=calls))
+    return min(timeit.repeat(lambda: function(theta, w), number=1, repeat=5))
 
 
 # ---------------------------------------------------------------------------------------------- gradient quality
@@ -233,16 +228,15 @@ MAX_REFERENCE_SHARE = 0.5
 _qualities: dict[tuple[Any, ...], dict[str, float]] = {}
 
 
-def gradient_quality(cell: Cell, problem: Problem, theta: np.ndarray, settings: Optimise) -> dict[str, float] | None:
+def gradient_quality(cell: Cell, problem: Problem, theta: np.ndarray, settings: Optimise) -> dict[str, float]:
     """Return relative error, cosine and share of bias of the estimator's gradients at ``theta (d,)``.
 
-    Returns None without an estimator. The reference is the mean of many gradients or of many zeroth-order terms,
+    Empty without an estimator. The reference is the mean of many gradients or of many zeroth-order terms,
     whichever vary less. Where the cost jumps or the backend has no gradients, it is the mean of zeroth-order terms.
     """
-    estimator = cell.parts["estimator"]
+    _, estimator = search_parts(cell)
     if estimator is None:
-        return None
-    assert isinstance(estimator, Estimator)
+        return {}
     key = (
         cell.program_key, cell.backend, estimator, cell.samples, cell.repeats, settings.quality_samples, theta.tobytes(),
     )  # fmt: skip
