@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import sys
@@ -12,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.errors import UserError, local_path, unknown
+from bench.errors import StorageError, UserError, local_path, unknown
 from bench.examine.examination import examine
 from bench.examine.report import Report
 from bench.run.files import make_directory
@@ -89,7 +90,9 @@ def _examined(cost: str, settings: Mapping[str, str], progress: bool) -> Report:
         key: PARSERS[key](value, key, module) if key in PARSERS else value for key, value in given.items()
     }
     if "save" in settings:  # a folder that cannot be written is an error before the examination, not after it
-        make_directory(local_path("save", settings["save"]))
+        make_directory(folder := local_path("save", settings["save"]))
+        if not os.access(folder, os.W_OK):
+            raise StorageError(f"save={folder} cannot be written: it is read-only")
     report = examine(function, name=cost, progress=progress, **values)
     words = " ".join(f"{key}={value}" for key, value in settings.items() if key != "expect")
     report = replace(report, command=f"python -m bench examine {cost} {words}".strip())

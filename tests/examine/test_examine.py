@@ -294,6 +294,8 @@ def test_bias_at_a_jump_is_that_of_the_closed_form():
     assert report.status == 1
     assert report.cause == "biased"
     assert found.best.name == "smoothing"
+    assert dataclasses.replace(report, expect="jumps").status == 0  # sigma measures what the jumps do
+    assert dataclasses.replace(report, expect="jumps", lines=[]).status == 1  # a bias without jumps is not expected
 
 
 # ------------------------------------------------------------------------------------- how it is called
