@@ -47,6 +47,7 @@ def test_exit_statuses(sim, capsys):
     assert run(f"{sim}:cost", "grad=right", "calls=300") == 0
     assert run(f"{sim}:cost", "grad=off", "calls=300") == 1
     assert run(f"{sim}:cost", "grad=right", "calls=3") == 3
+    assert run(f"{sim}:cost", "calls=300") == 0
     assert run(f"{sim}:nothing", "grad=zero", "calls=300") == 3
     assert run(f"{sim}:nothing", "grad=zero", "calls=300", "allow_zero=true") == 0
     assert run(f"{sim}:cost", "grad=wrong") == 2
