@@ -280,7 +280,7 @@ class _Examination:
             error=simulator.gradient_error if stages.is_failed else "",
             elsewhere=simulator.gradient_error if not stages.is_failed else "",
             n_failed=simulator.n_failed_gradients,
-            printed=simulator.printed,
+            printed=simulator.printed.getvalue().splitlines(),
             changing=sorted(simulator.changing),
             notes=[
                 *simulator.notes,

@@ -16,7 +16,6 @@ from bench.gradient.diagnosis import Explanation, grows, may_be_adaptive
 from bench.gradient.lines import ALIKE, LineScan
 from bench.gradient.rules import EXCUSABLE, RULES, SUSPICIOUS
 from bench.gradient.stages import Repeats, recaused
-from bench.simulator.simulator import Printed
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -175,7 +174,8 @@ class Findings:
     """The exception that the gradient raised at another theta; empty if none."""
     n_failed: int
     """Number of gradient calls that raised an exception."""
-    printed: Printed
+    printed: Sequence[str]
+    """The lines that cost and gradient printed."""
     changing: Sequence[str]
     """Which of the functions change theta in place."""
     notes: Sequence[str]
