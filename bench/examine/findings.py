@@ -12,7 +12,7 @@ import numpy as np
 
 from bench.examine.smoothing import TARGET_ERROR, Method, Smoothed
 from bench.gradient import FAULTS, TRUSTED, Check, Part, Sample
-from bench.gradient.diagnosis import Explanation, grows
+from bench.gradient.diagnosis import Explanation, grows, may_be_adaptive
 from bench.gradient.lines import ALIKE, LineScan
 from bench.gradient.rules import EXCUSABLE, RULES, SUSPICIOUS
 from bench.gradient.stages import Repeats, recaused
@@ -314,8 +314,9 @@ class Findings:
                 return "adaptive"
             if cause in (*SUSPICIOUS, "unsettled", "disconnected") and self.is_overwritten:
                 return "overwritten"
-            is_open = cause in SUSPICIOUS and explained.is_unexplained and not explained.gaps
-            return "undecided" if is_open else cause
+            # so small an error that adaptive steps may explain it, and the budget ended before that was known
+            is_open = explained.is_adaptive is None and self.check is not None and may_be_adaptive(self.check)
+            return "undecided" if cause in SUSPICIOUS and is_open and not explained.gaps else cause
         if not check.components or not self.is_complete:
             return "undecided"
         # no larger step is left than that with the best central difference

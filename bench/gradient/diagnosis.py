@@ -71,8 +71,6 @@ class Explanation:
     """Whether steps that depend on theta explain the error, by the jumps of the cost; None: not compared."""
     steps: str | None = None
     """The place of a loop whose length depends on theta, as ``ode.py:17``; empty without one, None: not searched."""
-    is_unexplained: bool = False
-    """Whether the error is so small that adaptive steps may explain it, and the budget ended before that was known."""
     gaps: Sequence[Gap] = ()
     """At theta and at others: how far gradient and cost are from the refined cost; empty without a refined cost."""
     growth: Sequence[Horizon] = ()
@@ -120,8 +118,8 @@ def errors_by_horizon(stages: GradientStages, horizons: Sequence[int]) -> list[H
             return other.costs(thetas, stages.same_noise(thetas.shape[1]))
 
         quick = FewSteps(
-            partial(space.costs, costs, width=other.width), space.origin(), space.scale, space.project(gradient),
-            float(costs(stages.theta[:, None])[0]), simulator.unit, stages.repeats.spread,
+            space, partial(space.costs, costs, width=other.width), gradient, float(costs(stages.theta[:, None])[0]),
+            simulator.unit, stages.repeats.spread,
         )  # fmt: skip
         quick.run_round(other.width)
         outcome = quick.check()

@@ -6,6 +6,7 @@ import io
 import sys
 from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout
+from functools import partial
 from importlib.util import find_spec
 from typing import Any
 
@@ -298,10 +299,9 @@ class Simulator:
                 value = self._by_jax("cost", "loop", *parts)
             self.clock.count("costs", 1, 0.0, warm=False)
             return as_numpy(value)
-        vector, *own_noise = (self._array(part[:, 0]) for part in parts)
         try:
             with self.clock.interrupt_when_over(first=True):
-                value = self._cost(self._build_theta(vector), *own_noise)
+                (value,) = self._each(self._cost, *parts)
         except RuntimeError as error:
             if self.library != "torch" or "dtype" not in str(error) or not self._double:
                 raise
@@ -354,7 +354,7 @@ class Simulator:
         self._batch_error = ""
         try:
             with self.clock.interrupt_when_over(first=True):
-                costs = as_numpy(self._call_batch(batch, *map(self._array, self._repeated(count))))
+                costs = as_numpy(self._whole(self._cost, batch, *map(self._array, self._repeated(count))))
         except Exception as error:
             self._batch_error = failure(error)["reason"]
             return False
@@ -367,8 +367,14 @@ class Simulator:
         self._check_cost(costs)
         return True
 
-    def _call_batch(self, batch: str, *parts: Any) -> Any:
-        return self._cost(*(part.T if batch == "rows" else part for part in parts))
+    def _whole(self, function: Callable[..., Any], batch: str, *parts: Any) -> Any:
+        """Return a user's function of a batch of arrays with one sample per column."""
+        return function(*(part.T if batch == "rows" else part for part in parts))
+
+    def _each(self, function: Callable[..., Any], *parts: np.ndarray) -> list[Any]:
+        """Return a user's function of each column of arrays."""
+        columns = ([self._array(part[:, i]) for part in parts] for i in range(parts[0].shape[1]))
+        return [function(self._build_theta(vector), *own_noise) for vector, *own_noise in columns]
 
     # ------------------------------------------------------------------------------------------- values
 
@@ -381,19 +387,15 @@ class Simulator:
             with torch.no_grad():
                 return as_numpy(self._torch_values(*map(self._array, (thetas, *w))))
         if self.batch == "loop":
-            calls = (
-                self._cost(self._build_theta(thetas[:, i]), *(part[:, i].copy() for part in w))
-                for i in range(thetas.shape[1])
-            )
-            return [float(as_numpy(cost).ravel()[0]) for cost in calls]
-        return as_numpy(self._call_batch(self.batch, *(part.copy() for part in (thetas, *w))))
+            return [float(as_numpy(cost).ravel()[0]) for cost in self._each(self._cost, thetas, *w)]
+        return as_numpy(self._whole(self._cost, self.batch, *map(self._array, (thetas, *w))))
 
     def _torch_values(self, thetas: Any, *w: Any) -> Any:
         """Return the costs as a tensor ``(B,)`` that is attached to the autograd graph."""
         import torch
 
         if self.batch in ("columns", "rows"):
-            return self._call_batch(self.batch, thetas, *w)
+            return self._whole(self._cost, self.batch, thetas, *w)
         if self.batch == "vmap":
             return torch.func.vmap(
                 lambda vector, *rest: self._cost(self._build_theta(vector), *rest).reshape(()),
@@ -418,7 +420,7 @@ class Simulator:
 
         if batch == "loop":
             return {"cost": raw, "gradient": jax.grad(one)}
-        whole = jax.vmap(one, in_axes=1) if batch == "vmap" else lambda *parts: self._call_batch(batch, *parts)
+        whole = jax.vmap(one, in_axes=1) if batch == "vmap" else partial(self._whole, self._cost, batch)
         return {"cost": whole, "gradient": jax.grad(lambda *parts: whole(*parts).sum())}
 
     def _by_jax(self, what: str, batch: str, *parts: np.ndarray) -> np.ndarray:
@@ -460,21 +462,14 @@ class Simulator:
     def _user_slopes(self, thetas: np.ndarray, *w: np.ndarray) -> np.ndarray:
         assert callable(self._grad)
         if self.batch in ("columns", "rows"):
-            arguments = map(self._array, (thetas, *w))
-            gradients = as_numpy(self._grad(*(part.T if self.batch == "rows" else part for part in arguments)))
+            gradients = as_numpy(self._whole(self._grad, self.batch, *map(self._array, (thetas, *w))))
             gradients = gradients.T if self.batch == "rows" else gradients
             if gradients.shape != thetas.shape:
                 raise UserError(
                     f"the gradient of {thetas.shape[1]} thetas has shape {gradients.shape}, not {thetas.shape}"
                 )
             return gradients
-        columns = [
-            self.layout.flatten(
-                self._grad(self._build_theta(self._array(thetas[:, i])), *(self._array(part[:, i]) for part in w))
-            )
-            for i in range(thetas.shape[1])
-        ]
-        return np.stack(columns, axis=1)
+        return np.stack([self.layout.flatten(each) for each in self._each(self._grad, thetas, *w)], axis=1)
 
 
 def _parse_batch(batch: str | int | None) -> tuple[str | None, int]:

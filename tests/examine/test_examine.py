@@ -18,7 +18,6 @@ from bench.errors import UserError
 from bench.examine import smoothing, text
 from bench.gradient.lines import Break, LineScan, scan
 from bench.simulator import simulator, tree
-from bench.simulator.clock import Clock
 from bench.simulator.simulator import Simulator
 from bench.simulator.tree import ParameterTree
 
@@ -504,7 +503,7 @@ def test_size_of_a_gradient_is_without_the_share_of_its_noise():
         simulator = Simulator(
             lambda x: 0.1 * x[0] + np.sin(3.0 * x[1]) ** 3 + np.sin(4.0 * x[2]) ** 3, ParameterTree(np.zeros(3))
         )
-        found = smoothing.measure_smoothed(simulator, np.zeros(3), 1.0, np.ones(3), None, Clock(60.0), seed, pairs=64)
+        found = smoothing.measure_smoothed(simulator, 1.0, np.ones(3), None, seed, pairs=64)
         sizes.append(found.norm)
         raw.append(np.linalg.norm(found.gradient))
         assert found.norm == pytest.approx(math.sqrt(max(raw[-1] ** 2 - found.error**2, 0.0)))

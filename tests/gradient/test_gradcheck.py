@@ -7,9 +7,8 @@ import shlex
 import numpy as np
 import pandas as pd
 import pytest
-from bench.plugins.studies.gradient_check import GradientCheck, measure
-from bench.plugins.studies.gradient_check.lines import by_point
-from bench.plugins.studies.gradient_check.points import is_trusted
+from bench.plugins.studies.gradient_check import GradientCheck, is_trusted, measure
+from bench.plugins.studies.gradient_check.views import by_point
 
 from bench import run
 from bench.cli import main
@@ -58,8 +57,8 @@ def verdicts(problem, unit=FLOAT64):
     drawn = noise.draw(0, scene.name, 1, 1, problem.program.n_noise, "test")[0, 0]
     directions = noise.draw(0, scene.name, 1, SEARCH.drawn, problem.dim, "test directions")[0]
     told = {}
-    for _, point in measure.examine(problem, problem.program.theta0, drawn, directions, unit, SEARCH):
-        told.setdefault(point.point, set()).add(point.verdict)
+    for point in measure.examine(problem, drawn, directions, unit, SEARCH):
+        told.setdefault(point.place.point, set()).add(point.verdict)
     return told
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from bench.plugins.studies.engines.views import LEVELS, levels
+from bench.plugins.studies.engines import LEVELS, levels
 
 import bench
 from bench.cli import main

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from bench.plugins.studies import stability
-from bench.plugins.studies.stability import Stability, views
+from bench.plugins.studies.stability import Stability
 
 from bench.experiment import config
 from bench.experiment.grid import cells
@@ -205,7 +205,7 @@ def test_backends_that_disagree_show_the_worse_verdict_and_no_verdict_is_no_find
     lines = [given.columns.blank() | cell.columns() | {"status": "ok", "verdict": "ok"} for cell in cells(given)]
     rows = given.columns.typed(pd.DataFrame(lines))
     rows.loc[(rows["backend"] == "numpy") & (rows["stiffness"] == 100), "verdict"] = "wrong_sign"
-    chart = views.views(given, rows).charts[0].frame.set_index("stiffness")
+    chart = given.study.show(given, rows).charts[0].frame.set_index("stiffness")
     assert dict(chart["level"]) == {10.0: "right", 100.0: "wrong"}
     assert rows["backend"][chart.loc[100.0, "row"]] == "numpy"
 

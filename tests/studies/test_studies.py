@@ -9,8 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from bench.plugins.studies.gradient_check import views as gradient_check
-from bench.plugins.studies.gradient_check.lines import PER_COMPONENT
-from bench.plugins.studies.stability.views import cells_of
+from bench.plugins.studies.stability import cells_of
 from bench.plugins.studies.twins import FLOOR
 
 import bench.report
@@ -93,7 +92,7 @@ def checked(*words):
         "point": ["start"], "sample": [0], "direction": [0], "derivative_program": [1.0], "check_verdict": ["smooth"],
         "check_error": [1e-9], "check_eps": [1e-4], "eps": list(eps), "derivative_differences": [1.0, 1.0],
         "relative_error": [1e-9, 1e-8], "mode_minus": ["", ""], "mode_plus": ["", ""],
-    } | {name: [0] for name in PER_COMPONENT}  # fmt: skip
+    } | {name: [0] for name in gradient_check.PER_COMPONENT}  # fmt: skip
     return given, rows.assign(verdict="smooth", **{name: [value] * len(rows) for name, value in values.items()})
 
 

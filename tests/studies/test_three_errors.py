@@ -3,8 +3,7 @@
 import numpy as np
 import pandas as pd
 import pytest
-from bench.plugins.studies.three_errors import ThreeErrors, _signs, difference_check
-from bench.plugins.studies.three_errors.views import FLOOR, OWN, PROGRAM, TRAP, traps, views
+from bench.plugins.studies.three_errors import FLOOR, OWN, PROGRAM, TRAP, ThreeErrors, _signs, difference_check, traps
 from classes import BounceOnce, BouncingBall, Impulse, Jax, SemiImplicitEuler
 
 from bench.experiment import config
@@ -77,7 +76,7 @@ def test_a_trap_is_exact_convergent_and_turned_away_or_no_nearer_at_every_step(c
     values |= {"model_error_rel": [1.5, 0.5]}
     typed = COLUMNS.typed(rows.assign(**(values | change)))
     assert len(traps(Shown(given, typed, ["dt"], ["estimator"], PROGRAM))) == 3 * trapped
-    found = views(given, typed)
+    found = given.study.show(given, typed)
     assert (set(found.charts[0].frame["series"]) == {OWN, TRAP}) == trapped
 
 
@@ -95,7 +94,8 @@ def laws(model, program=(1e-12, 1e-12, 1e-12)):
 
 def test_gradients_are_drawn_once_whatever_estimates_them_and_only_where_compared():
     model = [[0.0, 3.0, np.nan], [0.5, 0.2, 0.05]]
-    found = views(*laws(model, (1e-12, 1e-12, np.nan)))
+    given, rows = laws(model, (1e-12, 1e-12, np.nan))
+    found = given.study.show(given, rows)
     drawn = found.charts[0].plotted()
     zero = drawn[drawn["error"] == FLOOR]
     assert list(zero["law"]) == ["impulse"]

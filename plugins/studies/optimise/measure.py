@@ -15,7 +15,7 @@ from bench.experiment.cell import Cell
 from bench.experiment.session import Session
 from bench.measure import noise
 from bench.measure.solve import solve
-from bench.model import Answer, Estimator, KnownOptimum, Optimizer, Problem, Rollout
+from bench.model import Answer, Estimator, KnownOptimum, Optimizer, Problem, Rollout, zeroth_order
 from bench.model.program import OWN
 from bench.run.files import make_directory, write_whole
 
@@ -152,22 +152,30 @@ def known_optimum(cell: Cell, problem: Problem, session: Session) -> tuple[float
             return known
     if problem.dim > MAX_NEWTON_DIM or not problem.program.continuous or "grad" not in cell.backend.provides:
         return np.nan, "unknown"
-    path = session.experiment.results_dir / "references" / f"optimum_{cell.program_key}.json"
-    try:
-        stored = json.loads(path.read_text())
-        return float(stored["cost"]), str(stored["how"])
-    except (OSError, ValueError, KeyError, TypeError):
-        pass
+    found = stored_in(session, f"optimum_{cell.program_key}.json", lambda: _newton(problem))
+    return found["cost"], found["how"]
+
+
+def _newton(problem: Problem) -> dict[str, Any]:
     solution = solve(problem)
     if not np.isfinite(solution.cost):
-        return np.nan, "unknown"
+        return {"cost": np.nan, "how": "unknown"}
+    found = "local optimum by Newton's method" if solution.certified else "lowest cost found"
+    saddle = ", from a saddle at the start" if solution.starts_at_saddle else ""
     digits = f"|gradient| {solution.gradient:.0e}, least curvature {solution.curvature:.1g}"
-    how = f"local optimum by Newton's method, {digits}" if solution.certified else f"lowest cost found, {digits}"
-    if solution.starts_at_saddle:
-        how += ", from a saddle at the start"
-    make_directory(path.parent)
-    write_whole(path, json.dumps({"cost": solution.cost, "how": how}).encode())
-    return solution.cost, how
+    return {"cost": solution.cost, "how": f"{found}, {digits}{saddle}"}
+
+
+def stored_in(session: Session, name: str, compute: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """Return the content of a JSON file beside the references, which is computed and written if it cannot be read."""
+    path = session.experiment.results_dir / "references" / name
+    try:
+        content: dict[str, Any] = json.loads(path.read_text())
+    except (OSError, ValueError):
+        content = compute()
+        make_directory(path.parent)
+        write_whole(path, json.dumps(content).encode())
+    return content
 
 
 _classes: dict[str, str] = {}
@@ -187,11 +195,10 @@ def scene_class(cell: Cell, problem: Problem) -> str:
     if isinstance(program, Rollout) and program.scene.n_contacts:
         return "stiff"
     if cell.program_key not in _classes:
-        w = noise.draw(0, cell.scene.name, 1, 128, program.n_noise, "optimise: class")[0].T
+        drawn = noise.draw(0, cell.scene.name, 1, 128, program.n_noise, "optimise: class")
         with np.errstate(all="ignore"):
-            first = problem.grad(program.theta0, w).var(axis=1).sum()
-            cost = problem.value(program.theta0, w) - problem.value(program.theta0, 0.0 * w[:, :1])
-            zeroth = (cost * problem.score(program.theta0, w)).var(axis=1).sum()
+            first = problem.grad(program.theta0, drawn[0].T).var(axis=1).sum()
+            zeroth = zeroth_order(problem, program.theta0, drawn)[0].var(axis=0).sum()
         _classes[cell.program_key] = (
             "smooth" if first < zeroth else "chaotic" if isinstance(program, Rollout) else "stiff"
         )
@@ -241,12 +248,11 @@ def gradient_quality(cell: Cell, problem: Problem, theta: np.ndarray, settings: 
     )  # fmt: skip
     if key not in _qualities:
         program, scene = problem.program, cell.scene.name
-        w = noise.draw(0, scene, 1, settings.quality_samples, program.n_noise, "optimise: reference")[0].T
+        w = noise.draw(0, scene, 1, settings.quality_samples, program.n_noise, "optimise: reference")
         with np.errstate(all="ignore"):
-            cost = problem.value(theta, w) - problem.value(theta, 0.0 * w[:, :1])
-            terms = cost * problem.score(theta, w)
+            terms = zeroth_order(problem, theta, w)[0].T
             if program.continuous and "grad" in cell.backend.provides:
-                first = problem.grad(theta, w)
+                first = problem.grad(theta, w[0].T)
                 terms = first if first.var(axis=1).sum() < terms.var(axis=1).sum() else terms
         drawn = noise.draw(0, scene, max(cell.repeats, 2), cell.samples, program.n_noise, "optimise: quality")
         _qualities[key] = compare_with_reference(estimator.estimate(problem, theta, drawn), terms)
