@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from bench.compare.cells import assumed_defaults, compare_cells
+from bench.compare.cells import compare_cells
 from bench.compare.report import Comparison, show, write
 from bench.compare.sources import Results, read_results
 from bench.compare.timings import RUNS
@@ -57,23 +57,12 @@ def compare(before: str | Path, after: str | Path, again: Sequence[str | Path] =
         judged |= {column.name: column for column in one.columns.compared}
         table, of_times = compare_cells(one.rows, two.rows, one.columns, runs)
         own = [
-            *default_remarks(one, two),
             *version_remarks(one.rows, two.rows),
             *machine_remarks(one, two, bool(again)),
         ]
         remarks += [f"{name}: {remark}" for remark in (*own, *of_times)]
         parts.append(table.assign(experiment=name))
     return Comparison(f"{before} against {after}", pd.concat(parts, ignore_index=True), remarks, list(judged.values()))
-
-
-def default_remarks(old: Results, new: Results) -> list[str]:
-    """Return remarks on parameters that one side lacks, so that their present default is assumed."""
-    was, now = assumed_defaults(old.rows), assumed_defaults(new.rows)
-    remarks = []
-    for when, mine, other in (("before", was, now), ("after", now, was)):
-        if own := [f"{name}={value}" for name, value in mine.items() if name not in other]:
-            remarks.append(f"rows {when} do not store {', '.join(own)}: the present default is assumed")
-    return remarks
 
 
 def version_remarks(old: pd.DataFrame, new: pd.DataFrame) -> list[str]:
