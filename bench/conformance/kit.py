@@ -57,6 +57,12 @@ def require(condition: Any, message: str) -> None:
         raise Failed(message)
 
 
+def skip_unless(condition: Any, reason: str) -> None:
+    """Raise :class:`Skipped` unless the condition holds."""
+    if not condition:
+        raise Skipped(reason)
+
+
 def main(names: Sequence[str], limit: float = LIMIT_S, options: Sequence[str] = ()) -> int:
     """Check the named plugins, or all, in pytest, print a line per check, and return the exit status.
 
