@@ -587,7 +587,11 @@ def found(plugin, *checks):
 @pytest.mark.usefixtures("few_programs")
 @pytest.mark.parametrize(
     ("plugin", "check"),
-    [pytest.param(plugin, check, id=f"{plugin.name}-{check}") for plugin in PLANTED for check in PLANTED[plugin]],
+    [
+        pytest.param(plugin, check, id=f"{plugin.name}-{check}")
+        for plugin in PLANTED
+        for check in sorted(PLANTED[plugin])
+    ],
 )
 def test_planted_fault_is_caught(plugin, check):
     assert "fail" in dict(found(plugin, check))
