@@ -38,15 +38,15 @@ def apart(value: float, boundary: float, digits: int = 2) -> str:
     return next(text for text in (number(value, places) for places in range(digits, 18)) if float(text) != boundary)
 
 
-def interval(value: float, low: float, high: float) -> str:
-    """Return a ratio with its interval, whose ends print as 1 only where they are 1.
+def interval(value: float, low: float, high: float, boundary: float = 1.0) -> str:
+    """Return a ratio with its interval, whose ends never print as the boundary that they differ from.
 
     Ratios above 10,000 and below 1/10,000 are as good as infinite and 0.
 
     >>> interval(2.83, 1.03, 6.9), interval(2.0, 0.0, math.inf)
     ('2.8 [1.03, 6.9]', '2.0 [0, no limit]')
     """
-    ends = apart(low, 1.0) if low > 1e-4 else "0", apart(high, 1.0) if high < 1e4 else "no limit"
+    ends = apart(low, boundary) if low > 1e-4 else "0", apart(high, boundary) if high < 1e4 else "no limit"
     return f"{number(value)} [{', '.join(ends)}]"
 
 
