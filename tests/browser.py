@@ -45,6 +45,12 @@ class Page:
         self.said.clear()
         self.page.goto(path.resolve().as_uri())
 
+    def show(self, folder, text):
+        """Write a page into a folder and open it."""
+        path = folder / "report.html"
+        path.write_text(text)
+        self.open(path)
+
     def size(self, width, height, dark=False):
         """Set the size of the window in pixels, and whether the system prefers a dark theme."""
         self.page.set_viewport_size({"width": width, "height": height})

@@ -8,7 +8,7 @@ from bench.plugins.studies.optimise import views as searches
 from matplotlib.colors import to_rgb
 
 from bench.report.colours import estimator_order
-from bench.report.style import MARKERS, PALETTE, colour
+from bench.report.style import PALETTE, colour, marker
 
 DEUTERANOPIA = np.array(
     [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]]
@@ -37,11 +37,6 @@ def lab(text, seen):
 
 def apart(a, b, seen):
     return float(np.linalg.norm(lab(a, seen) - lab(b, seen)))
-
-
-def marker(place):
-    """The marker of an estimator without variants, as :class:`bench.report.style.Look` gives it."""
-    return MARKERS[(place + place // len(PALETTE)) % len(MARKERS)]
 
 
 def test_forty_estimators_have_forty_colours_each_apart_from_the_one_it_comes_from():

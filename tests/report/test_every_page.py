@@ -117,10 +117,8 @@ def test_charts_have_the_contrast_of_level_aa(dark, browser, tmp_path):
         for place, e in enumerate(estimators) for i, backend in enumerate(("one", "two")) for k in (1.0, 10.0)
     ]  # fmt: skip
     made = experiment(sweep={"stiffness": [1.0, 10.0]}, marks={"stiffness": {"limit": 5.0}})
-    path = tmp_path / "report.html"
-    path.write_text(page(made, table(rows)))
     browser.size(1280, 4000, dark)
-    browser.open(path)
+    browser.show(tmp_path, page(made, table(rows)))
     ground = browser.do("getComputedStyle(document.body).backgroundColor")
     found = browser.do(COLOURS)
     assert len(found) > 4 * len(estimators)
@@ -130,9 +128,7 @@ def test_charts_have_the_contrast_of_level_aa(dark, browser, tmp_path):
 
 def test_a_script_that_reaches_a_page_does_not_run(browser, tmp_path):
     body = "<main><script>window.hacked = 1</script><img src=x onerror='window.hacked = 1'><p onclick='window.hacked = 1'>x</p></main>"
-    path = tmp_path / "page.html"
-    path.write_text(shell.document("A <title>", body, ["window.ours = 1"]))
-    browser.open(path)
+    browser.show(tmp_path, shell.document("A <title>", body, ["window.ours = 1"]))
     browser.do("document.querySelector('p').click()")
     assert browser.do("[window.hacked === undefined, window.ours, document.title]") == [True, 1, "A <title>"]
     assert any("Content Security Policy" in text for text in browser.said)

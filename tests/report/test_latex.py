@@ -33,11 +33,6 @@ def overfull(folder, tables):
     return [width for width in widths if float(width) > NEGLIGIBLE]
 
 
-@needs_latex
-def test_tables_fit_a_paper_of_two_columns(tmp_path):
-    assert overfull(tmp_path, [STANDARD / "stiffness_sweep" / "bias_variance.tex"]) == []
-
-
 @pytest.mark.slow
 @needs_latex
 def test_every_stored_table_fits(tmp_path):

@@ -161,10 +161,8 @@ WIDE = (1200, 3000)
 @pytest.fixture(scope="module")
 def opened(browser, text, tmp_path_factory):
     """The page of a few rows, opened once."""
-    path = tmp_path_factory.mktemp("page") / "report.html"
-    path.write_text(text)
     browser.size(*WIDE)
-    browser.open(path)
+    browser.show(tmp_path_factory.mktemp("page"), text)
     return browser
 
 
@@ -180,9 +178,7 @@ def shown(opened):
 
 def test_unsteady_times_are_marked(browser, tmp_path):
     rows = table([row(stiffness=k, time_s=0.01, time_iqr_s=spread) for k, spread in ((1.0, 1e-4), (2.0, 5e-3))])
-    path = tmp_path / "report.html"
-    path.write_text(page(rows))
-    browser.open(path)
+    browser.show(tmp_path, page(rows))
     assert browser.do("[0, 1].map((i) => shownAs(page.columns.find((c) => c.name === 'time_s'), i))") == [
         "10 ms",
         "10 ms !",
@@ -190,10 +186,8 @@ def test_unsteady_times_are_marked(browser, tmp_path):
 
 
 def test_errors_time_and_status_are_in_sight_on_a_laptop(browser, tmp_path):
-    path = tmp_path / "report.html"
-    path.write_text(page(stiffness_rows()))
     browser.size(1280, 900)
-    browser.open(path)
+    browser.show(tmp_path, page(stiffness_rows()))
     heads = "[...document.querySelectorAll('#table th')]"
     for name in ("rel. RMSE", "rel. bias", "time", "status"):
         right = browser.do(f"{heads}.find((h) => h.textContent.trim() === '{name}').getBoundingClientRect().right")
@@ -203,16 +197,15 @@ def test_errors_time_and_status_are_in_sight_on_a_laptop(browser, tmp_path):
 
 def test_what_to_use_where_is_in_sight_as_a_whole_on_a_laptop(browser, tmp_path):
     """Long settings of estimators break; they pushed the last column out of sight."""
-    path, long = tmp_path / "report.html", "delta=0.95,gamma=4,sharing=shared,samples=quasi_random,pilot=0.25"
+    long = "delta=0.95,gamma=4,sharing=shared,samples=quasi_random,pilot=0.25"
     rows = [
         row(scene=scene, stiffness=k, estimator=e, estimator_params=p, rmse_rel=error)
         for scene in "abcdefgh"
         for k in (1.0, 10.0)
         for e, p, error in (("randomized_smoothing", "", 0.1), ("alpha_order", long, 2.0), ("alpha_order", f"{long},ratio=3", 0.5), ("control_variate", "", 3.0))
     ]  # fmt: skip
-    path.write_text(page(table(rows)))
     browser.size(1280, 900)
-    browser.open(path)
+    browser.show(tmp_path, page(table(rows)))
     wider = "(b => b.scrollWidth - b.clientWidth)(document.querySelector('#answers .scroll'))"
     assert browser.do(wider) <= 0
     assert browser.do("document.querySelectorAll('#answers tr').length") > 8
@@ -225,12 +218,10 @@ def test_what_to_use_where_is_in_sight_as_a_whole_on_a_laptop(browser, tmp_path)
 def test_20000_cells_open_within_three_seconds_of_processor_time_and_are_saved_as_csv(browser, tmp_path):
     rows = stiffness_rows()
     rows = pd.concat([rows] * -(-20_000 // len(rows)), ignore_index=True)
-    path = tmp_path / "report.html"
-    path.write_text(helpers.page(experiment(), rows, Views()))
     session = browser.page.context.new_cdp_session(browser.page)
     session.send("Performance.enable", {"timeDomain": "threadTicks"})
     browser.size(1280, 900)
-    browser.open(path)
+    browser.show(tmp_path, helpers.page(experiment(), rows, Views()))
     metrics = {one["name"]: one["value"] for one in session.send("Performance.getMetrics")["metrics"]}
     session.detach()
     browser.size(*WIDE)
@@ -359,13 +350,11 @@ def test_texts_of_a_drawing_are_as_wide_as_they_were_measured(shown):
 def test_hostile_names_are_shown_as_they_are_and_do_nothing(browser, tmp_path):
     rows = small_rows(estimators=("fobg", "reinforce"), backends=("jax",))
     hostile = [rows.assign(scene=name, estimator=name, reason=name, key=rows["key"] + name) for name in HOSTILE]
-    path = tmp_path / "report.html"
     every, made = pd.concat([rows, *hostile], ignore_index=True), experiment(name=HOSTILE[0])
     frame = pd.DataFrame({"x": [1.0, 2.0, 3.0] * len(HOSTILE), "name": sorted(HOSTILE * 3)})
     chart = Chart("hostile", frame, [Column("x")], [Column("x")], series="name", panel="name", text=HOSTILE[1])
     views = replace(views_of(made, every), charts=[chart])
-    path.write_text(helpers.page(made, every, views))
-    browser.open(path)
+    browser.show(tmp_path, helpers.page(made, every, views))
     browser.do("select(page.count - 1)")
     assert browser.do("window.hacked === undefined")
     texts = browser.do("document.body.innerText")
