@@ -280,7 +280,7 @@ class _Examination:
             error=simulator.gradient_error if stages.is_failed else "",
             elsewhere=simulator.gradient_error if not stages.is_failed else "",
             n_failed=simulator.n_failed_gradients,
-            printed=simulator.printed,
+            printed=simulator.printed.getvalue().splitlines(),
             changing=sorted(simulator.changing),
             notes=[
                 *simulator.notes,
@@ -335,7 +335,7 @@ class _Examination:
 
         def decide() -> bool | None:
             effort = self._effort(self.clock.affordable(0.9))
-            return None if effort is None else diagnosis.is_adaptive(self.stages, checked, near, *effort)
+            return None if effort is None else diagnosis.is_adaptive(self.stages, checked, near, effort)
 
         return self._attempt("the comparison along lines", decide) if near else None
 
@@ -370,9 +370,10 @@ class _Examination:
         if effort is None:
             self.left_out.append("jumps and kinks on lines")
             return []
-        points, halvings, most = effort
-        if points < POINTS:
-            self.left_out.append(f"fine line scans: {points} points instead of {POINTS}, and {most} places searched")
+        if effort[0] < POINTS:
+            self.left_out.append(
+                f"fine line scans: {effort[0]} points instead of {POINTS}, and {effort[2]} places searched"
+            )
         lines = []
         measured = checked.noise if checked is not None and math.isfinite(checked.noise) else 0.0
         self.clock.limit(min(1.0, 2 * share))
@@ -383,7 +384,7 @@ class _Examination:
                     measured, self.stages.repeats.spread, self.simulator.unit * (size if math.isfinite(size) else 0.0)
                 )
                 cost = partial(self.stages.costs_along, direction)
-                line = scan(cost, direction, rounding, 3.0, points, halvings, most, self.simulator.unit)
+                line = scan(cost, direction, rounding, 3.0, effort, self.simulator.unit)
                 lines.append(replace(line, missed=self._missed_share(line, checked)))
         except OutOfTime:
             self.left_out.append("jumps and kinks on lines")

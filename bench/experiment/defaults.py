@@ -3,7 +3,7 @@
 A stored row contains every parameter of its plugins and of its study as JSON. If a plugin has gained a parameter since,
 the row counts as computed with that parameter's present default. All code that compares, groups or shows rows by their
 parameters reads them through :func:`completed`, :func:`completed_json` or :func:`completed_rows`: ``compare``, ``plan``,
-``report``, ``index`` and :func:`bench.load`. :func:`missing_parameters` lists the added parameters, for messages.
+``report``, ``index`` and :func:`bench.load`.
 """
 
 from __future__ import annotations
@@ -38,17 +38,6 @@ def completed(given: Mapping[str, Any]) -> dict[str, Any]:
     result = {axis: _with_defaults(part, defaults_of(axis, given)) for axis, part in given.items()}
     records = {name: result.pop(name, None) for name in RECORDS}
     return result | records
-
-
-def missing_parameters(given: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the parameters that :func:`completed` adds, with their values: ``{"pushing.hold": 1}``."""
-    return {
-        f"{part.get('name', axis)}.{name}": value
-        for axis, part in given.items()
-        if isinstance(part, Mapping)
-        for name, value in defaults_of(axis, given).items()
-        if name not in part
-    }
 
 
 def completed_json(text: str) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import sys
 from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout
 from functools import partial
@@ -32,28 +31,6 @@ SIMPLE_BITS = 12
 """Costs with at most this many significant bits, such as 0.5, show nothing about the precision."""
 COMPARED = 10_000_000
 """Numbers of theta in all calls up to which each call is searched for changes of theta."""
-KEPT_LINES = 1000
-"""Most lines printed by the user's functions that are kept."""
-
-
-class Printed(io.TextIOBase):
-    """Collects what the user's functions print: the first lines, and the number of lines."""
-
-    def __init__(self) -> None:
-        self.lines: list[str] = []
-        self.count = 0
-        self._partial = ""
-
-    def write(self, text: str) -> int:
-        """Collect text."""
-        *whole, self._partial = (self._partial + text).split("\n")
-        self.count += len(whole)
-        self.lines += whole[: KEPT_LINES - len(self.lines)]
-        return len(text)
-
-    def isatty(self) -> bool:
-        """Return False."""
-        return False
 
 
 class Simulator:
@@ -96,7 +73,7 @@ class Simulator:
         """Number of gradient calls that raised an exception."""
         self.precision = "float64"
         """Floating-point type of the cost: its own, or float32 where all its values have single precision."""
-        self.printed = Printed()
+        self.printed = io.StringIO()
         """What cost and gradient print."""
         self.first_value = float("nan")
         """The cost at theta, from the first call, with w = 0."""
@@ -125,8 +102,6 @@ class Simulator:
             is_compared = is_compared and self.clock.used * self.layout.vector.size < COMPARED
             before = numbers(theta).copy() if is_compared else None
             try:
-                if sys.stdout is self.printed:
-                    return function(theta, *arguments, **settings)
                 with redirect_stdout(self.printed), redirect_stderr(self.printed):
                     return function(theta, *arguments, **settings)
             except SystemExit as error:

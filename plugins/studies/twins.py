@@ -119,7 +119,7 @@ class Twins(StudyPackage):
         worst = shown.good.groupby("problem")["gradient_difference_rel"].transform("max")
         frame = floored(shown.good.loc[worst.sort_values(ascending=False, kind="stable").index], FLOOR, DIFFERENCES)
         chart = Chart(
-            "twins", frame, [shown.column(name, limit=f"{name}_limit", log=True) for name in DIFFERENCES],
+            "twins", frame, [shown.column(name, limit=f"{name}_limit", log=True, label=self.columns.by_name[name].doc) for name in DIFFERENCES],
             [text("problem", label="")], "dots", series="method", marks=[Mark("rounding up to here", ROUNDING)], height=0.3,
             text="One dot per problem and engine. Left of the dashed line a difference is accumulated rounding.",
         )  # fmt: skip
