@@ -147,10 +147,9 @@ def unit_rate(optimizer: Optimizer, gradient: np.ndarray | None) -> float:
     name = tuned_parameter(optimizer)
     if name != "rate" or gradient is None:
         return 1.0
-    state = dataclasses.replace(optimizer, rate=1.0).start(0.0 * gradient)  # type: ignore[call-arg]
-    moved = dataclasses.replace(optimizer, rate=1.0).tell(  # type: ignore[call-arg]
-        state, state["theta"][:, None], Answer(None, gradient[:, None])
-    )
+    unit = dataclasses.replace(optimizer, rate=1.0)  # type: ignore[call-arg]
+    state = unit.start(0.0 * gradient)
+    moved = unit.tell(state, state["theta"][:, None], Answer(None, gradient[:, None]))
     size = float(np.abs(moved["theta"]).max())
     return 1.0 / size if size > 0 else 1.0
 
@@ -171,7 +170,7 @@ def tune(
     name = tuned_parameter(method.optimizer)
     found: dict[float, list[Search]] = {}
     rates = list(grid) if name else [0.0]
-    step = grid[1] / grid[0] if len(grid) > 1 else 10**0.5
+    step = grid[1] / grid[0]
     for widening in range(widenings + 1):
         missing = [rate for rate in rates if rate not in found]
         pairs = [(rate, seed) for rate in missing for seed in seeds]

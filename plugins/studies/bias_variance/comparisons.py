@@ -22,12 +22,6 @@ WORKS, FAILS, OPEN, NO_RESULT = "works", "fails", "open", "no result"
 """Verdicts of a method at a setting: its interval is below 1, above 1, contains 1 or is not known; it has no number."""
 NEAR = 2.0
 """A method whose error is more than this many times the lowest does not share the first place: the order is open."""
-VERDICTS = {
-    WORKS: "its error is below the gradient's norm, with the whole 95% interval",
-    FAILS: "its error is above the gradient's norm, with the whole 95% interval: the zero estimate is better",
-    OPEN: "its interval contains the gradient's norm, or is not known",
-    NO_RESULT: "the cell failed: see its status and reason",
-}
 EQUAL_SAMPLES, EQUAL_ROLLOUTS = "relative RMSE at equal samples", "relative RMSE at equal rollouts"
 COLUMNS = (
     text("problem", "what distinguishes the problem from the others"),

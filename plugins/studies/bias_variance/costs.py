@@ -25,7 +25,7 @@ class Cost:
         good = (rows["status"] == "ok").to_numpy(bool)
         for values in (self.of(rows).to_numpy(float), rows["rmse_rel"].to_numpy(float)):
             good = good & np.isfinite(values) & (values > 0)
-        return rows if good.all() else rows[good]
+        return rows[good]
 
 
 def _seconds(value: float) -> str:
