@@ -1,37 +1,13 @@
-"""The running hopper: conserved quantities, rest on the ground, rewards, and gradients around touch-down."""
+"""The running hopper in flight; ``test_integrators.py`` has its energy."""
 
-import jax
 import numpy as np
 import pytest
 
-from bench.model import State, compose, registry
-from bench.model.ops import LoopOps
-
-jax.config.update("jax_enable_x64", True)
+import bench
+from bench.model import LoopOps, State
 
 EXACT = 1e-12
 """Relative rounding error of a few hundred steps in float64."""
-
-
-def program_of(contact="penalty", law=None, **parameters):
-    scene = registry.make("scenes", "hopper_run", parameters)
-    law = registry.make("contacts", contact, {"stiffness": 1e4} | (law or {}))
-    return compose(scene, law, registry.make("integrators", "semi_implicit_euler"))
-
-
-def start_of(*, foot=0.1, speed=0.0, fall=0.0, angle=0.0, pitch=0.0, spin=0.0):
-    """Return one state with the leg at its rest length."""
-    q = [0.0, foot + 0.5 * np.cos(angle), pitch, 0.5 * np.sin(angle), foot]
-    return State(np.array(q)[:, None], np.array([speed, -fall, spin, speed, -fall])[:, None])
-
-
-def steps(program, state, count, u=0.0):
-    """Return the states before and after each of ``count`` control steps; ``u`` is a number or a function of the step."""
-    states = [state]
-    for t in range(count):
-        value = u(t) if callable(u) else u
-        states.append(program.step(LoopOps(), states[-1], np.zeros((2, 1)) + value))
-    return states
 
 
 def momentum(scene, state):
@@ -42,10 +18,12 @@ def momentum(scene, state):
 
 
 def test_flight_is_a_parabola_and_conserves_angular_momentum_under_any_actions():
-    program = program_of()
+    program = bench.problem("hopper_run", backend="numpy").program
     scene = program.scene
-    first = start_of(foot=2.0, speed=1.0, angle=0.3, pitch=-0.2, spin=0.5)
-    states = steps(program, first, 20, u=lambda t: np.array([[np.sin(t)], [np.cos(2 * t)]]))
+    first = State(np.array([[0.0], [2.5], [-0.2], [0.15], [2.0]]), np.array([[1.0], [0.0], [0.5], [1.0], [0.0]]))
+    states = [first]
+    for t in range(20):
+        states.append(program.step(LoopOps(), states[-1], np.array([[np.sin(t)], [np.cos(2 * t)]])))
     assert min(state.q[4, 0] for state in states) > 0
     share = scene.foot_mass / (scene.body_mass + scene.foot_mass)
     n = 20 * scene.substeps

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 from bench.plugins.estimators.planted import Planted
-from classes import Heaviside, Quadratic
+from classes import Quadratic
 from dose_response.measure import compare
 from scipy.stats import f, kstest
 
@@ -66,9 +66,3 @@ def test_heavy_tailed_errors_follow_an_f_distribution_whose_mean_is_the_stated_s
     # |t|^2 / d of a multivariate t vector is F(d, tails), with mean tails / (tails - 2)
     assert kstest(squares * tails / (tails - 2), f(D, tails).cdf).pvalue > UNLIKELY
     assert kstest(squares, f(D, 300).cdf).pvalue < UNLIKELY  # a normal error is told apart
-
-
-def test_rotation_of_one_coordinate_is_refused():
-    reason = Planted(angle=30.0).own_refusal(problem(Heaviside()).program)
-    assert reason is not None
-    assert "at least 2 coordinates" in reason
