@@ -152,28 +152,29 @@ def test_scaled_estimates_are_worse_on_equal_noise_however_large_their_variance(
     assert compared(after, before)["outcome"].iloc[0] in ("better", "changed")
 
 
-def test_a_remark_on_the_interval_does_not_hide_a_paired_change():
-    before, after = paired(reason="heavy tails"), paired((1.5, 2.5), reason="heavy tails")
-    assert "on the same noise" in only(compared(before, after), "worse")
+HEAVY = {"reason": "heavy tails"}
+NO_BIAS, BIAS = interval("bias", 0.0, 0.0, 0.1), interval("bias", 0.9, 1.0, 1.1)
+MOVED = paired(reference=(2.1, 1.9), **BIAS)
+PAIRED = [
+    (paired(**HEAVY), paired((1.5, 2.5), **HEAVY), "worse", "on the same noise"),
+    (paired(), paired((1 + 1e-9, 2.0)), "same", ""),
+    (paired(), paired((1.0001, 2.0)), "changed", "moved by"),
+    # intervals of the bias move with the reference; the estimates on the same noise are what they were
+    (paired(**NO_BIAS), MOVED, "changed", "the same estimates, but the reference moved by 1.00"),
+    (paired(**NO_BIAS), MOVED.assign(reference_se=0.5), "same", ""),
+    # the reference of before is the measure, so a fault that the reference shares cannot hide
+    (paired(), paired((1.1, 2.2), 0.605, (1.21, 2.09)), "worse", ""),
+]
+"""Rows before and after, and how compare judges them."""
 
 
-def test_rounding_is_no_change_and_a_small_move_is_neither_worse_nor_better():
-    before = paired()
-    assert set(compared(before, paired((1 + 1e-9, 2.0)))["outcome"]) == {"same"}
-    assert "moved by" in only(compared(before, paired((1.0001, 2.0))), "changed")
-
-
-def test_a_better_reference_is_no_merit_or_fault_of_the_same_estimates():
-    """Intervals of the bias move with the reference; the estimates on the same noise are what they were."""
-    before = paired(bias=0.0, bias_low=0.0, bias_high=0.1)
-    after = paired(bias=1.0, bias_low=0.9, bias_high=1.1, reference=(2.1, 1.9))
-    assert only(compared(before, after), "changed") == "the same estimates, but the reference moved by 1.00"
-    assert set(compared(before, after.assign(reference_se=0.5))["outcome"]) == {"same"}
-
-
-def test_a_fault_in_program_and_reference_alike_is_worse():
-    """The reference of before is the measure, so a fault that the reference shares cannot hide."""
-    assert only(compared(paired(), paired((1.1, 2.2), 0.605, (1.21, 2.09))), "worse")
+@pytest.mark.parametrize(
+    ("before", "after", "outcome", "said"), PAIRED, ids=lambda value: value if isinstance(value, str) else ""
+)
+def test_estimates_on_the_same_noise_are_judged_by_themselves(before, after, outcome, said):
+    found = compared(before, after)
+    assert list(found["outcome"]) == [outcome]
+    assert said in found["change"][0]
 
 
 @pytest.mark.parametrize("scene", ["pushing", "quadratic"])
@@ -213,11 +214,13 @@ def test_times_of_unchanged_code_are_the_same_although_every_call_of_one_run_agr
 
 
 @pytest.mark.parametrize(("factor", "outcome"), [(4.0, "worse"), (0.25, "better")])
-def test_a_time_beyond_the_spread_between_runs_is_a_change_where_times_are_asked_for(factor, outcome):
+def test_a_time_beyond_the_spread_between_runs_is_a_change_where_times_are_asked_for(factor, outcome, tmp_path):
     before, after, *more = runs(5, spread=0.05)
     after.loc[0, "time_s"] *= factor
     assert only(compared(before, after, again=more), outcome).startswith("time")
-    assert set(compared(before, after)["outcome"]) == {"same"}
+    old, new, *again = (save(rows, tmp_path / str(i)) for i, rows in enumerate((before, after, *more)))
+    assert run(old, new, out=tmp_path / "out") == 0
+    assert run(old, new, f"again={','.join(map(str, again))}", out=tmp_path / "out") == (outcome == "worse")
 
 
 @pytest.mark.parametrize(("was", "now", "outcome"), [("ok", "error", "worse"), ("timeout", "ok", "better"), ("error", "crashed", "changed")])  # fmt: skip
@@ -238,28 +241,25 @@ def test_cells_that_are_gone_or_new_are_reported():
 # ------------------------------------------------------------------------------------------------------- command
 
 
-def test_files_say_what_the_exit_status_says(tmp_path, capsys):
-    before, after = given(), given()
-    after.loc[good(after), ["status", "reason"]] = ["error", "it broke\x00 <badly> & \x1b[31m"]
-    old, new = save(before, tmp_path / "old"), save(after, tmp_path / "new")
+@pytest.mark.parametrize("study", list(registry.entries()["studies"]))
+def test_files_say_what_the_exit_status_says(study, tmp_path, capsys):
+    """Rows have every kind of column."""
+    columns, before = of_study(study, "scenes=[pushing,quadratic]")
+    numbers = {column.name: 1.0 for column in columns.compared if column.kind == "number"}
+    before = before.assign(experiment="some", **numbers)
+    after = before.copy()
+    after.loc[0, ["status", "reason"]] = ["error", "it broke\x00 <badly> & \x1b[31m"]
+    old, new = save(before, tmp_path / "old", "some"), save(after, tmp_path / "new", "some")
     out = tmp_path / "out"
     for other, failures in ((old, 0), (new, 1)):
         assert run(old, other, out=out) == failures
         table = pd.read_csv(out / "compare.csv")
         assert len(table) == len(before)
         assert (table["outcome"] == "worse").sum() == failures
-    assert list(table.columns) == ["experiment", *cells.FIRST, *cells.both_sides(COLUMNS.compared), *cells.LAST]
+    assert list(table.columns) == ["experiment", *cells.FIRST, *cells.both_sides(columns.compared), *cells.LAST]
     assert "status ok to error (it broke" in capsys.readouterr().out
     for name in ("compare.md", "compare.html"):
         assert "it broke" in (out / name).read_text()
-
-
-def test_further_runs_of_before_are_read(tmp_path):
-    before, after, *more = runs(4, spread=0.02)
-    after["time_s"] *= 9
-    old, new, *again = (save(rows, tmp_path / str(i)) for i, rows in enumerate((before, after, *more)))
-    assert run(old, new, out=tmp_path / "out") == 0
-    assert run(old, new, f"again={again[0]},{again[1]}", out=tmp_path / "out") == 1
 
 
 @pytest.mark.slow
@@ -295,32 +295,18 @@ def test_results_kept_in_git_are_found_in_their_own_folder(tmp_path):
     assert run(old, new, out=tmp_path / "out") == 0, "results of one's own come before those of the standard folder"
 
 
-def test_rows_without_parameters_are_refused(tmp_path, capsys):
-    new = save(given(), tmp_path / "new")
-    both = pd.concat([given().assign(parameters="").iloc[:3], given()])
-    assert run(save(both, tmp_path / "both"), new, out=tmp_path / "out") == 2
-    assert "have no parameters" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("study", list(registry.entries()["studies"]))
-def test_results_of_every_study_are_compared(study, tmp_path):
-    """One of them gave no result: rows of every kind of column."""
-    columns, rows = of_study(study, "scenes=[pushing,quadratic]")
-    rows = rows.assign(
-        experiment="some", **{column.name: 1.0 for column in columns.compared if column.kind == "number"}
-    )
-    old = save(rows, tmp_path / "old", "some")
-    assert run(old, old, out=tmp_path / "out") == 0
-    rows.loc[0, "status"] = "error"
-    assert run(old, save(rows, tmp_path / "new", "some"), out=tmp_path / "out") == 1
-    assert "error" in (tmp_path / "out" / "compare.html").read_text()
-
-
-def test_results_without_a_common_experiment_are_refused(tmp_path, capsys):
-    old = save(given().assign(experiment="one"), tmp_path / "old", "one")
-    new = save(given().assign(experiment="two"), tmp_path / "new", "two")
+@pytest.mark.parametrize(
+    ("name", "rows", "said"),
+    [
+        ("made_up", pd.concat([given().assign(parameters="").iloc[:3], given()]), "have no parameters"),
+        ("other", given().assign(experiment="other"), "no experiment in common"),
+    ],
+    ids=["parameters", "experiment"],
+)
+def test_what_cannot_be_compared_is_refused(name, rows, said, tmp_path, capsys):
+    old, new = save(rows, tmp_path / "old", name), save(given(), tmp_path / "new")
     assert run(old, new, out=tmp_path / "out") == 2
-    assert "no experiment in common" in capsys.readouterr().err
+    assert said in capsys.readouterr().err
 
 
 # ----------------------------------------------------------------------------------------------------- history

@@ -35,8 +35,6 @@ class Dropped(SampleMean):
 def tree(tmp_path_factory):
     made = Tree(tmp_path_factory.mktemp("plugins"))
     made.add("plugins/estimators/half_step.py", ESTIMATOR.format(name="half_step", requires=""))
-    made.add("plugins/estimators/broken.py", "import no_such_module_at_all\n")
-    made.add("plugins/scenes/unfinished.py", "from bench.plugin import Scene\n\nclass Unfinished(Scene:\n")
     absent = ESTIMATOR.format(name="absent", requires='"no_such_module=some-dist",')
     made.add("plugins/estimators/absent.py", absent)
     made.install(
@@ -93,8 +91,6 @@ def test_added_plugins_run_and_take_parameters_from_the_command_line(rows):
 @pytest.mark.parametrize(
     ("name", "reason"),
     [
-        ("broken", "No module named 'no_such_module_at_all'"),
-        ("unfinished", "SyntaxError"),
         ("gone", "NotThere"),
         ("absent", "pip install some-dist"),
     ],
