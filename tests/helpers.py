@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pytest
 from bench.plugins.studies.bias_variance import BiasVariance
 from bench.plugins.studies.bias_variance.columns import COLUMNS
 from trees import ROOT
@@ -272,6 +273,19 @@ class Springy(ContactScene):
         """Height squared."""
         return q[0] ** 2
 '''
+
+
+def need_backends(*names):
+    """Skip the tests of a module unless these backends are available."""
+    for name in names:
+        if reason := registry.find("backends", name).reason:
+            pytest.skip(f"backend {name} is {reason}", allow_module_level=True)
+
+
+def central_differences(problem, theta, w, step=1e-6):
+    """Return central differences of the costs at a theta ``(d,)``, ``(d, B)``."""
+    moves = step * np.eye(theta.size)
+    return np.stack([problem.value(theta + move, w) - problem.value(theta - move, w) for move in moves]) / (2 * step)
 
 
 def page(made, rows, views=None):

@@ -13,9 +13,11 @@ import numpy as np
 import pytest
 from bench.plugins.backends.numpy import Numpy, NumpyProblem
 from classes import (
+    Cem,
     Cubic,
     DoubleIntegrator,
     ExplicitEuler,
+    GradientDescent,
     Heaviside,
     MassSpring,
     Midpoint,
@@ -318,6 +320,46 @@ class DoubleAnyway(Numpy):
 
     def compile(self, program):
         return NumpyProblem(program, "float64", 1e-6)
+
+
+# ------------------------------------------------------------------------------------------- planted: optimizers
+
+
+@planted("path_repeats_after_a_stop")
+class Forgetful(GradientDescent):
+    """It keeps the iteration outside its state."""
+
+    def step(self, state, gradient):
+        counts = self.__dict__.setdefault("counts", [0])
+        counts[0] += 1
+        return {"theta": state["theta"] - 0.1 / counts[0] * gradient, "iteration": 0}
+
+
+@planted("state_is_left_alone")
+class Careless(GradientDescent):
+    """It changes the state it was given."""
+
+    def step(self, state, gradient):
+        state["theta"] -= 0.1 * gradient
+        return {"theta": state["theta"].copy(), "iteration": state["iteration"]}
+
+
+@planted("needs_are_declared")
+class Greedy(Cem):
+    """It declares a need that it never has."""
+
+    needs = frozenset({"value", "gradient"})
+
+    def required_fields(self, state):
+        return frozenset({"value"})
+
+
+@planted("descends_on_a_bowl")
+class Climbing(GradientDescent):
+    """The wrong sign."""
+
+    def step(self, state, gradient):
+        return {"theta": state["theta"] + 0.1 * gradient, "iteration": 0}
 
 
 # ----------------------------------------------------------------------------------------------- planted: scenes

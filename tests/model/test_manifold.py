@@ -6,6 +6,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 from classes import Penalty, SemiImplicitEuler, Windowed
+from helpers import central_differences
 
 from bench.model import JointScene, State, adjoint_gradient, compose, param, registry, slopes
 from bench.model.manifold import difference, n_changes, retract
@@ -80,11 +81,6 @@ def problem(scene, backend="mujoco", **values):
     return made.compile(compose(scene, law, SemiImplicitEuler()))
 
 
-def difference_gradient(p, w, h=1e-6):
-    theta = p.program.theta0
-    return np.stack([(p.value(theta + h * e, w) - p.value(theta - h * e, w)) / (2 * h) for e in np.eye(p.dim)])
-
-
 def test_lengths_follow_from_the_joints():
     assert (Tumbling.n_q, Tumbling.n_v, n_changes(Tumbling())) == (12, 10, 20)
     with pytest.raises(TypeError, match="joint 'screw'"):
@@ -114,7 +110,7 @@ def test_retract_and_difference_are_inverse_and_agree_with_mujoco():
 def test_gradients_through_quaternions_equal_differences(scene):
     p = problem(scene)
     w = np.random.default_rng(1).standard_normal((p.program.n_noise, 4))
-    expected = difference_gradient(p, w)
+    expected = central_differences(p, p.program.theta0, w)
     gradient = p.grad(p.program.theta0, w)
     np.testing.assert_allclose(gradient, expected, atol=2e-5 * np.abs(expected).max())
     path = slopes(p, p.program.theta0, w)

@@ -20,20 +20,18 @@ from classes import (
     Quadruped,
     SemiImplicitEuler,
 )
+from helpers import need_backends
 
 from bench.conformance import backends, scenes
 from bench.conformance.kit import Failed
 from bench.conformance.subjects import distance, law_for, samples
 from bench.experiment.cell import Cell
 from bench.experiment.experiment import Budget
-from bench.model import compose, registry
+from bench.model import compose
 from bench.plugins import mjcf
 
 ROOT = Path(__file__).resolve().parents[2]
-for _name in ("mujoco", "mjx"):
-    _entry = registry.find("backends", _name)
-    if not _entry.available:
-        pytest.skip(f"backend {_name} is {_entry.reason}", allow_module_level=True)
+need_backends("mujoco", "mjx")
 
 SPRING = (-1.56802, -1.22481, -1.22481 / 480)
 """Gradient of one bounce on an undamped spring of 1e4 N/m under semi-implicit Euler, made once by hand-written code.

@@ -4,16 +4,13 @@ import numpy as np
 import pandas as pd
 import pytest
 from classes import Numpy
+from helpers import need_backends
 
 from bench.cli import main
 from bench.engines import conformance
-from bench.model import registry
 from bench.plugins import mjx_solver
 
-for _name in ("mujoco", "mjx"):
-    _entry = registry.find("backends", _name)
-    if not _entry.available:
-        pytest.skip(f"backend {_name} is {_entry.reason}", allow_module_level=True)
+need_backends("mujoco", "mjx")
 
 
 # ------------------------------------------------------------------------------------------- without compilation

@@ -7,8 +7,6 @@ from bench.plugins.optimizers.ppo import Ppo
 from classes import Adam, Cem, GaussNewton, GradientDescent, Lbfgs, LineSearch, Momentum, Mppi
 from scipy.stats import norm
 
-from bench.conformance import optimizers as kit
-from bench.conformance.kit import Failed
 from bench.model import Answer
 
 SAMPLES = 400_000
@@ -157,53 +155,3 @@ def test_nothing_finite_is_no_step():
         points = optimizer.ask(state, np.random.default_rng(0).standard_normal((2, 4)))
         after = optimizer.tell(state, points, Answer(value=np.full(4, np.nan)))
         assert np.isfinite(after["theta"]).all()
-
-
-# ------------------------------------------------------------------------------------------------ planted faults
-
-
-class Forgetful(GradientDescent):
-    """It keeps the iteration outside its state."""
-
-    def step(self, state, gradient):
-        counts = self.__dict__.setdefault("counts", [0])
-        counts[0] += 1
-        return {"theta": state["theta"] - 0.1 / counts[0] * gradient, "iteration": 0}
-
-
-class Careless(GradientDescent):
-    """It changes the state it was given."""
-
-    def step(self, state, gradient):
-        state["theta"] -= 0.1 * gradient
-        return {"theta": state["theta"].copy(), "iteration": state["iteration"]}
-
-
-class Greedy(Cem):
-    """It declares a need that it never has."""
-
-    needs = frozenset({"value", "gradient"})
-
-    def required_fields(self, state):
-        return frozenset({"value"})
-
-
-class Climbing(GradientDescent):
-    """The wrong sign."""
-
-    def step(self, state, gradient):
-        return {"theta": state["theta"] + 0.1 * gradient, "iteration": 0}
-
-
-@pytest.mark.parametrize(
-    ("fault", "check", "message"),
-    [
-        (Forgetful(), kit.path_repeats_after_a_stop, "takes another path"),
-        (Careless(), kit.state_is_left_alone, "has changed the state"),
-        (Greedy(), kit.needs_are_declared, "declares"),
-        (Climbing(), kit.descends_on_a_bowl, "the cost goes from"),
-    ],
-)
-def test_kit_catches(fault, check, message):
-    with pytest.raises(Failed, match=message):
-        check(fault)

@@ -1,13 +1,12 @@
 """The robot that pushes a block: without contact the block's term has no gradient, and in contact a right one."""
 
 import numpy as np
-import pytest
 from classes import Mujoco, Penalty, QuadrupedPush, SemiImplicitEuler
+from helpers import central_differences, need_backends
 
-from bench.model import compose, registry
+from bench.model import compose
 
-if not registry.find("backends", "mujoco").available:
-    pytest.skip("MuJoCo is not installed", allow_module_level=True)
+need_backends("mujoco")
 
 STILL = np.zeros((12, 1))
 DOWN = {"effort": 0.0, "upright": 0.0}
@@ -18,13 +17,6 @@ def problem(backend=None, **values):
     scene = QuadrupedPush(**values)
     law = Penalty(**scene.contact_values)
     return (backend or Mujoco(impedance=0.9)).compile(compose(scene, law, SemiImplicitEuler()))
-
-
-def differences(pushing, theta, step=1e-6):
-    """Central differences of the cost, ``(d, 1)``."""
-    moved = theta[:, None] + step * np.concatenate([np.eye(theta.size), -np.eye(theta.size)], axis=1)
-    after, before = np.split(pushing.value(moved, np.repeat(STILL, moved.shape[1], axis=1)), 2)
-    return (after - before)[:, None] / (2 * step)
 
 
 def test_the_block_has_no_gradient_without_contact():
@@ -41,6 +33,8 @@ def test_in_contact_the_gradient_moves_the_block():
     pushing = problem(lean=0.2, **DOWN)
     theta = pushing.program.theta0
     gradient = pushing.grad(theta, STILL)
-    np.testing.assert_allclose(gradient, differences(pushing, theta), rtol=0, atol=1e-4 * np.linalg.norm(gradient))
+    np.testing.assert_allclose(
+        gradient, central_differences(pushing, theta, STILL), rtol=0, atol=1e-4 * np.linalg.norm(gradient)
+    )
     moved = theta[:, None] - 0.02 * gradient / np.linalg.norm(gradient)
     assert pushing.value(moved, STILL)[0] < pushing.value(theta, STILL)[0] - 0.02

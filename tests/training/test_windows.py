@@ -22,9 +22,13 @@ def environment(horizon=240, **parameters):
     return problems.environment(problems.cartpole_program(horizon=horizon, **parameters))
 
 
+def start(env, count=6):
+    return env.start(jnp.asarray(np.random.default_rng(0).standard_normal((8, count))))
+
+
 def window_return(env, actor, length, key, cut=0.0, first=None, discount=0.99):
     """Return gains of a window without a value at its end, and the window."""
-    first = env.start(jnp.asarray(np.random.default_rng(0).standard_normal((8, 6)))) if first is None else first
+    first = start(env) if first is None else first
     _, window = windows.rollout(env, actor.sample, first, length, key, cut)
     return windows.gains(window, jnp.zeros_like(window.reward), discount).sum(), window
 
@@ -63,7 +67,7 @@ def test_the_gradient_of_a_window_is_that_of_fobg_on_the_whole_program():
 def test_no_gradient_crosses_the_end_of_an_episode(actor):
     """With an end after step 2, the derivative of all later rewards by the state at the window's start is zero."""
     env = environment(horizon=2)
-    first = env.start(jnp.asarray(np.random.default_rng(0).standard_normal((8, 6))))
+    first = start(env)
 
     def late_reward(q, leak=False):
         moved, total = Episodes(State(q, first.state.v), first.age), 0.0
@@ -112,7 +116,7 @@ def test_a_cut_stops_the_gradient_where_the_jacobian_is_too_large(actor):
 def test_the_gradient_of_an_episode_in_windows_is_the_sum_of_theirs(actor):
     """By a loop over windows whose first states are constants: rewards and the last value, times gamma^steps before."""
     env, key, length, every, discount = environment(), jax.random.PRNGKey(2), 10, 4, 0.9
-    first = env.start(jnp.asarray(np.random.default_rng(0).standard_normal((8, 3))))
+    first = start(env, 3)
     noise = env.normal(jax.random.split(key)[0], (length, 1, 3))
 
     def value(seen):
@@ -144,7 +148,7 @@ def test_the_gradient_of_an_episode_in_windows_is_the_sum_of_theirs(actor):
 @pytest.mark.slow
 def test_the_norm_of_a_jacobian_agrees_with_differences():
     env = environment()
-    state = env.start(jnp.asarray(np.random.default_rng(0).standard_normal((8, 2)))).state
+    state = start(env, 2).state
     u, step = jnp.full((1, 2), 0.3), 1e-6
     x = np.concatenate(state)
 
