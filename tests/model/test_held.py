@@ -6,18 +6,16 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
+import bench
 from bench import UserError
 from bench.model import (
     LoopOps,
     State,
     ZeroOrderHoldScene,
     adjoint_gradient,
-    compose,
     param,
-    registry,
     slopes,
 )
-from bench.model.parameters import build
 
 ROUNDING = 1e-12
 """Relative difference of the same sums in another order."""
@@ -53,8 +51,7 @@ class Cart(ZeroOrderHoldScene):
 
 
 def compiled(scene):
-    step = build(registry.usable("integrators", "semi_implicit_euler"), {})
-    return build(registry.usable("backends", "numpy"), {}).compile(compose(scene, None, step))
+    return bench.problem(scene, backend="numpy")
 
 
 @pytest.fixture(scope="module")

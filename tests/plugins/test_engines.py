@@ -1,7 +1,5 @@
 """Physics engines: their twins are the scenes' programs, their gradients are right, and what they cannot do is refused."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from bench.plugins.backends import mujoco
@@ -30,7 +28,6 @@ from bench.experiment.experiment import Budget
 from bench.model import compose
 from bench.plugins import mjcf
 
-ROOT = Path(__file__).resolve().parents[2]
 need_backends("mujoco", "mjx")
 
 SPRING = (-1.56802, -1.22481, -1.22481 / 480)
@@ -44,16 +41,6 @@ ENGINES = [Mujoco(), pytest.param(Mjx(), marks=pytest.mark.slow)]
 def program(scene, **law):
     made = law_for(scene, Penalty, {"damping_mode": "clipped", **law}) if scene.n_contacts else None
     return compose(scene, made, SemiImplicitEuler())
-
-
-def cell(scene, law, backend):
-    parts = {"scene": scene, "contact": law, "integrator": SemiImplicitEuler(), "backend": backend, "estimator": Fobg()}
-    return Cell(parts, 8, 2, 0, BiasVariance(), budget=Budget(4096, 0.01))
-
-
-def gradients(backend, of, count=3):
-    theta, w = samples(of, count)
-    return backend.compile(of).grad(theta, w)
 
 
 # ---------------------------------------------------------------------------------------------------- numbers
@@ -100,8 +87,11 @@ def test_lean_changes_no_number():
 
 
 def test_reference_of_an_engine_is_its_own():
-    law = Penalty()
-    own, engine, other = (cell(Pushing(), law, backend) for backend in (Jax(), Mujoco(), Mujoco(impedance=0.9)))
+    parts = {"scene": Pushing(), "contact": Penalty(), "integrator": SemiImplicitEuler(), "estimator": Fobg()}
+    own, engine, other = (
+        Cell(parts | {"backend": backend}, 8, 2, 0, BiasVariance(), budget=Budget(4096, 0.01))
+        for backend in (Jax(), Mujoco(), Mujoco(impedance=0.9))
+    )
     assert own.reference_key == own.with_part("backend", Numpy()).reference_key
     assert len({one.reference_key for one in (own, engine, other)}) == 3
 

@@ -1,10 +1,10 @@
 """The robot that pushes a block: without contact the block's term has no gradient, and in contact a right one."""
 
 import numpy as np
-from classes import Mujoco, Penalty, QuadrupedPush, SemiImplicitEuler
+from classes import QuadrupedPush
 from helpers import central_differences, need_backends
 
-from bench.model import compose
+import bench
 
 need_backends("mujoco")
 
@@ -13,10 +13,8 @@ DOWN = {"effort": 0.0, "upright": 0.0}
 """Weights that leave only the block's term."""
 
 
-def problem(backend=None, **values):
-    scene = QuadrupedPush(**values)
-    law = Penalty(**scene.contact_values)
-    return (backend or Mujoco(impedance=0.9)).compile(compose(scene, law, SemiImplicitEuler()))
+def problem(**values):
+    return bench.problem(QuadrupedPush(**values), backend="mujoco[impedance=0.9]")
 
 
 def test_the_block_has_no_gradient_without_contact():

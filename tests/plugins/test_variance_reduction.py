@@ -12,8 +12,6 @@ from bench.model import compose
 
 ROUNDING = 1e-9
 """Relative rounding of a fit of 21 coefficients."""
-UNLIKELY = 1e-4
-"""Probability below which samples have another distribution."""
 LIMIT = 4.5
 """Standard errors within which a mean agrees with its expectation."""
 
