@@ -4,6 +4,7 @@ The inputs of a case are in its files: the model, the start, the controls, the p
 its value and derivatives by up to four sources that have to agree, and the numbers that typical faults give.
 """
 
+import dataclasses
 import json
 import re
 import sys
@@ -49,7 +50,7 @@ class ByTerms:
             stale = before if self._fault == "stale velocity" else v
             steps.append(self._derivatives(model, (q, v, control), data.qacc_warmstart.copy(), stale))
             before = v
-        end = case.__class__(case.name, case.data, data.qpos.copy(), *(getattr(case, term) for term in TERMS[1:]))
+        end = dataclasses.replace(case, qpos=data.qpos.copy())
         up = np.concatenate([case.data["weights"]["qpos"] @ end.tangent(), case.data["weights"]["qvel"]])
         by_control = []
         for a, b in reversed(steps):

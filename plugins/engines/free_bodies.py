@@ -4,6 +4,9 @@ import xml.etree.ElementTree as ElementTree
 
 import numpy as np
 
+STEP = 1e-6
+"""Step of the differences of a change of coordinates."""
+
 
 def without_motors(case):
     """Return the root of the case's MJCF without actuators, and the forces ``(n_v, n_u)`` of its motors per control."""
@@ -31,3 +34,8 @@ def in_world(case, q, v, sign=1):
         across = np.cross(axis, v[rates])
         v[rates] = v[rates] + 2 * (q[i] * across + np.cross(axis, across))
     return v
+
+
+def differences(function, x):
+    """Return the derivative of a function of a vector, by central differences."""
+    return np.array([(function(x + h) - function(x - h)) / (2 * STEP) for h in STEP * np.eye(len(x))])

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from bench.cli import main
-from bench.engines import conformance
+from bench.engines import conformance, table
 
 pytest.importorskip("mujoco")
 ROOT = Path(__file__).resolve().parents[2]
@@ -54,7 +54,7 @@ def test_an_engine_that_follows_the_page_runs_without_this_package(tmp_path):
     assert "2 passed" in done.stdout, done.stdout
     words = [sys.executable, "tests/conformance/runner.py", "tests/my_engine.py", "friction_loss", "free_joint"]
     done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=True)
-    *rows, last = json.loads(done.stdout.splitlines()[-1])["rows"]
+    _, *rows, last = map(json.loads, done.stdout.splitlines())
     assert [row["term"] for row in rows] == ["value", *conformance_set.TERMS]
     assert all(row["is_right"] and row["digits"] > 10 for row in rows)
     assert (last["case"], last["term"], last["is_right"]) == ("free_joint", "all", None)
@@ -247,6 +247,43 @@ def test_mjx_lacks_the_velocity_product_of_a_weld():
 
 
 # -------------------------------------------------------------------------------------------------------- table
+
+
+UNFINISHED = """
+import os
+
+
+class Engine:
+    versions = {"mine": "2"}
+
+    def rollout(self, case):
+        if case.name != "rk4":
+            os._exit(3)
+        return 0.0
+
+    def gradient(self, case):
+        return {}
+"""
+
+
+def test_rows_of_an_engine_that_ends_stay_with_the_reason(tmp_path):
+    (tmp_path / "mine_conformance.py").write_text(UNFINISHED)
+    row, last = table.conformance_rows("mine", None, tmp_path / "mine_conformance.py", "rk4", "weld")
+    assert (row["versions"], row["case"], row["is_right"]) == ("mine 2", "rk4", False)
+    assert "ended with status 3" in last["reason"]
+
+
+def test_the_table_keeps_other_releases(tmp_path, monkeypatch):
+    """A column per release, and a release that runs again replaces its rows."""
+    monkeypatch.setattr(table.subprocess, "run", lambda *words, **options: None)
+    for version, digits in (("3.1", 1.0), ("3.2", 2.0), ("3.1", 3.0)):
+        row = {"versions": f"mujoco {version}; x 1", "case": "rk4", "is_right": False, "digits": digits, "term": "qvel"}
+        monkeypatch.setattr(
+            table, "conformance_rows", lambda *of, row=row: [row | {"seconds": 1, "looks_like": "a fault"}]
+        )
+        page = table.write(["mujoco"], tmp_path).read_text()
+    assert "| case | mujoco 3.1 | mujoco 3.2 |" in page
+    assert "| rk4 | 3.0 wrong: qvel (a fault) | 2.0 wrong: qvel (a fault) |" in page
 
 
 @pytest.mark.slow
