@@ -87,10 +87,8 @@ def conformance_rows(name: str, backend: Any, file: Path, *cases: str) -> list[d
                 [python, runner.__file__, str(file), *cases],
                 env=environment, text=True, timeout=LIMIT_S, check=True, stdout=output, stderr=subprocess.PIPE,
             )  # fmt: skip
-        except subprocess.CalledProcessError as error:
-            reason = f"the conformance set ended with status {error.returncode} ({printable(error.stderr)[-200:]})"
-        except (OSError, subprocess.TimeoutExpired) as error:
-            reason = f"the conformance set stopped ({printable(error)[-200:]})"
+        except (OSError, subprocess.SubprocessError) as error:
+            reason = f"the conformance set stopped: {printable(error)[-80:]} {printable(getattr(error, 'stderr', ''))[-120:]}"
         output.seek(0)
         lines = [json.loads(line) for line in output if line.startswith("{")]
     versions = "; ".join(f"{library} {version}" for library, version in lines[0]["versions"].items()) if lines else ""
@@ -120,7 +118,7 @@ def by_case(table: pd.DataFrame) -> list[str]:
     run = run.assign(release=release, seconds=pd.to_numeric(run["seconds"]))
     cells = run.groupby(["case", "release"]).apply(_cell).unstack(fill_value="")[release.unique()]
     cells.loc["seconds"] = (
-        run.drop_duplicates(["release", "case"]).groupby("release")["seconds"].sum().map("{:.0f}".format)
+        run.drop_duplicates(["release", "case"]).groupby("release")["seconds"].sum().map("{:.3g}".format)
     )
     return _markdown(["case", *cells], list(cells.itertuples()))
 

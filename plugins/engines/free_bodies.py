@@ -4,9 +4,6 @@ import xml.etree.ElementTree as ElementTree
 
 import numpy as np
 
-STEP = 1e-6
-"""Step of the differences of a change of coordinates."""
-
 
 def without_motors(case):
     """Return the root of the case's MJCF without actuators, and the forces ``(n_v, n_u)`` of its motors per control."""
@@ -26,6 +23,11 @@ def without_motors(case):
     return root, arms
 
 
+def differing(root, reasons):
+    """Return the reasons whose paths find an element in the MJCF, as text."""
+    return "; ".join(reason for path, reason in reasons.items() if root.find(f".//{path}") is not None)
+
+
 def in_world(case, q, v, sign=1):
     """Return v with angular velocities of free bodies in the world's frame, or with sign -1 in the bodies' frames again."""
     v = v.copy()
@@ -34,8 +36,3 @@ def in_world(case, q, v, sign=1):
         across = np.cross(axis, v[rates])
         v[rates] = v[rates] + 2 * (q[i] * across + np.cross(axis, across))
     return v
-
-
-def differences(function, x):
-    """Return the derivative of a function of a vector, by central differences."""
-    return np.array([(function(x + h) - function(x - h)) / (2 * STEP) for h in STEP * np.eye(len(x))])

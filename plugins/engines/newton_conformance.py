@@ -5,10 +5,13 @@ import xml.etree.ElementTree as ElementTree
 
 import numpy as np
 import warp as wp
-from free_bodies import differences, in_world, without_motors
+from free_bodies import in_world, without_motors
 
 wp.config.quiet = True
 import newton  # noqa: E402
+
+STEP = 1e-6
+"""Step of the differences of a change of coordinates."""
 
 
 class Engine:
@@ -60,6 +63,7 @@ class Engine:
         return np.concatenate([after.joint_q.numpy(), after.joint_qd.numpy()]).astype(float), pull
 
     def _path(self, case):
+        self._model(case)  # raises what it does not have
         path = [_turned(case, np.concatenate([case.qpos, case.qvel]), True)]
         for u in case.controls:
             path.append(self._step(case, path[-1], u)[0])
@@ -76,13 +80,17 @@ class Engine:
     def gradient(self, case):
         """Return the derivatives by state and controls."""
         *path, end = self._path(case)
-        slope, by_control = differences(lambda x: self._cost(case, x), end), []
+        slope, by_control = _differences(lambda x: self._cost(case, x), end), []
         for x, u in zip(path[::-1], case.controls[::-1], strict=True):
             slope, by_u = self._step(case, x, u)[1](slope)
             by_control.insert(0, by_u)
         start = np.concatenate([case.qpos, case.qvel])
-        slope = differences(lambda at: slope @ _turned(case, at, True), start)
+        slope = _differences(lambda at: slope @ _turned(case, at, True), start)
         return {"qpos": slope[: case.qpos.size], "qvel": slope[case.qpos.size :], "controls": by_control}
+
+
+def _differences(function, x):
+    return np.array([(function(x + h) - function(x - h)) / (2 * STEP) for h in STEP * np.eye(len(x))])
 
 
 def _turned(case, x, is_forward):
