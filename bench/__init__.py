@@ -9,19 +9,20 @@
 import importlib
 from typing import TYPE_CHECKING, Any
 
+import bench.compare
 import bench.examine
 import bench.run
-from bench.compare import compare
 from bench.errors import Unsupported, UserError
 
 if TYPE_CHECKING:
     from bench import plugin
     from bench.api import estimate, list_plugins, load, problem, run
+    from bench.compare.command import compare
     from bench.examine.examination import examine
 
     list = list_plugins  # not in __all__: a star import must not replace the built-in type
 else:
-    del bench, run, examine  # the packages; the functions of these names are imported at their first use
+    del bench, compare, run, examine  # the packages; the functions of these names are imported at their first use
 
 __version__ = "0.5.0"
 __all__ = [
@@ -36,6 +37,7 @@ __all__ = [
     "run",
 ]
 _SOURCES = {
+    "compare": ("bench.compare.command", "compare"),
     "estimate": ("bench.api", "estimate"),
     "examine": ("bench.examine.examination", "examine"),
     "list": ("bench.api", "list_plugins"),

@@ -358,20 +358,21 @@ def _refer(verb: str, names: Sequence[str]) -> None:
 
 
 def _check(words: list[str]) -> int:
-    """Verify the declarations of the named plugins, or of all."""
+    """Verify the declarations of the named plugins, or of all; from the first option on, words are pytest's."""
     from bench import conformance
     from bench.experiment.words import parse_words
     from bench.model import registry
     from bench.simulator.clock import parse_duration
 
-    names, settings, _ = parse_words(words, "check", {"limit": f"{conformance.kit.LIMIT_S:g}"})
+    own = list(itertools.takewhile(lambda word: not word.startswith("-"), words))
+    names, settings, _ = parse_words(own, "check", {"limit": f"{conformance.kit.LIMIT_S:g}"})
     limit = parse_duration(settings["limit"], "limit")
     _refer("check", names)
     plugins = {name for table in registry.entries().values() for name in table}
     for name in names:
         if name not in plugins:
             raise registry.unknown_plugin("plugin", name, plugins, "list")
-    return conformance.main(names, limit)
+    return conformance.main(names, limit, words[len(own) :])
 
 
 def _examine(words: list[str]) -> int:
@@ -502,9 +503,10 @@ VERBS = {
         "that are installed, and writes a page and a CSV into out=DIR.\n", "Experiments",
     ),
     "check": Verb(
-        _check, "check [NAME ...] [limit=15m] [plugins=DIR]", "plugins: does each do what it declares?",
-        "Runs the conformance kit on some plugins, or all. A check that takes longer than `limit` fails. Exit "
-        "status 1 when a check fails.\n\n" + FAMILY, "Is it right?",
+        _check, "check [NAME ...] [limit=15m] [plugins=DIR] [option of pytest ...]", "plugins: does each do what it declares?",
+        "Runs the conformance kit on some plugins, or all, in pytest: -k WORD selects checks, -x stops at the first\n"
+        "failure, --junitxml=FILE writes a report. A check fails that takes longer than `limit` or ends its process.\n"
+        "Exit status 1 when a check fails.\n\n" + FAMILY, "Is it right?",
     ),
     "gradcheck": Verb(
         _gradcheck, "gradcheck SCENE ... [key=value ...]", "scenes: is each gradient the derivative of its program?",

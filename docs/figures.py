@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from bench.plugins.studies.bias_variance import trust
-from bench.plugins.studies.gradient_check.points import is_trusted
+from bench.plugins.studies.gradient_check import is_trusted
 
 from bench.engines import table
 from bench.model import registry

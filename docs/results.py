@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -88,7 +88,9 @@ def entries_of(results: Path) -> list[Entry]:
 def loaded(results: Path) -> dict[str, Experiment]:
     """Return every experiment by name."""
     registry.add_folder(PAPER)
-    return {name: config.load([f"experiment={name}", f"results_dir={results}"]) for name in config.experiments([PAPER])}
+    # an experiment with other settings than its file's would be loaded twice, to compare them
+    found = {name: config.load([f"experiment={name}"]) for name in config.experiments([PAPER])}
+    return {name: replace(experiment, results_dir=results) for name, experiment in found.items()}
 
 
 def entry_of(name: str, question: str, folder: Path) -> Entry:
@@ -135,8 +137,7 @@ def comparison(experiment: str, results: Path = STANDARD) -> pd.DataFrame:
     Verdicts are those of :mod:`bench.plugins.studies.bias_variance.comparisons`. ``best``: lowest,
     or not distinguishable from the lowest. ``biased``: more than half of the squared error is bias.
     """
-    loaded = config.load([f"experiment={experiment}", f"results_dir={results}"])
-    methods = comparisons.method_table(arrange(loaded, rows_of(experiment, results)))
+    methods = comparisons.method_table(arrange(loaded(results)[experiment], rows_of(experiment, results)))
     settings = comparisons.compare_errors(methods).to_dict("records")
     best = {(row["problem"], name) for row in settings for name in (row["first"], *row["tied"])}
     parts = methods["estimator"].str.partition("[")

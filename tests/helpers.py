@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 from bench.plugins.studies.bias_variance import BiasVariance
 from bench.plugins.studies.bias_variance.columns import COLUMNS
+from trees import ROOT
 
 from bench.experiment import config
 from bench.experiment.columns import IDENTITY
@@ -20,8 +21,11 @@ from bench.model.identity import parse_identity
 from bench.model.parameters import parameters
 from bench.report import writer
 from bench.report.finish import views_of
+from bench.report.views import newest_rows
 from bench.report.web import document
 from bench.report.web.data import page_data
+from bench.run.execute import store_of
+from bench.run.plan import requested_rows
 from bench.run.tasks import blank_row
 
 NAMES = ("alpha_order", "finite_difference", "fobg", "inverse_variance", "randomized_smoothing", "reinforce")
@@ -88,6 +92,19 @@ def rows_of(made, of):
             row | results(**given, backend=cell.backend.name, contact=cell.contact.name if cell.contact else "")
         )
     return made.columns.typed(pd.DataFrame(rows))
+
+
+def unmeasured(*words, **values):
+    """Return the experiment of a command line, and a row of each of its cells whose only results are ``values``."""
+    made, of = loaded(*words)
+    rows = pd.DataFrame([blank_row(made, cell) | {"status": "ok"} for cell in of])
+    return made, made.columns.typed(rows.assign(**values))
+
+
+def stored(name, *words):
+    """Return a standard experiment and its stored rows."""
+    made = config.load([f"experiment={name}", *words, f"results_dir={ROOT / 'results' / 'standard'}"])
+    return made, requested_rows(made, newest_rows(store_of(made).load()))[0]
 
 
 # ------------------------------------------------------------------------------------------- made up of columns

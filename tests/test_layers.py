@@ -100,11 +100,6 @@ def test_no_modules_import_each_other_in_a_circle():
     graphlib.TopologicalSorter(graph()).prepare()  # raises CycleError with the circle
 
 
-def test_only_the_command_line_stands_on_the_command_line():
-    importers = {module_of(path) for path in FILES for name in imported(path) if name.startswith("bench.cli")}
-    assert importers == {"bench.__main__"}
-
-
 TOPS = {"studies": "report"}
 """Kinds of plugins that stand on more than the contracts, and the highest room that they import."""
 

@@ -74,11 +74,11 @@ ENDS = {
 }  # fmt: skip
 RUN = ["scenes=[ends]", "backends=[numpy]", "estimators=[fobg]", "timing=false"]
 VERBS = {
-    "run": [*RUN, "workers=0"], "plan": RUN, "list": ["leaves"], "check": ["leaves"], "gradcheck": ["ends", "workers=0"],
+    "run": [*RUN, "workers=0"], "plan": RUN, "list": ["leaves"], "gradcheck": ["ends", "workers=0"],
     "trace": ["ends", "backends=[numpy]"],
 }  # fmt: skip
 """Commands that run the plugins in a process of their own."""
-LISTED = {"list": 0, "check": 1, "gradcheck": 1}
+LISTED = {"list": 0, "gradcheck": 1}
 """The status of a verdict on a plugin that calls sys.exit."""
 
 

@@ -1,10 +1,8 @@
 """Measures the speed of the harness, compared with a NumPy loop and native code: ``python validation/bench_self.py [FOLDER]``.
 
-Writes ``FOLDER/bench_self.json`` (by default in ``results/bench_self``), from which ``docs/speed.md`` is written. ``--quick``
-runs small sizes.
+Writes ``FOLDER/bench_self.json`` (by default in ``results/bench_self``), from which ``docs/speed.md`` is written.
 """
 
-import argparse
 import itertools
 import json
 import math
@@ -39,7 +37,7 @@ SCENES = ("pushing", "pendulum", "cartpole", "double_pendulum", "hopper", "bounc
 """Scenes whose gradients ``fused`` and ``jax`` are compared on."""
 SWEPT = {"stiffness": (500.0, 1e3, 2e3), "beta": (5.0, 10.0, 20.0), "sigma": (0.15, 0.3, 0.6)}
 """Values that differ in no shape, so that they compile nothing anew."""
-SIZES, QUICK = (1_000, 10_000, 100_000, 1_000_000), (64, 512)
+SIZES = (1_000, 10_000, 100_000, 1_000_000)
 SECONDS, CALLS = 1.0, 100
 """Least total time of the timed calls of one row [s], and largest number of repeats of each of its three calls."""
 LONGEST = 20.0
@@ -68,11 +66,11 @@ def microseconds(call, count):
     return clock.median_s / count * 1e6
 
 
-def measure_backends(sizes):
+def measure_backends():
     """Yield the time of every subject at every batch size, and the peak memory without noise and result."""
     for backend, contact, method in SUBJECTS:
         compiled = problem(backend, contact)
-        for count in sizes:
+        for count in SIZES:
             w = batch(compiled, count)
             timing.reset_peak_memory()
             each = microseconds(partial(getattr(compiled, method), compiled.program.theta0, w), count)
@@ -84,21 +82,21 @@ def measure_backends(sizes):
                 break
 
 
-def measure_baselines(sizes):
+def measure_baselines():
     """Yield the time of the same gradient in a NumPy loop and in native code, which is compared with ``jax``."""
     compiled, rival = problem("jax"), problem("fused")
     scene, theta = compiled.program.scene, compiled.program.theta0
     stiffness = compiled.program.contact.stiffness
-    for count in sizes[:2]:
+    for count in SIZES[:2]:
         call = partial(loop.gradient, scene, stiffness, theta, batch(compiled, count))
         yield f"plain NumPy loop with its adjoint, {count:g} rollouts", microseconds(call, count), "us"
     kernel = native.gradient(scene, stiffness)
-    w = batch(compiled, QUICK[0])
+    w = batch(compiled, 64)
     expected = compiled.grad(theta, w)
     difference = np.abs(kernel(theta, w) - expected).max() / np.abs(expected).max()
     yield "native C kernel: largest relative difference", float(difference), ""
     rival.threads = 1  # one thread like the kernel, since two threads may share a core
-    for count in sizes:
+    for count in SIZES:
         w = batch(compiled, count)
         columns = blocks.block_size(count, NATIVE_COLUMNS, native.LANES, 1)
         call = partial(blocks.evaluate, kernel, theta[:, None], w, columns, 1, (compiled.dim,))
@@ -108,9 +106,9 @@ def measure_baselines(sizes):
         yield f"fused on one thread over the C kernel, {count:g} rollouts", ratio, ""
 
 
-def compare_backends(scenes, sizes):
+def compare_backends():
     """Yield the ratio of the times of gradients by ``fused`` and by ``jax`` on the same cores."""
-    for scene, count in itertools.product(scenes, sizes):
+    for scene, count in itertools.product(SCENES, (1_000, 100_000)):
         problems = [problem(backend, scene=scene) for backend in ("fused", "jax")]
         times = [microseconds(partial(p.grad, p.program.theta0, batch(p, count)), count) for p in problems]
         yield f"fused over jax, {scene}, {count:g} rollouts", times[0] / times[1], ""
@@ -172,23 +170,16 @@ def processor_seconds():
 
 def main(words):
     """Measure, print and write the speeds."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("folder", nargs="?", type=Path, default=Path("results/bench_self"))
-    parser.add_argument("--quick", action="store_true", help="small sizes")
-    given = parser.parse_args(words)
+    folder = Path(*words or ["results/bench_self"])
     load_before, lines = os.getloadavg(), []
     for what, value, unit in itertools.chain(
-        measure_backends(QUICK if given.quick else SIZES),
-        measure_baselines(QUICK if given.quick else SIZES),
-        compare_backends(SCENES[: 1 if given.quick else None], QUICK[:1] if given.quick else (1_000, 100_000)),
-        count_compilations(),
-        measure_commands(*((5, 40) if given.quick else (100, 500))),
+        measure_backends(), measure_baselines(), compare_backends(), count_compilations(), measure_commands(100, 500)
     ):
         print(f"{what}: {value:.3g} {unit}", flush=True)
         lines.append({"what": what, "value": None if math.isnan(value) else value, "unit": unit})
-    given.folder.mkdir(parents=True, exist_ok=True)
+    folder.mkdir(parents=True, exist_ok=True)
     record = {"machine": machine(), "load_average_before": load_before, "lines": lines}
-    (given.folder / "bench_self.json").write_text(json.dumps(record, indent=1) + "\n")
+    (folder / "bench_self.json").write_text(json.dumps(record, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -42,7 +42,7 @@ GC, GD, GF, GK, GR, GS, GV = (
 )
 X = "plugins/estimators/"
 OF_TIMING = "tests/studies/test_flat.py tests/measure/test_timing.py"
-OF_STORE = "-m not\\ slow tests/run/test_store.py tests/run/test_nothing_lost.py"
+OF_STORE = "tests/run/test_rows.py tests/run/test_store.py tests/run/test_nothing_lost.py"
 OF_CHECKS = "tests/gradient/test_direction.py tests/gradient/test_check.py"
 EL, EG = "bench/gradient/lines.py", "bench/gradient/stages.py"
 EF, EX, ES = (f"bench/examine/{name}.py" for name in ("findings", "examination", "smoothing"))
@@ -50,7 +50,7 @@ OF_PLAN, OF_MECHANISMS = "tests/examine/test_budget.py", "tests/examine/test_mec
 OF_UNRESOLVED = "tests/examine/test_unresolved.py"
 OF_HOLD = "tests/examine/test_verdicts_hold.py"
 OF_GROUPS = "-m not\\ full tests/examine/test_mechanisms.py -k 10_000\\ or\\ may_hide"
-OF_EXAMINE = "-m not\\ slow tests/examine/test_examine.py --deselect tests/examine/test_examine.py::test_python_number_from_torch_is_disconnected_in_double_precision"
+OF_EXAMINE = "tests/examine/test_examine.py --deselect tests/examine/test_examine.py::test_python_number_from_torch_is_disconnected_in_double_precision"
 OF_ESTIMATORS = "tests/plugins/test_weights.py tests/plugins/test_estimators.py"
 OF_VARIANCE = "tests/plugins/test_variance_reduction.py"
 OF_EVENTS = "tests/plugins/test_events.py"
@@ -181,8 +181,7 @@ GROUPS: dict[tuple[str, str], list[tuple[str, str]]] = {
     (ST, OF_STORE): [
         ("self._sequence += 1", "pass"),
         ("duplicated(keep=\"last\")", "duplicated(keep=\"first\")"),
-        ("na_position=\"first\"", "na_position=\"last\""),
-        ("[\"sequence\", \"stored_at\"], kind", "[\"stored_at\", \"sequence\"], kind"),
+        ("sequence.sort_values(", "sequence.sort_values(ascending=False, "),
         ("between(0, MAX_SEQUENCE), 0.0)", "notna(), 0.0)"),
         ("return table[~is_older].reset_index(drop=True) if is_older.any() else table", "return table"),
         ("        if self._sequence is None:\n            self.load()\n        assert self._sequence is not None", "        self._sequence = self._sequence or 0"),

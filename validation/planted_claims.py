@@ -15,7 +15,7 @@ from bench.plugins.estimators.inverse_variance import InverseVariance, halves
 
 from bench.claims import discovery, results
 from bench.claims.claim import NOT_REPRODUCED
-from bench.model import DiagnosticEstimator, Problem, SampleMean, State, registry
+from bench.model import Problem, State, registry
 
 
 def scaled(factor):
@@ -43,18 +43,6 @@ def fast_step(original, self, dynamics, state, u, dt):
     return original(self, dynamics, state, u, 1.05 * dt)
 
 
-def with_numbers(original, self, problem, theta, noise):
-    values, numbers = original(self, problem, theta, noise)
-    return 1.05 * values, numbers
-
-
-def of(kind, name):
-    """Return a plugin's class."""
-    plugin = registry.find(kind, name).plugin
-    assert plugin is not None
-    return plugin
-
-
 CLAIMS = {
     "estimators": {
         "fobg": ("C5", "C6", "C19"), "inverse_variance": ("C19",), "measure_valued": ("C6",), "randomized_smoothing": ("C7",),
@@ -71,17 +59,13 @@ def _bugs():
     yield "time of impact .9 dt", (Impulse, "impulse", early_impact, ("C8", "C13"))
     yield "score 5% large", (Problem, "score", scaled(1.05), ("C1", "C5", "C6"))
     yield "weights swapped", (InverseVariance, "estimate_with_diagnostics", swapped_weights, ("C19",))
-    for name, claims in CLAIMS["estimators"].items():
-        plugin = of("estimators", name)
-        if issubclass(plugin, DiagnosticEstimator):
-            bug = (plugin, "estimate_with_diagnostics", with_numbers, claims)
-        else:
-            bug = (plugin, "terms" if issubclass(plugin, SampleMean) else "estimate", scaled(1.05), claims)
-        yield f"{name} 5% large", bug
-    for name, claims in CLAIMS["contacts"].items():
-        yield f"{name} force 5% large", (of("contacts", name), "force", scaled(1.05), claims)
-    for name, claims in CLAIMS["integrators"].items():
-        yield f"{name} step 5% long", (of("integrators", name), "step", fast_step, claims)
+    for kind, method, bug, wrapper in (
+        ("estimators", "estimate", "5% large", scaled(1.05)),
+        ("contacts", "force", "force 5% large", scaled(1.05)),
+        ("integrators", "step", "step 5% long", fast_step),
+    ):
+        for name, claims in CLAIMS[kind].items():
+            yield f"{name} {bug}", (registry.usable(kind, name), method, wrapper, claims)
 
 
 BUGS = dict(_bugs())

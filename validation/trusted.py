@@ -21,7 +21,7 @@ import pandas as pd
 from bench.plugins.backends.jax import Jax
 from bench.plugins.estimators.fobg import Fobg
 from bench.plugins.studies.bias_variance.trust import SPREAD, WRONG
-from bench.plugins.studies.gradient_check.points import is_trusted
+from bench.plugins.studies.gradient_check import is_trusted
 
 from bench.cli import main as command
 from bench.measure.statistics import Truth, summarise

@@ -62,8 +62,7 @@ class Figure:
         if not math.isfinite(self.measured):
             return False
         if self.factor:
-            ratio = self.measured / self.value if self.value else math.inf
-            return 1.0 / self.factor <= ratio <= self.factor
+            return 1.0 / self.factor <= self.measured / self.value <= self.factor
         return abs(self.measured - self.value) <= self.tolerance
 
     @property
@@ -119,7 +118,7 @@ class Outcome:
     reservation: str = ""
     """A condition or doubt that readers must know although the figures agree."""
     series: Mapping[str, Any] = field(default_factory=dict)
-    """Numbers, lists and arrays of numbers for the chart: values, or means with their standard errors."""
+    """The chart: places along x by the axis's label, then each curve by its label, as values or as means with their standard errors."""
 
 
 def verdict(figures: Sequence[Figure], reservation: str = "") -> str:
@@ -149,10 +148,8 @@ class Claim(Plugin):
     """The conclusion for a reader, in a sentence."""
     quick: ClassVar[bool] = True
     """Whether measuring takes less than 5 s on two cores."""
-    labels: ClassVar[tuple[str, str]] = ("", "")
-    """Labels of the chart's x and y axis."""
-    curves: ClassVar[Mapping[str, str]] = {}
-    """The curves of the chart: the names of their series with their labels, against the first series or its places."""
+    quantity: ClassVar[str] = ""
+    """What the chart's curves show, the label of its y axis."""
     logarithmic: ClassVar[str] = ""
     """The axes that are logarithmic: ``x``, ``y`` or ``xy``."""
     marks: ClassVar[Sequence[tuple[Literal["x", "y"], float, str]]] = ()

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from bench.claims import tables
 from bench.claims.tables import Results
+from bench.experiment.columns import text
 from bench.experiment.views import Views
 from bench.report.draw import draw
 from bench.report.figures import save, styled
@@ -26,16 +27,13 @@ def write(directory: Path, results: Results) -> list[Path]:
             drawn.append((chart, draw(chart)))
             save(drawn[-1][1], directory / chart.name, data=chart.plotted())
     figures, answer = tables.figures_table(results), tables.count_verdicts(results)
-    every = [figure for _, result in results for figure in result.figures or (tables.NOTHING,)]
-    cells = figures.assign(
-        measured=[*map(tables.measured_text, every)], resolution=[*map(tables.detectable_text, every)],
-        status=figures["agrees"].map({True: "agrees", False: "differs"}), reason=figures["limited_by"],
-    )  # fmt: skip
+    columns = [text("claim"), *tables.FIGURE[:3], tables.FIGURE[4], text("verdict"), text("lesson")]
+    cells = cells_data(tables.for_readers(figures), columns)
     views = Views([tables.claims_table(results)], headline=answer)
     content = {
         "claims.md": tables.markdown(results),
         "claims.csv": csv_blocks(figures),
-        "claims.html": blocks(tables.TITLE, QUESTION, views, cells_data(cells, tables.FIGURE), drawn),
+        "claims.html": blocks(tables.TITLE, QUESTION, views, cells, drawn),
         ANSWER: answer_json("claims", QUESTION, answer, drawn[0][0].name if drawn else ""),
     }
     return write_all(directory, content.items())

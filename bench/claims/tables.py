@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from itertools import groupby
@@ -16,6 +17,7 @@ from bench.claims.results import FAILED, ClaimResult
 from bench.errors import printable
 from bench.experiment.columns import Column, text
 from bench.experiment.views import Chart, Mark, Style, Table
+from bench.report.cells import readable
 from bench.report.colours import estimator_colour, estimator_marker
 from bench.report.tables import escape_markdown, plain_markdown
 from bench.report.text import counted, duration, number
@@ -23,62 +25,47 @@ from bench.report.text import counted, duration, number
 Results = Sequence[tuple[type[Claim], ClaimResult]]
 TITLE = "Published claims, run again"
 FIGURE = (
-    text("claim"), text("figure"), text("published"), text("measured"), text("resolution", label="would fail at"),
-    text("verdict"), text("lesson"),
+    text("figure"), text("published"), text("measured", label="measured (95%)"), text("status", label="verdict"),
+    Column("resolution", label="would fail at, relative"), text("reason", label="5% not detected for"),
 )  # fmt: skip
-"""Columns of the page's table of figures."""
+"""Columns of a table of figures for readers."""
 NOTHING = Figure("", "0", math.nan)
 """Stands for the figures of a claim that has none, since its code failed."""
 ESTIMATORS = {
-    **dict.fromkeys(("first", "pathwise", "coarse"), "fobg"), **dict.fromkeys(("zeroth", "score"), "reinforce"),
-    "measure-valued": "measure_valued", "gauss": "randomized_smoothing", "sphere": "sphere_smoothing",
+    "first": "fobg", "pathwise": "fobg", "zeroth": "reinforce", "score": "reinforce", "measure": "measure_valued",
+    "Gaussian": "randomized_smoothing", "sphere": "sphere_smoothing",
 }  # fmt: skip
-"""Series that have the look of an estimator, with its name."""
+"""First words of the labels of curves that have the look of an estimator, with its name."""
 
 
 def chart(claim: type[Claim], result: ClaimResult) -> Chart | None:
     """Return the chart of a claim from its stored series; None without a series."""
-    if not (result.series and claim.curves):
+    if not result.series:
         return None
-    first, is_log, parts = next(iter(result.series)), {axis: axis in claim.logarithmic for axis in "xy"}, []
-    x = pd.Series(result.series[first])
-    for name, label in claim.curves.items():
+    (place, places), *curves = result.series.items()
+    is_log = {axis: axis in claim.logarithmic for axis in "xy"}
+    parts, styles = [], {}
+    for label, series in curves:
         # a second column has the standard errors of means
-        values = pd.DataFrame(np.reshape(result.series[name], (len(result.series[name]), -1))).reindex(columns=[0, 1])
-        at = values.index if first in claim.curves else x
+        values = pd.DataFrame(np.reshape(series, (len(series), -1))).reindex(columns=[0, 1])
         low, high = (values[0] + side * 1.96 * values[1] for side in (-1, 1))
         parts.append(pd.DataFrame({
-            "series": label, "x": at, "y": values[0], "low": np.maximum(low, 0.1 * values[0]) if is_log["y"] else low, "high": high,
+            "series": label, "x": places, "y": values[0], "low": np.maximum(low, 0.1 * values[0]) if is_log["y"] else low, "high": high,
         }))  # fmt: skip
-    looks = {
-        claim.curves[n]: Style(estimator_colour(e), estimator_marker(e))
-        for n, e in ESTIMATORS.items()
-        if n in claim.curves
-    }
+        if estimator := ESTIMATORS.get(re.split(r"\W", label)[0]):
+            styles[label] = Style(estimator_colour(estimator), estimator_marker(estimator))
     return Chart(
-        claim.name, pd.concat(parts, ignore_index=True), [Column("x", label=claim.labels[0], log=is_log["x"])],
-        [Column("y", label=claim.labels[1], low="low", high="high", log=is_log["y"])], "lines",
-        claim.learned.partition(". ")[0], "series", styles=looks, marks=[Mark(label, value, axis=axis) for axis, value, label in claim.marks],
+        claim.name, pd.concat(parts, ignore_index=True), [Column("x", label=place, log=is_log["x"])],
+        [Column("y", label=claim.quantity, low="low", high="high", log=is_log["y"])], "lines",
+        claim.learned.partition(". ")[0], "series", styles=styles, marks=[Mark(label, value, axis=axis) for axis, value, label in claim.marks],
         subtitle=f"{claim.name}, {claim.source.partition(';')[0]}: {result.verdict}",
     )  # fmt: skip
 
 
-def measured_text(figure: Figure) -> str:
-    """Return the measured number as text, with its 95% interval unless that is negligible."""
-    value = number(figure.measured, 5)
-    half = 1.96 * figure.error
-    return f"{value} +- {number(half)}" if half > 1e-6 * abs(figure.measured) else value
-
-
-def detectable_text(figure: Figure) -> str:
-    """Return the smallest relative error that the figure detects, as text."""
-    if figure.value == 0.0:
-        return "any"
-    if figure.detectable_error < 1e-3:
-        return "<0.1%"
-    return (
-        f"{figure.detectable_error:.1%}" if figure.detectable_error < 1 else f"factor {1 + figure.detectable_error:.1f}"
-    )
+def measured_text(value: float, error: float) -> str:
+    """Return a measured number as text, with its 95% interval unless that is negligible."""
+    half = 1.96 * error
+    return f"{number(value, 5)} +- {number(half)}" if half > 1e-6 * abs(value) else number(value, 5)
 
 
 def insensitive_text(figures: Sequence[Figure]) -> str:
@@ -89,18 +76,12 @@ def insensitive_text(figures: Sequence[Figure]) -> str:
     return f"{of_all} cannot detect an error of 5%: {reasons}" if limits else ""
 
 
-def readable_figures(figures: Sequence[Figure]) -> pd.DataFrame:
-    """Return the table of figures for readers: one row per figure, with every value as text."""
-    return pd.DataFrame(
-        {
-            "figure": figure.what,
-            "published": figure.published,
-            "measured (95%)": measured_text(figure),
-            "agrees": "yes" if figure.agrees else "NO",
-            "would fail at": detectable_text(figure),
-            "detects 5%": f"no: {figure.limitation}" if figure.limitation else "yes",
-        }
-        for figure in figures
+def for_readers(figures: pd.DataFrame) -> pd.DataFrame:
+    """Return the table of figures with the columns :data:`FIGURE`."""
+    return figures.assign(
+        measured=[*map(measured_text, figures["measured"], figures["standard_error"])],
+        status=figures["agrees"].map({True: "agrees", False: "differs"}),
+        reason=figures["limited_by"],
     )
 
 
@@ -135,7 +116,8 @@ def markdown(results: Results) -> str:
         for claim, result in own:
             parts.append(f"### {claim.name}: {result.verdict}\n\n{claim.statement} ({claim.source})\n")
             if result.figures:
-                parts.append(plain_markdown(readable_figures(result.figures)) + "\n")
+                shown = for_readers(figures_table([(claim, result)]))
+                parts.append(plain_markdown(readable(Table(claim.name, shown, FIGURE))) + "\n")
             if result.remark:
                 parts.append(f"*{escape_markdown(result.remark)}*\n")
             if sentence := insensitive_text(result.figures):
@@ -166,7 +148,7 @@ def result_lines(claim: type[Claim], result: ClaimResult, is_stored: bool) -> It
     )
     for figure in result.figures:
         if not figure.agrees:
-            yield f"       {figure.what}: published {figure.published}, measured {measured_text(figure)}"
+            yield f"       {figure.what}: published {figure.published}, measured {measured_text(figure.measured, figure.error)}"
     for sentence in filter(None, (result.remark, insensitive_text(result.figures))):
         yield f"       {sentence}"
 

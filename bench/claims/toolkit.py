@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -77,12 +77,6 @@ def rule(count: int) -> tuple[np.ndarray, np.ndarray]:
     return nodes[None], weights / weights.sum()
 
 
-def hermite(count: int = 40) -> tuple[np.ndarray, np.ndarray]:
-    """Return nodes ``(1, count)`` and weights of Gauss-Hermite quadrature for a standard normal variable."""
-    nodes, weights = np.polynomial.hermite_e.hermegauss(count)
-    return nodes[None], weights / weights.sum()
-
-
 def moments(
     problem: Problem, estimator: Estimator, theta: np.ndarray | float | None = None, count: int = 400_000
 ) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -93,8 +87,13 @@ def moments(
         values = terms(problem, estimator, nodes, theta)[:, 0]
         mean = float(values @ weights)
         results.append((mean, float((values - mean) ** 2 @ weights)))
-    (mean, variance), (other_mean, other_variance) = results
-    return (mean, abs(mean - other_mean)), (variance, abs(variance - other_variance))
+    first, second = ((value, abs(value - other)) for value, other in zip(*results, strict=True))
+    return first, second
+
+
+def means(problem: Problem, estimator: Estimator, thetas: Iterable[float], count: int) -> list[float]:
+    """Return the means of an estimator with one noise variable at each theta, see :func:`moments`."""
+    return [moments(problem, estimator, theta, count)[0][0] for theta in thetas]
 
 
 def spread(values: np.ndarray, batches: int = 50) -> tuple[float, float]:

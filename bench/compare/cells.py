@@ -12,7 +12,7 @@ import pandas as pd
 from bench.compare import timings
 from bench.compare.judging import Change, Row, judge_cell, rule_of
 from bench.experiment.columns import IDENTITY, Column, Columns
-from bench.experiment.defaults import completed, missing_parameters
+from bench.experiment.defaults import completed
 
 OUTCOMES = ("worse", "better", "changed", "same")
 COUNTS = ("samples", "repeats", "seed")
@@ -66,16 +66,6 @@ def rows_by_cell(rows: pd.DataFrame) -> dict[Key, Row]:
 def canonical_parameters(parameters: str) -> str:
     """Return parameters as JSON with sorted names, and today's defaults where a parameter is missing."""
     return json.dumps(completed(json.loads(parameters)), sort_keys=True)
-
-
-def assumed_defaults(rows: pd.DataFrame) -> dict[str, Any]:
-    """Return the parameters missing from some row, with the defaults assumed for them: ``{"pushing.hold": 1}``."""
-    by_names = {}
-    for text in rows["parameters"].unique():
-        given = json.loads(text)
-        parts = {axis: part for axis, part in given.items() if isinstance(part, Mapping)}
-        by_names[tuple((axis, part.get("name"), frozenset(part)) for axis, part in parts.items())] = given
-    return {name: value for given in by_names.values() for name, value in missing_parameters(given).items()}
 
 
 def flat_parameters(row: Row) -> dict[str, Any]:

@@ -1,12 +1,13 @@
-"""The command ``compare``, and what it shares with the function of the same name."""
+"""The command ``compare``, and the function of the same name."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import pandas as pd
 
-from bench.compare.cells import assumed_defaults, compare_cells
+from bench.compare.cells import compare_cells
 from bench.compare.report import Comparison, show, write
 from bench.compare.sources import Results, read_results
 from bench.compare.timings import RUNS
@@ -23,21 +24,24 @@ def main(words: Sequence[str]) -> int:
             "name two results: python -m bench compare BEFORE AFTER (directories, or revisions as REV or REV:PATH)"
         )
     out = local_path("out", settings["out"])
-    comparison = compare_results(names[0], names[1], tuple(filter(None, settings["again"].split(","))))
+    comparison = compare(names[0], names[1], [*filter(None, settings["again"].split(","))])
     show(comparison, write(comparison, out))
     return int(comparison.worse)
 
 
-def compare_results(before: str, after: str, again: Sequence[str] = ()) -> Comparison:
-    """Compare the accuracy of the experiments that two results have in common, and their times with ``again``.
+def compare(before: str | Path, after: str | Path, again: Sequence[str | Path] = ()) -> Comparison:
+    """Compare two results, cell by cell; ``print`` shows what got worse or better.
 
-    ``again`` are further runs of ``before``, which show how much times differ between runs. Raises :class:`UserError`.
+    ``before`` and ``after`` are directories of experiments or of one experiment, or git revisions as ``REV`` or
+    ``REV:PATH``. ``comparison.to_frame()`` has one row per cell, and ``comparison.worse`` is true if some cell got
+    worse. With ``again``, two or more further runs of ``before``, times are compared with the spread between runs. Raises
+    :class:`bench.UserError` for results that cannot be read or compared.
     """
     if again and len(again) + 1 < RUNS:
         raise UserError(
             f"the spread between runs needs {RUNS} or more runs of before: again= names {len(again)} besides the first"
         )
-    old, new, *more = map(read_results, (before, after, *again))
+    old, new, *more = (read_results(str(name)) for name in (before, after, *again))
     shared = [name for name in old if name in new]
     if not shared:
         raise UserError(f"{before} ({', '.join(old)}) and {after} ({', '.join(new)}) have no experiment in common")
@@ -53,23 +57,12 @@ def compare_results(before: str, after: str, again: Sequence[str] = ()) -> Compa
         judged |= {column.name: column for column in one.columns.compared}
         table, of_times = compare_cells(one.rows, two.rows, one.columns, runs)
         own = [
-            *default_remarks(one, two),
             *version_remarks(one.rows, two.rows),
             *machine_remarks(one, two, bool(again)),
         ]
         remarks += [f"{name}: {remark}" for remark in (*own, *of_times)]
         parts.append(table.assign(experiment=name))
     return Comparison(f"{before} against {after}", pd.concat(parts, ignore_index=True), remarks, list(judged.values()))
-
-
-def default_remarks(old: Results, new: Results) -> list[str]:
-    """Return remarks on parameters that one side lacks, so that their present default is assumed."""
-    was, now = assumed_defaults(old.rows), assumed_defaults(new.rows)
-    remarks = []
-    for when, mine, other in (("before", was, now), ("after", now, was)):
-        if own := [f"{name}={value}" for name, value in mine.items() if name not in other]:
-            remarks.append(f"rows {when} do not store {', '.join(own)}: the present default is assumed")
-    return remarks
 
 
 def version_remarks(old: pd.DataFrame, new: pd.DataFrame) -> list[str]:

@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -54,11 +53,6 @@ class Comparison:
         return "\n".join(map(one_line, lines))
 
     __repr__ = __str__
-
-    def _repr_html_(self) -> str:
-        paragraphs = (self.title, summary(self.table), *self.remarks)
-        text = "".join(f"<p>{escape(paragraph)}</p>" for paragraph in paragraphs)
-        return text + str(self.changes.head(PRINTED).to_html(index=False, border=0))
 
     def to_frame(self) -> pd.DataFrame:
         """Return one row per cell: its name, the outcome, what changed, and both sides of every judged column."""

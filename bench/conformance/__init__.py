@@ -5,19 +5,17 @@ or raises :class:`Failed` or :class:`Skipped`. A plugin is checked with its defa
 other choice it offers (``reinforce[baseline=none]``). Noise has fixed seeds, so results repeat. Limits on sample
 means are 4.5 standard errors: one false alarm in 150,000.
 
-``python -m bench check`` prints a line for each check; :func:`parametrize` makes each check a pytest test.
+``python -m bench check`` runs them in pytest; :func:`parametrize` makes each check a test of one's own.
 """
 
 # importing these modules registers their checks
 from bench.conformance import backends, contacts, estimators, generic, integrators, optimizers, policies, scenes
-from bench.conformance.kit import CheckResult, Failed, Skipped, check, main, parametrize, verifies
+from bench.conformance.kit import Failed, Skipped, main, parametrize, verifies
 
 __all__ = [
-    "CheckResult",
     "Failed",
     "Skipped",
     "backends",
-    "check",
     "contacts",
     "estimators",
     "generic",

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
-from bench.conformance.kit import Failed, Skipped, require, verifies
+from bench.conformance.kit import Failed, Skipped, require, skip_unless, verifies
 from bench.conformance.subjects import (
     COLUMNS,
     DIFFERENCED,
     LIMIT,
     ROUNDED,
     SAME,
+    BareScene,
     NewtonOps,
     agree,
     all_programs,
@@ -34,7 +35,7 @@ from bench.conformance.subjects import (
 )
 from bench.engines.backend import EngineBackend
 from bench.engines.problem import Replayed
-from bench.gradient import EPS, FAULTS, TRUSTED, judge, sampled
+from bench.gradient import EPS, FAULTS, TRUSTED, Check, Options, check, judge, sampled
 from bench.gradient.stages import SINGLE_EPS
 from bench.model import (
     Array,
@@ -43,7 +44,6 @@ from bench.model import (
     EngineTwin,
     ForceLaw,
     Integrator,
-    MechanicalScene,
     Problem,
     Program,
     Rollout,
@@ -59,8 +59,6 @@ GRADIENT = {"float64": 1e-4, "float32": 5e-2}
 """Relative error of a gradient that always passes, by the type that a backend computes in by default."""
 REORDERED = {"float64": SAME, "float32": 1e-3}
 """Relative difference allowed between rollouts with the same operations in another order, by the same."""
-SCORE = 1e-5
-"""Relative error allowed against differences of log p over a step of 1e-3: only rounding, as log p is linear in theta."""
 SINGLE = 1e-2
 """Relative error allowed in single precision: rollouts round hundreds of times by 6e-8, and central differences keep
 two or three digits."""
@@ -92,19 +90,23 @@ def programs_for(
         for program in (all_programs() if candidates is None else candidates)
         if backend.refusal(program) is None
     ]
-    if not runs:
-        raise Skipped("supports no program")
+    skip_unless(runs, "supports no program")
     if backend == type(backend)():
         return sort(runs)
     few = distinguishing_programs(runs)
     return [program for program in few if program.needs_root or program.contact is None] or few[:1]
 
 
+def compiled(backend: Backend) -> Iterator[tuple[Program, Problem, np.ndarray, np.ndarray]]:
+    """Yield one program of each kind that the backend can run, its problem, and its samples of theta and noise."""
+    for program in programs_for(backend, distinguishing_programs):
+        yield program, backend.compile(program), *samples(program)
+
+
 @verifies(Backend)
 def value_agrees(backend: Backend) -> str:
     """Verify that costs equal the plain backend's on every scene and law, within the twin's tolerance for engines."""
-    if isinstance(backend, EngineBackend) and backend.own_contact:
-        raise Skipped("has contacts of its own")
+    skip_unless(not getattr(backend, "own_contact", False), "has contacts of its own")
     plain = plain_backend()
     programs = programs_for(backend, list, [program for program in all_programs() if plain.refusal(program) is None])
     worst = 0.0
@@ -142,8 +144,7 @@ def _allowed(backend: Backend, program: Program, exact: float) -> float:
 @verifies(Backend)
 def gradient_is_that_of_value(backend: Backend) -> str:
     """Verify gradients along random directions by the gradient checker, at kinks and jumps too where it decides there."""
-    if "grad" not in backend.provides:
-        raise Skipped("computes no gradients")
+    skip_unless("grad" in backend.provides, "computes no gradients")
     dtype = _dtype(backend)
     worst, judged, programs = 0.0, 0, programs_for(backend, representative_programs)
     for program in programs:
@@ -205,51 +206,45 @@ def _findings(backend: Backend, program: Program, distant: float, dtype: str) ->
 @verifies(Backend)
 def score_is_that_of_actions(backend: Backend) -> str:
     """Verify scores: w / sigma without feedback. With feedback, the derivative of log p(actions), with mean 0."""
-    if "score" not in backend.provides:
-        raise Skipped("computes no scores")
+    skip_unless("score" in backend.provides, "computes no scores")
     details = []
-    for program in programs_for(backend, distinguishing_programs):
-        theta, w = samples(program)
-        problem = backend.compile(program)
+    for program, problem, theta, w in compiled(backend):
         score = problem.score(theta, w)
         if program.noise_on_theta:
-            off = agree(
+            agree(
                 score, w[: program.dim] / program.scene.sigma, ROUNDED, f"{describe(program)}: differs from w / sigma"
             )
             continue
-        e, h, ops = rng("direction").standard_normal(theta.shape), 1e-3, NewtonOps()
-        ahead, behind = (
-            _along_own_states(backend, problem, theta, w).log_probability(ops, theta, theta + s * h * e, w)
-            for s in (1, -1)
-        )
-        off = agree(
-            (score * e).sum(axis=0),
-            (ahead - behind) / (2 * h),
-            SCORE,
-            f"{describe(program)}: differs from differences of log p",
-        )
+        found = _against_log_probability(backend, problem)
+        require(found.trusted, f"{describe(program)}: against differences of log p: {found.sentence()}")
         count = 64 if isinstance(backend, EngineBackend) else 4096
         many = problem.score(program.theta0, rng("scores").standard_normal((program.n_noise, count)))
         z = np.abs(many.mean(axis=1)) / (many.std(axis=1) / np.sqrt(count))
         require(z.max() < LIMIT, f"{describe(program)}: the mean is {z.max():.1f} standard errors from zero")
-        details.append(f"{describe(program)} to {off:.0e}, mean within {z.max():.1f} standard errors of 0")
+        details.append(f"{describe(program)}: {found.cause}, mean within {z.max():.1f} standard errors of 0")
     return "; ".join(details) or "w / sigma"
 
 
-def _along_own_states(backend: Backend, problem: Problem, theta: np.ndarray, w: np.ndarray) -> Program:
-    """Return the program, for a physics engine with the engine's states: actions follow from these."""
-    has_states = type(problem).trajectory is not Problem.trajectory
-    if "physics" not in backend.provides or not has_states or not isinstance(problem.program, Rollout):
-        return problem.program
-    return Replayed(problem.program, problem.trajectory(theta, w).states)
+def _against_log_probability(backend: Backend, problem: Problem) -> Check:
+    """Return the check of a score as the gradient of log p, along an engine's own states: actions follow from these."""
+    theta, w = (part[:, :1] for part in samples(problem.program))
+    program, has_states = problem.program, type(problem).trajectory is not Problem.trajectory
+    is_replayed = "physics" in backend.provides and has_states and isinstance(program, Rollout)
+    states = problem.trajectory(theta, w).states if is_replayed else None
+
+    def log_probability(scored: np.ndarray) -> np.ndarray:
+        own = program if states is None else Replayed(cast(Rollout, program), states)  # reads its states once
+        return np.asarray(own.log_probability(NewtonOps(), theta, scored, w))
+
+    score = problem.score(theta, w)[:, 0]
+    return check(log_probability, lambda _: score, theta[:, 0], Options(components=0, draws=0))
 
 
 @verifies(Backend)
 def columns_are_independent(backend: Backend) -> str:
     """Verify that column b of a result depends only on column b of theta and w, also alone, and with a shared ``theta (d,)``."""
-    worst, programs = 0.0, programs_for(backend, distinguishing_programs)
-    for program in programs:
-        problem, (theta, w) = backend.compile(program), samples(program)
+    worst, runs = 0.0, list(compiled(backend))
+    for program, problem, theta, w in runs:
         for capability in sorted(backend.provides & {"value", "grad", "score"}):
             function, rest = getattr(problem, capability), np.arange(COLUMNS) != 2
             whole, other = function(theta, w), function(*with_changed_column(theta, w))
@@ -257,7 +252,7 @@ def columns_are_independent(backend: Backend) -> str:
                 "a column changes others": (other[..., rest], whole[..., rest]),
                 "the order of columns matters": (function(theta[:, ::-1], w[:, ::-1])[..., ::-1], whole),
             }
-            if program is programs[-1]:
+            if program is runs[-1][0]:
                 spread = function(np.repeat(program.theta0[:, None], COLUMNS, axis=1), w)
                 compared["theta (d,) and (d, B) differ"] = function(program.theta0, w), spread
                 compared["a single column differs"] = function(program.theta0, w[:, :1]), spread[..., :1]
@@ -273,13 +268,10 @@ def failed_rollouts_have_no_gradient(backend: Backend) -> str:
     Theta is very large in one column of a batch. An engine that stops, resets or repeats its last state must report
     that.
     """
-    if "grad" not in backend.provides:
-        raise Skipped("computes no gradients")
+    skip_unless("grad" in backend.provides, "computes no gradients")
     lost, plain = [], plain_backend()
-    for program in programs_for(backend, distinguishing_programs):
-        theta, w = samples(program)
+    for program, problem, theta, w in compiled(backend):
         far = np.where(np.arange(COLUMNS) == 1, FAR * (1.0 + np.abs(theta)), theta)
-        problem = backend.compile(program)
         with np.errstate(all="ignore"):
             failed = ~np.isfinite(problem.value(far, w))
             gone = ~np.isfinite(problem.grad(far, w)).all(axis=0)
@@ -288,8 +280,7 @@ def failed_rollouts_have_no_gradient(backend: Backend) -> str:
                 require(failed[beyond].all(), f"{describe(program)}: a rollout that overflows has a finite cost")
         require(gone[failed].all(), f"{describe(program)}: a cost that is not finite has a finite gradient")
         lost.append(failed.any())
-    if not any(lost):
-        raise Skipped(f"no rollout fails {FAR:g} away")
+    skip_unless(any(lost), f"no rollout fails {FAR:g} away")
     return f"{sum(lost)} programs"
 
 
@@ -316,8 +307,7 @@ def provides_is_truthful(backend: Backend) -> str:
     strange = sorted(set(backend.provides) - CAPABILITIES)
     require(not strange, f"{', '.join(strange)}: not among {', '.join(sorted(CAPABILITIES))}")
     require("value" in backend.provides, "computes no costs")
-    for program in programs_for(backend, distinguishing_programs):
-        problem, (theta, w) = backend.compile(program), samples(program)
+    for program, problem, theta, w in compiled(backend):
         for capability in sorted(backend.provides & {"value", "grad", "score"}):
             result = getattr(problem, capability)(theta, w)
             shape = (COLUMNS,) if capability == "value" else theta.shape
@@ -338,7 +328,7 @@ COUPLING = np.array([[2.0, 0.5, -0.3], [0.2, 1.5, 0.4], [-0.6, 0.1, 1.8]])
 
 
 @dataclass(frozen=True)
-class _Initial(MechanicalScene):
+class _Initial(BareScene):
     """The cost sum_i (i + 1) q_i after one step from q = theta."""
 
     name = "conformance_initial"
@@ -349,12 +339,6 @@ class _Initial(MechanicalScene):
 
     def theta0(self) -> np.ndarray:
         return np.zeros(self.unknowns)
-
-    def initial_state(self, xp: Any, theta: Array) -> State:
-        return State(theta, 0.0 * theta)
-
-    def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        return 0.0 * q
 
     def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
         return sum((i + 1.0) * q[i] for i in range(self.unknowns))
@@ -375,11 +359,7 @@ class _Solving(Integrator):
 
         return State(dynamics.ops.root(residual, 0.0 * state.q, (state.q,)), state.v)
 
-    def amplification(self, z: complex) -> complex:
-        raise NotImplementedError
-
-    def transition(self, dt: float, stiffness: float, damping: float, factor: float) -> np.ndarray:
-        raise NotImplementedError
+    amplification = transition = None  # type: ignore[assignment]
 
 
 def _coupled(xp: Any, n: int, z: Array) -> Array:
@@ -392,7 +372,7 @@ def _implicit_problem(backend: Backend, unknowns: int) -> Problem:
 
 
 @dataclass(frozen=True)
-class _Pressed(EngineScene):
+class _Pressed(EngineScene, BareScene):
     """A ball of 1 kg that penetrates a plane with friction by 1 mm.
 
     theta is its velocity along and away from the plane [m/s]. The cost is the velocity away from the plane after one
@@ -406,9 +386,6 @@ class _Pressed(EngineScene):
 
     horizon: int = param(1, "number of time steps", positive=True)
     dt: float = 1e-4
-
-    def theta0(self) -> np.ndarray:
-        return np.zeros(self.n_q)
 
     def initial_state(self, xp: Any, theta: Array) -> State:
         zero = 0.0 * theta[0]
@@ -442,8 +419,7 @@ class _PressedDown(_Pressed):
 
 def _pressed(backend: Backend, scene: _Pressed, values: dict[str, Any], needs_spring: bool) -> Program:
     """Return the scene under the first law, or spring, that the backend runs. Raises :class:`Skipped` if it runs none."""
-    if "physics" not in backend.provides:
-        raise Skipped("does not have its own physics")
+    skip_unless("physics" in backend.provides, "does not have its own physics")
     laws = [law_for(scene, law, values) for law in available("contacts")]
     if needs_spring:
         laws = [law for law in laws if isinstance(law, ForceLaw) and law.spring() is not None]
@@ -460,8 +436,7 @@ def frictional_contact_has_the_force_of_its_law(backend: Backend) -> str:
     The result for a ball that slides at 1 m/s is reported but not limited, since an engine's friction then adds to the
     normal force.
     """
-    if isinstance(backend, EngineBackend) and backend.own_contact:
-        raise Skipped("has contacts of its own")
+    skip_unless(not getattr(backend, "own_contact", False), "has contacts of its own")
     program = _pressed(backend, _Pressed(), {}, needs_spring=True)
     along, away = np.array([0.0, 0.0, 0.0, 0.01, 1.0]), np.array([0.0, -0.1, 0.1, 0.0, 0.0])
     after = backend.compile(program).value(np.stack([along, away]), np.zeros((program.n_noise, along.size)))
@@ -487,8 +462,7 @@ def pressed_contact_pushes(backend: Backend) -> str:
 @verifies(Backend)
 def root_is_differentiated_implicitly(backend: Backend) -> str:
     """Verify costs and implicit-function gradients for one and for three coupled unknowns, with known solutions."""
-    if "root" not in backend.provides:
-        raise Skipped("solves no equations")
+    skip_unless("root" in backend.provides, "solves no equations")
     worst = 0.0
     for n in (1, 3) if backend == type(backend)() else (3,):
         z = rng("root").uniform(-1.0, 1.0, (n, COLUMNS))

@@ -9,9 +9,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from bench.conformance.kit import Skipped, require, verifies
+from bench.conformance.kit import require, skip_unless, verifies
 from bench.conformance.subjects import (
     ROUNDED,
+    BareScene,
     NewtonOps,
     distance,
     largest_jump,
@@ -24,22 +25,13 @@ from bench.model import Array, ContactLaw, ContactScene, ForceLaw, ImpulseLaw, O
 
 
 @dataclass(frozen=True)
-class _Tower(ContactScene):
+class _Tower(BareScene, ContactScene):
     """Two masses, one above the other, over a floor: two contacts that share a body."""
 
     name = "conformance_tower"
     n_q = 2
     n_contacts = 2
     masses: ClassVar[tuple[float, float]] = (0.5, 2.0)
-
-    def theta0(self) -> np.ndarray:
-        return np.array([1.0, 3.0])
-
-    def initial_state(self, xp: Any, theta: Array) -> State:
-        return State(theta, 0.0 * theta)
-
-    def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
-        return 0.0 * q
 
     def gap(self, xp: Any, q: Array) -> Array:
         return xp.stack([q[0], q[1] - q[0] - 1.0])
@@ -49,9 +41,6 @@ class _Tower(ContactScene):
 
     def contact_acceleration(self, xp: Any, q: Array, force: Array) -> Array:
         return xp.stack([(force[0] - force[1]) / self.masses[0], force[1] / self.masses[1]])
-
-    def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
-        return q[1]
 
 
 PUSH_DT = 0.01
@@ -129,8 +118,7 @@ def contacts_are_separate(law: ForceLaw) -> str:
 @verifies(ContactLaw)
 def smoothing_converges(law: ContactLaw) -> str:
     """Verify that forces converge as smoothing decreases by factors of 10."""
-    if not law.smoothing:
-        raise Skipped("has no smoothing")
+    skip_unless(law.smoothing, "has no smoothing")
     gaps = np.array([[-0.05, -0.01, -0.001, 0.0, 0.001, 0.01, 0.05], [1.0] * 7])
     forces = [_push(_sharpened(law, 10.0**k), gaps, 0 * gaps)[0] / PUSH_DT for k in range(5)]
     changes = [float(np.abs(b - a).max()) for a, b in itertools.pairwise(forces)]
@@ -184,6 +172,5 @@ def continuity_in_rollouts_is_as_declared(law: ContactLaw) -> str:
         else:
             require(jump, f"declares to jump, but no jump was found in {', '.join(sizes)}")
             details.append(f"a jump of {jump:.2g} of the range in {name}")
-    if not details:
-        raise Skipped("no continuous scene with contacts is registered")
+    skip_unless(details, "no continuous scene with contacts is registered")
     return "; ".join(details)

@@ -27,6 +27,12 @@ def is_frozen_dataclass(plugin: type[Plugin]) -> str:
 
 
 @verifies(Plugin)
+def builds(plugin: type[Plugin]) -> str:
+    """Verify that an instance can be created with default parameters, and with each other choice it offers."""
+    return f"{len(variants(plugin))} variants"
+
+
+@verifies(Plugin)
 def has_docstring(plugin: type[Plugin]) -> str:
     """Verify that the plugin has its own docstring, not the docstring that ``dataclass`` generates."""
     text = (plugin.__dict__.get("__doc__") or "").strip()

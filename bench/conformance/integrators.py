@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from bench.conformance.kit import require, verifies
-from bench.conformance.subjects import NewtonOps, agree, distance
+from bench.conformance.subjects import BareScene, NewtonOps, agree, distance
 from bench.model import (
     Array,
     Contact,
@@ -19,15 +19,14 @@ from bench.model import (
     Dynamics,
     ImpulseLaw,
     Integrator,
-    MechanicalScene,
     State,
     param,
 )
 
 
 @dataclass(frozen=True)
-class _Swing(DampedScene):
-    """The motion q'' = -4 sin q - 0.2 v + u from (q, v) = (1, 0.5), smooth and without a closed form."""
+class _Swing(DampedScene, BareScene):
+    """The motion q'' = -4 sin q - 0.2 v + u, smooth and without a closed form."""
 
     name = "conformance_swing"
     n_q = 1
@@ -36,17 +35,8 @@ class _Swing(DampedScene):
     stiffness: float = param(4.0, "restoring acceleration at a right angle", "rad/s^2")
     friction: float = param(0.2, "deceleration per velocity", "1/s")
 
-    def theta0(self) -> np.ndarray:
-        return np.array([1.0])
-
-    def initial_state(self, xp: Any, theta: Array) -> State:
-        return State(theta, 0.0 * theta + 0.5)
-
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
         return u - self.stiffness * xp.sin(q) - self.friction * v
-
-    def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
-        return q[0]
 
 
 @dataclass(frozen=True)
@@ -76,7 +66,7 @@ class _Kicked(_Swing, ContactScene):
 
 
 @dataclass(frozen=True)
-class _Decay(MechanicalScene):
+class _Decay(BareScene):
     """The motion v' = rate v, without positions."""
 
     name = "conformance_decay"
@@ -85,17 +75,8 @@ class _Decay(MechanicalScene):
 
     rate: float = param(-1.0, "growth rate", "1/s")
 
-    def theta0(self) -> np.ndarray:
-        return np.array([1.0])
-
-    def initial_state(self, xp: Any, theta: Array) -> State:
-        return State(theta[:0], theta)
-
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
         return self.rate * v
-
-    def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
-        return v[0]
 
 
 @dataclass(frozen=True)

@@ -1,34 +1,21 @@
-"""Registers checks, and runs them on plugins. Outcomes are printed lines, a list of results, or pytest tests."""
+"""Registers checks, and runs them on plugins as pytest tests."""
 
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import sys
-import threading
-import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from bench.engines.backend import EngineBackend
-from bench.engines.process import close_engines
-from bench.errors import failure, printable, unknown
+from bench.errors import UserError, printable, unknown
 from bench.model import Plugin, registry
 from bench.model.identity import identity
 from bench.model.parameters import build, parameters
-from bench.simulator.clock import Clock, OutOfTime
-
-
-@dataclass(frozen=True)
-class CheckResult:
-    """The outcome of one check: ``pass``, ``fail`` or ``skip``, with the measured numbers or the reason."""
-
-    plugin: str
-    check: str
-    outcome: str
-    detail: str = ""
 
 
 class Failed(Exception):
@@ -42,8 +29,15 @@ class Skipped(Exception):
 Check = Callable[[Any], str]
 LIMIT_S = 900.0
 """Default time limit of a check. The longest of the built-in plugins' checks take minutes."""
-GRACE_S = 30.0
-"""Time after the limit in which compiled code may return, before the process ends."""
+CHOSEN = "BENCH_CHECK"
+"""Environment variable with the names of the plugins to check and the folders of plugins, as JSON."""
+HERE = Path(__file__).parent
+PYTEST = (
+    *(str(HERE / "checks.py"), "-c", os.devnull, f"--rootdir={HERE}", "--noconftest", "-p", "no:cacheprovider"),
+    *("-p", "xdist.plugin", "-n1", "--max-worker-restart=1000", "--assert=plain", "--tb=short", "-q"),
+    *("-o", "faulthandler_exit_on_timeout=true"),
+)
+"""Arguments of pytest: none of the current folder's settings, no cache, and a worker that is replaced where it ends."""
 _CHECKS: dict[type[Plugin], list[Check]] = {}
 
 
@@ -63,98 +57,52 @@ def require(condition: Any, message: str) -> None:
         raise Failed(message)
 
 
-def main(names: Sequence[str], limit: float = LIMIT_S) -> int:
-    """Check the named plugins, or all of them, print a line per check, and return the exit status.
+def skip_unless(condition: Any, reason: str) -> None:
+    """Raise :class:`Skipped` unless the condition holds."""
+    if not condition:
+        raise Skipped(reason)
 
-    A check that is not finished within ``limit`` seconds fails. On a terminal, a line shows the running check.
+
+def main(names: Sequence[str], limit: float = LIMIT_S, options: Sequence[str] = ()) -> int:
+    """Check the named plugins, or all, in pytest, print a line per check, and return the exit status.
+
+    A check that takes longer than ``limit`` seconds fails, and so does one that ends its process. ``options`` are
+    pytest's.
     """
-    started = time.perf_counter()
-    tally = dict.fromkeys(("pass", "fail", "skip"), 0)
-    plugins = 0
-    for entry in (e for table in registry.entries().values() for e in table.values()):
-        if names and entry.name not in names:
-            continue
-        plugins += 1
-        plugin = entry.plugin if entry.available else None
-        reason = entry.reason if plugin is None else missing_environment(plugin)
-        if plugin is None or reason:
-            results = iter([CheckResult(entry.name, "available", "fail" if names else "skip", reason or "")])
-        else:
-            results = _results(plugin, limit=limit)
-        last = ""
-        for result in results:
-            tally[result.outcome] += 1
-            detail = "as above" if result.outcome == "fail" and result.detail == last else result.detail
-            last = result.detail
-            print(f"{result.outcome}  {result.plugin:<38} {result.check:<38} {detail}", flush=True)
-    print(
-        f"\n{plugins} plugin{'s' * (plugins != 1)}, {sum(tally.values())} checks: {tally['pass']} passed, "
-        f"{tally['fail']} failed, {tally['skip']} skipped in {time.perf_counter() - started:.1f} s"
-    )
-    return 1 if tally["fail"] else 0
+    if not (registry.installed("pytest") and registry.installed("xdist")):
+        raise UserError("check needs pytest and pytest-xdist: pip install 'diffsim-bench[check]'")
+    import pytest
+
+    for foreign in ("PYTEST_ADDOPTS", "PYTEST_PLUGINS"):
+        os.environ.pop(foreign, None)
+    os.environ["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"
+    os.environ[CHOSEN] = json.dumps([[*names], [str(folder) for folder in registry.folders()]])
+    words = [*PYTEST, "-o", f"faulthandler_timeout={limit}", *options]
+    status = pytest.main(words, plugins=[sys.modules[__name__]])
+    if status == pytest.ExitCode.INTERRUPTED:
+        raise KeyboardInterrupt
+    return int(status) if status in (pytest.ExitCode.OK, pytest.ExitCode.TESTS_FAILED) else 2
 
 
-def check(plugin_class: type[Plugin], only: Collection[str] = ()) -> list[CheckResult]:
-    """Return the results of a plugin class's checks, with default parameters and with each other choice it offers.
-
-    ``only`` contains the names of the checks to run; empty runs all.
-    """
-    return list(_results(plugin_class, only))
-
-
-def _results(
-    plugin_class: type[Plugin], only: Collection[str] = (), limit: float | None = None
-) -> Iterator[CheckResult]:
-    """Yield the results of :func:`check` one by one; with a limit [s], checks that reach it fail and progress is shown."""
-    items = [item for item in _items(plugin_class) if not only or item[2].__name__ in only]
-    shows = limit is not None and sys.stderr.isatty()
-    for index, (name, subject, function) in enumerate(items):
-        if shows:
-            _show(f"\r\033[Kcheck {index + 1} of {len(items)}: {name} {function.__name__}")
-        started = time.perf_counter()
-        try:
-            with _time_limit(limit, f"fail  {name} {function.__name__}") if limit else contextlib.nullcontext():
-                result = _outcome(function, subject, name)
-        except OutOfTime:
-            close_engines()  # an interrupted call leaves its answer in the pipe
-            text = (
-                f"not finished within {limit:g} s (limit=DURATION), stopped after {time.perf_counter() - started:.1f} s"
-            )
-            result = CheckResult(name, function.__name__, "fail", text)
-        if shows:
-            _show("\r\033[K")
-        if result.check != something_was_checked.__name__ or result.outcome == "fail":
-            yield result
-
-
-def _show(text: str) -> None:
-    print(text, end="", file=sys.stderr, flush=True)
-
-
-@contextlib.contextmanager
-def _time_limit(limit: float, label: str) -> Iterator[None]:
-    """Raise :class:`OutOfTime` in the block after ``limit`` seconds; end the process if compiled code does not return."""
-
-    def end() -> None:
-        sys.stdout.flush()
-        print(f"{label}: compiled code did not return within {limit + GRACE_S:g} s: the run ends here", flush=True)
-        os._exit(1)
-
-    last = threading.Timer(limit + GRACE_S, end)
-    last.daemon = True
-    last.start()
-    try:
-        with Clock(limit).interrupt_when_over():
-            yield
-    finally:
-        last.cancel()
+def pytest_report_teststatus(report: Any) -> tuple[str, str, str] | None:
+    """Print an outcome as a line, with the number of a passed check or a reason; pytest calls this hook."""
+    if report.passed and report.when != "call":
+        return None
+    if report.passed:
+        detail = dict(report.user_properties)["found"]
+    else:
+        detail = (
+            report.longrepr[2].removeprefix("Skipped: ") if report.skipped else report.longreprtext.splitlines()[-1]
+        )
+    plugin, _, name = report.nodeid.partition("[")[2][:-1].rpartition("-")
+    return report.outcome, f"{report.outcome[:4]}  {plugin:<38} {name:<38} {detail}\n", report.outcome.upper()
 
 
 def parametrize(plugins: Iterable[type[Plugin]], expected_failures: Mapping[str, str] | None = None) -> Any:
     """Return a ``pytest.mark.parametrize`` over (plugin, check) pairs: one per check of each variant of the plugins.
 
     ``expected_failures`` maps the name of a check, or the id of one test (``variant-check``), to the reason of the
-    failure. If such a check passes, the test fails. A plugin whose required modules are not installed is one skipped test::
+    failure. If such a check passes, the test fails. Tests of a plugin whose required modules are not installed are skipped::
 
         @bench.conformance.parametrize([MyEstimator], expected_failures={
             "bias_is_as_declared": "biased below 4 samples, see #12"})
@@ -163,27 +111,39 @@ def parametrize(plugins: Iterable[type[Plugin]], expected_failures: Mapping[str,
     """
     import pytest
 
-    reasons = dict(expected_failures or {})
-    items, names = [], set()
+    reasons, items = expected_failures or {}, []
+    names: set[str] = set()
     for plugin_class in plugins:
-        modules = (requirement.partition("=")[0] for requirement in plugin_class.requires)
-        missing = [f"not installed: {module}" for module in modules if not registry.installed(module)]
-        missing += filter(None, [missing_environment(plugin_class)])
+        missing = registry.missing_modules(plugin_class) or missing_environment(plugin_class)
         for name, subject, function in _items(plugin_class):
-            title = f"{name}-{function.__name__}"
-            names |= {title, function.__name__}
+            titles = f"{name}-{function.__name__}", function.__name__
+            names.update(titles)
+            marks = [pytest.mark.xfail(reason=reasons[title], strict=True) for title in titles if title in reasons][:1]
             if missing:
-                continue
-            reason = reasons.get(title, reasons.get(function.__name__))
-            marks = [] if reason is None else [pytest.mark.xfail(reason=reason, strict=True)]
-            items.append(pytest.param(subject, partial(_run, function, name), id=title, marks=marks))
-        if missing:
-            skipped = pytest.mark.skip(reason="; ".join(missing))
-            items.append(pytest.param(plugin_class, None, id=plugin_class.name, marks=[skipped]))
+                marks = [pytest.mark.skip(reason=missing)]
+            items.append(pytest.param(subject, partial(run, function), id=titles[0], marks=marks))
     for name in reasons:
         if name not in names:
             raise unknown("check in expected_failures:", name, names)
     return pytest.mark.parametrize(("plugin", "check"), items)
+
+
+def run(function: Check, subject: Any) -> str:
+    """Run the check as a test, and return its number; :class:`Skipped` skips the test, :class:`Failed` fails it."""
+    import pytest
+
+    try:
+        found = printable(function(subject))
+    except Skipped as reason:
+        pytest.skip(printable(reason))
+    except Failed as reason:
+        pytest.fail(printable(reason), pytrace=False)
+    _PASSED.add(type(subject))
+    return found
+
+
+_PASSED: set[type] = set()
+"""Classes of the plugins that passed a check of their kind in this process."""
 
 
 def variants(plugin_class: type[Plugin]) -> dict[str, Plugin]:
@@ -214,8 +174,7 @@ def _items(plugin_class: type[Plugin]) -> Iterator[tuple[str, Any, Check]]:
         yield plugin_class.name, plugin_class, function
     try:
         instances = variants(plugin_class)
-    except (Exception, SystemExit):
-        yield plugin_class.name, plugin_class, builds
+    except (Exception, SystemExit):  # the check ``builds`` fails
         return
     for name, plugin in instances.items():
         for function in _own_checks(plugin):
@@ -230,55 +189,12 @@ def _own_checks(plugin: Plugin) -> list[Check]:
     return [function for kind in kinds for function in _CHECKS[kind]]
 
 
-def builds(plugin_class: type[Plugin]) -> str:
-    """Verify that an instance can be created with default parameters, and with each other choice it offers."""
-    return f"{len(variants(plugin_class))} variants"
-
-
 def something_was_checked(plugin_class: type[Plugin]) -> str:
     """Verify that at least one check of the plugin's kind applies to it."""
-    for name, plugin in variants(plugin_class).items():
+    if plugin_class in _PASSED:
+        return "at least one passed"
+    for plugin in variants(plugin_class).values():
         for function in _own_checks(plugin):
-            if (function, plugin_class, name) not in _skipped:
-                _outcome(function, plugin, name)
-            if not _skipped[function, plugin_class, name]:
-                return f"{function.__name__} among others"
+            with contextlib.suppress(Skipped):
+                return function(plugin)
     raise Failed("every check of its kind was skipped")
-
-
-_skipped: dict[tuple[Check, type, str], bool] = {}
-"""Whether a check was skipped, by check, plugin class and variant, for the checks that ran in this process."""
-
-
-def _outcome(function: Check, subject: Any, name: str) -> CheckResult:
-    try:
-        outcome, detail = "pass", _remembered(function, subject, name)
-    except Skipped as reason:
-        outcome, detail = "skip", str(reason)
-    except Failed as reason:
-        outcome, detail = "fail", str(reason)
-    except (Exception, SystemExit) as error:
-        outcome, detail = "fail", failure(error)["reason"]
-    return CheckResult(name, function.__name__, outcome, printable(detail))
-
-
-def _remembered(function: Check, subject: Any, name: str) -> str:
-    """Run the check, record whether it was skipped, and return its details."""
-    skipped = False
-    try:
-        return function(subject)
-    except Skipped:
-        skipped = True
-        raise
-    finally:
-        _skipped[function, type(subject), name] = skipped
-
-
-def _run(function: Check, name: str, subject: Any) -> None:
-    """Run the check as a test; :class:`Skipped` skips the test."""
-    import pytest
-
-    try:
-        _remembered(function, subject, name)
-    except Skipped as reason:
-        pytest.skip(str(reason))

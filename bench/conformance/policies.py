@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bench.conformance.kit import Skipped, require, verifies
+from bench.conformance.kit import require, skip_unless, verifies
 from bench.conformance.subjects import ROUNDED, agree, available, rng
 from bench.gradient import Options, check
 from bench.model import Policy
@@ -58,8 +58,7 @@ def shared_theta_acts_like_columns(policy: Policy) -> str:
 @verifies(Policy)
 def derivatives_agree(policy: Policy) -> str:
     """Verify that JAX and central differences agree on the derivatives by theta, and that theta moves the controls."""
-    if not {"jax"} <= {backend.name for backend in available("backends")}:
-        raise Skipped("JAX is not installed")
+    skip_unless("jax" in {backend.name for backend in available("backends")}, "JAX is not installed")
     import jax
     import jax.numpy as jnp
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.conformance.kit import Failed, Skipped, require, verifies
+from bench.conformance.kit import Failed, Skipped, require, skip_unless, verifies
 from bench.conformance.subjects import (
     COLUMNS,
     DIFFERENCED,
@@ -95,9 +95,7 @@ def costs_are_finite(scene: Scene) -> str:
 @verifies(Scene)
 def gradient_is_finite(scene: Scene) -> str:
     """Verify that a library's derivative of the cost is finite at theta0, over at most :data:`SCORED_STEPS` steps."""
-    if isinstance(scene, MechanicalScene):
-        scene = dataclasses.replace(scene, horizon=min(scene.horizon, SCORED_STEPS))
-    for program in programs(scene):
+    for program in programs(_brief(scene)):
         able = [b for b in backends() if b.compiles and "grad" in b.provides and "physics" not in b.provides]
         backend = next((b for b in able if can_run(b, program) and works(b)), None)
         if backend is not None:
@@ -112,12 +110,18 @@ def gradient_is_finite(scene: Scene) -> str:
     raise Skipped("no available backend differentiates it by a library")
 
 
+def _brief(scene: Scene) -> Scene:
+    """Return the scene with at most :data:`SCORED_STEPS` steps."""
+    if not isinstance(scene, MechanicalScene):
+        return scene
+    return dataclasses.replace(scene, horizon=min(scene.horizon, SCORED_STEPS))
+
+
 @verifies(Scene)
 def noise_is_where_declared(scene: Scene) -> str:
     """Verify that costs at (theta, w) equal costs at (theta + sigma w, 0), except for action noise under a policy."""
     program = programs(scene)[0]
-    if not program.noise_on_theta:
-        raise Skipped("its noise is on the actions of a policy")
+    skip_unless(program.noise_on_theta, "its noise is on the actions of a policy")
     wanted = program.dim + program.exogenous
     require(program.n_noise == wanted, f"{program.n_noise} normal numbers for {program.dim} components of theta")
     (theta, w), problem = samples(program), able_backend(program).compile(program)
@@ -137,8 +141,7 @@ def backends_agree(scene: Scene) -> str:
 
     Backends with their own physics have a separate check, with the tolerance that the scene declares for its twin.
     """
-    if isinstance(scene, EngineScene):
-        raise Skipped("runs in physics engines only")
+    skip_unless(not isinstance(scene, EngineScene), "runs in physics engines only")
     worst, names = 0.0, set()
     for program in programs(scene):
         theta, w = samples(program)
@@ -165,8 +168,7 @@ def continuity_is_as_declared(scene: Scene) -> str:
     """
     subjects = [p for p in programs(scene) if p.contact is None or p.contact.continuous]
     runs = [p for p in subjects if plain_backend().refusal(p) is None] or subjects
-    if not runs:
-        raise Skipped("no continuous contact law is available")
+    skip_unless(runs, "no continuous contact law is available")
     jump = largest_jump(runs[0], lines=2)
     if scene.continuous:
         require(
@@ -200,8 +202,7 @@ def closed_form_is_right(scene: Scene) -> str:
             detail = f"{describe(program)}, sigma = {sigma:g}: {z:.1f} standard errors from the sampled gradient"
             require(z < LIMIT, detail)
             worst, count = max(worst, z), count + 1
-    if not count:
-        raise Skipped("has none")
+    skip_unless(count, "has none")
     return f"{count} programs, at most {worst:.1f} standard errors from sampling"
 
 
@@ -232,14 +233,10 @@ def score_gives_the_gradient(scene: Scene) -> str:
 
     Rollouts have at most :data:`SCORED_STEPS` steps, since the variance of both means grows with the number of steps.
     """
-    if isinstance(scene, MechanicalScene):
-        scene = dataclasses.replace(scene, horizon=min(scene.horizon, SCORED_STEPS))
-    runs = [p for p in programs(scene) if p.continuous and plain_backend().refusal(p) is None]
-    if not runs:
-        raise Skipped("no continuous program runs on the plain backend")
+    runs = [p for p in programs(_brief(scene)) if p.continuous and plain_backend().refusal(p) is None]
+    skip_unless(runs, "no continuous program runs on the plain backend")
     program = runs[0]
-    if not program.has_score_gradient:
-        raise Skipped(program.no_score_gradient)
+    skip_unless(program.has_score_gradient, program.no_score_gradient)
     problem, theta = plain_backend().compile(program), program.theta0[:, None]
     w = rng("score", scene.name).standard_normal((program.n_noise, 1 << 13))
     centre = problem.value(theta, np.zeros((program.n_noise, 1)))
@@ -283,8 +280,7 @@ def physical_gradient_is_the_limit(scene: Scene) -> str:
         # the slope of a coordinate that acts for one step changes with dt, but its ratio to the physical slope converges
         if np.isfinite(ratios).all() and np.abs(ratios[1] - ratios[0]).max() <= LIMITING:
             apart[describe(program)] = off
-    if not apart:
-        raise Skipped("the differences of no program converge at finer steps")
+    skip_unless(apart, "the differences of no program converge at finer steps")
     nearest = min(apart, key=lambda name: apart[name])
     raise Failed(
         f"{', '.join(apart)} converge to other slopes as steps get finer; the nearest, {nearest}, differs by {apart[nearest]:.0%}"
@@ -314,8 +310,7 @@ def _refined(scene: Scene, factor: int, law: ContactLaw | None, integrator: Inte
     if isinstance(scene, ZeroOrderHoldScene):
         finer["hold"] = scene.hold * factor
     fine = dataclasses.replace(scene, **finer)
-    if fine.theta0().shape != scene.theta0().shape:
-        raise Skipped("theta is longer at a finer step")
+    skip_unless(fine.theta0().shape == scene.theta0().shape, "theta is longer at a finer step")
     return compose(fine, law, integrator)
 
 

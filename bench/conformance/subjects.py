@@ -6,12 +6,13 @@ import contextlib
 import itertools
 import zlib
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from functools import cache
 from typing import Any, cast
 
 import numpy as np
 
-from bench.conformance.kit import Skipped, missing_environment, require
+from bench.conformance.kit import Skipped, missing_environment, require, skip_unless
 from bench.engines.backend import EngineBackend
 from bench.measure import jumps
 from bench.model import (
@@ -27,6 +28,7 @@ from bench.model import (
     MechanicalScene,
     Program,
     Scene,
+    State,
     compose,
     registry,
 )
@@ -131,8 +133,7 @@ def programs(scene: Scene) -> list[Program]:
     if isinstance(scene, EngineScene):
         engines = [backend for backend in backends() if "physics" in backend.provides]
         composed = [program for program in composed if any(can_run(engine, program) for engine in engines)]
-        if not composed:
-            raise Skipped("no available physics engine can run it")
+        skip_unless(composed, "no available physics engine can run it")
     return composed
 
 
@@ -240,6 +241,27 @@ def standard_errors(difference: np.ndarray, error: np.ndarray, tolerance: np.nda
     """
     beyond = np.maximum(np.abs(difference) - tolerance, 0.0)
     return np.asarray(np.divide(beyond, error, out=np.where(beyond > 0, np.inf, 0.0), where=error > 0))
+
+
+@dataclass(frozen=True)
+class BareScene(MechanicalScene):
+    """Bodies at rest at theta without forces, whose cost is their first coordinate: what the checks' own scenes change."""
+
+    def theta0(self) -> np.ndarray:
+        """Return zeros, ``(n_q,)``."""
+        return np.zeros(self.n_q)
+
+    def initial_state(self, xp: Any, theta: Array) -> State:
+        """Return positions theta and velocities 0."""
+        return State(theta, 0.0 * theta)
+
+    def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
+        """Return zeros, ``(n_v, B)``."""
+        return 0.0 * q
+
+    def terminal_cost(self, xp: Any, q: Array, v: Array) -> Array:
+        """Return the first coordinate, ``(B,)``."""
+        return q[0]
 
 
 class NewtonOps(LoopOps):

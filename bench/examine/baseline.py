@@ -8,16 +8,17 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from bench.errors import StorageError, UserError
+from bench.errors import UserError
 from bench.examine.findings import Findings
 from bench.report.text import number
+from bench.run.files import make_directory, write_whole
 
 GREW = 2.0
-"""Ratio of the sizes of an error, or of numbers of calls, above which a change is reported."""
+"""Ratio of the sizes of an error above which a change is reported."""
 
 
 def summary(report: Findings) -> dict[str, Any]:
-    """Return what a baseline stores of a report: its verdicts, the size of its error, and its calls."""
+    """Return what a baseline stores of a report: its verdicts and the size of its error."""
     size = report.size
     return {
         "name": report.name,
@@ -25,8 +26,6 @@ def summary(report: Findings) -> dict[str, Any]:
         "derivative": report.derivative,
         "cause": report.cause,
         "size": size if math.isfinite(size) else None,
-        "costs": report.spent.costs,
-        "gradients": report.spent.gradients,
     }
 
 
@@ -38,19 +37,16 @@ def read_baseline(path: Path) -> dict[str, Any] | None:
         return None
     except (OSError, ValueError) as error:
         raise UserError(f"baseline={path} cannot be read: {error}. Delete it to write a new one") from None
-    expected = {"status": int, "derivative": str, "cause": str, "costs": int}
+    expected = {"status": int, "derivative": str, "cause": str}
     if not isinstance(stored, Mapping) or not all(isinstance(stored.get(key), kind) for key, kind in expected.items()):
         raise UserError(f"baseline={path} is not a baseline of examine: it needs {', '.join(expected)}")
     return dict(stored)
 
 
 def write_baseline(path: Path, report: Findings) -> None:
-    """Write the baseline of a report. Raises :class:`StorageError` if that fails."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(summary(report), indent=1) + "\n")
-    except OSError as error:
-        raise StorageError(f"baseline={path} cannot be written: {error}") from None
+    """Write the baseline of a report. Raises :class:`bench.StorageError` if that fails."""
+    make_directory(path.parent)
+    write_whole(path, f"{json.dumps(summary(report), indent=1)}\n".encode())
 
 
 def differences(before: Mapping[str, Any], report: Findings) -> tuple[list[str], bool]:
@@ -68,8 +64,4 @@ def differences(before: Mapping[str, Any], report: Findings) -> tuple[list[str],
         if new > GREW * old or old > GREW * new:
             changes.append(f"the error was {number(100 * old)}%, is {number(100 * new)}%")
         is_worse |= bool(now["status"] and new > GREW * old)
-    for key in ("costs", "gradients"):
-        old, new = before.get(key), now[key]
-        if isinstance(old, int) and max(old, new) > GREW * max(min(old, new), 1):
-            changes.append(f"{key} were {old:,}, are {new:,}")
     return changes, is_worse

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import sys
 import textwrap
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from bench.errors import UserError, local_path, unknown
+from bench.errors import StorageError, UserError, local_path, unknown
 from bench.examine.examination import examine
 from bench.examine.report import Report
 from bench.run.files import make_directory
@@ -85,76 +86,44 @@ def _examined(cost: str, settings: Mapping[str, str], progress: bool) -> Report:
     if "theta" not in settings and not hasattr(module, "theta"):
         raise UserError("theta is missing: give theta=1,0 or define theta in the file")
     given = {key: value for key, value in {"theta": "theta", **settings}.items() if key not in FILES}
-    values: dict[str, Any] = {
-        key: PARSERS[key](value, key, module) if key in PARSERS else value for key, value in given.items()
-    }
+    values = {key: _value(key, value, module) for key, value in given.items()}
     if "save" in settings:  # a folder that cannot be written is an error before the examination, not after it
-        make_directory(local_path("save", settings["save"]))
+        make_directory(folder := local_path("save", settings["save"]))
+        if not os.access(folder, os.W_OK):
+            raise StorageError(f"save={folder} cannot be written: it is read-only")
     report = examine(function, name=cost, progress=progress, **values)
     words = " ".join(f"{key}={value}" for key, value in settings.items() if key != "expect")
     report = replace(report, command=f"python -m bench examine {cost} {words}".strip())
     return report.compared(settings["baseline"]) if "baseline" in settings else report
 
 
-# ---------------------------------------------------------------------------------------------- values
+def _value(key: str, given: str, module: Any) -> Any:
+    """Return the value of a setting: a function or theta of the file by its name, or numbers, also as ``name:number`` pairs."""
+    match key:
+        case "grad" | "refined":
+            libraries = LIBRARIES if key == "grad" else ()
+            return given if given in libraries else imports.load_attribute(given, module, key, libraries)
+        case "theta" | "scale" if re.fullmatch(r"[A-Za-z_][\w.]*", given):
+            theta = imports.load_attribute(given, module, "theta")
+            return theta() if callable(theta) else theta
+        case "noise" | "seed" | "calls":
+            if not re.fullmatch(r"\d+", given):
+                raise UserError(f"{key}={given} is not a whole number")
+            return int(given)
+        case "allow_zero":
+            words = {"true": True, "false": False}
+            return words.get(given.lower(), [name.strip() for name in given.split(",") if name.strip()])
+        case "theta" | "scale" | "sigma" | "tolerance" | "atol" | "horizons":
+            pairs = re.findall(r"([A-Za-z_][\w.\[\]]*):([^,]+)", given)
+            if pairs and len(pairs) == given.count(",") + 1:
+                return {name: _numbers(name, value)[0] for name, value in pairs}
+            numbers = _numbers(key, given)
+            return numbers[0] if len(numbers) == 1 and key not in ("theta", "horizons") else np.array(numbers)
+    return given
 
 
-def _numbers(given: str, key: str) -> list[float]:
+def _numbers(key: str, given: str) -> list[float]:
     try:
         return [float(part) for part in given.strip("[]() ").split(",") if part.strip()]
     except ValueError:
         raise UserError(f"{key}={given} is not a list of numbers: write {key}=1,0.5") from None
-
-
-def _count(given: str, key: str, module: Any) -> int:
-    if not re.fullmatch(r"\d+", given):
-        raise UserError(f"{key}={given} is not a whole number")
-    return int(given)
-
-
-def _counts(given: str, key: str, module: Any) -> list[int]:
-    return [int(one) for one in _numbers(given, key)]
-
-
-def _by_input(given: str, key: str, module: Any) -> Any:
-    """Return numbers, or a mapping of inputs to numbers, from ``name:number,name:number``."""
-    pairs = re.findall(r"([A-Za-z_][\w.\[\]]*):([^,]+)", given)
-    if pairs and len(pairs) == given.count(",") + 1:
-        return {name: _numbers(value, name)[0] for name, value in pairs}
-    return np.array(_numbers(given, key))
-
-
-def _one_by_input(given: str, key: str, module: Any) -> Any:
-    values = _by_input(given, key, module)
-    if not isinstance(values, dict) and values.size != 1:
-        raise UserError(f"{key}={given} is not valid: write one number, or {key}=mass:1e-3,gain:1e-2")
-    return values if isinstance(values, dict) else float(values[0])
-
-
-def _names(given: str, key: str, module: Any) -> Any:
-    words = {"true": True, "false": False}
-    return words.get(given.lower(), [name.strip() for name in given.split(",") if name.strip()])
-
-
-def _theta(given: str, key: str, module: Any) -> Any:
-    """Return theta from numbers, ``name:number`` pairs, or a name in the file, called if it is a function."""
-    if not re.fullmatch(r"[A-Za-z_][\w.]*", given):
-        return _by_input(given, key, module)
-    theta = imports.load_attribute(given, module, "theta")
-    return theta() if callable(theta) else theta
-
-
-def _function(given: str, key: str, module: Any) -> Any:
-    return imports.load_attribute(given, module, key)
-
-
-def _gradient(given: str, key: str, module: Any) -> Any:
-    return given if given in LIBRARIES else imports.load_attribute(given, module, "grad", LIBRARIES)
-
-
-PARSERS: dict[str, Callable[[str, str, Any], Any]] = {
-    "theta": _theta, "scale": _theta, "grad": _gradient, "refined": _function,
-    "sigma": _by_input, "tolerance": _one_by_input, "atol": _one_by_input, "allow_zero": _names, "horizons": _counts,
-    "noise": _count, "seed": _count, "calls": _count,
-}  # fmt: skip
-"""How the settings are read whose values are not taken as they are."""

@@ -133,7 +133,7 @@ def examine(
             limit = "compile_budget" if not clock.is_terminated else "the time until SIGTERM"
             took = f"the first call of the cost took longer than {limit}={clock.compile_budget:g} seconds"
             raise UserError(f"{took}: give a larger compile_budget or a shorter rollout") from None
-        examination = _Examination(simulator, setup, clock)
+        examination = _Examination(simulator, setup)
         try:
             return examination.run(named, refined)
         finally:
@@ -225,43 +225,38 @@ def _function_name(function: Any) -> str:
 
 
 class _Examination:
-    def __init__(self, simulator: Simulator, setup: Setup, clock: Clock) -> None:
-        self.simulator, self.layout, self.setup, self.clock = simulator, simulator.layout, setup, clock
-        self.scale, self.levels, self.seed = setup.scale, setup.levels, setup.seed
-        self.theta = self.layout.vector
+    def __init__(self, simulator: Simulator, setup: Setup) -> None:
+        self.simulator, self.setup, self.clock = simulator, setup, simulator.clock
         self.left_out: list[str] = []
         self.explained = diagnosis.Explanation()
         self._near: list[LineScan] | None = None
         """Lines at theta that do not depend on sigma."""
-        random = np.random.default_rng([setup.seed, 0x6578616D])
-        w = random.standard_normal((simulator.noise, 1)) if simulator.noise else None
-        self.stages = GradientStages(simulator, setup.scale, clock, setup.seed, w, random)
+        self.stages = GradientStages(simulator, setup.scale, setup.seed)
 
     def run(self, named: Mapping[str, Any], refined: Any) -> Report:
         """Run the checks that the budget allows, the decisive ones first, and return the report."""
         simulator, clock, stages, setup, explained = self.simulator, self.clock, self.stages, self.setup, self.explained
-        stages.run(self._is_adaptive)
+        stages.run(self._compare_early)
         self.left_out += stages.left_out
         checked = stages.check
         is_wrong = checked is not None and checked.cause in SUSPICIOUS
         if refined is not None and is_wrong and stages.gradient is not None:
-            self._explain("gaps", "the refined cost", lambda: diagnosis.refined_gaps(stages, refined))
+            explained.gaps = self._attempt("the refined cost", lambda: diagnosis.refined_gaps(stages, refined)) or ()
         if setup.horizons:
-            self._explain("growth", "horizons", lambda: diagnosis.errors_by_horizon(stages, setup.horizons))
+            explained.growth = (
+                self._attempt("horizons", lambda: diagnosis.errors_by_horizon(stages, setup.horizons)) or ()
+            )
         can_go_on = stages.gradient is not None or not simulator.has_gradient
         if checked is not None and is_wrong and can_go_on and explained.is_adaptive is None:
-            explained.is_adaptive = self._compare_along_lines(checked)
-        explained.is_unexplained = (
-            explained.is_adaptive is None and checked is not None and diagnosis.may_be_adaptive(checked)
-        )
+            explained.is_adaptive = self._compare_along_lines(checked, 0.9)
         lines = self._scan_lines(checked) if can_go_on else []
         smoothed = self._measure_noise(checked) if can_go_on else []
         if clock.is_terminated:
             self.left_out.append("everything after SIGTERM")
         return Report(
             **named,
-            names=self.layout.names,
-            theta=self.theta,
+            names=simulator.layout.names,
+            theta=stages.theta,
             cost=stages.value,
             precision=simulator.precision,
             is_hidden_single=stages.is_hidden_single,
@@ -285,7 +280,7 @@ class _Examination:
             error=simulator.gradient_error if stages.is_failed else "",
             elsewhere=simulator.gradient_error if not stages.is_failed else "",
             n_failed=simulator.n_failed_gradients,
-            printed=simulator.printed,
+            printed=simulator.printed.getvalue().splitlines(),
             changing=sorted(simulator.changing),
             notes=[
                 *simulator.notes,
@@ -302,7 +297,7 @@ class _Examination:
         sizes = {}
         for group in self.stages.groups:
             part = slice(group.first, group.last)
-            slope, scale = np.abs(gradient[part]), self.scale[part]
+            slope, scale = np.abs(gradient[part]), setup.scale[part]
             allowed, whole = (
                 float(np.linalg.norm(scale * each)) for each in (setup.atol[part] + setup.rtol[part] * slope, slope)
             )
@@ -318,37 +313,29 @@ class _Examination:
             self.left_out.append(what)
             return None
 
-    def _explain(self, name: str, what: str, function: Callable[[], Any]) -> None:
-        """Keep the result of a comparison, unless the budget ends before."""
-        result = self._attempt(what, function)
-        if result is not None:
-            setattr(self.explained, name, result)
-
     # ------------------------------------------------------------------------------------------------ lines
 
-    def _is_adaptive(self, checked: Check) -> bool:
-        """Return whether adaptive steps explain the small error of a gradient, and keep the answer."""
-        if not diagnosis.may_be_adaptive(checked):
-            return False
-        self.explained.is_adaptive = self._compare_along_lines(checked, EARLY_SHARE)
-        return bool(self.explained.is_adaptive)
+    def _compare_early(self, checked: Check) -> None:
+        """Keep whether adaptive steps explain the small error of a gradient."""
+        if diagnosis.may_be_adaptive(checked):
+            self.explained.is_adaptive = self._compare_along_lines(checked, EARLY_SHARE)
 
-    def _compare_along_lines(self, checked: Check, share: float = 0.0) -> bool | None:
+    def _compare_along_lines(self, checked: Check, share: float) -> bool | None:
         """Return whether the program's steps depend on theta and its jumps explain the gradient's error.
 
         None where the budget ends before. Nothing here depends on sigma.
         """
         if self.explained.steps is None:
-            self._explain("steps", "the loops of the program", lambda: diagnosis.changing_steps(self.stages))
+            self.explained.steps = self._attempt(
+                "the loops of the program", lambda: diagnosis.changing_steps(self.stages)
+            )
         if not self.explained.steps:
             return None if self.explained.steps is None else False
-        self._near = near = (
-            self._scan(self.scale * RELATIVE, checked, share or 0.9) if self._near is None else self._near
-        )
+        near = self._scan_near(checked, share)
 
         def decide() -> bool | None:
             effort = self._effort(self.clock.affordable(0.9))
-            return None if effort is None else diagnosis.is_adaptive(self.stages, checked, near, *effort)
+            return None if effort is None else diagnosis.is_adaptive(self.stages, checked, near, effort)
 
         return self._attempt("the comparison along lines", decide) if near else None
 
@@ -363,9 +350,14 @@ class _Examination:
 
     def _scan_lines(self, checked: Check | None) -> list[LineScan]:
         """Return scans of the cost over the noise, or near theta without sigma."""
-        if not self.levels:
-            return self._scan(self.scale * RELATIVE, checked, 0.9) if self._near is None else self._near
-        return self._scan(max(self.levels, key=lambda level: level[0])[1], checked, 0.5)
+        if not self.setup.levels:
+            return self._scan_near(checked, 0.9)
+        return self._scan(max(self.setup.levels, key=lambda level: level[0])[1], checked, 0.5)
+
+    def _scan_near(self, checked: Check | None, share: float) -> list[LineScan]:
+        if self._near is None:
+            self._near = self._scan(self.setup.scale * RELATIVE, checked, share)
+        return self._near
 
     def _scan(self, spread: np.ndarray, checked: Check | None, share: float) -> list[LineScan]:
         """Return scans of the cost for jumps and kinks, along random directions through theta.
@@ -373,14 +365,15 @@ class _Examination:
         They take at most ``share`` of the remaining budget.
         """
         self.clock.start_stage("scanning lines")
-        along = directions(2, spread, self.seed)
+        along = directions(2, spread, self.setup.seed)
         effort = self._effort(self.clock.affordable(share) / len(along))
         if effort is None:
             self.left_out.append("jumps and kinks on lines")
             return []
-        points, halvings, most = effort
-        if points < POINTS:
-            self.left_out.append(f"fine line scans: {points} points instead of {POINTS}, and {most} places searched")
+        if effort[0] < POINTS:
+            self.left_out.append(
+                f"fine line scans: {effort[0]} points instead of {POINTS}, and {effort[2]} places searched"
+            )
         lines = []
         measured = checked.noise if checked is not None and math.isfinite(checked.noise) else 0.0
         self.clock.limit(min(1.0, 2 * share))
@@ -391,7 +384,7 @@ class _Examination:
                     measured, self.stages.repeats.spread, self.simulator.unit * (size if math.isfinite(size) else 0.0)
                 )
                 cost = partial(self.stages.costs_along, direction)
-                line = scan(cost, direction, rounding, 3.0, points, halvings, most, self.simulator.unit)
+                line = scan(cost, direction, rounding, 3.0, effort, self.simulator.unit)
                 lines.append(replace(line, missed=self._missed_share(line, checked)))
         except OutOfTime:
             self.left_out.append("jumps and kinks on lines")
@@ -425,10 +418,10 @@ class _Examination:
 
     def _measure_noise(self, checked: Check | None) -> list[Smoothed]:
         """Return the gradient's bias and the methods' costs at each sigma, which all get an equal share of the budget."""
-        levels = list(self.levels)
+        levels, size = list(self.setup.levels), self.stages.theta.size
         if not levels and self.simulator.noise:
-            levels = [(RELATIVE, RELATIVE * self.scale)]
-        if levels and self.theta.size > MOST_NOISY:
+            levels = [(RELATIVE, RELATIVE * self.setup.scale)]
+        if levels and size > MOST_NOISY:
             self.left_out.append(f"noise on theta: it has more than {MOST_NOISY:,} numbers")
             return []
         plain = None
@@ -438,8 +431,8 @@ class _Examination:
         for index, (level, spread) in enumerate(levels):
             self.clock.start_stage(f"noise of sigma {level:g}")
             self.clock.limit(1.0 / (len(levels) - index))
-            pairs = min(PAIRS, max(FEWEST, HELD // self.theta.size))
-            one = measure_smoothed(self.simulator, self.theta, level, spread, plain, self.clock, self.seed, pairs)
+            pairs = min(PAIRS, max(FEWEST, HELD // size))
+            one = measure_smoothed(self.simulator, level, spread, plain, self.setup.seed, pairs)
             self.clock.limit(1.0)
             if one is None:
                 self.left_out.append(f"noise of sigma {level:g}")

@@ -28,8 +28,8 @@ def write(report: Findings, directory: Path) -> list[Path]:
     make_directory(directory)
     tables = {"derivatives": report.frame, "sigmas": report.sigmas, "breaks": report.breaks}
     texts = {f"{name}.csv": table.to_csv(index=False, lineterminator="\n") for name, table in tables.items()}
-    if report.printed.count:
-        texts["printed.txt"] = "".join(f"{line}\n" for line in report.printed.lines)
+    if report.printed:
+        texts["printed.txt"] = "\n".join([*report.printed, ""])
     paths = write_all(directory, {"report.txt": f"{report}\n", **texts})
     with styled():
         for chart in charts(report):

@@ -12,11 +12,10 @@ import numpy as np
 
 from bench.examine.smoothing import TARGET_ERROR, Method, Smoothed
 from bench.gradient import FAULTS, TRUSTED, Check, Part, Sample
-from bench.gradient.diagnosis import Explanation, grows
+from bench.gradient.diagnosis import Explanation, grows, may_be_adaptive
 from bench.gradient.lines import ALIKE, LineScan
 from bench.gradient.rules import EXCUSABLE, RULES, SUSPICIOUS
 from bench.gradient.stages import Repeats, recaused
-from bench.simulator.simulator import Printed
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -175,7 +174,8 @@ class Findings:
     """The exception that the gradient raised at another theta; empty if none."""
     n_failed: int
     """Number of gradient calls that raised an exception."""
-    printed: Printed
+    printed: Sequence[str]
+    """The lines that cost and gradient printed."""
     changing: Sequence[str]
     """Which of the functions change theta in place."""
     notes: Sequence[str]
@@ -314,8 +314,9 @@ class Findings:
                 return "adaptive"
             if cause in (*SUSPICIOUS, "unsettled", "disconnected") and self.is_overwritten:
                 return "overwritten"
-            is_open = cause in SUSPICIOUS and explained.is_unexplained and not explained.gaps
-            return "undecided" if is_open else cause
+            # so small an error that adaptive steps may explain it, and the budget ended before that was known
+            is_open = explained.is_adaptive is None and self.check is not None and may_be_adaptive(self.check)
+            return "undecided" if cause in SUSPICIOUS and is_open and not explained.gaps else cause
         if not check.components or not self.is_complete:
             return "undecided"
         # no larger step is left than that with the best central difference
@@ -451,7 +452,9 @@ class Findings:
     def is_expected(self) -> bool:
         """Whether the cause is the expected one, and no wrong gradient."""
         is_open = RULES[self.cause].kind in ("open", "broken") or self.derivative in (RIGHT, NONE)
-        return bool(self.expect) and self.expect == self.cause and is_open
+        # with sigma, the bias that jumps on a line make is measured and has a cause of its own
+        is_of_jumps = self.cause == "biased" and self.missed > TARGET_ERROR
+        return self.expect in (self.cause, "jumps" if is_of_jumps else self.cause) and is_open
 
     @property
     def size(self) -> float:

@@ -110,11 +110,9 @@ class Smoothed:
 
 def measure_smoothed(
     simulator: Simulator,
-    theta: np.ndarray,
     sigma: float,
     spread: np.ndarray,
     plain: np.ndarray | None,
-    clock: Clock,
     seed: int = 0,
     pairs: int = PAIRS,
 ) -> Smoothed | None:
@@ -128,8 +126,8 @@ def measure_smoothed(
     size, result = FEWEST, None
     try:
         while size <= pairs:
-            drawn.append(_draw(simulator, theta, spread, random, size if result is None else size // 2))
-            result = _summary(sigma, spread, np.concatenate(drawn, axis=1), plain, simulator, clock)
+            drawn.append(_draw(simulator, spread, random, size if result is None else size // 2))
+            result = _summary(sigma, spread, np.concatenate(drawn, axis=1), plain, simulator)
             if size >= FIRM and result.error <= ENOUGH * result.norm and result.decided:
                 break
             size *= 2
@@ -138,10 +136,9 @@ def measure_smoothed(
     return result
 
 
-def _draw(
-    simulator: Simulator, theta: np.ndarray, spread: np.ndarray, random: np.random.Generator, size: int
-) -> np.ndarray:
+def _draw(simulator: Simulator, spread: np.ndarray, random: np.random.Generator, size: int) -> np.ndarray:
     """Return ``size`` pairs, ``(3 d + 1, size)``: directions u, half differences of costs, gradients at +u and at -u."""
+    theta = simulator.layout.vector
     u = random.standard_normal((theta.size, size))
     w = random.standard_normal((simulator.noise, size)) if simulator.noise else None
     up, down = theta[:, None] + spread[:, None] * u, theta[:, None] - spread[:, None] * u
@@ -157,7 +154,6 @@ def _summary(
     drawn: np.ndarray,
     plain: np.ndarray | None,
     simulator: Simulator,
-    clock: Clock,
 ) -> Smoothed:
     # SciPy's distributions are slow to import, and only this function needs them
     from bench.measure.statistics import Truth, summarise
@@ -191,7 +187,7 @@ def _summary(
         )
     if plain is not None:
         moved = float(np.linalg.norm(truth - plain))
-    methods = _methods(norm, high, d * u / spread[:, None], up, clock) if norm > 4.0 * error else ()
+    methods = _methods(norm, high, d * u / spread[:, None], up, simulator.clock) if norm > 4.0 * error else ()
     return Smoothed(sigma, truth, error, norm, pairs, bias, low, high, moved, remark, methods)
 
 

@@ -304,9 +304,9 @@ def warnings(report: Findings) -> list[str]:
     if report.derivative_cause != "nonfinite" and (place := _where_cost_fails(report)):
         found.append(f"the cost is not a number or raises an exception, {place}")
     found += [f"{name} changes theta in place: each call gets a copy" for name in report.changing]
-    if report.printed.count:
-        lines = counted(report.printed.count, "line")
-        found.append(f"cost and gradient printed {lines}; the first: {shortened(report.printed.lines[0])}")
+    if report.printed:
+        lines = counted(len(report.printed), "line")
+        found.append(f"cost and gradient printed {lines}; the first: {shortened(report.printed[0])}")
     if not report.status and report.missed > SEEN and report.noise_cause not in ("jumps", "staircase"):
         found.append(missed_text(report))
     return [*found, *(f"not done within the budget: {what}" for what in report.left_out)]

@@ -213,8 +213,6 @@ def relabel(rows: pd.DataFrame, axes: Sequence[Axis]) -> pd.DataFrame:
     """
     import pandas as pd
 
-    if "parameters" not in rows:
-        return rows
     names = [name for axis in axes for name in axis.names]
     views = [name for name in VIEWS if (rows.groupby(["scene", "contact"])[name].nunique() > 1).any()]
     read = cache(lambda text: _labels(json.loads(text), names, views))

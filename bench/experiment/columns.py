@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal
@@ -93,6 +93,11 @@ def interval(name: str, doc: str = "", unit: str = "", **more: Any) -> Column:
     return Column(name, doc, unit, low=f"{name}_low", high=f"{name}_high", **more)
 
 
+def seconds(name: str, doc: str, label: str = "", **more: Any) -> Column:
+    """Return a column of measured times."""
+    return Column(name, doc, "s", measured=True, label=label, format="seconds", **more)
+
+
 def text(name: str, doc: str = "", **more: Any) -> Column:
     """Return a column of strings."""
     return Column(name, doc, kind="text", **more)
@@ -101,6 +106,11 @@ def text(name: str, doc: str = "", **more: Any) -> Column:
 def numbers(name: str, doc: str = "", unit: str = "", **more: Any) -> Column:
     """Return a column whose values are lists of numbers or strings."""
     return Column(name, doc, unit, kind="list", **more)
+
+
+def several(kind: Callable[..., Column], docs: Mapping[str, str], **more: Any) -> list[Column]:
+    """Return columns of one kind, such as :func:`numbers`, from a table of their names and meanings."""
+    return [kind(name, doc, **more) for name, doc in docs.items()]
 
 
 FIRST = (

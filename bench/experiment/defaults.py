@@ -3,7 +3,7 @@
 A stored row contains every parameter of its plugins and of its study as JSON. If a plugin has gained a parameter since,
 the row counts as computed with that parameter's present default. All code that compares, groups or shows rows by their
 parameters reads them through :func:`completed`, :func:`completed_json` or :func:`completed_rows`: ``compare``, ``plan``,
-``report``, ``index`` and :func:`bench.load`. :func:`missing_parameters` lists the added parameters, for messages.
+``report``, ``index`` and :func:`bench.load`.
 """
 
 from __future__ import annotations
@@ -40,17 +40,6 @@ def completed(given: Mapping[str, Any]) -> dict[str, Any]:
     return result | records
 
 
-def missing_parameters(given: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the parameters that :func:`completed` adds, with their values: ``{"pushing.hold": 1}``."""
-    return {
-        f"{part.get('name', axis)}.{name}": value
-        for axis, part in given.items()
-        if isinstance(part, Mapping)
-        for name, value in defaults_of(axis, given).items()
-        if name not in part
-    }
-
-
 def completed_json(text: str) -> str:
     """Return :func:`completed` parameters as JSON in the format of new rows; other strings are returned unchanged."""
     return _completed_json(text, registry.folders())
@@ -70,8 +59,6 @@ def _completed_json(text: str, folders: tuple[Path, ...]) -> str:
 
 def completed_rows(rows: pd.DataFrame) -> pd.DataFrame:
     """Return rows with the column ``parameters`` completed, so that rows stored before and after a change agree."""
-    if "parameters" not in rows:
-        return rows
     texts = {text: completed_json(text) for text in rows["parameters"].unique()}
     if all(text is new or text == new for text, new in texts.items()):
         return rows

@@ -1,4 +1,4 @@
-"""Prepares command-line words for Hydra, and checks experiment files; errors name the word, or the file and its line."""
+"""Prepares command-line words for Hydra, and checks experiment files; errors name the word or the file."""
 
 from __future__ import annotations
 
@@ -53,24 +53,16 @@ def _range(key: str, match: re.Match[str]) -> range:
 
 
 def check_file(path: Path) -> None:
-    """Raise :class:`UserError` with file, line and the nearest fix if an experiment file cannot be read."""
-    import yaml
+    """Raise :class:`UserError` with the file and, as YAML gives it, the line if an experiment file cannot be read."""
     from omegaconf import OmegaConf
 
     try:
         text = path.read_bytes().decode()
         content = OmegaConf.to_container(OmegaConf.load(path), resolve=False) if text.strip() else {}
-    except OSError as error:
-        raise UserError(f"'{path}' cannot be read: {error.strerror}") from None
-    except UnicodeDecodeError as error:
-        line = path.read_bytes()[: error.start].count(b"\n") + 1
-        raise UserError(f"'{path}', line {line}: not UTF-8; save the file as UTF-8") from None
-    except yaml.YAMLError as error:
-        raise UserError(f"'{path}'{_explained(error)}") from None
     except RecursionError:
         raise UserError(f"'{path}' is nested too deeply") from None
-    except Exception as error:  # OmegaConf's own errors, such as a key that is a list
-        raise UserError(f"'{path}': {printable(error).split('.')[0][:300]}") from None
+    except Exception as error:  # of the file, of YAML, and OmegaConf's own, such as a key that is a list
+        raise UserError(f"'{path}' cannot be read: {printable(error)[:400]}") from None
     _check_content(path, text, content)
 
 
@@ -87,17 +79,3 @@ def _check_content(path: Path, text: str, content: Any) -> None:
             raise UserError(f"{where}: {key!r} is not a setting: settings are names")
         if key in TABLES and value is not None and not isinstance(value, dict):
             raise UserError(f"{where}: {key} must be a table, and is {repr(value)[:100]}: write {key}: {{name: value}}")
-
-
-def _explained(error: Any) -> str:
-    """Return line, problem and fix of a YAML error."""
-    mark = getattr(error, "problem_mark", None) or getattr(error, "context_mark", None)
-    problem = printable(getattr(error, "problem", None) or getattr(error, "reason", None) or error)
-    fixes = {
-        "\\t": "indent with spaces", "constructor for the tag": "tags are not supported, write the value itself",
-        "duplicate key": "give each setting once", 
-        "undefined alias": "put strings that begin with * in quotes", "cannot start any token": "put the string in quotes",
-        "expected ',' or": "close the bracket", "another document": "remove the line ---", "mapping values": "put strings with a colon in quotes",
-    }  # fmt: skip
-    fix = next((f": {fix}" for part, fix in fixes.items() if part in problem), "")
-    return f"{f', line {mark.line + 1}' if mark else ''}: {problem}{fix}"

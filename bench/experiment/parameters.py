@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bench.experiment.defaults import completed_json
-from bench.experiment.grid import THETA, is_theta_axis, parameter_name
+from bench.experiment.grid import THETA, is_theta_axis
 from bench.model import registry
 
 if TYPE_CHECKING:
@@ -26,14 +26,10 @@ PROBLEM = ("scene", "contact", "integrator")
 """The parts of the grid that decide the simulation, and so the gradient that estimates are compared with."""
 NOT_PLUGINS = ("study", "theta", "reference")
 """Entries of a row's parameters that are not plugins on an axis of the grid."""
-VIEWS = ("noise", "horizon", "dt", "stiffness", "sigma", "smoothing")
-"""Identity columns that show a problem's parameters; they identify the problem of rows without parameters."""
 
 
 def parse(rows: pd.DataFrame) -> list[Mapping[str, Any]]:
     """Return each row's parameters by axis, with today's defaults for missing ones; empty if the row stores none."""
-    if "parameters" not in rows:
-        return [{}] * len(rows)
     return [_parsed(text, registry.folders()) for text in rows["parameters"]]
 
 
@@ -53,7 +49,7 @@ def flatten(rows: pd.DataFrame) -> pd.DataFrame:
     """
     import pandas as pd
 
-    if "parameters" not in rows or rows.empty:
+    if rows.empty:
         return pd.DataFrame(index=rows.index)
     codes, texts = pd.factorize(rows["parameters"])
     return _flattened(tuple(texts), registry.folders()).take(codes).set_axis(rows.index)
@@ -131,7 +127,6 @@ def problem_columns(
     """Return the columns that identify the problem of each row: equal rows are the same problem.
 
     The columns are all parameters of the axes ``parts`` and of the study, and theta, except the swept names ``without``.
-    Rows without parameters, which older versions stored, are distinguished by their identity columns.
     """
     table = flatten(rows)
     wanted = [f"{part}." for part in (*parts, "study", "theta", THETA)]
@@ -140,11 +135,7 @@ def problem_columns(
         for column, mask in swept_columns(name, table).items():
             if column in problem:
                 problem = problem.assign(**{column: problem[column].mask(mask)})
-    is_bare = rows["parameters"] == "" if "parameters" in rows else rows["status"].notna()
-    if not is_bare.any():
-        return problem
-    names = [name for name in (*parts, *VIEWS) if name in rows and name not in map(parameter_name, without)]
-    return problem.assign(**{f"identity.{name}": rows[name].astype(str).where(is_bare) for name in names})
+    return problem
 
 
 def number_problems(rows: pd.DataFrame, parts: Collection[str] = PROBLEM, without: Collection[str] = ()) -> pd.Series:

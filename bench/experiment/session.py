@@ -58,19 +58,18 @@ class ReferenceSource(Protocol):
         """Return the reference gradient of a cell, computed or stored; raises the errors of its computation."""
 
 
-class Session(Protocol):
-    """The compiled problems and reference gradients that the cells of one run share."""
+class Session:
+    """The compiled problems and reference gradients that the cells of one run share; :mod:`bench.run.session` opens one."""
 
     experiment: Experiment
     problems: Problems
-
-    @property
-    def references(self) -> ReferenceSource:
-        """The reference gradients of the run."""
+    references: ReferenceSource
 
     def problem(self, cell: Cell) -> Problem:
         """Return the cell's program, compiled on its backend."""
+        return self.problems.of(cell.backend, cell)
 
     @property
     def compilations(self) -> Compilations:
         """Compilations of the run's problems since the count was restarted."""
+        return self.problems.compilations

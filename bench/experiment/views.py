@@ -51,7 +51,7 @@ class Chart:
     - ``lines``: y against x, a line per ``series``, 95% intervals where the columns have them.
     - ``points``: the same without lines.
     - ``dots``: a row per value of the text column y, and x with its interval; ``join`` connects the dots of a row.
-    - ``grid``: a cell per pair of x and y, coloured by the text column ``level`` or by the number ``value``, with the
+    - ``grid``: a cell per pair of x and y, coloured by the text column ``level`` or by the number ``shade`` from 0 to 1, with the
       text of the column ``cell``.
     """
 
@@ -72,14 +72,12 @@ class Chart:
     panel: str = ""
     """The column with a panel per value."""
     level: str = ""
-    value: str = ""
+    shade: str = ""
     cell: str = ""
     text: str = ""
     """How to read the chart, for the page."""
     subtitle: str = ""
     """Conditions that all panels share."""
-    value_range: tuple[float, float] | None = None
-    """The numbers ``value`` of the lightest and the darkest cell; by default the smallest and the largest."""
     panel_notes: Mapping[str, str] = field(default_factory=dict)
     """Words below the title of a panel, such as a verdict, by panel."""
     styles: Mapping[str, Style] = field(default_factory=dict)
@@ -96,10 +94,6 @@ class Chart:
     """Whether a line joins the Pareto front of a panel: the points that no other beats in x and y, smaller being better."""
     band: bool = False
     """Whether intervals are drawn as bands and not as bars."""
-    shape: str = ""
-    """The column whose values have a marker each, where ``series`` has the colours."""
-    chosen: Sequence[tuple[str, Sequence[Any]]] = ()
-    """What is drawn of the table: columns with the values to keep, in this order."""
     own_scales: bool = False
     """Whether each panel has its own scale of y (of x, for dots); panels above each other then share that of x."""
 
@@ -107,22 +101,14 @@ class Chart:
         if missing := sorted(set(self._names()) - set(self.frame)):
             raise ValueError(f"chart {self.name}: its table has no column {', '.join(missing)}")
 
-    def drawn(self) -> pd.DataFrame:
-        """Return the lines of the table that are drawn."""
-        frame = self.frame
-        for name, values in self.chosen:
-            kept = frame[frame[name].isin(values)]
-            frame = kept.iloc[kept[name].map(list(values).index).argsort(kind="stable")]
-        return frame
-
     def plotted(self) -> pd.DataFrame:
-        """Return the drawn lines and columns: panel, series, levels, and all quantities with their intervals."""
-        return self.drawn()[self._names()]
+        """Return the drawn columns: panel, series, levels, and all quantities with their intervals."""
+        return self.frame[self._names()]
 
     def _names(self) -> list[str]:
         """Return the columns of the table that the chart needs."""
         axes = [name for c in (*self.x, *self.y) for name in (c.name, c.low, c.high, c.limit)]
-        names = [self.panel, self.series, self.line, self.shape, self.level, self.value, self.cell,
+        names = [self.panel, self.series, self.line, self.level, self.shade, self.cell,
                  self.failed, *axes]  # fmt: skip
         return [name for name in dict.fromkeys(names) if name]
 

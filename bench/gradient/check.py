@@ -425,7 +425,7 @@ class _Checker:
         still = bool(at_draws) and all(np.array_equal(g, at_draws[0]) for g in at_draws)
         here = [part for part in parts if part.verdict in FAULTS]
         if still and at_draws[0].any() and not here:
-            return parts, [_with_verdict(part, "stale_gradient", ("wrong_adjoint",)) for part in draws]
+            return parts, [_named(part, "stale_gradient") for part in draws]
         components = [p.component for p in parts if any(p is one for one in wrong) and p.component is not None]
         ratios = {i: [part.ratio_with_error for part in parts if part.component == i] for i in components}
         again = self._check_lines(
@@ -445,8 +445,8 @@ class _Checker:
         cause = causes_of_ratios(ratios, along, right)
         if "wrong_adjoint" in cause.values() and self._is_right_far_away():
             cause = causes_of_ratios(ratios, along, right, right_elsewhere=True)
-        renamed = [_with_verdict(part, cause.get(part.component, cause[None]), ("wrong_adjoint",)) for part in parts]
-        return renamed, [_with_verdict(part, cause[None], ("wrong_adjoint",)) for part in draws]
+        renamed = [_named(part, cause.get(part.component, cause[None])) for part in parts]
+        return renamed, [_named(part, cause[None]) for part in draws]
 
     def _is_right_far_away(self) -> bool:
         """Return whether the gradient is right at some theta farther away, so that a missing term acts only near theta.
@@ -477,5 +477,6 @@ def _real(name: str, values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     return np.asarray(values, dtype=np.float64)
 
 
-def _with_verdict(part: Part, verdict: str, instead: Sequence[str]) -> Part:
-    return replace(part, verdict=verdict) if part.verdict in instead else part
+def _named(part: Part, cause: str) -> Part:
+    """Return a part with the cause of its wrong derivative as its verdict."""
+    return replace(part, verdict=cause) if part.verdict == "wrong_adjoint" else part

@@ -71,8 +71,6 @@ class Explanation:
     """Whether steps that depend on theta explain the error, by the jumps of the cost; None: not compared."""
     steps: str | None = None
     """The place of a loop whose length depends on theta, as ``ode.py:17``; empty without one, None: not searched."""
-    is_unexplained: bool = False
-    """Whether the error is so small that adaptive steps may explain it, and the budget ended before that was known."""
     gaps: Sequence[Gap] = ()
     """At theta and at others: how far gradient and cost are from the refined cost; empty without a refined cost."""
     growth: Sequence[Horizon] = ()
@@ -120,8 +118,8 @@ def errors_by_horizon(stages: GradientStages, horizons: Sequence[int]) -> list[H
             return other.costs(thetas, stages.same_noise(thetas.shape[1]))
 
         quick = FewSteps(
-            partial(space.costs, costs, width=other.width), space.origin(), space.scale, space.project(gradient),
-            float(costs(stages.theta[:, None])[0]), simulator.unit, stages.repeats.spread,
+            space, partial(space.costs, costs, width=other.width), gradient, float(costs(stages.theta[:, None])[0]),
+            simulator.unit, stages.repeats.spread,
         )  # fmt: skip
         quick.run_round(other.width)
         outcome = quick.check()
@@ -168,7 +166,7 @@ def may_be_adaptive(outcome: Check) -> bool:
 
 
 def is_adaptive(
-    stages: GradientStages, outcome: Check, lines: Sequence[LineScan], points: int, halvings: int, most: int
+    stages: GradientStages, outcome: Check, lines: Sequence[LineScan], effort: tuple[int, int, int]
 ) -> bool:
     """Return whether the jumps of the cost explain the error of the gradient, as with adaptive steps.
 
@@ -176,8 +174,8 @@ def is_adaptive(
     Its cost has a small jump there, and slopes between jumps that differ from the solution's slopes by about the height
     of a jump over the distance between jumps. Reverse mode through such a solver holds the steps fixed, and an adjoint
     that is solved separately has steps of its own, so these gradients differ by as much. Where few jumps are found
-    beside a small error, a line ten times as long is searched, as :func:`scan` does with ``points``, ``halvings`` and
-    ``most``. A larger error counts where the jumps on the first lines change the cost by more than the error does.
+    beside a small error, a line ten times as long is searched, as :func:`scan` does with ``effort``. A larger error
+    counts where the jumps on the first lines change the cost by more than the error does.
     """
     lines = [line for line in lines if np.isfinite(line.costs).all()]
     error = relative_error(outcome)
@@ -188,7 +186,7 @@ def is_adaptive(
         first, noise = lines[0], max(outcome.noise, stages.repeats.spread)
         reach, unit = LONGER * float(first.at[-1]), stages.simulator.unit
         cost = partial(stages.costs_along, first.direction)
-        lines = [scan(cost, first.direction, noise, reach, points, halvings, most, unit)]
+        lines = [scan(cost, first.direction, noise, reach, effort, unit)]
     if sum(len(line.jumps) for line in lines) < FEWEST_JUMPS:
         return False
     rows = []

@@ -16,6 +16,7 @@ import numpy as np
 from .causes import causes_of_ratios
 from .check import Check, Part
 from .direction import ALIKE, MEASURED, Sample, finding_at, wrong
+from .subspace import Subspace
 from .verdicts import most_severe
 
 ROUNDS = (1.0, 30.0, 0.1)
@@ -32,12 +33,13 @@ FLOOR = 4.0
 
 @dataclass
 class FewSteps:
-    """Differences of a cost at one to three steps per coordinate. Each finished difference is kept."""
+    """Differences of a cost at one to three steps per coordinate of a space. Each finished difference is kept."""
 
+    space: Subspace
     cost: Callable[[np.ndarray], np.ndarray]
-    theta: np.ndarray
-    scale: np.ndarray
+    """The cost by coordinates, ``(m, B)`` to ``(B,)``."""
     gradient: np.ndarray | None
+    """The gradient by theta, ``(d,)``."""
     centre: float
     """The cost at theta."""
     unit: float
@@ -50,10 +52,10 @@ class FewSteps:
 
     def run_round(self, width: int = 1) -> None:
         """Compute two costs per coordinate at the next step, at most ``width`` costs per call."""
-        steps = ROUNDS[self.rounds] * float(np.cbrt(self.unit)) * self.scale
-        for chosen in np.array_split(np.arange(self.theta.size), -(-self.theta.size // max(width // 2, 1))):
-            moved = np.repeat(self.theta[:, None], 2 * chosen.size, axis=1)
-            moved[np.tile(chosen, 2), np.arange(2 * chosen.size)] += np.r_[-steps[chosen], steps[chosen]]
+        steps, size = ROUNDS[self.rounds] * float(np.cbrt(self.unit)) * self.space.scale, self.space.size
+        for chosen in np.array_split(np.arange(size), -(-size // max(width // 2, 1))):
+            moved = np.zeros((size, 2 * chosen.size))
+            moved[np.tile(chosen, 2), np.arange(2 * chosen.size)] = np.r_[-steps[chosen], steps[chosen]]
             costs = self.cost(moved).reshape(2, -1)
             for index, minus, plus in zip(chosen, *costs, strict=True):
                 self.values[int(index)].append((float(steps[index]), float(minus), float(plus)))
@@ -61,7 +63,8 @@ class FewSteps:
 
     def check(self) -> Check | None:
         """Return the outcome for the coordinates with at least one difference; None if there are none."""
-        parts = [self._part(i) for i in sorted(self.values)]
+        gradient = np.full(self.space.size, np.nan) if self.gradient is None else self.space.project(self.gradient)
+        parts = [self._part(i, float(gradient[i])) for i in sorted(self.values)]
         if not parts:
             return None
         ratios = {i: [part.ratio_with_error] for i, part in enumerate(parts) if part.verdict == "wrong_adjoint"}
@@ -69,15 +72,13 @@ class FewSteps:
             causes = causes_of_ratios(ratios, [], any(part.verdict == "smooth" for part in parts))
             if set(causes.values()) == {"wrong_factor"}:
                 parts = [replace(p, verdict="wrong_factor") if i in ratios else p for i, p in enumerate(parts)]
-        gradient = np.full(self.theta.size, np.nan) if self.gradient is None else self.gradient
-        return Check(most_severe(part.verdict for part in parts), gradient, tuple(parts), ())
+        return self.space.restore(Check(most_severe(part.verdict for part in parts), gradient, tuple(parts), ()))
 
     @np.errstate(all="ignore")
-    def _part(self, index: int) -> Part:
+    def _part(self, index: int, program: float) -> Part:
         step, minus, plus = np.array(sorted(self.values[index], reverse=True)).T
-        program = 0.0 if self.gradient is None else float(self.gradient[index])
         sample = Sample(
-            step, minus, self.centre, plus, program, np.zeros(step.size, bool), scale=float(self.scale[index]),
+            step, minus, self.centre, plus, program, np.zeros(step.size, bool), scale=float(self.space.scale[index]),
             unit=self.unit, noise=self.floor,
         )  # fmt: skip
         noise = ROUNDED / MEASURED * sample.rounding(self.unit) + FLOOR * self.floor / step

@@ -94,16 +94,15 @@ def scan(
     direction: np.ndarray,
     noise: float,
     reach: float = 3.0,
-    points: int = POINTS,
-    halvings: int = HALVINGS,
-    most: int = PLACES,
+    effort: tuple[int, int, int] = (POINTS, HALVINGS, PLACES),
     unit: float = float(np.finfo(np.float64).eps),
 ) -> LineScan:
     """Return a scan of the cost ``along(t)``, ``(n,)`` to ``(n,)``, on ``theta + t * direction`` for t from -reach to +reach.
 
     ``noise`` is the size of the cost's rounding errors at theta, and ``unit`` the unit roundoff, from which they follow
-    elsewhere. At most ``most`` places are searched for breaks.
+    elsewhere. ``effort`` is the number of points, of halvings, and the most places that are searched for breaks.
     """
+    points, halvings, most = effort
     t = np.linspace(-reach, reach, points)
     f = along(t)
     finite = f[np.isfinite(f)]

@@ -31,7 +31,7 @@ from bench.gradient import (
 )  # fmt: skip
 from bench.gradient.roughness import FINE
 from bench.gradient.subspace import Group, Subspace, choose, locate
-from bench.simulator.clock import Clock, OutOfTime
+from bench.simulator.clock import OutOfTime
 from bench.simulator.simulator import Simulator
 
 SINGLE_EPS = np.logspace(-1, -7, 13)
@@ -118,13 +118,13 @@ class GradientStages:
         self,
         simulator: Simulator,
         scale: np.ndarray,
-        clock: Clock,
         seed: int,
-        w: np.ndarray | None,
-        random: np.random.Generator,
     ) -> None:
-        self.simulator, self.scale, self.clock, self.seed, self.w = simulator, scale, clock, seed, w
+        self.simulator, self.scale, self.clock, self.seed = simulator, scale, simulator.clock, seed
         self.layout, self.theta = simulator.layout, simulator.layout.vector
+        self._random = np.random.default_rng([seed, 0x6578616D])
+        self.w = self._random.standard_normal((simulator.noise, 1)) if simulator.noise else None
+        """The draw of the simulator's own noise, ``(n, 1)``."""
         self.value = math.nan
         self.gradient: np.ndarray | None = None
         """The gradient at theta, ``(d,)``; None without a gradient, or where it failed."""
@@ -147,7 +147,6 @@ class GradientStages:
         self._repeated = False  # whether calls were repeated within the budget
         self.is_hidden_single = False
         """Whether the cost has single precision, though it returns a float64."""
-        self._random = random
         self._costs_store, self._gradients_store = Store(), Store()
 
     # ------------------------------------------------------------------------------------------------ calls
@@ -216,7 +215,7 @@ class GradientStages:
 
     # ------------------------------------------------------------------------------------------------ stages
 
-    def run(self, explain: Callable[[Check], bool] = lambda check: False) -> None:
+    def run(self, explain: Callable[[Check], None]) -> None:
         """Run all stages that the budget allows; ``explain`` gets the outcome of a wrong gradient before it is named."""
         try:
             self._start()
@@ -230,7 +229,7 @@ class GradientStages:
         space = choose(self.layout, self.scale, self.gradient, self.seed)
         self.groups = space.groups
         if self.gradient is not None:
-            self._gradients_store.put(space.origin().tobytes(), space.project(self.gradient))
+            self._gradients_store.put(np.zeros(space.size).tobytes(), space.project(self.gradient))
             self._gradients_store.refresh()
         try:
             for stage in (partial(self._compare_quickly, space), self._repeat):
@@ -266,11 +265,8 @@ class GradientStages:
     def _compare_quickly(self, space: Subspace) -> None:
         """Compare the gradient with two costs per coordinate, and with more where the full steps do not fit."""
         self.clock.start_stage("one step per component")
-        slope = None if self.gradient is None else space.project(self.gradient)
-        quick = FewSteps(
-            partial(self._stored_costs, space), space.origin(), space.scale, slope, self.value, self.simulator.unit,
-            self.repeats.spread,
-        )  # fmt: skip
+        cost, unit = partial(self._stored_costs, space), self.simulator.unit
+        quick = FewSteps(space, cost, self.gradient, self.value, unit, self.repeats.spread)
         try:
             for _ in ROUNDS:
                 quick.run_round(self.simulator.width)
@@ -280,7 +276,7 @@ class GradientStages:
         finally:
             outcome = quick.check()
             if outcome is not None:
-                self.check, self.is_quick = space.restore(outcome), True
+                self.check, self.is_quick = outcome, True
                 self.is_complete = len(outcome.parts) == space.size
 
     def _repeat(self) -> None:
@@ -380,7 +376,7 @@ class GradientStages:
         gradients = 0 if self.gradient is None else 3 + options.draws * (3 if wrong else 1)
         return costs, gradients
 
-    def _check_in_stages(self, space: Subspace, explain: Callable[[Check], bool]) -> None:
+    def _check_in_stages(self, space: Subspace, explain: Callable[[Check], None]) -> None:
         self.clock.start_stage("checking the gradient")
         assert self.check is not None
 
@@ -434,7 +430,10 @@ class GradientStages:
             return space.project(self.gradient_at(space.place(z[:, None])[:, 0], w))
 
         outcome = check(
-            cost, slope if self.gradient is not None else None, space.origin(), replace(options, scale=space.scale)
+            cost,
+            slope if self.gradient is not None else None,
+            np.zeros(space.size),
+            replace(options, scale=space.scale),
         )
         if self.simulator.n_failed_gradients:
             # a gradient that raises at other thetas is reported as such
@@ -486,21 +485,14 @@ class GradientStages:
         """
         assert self.check is not None
         assert self.gradient is not None
-
-        def cost(z: np.ndarray) -> np.ndarray:
-            thetas = np.repeat(self.theta[:, None], z.shape[1], axis=1)
-            thetas[index] = z[0]
-            return self.costs(thetas)
-
-        one, unit = [index], self.simulator.unit
-        quick = FewSteps(
-            cost, self.theta[one], self.scale[one], self.gradient[one], self.value, unit, self.repeats.spread
-        )
+        space, unit = Subspace(self.layout, self.scale, [index], []), self.simulator.unit
+        cost = partial(space.costs, self.costs, width=self.simulator.width)
+        quick = FewSteps(space, cost, self.gradient, self.value, unit, self.repeats.spread)
         for _ in ROUNDS:
             quick.run_round()
         outcome = quick.check()
         if outcome is not None and outcome.cause in FAULTS:
-            added = replace(outcome.parts[0], component=index, verdict=verdict)
+            added = replace(outcome.parts[0], verdict=verdict)
             self.check = replace(self.check, parts=(added, *self.check.parts))
 
     def _check_under_other_noise(self) -> None:

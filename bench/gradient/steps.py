@@ -6,10 +6,12 @@ loops all have fixed lengths has no such excuse.
 
 from __future__ import annotations
 
-import dis
+import ast
+import linecache
 import sys
+from functools import cache
 from pathlib import Path
-from types import CodeType, FrameType
+from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -47,17 +49,14 @@ def changed_loop(runs: list[Loops]) -> str:
 def traced_loops(simulator: Simulator, theta: np.ndarray, w: np.ndarray | None) -> Loops:
     """Return the loops of one call of the cost at ``theta (d,)``, with the numbers of iterations of each run."""
     loops: Loops = {}
-    spans: dict[CodeType, dict[int, int]] = {}
 
     def enter(frame: FrameType, event: str, argument: Any) -> Any:
         code = frame.f_code
         if event != "call" or any(folder in code.co_filename for folder in SKIPPED):
             return None
-        if code not in spans:
-            spans[code] = _loop_lines(code)
-        if not spans[code]:
+        own, last, running = _while_loops(code.co_filename), frame.f_lineno, dict[int, int]()
+        if not own:
             return None
-        own, last, running = spans[code], frame.f_lineno, dict[int, int]()
 
         def finish(line: int) -> None:
             loops.setdefault((code.co_filename, line), set()).add(running.pop(line))
@@ -89,24 +88,19 @@ def traced_loops(simulator: Simulator, theta: np.ndarray, w: np.ndarray | None) 
     return loops
 
 
-def _loop_lines(code: CodeType) -> dict[int, int]:
-    """Return the last line of each while loop of a function by its first line.
+@cache
+def _while_loops(file: str) -> dict[int, int]:
+    """Return the last line of each while loop of a file by the line at which each of its rounds begins.
 
     A for loop runs over a list, whose length is often the number of contacts rather than of steps.
     """
-    lines: dict[int, int] = {}
-    names: dict[int, str] = {}
-    line = code.co_firstlineno
-    spans: dict[int, int] = {}
-    for instruction in dis.get_instructions(code):
-        line = (instruction.positions and instruction.positions.lineno) or line
-        lines[instruction.offset], names[instruction.offset] = line, instruction.opname
-        target = instruction.argval
-        if "JUMP_BACKWARD" in instruction.opname and names.get(target, "FOR_ITER") != "FOR_ITER":
-            first = min(lines[target], line)
-            last = max(one for offset, one in lines.items() if offset >= target)
-            spans[first] = max(spans.get(first, first), last)
-    return spans
+    try:
+        nodes = ast.walk(ast.parse("".join(linecache.getlines(file))))
+    except SyntaxError:
+        return {}
+    loops = [node for node in nodes if isinstance(node, ast.While)]
+    firsts = [loop.body[0] if isinstance(loop.test, ast.Constant) else loop for loop in loops]
+    return {first.lineno: loop.end_lineno or first.lineno for first, loop in zip(firsts, loops, strict=True)}
 
 
 # ------------------------------------------------------------------------------------------------------------- JAX

@@ -14,8 +14,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bench.gradient import Check, Part, extremes
 from bench.simulator.tree import ParameterTree
+
+from .check import Check, Part, extremes
 
 MOST = 16
 """Most components checked one by one."""
@@ -39,16 +40,12 @@ class Group:
 
 
 class Subspace:
-    """Coordinates z of theta + V z, with the columns of V as components and directions of groups.
-
-    With ``groups`` empty and all components chosen, z is the displacement of theta itself.
-    """
+    """Coordinates z of theta + V z, with the columns of V as components and directions of groups."""
 
     def __init__(self, layout: ParameterTree, scale: np.ndarray, components: list[int], groups: list[Group]) -> None:
         self.theta, self.components, self.groups = layout.vector, components, groups
         self.scale = np.r_[scale[components], np.ones(len(groups))]
         """The size of each coordinate ``(m,)``."""
-        self.is_whole = not groups
         self._thetas = np.empty((0, 0))
 
     @property
@@ -56,18 +53,9 @@ class Subspace:
         """Number of coordinates m."""
         return len(self.components) + len(self.groups)
 
-    def origin(self) -> np.ndarray:
-        """Return the coordinates of theta, ``(m,)``: theta itself where every component is a coordinate, else 0."""
-        return self.theta.copy() if self.is_whole else np.zeros(self.size)
-
-    def place(self, z: np.ndarray) -> np.ndarray:
-        """Return the thetas ``(d, B)`` at coordinates ``z (m, B)``."""
-        if self.is_whole:
-            return z
-        return self._place_into(np.empty((self.theta.size, z.shape[1])), z)
-
-    def _place_into(self, thetas: np.ndarray, z: np.ndarray) -> np.ndarray:
-        """Write the thetas at coordinates ``z (m, B)`` into ``thetas (d, B)``, and return them."""
+    def place(self, z: np.ndarray, thetas: np.ndarray | None = None) -> np.ndarray:
+        """Return the thetas ``(d, B)`` at coordinates ``z (m, B)``, written into ``thetas`` if given."""
+        thetas = np.empty((self.theta.size, z.shape[1])) if thetas is None else thetas
         thetas[:] = self.theta[:, None]
         if self.components:
             thetas[self.components] += z[: len(self.components)]
@@ -78,28 +66,22 @@ class Subspace:
 
     def project(self, gradient: np.ndarray) -> np.ndarray:
         """Return the derivatives by the coordinates ``(m,)`` from a gradient ``(d,)``."""
-        if self.is_whole:
-            return gradient
         along = [float(group.vector @ gradient[group.first : group.last]) for group in self.groups]
         return np.asarray(np.r_[gradient[self.components], along])
 
     def costs(self, cost: Callable[[np.ndarray], np.ndarray], z: np.ndarray, width: int) -> np.ndarray:
         """Return the costs ``(B,)`` at ``z (m, B)``, from ``cost`` of at most ``width`` thetas ``(d, width)`` at a time."""
-        if self.is_whole:
-            return cost(z)
         # one array for all calls, since new memory for a million numbers takes longer than writing them
         costs = [np.zeros(0)]
         for first in range(0, z.shape[1], width):
             part = z[:, first : first + width]
             if self._thetas.shape != (self.theta.size, part.shape[1]):
                 self._thetas = np.empty((self.theta.size, part.shape[1]))
-            costs.append(cost(self._place_into(self._thetas, part)))
+            costs.append(cost(self.place(part, self._thetas)))
         return np.concatenate(costs)
 
     def restore(self, check: Check) -> Check:
         """Return a check in these coordinates with its parts named after theta's components and groups."""
-        if self.is_whole:
-            return check
         return replace(check, parts=tuple(self._restore_part(part) for part in check.parts))
 
     def _restore_part(self, part: Part) -> Part:

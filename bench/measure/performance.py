@@ -2,8 +2,8 @@
 
 Intervals are at 95%.
 
-Sources: Wilson 1927 (success rates), Hansen et al. 2016, *COCO performance assessment* (average runtime, ECDF with
-simulated restarts), Agarwal et al. 2021, *Deep RL at the edge of the statistical precipice* (interquartile mean,
+Sources: Wilson 1927 (success rates), Hansen et al. 2016, *COCO performance assessment* (average runtime),
+Agarwal et al. 2021, *Deep RL at the edge of the statistical precipice* (interquartile mean,
 probability of improvement), Dahl et al. 2023, *AlgoPerf* (the integral of the performance profile), Efron 1979
 (bootstrap), Hesterberg 2015, *What teachers should know about the bootstrap* (its quantiles for few values). Ranks are
 SciPy's. The Wilson interval and Spearman's rho agree with SciPy's to 1e-14. SciPy's are not used because their last
@@ -112,21 +112,6 @@ def runtime_interval(spent: np.ndarray, reached: np.ndarray, seed: int = 0, draw
     tail = _tail([len(spent)])
     low, high = np.quantile(values, [tail, 1.0 - tail], method="nearest")
     return float(low), float(high)
-
-
-def runtimes(spent: np.ndarray, reached: np.ndarray, count: int, seed: int = 0) -> np.ndarray:
-    """Return ``count`` simulated runtimes with restarts: the total cost of runs drawn at random until one succeeds.
-
-    All runtimes are infinite if no run succeeds.
-    """
-    if not np.any(reached):
-        return np.full(count, math.inf)
-    rng, total, done = np.random.default_rng(seed), np.zeros(count), np.zeros(count, dtype=bool)
-    while not done.all():
-        drawn = rng.integers(0, len(spent), count)
-        total += np.where(done, 0.0, spent[drawn])
-        done |= reached[drawn]
-    return total
 
 
 def interquartile_mean(values: np.ndarray) -> float:

@@ -416,11 +416,6 @@ class Summary:
     note: str = ""
     """Caveats for reading the intervals; empty if there are none."""
 
-    @property
-    def indistinguishable(self) -> bool:
-        """Whether the interval of the bias contains 0."""
-        return self.bias_low <= 0.0
-
 
 def summarise(
     estimates: np.ndarray,

@@ -11,7 +11,7 @@ traced value, so Python code must not branch on it. All other types are static.
 
 from bench.errors import Unsupported, UserError, unknown
 from bench.model import adjoint
-from bench.model.adjoint import Slopes, by_actions, by_theta, slopes
+from bench.model.adjoint import Slopes, by_actions, by_theta, slopes, slopes_along
 from bench.model.adjoint import gradient as adjoint_gradient
 from bench.model.backend import Backend
 from bench.model.blocks import cores
@@ -150,6 +150,7 @@ __all__ = [
     "simulator_files",
     "slope_by_changes",
     "slopes",
+    "slopes_along",
     "stopped",
     "undeclared_jumps",
     "uniform",

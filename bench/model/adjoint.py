@@ -55,8 +55,14 @@ def slopes(problem: Problem, theta: np.ndarray, w: np.ndarray) -> Slopes:
     solves an equation if the backend provides no Jacobians.
     """
     program = rollout(problem.program)
-    full = np.repeat(np.reshape(theta, (program.dim, -1)), w.shape[1] if np.ndim(theta) == 1 else 1, axis=1)
+    full = _columns(theta, w)
     path = problem.jacobians(full, w) if problem.gives_jacobians else _difference_jacobians(program, full, w)
+    return slopes_along(program, path, theta, w)
+
+
+def slopes_along(program: Rollout, path: Jacobians, theta: np.ndarray, w: np.ndarray) -> Slopes:
+    """Return :func:`slopes` from the rollouts and step Jacobians ``path``."""
+    full = _columns(theta, w)
     scene, (horizon, m, count) = program.scene, path.controls.shape
     noisy = full if program.action_noise else full + scene.sigma * w[: program.dim]
     before, controls = _flatten(path.states[:-1]), _flatten(path.controls)
@@ -215,6 +221,11 @@ def _theta_differences(
         # sum over all axes except the last, then over the repetitions of the columns
         result[i] = change.reshape(-1, change.shape[-1]).sum(axis=0).reshape(-1, count).sum(axis=0) / (2 * h)
     return result
+
+
+def _columns(theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+    """Return ``theta (d,)`` or ``(d, B)`` as a column per column of ``w (n_w, B)``."""
+    return theta if np.ndim(theta) == 2 else np.repeat(theta[:, None], w.shape[1], axis=1)
 
 
 def _split(program: Rollout, x: np.ndarray) -> State:

@@ -35,8 +35,6 @@ SETTINGS: dict[str, tuple[str, Callable[[Any], Any]]] = {
     "the seed of random": ("random", lambda _: random.getstate()),
     DRAWN: ("numpy", lambda _: _numpy_generator()),
     "the seed of torch": ("torch", lambda torch: torch.random.get_rng_state().numpy().tobytes()),
-    "the rounding of numbers": ("sys", lambda _: [x / k for x in (1.0, 1e-308) for k in (3.0, -3.0, 7.0)]),
-    "NumPy's print options": ("numpy", lambda numpy: numpy.get_printoptions()),
     "NumPy's error state": ("numpy", lambda numpy: numpy.geterr()),
     "SciPy's error state": ("scipy.special", lambda special: special.geterr()),
     "JAX's configuration": ("jax", lambda jax: {name: jax.config.values.get(name) for name in JAX}),

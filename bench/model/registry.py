@@ -289,7 +289,7 @@ def _add(table: Table, plugin: type[Plugin]) -> None:
         missing = ", ".join(sorted(plugin.__abstractmethods__))
         kind_entries[plugin.name] = Entry(kind, plugin.name, None, f"{plugin.__qualname__} does not define {missing}")
     else:
-        kind_entries[plugin.name] = Entry(kind, plugin.name, plugin, _missing(plugin))
+        kind_entries[plugin.name] = Entry(kind, plugin.name, plugin, missing_modules(plugin))
 
 
 def _faults(plugin: type[Plugin]) -> str:
@@ -307,10 +307,11 @@ def _faults(plugin: type[Plugin]) -> str:
     return ""
 
 
-def _missing(plugin: type[Plugin]) -> str:
+def missing_modules(plugin: type[Plugin]) -> str:
+    """Return which modules that a plugin requires are not installed and how to install them, or an empty string."""
     parts = (requirement.partition("=") for requirement in plugin.requires)
-    missing = [distribution or module for module, _, distribution in parts if not installed(module)]
-    return f"not installed: {', '.join(missing)}; pip install {' '.join(missing)}" if missing else ""
+    absent = [distribution or module for module, _, distribution in parts if not installed(module)]
+    return f"not installed: {', '.join(absent)}; pip install {' '.join(absent)}" if absent else ""
 
 
 def installed(module: str) -> bool:

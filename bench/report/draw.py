@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
@@ -16,7 +15,7 @@ import pandas as pd
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import LogNorm, Normalize, to_hex, to_rgb
+from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
@@ -54,7 +53,6 @@ MANY = 12
 
 def draw(chart: Chart, width: float | None = None) -> Figure:
     """Return the chart as a figure of a width in inches: by default two columns of a paper, or one for a single panel."""
-    chart = replace(chart, frame=chart.drawn(), chosen=())
     panels = [(str(name), part) for name, part in chart.frame.groupby(chart.panel, sort=False)] if chart.panel else []
     panels = panels or [("", chart.frame)]
     is_plot = chart.kind in ("lines", "points")
@@ -188,7 +186,7 @@ def _grey(chart: Chart) -> str:
 
 
 def _legend(chart: Chart, styles: dict[str, Style], width: float) -> list[Any]:
-    """Return the handles of the legend: series or levels, shapes, the front, and named values and ranges of the axes."""
+    """Return the handles of the legend: series or levels, the front, and named values and ranges of the axes."""
     labels = {name: _wrapped(style.meaning or name, width - 0.6) for name, style in styles.items() if name}
     handles: list[Any] = []
     if chart.kind == "grid":
@@ -200,23 +198,15 @@ def _legend(chart: Chart, styles: dict[str, Style], width: float) -> list[Any]:
         bare = is_line and keys and chart.frame.groupby(keys).size().min() > MANY
         for name, label in labels.items():
             style = styles[name]
-            mark = "s" if chart.shape else "" if bare and style.line != "none" else style.marker
+            mark = "" if bare and style.line != "none" else style.marker
             line: Any = style.line if is_line else "none"
             handles.append(
                 Line2D([], [], color=style.colour, marker=mark, linestyle=line, linewidth=style.width, label=label)
             )
-    hollow: dict[str, Any] = {"color": GREY, "markerfacecolor": "none", "linestyle": "none"}
-    handles += [Line2D([], [], marker=mark, label=plain(name), **hollow) for name, mark in _shapes(chart).items()]
     handles += [Line2D([], [], label="Pareto front", **FRONT)] * chart.front
     ranges = dict.fromkeys(mark.name for mark in chart.marks if mark.to is not None)
     handles += [Line2D([], [], label=plain(name), **look) for name, look in _mark_looks(chart).items() if name]
     return handles + [Patch(label=plain(name), **BAND) for name in ranges]
-
-
-def _shapes(chart: Chart) -> dict[str, str]:
-    """Return a marker for each value of the column of shapes."""
-    names = dict.fromkeys(chart.frame[chart.shape].astype(str)) if chart.shape else {}
-    return {name: MARKERS[i % len(MARKERS)] for i, name in enumerate(names)}
 
 
 def _legend_columns(labels: Sequence[str], width: float) -> int:
@@ -319,8 +309,7 @@ def _draw_marks(chart: Chart, panel: Axes, name: str) -> None:
 def _draw_lines(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str, Style]) -> None:
     x, y = chart.x[0], chart.y[0]
     log = _is_log(y, (part if chart.own_scales else chart.frame)[y.name])
-    keys = [key for key in dict.fromkeys((chart.series, chart.line, chart.shape)) if key]
-    shapes = _shapes(chart)
+    keys = [key for key in dict.fromkeys((chart.series, chart.line)) if key]
     for order, (key, points) in enumerate(part.groupby(keys, sort=False) if keys else [(("",), part)]):
         style = styles[str(key[0]) if chart.series else ""]
         is_line, is_number = chart.kind == "lines", pd.api.types.is_numeric_dtype(points[x.name])
@@ -328,7 +317,6 @@ def _draw_lines(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str,
         values, low, high, limit = _values(points, y, log)
         places = points[x.name].to_numpy()
         mark = style.marker if not is_line or len(points) <= MANY or style.line == "none" else ""
-        mark = shapes[str(points[chart.shape].iloc[0])] if chart.shape else mark
         common: dict[str, Any] = {"color": style.colour, "zorder": 3 + 0.01 * order}
         panel.plot(places, values, linestyle=style.line if is_line else "none", linewidth=style.width, **common)
         if mark:
@@ -415,7 +403,7 @@ def _draw_grid(
     size = min(SIZE - 1, 0.8 * 72 * room, SIZE * 0.92 * room / max(widest, 0.1))
     for line in part.to_dict("records"):
         at = names.index(_category(line[x.name])), place[_category(line[y.name])]
-        face = styles[str(line[chart.level])].colour if chart.level else _shade(chart, float(line[chart.value]))
+        face = styles[str(line[chart.level])].colour if chart.level else _shade(float(line[chart.shade]))
         panel.add_patch(Rectangle((at[0] - 0.5, at[1] - 0.5), 1, 1, facecolor=face, edgecolor="white", linewidth=0.8))
         text = plain(str(line[chart.cell])) if chart.cell else ""
         panel.text(*at, text, ha="center", va="center", color=ink_on(face), fontsize=size)
@@ -452,15 +440,9 @@ def _categories(column: Column, rows: pd.DataFrame, downwards: bool = False) -> 
     return list(map(str, values))
 
 
-def _shade(chart: Chart, value: float) -> str:
-    """Return the colour of a cell by its number: darker is larger."""
-    if not math.isfinite(value):
-        return "#f0f0f0"
-    values = chart.frame[chart.value]
-    values = values[np.isfinite(values)]
-    lowest, highest = chart.value_range or (values.min(), values.max())
-    kind = LogNorm if chart.value_range or is_logarithmic(values) else Normalize
-    return to_hex(colormaps["YlOrBr"](0.08 + 0.84 * float(kind(lowest, highest, clip=True)(value))))
+def _shade(share: float) -> str:
+    """Return the colour of a cell by a number from 0 to 1: darker is larger."""
+    return to_hex(colormaps["YlOrBr"](0.08 + 0.84 * share)) if math.isfinite(share) else "#f0f0f0"
 
 
 def ink_on(ground: str) -> str:

@@ -220,10 +220,10 @@ def rmse_interval(row: Any) -> tuple[Any, Any]:
     return low, high
 
 
-def bias_text(row: Any, norm: float = 1.0, interval: bool = True) -> str:
+def bias_text(row: Any, norm: float = 1.0) -> str:
     """Format a bias divided by a norm: ``0.500 [0.400, 0.600]``, or ``0 (< 0.124)`` if not distinguishable from 0."""
     value, low, high = (row[c] / norm if norm > 0 else math.nan for c in ("bias", "bias_low", "bias_high"))
     if not low > 0 and math.isfinite(high):
         return f"0 (< {number(high, 3)})" if high > 0 else "0"
     text = number(value, 3)
-    return f"{text} [{number(low, 3)}, {number(high, 3)}]" if interval and math.isfinite(low + high) else text
+    return f"{text} [{number(low, 3)}, {number(high, 3)}]" if math.isfinite(low + high) else text

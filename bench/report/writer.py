@@ -53,7 +53,7 @@ def drawings(experiment: Experiment, views: Views) -> list[tuple[Chart, Figure]]
 
 def _is_telling(chart: Chart) -> bool:
     """Return whether at least :data:`LEAST` points are drawn, and lines have as many places along a numeric axis."""
-    frame, x = chart.drawn(), chart.x[0].name
+    frame, x = chart.frame, chart.x[0].name
     is_line = chart.kind == "lines" and pd.api.types.is_numeric_dtype(frame[x])
     return len(frame) >= LEAST and (not is_line or frame[x].nunique() >= LEAST)
 

@@ -37,7 +37,7 @@ TICK = 0.05
 CHILDREN_S = 1.0
 """Seconds between searches for the processes that a worker has started, whose memory counts as the worker's."""
 BATCH_S = 0.05
-"""Seconds for which the answers of quick items are gathered, to be stored in one file."""
+"""Seconds for which the answers of quick items are gathered, to be stored in one file: syncing takes longer than a small cell."""
 STEAL_S = 5.0
 """Seconds of queued work above which an idle worker takes half of a queue, although it has to compile again."""
 START_S = 60.0

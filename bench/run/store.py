@@ -150,9 +150,7 @@ class Store:
         self._refuse_other_studies(table["study"])
         sequence = table["sequence"].where(table["sequence"].between(0, MAX_SEQUENCE), 0.0)
         self._sequence = max(self._sequence, int(sequence.max()))
-        # rows of older versions have no sequence: the clock orders them, and any row with a sequence is newer
-        age = table.assign(sequence=sequence)[["sequence", "stored_at"]]
-        newest_last = age.sort_values(["sequence", "stored_at"], kind="stable", na_position="first").index
+        newest_last = sequence.sort_values(kind="stable").index
         is_older = table["key"].loc[newest_last].duplicated(keep="last").sort_index()
         return table[~is_older].reset_index(drop=True) if is_older.any() else table
 

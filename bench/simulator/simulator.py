@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import io
-import sys
 from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout
+from functools import partial
 from importlib.util import find_spec
 from typing import Any
 
@@ -31,28 +31,6 @@ SIMPLE_BITS = 12
 """Costs with at most this many significant bits, such as 0.5, show nothing about the precision."""
 COMPARED = 10_000_000
 """Numbers of theta in all calls up to which each call is searched for changes of theta."""
-KEPT_LINES = 1000
-"""Most lines printed by the user's functions that are kept."""
-
-
-class Printed(io.TextIOBase):
-    """Collects what the user's functions print: the first lines, and the number of lines."""
-
-    def __init__(self) -> None:
-        self.lines: list[str] = []
-        self.count = 0
-        self._partial = ""
-
-    def write(self, text: str) -> int:
-        """Collect text."""
-        *whole, self._partial = (self._partial + text).split("\n")
-        self.count += len(whole)
-        self.lines += whole[: KEPT_LINES - len(self.lines)]
-        return len(text)
-
-    def isatty(self) -> bool:
-        """Return False."""
-        return False
 
 
 class Simulator:
@@ -95,7 +73,7 @@ class Simulator:
         """Number of gradient calls that raised an exception."""
         self.precision = "float64"
         """Floating-point type of the cost: its own, or float32 where all its values have single precision."""
-        self.printed = Printed()
+        self.printed = io.StringIO()
         """What cost and gradient print."""
         self.first_value = float("nan")
         """The cost at theta, from the first call, with w = 0."""
@@ -124,8 +102,6 @@ class Simulator:
             is_compared = is_compared and self.clock.used * self.layout.vector.size < COMPARED
             before = numbers(theta).copy() if is_compared else None
             try:
-                if sys.stdout is self.printed:
-                    return function(theta, *arguments, **settings)
                 with redirect_stdout(self.printed), redirect_stderr(self.printed):
                     return function(theta, *arguments, **settings)
             except SystemExit as error:
@@ -298,10 +274,9 @@ class Simulator:
                 value = self._by_jax("cost", "loop", *parts)
             self.clock.count("costs", 1, 0.0, warm=False)
             return as_numpy(value)
-        vector, *own_noise = (self._array(part[:, 0]) for part in parts)
         try:
             with self.clock.interrupt_when_over(first=True):
-                value = self._cost(self._build_theta(vector), *own_noise)
+                (value,) = self._each(self._cost, *parts)
         except RuntimeError as error:
             if self.library != "torch" or "dtype" not in str(error) or not self._double:
                 raise
@@ -354,7 +329,7 @@ class Simulator:
         self._batch_error = ""
         try:
             with self.clock.interrupt_when_over(first=True):
-                costs = as_numpy(self._call_batch(batch, *map(self._array, self._repeated(count))))
+                costs = as_numpy(self._whole(self._cost, batch, *map(self._array, self._repeated(count))))
         except Exception as error:
             self._batch_error = failure(error)["reason"]
             return False
@@ -367,8 +342,14 @@ class Simulator:
         self._check_cost(costs)
         return True
 
-    def _call_batch(self, batch: str, *parts: Any) -> Any:
-        return self._cost(*(part.T if batch == "rows" else part for part in parts))
+    def _whole(self, function: Callable[..., Any], batch: str, *parts: Any) -> Any:
+        """Return a user's function of a batch of arrays with one sample per column."""
+        return function(*(part.T if batch == "rows" else part for part in parts))
+
+    def _each(self, function: Callable[..., Any], *parts: np.ndarray) -> list[Any]:
+        """Return a user's function of each column of arrays."""
+        columns = ([self._array(part[:, i]) for part in parts] for i in range(parts[0].shape[1]))
+        return [function(self._build_theta(vector), *own_noise) for vector, *own_noise in columns]
 
     # ------------------------------------------------------------------------------------------- values
 
@@ -381,19 +362,15 @@ class Simulator:
             with torch.no_grad():
                 return as_numpy(self._torch_values(*map(self._array, (thetas, *w))))
         if self.batch == "loop":
-            calls = (
-                self._cost(self._build_theta(thetas[:, i]), *(part[:, i].copy() for part in w))
-                for i in range(thetas.shape[1])
-            )
-            return [float(as_numpy(cost).ravel()[0]) for cost in calls]
-        return as_numpy(self._call_batch(self.batch, *(part.copy() for part in (thetas, *w))))
+            return [float(as_numpy(cost).ravel()[0]) for cost in self._each(self._cost, thetas, *w)]
+        return as_numpy(self._whole(self._cost, self.batch, *map(self._array, (thetas, *w))))
 
     def _torch_values(self, thetas: Any, *w: Any) -> Any:
         """Return the costs as a tensor ``(B,)`` that is attached to the autograd graph."""
         import torch
 
         if self.batch in ("columns", "rows"):
-            return self._call_batch(self.batch, thetas, *w)
+            return self._whole(self._cost, self.batch, thetas, *w)
         if self.batch == "vmap":
             return torch.func.vmap(
                 lambda vector, *rest: self._cost(self._build_theta(vector), *rest).reshape(()),
@@ -418,7 +395,7 @@ class Simulator:
 
         if batch == "loop":
             return {"cost": raw, "gradient": jax.grad(one)}
-        whole = jax.vmap(one, in_axes=1) if batch == "vmap" else lambda *parts: self._call_batch(batch, *parts)
+        whole = jax.vmap(one, in_axes=1) if batch == "vmap" else partial(self._whole, self._cost, batch)
         return {"cost": whole, "gradient": jax.grad(lambda *parts: whole(*parts).sum())}
 
     def _by_jax(self, what: str, batch: str, *parts: np.ndarray) -> np.ndarray:
@@ -460,21 +437,14 @@ class Simulator:
     def _user_slopes(self, thetas: np.ndarray, *w: np.ndarray) -> np.ndarray:
         assert callable(self._grad)
         if self.batch in ("columns", "rows"):
-            arguments = map(self._array, (thetas, *w))
-            gradients = as_numpy(self._grad(*(part.T if self.batch == "rows" else part for part in arguments)))
+            gradients = as_numpy(self._whole(self._grad, self.batch, *map(self._array, (thetas, *w))))
             gradients = gradients.T if self.batch == "rows" else gradients
             if gradients.shape != thetas.shape:
                 raise UserError(
                     f"the gradient of {thetas.shape[1]} thetas has shape {gradients.shape}, not {thetas.shape}"
                 )
             return gradients
-        columns = [
-            self.layout.flatten(
-                self._grad(self._build_theta(self._array(thetas[:, i])), *(self._array(part[:, i]) for part in w))
-            )
-            for i in range(thetas.shape[1])
-        ]
-        return np.stack(columns, axis=1)
+        return np.stack([self.layout.flatten(each) for each in self._each(self._grad, thetas, *w)], axis=1)
 
 
 def _parse_batch(batch: str | int | None) -> tuple[str | None, int]:

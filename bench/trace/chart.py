@@ -12,8 +12,8 @@ from bench.experiment.columns import Column
 from bench.experiment.views import Chart, Mark, Style
 from bench.report.draw import draw
 from bench.report.figures import save, styled
+from bench.report.text import number
 from bench.run.files import make_directory, write_whole
-from bench.trace.sentences import three_digits
 from bench.trace.spikes import MEASURES, align, spikes
 from bench.trace.trace import Trace
 
@@ -67,7 +67,7 @@ def chart(trace: Trace) -> Chart:
                     f"{found.near} of {found.spikes} spikes at a switch, {found.chance:.0%} by chance, p = {found.p_value:.1g}"
                 )
         elif title == "cost":
-            notes[title] = f"sum {three_digits(table[['cost_stage', 'cost_terminal']].sum().sum())}"
+            notes[title] = f"sum {number(table[['cost_stage', 'cost_terminal']].sum().sum(), 3)}"
     frame = pd.concat(parts, ignore_index=True)
     frame["value"] = frame["value"].where(frame["value"].abs() < DRAWN)
     time = table["time"].to_numpy()

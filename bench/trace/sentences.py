@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 
+from bench.report.text import number
 from bench.trace.contacts import TOUCHES
 from bench.trace.spikes import LEVEL, MEASURES, Alignment, align, changes, spikes
 
@@ -20,7 +21,11 @@ def report(table: pd.DataFrame, gradient_error: float) -> list[str]:
         "largest penetration [m]": table["penetration"].max(), "largest force [N]": table["force"].max(),
         "relative error of the adjoints' gradient": gradient_error, "contact switches": len(switches),
     }  # fmt: skip
-    values = [f"{name} {three_digits(value)}" for name, value in facts.items() if np.isfinite(value)]
+    values = [
+        f"{name} {value if isinstance(value, int) else number(value, 3)}"
+        for name, value in facts.items()
+        if np.isfinite(value)
+    ]
     touches = [
         f"{name.removeprefix(TOUCHES)} {table[name].sum()}"
         for name in table
@@ -43,7 +48,9 @@ def verdict(table: pd.DataFrame) -> list[str]:
             align(table[name], table["switch"]),
             changes(table[name]),
         )
-        facts = f"{three_digits(norms.min())} to {three_digits(norms.max())}; at most {three_digits(np.exp(sizes.max()))}x per step"
+        facts = (
+            f"{number(norms.min(), 3)} to {number(norms.max(), 3)}; at most {number(np.exp(sizes.max()), 3)}x per step"
+        )
         if found.spikes:
             at = sorted(np.flatnonzero(spikes(table[name])), key=lambda k: -sizes[k])
             facts += (
@@ -61,12 +68,3 @@ def conclusion(alignment: Alignment, switches: int) -> str:
     if alignment.near == 0:
         return "spikes do not line up with contact switches"
     return "spikes line up with contact switches" if alignment.p_value <= LEVEL else "open: chance could explain it"
-
-
-def three_digits(value: float) -> str:
-    """Return a number as text with three digits, and an exponent only where necessary.
-
-    >>> three_digits(0.0126), three_digits(1900.0), three_digits(2.5e7)
-    ('0.0126', '1,900', '2.5e+07')
-    """
-    return f"{value:,.0f}" if 1e3 <= abs(value) < 1e6 else f"{value:.3g}"

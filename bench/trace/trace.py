@@ -6,6 +6,7 @@ largest changes of |dF/dx| or |dL/dx| coincide with steps at which a contact is 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,11 +20,22 @@ from bench.experiment.grid import cells
 from bench.experiment.reference_backends import backends_with_jacobians
 from bench.measure import noise
 from bench.measure.contacts import split
-from bench.model import Jacobians, LoopOps, MechanicalScene, Problem, Program, Unsupported, rollout
+from bench.model import (
+    Jacobians,
+    LoopOps,
+    MechanicalScene,
+    Problem,
+    Program,
+    Slopes,
+    Unsupported,
+    by_actions,
+    by_theta,
+    rollout,
+    slopes_along,
+)
 from bench.model.identity import label
 from bench.run.session import Session
 from bench.trace import sentences
-from bench.trace.adjoints import adjoints
 from bench.trace.contacts import contact_columns
 
 COLUMNS = (
@@ -46,7 +58,10 @@ class Trace:
     table: pd.DataFrame
     """``horizon + 1`` rows, one per state; NaN where a quantity does not exist, such as |dF/dx| at the last state."""
     gradient_error: float
-    """|adjoints' gradient - program's gradient| / |program's gradient|; absolute if the program's gradient is 0."""
+    """|adjoints' gradient - program's gradient| / |program's gradient|; absolute if the program's gradient is 0.
+
+    NaN where theta names parameters of the scene.
+    """
 
     def report(self) -> list[str]:
         """Describe the trace in sentences."""
@@ -117,11 +132,12 @@ def trace(problem: Problem, w: np.ndarray) -> tuple[pd.DataFrame, float]:
     """
     program = rollout(problem.program)
     theta = program.theta0
-    path = Jacobians(*(part[..., 0] for part in problem.jacobians(theta, w)))
-    bound, *_ = program.resolved(LoopOps(), theta[:, None], w)
+    steps = problem.jacobians(theta, w)
+    path = Jacobians(*(part[..., 0] for part in steps))
+    bound, own, noise_left = program.resolved(LoopOps(), theta[:, None], w)
     scene = bound.scene
     with np.errstate(all="ignore"):
-        adjoint, gradient = adjoints(program, theta, w, path)
+        adjoint, gradient_error = _adjoints(problem, slopes_along(bound, steps, own, noise_left), w)
         columns = {**contact_columns(problem, bound, path), **_costs(scene, path)}
         columns["jacobian_norm"] = per_state(_norms(path.a))
         columns["adjoint_norm"] = np.linalg.norm(adjoint, axis=1)
@@ -132,7 +148,7 @@ def trace(problem: Problem, w: np.ndarray) -> tuple[pd.DataFrame, float]:
     states |= {f"v{i + 1}": path.states[:, scene.n_q + i] for i in range(path.states.shape[1] - scene.n_q)}
     controls = {f"u{i + 1}": per_state(path.controls[:, i]) for i in range(scene.n_u)}
     table = pd.DataFrame({name: columns[name] for name in [*COLUMNS, *extra]} | states | controls)
-    return table, _gradient_error(gradient, problem.grad(theta, w)[:, 0])
+    return table, gradient_error
 
 
 def per_state(values: Any) -> np.ndarray:
@@ -140,9 +156,20 @@ def per_state(values: Any) -> np.ndarray:
     return np.append(np.asarray(values, dtype=np.float64), np.nan)
 
 
-def _gradient_error(gradient: np.ndarray, expected: np.ndarray) -> float:
-    scale = float(np.linalg.norm(expected))
-    return float(np.linalg.norm(gradient - expected)) / (scale or 1.0)
+def _adjoints(problem: Problem, path: Slopes, w: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return the adjoints dL/dx_k, ``(T + 1, k)``, and the error of the gradient that follows from them."""
+    kept = list(path.cost_x)
+
+    def keep(t: int, state: np.ndarray, adjoint: np.ndarray) -> np.ndarray:
+        kept[t] = adjoint
+        return adjoint
+
+    by_control, kept[0] = by_actions(path, keep)
+    adjoint = np.stack(kept)[..., 0]
+    if problem.program.decision.names:  # theta moves the steps themselves, beside their states
+        return adjoint, math.nan
+    gradient, expected = by_theta(problem, path, by_control, kept[0]), problem.grad(problem.program.theta0, w)
+    return adjoint, float(np.linalg.norm(gradient - expected)) / (float(np.linalg.norm(expected)) or 1.0)
 
 
 def _norms(matrices: np.ndarray) -> np.ndarray:

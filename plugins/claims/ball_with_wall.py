@@ -8,11 +8,16 @@ import numpy as np
 from scipy.optimize import bisect, brentq
 
 from bench.claims import Claim, Figure, Outcome
-from bench.claims.toolkit import centre, descend, estimator, function, moments, problem, rule, stochastic_descent
+from bench.claims.toolkit import centre, descend, estimator, function, means, moments, problem, rule, stochastic_descent
 from bench.model import Array, Problem
 
 GRAVITY, WALL, HEIGHT, SIGMA = 9.81, 0.06, 0.02, 0.1
 RUNS = 60
+EDGES = (
+    ("first jump", "0.69320", 0.6832, 0.7032), ("second jump", "1.19935", 1.18935, 1.20935),
+    ("first kink", "0.31467", 0.25, 0.4), ("second kink", "1.25613", 1.21, 1.4),
+)  # fmt: skip
+"""Angles at which the ball begins or ceases to stop at the wall, as published, each with a range around it."""
 
 
 def ball_with_wall(xp: Any, x: Array) -> Array:
@@ -43,8 +48,7 @@ class ThrownBall(Claim):
         "A jump hides the way on from a first-order gradient. And read a method's settings: a fixed accuracy far below what "
         "the samples can resolve turns alpha-order into the zeroth order."
     )
-    labels = ("angle [rad]", "gradient of the smoothed cost")
-    curves = {"truth": "true", "first": "first-order mean"}
+    quantity = "gradient of the smoothed cost"
     marks = (("y", 0.0, ""),)
     quick = False
 
@@ -52,28 +56,21 @@ class ThrownBall(Claim):
         """Locate the jumps and kinks, integrate the gradients, and run the descents."""
         at, orders = problem(SCENE), (estimator("fobg"), estimator("reinforce[baseline=none]"))
 
-        def f(x: float) -> float:
-            return float(at.value(np.array([x]), np.zeros((1, 1)))[0])
+        def is_stopped(x: float) -> bool:
+            cost = at.value(np.array([x]), np.zeros((1, 1)))[0]
+            return bool(abs(cost + WALL * WALL) < 1e-12)
 
-        def jump(guess: float) -> float:
-            low, high = guess - 0.01, guess + 0.01
-            return float(bisect(lambda x: f(x) - (f(low) + f(high)) / 2, low, high, xtol=1e-9))
-
-        def kink(low: float, high: float) -> float:
-            """Return where f stops, or begins, to equal its value at the wall."""
-            return float(bisect(lambda x: (abs(f(x) + WALL * WALL) < 1e-12) - 0.5, low, high, xtol=1e-9))
-
-        def mean(order: int, x: float, count: int = 200_000) -> tuple[float, float]:
-            return moments(at, orders[order], x, count)[0]
+        def mean(order: int, x: float) -> tuple[float, float]:
+            return moments(at, orders[order], x, 200_000)[0]
 
         lowest = brentq(lambda x: mean(1, x)[0], 0.8, 0.93, xtol=1e-7)
         false_zero = brentq(lambda x: mean(0, x)[0], 0.69, 0.78, xtol=1e-6)
         figures = [
             # positions are published to one unit of their last digit: the second jump is at 1.199344
-            Figure("first jump", "0.69320", jump(0.69320), spread=1e-5),
-            Figure("second jump", "1.19935", jump(1.19935), spread=1e-5),
-            Figure("first kink", "0.31467", kink(0.25, 0.4), spread=1e-5),
-            Figure("second kink", "1.25613", kink(1.21, 1.4), spread=1e-5),
+            *(
+                Figure(what, text, float(bisect(lambda x: is_stopped(x) - 0.5, *ends, xtol=1e-9)), spread=1e-5)
+                for what, text, *ends in EDGES
+            ),
             Figure("lowest point of the smoothed cost", "0.861466", lowest, 1e-6),
             Figure("false zero of the first-order mean", "0.73", false_zero),
         ]
@@ -107,8 +104,8 @@ class ThrownBall(Claim):
                 f"gradient ends at {exact[-1]:.4f}, and passes 0.8331 after {late} of the 1,000 steps, still moving: a few "
                 "steps fewer would explain the difference"
             ),
-            series={"x": grid}
-            | {name: [mean(i, x, 20_000)[0] for x in grid] for i, name in enumerate(("first", "truth"))},
+            series={"angle [rad]": grid}
+            | {name: means(at, orders[i], grid, 20_000) for i, name in ((1, "true"), (0, "first-order mean"))},
         )
 
 

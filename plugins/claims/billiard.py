@@ -23,8 +23,7 @@ class Missed(Claim):
     learned = (
         "A surrogate gradient sees what was missed and keeps the motion, but it is not the derivative of the program."
     )
-    labels = ("force across u0 [N]", "df / du0")
-    curves = {"truth": "true", "plain": "plain", "surrogate": "surrogate"}
+    quantity = "df / du0"
     quick = False
 
     def measure(self) -> Outcome:
@@ -60,7 +59,7 @@ class Missed(Claim):
                 f"{bias['surrogate']:.0%} of the true gradient's root mean square, the plain one's by {bias['plain']:.1%}; "
                 f"beyond |u0| = 2.6, where the true gradient is 0, it pushes at {pushes:.0%} of the forces"
             ),
-            series={name: values[::8] for name, values in {"u": wide[inside], "truth": truth, **means}.items()},
+            series={name: v[::8] for name, v in {"force across u0 [N]": wide[inside], "true": truth, **means}.items()},
         )
 
 

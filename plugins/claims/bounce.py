@@ -29,27 +29,26 @@ class TimeOfImpact(Claim):
     learned = (
         "A motion that is right to first order can have a derivative of the wrong sign, and refining does not help."
     )
-    labels = ("initial height [m]", "final height [m]")
-    curves = {"with": "with time of impact: slope -1", "without": "without: slope +1 on every tooth"}
+    quantity = "final height [m]"
 
     def measure(self) -> Outcome:
         """Differentiate both programs away from the boundary between steps, and around the source's start."""
         still = np.zeros((3, 1))
         step = 1 / 480
         heights = np.linspace(1 - 4 * step, 1 + 8 * step, 97)
-        figures, series = [], {"height": heights}
+        figures, series = [], {"initial height [m]": heights}
         cases = (
-            ("with", "impulse", ("-1.000", "-1.000", "-0.0021")),
-            ("without", "impulse[time_of_impact=false]", ("1.000", "-0.09583", "-0.0002")),
+            ("with", " time of impact: slope -1", "impulse", ("-1.000", "-1.000", "-0.0021")),
+            ("without", ": slope +1 on every tooth", "impulse[time_of_impact=false]", ("1.000", "-0.09583", "-0.0002")),
         )
-        for name, law, exact in cases:
+        for name, more, law, exact in cases:
             at = problem("bounce_once", law)
             # 1 + 1/480 is half way between two boundaries; a start 2/480 m higher meets the ground one step later
             off, late = (at.grad(_starts(1 + n * step), still)[:, 0] for n in (1, 3))
             figures += [
                 Figure(f"{part}, {name}", text, float(x)) for part, text, x in zip(NAMES, exact, late, strict=True)
             ]
-            series[name] = at.value(_starts(heights), np.zeros((3, heights.size)))
+            series[name + more] = at.value(_starts(heights), np.zeros((3, heights.size)))
         return Outcome(
             figures,
             reservation=(
@@ -69,23 +68,23 @@ class PenaltyPhase(Claim):
     statement = "A penalty bounce's gradient error grows with stiffness, and falls a hundredfold with the step."
     source = f"{SOURCE}; recomputed over 256 phases"
     learned = "What counts is stiffness times squared step: how many steps a contact lasts."
-    labels = ("stiffness [N/m]", "RMS of df/dy0 + 1")
+    quantity = "RMS of df/dy0 + 1"
     logarithmic = "xy"
-    curves = {"480": "dt = 1/480 s", "48000": "dt = 1/48000 s"}
     quick = False
 
     def measure(self) -> Outcome:
         """Compute the root mean square error over 256 starts within the distance of one step."""
-        figures, series = [], {"k": [1e2, 1e3, 1e4, 1e5]}
+        stiffnesses = [1e2, 1e3, 1e4, 1e5]
+        figures, series = [], {"stiffness [N/m]": stiffnesses}
         coarse, fine = ("0.020", "0.439", "2.37", "55.5"), ("2.3e-4", "0.0046", "0.0199", "0.391")
         for parts, published in ((480, coarse), (48000, fine)):
             errors = []
             heights = 1.0 + 2.0 / parts * np.arange(256) / 256
-            for k, text in zip(series["k"], published, strict=True):
+            for k, text in zip(stiffnesses, published, strict=True):
                 scene = f"bounce_once[horizon={parts},dt={1 / parts!r}]"
                 at = problem(scene, f"penalty[stiffness={k!r}]", backend="jax[mode=forward]")
                 slope = at.grad(_starts(heights), np.zeros((3, 256)))[0]
                 errors.append(float(np.sqrt(np.mean((slope + 1) ** 2))))
                 figures.append(Figure(f"k = {k:g}, dt = 1/{parts}", text, errors[-1]))
-            series[str(parts)] = errors
+            series[f"dt = 1/{parts} s"] = errors
         return Outcome(figures, series=series)

@@ -33,8 +33,7 @@ class CentralPath(Claim):
     statement = "Relaxing complementarity by kappa equals smoothing by Student t noise of two degrees of freedom."
     source = "Suh, Pang, Tedrake 2022; Pang et al. 2023"
     learned = "Analytic smoothing and smoothing by noise are the same thing; only the analytic one has no variance."
-    labels = ("gap without force / sqrt(c)", "derivative of the gap after it")
-    curves = {"relaxed": "central path = t(2) noise", "gauss": "closest Gaussian"}
+    quantity = "derivative of the gap after it"
 
     def measure(self) -> Outcome:
         """Compare the relaxed derivative with the chance under that noise, and the kink's variances."""
@@ -62,4 +61,6 @@ class CentralPath(Claim):
             Figure("first-order sd at the kink, 500 samples", "0.02236", (first / 500) ** 0.5, first_error / 20),
             Figure("zeroth-order sd at the kink, 500 samples", "0.0500", (zeroth / 500) ** 0.5, zeroth_error / 20),
         ]
-        return Outcome(figures, series={"a": a[::8], "relaxed": relaxed[::8], "gauss": ndtr(a / closest.x)[::8]})
+        curves = {"central path = t(2) noise": relaxed, "closest Gaussian": ndtr(a / closest.x)}
+        series = {"gap without force / sqrt(c)": a} | curves
+        return Outcome(figures, series={name: values[::8] for name, values in series.items()})

@@ -29,12 +29,12 @@ class Damper(Claim):
     )
     source = "Zhong, Han, Brikis 2022, task 2; distances by an independent program"
     learned = "A stiff contact does not bias the first order; a force that jumps does, at any step."
-    labels = ("damper [N s/m], a thousandth of the stiffness", "distance of first from zeroth order")
-    curves = {str(steps): f"{steps} steps" for steps in DISTANCES}
+    quantity = "distance of first from zeroth order"
 
     def measure(self) -> Outcome:
         """Estimate both means with the same samples."""
-        figures, series = [], {"damper": [0.0, *(stiffness / 1e3 for stiffness in STIFFNESSES)]}
+        dampers = [0.0, *(stiffness / 1e3 for stiffness in STIFFNESSES)]
+        figures, series = [], {"damper [N s/m], a thousandth of the stiffness": dampers}
         for steps, published in DISTANCES.items():
             without = _distance(1e4, 0.0, steps)
             distances = [without[0]]
@@ -44,7 +44,7 @@ class Damper(Claim):
                 figures.append(Figure(label, text, distance, error, spread=SPREAD * float(text)))
                 distances.append(distance)
             figures.append(Figure(f"without a damper, {steps} steps", "0.00", *without))
-            series[str(steps)] = distances
+            series[f"{steps} steps"] = distances
         figures.append(Figure("a damper of 30", "9.16", *_distance(1e4, 30.0, 288), spread=SPREAD * 9.16))
         finer = _distance(1e4, 10.0, 2880)
         figures.append(Figure("a damper of 10, steps ten times finer", "3.36", *finer, spread=SPREAD * 3.36))

@@ -12,9 +12,8 @@ from bench.claims import Claim, Figure, Outcome
 from bench.claims.toolkit import exact_descent, native, plugin
 from bench.model import Array, MechanicalScene, State
 
-LABELS = {"with": "with time of impact", "without": "without", "penalty": "penalty"}
-LAWS = {"with": "impulse", "without": "impulse[time_of_impact=false]", "penalty": "penalty"}
-ITERATIONS = list(range(0, 1001, 20))
+LAWS = {"with time of impact": "impulse", "without": "impulse[time_of_impact=false]", "penalty": "penalty"}
+EVERY = {"iteration": list(range(0, 1001, 20))}
 SINGLE = 2 * 2.0**-24 * math.sqrt(288)
 """Relative rounding error of position and velocity over 288 steps in single precision, as in the published ends of C10."""
 FITTED = 1e4
@@ -25,11 +24,11 @@ STEPS, OPTIMUM = 480, 0.311417
 SHARE = 0.03
 """Relative difference allowed between the ends of C12: the source's programs are not described to the last operation."""
 CASES = {
-    "event": ("steps from the impact", "impulse", "event_driven", "0.31517"),
-    "time": ("time of impact only", "impulse", "semi_implicit_euler", "0.39494"),
-    "neither": ("neither", "impulse[time_of_impact=false]", "semi_implicit_euler", "0.36158"),
+    "steps from the impact": ("impulse", "event_driven", "0.31517"),
+    "time of impact only": ("impulse", "semi_implicit_euler", "0.39494"),
+    "neither": ("impulse[time_of_impact=false]", "semi_implicit_euler", "0.36158"),
 }
-"""Label, law, integrator and published end of C12 by case."""
+"""Law, integrator and published end of C12 by case."""
 
 
 class Throw(Claim):
@@ -45,24 +44,21 @@ class Throw(Claim):
     learned = (
         "A wrong gradient can still find a way, another one and a worse one; the forward law decides what is reachable."
     )
-    labels = ("iteration", "squared distance to the target [m^2]")
+    quantity = "squared distance to the target [m^2]"
     logarithmic = "y"
-    curves = LABELS
     quick = False
 
     def measure(self) -> Outcome:
         """Descend under three laws."""
-        published = {
-            "with": ("7.8e-5", "10.184146", "-4.160555"),
-            "without": ("0.00425", "-2.493337", "-4.298402"),
-            "penalty": ("7e-12", "10.638576", "-4.282096"),
-        }
+        published = (
+            ("7.8e-5", "10.184146", "-4.160555"), ("0.00425", "-2.493337", "-4.298402"), ("7e-12", "10.638576", "-4.282096")
+        )  # fmt: skip
         figures: list[Figure] = []
-        series: dict[str, Any] = {"iteration": ITERATIONS}
-        for name, (loss, *ends) in published.items():
-            at = native("ground_wall", LAWS[name])
-            end, series[name] = exact_descent(at, np.array([5.0, -5.0]), 0.01, 1000, 20)
-            figures.append(Figure(f"loss at the end, {name}", loss, float(series[name][-1])))
+        series: dict[str, Any] = dict(EVERY)
+        for (label, law), (loss, *ends) in zip(LAWS.items(), published, strict=True):
+            end, series[label] = exact_descent(native("ground_wall", law), np.array([5.0, -5.0]), 0.01, 1000, 20)
+            name = label.partition(" ")[0]
+            figures.append(Figure(f"loss at the end, {name}", loss, float(series[label][-1])))
             for part, text, x in zip(("vx", "vy"), ends, end, strict=True):
                 figures.append(Figure(f"{part} at the end, {name}", text, float(x), spread=SINGLE * np.abs(end).max()))
         return Outcome(figures, series=series)
@@ -79,18 +75,18 @@ class Collision(Claim):
     )
     source = "Zhong, Han, Brikis 2022, arXiv 2207.05060, task 3"
     learned = "With the wrong sign at the impact the optimiser learns not to touch: it gives up."
-    labels = ("iteration", "cost")
-    curves = LABELS
+    quantity = "cost"
     marks = (("y", 2.0, "doing nothing"),)
     quick = False
 
     def measure(self) -> Outcome:
         """Descend at rate 10 under each law."""
-        figures: list[Figure] = []
-        series: dict[str, Any] = {"iteration": ITERATIONS}
-        for name, loss in (("with", "1.395808"), ("without", "2.001432"), ("penalty", "1.6694")):
-            series[name] = _costs(LAWS[name] if name != "penalty" else f"penalty[stiffness={FITTED!r}]")
-            figures.append(Figure(f"cost at the end, {name}", loss, float(series[name][-1])))
+        laws = LAWS | {"penalty": f"penalty[stiffness={FITTED!r}]"}
+        series: dict[str, Any] = {label: _costs(law) for label, law in laws.items()}
+        figures = [
+            Figure(f"cost at the end, {label.partition(' ')[0]}", loss, float(series[label][-1]))
+            for label, loss in zip(LAWS, ("1.395808", "2.001432", "1.6694"), strict=True)
+        ]
         tried = {k: float(_costs(f"penalty[stiffness={k!r}]")[-1]) for k in TRIED}
         ends = ", ".join(f"{end:.4f} at {k:g}" for k, end in tried.items())
         last = series["penalty"][-5:]
@@ -102,7 +98,7 @@ class Collision(Claim):
                 f"At {FITTED:g} it does not settle: over the last 80 steps its cost is between {min(last):.3f} and {max(last):.3f}, "
                 "so that an end that agrees in four digits is hardly chance"
             ),
-            series=series | {"stiffness": list(tried), "end": list(tried.values())},
+            series=EVERY | series,
         )
 
 
@@ -143,9 +139,8 @@ class ObliqueCollision(Claim):
     )
     source = "Zhong, Han, Brikis 2023, arXiv 2305.00092"
     learned = "Where the normal turns with the place of impact, the right position with a wrong velocity is worse than neither."
-    labels = ("iteration", "cost")
+    quantity = "cost"
     logarithmic = "y"
-    curves = {name: label for name, (label, *_) in CASES.items()}
     marks = (("y", OPTIMUM, "optimum"),)
     quick = False
 
@@ -154,13 +149,18 @@ class ObliqueCollision(Claim):
         scene = oblique()
         figures: list[Figure] = []
         series: dict[str, Any] = {"iteration": list(range(0, 501, 10))}
-        for name, (label, law, integrator, end) in CASES.items():
+        for label, (law, integrator, end) in CASES.items():
             at = native(scene, law, integrator)
-            series[name] = costs = exact_descent(at, at.program.theta0, 200.0, 500, 10)[1]
+            series[label] = costs = exact_descent(at, at.program.theta0, 200.0, 500, 10)[1]
             figures.append(Figure(f"cost at the end, {label}", end, costs[-1], spread=SHARE * float(end)))
         # the optimum is a bound: within 3% of it, or 10% above it
         figures.append(
-            Figure("end over the optimum, steps from the impact", "1.012", series["event"][-1] / OPTIMUM, spread=0.018)
+            Figure(
+                "end over the optimum, steps from the impact",
+                "1.012",
+                series["steps from the impact"][-1] / OPTIMUM,
+                spread=0.018,
+            )
         )
         return Outcome(
             figures,

@@ -11,7 +11,8 @@ from bench.claims.toolkit import centre, estimator, problem
 
 D, REPEATS = 20, {20: 16_000, 100: 16_000, 400: 4000}
 """Number of variables, and of estimates per number of samples."""
-NAMES = {"gauss": "randomized_smoothing", "sphere": "sphere_smoothing"}
+NAMES = {"Gaussian: (n + 1)/N": "randomized_smoothing", "sphere: (n - 1)/N": "sphere_smoothing"}
+"""Estimators by their curve."""
 CHUNK = 2000
 """Number of estimates per batch."""
 
@@ -27,18 +28,14 @@ class Directions(Claim):
     )
     source = "Nesterov, Spokoiny 2017; Berahas et al. 2022"
     learned = "Zeroth order pays for dimension: it needs as many samples as variables to be 100% off."
-    labels = ("samples N", "relative squared error")
+    quantity = "relative squared error"
     logarithmic = "xy"
-    curves = {
-        "gauss": "Gaussian: (n + 1)/N",
-        "sphere": "sphere: (n - 1)/N",
-    }
     quick = False
 
     def measure(self) -> Outcome:
         """Sample estimates at two noise levels."""
         figures: list[Figure] = []
-        series: dict[str, list[Any]] = {"n": [20, 100, 400], "gauss": [], "sphere": []}
+        series: dict[str, list[Any]] = {"samples N": list(REPEATS), **{key: [] for key in NAMES}}
         draw = np.random.default_rng(7)
         for count, texts in ((20, ("1.05", "0.95")), (100, ("0.21", "0.19")), (400, ("0.0525", "0.0475"))):
             noise = [draw.standard_normal((CHUNK, count, D)) for _ in range(REPEATS[count] // CHUNK)]

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from bench.claims import Claim, Figure, Outcome
-from bench.claims.toolkit import estimator, function, moments, problem
+from bench.claims.toolkit import estimator, function, means, moments, problem
 from bench.model import Array
 
 
@@ -31,22 +31,19 @@ class Sticking(Claim):
     )
     source = "Le Lidec et al. 2023"
     learned = "An exact zero can be right and still of no use to an optimiser; noise looks past the edge of the cone."
-    labels = ("push F", "derivative of the acceleration")
-    curves = {"smooth": "smoothed, s = mu", "exact": "exact"}
+    quantity = "derivative of the acceleration"
 
     def measure(self) -> Outcome:
         """Compute the exact derivative, and integrate both orders over the noise."""
         at = problem(SCENE)
-        (first, first_error), _ = moments(at, estimator("fobg"))
-        (zeroth, zeroth_error), _ = moments(at, estimator("reinforce"))
         forces = np.linspace(-4, 4, 41)
         exact = at.grad(forces[None], np.zeros((1, forces.size)))[0]
-        smooth = [moments(at, estimator("fobg"), f, 20_000)[0][0] for f in forces]
+        smooth = means(at, estimator("fobg"), forces, 20_000)
         formula = ndtr(forces - 1) + ndtr(-forces - 1)
         figures = [
             Figure("exact derivative at rest", "0.0", float(exact[20])),
-            Figure("smoothed, first order", "0.3173", first, first_error),
-            Figure("smoothed, zeroth order", "0.3173", zeroth, zeroth_error),
+            Figure("smoothed, first order", "0.3173", *moments(at, estimator("fobg"))[0]),
+            Figure("smoothed, zeroth order", "0.3173", *moments(at, estimator("reinforce"))[0]),
             Figure(
                 "largest difference from the formula, F from -4 to 4",
                 "0.0",
@@ -54,4 +51,4 @@ class Sticking(Claim):
                 spread=2e-3,
             ),
         ]
-        return Outcome(figures, series={"force": forces, "smooth": smooth, "exact": exact})
+        return Outcome(figures, series={"push F": forces, "smoothed, s = mu": smooth, "exact": exact})

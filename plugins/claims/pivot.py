@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from bench.claims import Claim, Figure, Outcome
-from bench.claims.toolkit import centre, estimator, function, moments, problem, stochastic_descent
+from bench.claims.toolkit import centre, estimator, function, means, moments, problem, stochastic_descent
 from bench.model import Array
 
 SIGMA = 0.02
@@ -31,20 +31,15 @@ class FallingPivot(Claim):
     statement = "A first-order descent towards the best angle of a pivot walks over its edge; a zeroth-order one stops in front."
     source = "Suh et al. 2022, ICML"
     learned = "Near the edge the first-order gradient misses exactly the part that warns: the jump times its density."
-    labels = ("angle [rad]", "mean gradient")
-    curves = {"truth": "true", "first": "first-order mean"}
+    quantity = "mean gradient"
     marks = (("x", math.pi / 4, "edge"),)
 
     def measure(self) -> Outcome:
         """Integrate the missing part, and descend."""
         at, orders = problem(SCENE), (estimator("fobg"), estimator("reinforce[baseline=none]"))
-
-        def means(x: float, count: int = 200_000) -> list[tuple[float, float]]:
-            return [moments(at, order, x, count)[0] for order in orders]
-
         figures = []
         for text, x, label in (("-0.7586", 0.74, "0.74"), ("-4.453", 0.76, "0.76"), ("-9.974", math.pi / 4, "pi/4")):
-            (first, error), (truth, truth_error) = means(x)
+            (first, error), (truth, truth_error) = (moments(at, order, x, 200_000)[0] for order in orders)
             figures.append(
                 Figure(f"first-order mean less the gradient at {label}", text, first - truth, error + truth_error)
             )
@@ -56,5 +51,5 @@ class FallingPivot(Claim):
             Figure("end of the zeroth-order descent", "0.74", *centre(stopped), spread=0.02),
         ]
         grid = np.linspace(0.6, 0.9, 61)
-        first, truth = np.array([means(x, 20_000) for x in grid])[:, :, 0].T
-        return Outcome(figures, series={"x": grid, "first": first, "truth": truth})
+        low, true = (means(at, order, grid, 20_000) for order in orders)
+        return Outcome(figures, series={"angle [rad]": grid, "true": true, "first-order mean": low})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,14 +14,15 @@ from bench.model import Problem
 
 SMOOTHED, COARSE, FINE = 20_000, 20_000, 4096
 """Samples of each variance."""
+CURVES = ("first order, step 5 ms", "step 0.25 ms, first order", "zeroth order")
 TAILS = 0.25
 """Relative error of a variance of 1,000 samples above which a few samples dominate it."""
 
 
-def sampled(at: Problem, count: int, seed: int) -> list[tuple[float, float]]:
-    """Return the variances of first- and zeroth-order terms, each with its standard error."""
+def sampled(at: Problem, count: int, seed: int, batches: int = 20) -> Iterator[tuple[float, float]]:
+    """Yield the variances of first- and zeroth-order terms, each with its standard error."""
     w = np.random.default_rng(seed).standard_normal((at.program.n_noise, count))
-    return [spread(terms(at, estimator(name), w), 20) for name in ("fobg", "reinforce")]
+    return (spread(terms(at, estimator(name), w), batches) for name in ("fobg", "reinforce"))
 
 
 def source_error(values: tuple[float, float], count: int) -> float:
@@ -42,9 +44,8 @@ class SmoothedPush(Claim):
     )
     source = "Suh et al. 2022, ICML"
     learned = "Smooth contact until its width is that of a sample's motion: then the first order is far better."
-    labels = ("sharpness beta [1/m]", "variance of one sample")
+    quantity = "variance of one sample"
     logarithmic = "xy"
-    curves = {"first": "first order", "zeroth": "zeroth order"}
     quick = False
 
     def measure(self) -> Outcome:
@@ -53,15 +54,14 @@ class SmoothedPush(Claim):
             "1e2": ("10.82", "2970"), "1.27e4": ("10.77", "2959"), "2.8e4": ("15.99", "2967"), "6.4e4": ("3.9e5", "2368")
         }  # fmt: skip
         figures: list[Figure] = []
-        series: dict[str, list[Any]] = {"beta": [float(beta) for beta in published], "first": [], "zeroth": []}
+        variances = []
         for beta, (first, zeroth) in published.items():
             at = problem("pushing[sigma=0.3]", f"softplus[stiffness=1e5,beta={float(beta)!r}]")
             one, none = sampled(at, SMOOTHED, 16)
-            series["first"].append(one)
-            series["zeroth"].append(none)
+            variances.append((one, none))
             figures.append(Figure(f"zeroth order, beta = {beta}", zeroth, *none, spread=source_error(none, SMOOTHED)))
             if beta == "6.4e4":
-                seeds = [sampled(at, 1000, seed)[0][0] for seed in range(12)]
+                seeds = [next(sampled(at, 1000, seed))[0] for seed in range(12)]
                 what = f"first order, beta = {beta}, median of 12 seeds of 1,000"
                 figures.append(Figure(what, first, float(np.median(seeds)), factor=30.0))
             else:
@@ -73,7 +73,7 @@ class SmoothedPush(Claim):
                 f"at the hard end the first order's variance is that of a few samples: between {low:.1e} and {high:.1e} over "
                 "12 seeds of 1,000; and h^2 2 k / m = 50 there, beyond the step's stability limit of 3.2"
             ),
-            series=series,
+            series=_by_order("sharpness beta [1/m]", published, ("first order", "zeroth order"), variances),
         )
 
 
@@ -88,42 +88,39 @@ class StiffPush(Claim):
     )
     source = "Suh et al. 2022, ICML; recomputed with a finer step"
     learned = "Two to three of the decades at k = 1000 are the step's, not the contact's: refine before you smooth."
-    labels = ("stiffness [N/m]", "variance of one sample")
+    quantity = "variance of one sample"
     logarithmic = "xy"
-    curves = {
-        "coarse": "first order, step 5 ms",
-        "fine": "first order, step 0.25 ms",
-        "zeroth": "zeroth order",
-    }
     quick = False
 
     def measure(self) -> Outcome:
         """Sample with the published step, then with a step 20 times finer, each control held over 20 steps."""
         values = "velocity_factor=0.998,push=0.1,sigma=0.1"
-        finer = f"velocity_factor={0.998 ** (1 / 20)!r},push=0.1,sigma=0.1,horizon=4000,hold=20,dt=0.00025"
+        fine_values = f"velocity_factor={0.998 ** (1 / 20)!r},push=0.1,sigma=0.1,horizon=4000,hold=20,dt=0.00025"
         published = {10.0: ("46", "44"), 100.0: ("7e2", "6e2"), 300.0: ("4e4", "1e4"), 1000.0: ("1e10", "2e7")}
-        figures, finer_figures = [], []
-        series: dict[str, list[Any]] = {"k": list(published), "coarse": [], "fine": [], "zeroth": []}
+        figures, finer_figures, variances = [], [], []
         for k, (coarse, fine) in published.items():
             at = problem(f"pushing[{values},horizon=200,dt=0.005]", f"penalty[stiffness={k!r}]")
             one, none = sampled(at, COARSE, 17)
-            series["coarse"].append(one)
-            series["zeroth"].append(none)
             figures.append(_heavy(f"first order, k = {k:g}", coarse, one, COARSE))
             figures.append(Figure(f"zeroth order, k = {k:g}", "1.3e7", *none, spread=source_error(none, COARSE)))
-            at = problem(f"pushing[{finer}]", f"penalty[stiffness={k!r}]")
-            w = np.random.default_rng(171).standard_normal((200, FINE))
-            series["fine"].append(spread(terms(at, estimator("fobg"), w), 16))
-            finer_figures.append(_heavy(f"first order, k = {k:g}, step 20 times finer", fine, series["fine"][-1], FINE))
-        ratio = series["coarse"][-1][0] / series["fine"][-1][0]
+            at = problem(f"pushing[{fine_values}]", f"penalty[stiffness={k!r}]")
+            finer = next(sampled(at, FINE, 171, 16))
+            finer_figures.append(_heavy(f"first order, k = {k:g}, step 20 times finer", fine, finer, FINE))
+            variances.append((one, finer, none))
+        ratio = one[0] / finer[0]
         return Outcome(
             figures + finer_figures,
             reservation=(
                 f"at k = 1000 the variance falls {ratio:.0f}-fold when the step alone is refined, so {np.log10(ratio):.1f} of "
                 "its decades are the step's; both numbers there have tails that no seed settles, and are compared by a factor"
             ),
-            series=series,
+            series=_by_order("stiffness [N/m]", published, CURVES, variances),
         )
+
+
+def _by_order(name: str, places: Iterable[Any], curves: Sequence[str], variances: Sequence[Any]) -> dict[str, Any]:
+    """Return the series of a chart from the variances of all curves at each place."""
+    return {name: list(map(float, places)), **dict(zip(curves, zip(*variances, strict=True), strict=True))}
 
 
 def _heavy(what: str, text: str, values: tuple[float, float], count: int) -> Figure:

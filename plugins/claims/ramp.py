@@ -25,9 +25,8 @@ class Ramp(Claim):
     )
     source = "Suh et al. 2022, ICML"
     learned = "An unbiased gradient can be useless: in finite samples a steep ramp is a jump."
-    labels = ("width of the ramp / sigma", "variance of one sample")
+    quantity = "variance of one sample"
     logarithmic = "xy"
-    curves = {"first": "first order", "zeroth": "zeroth order"}
     marks = (("x", 1.517, "published crossing"),)
     quick = False
 
@@ -56,9 +55,9 @@ class Ramp(Claim):
         problems = [problem(f"soft_heaviside[nu={float(nu)!r},sigma={SIGMA}]") for nu in widths]
         curves = {
             name: [moments(one, order, count=40_000)[1][0] for one in problems]
-            for name, order in (("first", first), ("zeroth", zeroth))
+            for name, order in (("first order", first), ("zeroth order", zeroth))
         }
-        return Outcome(figures, series={"width": widths / SIGMA} | curves)
+        return Outcome(figures, series={"width of the ramp / sigma": widths / SIGMA} | curves)
 
 
 def _errors(at: Any, draw: np.random.Generator, count: int, expected: list[str]) -> list[Figure]:

@@ -26,9 +26,8 @@ class SoftWall(Claim):
     )
     source = "Paulus et al. 2025, arXiv 2506.14186, toy example"
     learned = "Before blaming contact, halve the time step and look again."
-    labels = ("time step [s]", "mean error of df/dq0")
+    quantity = "mean error of df/dq0"
     logarithmic = "xy"
-    curves = {"error": "penalty program"}
     marks = (("y", SPEED, "size of the gradient"),)
 
     def measure(self) -> Outcome:
@@ -50,7 +49,7 @@ class SoftWall(Claim):
                 f"meet the same few phases of the step again and again: 149 of them give {few:.3f} at a step of 0.02 s, where "
                 f"all phases give {errors[2]:.3f}"
             ),
-            series={"dt": list(PUBLISHED), "error": errors},
+            series={"time step [s]": list(PUBLISHED), "penalty program": errors},
         )
 
 

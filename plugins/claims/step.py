@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from bench.claims import Claim, Figure, Outcome
-from bench.claims.toolkit import estimator, moments, problem
+from bench.claims.toolkit import estimator, means, moments, problem
 
 
 class Step(Claim):
@@ -18,31 +18,32 @@ class Step(Claim):
     )
     source = "Suh et al. 2022, ICML"
     learned = "A gradient that repeats itself perfectly can be wholly wrong."
-    labels = ("theta", "mean gradient")
-    curves = {
-        "zeroth": "zeroth order: the slope",
-        "first": "first order: 0 everywhere",
-    }
+    quantity = "mean gradient"
 
     def measure(self) -> Outcome:
         """Integrate both estimators over the noise."""
         first, zeroth = estimator("fobg"), estimator("reinforce")
         at = problem("heaviside[sigma=0.1]")
-        (mean, mean_error), (variance, _) = moments(at, first)
-        (slope, slope_error), (centred, centred_error) = moments(at, zeroth)
-        _, (moved, moved_error) = moments(at, zeroth, 0.1)
-        _, (bare, bare_error) = moments(at, estimator("reinforce[baseline=none]"), 0.1)
+        mean, variance = moments(at, first)
+        slope, centred = moments(at, zeroth)
         figures = [
-            Figure("slope of the smoothed cost at 0", "3.98942", slope, slope_error),
-            Figure("first-order mean", "0.0", mean, mean_error),
-            Figure("first-order variance", "0.0", variance),
-            Figure("zeroth-order variance at 0", "34.085", centred, centred_error),
-            Figure("zeroth-order variance at 0.1", "34.208", moved, moved_error),
-            Figure("zeroth-order variance at 0.1 without a baseline", "54.08", bare, bare_error),
+            Figure("slope of the smoothed cost at 0", "3.98942", *slope),
+            Figure("first-order mean", "0.0", *mean),
+            Figure("first-order variance", "0.0", variance[0]),
+            Figure("zeroth-order variance at 0", "34.085", *centred),
+            Figure("zeroth-order variance at 0.1", "34.208", *moments(at, zeroth, 0.1)[1]),
+            Figure(
+                "zeroth-order variance at 0.1 without a baseline",
+                "54.08",
+                *moments(at, estimator("reinforce[baseline=none]"), 0.1)[1],
+            ),
         ]
         thetas = np.linspace(-0.3, 0.3, 25)
-        curves = {
-            name: [moments(at, order, x, 4000)[0][0] for x in thetas]
-            for name, order in (("first", first), ("zeroth", zeroth))
-        }
-        return Outcome(figures, series={"theta": thetas} | curves)
+        return Outcome(
+            figures,
+            series={
+                "theta": thetas,
+                "zeroth order: the slope": means(at, zeroth, thetas, 4000),
+                "first order: 0 everywhere": means(at, first, thetas, 4000),
+            },
+        )

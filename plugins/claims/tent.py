@@ -41,23 +41,20 @@ class Chaos(Claim):
     )
     source = "Metz et al. 2021; Parmas et al. 2018; figures for the tent map in closed form"
     learned = "Beyond the horizon of chaos derivatives are right and useless; sampling does not care."
-    labels = ("steps T", "variance of one sample")
+    quantity = "variance of one sample"
     logarithmic = "y"
-    curves = {"first": "first order: 4^T", "zeroth": "zeroth order"}
 
     def measure(self) -> Outcome:
         """Sample both orders at several horizons."""
         first, zeroth = estimator("fobg"), estimator("reinforce")
         draw = np.random.default_rng(19)
-        series: dict[str, list[Any]] = {"steps": [1, 2, 5, 10, 14, 20], "first": [], "zeroth": []}
-        figures = []
-        for steps in series["steps"]:
+        figures, horizons, variances = [], [1, 2, 5, 10, 14, 20], []
+        for steps in horizons:
             at = problem(tent(steps))
             w = draw.standard_normal((1, AT_GAIN if steps == 20 else SAMPLES))
             gradients = terms(at, first, w)
             (v1, e1), (v0, e0) = spread(gradients), spread(terms(at, zeroth, w))
-            series["first"].append((v1, e1))
-            series["zeroth"].append((v0, e0))
+            variances.append([(v1, e1), (v0, e0)])
             if text := {10: "1.05e6", 20: "1.10e12"}.get(steps):
                 figures += [
                     Figure(f"first-order variance, T = {steps}", text, v1, e1),
@@ -82,4 +79,5 @@ class Chaos(Claim):
         error = float(np.hypot(error, expected * (e0 / v0 + (1.0 - ratio) * e1 / v1)))
         what = f"variance of inverse_variance, T = {WEIGHED}, over that of the best mixture"
         figures.append(Figure(what, "1.000", measured / expected, error / expected))
-        return Outcome(figures, series=series)
+        growing, staying = zip(*variances, strict=True)
+        return Outcome(figures, series={"steps T": horizons, "first order: 4^T": growing, "zeroth order": staying})

@@ -37,9 +37,8 @@ class Windows(Claim):
     )
     source = "Xu et al. 2022 (idea); closed form by Riccati steps"
     learned = "Cutting a rollout is cheap only if its end is worth something."
-    labels = ("window H", "excess cost")
+    quantity = "excess cost"
     logarithmic = "y"
-    curves = {"excess": "no value at the end"}
 
     def measure(self) -> Outcome:
         """Compute the optimum of each window from its gradient, which is linear in the controls."""
@@ -48,7 +47,7 @@ class Windows(Claim):
             5: ("0.234621", "0.01129"), 6: ("0.250723", "0.00319"),
         }  # fmt: skip
         figures: list[Figure] = []
-        series: dict[str, list[float]] = {"window": [], "excess": []}
+        costs = {}
         best = _infinite_horizon_cost(GAIN)
         for steps, (gain, excess) in published.items():
             plain = _first_gain(steps)
@@ -56,11 +55,10 @@ class Windows(Claim):
             if excess:
                 off = _infinite_horizon_cost(plain) / best - 1
                 figures.append(Figure(f"excess cost of a window of {steps}", excess, off, 1e-9))
-                series["window"].append(steps)
-                series["excess"].append(off)
+                costs[steps] = off
             valued = _first_gain(steps, VALUE)
             figures.append(Figure(f"gain of a window of {steps} with the value", "0.270156", valued, 1e-7))
-        return Outcome(figures, series=series)
+        return Outcome(figures, series={"window H": list(costs), "no value at the end": list(costs.values())})
 
 
 def _first_gain(d: int, value: float = 0.0) -> float:
@@ -85,9 +83,8 @@ class OtherObjective(Claim):
     statement = "iLQR swings a pendulum up in five iterations: 1856.154, 1202.106, 699.799, 423.583, 357.476, 357.297."
     source = "Suh et al. 2021, Bundled gradients, public result file"
     learned = "Say which objective was given and on which one it is scored; nobody can tell from the curve."
-    labels = ("iteration", "cost above the least, 349.49")
+    quantity = "cost above the least, 349.49"
     logarithmic = "y"
-    curves = {"given": "given weights 1/2 and 20", "scored": "given weights 1 and 1"}
 
     def measure(self) -> Outcome:
         """Run iLQR with weights 1/2 and 20 and with weights 1 and 1, both scored with 1 and 1."""
@@ -105,7 +102,11 @@ class OtherObjective(Claim):
                 "the curve solves with control weight 1/2 and terminal weight 20 and is scored with 1 and 1: it ends "
                 f"{given[-1] / scored[-1] - 1:.1%} above what the same method reaches when given the objective it is scored on"
             ),
-            series={"given": np.array(given) - scored[-1], "scored": np.array(scored[:6]) - scored[-1]},
+            series={
+                "iteration": list(range(6)),
+                "given weights 1/2 and 20": np.array(given) - scored[-1],
+                "given weights 1 and 1": np.array(scored[:6]) - scored[-1],
+            },
         )
 
 

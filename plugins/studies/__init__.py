@@ -21,6 +21,8 @@ from bench.model import Problem
 if TYPE_CHECKING:
     import pandas as pd
 
+PARTS = ("scene", "contact", "integrator", "backend")
+"""Parts of the grid that identify a program: the axes of a study without estimators."""
 FINE = 1e-3
 """Spacing of a reference's points, in standard deviations, above which a remark states it: that of points in a plane."""
 
@@ -101,6 +103,11 @@ def mean_interval(values: np.ndarray) -> tuple[float, float, float]:
     reach = float(stdtrit(values.size - 1, 0.975)) * float(values.std(ddof=1)) / math.sqrt(values.size)
     mean = float(values.mean())
     return mean, mean - reach, mean + reach
+
+
+def all_noise(cell: Cell, width: int) -> np.ndarray:
+    """Return the noise of all rollouts of a cell, ``(repeats, samples, width)``."""
+    return np.asarray(noise.shared(cell.seed, cell.scene.name, cell.repeats, cell.samples, width))
 
 
 def first_batch(cell: Cell, width: int) -> np.ndarray:

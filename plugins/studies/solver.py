@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from bench.experiment.cell import Cell
-from bench.experiment.columns import Column, Columns, ComparisonRule, numbers
+from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, seconds
 from bench.experiment.experiment import Experiment
 from bench.experiment.session import Session
 from bench.experiment.views import Chart, Mark, Views
 from bench.model import param
 from bench.model.parameters import values
 
-from . import StudyPackage, finite_status, first_batch, gradient_seconds, norm, relative_error
+from . import PARTS, StudyPackage, finite_status, first_batch, gradient_seconds, norm, relative_error
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -36,8 +36,8 @@ class Solver(StudyPackage):
     """Measures the error of a gradient to the gradient of the program with a converged constraint solver, and its time."""
 
     name = "solver"
-    axes: ClassVar[tuple[str, ...]] = ("scene", "contact", "integrator", "backend")
-    columns: ClassVar[Columns] = Columns.of(
+    axes = PARTS
+    columns = Columns.of(
         Column("iterations", "maximum iterations of the constraint solver"),
         Column("gradient_norm", "norm of the gradient"),
         Column("converged_norm", "norm of the converged program's gradient"),
@@ -46,12 +46,12 @@ class Solver(StudyPackage):
         Column("gradient_cosine", "cosine between the gradient and the converged program's gradient", label="cosine"),
         Column("wrong_signs", "share of coordinates whose sign is not that of the converged program's gradient", label="wrong signs",
                comparison=ComparisonRule("exact", "wrong signs")),
-        Column("gradient_s", "time of the gradients of `samples` rollouts", "s", measured=True, label="gradients", format="seconds"),
-        Column("compile_s", "time of compiling the gradient", "s", measured=True, label="compilation", format="seconds"),
+        seconds("gradient_s", "time of the gradients of `samples` rollouts", "gradients"),
+        seconds("compile_s", "time of compiling the gradient", "compilation"),
         numbers("gradient", "gradient at w = 0, by coordinate of theta"),
         numbers("converged_gradient", "the converged program's gradient at w = 0, by coordinate of theta"),
     )  # fmt: skip
-    timed: ClassVar[bool] = True
+    timed = True
 
     converged: int = param(100, "iterations of the program that counts as converged", positive=True)
     timed_calls: int = param(5, "calls timed", positive=True)

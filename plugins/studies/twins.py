@@ -7,12 +7,12 @@ for its own program. Times are for a batch of ``samples`` rollouts.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from bench.experiment.cell import Cell
-from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, text
+from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, seconds, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.session import Session
 from bench.experiment.views import Chart, Mark, Views
@@ -45,8 +45,8 @@ class Twins(StudyPackage):
     """Measures the difference between a physics engine's twin and the scene's own program, and the time of gradients."""
 
     name = "twins"
-    timed: ClassVar[bool] = True
-    columns: ClassVar[Columns] = Columns.of(
+    timed = True
+    columns = Columns.of(
         Column("state_difference", "largest difference of states over time and coordinates", label="states"),
         Column("state_difference_rel", "largest difference of states, each coordinate in units of its largest value",
                label="states, relative",
@@ -59,11 +59,11 @@ class Twins(StudyPackage):
         Column("gradient_difference_rel", "relative difference of the gradients", label="gradient, relative",
                comparison=ComparisonRule("exact", "difference of gradients")),
         Column("gradient_cosine", "cosine between the gradients", label="cosine"),
-        Column("value_s", "time of the costs of `samples` rollouts", "s", measured=True, label="costs", format="seconds"),
-        Column("gradient_s", "time of the gradients of `samples` rollouts", "s", measured=True, label="gradients", format="seconds"),
+        seconds("value_s", "time of the costs of `samples` rollouts", "costs"),
+        seconds("gradient_s", "time of the gradients of `samples` rollouts", "gradients"),
         Column("trace_s", "part of compile_s: tracing the Python code", "s", measured=True),
         Column("lower_s", "part of compile_s: lowering the trace to the compiler's input", "s", measured=True),
-        Column("compile_s", "total time of compiling the gradient", "s", measured=True, label="compilation", format="seconds"),
+        seconds("compile_s", "total time of compiling the gradient", "compilation"),
         text("own_backend", "backend of the scene's own program"),
         numbers("gradient", "the twin's gradient, by coordinate of theta"),
         numbers("own_gradient", "the own program's gradient, by coordinate of theta"),
@@ -119,7 +119,7 @@ class Twins(StudyPackage):
         worst = shown.good.groupby("problem")["gradient_difference_rel"].transform("max")
         frame = floored(shown.good.loc[worst.sort_values(ascending=False, kind="stable").index], FLOOR, DIFFERENCES)
         chart = Chart(
-            "twins", frame, [shown.column(name, limit=f"{name}_limit", log=True) for name in DIFFERENCES],
+            "twins", frame, [shown.column(name, limit=f"{name}_limit", log=True, label=self.columns.by_name[name].doc) for name in DIFFERENCES],
             [text("problem", label="")], "dots", series="method", marks=[Mark("rounding up to here", ROUNDING)], height=0.3,
             text="One dot per problem and engine. Left of the dashed line a difference is accumulated rounding.",
         )  # fmt: skip

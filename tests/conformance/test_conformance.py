@@ -1,9 +1,12 @@
 """The conformance kit catches the faults planted here, and its checks are pytest items."""
 
-import contextlib
+import os
 import re
+import subprocess
 import sys
 from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
@@ -24,7 +27,7 @@ from classes import (
 )
 
 from bench import cli, conformance
-from bench.conformance import Skipped, check, kit, main, parametrize, subjects
+from bench.conformance import main, parametrize, subjects
 from bench.conformance.kit import variants
 from bench.conformance.subjects import all_programs, distinguishing_programs, sound_scenes
 from bench.errors import UserError
@@ -47,6 +50,7 @@ from bench.model import (
     registry,
 )
 
+ROOT = Path(__file__).parents[2]
 PLANTED: dict[type[Plugin], set[str]] = {}
 """By plugin with a fault: the checks that have to fail."""
 
@@ -558,11 +562,39 @@ def few_programs(monkeypatch):
     monkeypatch.setattr(conformance.contacts, "sound_scenes", lambda: touching[::4])
 
 
+def items(*arguments, **options):
+    """The (plugin, check) pairs that the decorator makes, by id, with their marks."""
+    mark = parametrize(*arguments, **options).mark
+    assert mark.args[0] == ("plugin", "check")
+    return {item.id: item for item in mark.args[1]}
+
+
+def found(plugin, *checks):
+    """The outcome of each of the named checks, or of all, with what it says: its number or its reason."""
+    outcomes = []
+    for title, item in items([plugin]).items():
+        subject, run = item.values
+        if not checks or title.rpartition("-")[2] in checks:
+            try:
+                outcomes.append(("pass", run(subject)))
+            except pytest.skip.Exception as reason:
+                outcomes.append(("skip", str(reason)))
+            except (pytest.fail.Exception, SystemExit, Exception) as reason:
+                outcomes.append(("fail", str(reason)))
+    return outcomes
+
+
 @pytest.mark.usefixtures("few_programs")
-@pytest.mark.parametrize("plugin", PLANTED, ids=lambda plugin: plugin.name)
-def test_planted_fault_is_caught(plugin):
-    failed = {result.check: result.detail for result in check(plugin, PLANTED[plugin]) if result.outcome == "fail"}
-    assert PLANTED[plugin] <= failed.keys(), failed
+@pytest.mark.parametrize(
+    ("plugin", "check"),
+    [
+        pytest.param(plugin, check, id=f"{plugin.name}-{check}")
+        for plugin in PLANTED
+        for check in sorted(PLANTED[plugin])
+    ],
+)
+def test_planted_fault_is_caught(plugin, check):
+    assert "fail" in dict(found(plugin, check))
 
 
 @dataclass(frozen=True)
@@ -577,10 +609,10 @@ class Mirrored(SampleMean):
 
 
 def test_a_sound_estimator_passes_though_a_difference_straddles_a_jump():
-    results = check(Mirrored, {"bias_is_as_declared", "bias_across_jumps_is_as_declared"})
-    assert {result.outcome for result in results} == {"pass"}
-    assert "bias 21.4 on coin_walk[sigma=0.1]" in results[1].detail
-    assert "of up to 20 dimensions" in results[0].detail
+    (bias, one), (across, other) = found(Mirrored, "bias_is_as_declared", "bias_across_jumps_is_as_declared")
+    assert bias == across == "pass"
+    assert "of up to 20 dimensions" in one
+    assert "bias 21.4 on coin_walk[sigma=0.1]" in other
 
 
 @pytest.mark.parametrize(("module", "where"), [(__name__, " in test_conformance.py"), ("notebook", "")])
@@ -591,37 +623,8 @@ def test_a_wrong_shape_is_named_with_the_file_and_the_shape_of_terms(module, whe
         def terms(self, problem, theta, w):
             return problem.grad(theta, w)[:1].T
 
-    (result,) = check(Row, {"shape_and_repeatability"})
-    assert f"mirrored{where} returned shape (56, 1), not (d, B) = (2, 56)" in result.detail
-
-
-def test_line_per_check_and_exit_status(capsys):
-    assert main(["cubic", "explicit_euler"]) == 0
-    *lines, empty, summary = capsys.readouterr().out.splitlines()
-    assert {line.split()[0] for line in lines} <= {"pass", "skip"}
-    assert {line.split()[1] for line in lines} == {"cubic", "explicit_euler"}
-    assert not empty
-    assert summary.startswith(f"2 plugins, {len(lines)} checks: ")
-    assert " 0 failed" in summary
-
-
-def test_unavailable_plugin_is_skipped_unless_named(capsys, monkeypatch):
-    entry = registry.Entry("scenes", "far_away", None, "not installed: some-dist; pip install some-dist")
-    monkeypatch.setattr(registry, "entries", lambda: {"scenes": {"far_away": entry}})
-    assert main([]) == 0
-    assert main(["far_away"]) == 1
-    unnamed, named = (line for line in capsys.readouterr().out.splitlines() if "far_away" in line)
-    assert unnamed.startswith("skip")
-    assert named.startswith("fail")
-    assert "pip install some-dist" in unnamed
-    assert "pip install some-dist" in named
-
-
-def test_a_plugin_that_ends_the_process_fails_its_check():
-    leaves = type("Leaves", (WrongSign,), {"terms": lambda *given: sys.exit(0)})
-    (result,) = check(leaves, {"shape_and_repeatability"})
-    assert result.outcome == "fail"
-    assert re.match(r"SystemExit: 0 \(test_conformance\.py:\d+ in ", result.detail)
+    ((_, reason),) = found(Row, "shape_and_repeatability")
+    assert f"mirrored{where} returned shape (56, 1), not (d, B) = (2, 56)" in reason
 
 
 # ------------------------------------------------------------------------------------------------ abstract plugins
@@ -649,25 +652,13 @@ def test_registry_says_which_methods_are_missing(tmp_path):
         "        return x[0]\n"
     )
     (tmp_path / "broken.py").write_text("from bench.model import FunctionScene\nimport no_such_module\n")
-    with folder_of_plugins(tmp_path):
-        entry = registry.find("scenes", "half_done")
-        assert not entry.available
-        assert entry.reason == "HalfDone does not define theta0"
-        assert "no_such_module" in registry.find("scenes", "broken").reason
-        with pytest.raises(UserError, match=r"scene 'half_done' cannot be used: HalfDone does not define theta0"):
-            registry.make("scenes", "half_done")
-
-
-@contextlib.contextmanager
-def folder_of_plugins(path):
-    """The registry with the plugins of a folder, and without them again."""
-    before = list(registry._folders)
-    registry.add_folder(path)
-    try:
-        yield
-    finally:
-        registry._folders[:] = before
-        registry.entries.cache_clear()
+    registry.add_folder(tmp_path)
+    entry = registry.find("scenes", "half_done")
+    assert not entry.available
+    assert entry.reason == "HalfDone does not define theta0"
+    assert "no_such_module" in registry.find("scenes", "broken").reason
+    with pytest.raises(UserError, match=r"scene 'half_done' cannot be used: HalfDone does not define theta0"):
+        registry.make("scenes", "half_done")
 
 
 @pytest.mark.parametrize("base", [MechanicalScene, DoubleIntegrator])
@@ -681,33 +672,17 @@ def test_contacts_without_contact_scene_are_refused_with_the_fix(base):
 # ---------------------------------------------------------------------------------------------- as pytest items
 
 
-def items(*arguments, **options):
-    """The (plugin, check) pairs that the decorator makes, by id, with their marks."""
-    mark = parametrize(*arguments, **options).mark
-    assert mark.args[0] == ("plugin", "check")
-    return {item.id: item for item in mark.args[1]}
-
-
-@pytest.mark.slow
 def test_every_check_of_every_variant_is_an_item():
     made = items([Penalty])
     assert {item.split("-")[0] for item in made} == set(variants(Penalty))
-    results = {f"{result.plugin}-{result.check}" for result in check(Penalty)}
-    assert results | {"penalty-something_was_checked"} == set(made)
+    assert {"penalty-has_docstring", "penalty-pushes_in_contact", "penalty-something_was_checked"} <= set(made)
 
 
-def test_item_fails_where_the_check_does():
-    plugin, run = items([ClaimsAJump])["claims_a_jump-continuity_is_as_declared"].values
-    with pytest.raises(Exception, match="no jump"):
-        run(plugin)
-
-
-def test_item_skips_with_the_reason_of_the_kit():
-    plugin, run = items([ExplicitEuler, Penalty])["penalty-smoothing_converges"].values
-    with pytest.raises(pytest.skip.Exception, match="has no smoothing"):
-        run(plugin)
-    with pytest.raises(Skipped):
-        run.args[0](plugin)
+def test_item_fails_and_skips_with_the_reason_of_the_kit():
+    ((outcome, reason),) = found(ClaimsAJump, "continuity_is_as_declared")
+    assert outcome == "fail"
+    assert "no jump" in reason
+    assert set(found(Penalty, "smoothing_converges")) == {("skip", "has no smoothing")}
 
 
 @parametrize([ClaimsAJump], expected_failures={"continuity_is_as_declared": "planted"})
@@ -733,29 +708,41 @@ def test_expected_failure_of_no_check_gets_the_nearest_name():
 
 def test_plugin_that_lacks_a_module_is_skipped():
     absent = dataclass(frozen=True)(type("Absent", (Cubic,), {"name": "absent", "requires": ("no_such_module",)}))
-    (item,) = items([absent]).values()
-    assert [(m.name, m.kwargs) for m in item.marks] == [("skip", {"reason": "not installed: no_such_module"})]
+    reasons = {item.marks[0].kwargs["reason"] for item in items([absent]).values() if item.marks[0].name == "skip"}
+    assert reasons == {"not installed: no_such_module; pip install no_such_module"}
 
 
 def test_plugin_of_another_kind_needs_no_checks_of_its_own():
     study = next(iter(registry.entries()["studies"].values())).plugin
-    assert {result.outcome for result in check(study)} == {"pass"}
+    assert {outcome for outcome, _ in found(study)} == {"pass"}
 
 
-# ------------------------------------------------------------------------------------- time limit, broken neighbours
+# ------------------------------------------------------------------------------- the command, broken neighbours
 
-SLOW_BACKEND = """
-import time
+SCENE = """
+import os, sys, time
 from dataclasses import dataclass
-from bench.plugin import Backend
+import numpy as np
+from bench.plugin import FunctionScene
 
 @dataclass(frozen=True)
-class Endless(Backend):
-    \"\"\"Never returns.\"\"\"
-    name = "endless"
-    def compile(self, program):
-        time.sleep(1000)
+class Mine(FunctionScene):
+    \"\"\"A cost.\"\"\"
+    name = "NAME"
+    def theta0(self):
+        BODY
+        return np.ones(2)
+    def cost(self, xp, x):
+        return x[0] * x[1]
 """
+BODIES = {
+    "ends": ("os._exit(0)", "worker 'gw0' crashed while running"),
+    "exits": ("sys.exit(0)", "SystemExit"),
+    "hangs": ("time.sleep(1000)", "worker 'gw1' crashed while running"),
+    "prints": ("print('x' * 9)", "d = 2, parameter noise"),
+    "raises": ("1 / 0", "ZeroDivisionError"),
+}
+"""What a scene does where it is asked for theta, and what the line of the check has to say."""
 BROKEN_BACKEND = """
 from dataclasses import dataclass
 from bench.plugin import Backend
@@ -772,27 +759,71 @@ class ABroken(Backend):
 """
 
 
+@pytest.fixture
+def check(tmp_path):
+    """Return what runs the command in a read-only folder of plugins with foreign settings of pytest."""
+    for name, (body, _) in BODIES.items():
+        (tmp_path / f"{name}.py").write_text(SCENE.replace("NAME", name).replace("BODY", body))
+    (tmp_path / "lacks.py").write_text(SCENE.replace("NAME", "lacks").replace("def cost", "def price"))
+    (tmp_path / "conftest.py").write_text("raise RuntimeError('read')")
+    (tmp_path / "pytest.ini").write_text("[pytest]\naddopts = --unknown")
+    (tmp_path / "out").mkdir()
+    files = set(tmp_path.iterdir())
+    tmp_path.chmod(0o500)
+    environment = os.environ | {"PYTEST_ADDOPTS": "--unknown", "PYTEST_PLUGINS": "nowhere", "PYTHONPATH": str(ROOT)}
+
+    def run(*words):
+        command = [sys.executable, "-P", "-m", "bench", "check", *words]
+        return subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+
+    yield run
+    assert set(tmp_path.iterdir()) == files
+    tmp_path.chmod(0o700)
+
+
 @pytest.mark.slow
-def test_a_check_ends_at_the_time_limit_and_the_others_run(capsys, tmp_path, monkeypatch):
-    (tmp_path / "endless.py").write_text(SLOW_BACKEND)
-    with folder_of_plugins(tmp_path):
-        endless = registry.usable("backends", "endless")
-        monkeypatch.setattr(kit, "_CHECKS", {Plugin: kit._CHECKS[Plugin][:2], Backend: kit._CHECKS[Backend][:1]})
-        assert main(["endless"], limit=2.0) == 1
-    lines = capsys.readouterr().out.splitlines()
-    assert endless.name in lines[0]
-    assert any(
-        line.startswith("fail  endless") and "not finished within 2 s (limit=DURATION)" in line for line in lines
-    )
-    assert any(line.startswith("pass  endless") for line in lines)
+def test_the_command_survives_any_plugin(check, tmp_path):
+    few = ["-k", "has_docstring or theta_and_noise or available", "--junitxml=out/report.xml"]
+    done = check(*BODIES, "lacks", "plugins=.", "limit=30s", *few)
+    assert done.returncode == 1, done.stdout + done.stderr
+    lines = (line.split(maxsplit=3) for line in done.stdout.splitlines() if re.match("[a-z]{4}  ", line))
+    said = {(plugin, name): (outcome, detail) for outcome, plugin, name, detail in lines}
+    assert said["lacks", "available"] == ("fail", "Mine does not define cost")
+    for plugin, (_, expected) in BODIES.items():
+        assert said[plugin, "has_docstring"] == ("pass", "A cost.")
+        outcome, detail = said[plugin, "theta_and_noise_are_declared"]
+        assert outcome == ("pass" if plugin == "prints" else "fail")
+        assert expected in detail
+    assert "Timeout (0:00:30)!" in done.stderr
+    report = (tmp_path / "out" / "report.xml").read_text()
+    assert 'tests="11"' in report
+    assert '<property name="found" value="d = 2, parameter noise"' in report
 
 
-def test_progress_goes_to_a_terminal_only(capsys, monkeypatch):
-    main(["linear"])
-    assert not capsys.readouterr().err
-    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
-    main(["linear"])
-    assert re.search(r"check 1 of \d+: linear is_frozen_dataclass", capsys.readouterr().err)
+@pytest.mark.slow
+def test_a_missing_plugin_is_skipped_unless_named_and_no_check_is_bad_input(check):
+    done = check("plugins=.", "-k", "lacks")
+    assert (done.returncode, done.stdout.count("skip  lacks")) == (0, 1)
+    for words in (["-k", "nothing_matches"], ["--no-such-option"], ["no_such_file"]):
+        assert check("prints", "plugins=.", "-x", *words).returncode == 2
+
+
+def test_statuses_are_those_of_a_command(monkeypatch):
+    monkeypatch.setattr(os, "environ", {})
+    statuses = {0: 0, 1: 1, 3: 2, 4: 2, 5: 2}
+    for status, expected in statuses.items():
+        monkeypatch.setattr(pytest, "main", lambda *_, status=status, **__: pytest.ExitCode(status))
+        assert main(["linear"]) == expected
+    monkeypatch.setattr(pytest, "main", lambda *_, **__: pytest.ExitCode.INTERRUPTED)
+    with pytest.raises(KeyboardInterrupt):
+        main(["linear"])
+
+
+@pytest.mark.parametrize("module", ["pytest", "xdist"])
+def test_without_pytest_the_command_that_installs_it_is_named(module, monkeypatch):
+    monkeypatch.setattr(registry, "installed", lambda name: name != module)
+    with pytest.raises(UserError, match=r"pip install 'diffsim-bench\[check\]'"):
+        main(["linear"])
 
 
 def test_a_limit_that_is_no_duration_is_refused():
@@ -801,19 +832,13 @@ def test_a_limit_that_is_no_duration_is_refused():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("provides", ["{'physics'}", pytest.param("set()", marks=pytest.mark.slow)])
-def test_a_broken_backend_does_not_fail_the_checks_of_a_scene(tmp_path, provides):
+@pytest.mark.parametrize("provides", ["{'physics'}", "set()"])
+def test_a_broken_backend_does_not_fail_the_checks_of_a_scene(tmp_path, monkeypatch, provides):
     (tmp_path / "a_broken.py").write_text(BROKEN_BACKEND.replace("PROVIDES", provides))
-    for cached in (subjects.plain_backend, subjects.all_programs, subjects.sound_laws):
-        cached.cache_clear()
-    try:
-        with folder_of_plugins(tmp_path):
-            assert registry.usable("backends", "a_broken")
-            for name in ("linear", "double_integrator", "tossed_box"):
-                results = check(registry.usable("scenes", name))
-                assert [r for r in results if r.outcome == "fail"] == []
-            broken = check(registry.usable("backends", "a_broken"))
-            assert any(r.outcome == "fail" and "ZeroDivisionError" in r.detail for r in broken)
-    finally:
-        for cached in (subjects.plain_backend, subjects.all_programs, subjects.sound_laws):
-            cached.cache_clear()
+    registry.add_folder(tmp_path)
+    for cached in ("plain_backend", "all_programs", "sound_laws"):
+        monkeypatch.setattr(subjects, cached, cache(getattr(subjects, cached).__wrapped__))
+    for name in ("linear", "double_integrator", "tossed_box"):
+        assert "fail" not in dict(found(registry.usable("scenes", name)))
+    said = found(registry.usable("backends", "a_broken"))
+    assert any(outcome == "fail" and "ZeroDivisionError" in reason for outcome, reason in said)

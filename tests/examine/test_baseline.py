@@ -47,6 +47,7 @@ def test_exit_statuses(sim, capsys):
     assert run(f"{sim}:cost", "grad=right", "calls=300") == 0
     assert run(f"{sim}:cost", "grad=off", "calls=300") == 1
     assert run(f"{sim}:cost", "grad=right", "calls=3") == 3
+    assert run(f"{sim}:cost", "calls=300") == 0
     assert run(f"{sim}:nothing", "grad=zero", "calls=300") == 3
     assert run(f"{sim}:nothing", "grad=zero", "calls=300", "allow_zero=true") == 0
     assert run(f"{sim}:cost", "grad=wrong") == 2
@@ -67,7 +68,15 @@ def test_settings_of_the_command_line(sim, capsys):
     assert run(f"{sim}:cost", "grad=off", "calls=400", *settings) == 0
     assert "small error, within the tolerance" in capsys.readouterr().out
     assert run(f"{sim}:cost", "expect=nonsense") == 2
-    assert run(f"{sim}:cost", "tolerance=1,2") == 2
+    assert run(f"{sim}:cost", "tolerance=1,2,3") == 2
+
+
+def test_a_folder_that_cannot_be_written_is_an_error_before_the_examination(sim, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("os.access", lambda path, mode: False)
+    assert run(f"{sim}:cost", "calls=300", f"save={tmp_path}") == 2
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert f"save={tmp_path} cannot be written" in printed.err
 
 
 # -------------------------------------------------------------------------------------------- baseline

@@ -42,8 +42,3 @@ def test_a_problem_is_scene_law_integrator_study_and_theta_less_the_swept_names(
     assert number_problems(rows, without=["mass"]).tolist() == [0, 0, 1, 1, 0, 0]
     assert number_problems(rows, ["backend"]).nunique() == 1
     assert not any(column.startswith(("estimator.", "backend.")) for column in problem_columns(rows))
-
-
-def test_rows_without_parameters_are_distinguished_by_their_identity():
-    rows = rows_with().assign(parameters="")
-    assert number_problems(rows).tolist() == [0, 0, 1, 1]

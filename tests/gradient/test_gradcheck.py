@@ -7,9 +7,8 @@ import shlex
 import numpy as np
 import pandas as pd
 import pytest
-from bench.plugins.studies.gradient_check import GradientCheck, measure
-from bench.plugins.studies.gradient_check.lines import by_point
-from bench.plugins.studies.gradient_check.points import is_trusted
+from bench.plugins.studies.gradient_check import GradientCheck, is_trusted, measure
+from bench.plugins.studies.gradient_check.views import by_point
 
 from bench import run
 from bench.cli import main
@@ -58,8 +57,8 @@ def verdicts(problem, unit=FLOAT64):
     drawn = noise.draw(0, scene.name, 1, 1, problem.program.n_noise, "test")[0, 0]
     directions = noise.draw(0, scene.name, 1, SEARCH.drawn, problem.dim, "test directions")[0]
     told = {}
-    for _, point in measure.examine(problem, problem.program.theta0, drawn, directions, unit, SEARCH):
-        told.setdefault(point.point, set()).add(point.verdict)
+    for point in measure.examine(problem, drawn, directions, unit, SEARCH):
+        told.setdefault(point.place.point, set()).add(point.verdict)
     return told
 
 
@@ -149,10 +148,9 @@ def test_switch_of_a_damped_contact_is_a_jump():
 
 
 @pytest.mark.parametrize("law", ["penalty", "impulse", "complementarity"])
-def test_every_kind_of_law_shows_when_it_acts(law):
+def test_every_kind_of_law_shows_when_it_acts(bounce, law):
     """A ball 5.3 steps above the ground, at 1 step's worth a step, is first pushed in step 5 or the one after."""
-    scene = plugin("scenes", "bounce_once", horizon=10, height=0.1 + 5.3 * 2.0 / 480.0)
-    problem = compiled(scene, plugin("contacts", law), "implicit")
+    problem = compiled(bounce.program.scene, plugin("contacts", law), "implicit")
     modes = measure.contact_modes(problem)
     (name,) = modes(problem.program.theta0[:, None], np.zeros((3, 1)))
     first = {"penalty": "6-9", "impulse": "5"}
@@ -208,10 +206,9 @@ def test_fault_is_exit_status_1_and_its_line_repeats_it(tmp_path, monkeypatch, c
     pd.testing.assert_frame_equal(first, second)
 
 
-def test_contacts_of_an_engine_are_asked_from_the_engine(monkeypatch):
+def test_contacts_of_an_engine_are_asked_from_the_engine(bounce, monkeypatch):
     """An engine's steps cannot be taken in NumPy, and some of its contacts are known to the engine only."""
-    scene = plugin("scenes", "bounce_once", horizon=10, height=0.1 + 5.3 * 2.0 / 480.0)
-    problem = compiled(scene, plugin("contacts", "penalty", stiffness=1e4), "mujoco")
+    problem = compiled(bounce.program.scene, bounce.program.contact, "mujoco")
     problem.provides = problem.provides | {"physics"}
     modes = measure.contact_modes(problem)
     assert modes(problem.program.theta0[:, None], np.zeros((3, 1))) == ["6-9"]

@@ -58,7 +58,7 @@ def test_complex_step_is_the_derivative_of_the_program():
     theta = problem.program.theta0
     along = np.linspace(-1.0, 1.0, theta.size)
     slope = problem.grad(theta, np.zeros((problem.program.n_noise, 1)))[:, 0] @ along
-    assert complex_step(problem, theta, along) == pytest.approx(slope, rel=1e-10)
+    assert complex_step(problem, theta, along, np.zeros(problem.program.n_noise)) == pytest.approx(slope, rel=1e-10)
 
 
 @pytest.mark.parametrize(

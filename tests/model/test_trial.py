@@ -14,17 +14,6 @@ FATAL = {
     "exits": ("import os\nos._exit(0)\n", "ended the process (exit status 0)"),
     "crashes": ("import ctypes\nctypes.string_at(0)\n", "ended the process by SIGSEGV when it was imported"),
 }
-CHANGES = {
-    "errors": ("import numpy\nnumpy.seterr(all='raise')\n", "NumPy's error state"),
-    "prints": ("import numpy\nnumpy.set_printoptions(precision=1)\n", "NumPy's print options"),
-    "seeds": ("import random\nrandom.seed(0)\n", "the seed of random"),
-    "rounds": ("import ctypes\nctypes.CDLL(None).fesetround(0x400)\n", "the rounding of numbers"),
-    "roots": ("import numpy\nnumpy.sqrt = numpy.square\n", "numpy.sqrt"),
-    "noises": ("import bench.measure.noise as noise\nnoise.draw = None\n", "bench.measure.noise.draw"),
-    "opens": ("import builtins\nbuiltins.open = None\n", "builtins.open"),
-    "acts": ("import threading, time\nthreading.Thread(target=time.sleep, args=(9,), daemon=True).start()\n", "running threads"),
-}  # fmt: skip
-"""Code that changes the process when it is imported, and the words that name the change."""
 ODD = "from bench.model import SampleMean\nclass Odd(SampleMean):\n    name = 'odd'\n    requires = None\n"
 
 
@@ -76,16 +65,6 @@ def test_an_import_that_does_not_come_back(folder):
     assert {name.rpartition(".")[2]: said for name, said in found.items()} == {
         "hangs": "did not return within 3 s when it was imported"
     }
-
-
-def test_what_an_import_changes_is_named_and_the_others_are_not_blamed(folder):
-    for name, (text, _) in CHANGES.items():
-        (folder / f"{name}.py").write_text(text)
-    (folder / "imports.py").write_text("import os, sys, scipy.stats\nos.environ['A'] = 'b'\nsys.path.insert(0, '/')\n")
-    found = {name.rpartition(".")[2]: said for name, said in fatal(folder, ["good", *CHANGES, "imports"]).items()}
-    assert found.keys() == CHANGES.keys()
-    for name, (_, words) in CHANGES.items():
-        assert words in found[name]
 
 
 def test_a_plugin_at_work_moves_no_command_to_another_folder(tmp_path):

@@ -21,7 +21,6 @@ class Lesson(Claim):
     """A claim for a page."""
 
     name, lesson, statement, source, learned = "T1", "A lesson", "one is <b>one</b>", "here & now", "it is one"
-    curves = {"y": "line"}
 
     def measure(self):
         """Nothing: results are given."""

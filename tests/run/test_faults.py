@@ -167,23 +167,17 @@ def tree(tmp_path_factory):
     return made
 
 
-@pytest.fixture(
-    scope="module", params=[pytest.param(2, marks=pytest.mark.slow), pytest.param(1, marks=pytest.mark.full)]
-)
-def run(request, tree):
-    """All faults among sound cells, run by one or two workers."""
+@pytest.fixture(scope="module")
+def run(tree):
+    """All faults among sound cells, run by two workers."""
     names = [name for fault in EXPECTED for name in (fault, "fobg")]
-    words = [
-        f"estimators=[{','.join(dict.fromkeys(names))},reinforce]",
-        *(["sweep.samples=[8,16]"] if request.param == 1 else []),
-        f"name=of{request.param}",
-    ]
-    done = tree.run(*BASE, *words, *LIMITS, f"workers={request.param}", "results_dir=out")
+    words = [f"estimators=[{','.join(dict.fromkeys(names))},reinforce]", "name=faulty"]
+    done = tree.run(*BASE, *words, *LIMITS, "workers=2", "results_dir=out")
     assert done.returncode == 1, done.stderr
-    rows = pd.read_csv(tree.root / "out" / f"of{request.param}" / "bias_variance.csv")
-    return done, rows
+    return done, pd.read_csv(tree.root / "out" / "faulty" / "bias_variance.csv")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", EXPECTED)
 def test_fault_has_its_status_and_reason(run, name):
     status, said = EXPECTED[name]
@@ -195,17 +189,16 @@ def test_fault_has_its_status_and_reason(run, name):
         assert "\n" not in reason
 
 
+@pytest.mark.slow
 def test_sound_cells_are_untouched(tree, run):
-    swept = ["sweep.samples=[8,16]"] if len(run[1]["samples"].unique()) > 1 else []
-    done = tree.run(
-        *BASE, "estimators=[fobg,reinforce]", *swept, f"name=sound{len(swept)}", "workers=0", "results_dir=out"
-    )
+    done = tree.run(*BASE, "estimators=[fobg,reinforce]", "name=sound", "workers=0", "results_dir=out")
     assert done.returncode == 0, done.stderr
-    alone = pd.read_csv(tree.root / "out" / f"sound{len(swept)}" / "bias_variance.csv")
+    alone = pd.read_csv(tree.root / "out" / "sound" / "bias_variance.csv")
     among = run[1][run[1]["estimator"].isin(["fobg", "reinforce"])].reset_index(drop=True)
     pd.testing.assert_frame_equal(alone.drop(columns="experiment"), among.drop(columns="experiment"), check_exact=True)
 
 
+@pytest.mark.slow
 def test_what_plugins_print_stays_out_of_our_output(run):
     done, rows = run
     assert "yyyy" not in done.stdout + done.stderr
@@ -217,6 +210,7 @@ def test_what_plugins_print_stays_out_of_our_output(run):
     assert rows[rows["estimator"] == "bad_number"]["reason"].str.contains("repeat 0").all()
 
 
+@pytest.mark.slow
 def test_no_process_is_left(tree, run):
     wait_for(lambda: not processes_in(tree.root), 5.0)
 

@@ -108,13 +108,6 @@ def test_a_second_run_starts_no_rung_above_the_fault(climbed, capsys):
 
 
 @pytest.mark.slow
-def test_without_the_ladder_the_waiting_cells_run(climbed):
-    words, experiment = climbed
-    assert main([*words, "ladder=false", "scenes=[mass_spring]", "backends=[forgetful_climber]"]) == 0
-    assert statuses(experiment, "forgetful_climber")["mass_spring"] == "ok"
-
-
-@pytest.mark.slow
 def test_a_rung_that_its_backend_cannot_run_stops_the_climb(tmp_path):
     words = [*WORDS, "scenes=[pendulum,quadruped,double_integrator]", "backends=[numpy]", f"results_dir={tmp_path}"]
     assert main(words) == 0

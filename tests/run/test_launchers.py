@@ -81,19 +81,6 @@ def test_a_cluster_that_does_not_answer_is_refused(address, said):
         ray_launcher.reach(address)
 
 
-def test_a_cluster_without_the_cores_of_a_job_says_so():
-    class Cluster:
-        def nodes(self):
-            return [
-                {"NodeID": "a", "Alive": True, "Resources": {"CPU": 2.0}},
-                {"NodeID": "b", "Alive": False, "Resources": {"CPU": 64.0}},
-            ]
-
-    launcher = ray_launcher.RayLauncher.__new__(ray_launcher.RayLauncher)
-    launcher._ray, launcher._settings = Cluster(), ray_launcher.RaySettings(cpus=4.0)
-    assert "ray.cpus=4 cores, and the largest node of the cluster has 2" in launcher._lack_of_cores()
-
-
 def test_a_launcher_whose_library_is_absent_says_how_to_get_it(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     assert main([*WORDS, "estimators=[fobg]", "launcher=ray", f"results_dir={tmp_path}"]) == 2
@@ -126,10 +113,10 @@ def test_shards_at_once_one_killed_give_the_rows_of_one_run(tmp_path, capsys):
     pd.testing.assert_frame_equal(rows(tmp_path / "parts"), rows(tmp_path / "local"), check_exact=True)
 
 
-def test_groups_are_cut_only_as_far_as_all_slots_get_a_part():
-    assert ray_launcher.split([list(range(10)), [1]], 100, 1) == [list(range(10)), [1]]
-    assert [len(part) for part in ray_launcher.split([list(range(10))], 100, 4)] == [3, 3, 3, 1]
-    assert [len(part) for part in ray_launcher.split([list(range(10))], 4, 1)] == [4, 4, 2]
+def test_groups_are_cut_only_as_far_as_all_nodes_get_a_part():
+    assert [len(part) for part in ray_launcher.split([range(10), [1]], 100, [1])] == [3, 3, 3, 1, 1]
+    assert [len(part) for part in ray_launcher.split([range(10)], 100, [8])] == [8, 2]
+    assert [len(part) for part in ray_launcher.split([range(40)], 4, [1])] == [4] * 10
 
 
 def test_every_row_says_which_kind_of_machine_made_it(tmp_path):

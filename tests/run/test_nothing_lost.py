@@ -81,15 +81,6 @@ def test_the_row_that_is_stored_last_wins_wherever_it_lies_and_however_the_other
             assert list(Store(tmp_path, COLUMNS).load()["bias"]) == [bias]
 
 
-@pytest.mark.parametrize("dated", [0, 1])
-def test_of_two_rows_without_a_count_the_one_with_a_date_wins(tmp_path, dated):
-    (tmp_path / "pending").mkdir()
-    for i in range(2):
-        old = {name: value for name, value in row(bias=float(i)).items() if name not in ("stored_at", "sequence")}
-        (tmp_path / "pending" / f"{i}.json").write_text(json.dumps([old | ({"stored_at": 1e9} if i == dated else {})]))
-    assert list(Store(tmp_path, COLUMNS).load()["bias"]) == [float(dated)]
-
-
 # ------------------------------------------------------------------------------------------------------------- files
 
 

@@ -59,10 +59,8 @@ def test_a_spoilt_row_is_left_out_and_named(tmp_path, capsys, name):
 
 
 SMALL = {
-    "surrogate": {"reason": "\ud800"}, "status": {"status": 5}, "text": {"scene": ["a"]}, "number": {"bias": "abc"},
-    "true": {"seed": True}, "list": {"mean_estimate": "x"}, "nested": {"mean_estimate": [[1]]}, "big": {"bias": 10**400},
+    "surrogate": {"reason": "\ud800"}, "status": {"status": 5}, "true": {"seed": True}, "big": {"bias": 10**400},
     "extra": {"extra": {"a": [1]}}, "extra_big": {"extra": 2**70}, "date": {"stored_at": "x"}, "parameters": {"parameters": {"a": 1}},
-    "deep": {"parameters": "[" * DEEP + "]" * DEEP}, "variance": {"variance": -1.0}, "seed": {"seed": 0.5},
 }  # fmt: skip
 
 

@@ -302,17 +302,6 @@ def test_disk_that_fills(tmp_path, capsys, monkeypatch, after):
     assert len(pd.read_parquet(tmp_path / "tiny" / "rows.parquet")) == 4
 
 
-def test_directory_that_refuses(tmp_path, capsys, monkeypatch):
-    def refuse(*_, **__):
-        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
-
-    monkeypatch.setattr(store_module.Path, "mkdir", refuse)
-    assert main([*TINY, "name=tiny", f"results_dir={tmp_path}"]) == 2
-    said = capsys.readouterr().err.strip()
-    assert "cannot be written: Permission denied" in said
-    assert len(said.splitlines()) == 1
-
-
 # ---------------------------------------------------------------------------------------- kills and company
 
 
@@ -344,17 +333,6 @@ def test_any_number_of_workers_gives_the_same_bytes(tmp_path):
     csv = [(tmp_path / str(workers) / "sweep" / "bias_variance.csv").read_bytes() for workers in (0, 2)]
     assert csv[0] == csv[1]
     assert table(tmp_path / "2")["time_s"].isna().all()
-
-
-@pytest.mark.slow
-def test_two_runs_of_one_experiment_at_once(tmp_path):
-    words = [*sweep(40), f"results_dir={tmp_path}"]
-    runs = [start(*words) for _ in range(2)]
-    assert [run.wait(timeout=120) for run in runs] == [0, 0]
-    found = table(tmp_path)
-    assert len(found) == 40
-    assert found["key"].is_unique
-    assert not list((tmp_path / "sweep" / "pending").glob("[!.]*"))
 
 
 @pytest.mark.parametrize("kills", [pytest.param(5, marks=pytest.mark.slow), pytest.param(20, marks=pytest.mark.full)])

@@ -4,7 +4,6 @@ import itertools
 import json
 import threading
 
-import bench_self
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -161,15 +160,3 @@ def test_measured_compilation_is_not_taken_from_the_folder(tmp_path):
         problem.value(theta, w)
         made.append(compilations.made)
     assert made == [1, 0, 1]
-
-
-# -------------------------------------------------------------------------------------------------------- bench_self
-
-
-@pytest.mark.full
-def test_bench_self_writes_its_table(tmp_path):
-    bench_self.main(["--quick", str(tmp_path)])
-    lines = json.loads((tmp_path / "bench_self.json").read_text())["lines"]
-    found = {line["what"]: line["value"] for line in lines}
-    assert found["compilations over 27 values of stiffness x beta x sigma: distinct shapes"] == 2
-    assert found["fused over jax, pushing, 64 rollouts"] > 0

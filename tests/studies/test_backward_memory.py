@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 import pytest
-from bench.plugins.studies.backward_memory import in_process, spread, views
+from bench.plugins.studies.backward_memory import in_process, spread
 
 from bench.errors import Crashed
 from bench.experiment import config
@@ -114,8 +114,12 @@ def rows():
     return given, given.columns.typed(pd.DataFrame(lines))
 
 
+def shown(given, table):
+    return given.study.show(given, table)
+
+
 def test_orders_and_ratios_at_the_longest_horizon_are_those_of_the_memory():
-    table = views.views(*rows()).tables[0].frame
+    table = shown(*rows()).tables[0].frame
     assert list(table["method"]) == ["jax", "torch", "fused"]
     assert list(table["order"]) == pytest.approx([1.0, 1.0, 0.5])
     assert list(table["less"]) == pytest.approx([math.nan, 10.0, 100.0], nan_ok=True), "jax is not compared with itself"
@@ -127,7 +131,7 @@ def test_orders_and_ratios_at_the_longest_horizon_are_those_of_the_memory():
 def test_without_a_result_of_the_first_method_no_other_takes_its_place():
     given, table = rows()
     table.loc[table["backend"] == "jax", "status"] = "error"
-    assert views.views(given, table).tables[0].frame["less"].isna().all()
+    assert shown(given, table).tables[0].frame["less"].isna().all()
 
 
 def test_backends_without_gradients_are_refused():

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from bench.plugins.studies.optimise.measure import objective
-from classes import Adam, CartpoleSwing, GradientDescent, Numpy, Planted, Quadratic
+from classes import Adam, CartpoleSwing, GradientDescent, Planted, Quadratic
 from dose_response import analysis, views
 from dose_response.batched import run_batched
 from dose_response.ground import BestGradient, scored_noise
@@ -17,7 +17,7 @@ from trees import ROOT
 
 import bench
 from bench.experiment import config
-from bench.model import compose, slopes
+from bench.model import slopes
 
 PAPER = ROOT / "examples" / "cost_of_error"
 D = 8
@@ -116,46 +116,19 @@ def test_searches_in_shared_calls_equal_separate_searches(bowl):
     assert [s.updates for s in together] == [s.updates for s in apart]
 
 
-def test_a_seed_that_fails_among_others_fails_alone():
-    problem = Numpy().compile(compose(Quadratic(), None, None))
-    asked = []
-
-    def search(seed):
-        def run(lane):
-            first = lane.value(np.full(lane.dim, float(seed)), np.zeros((lane.program.n_noise, 2)))
-            if seed == 1:
-                raise ZeroDivisionError("seed 1")
-            asked.append(seed)
-            return {
-                "cost": float(first[0]),
-                "again": float(lane.value(np.zeros(lane.dim), np.zeros((lane.program.n_noise, 1)))[0]),
-            }
-
-        return run
-
-    found = run_batched(problem, [search(seed) for seed in range(3)])
-    assert isinstance(found[1], ZeroDivisionError)
-    assert asked == [0, 2]
-    assert found[0]["cost"] != found[2]["cost"]
-    assert found[0]["again"] == found[2]["again"]
-
-
-def test_a_call_that_fails_for_one_seed_is_made_for_each_alone():
-    def search(width):
-        return lambda lane: {"cost": lane.value(np.zeros(lane.dim), np.zeros((width, 1)))}
-
-    problem = Numpy().compile(compose(Quadratic(), None, None))
-    good, bad = run_batched(problem, [search(problem.program.n_noise), search(problem.program.n_noise + 1)])
-    assert isinstance(good, dict)
-    assert isinstance(bad, BaseException)
+def test_the_error_of_one_of_the_searches_that_share_calls_is_raised(bowl):
+    widths = [bowl.program.n_noise, bowl.program.n_noise + 1]
+    searches = [lambda lane, width=width: lane.value(np.zeros(lane.dim), np.zeros((width, 1))) for width in widths]
+    with pytest.raises(ValueError, match="dimension"):
+        run_batched(bowl, searches)
 
 
 def test_step_jacobians_of_searches_that_share_batches():
     """Without step Jacobians of the backend they are differences, in a shared problem too."""
     problem = bench.problem("lqr[horizon=5]", backend="numpy")
     theta, still = np.ones(5), np.zeros((5, 1))
-    (shared,) = run_batched(problem, [lambda lane: {"a": slopes(lane, theta, still).a}])
-    assert np.array_equal(shared["a"], slopes(problem, theta, still).a)
+    (shared,) = run_batched(problem, [lambda lane: slopes(lane, theta, still).a])
+    assert np.array_equal(shared, slopes(problem, theta, still).a)
 
 
 def test_compare_splits_the_error_into_bias_and_spread():

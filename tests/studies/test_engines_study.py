@@ -6,17 +6,14 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from bench.plugins.studies.engines.views import LEVELS, levels
+from bench.plugins.studies.engines import LEVELS, levels
+from helpers import stored
 
 import bench
 from bench.cli import main
 from bench.engines.process import close_engines
-from bench.experiment import config
 from bench.report import finish
-from bench.report.views import newest_rows
 from bench.report.web.data import page_data
-from bench.run.execute import store_of
-from bench.run.plan import requested_rows
 
 TOYS = Path(__file__).resolve().parents[1] / "engines" / "toys"
 
@@ -89,9 +86,7 @@ def test_levels_of_a_gradient(expected, changes):
 
 def test_the_page_shows_the_limit_that_the_table_shows():
     """The page showed the stored number, where the table had the end of its interval."""
-    standard = Path(__file__).resolve().parents[2] / "results" / "standard"
-    made = config.load(["+experiment=engine_gradients", f"results_dir={standard}"])
-    rows, _ = requested_rows(made, newest_rows(store_of(made).load()))
+    made, rows = stored("engine_gradients")
     shown = finish.views_of(made, rows)
     data = page_data(made, rows, shown, [[]] * len(rows))
     newton = "scene == 'cartpole' and backend == 'newton'"

@@ -5,9 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 from bench.plugins.studies.bias_variance.estimates import Estimates
+from helpers import loaded
 
-from bench.experiment import config
-from bench.experiment.grid import cells
 from bench.measure import noise, statistics
 from bench.model import compose, registry
 
@@ -16,14 +15,8 @@ ROUNDED = 1e-12
 
 
 def cell_of(estimator, samples=48, repeats=4):
-    words = [
-        "scenes=[cubic]",
-        "backends=[numpy]",
-        f"estimators=[{estimator}]",
-        f"samples={samples}",
-        f"repeats={repeats}",
-    ]
-    (cell,) = cells(config.load(words))
+    counts = f"samples={samples}", f"repeats={repeats}"
+    _, (cell,) = loaded("scenes=[cubic]", "backends=[numpy]", f"estimators=[{estimator}]", *counts)
     return cell
 
 

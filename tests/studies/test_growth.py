@@ -4,8 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from bench.plugins.studies.growth import classify, products, rate
-from bench.plugins.studies.growth.views import fit
+from bench.plugins.studies.growth import classify, fit, products, rate
 from classes import DoubleIntegrator, Jax, SemiImplicitEuler
 
 from bench.model import Jacobians, compose

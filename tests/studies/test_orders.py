@@ -5,11 +5,9 @@ from functools import partial
 import numpy as np
 import pytest
 from bench.plugins.studies.optimise.measure import advance, estimates, mean_costs
+from helpers import loaded
 
 import bench
-from bench.experiment import config
-from bench.experiment.grid import cells
-from bench.experiment.study import study_of
 from bench.measure import noise
 from bench.model import registry
 from bench.run.session import Session
@@ -80,9 +78,9 @@ def test_the_rate_moves_a_method_further_than_methods_are_apart():
 
 def ends(*words):
     """The rows of an experiment's cells, in order."""
-    made = config.load(list(words))
+    made, cells = loaded(*words)
     session = Session(made)
-    return [study_of(made).measure(cell, session) for cell in cells(made)]
+    return [made.study.measure(cell, session) for cell in cells]
 
 
 @pytest.mark.slow

@@ -7,17 +7,15 @@ import numpy as np
 import pandas as pd
 import pytest
 from bench.plugins.studies import stability
-from bench.plugins.studies.stability import Stability, views
+from bench.plugins.studies.stability import Stability
+from helpers import unmeasured
 
 from bench.experiment import config
 from bench.experiment.grid import cells
 from bench.model import MechanicalScene, State, registry
 from bench.model.parameters import build
-from bench.run import progress, tasks
-from bench.run.execute import Runner
-from bench.run.plan import plan
+from bench.run import tasks
 from bench.run.session import Session
-from bench.run.store import Store
 
 STIFFNESS = tuple(float(k) for k in np.logspace(1, 4, 13))
 HORIZON, DT = 40, 0.05
@@ -43,11 +41,8 @@ def swept(tmp_path, integrator, *words):
         tmp_path, "scenes=[mass_spring]", f"integrators=[{integrator}]", f"sweep.stiffness={list(STIFFNESS)}",
         f"scene.mass_spring.horizon={HORIZON}", f"scene.mass_spring.dt={DT}", *words,
     )  # fmt: skip
-    store = Store(given.directory, given.columns)
-    planned = plan(given, store)
-    with progress.show_progress(given.name, planned, quiet=True) as shown:
-        Runner(given, store, shown).run(planned)
-    return given, store.load().sort_values("stiffness").reset_index(drop=True)
+    session = Session(given)
+    return pd.DataFrame([cell.columns() | tasks.measure_cell(cell, session, LIMITS) for cell in cells(given)])
 
 
 def agrees(rows):
@@ -96,7 +91,7 @@ def measured(found, given):
 @pytest.mark.parametrize("integrator", sorted(registry.entries()["integrators"]))
 def test_measured_boundary_is_within_a_cell_of_the_theoretical_one(tmp_path, integrator, damping):
     """For every integrator, those too that grow too slowly to diverge within the rollout."""
-    _, rows = swept(tmp_path, integrator, f"scene.mass_spring.damping={damping}")
+    rows = swept(tmp_path, integrator, f"scene.mass_spring.damping={damping}")
     assert agrees(rows)
     assert rows["growth_factor"].to_numpy() == pytest.approx(rows["spectral_radius"].to_numpy(), rel=1e-6)
 
@@ -128,7 +123,7 @@ def test_backends_without_step_jacobians_are_classified_alike(tmp_path, backend)
 
 
 def test_first_bad_step_and_its_state_are_in_the_row(tmp_path):
-    _, rows = swept(tmp_path, "semi_implicit_euler")
+    rows = swept(tmp_path, "semi_implicit_euler")
     row = rows[rows["verdict"] == "diverged"].iloc[0]
     assert row["status"] == "diverged"
     assert f"step {int(row['first_bad_step'])} of {HORIZON}" in row["reason"]
@@ -200,12 +195,11 @@ def test_limits_hold_what_is_known():
     assert limit("implicit_euler") == limit("implicit_midpoint") == math.inf
 
 
-def test_backends_that_disagree_show_the_worse_verdict_and_no_verdict_is_no_finding(tmp_path):
-    given = experiment(tmp_path, "scenes=[mass_spring]", "backends=[jax,numpy]", "sweep.stiffness=[10,100]")
-    lines = [given.columns.blank() | cell.columns() | {"status": "ok", "verdict": "ok"} for cell in cells(given)]
-    rows = given.columns.typed(pd.DataFrame(lines))
+def test_backends_that_disagree_show_the_worse_verdict_and_no_verdict_is_no_finding():
+    words = "study=stability", "scenes=[mass_spring]", "backends=[jax,numpy]", "sweep.stiffness=[10,100]"
+    given, rows = unmeasured(*words, "estimators=[fobg]", verdict="ok")
     rows.loc[(rows["backend"] == "numpy") & (rows["stiffness"] == 100), "verdict"] = "wrong_sign"
-    chart = views.views(given, rows).charts[0].frame.set_index("stiffness")
+    chart = given.study.show(given, rows).charts[0].frame.set_index("stiffness")
     assert dict(chart["level"]) == {10.0: "right", 100.0: "wrong"}
     assert rows["backend"][chart.loc[100.0, "row"]] == "numpy"
 

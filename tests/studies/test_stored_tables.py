@@ -1,16 +1,13 @@
 """The tables of the stored rows of standard experiments are the stored tables, to the byte."""
 
 import pytest
+from helpers import stored
 from trees import ROOT
 
-from bench.experiment import config
 from bench.report.finish import views_of
-from bench.report.views import newest_rows
 from bench.report.writer import table_files
-from bench.run.execute import store_of
-from bench.run.plan import requested_rows
 
-STANDARD, EXAMPLE = ROOT / "results" / "standard", ROOT / "examples" / "cost_of_error"
+EXAMPLE = ROOT / "examples" / "cost_of_error"
 FAST = {
     "backward_memory", "dose_response/controls", "engine_gradients", "horizon_growth", "identify", "optimise/small", "quadruped_check",
     "quick", "solver_iterations", "stability_map", "three_errors", "train/half_cheetah", "twins",
@@ -26,10 +23,9 @@ NAMES = {
 @pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (n not in FAST)) for n in NAMES])
 def test_tables_of_stored_rows_are_the_stored_tables(name):
     """Where they differ on purpose, write them again: ``python -m bench report +experiment=NAME results_dir=results/standard``."""
-    given = config.load([f"experiment={name}", *NAMES[name], f"results_dir={STANDARD}"])
-    if not (given.directory / "rows.parquet").exists():
+    given, rows = stored(name, *NAMES[name])
+    if rows.empty:
         pytest.skip("no rows are stored")
-    rows, _ = requested_rows(given, newest_rows(store_of(given).load()))
     tables = views_of(given, rows).tables
     for table in dict.fromkeys(table.name for table in tables):
         for file, content in table_files([one for one in tables if one.name == table], given.name):

@@ -6,12 +6,11 @@ import shlex
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 from bench.plugins.studies.gradient_check import views as gradient_check
-from bench.plugins.studies.gradient_check.lines import PER_COMPONENT
-from bench.plugins.studies.stability.views import cells_of
+from bench.plugins.studies.stability import cells_of
 from bench.plugins.studies.twins import FLOOR
+from helpers import unmeasured
 
 import bench.report
 from bench.experiment import config
@@ -74,26 +73,17 @@ def own(tmp_path_factory):
     return folder
 
 
-def made(*words):
-    """An experiment, and a row without results for each of its cells."""
-    given = config.load([*words])
-    lines = [
-        given.columns.blank() | cell.columns() | {"experiment": given.name, "status": "ok"} for cell in cells(given)
-    ]
-    return given, given.columns.typed(pd.DataFrame(lines))
-
-
 # -------------------------------------------------------------------------------------------------- gradient_check
 
 
 def checked(*words):
-    given, rows = made("study=gradient_check", "backends=[jax,torch]", "estimators=[fobg]", *words)
+    given, rows = unmeasured("study=gradient_check", "backends=[jax,torch]", "estimators=[fobg]", *words)
     eps = EPS[:2]
     values = {
         "point": ["start"], "sample": [0], "direction": [0], "derivative_program": [1.0], "check_verdict": ["smooth"],
         "check_error": [1e-9], "check_eps": [1e-4], "eps": list(eps), "derivative_differences": [1.0, 1.0],
         "relative_error": [1e-9, 1e-8], "mode_minus": ["", ""], "mode_plus": ["", ""],
-    } | {name: [0] for name in PER_COMPONENT}  # fmt: skip
+    } | {name: [0] for name in gradient_check.PER_COMPONENT}  # fmt: skip
     return given, rows.assign(verdict="smooth", **{name: [value] * len(rows) for name, value in values.items()})
 
 
@@ -133,9 +123,11 @@ def test_untrusted_undecided_and_missing_gradients_come_first_and_are_never_righ
 
 
 def erring(*words):
-    given, rows = made("study=three_errors", "backends=[jax]", "estimators=[fobg,reinforce]", *words)
-    numbers = {name: 0.5 for name in ("forward_error_rel", "program_error_rel", "model_error_rel", "model_cosine")}
-    return given, rows.assign(**numbers, bias=0.1, bias_rel=0.1, bias_low=0.05, bias_high=0.2, reference_norm=1.0)
+    numbers = dict.fromkeys(("forward_error_rel", "program_error_rel", "model_error_rel", "model_cosine"), 0.5)
+    biases = {"bias": 0.1, "bias_rel": 0.1, "bias_low": 0.05, "bias_high": 0.2, "reference_norm": 1.0}
+    return unmeasured(
+        "study=three_errors", "backends=[jax]", "estimators=[fobg,reinforce]", *words, **numbers, **biases
+    )
 
 
 def test_the_main_chart_of_three_errors_is_along_the_time_step_where_it_is_swept():
@@ -155,8 +147,8 @@ def test_the_main_chart_of_three_errors_is_along_the_time_step_where_it_is_swept
 
 
 def mapped(*words):
-    given, rows = made("study=stability", "backends=[jax]", "estimators=[fobg]", *words)
-    return given, rows.assign(verdict="ok", truth="physical", growth_factor=1.0)
+    words = ("study=stability", "backends=[jax]", "estimators=[fobg]", *words)
+    return unmeasured(*words, verdict="ok", truth="physical", growth_factor=1.0)
 
 
 @pytest.mark.parametrize(
@@ -191,7 +183,7 @@ def test_a_share_is_not_named_after_a_parameter_that_varies_in_it():
 
 def test_growth_keeps_noises_apart_and_joins_what_steps_with_the_horizon():
     words = ["study=growth", "scenes=[double_integrator]", "estimators=[fobg]", "sweep.sigma=[0.1,0.2]"]
-    given, rows = made(*words, "sweep.zip.horizon=[10,20]", "sweep.zip.dt=[0.1,0.05]")
+    given, rows = unmeasured(*words, "sweep.zip.horizon=[10,20]", "sweep.zip.dt=[0.1,0.05]")
     rows = rows.assign(gradient_median=1.0, time_horizon=rows["horizon"] * rows["dt"])
     shown = given.study.views(given, rows)
     assert dict(shown.rows["problem"].value_counts()) == {
@@ -201,7 +193,7 @@ def test_growth_keeps_noises_apart_and_joins_what_steps_with_the_horizon():
 
 
 def test_twins_of_a_swept_scene_are_panels_of_their_own():
-    given, rows = made(
+    given, rows = unmeasured(
         "study=twins", "scenes=[pendulum]", "backends=[mujoco,mjx]", "estimators=[fobg]", "sweep.horizon=[2,3]"
     )
     own = [list(np.zeros(int(h) + 1)) for h in rows["horizon"]]
@@ -225,7 +217,7 @@ def test_twins_of_a_swept_scene_are_panels_of_their_own():
 
 def test_a_scene_with_a_stiffness_of_its_own_keeps_its_cells_apart(own):
     words = [f"plugins=['{own}']", "scenes=[sprung]", "contacts=[penalty]", "estimators=[fobg]"]
-    given, rows = made(*words, "sweep.sprung.stiffness=[1,10,100]")
+    given, rows = unmeasured(*words, "sweep.sprung.stiffness=[1,10,100]")
     assert problem_numbers(rows, ["scene"]).nunique() == 3
     shown = arrange(given, rows)
     (axis,) = shown.axes
@@ -242,7 +234,7 @@ def test_a_scene_with_a_stiffness_of_its_own_keeps_its_cells_apart(own):
 
 def test_a_study_without_a_page_gets_its_numbers_and_filters_by_what_varies(own):
     words = [f"plugins=['{own}']", "study=counted", "scenes=[mass_spring]", "estimators=[fobg]", "sweep.mass=[1,2,3]"]
-    given, rows = made(*words)
+    given, rows = unmeasured(*words)
     rows = rows.assign(weight=[1.0, 2.0, 30.0], outcome=["good", "bad", "good"])
     views = views_of(given, rows)
     data = page_data(given, rows, views, [[]] * 3)
@@ -294,7 +286,7 @@ def one_a_study():
 
 @pytest.fixture(scope="module", params=one_a_study())
 def standard(request):
-    return made(f"experiment={request.param}")
+    return unmeasured(f"experiment={request.param}")
 
 
 def test_a_standard_experiment_of_each_study_says_how_its_rows_are_made_again(standard):
@@ -319,20 +311,20 @@ def test_a_standard_experiment_of_each_study_says_how_its_rows_are_made_again(st
     ],
 )
 def test_whatever_decides_a_cell_is_in_its_command(words):
-    given, rows = made(*words)
+    given, rows = unmeasured(*words)
     for command, key in zip(reproduce.commands(given, rows), rows["key"], strict=True):
         assert again(given, rows, command) == [key]
 
 
 def test_the_command_of_a_cell_names_the_folders_of_its_plugins(own):
-    given, rows = made(f"plugins=['{own}']", "scenes=['sprung[stiffness=3]']", "study=counted")
+    given, rows = unmeasured(f"plugins=['{own}']", "scenes=['sprung[stiffness=3]']", "study=counted")
     (command,) = reproduce.commands(given, rows[:1])
     assert any(str(own) in word for word in command)
     assert again(given, rows, command) == [rows["key"][0]]
 
 
 def test_a_row_of_a_plugin_that_is_not_installed_has_no_command():
-    given, rows = made("scenes=[pushing]")
+    given, rows = unmeasured("scenes=[pushing]")
     rows["parameters"] = rows["parameters"].str.replace('"name":"pushing"', '"name":"gone"')
     assert reproduce.commands(given, rows) == [[]] * len(rows)
     assert views_of(given, rows).tables

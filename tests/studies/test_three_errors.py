@@ -1,18 +1,14 @@
 """Program, model and estimator error kept apart: the impulse without time of impact, which only the model error betrays."""
 
 import numpy as np
-import pandas as pd
 import pytest
-from bench.plugins.studies.three_errors import ThreeErrors, _signs, difference_check
-from bench.plugins.studies.three_errors.views import FLOOR, OWN, PROGRAM, TRAP, traps, views
+from bench.plugins.studies.three_errors import FLOOR, OWN, PARTS, TRAP, _signs, difference_check, traps
 from classes import BounceOnce, BouncingBall, Impulse, Jax, SemiImplicitEuler
+from helpers import unmeasured
 
-from bench.experiment import config
-from bench.experiment.grid import cells
 from bench.model import compose
 from bench.report.shown import Shown
 
-COLUMNS = ThreeErrors.columns
 NO_IMPACT = Impulse(time_of_impact=False)
 
 
@@ -71,31 +67,27 @@ def test_a_trap_is_exact_convergent_and_turned_away_or_no_nearer_at_every_step(c
         "backends=[jax]",
         "sweep.dt=[0.1,0.05]",
     ]
-    given = config.load([*words, "estimators=[fobg]"])
-    rows = pd.DataFrame([COLUMNS.blank() | cell.columns() for cell in cells(given)]).assign(status="ok", reason="")
     values = {"program_error_rel": [1e-12, 1e-13], "model_cosine": [-0.5, -0.4], "forward_error_rel": [0.4, 0.1]}
     values |= {"model_error_rel": [1.5, 0.5]}
-    typed = COLUMNS.typed(rows.assign(**(values | change)))
-    assert len(traps(Shown(given, typed, ["dt"], ["estimator"], PROGRAM))) == 3 * trapped
-    found = views(given, typed)
+    given, typed = unmeasured(*words, "estimators=[fobg]", **(values | change))
+    assert len(traps(Shown(given, typed, ["dt"], ["estimator"], PARTS))) == 3 * trapped
+    found = given.study.show(given, typed)
     assert (set(found.charts[0].frame["series"]) == {OWN, TRAP}) == trapped
 
 
 def laws(model, program=(1e-12, 1e-12, 1e-12)):
     """Three laws on two scenes with planted errors: ``model`` has the errors of a scene's laws."""
     words = ["study=three_errors", "scenes=[bounce_once,bouncing_ball]", "contacts=[impulse,penalty,softplus]"]
-    given = config.load([*words, "backends=[jax]", "estimators=[fobg,reinforce]"])
-    rows = pd.DataFrame([COLUMNS.blank() | cell.columns() for cell in cells(given)]).assign(
-        status="ok", reason="", bias=0.1, bias_rel=0.1, bias_low=0.0, bias_high=0.2, reference_norm=1.0
-    )
-    rows["model_error_rel"] = np.repeat(np.ravel(model), 2)
-    rows["program_error_rel"] = np.repeat([*program, *program], 2)
-    return given, COLUMNS.typed(rows)
+    return unmeasured(
+        *words, "backends=[jax]", "estimators=[fobg,reinforce]", bias=0.1, bias_rel=0.1, bias_low=0.0, bias_high=0.2,
+        reference_norm=1.0, model_error_rel=np.repeat(np.ravel(model), 2), program_error_rel=np.repeat([*program, *program], 2),
+    )  # fmt: skip
 
 
 def test_gradients_are_drawn_once_whatever_estimates_them_and_only_where_compared():
     model = [[0.0, 3.0, np.nan], [0.5, 0.2, 0.05]]
-    found = views(*laws(model, (1e-12, 1e-12, np.nan)))
+    given, rows = laws(model, (1e-12, 1e-12, np.nan))
+    found = given.study.show(given, rows)
     drawn = found.charts[0].plotted()
     zero = drawn[drawn["error"] == FLOOR]
     assert list(zero["law"]) == ["impulse"]

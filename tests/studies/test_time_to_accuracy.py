@@ -1,6 +1,5 @@
 """The fastest method for an error: costs at a known law of bias and variance."""
 
-import json
 import math
 
 import pandas as pd
@@ -8,7 +7,7 @@ import pytest
 from bench.plugins.studies.bias_variance.costs import ROLLOUTS, TIME, with_gradient_cost
 from bench.plugins.studies.bias_variance.time_to_accuracy import limits, required_cost
 from bench.plugins.studies.bias_variance.time_to_accuracy import table as table_of
-from helpers import described_by
+from helpers import row
 
 from bench.cli import main
 from bench.experiment import config
@@ -23,39 +22,29 @@ VARIANCE = 4.0
 def rows(bias=0.0, resolved=None, **values):
     """Rows of a method with that law, 1 ms a sample, for a gradient of norm 2."""
     resolved = bias > 0 if resolved is None else resolved
-    found = [
-        {
-            "scene": "s", "contact": "none", "integrator": "i", "noise": "action", "backend": "b", "dtype": "float64",
-            "estimator": "e", "estimator_params": "", "horizon": 10.0, "dt": 0.1, "stiffness": math.nan, "sigma": 0.1,
-            "smoothing": math.nan, "repeats": 8, "seed": 0, "status": "ok", "samples": float(n),
-            "reference_norm": 2.0, "bias": 2 * bias, "bias_low": 1.9 * bias if resolved else 0.0, "bias_high": 2.1 * bias,
-            "variance": 4 * VARIANCE / n, "rmse": 2 * math.sqrt(bias**2 + VARIANCE / n),
-            "rmse_rel": math.sqrt(bias**2 + VARIANCE / n), "time_s": 1e-3 * n, "time_iqr_s": 0.0, "compile_s": 2.0,
-            "rollouts": float(n), "gradients": float(n),
-        } | values
+    return pd.DataFrame([
+        row(**{
+            "backend": "b", "estimator": "e", "repeats": 8, "samples": float(n), "reference_norm": 2.0, "bias": 2 * bias,
+            "bias_low": 1.9 * bias if resolved else 0.0, "bias_high": 2.1 * bias,
+            **dict.fromkeys(("variance", "variance_low", "variance_high"), 4 * VARIANCE / n),
+            "rmse": 2 * math.sqrt(bias**2 + VARIANCE / n), "rmse_rel": math.sqrt(bias**2 + VARIANCE / n), "time_s": 1e-3 * n,
+            "time_iqr_s": 0.0, "rollouts": float(n), "gradients": float(n),
+        } | values)
         for n in SAMPLES
-    ]  # fmt: skip
-    return pd.DataFrame(
-        [one | {"study": "bias_variance", "parameters": json.dumps(described_by(one))} for one in found]
-    )
+    ])  # fmt: skip
 
 
 GIVEN = config.load(["sweep.samples=[16,64,256]"])
 
 
-def table(*parts, width=None):
-    """The table of some rows, whose variances of one sample have intervals ``width`` times up and down."""
+def table(*parts, width=1.0):
+    """The table of some rows, whose variances have intervals ``width`` times up and down."""
     found = pd.concat(parts, ignore_index=True)
-    if width:
-        ends = {"_low": 1 / width, "_high": width, "": 1.0}
-        found = found.assign(
-            **{f"variance_per_sample{end}": found["variance"] * found["samples"] * k for end, k in ends.items()}
-        )
-        found = found.assign(**{f"variance{end}": found["variance"] * k for end, k in ends.items()})
+    found = found.assign(variance_low=found["variance"] / width, variance_high=found["variance"] * width)
     return table_of(arrange(GIVEN, with_gradient_cost(found)))
 
 
-def entry(*parts, by="rollouts", target=0.1, width=None):
+def entry(*parts, by="rollouts", target=0.1, width=1.0):
     found = table(*parts, width=width)
     return found[(found["by"] == by) & (found["relative error"] == target)].iloc[0]
 
@@ -170,14 +159,13 @@ def test_a_cost_at_the_fewest_samples_is_a_limit():
     assert limits(pd.DataFrame([found])) == ["at least 25"]
 
 
-@pytest.mark.parametrize(("width", "tied"), [(None, ()), (1.2, ()), (3.0, ("slow on b",))])
+@pytest.mark.parametrize(("width", "tied"), [(1.0, ()), (1.2, ()), (3.0, ("slow on b",))])
 def test_the_table_names_the_fastest_and_a_factor_only_where_its_interval_excludes_1(width, tied):
     found = entry(rows(), slower(3, estimator="slow"), rows(bias=0.3, estimator="biased"), by="time", width=width)
     assert (found["fastest"], found["next"], found["how"]) == ("e on b", "slow on b", "extrapolated")
     assert found["factor"] == pytest.approx(3.0)
     assert found["never"] == "biased on b"
-    if width:
-        assert (found["factor_low"] > 1.0, found["tied"]) == (not tied, tied)
+    assert (found["factor_low"] > 1.0, found["tied"]) == (not tied, tied)
 
 
 def test_nothing_is_told_where_samples_are_not_swept():

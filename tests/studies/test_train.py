@@ -37,10 +37,13 @@ def made_up(final=FINAL, seeds=range(5), spread=10.0, **columns):
     return experiment, experiment.columns.typed(pd.DataFrame(rows))
 
 
+def tables_of(experiment, rows):
+    return {table.name: table for table in views(experiment, rows).tables}
+
+
 def verdicts_of(experiment, rows):
     """The verdict on each trainer, by the table of trainers."""
-    table = next(table for table in views(experiment, rows).tables if table.name == "summary")
-    return dict(zip(table.frame["method"], table.frame["verdict"], strict=True))
+    return tables_of(experiment, rows)["summary"].frame.set_index("method")["verdict"].to_dict()
 
 
 @pytest.mark.parametrize(
@@ -67,8 +70,9 @@ def test_few_seeds_give_no_interval_and_no_order():
 
 
 def test_windows_that_are_not_distinguishable_from_the_best_are_tied():
-    experiment, rows = made_up({"shac": -530.0, "shac[window=16]": -531.0, "shac[window=8]": -700.0})
-    windows = next(table for table in views(experiment, rows).tables if table.name == "windows").frame
+    windows = tables_of(*made_up({"shac": -530.0, "shac[window=16]": -531.0, "shac[window=8]": -700.0}))[
+        "windows"
+    ].frame
     assert sorted(windows["verdict"]) == ["behind", "first", "tied"]
     assert windows.loc[windows["verdict"] == "behind", "window"].tolist() == [8]
 
@@ -80,7 +84,7 @@ def test_a_trainer_without_a_run_that_ends_is_not_the_best_by_its_untrained_poli
     rows.loc[planted, ["status", "first_return"]] = ["nonfinite", -100.0]
     assert verdicts_of(experiment, rows) == {"shac": "first", "shac[window=8]": "behind", "ppo": "no result"}
     rows.loc[rows["trainer"] == "shac[window=8]", ["status", "first_return"]] = ["nonfinite", -100.0]
-    assert "windows" not in {table.name for table in views(experiment, rows).tables}, "one window is left"
+    assert "windows" not in tables_of(experiment, rows), "one window is left"
     rows["status"] = "nonfinite"
     assert set(verdicts_of(experiment, rows).values()) == {"no result"}
 
@@ -96,8 +100,7 @@ def test_a_run_that_is_not_finite_counts_as_its_untrained_policy():
 
 
 def test_a_fault_is_reported_with_its_run_and_its_number():
-    experiment, rows = made_up(gradient_zero=0.9)
-    table = next(table for table in views(experiment, rows).tables if table.name == "faults")
+    table = tables_of(*made_up(gradient_zero=0.9))["faults"]
     assert len(table.frame) == 15
     assert (table.frame[["code", "value"]] == ["zero", 0.9]).all(axis=None)
     assert "- zero: share of updates with a gradient of exactly 0" in table.notes

@@ -1,4 +1,9 @@
-"""Launchers, which run tasks here or on a cluster. All produce the same rows, and can resume each other's sweeps."""
+"""Launchers, which run tasks here or on a cluster. All produce the same rows, and can resume each other's sweeps.
+
+Another launcher is a class with the methods of :class:`~bench.run.launchers.launcher.Launcher`, a case of
+:func:`launcher_of`, a name in ``LAUNCHERS`` of :mod:`bench.experiment.config`, and its settings in ``conf/config.yaml`` and
+``TABLES`` of :mod:`bench.experiment.overrides`.
+"""
 
 from __future__ import annotations
 

@@ -11,11 +11,8 @@ from types import TracebackType
 from typing import Any, Protocol
 
 from bench.experiment.experiment import Experiment
-from bench.run.pool import Answer, Pool, ResourceLimits
+from bench.run.pool import BATCH_S, Answer, Pool, ResourceLimits
 from bench.run.tasks import FAILED, Task, TaskHandler
-
-BATCH_S = 0.05
-"""Seconds of work whose answers are yielded together, to be stored in one file: syncing takes longer than a small cell."""
 
 
 class Launcher(Protocol):

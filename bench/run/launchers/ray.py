@@ -1,4 +1,7 @@
-"""Runs tasks as many small jobs on a Ray cluster; the tasks of a lost node run on another one."""
+"""Runs tasks on the nodes of a Ray cluster, one job per node at a time; the tasks of a lost node run on another one.
+
+A job is a list of tasks that a pool of local workers runs on its node. Its answers arrive one by one.
+"""
 
 from __future__ import annotations
 
@@ -28,8 +31,8 @@ TICK = 0.1
 """Seconds between checks of the jobs."""
 ANSWER_S = 10.0
 """Seconds in which a cluster answers."""
-JOBS_PER_CORE = 2
-"""Jobs sent per core: one runs, and another is ready to start."""
+JOBS_PER_NODE = 4
+"""Jobs into which a node's share of the tasks is cut, so that quick nodes get more of them."""
 MAX_LOSSES = 3
 """Number of losses of a node while it runs a task after which the task counts as crashed."""
 
@@ -42,8 +45,7 @@ class RaySettings(Plugin):
     name: ClassVar[str] = "ray"
 
     address: str | None = param(None, "host and port of the cluster; null: RAY_ADDRESS, or a cluster of this machine")
-    cells: int = param(50, "most cells of a job", low=1)
-    cpus: float = param(1.0, "cores that a job reserves", low=1)
+    cells: int = param(50, "most cells of a job per core", low=1)
 
 
 @dataclass(eq=False)
@@ -56,7 +58,7 @@ class _SentJob:
 
 
 class RayLauncher:
-    """Runs jobs on the nodes of a Ray cluster; timed jobs have a node to themselves, and all nodes are of one kind.
+    """Runs jobs on the nodes of a Ray cluster, each on all cores of its node; timed jobs run on nodes of one kind.
 
     Raises :class:`UserError` if Ray is not installed, no cluster runs, or no node is of kind ``kind``.
     """
@@ -64,12 +66,6 @@ class RayLauncher:
     def __init__(self, experiment: Experiment, timed: bool, kind: str) -> None:
         self._settings = cast(RaySettings, build(RaySettings, experiment.execution.cluster))
         self._address = self._settings.address or os.environ.get("RAY_ADDRESS")
-        n_cores = os.cpu_count() or 1
-        if not self._address and self._settings.cpus > n_cores:
-            raise UserError(
-                f"ray.cpus={self._settings.cpus:g} is more than the {n_cores} cores of this machine, on which a cluster is "
-                "started without ray.address"
-            )
         try:
             os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # Ray warns if this is unset
             import ray
@@ -97,9 +93,6 @@ class RayLauncher:
                     f"no Ray cluster at {self._address or 'this machine'}: {printable(error)[:300]}; start one: ray start --head"
                 ) from None
             self._has_started_ray = True
-        if lack := self._lack_of_cores():
-            self.__exit__()
-            raise UserError(lack)
         folder = self._experiment.results_dir.absolute()
         self._packed = self._ray.put(pickle.dumps(replace(without_grid(self._experiment), results_dir=folder)))
         return self
@@ -112,17 +105,11 @@ class RayLauncher:
         if self._has_started_ray:
             self._ray.shutdown()
 
-    def _lack_of_cores(self) -> str:
-        """Return why no node has the cores of a job, or an empty string."""
-        most = max((float(node["Resources"].get("CPU", 0)) for node in self._alive.values()), default=0.0)
-        cpus = self._settings.cpus
-        lack = f"a job reserves ray.cpus={cpus:g} cores, and the largest node of the cluster has {most:g}"
-        return lack if most < cpus else ""
-
     @property
-    def _alive(self) -> dict[str, Any]:
-        """The nodes by id."""
-        return {node["NodeID"]: node for node in self._ray.nodes() if node["Alive"]}
+    def _cores(self) -> dict[str, int]:
+        """The number of cores of each node that has some, by the node's id."""
+        cores = {node["NodeID"]: int(node["Resources"].get("CPU", 0)) for node in self._ray.nodes() if node["Alive"]}
+        return {node: count for node, count in cores.items() if count}
 
     @property
     def current(self) -> list[Task]:
@@ -131,34 +118,23 @@ class RayLauncher:
 
     def run(self, groups: Sequence[Sequence[Task]]) -> Iterator[list[Answer]]:
         """Yield answers as they arrive, one per task, and empty lists while the caller has to wait."""
-        nodes = self._nodes_of_one_kind() if self._timed else {}
-        n_slots = len(nodes) if self._timed else self._n_cores
-        waiting = deque(split(groups, self._settings.cells, JOBS_PER_CORE * n_slots))
+        chosen = self._of_one_kind() if self._timed else None
+        waiting = deque(split(groups, self._settings.cells, list(self._cores.values())))
         while waiting or self._jobs:
-            if self._timed:
-                nodes = {node: cores for node, cores in nodes.items() if node in self._alive}
-                if waiting and not nodes:
-                    raise UserError(
-                        f"no node of the kind '{self._kind}' is left; run the same command again when there is one"
-                    )
-                free = [node for node in nodes if all(job.node != node for job in self._jobs)]
-                for node in free[: len(waiting)]:
-                    self._send(waiting.popleft(), nodes[node], node)
-            else:
-                while waiting and len(self._jobs) < JOBS_PER_CORE * self._n_cores:
-                    self._send(waiting.popleft(), self._settings.cpus)
+            nodes = {node: n for node, n in self._cores.items() if chosen is None or node in chosen}
+            if waiting and not nodes:
+                kind = f" of the kind '{self._kind}'" if self._timed else ""
+                raise UserError(f"no node{kind} is left; run the same command again when there is one")
+            free = nodes.keys() - {job.node for job in self._jobs}
+            for node in list(free)[: len(waiting)]:
+                self._send(waiting.popleft(), nodes[node], node)
             yield self._collect(waiting)
 
-    @property
-    def _n_cores(self) -> int:
-        return int(self._ray.cluster_resources().get("CPU", 1))
-
-    def _send(self, tasks: list[Task], cores: float, node: str = "") -> None:
-        place = self._only_on(node) if node else "SPREAD"
+    def _send(self, tasks: list[Task], cores: int, node: str) -> None:
         job = self._ray.remote(_run_job).options(
-            num_cpus=cores, num_returns="streaming", max_retries=0, scheduling_strategy=place
+            num_cpus=cores, num_returns="streaming", max_retries=0, scheduling_strategy=self._only_on(node)
         )
-        stream = job.remote(self._experiment.plugins, self._packed, pickle.dumps(tasks), self._timed)
+        stream = job.remote(self._experiment.plugins, self._packed, pickle.dumps(tasks), self._timed, cores)
         self._jobs.append(_SentJob(stream, dict(enumerate(tasks)), node))
 
     def _only_on(self, node: str) -> Any:
@@ -192,13 +168,11 @@ class RayLauncher:
                 answers.append(Answer(job.unanswered.pop(index), **answer))
         return answers
 
-    def _nodes_of_one_kind(self) -> dict[str, float]:
-        """Return the core counts, by node, of the nodes for timed cells: of the required kind, else of the first node's."""
-        cores = {name: float(node["Resources"].get("CPU", 0)) for name, node in self._alive.items()}
+    def _of_one_kind(self) -> set[str]:
+        """Return the nodes for timed cells: those of the required kind, else of the first node's."""
         requests = {
             node: self._ray.remote(_kind_of_node).options(num_cpus=0, scheduling_strategy=self._only_on(node)).remote()
-            for node, count in cores.items()
-            if count >= 1
+            for node in self._cores
         }
         kinds: dict[str, str] = {}
         for node, request in requests.items():
@@ -207,7 +181,7 @@ class RayLauncher:
         if not kinds:
             raise UserError("the Ray cluster has no node with a core")
         self._kind = self._kind or next(iter(kinds.values()))
-        nodes = {node: cores[node] for node, kind in kinds.items() if kind == self._kind}
+        nodes = {node for node, kind in kinds.items() if kind == self._kind}
         if not nodes:
             raise UserError(
                 f"the stored times are from '{self._kind}', and the cluster has {', '.join(sorted(set(kinds.values())))}: times "
@@ -216,15 +190,15 @@ class RayLauncher:
         return nodes
 
 
-def split(groups: Sequence[Sequence[Task]], max_tasks: int, n_slots: int) -> list[list[Task]]:
-    """Split groups into chunks of at most ``max_tasks`` tasks, smaller if slots would stay idle."""
-    n_tasks = sum(map(len, groups))
-    size = max(1, min(max_tasks, -(-n_tasks // max(1, n_slots))))
+def split(groups: Sequence[Sequence[Task]], cells: int, cores: Sequence[int]) -> list[list[Task]]:
+    """Split groups into jobs of at most ``cells`` tasks per core of the largest node, smaller if nodes would stay idle."""
+    n_tasks, most = sum(map(len, groups)), max(cores, default=1)
+    size = min(cells * most, max(most, -(-n_tasks // (JOBS_PER_NODE * len(cores) or 1))))
     return [list(group[i : i + size]) for group in groups for i in range(0, len(group), size)]
 
 
 def _run_job(
-    folders: Sequence[Path], experiment: bytes, tasks: bytes, timed: bool
+    folders: Sequence[Path], experiment: bytes, tasks: bytes, timed: bool, cores: int
 ) -> Iterator[tuple[int, dict[str, Any]]]:
     """Run tasks on this machine; yields the index of each task and the fields of its answer.
 
@@ -234,7 +208,8 @@ def _run_job(
         registry.add_folder(folder)
     own: list[Task] = pickle.loads(tasks)
     index = {id(task): i for i, task in enumerate(own)}
-    with local_launcher(pickle.loads(experiment), timed, n_workers=1) as launcher:
+    given: Experiment = pickle.loads(experiment)
+    with local_launcher(given, timed, given.execution.workers or cores) as launcher:
         for a in itertools.chain.from_iterable(launcher.run([own])):
             answer = {"result": a.result, "seconds": a.seconds, "output": a.output, "machine": kind_of_machine()}
             yield index[id(a.item)], answer

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 from bench.plugins.studies.optimise import SearchStudy
 
-from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, text
+from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, seconds, several, text
 from bench.model import param
 
 REVISION = 1
@@ -19,7 +18,7 @@ class DoseResponse(SearchStudy):
     """Searches with gradients of known error at their best rate, and counts the updates until the regret has fallen."""
 
     name = "dose_response"
-    columns: ClassVar[Columns] = Columns.of(
+    columns = Columns.of(
         text("optimizer", "identity string of the optimizer"),
         text("scene_class", "smooth, stiff (contact), chaotic (gradients vary more than costs), discontinuous or identification",
              label="class"),
@@ -41,16 +40,17 @@ class DoseResponse(SearchStudy):
         Column("gradients_per_update", "gradients of an update"),
         Column("tuning_rollouts", "costs of all searches that choose the rate"),
         Column("tuning_gradients", "gradients of all searches that choose the rate"),
-        Column("rollout_s", "time of a cost in a batch of 256", "s", format="seconds", measured=True, untimed=True),
-        Column("gradient_s", "time of a gradient in a batch of 256", "s", format="seconds", measured=True, untimed=True),
+        seconds("rollout_s", "time of a cost in a batch of 256", untimed=True),
+        seconds("gradient_s", "time of a gradient in a batch of 256", untimed=True),
         text("hypotheses", "hash of the file of hypotheses at the time of the measurement"),
-        numbers("updates", "updates to 1/10, 1/30, 1/100, 1/300 and 1/1000 of the first regret, `runs` each; empty: missed",
-                table=False),
-        numbers("best_rates", "rate of each target, chosen on seeds that do not score", table=False),
-        numbers("is_inside", "whether the rate of each target is inside the grid of rates", table=False),
-        numbers("rates", "rates tried", table=False),
-        numbers("rate_updates", "median updates to each target at each rate", table=False),
-        numbers("path_errors", "relative error at each of the ten thetas", table=False),
+        *several(numbers, {
+            "updates": "updates to 1/10, 1/30, 1/100, 1/300 and 1/1000 of the first regret, `runs` each; empty: missed",
+            "best_rates": "rate of each target, chosen on seeds that do not score",
+            "is_inside": "whether the rate of each target is inside the grid of rates",
+            "rates": "rates tried",
+            "rate_updates": "median updates to each target at each rate",
+            "path_errors": "relative error at each of the ten thetas",
+        }, table=False),
     )  # fmt: skip
 
     iterations: int = param(200, "most updates of a search", positive=True)

@@ -212,13 +212,13 @@ def median_interval(values: np.ndarray) -> tuple[float, float, float]:
     return float(np.median(values)), low, high
 
 
-def relative_times(lines: pd.DataFrame, target: float = MAIN) -> pd.DataFrame:
+def relative_times(lines: pd.DataFrame) -> pd.DataFrame:
     """Return the points of the chart: by class, kind and dose, median error and updates over the best gradient's.
 
     Medians are over scenes, with their intervals. Where half of the scenes miss the target the time is missing and
     ``is_missed`` is true.
     """
-    part = lines[(lines["target"] == target) & (lines["kind"] != BEST)]
+    part = lines[(lines["target"] == MAIN) & (lines["kind"] != BEST)]
     part = part.assign(size=part["dose"].fillna(part["samples"]), relative=part["median"] / part["floor"])
     keys = ["scene_class", "kind", "method", "size"]
     result = []

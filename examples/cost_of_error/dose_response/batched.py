@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-import itertools
 import threading
 from collections.abc import Callable, Sequence
 from queue import SimpleQueue
@@ -11,121 +9,83 @@ from typing import Any
 
 import numpy as np
 
-from bench.errors import StorageError
 from bench.model import Problem
-
-Outcome = dict[str, Any] | BaseException
-"""The columns that a search returns, or the exception that it raises."""
-
-
-@dataclasses.dataclass
-class Request:
-    """A function call that a search waits for, or the outcome of a search that has ended."""
-
-    function: str = ""
-    theta: np.ndarray = dataclasses.field(default_factory=lambda: np.empty((0, 0)))
-    w: np.ndarray = dataclasses.field(default_factory=lambda: np.empty((0, 0)))
-    outcome: Outcome | None = None
 
 
 class Lane(Problem):
-    """A problem shared by several searches: each call waits until every search has made one, then all run as one batch.
+    """A problem shared by several searches: each call waits until other searches have made theirs, and all run as one batch.
 
     Each search has its own thread and its own lane. Only one thread runs at a time, always in the same order, so that
     results do not depend on scheduling. Trajectories and step Jacobians are computed per lane, not in batches.
     """
 
-    def __init__(self, inner: Problem, search: Callable[[Problem], dict[str, Any]]) -> None:
+    def __init__(self, inner: Problem, search: Callable[[Problem], Any]) -> None:
         super().__init__(inner.program)
         self._inner, self._search = inner, search
         self.device, self.provides = inner.device, inner.provides
-        self._requests: SimpleQueue[Request] = SimpleQueue()
-        self._answers: SimpleQueue[np.ndarray | BaseException] = SimpleQueue()
-        self._thread = threading.Thread(target=self._run, daemon=True)
+        self.jacobians, self.trajectory = inner.jacobians, inner.trajectory  # type: ignore[method-assign]
+        self._requests: SimpleQueue[Any] = SimpleQueue()
+        self._answers: SimpleQueue[Any] = SimpleQueue()
+        self.result: Any = None
+        """What the search returns, or the exception that it raises."""
+        threading.Thread(target=self._run, daemon=True).start()
+        self.request = self._requests.get()
+        """The name of the function that the search waits for, with theta and noise; None at its end."""
 
-    def start(self) -> Request:
-        """Start the search and return its first request."""
-        self._thread.start()
-        return self._requests.get()
-
-    def resume(self, answer: np.ndarray | BaseException) -> Request:
-        """Answer the search's request; return its next request, or its outcome at its end."""
+    def resume(self, answer: np.ndarray | BaseException) -> None:
+        """Answer the search's request, and wait for the next one."""
         self._answers.put(answer)
-        return self._requests.get()
+        self.request = self._requests.get()
 
     def _run(self) -> None:
         try:
-            outcome: Outcome = self._search(self)
-        except BaseException as error:  # reported in this seed's row
-            outcome = error
-        self._requests.put(Request(outcome=outcome))
+            self.result = self._search(self)
+        except BaseException as error:  # raised by run_batched
+            self.result = error
+        self._requests.put(None)
 
     def _call(self, function: str, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        theta = np.asarray(theta, dtype=np.float64).reshape(self.dim, -1)
-        self._requests.put(Request(function, np.broadcast_to(theta, (self.dim, w.shape[1])), w))
+        self._requests.put((function, np.broadcast_to(theta, (self.dim, w.shape[1])), w))
         answer = self._answers.get()
         if isinstance(answer, BaseException):
             raise answer
-        return answer
+        return np.ascontiguousarray(answer)
 
-    _value = _grad = _score = None  # type: ignore[assignment]
+    def _value(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        return self._call("value", theta, w)
+
+    def _grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        return self._call("grad", theta, w)
+
+    def _score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        return self._call("score", theta, w)
 
     @property
     def gives_jacobians(self) -> bool:
         """Whether the shared problem defines :meth:`jacobians`."""
         return self._inner.gives_jacobians
 
-    def jacobians(self, theta: np.ndarray, w: np.ndarray) -> Any:
-        """Return the step Jacobians."""
-        return self._inner.jacobians(theta, w)
 
-    def trajectory(self, theta: np.ndarray, w: np.ndarray) -> Any:
-        """Return the states."""
-        return self._inner.trajectory(theta, w)
+def run_batched(problem: Problem, searches: Sequence[Callable[[Problem], Any]]) -> list[Any]:
+    """Run searches in lockstep and return their results in order; raises the first error of a search.
 
-    def value(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """Return costs ``(B,)``."""
-        self.usage.rollouts += w.shape[1]
-        return self._call("value", theta, w)
-
-    def grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """Return per-sample gradients ``(d, B)``."""
-        self.usage.gradients += w.shape[1]
-        return self._call("grad", theta, w)
-
-    def score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """Return per-sample scores ``(d, B)``."""
-        return self._call("score", theta, w)
-
-
-def run_batched(problem: Problem, searches: Sequence[Callable[[Problem], dict[str, Any]]]) -> list[Outcome]:
-    """Run searches in lockstep and return their outcomes in order.
-
-    Each round calls the problem once per requested function. Searches with the same optimizer need one round per call.
+    Each round calls the problem once, for all searches that wait for the same function as the first that waits.
     """
     lanes = [Lane(problem, search) for search in searches]
-    requests = {lane: lane.start() for lane in lanes}
-    while waiting := [lane for lane in lanes if requests[lane].outcome is None]:
-        for function in list(dict.fromkeys(requests[lane].function for lane in waiting)):
-            group = [lane for lane in waiting if requests[lane].function == function]
-            for lane, answer in zip(group, _evaluate(problem, [requests[lane] for lane in group]), strict=True):
-                requests[lane] = lane.resume(answer)
-            # a resumed search may request the same function again: that request waits for the next round
-            waiting = [lane for lane in waiting if lane not in group]
-    return [requests[lane].outcome or {} for lane in lanes]
-
-
-def _evaluate(problem: Problem, requests: list[Request]) -> list[np.ndarray | BaseException]:
-    """Return the answers to requests of one function, from one shared call, or from one call per request if that fails."""
-    function = getattr(problem, requests[0].function)
-    widths = [request.w.shape[1] for request in requests]
-    try:
-        with np.errstate(all="ignore"):
-            values = function(*(np.concatenate([getattr(r, n) for r in requests], axis=1) for n in ("theta", "w")))
-    except (StorageError, KeyboardInterrupt):
-        raise
-    except BaseException as error:
-        if len(requests) == 1:
-            return [error]
-        return list(itertools.chain.from_iterable(_evaluate(problem, [request]) for request in requests))
-    return [np.ascontiguousarray(part) for part in np.split(values, np.cumsum(widths)[:-1], axis=-1)]
+    while waiting := [lane for lane in lanes if lane.request]:
+        function = waiting[0].request[0]
+        group = [lane for lane in waiting if lane.request[0] == function]
+        _, thetas, noises = zip(*(lane.request for lane in group), strict=True)
+        answers: Sequence[Any] = ()
+        try:
+            with np.errstate(all="ignore"):
+                values = getattr(problem, function)(np.concatenate(thetas, axis=1), np.concatenate(noises, axis=1))
+            answers = np.split(values, np.cumsum([w.shape[1] for w in noises])[:-1], axis=-1)
+        except BaseException as error:
+            answers = [error] * len(group)
+        for lane, answer in zip(group, answers, strict=True):
+            lane.resume(answer)
+    for lane in lanes:
+        if isinstance(lane.result, BaseException):
+            raise lane.result
+    return [lane.result for lane in lanes]

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from bench.plugins.studies.optimise.measure import known_optimum, objective
+from bench.plugins.studies.optimise import search_parts
+from bench.plugins.studies.optimise.measure import known_optimum, objective, stored_in
 from scipy.optimize import minimize
 
 from bench.errors import Unsupported
@@ -16,7 +16,6 @@ from bench.experiment.keys import fingerprint, hashed
 from bench.experiment.session import Session
 from bench.measure import noise
 from bench.model import Estimator, Optimizer, Problem, best_gradient, zeroth_order
-from bench.run.files import make_directory, write_whole
 
 from .search import Method, Task, run_searches, tune, unit_rate, with_rate
 
@@ -68,33 +67,23 @@ def scored_noise(problem: Problem, scene: str) -> np.ndarray:
 
 def ground_of(cell: Cell, problem: Problem, session: Session, settings: Any) -> Ground:
     """Return the problem's optimum and common path, from a file beside the references or computed and stored."""
-    optimizer = cell.parts["optimizer"]
-    assert isinstance(optimizer, Optimizer)
+    optimizer, _ = search_parts(cell)
     key = hashed(cell.program_key, fingerprint(cell.study), fingerprint(optimizer), fingerprint(cell.backend))
-    path = session.experiment.results_dir / "references" / f"path_{key}.json"
-    try:
-        stored = json.loads(path.read_text())
-        arrays = {name: np.array(stored[name]) for name in ("thetas", "gradients", "variances")}
-        return Ground(stored["start"], stored["optimum"], stored["how"], **arrays)
-    except (OSError, ValueError, KeyError, TypeError):
-        pass
-    ground = _compute(cell, problem, session, settings, optimizer)
-    make_directory(path.parent)
-    listed = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in vars(ground).items()}
-    write_whole(path, json.dumps(listed).encode())
-    return ground
+    found = stored_in(session, f"path_{key}.json", lambda: _compute(cell, problem, session, settings, optimizer))
+    arrays = {name: np.array(found[name]) for name in ("thetas", "gradients", "variances")}
+    return Ground(**found | arrays)
 
 
-def _compute(cell: Cell, problem: Problem, session: Session, settings: Any, optimizer: Optimizer) -> Ground:
+def _compute(cell: Cell, problem: Problem, session: Session, settings: Any, optimizer: Optimizer) -> dict[str, Any]:
     scored = scored_noise(problem, cell.scene.name)
-    theta0 = np.array(problem.program.theta0, dtype=np.float64)
+    theta0 = problem.program.theta0
     start = objective(problem, theta0, scored)
     optimum, how = _optimum(cell, problem, session, scored)
     if not start - optimum > 1e-9 * (abs(start) + abs(optimum)):
         raise Unsupported(f"the cost at the start, {start:g}, is not above the lowest cost known, {optimum:g} ({how})")
-    empty = Ground(start, optimum, how, np.empty((0, 0)), np.empty((0, 0)), np.empty(0))
+    found = {"start": start, "optimum": optimum, "how": how, "thetas": [], "gradients": [], "variances": []}
     if "gradient" not in optimizer.needs:
-        return empty
+        return found
     task = Task(cell.scene.name, scored, start, optimum, settings.iterations)
     is_random = not problem.program.continuous
     method = Method(optimizer, BestGradient(), PRECISE if is_random else 1, is_random)
@@ -109,7 +98,8 @@ def _compute(cell: Cell, problem: Problem, session: Session, settings: Any, opti
     places = np.linspace(0, max(lowest - 1, 0), POINTS).round().astype(int)
     thetas = np.array([search.thetas[i] for i in places])
     gradients, variances = _gradients(problem, cell.scene.name, thetas)
-    return Ground(start, optimum, how, thetas, gradients, variances)
+    lists = {"thetas": thetas.tolist(), "gradients": gradients.tolist(), "variances": variances.tolist()}
+    return found | lists
 
 
 def _gradients(problem: Problem, scene: str, thetas: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -130,7 +120,7 @@ def _optimum(cell: Cell, problem: Problem, session: Session, scored: np.ndarray)
         optimum, how = known_optimum(cell, problem, session)
         if np.isfinite(optimum):
             return optimum, how
-    theta0 = np.array(problem.program.theta0, dtype=np.float64)
+    theta0 = problem.program.theta0
     w = noise.draw(0, cell.scene.name, 1, PRECISE, problem.program.n_noise, "dose_response: optimum")
 
     def cost(theta: np.ndarray) -> float:

@@ -9,13 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from bench.plugins.studies.optimise import search_parts
 from bench.plugins.studies.optimise.measure import error_parts, fastest, scene_class
 
 from bench.errors import Unsupported
 from bench.experiment.cell import Cell
 from bench.experiment.session import Session
 from bench.measure import noise
-from bench.model import Estimator, Optimizer, Problem
+from bench.model import Problem
 
 from . import DoseResponse
 from .ground import Ground, ground_of, scored_noise
@@ -82,11 +83,9 @@ def hypotheses_hash() -> str:
 
 def _method(cell: Cell, problem: Problem) -> tuple[Method, np.ndarray | None]:
     """Return the method of a cell, and a gradient at the start for an optimizer that uses gradients."""
-    optimizer, estimator = cell.parts["optimizer"], cell.parts["estimator"]
-    assert isinstance(optimizer, Optimizer)
+    optimizer, estimator = search_parts(cell)
     if estimator is None:
         return Method(optimizer, None, 1), None
-    assert isinstance(estimator, Estimator)
     w = noise.draw(cell.seed, cell.scene.name, 4, cell.samples, problem.program.n_noise, "dose_response: first")
     first = estimator.estimate(problem, problem.program.theta0, w)
     if not np.isfinite(first).all():

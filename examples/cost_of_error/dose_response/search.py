@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from typing import Any
 
 import numpy as np
 from bench.plugins.studies.optimise.measure import advance, estimates, mean_costs, objective
@@ -78,7 +77,7 @@ def _noise(seed: int, scene: str, samples: int, width: int, iteration: int) -> n
 def follow(problem: Problem, method: Method, task: Task, seed: int, keep: bool = False) -> Search:
     """Search until the last target, divergence or the number of updates; ``keep`` returns theta at every update."""
     optimizer, width = method.optimizer, problem.program.n_noise
-    state = optimizer.start(np.array(problem.program.theta0, dtype=np.float64))
+    state = optimizer.start(problem.program.theta0)
     updates, lowest, thetas, i = [math.inf] * len(TARGETS), math.inf, [], 0
     problem.usage.rollouts = problem.usage.gradients = 0
     first = task.start - task.optimum
@@ -111,18 +110,12 @@ def run_searches(
     """Return the searches of each pair of method and seed; searches share calls of the problem."""
     samples = max(max(m.samples for m in methods) if methods[0].is_random else 1, task.scored.shape[1])
     group = max(1, MOST_NUMBERS // (samples * max(problem.dim, problem.program.n_noise)))
-    results: list[Search] = []
-
-    def job(method: Method, seed: int) -> Callable[[Problem], dict[str, Any]]:
-        return lambda lane: {"search": follow(lane, method, task, seed, keep)}
-
-    jobs = [job(method, seed) for method, seed in zip(methods, seeds, strict=True)]
-    for start in range(0, len(jobs), group):
-        for outcome in run_batched(problem, jobs[start : start + group]):
-            if isinstance(outcome, BaseException):
-                raise outcome
-            results.append(outcome["search"])
-    return results
+    jobs = [
+        partial(follow, method=method, task=task, seed=seed, keep=keep)
+        for method, seed in zip(methods, seeds, strict=True)
+    ]
+    parts = (run_batched(problem, jobs[start : start + group]) for start in range(0, len(jobs), group))
+    return [search for part in parts for search in part]
 
 
 # ------------------------------------------------------------------------------------------------------ tuning

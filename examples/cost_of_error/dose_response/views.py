@@ -9,20 +9,16 @@ from bench.experiment.axes import table as csv_table
 from bench.experiment.columns import Column, interval, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Mark, Style, Table, Views
-from bench.report.style import MARKERS, PALETTE, VARIANTS
+from bench.report.style import MARKERS, PALETTE
 
 from . import analysis
-from .analysis import BIAS, COSTS_ONLY, FIXED, MAIN, RANDOM, ROTATION, TAILS
+from .analysis import BIAS, COSTS_ONLY, MAIN, RANDOM
 
 STYLES = {
     RANDOM: Style(PALETTE[0], "o"),
-    FIXED: Style(PALETTE[0], "s", VARIANTS[1]),
-    TAILS: Style(PALETTE[6], "D", VARIANTS[2]),
     BIAS: Style(PALETTE[2], "^"),
-    ROTATION: Style(PALETTE[2], "v", VARIANTS[1]),
 }
-NATURAL = ((PALETTE[3], "P"), (PALETTE[5], "*"), (PALETTE[4], "h"), (PALETTE[7], "p"))
-"""Colour and marker of each natural method, drawn as points."""
+"""The errors that are drawn; the tables have the others and the natural methods."""
 VERDICTS = {"above 1": Style(PALETTE[2]), "below 1": Style(PALETTE[0]), "not known": Style("#767676")}
 CLASS, PROBLEMS, SCENES = (
     text("scene_class", label="class"),
@@ -87,19 +83,16 @@ def _problems(table: pd.DataFrame) -> Table:
 
 def _chart(points: pd.DataFrame, pairs: pd.DataFrame) -> Chart:
     """Return the cost of an error: updates over the best gradient's against the relative error, a panel per class."""
-    natural = list(dict.fromkeys(points.loc[~points["kind"].isin(analysis.PLANTED), "method"]))
-    looks = {name: Style(colour, marker, "none") for name, (colour, marker) in zip(natural, NATURAL * 9, strict=False)}
-    points = points[points["error"] > 0].assign(time_low=lambda f: f["time_low"].where(f["time_low"] > 0))
+    points = points[points["kind"].isin(STYLES)].assign(time_low=lambda f: f["time_low"].where(f["time_low"] > 0))
     sizes = pairs[pairs["target"] == MAIN].groupby("scene_class")[["problems", "scenes"]].max()
     return Chart(
         "cost_of_error", points.sort_values("method", kind="stable"), [Column("error", label="relative error", log=True)],
         [interval("time", label="updates / best gradient's", log=True)],
-        kind="lines", series="method", panel="scene_class", styles=STYLES | looks, failed="is_missed", across=3, height=2.0,
+        kind="lines", series="method", panel="scene_class", styles=STYLES, failed="is_missed", across=3, height=2.0,
         panel_notes={row.Index: f"{row.problems} problems of {row.scenes} scenes" for row in sizes.itertuples()},
         subtitle=f"To 1/{MAIN:g} of the first regret, each method at its best rate. Cross: half of the scenes miss it. "
         "A bar to the top: no upper end",
-        text="Lines: planted errors. Points: natural methods, one per number of samples. Medians over scenes, with 95% "
-        "intervals where there are six. The error is the median over ten thetas that all methods of a problem share.",
+        text="Planted errors: noise, and a bias. Medians over scenes, with 95% intervals where there are six. The error is the median over ten thetas that all methods of a problem share.",
     )  # fmt: skip
 
 

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
-from bench.experiment.columns import Columns
 from bench.model import param
 
 from .. import StudyPackage
@@ -17,8 +15,8 @@ class BiasVariance(StudyPackage):
     """Measures bias and variance of estimates against the reference gradient, and the cost of an estimate."""
 
     name = "bias_variance"
-    columns: ClassVar[Columns] = COLUMNS
-    timed: ClassVar[bool] = True
+    columns = COLUMNS
+    timed = True
 
     timed_calls: int = param(
         5, "estimates timed one by one on backends that do not compile; the other repeats are evaluated together",

@@ -21,6 +21,7 @@ from bench.report.style import colour, marker
 from bench.report.text import counted, number
 from bench.report.views import (
     Arranged,
+    Curve,
     attempted,
     estimator_curves,
     estimator_label,
@@ -55,6 +56,7 @@ BIAS = Column(
 )  # fmt: skip
 SECONDS = replace(COLUMNS.by_name["time_s"], label="time of one estimate", log=True)
 ROLLOUTS_SPENT = Column("rollouts_", label="rollouts of one estimate, a gradient at its measured cost", log=True)
+FASTEST = "each estimator on its fastest backend"
 ESTIMATOR = text("series", label="")
 
 
@@ -160,25 +162,26 @@ def _along(
     total = frame["series"].nunique()
     panels = [problem.title() for problem in drawn]
     shares = [f"{len(names)} of {total} estimators"] if len(names) < total else []
+    for column, kept in (("series", names), ("panel", panels)):
+        frame = frame[frame[column].isin(kept)]
+        frame = frame.iloc[frame[column].map(kept.index).argsort(kind="stable")]
     marks = [Mark(f"beyond the {name}", value, math.inf) for name, value in shown.marks(axis).items()]
     x = Column("x", label=axis.title, format="setting")
     return Chart(
         "bias_variance_" + re.sub(r"\W", "_", axis.column), frame, [x], [RMSE, BIAS], series="series",
-        line="line", panel="panel", styles=styles, marks=marks, failed="failed", across=len(drawn),
+        panel="panel", styles=styles, marks=marks, failed="failed", across=len(drawn),
         height=2.7 if len(drawn) <= 2 else 2.1,
-        subtitle=", ".join(filter(None, [subtitle, *notes, *shares])), chosen=(("first", [True]), ("series", names), ("panel", panels)),
+        subtitle=", ".join(filter(None, [subtitle, *notes, *shares])),
         text="Bars are 95% intervals. A hollow marker is the upper limit of a bias that is not distinguishable from 0.",
     )  # fmt: skip
 
 
 def _lines(problem: ProblemRows) -> pd.DataFrame:
-    """Return the points of a problem: of each estimator the first of the backends that agree, and the others."""
-    parts: list[pd.DataFrame] = []
-    seen: set[str] = set()
+    """Return the points of a problem: of each estimator the first of the backends that agree."""
+    curves: dict[str, Curve] = {}
     for curve in estimator_curves(problem.rows, 0.03):
-        parts.append(curve.rows.reset_index().assign(panel=problem.title(), first=curve.label not in seen))
-        seen.add(curve.label)
-    return pd.concat(parts, ignore_index=True)
+        curves.setdefault(curve.label, curve)
+    return pd.concat([curve.rows.reset_index().assign(panel=problem.title()) for curve in curves.values()])
 
 
 def _main_series(frame: pd.DataFrame, methods: pd.DataFrame, comparisons: pd.DataFrame) -> list[str]:
@@ -238,7 +241,7 @@ def _speed_accuracy(shown: Arranged, best: pd.DataFrame, styles: Mapping[str, St
     return Chart(
         "speed_accuracy" if timed else "rollouts_accuracy", frame, [x], [RMSE], series="series",
         panel="panel", styles=styles, marks=marks, across=3, height=2.0,
-        subtitle=", ".join(filter(None, [subtitle, "each estimator on its fastest backend"])),
+        subtitle=", ".join(filter(None, [subtitle, FASTEST])),
         text="Only estimates that no other of the same estimator beats in both error and cost are drawn.",
     )  # fmt: skip
 
@@ -252,16 +255,15 @@ def _on_fastest(rows: pd.DataFrame, cost: Cost) -> pd.DataFrame:
 
 
 def _error_and_cost(shown: Arranged, styles: Mapping[str, Style], subtitle: str) -> Chart:
-    """Return error against time where samples were not swept: a dot per estimator and backend, by problem."""
+    """Return error against time where samples were not swept: a dot per estimator, by problem."""
     rows = TIME.known(shown.rows)
+    rows = rows.loc[rows.groupby(["problem_", "series"], sort=False)["time_s"].idxmin()]
     problems = list(dict.fromkeys(rows["problem_"]))
-    step = max(1, math.ceil(len(problems) / 6))
-    chosen = problems[::step]
+    chosen = problems[:: math.ceil(len(problems) / 3)] if problems else []
     shares = [f"{len(chosen)} of {counted(len(problems), 'problem')}"] if len(chosen) < len(problems) else []
     return Chart(
-        "speed_accuracy", rows, [SECONDS], [RMSE], "points", series="series", shape="backend", panel="problem_",
-        styles=styles, across=3, height=1.9, subtitle=", ".join(filter(None, [subtitle, *shares])),
-        chosen=(("problem_", chosen),), front=True,
+        "speed_accuracy", rows[rows["problem_"].isin(chosen)], [SECONDS], [RMSE], "points", series="series", panel="problem_",
+        styles=styles, across=3, height=1.9, subtitle=", ".join(filter(None, [subtitle, *shares, FASTEST])), front=True,
     )  # fmt: skip
 
 
@@ -279,10 +281,10 @@ def _estimators(methods: pd.DataFrame) -> Chart:
     marks = frame["status"].where(frame["verdict"] == NO_RESULT, "").mask(frame["verdict"] == FAILS, " fails")
     return Chart(
         "estimators",
-        frame.assign(panel=frame["estimator"].map(families), series=frame["estimator"], value=error.clip(1e-3, 1e3).where(known),
+        frame.assign(panel=frame["estimator"].map(families), series=frame["estimator"], shade=(np.log10(error.clip(1e-2, 1e2)) / 4 + 0.5).where(known),
                      cell=error.map(number).where(known, marks)),
-        [text("problem", label="")], [ESTIMATOR], "grid", panel="panel", value="value",
-        cell="cell", across=1, height=0.2, value_range=(1e-2, 1e2),
+        [text("problem", label="")], [ESTIMATOR], "grid", panel="panel", shade="shade",
+        cell="cell", across=1, height=0.2,
         subtitle="relative RMSE of one estimate, sorted by the worst case; above 1 the zero estimate is better",
     )  # fmt: skip
 

@@ -1,6 +1,6 @@
 """The columns of the main table, which users' scripts rely on."""
 
-from bench.experiment.columns import Column, Columns, ComparisonRule, interval, numbers, text
+from bench.experiment.columns import Column, Columns, ComparisonRule, interval, numbers, seconds, text
 
 TABLE = (
     "experiment", "scene", "contact", "integrator", "backend", "estimator", "estimator_params", "noise",
@@ -34,10 +34,9 @@ COLUMNS = Columns.ordered(
     Column("sign_agreement", "share of coordinates of one estimate whose sign is the reference's"),
     Column("finite_fraction", "share of repeats that are finite"),
     Column("model_error", "norm of (program's gradient - physics' gradient) at w = 0"),
-    Column("time_s", "one estimate of N samples without drawing noise, steady state, median over calls", "s", measured=True, label="time", format="seconds",
-           comparison=ComparisonRule("time", "time")),
+    seconds("time_s", "one estimate of N samples without drawing noise, steady state, median over calls", "time", comparison=ComparisonRule("time", "time")),
     Column("time_iqr_s", "interquartile range over calls", "s", measured=True),
-    Column("compile_s", "time of compiling the programs of the estimates", "s", measured=True, format="seconds"),
+    seconds("compile_s", "time of compiling the programs of the estimates"),
     Column("rollouts", "costs evaluated for one estimate"),
     Column("gradients", "gradients evaluated for one estimate"),
     Column("peak_memory_mb", "largest resident memory of the process, libraries included", "MB", measured=True),

@@ -17,6 +17,8 @@ from bench.measure.timing import Pause
 from bench.model import Auxiliaries, Problem, SampleMean, columns, per_repeat
 from bench.model.estimator import require_shape
 
+from .. import all_noise
+
 MOST_TERMS = 1 << 25
 """Most numbers in the terms of one call (256 MiB): d per sample. With more, fewer repeats or samples share a call."""
 
@@ -34,9 +36,7 @@ class Estimates:
         self._estimator = cell.estimator
         self._columns = max(1, MOST_TERMS // problem.dim)
         fits = cell.repeats * cell.samples * self._width <= noise.HELD
-        self._noise = (
-            noise.shared(cell.seed, cell.scene.name, cell.repeats, cell.samples, self._width) if fits else None
-        )
+        self._noise = all_noise(cell, self._width) if fits else None
         self._centre: np.ndarray | None = None
         self._terms: dict[int, tuple[Any, float]] = {}
         """Per repeat, the sum of (term - common centre), ``(d,)``, and the sum of its squared norms."""

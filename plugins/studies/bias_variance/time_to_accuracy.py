@@ -27,6 +27,7 @@ from bench.report.views import Arranged, Curve, estimator_curves
 from .costs import ROLLOUTS, TIME, Cost
 
 SAMPLES = Axis("samples", ("samples",))
+COSTS = {"time": TIME, "rollouts": ROLLOUTS}
 TARGETS = (0.1, 0.01)
 """Target relative errors."""
 NOTES = (
@@ -51,7 +52,7 @@ class RequiredCost:
     cost: float = math.nan
     samples: float = math.nan
     down: float = math.nan
-    """Log of cost over the lower end of its 95% interval; NaN where the variance has no interval."""
+    """Log of cost over the lower end of its 95% interval; infinite where the variance has no interval."""
     up: float = math.nan
     """Log of the upper end over the cost; infinite where it is not certain that the error is reached."""
     beyond: float = math.inf
@@ -70,8 +71,6 @@ def required_cost(line: Curve, target: float, cost: Cost) -> RequiredCost:
     way = _required_cost(rows, target, cost, is_coupled)
     last = rows.iloc[-1]
     times = float(last["time_iqr_s"] / last["time_s"]) if cost is not ROLLOUTS else 0.0
-    if "variance_high" not in rows:
-        return replace(way, times=times)
     ends = (_at_interval_end(rows, end) for end in ("low", "high"))
     low, high = (_required_cost(end, target, cost, is_coupled) for end in ends)
     if not math.isfinite(way.cost):
@@ -159,13 +158,12 @@ def table(shown: Arranged) -> pd.DataFrame:
     """Return a line per problem, kind of cost and target error; empty if samples were not swept."""
     if shown.rows["samples"].nunique() < 2:
         return pd.DataFrame()
-    costs = (("time", TIME), ("rollouts", ROLLOUTS))
-    timed = bool(np.isfinite(shown.rows["time_s"]).any())
+    kinds = ["rollouts"] if shown.rows["time_s"].isna().all() else [*COSTS]
     entries = [
-        line(problem, target, kind, cost)
+        line(problem, target, kind)
         for problem in split_by_problem(shown, SAMPLES, ("scene",))
         if problem.rows["x"].nunique() > 1
-        for kind, cost in costs[0 if timed else 1 :]
+        for kind in kinds
         for target in TARGETS
     ]
     return pd.DataFrame(entries)
@@ -192,21 +190,12 @@ def estimator_of(method: str) -> str:
     return method.partition(" on ")[0]
 
 
-def line(problem: ProblemRows, target: float, kind: str, cost: Cost) -> dict[str, Any]:
+def line(problem: ProblemRows, target: float, kind: str) -> dict[str, Any]:
     """Return a line of the table: the cheapest method, the next (if possible of another estimator), and excluded ones."""
-    reached = methods(problem, target, cost)
+    reached = methods(problem, target, COSTS[kind])
     ranked = sorted((r.cost, name) for name, r in reached.items() if math.isfinite(r.cost))
-    entry: dict[str, Any] = {
-        "fastest": "-",
-        "cost": math.nan,
-        "samples": math.nan,
-        "how": "-",
-        "next": "-",
-        "factor": math.nan,
-        "factor_low": math.nan,
-        "factor_high": math.nan,
-        "tied": (),
-    }
+    numbers = ("cost", "samples", "how", "next", "factor", "factor_low", "factor_high")
+    entry = {"fastest": "-"} | dict.fromkeys(numbers, math.nan) | {"how": "-", "next": "-", "tied": ()}
     if ranked:
         first = ranked[0][1]
         best = reached[first]
@@ -227,12 +216,11 @@ def _following(first: str, known: list[str], reached: dict[str, RequiredCost]) -
     unknown = [name for name, r in reached.items() if r.how == "unknown" and math.isfinite(r.beyond)]
     others = [name for name in (*known, *unknown) if estimator_of(name) != estimator_of(first)]
     leads = {name: lead(best, reached[name]) for name in others}
-    tied = tuple(name for name in others if not leads[name][1] > 1.0)
     if not others:
         if not known:
             return {}
         leads = {known[0]: lead(best, reached[known[0]], alike=True)}
-        tied = tuple(name for name, factors in leads.items() if not factors[1] > 1.0)
+    tied = tuple(name for name, factors in leads.items() if not factors[1] > 1.0)
     ranked = [name for name in leads if name in known]
     following = ranked[0] if ranked else min(leads, key=lambda name: leads[name][1])
     factor, low, high = leads[following]
@@ -245,9 +233,8 @@ def _following(first: str, known: list[str], reached: dict[str, RequiredCost]) -
 
 def accuracy_table(best: pd.DataFrame) -> Table:
     """Return the table of :func:`table` for readers."""
-    kinds = {"time": TIME, "rollouts": ROLLOUTS}
     costs = [
-        kinds[kind].text(float(number(cost))) if math.isfinite(cost) else "-"
+        COSTS[kind].text(float(number(cost))) if math.isfinite(cost) else "-"
         for kind, cost in zip(best["by"], best["cost"], strict=True)
     ]
     columns = [

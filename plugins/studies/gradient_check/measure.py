@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -21,8 +21,8 @@ from bench.measure.jumps import MissedSlope, jump_under_noise, missed_slope
 from bench.model import SURROGATE, ContactScene, EngineScene, ForceLaw, LoopOps, Problem, Rollout, Unsupported, registry
 
 from .. import norm
-from . import GradientCheck
-from .points import is_trusted
+from ..stability import spectral_radius
+from . import GradientCheck, is_trusted
 
 COLUMNS_AT_ONCE = 128
 """Rollouts per evaluation. The number is fixed, so that a compiling backend compiles once."""
@@ -39,14 +39,14 @@ class Place:
     """Where one directional derivative is checked: ``theta (d,)``, unit ``direction (d,)``, noise ``w (n_w,)``, and labels."""
 
     point: str
-    """One of :data:`bench.plugins.studies.gradient_check.points.POINTS`."""
+    """One of :data:`bench.plugins.studies.gradient_check.POINTS`."""
+    number: int
+    """Number of the direction, or -1 - i for component i."""
+    noise: int
+    """0 without noise, 1 with it."""
     theta: np.ndarray
     direction: np.ndarray
     w: np.ndarray
-    number: int
-    """Number of the direction."""
-    sample: int = 0
-    """0 without noise, 1 with it."""
     switch: str = ""
     """The contact switch that the place is at, in words."""
 
@@ -55,20 +55,13 @@ class Place:
 class Point:
     """One checked directional derivative and its verdict."""
 
-    point: str
-    """One of :data:`bench.plugins.studies.gradient_check.points.POINTS`."""
-    noise: int
-    """0 without noise, 1 with it."""
-    number: int
-    """Number of the direction, or -1 - i for component i."""
+    place: Place
     verdict: str
     sample: gradcheck.Sample
     minus: Sequence[str]
     """Contact modes on the minus side, one per step of the differences."""
     plus: Sequence[str]
     """Contact modes on the plus side."""
-    switch: str = ""
-    """The contact switch that it is at, in words."""
 
 
 def measure(cell: Cell, session: Session, search: GradientCheck) -> dict[str, Any]:
@@ -84,9 +77,10 @@ def measure(cell: Cell, session: Session, search: GradientCheck) -> dict[str, An
     missed = MissedSlope(0.0, at_jump) if jump.height else missed_slope(problem, theta, cell.seed, COLUMNS_AT_ONCE)
     under_noise = "jump" if jump.height else "missed_slope" if missed.share else ""
     at = at_jump if jump.height else missed.w
-    reached = [Place("noise", theta, directions[0] / np.linalg.norm(directions[0]), at, 0, 1)] if under_noise else []
-    found = examine(problem, theta, drawn, directions, unit, search, reached)
-    points = [*at_start(whole), *(_settled(problem, *each, under_noise) for each in found)]
+    reached = [Place("noise", 0, 1, theta, directions[0] / np.linalg.norm(directions[0]), at)] if under_noise else []
+    found = examine(problem, drawn, directions, unit, search, reached)
+    points = [*at_start(whole), *(_settled(problem, point, under_noise) for point in found)]
+    places = [point.place for point in points]
     verdicts = [point.verdict for point in points]
     best = [gradcheck.best(point.sample) for point in points]
     errors = [float(point.sample.errors[i]) for point, i in zip(points, best, strict=True)]
@@ -109,8 +103,8 @@ def measure(cell: Cell, session: Session, search: GradientCheck) -> dict[str, An
     return {
         "status": "nonfinite" if lost else "ok",
         "reason": "no cost is finite" if lost else "; ".join([*remarks, *beyond_stability(cell)]),
-        "verdict": gradcheck.most_severe(verdicts),
-        "untrusted": sum(not is_trusted(point.point, point.verdict) for point in points),
+        "verdict": verdicts[severest],
+        "untrusted": sum(not is_trusted(point.place.point, point.verdict) for point in points),
         "best_error": errors[severest],
         "best_eps": float(gradcheck.EPS[best[severest]]),
         "scale": scale_of(theta),
@@ -122,17 +116,17 @@ def measure(cell: Cell, session: Session, search: GradientCheck) -> dict[str, An
         "device": problem.device,
         "component": [part.component for part in parts],
         **{f"component_{name}": [getattr(part, name) for part in parts] for name in PER_COMPONENT},
-        "point": [point.point for point in points],
-        "sample": [point.noise for point in points],
-        "direction": [point.number for point in points],
-        "contact_switch": [point.switch for point in points],
+        "point": [place.point for place in places],
+        "sample": [place.noise for place in places],
+        "direction": [place.number for place in places],
+        "contact_switch": [place.switch for place in places],
         "derivative_program": [point.sample.derivative for point in points],
         "check_verdict": verdicts,
         "check_error": errors,
         "check_eps": [float(gradcheck.EPS[i]) for i in best],
         "eps": gradcheck.EPS.tolist(),
-        "derivative_differences": _joined(point.sample.differences for point in points),
-        "relative_error": _joined(point.sample.errors for point in points),
+        "derivative_differences": np.concatenate([point.sample.differences for point in points]).tolist(),
+        "relative_error": np.concatenate([point.sample.errors for point in points]).tolist(),
         "mode_minus": [mode for point in points for mode in point.minus],
         "mode_plus": [mode for point in points for mode in point.plus],
     }
@@ -162,24 +156,25 @@ def start(problem: Problem, theta: np.ndarray, unit: float, search: GradientChec
     modes = contact_modes(problem)
     named = None if modes is None else lambda thetas: modes(thetas, np.zeros((still.shape[0], thetas.shape[1])))
     options = gradcheck.Options(directions=search.directions, draws=search.around, unit=unit, seed=seed)
-    return gradcheck.check(cost, gradient, theta, options, named, lambda at, along: tangent(problem, at, along))
+    return gradcheck.check(
+        cost, gradient, theta, options, named, lambda at, along: tangent(problem, at, along, still[:, 0])
+    )
 
 
-def tangent(problem: Problem, theta: np.ndarray, direction: np.ndarray, w: np.ndarray | None = None) -> float:
-    """Return the derivative at ``theta (d,)`` along ``direction (d,)`` by the backend's second method, else a complex step.
+def tangent(problem: Problem, theta: np.ndarray, direction: np.ndarray, w: np.ndarray) -> float:
+    """Return the derivative at ``theta (d,)`` along ``direction (d,)`` under noise ``w (n_w,)`` by the backend's second method, else a complex step.
 
     It is NaN where neither is possible.
     """
     if problem.program.surrogate:
         return math.nan
-    noise_ = np.zeros((problem.program.n_noise, 1)) if w is None else w[:, None]
     try:
-        return float(problem.second_gradient(theta, noise_)[:, 0] @ direction)
+        return float(problem.second_gradient(theta, w[:, None])[:, 0] @ direction)
     except Exception:  # unsupported, or a program that the second method cannot differentiate
         return complex_step(problem, theta, direction, w)
 
 
-def complex_step(problem: Problem, theta: np.ndarray, direction: np.ndarray, w: np.ndarray | None = None) -> float:
+def complex_step(problem: Problem, theta: np.ndarray, direction: np.ndarray, w: np.ndarray) -> float:
     """Return the derivative of the program at ``theta (d,)`` along ``direction (d,)`` by a complex step; NaN if invalid.
 
     The imaginary part of the cost at theta + i h direction is h times the derivative, without cancellation (Squire and
@@ -189,12 +184,13 @@ def complex_step(problem: Problem, theta: np.ndarray, direction: np.ndarray, w: 
     program = problem.program
     if program.contact is not None or program.needs or program.surrogate or "physics" in problem.provides:
         return math.nan
-    noise_ = np.zeros((program.n_noise, 1)) if w is None else w[:, None]
     size = COMPLEX_STEP / max(float(np.abs(direction).max()), 1e-300)
     try:
         with np.errstate(all="ignore"):
-            value = program.cost(LoopOps(), theta[:, None] + 1j * size * direction[:, None], noise_.astype(complex))[0]
-            real = problem.value(theta, noise_)[0]
+            value = program.cost(
+                LoopOps(), theta[:, None] + 1j * size * direction[:, None], w[:, None].astype(complex)
+            )[0]
+            real = problem.value(theta, w[:, None])[0]
     except Exception:  # code of a plugin that does not run on complex numbers
         return math.nan
     if not abs(complex(value).real - real) <= SAME_COST * abs(real):
@@ -212,15 +208,18 @@ def at_start(whole: gradcheck.Check) -> list[Point]:
     if whole.cause not in (*seen, *(part.verdict for part in parts)):
         # the cause occurs only at other thetas, or in a second evaluation
         parts += [replace(part, verdict=whole.cause) for part in (*whole.worst_parts, *whole.parts)[:1]]
-    return [Point("start", 0, _number(part), part.verdict, part.sample, *part.modes) for part in parts]
+    none = np.empty(0)
+    places = [Place("start", _number(part), 0, none, none, none) for part in parts]
+    return [Point(at, part.verdict, part.sample, *part.modes) for at, part in zip(places, parts, strict=True)]
 
 
 def _number(part: gradcheck.Part) -> int:
     return -1 - part.component if part.component is not None else int(part.name.rpartition(" ")[2])
 
 
-def _settled(problem: Problem, place: Place, point: Point, under_noise: str) -> Point:
+def _settled(problem: Problem, point: Point, under_noise: str) -> Point:
     """Return the point with its verdict under noise, or from smaller steps or a tangent if the usual steps leave it unsettled."""
+    place = point.place
     if place.point == "noise":
         return replace(point, verdict=under_noise)
     if point.verdict != "unsettled":
@@ -247,18 +246,13 @@ def beyond_stability(cell: Cell) -> list[str]:
     first = scene.initial_state(np, scene.theta0()[:, None])
     response = float(scene.contact(np).response(np, first.q).max())
     factor = float(getattr(scene, "velocity_factor", 1.0))
-    matrix = integrator.transition(float(scene.dt), spring[0] * response, spring[1] * response, factor)
-    growth = float(np.abs(np.linalg.eigvals(matrix)).max())
+    growth = spectral_radius(integrator, float(scene.dt), spring[0] * response, spring[1] * response, factor)
     if growth <= 1.0 + NEUTRAL:
         return []
     return [
         f"the step is beyond the stability limit of the contact: each step in contact multiplies the state by up to "
         f"{growth:.3g}; take a smaller dt"
     ]
-
-
-def _joined(parts: Iterator[np.ndarray]) -> list[float]:
-    return [float(value) for part in parts for value in part]
 
 
 def scale_of(theta: np.ndarray) -> float:
@@ -271,24 +265,23 @@ def scale_of(theta: np.ndarray) -> float:
 
 def examine(
     problem: Problem,
-    theta: np.ndarray,
     drawn: np.ndarray,
     directions: np.ndarray,
     unit: float,
     search: GradientCheck,
     more: Sequence[Place] = (),
-) -> list[tuple[Place, Point]]:
-    """Check directional derivatives at ``theta (d,)``, without noise and with ``drawn (n_w,)``, and at contact switches.
+) -> list[Point]:
+    """Check directional derivatives at theta0, without noise and with ``drawn (n_w,)``, and at contact switches.
 
-    Derivatives at theta are along the first ``search.directions`` of ``directions (D, d)``. Switches are searched along
+    Derivatives at theta0 are along the first ``search.directions`` of ``directions (D, d)``. Switches are searched along
     all directions, without noise, and checked along the first ``search.directions`` that meet one. ``more`` places are
     checked too. ``unit`` is the unit roundoff of the program's arithmetic. All costs are evaluated twice.
     """
     directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
-    modes = contact_modes(problem)
+    modes, theta = contact_modes(problem), problem.program.theta0
     still = np.zeros_like(drawn)
     places = [
-        Place("start", theta, direction, w, number, sample)
+        Place("start", number, sample, theta, direction, w)
         for sample, w in enumerate((still, drawn))
         for number, direction in enumerate(directions[: search.directions])
     ]
@@ -306,11 +299,8 @@ def examine(
         np.full(len(places), scale), np.array(slopes), unit,
         modes=None if modes is None else lambda at: modes(at[:d], at[d:]), twice=True,
     )  # fmt: skip
-    points = [
-        Point(at.point, at.sample, at.number, gradcheck.judge(sample).verdict, sample, left, right, at.switch)
-        for at, sample, left, right in zip(places, samples, minus, plus, strict=True)
-    ]
-    return list(zip(places, points, strict=True))
+    parts = zip(places, samples, minus, plus, strict=True)
+    return [Point(place, gradcheck.judge(sample).verdict, sample, *sides) for place, sample, *sides in parts]
 
 
 def boundary(
@@ -330,7 +320,7 @@ def boundary(
     at = {"before": inner - side * search.aside * scale, "at": inner, "after": outer + side * search.aside * scale}
     name = modes.switch(theta + inner * direction, theta + outer * direction, w)
     return [
-        Place(point, theta + s * direction, direction, w, number, 0, name if point == "at" else "")
+        Place(point, number, 0, theta + s * direction, direction, w, name if point == "at" else "")
         for point, s in at.items()
     ]
 
@@ -344,24 +334,23 @@ def switch(names: Callable[[np.ndarray], list[str]], reach: float) -> tuple[floa
     half = np.linspace(0.0, reach, COLUMNS_AT_ONCE // 2)
     values = names(np.concatenate([half, -half]))
     sides = ((1.0, values[: half.size]), (-1.0, values[half.size :]))
-    changes = [(_change(names_), sign) for sign, names_ in sides if _change(names_) is not None]
+    changes = [(index, sign) for sign, side in sides if (index := _change(side))]
     if not changes:
         return None
-    index, sign = min(changes, key=lambda change: change[0] or 0)
-    assert index is not None
+    index, sign = min(changes, key=lambda change: change[0])
     low, high = sign * half[index - 1], sign * half[index]
     while abs(high - low) > 4.0 * np.spacing(reach):
         grid_ = np.linspace(low, high, COLUMNS_AT_ONCE)
         index = _change(names(grid_))
-        if index is None:
+        if not index:
             break
         low, high = grid_[index - 1], grid_[index]
     return float(low), float(high)
 
 
-def _change(names: Sequence[str]) -> int | None:
-    """Return the index of the first name that differs from name 0, or None."""
-    return next((i for i, name in enumerate(names) if name != names[0]), None)
+def _change(names: Sequence[str]) -> int:
+    """Return the index of the first name that differs from name 0, or 0."""
+    return next((i for i, name in enumerate(names) if name != names[0]), 0)
 
 
 # ---------------------------------------------------------------------------------------------- contact modes

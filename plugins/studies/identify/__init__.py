@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 from bench.errors import UserError
 from bench.experiment.cell import Cell
-from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, text
+from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, several, text
 from bench.model import Decision, Identified, MechanicalScene, Optimizer, param
 
-from .. import StudyPackage
+from .. import PARTS, StudyPackage
 
 START = "start."
 """Prefix of entries of the initial state in theta."""
@@ -22,9 +20,9 @@ class Identify(StudyPackage):
     """Fits parameters of a scene to noisy records of its motion, and compares the fits with the Cramer-Rao bound."""
 
     name = "identify"
-    axes: ClassVar[tuple[str, ...]] = ("scene", "contact", "integrator", "backend", "optimizer")
-    default_plugins: ClassVar[Mapping[str, Sequence[str]]] = {"optimizers": ("gauss_newton",)}
-    columns: ClassVar[Columns] = Columns.of(
+    axes = (*PARTS, "optimizer")
+    default_plugins = {"optimizers": ("gauss_newton",)}
+    columns = Columns.of(
         text("optimizer", "identity string of the optimizer"),
         Column("rank", "directions of the parameters that the record sees"),
         Column("condition", "largest singular value of the information over the smallest that is seen",
@@ -50,12 +48,14 @@ class Identify(StudyPackage):
         numbers("term", "the term"),
         numbers("unnoticed", "the largest bias that it causes while 5% of records do not show it", label="unseen bias"),
         numbers("errors", "this bias in standard errors", label="in standard errors"),
-        numbers("unknowns", "names of the parameters"),
-        numbers("truth", "true values of the parameters; nan: a record of your own"),
-        numbers("invariants", "identifiable products of powers of the parameters"),
-        numbers("bound", "Cramer-Rao bound of the relative standard deviation of each invariant"),
-        numbers("shooting", "the shooting methods: single, multiple, windows"),
-        numbers("optimum", "by shooting method, share of fits whose optimizer has reached an optimum"),
+        *several(numbers, {
+            "unknowns": "names of the parameters",
+            "truth": "true values of the parameters; nan: a record of your own",
+            "invariants": "identifiable products of powers of the parameters",
+            "bound": "Cramer-Rao bound of the relative standard deviation of each invariant",
+            "shooting": "the shooting methods: single, multiple, windows",
+            "optimum": "by shooting method, share of fits whose optimizer has reached an optimum",
+        }),
         numbers("converged", "by shooting method, share of fits whose residuals are consistent with the noise",
                 label="share of fits that converge", low="converged_low", high="converged_high"),
         numbers("converged_low", "lower end of its 95% interval"),
@@ -69,7 +69,7 @@ class Identify(StudyPackage):
         numbers("hidden", "by shooting method, fits with more identifiable directions than the record has"),
     )  # fmt: skip
 
-    revision: ClassVar[int] = 3
+    revision = 3
 
     measurement: float | None = param(
         None,

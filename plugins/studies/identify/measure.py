@@ -108,7 +108,8 @@ class Model:
     def points(self, theta: np.ndarray) -> np.ndarray:
         """Return the coordinates ``(p, B)`` of unknowns."""
         scale = self.scale[:, None]
-        return np.where(scale, theta / np.where(scale, scale, 1.0), np.log(np.where(scale, 1.0, theta)))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray(np.where(scale, theta / scale, np.log(theta)))
 
     def scaled(self, theta: np.ndarray) -> Model:
         """Return the model with the sizes in ``theta (p,)`` as scales, where they change the motion noticeably."""
@@ -291,19 +292,19 @@ class Fitting:
         Windows after the first start at the measured positions and finite differences of them; in a first-order scene at
         the measured states. What is not measured starts on the rollout of theta.
         """
-        batch, n = data.shape[1], len(self.model.unit)
-        states = np.zeros((self.n_windows - 1, n, batch))
-        if self.n_windows > 1:
-            at = np.arange(1, self.n_windows) * self.window_steps
-            states[:] = self.model.motion(theta)[0][at]
-            table = data.reshape(-1, len(self.model.measured), batch)
-            n_q, dt = self.model.program.scene.n_q, self.model.program.scene.dt
-            slopes = np.gradient(table, dt, axis=0)
-            for column, entry in enumerate(self.model.measured if n in (n_q, 2 * n_q) or not n_q else ()):
-                if n_q and entry < n_q:
-                    states[:, n_q + entry] = slopes[at - 1, column]
-                states[:, entry] = table[at - 1, column]
-        return np.concatenate([self.model.points(theta), (states / self.model.unit[:, None]).reshape(-1, batch)])
+        model, batch, n = self.model, data.shape[1], len(self.model.unit)
+        points = model.points(theta)
+        if self.n_windows == 1:
+            return points
+        at = np.arange(1, self.n_windows) * self.window_steps
+        states = model.motion(theta)[0][at]
+        table, n_q = data.reshape(-1, len(model.measured), batch), model.program.scene.n_q
+        slopes = np.gradient(table, model.program.scene.dt, axis=0)
+        for column, entry in enumerate(model.measured if n in (n_q, 2 * n_q) or not n_q else ()):
+            if entry < n_q:
+                states[:, n_q + entry] = slopes[at - 1, column]
+            states[:, entry] = table[at - 1, column]
+        return np.concatenate([points, (states / model.unit[:, None]).reshape(-1, batch)])
 
 
 def run_fits(
@@ -374,12 +375,15 @@ def measure(cell: Cell, session: Session, settings: Identify) -> dict[str, Any]:
     n_windows = count_windows(horizon, settings.windows)
     has_windows = len(model.steps) == horizon and n_windows > 1
 
+    is_noise_known = settings.measurement is not None or not is_own
+
     def fit(shooting: str, sigma: float) -> Fit:
         fitting = Fitting(model, shooting, 1 if shooting == "single" else n_windows, sigma)
         fitted = run_fits(fitting, optimizer, fitting.start(start, data), data, settings.iterations)
-        return Fit(fitting, *fitted, fitting.residuals(fitted[0], data), fitting.jacobians(fitted[0], data))
+        return Fit(
+            fitting, is_noise_known, *fitted, fitting.residuals(fitted[0], data), fitting.jacobians(fitted[0], data)
+        )
 
-    is_noise_known = settings.measurement is not None or not is_own
     sigma = settings.measurement or (float(np.std(data)) or 1.0 if is_own else NOISE)
     if is_own:
         first, free = fit("single", sigma), len(data) - len(theta)
@@ -398,11 +402,10 @@ def measure(cell: Cell, session: Session, settings: Identify) -> dict[str, Any]:
         "unknowns": list(model.names), "truth": [math.nan] * len(theta) if is_own else theta.tolist(),
         "invariants": known.labels, "bound": known.bound.tolist(),
         **step_dependence(cell, model, theta, known, sigma),
-        **_estimates(single, known, start[:, 0], is_noise_known, expressions(settings.terms)),
+        **_estimates(single, known, start[:, 0], expressions(settings.terms)),
     }  # fmt: skip
     fits = [single, *(fit(shooting, sigma) for shooting in SHOOTING[1:] if has_windows)]
-    lines = pd.DataFrame([_fit_statistics(one, known, is_own, is_noise_known) for one in fits])
-    result |= lines.to_dict("list")
+    result |= pd.DataFrame([_fit_statistics(one, known, is_own) for one in fits]).to_dict("list")
     return result
 
 
@@ -411,6 +414,7 @@ class Fit:
     """Fits of all records by one shooting method."""
 
     fitting: Fitting
+    is_noise_known: bool
     solution: np.ndarray
     """The unknowns, ``(dim, B)``."""
     has_converged: np.ndarray
@@ -429,9 +433,7 @@ class Fit:
         return np.asarray(own - later @ (np.linalg.pinv(later) @ own))
 
 
-def _estimates(
-    fit: Fit, known: Information, start: np.ndarray, is_noise_known: bool, own: Mapping[str, str]
-) -> dict[str, Any]:
+def _estimates(fit: Fit, known: Information, start: np.ndarray, own: Mapping[str, str]) -> dict[str, Any]:
     """Return the first record's estimates, whether fits explain the records, and the biases that tests can miss.
 
     ``explained`` is the share of records that no test contradicts. The other columns belong to the first record.
@@ -446,7 +448,7 @@ def _estimates(
     own_units = {name: (part.unit or "1") if (part := named(parts, name)) else "" for name in known.names}
     units = tuple(f"({unit})" if {*unit} & {*" /"} else unit or "1" for unit in own_units.values())
     # an unknown without a logarithm has an interval of its own values
-    estimate, half, noise_kind = _products(theta, invariants), *_half_widths(fit, 0, known, is_noise_known)
+    estimate, half, noise_kind = _products(theta, invariants), *_half_widths(fit, 0, known)
     size = np.abs(_products(np.where(model.scale, model.scale, theta), invariants))
     is_linear = np.abs(invariants) @ (model.scale != 0.0) > SHARE
     with np.errstate(over="ignore", invalid="ignore"):
@@ -469,7 +471,7 @@ def _estimates(
     # the effects of missing terms at one fit serve all records, which have the same truth
     terms = missing_terms(model, theta, sigma, own)
     verdicts = [
-        adequacy.judge(residual[:, i], known.along(fit.slopes(i)), len(model.measured), terms, i, is_noise_known)
+        adequacy.judge(residual[:, i], known.along(fit.slopes(i)), len(model.measured), terms, i, fit.is_noise_known)
         for i in finite
     ]
     first, free = verdicts[0], max(len(residual) - rank, 1)
@@ -490,7 +492,7 @@ def _estimates(
     }  # fmt: skip
 
 
-def _half_widths(fit: Fit, i: int, known: Information, is_noise_known: bool) -> tuple[np.ndarray, str]:
+def _half_widths(fit: Fit, i: int, known: Information) -> tuple[np.ndarray, str]:
     """Return half the widths of fit ``i``'s 95% intervals of the invariants' coordinates, and the noise they allow for."""
     if not fit.is_finite[i] or Information(known.names, fit.slopes(i)).rank < known.rank:
         return np.full(known.rank, np.inf), ""
@@ -498,7 +500,7 @@ def _half_widths(fit: Fit, i: int, known: Information, is_noise_known: bool) -> 
     if fit.fitting.shooting != "single":
         return performance.Z * np.sqrt(np.diag(np.linalg.inv(slopes.T @ slopes))), ""
     channels = len(fit.fitting.model.measured)
-    variance, kind, quantile = adequacy.variances(fit.residual[:, i], slopes, channels, is_noise_known)
+    variance, kind, quantile = adequacy.variances(fit.residual[:, i], slopes, channels, fit.is_noise_known)
     return quantile * np.sqrt(variance), kind
 
 
@@ -571,7 +573,7 @@ def _products(theta: np.ndarray, exponents: np.ndarray) -> np.ndarray:
         return np.asarray(np.prod(np.sign(theta) ** np.rint(exponents) * np.abs(theta) ** exponents, axis=1))
 
 
-def _fit_statistics(fit: Fit, known: Information, is_own: bool, is_noise_known: bool) -> dict[str, Any]:
+def _fit_statistics(fit: Fit, known: Information, is_own: bool) -> dict[str, Any]:
     """Return the entries of one shooting method."""
     p, n_fits, shooting, model = len(known.names), fit.solution.shape[1], fit.fitting.shooting, fit.fitting.model
     measured = len(model.steps) * len(model.measured)
@@ -582,22 +584,23 @@ def _fit_statistics(fit: Fit, known: Information, is_own: bool, is_noise_known: 
     hidden = sum(
         Information(known.names, fit.slopes(i)).rank > known.rank for i in np.flatnonzero(fit.is_finite).tolist()
     )
-    halves = np.stack([_half_widths(fit, i, known, is_noise_known)[0] for i in range(n_fits)], axis=1)
+    halves = np.stack([_half_widths(fit, i, known)[0] for i in range(n_fits)], axis=1)
     chosen = has_converged & np.isfinite(halves).all(axis=0) & (not is_own)
     apart = known.invariants @ (fit.solution[:p] - model.points(model.values[:, None]))
     errors = (apart / known.bound[:, None])[:, chosen]
     is_covered = (np.abs(apart) <= halves)[:, chosen]
     n_converged, coverage, interval = int(has_converged.sum()), math.nan, (math.nan, math.nan)
-    low, high = performance.wilson(n_converged, n_fits)
     if is_covered.size:
         coverage = float(is_covered.mean())
         # the sample size of this interval is the number of records: invariants of one record are dependent
         interval = performance.wilson(round(coverage * n_converged), n_converged)
+    names = [f"{name}_{end}" for name in ("converged", "coverage") for end in ("low", "high")]
     return {
         "shooting": shooting, "optimum": float(fit.has_converged.mean()),
-        "converged": n_converged / n_fits, "converged_low": low, "converged_high": high,
+        "converged": n_converged / n_fits,
         "error": float(np.sqrt(np.mean(np.square(errors)))) if errors.size else math.nan,
-        "coverage": coverage, "coverage_low": interval[0], "coverage_high": interval[1], "hidden": hidden,
+        "coverage": coverage, "hidden": hidden,
+        **dict(zip(names, (*performance.wilson(n_converged, n_fits), *interval), strict=True)),
     }  # fmt: skip
 
 

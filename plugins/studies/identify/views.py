@@ -15,9 +15,9 @@ from bench.experiment.columns import Column, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Mark, Table, Views
 from bench.report.problems import problem_names
+from bench.report.shown import PROBLEM
 from bench.report.views import arrange, attempted
 
-PARTS = ("scene", "contact", "integrator")
 STATISTICS = (
     "converged", "converged_low", "converged_high", "error", "coverage", "coverage_low", "coverage_high", "hidden",
 )  # fmt: skip
@@ -65,7 +65,7 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     given = attempted(shown.rows)
     # rows of older versions lack the columns
     given = given[(given["status"] == "ok") & (given["parameter"].map(np.ndim) > 0)]
-    names = problem_names(shown, PARTS, rows=given)
+    names = problem_names(shown, PROBLEM, rows=given)
     doubts = {
         "unfinished": [values[0] < 1.0 for values in given["optimum"]], "not explained": given["contradictions"] != "",
         "untested": given["explained"].isna(), "time step": given["step_shift_bound"] > MAX_STEP_SHIFT,

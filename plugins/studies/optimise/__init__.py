@@ -3,20 +3,27 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 from bench.experiment.cell import Cell
-from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, text
+from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, seconds, several, text
 from bench.model import Estimator, Optimizer, Plugin, param
 
-from .. import StudyPackage
+from .. import PARTS, StudyPackage
+
+
+def search_parts(cell: Cell) -> tuple[Optimizer, Estimator | None]:
+    """Return the optimizer and the estimator of a search."""
+    optimizer, estimator = cell.parts["optimizer"], cell.parts["estimator"]
+    assert isinstance(optimizer, Optimizer)
+    assert estimator is None or isinstance(estimator, Estimator)
+    return optimizer, estimator
 
 
 @dataclass(frozen=True)
 class SearchStudy(StudyPackage):
     """A study whose cells search with an optimizer."""
 
-    axes: ClassVar[tuple[str, ...]] = ("scene", "contact", "integrator", "backend", "estimator", "optimizer")
+    axes = (*PARTS, "estimator", "optimizer")
 
     def parts(self, given: dict[str, Plugin | None]) -> dict[str, Plugin | None]:
         """Return the plugins, without the estimator if the optimizer uses only costs: it then has no effect."""
@@ -27,9 +34,7 @@ class SearchStudy(StudyPackage):
 
     def refusal(self, cell: Cell) -> str | None:
         """Return what the optimizer needs and no part of the cell provides, or None."""
-        optimizer, estimator = cell.parts["optimizer"], cell.parts["estimator"]
-        assert isinstance(optimizer, Optimizer)
-        assert estimator is None or isinstance(estimator, Estimator)
+        optimizer, estimator = search_parts(cell)
         available = {"value"} | ({"gradient"} if estimator is not None and estimator.gives_gradient else set())
         missing = sorted(optimizer.needs - available)
         if missing:
@@ -43,8 +48,8 @@ class Optimise(SearchStudy):
     """Searches for the best theta with each estimator and optimizer, and records the path."""
 
     name = "optimise"
-    timed: ClassVar[bool] = True
-    columns: ClassVar[Columns] = Columns.of(
+    timed = True
+    columns = Columns.of(
         text("optimizer", "identity string of the optimizer"),
         text("stopped", "reason for the end of the search: budget or diverged"),
         text("scene_class", "smooth, stiff (contact), chaotic (gradients vary more than costs), discontinuous or identification",
@@ -53,8 +58,7 @@ class Optimise(SearchStudy):
         Column("rollouts", "rollouts of the search, without those that score its path"),
         Column("gradients", "gradients of the search"),
         Column("gradient_ratio", "measured time of a gradient over that of a rollout", measured=True),
-        Column("search_s", "time of the search, without compilation and scores", "s", measured=True, label="search",
-               format="seconds"),
+        seconds("search_s", "time of the search, without compilation and scores", "search"),
         Column("start_cost", "objective at the start"),
         Column("final_cost", "objective at the last theta", comparison=ComparisonRule("exact", "final cost")),
         Column("best_cost", "lowest objective on the path"),
@@ -65,10 +69,12 @@ class Optimise(SearchStudy):
                label="gradient's error, relative"),
         Column("quality_cosine", "mean cosine between those gradients and the reference"),
         Column("quality_bias_share", "share of bias in the squared error of those gradients", label="share of bias"),
-        numbers("path_iteration", "iterations at which the path is recorded", table=False),
-        numbers("path_cost", "objective at those iterations", table=False),
-        numbers("path_rollouts", "rollouts up to those iterations", table=False),
-        numbers("path_gradients", "gradients up to those iterations", table=False),
+        *several(numbers, {
+            "path_iteration": "iterations at which the path is recorded",
+            "path_cost": "objective at those iterations",
+            "path_rollouts": "rollouts up to those iterations",
+            "path_gradients": "gradients up to those iterations",
+        }, table=False),
         numbers("path_s", "time up to those iterations", "s", table=False, measured=True),
         numbers("theta", "the last theta", table=False),
     )  # fmt: skip

@@ -19,7 +19,8 @@ from bench.report.problems import problem_names, titled
 from bench.report.text import axis_value
 from bench.report.views import arrange, attempted, estimator_labels
 
-PARTS = ("scene", "contact", "integrator", "backend")
+from .. import PARTS
+
 TARGETS = (10.0, 100.0, 1000.0)
 """Target regrets: the first regret divided by each of these factors."""
 FEWEST_POINTS = 5
@@ -212,8 +213,8 @@ def summarise(runs: RunSet) -> pd.DataFrame:
     return pd.DataFrame(lines)
 
 
-def improvement(runs: RunSet, baseline: str = "fobg") -> pd.DataFrame:
-    """Return, per method, the probability of a lower final cost than the first method whose estimator is ``baseline``.
+def improvement(runs: RunSet) -> pd.DataFrame:
+    """Return, per method, the probability of a lower final cost than the first method whose estimator is ``fobg``.
 
     Searches are paired by problem and seed, and problems count the same; a tie counts half. The interval is Wilson's: where few
     pairs all agree, that of a bootstrap would be a single point. NaN for the baseline and without pairs.
@@ -221,7 +222,7 @@ def improvement(runs: RunSet, baseline: str = "fobg") -> pd.DataFrame:
     final = runs.best_runs.assign(final=runs.best_runs["final_cost"].where(runs.best_runs["status"] == "ok", math.inf))
     wide = final.pivot_table(index=["problem", "seed"], columns="method", values="final", aggfunc="first", dropna=False)
     methods = runs.rows["method"].unique()
-    base = next((m for m in methods if m.partition(",")[0].partition("[")[0] == baseline), None)
+    base = next((m for m in methods if m.partition(",")[0].partition("[")[0] == "fobg"), None)
     lines = {}
     for method in methods:
         lines[method] = (math.nan, math.nan, math.nan)
@@ -238,17 +239,17 @@ def _pooled_score(strata: Sequence[np.ndarray]) -> float:
 
 
 @remember
-def quality_and_runtime(runs: RunSet, factor: float = TARGETS[0]) -> pd.DataFrame:
-    """Return, per problem and method with an estimator, the gradient's error at the start and the runtime to a target.
+def quality_and_runtime(runs: RunSet) -> pd.DataFrame:
+    """Return, per problem and method with an estimator, the gradient's error at the start and the runtime to the first target.
 
-    ``art`` is the average runtime, in rollouts, until the regret is the first regret / ``factor``.
+    ``art`` is the average runtime, in rollouts, until the regret is a tenth of the first.
     """
     keys = ["problem", "method"]
     found = runs.best_runs.groupby(keys, sort=False).agg(
         scene_class=("scene_class", "first"), rmse_rel=("quality_rmse_rel", "median")
     )
     reached = times_to_targets(runs)
-    runtime = reached[reached["target"] == factor].set_index(keys)["art"]
+    runtime = reached[reached["target"] == TARGETS[0]].set_index(keys)["art"]
     return found.dropna(subset=["rmse_rel"]).join(runtime).reset_index()
 
 

@@ -15,12 +15,14 @@ from bench.experiment.cell import Cell
 from bench.experiment.session import Session
 from bench.measure import noise
 from bench.measure.solve import solve
-from bench.model import Answer, Estimator, KnownOptimum, Optimizer, Problem, Rollout
+from bench.model import Answer, Estimator, KnownOptimum, Optimizer, Problem, Rollout, zeroth_order
 from bench.model.program import OWN
 from bench.run.files import make_directory, write_whole
 
-from . import Optimise
+from . import Optimise, search_parts
 
+PATH = ("iteration", "cost", "rollouts", "gradients", "s")
+"""What is recorded along a path."""
 MAX_POINTS = 300
 """Most points of a path to store, about; they are denser in early iterations."""
 MAX_NEWTON_DIM = 1000
@@ -67,8 +69,8 @@ def measure(cell: Cell, session: Session, settings: Optimise) -> dict[str, Any]:
     """Search until the budget is spent or the cost has diverged; return the cell's results by column."""
     problem = session.problem(cell)
     optimum, how = known_optimum(cell, problem, session)
-    theta0 = np.array(problem.program.theta0, dtype=np.float64)
-    quality = gradient_quality(cell, problem, theta0, settings) if settings.quality != "none" else None
+    theta0 = problem.program.theta0
+    quality = {} if settings.quality == "none" else gradient_quality(cell, problem, theta0, settings)
     path, theta, stopped = follow_path(cell, problem, theta0, settings)
     last = {name: values[-1] for name, values in path.items()}
     cost, is_lost = path["cost"], stopped == "diverged"
@@ -84,7 +86,7 @@ def measure(cell: Cell, session: Session, settings: Optimise) -> dict[str, Any]:
         "optimum": optimum, "optimum_status": how, "score": 0.0 if is_lost and not np.isfinite(score) else score,
         **{f"path_{name}": np.asarray(values)[stored].tolist() for name, values in path.items()},
         "theta": theta.tolist(),
-        **{f"quality_{name}": value for name, value in (quality or {}).items()},
+        **{f"quality_{name}": value for name, value in quality.items()},
     }  # fmt: skip
 
 
@@ -103,9 +105,7 @@ def follow_path(
 
     The path has lists with an entry per iteration: iteration, cost, rollouts, gradients and time ``s``.
     """
-    optimizer, estimator, usage = cell.parts["optimizer"], cell.parts["estimator"], problem.usage
-    assert isinstance(optimizer, Optimizer)
-    assert estimator is None or isinstance(estimator, Estimator)
+    (optimizer, estimator), usage = search_parts(cell), problem.usage
     still = np.zeros((problem.program.n_noise, 1))
 
     def step(state: dict[str, Any], iteration: int) -> dict[str, Any]:
@@ -120,17 +120,14 @@ def follow_path(
 
     state = optimizer.start(theta0)
     step(state, 1)  # compiles, untimed
-    path: dict[str, list[Any]] = {}
+    path: dict[str, list[Any]] = {name: [] for name in PATH}
     usage.rollouts = usage.gradients = 0
     most = settings.iterations if settings.iterations is not None else math.inf
     iteration, seconds = 0, 0.0
     while True:
         cost = objective(problem, state["theta"], still)
-        point = {
-            "iteration": iteration, "cost": cost, "rollouts": usage.rollouts, "gradients": usage.gradients, "s": seconds,
-        }  # fmt: skip
-        for name, value in point.items():
-            path.setdefault(name, []).append(value)
+        for name, value in zip(PATH, (iteration, cost, usage.rollouts, usage.gradients, seconds), strict=True):
+            path[name].append(value)
         if not np.isfinite(cost) or abs(cost) > settings.limit * (abs(path["cost"][0]) + 1.0):
             return path, state["theta"], "diverged"
         if usage.rollouts + settings.gradient_cost * usage.gradients >= settings.budget or iteration >= most:
@@ -152,22 +149,30 @@ def known_optimum(cell: Cell, problem: Problem, session: Session) -> tuple[float
             return known
     if problem.dim > MAX_NEWTON_DIM or not problem.program.continuous or "grad" not in cell.backend.provides:
         return np.nan, "unknown"
-    path = session.experiment.results_dir / "references" / f"optimum_{cell.program_key}.json"
-    try:
-        stored = json.loads(path.read_text())
-        return float(stored["cost"]), str(stored["how"])
-    except (OSError, ValueError, KeyError, TypeError):
-        pass
+    found = stored_in(session, f"optimum_{cell.program_key}.json", lambda: _newton(problem))
+    return found["cost"], found["how"]
+
+
+def _newton(problem: Problem) -> dict[str, Any]:
     solution = solve(problem)
     if not np.isfinite(solution.cost):
-        return np.nan, "unknown"
+        return {"cost": np.nan, "how": "unknown"}
+    found = "local optimum by Newton's method" if solution.certified else "lowest cost found"
+    saddle = ", from a saddle at the start" if solution.starts_at_saddle else ""
     digits = f"|gradient| {solution.gradient:.0e}, least curvature {solution.curvature:.1g}"
-    how = f"local optimum by Newton's method, {digits}" if solution.certified else f"lowest cost found, {digits}"
-    if solution.starts_at_saddle:
-        how += ", from a saddle at the start"
-    make_directory(path.parent)
-    write_whole(path, json.dumps({"cost": solution.cost, "how": how}).encode())
-    return solution.cost, how
+    return {"cost": solution.cost, "how": f"{found}, {digits}{saddle}"}
+
+
+def stored_in(session: Session, name: str, compute: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """Return the content of a JSON file beside the references, which is computed and written if it cannot be read."""
+    path = session.experiment.results_dir / "references" / name
+    try:
+        content: dict[str, Any] = json.loads(path.read_text())
+    except (OSError, ValueError):
+        content = compute()
+        make_directory(path.parent)
+        write_whole(path, json.dumps(content).encode())
+    return content
 
 
 _classes: dict[str, str] = {}
@@ -187,11 +192,10 @@ def scene_class(cell: Cell, problem: Problem) -> str:
     if isinstance(program, Rollout) and program.scene.n_contacts:
         return "stiff"
     if cell.program_key not in _classes:
-        w = noise.draw(0, cell.scene.name, 1, 128, program.n_noise, "optimise: class")[0].T
+        drawn = noise.draw(0, cell.scene.name, 1, 128, program.n_noise, "optimise: class")
         with np.errstate(all="ignore"):
-            first = problem.grad(program.theta0, w).var(axis=1).sum()
-            cost = problem.value(program.theta0, w) - problem.value(program.theta0, 0.0 * w[:, :1])
-            zeroth = (cost * problem.score(program.theta0, w)).var(axis=1).sum()
+            first = problem.grad(program.theta0, drawn[0].T).var(axis=1).sum()
+            zeroth = zeroth_order(problem, program.theta0, drawn)[0].var(axis=0).sum()
         _classes[cell.program_key] = (
             "smooth" if first < zeroth else "chaotic" if isinstance(program, Rollout) else "stiff"
         )
@@ -210,12 +214,10 @@ def gradient_ratio(problem: Problem, cell: Cell) -> float:
     return _ratios[key]
 
 
-def fastest(
-    function: Callable[[np.ndarray, np.ndarray], Any], theta: np.ndarray, w: np.ndarray, calls: int = 5
-) -> float:
-    """Return the least time [s] of some calls after a first one that compiles."""
+def fastest(function: Callable[[np.ndarray, np.ndarray], Any], theta: np.ndarray, w: np.ndarray) -> float:
+    """Return the least time [s] of five calls after a first one that compiles."""
     function(theta, w)
-    return min(timeit.repeat(lambda: function(theta, w), number=1, repeat=calls))
+    return min(timeit.repeat(lambda: function(theta, w), number=1, repeat=5))
 
 
 # ---------------------------------------------------------------------------------------------- gradient quality
@@ -226,27 +228,25 @@ MAX_REFERENCE_SHARE = 0.5
 _qualities: dict[tuple[Any, ...], dict[str, float]] = {}
 
 
-def gradient_quality(cell: Cell, problem: Problem, theta: np.ndarray, settings: Optimise) -> dict[str, float] | None:
+def gradient_quality(cell: Cell, problem: Problem, theta: np.ndarray, settings: Optimise) -> dict[str, float]:
     """Return relative error, cosine and share of bias of the estimator's gradients at ``theta (d,)``.
 
-    Returns None without an estimator. The reference is the mean of many gradients or of many zeroth-order terms,
+    Empty without an estimator. The reference is the mean of many gradients or of many zeroth-order terms,
     whichever vary less. Where the cost jumps or the backend has no gradients, it is the mean of zeroth-order terms.
     """
-    estimator = cell.parts["estimator"]
+    _, estimator = search_parts(cell)
     if estimator is None:
-        return None
-    assert isinstance(estimator, Estimator)
+        return {}
     key = (
         cell.program_key, cell.backend, estimator, cell.samples, cell.repeats, settings.quality_samples, theta.tobytes(),
     )  # fmt: skip
     if key not in _qualities:
         program, scene = problem.program, cell.scene.name
-        w = noise.draw(0, scene, 1, settings.quality_samples, program.n_noise, "optimise: reference")[0].T
+        w = noise.draw(0, scene, 1, settings.quality_samples, program.n_noise, "optimise: reference")
         with np.errstate(all="ignore"):
-            cost = problem.value(theta, w) - problem.value(theta, 0.0 * w[:, :1])
-            terms = cost * problem.score(theta, w)
+            terms = zeroth_order(problem, theta, w)[0].T
             if program.continuous and "grad" in cell.backend.provides:
-                first = problem.grad(theta, w)
+                first = problem.grad(theta, w[0].T)
                 terms = first if first.var(axis=1).sum() < terms.var(axis=1).sum() else terms
         drawn = noise.draw(0, scene, max(cell.repeats, 2), cell.samples, program.n_noise, "optimise: quality")
         _qualities[key] = compare_with_reference(estimator.estimate(problem, theta, drawn), terms)

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 from bench.experiment.cell import Cell
-from bench.experiment.columns import Column, Columns, ComparisonRule, interval, numbers, text
+from bench.experiment.columns import Column, Columns, ComparisonRule, interval, numbers, seconds, several, text
 from bench.model import Trainer, param
 from bench.model.policy import PolicyScene
 from bench.model.trainer import LOGGED
 
-from .. import StudyPackage
+from .. import PARTS, StudyPackage
 
 
 @dataclass(frozen=True)
@@ -19,9 +18,9 @@ class Train(StudyPackage):
     """Trains a policy with each trainer and seed; records returns along the run and a log of every update."""
 
     name = "train"
-    axes: ClassVar[tuple[str, ...]] = ("scene", "contact", "integrator", "backend", "trainer")
-    timed: ClassVar[bool] = True
-    columns: ClassVar[Columns] = Columns.of(
+    axes = (*PARTS, "trainer")
+    timed = True
+    columns = Columns.of(
         text("trainer", "identity string of the trainer"),
         Column("first_return", "mean return of the deterministic policy before the first update"),
         interval("final_return", "mean return of the deterministic policy after the last update", digits=3, log=False, comparison=ComparisonRule("interval", "final return", neutral=True)),
@@ -30,10 +29,8 @@ class Train(StudyPackage):
         Column("final_median", "median return over starts after the last update", digits=3, log=False),
         Column("updates", "updates of the run"),
         Column("steps", "control steps of the run, over all rollouts", "steps"),
-        Column("train_s", "time of the updates, without compilation and evaluations", "s", measured=True, label="training",
-               format="seconds"),
-        Column("compile_s", "time of compiling start, update and evaluation", "s", measured=True, label="compilation",
-               format="seconds"),
+        seconds("train_s", "time of the updates, without compilation and evaluations", "training"),
+        seconds("compile_s", "time of compiling start, update and evaluation", "compilation"),
         Column("gradient_typical", "median norm of the actor's gradient over updates", label="gradient norm"),
         Column("gradient_peak", "largest norm of the actor's gradient over updates", label="largest gradient"),
         Column("window_gradient", "norm of the gradient of whole episodes that is cut into windows, each of which ends in the "
@@ -47,14 +44,15 @@ class Train(StudyPackage):
         numbers("curve_update", "updates at which the policy was evaluated", table=False),
         numbers("curve_step", "control steps up to those updates", table=False),
         numbers("curve_s", "time up to those updates", "s", table=False, measured=True),
-        numbers("curve_return", "mean return of the deterministic policy there", table=False),
-        numbers("curve_return_low", "lower end of its 95% interval over starts", table=False),
-        numbers("curve_return_high", "upper end of its 95% interval over starts", table=False),
-        numbers("cosine_update", "updates at which first- and zeroth-order gradients were compared", table=False),
-        numbers("cosine", "cosine between both gradients there", table=False),
-        numbers("cosine_denoised", "the same without noise, NaN where the noise is larger than a gradient", table=False),
-        numbers("log_update", "last update of each entry of the log", table=False),
-        *(numbers(f"log_{name}", meaning, table=False) for name, meaning in LOGGED.items()),
+        *several(numbers, {
+            "curve_return": "mean return of the deterministic policy there",
+            "curve_return_low": "lower end of its 95% interval over starts",
+            "curve_return_high": "upper end of its 95% interval over starts",
+            "cosine_update": "updates at which first- and zeroth-order gradients were compared",
+            "cosine": "cosine between both gradients there",
+            "cosine_denoised": "the same without noise, NaN where the noise is larger than a gradient",
+            "log_update": "last update of each entry of the log",
+        } | {f"log_{name}": meaning for name, meaning in LOGGED.items()}, table=False),
     )  # fmt: skip
 
     starts: int = param(256, "starts of an evaluation, the same for all trainers and seeds", low=2)

@@ -15,10 +15,8 @@ from bench.measure.performance import bootstrap, bootstrap_along, interquartile_
 from bench.report.problems import problem_names
 from bench.report.views import arrange, attempted
 
+from .. import PARTS
 from .verdicts import judge, series
-
-PARTS = ("scene", "contact", "integrator", "backend")
-"""Parts of the grid that identify a problem."""
 
 
 def runs_of(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:

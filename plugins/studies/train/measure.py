@@ -26,6 +26,8 @@ from bench.training.run import Training
 from . import Train
 from .verdicts import FINITE
 
+CURVE = ("update", "step", "s", "return", "return_low", "return_high")
+"""What is stored of each evaluation."""
 MEANS = frozenset({"loss", "reward", "value_loss", "cut", "used", "contacts", "step_length", "deviation"})
 """Quantities whose mean an entry of a stored log has; it has the largest value of the others, so that no peak is lost."""
 LENGTHS = (1e-6, 1e-7, 1e-8)
@@ -57,11 +59,9 @@ def measure(cell: Cell, session: Session, settings: Train) -> dict[str, Any]:
     bad: tuple[int, str] | None = None
     probe: dict[str, Any] = {}
     spent = 0.0
-    pending: list[Any] = []
     for update in range(total + 1):
         if update in marks or update == total:
-            log += [{name: float(value) for name, value in entry.items()} for entry in pending]
-            pending, bad = [], _first_not_finite(log)
+            bad = _first_not_finite(log)
             curve.append((update, update * per_update, spent, *_interval(training.returns(state, starts))))
             if bad is not None or update == total:
                 break
@@ -74,7 +74,7 @@ def measure(cell: Cell, session: Session, settings: Train) -> dict[str, Any]:
         started = time.perf_counter()
         state, entry = jax.block_until_ready(training.update(state))
         spent += time.perf_counter() - started
-        pending.append(entry)
+        log.append({name: float(value) for name, value in entry.items()})
 
     table = np.array(curve)
     final = table[-1, 3:]
@@ -87,9 +87,7 @@ def measure(cell: Cell, session: Session, settings: Train) -> dict[str, Any]:
         "compile_s": compile_s, "gradient_typical": float(np.nanmedian(norms)), "gradient_peak": float(np.nanmax(norms)),
         "gradient_zero": float((norms == 0).mean()),
         **probe,
-        "curve_update": table[:, 0].tolist(), "curve_step": table[:, 1].tolist(), "curve_s": table[:, 2].tolist(),
-        "curve_return": table[:, 3].tolist(), "curve_return_low": table[:, 4].tolist(),
-        "curve_return_high": table[:, 5].tolist(),
+        **{f"curve_{name}": table[:, i].tolist() for i, name in enumerate(CURVE)},
         **{name: [row[i] for row in cosines] for i, name in enumerate(("cosine_update", "cosine", "cosine_denoised"))},
         **_thinned(log, settings.entries),
     }  # fmt: skip

@@ -42,10 +42,7 @@ FAULTS = (
     Column("value"),
 )
 COST = interval("cost", label="cost of an episode")
-STEP, SECONDS = (
-    Column("step", label="control steps", log=False),
-    Column("seconds", label="training time [s]", log=False),
-)
+STEP = Column("step", label="control steps", log=False)
 SEEDS = f"interquartile mean over seeds, with its 95% bootstrap interval from {aggregate.MIN_SEEDS} seeds on"
 NOTE = (
     f"final return: the mean undiscounted return of the deterministic policy from the same starts, {SEEDS}. A run that is not "
@@ -99,15 +96,12 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views | None:
 def _charts(runs: pd.DataFrame, windows: pd.DataFrame) -> list[Chart]:
     frame = aggregate.curves(runs)
     cost = replace(COST, log=bool((frame["cost"] > 0).all()))
-    curves = [
-        Chart(
-            name, frame.dropna(subset=[x.name]), [x], [cost], series="method", panel="problem", band=True,
-            subtitle=f"cost: minus the return; {SEEDS}", text="A line per trainer, at its evaluations.",
-        )
-        for name, x in (("train", STEP), ("train_seconds", SECONDS))
-    ]  # fmt: skip
+    curves = Chart(
+        "train", frame.dropna(subset=["step"]), [STEP], [cost], series="method", panel="problem", band=True,
+        subtitle=f"cost: minus the return; {SEEDS}", text="A line per trainer, at its evaluations.",
+    )  # fmt: skip
     lengths = Chart(
         "windows", windows, [replace(WINDOW, log=True)], [FINAL, WINDOW_BIAS, WINDOW_GRADIENT], series="family", panel="problem",
         subtitle=f"final return: {SEEDS}", text="A point per length of window.",
     )  # fmt: skip
-    return [*curves, lengths]
+    return [curves, lengths]

@@ -9,19 +9,27 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from bench.experiment.cell import Cell
-from bench.experiment.columns import Column, Columns, ComparisonRule, numbers
+from bench.experiment.columns import COMMON, Column, Columns, ComparisonRule, numbers, text
+from bench.experiment.experiment import Experiment
 from bench.experiment.session import Session
+from bench.experiment.views import Chart, Style, Table, Views
 from bench.gradient import sampled
-from bench.measure import noise, statistics
+from bench.measure import statistics
 from bench.model import Problem, Program
+from bench.report.style import PALETTE
 
-from .. import StudyPackage, finite_status, norm, ratio, relative_error
-from ..bias_variance.columns import COLUMNS as ESTIMATES
+from . import PARTS, StudyPackage, all_noise, finite_status, norm, ratio, relative_error
+from .bias_variance.columns import COLUMNS as ESTIMATES
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from bench.report.shown import Shown
 
 SUMMARY = (
     "reference_norm", "reference_se", "bias", "bias_low", "bias_high", "bias_rel", "variance", "rmse_rel", "cosine",
@@ -32,6 +40,30 @@ ROUNDING = 1e-9
 """Share of a gradient's norm up to which a coordinate counts as rounding error and its sign as 0."""
 STEPS = 10.0 ** -np.arange(1.0, 9.5, 0.5)
 """Step sizes of the central differences, in the units of theta."""
+EXACT = 1e-6
+"""Program error up to which a gradient counts as exact."""
+CONVERGED = 0.5
+"""A cost or gradient converges if its error falls at least to this share from the largest to the smallest step."""
+WRONG = 0.1
+"""Smallest model error of a wrong gradient."""
+FLOOR = 1e-16
+"""Smallest error that is drawn; smaller ones, 0 included, are drawn here as upper limits."""
+RESULTS = ("forward_error_rel", "program_error_rel", "model_error_rel", "model_cosine", "model_signs")
+OWN, PHYSICS, TRAP = "program error", "model error", "model error of a trap"
+STYLES = {
+    OWN: Style(PALETTE[0], "o", meaning="program error: to differences of its own cost"),
+    PHYSICS: Style(PALETTE[1], "s", meaning="model error: to the gradient of the physics"),
+    TRAP: Style(PALETTE[2], "D", meaning="model error of a trap: its cost converges, its gradient does not"),
+}
+NOTE = (
+    "Relative errors at theta, without noise except for the estimator error. forward: |cost - physics' cost|. program: "
+    "gradient against the best central difference of the same program. model: gradient against the physics'. right signs: "
+    "share of coordinates with the physics' sign. estimator: bias against grad J_sigma of the program, with its 95% interval."
+)
+TRAP_NOTE = (
+    "The gradient agrees with differences at every time step and the cost converges with the step. Yet the cosine to the physical "
+    "gradient is negative at every step, or the model error does not converge. Errors are at the largest and the smallest step."
+)
 
 
 @dataclass(frozen=True)
@@ -39,7 +71,7 @@ class ThreeErrors(StudyPackage):
     """Measures program, model and estimator error of a gradient, and the forward error."""
 
     name = "three_errors"
-    columns: ClassVar[Columns] = Columns.of(
+    columns = Columns.of(
         Column("cost", "cost f at theta, without noise"),
         Column("physical_cost", "cost of the physics at theta, without noise"),
         Column("forward_error", "difference of cost and physical_cost"),
@@ -91,11 +123,33 @@ class ThreeErrors(StudyPackage):
         status = finite_status(truth.note or "the reference gradient is not finite", truth.batches)
         if status["status"] != "ok":
             return result | status
-        w = noise.shared(cell.seed, cell.scene.name, cell.repeats, cell.samples, problem.program.n_noise)
+        w = all_noise(cell, problem.program.n_noise)
         estimates = np.asarray(cell.estimator.estimate(problem, problem.program.theta0, w), dtype=np.float64)
         summary = asdict(statistics.summarise(estimates, truth.known(), cell.samples))
         status = finite_status("", estimates, check.gradient) | {"reason": summary["note"]}
         return result | {name: summary[name] for name in SUMMARY} | status
+
+    def show(self, experiment: Experiment, rows: pd.DataFrame) -> Views:
+        """Return a line per cell, the traps and the chart."""
+        from bench.report.shown import Shown
+
+        shown = Shown(experiment, rows, ["dt"], ["estimator"], PARTS)
+        ends = {f"bias_rel_{end}": shown.rows[f"bias_{end}"] / shown.rows["reference_norm"] for end in ("low", "high")}
+        bias = shown.column("bias_rel", label="estimator error", low="bias_rel_low", high="bias_rel_high")
+        cells = shown.cells(
+            [COMMON["dt"], *map(shown.column, RESULTS), bias], "program, model and estimator error", [NOTE],
+            ("scene", "contact", "estimator"), shown.rows.assign(**ends),
+        )  # fmt: skip
+        if shown.good.empty:
+            return Views([cells])
+        trapped, problem = traps(shown), text("problem")
+        either = Column("largest", label="at the largest step"), Column("smallest", label="at the smallest step")
+        tables = [
+            cells,
+            Table("three_errors_traps", trapped, [problem, text("error"), *either], title="Traps", notes=[TRAP_NOTE],
+                  files=["csv"] if len(trapped) else [], terminal=bool(len(trapped)), page=True),
+        ]  # fmt: skip
+        return Views(tables, [_dumbbells(shown, trapped)])
 
 
 @dataclass(frozen=True)
@@ -110,7 +164,7 @@ class DifferenceCheck:
     step: float
 
 
-def difference_check(problem: Problem, steps: np.ndarray = STEPS) -> DifferenceCheck:
+def difference_check(problem: Problem) -> DifferenceCheck:
     """Compare the program's gradient with its best central difference over a sweep of step sizes, at w = 0.
 
     Truncation errors and jumps dominate at large steps, rounding at small steps. All costs are one batch.
@@ -119,13 +173,13 @@ def difference_check(problem: Problem, steps: np.ndarray = STEPS) -> DifferenceC
     gradient = problem.grad(theta, np.zeros((n_noise, 1)))[:, 0]
     samples, *_ = sampled(
         lambda at: problem.value(at, np.zeros((n_noise, at.shape[1]))), theta, np.eye(theta.size), np.ones(theta.size),
-        gradient, float(np.finfo(np.float64).eps), steps,
+        gradient, float(np.finfo(np.float64).eps), STEPS,
     )  # fmt: skip
     differences = np.array([sample.differences for sample in samples])
     errors = np.linalg.norm(differences - gradient[:, None], axis=0)
     # without the mask, np.argmin would return the index of a NaN
     best = int(np.argmin(np.where(np.isfinite(errors), errors, np.inf)))
-    return DifferenceCheck(samples[0].centre, gradient, differences[:, best], float(steps[best]))
+    return DifferenceCheck(samples[0].centre, gradient, differences[:, best], float(STEPS[best]))
 
 
 def _against_physics(program: Program, check: DifferenceCheck) -> dict[str, Any]:
@@ -154,3 +208,53 @@ def _against_physics(program: Program, check: DifferenceCheck) -> dict[str, Any]
 def _signs(gradient: np.ndarray) -> np.ndarray:
     """Return the signs of a gradient's coordinates, 0 where a coordinate is rounding error."""
     return np.where(np.abs(gradient) > ROUNDING * norm(gradient), np.sign(gradient), 0.0)
+
+
+# ------------------------------------------------------------------------------------------------- what is shown
+
+
+def along_steps(shown: Shown) -> pd.DataFrame:
+    """Return the rows of the programs with several time steps, the smallest first; without any, all rows."""
+    rows = shown.rows.sort_values("dt", kind="stable")
+    varies = rows.groupby("problem")["dt"].transform("nunique") > 1
+    return rows[varies] if varies.any() else shown.rows
+
+
+def traps(shown: Shown) -> pd.DataFrame:
+    """Return two or three lines per trap: its errors at the largest and the smallest time step. A missing error is no trap."""
+    import pandas as pd
+
+    lines, names = [], ("forward_error_rel", "model_error_rel", "model_cosine")
+    for problem, rows in along_steps(shown).groupby("problem", sort=False):
+        steps = rows.drop_duplicates("dt")
+        forward, model, cosine, program = (steps[name] for name in (*names, "program_error_rel"))
+        converges = forward.is_monotonic_increasing and forward.iloc[0] <= CONVERGED * forward.iloc[-1]
+        stays_wrong = model.iloc[0] > max(CONVERGED * model.iloc[-1], WRONG)
+        is_trap = ((cosine < 0).all() or stays_wrong) and program.max(skipna=False) <= EXACT and converges
+        if is_trap and len(steps) > 1:
+            lines += [[problem, shown.column(name).heading, *steps[name].iloc[[-1, 0]]] for name in names]
+    return pd.DataFrame(lines, columns=["problem", "error", "largest", "smallest"])
+
+
+def _dumbbells(shown: Shown, trapped: pd.DataFrame) -> Chart:
+    """Return the main chart: for each scene and law, program and model error joined by a line, traps in red."""
+    import pandas as pd
+
+    from bench.report.problems import problem_names
+    from bench.report.shown import floored, stacked
+
+    rows = along_steps(shown)
+    scene = problem_names(shown.arranged, ["scene"], shown.over or shown.arranged.axes, ["scene"], rows)
+    # a law is named by what distinguishes it on its scene
+    laws = [problem_names(shown.arranged, PARTS[1:], shown.over, ["contact"], own) for _, own in rows.groupby(scene)]
+    rows = rows.assign(panel=scene, law=pd.concat(laws)).drop_duplicates(["panel", "law"]).sort_index()
+    errors = stacked(rows, {OWN: "program_error_rel", PHYSICS: "model_error_rel"}, "error")
+    errors = floored(errors.sort_values("row", kind="stable"), FLOOR, ["error"]).dropna(subset=["error"])
+    is_trap = errors["problem"].isin(trapped["problem"]) & (errors["series"] == PHYSICS)
+    return Chart(
+        "three_errors", errors.assign(series=errors["series"].mask(is_trap, TRAP)).reset_index(drop=True),
+        [Column("error", label="relative error", limit="error_limit", log=True, above_one="larger than the gradient")],
+        [text("law", label="")], "dots", series="series", panel="panel", styles=STYLES, join=True, across=2, height=0.2,
+        subtitle="At the smallest time step." if shown.over else "",
+        text="The longer the line, the better a wrong gradient passes a check against differences of its own cost.",
+    )  # fmt: skip

@@ -1,24 +1,35 @@
-"""How gradients grow with the horizon: their norm, the product of the step Jacobians, and the variance."""
+"""How gradients grow with the horizon: their norm, the product of the step Jacobians, and the variance.
+
+Shown are the curve that the norms of gradients follow, and from where on the zeroth order varies less.
+"""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from bench.experiment.cell import Cell
-from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, text
+from bench.experiment.columns import COMMON, Column, Columns, ComparisonRule, interval, numbers, text
+from bench.experiment.experiment import Experiment
 from bench.experiment.session import Session
-from bench.measure import noise
+from bench.experiment.views import Chart, Table, Views
 from bench.model import Jacobians, Problem, Rollout, columns, param
 
-from .. import StudyPackage, mean_interval, norm
+from . import PARTS, StudyPackage, all_noise, mean_interval, norm
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 ROUNDING = 1e-6
-"""Rounding error of the log of a product's spectral radius: above sqrt(eps), the error at a defective eigenvalue."""
-
+"""Rounding error of the log of a product's spectral radius, above sqrt(eps), the error at a defective eigenvalue; and
+of the log of a norm that a curve describes exactly."""
+STRONG = 20.0
+"""Ratio of likelihoods from which one curve beats the other. By it, at most 5% of noisy power laws count as exploding."""
+FEWEST = 5
+"""Fewest horizons of a verdict: with four, 8% of noisy power laws count as exploding."""
 
 QUANTILES = {"low": 0.05, "quarter": 0.25, "median": 0.5, "three_quarters": 0.75, "high": 0.95}
 """Quantiles over noise samples, stored for heavy-tailed quantities."""
@@ -26,6 +37,28 @@ ORDERS = {"first_order": "first-order", "zeroth_order": "zeroth-order"}
 RATES = {"stretch": "largest singular value", "spectral": "spectral radius"}
 MEDIAN: dict[str, Any] = {"label": "norm of one gradient", "low": "gradient_low", "high": "gradient_high"}
 INTERVAL = {"low": "lower end of its 95% interval", "high": "upper end of its 95% interval"}
+VERDICT = (
+    text("problem"),
+    text("verdict", "what the norms do along the horizon"),
+    interval("order", "order of the best power law"),
+    interval("rate", "rate of the best exponential", "1/s"),
+    Column("odds", "likelihood of the exponential relative to the power law", label="exponential to power law"),
+    text("lower", "the order whose variance is lower beyond doubt", label="lower variance"),
+    Column("zeroth_from", "horizon from which on that is the zeroth order", "s", label="from", format="setting"),
+)
+"""The columns of the table with a line per problem."""
+VERDICT_NOTE = (
+    "Median norms of one sample's gradient against the horizon, fitted by a power law and by an exponential. exploding: the "
+    "exponential is at least 20 times as likely as the power law, and its rate is above 0. polynomial: the power law is as "
+    "much more likely, or the more likely one where the Jacobian product does not grow, and its order is above 0. "
+    "vanishing: the better curve falls by as much evidence. open: none of these. Intervals are of 95%. A variance is lower where the ranges over "
+    "repeats from 5% to 95% do not overlap: first at every horizon, zeroth from a horizon on, else open."
+)
+NOTE = (
+    "norm of one gradient: median and 5% to 95% of the noise samples. stretch, spectral: log of the largest singular value "
+    "and of the spectral radius of the Jacobian product dx_N/dx_0, per second, mean and 95% interval. Jacobian product: "
+    "exploding if the spectral radius certainly grows, vanishing if the stretch certainly falls. variance: per sample, median."
+)
 
 
 @dataclass(frozen=True)
@@ -33,7 +66,7 @@ class Growth(StudyPackage):
     """Measures norms of sampled gradients, products of step Jacobians, and variances of first- and zeroth-order terms."""
 
     name = "growth"
-    columns: ClassVar[Columns] = Columns.of(
+    columns = Columns.of(
         Column("time_horizon", "duration of the rollout", "s", label="horizon", format="setting"),
         *(
             Column(f"gradient_{name}", f"norm of one sample's gradient, {q:.0%} quantile",
@@ -82,7 +115,7 @@ class Growth(StudyPackage):
         """
         problem = session.problem(cell)
         program, theta = problem.program, problem.program.theta0
-        w = columns(noise.shared(cell.seed, cell.scene.name, cell.repeats, cell.samples, program.n_noise))
+        w = columns(all_noise(cell, program.n_noise))
         first, centre = problem.grad(theta, w), problem.value(theta, np.zeros((w.shape[0], 1)))
         zeroth = (problem.value(theta, w) - centre) * problem.score(theta, w)
         good = np.isfinite(first).all(axis=0) & np.isfinite(zeroth).all(axis=0)
@@ -105,6 +138,38 @@ class Growth(StudyPackage):
             ends = zip(("", "_low", "_high", "_mean"), map(float, found), strict=True)
             result |= {f"{order}_variance{end}": value for end, value in ends}
         return result | _product_columns(problem, w[:, good][:, : self.rollouts], self.lags)
+
+    def show(self, experiment: Experiment, rows: pd.DataFrame) -> Views:
+        """Return a table with a line per problem and one with a line per cell, and the charts."""
+        import pandas as pd
+
+        from bench.report.shown import Shown
+
+        shown = Shown(experiment, rows, along=["horizon"], method=(), problem=PARTS)
+        per_second = {
+            f"{name}_{end}": shown.rows[f"{name}_{end}"] / shown.rows["dt"] for name in RATES for end in ("rate", "low", "high")
+        }  # fmt: skip
+        columns = [
+            COMMON["horizon"], shown.column("time_horizon"), shown.column("gradient_median"),
+            *(shown.column(f"{name}_rate", unit="1/s") for name in RATES), shown.column("growth"),
+            *(shown.column(f"{order}_variance", low="", high="") for order in ORDERS),
+        ]  # fmt: skip
+        cells = shown.cells(columns, "growth of gradients with the horizon", [NOTE], ("scene", "contact"),
+                            shown.rows.assign(**per_second), terminal=False)  # fmt: skip
+        good = shown.rows[np.isfinite(shown.rows["gradient_median"]) & (shown.rows["gradient_median"] > 0)]
+        if good.empty:
+            return Views([cells])
+        lines = pd.DataFrame([verdict(part) for _, part in good.groupby("problem", sort=False)])
+        answers = Table(
+            "growth_verdicts", lines, VERDICT, "Growth of the gradient", [VERDICT_NOTE], terminal=True, page=True
+        )
+        chart = Chart(
+            "growth", good, [shown.column("time_horizon", log=True)], [shown.column("gradient_median", log=True)], panel="problem",
+            across=5, height=1.9, band=True, panel_notes=dict(zip(lines["problem"], lines["verdict"], strict=True)),
+            text="Median over noise samples, and 5% to 95% of them. On these axes a power law is straight and an exponential bends upwards.",
+        )  # fmt: skip
+        named = shown.arranged.rows.assign(problem=shown.rows["problem"]).fillna({"problem": ""})
+        return Views([answers, cells], [chart], named)
 
 
 # ------------------------------------------------------------------------------------------------ products
@@ -174,3 +239,61 @@ def _product_columns(problem: Problem, w: np.ndarray, most_lags: int) -> dict[st
         "lags": lags.tolist(), **dict(zip(("gain_low", "gain", "gain_high"), gains, strict=True)),
         "singular_values": np.exp(np.median(product.singular, axis=0)).tolist(),
     }  # fmt: skip
+
+
+# ------------------------------------------------------------------------------------------------ verdicts
+
+
+def verdict(rows: pd.DataFrame) -> dict[str, Any]:
+    """Return the line of one problem: the curves through its norms, the verdict, and where variances cross."""
+    rows = rows.sort_values("time_horizon", kind="stable")
+    counts = rows["samples"] * rows["repeats"] * rows["finite_fraction"]
+    spread = np.log(rows["gradient_three_quarters"] / rows["gradient_quarter"])
+    # standard error of a normal median: 1.2533 sigma / sqrt(n), and sigma is the interquartile range / 1.349
+    errors = (1.2533 / 1.349 * spread / np.sqrt(counts)).fillna(0.0).to_numpy(float)
+    horizons, norms = (rows[name].to_numpy(float) for name in ("time_horizon", "gradient_median"))
+    fitted = fit(horizons, norms, errors, bounded=rows["growth"].iloc[-1] in ("neutral", "vanishing"))
+    zeroth = (rows["zeroth_order_variance_high"] < rows["first_order_variance_low"]).to_numpy()
+    is_first = (rows["first_order_variance_high"] < rows["zeroth_order_variance_low"]).all()
+    # the first of the longest horizons at all of which the zeroth order varies less
+    start = horizons[np.logical_and.accumulate(zeroth[::-1])[::-1]].min(initial=math.inf)
+    lower = "zeroth" if math.isfinite(start) else "first" if is_first else "open"
+    return {"problem": rows["problem"].iloc[0], **fitted, "lower": lower,
+            "zeroth_from": start if lower == "zeroth" else math.nan}  # fmt: skip
+
+
+def fit(horizons: np.ndarray, norms: np.ndarray, errors: np.ndarray, bounded: bool = False) -> dict[str, Any]:
+    """Fit a power law and an exponential to norms ``(n,)``; return the verdict on which they follow, ``odds`` and slopes.
+
+    ``errors`` are the standard errors of the norms' logarithms. ``bounded`` states that the Jacobian product does not
+    grow, which leaves the power law if the norms do not contradict it. The ratio of likelihoods of two least-squares fits
+    with equally many parameters is (residual_1 / residual_2)^(n/2).
+    """
+    places, logarithms, errors = (np.log(horizons), horizons), np.log(norms), np.maximum(errors, ROUNDING)
+    (*order, power), (*rate, exponential) = (_slope(at, logarithms, errors) for at in places)
+    odds = (power / exponential) ** (len(norms) / 2) if len(norms) >= FEWEST else math.nan
+    verdict = "open"
+    if odds >= STRONG and rate[1] > 0:
+        verdict = "exploding"
+    elif (odds >= STRONG and rate[2] < 0) or (odds <= 1 / STRONG and order[2] < 0):
+        verdict = "vanishing"
+    elif order[1] > 0 and (odds <= 1 / STRONG or (odds <= 1 and bounded)):
+        verdict = "polynomial"
+    names = (f"{name}{end}" for name in ("order", "rate") for end in ("", "_low", "_high"))
+    return {"verdict": verdict, "odds": odds, **dict(zip(names, (*order, *rate), strict=True))}
+
+
+def _slope(places: np.ndarray, logarithms: np.ndarray, errors: np.ndarray) -> tuple[float, ...]:
+    """Return the slope of a line with its 95% interval (Student's t), and the sum of squared residuals and errors."""
+    from scipy.special import stdtrit
+
+    count = len(places)
+    if count < 3 or np.ptp(places) == 0:
+        return (math.nan,) * 4
+    away = places - places.mean()
+    slope = float(away @ logarithms / (away @ away))
+    start = float(logarithms.mean() - slope * places.mean())
+    left = logarithms - start - slope * places
+    residual = float(left @ left + errors @ errors)
+    reach = float(stdtrit(count - 2, 0.975)) * math.sqrt(residual / (count - 2) / float(away @ away))
+    return slope, slope - reach, slope + reach, residual

@@ -5,23 +5,63 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from bench.engines.problem import EngineProblem
 from bench.experiment.cell import Cell
-from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, text
+from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, seconds, text
+from bench.experiment.experiment import Experiment
 from bench.experiment.session import Session
+from bench.experiment.views import Chart, Style, Views
 from bench.measure import noise, statistics, timing
 from bench.model import Problem, param, zeroth_order
+from bench.report.style import PALETTE
+from bench.report.text import number
 
-from .. import StudyPackage, finite_status, relative_error
-from ..bias_variance.columns import COLUMNS as ESTIMATES
-from ..three_errors import difference_check
+from . import PARTS, StudyPackage, all_noise, finite_status, relative_error
+from .bias_variance.columns import COLUMNS as ESTIMATES
+from .three_errors import difference_check
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 SUMMARY = ("reference_norm", "reference_se", "bias", "bias_low", "bias_high", "variance", "rmse_rel")
 """Columns that are statistics of averaged gradients."""
+ACCURATE = 0.02
+"""Relative program error up to which a gradient counts as the derivative of its program. Differences of float32 costs
+have two digits."""
+SAME = 0.1
+"""Relative model error up to which a gradient counts as the gradient of the model."""
+USELESS = 1.0
+"""Relative RMSE from which on an estimate is no better than the zero estimate."""
+SHOWN = (
+    "program_error_rel", "model_error_rel", "rmse_rel", "zeroth_rmse_rel", "nan_share", "value_s", "gradient_s", "first_s",
+    "pipe_share", "memory_mb",
+)  # fmt: skip
+DETAILS = (
+    "difference_step", "model", "reference_norm", "reference_se", "reference_method", "bias", "bias_low", "bias_high",
+    "variance", "pass_share",
+)  # fmt: skip
+"""Further columns of the page."""
+LEVELS = {
+    "right": Style(PALETTE[3], letter="+", meaning="derivative of its program, and near the model's gradient"),
+    "own": Style(PALETTE[0], letter="o", meaning="derivative of its program, which is not near the model"),
+    "noisy": Style(PALETTE[5], letter="~", meaning="derivative of its program, but averages are no better than 0"),
+    "open": Style(
+        PALETTE[4], letter="?", meaning="derivative of its program; whether averages are better than 0 is open"
+    ),
+    "wrong": Style(PALETTE[2], letter="x", meaning="not the derivative of its program, or not finite"),
+    "none": Style("0.85", letter="-", meaning="no gradient, or the engine cannot run the scene"),
+}
+NOTES = (
+    "Program error: distance of the gradient from differences of the engine's own cost. Model error: distance from rigid "
+    "contact's gradient where it has a closed form, otherwise from the gradient of the scene's own program. RMSE: of "
+    "`samples` averaged gradients, or costs with scores, relative to the engine's own grad J_sigma; where that is not "
+    "known well enough, the upper end of the interval. Times are of `batch` rollouts. Pipe: share of the gradients' "
+    "time that is spent outside the engine's process.",
+)
 
 
 @dataclass(frozen=True)
@@ -29,9 +69,9 @@ class Engines(StudyPackage):
     """Measures whether an engine's gradient is right, its bias and variance, and what it costs."""
 
     name = "engines"
-    axes = ("scene", "contact", "integrator", "backend")
+    axes = PARTS
     timed = True
-    columns: ClassVar[Columns] = Columns.of(
+    columns = Columns.of(
         Column("program_error_rel", "distance of the gradient from its best central difference, relative to that difference",
                label="program error", comparison=ComparisonRule("exact", "program error")),
         Column("difference_step", "step of the best central difference, in the units of theta"),
@@ -41,10 +81,9 @@ class Engines(StudyPackage):
         *(ESTIMATES.by_name[name] for name in (*SUMMARY[:2], "reference_method", "reference_spacing", *SUMMARY[2:])),
         Column("zeroth_rmse_rel", "rmse_rel from `samples` costs with scores, without gradients", label="RMSE, costs only"),
         Column("nan_share", "share of the gradients that are not finite", label="NaN share"),
-        Column("gradient_s", "time of `batch` gradients, median", "s", label="gradients", measured=True, format="seconds"),
-        Column("value_s", "time of `batch` costs, median", "s", label="costs", measured=True, format="seconds"),
-        Column("first_s", "time of the first gradients and costs, with starts and compilation", "s", label="first call",
-               measured=True, format="seconds"),
+        seconds("gradient_s", "time of `batch` gradients, median", "gradients"),
+        seconds("value_s", "time of `batch` costs, median", "costs"),
+        seconds("first_s", "time of the first gradients and costs, with starts and compilation", "first call"),
         Column("pipe_share", "share of gradient_s outside the engine's process: pipes and copies", label="pipe", measured=True),
         Column("pass_share", "share of gradient_s in this process: costs, policy and adjoint pass", label="harness",
                measured=True),
@@ -70,7 +109,7 @@ class Engines(StudyPackage):
         truth = session.references.of(cell)
         known, noted = truth.known(), truth.note or "the reference gradient is not finite"
         status = finite_status(noted, truth.batches)
-        w = noise.shared(cell.seed, cell.scene.name, cell.repeats, cell.samples, program.n_noise)
+        w = all_noise(cell, program.n_noise)
         zeroth = zeroth_order(problem, theta, w).mean(axis=1)
         result |= {
             "reference_method": truth.method, "reference_spacing": truth.spacing, "device": problem.device,
@@ -97,6 +136,22 @@ class Engines(StudyPackage):
             result["engine_settings"] = ";".join(f"{name}={value}" for name, value in problem.settings.items())
         memory = problem.peak_memory_mb if isinstance(problem, EngineProblem) else timing.peak_memory_mb()
         return status | result | {"memory_mb": memory}
+
+    def show(self, experiment: Experiment, rows: pd.DataFrame) -> Views:
+        """Return the table with a line per scene and engine, and the grid of usable gradients."""
+        from bench.report.shown import Shown
+
+        shown = Shown(experiment, rows)
+        cells = with_limits(shown.rows)
+        measured = cells["status"].isin(("ok", "nonfinite"))
+        cells = cells.assign(level=np.where(measured, levels(cells), ""))
+        columns = experiment.columns.by_name | {
+            "rmse_rel": shown.column("rmse_rel", label="RMSE, gradients", limit="rmse_is_limit")
+        }
+        own, details = ([columns[name] for name in names] for names in (SHOWN, DETAILS))
+        table = shown.cells([text("level", label="gradient"), *own], "gradients of physics engines", NOTES, rows=cells)
+        charts = [_chart(cells[measured])] if measured.any() else []
+        return Views([table], charts, with_limits(shown.arranged.rows), [*own, *details])
 
 
 def _model_error(cell: Cell, session: Session, gradient: np.ndarray) -> dict[str, Any]:
@@ -138,3 +193,57 @@ def _times(cell: Cell, problem: Problem, study: Engines, has_gradient: bool) -> 
 def _inside(problem: Problem) -> tuple[float, float]:
     """Return the seconds so far inside the engine's process and in pipes; 0 in this process."""
     return (problem.engine_s, problem.pipe_s) if isinstance(problem, EngineProblem) else (0.0, 0.0)
+
+
+# ------------------------------------------------------------------------------------------------- what is shown
+
+
+def levels(rows: pd.DataFrame) -> np.ndarray:
+    """Return the level of each row's gradient, a key of :data:`LEVELS`."""
+    low, high = rmse_interval(rows)
+    is_right = (rows["status"] == "ok") & ~(rows["nan_share"] > 0) & (rows["program_error_rel"] <= ACCURATE)
+    kinds = {
+        "none": rows["gradient"].map(len) == 0, "wrong": ~is_right, "noisy": low >= USELESS, "open": ~(high < USELESS),
+        "right": rows["model_error_rel"] <= SAME,
+    }  # fmt: skip
+    return np.select(list(kinds.values()), list(kinds), "own")
+
+
+def rmse_interval(rows: pd.DataFrame) -> tuple[pd.Series, pd.Series]:
+    """Return an interval of at least 95% of each relative RMSE, from the intervals of bias, variance and norm.
+
+    The variance's interval is that of normal numbers, one per repeat. The reference's error is in the interval of the bias,
+    and makes that of the norm two standard errors wide. The upper end is infinite where the norm may be 0.
+    """
+    from scipy.special import chdtri
+
+    free = np.maximum(rows["repeats"] - 1, 1)
+    low, high = (np.sqrt(rows["variance"] * free / chdtri(free, tail)) for tail in (0.025, 0.975))
+    reach, norm = 2.0 * rows["reference_se"], rows["reference_norm"]
+    upper = np.hypot(rows["bias_high"], high) / (norm - reach)
+    return np.hypot(rows["bias_low"], low) / (norm + reach), upper.where(norm > reach, np.inf)
+
+
+def with_limits(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return rows with the upper end of the RMSE's interval where the reference is not known well enough for the RMSE.
+
+    The column ``rmse_is_limit`` is true there. Where the interval has no upper end the RMSE is missing.
+    """
+    known = rows["reference_norm"].notna()
+    hidden = known & ~(rows["rmse_rel"] > 2.0 * rows["reference_se"] / rows["reference_norm"])
+    limit = rmse_interval(rows)[1].replace(np.inf, np.nan)
+    return rows.assign(rmse_is_limit=hidden, rmse_rel=rows["rmse_rel"].mask(hidden, limit))
+
+
+def _chart(measured: pd.DataFrame) -> Chart:
+    """Return the grid of engines and scenes, coloured by level, with the model error of each gradient."""
+    rigid = (measured["contact"] == "impulse") & (measured["contact"].nunique() > 1)
+    letters = measured["level"].map({name: style.letter for name, style in LEVELS.items()})
+    errors = (" " + measured["model_error_rel"].map(number)).mask(measured["level"] == "none", "")
+    frame = measured.assign(place=measured["scene"] + rigid.map({True: ", rigid", False: ""}), cell=letters + errors)
+    return Chart(
+        "engines", frame, [text("place", label="")], [text("method", label="")], "grid",
+        level="level", cell="cell", styles=LEVELS, height=0.3, across=1,
+        subtitle="Number: model error, the relative distance from the model's gradient.",
+        text="A cell per engine and scene (rigid: with the law impulse). An empty cell: the engine does not run it.",
+    )  # fmt: skip
