@@ -58,7 +58,7 @@ WORDS = ["scenes=[quadratic]", "samples=8", "repeats=4", "timing=false", "refere
 
 def rows_of_run(folder, backend, kinds, workers):
     """Return the rows of a run of ``fobg``, changing estimators and ``reinforce``, by estimator."""
-    (folder / "mine").mkdir(parents=True)
+    (folder / "mine").mkdir(parents=True, exist_ok=True)
     for kind in kinds:
         (folder / "mine" / f"{kind}.py").write_text(plugin(kind))
     names = ",".join(["fobg", *(f"changes_{kind}" for kind in kinds), "reinforce"])
@@ -123,14 +123,10 @@ def test_new_processes_do_not_inherit_what_an_import_sets(tmp_path, monkeypatch)
 
 def test_a_worker_loads_no_file_that_its_cells_do_not_need(tmp_path):
     """The change by the import of another plugin is in no row."""
-    mine = tmp_path / "mine"
-    mine.mkdir()
-    (mine / "seed.py").write_text(plugin("seed"))
-    (mine / "imported.py").write_text(IMPORTED)
-    words = [*WORDS, "backends=[numpy]", "estimators=[fobg,changes_seed]", "workers=1", f"results_dir={tmp_path}"]
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "imported.py").write_text(IMPORTED)
     with np.errstate():
-        execute(load([*words, f"plugins=[{mine}]"]))
-    rows = pd.read_parquet(tmp_path / "changed" / "rows.parquet").set_index("estimator")
+        rows = rows_of_run(tmp_path, "numpy", ["seed"], 1)
     assert "settings changed" not in rows["reason"]["fobg"]
     assert "error state" not in rows["reason"]["changes_seed"]
 

@@ -5,7 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from bench.model import Compilations, compose, registry
+import bench
+from bench.model import Compilations
 
 pytest.importorskip("jax")
 
@@ -18,22 +19,6 @@ ORDERS = {0: 1.0, 1: 1.0, 2: 1 / 2, 3: 1 / 3}
 """p in memory ~ T^p by levels of checkpoints."""
 ROUNDED = 0.06
 """Error of p between 4,096 and 262,144 steps: some arrays of one step are kept at any horizon."""
-
-
-def problem(horizon, backend="checkpointed", scene="cartpole", **values):
-    """A cart-pole, or another scene, with a backend's parameters."""
-    plugin = registry.make("backends", backend, values)
-    parts = (
-        registry.make("scenes", scene, {"horizon": horizon}),
-        None,
-        registry.make("integrators", "semi_implicit_euler"),
-    )
-    return plugin.compile(compose(*parts))
-
-
-def gradient(one):
-    w = np.random.default_rng(0).standard_normal((one.program.n_noise, 3))
-    return one.grad(one.program.theta0, w)
 
 
 @pytest.mark.parametrize("levels", ORDERS)
@@ -55,20 +40,12 @@ def test_memory_grows_with_the_horizon_as_the_levels_promise(levels):
 
 @pytest.mark.slow
 def test_backends_that_keep_something_else_share_no_executable():
-    counts = []
-    for values in ({"levels": 1}, {"levels": 2}, {"keep": "everything"}):
-        one = problem(3, **values)
-        gradient(one)
-        counts.append(one.compilations.shapes)
-    jax = problem(3, "jax")
-    gradient(jax)
-    assert len(set().union(*counts, jax.compilations.shapes)) == 4
-
-
-def test_a_plain_function_has_no_step_jacobians():
-    plugin = registry.make("backends", "checkpointed", {"keep": "jacobians"})
-    program = compose(registry.make("scenes", "quadratic"))
-    assert "needs time steps" in plugin.refusal(program)
+    shapes = set()
+    for backend in ("checkpointed[levels=1]", "checkpointed[levels=2]", "checkpointed[keep=everything]", "jax"):
+        problem = bench.problem("cartpole[horizon=3]", backend=backend)
+        problem.grad(problem.program.theta0, np.ones((problem.program.n_noise, 3)))
+        shapes |= problem.compilations.shapes
+    assert len(shapes) == 4
 
 
 def test_the_executables_used_last_are_kept(monkeypatch):

@@ -9,8 +9,6 @@ from bench.plugins.studies.bias_variance import BiasVariance
 from classes import (
     BounceOnce,
     BouncingBall,
-    Complementarity,
-    DoublePendulum,
     Fobg,
     Jax,
     Mjx,
@@ -20,10 +18,7 @@ from classes import (
     Pendulum,
     Pushing,
     Quadruped,
-    Rk4,
     SemiImplicitEuler,
-    TossedBox,
-    WallPenalty1d,
 )
 
 from bench.conformance import backends, scenes
@@ -104,33 +99,6 @@ def test_lean_changes_no_number():
 
 
 # --------------------------------------------------------------------------------------------------- refusals
-
-
-@pytest.mark.parametrize(
-    ("engine", "of", "reason"),
-    [
-        (Mujoco(), compose(Pushing(), Complementarity(), SemiImplicitEuler()), "replaces penalty, not complementarity"),
-        (Mujoco(), compose(Pendulum(), None, Rk4()), "not rk4"),
-        (Mujoco(), compose(DoublePendulum(), None, SemiImplicitEuler()), "no MJCF twin"),
-        (Mujoco(), compose(WallPenalty1d(), law_for(WallPenalty1d(), Penalty), SemiImplicitEuler()), "supports damping_mode=clipped only"),
-        (Mujoco(dtype="float32"), program(Pushing()), "double precision"),
-        (Mjx(mode="reverse", iterations=2, derivative="unrolled"), program(Pushing()), "use derivative=implicit, mode="),
-        (Mjx(cone="elliptic"), program(TossedBox()), "NaN"),
-        (Mjx(cone="elliptic", iterations=9, derivative="unrolled"), program(TossedBox()), "use derivative=implicit and"),
-        (Mjx(cone="elliptic", iterations=9), program(Pushing()), "without friction beside elliptic cones"),
-        (Mjx(integrator="rk4"), program(Pendulum()), "not semi_implicit_euler"),
-    ],
-    ids=lambda value: value if isinstance(value, str) else "",
-)  # fmt: skip
-def test_what_an_engine_cannot_do_is_refused(engine, of, reason):
-    assert reason in engine.own_refusal(of)
-
-
-def test_scene_for_engines_is_refused_elsewhere():
-    scene = TossedBox()
-    made = cell(scene, law_for(scene, Penalty), Jax())
-    assert made.refusal() == ("unsupported", "tossed_box runs only in physics engines, and backend jax is not one")
-    assert made.with_part("backend", Mujoco()).refusal() is None
 
 
 def test_reference_of_an_engine_is_its_own():

@@ -76,37 +76,38 @@ def test_sharing_takes_every_sample_for_both_orders():
     assert (alpha > 0).all()
 
 
-def test_zeroth_orders_on_a_linear_cost_have_their_closed_form_errors():
-    """Relative squared errors on a plane of d variables: (d + 1) / N, (d - 1) / N, and 0 for d orthogonal directions."""
+FIXED = Orthogonal(lengths="fixed")
+ON_A_PLANE = [
+    (RandomizedSmoothing(), 8, 9 / 8),
+    (RandomizedSmoothing(variant="forward"), 8, 9 / 8),
+    (FiniteDifference(), 8, 0.0),
+    (SphereSmoothing(), 8, 7 / 8),
+    (FIXED, 8, 0.0),
+    (FIXED, 2, 3.0),
+    (ControlVariate(), 8, 0.0),  # what differences leave of the gradient at w = 0
+    (Guided(subspace=1, share=0.1), 2, 2.7),
+]
+"""Estimator, samples, and the relative squared error on a plane of 8 variables.
+
+It is (d + 1) / N of a normal, (d - 1) / N of a sphere, d / N - 1 of orthogonal directions (Choromanski et al. 2018), and
+2 + 7 share of guided ones.
+"""
+
+
+def error_on_a_plane(estimator, samples):
     problem = Numpy().compile(compose(Linear(dimension=8)))
-    theta, truth = problem.program.theta0, problem.program.closed_form_gradient()
-    w = noise.draw(1, "plane", 4000, 8, 8, "cells")
-
-    def error(estimator):
-        return float(((estimator.estimate(problem, theta, w) - truth) ** 2).sum(axis=1).mean() / (truth @ truth))
-
-    tolerance = 0.05  # 4,000 repeats: 2%
-    for smoothing in (RandomizedSmoothing(), RandomizedSmoothing(variant="forward")):
-        assert error(smoothing) == pytest.approx(9 / 8, rel=tolerance)
-    assert error(FiniteDifference()) < 1e-16
-    assert error(SphereSmoothing()) == pytest.approx(7 / 8, rel=tolerance)
-    assert error(Orthogonal(lengths="fixed")) < 1e-20
-    assert error(Orthogonal()) < 0.5 * error(RandomizedSmoothing())
-    assert error(ControlVariate()) < 1e-16  # what differences leave of the gradient at w = 0
+    truth, w = problem.program.closed_form_gradient(), noise.draw(2, "plane", 20_000, samples, 8, "cells")
+    values = estimator.estimate(problem, problem.program.theta0, w)
+    return ((values - truth) ** 2).sum(axis=1).mean() / (truth @ truth)
 
 
-def test_directions_on_a_plane_have_their_closed_form_errors():
-    """The squared error d / N - 1 of N orthogonal directions (Choromanski et al. 2018), and 2 + 7 share of guided ones."""
-    problem = Numpy().compile(compose(Linear(dimension=8)))
-    truth, w = problem.program.closed_form_gradient(), noise.draw(2, "plane", 20_000, 2, 8, "cells")
+@pytest.mark.parametrize(("estimator", "samples", "error"), ON_A_PLANE, ids=str)
+def test_errors_on_a_plane_are_their_closed_forms(estimator, samples, error):
+    assert error_on_a_plane(estimator, samples) == pytest.approx(error, rel=0.03, abs=1e-16)  # 2.7 varies by 1%
 
-    def mean(estimator):
-        values = estimator.estimate(problem, problem.program.theta0, w)
-        errors = ((values - truth) ** 2).sum(axis=1) / (truth @ truth)
-        return values.mean(axis=0) @ truth / (truth @ truth), errors.mean()
 
-    assert mean(Orthogonal(lengths="fixed"))[1] == pytest.approx(3.0, rel=0.01)
-    assert mean(Guided(subspace=1, share=0.1)) == pytest.approx((1.0, 2.7), rel=0.03)  # 2.7 varies by 1%
+def test_orthogonal_directions_halve_the_error_on_a_plane():
+    assert error_on_a_plane(Orthogonal(), 8) < 0.5 * 9 / 8
 
 
 def test_clipping_a_batch_cuts_its_norm():

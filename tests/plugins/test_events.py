@@ -1,27 +1,21 @@
 """Estimators that use declared events, against closed forms and exact sums over all outcomes."""
 
 import dataclasses
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from classes import (
     Boundary,
-    CoinWalk,
     Cubic,
     Fobg,
     Heaviside,
-    Impulse,
     Ledge,
-    Penalty,
-    Pushing,
-    SemiImplicitEuler,
     StochasticDerivative,
     Torch,
 )
 from scipy import stats
 
-from bench.model import Decision, DisturbedScene, Events, EventScene, FunctionScene, compose, half_spaces
+from bench.model import DisturbedScene, Events, EventScene, FunctionScene, compose, half_spaces
 
 LIMIT = 4.5
 """Standard errors within which a mean agrees with its expectation."""
@@ -136,22 +130,3 @@ def test_one_coin_has_the_weights_of_its_source(sign, at):
     np.testing.assert_allclose(terms[0], [happened, not_happened], rtol=1e-7)
     boundary = Boundary().terms(problem(scene), scene.theta0(), np.zeros((2, 1)))
     np.testing.assert_allclose(boundary[0], sign * slope * 3, rtol=1e-7)
-
-
-# ------------------------------------------------------------------------------------------------- refusals
-
-
-def test_undeclared_jumps_are_refused_with_the_reason():
-    integrator = SemiImplicitEuler()
-    assert Boundary().own_refusal(compose(Pushing(), Penalty(), integrator)) is None
-    assert "impulse may jump" in Boundary().own_refusal(compose(Pushing(), Impulse(), integrator))
-    named = compose(Ledge(), decision=Decision(("height",)))
-    assert "its own theta" in Boundary().own_refusal(named)
-    jumping = dataclasses.make_dataclass("Jumping", [], bases=(Cubic,), frozen=True, namespace={"continuous": False})
-    assert "declares no events" in Boundary().own_refusal(compose(jumping()))
-    surrogate = SimpleNamespace(name="soft", continuous=True)
-    program = SimpleNamespace(scene=Heaviside(), contact=surrogate, surrogate=True)
-    assert "soft is a surrogate" in Boundary().own_refusal(program)
-    for scene in (Heaviside(), Cubic()):
-        assert "declares discrete events" in StochasticDerivative().own_refusal(compose(scene))
-    assert StochasticDerivative().own_refusal(compose(CoinWalk())) is None

@@ -7,7 +7,9 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
+from classes import Quadratic
 
+import bench
 from bench.model import Compilations, FunctionScene, compose, param, registry
 
 pytest.importorskip("numba")
@@ -49,11 +51,6 @@ class Sorted(Kinks):
         return xp.sort(x, axis=0)[-1]
 
 
-def both(program):
-    """The program on the fused backend and on JAX."""
-    return (registry.make("backends", name).compile(program) for name in ("fused", "jax"))
-
-
 def relative(a, b):
     assert np.array_equal(np.isnan(a), np.isnan(b))
     return np.nanmax(np.abs(a - b)) / np.nanmax(np.abs(b))
@@ -61,14 +58,12 @@ def relative(a, b):
 
 @pytest.fixture(scope="module")
 def kinks():
-    return both(compose(Kinks()))
+    return [registry.make("backends", name).compile(compose(Kinks())) for name in ("fused", "jax")]
 
 
 @pytest.fixture(scope="module")
 def pushing():
-    scene = registry.make("scenes", "pushing", {"horizon": 3})
-    law, integrator = registry.make("contacts", "penalty"), registry.make("integrators", "semi_implicit_euler")
-    return list(both(compose(scene, law, integrator)))
+    return [bench.problem("pushing[horizon=3]", backend=name) for name in ("fused", "jax")]
 
 
 @pytest.mark.slow
@@ -96,8 +91,7 @@ def test_a_cost_that_overflows_has_no_gradient_finite_as_its_slope_may_be(pushin
 
 def test_what_is_remembered_of_a_block_begins_at_zero_without_a_loop_over_time_too():
     """Without carries nothing was stored before the passes, and the mark of large slopes was whatever lay in memory."""
-    program = compose(registry.make("scenes", "quadratic"))
-    text = _source(program, "grad", "float64").text
+    text = _source(compose(Quadratic()), "grad", "float64").text
     place = re.search(r"lane\[(\d+) \+ l\] = lane\[\1 \+ l\] if abs", text)
     assert place
     assert f"lane[{place[1]} + l] = F(0.0)" in text
@@ -107,10 +101,10 @@ def test_parameters_and_horizon_compile_nothing_again(pushing):
     fused, _ = pushing
     w = np.zeros((3, 32))
     fused.grad(fused.program.theta0, w)
-    scene = registry.make("scenes", "pushing", {"horizon": 5, "mass": 0.3})
-    law = registry.make("contacts", "penalty", {"stiffness": 77.0})
-    other = compose(scene, law, registry.make("integrators", "semi_implicit_euler"))
-    changed, jax = both(other)
+    changed, jax = (
+        bench.problem("pushing[horizon=5,mass=0.3]", "penalty[stiffness=77]", backend=name) for name in ("fused", "jax")
+    )
+    other = changed.program
     w = np.random.default_rng(1).standard_normal((5, 40))
     changed.compilations = Compilations()
     assert relative(changed.grad(other.theta0, w), jax.grad(other.theta0, w)) < SAME
@@ -119,7 +113,7 @@ def test_parameters_and_horizon_compile_nothing_again(pushing):
 
 def test_machine_code_is_kept_on_disk(tmp_path, monkeypatch):
     monkeypatch.setattr(kernels, "_known", {})
-    fused = registry.make("backends", "fused").compile(compose(registry.make("scenes", "linear", {"dimension": 2})))
+    fused = bench.problem("linear[dimension=2]", backend="fused")
     fused.compilations = Compilations(tmp_path)
     first = fused.value(np.ones(2), np.zeros((2, 1)))
     assert fused.compilations.made == 1
@@ -131,18 +125,6 @@ def test_machine_code_is_kept_on_disk(tmp_path, monkeypatch):
 def test_an_operation_without_scalar_form_is_refused_by_name():
     backend = registry.make("backends", "fused")
     assert "no scalar code for sort" in str(backend.own_refusal(compose(Sorted())))
-    pushed = compose(
-        registry.make("scenes", "pushing"),
-        registry.make("contacts", "complementarity"),
-        registry.make("integrators", "semi_implicit_euler"),
-    )
-    assert "no root finder" in str(backend.refusal(pushed))
-    surrogate = compose(
-        registry.make("scenes", "pushing"),
-        registry.make("contacts", "straight_through"),
-        registry.make("integrators", "semi_implicit_euler"),
-    )
-    assert "surrogate" in str(backend.refusal(surrogate))
 
 
 def test_sine_and_cosine_are_accurate_in_the_whole_range():

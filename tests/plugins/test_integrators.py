@@ -1,4 +1,4 @@
-"""Integrators and the smooth scenes that tell them apart: stability, order, energy, impacts, chaos."""
+"""Integrators beyond the conformance kit: gradients across impacts, and energy."""
 
 import dataclasses
 
@@ -6,72 +6,62 @@ import numpy as np
 import pytest
 from classes import (
     BouncingBall,
+    CartpoleSwing,
     DoublePendulum,
     EventDriven,
-    Implicit,
+    HopperRun,
     Impulse,
-    Numpy,
     Penalty,
-    StormerVerlet,
     Torch,
 )
 
-from bench.model import compose
-
-
-def compiled(scene, integrator, law=None, backend=None):
-    """On the given backend, or on a fast one that can run it."""
-    backend = backend or (Implicit() if integrator.needs_root else Numpy())
-    return backend.compile(compose(scene, law, integrator))
-
-
-def quiet(problem):
-    return np.zeros((problem.program.n_noise, 1))
-
-
-def normal(problem, count, seed=0):
-    return np.random.default_rng(seed).standard_normal((problem.program.n_noise, count))
-
-
-def gradient(problem):
-    """At theta0, without noise, ``(d,)``."""
-    return problem.grad(problem.program.theta0, quiet(problem))[:, 0]
-
-
-# ---------------------------------------------------------------------------------------------- double_pendulum
-
-
-def test_double_pendulum_acceleration_is_that_of_its_energy():
-    """d(energy)/dt = 0 from every state; hanging still is an equilibrium."""
-    scene = DoublePendulum()
-    q, v = np.random.default_rng(0).normal(size=(2, 2, 50))
-    a, eps = scene.acceleration(np, q, v, np.zeros((0, 50))), 1e-5
-    rate = (scene.energy(np, q + eps * v, v + eps * a) - scene.energy(np, q - eps * v, v - eps * a)) / (2 * eps)
-    assert (
-        np.abs(rate).max() < 1e-7
-    )  # differences of step 1e-5: rounding 1e-11, truncation 1e-10 times third derivatives
-    still = scene.acceleration(np, np.array([[0.0], [0.0]]), np.zeros((2, 1)), np.zeros((0, 1)))
-    assert np.abs(still).max() == 0.0
-
-
-# ------------------------------------------------------------------------------------------------- event_driven
+from bench.model import Dynamics, LoopOps, compose
 
 
 def test_event_driven_gradients_across_noise():
     """Each of 1,000 samples, among which impacts fall everywhere within a step."""
     scene = BouncingBall(horizon=100, dt=0.01)
-    problem = compiled(scene, EventDriven(), Impulse(), Torch())
-    w = normal(problem, 1000)
+    problem = Torch().compile(compose(scene, Impulse(), EventDriven()))
+    w = np.random.default_rng(0).standard_normal((problem.program.n_noise, 1000))
     starts = scene.theta0()[:, None] + scene.sigma * w
     exact = [dataclasses.replace(scene, height=h, velocity=v).physical_gradient() for h, v in starts.T]
     assert problem.grad(scene.theta0(), w) == pytest.approx(np.transpose(exact), rel=1e-8, abs=1e-10)
 
 
-def test_event_driven_without_impacts_is_stormer_verlet():
-    for scene, law in (
-        (DoublePendulum(horizon=20), None),
-        (BouncingBall(horizon=100, dt=0.01), Penalty(stiffness=1e4)),
-    ):
-        event, plain = (compiled(scene, integrator, law) for integrator in (EventDriven(), StormerVerlet()))
-        w = normal(event, 4)
-        assert np.array_equal(event.value(scene.theta0(), w), plain.value(scene.theta0(), w))
+# ------------------------------------------------------------------------------------------------------- energy
+
+
+def cartpole_energy(scene, q, v):
+    moment, total = scene.pole_mass * scene.length, scene.cart_mass + scene.pole_mass
+    turning = moment * np.cos(q[1]) * v[0] * v[1] + 2 / 3 * moment * scene.length * v[1] ** 2
+    return 0.5 * total * v[0] ** 2 + turning + moment * scene.gravity * np.cos(q[1])
+
+
+def hopper_energy(scene, q, v):
+    """With the energy of gravity, leg, hip and contact."""
+    masses = np.array([scene.body_mass, scene.body_mass, scene.inertia, scene.foot_mass, scene.foot_mass])
+    hip = np.arctan2(q[3] - q[0], q[1] - q[4]) - q[2]
+    stretch = np.hypot(q[3] - q[0], q[4] - q[1]) - scene.leg
+    springs = scene.leg_stiffness * stretch**2 + scene.hip_stiffness * hip**2 + STIFFNESS * np.minimum(q[4], 0.0) ** 2
+    return 0.5 * (masses @ v**2 + springs) + scene.gravity * (scene.body_mass * q[1] + scene.foot_mass * q[4])
+
+
+STIFFNESS = 1e4
+KEPT = [
+    (DoublePendulum(), lambda scene, q, v: scene.energy(np, q, v), 0.0),
+    (CartpoleSwing(), cartpole_energy, 0.0),
+    (HopperRun(leg_damping=0.0, friction=0.0), hopper_energy, np.array([[0.0], [2.0], [0.0], [0.0], [0.0]])),
+]
+"""Scenes without damping and friction, their energy, and the middle of their positions."""
+
+
+@pytest.mark.parametrize(("scene", "energy", "middle"), KEPT, ids=lambda value: getattr(value, "name", ""))
+def test_accelerations_keep_the_energy(scene, energy, middle):
+    """d(energy)/dt = 0 from every state, in contact too."""
+    q, v = np.random.default_rng(0).normal(size=(2, scene.n_q, 50))
+    q = middle + 0.5 * q
+    dynamics = Dynamics(LoopOps(), scene, Penalty(stiffness=STIFFNESS))
+    a, eps = dynamics.acceleration(q, v, np.zeros((scene.n_u, 50))), 1e-5
+    rate = (energy(scene, q + eps * v, v + eps * a) - energy(scene, q - eps * v, v - eps * a)) / (2 * eps)
+    # differences: rounding of the energy over 1e-5, and 1e-10 times third derivatives
+    assert np.abs(rate).max() < 1e-9 * (energy(scene, q, v).max() + np.abs(a).max())

@@ -108,64 +108,43 @@ def test_a_changed_file_changes_the_key(pendulum):
     assert fingerprint(make("scenes", f"mjcf[file={pendulum},functions={other}]")) != changed
 
 
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        ({"file": "quadrupd.xml"}, "quadrupd.xml.*quadruped.xml"),
-        ({"file": "/nowhere/robot.xml"}, "this file does not exist"),
-        ({"file": "nosuchpackage:robot.xml"}, "pip install nosuchpackage"),
-        ({"functions": "/nowhere/task.py"}, "/nowhere/task.py does not exist"),
-    ],
-)
-def test_a_missing_file_is_named(values, message):
-    with pytest.raises(UserError, match=message):
-        problem(**{"file": "quadruped.xml", **values})
-
-
-def test_a_task_without_a_cost_is_named(pendulum):
-    pendulum.with_suffix(".py").write_text("def observation(xp, q, v):\n    return q\n")
-    with pytest.raises(UserError, match="defines no function stage_cost"):
-        problem(pendulum)
-
-
-def test_a_broken_model_is_named(pendulum):
-    pendulum.write_text("<mujoco><worldbody><bdy/></worldbody></mujoco>")
-    with pytest.raises(UserError, match=r"cannot be read: (.|\n)*bdy"):
-        problem(pendulum)
-
-
 ELLIPTIC = {"<option": '<option cone="elliptic"'}
 PASSIVE = {'<motor joint="hinge"/>': "", 'ctrl="0.2"': 'qvel="0.3"'}
+NO_COST = {"def stage_cost": "def no_cost"}
+BAD = [
+    ({}, {"file": "quadrupd.xml"}, "quadrupd.xml.*quadruped.xml"),
+    ({}, {"file": "/nowhere/robot.xml"}, "this file does not exist"),
+    ({}, {"file": "nosuchpackage:robot.xml"}, "pip install nosuchpackage"),
+    ({}, {"functions": "/nowhere/task.py"}, "/nowhere/task.py does not exist"),
+    (NO_COST, {}, "defines no function stage_cost"),
+    ({"<body>": "<bdy>"}, {}, r"cannot be read: (.|\n)*bdy"),
+    (PASSIVE, {}, "no actuators for a policy: use theta=velocity"),
+    ({}, {"backend": "mjx"}, r"use mjx\[iterations=20\]"),
+    ({}, {"backend": "mjx[derivative=unrolled]"}, r"use mjx\[iterations=20\]"),
+    ({}, {"backend": "mjx[iterations=5,derivative=unrolled,mode=reverse]"}, "no reverse mode with iterations=5"),
+    ({}, {"backend": "mjx[iterations=5,cone=elliptic]"}, "cone=elliptic would have no effect"),
+    ({}, {"backend": "mujoco[impedance=0.5]"}, "impedance=0.5 would have no effect"),
+    (ELLIPTIC | {"<geom": '<geom condim="1"'}, {"backend": "mjx[iterations=5]"}, "use pyramidal cones"),
+    (ELLIPTIC, {"backend": "mjx[iterations=5,derivative=unrolled]"}, "NaN with elliptic friction cones"),
+]
+"""Texts changed in the model and the task, settings, and the message."""
 
 
 def changed(file, changes):
-    for old, new in changes.items():
-        file.write_text(file.read_text().replace(old, new))
+    for path in (file, file.with_suffix(".py")):
+        for old, new in changes.items():
+            path.write_text(path.read_text().replace(old, new))
     return file
 
 
-@pytest.mark.parametrize(
-    ("changes", "backend", "reason"),
-    [
-        ({}, "mjx", r"use mjx\[iterations=20\]"),
-        ({}, "mjx[derivative=unrolled]", r"use mjx\[iterations=20\]"),
-        ({}, "mjx[iterations=5,derivative=unrolled,mode=reverse]", "no reverse mode with iterations=5"),
-        ({}, "mjx[iterations=5,cone=elliptic]", "cone=elliptic would have no effect"),
-        ({}, "mujoco[impedance=0.5]", "impedance=0.5 would have no effect"),
-        (ELLIPTIC | {"<geom": '<geom condim="1"'}, "mjx[iterations=5]", "use pyramidal cones"),
-        (ELLIPTIC, "mjx[iterations=5,derivative=unrolled]", "NaN with elliptic friction cones"),
-    ],
-)
-def test_what_an_engine_cannot_do_with_a_file_is_named(pendulum, changes, backend, reason):
-    with pytest.raises(bench.Unsupported, match=reason):
-        problem(changed(pendulum, changes), backend)
+@pytest.mark.parametrize(("changes", "values", "message"), BAD)
+def test_what_cannot_be_run_is_named(pendulum, changes, values, message):
+    with pytest.raises(bench.Unsupported if "backend" in values else UserError, match=message):
+        problem(**{"file": changed(pendulum, changes), **values})
 
 
 def test_a_file_without_actuators_has_velocities_as_theta(pendulum):
-    file = changed(pendulum, PASSIVE)
-    with pytest.raises(UserError, match="no actuators for a policy: use theta=velocity"):
-        problem(file)
-    given = problem(file, theta="velocity", noise="parameter")
+    given = problem(changed(pendulum, PASSIVE), theta="velocity", noise="parameter")
     assert np.isfinite(given.grad(given.program.theta0, drawn(given))).all()
     assert given.program.theta0 == 0.3
 

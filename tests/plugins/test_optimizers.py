@@ -117,22 +117,13 @@ def test_constants_of_cma(dim, population):
     assert (ours.c_sigma, ours.d_sigma) == pytest.approx((size.cs, size.damps), rel=SAME)
 
 
-def test_gauss_newton_takes_back_a_bad_step():
-    optimizer = GaussNewton()
-    state = optimizer.start(np.array([3.0]))
-    for _ in range(60):
-        x = optimizer.ask(state, np.empty((1, 0)))
-        state = optimizer.tell(state, x, Answer(residual=np.arctan(x), jacobian=(1 / (1 + x**2))[:, None]))
-    assert abs(state["theta"][0]) < 1e-6  # undamped steps diverge from |x| > 1.39
-
-
-def steps(optimizer, cost, slope, count):
-    """Thetas from 1 on, ``(count + 1,)``. The residual of a least-squares method is the gradient, with derivative 1."""
-    state = optimizer.start(np.ones(1))
-    found = [1.0]
+def steps(optimizer, cost, slope, count, start=1.0, curvature=np.ones_like):
+    """Thetas, ``(count + 1,)``. The residual of a least-squares method is the gradient."""
+    state = optimizer.start(np.array([start]))
+    found = [start]
     for _ in range(count):
         x = optimizer.ask(state, np.empty((1, 0)))
-        state = optimizer.tell(state, x, Answer(cost(x[0]), slope(x), slope(x), np.ones((1, *x.shape))))
+        state = optimizer.tell(state, x, Answer(cost(x[0]), slope(x), slope(x), curvature(x)[None]))
         found.append(float(state["theta"][0]))
     return found
 
@@ -153,6 +144,11 @@ def test_a_damped_step_of_gauss_newton():
     """Marquardt 1963: the share damping / (1 + damping) remains."""
     found = steps(GaussNewton(damping=0.001), lambda x: 0.5 * x**2, lambda x: x, 2)
     assert found[2] == pytest.approx(0.001 / 1.001, rel=1e-9)
+
+
+def test_gauss_newton_takes_back_a_bad_step():
+    found = steps(GaussNewton(), lambda x: 0.0, np.arctan, 60, 3.0, lambda x: 1 / (1 + x**2))
+    assert abs(found[-1]) < 1e-6  # undamped steps diverge from |x| > 1.39
 
 
 def test_nothing_finite_is_no_step():

@@ -110,21 +110,3 @@ def test_a_rollout_that_has_ended_stays():
     first = np.argmax(ended, axis=0)
     for column in np.flatnonzero(ended[-1]):
         assert (states[first[column] :, column] == states[first[column], column]).all()
-
-
-def test_energy_is_kept_without_force():
-    scene = CartpoleSwing()
-    program = compile_problem("cartpole_swing[substeps=400]", None, "semi_implicit_euler", "numpy").program
-
-    def energy(q, v):
-        m, half, total = scene.pole_mass, scene.length, scene.cart_mass + scene.pole_mass
-        kinetic = (
-            0.5 * total * v[0] ** 2 + m * half * np.cos(q[1]) * v[0] * v[1] + 0.5 * (4 / 3) * m * half**2 * v[1] ** 2
-        )
-        return kinetic + m * scene.gravity * half * np.cos(q[1])
-
-    state = State(np.array([[0.0], [2.0]]), np.array([[0.1], [0.4]]))
-    before = energy(*state)
-    for _ in range(60):
-        state = program.step(LoopOps(), state, np.zeros((1, 1)))
-    assert energy(*state) == pytest.approx(before, rel=1e-4)  # 24,000 steps of first order

@@ -5,7 +5,6 @@ import pytest
 from bench.plugins.estimators.total_propagation import TotalPropagation, _weight
 from classes import (
     AlphaOrder,
-    BouncingBall,
     Cartpole,
     Clipped,
     ControlVariate,
@@ -13,7 +12,6 @@ from classes import (
     InverseVariance,
     Numpy,
     Penalty,
-    Pushing,
     Reinforce,
     SemiImplicitEuler,
     SphereSmoothing,
@@ -164,9 +162,3 @@ def test_zeroth_order_per_action_has_the_policys_gradient_as_its_mean(policy, mo
         spread = found.std(axis=0, ddof=1) / np.sqrt(len(found))
         # 4.5 standard errors: below 1e-5 by chance
         assert (np.abs(found.mean(axis=0) - mean) < 4.5 * np.hypot(spread, error)).all()
-
-
-def test_actions_without_noise_of_their_own_are_refused():
-    for scene, is_refused in ((Pushing(hold=3), True), (BouncingBall(), True), (Pushing(), False)):
-        reason = TotalPropagation(per="action").own_refusal(compose(scene, None, SemiImplicitEuler()))
-        assert ("noise on the action" in str(reason)) == is_refused

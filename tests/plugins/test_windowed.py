@@ -81,11 +81,3 @@ def test_stiff_steps_end_a_window():
     assert low == pytest.approx(Windowed(steps=1).estimate(problem, theta, noise), rel=1e-9)
     high = Windowed(steps=100, cut=1e9).estimate(problem, theta, noise)
     assert high == pytest.approx(Fobg().estimate(problem, theta, noise), rel=1e-5)
-
-
-def test_refusals():
-    assert "knows its cost-to-go" in Windowed(terminal="exact").own_refusal(
-        bench.problem("pendulum", backend="numpy").program
-    )
-    named = bench.problem("pushing", backend="numpy", theta=("mass",)).program
-    assert "theta must be the scene's own" in Windowed().own_refusal(named)

@@ -3,15 +3,16 @@
 from dataclasses import dataclass
 from typing import ClassVar
 
+from classes import CartpoleSwing, SemiImplicitEuler
+
 from bench.model import ContactScene, State, compose, param, registry
 from bench.model.policy import PolicyScene, uniform
+from bench.training.environment import Environment
 
 
 def cartpole_program(**parameters):
     """Return the program of cart-pole with semi-implicit Euler."""
-    return compose(
-        registry.make("scenes", "cartpole_swing", parameters), None, registry.make("integrators", "semi_implicit_euler")
-    )
+    return compose(CartpoleSwing(**parameters), None, SemiImplicitEuler())
 
 
 @dataclass(frozen=True)
@@ -71,8 +72,9 @@ class Untouched(Pressed):
 
 def pressed_program(contact="penalty", scene=None, **parameters):
     """Return the program of the pressed mass, or of another scene with a contact, under a contact law."""
-    return compose(
-        scene or Pressed(),
-        registry.make("contacts", contact, parameters),
-        registry.make("integrators", "semi_implicit_euler"),
-    )
+    return compose(scene or Pressed(), registry.make("contacts", contact, parameters), SemiImplicitEuler())
+
+
+def environment(program, backend="jax", dtype="float64"):
+    """Return the episodes of a program with the operations of a backend."""
+    return Environment(program, registry.make("backends", backend).ops(), dtype)

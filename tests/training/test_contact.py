@@ -4,17 +4,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from problems import pressed_program
+from classes import HopperRun
+from problems import environment, pressed_program
 
-from bench.model import State, compose, registry
-from bench.training.environment import Environment
+from bench.model import State, registry
 from bench.training.run import Training
 
 SHAC = {"hidden": 4, "rollouts": 4, "window": 12, "passes": 1, "batches": 1, "steps": 480}
 
 
 def test_contacts_penetration_and_force_of_a_state():
-    env = Environment(pressed_program(stiffness=1e3), registry.make("backends", "jax").ops())
+    env = environment(pressed_program(stiffness=1e3))
     state = State(jnp.array([[-0.02, 0.1]]), jnp.zeros((1, 2)))
     closed, depth, force = env.contacts(state)
     np.testing.assert_allclose(closed, [1.0, 0.0])
@@ -24,7 +24,7 @@ def test_contacts_penetration_and_force_of_a_state():
 
 def updated(contact="penalty", backend="jax", **parameters):
     """The log of one update under a contact law, and the seconds of compilation."""
-    env = Environment(pressed_program(contact, **parameters), registry.make("backends", backend).ops())
+    env = environment(pressed_program(contact, **parameters), backend)
     run = Training(env, registry.make("trainers", "shac", SHAC))
     _, log = run.update(run.start(0))
     return {name: float(value) for name, value in log.items()}, run.compile_s
@@ -50,12 +50,7 @@ def test_a_contact_law_that_solves_an_equation_trains_on_the_implicit_backend():
 @pytest.mark.full
 def test_shac_learns_to_run_by_hopping():
     """A fifth of the steps of results/standard/train_hopper, whose shac runs 4 m/s; falling over gives a return below 100."""
-    backend = registry.make("backends", "jax", {"dtype": "float32"})
-    program = compose(
-        registry.make("scenes", "hopper_run"), registry.make("contacts", "penalty", {"stiffness": 1e4}),
-        registry.make("integrators", "semi_implicit_euler"),
-    )  # fmt: skip
-    env = Environment(program, backend.ops(), "float32")
+    env = environment(pressed_program(scene=HopperRun(), stiffness=1e4), dtype="float32")
     trainer = registry.make("trainers", "shac", {"actor_rate": 0.002, "steps": 204_800})
     run = Training(env, trainer)
     state = run.start(0)

@@ -6,19 +6,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from problems import cartpole_program
+from classes import CartpoleSwing, SemiImplicitEuler
+from problems import cartpole_program, environment
 
 from bench.errors import UserError
-from bench.model import LoopOps, State, compose, registry
+from bench.model import LoopOps, State, compose
 from bench.training import steps
-from bench.training.environment import Environment
 
 ROUNDING = 1e-9
 """Relative difference allowed between a loop in NumPy and a scan in JAX, both in float64, over 30 steps."""
 
 
 def test_returns_are_those_of_a_loop_in_numpy():
-    env = Environment(cartpole_program(horizon=30), registry.make("backends", "jax").ops())
+    env = environment(cartpole_program(horizon=30))
     numbers = np.random.default_rng(0).standard_normal((8, 5))
     ours = env.returns(lambda seen: 0.2 * seen[:1] - seen[4:], jnp.asarray(numbers))
     scene, program, ops = env.scene, env.program, LoopOps(np)
@@ -33,14 +33,13 @@ def test_returns_are_those_of_a_loop_in_numpy():
 
 def at_rest(scene, n_start):
     """The returns of three rollouts of a scene without actions, from starts of zeros."""
-    program = compose(scene, None, registry.make("integrators", "semi_implicit_euler"))
-    env = Environment(program, registry.make("backends", "jax").ops())
+    env = environment(compose(scene, None, SemiImplicitEuler()))
     return np.asarray(env.returns(lambda seen: 0.0 * seen[:1], jnp.zeros((n_start, 3))))
 
 
 def test_an_episode_counts_up_to_its_first_end():
     @dataclass(frozen=True)
-    class Falls(registry.usable("scenes", "cartpole_swing")):
+    class Falls(CartpoleSwing):
         name = "falls"
 
         def has_ended(self, xp, q, v):
@@ -59,7 +58,7 @@ def test_an_episode_counts_up_to_its_first_end():
 
 def test_a_scene_without_random_starts_has_returns():
     @dataclass(frozen=True)
-    class Fixed(registry.usable("scenes", "cartpole_swing")):
+    class Fixed(CartpoleSwing):
         name = "fixed"
         n_start = 0
 

@@ -1,19 +1,11 @@
 """The running mean and variance of observations."""
 
 import numpy as np
-import pytest
 
 from bench.training import normaliser
 
 FIRST_WEIGHT = 1e-3
 """Allowed effect of the initial mean 0 and variance 1 after a hundred observations, which weigh 1e6 times as much."""
-
-
-@pytest.fixture(autouse=True)
-def double_precision():
-    from bench.model import registry
-
-    registry.make("backends", "jax").ops()
 
 
 def test_parts_give_the_mean_and_variance_of_the_whole():

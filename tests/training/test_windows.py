@@ -3,12 +3,12 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import problems
 import pytest
-from problems import cartpole_program
 
 from bench.model import State, registry
 from bench.training import windows
-from bench.training.environment import Environment, Episodes
+from bench.training.environment import Episodes
 from bench.training.networks import Actor
 
 DIFFERENCE = 1e-5
@@ -19,7 +19,7 @@ ROUNDING = 1e-10
 
 def environment(horizon=240, **parameters):
     parameters = {"substeps": 1, **parameters}  # a quarter of the program to compile
-    return Environment(cartpole_program(horizon=horizon, **parameters), registry.make("backends", "jax").ops())
+    return problems.environment(problems.cartpole_program(horizon=horizon, **parameters))
 
 
 def window_return(env, actor, length, key, cut=0.0, first=None, discount=0.99):
@@ -31,7 +31,6 @@ def window_return(env, actor, length, key, cut=0.0, first=None, discount=0.99):
 
 @pytest.fixture
 def actor():
-    environment()
     return Actor(jax.random.PRNGKey(1), [5, 8, 1], "float64")
 
 
@@ -39,9 +38,9 @@ def actor():
 def test_the_gradient_of_a_window_is_that_of_fobg_on_the_whole_program():
     """Without discount and value, a window as long as the horizon has the cost of the sweep's own program."""
     steps, count, sigma = 5, 6, 0.3
-    program = cartpole_program(horizon=steps, substeps=1, sigma=sigma, policy="mlp[hidden=4]")
+    program = problems.cartpole_program(horizon=steps, substeps=1, sigma=sigma, policy="mlp[hidden=4]")
     backend, key = registry.make("backends", "jax"), jax.random.PRNGKey(2)
-    env, scene = Environment(program, backend.ops()), program.scene
+    env, scene = problems.environment(program), program.scene
     noise = np.asarray(env.normal(jax.random.split(key)[0], (steps, 1, count)))
     numbers = np.random.default_rng(0).standard_normal((8, count))
     w = np.concatenate([noise.reshape(steps, count), numbers])
