@@ -4,7 +4,6 @@ import html
 import io
 import json
 import re
-import shlex
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -24,7 +23,6 @@ from bench.report.finish import views_of
 from bench.report.style import width_in_inches
 from bench.report.web import shell
 from bench.report.web.data import encode
-from bench.run.store import Store
 
 HOSTILE = (
     "<script>window.hacked=1</script>",
@@ -123,24 +121,6 @@ def ran(tmp_path_factory):
     directory = tmp_path_factory.mktemp("results")
     assert cli.main([*RUN, "workers=0", f"results_dir={directory}"]) == 0
     return directory
-
-
-def stored(directory, name):
-    return Store(directory / name, COLUMNS).load().set_index("key")
-
-
-@pytest.mark.slow
-def test_command_in_the_page_gives_the_same_numbers_of_that_cell_alone(ran, tmp_path):
-    found = data_of((ran / "mine" / "report.html").read_text())
-    place = column(found, "status").index("ok")
-    words = [c["values"][c["index"][place]] for c in found["command"]["words"]]
-    told = shlex.split(" ".join([found["command"]["head"], *filter(None, words)]))
-    assert cli.main([*told[3:], "workers=0", f"results_dir={tmp_path}"]) == 0
-    alone = stored(tmp_path, "one_cell")
-    assert len(alone) == 1
-    before = stored(ran, "mine").loc[alone.index[0]]
-    for name in ("bias", "variance", "rmse"):
-        assert alone[name].iloc[0] == before[name]
 
 
 @pytest.mark.slow
