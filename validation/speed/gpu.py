@@ -131,7 +131,7 @@ def timed(call, seconds=SECONDS):
 
 
 def work(unit, options, lock, began):
-    """Measure a unit's rows. With ``whole``, or on a GPU, a batch is one program; else the backend splits it into blocks."""
+    """Measure a unit's rows. On a GPU a batch is one program; else the backend splits it into blocks."""
     import jax
 
     given = problem(unit, options.out)
@@ -143,7 +143,7 @@ def work(unit, options, lock, began):
             REFERENCE.write_text(json.dumps(kept) + "\n")
         return
     device = "cpu" if unit.backend == "fused" else jax.default_backend()
-    whole = unit.backend != "fused" and (options.whole or device != "cpu")
+    whole = device != "cpu"
     for batch in unit.batches:
         row = dict(zip(COLUMNS, (*unit[:3], device, batch), strict=False))
         try:
@@ -240,7 +240,6 @@ def main():
     parser.add_argument("--jobs", type=int, default=max(1, (os.cpu_count() or 1) - 2), help="processes at once")
     parser.add_argument("--batches", default=",".join(map(str, BATCHES)))
     parser.add_argument("--cases", default=",".join((*ROBOTS, *SCENES)))
-    parser.add_argument("--whole", action="store_true", help="a batch is one program on the CPU too")
     parser.add_argument("--reference", action="store_true", help=f"write {REFERENCE.name} instead of rows")
     parser.add_argument("--draw", type=Path, help="draw the rows of a folder")
     options = parser.parse_args()
