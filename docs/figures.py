@@ -23,6 +23,7 @@ import pandas as pd
 from bench.plugins.studies.bias_variance import trust
 from bench.plugins.studies.gradient_check import is_trusted
 
+from bench.engines import table
 from bench.model import registry
 from bench.report import answer
 from bench.report.text import interval as text_of_interval
@@ -232,6 +233,7 @@ FIGURES: dict[str, str | Callable[[], str]] = {
     "quadruped-sides": sides_right,
     "quadruped-jumps": jumps_at_switches,
     "quadruped-engines": engines_agree,
+    "engines-table": lambda: block(table.by_case(table.read(STANDARD / "engines_table" / "engines.csv"))),
     "dose-pairs": lambda: dose_classes({name: name for name in UPDATES}),
     "dose-runs": dose_runs,
     "dose-unreached": dose_unreached,

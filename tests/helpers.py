@@ -223,58 +223,6 @@ def experiment(
     )
 
 
-SPRINGY = '''
-"""A scene for a test."""
-
-from dataclasses import dataclass
-from typing import ClassVar
-
-import numpy as np
-
-from bench.model import ContactScene, State, param
-
-
-@dataclass(frozen=True)
-class Springy(ContactScene):
-    """A point on a spring above the ground."""
-
-    name = "springy"
-    n_q: ClassVar[int] = 1
-    n_contacts: ClassVar[int] = 1
-
-    horizon: int = param(5, "number of time steps", "steps", positive=True)
-    stiffness: float = param(2.0, "of the spring", "N/m", positive=True)
-
-    def theta0(self):
-        """Above the ground."""
-        return np.array([0.1])
-
-    def initial_state(self, xp, theta):
-        """Falling."""
-        return State(theta[0:1], 0.0 * theta[0:1] - 1.0)
-
-    def acceleration(self, xp, q, v, u):
-        """The spring's."""
-        return -self.stiffness * q
-
-    def gap(self, xp, q):
-        """Height."""
-        return q
-
-    def gap_rate(self, xp, q, v):
-        """Velocity."""
-        return v
-
-    def contact_acceleration(self, xp, q, force):
-        """Upwards."""
-        return force
-
-    def terminal_cost(self, xp, q, v):
-        """Height squared."""
-        return q[0] ** 2
-'''
-
-
 def need_backends(*names):
     """Skip the tests of a module unless these backends are available."""
     for name in names:

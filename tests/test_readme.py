@@ -5,6 +5,7 @@ import re
 import shlex
 import subprocess
 import sys
+from itertools import takewhile
 from pathlib import Path
 
 import pytest
@@ -132,7 +133,9 @@ def planned(words):
         rest = [*chosen, *[f"scenes=[{','.join(scenes)}]"][: len(scenes)], *rest[len(scenes) :]]
     if verb in ("run", "report", "plan", "gradcheck", "trace"):
         return ["plan", *rest]
-    return ["list", *rest] if verb in ("list", "check") else [verb, "--help"]
+    if verb == "check":
+        return ["list", *takewhile(lambda word: not word.startswith("-"), rest)]  # then options of pytest
+    return ["list", *rest] if verb == "list" else [verb, "--help"]
 
 
 @pytest.mark.slow

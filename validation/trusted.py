@@ -1,4 +1,4 @@
-"""Counts the rule of when to trust `fobg` on scenes that were not used to find it: `python validation/trusted.py [new]`.
+"""Counts the rule of when to trust `fobg` on scenes that were not used to find it: `python validation/trusted.py`.
 
 The rule trusts a cell where one estimate spreads by less than half of its mean and the command `gradcheck` refuses nothing.
 Eighteen families have three or four scenes each. A cell is one scene and one seed. It is wrong where the relative RMSE is
@@ -346,11 +346,10 @@ class Counted(FunctionScene):
 '''
 
 
-def refused(seed, indices, folder):
+def refused(seed, folder):
     """Return by number why the command `gradcheck` refuses scenes, empty where it does not; ``folder`` has the plugin."""
-    every = scenes()
     with tempfile.TemporaryDirectory() as results:
-        names = [f"counted[index={i},sigma={every[i].sigma}]" for i in indices]
+        names = [f"counted[index={i},sigma={scene.sigma}]" for i, scene in enumerate(scenes())]
         settings = ["backends=[jax]", "workers=0", f"seed={seed}", f"plugins={folder}", f"results_dir={results}"]
         command(["gradcheck", *names, *settings, "--quiet"])
         rows = pd.read_parquet(Path(results) / "gradcheck" / "rows.parquet")
@@ -388,31 +387,31 @@ def outcomes(scene, seed):
     return math.sqrt(found.variance) / found.grad_norm if found.grad_norm else math.inf, found.rmse_rel
 
 
-def main(*parts):
-    """Print a line per cell and the counts by part, by default of all parts; return 1 if the rule trusts a wrong cell."""
-    chosen = {index: scene for index, scene in enumerate(scenes()) if scene.part in (parts or FAMILIES)}
+def main():
+    """Print a line per cell and the counts by part; return 1 if the rule trusts a wrong cell."""
+    every = scenes()
     with tempfile.TemporaryDirectory() as folder:
         (Path(folder) / "counted.py").write_text(PLUGIN)
-        verdicts = {seed: refused(seed, chosen, folder) for seed in SEEDS}
-    every = pd.DataFrame(
+        verdicts = {seed: refused(seed, folder) for seed in SEEDS}
+    counted = pd.DataFrame(
         [
             (*scene[:3], seed, verdicts[seed][index], *outcomes(scene, seed))
-            for index, scene in chosen.items()
+            for index, scene in enumerate(every)
             for seed in SEEDS
         ],
         columns=["part", "family", "label", "seed", "refused", "spread", "rmse"],
     )
-    every["wrong"] = every["rmse"] >= WRONG
-    every["spread alone"] = every["spread"] < SPREAD
-    every["with `gradcheck`"] = every["spread alone"] & (every["refused"] == "")
-    print(every.to_string())
-    for (part, cells), rule in itertools.product(every.groupby("part"), every.columns[-2:]):
+    counted["wrong"] = counted["rmse"] >= WRONG
+    counted["spread alone"] = counted["spread"] < SPREAD
+    counted["with `gradcheck`"] = counted["spread alone"] & (counted["refused"] == "")
+    print(counted.to_string())
+    for (part, cells), rule in itertools.product(counted.groupby("part"), counted.columns[-2:]):
         trusted, bad, right = cells[cells[rule]], cells["wrong"] & cells[rule], ~cells["wrong"] & ~cells[rule]
         n = len(trusted[["family", "label"]].drop_duplicates())
         print(f"| {part} | {rule} | {len(trusted)} of {len(cells)} | {bad.sum()} | {right.sum()} |")
         print(f"cells of {n} scenes; if none is wrong: below {100 * (1 - 0.05 ** (1 / max(n, 1))):.0f}% by scene")
-    return int((every["with `gradcheck`"] & every["wrong"]).any())
+    return int((counted["with `gradcheck`"] & counted["wrong"]).any())
 
 
 if __name__ == "__main__":
-    sys.exit(main(*sys.argv[1:]))
+    sys.exit(main())

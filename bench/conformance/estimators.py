@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from functools import cache, partialmethod
 from typing import Any, NamedTuple
 
@@ -144,20 +144,26 @@ def varying_oracle(estimator: Estimator) -> Oracle:
     raise Skipped("supports no oracle whose samples all differ")
 
 
-def skip_if_plain(estimator: Estimator, oracle: Oracle) -> None:
-    """Raise :class:`Skipped` for an estimator that declares a bias and returns the gradient at w = 0.
+def sampled_oracle(estimator: Estimator) -> Oracle:
+    """Return :func:`varying_oracle`; skips an estimator that declares a bias and returns the gradient at w = 0.
 
     That gradient is exact for the cost without noise, so it has no variance and uses no sample.
     """
-    if not estimator.unbiased and oracle.program.continuous:
-        values = estimates(estimator, oracle, draw_noise(oracle, 2, 8, "plain"))
-        if (values == values[0]).all() and distance(values[0], oracle.plain) < DIFFERENCED:
-            raise Skipped("returns the gradient at w = 0, which uses no sample")
+    oracle = varying_oracle(estimator)
+    values = estimates(estimator, oracle, draw_noise(oracle, 2, 8, "plain"))
+    is_plain = (values == values[0]).all() and distance(values[0], oracle.plain) < DIFFERENCED
+    skip_unless(
+        estimator.unbiased or not oracle.program.continuous or not is_plain,
+        "returns the gradient at w = 0, which uses no sample",
+    )
+    return oracle
 
 
-def usable(estimator: Estimator, candidates: Iterable[Oracle]) -> Iterator[Oracle]:
-    """Return the oracles that the estimator supports."""
-    return (oracle for oracle in candidates if estimator.own_refusal(oracle.program) is None)
+def usable(estimator: Estimator, candidates: Iterable[Oracle]) -> list[Oracle]:
+    """Return the oracles that the estimator supports; raises :class:`Skipped` if there are none."""
+    able = [oracle for oracle in candidates if estimator.own_refusal(oracle.program) is None]
+    skip_unless(able, "supports no such oracle")
+    return able
 
 
 def draw_noise(oracle: Oracle, repeats: int, count: int, *key: str | int) -> np.ndarray:
@@ -184,14 +190,12 @@ def target(estimator: Estimator, oracle: Oracle) -> np.ndarray:
 @verifies(Estimator)
 def shape_and_repeatability(estimator: Estimator) -> str:
     """Verify that estimates are ``(R, d)``, finite, and the same in a second call."""
-    labels = []
-    for oracle in usable(estimator, oracles()):
+    able = usable(estimator, oracles())
+    for oracle in able:
         noise = draw_noise(oracle, 7, 8)
         first, second = estimates(estimator, oracle, noise), estimates(estimator, oracle, noise)
         require(np.array_equal(first, second), f"a second call with the same noise differs on {oracle.label}")
-        labels.append(oracle.label)
-    skip_unless(labels, "supports no oracle")
-    return f"{len(labels)} oracles"
+    return f"{len(able)} oracles"
 
 
 @verifies(Estimator)
@@ -216,8 +220,7 @@ def diagnostics_are_as_declared(estimator: Estimator) -> str:
 @verifies(Estimator)
 def repeats_are_independent(estimator: Estimator) -> str:
     """Verify that estimate r depends only on ``noise[r]``."""
-    oracle = varying_oracle(estimator)
-    skip_if_plain(estimator, oracle)
+    oracle = sampled_oracle(estimator)
     noise = np.array(draw_noise(oracle, 6, 8))
     whole = estimates(estimator, oracle, noise)
     order = np.array([3, 0, 5, 1, 4, 2])
@@ -238,8 +241,7 @@ def repeats_are_independent(estimator: Estimator) -> str:
 @verifies(Estimator)
 def uses_every_sample(estimator: Estimator) -> str:
     """Verify that the estimate depends on the noise of each of 8 samples, or else of each eighth of 4096 samples."""
-    oracle = varying_oracle(estimator)
-    skip_if_plain(estimator, oracle)
+    oracle = sampled_oracle(estimator)
     unused = set(range(8))
     for size in (1, 512):
         noise = draw_noise(oracle, 8, 8 * size)
@@ -261,8 +263,7 @@ def variance_falls_as_one_over_n(estimator: Estimator) -> str:
     An unbiased estimator that is not a sample mean may declare ``couples_samples = True``, since its directions are
     chosen together or a model is fitted to them. Its variance may fall faster than 1/N.
     """
-    oracle = varying_oracle(estimator)
-    skip_if_plain(estimator, oracle)
+    oracle = sampled_oracle(estimator)
     counts, groups = np.array([32, 128, 512]), 16
     logs = np.empty((len(counts), groups))
     for i, n in enumerate(counts):
@@ -284,18 +285,16 @@ def variance_falls_as_one_over_n(estimator: Estimator) -> str:
 @verifies(Estimator)
 def bias_is_as_declared(estimator: Estimator) -> str:
     """Verify the bias on continuous costs: none if ``unbiased``, else smaller than the bias of the zero estimate."""
-    candidates = list(usable(estimator, [o for o in oracles() if o.program.continuous]))
-    skip_unless(candidates, "supports no continuous oracle")
-    skip_if_plain(estimator, varying_oracle(estimator))
+    candidates = usable(estimator, [o for o in oracles() if o.program.continuous])
+    sampled_oracle(estimator)
     return _verify_bias(estimator, candidates)
 
 
 @verifies(Estimator)
 def bias_across_jumps_is_as_declared(estimator: Estimator) -> str:
     """Verify the bias on discontinuous costs: none if ``unbiased_at_discontinuities``, else a significant bias."""
-    candidates = list(usable(estimator, [o for o in oracles() if not o.program.continuous]))
-    skip_unless(estimator.unbiased, "declares a bias everywhere")
-    skip_unless(candidates and estimator.target == "smoothed", "supports no oracle with a jump")
+    skip_unless(estimator.unbiased and estimator.target == "smoothed", "declares a bias everywhere, or another target")
+    candidates = usable(estimator, [o for o in oracles() if not o.program.continuous])
     if estimator.unbiased_at_discontinuities:
         return _verify_bias(estimator, candidates)
     details = []
@@ -311,9 +310,7 @@ def bias_across_jumps_is_as_declared(estimator: Estimator) -> str:
 def bias_under_action_feedback(estimator: Estimator) -> str:
     """Verify the bias with noise on the actions of a feedback policy, for estimators that use the policy's score."""
     skip_unless("score" in estimator.needs and estimator.target == "smoothed", "does not use the score")
-    candidates = list(usable(estimator, [feedback_oracle()]))
-    skip_unless(candidates, "does not support feedback policies")
-    return _verify_bias(estimator, candidates)
+    return _verify_bias(estimator, usable(estimator, [feedback_oracle()]))
 
 
 def _verify_bias(estimator: Estimator, candidates: list[Oracle]) -> str:
@@ -347,8 +344,7 @@ def _standard_errors(estimator: Estimator, oracle: Oracle, count: int, repeats: 
 @verifies(Estimator)
 def needs_are_truthful(estimator: Estimator) -> str:
     """Verify that the estimator uses every capability in ``needs``, and no other capability."""
-    oracle = varying_oracle(estimator)
-    skip_if_plain(estimator, oracle)
+    oracle = sampled_oracle(estimator)
     used: set[str] = set()
     for oracle in usable(estimator, oracles()):  # some capabilities may be for costs with events only
         recording = RecordingProblem(oracle.problem, estimator.needs)

@@ -16,6 +16,7 @@ from bench.errors import UserError, printable, unknown
 from bench.model import Plugin, registry
 from bench.model.identity import identity
 from bench.model.parameters import build, parameters
+from bench.simulator.clock import parse_duration
 
 
 class Failed(Exception):
@@ -27,8 +28,6 @@ class Skipped(Exception):
 
 
 Check = Callable[[Any], str]
-LIMIT_S = 900.0
-"""Default time limit of a check. The longest of the built-in plugins' checks take minutes."""
 CHOSEN = "BENCH_CHECK"
 """Environment variable with the names of the plugins to check and the folders of plugins, as JSON."""
 HERE = Path(__file__).parent
@@ -63,12 +62,15 @@ def skip_unless(condition: Any, reason: str) -> None:
         raise Skipped(reason)
 
 
-def main(names: Sequence[str], limit: float = LIMIT_S, options: Sequence[str] = ()) -> int:
+def main(names: Sequence[str], limit: str = "15m", options: Sequence[str] = ()) -> int:
     """Check the named plugins, or all, in pytest, print a line per check, and return the exit status.
 
-    A check that takes longer than ``limit`` seconds fails, and so does one that ends its process. ``options`` are
+    A check that takes longer than ``limit`` fails, and so does one that ends its process. ``options`` are
     pytest's.
     """
+    seconds, plugins = parse_duration(limit, "limit"), {name for table in registry.entries().values() for name in table}
+    for name in set(names) - plugins:
+        raise registry.unknown_plugin("plugin", name, plugins, "list")
     if not (registry.installed("pytest") and registry.installed("xdist")):
         raise UserError("check needs pytest and pytest-xdist: pip install 'diffsim-bench[check]'")
     import pytest
@@ -77,7 +79,7 @@ def main(names: Sequence[str], limit: float = LIMIT_S, options: Sequence[str] = 
         os.environ.pop(foreign, None)
     os.environ["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"
     os.environ[CHOSEN] = json.dumps([[*names], [str(folder) for folder in registry.folders()]])
-    words = [*PYTEST, "-o", f"faulthandler_timeout={limit}", *options]
+    words = [*PYTEST, "-o", f"faulthandler_timeout={seconds}", *options]
     status = pytest.main(words, plugins=[sys.modules[__name__]])
     if status == pytest.ExitCode.INTERRUPTED:
         raise KeyboardInterrupt

@@ -25,9 +25,7 @@ def main(words: Sequence[str]) -> int:
             registry.add_folder(Path(word.partition("=")[2]))
         elif word.startswith("out="):
             out = local_path("out", word.partition("=")[2])
-    names = [word for word in words if not word.startswith(("plugins=", "out=", "--"))]
-    if strange := [word for word in words if word.startswith("--") and word != "--again"]:
-        raise UserError(f"engines: unknown option {strange[0]} (allowed: --again): {USAGE}")
+    names = [word for word in words if not word.startswith(("plugins=", "out=", "--again"))]
     if not names:
         return _list()
     if names[0] == "table":

@@ -109,20 +109,13 @@ class EngineModel:
     def _call(self, name: str, arrays: tuple[np.ndarray, ...]) -> tuple[dict[str, Any], list[np.ndarray]]:
         if self._place not in _running:
             _running[self._place] = EngineProcess(self._python, self._file)
-        answer, results = self._ask({"call": name}, list(arrays))
-        if "is_unknown" in answer:  # not built yet, or dropped by its process
-            built, _ = self._ask({"call": "build", "description": self._description}, [])
-            self.device, self.settings, self.build_s = built["device"], built["settings"], built["seconds"]
-            answer, results = self._ask({"call": name}, list(arrays))
-        return answer, results
-
-    def _ask(self, request: dict[str, Any], arrays: list[np.ndarray]) -> tuple[dict[str, Any], list[np.ndarray]]:
         connection = _running[self._place].connection
-        connection.send(({**request, "model": self._key}, arrays))
+        connection.send(({"call": name, "model": self._key, "description": self._description}, arrays))
         answer, results = connection.recv()
         if "error" in answer:
             error = {"unsupported": Unsupported, "unavailable": Unavailable}.get(answer["kind"], EngineError)
             raise error(f"engine {self._name}: {printable(answer['error'])} ({answer['places']})")
+        self.device, self.settings, self.build_s = (answer[key] for key in ("device", "settings", "build_s"))
         return answer, results
 
     def _end(self) -> str:

@@ -113,18 +113,17 @@ def serve(file: str, requests: Connection) -> None:
         try:
             if module is None:
                 module = _load(file)
-            if name == "build":
+            if key not in models:
                 models[key] = Controlled(module.Model(header["description"]), header["description"]["forces"])
-                answer |= {"device": models[key].device, "settings": models[key].settings}
                 while len(models) > KEPT:
                     del models[next(iter(models))]
-            elif key not in models:
-                answer["is_unknown"] = True
-            else:
-                models[key] = models.pop(key)
-                results, width = models[key].call(name, *arrays)
-                answer |= {"width": width, "is_first": (key, name, width) not in first_calls}
-                first_calls.add((key, name, width))
+                models[key].build_s = time.perf_counter() - started
+                started = time.perf_counter()
+            model = models[key] = models.pop(key)
+            results, width = model.call(name, *arrays)
+            answer |= {"device": model.device, "settings": model.settings, "build_s": model.build_s}
+            answer |= {"width": width, "is_first": (key, name, width) not in first_calls}
+            first_calls.add((key, name, width))
         except Exception as error:
             kind = "unsupported" if isinstance(error, NotImplementedError) else "error"
             kind = "unavailable" if isinstance(error, ImportError) else kind

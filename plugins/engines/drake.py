@@ -25,13 +25,11 @@ class Model:
         touching = [contact["bodies"] for contact in program["contacts"]]
         for i, body in enumerate(program["bodies"]):
             com, mass = np.array(body["com"]), body["mass"]
-            inertia = drake.RotationalInertia(*body["inertia"]).ShiftFromCenterOfMass(mass, -com) if mass else None
-            unit = (
-                drake.UnitInertia(*(np.diag(inertia.CopyToFullMatrix3()) / mass))
-                if mass
-                else drake.UnitInertia(0, 0, 0)
-            )
-            link = plant.AddRigidBody(f"body{i}", drake.SpatialInertia(mass, com, unit, skip_validity_check=True))
+            inertia = drake.SpatialInertia.Zero()
+            if mass:
+                central = drake.RotationalInertia(*body["inertia"])
+                inertia = drake.SpatialInertia.MakeFromCentralInertia(mass, com, central)
+            link = plant.AddRigidBody(f"body{i}", inertia)
             parent = links[body["parent"]] if body["parent"] >= 0 else plant.world_body()
             kind = drake.PrismaticJoint if body["joint"] == "slide" else drake.RevoluteJoint
             plant.AddJoint(kind(f"joint{i}", parent.body_frame(), link.body_frame(), body["axis"]))

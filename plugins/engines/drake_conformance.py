@@ -6,7 +6,7 @@ import xml.etree.ElementTree as ElementTree
 
 import numpy as np
 import pydrake.all as drake
-from free_bodies import in_world, without_motors
+from free_bodies import differing, in_world, without_motors
 
 logging.getLogger("drake").setLevel(logging.ERROR)
 DIFFERENT = {
@@ -32,8 +32,7 @@ class Engine:
 
     def _build(self, case):
         root, arms = without_motors(case)
-        if reasons := [reason for path, reason in DIFFERENT.items() if root.find(f".//{path}") is not None]:
-            self.differs[case.name] = "; ".join(reasons)
+        self.differs[case.name] = differing(root, DIFFERENT)
         builder = drake.DiagramBuilder()
         plant, _ = drake.AddMultibodyPlantSceneGraph(builder, float(root.find("option").get("timestep")))
         drake.Parser(plant).AddModelsFromString(ElementTree.tostring(root, encoding="unicode"), "xml")

@@ -23,6 +23,11 @@ def without_motors(case):
     return root, arms
 
 
+def differing(root, reasons):
+    """Return the reasons whose paths find an element in the MJCF, as text."""
+    return "; ".join(reason for path, reason in reasons.items() if root.find(f".//{path}") is not None)
+
+
 def in_world(case, q, v, sign=1):
     """Return v with angular velocities of free bodies in the world's frame, or with sign -1 in the bodies' frames again."""
     v = v.copy()

@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import mujoco
 import numpy as np
-from bench.plugins.engines.mujoco_conformance import place
+from bench.plugins.engines.mujoco_conformance import TERMS, place
 
 from bench.engines.conformance import cases
 from bench.plugins import mjx_solver
@@ -67,27 +67,31 @@ class Group:
         self._places = [place(self._model, case, f"{case.name}/") for case in members]
 
     @functools.cached_property
-    def _step(self) -> Any:
-        """Return the compiled function of a vector and a step's inputs: next (q, v), warm start, and the vector's product."""
+    def _cost(self) -> Any:
+        """Return the compiled function of start, controls, parameters and weights: the cost and its derivatives by the first four."""
         mjx = mjx_solver.library()
         model, data = mjx.put_model(self._model), mjx.make_data(self._model)
         data = jax.tree.map(lambda leaf: leaf.astype(float) if leaf.dtype.kind == "f" else leaf, data)
 
-        def step(q: Any, v: Any, u: Any, p: Any, warm: Any) -> Any:
+        def cost(q: Any, v: Any, controls: Any, parameters: Any, weights: Any) -> Any:
             changed: dict[str, Any] = {}
-            for value, case, (owner, field, index) in zip(p, self._members.values(), self._places, strict=True):
+            for value, case, (owner, field, index) in zip(
+                parameters, self._members.values(), self._places, strict=True
+            ):
                 name = f"opt.{field}" if owner is self._model.opt else field
                 old = getattr(model.opt if owner is self._model.opt else model, field)
                 changed[name] = changed.get(name, jax.numpy.asarray(old, float)).at[index].add(value - case.parameter)
-            with self._solver():
-                after = mjx.step(model.tree_replace(changed), data.replace(qpos=q, qvel=v, ctrl=u, qacc_warmstart=warm))
-            return (after.qpos, after.qvel), jax.lax.stop_gradient(after.qacc)
+            own = model.tree_replace(changed)
 
-        def pull(up: Any, *at: Any) -> Any:
-            after, back, warm = jax.vjp(lambda *inputs: step(*inputs, at[-1]), *at[:-1], has_aux=True)
-            return after, warm, back(up)
+            def step(at: Any, u: Any) -> Any:
+                with self._solver():
+                    after = mjx.step(own, data.replace(qpos=at[0], qvel=at[1], ctrl=u, qacc_warmstart=at[2]))
+                return (after.qpos, after.qvel, jax.lax.stop_gradient(after.qacc)), None
 
-        return jax.jit(pull)
+            (q, v, _), _ = jax.lax.scan(step, (q, v, 0.0 * v), controls)
+            return weights[0] @ q + weights[1] @ v
+
+        return jax.jit(jax.value_and_grad(cost, (0, 1, 2, 3)))
 
     def _slice(self, case: Any, field: str) -> slice:
         """Return the part of all cases' values that is a case's."""
@@ -95,32 +99,21 @@ class Group:
         number = list(self._members).index(case.name)
         return slice(sum(sizes[:number]), sum(sizes[: number + 1]))
 
-    def path(self, case: Any) -> list[Any]:
-        """Return what each step starts from, (q, v, u, p, warm start), and last (q, v), with all other cases as stored."""
+    def _run(self, case: Any) -> Any:
+        """Return a case's cost and its derivatives, with all other cases as stored."""
         members = (self._members | {case.name: case}).values()
-        q, v, p = (np.hstack([getattr(each, field) for each in members]) for field in ("qpos", "qvel", "parameter"))
-        q, warm, steps = q + self._shift, 0.0 * v, []
-        for u in np.hstack([each.controls for each in members]):
-            steps.append((q, v, u, p, warm))
-            (q, v), warm, _ = self._step((0.0 * q, 0.0 * v), *steps[-1])
-        return [*steps, (q, v)]
+        q, v, *others = (np.hstack([getattr(each, term) for each in members]) for term in TERMS)
+        weights = [np.zeros(len(q)), np.zeros(len(v))]
+        for term, weight in zip(TERMS, weights, strict=False):
+            weight[self._slice(case, term)] = case.data["weights"][term]
+        value, slopes = self._cost(q + self._shift, v, *others, weights)
+        return value - weights[0] @ self._shift, slopes
 
     def rollout(self, case: Any) -> float:
         """Return the cost of a case."""
-        q, v = self.path(case)[-1]
-        own = self._slice(case, "qpos")
-        return float(case.cost((q - self._shift)[own], v[self._slice(case, "qvel")]))
+        return float(self._run(case)[0])
 
     def gradient(self, case: Any) -> dict[str, np.ndarray]:
         """Return the derivatives of a case's cost."""
-        *steps, (q, v) = self.path(case)
-        of_q, of_v, of_u, of_p = (self._slice(case, field) for field in ("qpos", "qvel", "controls", "parameter"))
-        up = [np.zeros(len(q)), np.zeros(len(v))]
-        up[0][of_q], up[1][of_v] = case.data["weights"]["qpos"], case.data["weights"]["qvel"]
-        by_control, by_parameter = [], 0.0
-        for step in reversed(steps):
-            *up, by_u, by_p = self._step(tuple(up), *step)[2]
-            by_control.insert(0, by_u[of_u])
-            by_parameter = by_parameter + by_p[of_p]
-        found = {"qpos": up[0][of_q], "qvel": up[1][of_v], "controls": by_control, "parameter": by_parameter}
-        return {term: np.asarray(value) for term, value in found.items()}
+        slopes = zip(TERMS, self._run(case)[1], strict=True)
+        return {term: np.asarray(slope)[..., self._slice(case, term)] for term, slope in slopes}

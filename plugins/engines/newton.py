@@ -29,10 +29,6 @@ class Model:
         """Return the derivatives of one step, by one backward pass per component of the state."""
         return self._batch(x).jacobians(x, u)
 
-    def pull(self, x, u, slope):
-        """Return the derivatives of the sum of slope times the next states, by one backward pass."""
-        return self._batch(x).pull(x, u, slope)
-
     def _batch(self, x):
         width = x.shape[1]
         if width not in self._batches:
@@ -133,9 +129,6 @@ class _Batch:
         tape = self._run(x, u)
         slopes = [np.broadcast_to(row[:, None], x.shape) for row in np.eye(len(x))]
         return [np.stack(parts) for parts in zip(*(self._back(tape, slope) for slope in slopes), strict=True)]
-
-    def pull(self, x, u, slope):
-        return self._back(self._run(x, u), slope)
 
     def _back(self, tape, slope):
         tape.zero()

@@ -63,6 +63,7 @@ class Engine:
         return np.concatenate([after.joint_q.numpy(), after.joint_qd.numpy()]).astype(float), pull
 
     def _path(self, case):
+        self._model(case)  # raises what it does not have
         path = [_turned(case, np.concatenate([case.qpos, case.qvel]), True)]
         for u in case.controls:
             path.append(self._step(case, path[-1], u)[0])

@@ -48,18 +48,14 @@ ITEMS = parametrize(plugin for plugin in PLUGINS if not issubclass(plugin, Engin
 GENERIC = {check.__name__ for check in kit._CHECKS[Plugin]}
 
 
-def kept(keep):
-    """The kit's items of registered plugins, beside those of any plugin, whose subject and name of check are to be kept."""
-    named = [(item, item.values[0], item.values[1].args[0].__name__) for item in ITEMS]
-    return [each for each in named if each[2] not in GENERIC and keep(*each[1:])]
-
-
 def kit_items(keep, is_slow=lambda subject, name: False):
-    """A test of each kept item."""
-    items = [
-        pytest.param(*item.values, id=item.id, marks=[pytest.mark.slow] * bool(is_slow(subject, name)))
-        for item, subject, name in kept(keep)
-    ]
+    """A test of each of the kit's items whose subject and name of check are to be kept, beside those of any plugin."""
+    items = []
+    for item in ITEMS:
+        subject, name = item.values[0], item.values[1].args[0].__name__
+        if name not in GENERIC and keep(subject, name):
+            marks = [pytest.mark.slow] * bool(is_slow(subject, name))
+            items.append(pytest.param(*item.values, id=item.id, marks=marks))
     return pytest.mark.parametrize(("plugin", "check"), items)
 
 

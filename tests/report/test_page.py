@@ -4,27 +4,20 @@ import html
 import io
 import json
 import re
-import shlex
-from dataclasses import dataclass, replace
-from typing import ClassVar
+from dataclasses import replace
 
 import helpers
 import numpy as np
 import pandas as pd
 import pytest
-from bench.plugins.studies.bias_variance.columns import COLUMNS
 from helpers import experiment, row, small_rows, stiffness_rows, table
 
-from bench import cli
-from bench.experiment.columns import Column, Columns
-from bench.experiment.study import Study
+from bench.experiment.columns import Column
 from bench.experiment.views import Chart, Views
-from bench.model import registry
 from bench.report.finish import views_of
 from bench.report.style import width_in_inches
 from bench.report.web import shell
 from bench.report.web.data import encode
-from bench.run.store import Store
 
 HOSTILE = (
     "<script>window.hacked=1</script>",
@@ -108,48 +101,6 @@ def test_page_asks_for_nothing_and_stays_small(text):
     assert text.count("<svg") == 2
     assert not re.search(r'(src|href)="(?!#)', text.partition('id="data"')[0])
     assert "default-src 'none'" in text
-
-
-RUN = (
-    "name=mine", "scenes=[pushing]", "scene.pushing.horizon=5", "contacts=[penalty,complementarity]", "backends=[numpy]",
-    "estimators=[reinforce,randomized_smoothing]", "sweep.stiffness=[1e2,1e3]", "samples=8", "repeats=4",
-    "reference.samples=4096",
-)  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def ran(tmp_path_factory):
-    """A small run through the command line: the directory of its results."""
-    directory = tmp_path_factory.mktemp("results")
-    assert cli.main([*RUN, "workers=0", f"results_dir={directory}"]) == 0
-    return directory
-
-
-def stored(directory, name):
-    return Store(directory / name, COLUMNS).load().set_index("key")
-
-
-@pytest.mark.slow
-def test_command_in_the_page_gives_the_same_numbers_of_that_cell_alone(ran, tmp_path):
-    found = data_of((ran / "mine" / "report.html").read_text())
-    place = column(found, "status").index("ok")
-    words = [c["values"][c["index"][place]] for c in found["command"]["words"]]
-    told = shlex.split(" ".join([found["command"]["head"], *filter(None, words)]))
-    assert cli.main([*told[3:], "workers=0", f"results_dir={tmp_path}"]) == 0
-    alone = stored(tmp_path, "one_cell")
-    assert len(alone) == 1
-    before = stored(ran, "mine").loc[alone.index[0]]
-    for name in ("bias", "variance", "rmse"):
-        assert alone[name].iloc[0] == before[name]
-
-
-@pytest.mark.slow
-def test_report_writes_the_page_again_with_machine_and_versions(ran):
-    path = ran / "mine" / "report.html"
-    path.unlink()
-    assert cli.main(["report", *RUN, f"results_dir={ran}"]) == 0
-    text = path.read_text()
-    assert "numpy" in text.partition("Configuration")[0].partition('id="made"')[2]
 
 
 # -------------------------------------------------------------------------------------------------------- browser
@@ -244,21 +195,7 @@ def test_print_fits_its_paper(shown):
     assert shown.do(f"{SVG}.getBoundingClientRect().width") > 0.9 * 680
 
 
-def test_a_filter_takes_cells_from_the_table(shown):
-    box = "document.querySelector('#filters details[data-column=estimator]')"
-    shown.do(f"{box}.open = true")
-    shown.page.get_by_role("checkbox", name="fobg").uncheck()
-    left = small_rows().query("estimator != 'fobg'")
-    assert shown.do("shown.length") == len(left)
-    names = "[...document.querySelectorAll('#table td.estimator')].map((cell) => cell.textContent)"
-    assert set(shown.do(names)) == set(left["estimator"])
-    shown.page.get_by_label("Find").fill("numpy")
-    assert shown.do("shown.length") == len(left.query("backend == 'numpy'"))
-    shown.page.get_by_role("button", name="Show all").click()
-    assert shown.do("shown.length") == len(small_rows())
-
-
-def test_filters_stay_in_the_address_and_the_csv_has_what_is_shown(shown, tmp_path):
+def test_filters_take_cells_stay_in_the_address_and_the_csv_has_what_is_shown(shown):
     rows = small_rows()
     address = shown.do("location.href.split('#')[0]")
     box = "document.querySelector('#filters details[data-column=estimator] input[value=fobg]')"
@@ -271,7 +208,9 @@ def test_filters_stay_in_the_address_and_the_csv_has_what_is_shown(shown, tmp_pa
     assert len(back) == len(left)
     assert set(back["estimator"]) == set(left["estimator"])
     assert back["rmse_rel"].tolist() == pytest.approx(left["rmse_rel"].tolist(), rel=1e-5, nan_ok=True)
-    shown.do("document.getElementById('clear').click()")
+    shown.page.get_by_label("Find").fill("numpy")
+    assert shown.do("shown.length") == len(left.query("backend == 'numpy'"))
+    shown.page.get_by_role("button", name="Show all").click()
     assert shown.do("location.hash") == ""
     shown.do(
         f"location.hash = {json.dumps('#' + link.partition('#')[2])}; new Promise((done) => setTimeout(done, 200))"
@@ -363,26 +302,3 @@ def test_hostile_names_are_shown_as_they_are_and_do_nothing(browser, tmp_path):
     legend = browser.do("[...document.querySelectorAll('.drawing text')].map((one) => one.textContent)")
     assert set(HOSTILE) <= set(legend)
     assert browser.said == browser.requests == []
-
-
-@dataclass(frozen=True)
-class Unknown(Study):
-    """A study without a page of its own."""
-
-    name = "unknown"
-    columns: ClassVar[Columns] = COLUMNS
-
-    def measure(self, cell, session):
-        """Nothing."""
-        return {"status": "ok"}
-
-
-STUDIES = {name: entry.plugin for name, entry in registry.entries()["studies"].items() if name != "bias_variance"}
-
-
-@pytest.mark.parametrize("study", [*STUDIES.values(), Unknown], ids=[*STUDIES, "unknown"])
-def test_page_of_every_other_study_says_why_nothing_ran(study):
-    blank = study.columns.blank() | {"experiment": "made_up", "scene": "pushing", "estimator": "fobg", "seed": 0.0}
-    rows = [blank | {"key": status, "status": status, "reason": "no reason"} for status in ("unsupported", "error")]
-    found = data_of(page(study.columns.typed(pd.DataFrame(rows)), study=study()))
-    assert column(found, "reason") == ["no reason", "no reason"]

@@ -1,7 +1,6 @@
 """Plugins that misbehave: each cell ends with the right status, the others are untouched, and no process is left."""
 
 import os
-import signal
 import subprocess
 
 import pandas as pd
@@ -239,20 +238,6 @@ def start(tree, *words):
         stdout=subprocess.DEVNULL,
         text=True,
     )
-
-
-@pytest.mark.slow
-def test_killing_a_run_leaves_rows_and_no_process(tree):
-    where = "killed"
-    words = [*BASE, "estimators=[fobg,hangs]", f"name={where}", "results_dir=out", "workers=1", "timeout=null"]
-    process = start(tree, *words)
-    folder = tree.root / "out" / where
-    wait_for(lambda: list(folder.glob("pending/*.json")))
-    process.send_signal(signal.SIGKILL)
-    process.communicate(timeout=30)
-    wait_for(lambda: not processes_in(tree.root), 10.0)
-    done = tree.run("plan", *words)
-    assert "2 cells, 1 stored, 1 to run" in done.stdout
 
 
 @pytest.mark.slow

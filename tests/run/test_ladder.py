@@ -74,18 +74,6 @@ def statuses(experiment, backend):
     return dict(zip(rows["scene"], rows["status"], strict=True))
 
 
-@pytest.mark.slow
-def test_a_fault_on_a_rung_stops_the_climb_of_its_backend_there(climbed):
-    _, experiment = climbed
-    waiting = {"double_integrator": "ok", "pendulum": "ok", "cartpole": "waiting", "mass_spring": "waiting"}
-    assert statuses(experiment, "forgetful_climber") == waiting
-    assert statuses(experiment, "numpy") == dict.fromkeys(SCENES, "ok")
-    rows = store_of(experiment).load()
-    (reason,) = set(rows.loc[rows["status"] == "waiting", "reason"])
-    assert reason.startswith("the rung below (pendulum) did not pass: ")
-    assert "missing_term" in reason or "disconnected" in reason or "wrong_adjoint" in reason
-
-
 def test_the_report_says_which_rung_was_reached_and_what_was_not_started(climbed):
     _, experiment = climbed
     table = views_of(experiment, store_of(experiment).load()).tables[0].frame
@@ -104,7 +92,9 @@ def test_a_second_run_starts_no_rung_above_the_fault(climbed, capsys):
     after = store_of(experiment).load()
     measured = before[before["status"] == "ok"].set_index("key")["stored_at"]
     pd.testing.assert_series_equal(after[after["status"] == "ok"].set_index("key")["stored_at"], measured)
-    assert (after["status"] == "waiting").sum() == 2
+    waiting = after[after["status"] == "waiting"]
+    assert len(waiting) == 2
+    assert waiting["reason"].str.startswith("the rung below (pendulum) did not pass: ").all()
 
 
 @pytest.mark.slow

@@ -9,7 +9,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import threading
 import time
 
 import numpy as np
@@ -139,45 +138,6 @@ def test_compaction_cut_short_at_any_step_loses_nothing(tmp_path, monkeypatch, s
     store.compact()
     assert keys(store) == [1, 2, 3, 4]
     assert len(pd.read_parquet(tmp_path / "rows.parquet")) == 4
-
-
-@pytest.mark.slow
-def test_writers_readers_and_compactions_side_by_side(tmp_path):
-    """Four threads store and fold, one reads: what was stored stays, and is never missed for a moment."""
-    stored = set()
-    faults = []
-    done = threading.Event()
-
-    def write(writer):
-        store = Store(tmp_path, COLUMNS)
-        for i in range(25):
-            store.append(row(writer * 100 + i))
-            stored.add(writer * 100 + i)
-            if i % 3 == 0:
-                store.compact()
-        store.compact()
-
-    def read():
-        while not done.is_set():
-            before = set(stored)
-            lost = before - set(keys(Store(tmp_path, COLUMNS)))
-            if lost:
-                faults.append(f"{lost} not seen")
-
-    reader = threading.Thread(target=read)
-    writers = [threading.Thread(target=write, args=(i,)) for i in range(4)]
-    reader.start()
-    for thread in writers:
-        thread.start()
-    for thread in writers:
-        thread.join()
-    done.set()
-    reader.join()
-    assert not faults
-    Store(tmp_path, COLUMNS).compact()
-    table = pd.read_parquet(tmp_path / "rows.parquet")
-    assert len(table) == 100
-    assert table["key"].is_unique
 
 
 def once(act):

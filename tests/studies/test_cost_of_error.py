@@ -195,18 +195,11 @@ def test_problems_that_the_best_gradient_solves_in_a_few_updates_do_not_count():
 # ------------------------------------------------------------------------------------------------ without a model
 
 
-@pytest.mark.parametrize(("n", "low", "high"), [(6, 1, 6), (8, 1, 8), (9, 2, 8), (25, 8, 18)])
+@pytest.mark.parametrize(("n", "low", "high"), [(5, 0, math.inf), (6, 1, 6), (8, 1, 8), (9, 2, 8), (25, 8, 18)])
 def test_interval_of_a_median_has_the_order_statistics_of_the_tables(n, low, high):
-    """Of n values the k-th from either end, with k from the sign test at 5% (Conover 1999, Practical Nonparametric Statistics)."""
+    """Of n values the k-th from either end, with k from the sign test at 5% (Conover 1999, Practical Nonparametric Statistics); five leave it open."""
     values = np.random.default_rng(0).permutation(np.arange(1.0, n + 1))
     assert analysis.median_interval(values) == ((n + 1) / 2, low, high)
-
-
-def test_interval_of_a_median_covers_and_fewer_than_six_values_leave_it_open():
-    assert analysis.median_interval(np.arange(1.0, 6)) == (3.0, 0.0, math.inf)
-    rng = np.random.default_rng(1)
-    intervals = [analysis.median_interval(rng.lognormal(0.0, 1.0, 8)) for _ in range(2000)]
-    assert np.mean([low <= 1.0 <= high for _, low, high in intervals]) >= 0.95
 
 
 def planted(scene, kind, dose, updates, problem=""):
@@ -251,17 +244,6 @@ def test_a_verdict_counts_scenes_and_not_problems(scenes, verdict):
              for kind, dose, updates in ((analysis.RANDOM, 0.3, 10.0), (analysis.RANDOM, 3.0, 20.0 + i))]  # fmt: skip
     line = compared(lines, "random error 3 / 0.3")
     assert (line["problems"], line["scenes"], line["above"], line["verdict"]) == (40, scenes, scenes, verdict)
-
-
-def test_verdicts_without_an_effect_are_wrong_in_at_most_5_percent():
-    rng = np.random.default_rng(0)
-    known = pd.concat([
-        pd.DataFrame({"scene_class": "smooth", "target": float(draw), "comparison": "c", "scene": scenes,
-                      "ratio": np.exp(rng.standard_normal(22))[scenes] * np.exp(0.1 * rng.standard_normal(41))})
-        for draw in range(400) for scenes in [rng.integers(0, 22, 41)]
-    ])  # fmt: skip
-    wrong = analysis.by_scene(known).query("scene_class == 'smooth'")["verdict"].ne("not known").mean()
-    assert wrong <= 0.05 + 3 * math.sqrt(0.05 * 0.95 / 400)
 
 
 def test_planted_errors_alone_have_a_report_that_compares_no_orders(run):

@@ -211,6 +211,8 @@ def test_tables_charts_and_page(finished):
     folder, experiment = finished
     for name in ("optimise.csv", "targets.csv", "runtimes.png", "answer.json", "targets.png", "report.html"):
         assert (folder / name).stat().st_size > 0, name
+    made = (folder / "report.html").read_text().partition('id="made"')[2]
+    assert "numpy" in made.partition("Configuration")[0], "machine and versions are in the page"
     effect = pd.read_csv(folder / "effect_of_error.csv")
     assert effect["verdict"].tolist() == ["open"]  # two methods on one problem say nothing
     found = aggregate.collect_runs(experiment, bench.load(folder))

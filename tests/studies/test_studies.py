@@ -279,7 +279,7 @@ def one_a_study():
     found = {}
     for name in config.experiments():
         text = (config.config_dir() / "experiment" / f"{name}.yaml").read_text()
-        study = re.search(r"^study: *(\w+)", text, re.MULTILINE)
+        study = re.search(r'^study: *"?(\w+)', text, re.MULTILINE)
         found.setdefault(study[1] if study else "bias_variance", name)
     return list(found.values())
 

@@ -1,12 +1,12 @@
-"""Runs the conformance set on an engine, with NumPy only: ``python runner.py ENGINE.py [CASE ...]`` prints the rows as JSON."""
+"""Runs the conformance set on an engine, with NumPy only: ``python runner.py ENGINE.py [CASE ...]`` prints its rows as JSON."""
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import runpy
 import sys
 import time
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,21 +25,18 @@ EXPLAINED = 0.1
 """Largest distance to a fault's numbers, as a share of the distance to the right ones, at which an engine has the fault."""
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class Case:
     """A model with a start, controls ``(horizon, n_u)``, a parameter, and weights of the last state, whose sum is the cost."""
 
     name: str
-    data: dict[str, Any] = dataclasses.field(repr=False)
+    model: Path
+    """The MJCF file."""
+    data: dict[str, Any] = field(repr=False)
     qpos: np.ndarray
     qvel: np.ndarray
     controls: np.ndarray
     parameter: np.ndarray
-
-    @property
-    def model(self) -> Path:
-        """The MJCF file."""
-        return FOLDER / f"{self.name}.xml"
 
     def cost(self, qpos: Any, qvel: Any) -> Any:
         """Return the cost of a rollout whose last state this is; sums of products only, so that any array will do."""
@@ -48,26 +45,19 @@ class Case:
 
     def tangent(self) -> np.ndarray:
         """Return the derivative of qpos by a velocity times time, ``(n_q, n_v)``: quaternions turn in their body's frame."""
-        result, row, column = np.zeros((self.qpos.size, self.qvel.size)), 0, 0
-        while row < len(result):
-            block = np.eye(1)
-            if row in self.data["quaternions"]:
-                w, x, y, z = self.qpos[row : row + 4]
-                block = np.array([[-x, -y, -z], [w, -z, y], [z, w, -x], [-y, x, w]]) / 2
-            end, last = row + len(block), column + block.shape[1]
-            result[row:end, column:last] = block
-            row, column = end, last
+        result = np.delete(np.eye(self.qpos.size), self.data["quaternions"], axis=1)
+        for before, i in enumerate(self.data["quaternions"]):
+            w, x, y, z = self.qpos[i : i + 4] / 2
+            result[i : i + 4, i - before : i - before + 3] = [[-x, -y, -z], [w, -z, y], [z, w, -x], [-y, x, w]]
         return result
 
     def moved(self, term: str, change: np.ndarray) -> Case:
         """Return the case with another start, controls or parameter; ``change`` is flat, and of velocities for qpos."""
-        if term != "qpos":
-            old = getattr(self, term)
-            return dataclasses.replace(self, **{term: old + change.reshape(old.shape)})
-        qpos = self.qpos + self.tangent() @ change
-        for i in self.data["quaternions"]:
-            qpos[i : i + 4] /= np.linalg.norm(qpos[i : i + 4])
-        return dataclasses.replace(self, qpos=qpos)
+        old = getattr(self, term)
+        new = old + (self.tangent() @ change if term == "qpos" else change.reshape(old.shape))
+        for i in self.data["quaternions"] if term == "qpos" else ():
+            new[i : i + 4] /= np.linalg.norm(new[i : i + 4])
+        return replace(self, **{term: new})
 
     def differences(self, engine: Any, term: str) -> tuple[np.ndarray, float]:
         """Return the derivative by central differences of the engine's own costs, and its uncertainty.
@@ -96,8 +86,9 @@ def cases(*names: str) -> list[Case]:
     result = []
     for file in [FOLDER / f"{name}.json" for name in names] or sorted(FOLDER.glob("*.json")):
         data = json.loads(file.read_text())
-        given = (data["qpos"], data["qvel"], data["controls"], data["parameter"]["value"])
-        result.append(Case(file.stem, data, *(np.array(part, dtype=float) for part in given)))
+        given = (*(data[term] for term in TERMS[:3]), data["parameter"]["value"])
+        inputs = (np.array(values, dtype=float) for values in given)
+        result.append(Case(file.stem, file.with_suffix(".xml"), data, *inputs))
     return result
 
 
@@ -111,36 +102,31 @@ def check(engine: Any, case: Case) -> list[dict[str, Any]]:
     started = time.perf_counter()
     try:
         results = {"value": engine.rollout(case), **engine.gradient(case)}
+        seconds, differs = time.perf_counter() - started, getattr(engine, "differs", {}).get(case.name, "")
+        row |= {"against": "own differences" if differs else "the set", "seconds": round(seconds, 4), "reason": differs}
+        return [row | {"term": term} | _verdict(engine, case, term, found) for term, found in results.items()]
     except Exception as error:  # another engine's code may raise anything
         is_right = None if isinstance(error, NotImplementedError) else False
         return [row | {"is_right": is_right, "reason": f"{type(error).__name__}: {error}"}]
-    differs = getattr(engine, "differs", {}).get(case.name, "")
-    row |= {"seconds": round(time.perf_counter() - started, 4), "reason": differs}
-    row["against"] = "own differences" if differs else "the set"
-    return [row | {"term": term} | _verdict(engine, case, term, result, differs) for term, result in results.items()]
 
 
-def _verdict(engine: Any, case: Case, term: str, result: Any, differs: str) -> dict[str, Any]:
+def _verdict(engine: Any, case: Case, term: str, found: Any) -> dict[str, Any]:
     """Return whether a value or derivative is right, its digits of agreement, and the faults that it looks like."""
-    result, faults = np.ravel(np.array(result, dtype=float)), {}
+    result = np.ravel(np.array(found, dtype=float))
     if term == "qpos" and result.size > case.qvel.size:
         result = result @ case.tangent()
-    expected, doubt = case.data["expected"][term], np.inf
-    if not differs:
-        doubt, faults = case.data["certainty"][term], case.data["faults"]
-    elif term != "value":
-        expected, doubt = case.differences(engine, term)
-    if result.size != np.size(expected):
-        return {"is_right": False, "seconds": None, "reason": f"{result.size} numbers instead of {np.size(expected)}"}
-
-    def distance(numbers: Any) -> float:
-        return float(np.abs(result - np.ravel(numbers)).max(initial=0.0))
-
-    off, scale, margin = distance(expected), np.abs(expected).max(initial=1e-9), DOUBTS * doubt
-    is_right = bool(off <= getattr(engine, "tolerance", 1e-6) * scale + margin)
-    near = [name for name, fault in faults.items() if distance(fault.get(term, np.inf)) <= EXPLAINED * off]
+    expected, doubt, faults = (case.data[name] for name in ("expected", "certainty", "faults"))
+    expected, doubt = np.ravel(expected[term]), doubt[term]
+    if getattr(engine, "differs", {}).get(case.name):
+        expected, doubt = (expected, np.inf) if term == "value" else case.differences(engine, term)
+        faults = {}
+    if result.size != expected.size:
+        return {"is_right": False, "reason": f"{result.size} numbers instead of {expected.size}"}
+    off, scale, margin = np.abs(result - expected).max(), np.abs(expected).max(initial=1e-9), DOUBTS * doubt
+    is_right = off <= getattr(engine, "tolerance", 1e-6) * scale + margin
+    near = [name for name, by in faults.items() if np.abs(result - by.get(term, np.inf)).max() <= EXPLAINED * off]
     return {
-        "is_right": is_right if margin <= UNCERTAIN * scale else None,
+        "is_right": bool(is_right) if margin <= UNCERTAIN * scale else None,
         "digits": round(float(-np.log10(max(off / scale, 1e-16))), 1) if np.isfinite(off) else None,
         "looks_like": "" if is_right else " or ".join(near),
     }
@@ -152,14 +138,13 @@ def run(engine: Any, *names: str) -> list[dict[str, Any]]:
 
 
 def main(path: str, *names: str) -> None:
-    """Print the rows of the class ``Engine`` of a file, and then, with its versions, as JSON in the last line."""
+    """Print the versions and the rows of the class ``Engine`` of a file as JSON, each on a line as soon as it is known."""
     sys.path.append(str(Path(path).parent))  # last: a file may have the name of a library
-    engine, rows = runpy.run_path(path)["Engine"](), []
+    engine = runpy.run_path(path)["Engine"]()
+    print(json.dumps({"versions": getattr(engine, "versions", {})}))
     for case in cases(*names):
         for row in check(engine, case):
-            print(*row.values(), sep="\t", flush=True)
-            rows.append(row)
-    print(json.dumps({"versions": getattr(engine, "versions", {}), "rows": rows}))
+            print(json.dumps(row), flush=True)
 
 
 if __name__ == "__main__":

@@ -14,4 +14,3 @@ class Toy(EngineBackend):
     libraries = ("numpy",)
 
     fault: str = param("", "no_contact, or what happens when Jacobians are computed: exit, loop, memory or raise")
-    marker: str = param("", "file of a fault that happens once, in the third call; empty: it happens in each call")
