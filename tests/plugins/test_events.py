@@ -1,6 +1,7 @@
 """Estimators that use declared events, against closed forms and exact sums over all outcomes."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from classes import (
 from scipy import stats
 
 from bench.model import DisturbedScene, Events, EventScene, FunctionScene, compose, half_spaces
+from bench.model.events import events_of
 
 LIMIT = 4.5
 """Standard errors within which a mean agrees with its expectation."""
@@ -34,6 +36,15 @@ def estimates(estimator, scene, repeats=1000, samples=64, seed=0):
 def agrees(values, truth):
     error = values.std(axis=0) / np.sqrt(len(values))
     return (np.abs(values.mean(axis=0) - truth) <= LIMIT * error + 1e-9).all()
+
+
+def test_events_of_a_problem_with_twice_the_noise_are_at_half_the_limits():
+    scene, w = Heaviside(sigma=0.3), np.linspace(-2.0, 2.0, 9)[None]
+    doubled = SimpleNamespace(program=compose(scene), sigma=0.6, dim=1)
+    theta = doubled.program.theta0 + 0.1
+    whole, found = scene.events(theta, 2 * w), events_of(doubled, theta, w)
+    assert np.array_equal(found.directions @ w < found.limits, whole.directions @ (2 * w) < whole.limits)
+    assert found.slopes == pytest.approx(whole.slopes / 2)
 
 
 @dataclasses.dataclass(frozen=True)

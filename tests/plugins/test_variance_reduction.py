@@ -29,6 +29,11 @@ def estimates(estimator, scene, repeats=1500, samples=512, seed=0):
     return estimator.estimate(p, p.program.theta0, drawn(repeats, samples, p.dim, seed))
 
 
+def test_each_quasi_random_direction_alone_is_normal():
+    first = directions(drawn(2000, 16, 1))[:, 0, 0]
+    assert stats.kstest(first, "norm").pvalue > 1e-4
+
+
 def test_optimal_baseline_is_computed_from_the_other_samples():
     scene = Quadratic(dimension=2)
     p, w = problem(scene), drawn(3, 7, 2)
