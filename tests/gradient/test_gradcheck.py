@@ -176,9 +176,6 @@ def test_command_writes_files_and_exits_with_0(tmp_path, capsys):
     assert set(table["verdict"]) <= set(VERDICTS)
     assert (table["status"] == "ok").all()
     assert set(table["horizon"]) == {1, 5}
-    a, b = table["derivative_program"], table["derivative_differences"]
-    expected = (a - b).abs() / np.maximum(1.0, np.maximum(a.abs(), b.abs()))
-    np.testing.assert_allclose(table["relative_error"], expected, rtol=1e-6, atol=1e-16)  # digits lost in CSV's a - b
     assert json.loads((directory / "run.json").read_text())["study"] == "gradient_check"
 
 
@@ -268,9 +265,6 @@ def test_components_are_columns_of_the_row(tmp_path):
     np.testing.assert_allclose(row["component_program"], row["component_difference"], rtol=1e-6)
     assert set(row["component_verdict"]) == {"smooth"}
     assert row["untrusted"] == 0
-    table = pd.read_csv(tmp_path / "one" / "gradient_components.csv")
-    assert list(table["component"]) == list(row["component"])
-    np.testing.assert_allclose(table["component_program"], row["component_program"])
 
 
 def test_worst_check_decides_the_line_of_a_point():
