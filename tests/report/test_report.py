@@ -438,16 +438,6 @@ def test_no_cell_is_lost_where_a_swept_value_is_the_default_of_one_scene(capsys,
     assert set(chart.frame["x"]) == {0.0, 1.0, 10.0}
 
 
-def test_a_law_parameter_that_happens_to_equal_another_keeps_its_problem():
-    """Stiffness 10 stays stiffness 10 where damping is 10 as well."""
-    swept, cells = loaded(*FEW, "scenes=[pushing]", "sweep.stiffness=[10,100]", "sweep.damping=[1,10]")
-    rows = rows_of(swept, cells)
-    shown = views.arrange(swept, rows)
-    for column in ("stiffness", "damping"):
-        found = split_by_problem(shown, named(shown, column))
-        assert [len(family.rows) for family in found] == [2, 2]
-
-
 def test_the_newest_row_of_a_cell_counts():
     new = table([row(stiffness=k) for k in (1.0, 2.0, 3.0)])
     found = views.newest_rows(pd.concat([new.assign(bias=7.0), new[:2]], ignore_index=True))

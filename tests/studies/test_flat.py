@@ -27,15 +27,6 @@ def made(cell):
     return estimates, estimates.of(0, cell.repeats)
 
 
-def test_parts_are_the_noise_drawn_in_one_go(monkeypatch):
-    monkeypatch.setattr(noise, "HELD", 70)
-    whole = noise.draw(3, "a scene", 2, 50, 7, "cells")
-    for repeat in range(2):
-        parts = list(noise.parts(3, "a scene", repeat, 50, 7, "cells"))
-        assert max(part.size for part in parts) <= 70
-        assert np.array_equal(np.concatenate(parts, axis=1).T, whole[repeat])
-
-
 @pytest.mark.parametrize(
     "estimator", ["fobg", "reinforce", "reinforce[baseline=leave_one_out]", "randomized_smoothing", "inverse_variance"]
 )
@@ -67,17 +58,6 @@ def test_terms_of_a_long_theta_are_computed_in_parts(most, largest, monkeypatch)
     _, found = made(cell)
     np.testing.assert_allclose(found, expected, rtol=ROUNDED)
     assert max(sizes) == largest
-
-
-def test_variance_per_sample_is_that_of_all_terms():
-    cell = cell_of("fobg", samples=400, repeats=8)
-    found, _ = made(cell)
-    program = compose(cell.scene)
-    w = noise.draw(cell.seed, "cubic", 8, 400, program.n_noise, "cells").reshape(-1, program.n_noise).T
-    terms = cell.backend.compile(program).grad(program.theta0, w)
-    value, low, high = statistics.variance_per_sample(*found.sums, 400)
-    assert value == pytest.approx(terms.var(axis=1, ddof=1).sum(), rel=1e-9)
-    assert low < value < high
 
 
 def test_an_estimator_with_an_estimate_of_its_own_is_not_taken_apart():
