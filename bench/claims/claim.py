@@ -62,7 +62,8 @@ class Figure:
         if not math.isfinite(self.measured):
             return False
         if self.factor:
-            return 1.0 / self.factor <= self.measured / self.value <= self.factor
+            ratio = self.measured / self.value if self.value else math.inf
+            return 1.0 / self.factor <= ratio <= self.factor
         return abs(self.measured - self.value) <= self.tolerance
 
     @property

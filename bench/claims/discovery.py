@@ -9,6 +9,8 @@ from bench.claims.claim import Claim
 from bench.errors import printable, unknown
 from bench.model import registry
 
+REQUIRED = ("lesson", "statement", "source", "learned")
+"""Strings that every claim defines."""
 LESSONS = {
     "Low variance is not low bias": "The spread of a gradient says nothing about its distance from the truth.",
     "Which variance is smaller": "Roughness costs the first order, dimension the zeroth.",
@@ -28,8 +30,15 @@ def claims() -> dict[str, type[Claim]]:
     for entry in (*entries, *others):
         if entry.plugin is None:
             print(f"bench: '{printable(entry.name)}' cannot be used: {printable(entry.reason)}", file=sys.stderr)
-    usable = [entry.plugin for entry in entries if entry.plugin is not None and issubclass(entry.plugin, Claim)]
-    return {claim.name: claim for claim in sorted(usable, key=_position)}
+    complete: list[type[Claim]] = []
+    for entry in entries:
+        if entry.plugin is not None and issubclass(entry.plugin, Claim):
+            missing = [name for name in REQUIRED if not isinstance(getattr(entry.plugin, name, None), str)]
+            if missing:
+                print(f"bench: claim '{entry.name}' does not define {', '.join(missing)}", file=sys.stderr)
+            else:
+                complete.append(entry.plugin)
+    return {claim.name: claim for claim in sorted(complete, key=_position)}
 
 
 def _position(claim: type[Claim]) -> tuple[int, str, str, int]:

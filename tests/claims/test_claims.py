@@ -214,12 +214,14 @@ def test_a_claim_in_a_plugin_folder_is_found(tmp_path, capsys):
     (own / "claims" / "mine.py").write_text(OF_ANOTHER)
     (own / "also.py").write_text(OF_ANOTHER.replace("M1", "M2"))
     (own / "broken.py").write_text("import no_such_module")
+    (own / "bare.py").write_text(OF_ANOTHER.replace('"M1", "My lesson"', '"M3", None'))
     (own / "again.py").write_text(OF_ANOTHER.replace("M1", "C1"))
     place = [f"plugins={own}", f"results_dir={tmp_path}"]
     assert cli.main(["claims", "m1", "M2", *place]) == 0
     printed = capsys.readouterr()
     assert printed.out.count("two is two") == 2
     assert "'broken' cannot be used: import failed: ModuleNotFoundError" in printed.err
+    assert "claim 'M3' does not define lesson" in printed.err
     assert "'C1' cannot be used: the name is taken by bench.plugins.claims.step" in printed.err
     assert cli.main(["claims", "M1", *place]) == 0
     assert "as stored" in capsys.readouterr().out
