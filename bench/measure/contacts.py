@@ -11,7 +11,6 @@ from bench.model import (
     ContactScene,
     EngineScene,
     ForceLaw,
-    MechanicalScene,
     Problem,
     Rollout,
     State,
@@ -81,7 +80,7 @@ def active_contacts(
     scene = program.scene
     if not isinstance(scene, ContactScene):
         raise Unsupported(f"only the engine knows the contacts of scene {scene.name}")
-    before = [split(scene, x) for x in states[:-1]]
+    before = [scene.split(x) for x in states[:-1]]
     if isinstance(program.contact, ForceLaw):
         return np.stack([scene.gap(np, state.q) < 0 for state in before])
     if forces is None:
@@ -89,7 +88,7 @@ def active_contacts(
             [_predicted_contacts(program, scene, state, u) for state, u in zip(before, controls, strict=True)]
         )
     steps = zip(before, states[1:], forces, strict=True)
-    return np.stack([_measured_contacts(scene, state, split(scene, x), force) for state, x, force in steps])
+    return np.stack([_measured_contacts(scene, state, scene.split(x), force) for state, x, force in steps])
 
 
 def _measured_contacts(scene: ContactScene, before: State, after: State, force: np.ndarray) -> np.ndarray:
@@ -103,8 +102,3 @@ def _predicted_contacts(program: Rollout, scene: ContactScene, before: State, u:
         free = scene.carried(v) + scene.dt * scene.acceleration(np, q, v, u)
         return np.asarray(scene.gap(np, q + scene.dt * free) < 0)
     return np.asarray((scene.gap(np, q + scene.dt * v) < 0) & (scene.gap_rate(np, q, v) < 0))
-
-
-def split(scene: MechanicalScene, x: Array) -> State:
-    """Return the positions and velocities of a state ``x (n, B)`` = (q, v)."""
-    return State(x[: scene.n_q], x[scene.n_q :])

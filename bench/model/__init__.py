@@ -40,7 +40,7 @@ from bench.model.ops import Array, LoopOps, Ops, State, stopped
 from bench.model.optimizer import Answer, Descent, Optimizer, OptimizerState, Population
 from bench.model.parameters import Plugin, param
 from bench.model.policy import Policy, PolicyScene, affine, uniform
-from bench.model.problem import Compilations, Jacobians, Problem, Trajectory
+from bench.model.problem import Compilations, Executable, Jacobians, Problem, Trajectory
 from bench.model.program import (
     SURROGATE,
     CallableProgram,
@@ -93,6 +93,7 @@ __all__ = [
     "Estimator",
     "EventScene",
     "Events",
+    "Executable",
     "ForceLaw",
     "FrictionScene",
     "FunctionScene",

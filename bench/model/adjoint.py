@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bench.model.manifold import difference, n_changes, retract, slope_by_changes
-from bench.model.ops import LoopOps, State
+from bench.model.ops import LoopOps
 from bench.model.problem import Jacobians, Problem
 from bench.model.program import Rollout, rollout
 from bench.model.scene import MechanicalScene
@@ -68,10 +68,10 @@ def slopes_along(program: Rollout, path: Jacobians, theta: np.ndarray, w: np.nda
     before, controls = _flatten(path.states[:-1]), _flatten(path.controls)
 
     def stage(x: np.ndarray, u: np.ndarray) -> np.ndarray:
-        return np.asarray(0.0 * x[0] + scene.stage_cost(np, *_split(program, x), u))
+        return np.asarray(0.0 * x[0] + scene.stage_cost(np, *scene.split(x), u))
 
     def end(x: np.ndarray) -> np.ndarray:
-        return np.asarray(scene.terminal_cost(np, *_split(program, x)))
+        return np.asarray(scene.terminal_cost(np, *scene.split(x)))
 
     def by_state(function: Callable[[np.ndarray], np.ndarray], x: np.ndarray) -> np.ndarray:
         if n_changes(scene) == len(x):
@@ -178,7 +178,7 @@ def _difference_jacobians(program: Rollout, theta: np.ndarray, w: np.ndarray) ->
 
     def after(x: np.ndarray, u: np.ndarray) -> np.ndarray:
         with np.errstate(all="ignore"):
-            return np.concatenate(program.step(ops, State(*_split(program, x)), u))
+            return np.concatenate(program.step(ops, program.scene.split(x), u))
 
     def by(function: Callable[[np.ndarray], np.ndarray], x: np.ndarray) -> np.ndarray:
         return np.stack([_unflatten(row, len(controls)) for row in _central_differences(function, x)], axis=1)
@@ -230,13 +230,9 @@ def _columns(theta: np.ndarray, w: np.ndarray) -> np.ndarray:
     return theta if np.ndim(theta) == 2 else np.repeat(theta[:, None], w.shape[1], axis=1)
 
 
-def _split(program: Rollout, x: np.ndarray) -> State:
-    return State(*np.split(x, [program.scene.n_q]))
-
-
 def _feedback(program: Rollout, theta: np.ndarray, x: np.ndarray) -> Any:
     """Return the feedback in the states ``x (n, T * B)`` under ``theta (d, B)``, ``(n_u, T * B)``; None without it."""
-    return program.scene.feedback(np, np.tile(theta, (1, x.shape[1] // theta.shape[1])), *_split(program, x))
+    return program.scene.feedback(np, np.tile(theta, (1, x.shape[1] // theta.shape[1])), *program.scene.split(x))
 
 
 def _flatten(values: np.ndarray) -> np.ndarray:

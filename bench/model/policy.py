@@ -82,14 +82,12 @@ def policy_of(identity: str) -> Policy:
 class PolicyScene(MechanicalScene):
     """A role: the controls are a :class:`Policy` of observations, u_t = pi(theta, o(x_t)) + sigma w_t.
 
-    Theta holds the policy's parameters. Every rollout starts at a random state if ``n_start`` is not 0, and J is the
-    mean over starts too. One step of ``dt`` is a control step, made of ``substeps`` steps of the integrator. After
-    :meth:`has_ended` the state no longer moves, and :meth:`stage_cost` should be 0 there.
+    Theta holds the policy's parameters. The scene's own noise, if ``exogenous`` is not 0, decides the start of each
+    rollout, and J is the mean over starts too. One step of ``dt`` is a control step, made of ``substeps`` steps of the
+    integrator. After :meth:`has_ended` the state no longer moves, and :meth:`stage_cost` should be 0 there.
     """
 
     n_observations: ClassVar[int]
-    n_start: ClassVar[int] = 0
-    """Number of standard normal numbers that decide the start of one rollout."""
 
     noise: str = param("action", "whether noise is on the actions or on theta", choices=("action", "parameter"))
     horizon: int = param(100, "number of control steps", "steps", positive=True)
@@ -109,18 +107,13 @@ class PolicyScene(MechanicalScene):
     def observation(self, xp: Any, q: Array, v: Array) -> Array:
         """Return the inputs of the policy, ``(n_observations, B)``, each of order 1."""
 
-    @property
-    def exogenous(self) -> int:  # type: ignore[override]
-        """Number of normal numbers of the random start."""
-        return self.n_start
-
     def starting_state(self, xp: Any, theta: Array, e: Array | None) -> State:
         """Return the random state at t = 0, or the initial state of a scene without random starts."""
-        return self.random_start(xp, e) if self.n_start else self.initial_state(xp, theta)
+        return self.random_start(xp, e) if self.exogenous else self.initial_state(xp, theta)
 
     def random_start(self, xp: Any, e: Array) -> State:
-        """Return the states at t = 0 from standard normal ``e (n_start, B)``; needed only if ``n_start`` is not 0."""
-        raise Unsupported(f"scene {self.name} has n_start={self.n_start} and defines no random_start")
+        """Return the states at t = 0 from standard normal ``e (exogenous, B)``; needed only if ``exogenous`` is not 0."""
+        raise Unsupported(f"scene {self.name} has exogenous={self.exogenous} and defines no random_start")
 
     def theta0(self) -> np.ndarray:
         """Return the policy's initial parameters, ``(d,)``."""
@@ -170,7 +163,7 @@ def _product(scene: PolicyScene, by_theta: bool) -> Callable[..., Any]:
             x, weight = at
 
             def controls(theta: Array, x: Array) -> Array:
-                return scene.feedback(jnp, theta, x[: scene.n_q], x[scene.n_q :])
+                return scene.feedback(jnp, theta, *scene.split(x))
 
             if not by_theta:
                 return total, jax.vjp(lambda x: controls(theta, x), x)[1](weight)[0]

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -64,6 +64,16 @@ class Usage:
     lower_s: float = 0.0
 
 
+@dataclass(frozen=True)
+class Executable:
+    """A compiled function, the seconds of each part of its compilation, and whether it was loaded from a folder."""
+
+    name: str
+    call: Callable[..., Any]
+    seconds: tuple[float, ...]
+    loaded: bool
+
+
 @dataclass
 class Compilations:
     """Compilation counts of one session, and the folder in which compiled programs are stored.
@@ -77,6 +87,22 @@ class Compilations:
     """Number of compilations, excluding programs loaded from the folder."""
     shapes: set[str] = field(default_factory=set)
     """Hashes of the requested programs, one per program structure, function and shape."""
+
+    def obtain(
+        self, known: dict[Any, Executable], key: Any, fresh: bool, make: Callable[[Path | None], Executable]
+    ) -> Executable:
+        """Return the executable of ``key`` from ``known``, of which it becomes the last; made if it is missing.
+
+        ``make`` gets the folder. With ``fresh`` it gets none, and an executable loaded from the folder is made again, so
+        that the seconds are a true compile time.
+        """
+        executable = known.pop(key, None)
+        if executable is None or (fresh and executable.loaded):
+            executable = make(None if fresh else self.folder)
+            self.made += not executable.loaded
+        known[key] = executable
+        self.shapes.add(executable.name)
+        return executable
 
     def restart(self) -> None:
         """Reset the counts to zero."""
@@ -115,6 +141,15 @@ class Problem(ABC):
         self._measured = True
         self.usage = Usage()
         self._charged.clear()
+
+    def _charge(self, key: object, seconds: Sequence[float]) -> None:
+        """Add the compile time of an executable, once in each measurement: of tracing, lowering and the rest, or in all."""
+        if key not in self._charged:
+            self._charged.add(key)
+            self.usage.compile_s += sum(seconds)
+            if len(seconds) > 1:
+                self.usage.trace_s += seconds[0]
+                self.usage.lower_s += seconds[1]
 
     def fit_blocks(self, column_bytes: int) -> None:
         """Set the block size so that a block fills half of a core's cache, at ``column_bytes`` per rollout."""

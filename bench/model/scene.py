@@ -135,6 +135,10 @@ class MechanicalScene(Scene):
     def initial_state(self, xp: Any, theta: Array) -> State:
         """Return the state at t = 0 for ``theta (d, B)``."""
 
+    def split(self, x: Array) -> State:
+        """Return the positions and velocities of states ``x (n, ...)``."""
+        return State(x[: self.n_q], x[self.n_q :])
+
     @staticmethod
     def at_rest(xp: Any, theta: Array, *q: Any) -> State:
         """Return the state with the positions ``q``, one number each, and without velocity, for ``theta (d, B)``."""

@@ -54,7 +54,7 @@ class SteppedProblem(Problem):
                 return Trajectory(self.moved(states[0], planned), planned)
             for t in times:
                 controls.append(control(t))
-                after = self._split(self.moved(states[-1], controls[-1][None])[1])
+                after = program.scene.split(self.moved(states[-1], controls[-1][None])[1])
                 state = program.stopped(np, state, after)
                 states.append(np.concatenate(state))
             return Trajectory(np.stack(states), np.stack(controls))
@@ -64,13 +64,10 @@ class SteppedProblem(Problem):
         states, controls = self.trajectory(theta, w)
         a, b = self.step_jacobians(states, controls)
         for t, x in enumerate(states[:-1]):
-            ended = self._rolled.scene.has_ended(np, *self._split(x))
+            ended = self._rolled.scene.has_ended(np, *self._rolled.scene.split(x))
             if ended is not None:
                 a[t][..., ended], b[t][..., ended] = np.eye(a.shape[1])[..., None], 0.0
         return Jacobians(states, controls, a, b)
-
-    def _split(self, x: np.ndarray) -> State:
-        return State(*np.split(x, [self._rolled.scene.n_q]))
 
     def _value(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         states = self.trajectory(theta, w).states
@@ -103,4 +100,4 @@ class Replayed(Rollout):
 
     def step(self, ops: Ops, state: State, u: Array) -> State:
         """Return the next recorded state."""
-        return State(*np.split(next(self._states), [self.scene.n_q]))
+        return self.scene.split(next(self._states))

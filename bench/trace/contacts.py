@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from bench.experiment.by_name import make
-from bench.measure.contacts import active_contacts, contact_names, engine_contacts, split
+from bench.measure.contacts import active_contacts, contact_names, engine_contacts
 from bench.model import (
     ContactScene,
     EngineScene,
@@ -40,7 +40,7 @@ def contact_columns(problem: Problem, program: Rollout, path: Jacobians) -> dict
     elif law is None or not isinstance(scene, ContactScene):
         return columns
     else:
-        state = split(scene, path.states.T)
+        state = scene.split(path.states.T)
         gap = scene.gap(np, state.q)
         touching, force = _touching(program, scene, path)
         names = contact_names(problem)
@@ -80,7 +80,7 @@ def _touching(program: Rollout, scene: ContactScene, path: Jacobians) -> tuple[n
     """
     law, states, controls = program.contact, path.states[..., None], path.controls[..., None]
     if isinstance(law, ForceLaw):
-        state = split(scene, path.states.T)
+        state = scene.split(path.states.T)
         gap = scene.gap(np, state.q)
         touching = active_contacts(program, states, controls)[..., 0].T
         force = law.force(np, gap, scene.gap_rate(np, *state)) + 0.0
@@ -97,10 +97,10 @@ def _impulse_forces(program: Rollout, scene: ContactScene, path: Jacobians) -> n
     The forces lambda solve M^-1 J^T lambda dt = v_{k+1} - v_free by least squares, exactly where the normals of the
     contacts are independent.
     """
-    q = split(scene, path.states[:-1].T).q
+    q = scene.split(path.states[:-1].T).q
     without_contact = compose(scene, None, program.integrator)
     assert isinstance(without_contact, Rollout)
-    jump = split(scene, _stepped(program, path) - _stepped(without_contact, path)).v
+    jump = scene.split(_stepped(program, path) - _stepped(without_contact, path)).v
     units = np.eye(scene.n_contacts)[:, :, None] + np.zeros((1, 1, q.shape[1]))
     response = np.stack([scene.contact_acceleration(np, q, unit) for unit in units])
     inverse = np.linalg.pinv(np.nan_to_num(response.transpose(2, 1, 0)))
@@ -113,4 +113,4 @@ def _stepped(program: Rollout, path: Jacobians) -> np.ndarray:
 
     ops = make("backends", "implicit").ops() if program.needs_root else LoopOps(jnp)
     before, u = jnp.asarray(path.states[:-1].T), jnp.asarray(path.controls.T)
-    return np.concatenate([np.asarray(part) for part in program.step(ops, split(program.scene, before), u)])
+    return np.concatenate([np.asarray(part) for part in program.step(ops, program.scene.split(before), u)])

@@ -19,7 +19,6 @@ from bench.experiment.experiment import Experiment
 from bench.experiment.grid import cells
 from bench.experiment.reference_backends import backends_with_jacobians
 from bench.measure import noise
-from bench.measure.contacts import split
 from bench.model import (
     Jacobians,
     LoopOps,
@@ -183,13 +182,13 @@ def _norms(matrices: np.ndarray) -> np.ndarray:
 def _costs(scene: MechanicalScene, path: Jacobians) -> dict[str, np.ndarray]:
     """Return costs by column, each ``(T + 1,)``: stage costs and terms per step, the terminal cost at the last state."""
     states, u = path.states.T, path.controls.T
-    before = split(scene, states[:, :-1])
+    before = scene.split(states[:, :-1])
 
     def staged(value: Any) -> np.ndarray:
         return per_state(np.broadcast_to(value, u.shape[1]))
 
     terms = {"stage": staged(scene.stage_cost(np, *before, u))}
     terms["terminal"] = np.full(states.shape[1], np.nan)
-    terms["terminal"][-1] = scene.terminal_cost(np, *split(scene, states[:, -1:]))[0]
+    terms["terminal"][-1] = scene.terminal_cost(np, *scene.split(states[:, -1:]))[0]
     terms |= {name: staged(value) for name, value in scene.cost_terms(np, *before, u).items()}
     return {f"cost_{name}": values for name, values in terms.items()}

@@ -71,7 +71,7 @@ class Environment:
     @property
     def n_start(self) -> int:
         """Number of standard normal numbers that decide a start."""
-        return int(self.scene.n_start)
+        return int(self.scene.exogenous)
 
     @property
     def structure(self) -> tuple[Any, ...]:

@@ -6,27 +6,17 @@ import hashlib
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 from typing import Any
 
-from bench.model import Compilations
+from bench.model import Compilations, Executable
 
 KEPT = 256
 """Executables kept per process. Each has 20 to 40 memory mappings, and Linux ends a process that needs more than 65,530."""
 
-_known: dict[tuple[Any, ...], Compiled] = {}
+_known: dict[tuple[Any, ...], Executable] = {}
 _busy = threading.Lock()
-
-
-@dataclass(frozen=True)
-class Compiled:
-    """An executable and the seconds of tracing, lowering and compiling; ``loaded`` if it was read from the folder."""
-
-    name: str
-    call: Callable[..., Any]
-    seconds: tuple[float, float, float]
-    loaded: bool
 
 
 def compiled(
@@ -35,28 +25,25 @@ def compiled(
     arguments: tuple[Any, ...],
     fresh: bool,
     count: Compilations,
-) -> Compiled:
+) -> Executable:
     """Return the executable of ``function`` for the shapes of ``arguments``; ``key`` identifies program and shapes.
 
-    With ``fresh``, the folder of ``count`` is bypassed and an executable loaded from it is compiled again, so that the
-    seconds are a true compile time. Compilations and requests are added to ``count``.
+    Its seconds are of tracing, lowering and compiling. For ``fresh`` see :meth:`Compilations.obtain`.
     """
+
+    def make(folder: Path | None) -> Executable:
+        name = hashlib.sha256(repr(key).encode()).hexdigest()[:16]
+        return _compile(name, function, arguments, None if folder is None else str(folder))
+
     # one at a time, since JAX's cache folder is a global setting
     with _busy:
-        executable = _known.pop(key, None)
-        if executable is None or (fresh and executable.loaded):
-            name = executable.name if executable else hashlib.sha256(repr(key).encode()).hexdigest()[:16]
-            folder = None if fresh or count.folder is None else str(count.folder)
-            executable = _compile(name, function, arguments, folder)
-            count.made += not executable.loaded
-        _known[key] = executable
+        executable = count.obtain(_known, key, fresh, make)
         if len(_known) > KEPT:
             del _known[next(iter(_known))]
-        count.shapes.add(executable.name)
         return executable
 
 
-def _compile(name: str, function: Callable[..., Any], arguments: tuple[Any, ...], folder: str | None) -> Compiled:
+def _compile(name: str, function: Callable[..., Any], arguments: tuple[Any, ...], folder: str | None) -> Executable:
     """Return the executable of a function, with its compile times.
 
     Libraries may compile single operations on constants meanwhile. Their time is included, but they are not counted.
@@ -77,7 +64,7 @@ def _compile(name: str, function: Callable[..., Any], arguments: tuple[Any, ...]
     before = _loaded
     call = lowered.compile(options)
     seconds = (after_trace - started, after_lowering - after_trace, time.perf_counter() - after_lowering)
-    return Compiled(name, call, seconds, loaded=_loaded > before)
+    return Executable(name, call, seconds, loaded=_loaded > before)
 
 
 def _use(folder: str | None) -> None:

@@ -142,7 +142,5 @@ class FusedProblem(JaxProblem):
 
     def _compiled(self, text: str) -> Any:
         kernel = kernels.compiled(text, self._dtype.name, self._measured, self.compilations)
-        if kernel.name not in self._charged:
-            self._charged.add(kernel.name)
-            self.usage.compile_s += kernel.seconds
+        self._charge(kernel.name, kernel.seconds)
         return kernel.call

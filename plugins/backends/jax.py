@@ -189,7 +189,7 @@ class JaxProblem(Problem):
 
             def step(change: Array, u: Array) -> Array:
                 moved = retract(scene, jnp, x, change)
-                state = program.step(self._ops, State(moved[: scene.n_q], moved[scene.n_q :]), u)
+                state = program.step(self._ops, scene.split(moved), u)
                 return difference(scene, jnp, jnp.concatenate(state), after)
 
             def by(function: Callable[[Array], Array], point: Array) -> Array:
@@ -209,17 +209,12 @@ class JaxProblem(Problem):
         return np.asarray(self._run(function, theta, w), dtype=np.float64)
 
     def _run(self, function: Callable[..., Any], theta: np.ndarray, w: np.ndarray) -> Any:
-
         args = (self._parameters, theta.astype(self._dtype, copy=False), w.astype(self._dtype, copy=False))
         solver = type(self._ops) if self.program.needs_root else None
         what = (solver, self.variant, function.__name__, self._mode, self._dtype)
         key = (*what, self.program.structure, theta.shape, w.shape)
         executable = compiled(key, function, args, self._measured, self.compilations)
-        if key not in self._charged:
-            self._charged.add(key)
-            self.usage.compile_s += sum(executable.seconds)
-            self.usage.trace_s += executable.seconds[0]
-            self.usage.lower_s += executable.seconds[1]
+        self._charge(key, executable.seconds)
         return executable.call(*args)
 
     def _cost(self, parameters: Array, theta: Array, w: Array) -> Array:

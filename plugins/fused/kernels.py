@@ -9,46 +9,26 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from bench.model import Compilations
+from bench.model import Compilations, Executable
 
 from .functions import FAST, SLOW
 
-_known: dict[str, Kernel] = {}
+_known: dict[str, Executable] = {}
 _busy = threading.Lock()
 
 
-@dataclass(frozen=True)
-class Kernel:
-    """A compiled kernel, its compile time in seconds, and whether it was loaded from a folder."""
-
-    name: str
-    call: Callable[..., tuple[bool, bool]]
-    seconds: float
-    loaded: bool
-
-
-def compiled(text: str, dtype: str, fresh: bool, count: Compilations) -> Kernel:
-    """Return the kernel of the source ``text``, compiled once per process.
-
-    With ``fresh``, a kernel that was loaded from the folder is compiled again, so that ``seconds`` is its compile time.
-    Compilations and requests are added to ``count``.
-    """
+def compiled(text: str, dtype: str, fresh: bool, count: Compilations) -> Executable:
+    """Return the kernel of the source ``text``, compiled once per process; for ``fresh`` see :meth:`Compilations.obtain`."""
     name = hashlib.sha256(text.encode()).hexdigest()[:16]
     # one at a time: Numba's compiler has its own lock
     with _busy:
-        found = _known.get(name)
-        if found is None or (fresh and found.loaded):
-            folder = None if fresh or count.folder is None else Path(count.folder) / "fused"
-            found = _known[name] = _compile(name, text, dtype, folder)
-            count.made += not found.loaded
-        count.shapes.add(name)
-        return found
+        return count.obtain(
+            _known, name, fresh, lambda folder: _compile(name, text, dtype, folder and folder / "fused")
+        )
 
 
 def exact(text: str) -> str:
@@ -56,7 +36,7 @@ def exact(text: str) -> str:
     return text.replace(FAST, SLOW)
 
 
-def _compile(name: str, text: str, dtype: str, folder: Path | None) -> Kernel:
+def _compile(name: str, text: str, dtype: str, folder: Path | None) -> Executable:
     from numba import types
 
     started = time.perf_counter()
@@ -67,7 +47,7 @@ def _compile(name: str, text: str, dtype: str, folder: Path | None) -> Kernel:
     column = (vector, size, size)
     kernel.compile((vector, vector, whole, size, *column, *column, vector, size, vector, size, size, size, size))
     loaded = folder is not None and bool(kernel.stats.cache_hits)
-    return Kernel(name, kernel, time.perf_counter() - started, loaded)
+    return Executable(name, kernel, (time.perf_counter() - started,), loaded)
 
 
 def _module(name: str, text: str, folder: Path | None) -> ModuleType:

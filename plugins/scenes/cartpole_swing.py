@@ -25,7 +25,7 @@ class CartpoleSwing(PolicyScene):
     n_q = 2
     n_u = 1
     n_observations = 5
-    n_start = 8
+    exogenous = 8
 
     sigma: float = param(0.3, "standard deviation of the noise on each action, or on each parameter", positive=True)
     horizon: int = 240

@@ -43,7 +43,7 @@ class HopperRun(PolicyScene, AxisContactScene, FrictionScene):
     slip_axis = 3
     contact_mass = "foot_mass"
     n_observations = 10
-    n_start = 10
+    exogenous = 10
     contact_values = {"stiffness": 1e4}
 
     sigma: float = param(0.3, "standard deviation of the noise on each action, or on each parameter", positive=True)

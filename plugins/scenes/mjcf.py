@@ -133,7 +133,7 @@ class Mjcf(PolicyScene, JointScene):
         return len(self.robot.controls)
 
     @property
-    def n_start(self) -> int:  # type: ignore[override]
+    def exogenous(self) -> int:  # type: ignore[override]
         """Number of standard normal numbers of a random start: ``n_start`` of the Python file, or 0."""
         return int(getattr(self.module, "n_start", 0)) if self.theta == "policy" else 0
 

@@ -24,7 +24,7 @@ class Pressed(PolicyScene, ContactScene):
     n_u: ClassVar[int] = 1
     n_contacts: ClassVar[int] = 1
     n_observations: ClassVar[int] = 2
-    n_start: ClassVar[int] = 2
+    exogenous: ClassVar[int] = 2
 
     horizon: int = param(20, "control steps", "steps", positive=True)
     dt: float = param(0.01, "length of a control step", "s", positive=True)

@@ -35,7 +35,7 @@ def test_an_episode_counts_up_to_its_first_end_also_without_random_starts():
     @dataclass(frozen=True)
     class Falls(CartpoleSwing):
         name = "falls"
-        n_start = 0
+        exogenous = 0
 
         def has_ended(self, xp, q, v):
             return q[0] > 0.05
