@@ -13,7 +13,7 @@ import numpy as np
 
 from bench.experiment import grid
 from bench.experiment.cell import Cell
-from bench.experiment.columns import Column, Columns, ComparisonRule, interval, numbers, text
+from bench.experiment.columns import Column, Columns, ComparisonRule, bounded, exact, interval, numbers, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.session import Session
 from bench.experiment.views import Chart, Table, Views
@@ -34,6 +34,7 @@ FLOOR = 0.3
 """Error of a measured memory in MiB: the kernel counts resident pages late, so that peaks are 0.1 to 0.25 MiB too low."""
 SMALL = 1.0
 """Memory in MiB, about three floors, below which a memory is an upper limit without ratios and orders."""
+RANGE = "the range of the calls"
 ENDS = ("", "_low", "_high")
 """Endings of the columns of a value and of the ends of its interval."""
 SHOWN = ("memory_mb", "gradient_s", "process_mb", "gradient_error_rel")
@@ -68,17 +69,14 @@ class BackwardMemory(StudyPackage):
     name = "backward_memory"
     axes = PARTS
     columns = Columns.of(
-        interval("memory_mb", "largest resident memory during `samples` gradients beyond the memory before, median over calls",
-               "MiB", label="memory", measured=True),
-        Column("memory_mb_low", "smallest of the calls: lower end of the interval", "MiB", measured=True),
-        Column("memory_mb_high", "largest of the calls: upper end of the interval", "MiB", measured=True),
-        interval("gradient_s", "processor time of `samples` gradients on one thread, median over calls", "s", label="gradients", measured=True, format="seconds"),
-        Column("gradient_s_low", "smallest of the calls: lower end of the interval", "s", measured=True),
-        Column("gradient_s_high", "largest of the calls: upper end of the interval", "s", measured=True),
+        *bounded("memory_mb", "largest resident memory during `samples` gradients beyond the memory before, median over calls",
+                 "MiB", RANGE, label="memory", measured=True),
+        *bounded("gradient_s", "processor time of `samples` gradients on one thread, median over calls", "s", RANGE,
+                 label="gradients", measured=True, format="seconds"),
         Column("process_mb", "resident memory before the gradients: libraries, compiled program, theta and noise", "MiB",
                label="process", measured=True),
-        Column("gradient_error_rel", "distance of the mean gradient from that of the backend in `compared_with`, relative to "
-               "its norm", label="difference", comparison=ComparisonRule("exact", "difference of gradients")),
+        exact("gradient_error_rel", "distance of the mean gradient from that of the backend in `compared_with`, relative to its norm",
+              "difference of gradients", "difference"),
         text("compared_with", "backend of the gradient that gradient_error_rel compares with"),
         numbers("gradient", "mean gradient of the batch, by coordinate of theta",
                 comparison=ComparisonRule("vector", "gradient")),
