@@ -1,4 +1,4 @@
-"""What the study of searches shows: targets reached by method, regret along the paths, errors of gradients, and tuning."""
+"""What the study of searches shows: targets reached by method, and in how many rollouts."""
 
 from __future__ import annotations
 
@@ -44,14 +44,6 @@ NOTE = (
     "median final cost of {seeds}, next to the number of tunings and the median score over all of them. Methods without "
     "an estimator (dashed in charts) are context."
 )
-EFFECT = (
-    text("scene_class", label="class"), text("verdict"), interval("rho", log=False),
-    Column("points", format="setting"), Column("chance", label="chance of a random order"),
-)  # fmt: skip
-EFFECT_NOTES = (
-    "rho: rank correlation of the error of gradients at the start and the average runtime, ranked within each problem. sooner or "
-    "later: the whole 95% interval is on one side of 0, and a random order is at least as good with a probability of 5% at most.",
-)
 PAGE = (
     "stopped", "scene_class", "final_cost", "best_known", "score", "rollouts", "gradients", "search_s", "quality_rmse_rel",
     "quality_bias_share",
@@ -94,7 +86,6 @@ def tables(experiment: Experiment, rows: pd.DataFrame, runs: RunSet, name: Calla
     chosen = runs.tuning_seeds
     seeds = f"seeds {', '.join(map(str, chosen))}, which do not score" if chosen else "the same seeds that score"
     notes = [NOTE.format(seeds=seeds), *([f"{key}."] if key else [])]
-    effects = aggregate.effects_of_error(runs)
     return [
         Table(
             "optimise", methods,
@@ -113,8 +104,6 @@ def tables(experiment: Experiment, rows: pd.DataFrame, runs: RunSet, name: Calla
              Column("best_known", label="J*", digits=8), text("best_known_status", label="source of J*")],
             "Lowest costs", terminal=True,
         ),
-        *([Table("effect_of_error", effects, EFFECT, "Does a smaller error reach a tenth of the first regret sooner?", EFFECT_NOTES)]
-          if len(effects) else []),
         Table("targets", reached, [], files=["csv"]),
         Table("summary", summary, [], files=["csv"]),
     ]  # fmt: skip
