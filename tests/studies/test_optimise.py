@@ -6,7 +6,6 @@ import numpy as np
 import pandas as pd
 import pytest
 from bench.plugins.studies.optimise import aggregate
-from bench.plugins.studies.optimise import views as shown
 from bench.plugins.studies.optimise.measure import compare_with_reference, scene_class
 from classes import ExplicitEuler, Impulse, Lqr, Penalty, SemiImplicitEuler, StaticGain, TwoBalls
 from helpers import loaded, stored
@@ -363,9 +362,3 @@ def test_charts_have_the_tables_numbers(standard):
 def test_who_reaches_most_targets_needs_an_interval(reached, problems, tied):
     summary = pd.DataFrame({"reached": reached, "reached_se": 0.06, "problems": problems})
     assert aggregate.is_tied(summary).tolist() == tied
-
-
-def test_short_names_stay_unique():
-    name = shown.short_names(["cem[population=40]", "cem[population=20]", "windowed[terminal=learned], adam"])
-    assert name("cem[population=40]") == "cem[population=40]"
-    assert name("windowed[terminal=learned], adam") == "windowed, adam"
