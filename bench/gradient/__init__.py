@@ -3,16 +3,16 @@
 from .check import Check, Options, Part, check, extremes, settle
 from .direction import EPS, FINE, Finding, Sample, best, judge
 from .few import ROUNDS, FewSteps, is_nothing
+from .rules import BROKEN, FAULTS, RULES, TRUSTED, UNDECIDED, VERDICTS, most_severe
 from .sampling import order, sampled
-from .verdicts import BROKEN, FAULTS, MEANING, TRUSTED, UNDECIDED, VERDICTS, most_severe
 
 __all__ = [
     "BROKEN",
     "EPS",
     "FAULTS",
     "FINE",
-    "MEANING",
     "ROUNDS",
+    "RULES",
     "TRUSTED",
     "UNDECIDED",
     "VERDICTS",

@@ -13,8 +13,8 @@ import numpy as np
 from . import roughness
 from .causes import Ratio, causes_of_ratios
 from .direction import EPS, FINE, GUARD, Finding, Sample, judge
+from .rules import FAULTS, RULES, TRUSTED, most_severe
 from .sampling import Modes, order, repeats, sampled
-from .verdicts import FAULTS, MEANING, TRUSTED, most_severe
 
 Cost = Callable[[np.ndarray], np.ndarray]
 """Costs of columns: ``(d, B)`` to ``(B,)``."""
@@ -111,7 +111,7 @@ class Check:
     """The outcome of a check."""
 
     cause: str
-    """The worst verdict, one of :data:`.verdicts.VERDICTS`."""
+    """The worst verdict, one of :data:`.rules.VERDICTS`."""
     gradient: np.ndarray
     parts: tuple[Part, ...]
     """Components and random directions at theta."""
@@ -148,7 +148,7 @@ class Check:
 
     def sentence(self) -> str:
         """Return the verdict in one sentence, with the numbers of the worst part."""
-        text = f"{self.cause}: {MEANING[self.cause]}"
+        text = f"{self.cause}: {RULES[self.cause].meaning}"
         if self.trusted or not self.worst_parts:
             return text
         part = max(self.worst_parts, key=lambda p: (p.component is not None, np.nan_to_num(p.error, nan=np.inf)))

@@ -1,6 +1,7 @@
 """No hint softens a verdict about theta: every planted fault, with and without refined=, sigma=, noise= and expect=."""
 
 import dataclasses
+import sys
 
 import numpy as np
 import pytest
@@ -11,9 +12,11 @@ from bench.gradient.rules import RULES
 START = np.array([0.5, -1.0, 8.0])
 RANK = {"right": 0, "not shown": 1, "wrong": 2}
 DAMPING = 0.4
+DAMPERS = 0.0125, 0.03, 0.06, 0.125, 0.3, 0.6, 1.25
+"""Sizes from under a thousandth to a twelfth of the critical damping."""
 
 
-def ball(x, w=None, steps=40, damping=DAMPING, held=None):
+def ball(x, w=None, steps=40, held=None):
     """A ball falls on a soft floor: explicit steps of fixed length; theta is height, speed and root of the stiffness.
 
     ``held`` are damper forces that a detached damper takes from another run.
@@ -21,7 +24,7 @@ def ball(x, w=None, steps=40, damping=DAMPING, held=None):
     q, v, dt, forces = x[0], x[1] + (0.0 if w is None else 0.05 * w[0]), 0.8 / steps, []
     for i in range(steps):
         depth = -q if q.real < 0 else 0.0
-        force = 0.0 if q.real >= 0 else damping * v if held is None else held[i]
+        force = 0.0 if q.real >= 0 else DAMPING * v if held is None else held[i]
         forces.append(force)
         v = v + dt * (-9.81 + x[2] * x[2] * depth - force)
         q = q + dt * v
@@ -72,9 +75,14 @@ def examined(fault, **hints):
 
 
 @pytest.mark.parametrize(
-    "fault", [pytest.param(f, marks=[pytest.mark.slow] * (i % 4 > 0)) for i, f in enumerate(FAULTS)]
+    ("fault", "damping"),
+    [
+        *(pytest.param(f, DAMPING, marks=[pytest.mark.slow] * (i % 4 > 0)) for i, f in enumerate(FAULTS)),
+        *(pytest.param("a detached damper", size, marks=pytest.mark.slow) for size in DAMPERS),
+    ],
 )
-def test_no_hint_softens_a_verdict(fault):
+def test_no_hint_softens_a_verdict(fault, damping, monkeypatch):
+    monkeypatch.setattr(sys.modules[__name__], "DAMPING", damping)
     plain = examined(fault)
     assert (plain.status, plain.derivative) == (1, "wrong"), str(plain)
     assert {dataclasses.replace(plain, expect=cause).status for cause in RULES} == {1}
