@@ -146,8 +146,6 @@ class Findings:
     """``(d,)``."""
     cost: float
     precision: str
-    is_hidden_single: bool
-    """Whether the cost returns float64 numbers with single precision."""
     batch: str
     repeats: Repeats
     setup: Setup

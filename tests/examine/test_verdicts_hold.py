@@ -44,15 +44,11 @@ def slope(x, w=None, is_detached=False):
     return np.array([ball(row, w, held=held)[0].imag for row in np.asarray(x) + 1e-30j * np.eye(3)]) / 1e-30
 
 
-def towards_refined(x, w=None):
-    """A factor that makes the gradient more like that of the refined cost, of which it is no derivative either."""
-    return 0.9 * slope(x, w)
-
-
 FAULTS = {
     "a factor of .96": lambda x, w=None: 0.96 * slope(x, w),
     "a factor of 1.04": lambda x, w=None: 1.04 * slope(x, w),
-    "a factor of .9": towards_refined,
+    # more like the gradient of the refined cost, of which it is no derivative either
+    "a factor of .9": lambda x, w=None: 0.9 * slope(x, w),
     "a sign": lambda x, w=None: -slope(x, w),
     "one component": lambda x, w=None: slope(x, w) * [1.0, 1.03, 1.0],
     "a detached damper": lambda x, w=None: slope(x, w, is_detached=True),
@@ -70,8 +66,8 @@ HINTS = {
 }
 
 
-def examined(fault, **hints):
-    return bench.examine(cost, START, grad=FAULTS[fault], calls=1500, progress=False, **hints)
+def examined(grad, **hints):
+    return bench.examine(cost, START, grad=grad, calls=1500, progress=False, **hints)
 
 
 @pytest.mark.parametrize(
@@ -83,11 +79,11 @@ def examined(fault, **hints):
 )
 def test_no_hint_softens_a_verdict(fault, damping, monkeypatch):
     monkeypatch.setattr(sys.modules[__name__], "DAMPING", damping)
-    plain = examined(fault)
+    plain = examined(FAULTS[fault])
     assert (plain.status, plain.derivative) == (1, "wrong"), str(plain)
     assert {dataclasses.replace(plain, expect=cause).status for cause in RULES} == {1}
     for name, hints in HINTS.items():
-        report = examined(fault, **hints)
+        report = examined(FAULTS[fault], **hints)
         assert RANK[report.derivative] >= RANK[plain.derivative], f"{name}\n{report}"
         assert report.status == 1, f"{name}\n{report}"
         assert report.cause != "adaptive"
@@ -95,13 +91,9 @@ def test_no_hint_softens_a_verdict(fault, damping, monkeypatch):
 
 @pytest.mark.slow
 def test_the_right_gradient_of_the_same_program_passes_with_every_hint():
-    FAULTS["none"] = slope
-    try:
-        for name, hints in {"none": {}, **HINTS}.items():
-            report = examined("none", **hints)
-            assert report.derivative == "right", f"{name}\n{report}"
-    finally:
-        del FAULTS["none"]
+    for name, hints in {"none": {}, **HINTS}.items():
+        report = examined(slope, **hints)
+        assert report.derivative == "right", f"{name}\n{report}"
 
 
 def rounded(x, w=None):
