@@ -56,6 +56,7 @@ class Unit(NamedTuple):
 
 ROBOTS = {
     "half_cheetah": (f"mjcf[file={GYMNASIUM}/half_cheetah.xml,horizon=10,substeps=2]", "mjx[iterations=10]"),
+    "ant": (f"mjcf[file={GYMNASIUM}/ant.xml,horizon=10,substeps=2,dt=0.03]", "mjx[iterations=10]"),  # so that it lands
     "quadruped": ("mjcf[file=quadruped.xml,horizon=10,substeps=2]", "mjx[iterations=10]"),
     "humanoid": (f"mjcf[file={GYMNASIUM}/humanoid.xml,functions={{humanoid}},horizon=10,substeps=2]", "mjx[iterations=20]"),
 }  # fmt: skip
@@ -140,7 +141,7 @@ def work(unit, options, lock, began):
         with lock:
             kept = json.loads(REFERENCE.read_text())
             kept[unit.case] = projected(gradients).tolist()
-            REFERENCE.write_text(json.dumps(kept) + "\n")
+            REFERENCE.write_text(json.dumps(kept).replace("]], ", "]],\n") + "\n")
         return
     device = "cpu" if unit.backend == "fused" else jax.default_backend()
     whole = device != "cpu"
