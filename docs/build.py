@@ -62,13 +62,12 @@ ANSWERS_INTRODUCTION = """\
 
 
 def results_entry(entry: Entry, folder: Path) -> str:
-    """Return an experiment's name, question, data, chart and answer; paths are relative to ``folder``."""
+    """Return an experiment's name, chart, answer (its question if it has none) and data; paths are relative to ``folder``."""
     chart, data = (os.path.relpath(path, folder) if path else "" for path in (entry.chart, entry.folder))
     parts = [
         f"### {entry.name}",
-        f"*{escape_markdown(entry.question)}* [Data]({data})",
         f"![{entry.name}]({chart})" if chart else "",
-        escape_markdown(entry.answer),
+        f"{escape_markdown(entry.answer or entry.question)} [Data]({data})",
     ]
     return "\n\n".join(filter(None, parts))
 
