@@ -15,16 +15,14 @@ from bench.experiment.axes import Axis
 from bench.experiment.columns import Column, text
 from bench.experiment.views import Chart, Mark, Style
 from bench.model import SURROGATE, registry
-from bench.report.colours import estimator_order
-from bench.report.problems import ProblemRows, named_values, split_by_problem, titled
-from bench.report.style import colour, marker
+from bench.report.colours import method_styles
+from bench.report.problems import ProblemRows, split_by_problem
 from bench.report.text import counted, number
 from bench.report.views import (
     Arranged,
     Curve,
     attempted,
     estimator_curves,
-    estimator_label,
     estimator_labels,
     is_bias_resolved,
     pareto,
@@ -43,8 +41,6 @@ PANELS = 4
 """Most problems of a chart along an axis."""
 FEW = 3
 """Most points of an estimator that no line of error against cost joins."""
-POOLED = ("horizon", "stiffness", "sigma", "smoothing")
-"""Columns that change the cost of an estimate: each value has a panel of its own."""
 DISTINCT = 1.2
 """Median factor between the errors of two estimators from which a reader distinguishes their lines."""
 RMSE = Column(
@@ -69,7 +65,7 @@ def charts(
 ) -> list[Chart]:
     """Return all charts, the main one first."""
     labelled = replace(shown, rows=with_plotted_columns(shown.rows))
-    styles = estimator_styles(shown.rows)
+    styles = method_styles(labelled.rows["series"].unique())
     subtitle = _conditions(shown)
     swept = shown.swept()
     order = sorted(swept, key=lambda a: (-swept[a], a.column != "stiffness"))
@@ -109,25 +105,9 @@ def with_plotted_columns(rows: pd.DataFrame) -> pd.DataFrame:
         **{name: column.where(good) for name, column in values.items()},
         bias_limit=limit,
         series=estimator_labels(rows),
-        problem_=titled(rows.assign(**named_values(rows, POOLED)), ["scene", "contact", *POOLED]),
         line=rows["backend"] + " " + rows["dtype"],
         failed=~good,
     )
-
-
-def estimator_styles(rows: pd.DataFrame) -> dict[str, Style]:
-    """Return the look of every estimator in the rows: its own colour in all charts; its variants have free colours."""
-    places = {name: i for i, name in enumerate(estimator_order())}
-    pairs = list(dict.fromkeys(zip(rows["estimator"], rows["estimator_params"], strict=True)))
-    names = list(dict.fromkeys(name for name, _ in pairs))
-    used = {places.get(name, len(places) + i) for i, name in enumerate(names)}
-    free = (i for i in range(1000) if i not in used)
-    styles: dict[str, Style] = {}
-    for name, params in sorted(pairs, key=lambda pair: pair[1] != ""):
-        first = not any(label.partition("[")[0] == name for label in styles)
-        place = places.get(name, len(places) + names.index(name)) if first else next(free)
-        styles[estimator_label(name, params)] = Style(colour(place), marker(place))
-    return {estimator_label(*pair): styles[estimator_label(*pair)] for pair in pairs}
 
 
 def _conditions(shown: Arranged) -> str:
@@ -258,14 +238,14 @@ def _on_fastest(rows: pd.DataFrame, cost: Cost) -> pd.DataFrame:
 
 def _error_and_cost(shown: Arranged, styles: Mapping[str, Style], subtitle: str) -> Chart:
     """Return error against time where samples were not swept: a dot per estimator, by problem."""
-    rows = TIME.known(shown.rows)
-    rows = rows.loc[rows.groupby(["problem_", "series"], sort=False)["time_s"].idxmin()]
-    problems = list(dict.fromkeys(rows["problem_"]))
-    chosen = problems[:: math.ceil(len(problems) / 3)] if problems else []
+    problems = split_by_problem(shown, None, ("scene", "contact"))
+    chosen = problems[:: math.ceil(len(problems) / 3)]
+    rows = pd.concat([TIME.known(one.rows).assign(panel=one.title()) for one in chosen], ignore_index=True)
+    rows = rows.loc[rows.groupby(["panel", "series"], sort=False)["time_s"].idxmin()]
     shares = [f"{len(chosen)} of {counted(len(problems), 'problem')}"] if len(chosen) < len(problems) else []
     return Chart(
-        "speed_accuracy", rows[rows["problem_"].isin(chosen)], [SECONDS], [RMSE], "points", series="series", panel="problem_",
-        styles=styles, across=3, height=1.9, subtitle=", ".join(filter(None, [subtitle, *shares, FASTEST])), front=True,
+        "speed_accuracy", rows, [SECONDS], [RMSE], "points", series="series", panel="panel", styles=styles, across=3, height=1.9,
+        subtitle=", ".join(filter(None, [subtitle, *shares, FASTEST])), front=True,
     )  # fmt: skip
 
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -16,12 +14,11 @@ from bench.experiment.axes import Axis, table
 from bench.experiment.columns import Column, interval, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.parameters import flatten, swept_columns
-from bench.experiment.views import Chart, Style, Table, Views
+from bench.experiment.views import Chart, Table, Views
 from bench.measure import performance
 from bench.model.parameters import remember
-from bench.report.colours import estimator_colour, estimator_marker
+from bench.report.colours import method_styles
 from bench.report.problems import problem_names, titled
-from bench.report.style import VARIANTS
 from bench.report.text import axis_value
 from bench.report.views import arrange, attempted, estimator_labels
 
@@ -334,23 +331,10 @@ def tables(experiment: Experiment, rows: pd.DataFrame, runs: RunSet) -> list[Tab
 # --------------------------------------------------------------------------------------------------------- charts
 
 
-def styles(methods: Sequence[str]) -> dict[str, Style]:
-    """Return the style of each method with an estimator: the estimator's colour."""
-    looks: dict[str, Style] = {}
-    uses: Counter[str] = Counter()
-    for method in methods:
-        if ", " in method:  # "estimator, optimizer"
-            estimator = re.split(r"[\[,]", method)[0]
-            turn = uses[estimator]
-            uses[estimator] += 1
-            dashes = VARIANTS[turn % len(VARIANTS)]
-            looks[method] = Style(estimator_colour(estimator), estimator_marker(estimator, turn), dashes)
-    return looks
-
-
 def charts(runs: RunSet) -> list[Chart]:
     """Return the charts, the shares of targets reached first."""
-    looks = styles(runs.rows["method"].unique())
+    # a method without an estimator has no comma, and a free colour
+    looks = method_styles(method for method in runs.rows["method"].unique() if ", " in method)
     return [replace(chart, series="method", styles=looks) for chart in (_targets(runs), *_progress(runs))]
 
 
