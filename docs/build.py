@@ -6,7 +6,7 @@ lines that differ, and exits with 1 if there are any.
 - ``results``: ``docs/answers.md``, from the answers in ``results/standard``, in the order of ``docs/results.md``.
 - ``columns``: ``docs/columns.md``, from the columns that each study declares.
 - ``figures``: the marked figures of all documents, from the rows in ``results/standard``: see :mod:`docs.figures`.
-- ``verdicts``: the lists of verdicts and causes of the checks of gradients, from their rules.
+- ``verdicts``: the table of rules of the checks of gradients.
 - ``site``: the whole site as HTML, in ``build/site/html``. Only on request, since it needs Sphinx.
 """
 
@@ -16,14 +16,15 @@ import difflib
 import os
 import re
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import cast
 
 from bench.errors import UserError
 from bench.experiment.columns import COMMON, Column
 from bench.experiment.study import Study
-from bench.gradient import rules, verdicts
+from bench.gradient import rules
 from bench.model import registry
 from bench.report.tables import escape_markdown
 from bench.run.files import write_whole
@@ -157,19 +158,37 @@ def table_row(column: Column) -> str:
 # ------------------------------------------------------------------------------------------------------ verdicts
 
 RULE_MARKS = "<!-- verdicts -->\n", "<!-- end of verdicts -->"
+RULE_MODULES = {
+    "gradient": "causes check diagnosis direction few roughness sampling stages", "examine": "findings smoothing", "measure": "jumps",
+}  # fmt: skip
+"""The modules whose constants conditions of rules name."""
 
 
-def rule_pages() -> dict[Path, str]:
-    """Return the documents with lists of verdicts and causes, written again."""
-    own = {cause: rule for cause, rule in rules.RULES.items() if verdicts.RULES.get(cause) != rule}
-    return {DOCS / f"{name}.md": with_rules(DOCS / f"{name}.md", table)
-            for name, table in (("gradcheck", verdicts.RULES), ("examine", own))}  # fmt: skip
+RULE_HEADS = {
+    rules.DERIVATIVE: "One derivative, worst first",
+    rules.EXAMINATION: "All that `examine` finds at theta",
+    rules.NOISE: "Around theta and under noise, in `examine`",
+}
 
 
-def with_rules(page: Path, table: Mapping[str, verdicts.Rule]) -> str:
-    """Return a document with a list of rules between :data:`RULE_MARKS`."""
-    before, _, rest = page.read_text().partition(RULE_MARKS[0])
-    lines = [f"- `{name}` ({rule.kind}): {rule.meaning}" for name, rule in table.items()]
+def rule_page() -> str:
+    """Return the page of `gradcheck` with the table of rules between :data:`RULE_MARKS`, with the constants of the code."""
+    before, _, rest = (DOCS / "gradcheck.md").read_text().partition(RULE_MARKS[0])
+    modules = {
+        name: import_module(f"bench.{package}.{name}")
+        for package, names in RULE_MODULES.items()
+        for name in names.split()
+    }
+    statuses = ", ".join(f"`{kind}` {status}" for kind, status in rules.STATUS.items())
+    lines = [f"Exit status of `examine` by kind: {statuses}."]
+    for about, head in RULE_HEADS.items():
+        lines += [f"\n{head}:\n"]
+        for name, rule in rules.RULES.items():
+            if rule.about == about:
+                settings = ", ".join(f"`{one.partition('=')[0]}=`".replace("{more}", "budget") for one in rule.settings)
+                steps = [rule.advice.format(names="it"), settings]
+                text = f"- `{name}` ({rule.kind}): {rule.meaning}. *When:* {rule.condition.format(**modules)}."
+                lines.append(text + f" *Next:* {'; '.join(filter(None, steps))}." * any(steps))
     return before + RULE_MARKS[0] + "\n".join(lines) + "\n" + RULE_MARKS[1] + rest.partition(RULE_MARKS[1])[2]
 
 
@@ -185,7 +204,7 @@ def main(words: Sequence[str]) -> int:
     tasks: dict[str, Callable[[], dict[Path, str]]] = {
         "results": lambda: {DOCS / "answers.md": answers_page(DOCS / "results.md")},
         "columns": lambda: {DOCS / "columns.md": columns_page()},
-        "verdicts": rule_pages,
+        "verdicts": lambda: {DOCS / "gradcheck.md": rule_page()},
         "figures": lambda: {
             page: figures.with_figures(page.read_text()) for page in map(ROOT.joinpath, website.PAGES.values())
         },

@@ -13,8 +13,8 @@ import numpy as np
 from . import roughness
 from .causes import Ratio, causes_of_ratios
 from .direction import EPS, FINE, GUARD, Finding, Sample, judge
+from .rules import FAULTS, RULES, TRUSTED, most_severe
 from .sampling import Modes, order, repeats, sampled
-from .verdicts import FAULTS, MEANING, TRUSTED, most_severe
 
 Cost = Callable[[np.ndarray], np.ndarray]
 """Costs of columns: ``(d, B)`` to ``(B,)``."""
@@ -111,7 +111,7 @@ class Check:
     """The outcome of a check."""
 
     cause: str
-    """The worst verdict, one of :data:`.verdicts.VERDICTS`."""
+    """The worst verdict, one of :data:`.rules.VERDICTS`."""
     gradient: np.ndarray
     parts: tuple[Part, ...]
     """Components and random directions at theta."""
@@ -148,7 +148,7 @@ class Check:
 
     def sentence(self) -> str:
         """Return the verdict in one sentence, with the numbers of the worst part."""
-        text = f"{self.cause}: {MEANING[self.cause]}"
+        text = f"{self.cause}: {RULES[self.cause].meaning}"
         if self.trusted or not self.worst_parts:
             return text
         part = max(self.worst_parts, key=lambda p: (p.component is not None, np.nan_to_num(p.error, nan=np.inf)))
@@ -225,24 +225,23 @@ class _Line:
     component: int | None = None
 
 
+@dataclass
 class _Checker:
-    """One check: the callables, and the counts of costs and gradients computed."""
+    """One check: what is given, the random numbers, and what was measured of a loose solver."""
 
-    def __init__(
-        self,
-        cost: Cost,
-        gradient: Gradient | None,
-        theta: np.ndarray,
-        options: Options,
-        modes: Modes | None,
-        tangent: Tangent | None = None,
-    ) -> None:
-        if theta.ndim != 1 or not theta.size:
-            raise ValueError(f"theta is a vector of at least one number, not of shape {theta.shape}")
-        self._cost, self._gradient, self._modes, self._tangent = cost, gradient, modes, tangent
-        self.theta, self.options, self.unit = theta, options, options.unit
-        self.scale = self._scales() if options.scale is None else np.asarray(options.scale, dtype=np.float64)
-        self.random = np.random.default_rng([options.seed, 0x67726164])
+    _cost: Cost
+    _gradient: Gradient | None
+    theta: np.ndarray
+    options: Options
+    _modes: Modes | None
+    _tangent: Tangent | None
+
+    def __post_init__(self) -> None:
+        if self.theta.ndim != 1 or not self.theta.size:
+            raise ValueError(f"theta is a vector of at least one number, not of shape {self.theta.shape}")
+        scale, self.unit = self.options.scale, self.options.unit
+        self.scale = self._scales() if scale is None else np.asarray(scale, dtype=np.float64)
+        self.random = np.random.default_rng([self.options.seed, 0x67726164])
         self._rates: list[float] = []
 
     def _scales(self) -> np.ndarray:
@@ -391,7 +390,7 @@ class _Checker:
             if finding.verdict not in clear
             or (finding.verdict == "nonlinear" and sample.derivative == 0.0 and sample.differences.any())
         ][: self.options.scanned]
-        along = roughness.staircase_offsets(1.0, self.unit)
+        along = roughness.staircase_offsets(self.unit)
         for m in to_scan:
             at = lines[m].theta[:, None] + lines[m].vector[:, None] * along.reshape(1, -1)
             values = self.cost(at).reshape(along.shape)

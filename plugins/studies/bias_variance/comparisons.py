@@ -1,4 +1,4 @@
-"""Compares estimators at each setting, with intervals: the one table behind charts and page.
+"""Compares estimators at each setting, with intervals: the one table behind ranking, charts and page.
 
 A setting is a problem at one value of its swept axis. A method is an estimator, on the backends that agree.
 """
@@ -174,3 +174,12 @@ def leaders(comparisons: pd.DataFrame, methods: pd.DataFrame) -> dict[str, list[
         near = [estimator for estimator, error in lines if not error > NEAR * row["value"]]
         result[row["setting"]] = list(dict.fromkeys(near))
     return result
+
+
+def verdicts_by_estimator(methods: pd.DataFrame) -> pd.DataFrame:
+    """Return the number of settings per estimator and verdict; an estimator with several methods has the worst of them."""
+    order = [WORKS, OPEN, FAILS, NO_RESULT]
+    ranks = methods.assign(rank=methods["verdict"].map(order.index))
+    worst = ranks.groupby(["estimator", "setting"], sort=False)["rank"].max()
+    counts = worst.groupby(level="estimator", sort=False).value_counts().unstack(fill_value=0)
+    return counts.rename(columns=dict(enumerate(order))).reindex(columns=order, fill_value=0)

@@ -13,7 +13,7 @@ import pandas as pd
 from bench.errors import unknown
 from bench.experiment import axes
 from bench.experiment.axes import Axis
-from bench.experiment.columns import IDENTITY, interval, text
+from bench.experiment.columns import IDENTITY, Column, interval, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.parameters import number_problems
 from bench.experiment.views import Table, Views
@@ -35,6 +35,7 @@ from .comparisons import (
     method_names,
     method_table,
     problems_by_axis,
+    verdicts_by_estimator,
 )
 from .time_to_accuracy import limits, with_gradient_cost
 
@@ -91,6 +92,10 @@ FAILURES = {
 """Sign and meaning of each status other than ``ok``."""
 REMARKED = "?"
 """Mark of a cell whose row has a remark."""
+LEAST = 3
+"""Fewest estimators for which the ranking is written; the main table is enough for fewer."""
+MANY = 2.5
+"""The number of evaluations per sample is shown above this value."""
 ESTIMATOR = text("method", label="estimator")
 
 
@@ -102,6 +107,8 @@ def tables(
     result[0] = replace(result[0], data=axes.table(experiment, rows))
     columns = [COLUMNS.by_name[name] for name in ("scene", "contact", "backend", "estimator", "rmse_rel", "time_s")]
     result.append(Table("speed_accuracy", speed_accuracy(rows), columns, files=["csv"]))
+    if methods["estimator"].nunique() >= LEAST and methods["problem"].nunique() > 1:
+        result.append(ranking(methods))
     errors = comparisons[comparisons["basis"].isin((EQUAL_SAMPLES, EQUAL_ROLLOUTS))]
     result.append(recommendations(methods, errors))
     result.append(Table("verdicts", methods.drop(columns="setting"), [], files=["csv"]))
@@ -212,7 +219,41 @@ def speed_accuracy(rows: pd.DataFrame) -> pd.DataFrame:
     return table
 
 
-# ------------------------------------------------------------------------------------------- recommendations
+# --------------------------------------------------------------------------------------------------- ranking
+
+
+def ranking(methods: pd.DataFrame) -> Table:
+    """Return the ranking: a line per estimator with the number of settings by verdict, and its errors by problem.
+
+    Where a problem was swept, its error is the largest along the axis: the worst case.
+    """
+    counts = verdicts_by_estimator(methods)
+    worst = methods.assign(known=methods["error"].fillna(math.inf)).sort_values("known", kind="stable")
+    worst = worst.drop_duplicates(["estimator", "problem"], keep="last")
+    shares = worst["verdict"] + np.where(worst["bias_share"] > 0.5, ", biased", "")
+    work = worst["evaluations"].map(" ({:.0f}x)".format).where(worst["evaluations"] > MANY, "")
+    worst = worst.assign(note=shares.mask(worst["status"] != "ok", worst["status"]) + work)
+    problems, parts = list(dict.fromkeys(methods["problem"])), []
+    for i, problem in enumerate(problems):
+        own = worst[worst["problem"] == problem].set_index("estimator").reindex(counts.index)
+        named = {"error": f"p{i}", "error_low": f"p{i}_low", "error_high": f"p{i}_high", "note": f"p{i}_note"}
+        parts.append(own[[*named]].rename(columns=named).fillna({f"p{i}_note": ""}))
+    frame = pd.concat([counts, *parts], axis=1).rename_axis("method").reset_index()
+    errors = frame[[f"p{i}" for i in range(len(problems))]]
+    frame["worst"] = errors.max(axis=1).where(np.isfinite(errors).all(axis=1))
+    frame = frame.sort_values("worst", kind="stable", na_position="last")
+    columns = [
+        ESTIMATOR,
+        *(Column(str(name), format="setting") for name in counts),
+        *(interval(f"p{i}", label=problem, note=f"p{i}_note") for i, problem in enumerate(problems)),
+    ]
+    notes = (
+        f"Sorted by the worst case. Relative RMSE [95% interval] at equal {_basis(methods)}; where a problem was swept, the largest along "
+        "the axis. works: the whole interval is below 1; fails: it is above 1; open: it contains 1 or is not known. biased: more "
+        "than half of the squared error is bias. (40x): it evaluates 40 costs and gradients per sample, where others take "
+        "one or two.",
+    )
+    return Table("ranking", frame, columns, "estimators by their worst case", notes)
 
 
 def _basis(methods: pd.DataFrame) -> str:

@@ -12,7 +12,7 @@ from bench.experiment.axes import with_axes
 from bench.experiment.columns import COMMON, IDENTITY, Column, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Style, Table, Views
-from bench.gradient import FAULTS, MEANING, TRUSTED, UNDECIDED, VERDICTS
+from bench.gradient import FAULTS, RULES, TRUSTED, UNDECIDED, VERDICTS
 from bench.report.problems import axes_of, label_columns, problem_names, problem_numbers
 from bench.report.shown import PROBLEM
 from bench.report.style import PALETTE
@@ -176,7 +176,7 @@ def _lines(shown: Arranged, points: pd.DataFrame) -> tuple[pd.DataFrame, list[Co
 def _verdicts(points: pd.DataFrame) -> tuple[pd.DataFrame, list[Column]]:
     """Return a line per verdict: its meaning, the number of points, the largest error and the scenes; and the columns."""
     lines = [
-        {"verdict": verdict, "meaning": MEANING[verdict], "trusted": _trusted(verdict, part),
+        {"verdict": verdict, "meaning": RULES[verdict].meaning, "trusted": _trusted(verdict, part),
          "points": len(part), "error": part["error"].max(), "scenes": ", ".join(dict.fromkeys(part["scene"]))}
         for verdict in VERDICTS if len(part := points[points["verdict"] == verdict])
     ]  # fmt: skip
