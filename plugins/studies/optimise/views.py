@@ -67,12 +67,11 @@ class RunSet:
     """The searches of an experiment, by problem, method and tuning.
 
     ``rows`` has the columns ``problem``, ``method``, ``tuning`` (the optimizer's swept parameters as a string),
-    ``best_known`` (J*, or the lowest cost of any search if lower), ``best_known_status`` (its source) and ``score``.
+    ``best_known`` (J*, or the lowest cost of any search if lower), ``best_known_status`` (its source), ``score`` and ``ratio``,
+    the rollouts that take as long as one gradient: the median over searches, or what one counts as in the budget.
     """
 
     rows: pd.DataFrame
-    gradient_cost: float = 4.0
-    """The rollouts that a gradient counts as where no times were measured."""
 
     @cached_property
     def tuning_seeds(self) -> tuple[int, ...]:
@@ -92,7 +91,7 @@ class RunSet:
         final = rows["final_cost"].where(rows["status"] == "ok", math.inf).fillna(math.inf)
         # the lower of the two middle costs, because their mean is infinite if one search failed
         groups = final.groupby([rows[n] for n in ("problem", "method", "tuning")], sort=False)
-        middle = groups.agg(lambda costs: np.sort(costs)[(len(costs) - 1) // 2])
+        middle = groups.quantile(interpolation="lower")
         best = middle.reset_index().sort_values("final_cost", kind="stable").drop_duplicates(["problem", "method"])
         return dict(zip(zip(best["problem"], best["method"], strict=True), best["tuning"], strict=True))
 
@@ -102,11 +101,6 @@ class RunSet:
         rows = self.rows[~self.rows["seed"].isin(self.tuning_seeds)]
         best = [(*key, tuning) for key, tuning in self.best_tunings.items()]
         return rows[pd.MultiIndex.from_frame(rows[["problem", "method", "tuning"]]).isin(best)]
-
-    def gradient_ratio(self, problem: str) -> float:
-        """Return the rollouts that take as long as one gradient: the median over searches, or what one counts as."""
-        ratios = self.rows.loc[self.rows["problem"] == problem, "gradient_ratio"]
-        return self.gradient_cost if ratios.isna().all() else float(ratios.median())
 
 
 def collect_runs(experiment: Experiment, rows: pd.DataFrame) -> RunSet:
@@ -122,8 +116,8 @@ def collect_runs(experiment: Experiment, rows: pd.DataFrame) -> RunSet:
     start, final = runs["start_cost"], runs["final_cost"]
     achievable = (start - best_known).where(start > best_known)
     score = ((start - final) / achievable).clip(0.0, 1.0).mask(runs["status"] != "ok", 0.0)
-    searches = runs.assign(best_known=best_known, best_known_status=status, score=score)
-    return RunSet(searches, experiment.study.gradient_cost)  # type: ignore[attr-defined]
+    ratio = runs.groupby("problem")["gradient_ratio"].transform("median").fillna(experiment.study.gradient_cost)  # type: ignore[attr-defined]
+    return RunSet(runs.assign(best_known=best_known, best_known_status=status, score=score, ratio=ratio))
 
 
 def _is_tuned(axis: Axis, rows: pd.DataFrame) -> bool:
@@ -167,8 +161,9 @@ def hits(runs: RunSet) -> pd.DataFrame:
     """
     lines = []
     for row in runs.best_runs.to_dict("records"):
-        ratio = runs.gradient_ratio(row["problem"])
-        spent = np.asarray(row["path_rollouts"], dtype=float) + ratio * np.asarray(row["path_gradients"], dtype=float)
+        spent = np.asarray(row["path_rollouts"], dtype=float) + row["ratio"] * np.asarray(
+            row["path_gradients"], dtype=float
+        )
         rounding = ROUNDING * max(abs(row["start_cost"] - row["best_known"]), 1e-300)
         regret = np.maximum(np.asarray(row["path_cost"], dtype=float) - row["best_known"], rounding)
         for target in TARGETS:
