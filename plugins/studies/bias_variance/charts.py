@@ -76,9 +76,9 @@ def charts(
         if axis.column != "samples" or best.empty
     ]
     if not best.empty:
-        along = [_speed_accuracy(labelled, best, styles, subtitle), *along]
+        along = [_error_and_cost(labelled, best, styles, subtitle), *along]
     elif shown.rows["backend"].nunique() > 1:
-        along += [_error_and_cost(labelled, styles, subtitle)]
+        along += [_error_and_cost(labelled, best, styles, subtitle)]
     if not swept and methods["problem"].nunique() > 1:
         along = [_estimators(methods), *along]
     return [chart for chart in along if chart is not None]
@@ -202,29 +202,30 @@ def choose_problems(problems: Sequence[ProblemRows], room: int) -> tuple[list[Pr
 # ----------------------------------------------------------------------------------------------- error and cost
 
 
-def _speed_accuracy(shown: Arranged, best: pd.DataFrame, styles: Mapping[str, Style], subtitle: str) -> Chart | None:
-    """Return error against cost where samples were swept: of each estimator the best backends' front, per problem."""
-    timed = bool((best["by"] == "time").any())
+def _error_and_cost(shown: Arranged, best: pd.DataFrame, styles: Mapping[str, Style], subtitle: str) -> Chart | None:
+    """Return error against cost: where samples were swept the front of each estimator, per problem, else a point each."""
+    is_swept, parts = not best.empty, []
+    timed = not is_swept or bool((best["by"] == "time").any())
     cost, x = (TIME, SECONDS) if timed else (ROLLOUTS, ROLLOUTS_SPENT)
-    parts = []
-    for problem in split_by_problem(shown, SAMPLES, ("scene",)):
+    axis, always = (SAMPLES, ("scene",)) if is_swept else (None, ("scene", "contact"))
+    problems = split_by_problem(shown, axis, always)
+    chosen = problems if is_swept else problems[:: math.ceil(len(problems) / 3)]
+    for problem in chosen:
         rows = cost.known(problem.rows)
-        if rows["x"].nunique() < 2:
-            continue
-        for _, every in rows.groupby("series", sort=False):
+        for _, every in rows.groupby("series", sort=False) if not is_swept or rows["x"].nunique() > 1 else ():
             part = _on_fastest(every, cost)
-            front = part[pareto(cost.of(part), part["rmse_rel"])]
-            parts.append(front.assign(panel=problem.title()))
+            parts.append(part[pareto(cost.of(part), part["rmse_rel"])].assign(panel=problem.title()))
     if not parts:
         return None
-    marks = [Mark(f"{target:.0%}", target, axis="y") for target in TARGETS]
     frame = pd.concat(parts, ignore_index=True)
     is_line = frame.groupby(["panel", "series"]).size().max() > FEW
+    shares = [f"{len(chosen)} of {counted(len(problems), 'problem')}"] if len(chosen) < len(problems) else []
+    marks = [Mark(f"{target:.0%}", target, axis="y") for target in TARGETS if is_swept]
     return Chart(
-        "speed_accuracy" if timed else "rollouts_accuracy", frame, [x], [RMSE], "lines" if is_line else "points",
-        series="series", panel="panel", styles=styles, marks=marks, across=3, height=2.0,
-        subtitle=", ".join(filter(None, [subtitle, FASTEST])),
-        text="Only estimates that no other of the same estimator beats in both error and cost are drawn.",
+        "speed_accuracy" if timed else "rollouts_accuracy", frame, [x], [RMSE], "lines" if is_line else "points", series="series",
+        panel="panel", styles=styles, marks=marks, across=3, height=2.0 if is_swept else 1.9, front=not is_swept,
+        subtitle=", ".join(filter(None, [subtitle, *shares, FASTEST])),
+        text="Only estimates that no other of the same estimator beats in both error and cost are drawn." if is_swept else "",
     )  # fmt: skip
 
 
@@ -234,19 +235,6 @@ def _on_fastest(rows: pd.DataFrame, cost: Cost) -> pd.DataFrame:
     shared = rows[rows.groupby("x")["line"].transform("nunique") == lines.nunique()]
     rows_of = shared if len(shared) else rows
     return rows[lines == cost.of(rows_of).groupby(rows_of["line"]).median().idxmin()]
-
-
-def _error_and_cost(shown: Arranged, styles: Mapping[str, Style], subtitle: str) -> Chart:
-    """Return error against time where samples were not swept: a dot per estimator, by problem."""
-    problems = split_by_problem(shown, None, ("scene", "contact"))
-    chosen = problems[:: math.ceil(len(problems) / 3)]
-    rows = pd.concat([TIME.known(one.rows).assign(panel=one.title()) for one in chosen], ignore_index=True)
-    rows = rows.loc[rows.groupby(["panel", "series"], sort=False)["time_s"].idxmin()]
-    shares = [f"{len(chosen)} of {counted(len(problems), 'problem')}"] if len(chosen) < len(problems) else []
-    return Chart(
-        "speed_accuracy", rows, [SECONDS], [RMSE], "points", series="series", panel="panel", styles=styles, across=3, height=1.9,
-        subtitle=", ".join(filter(None, [subtitle, *shares, FASTEST])), front=True,
-    )  # fmt: skip
 
 
 # --------------------------------------------------------------------------------------------------- estimators
