@@ -46,14 +46,12 @@ DETAILS = (
 )  # fmt: skip
 """Further columns of the page."""
 LEVELS = {
-    "right": Style(PALETTE[3], letter="+", meaning="derivative of its program, and near the model's gradient"),
-    "own": Style(PALETTE[0], letter="o", meaning="derivative of its program, which is not near the model"),
-    "noisy": Style(PALETTE[5], letter="~", meaning="derivative of its program, but averages are no better than 0"),
-    "open": Style(
-        PALETTE[4], letter="?", meaning="derivative of its program; whether averages are better than 0 is open"
-    ),
-    "wrong": Style(PALETTE[2], letter="x", meaning="not the derivative of its program, or not finite"),
-    "none": Style("0.85", letter="-", meaning="no gradient, or the engine cannot run the scene"),
+    "right": Style(PALETTE[3], meaning="derivative of its program, and near the model's gradient"),
+    "own": Style(PALETTE[0], meaning="derivative of its program, which is not near the model"),
+    "noisy": Style(PALETTE[5], meaning="derivative of its program, but averages are no better than 0"),
+    "open": Style(PALETTE[4], meaning="derivative of its program; whether averages are better than 0 is open"),
+    "wrong": Style(PALETTE[2], meaning="not the derivative of its program, or not finite"),
+    "none": Style("0.85", meaning="no gradient, or the engine cannot run the scene"),
 }
 NOTES = (
     "Program error: distance of the gradient from differences of the engine's own cost. Model error: distance from rigid "
@@ -238,7 +236,7 @@ def with_limits(rows: pd.DataFrame) -> pd.DataFrame:
 def _chart(measured: pd.DataFrame) -> Chart:
     """Return the grid of engines and scenes, coloured by level, with the model error of each gradient."""
     rigid = (measured["contact"] == "impulse") & (measured["contact"].nunique() > 1)
-    letters = measured["level"].map({name: style.letter for name, style in LEVELS.items()})
+    letters = measured["level"].map(dict(zip(LEVELS, "+o~?x-", strict=True)))
     errors = (" " + measured["model_error_rel"].map(number)).mask(measured["level"] == "none", "")
     frame = measured.assign(place=measured["scene"] + rigid.map({True: ", rigid", False: ""}), cell=letters + errors)
     return Chart(

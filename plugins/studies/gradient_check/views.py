@@ -26,11 +26,11 @@ PER_CHECK = ["point", "sample", "direction", "derivative_program"]
 PER_STEP = ["derivative_differences", "relative_error", "mode_minus", "mode_plus"]
 PER_COMPONENT = [name for name in GradientCheck.columns.by_name if name.startswith("component")]
 KINDS: dict[str, tuple[tuple[str, ...], Style]] = {
-    "X": (FAULTS, Style(PALETTE[2], letter="X", meaning="X: not the derivative of its cost")),
-    "?": (UNDECIDED, Style("#bdbdbd", letter="?", meaning="?: undecided")),
-    "J": (("jump", "missed_slope"), Style(PALETTE[4], letter="J", meaning="J: the cost jumps or rises steeply here")),
-    "K": (("kink",), Style(PALETTE[5], letter="K", meaning="K: kink, at most a one-sided slope")),
-    "ok": (TRUSTED, Style("#cfe8df", letter="ok", meaning="ok: right")),
+    "X": (FAULTS, Style(PALETTE[2], meaning="X: not the derivative of its cost")),
+    "?": (UNDECIDED, Style("#bdbdbd", meaning="?: undecided")),
+    "J": (("jump", "missed_slope"), Style(PALETTE[4], meaning="J: the cost jumps or rises steeply here")),
+    "K": (("kink",), Style(PALETTE[5], meaning="K: kink, at most a one-sided slope")),
+    "ok": (TRUSTED, Style("#cfe8df", meaning="ok: right")),
 }
 """Verdicts and look of each letter in a cell, the worst first."""
 ERROR = Column("error", label="best error")

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -16,12 +14,11 @@ from bench.experiment.axes import Axis, table
 from bench.experiment.columns import Column, interval, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.parameters import flatten, swept_columns
-from bench.experiment.views import Chart, Style, Table, Views
+from bench.experiment.views import Chart, Table, Views
 from bench.measure import performance
 from bench.model.parameters import remember
-from bench.report.colours import estimator_colour, estimator_marker
+from bench.report.colours import method_styles
 from bench.report.problems import problem_names, titled
-from bench.report.style import VARIANTS
 from bench.report.text import axis_value
 from bench.report.views import arrange, attempted, estimator_labels
 
@@ -70,12 +67,11 @@ class RunSet:
     """The searches of an experiment, by problem, method and tuning.
 
     ``rows`` has the columns ``problem``, ``method``, ``tuning`` (the optimizer's swept parameters as a string),
-    ``best_known`` (J*, or the lowest cost of any search if lower), ``best_known_status`` (its source) and ``score``.
+    ``best_known`` (J*, or the lowest cost of any search if lower), ``best_known_status`` (its source), ``score`` and ``ratio``,
+    the rollouts that take as long as one gradient: the median over searches, or what one counts as in the budget.
     """
 
     rows: pd.DataFrame
-    gradient_cost: float = 4.0
-    """The rollouts that a gradient counts as where no times were measured."""
 
     @cached_property
     def tuning_seeds(self) -> tuple[int, ...]:
@@ -95,7 +91,7 @@ class RunSet:
         final = rows["final_cost"].where(rows["status"] == "ok", math.inf).fillna(math.inf)
         # the lower of the two middle costs, because their mean is infinite if one search failed
         groups = final.groupby([rows[n] for n in ("problem", "method", "tuning")], sort=False)
-        middle = groups.agg(lambda costs: np.sort(costs)[(len(costs) - 1) // 2])
+        middle = groups.quantile(interpolation="lower")
         best = middle.reset_index().sort_values("final_cost", kind="stable").drop_duplicates(["problem", "method"])
         return dict(zip(zip(best["problem"], best["method"], strict=True), best["tuning"], strict=True))
 
@@ -105,11 +101,6 @@ class RunSet:
         rows = self.rows[~self.rows["seed"].isin(self.tuning_seeds)]
         best = [(*key, tuning) for key, tuning in self.best_tunings.items()]
         return rows[pd.MultiIndex.from_frame(rows[["problem", "method", "tuning"]]).isin(best)]
-
-    def gradient_ratio(self, problem: str) -> float:
-        """Return the rollouts that take as long as one gradient: the median over searches, or what one counts as."""
-        ratios = self.rows.loc[self.rows["problem"] == problem, "gradient_ratio"]
-        return self.gradient_cost if ratios.isna().all() else float(ratios.median())
 
 
 def collect_runs(experiment: Experiment, rows: pd.DataFrame) -> RunSet:
@@ -125,8 +116,8 @@ def collect_runs(experiment: Experiment, rows: pd.DataFrame) -> RunSet:
     start, final = runs["start_cost"], runs["final_cost"]
     achievable = (start - best_known).where(start > best_known)
     score = ((start - final) / achievable).clip(0.0, 1.0).mask(runs["status"] != "ok", 0.0)
-    searches = runs.assign(best_known=best_known, best_known_status=status, score=score)
-    return RunSet(searches, experiment.study.gradient_cost)  # type: ignore[attr-defined]
+    ratio = runs.groupby("problem")["gradient_ratio"].transform("median").fillna(experiment.study.gradient_cost)  # type: ignore[attr-defined]
+    return RunSet(runs.assign(best_known=best_known, best_known_status=status, score=score, ratio=ratio))
 
 
 def _is_tuned(axis: Axis, rows: pd.DataFrame) -> bool:
@@ -170,8 +161,9 @@ def hits(runs: RunSet) -> pd.DataFrame:
     """
     lines = []
     for row in runs.best_runs.to_dict("records"):
-        ratio = runs.gradient_ratio(row["problem"])
-        spent = np.asarray(row["path_rollouts"], dtype=float) + ratio * np.asarray(row["path_gradients"], dtype=float)
+        spent = np.asarray(row["path_rollouts"], dtype=float) + row["ratio"] * np.asarray(
+            row["path_gradients"], dtype=float
+        )
         rounding = ROUNDING * max(abs(row["start_cost"] - row["best_known"]), 1e-300)
         regret = np.maximum(np.asarray(row["path_cost"], dtype=float) - row["best_known"], rounding)
         for target in TARGETS:
@@ -334,23 +326,10 @@ def tables(experiment: Experiment, rows: pd.DataFrame, runs: RunSet) -> list[Tab
 # --------------------------------------------------------------------------------------------------------- charts
 
 
-def styles(methods: Sequence[str]) -> dict[str, Style]:
-    """Return the style of each method with an estimator: the estimator's colour."""
-    looks: dict[str, Style] = {}
-    uses: Counter[str] = Counter()
-    for method in methods:
-        if ", " in method:  # "estimator, optimizer"
-            estimator = re.split(r"[\[,]", method)[0]
-            turn = uses[estimator]
-            uses[estimator] += 1
-            dashes = VARIANTS[turn % len(VARIANTS)]
-            looks[method] = Style(estimator_colour(estimator), estimator_marker(estimator, turn), dashes)
-    return looks
-
-
 def charts(runs: RunSet) -> list[Chart]:
     """Return the charts, the shares of targets reached first."""
-    looks = styles(runs.rows["method"].unique())
+    # a method without an estimator has no comma, and a free colour
+    looks = method_styles(method for method in runs.rows["method"].unique() if ", " in method)
     return [replace(chart, series="method", styles=looks) for chart in (_targets(runs), *_progress(runs))]
 
 
