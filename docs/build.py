@@ -108,7 +108,6 @@ Beside the files of [every run](reading-results.md#files), each study writes its
   and the share of targets reached in time. `targets.csv`: per problem, method and target (the first regret over
   10, 100 and 1,000) the successes with Wilson's interval and the average runtime in rollouts. The runtime includes failed
   searches, and is infinite where none succeeded. Methods are compared at their best tuning on each problem.
-  `effect_of_error.csv`: per class of scenes whether gradients with a smaller error reach a tenth of the first regret `sooner`.
 - `train.csv`: one line per run, with the return before and after it. `summary.csv`: per trainer the final return with its interval
   and a verdict: `first`, `tied`, `behind`, `open` or `no result`. `windows.csv`: the same per length of a window, with the norm of
   its gradient. `faults.csv`: what the logs show, by code, with the numbers that show it.

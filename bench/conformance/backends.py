@@ -33,7 +33,6 @@ from bench.conformance.subjects import (
     with_changed_column,
 )
 from bench.engines.backend import EngineBackend
-from bench.engines.problem import Replayed
 from bench.gradient import EPS, FAULTS, TRUSTED, Check, Options, check, judge, sampled
 from bench.gradient.stages import SINGLE_EPS
 from bench.model import (
@@ -45,6 +44,7 @@ from bench.model import (
     Integrator,
     Problem,
     Program,
+    Replayed,
     Rollout,
     State,
     Unsupported,

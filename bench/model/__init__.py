@@ -66,6 +66,7 @@ from bench.model.scene import (
     ZeroOrderHoldScene,
     half_spaces,
 )
+from bench.model.stepped import Replayed, SteppedProblem
 from bench.model.trainer import Trainer
 from bench.simulator import load_module, load_simulator, simulator_files
 
@@ -114,12 +115,14 @@ __all__ = [
     "Population",
     "Problem",
     "Program",
+    "Replayed",
     "Rollout",
     "SampleMean",
     "Scene",
     "Slopes",
     "Smoothing",
     "State",
+    "SteppedProblem",
     "Trainer",
     "Trajectory",
     "Unsupported",

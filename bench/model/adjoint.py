@@ -90,7 +90,7 @@ def slopes_along(program: Rollout, path: Jacobians, theta: np.ndarray, w: np.nda
     )
     is_shared = np.ndim(theta) == 1 and program.action_noise
     feedback_x = _feedback_slopes(scene, path, noisy[:, :1] if is_shared else noisy)
-    if feedback_x is None and not program.is_open_loop:
+    if feedback_x is None and m and not program.is_open_loop:
         rows = by_state(lambda x: _feedback(program, noisy, x), before)
         feedback_x = np.stack([_unflatten(row, horizon) for row in rows], axis=1)
     return Slopes(path.states, path.a, path.b, cost, cost_x, cost_u, feedback_x, noisy)
@@ -122,30 +122,32 @@ def by_actions(path: Slopes, cut: Cut | None = None) -> tuple[np.ndarray, np.nda
 def by_theta(problem: Problem, path: Slopes, by_control: np.ndarray, adjoint: np.ndarray) -> np.ndarray:
     """Return the gradient ``(d, B)`` from derivatives by action ``(T, m, B)`` and by initial state ``(k, B)``."""
     program = rollout(problem.program)
-    scene = program.scene
-    if scene.open_loop:
-        each = by_control.reshape(scene.controls, -1, *by_control.shape[1:])
-        result = each.sum(axis=1).reshape(program.dim, -1)
-    else:
-        result = _theta_differences(lambda theta: scene.planned_controls(np, theta), path.theta, by_control)
-    x = _flatten(path.states[:-1])
-    flat = _flatten(by_control)
-
-    if path.feedback_x is not None:
-        along = scene.pullback(path.theta, np.moveaxis(path.states[:-1], 1, 0), np.moveaxis(by_control, 1, 0))
-        result = result + (
-            _theta_differences(lambda theta: _feedback(program, theta, x), path.theta, flat)
-            if along is None
-            else along[0]
-        )
-    first = path.states[0]
+    scene, first = program.scene, path.states[0]
 
     def initial(theta: np.ndarray) -> np.ndarray:
         x = np.concatenate(scene.initial_state(np, theta))
         return x if n_changes(scene) == len(first) else difference(scene, np, x, first)
 
-    start = _theta_differences(initial, path.theta, adjoint)
-    return np.asarray(result + start)
+    along = controls_by_theta(program, path.states, path.theta, by_control)
+    return np.asarray(along + _theta_differences(initial, path.theta, adjoint))
+
+
+def controls_by_theta(program: Rollout, states: np.ndarray, theta: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Return the derivative of sum(weights * controls) by theta along states ``(T + 1, n, B)``, ``(d, B)``."""
+    scene = program.scene
+    if scene.open_loop:
+        each = weights.reshape(scene.controls, -1, *weights.shape[1:])
+        result: np.ndarray = each.sum(axis=1).reshape(program.dim, -1)
+    else:
+        result = _theta_differences(lambda theta: scene.planned_controls(np, theta), theta, weights)
+    if program.is_open_loop:
+        return result
+    x, flat = _flatten(states[:-1]), _flatten(weights)
+    along = scene.pullback(theta, np.moveaxis(states[:-1], 1, 0), np.moveaxis(weights, 1, 0))
+    by_feedback = (
+        _theta_differences(lambda theta: _feedback(program, theta, x), theta, flat) if along is None else along[0]
+    )
+    return np.asarray(result + by_feedback)
 
 
 def _feedback_slopes(scene: MechanicalScene, path: Jacobians, theta: np.ndarray) -> np.ndarray | None:

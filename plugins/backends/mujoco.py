@@ -2,33 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from bench.model import (
-    Array,
-    Backend,
-    Jacobians,
-    Ops,
-    Problem,
-    Program,
-    Rollout,
-    State,
-    Trajectory,
-    cores,
-    difference,
-    param,
-    retract,
-    rollout,
-)
+from bench.model import Backend, Problem, Program, SteppedProblem, cores, param
 
 from .. import mjcf
-from .numpy import NumpyProblem
-from .torch import TorchOps
+from .numpy import differences
 
 SHORTER = 0.03
 """Factor between the differences of a step that straddle a switch of contact and the next shorter ones."""
@@ -49,7 +32,7 @@ class Mujoco(Backend):
 
     name = "mujoco"
     uses = (mjcf,)
-    requires = ("mujoco", "torch")
+    requires = ("mujoco",)
     provides = Backend.provides | {"physics"}
 
     gradient: str = param(
@@ -77,69 +60,30 @@ class Mujoco(Backend):
         return mjcf.refusal(self, program)
 
 
-class MujocoProblem(NumpyProblem):
+class MujocoProblem(SteppedProblem):
     """A program stepped by MuJoCo."""
 
-    block = 1 << 10
-
     def __init__(self, program: Program, backend: Mujoco) -> None:
-        super().__init__(program, backend.dtype, backend.step)
-        self._rolled = rollout(program)
+        super().__init__(program)
         self._backend = backend
         self._engine = Engine(mjcf.build(backend, program), self._rolled.scene.substeps)
-        self._open_loop = self._rolled.is_open_loop
 
-    def _value(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        states, _ = self._rollout(theta, w)
-        return np.asarray(Recorded(self._rolled, states).cost(self._ops, theta, w))
+    def moved(self, first: np.ndarray, controls: np.ndarray) -> np.ndarray:
+        """Return the engine's states."""
+        return self._engine.rollout(first, controls)
 
-    def _grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        if self._backend.gradient == "rollouts":
-            return super()._grad(theta, w)
-        path = self.jacobians(theta, w)
-        return _reverse(Recorded(self._rolled, path.states, path), theta, w, scored=False)
-
-    def _score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        return _reverse(Recorded(self._rolled, self._rollout(theta, w)[0]), theta, w, scored=True)
-
-    def trajectory(self, theta: np.ndarray, w: np.ndarray) -> Trajectory:
-        return Trajectory(*self._rollout(np.asarray(theta, dtype=np.float64).reshape(self.dim, -1), w))
+    def step_jacobians(self, states: np.ndarray, controls: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return finite-difference Jacobians of the steps (``mjd_transitionFD``)."""
+        return self._engine.jacobians(states, controls, self._backend.step, self._backend.differences == "central")
 
     def engine_contacts(self) -> mjcf.Contacts:
         """Return the contacts of the twin's model."""
         return mjcf.Contacts(mjcf.build(self._backend, self.program))
 
-    def jacobians(self, theta: np.ndarray, w: np.ndarray) -> Jacobians:
-        """Return states, controls and finite-difference Jacobians of the steps (``mjd_transitionFD``)."""
-        theta = np.asarray(theta, dtype=np.float64).reshape(self.dim, -1)
-        states, controls = self._rollout(theta, w)
-        central = self._backend.differences == "central"
-        a, b = self._engine.jacobians(states, controls, self._backend.step, central)
-        n_q = self._rolled.scene.n_q
-        for t, x in enumerate(states[:-1]):
-            ended = self._rolled.scene.has_ended(np, x[:n_q], x[n_q:])
-            if ended is not None:
-                a[t][..., ended], b[t][..., ended] = np.eye(a.shape[1])[..., None], 0.0
-        return Jacobians(states, controls, a, b)
-
-    def _rollout(self, theta: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return states ``(horizon + 1, n, B)`` and controls ``(horizon, n_u, B)``; NaN after the engine has stopped."""
-        moved, state, scanned = self._rolled.start(self._ops, theta, w)
-        horizon = self._rolled.scene.horizon
-
-        def control(t: int) -> np.ndarray:
-            return np.asarray(self._rolled.control(self._ops, moved, state, tuple(x[t] for x in scanned)))
-
-        if self._open_loop:
-            controls = np.stack([control(t) for t in range(horizon)])
-            return self._engine.rollout(np.concatenate(state), controls), controls
-        states, controls_ = [np.concatenate(state)], []
-        for t in range(horizon):
-            controls_.append(control(t))
-            after = State(*np.split(self._engine.rollout(states[-1], controls_[-1][None])[1], [self._rolled.scene.n_q]))
-            state = self._rolled.stopped(np, state, after)
-            states.append(np.concatenate(state))
-        return np.stack(states), np.stack(controls_)
+    def _grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        if self._backend.gradient == "rollouts":
+            return differences(self._value, theta, w, self._backend.step, self.block)
+        return super()._grad(theta, w)
 
 
 class Engine:
@@ -223,42 +167,3 @@ class Engine:
         with ThreadPoolExecutor(len(self._data)) as threads:
             list(threads.map(work, self._data, shares))
         return np.moveaxis(a, 0, -1), np.moveaxis(b, 0, -1)
-
-
-class Recorded(Rollout):
-    """A program that replays recorded engine states; with Jacobians, linearised about these states.
-
-    Its cost and gradient equal the cost and gradient of the engine's rollouts: reverse mode through it is the adjoint
-    pass lambda_t = A_t^T lambda_{t+1} + ..., including feedback and stage costs.
-    """
-
-    def __init__(self, program: Rollout, states: np.ndarray, path: Jacobians | None = None) -> None:
-        super().__init__(program.scene, program.contact, program.integrator, program.decision)
-        self._states, self._path = states, path
-        self._times: Iterator[int] = iter(range(len(states) - 1))
-
-    def step(self, ops: Ops, state: State, u: Array) -> State:
-        """Return the next recorded state, linearised if there are Jacobians. The recorded rollout can run only once."""
-        t, xp = next(self._times), ops.xp
-        after = xp.asarray(self._states[t + 1])
-        if self._path is not None:
-            moved = difference(self.scene, xp, xp.concat([state.q, state.v]), xp.asarray(self._states[t]))
-            change = xp.sum(xp.asarray(self._path.a[t]) * moved[None], axis=1)
-            pushed = u - xp.asarray(self._path.controls[t])
-            change = change + xp.sum(xp.asarray(self._path.b[t]) * pushed[None], axis=1)
-            after = retract(self.scene, xp, after, change)
-        n_q = state.q.shape[0]
-        return State(after[:n_q], after[n_q:])
-
-
-def _reverse(program: Program, theta: np.ndarray, w: np.ndarray, scored: bool) -> np.ndarray:
-    """Return the derivative of column b of the cost, or of the log-probability, by column b of theta, ``(d, B)``."""
-    import torch
-
-    fixed, noise = torch.tensor(theta.copy()), torch.tensor(w.copy())
-    free = torch.tensor(np.broadcast_to(theta, (theta.shape[0], w.shape[1])).copy(), requires_grad=True)
-    ops = TorchOps()
-    result = program.log_probability(ops, fixed, free, noise) if scored else program.cost(ops, free, noise)
-    (gradient,) = torch.autograd.grad(result.sum(), free, materialize_grads=True)
-    # torch.where between NaN and a number would have the number's derivative
-    return np.asarray(gradient.masked_fill(~torch.isfinite(result.detach()), float("nan")))

@@ -11,7 +11,7 @@ import numpy as np
 
 from bench.engines.problem import EngineProblem
 from bench.experiment.cell import Cell
-from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, seconds, text
+from bench.experiment.columns import Column, Columns, ComparisonRule, exact, numbers, seconds, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.session import Session
 from bench.experiment.views import Chart, Style, Views
@@ -72,11 +72,11 @@ class Engines(StudyPackage):
     axes = PARTS
     timed = True
     columns = Columns.of(
-        Column("program_error_rel", "distance of the gradient from its best central difference, relative to that difference",
-               label="program error", comparison=ComparisonRule("exact", "program error")),
+        exact("program_error_rel", "distance of the gradient from its best central difference, relative to that difference",
+              "program error", "program error"),
         Column("difference_step", "step of the best central difference, in the units of theta"),
-        Column("model_error_rel", "distance of the gradient from the gradient named in `model`, relative to its norm",
-               label="model error", comparison=ComparisonRule("exact", "model error")),
+        exact("model_error_rel", "distance of the gradient from the gradient named in `model`, relative to its norm", "model error",
+              "model error"),
         text("model", "what model_error_rel compares with: rigid contact in closed form, or the scene's own program"),
         *(ESTIMATES.by_name[name] for name in (*SUMMARY[:2], "reference_method", "reference_spacing", *SUMMARY[2:])),
         Column("zeroth_rmse_rel", "rmse_rel from `samples` costs with scores, without gradients", label="RMSE, costs only"),

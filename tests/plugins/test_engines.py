@@ -103,8 +103,8 @@ def test_force_of_unscaled_edges_fails_the_kit(monkeypatch):
 
 
 def test_gradient_of_a_failed_rollout_that_is_a_number_fails_the_kit(monkeypatch):
-    reverse = mujoco._reverse
-    monkeypatch.setattr(mujoco, "_reverse", lambda *given, **more: np.nan_to_num(reverse(*given, **more)))
+    grad = mujoco.MujocoProblem._grad
+    monkeypatch.setattr(mujoco.MujocoProblem, "_grad", lambda *given: np.nan_to_num(grad(*given)))
     monkeypatch.setattr(backends, "all_programs", lambda: [program(Pendulum(horizon=20))])
     with pytest.raises(Failed, match="has a finite gradient"):
         backends.failed_rollouts_have_no_gradient(Mujoco())

@@ -42,6 +42,8 @@ SERIES = 3
 """Most estimators of a chart along an axis."""
 PANELS = 4
 """Most problems of a chart along an axis."""
+FEW = 3
+"""Most points of an estimator that no line of error against cost joins."""
 POOLED = ("horizon", "stiffness", "sigma", "smoothing")
 """Columns that change the cost of an estimate: each value has a panel of its own."""
 DISTINCT = 1.2
@@ -238,9 +240,10 @@ def _speed_accuracy(shown: Arranged, best: pd.DataFrame, styles: Mapping[str, St
         return None
     marks = [Mark(f"{target:.0%}", target, axis="y") for target in TARGETS]
     frame = pd.concat(parts, ignore_index=True)
+    is_line = frame.groupby(["panel", "series"]).size().max() > FEW
     return Chart(
-        "speed_accuracy" if timed else "rollouts_accuracy", frame, [x], [RMSE], series="series",
-        panel="panel", styles=styles, marks=marks, across=3, height=2.0,
+        "speed_accuracy" if timed else "rollouts_accuracy", frame, [x], [RMSE], "lines" if is_line else "points",
+        series="series", panel="panel", styles=styles, marks=marks, across=3, height=2.0,
         subtitle=", ".join(filter(None, [subtitle, FASTEST])),
         text="Only estimates that no other of the same estimator beats in both error and cost are drawn.",
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Aggregates searches by method: regret, times to targets, scores, and the effect of the gradient's error on runtime."""
+"""Aggregates searches by method: regret, times to targets and scores."""
 
 from __future__ import annotations
 
@@ -23,8 +23,6 @@ from .. import PARTS
 
 TARGETS = (10.0, 100.0, 1000.0)
 """Target regrets: the first regret divided by each of these factors."""
-FEWEST_POINTS = 5
-"""Fewest points for a rank correlation."""
 MIN_SEEDS_TO_SPLIT = 4
 """Fewest seeds to split: some choose the tunings, the others score."""
 ROUNDING = 1e-12
@@ -238,38 +236,6 @@ def _pooled_score(strata: Sequence[np.ndarray]) -> float:
     return performance.interquartile_mean(np.concatenate(strata)) if strata else math.nan
 
 
-@remember
-def quality_and_runtime(runs: RunSet) -> pd.DataFrame:
-    """Return, per problem and method with an estimator, the gradient's error at the start and the runtime to the first target.
-
-    ``art`` is the average runtime, in rollouts, until the regret is a tenth of the first.
-    """
-    keys = ["problem", "method"]
-    found = runs.best_runs.groupby(keys, sort=False).agg(
-        scene_class=("scene_class", "first"), rmse_rel=("quality_rmse_rel", "median")
-    )
-    reached = times_to_targets(runs)
-    runtime = reached[reached["target"] == TARGETS[0]].set_index(keys)["art"]
-    return found.dropna(subset=["rmse_rel"]).join(runtime).reset_index()
-
-
-@remember
-def effects_of_error(runs: RunSet) -> pd.DataFrame:
-    """Return :func:`rank_correlations` of the errors and runtimes of :func:`quality_and_runtime`, with a verdict.
-
-    Gradients with smaller errors reach the target ``sooner`` or ``later`` where the whole interval is on one side of 0, and
-    a random order is seldom as good; else it is ``open``.
-    """
-    rho = rank_correlations(quality_and_runtime(runs))
-    is_known = rho["chance"] <= CHANCE  # 1 from too few points
-    sides = {"sooner": is_known & (rho["rho_low"] > 0), "later": is_known & (rho["rho_high"] < 0)}
-    return rho.assign(verdict=np.select(list(sides.values()), list(sides), "open"))
-
-
-CHANCE = 0.05
-"""An order counts as random if a random order is at least as good with more than this probability."""
-
-
 def is_tied(summary: pd.DataFrame) -> pd.Series:
     """Return a mask of the methods that reach most targets, or that are not distinguishable from the first.
 
@@ -280,26 +246,3 @@ def is_tied(summary: pd.DataFrame) -> pd.Series:
     error = np.sqrt(best["reached_se"] ** 2 + full["reached_se"] ** 2)
     tied = (best["reached"] - full["reached"] < performance.Z * error) | (full.index == best.name)
     return tied.reindex(summary.index, fill_value=False)
-
-
-def rank_correlations(points: pd.DataFrame) -> pd.DataFrame:
-    """Return Spearman's rho of gradient error against runtime, by class of scene.
-
-    Costs vary between problems, so errors and runtimes are ranked within each problem, and the ranks are scaled to
-    0..1. A positive rho means that gradients with smaller errors reach the target sooner. It is NaN from fewer than
-    :data:`FEWEST_POINTS` points.
-    """
-    lines = []
-    for name, part in points.groupby("scene_class", sort=False):
-        groups = part.groupby("problem", sort=False)
-        scaled = (groups[["rmse_rel", "art"]].rank() - 1).div(groups["art"].transform("size") - 1, axis=0).dropna()
-        strata = [own.to_numpy() for _, own in scaled.groupby(part["problem"], sort=False)]
-        pooled = np.concatenate(strata) if strata else np.empty((0, 2))
-        enough = len(pooled) >= FEWEST_POINTS
-        low, high = performance.spearman_interval(strata) if enough else (math.nan, math.nan)
-        lines.append({
-            "scene_class": str(name), "rho": performance.spearman(pooled[:, 0], pooled[:, 1]) if enough else math.nan,
-            "rho_low": low, "rho_high": high, "chance": performance.spearman_chance(strata) if enough else 1.0,
-            "points": len(pooled), "problems": len(strata),
-        })  # fmt: skip
-    return pd.DataFrame(lines, columns=["scene_class", "rho", "rho_low", "rho_high", "chance", "points", "problems"])

@@ -1,10 +1,10 @@
-"""What the study of searches shows: targets reached by method, regret along the paths, errors of gradients, and tuning."""
+"""What the study of searches shows: targets reached by method, and in how many rollouts."""
 
 from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -44,14 +44,6 @@ NOTE = (
     "median final cost of {seeds}, next to the number of tunings and the median score over all of them. Methods without "
     "an estimator (dashed in charts) are context."
 )
-EFFECT = (
-    text("scene_class", label="class"), text("verdict"), interval("rho", log=False),
-    Column("points", format="setting"), Column("chance", label="chance of a random order"),
-)  # fmt: skip
-EFFECT_NOTES = (
-    "rho: rank correlation of the error of gradients at the start and the average runtime, ranked within each problem. sooner or "
-    "later: the whole 95% interval is on one side of 0, and a random order is at least as good with a probability of 5% at most.",
-)
 PAGE = (
     "stopped", "scene_class", "final_cost", "best_known", "score", "rollouts", "gradients", "search_s", "quality_rmse_rel",
     "quality_bias_share",
@@ -63,48 +55,35 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views | None:
     runs = aggregate.collect_runs(experiment, rows)
     if runs.rows.empty:
         return None
-    name = short_names(runs.rows["method"].unique())
     cells = rows.assign(**{c: runs.rows[c] for c in ("problem", "method", "tuning", "best_known", "score")})
     cells = cells.fillna({"problem": "", "method": "", "tuning": ""}).astype({"score": float, "best_known": float})
     by_name = experiment.columns.by_name | {"best_known": Column("best_known", label="J*")}
     return Views(
-        tables(experiment, rows, runs, name), charts(runs, name), rows=cells,
+        tables(experiment, rows, runs), charts(runs), rows=cells,
         columns=[METHOD, *(by_name[column] for column in PAGE)],
     )  # fmt: skip
-
-
-def short_names(methods: Sequence[str]) -> Callable[[str], str]:
-    """Return the function that shortens a method's name by its parameters in brackets, where that leaves it unique."""
-    short = {method: re.sub(r"\[[^\]]*\]", "", method) for method in methods}
-    counts = Counter(short.values())
-    return lambda method: short[method] if counts[short[method]] == 1 else method
 
 
 # --------------------------------------------------------------------------------------------------------- tables
 
 
-def tables(experiment: Experiment, rows: pd.DataFrame, runs: RunSet, name: Callable[[str], str]) -> list[Table]:
+def tables(experiment: Experiment, rows: pd.DataFrame, runs: RunSet) -> list[Table]:
     """Return the tables of methods, of times to targets and of lowest costs."""
     reached, summary = aggregate.times_to_targets(runs), aggregate.summarise(runs)
     methods = summary.sort_values(["reached", "score"], ascending=False, kind="stable")
-    methods = methods.assign(
-        name=methods["method"].map(name), verdict=np.where(aggregate.is_tied(methods), "first or tied", ""),
-    )  # fmt: skip
-    key = "; ".join(f"{name(method)}: {method}" for method in runs.rows["method"].unique() if name(method) != method)
+    methods = methods.assign(verdict=np.where(aggregate.is_tied(methods), "first or tied", ""))
     chosen = runs.tuning_seeds
     seeds = f"seeds {', '.join(map(str, chosen))}, which do not score" if chosen else "the same seeds that score"
-    notes = [NOTE.format(seeds=seeds), *([f"{key}."] if key else [])]
-    effects = aggregate.effects_of_error(runs)
     return [
         Table(
             "optimise", methods,
-            [text("name", label="method"), REACHED, text("verdict"), SCORE, BETTER, PROFILE, *(Column(name, format="setting") for name in ("tunings", "searches", "diverged")), MEDIAN],
-            "methods by the share of targets they reach", notes, terminal=True, page=True,
+            [METHOD, REACHED, text("verdict"), SCORE, BETTER, PROFILE, *(Column(name, format="setting") for name in ("tunings", "searches", "diverged")), MEDIAN],
+            "methods by the share of targets they reach", [NOTE.format(seeds=seeds)], terminal=True, page=True,
             data=table(experiment, rows),
         ),
         Table(
-            "optimise", reached.assign(regret=[f"1/{t:g}" for t in reached["target"]], name=reached["method"].map(name)),
-            [PROBLEM, text("name", label="method"), text("tuning"), text("regret"), RATE, RUNTIME], "Times to targets",
+            "optimise", reached.assign(regret=[f"1/{t:g}" for t in reached["target"]]),
+            [PROBLEM, METHOD, text("tuning"), text("regret"), RATE, RUNTIME], "Times to targets",
             terminal=True,
         ),
         Table(
@@ -113,8 +92,6 @@ def tables(experiment: Experiment, rows: pd.DataFrame, runs: RunSet, name: Calla
              Column("best_known", label="J*", digits=8), text("best_known_status", label="source of J*")],
             "Lowest costs", terminal=True,
         ),
-        *([Table("effect_of_error", effects, EFFECT, "Does a smaller error reach a tenth of the first regret sooner?", EFFECT_NOTES)]
-          if len(effects) else []),
         Table("targets", reached, [], files=["csv"]),
         Table("summary", summary, [], files=["csv"]),
     ]  # fmt: skip
@@ -123,8 +100,8 @@ def tables(experiment: Experiment, rows: pd.DataFrame, runs: RunSet, name: Calla
 # --------------------------------------------------------------------------------------------------------- charts
 
 
-def styles(methods: Sequence[str], name: Callable[[str], str] = str) -> dict[str, Style]:
-    """Return the style of each method with an estimator by its short name: the estimator's colour."""
+def styles(methods: Sequence[str]) -> dict[str, Style]:
+    """Return the style of each method with an estimator: the estimator's colour."""
     looks: dict[str, Style] = {}
     uses: Counter[str] = Counter()
     for method in methods:
@@ -133,19 +110,14 @@ def styles(methods: Sequence[str], name: Callable[[str], str] = str) -> dict[str
             turn = uses[estimator]
             uses[estimator] += 1
             dashes = VARIANTS[turn % len(VARIANTS)]
-            looks[name(method)] = Style(estimator_colour(estimator), estimator_marker(estimator, turn), dashes)
+            looks[method] = Style(estimator_colour(estimator), estimator_marker(estimator, turn), dashes)
     return looks
 
 
-def charts(runs: RunSet, name: Callable[[str], str]) -> list[Chart]:
+def charts(runs: RunSet) -> list[Chart]:
     """Return the charts, the shares of targets reached first."""
-    looks = styles(runs.rows["method"].unique(), name)
-    found = (_targets(runs), _progress(runs))
-    return [
-        replace(chart, frame=chart.frame.assign(method=chart.frame["method"].map(name)), series="method", styles=looks)
-        for chart in found
-        if chart is not None
-    ]
+    looks = styles(runs.rows["method"].unique())
+    return [replace(chart, series="method", styles=looks) for chart in (_targets(runs), *_progress(runs))]
 
 
 def _targets(runs: RunSet) -> Chart:
@@ -163,12 +135,12 @@ def _where(runs: RunSet, what: str) -> str:
     return f"{len(problems)} problems, {what}" if len(problems) > 1 else f"{problems[0]}, {what}"
 
 
-def _progress(runs: RunSet) -> Chart | None:
+def _progress(runs: RunSet) -> list[Chart]:
     """Return the share of targets that single searches reach within a number of rollouts."""
     times = aggregate.runtimes(runs)
     finite = times.loc[np.isfinite(times["runtime"]) & (times["runtime"] > 0), "runtime"]
     if finite.empty:
-        return None
+        return []
     grid = np.geomspace(finite.min() / 1.5, finite.max() * 1.2, STEPS)
     shares = {
         method: [float(part["weight"][part["runtime"] <= x].sum()) for x in grid]
@@ -178,8 +150,9 @@ def _progress(runs: RunSet) -> Chart | None:
         var_name="method", value_name="share", ignore_index=False
     )
     share = Column("share", label="share of targets reached", format="percent", log=False)
-    return Chart(
+    chart = Chart(
         "runtimes", frame.reset_index(), [SPENT], [share], height=2.6, panel="",
         subtitle=_where(runs, "single searches, a gradient counts as its time in rollouts"),
         text="Where a line ends is the share of targets reached in the whole budget.",
     )  # fmt: skip
+    return [chart]
