@@ -101,7 +101,7 @@ DERIVATIVE = {
     ),
     "saturated": Rule(
         "right", "exactly 0, though wider differences are not: the input is clipped or has no effect here",
-        "0, as the differences at the {direction.MIN_STEPS} smallest steps", "", SIGMA,
+        "0, as the differences at the {direction.MIN_STEPS} smallest steps; or `zero` for all, where jumps or noise around theta move the cost", "", SIGMA,
     ),
     "rounding": Rule(
         "right", "small steps have larger errors than the arithmetic explains, as with a loose solver tolerance",
