@@ -10,7 +10,7 @@ import subprocess
 import numpy as np
 import pandas as pd
 import pytest
-from bench.plugins.studies.bias_variance import tables
+from bench.plugins.studies.bias_variance import views as tables
 from bench.plugins.studies.bias_variance.charts import estimator_styles
 from bench.plugins.studies.bias_variance.columns import TABLE
 from bench.plugins.studies.bias_variance.comparisons import problems_by_axis

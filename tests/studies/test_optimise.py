@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pandas as pd
 import pytest
-from bench.plugins.studies.optimise import aggregate
+from bench.plugins.studies.optimise import views as studied
 from bench.plugins.studies.optimise.measure import compare_with_reference, scene_class
 from classes import ExplicitEuler, Impulse, Lqr, Penalty, SemiImplicitEuler, StaticGain, TwoBalls
 from helpers import loaded, stored
@@ -212,7 +212,7 @@ def test_tables_charts_and_page(finished):
         assert (folder / name).stat().st_size > 0, name
     made = (folder / "report.html").read_text().partition('id="made"')[2]
     assert "numpy" in made.partition("Configuration")[0], "machine and versions are in the page"
-    found = aggregate.collect_runs(experiment, bench.load(folder))
+    found = studied.collect_runs(experiment, bench.load(folder))
     searches = found.rows.groupby("method").size().to_dict()
     # a search that looks at costs only is run once for all estimators
     assert searches == {"fobg, gradient_descent": 4, "reinforce, gradient_descent": 4, "cem[elites=5,population=20]": 2}
@@ -300,7 +300,7 @@ def searches(finals):
         for (method, tuning), costs in finals.items()
         for seed, cost in enumerate(costs)
     ]
-    return aggregate.RunSet(pd.DataFrame(rows))
+    return studied.RunSet(pd.DataFrame(rows))
 
 
 def test_seeds_that_choose_a_tuning_do_not_score_it():
@@ -323,7 +323,7 @@ def test_a_method_beats_the_baseline_in_the_share_of_pairs_that_it_wins():
     """Two wins, a tie and two losses are a half, with Wilson's interval of five pairs; a failed search has lost."""
     runs = searches({("fobg", ""): [3, 3, 3, 3, 3], ("other", ""): [1, 2, 3, 4, 5], ("failed", ""): [1, 1, 1, 1, 1]})
     runs.rows.loc[runs.rows["method"] == "failed", "status"] = "diverged"
-    found = aggregate.improvement(runs)
+    found = studied.improvement(runs)
     assert found.loc["other"].tolist() == pytest.approx([0.5, *performance.wilson(2, 5)])
     assert found["improvement"].isna().tolist() == [True, False, False]
     assert found.loc["failed", "improvement"] == 0.0
@@ -361,4 +361,4 @@ def test_charts_have_the_tables_numbers(standard):
 )
 def test_who_reaches_most_targets_needs_an_interval(reached, problems, tied):
     summary = pd.DataFrame({"reached": reached, "reached_se": 0.06, "problems": problems})
-    assert aggregate.is_tied(summary).tolist() == tied
+    assert studied.is_tied(summary).tolist() == tied

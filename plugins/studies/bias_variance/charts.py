@@ -33,8 +33,7 @@ from bench.report.views import (
 
 from .columns import COLUMNS
 from .comparisons import FAILS, NO_RESULT
-from .costs import ROLLOUTS, TIME, Cost
-from .time_to_accuracy import SAMPLES, TARGETS
+from .time_to_accuracy import ROLLOUTS, SAMPLES, TARGETS, TIME, Cost
 
 FLOOR = 1e-4
 """Relative biases below this are drawn here, as upper limits."""
