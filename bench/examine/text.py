@@ -92,7 +92,13 @@ def noise_answer(report: Findings) -> str:
     """Return the answer about the gradient under noise in one line; empty without a gradient."""
     if not report.gradient:
         return ""
-    sigmas = ", ".join(sigma_text(report, one) for one in report.setup.sigmas)
+    levels = report.setup.sigmas
+    if levels and report.noise_cause not in ("", "unmeasured"):
+        # a problem is said of the sigmas that show it; lines show that of the largest
+        levels = [one.sigma for cause, one in report.noise_found if one and cause == report.noise_cause] or [
+            report.setup.reach
+        ]
+    sigmas = ", ".join(sigma_text(report, one) for one in levels)
     where = f"Under noise of sigma {sigmas}" if sigmas else "Around theta" if report.noise_cause else "Under noise"
     if report.noise_cause not in ("", "unmeasured"):
         reason = noise_problems(report)[0]

@@ -13,7 +13,7 @@ import numpy as np
 from . import roughness
 from .causes import Ratio, causes_of_ratios
 from .direction import EPS, FINE, GUARD, Finding, Sample, judge
-from .rules import FAULTS, RULES, TRUSTED, most_severe
+from .rules import FAULTS, RULES, TRUSTED, UNEQUAL, most_severe
 from .sampling import Modes, order, repeats, sampled
 
 Cost = Callable[[np.ndarray], np.ndarray]
@@ -142,9 +142,10 @@ class Check:
 
     @property
     def worst_parts(self) -> tuple[Part, ...]:
-        """The parts with the worst verdict: at theta if there are any, else at other thetas."""
-        here = tuple(part for part in self.parts if part.verdict == self.cause)
-        return here or tuple(part for part in self.draws if part.verdict == self.cause)
+        """The parts with the worst verdict, or all unequal ones with the first of these: at theta if any, else at other thetas."""
+        causes = UNEQUAL if self.cause in UNEQUAL else (self.cause,)
+        here = tuple(part for part in self.parts if part.verdict in causes)
+        return here or tuple(part for part in self.draws if part.verdict in causes)
 
     def sentence(self) -> str:
         """Return the verdict in one sentence, with the numbers of the worst part."""
