@@ -6,7 +6,7 @@ lines that differ, and exits with 1 if there are any.
 - ``results``: ``docs/answers.md``, from the answers in ``results/standard``, in the order of ``docs/results.md``.
 - ``columns``: ``docs/columns.md``, from the columns that each study declares.
 - ``figures``: the marked figures of all documents, from the rows in ``results/standard``: see :mod:`docs.figures`.
-- ``verdicts``: the lists of verdicts and causes of the checks of gradients, from their rules.
+- ``verdicts``: the table of rules of the checks of gradients.
 - ``site``: the whole site as HTML, in ``build/site/html``. Only on request, since it needs Sphinx.
 """
 
@@ -16,14 +16,15 @@ import difflib
 import os
 import re
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import cast
 
 from bench.errors import UserError
 from bench.experiment.columns import COMMON, Column
 from bench.experiment.study import Study
-from bench.gradient import rules, verdicts
+from bench.gradient import rules
 from bench.model import registry
 from bench.report.tables import escape_markdown
 from bench.run.files import write_whole
@@ -61,13 +62,12 @@ ANSWERS_INTRODUCTION = """\
 
 
 def results_entry(entry: Entry, folder: Path) -> str:
-    """Return an experiment's name, question, data, chart and answer; paths are relative to ``folder``."""
+    """Return an experiment's name, chart, answer (its question if it has none) and data; paths are relative to ``folder``."""
     chart, data = (os.path.relpath(path, folder) if path else "" for path in (entry.chart, entry.folder))
     parts = [
         f"### {entry.name}",
-        f"*{escape_markdown(entry.question)}* [Data]({data})",
         f"![{entry.name}]({chart})" if chart else "",
-        escape_markdown(entry.answer),
+        f"{escape_markdown(entry.answer or entry.question)} [Data]({data})",
     ]
     return "\n\n".join(filter(None, parts))
 
@@ -107,7 +107,6 @@ Beside the files of [every run](reading-results.md#files), each study writes its
   and the share of targets reached in time. `targets.csv`: per problem, method and target (the first regret over
   10, 100 and 1,000) the successes with Wilson's interval and the average runtime in rollouts. The runtime includes failed
   searches, and is infinite where none succeeded. Methods are compared at their best tuning on each problem.
-  `effect_of_error.csv`: per class of scenes whether gradients with a smaller error reach a tenth of the first regret `sooner`.
 - `train.csv`: one line per run, with the return before and after it. `summary.csv`: per trainer the final return with its interval
   and a verdict: `first`, `tied`, `behind`, `open` or `no result`. `windows.csv`: the same per length of a window, with the norm of
   its gradient. `faults.csv`: what the logs show, by code, with the numbers that show it.
@@ -158,19 +157,33 @@ def table_row(column: Column) -> str:
 # ------------------------------------------------------------------------------------------------------ verdicts
 
 RULE_MARKS = "<!-- verdicts -->\n", "<!-- end of verdicts -->"
+RULE_MODULES = (
+    "gradient.causes gradient.check gradient.diagnosis gradient.direction gradient.few gradient.roughness "
+    "gradient.sampling gradient.stages examine.findings examine.smoothing measure.jumps"
+)
+"""The modules whose constants conditions of rules name."""
 
 
-def rule_pages() -> dict[Path, str]:
-    """Return the documents with lists of verdicts and causes, written again."""
-    own = {cause: rule for cause, rule in rules.RULES.items() if verdicts.RULES.get(cause) != rule}
-    return {DOCS / f"{name}.md": with_rules(DOCS / f"{name}.md", table)
-            for name, table in (("gradcheck", verdicts.RULES), ("examine", own))}  # fmt: skip
+RULE_HEADS = {
+    "One derivative, worst first": rules.DERIVATIVE,
+    "All that `examine` finds at theta, instead of the worst of its derivatives": rules.EXAMINATION,
+    "Around theta and under noise, in `examine`": rules.NOISE,
+}
 
 
-def with_rules(page: Path, table: Mapping[str, verdicts.Rule]) -> str:
-    """Return a document with a list of rules between :data:`RULE_MARKS`."""
-    before, _, rest = page.read_text().partition(RULE_MARKS[0])
-    lines = [f"- `{name}` ({rule.kind}): {rule.meaning}" for name, rule in table.items()]
+def rule_page() -> str:
+    """Return the page of `gradcheck` with the table of rules between :data:`RULE_MARKS`, with the constants of the code."""
+    before, _, rest = (DOCS / "gradcheck.md").read_text().partition(RULE_MARKS[0])
+    modules = {name.partition(".")[2]: import_module(f"bench.{name}") for name in RULE_MODULES.split()}
+    statuses = ", ".join(f"`{kind}` {status}" for kind, status in rules.STATUS.items())
+    lines = [f"Exit status of `examine` by kind: {statuses}."]
+    for head, table in RULE_HEADS.items():
+        lines += [f"\n{head}:\n"]
+        for name, rule in table.items():
+            settings = ", ".join(f"`{one.partition('=')[0]}=`".replace("{more}", "budget") for one in rule.settings)
+            steps = [rule.advice.format(names="it"), settings]
+            text = f"- `{name}` ({rule.kind}): {rule.meaning}. *When:* {rule.condition.format(**modules)}."
+            lines.append(text + f" *Next:* {'; '.join(filter(None, steps))}." * any(steps))
     return before + RULE_MARKS[0] + "\n".join(lines) + "\n" + RULE_MARKS[1] + rest.partition(RULE_MARKS[1])[2]
 
 
@@ -186,7 +199,7 @@ def main(words: Sequence[str]) -> int:
     tasks: dict[str, Callable[[], dict[Path, str]]] = {
         "results": lambda: {DOCS / "answers.md": answers_page(DOCS / "results.md")},
         "columns": lambda: {DOCS / "columns.md": columns_page()},
-        "verdicts": rule_pages,
+        "verdicts": lambda: {DOCS / "gradcheck.md": rule_page()},
         "figures": lambda: {
             page: figures.with_figures(page.read_text()) for page in map(ROOT.joinpath, website.PAGES.values())
         },

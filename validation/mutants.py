@@ -38,7 +38,7 @@ OF_SCORES = "tests/model/test_scores.py"
 OF_WEIGHTS = "tests/plugins/test_weights.py"
 T, ST = "bench/measure/timing.py", "bench/run/store.py"
 GC, GD, GF, GK, GR, GS, GV = (
-    f"bench/gradient/{name}.py" for name in ("check", "direction", "few", "causes", "roughness", "sampling", "verdicts")
+    f"bench/gradient/{name}.py" for name in ("check", "direction", "few", "causes", "roughness", "sampling", "rules")
 )
 X = "plugins/estimators/"
 OF_TIMING = "tests/studies/test_flat.py tests/measure/test_timing.py"
@@ -233,7 +233,7 @@ GROUPS: dict[tuple[str, str], list[tuple[str, str]]] = {
     ],
     (GD, OF_CHECKS): [
         ("apart <= min(tolerance, alike + rounding + sample.doubt)", "apart <= tolerance"),
-        ("tolerance = 10.0 * spread +", "tolerance = 100.0 * spread +"),
+        ("tolerance = CHANCE * spread +", "tolerance = 100.0 * spread +"),
         ("(self.plus - self.minus) / (2.0 * self.step)", "(self.plus - self.minus) / self.step"),
         ("ALIKE = 0.1", "ALIKE = 1.0"),
         ("DECADES = 3.0", "DECADES = 0.5"),
@@ -305,7 +305,7 @@ GROUPS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("        elif self.misses_jumps:", "        elif False:"),
         ("checks = [self.settled, *self.more]", "checks = [self.settled]"),
         ("[(one.cause, one)] if one.cause else []", "[]"),
-        ("{\"open\": 3, \"right\": 0}.get(RULES[self.cause].kind, 1)", "{\"open\": 3, \"right\": 0}.get(RULES[self.cause].kind, 0)"),
+        ("return STATUS[RULES[self.cause].kind]", "return 3 * (RULES[self.cause].kind == \"open\")"),
     ],
     (EF, OF_HOLD): [
         ("is_still = not self.moves_around", "is_still = True"),

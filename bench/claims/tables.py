@@ -16,9 +16,9 @@ from bench.claims.discovery import LESSONS
 from bench.claims.results import FAILED, ClaimResult
 from bench.errors import printable
 from bench.experiment.columns import Column, text
-from bench.experiment.views import Chart, Mark, Style, Table
+from bench.experiment.views import Chart, Mark, Table
 from bench.report.cells import readable
-from bench.report.colours import estimator_colour, estimator_marker
+from bench.report.colours import estimator_style
 from bench.report.tables import escape_markdown, plain_markdown
 from bench.report.text import counted, duration, number
 
@@ -53,7 +53,7 @@ def chart(claim: type[Claim], result: ClaimResult) -> Chart | None:
             "series": label, "x": places, "y": values[0], "low": np.maximum(low, 0.1 * values[0]) if is_log["y"] else low, "high": high,
         }))  # fmt: skip
         if estimator := ESTIMATORS.get(re.split(r"\W", label)[0]):
-            styles[label] = Style(estimator_colour(estimator), estimator_marker(estimator))
+            styles[label] = estimator_style(estimator)
     return Chart(
         claim.name, pd.concat(parts, ignore_index=True), [Column("x", label=place, log=is_log["x"])],
         [Column("y", label=claim.quantity, low="low", high="high", log=is_log["y"])], "lines",

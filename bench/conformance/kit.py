@@ -87,17 +87,22 @@ def main(names: Sequence[str], limit: str = "15m", options: Sequence[str] = ()) 
 
 
 def pytest_report_teststatus(report: Any) -> tuple[str, str, str] | None:
-    """Print an outcome as a line, with the number of a passed check or a reason; pytest calls this hook."""
+    """Print an outcome as a line, with the number of a passed check or a reason; pytest calls this hook.
+
+    A failure of which the line has the whole reason has a category of its own, of which pytest repeats nothing below.
+    """
     if report.passed and report.when != "call":
         return None
+    category = report.outcome
     if report.passed:
         detail = dict(report.user_properties)["found"]
+    elif report.skipped:
+        detail = report.longrepr[2].removeprefix("Skipped: ")
     else:
-        detail = (
-            report.longrepr[2].removeprefix("Skipped: ") if report.skipped else report.longreprtext.splitlines()[-1]
-        )
+        *above, detail = str(report.longrepr).splitlines()
+        category = "failed" if above else "not as declared"
     plugin, _, name = report.nodeid.partition("[")[2][:-1].rpartition("-")
-    return report.outcome, f"{report.outcome[:4]}  {plugin:<38} {name:<38} {detail}\n", report.outcome.upper()
+    return category, f"{report.outcome[:4]}  {plugin:<38} {name:<38} {detail}\n", report.outcome.upper()
 
 
 def parametrize(plugins: Iterable[type[Plugin]], expected_failures: Mapping[str, str] | None = None) -> Any:
@@ -139,7 +144,7 @@ def run(function: Check, subject: Any) -> str:
     except Skipped as reason:
         pytest.skip(printable(reason))
     except Failed as reason:
-        pytest.fail(printable(reason), pytrace=False)
+        raise pytest.fail.Exception(printable(reason), pytrace=False) from None
     _PASSED.add(type(subject))
     return found
 

@@ -103,8 +103,8 @@ def state_is_left_alone(optimizer: Optimizer) -> str:
 @verifies(Optimizer)
 def descends_on_a_bowl(optimizer: Optimizer) -> str:
     """Verify that the optimizer lowers the cost of a quadratic bowl."""
-    first = float(answer(np.zeros((DIM, 1)), frozenset({"value"})).value[0])  # type: ignore[index]
     state, _ = search(optimizer, steps=4 * STEPS)
-    last = float(answer(state["theta"][:, None], frozenset({"value"})).value[0])  # type: ignore[index]
+    both = np.stack([np.zeros(DIM), state["theta"]], axis=1)
+    first, last = map(float, answer(both, frozenset({"value"})).value)  # type: ignore[arg-type]
     require(last < first, f"the cost goes from {first:.3g} to {last:.3g} in {4 * STEPS} steps")
     return f"{first:.3g} to {last:.1e} in {4 * STEPS} steps"

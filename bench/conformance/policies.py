@@ -42,7 +42,7 @@ def shared_theta_acts_like_columns(policy: Policy) -> str:
     shared = policy.act(np, theta[:, :1], observations)
     repeated = policy.act(np, np.repeat(theta[:, :1], COLUMNS, axis=1), observations)
     require(shared.shape == (OUTPUTS, COLUMNS), f"controls are {shared.shape}, not {(OUTPUTS, COLUMNS)}")
-    off = agree(shared, repeated, ROUNDED, "a shared theta and its copies differ")
+    agree(shared, repeated, ROUNDED, "a shared theta and its copies differ")
     changed = observations.copy()
     changed[:, 2] += 1.0
     others = np.arange(COLUMNS) != 2

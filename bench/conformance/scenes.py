@@ -171,17 +171,11 @@ def continuity_is_as_declared(scene: Scene) -> str:
     skip_unless(runs, "no continuous contact law is available")
     jump = largest_jump(runs[0], lines=2)
     if scene.continuous:
-        require(
-            not jump,
-            f"is continuous unless it declares `continuous = False`, but jumps by {jump:.1e} of its range under "
-            f"{describe(runs[0])}",
-        )
-        jump = max(largest_jump(runs[0], offset=side * ELSEWHERE) for side in (1, -1))
-        require(
-            not jump,
-            f"declares to be continuous, but jumps by {jump:.1e} of its range at an offset of {ELSEWHERE:g} sigma",
-        )
-        return f"no jump within {ELSEWHERE + 4:g} sigma of theta0"
+        where = f"within {ELSEWHERE + 4:g} sigma of theta0"
+        jump = jump or max(largest_jump(runs[0], offset=side * ELSEWHERE) for side in (1, -1))
+        detail = f"jumps by {jump:.1e} of its range {where} under {describe(runs[0])}"
+        require(not jump, f"is continuous unless it declares `continuous = False`, but {detail}")
+        return f"no jump {where}"
     require(jump, "declares to jump, but no jump was found within 4 sigma of theta0")
     return f"a jump of {jump:.2g} of the range"
 

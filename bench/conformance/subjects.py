@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import zlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, cast
@@ -175,18 +175,15 @@ def sound_scenes() -> list[Scene]:
     return list(dict.fromkeys(program.scene for program in all_programs()))
 
 
-def representative_programs(programs: Iterable[Program]) -> list[Program]:
+def representative_programs(programs: Sequence[Program]) -> list[Program]:
     """Return a subset of the programs that contains every scene and every contact law."""
     few = []
     for index, (_, group) in enumerate(itertools.groupby(programs, key=lambda p: type(p.scene))):
         laws = list(group)
         few.append(laws[index % len(laws)])
-    used = {type(p.contact) for p in few}
-    for program in programs:
-        if type(program.contact) not in used:
-            used.add(type(program.contact))
-            few.append(program)
-    return few
+    first = {type(program.contact): program for program in reversed(programs)}
+    used = {type(program.contact) for program in few}
+    return few + [first[law] for law in reversed(first) if law not in used]
 
 
 def distinguishing_programs(programs: Iterable[Program]) -> list[Program]:

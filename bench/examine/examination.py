@@ -98,8 +98,13 @@ def examine(
     >>> report.status, report.cause
     (0, 'smooth')
     """
+    if calls is not None and not (isinstance(calls, int | np.integer) and calls > 0):
+        raise UserError(f"calls={calls} is not a number of calls: give a whole number above 0")
     clock = Clock(
-        _time_limit(budget, calls), progress, _call_limit(calls), parse_duration(compile_budget, "compile_budget")
+        math.inf if budget is None and calls is not None else parse_duration(60.0 if budget is None else budget),
+        progress,
+        math.inf if calls is None else float(calls),
+        parse_duration(compile_budget, "compile_budget"),
     )
     if not isinstance(noise, int | np.integer) or noise < 0:
         raise UserError(f"noise={noise} is not the length of w in cost(theta, w): give a whole number")
@@ -138,20 +143,6 @@ def examine(
             return examination.run(named, refined)
         finally:
             clock.clear_progress()
-
-
-def _time_limit(budget: float | str | None, calls: int | None) -> float:
-    if budget is None:
-        return 60.0 if calls is None else math.inf
-    return parse_duration(budget)
-
-
-def _call_limit(calls: int | None) -> float:
-    if calls is None:
-        return math.inf
-    if not isinstance(calls, int | np.integer) or calls < 1:
-        raise UserError(f"calls={calls} is not a number of calls: give a whole number above 0")
-    return float(calls)
 
 
 def _levels(sigma: Any, layout: ParameterTree) -> list[tuple[float, np.ndarray]]:
@@ -259,7 +250,6 @@ class _Examination:
             theta=stages.theta,
             cost=stages.value,
             precision=simulator.precision,
-            is_hidden_single=stages.is_hidden_single,
             batch=simulator.batch + (f":{simulator.fixed}" if simulator.fixed else ""),
             repeats=stages.repeats,
             setup=setup,

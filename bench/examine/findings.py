@@ -14,7 +14,7 @@ from bench.examine.smoothing import TARGET_ERROR, Method, Smoothed
 from bench.gradient import FAULTS, TRUSTED, Check, Part, Sample
 from bench.gradient.diagnosis import Explanation, grows, may_be_adaptive
 from bench.gradient.lines import ALIKE, LineScan
-from bench.gradient.rules import EXCUSABLE, RULES, SUSPICIOUS
+from bench.gradient.rules import EXCUSABLE, RULES, STATUS, SUSPICIOUS, UNEQUAL
 from bench.gradient.stages import Repeats, recaused
 
 if TYPE_CHECKING:
@@ -146,8 +146,6 @@ class Findings:
     """``(d,)``."""
     cost: float
     precision: str
-    is_hidden_single: bool
-    """Whether the cost returns float64 numbers with single precision."""
     batch: str
     repeats: Repeats
     setup: Setup
@@ -197,7 +195,7 @@ class Findings:
     @cached_property
     def settled(self) -> Check | None:
         """The check with tolerated errors counted as right."""
-        if self.check is None or self.check.cause not in (*SUSPICIOUS, "disconnected"):
+        if self.check is None or self.check.cause not in UNEQUAL:
             return self.check
         return recaused(self.check, lambda part: replace(part, verdict="nonlinear") if self._is_small(part) else part)
 
@@ -205,7 +203,7 @@ class Findings:
     def _is_small(self, part: Part) -> bool:
         """Return whether a wrong part's error is within the tolerance."""
         assert self.check is not None
-        if part.verdict not in (*SUSPICIOUS, "disconnected"):
+        if part.verdict not in UNEQUAL:
             return False
         rtol, atol = self.setup.rtol, self.setup.atol
         if part.component is not None:
@@ -312,7 +310,8 @@ class Findings:
                 return "staircase"
             if cause in EXCUSABLE and self.is_discretisation_gap:
                 return "adaptive"
-            if cause in (*SUSPICIOUS, "unsettled", "disconnected") and self.is_overwritten:
+            grown = grows(explained.growth, max(float(self.setup.rtol.max()), 1e-3))
+            if cause in (*UNEQUAL, "unsettled") and grown:
                 return "overwritten"
             # so small an error that adaptive steps may explain it, and the budget ended before that was known
             is_open = explained.is_adaptive is None and self.check is not None and may_be_adaptive(self.check)
@@ -326,7 +325,7 @@ class Findings:
             return "unresolved"
         is_still = not self.moves_around
         if is_still and all(part.verdict == "zero" for part in check.parts) and (allowed is None or not allowed.all()):
-            return "zero"
+            return "constant"
         if is_still and allowed is not None and self.zeros:
             return "no_effect"
         return "saturated" if check.cause == "zero" else check.cause
@@ -356,11 +355,6 @@ class Findings:
             return True
         gradient, own = np.linalg.norm([(gap.gradient, gap.own) for gap in explained.gaps], axis=0)
         return bool(explained.steps) and bool(gradient <= AS_FAR * own)
-
-    @property
-    def is_overwritten(self) -> bool:
-        """Whether the gradient's error grows with the number of steps."""
-        return grows(self.explained.growth, max(float(self.setup.rtol.max()), 1e-3))
 
     @property
     def derivative(self) -> str:
@@ -446,7 +440,7 @@ class Findings:
         """The exit status: 0 right, 1 wrong, 3 not decided; 0 also for the expected cause, and as in the baseline."""
         if self.is_as_before or self.is_expected:
             return 0
-        return {"open": 3, "right": 0}.get(RULES[self.cause].kind, 1)
+        return STATUS[RULES[self.cause].kind]
 
     @property
     def is_expected(self) -> bool:

@@ -27,6 +27,8 @@ GROUPS = 32
 """Number of independent means from which intervals are computed."""
 ENOUGH = 0.03
 """Relative standard error of grad J at which sampling stops, once the bias is decided."""
+CLEAR = 4.0
+"""Multiple of its standard error above which grad J is distinguishable from 0."""
 SMALL_BIAS = 0.01
 """Width of the bias interval, relative to |grad J|, below which remarks on it are omitted."""
 TARGET_ERROR = 0.1
@@ -79,7 +81,7 @@ class Smoothed:
     @property
     def known(self) -> bool:
         """Whether grad J is clearly larger than its own error."""
-        return self.norm > 4.0 * self.error
+        return self.norm > CLEAR * self.error
 
     @property
     def decided(self) -> bool:
@@ -187,7 +189,7 @@ def _summary(
         )
     if plain is not None:
         moved = float(np.linalg.norm(truth - plain))
-    methods = _methods(norm, high, d * u / spread[:, None], up, simulator.clock) if norm > 4.0 * error else ()
+    methods = _methods(norm, high, d * u / spread[:, None], up, simulator.clock) if norm > CLEAR * error else ()
     return Smoothed(sigma, truth, error, norm, pairs, bias, low, high, moved, remark, methods)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from bench.examine.findings import RIGHT, SEEN, UNSHOWN, WRONG, Findings
 from bench.examine.smoothing import PAIRS
 from bench.gradient import FAULTS, Check, Part
-from bench.gradient.rules import RULES, SUSPICIOUS
+from bench.gradient.rules import RULES, SUSPICIOUS, UNEQUAL
 from bench.gradient.stages import is_rough
 from bench.gradient.subspace import GROUPS, MOST
 from bench.report.text import counted, duration, number, span
@@ -42,9 +42,7 @@ def problems(report: Findings) -> list[str]:
     found = [_sentence(cause, derivative_facts(report))]
     if cause == "nondeterministic":  # it does not hide another fault
         found += [
-            _sentence(one.cause, check_facts(report, one))
-            for one in report.wrong_checks[:1]
-            if one.cause in (*SUSPICIOUS, "disconnected")
+            _sentence(one.cause, check_facts(report, one)) for one in report.wrong_checks[:1] if one.cause in UNEQUAL
         ]
     return found
 
@@ -62,7 +60,7 @@ def noise_problems(report: Findings) -> list[str]:
 
 
 def _why_biased(report: Findings) -> str:
-    if report.derivative_cause in (*SUSPICIOUS, "disconnected", "overwritten", "stale_gradient"):
+    if report.derivative_cause in (*UNEQUAL, "overwritten", "stale_gradient"):
         return "the gradient is wrong at theta already"
     return "" if report.derivative == UNSHOWN else "as at a jump, which no gradient sees"
 
@@ -94,7 +92,13 @@ def noise_answer(report: Findings) -> str:
     """Return the answer about the gradient under noise in one line; empty without a gradient."""
     if not report.gradient:
         return ""
-    sigmas = ", ".join(sigma_text(report, one) for one in report.setup.sigmas)
+    levels = report.setup.sigmas
+    if levels and report.noise_cause not in ("", "unmeasured"):
+        # a problem is said of the sigmas that show it; lines show that of the largest
+        levels = [one.sigma for cause, one in report.noise_found if one and cause == report.noise_cause] or [
+            report.setup.reach
+        ]
+    sigmas = ", ".join(sigma_text(report, one) for one in levels)
     where = f"Under noise of sigma {sigmas}" if sigmas else "Around theta" if report.noise_cause else "Under noise"
     if report.noise_cause not in ("", "unmeasured"):
         reason = noise_problems(report)[0]
@@ -142,7 +146,7 @@ def derivative_facts(report: Findings) -> list[str]:
             f"gradients differ by {number(100 * repeats.of_gradient)}%" if repeats.of_gradient else "",
         ],
         "no_effect": report.zeros[:MANY],
-        "zero": [],
+        "constant": [],
         "unresolved": [size_of(report, part) for part in report.unresolved[:1]],
         "rough": [f"by {number(report.settled.noise if report.settled else math.nan)}"],
     }
@@ -288,7 +292,7 @@ def warnings(report: Findings) -> list[str]:
         found.append(
             f"small error, within the tolerance: {size_of(report, small[0])}, in {counted(len(small), 'derivative')}"
         )
-    if report.check is not None and report.check.trusted and report.derivative_cause not in ("zero", "no_effect"):
+    if report.check is not None and report.check.trusted and report.derivative_cause not in ("constant", "no_effect"):
         saturated = [report.label(part) for part in report.check.components if part.verdict == "saturated"]
         is_whole = len(report.zeros) == report.theta.size and report.moves_around  # they have an effect, beside theta
         for verdict, names in (("zero", [] if is_whole else report.zeros), ("saturated", saturated)):
@@ -340,7 +344,7 @@ def advice(report: Findings) -> str:
 def again(report: Findings, setting: str) -> str:
     """Return the command of a report with another setting."""
     name = setting.partition("=")[0]
-    return f"{re.sub(rf' {name}=[^ ]+', '', report.command)} {setting}" if report.command else setting
+    return f"{re.sub(rf' {name}=[^ ]+', '', report.command)} {setting}"
 
 
 # ---------------------------------------------------------------------------------------------------- the text

@@ -93,6 +93,31 @@ def interval(name: str, doc: str = "", unit: str = "", **more: Any) -> Column:
     return Column(name, doc, unit, low=f"{name}_low", high=f"{name}_high", **more)
 
 
+def bounded(
+    name: str,
+    doc: str,
+    unit: str = "",
+    of: str = "its 95% interval",
+    stem: str = "",
+    kind: Callable[..., Column] = Column,
+    has_csv: bool = True,
+    **more: Any,
+) -> list[Column]:
+    """Return a column and those of the ends of its intervals ``of`` some kind, ``<stem>_low`` and ``<stem>_high``."""
+    names = [f"{stem or name}_{end}" for end in ("low", "high")]
+    plain = {"measured": more.get("measured", False), "table": has_csv}
+    ends = zip(names, ("lower", "upper"), strict=True)
+    return [
+        kind(name, doc, unit, low=names[0], high=names[1], **more),
+        *(kind(end, f"{which} end of {of}", unit, **plain) for end, which in ends),
+    ]
+
+
+def exact(name: str, doc: str, called: str, label: str = "", **more: Any) -> Column:
+    """Return a column of numbers without noise; ``called`` is its name in sentences of ``compare``."""
+    return Column(name, doc, comparison=ComparisonRule("exact", called), label=label, **more)
+
+
 def seconds(name: str, doc: str, label: str = "", **more: Any) -> Column:
     """Return a column of measured times."""
     return Column(name, doc, "s", measured=True, label=label, format="seconds", **more)

@@ -35,6 +35,8 @@ class Study(Plugin):
     """The columns of its rows."""
     timed: ClassVar[bool] = False
     """Whether its cells are timed by default: one at a time, with the machine to themselves."""
+    fresh_process: ClassVar[bool] = False
+    """Whether each cell runs in a worker of its own, with one thread, as measurements of memory need."""
 
     default_plugins: ClassVar[Mapping[str, Sequence[str]]] = {"optimizers": ("adam",)}
     """Names of the plugins of a kind that the configuration leaves null, such as ``optimizers``."""

@@ -23,8 +23,6 @@ class Style:
     """A Matplotlib marker; empty for a line without markers."""
     line: Any = "-"
     """A Matplotlib line style; ``none`` for points without a line, each with its marker."""
-    letter: str = ""
-    """The letter in the cells of a grid."""
     meaning: str = ""
     """What the name stands for, in legends."""
     width: float = 1.3

@@ -13,8 +13,8 @@ import numpy as np
 from . import roughness
 from .causes import Ratio, causes_of_ratios
 from .direction import EPS, FINE, GUARD, Finding, Sample, judge
+from .rules import FAULTS, RULES, TRUSTED, UNEQUAL, most_severe
 from .sampling import Modes, order, repeats, sampled
-from .verdicts import FAULTS, MEANING, TRUSTED, most_severe
 
 Cost = Callable[[np.ndarray], np.ndarray]
 """Costs of columns: ``(d, B)`` to ``(B,)``."""
@@ -111,7 +111,7 @@ class Check:
     """The outcome of a check."""
 
     cause: str
-    """The worst verdict, one of :data:`.verdicts.VERDICTS`."""
+    """The worst verdict, one of :data:`.rules.VERDICTS`."""
     gradient: np.ndarray
     parts: tuple[Part, ...]
     """Components and random directions at theta."""
@@ -142,13 +142,14 @@ class Check:
 
     @property
     def worst_parts(self) -> tuple[Part, ...]:
-        """The parts with the worst verdict: at theta if there are any, else at other thetas."""
-        here = tuple(part for part in self.parts if part.verdict == self.cause)
-        return here or tuple(part for part in self.draws if part.verdict == self.cause)
+        """The parts with the worst verdict, or all unequal ones with the first of these: at theta if any, else at other thetas."""
+        causes = UNEQUAL if self.cause in UNEQUAL else (self.cause,)
+        here = tuple(part for part in self.parts if part.verdict in causes)
+        return here or tuple(part for part in self.draws if part.verdict in causes)
 
     def sentence(self) -> str:
         """Return the verdict in one sentence, with the numbers of the worst part."""
-        text = f"{self.cause}: {MEANING[self.cause]}"
+        text = f"{self.cause}: {RULES[self.cause].meaning}"
         if self.trusted or not self.worst_parts:
             return text
         part = max(self.worst_parts, key=lambda p: (p.component is not None, np.nan_to_num(p.error, nan=np.inf)))
@@ -225,24 +226,23 @@ class _Line:
     component: int | None = None
 
 
+@dataclass
 class _Checker:
-    """One check: the callables, and the counts of costs and gradients computed."""
+    """One check: what is given, the random numbers, and what was measured of a loose solver."""
 
-    def __init__(
-        self,
-        cost: Cost,
-        gradient: Gradient | None,
-        theta: np.ndarray,
-        options: Options,
-        modes: Modes | None,
-        tangent: Tangent | None = None,
-    ) -> None:
-        if theta.ndim != 1 or not theta.size:
-            raise ValueError(f"theta is a vector of at least one number, not of shape {theta.shape}")
-        self._cost, self._gradient, self._modes, self._tangent = cost, gradient, modes, tangent
-        self.theta, self.options, self.unit = theta, options, options.unit
-        self.scale = self._scales() if options.scale is None else np.asarray(options.scale, dtype=np.float64)
-        self.random = np.random.default_rng([options.seed, 0x67726164])
+    _cost: Cost
+    _gradient: Gradient | None
+    theta: np.ndarray
+    options: Options
+    _modes: Modes | None
+    _tangent: Tangent | None
+
+    def __post_init__(self) -> None:
+        if self.theta.ndim != 1 or not self.theta.size:
+            raise ValueError(f"theta is a vector of at least one number, not of shape {self.theta.shape}")
+        scale, self.unit = self.options.scale, self.options.unit
+        self.scale = self._scales() if scale is None else np.asarray(scale, dtype=np.float64)
+        self.random = np.random.default_rng([self.options.seed, 0x67726164])
         self._rates: list[float] = []
 
     def _scales(self) -> np.ndarray:
@@ -384,14 +384,14 @@ class _Checker:
         Directions that are clearly right are not scanned. A derivative of exactly 0 is not clearly right where
         differences are not 0, since it may be the slope of a tread.
         """
-        clear = ("smooth", "nonlinear", "mode_crossing", "zero", "nonfinite", "nondeterministic")
+        clear = (*PLAINLY, "zero", "nonfinite", "nondeterministic")
         to_scan = [
             m
             for m, (sample, finding) in enumerate(zip(measured, findings, strict=True))
             if finding.verdict not in clear
             or (finding.verdict == "nonlinear" and sample.derivative == 0.0 and sample.differences.any())
         ][: self.options.scanned]
-        along = roughness.staircase_offsets(1.0, self.unit)
+        along = roughness.staircase_offsets(self.unit)
         for m in to_scan:
             at = lines[m].theta[:, None] + lines[m].vector[:, None] * along.reshape(1, -1)
             values = self.cost(at).reshape(along.shape)

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from bench.gradient import Check, FewSteps
+from bench.gradient import Check
+from bench.gradient.few import FewSteps
 from bench.gradient.lines import LineScan, scan
 from bench.gradient.rules import SUSPICIOUS
 from bench.gradient.stages import GradientStages

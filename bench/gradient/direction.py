@@ -23,6 +23,8 @@ GUARD = 64.0
 """Allowed rounding error of a rollout's cost and of displaced thetas, in unit roundoffs."""
 MEASURED = 8.0
 """Allowed error of a cost whose noise is measured, in standard deviations of the noise and in unit roundoffs."""
+NOISY = 80.0
+"""Error of a difference, in multiples of its rounding in float64, above which the cost has noise of its own."""
 RISE = 0.01
 """Relative error above which the difference at a large step counts as inaccurate."""
 DECADES = 3.0
@@ -31,6 +33,8 @@ SHORT_WINDOW = 4
 """Neighbouring steps over which a slope must be constant in an exploding rollout, and a jump at the smallest steps."""
 ALIKE = 0.1
 """Relative spread within which values count as equal."""
+CHANCE = 10.0
+"""Multiple of the smallest spread of neighbouring differences that counts as their error: it is partly small by chance."""
 MIN_STEPS = 7
 """Fewest steps with finite costs on both sides; with fewer, the verdict is ``nonfinite``."""
 
@@ -171,8 +175,7 @@ def _judge(sample: Sample) -> Finding:
         )
     index, spread = plateau(sample, noise)
     uncertainty = spread + float(noise[index])
-    # ten times the spread, since the smallest of many spreads is partly small by chance
-    tolerance = 10.0 * spread + float(noise[index]) + _resolution(sample, index) + sample.doubt
+    tolerance = CHANCE * spread + float(noise[index]) + _resolution(sample, index) + sample.doubt
     apart = abs(float(sample.differences[index]) - sample.derivative)
     alike, rounding = ALIKE * sample.size(index), GUARD * float(sample.rounding(sample.unit)[index])
     resolved = uncertainty <= max(alike, rounding)
@@ -202,7 +205,8 @@ def plateau(sample: Sample, noise: np.ndarray) -> tuple[int, float]:
     changes.
     """
     differences = sample.differences
-    spread = _spread(differences)
+    between = np.abs(np.diff(differences))
+    spread = np.fmax(np.r_[between[0], between], np.r_[between, between[-1]])  # the largest distance from a neighbour
     apart = np.abs(differences[:, None] - differences)
     allowed = 3.0 * spread[:, None] + noise[:, None] + 2.0 * noise
     contradicted = (np.triu(apart > allowed, 1)).any(axis=1)
@@ -214,12 +218,6 @@ def plateau(sample: Sample, noise: np.ndarray) -> tuple[int, float]:
         worth = np.where(differences == 0.0, np.inf, worth)
     index = int(np.argmin(worth))
     return index, float(spread[index])
-
-
-def _spread(differences: np.ndarray) -> np.ndarray:
-    """Return the largest disagreement of each difference with its neighbours, ``(K,)``."""
-    apart = np.abs(np.diff(differences))
-    return np.asarray(np.fmax(np.r_[apart[0], apart], np.r_[apart, apart[-1]]))
 
 
 def _is_credible(sample: Sample, index: int, uncertainty: float, tolerance: float) -> bool:
@@ -344,7 +342,7 @@ def _classify_right(sample: Sample, index: int, still: np.ndarray) -> str:
         return "saturated"
     errors = np.abs(sample.differences - sample.derivative)
     small = np.arange(errors.size) > index
-    if (errors > 10.0 * GUARD / MEASURED * sample.rounding(float(np.finfo(np.float64).eps)))[small].sum() >= 3:
+    if (errors > NOISY * sample.rounding(float(np.finfo(np.float64).eps)))[small].sum() >= 3:
         return "rounding"
     risen = (errors > RISE * sample.size(index)) & ~small & (errors > sample.uncertainty)
     if (risen & sample.crossing).any():

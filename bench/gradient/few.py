@@ -16,8 +16,8 @@ import numpy as np
 from .causes import causes_of_ratios
 from .check import Check, Part
 from .direction import ALIKE, MEASURED, Sample, finding_at, wrong
+from .rules import most_severe
 from .subspace import Subspace
-from .verdicts import most_severe
 
 ROUNDS = (1.0, 30.0, 0.1)
 """Steps of the rounds, in multiples of the cube root of the unit roundoff, at which rounding and curvature balance."""

@@ -71,10 +71,9 @@ def scatter(step: np.ndarray, differences: np.ndarray) -> float:
     return middle if turns >= POINTS // 2 and size.max() <= 10.0 * middle else 0.0
 
 
-def staircase_offsets(scale: float, unit: float) -> np.ndarray:
+def staircase_offsets(unit: float) -> np.ndarray:
     """Return displacements ``(7, SCAN)`` for :func:`is_staircase`, at seven spacings a decade apart."""
-    spacings = np.sqrt(unit) * 10.0 ** np.arange(-2.0, 5.0) * scale
-    return np.asarray(spacings[:, None] * np.arange(SCAN))
+    return np.outer(np.sqrt(unit) * 10.0 ** np.arange(-2.0, 5.0), np.arange(SCAN))
 
 
 def is_staircase(values: np.ndarray, rounding: float) -> bool:

@@ -18,17 +18,15 @@ import numpy as np
 from bench.gradient import (
     EPS,
     FAULTS,
-    ROUNDS,
     TRUSTED,
     Check,
-    FewSteps,
     Options,
     Part,
     Sample,
     check,
-    is_nothing,
     most_severe,
 )  # fmt: skip
+from bench.gradient.few import ROUNDS, FewSteps, is_nothing
 from bench.gradient.roughness import FINE
 from bench.gradient.subspace import Group, Subspace, choose, locate
 from bench.simulator.clock import OutOfTime
@@ -145,8 +143,6 @@ class GradientStages:
         self.left_out: list[str] = []
         self.repeats = Repeats(floor_of_gradient=simulator.unit**SMALL)
         self._repeated = False  # whether calls were repeated within the budget
-        self.is_hidden_single = False
-        """Whether the cost has single precision, though it returns a float64."""
         self._costs_store, self._gradients_store = Store(), Store()
 
     # ------------------------------------------------------------------------------------------------ calls
@@ -235,7 +231,7 @@ class GradientStages:
             for stage in (partial(self._compare_quickly, space), self._repeat):
                 stage()
                 if self._has_hidden_single():
-                    self.simulator.precision, self.is_hidden_single = "float32", True
+                    self.simulator.precision = "float32"
                     self._compare_quickly(space)
         except OutOfTime:
             self.left_out.append("the check at more than one step")

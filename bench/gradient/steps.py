@@ -35,12 +35,8 @@ def changing_loop(simulator: Simulator, thetas: np.ndarray, w: np.ndarray | None
     place = _loop_of_jax(simulator, thetas[:, 0], w)
     if place or simulator.library == "jax":
         return place
-    return changed_loop([traced_loops(simulator, theta, w) for theta in thetas.T])
-
-
-def changed_loop(runs: list[Loops]) -> str:
-    """Return the place of a loop that ran in each of the runs, with other numbers of iterations; empty without one."""
-    for file, line in sorted(set.intersection(*(set(loops) for loops in runs))):
+    runs = [traced_loops(simulator, theta, w) for theta in thetas.T]
+    for file, line in sorted(set.intersection(*map(set, runs))):
         if any(loops[file, line] != runs[0][file, line] for loops in runs):
             return f"{Path(file).name}:{line}"
     return ""

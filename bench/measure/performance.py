@@ -59,14 +59,12 @@ def bootstrap(
     statistic: Callable[[Sequence[np.ndarray]], float],
     seed: int = 0,
     draws: int = DRAWS,
-    expanded: bool = True,
 ) -> Interval:
     """Return the bootstrap percentile interval of a statistic, resampling each stratum along its first axis.
 
-    Resamples in which the statistic is NaN are ignored. The interval is NaN if all are. With ``expanded``, :func:`_tail`
-    gives the quantiles, for statistics such as means; else they are 2.5% and 97.5%.
+    Resamples in which the statistic is NaN are ignored. The interval is NaN if all are. :func:`_tail` gives the quantiles.
     """
-    (interval,) = bootstrap_along(strata, lambda drawn: np.array([statistic(drawn)]), seed, draws, expanded)
+    (interval,) = bootstrap_along(strata, lambda drawn: np.array([statistic(drawn)]), seed, draws)
     return interval
 
 
@@ -75,12 +73,11 @@ def bootstrap_along(
     statistic: Callable[[Sequence[np.ndarray]], np.ndarray],
     seed: int = 0,
     draws: int = DRAWS,
-    expanded: bool = True,
 ) -> list[Interval]:
     """Return the intervals of :func:`bootstrap` of each number of a statistic ``(k,)``, from the same resamples."""
     rng = np.random.default_rng(seed)
     drawn = [statistic([part[rng.integers(0, len(part), len(part))] for part in strata]) for _ in range(draws)]
-    tail = _tail([len(part) for part in strata]) if expanded else 0.025
+    tail = _tail([len(part) for part in strata])
     intervals = []
     for values in np.transpose(drawn):
         known = values[~np.isnan(values)]
@@ -126,45 +123,3 @@ def interquartile_mean(values: np.ndarray) -> float:
     edges = np.arange(n + 1) / n
     inside = np.clip(np.minimum(edges[1:], 0.75) - np.maximum(edges[:-1], 0.25), 0.0, None)
     return float(ordered @ inside / inside.sum())
-
-
-def ranks(values: np.ndarray) -> np.ndarray:
-    """Return ranks, starting at 1. Ties share their mean rank, and infinities tie for last."""
-    from scipy.stats import rankdata
-
-    return np.asarray(rankdata(values))
-
-
-def spearman(x: np.ndarray, y: np.ndarray) -> float:
-    """Return Spearman's rank correlation; NaN if ``x`` or ``y`` is constant or there are fewer than three points."""
-    if len(x) < 3:
-        return math.nan
-    a, b = ranks(x), ranks(y)
-    a, b = a - a.mean(), b - b.mean()
-    size = math.sqrt(float((a @ a) * (b @ b)))
-    return float(a @ b) / size if size else math.nan
-
-
-def spearman_interval(points: Sequence[np.ndarray], seed: int = 0, draws: int = DRAWS) -> Interval:
-    """Return the bootstrap interval of Spearman's rho over strata of points ``(n, 2)``, resampled within each stratum."""
-
-    def rho(parts: Sequence[np.ndarray]) -> float:
-        both = np.concatenate(parts)
-        return spearman(both[:, 0], both[:, 1])
-
-    return bootstrap(points, rho, seed, draws, expanded=False)
-
-
-def spearman_chance(points: Sequence[np.ndarray], seed: int = 0, draws: int = DRAWS) -> float:
-    """Return the permutation p-value of Spearman's rho over strata of points ``(n, 2)``, permuted within each stratum.
-
-    A few points that happen to be in order give a narrow bootstrap interval, but their p-value stays large.
-    """
-    rng = np.random.default_rng(seed)
-    whole = np.concatenate(points)
-    observed = abs(spearman(whole[:, 0], whole[:, 1]))
-    if math.isnan(observed):
-        return 1.0
-    y = np.stack([np.concatenate([rng.permutation(part[:, 1]) for part in points]) for _ in range(draws)])
-    n_as_far = sum(abs(spearman(whole[:, 0], one)) >= observed - 1e-12 for one in y)
-    return (1 + n_as_far) / (1 + draws)

@@ -18,7 +18,7 @@ import pandas as pd
 
 from bench.errors import UserError, unknown
 from bench.report.problems import value_text
-from bench.report.text import duration, interval, listed, number, span
+from bench.report.text import duration, interval, listed, number
 
 REFERENCE = re.compile(r"\{([^{}]*)\}")
 CONDITION = re.compile(r'\s*([^,=<>!]+?)\s*(<=|>=|!=|=|<|>)\s*("[^"]*"|[^,]*)\s*(?:,|$)')
@@ -106,26 +106,21 @@ def _percents(rows: pd.DataFrame, column: str) -> str:
     return f"{value:.0%} [{low:.0%}, {high:.0%}]"
 
 
-def _seconds(rows: pd.DataFrame, column: str) -> str:
-    values = _finite(rows, column)
-    return " to ".join(dict.fromkeys((duration(values.min()), duration(values.max()))))
+def _ends(text: Callable[[float], str]) -> Callable[[pd.DataFrame, str], str]:
+    """Return the function that formats the least and the largest value, or one of them where both print the same."""
 
+    def ends(rows: pd.DataFrame, column: str) -> str:
+        values = _finite(rows, column)
+        return " to ".join(dict.fromkeys((text(values.min()), text(values.max()))))
 
-def _number(rows: pd.DataFrame, column: str, factor: float = 1.0, suffix: str = "") -> str:
-    values = factor * _finite(rows, column)
-    return span(values.min(), values.max(), suffix=suffix)
-
-
-def _integer(rows: pd.DataFrame, column: str) -> str:
-    values = _finite(rows, column)
-    return " to ".join(dict.fromkeys((f"{values.min():,.0f}", f"{values.max():,.0f}")))
+    return ends
 
 
 FORMATS: dict[str, Callable[[pd.DataFrame, str], str]] = {
-    "number": _number,
-    "percent": lambda rows, column: _number(rows, column, 100.0, "%"),
-    "integer": _integer,
-    "seconds": _seconds,
+    "number": _ends(number),
+    "percent": _ends(lambda value: f"{number(100.0 * value)}%"),
+    "integer": _ends("{:,.0f}".format),
+    "seconds": _ends(duration),
     "least": lambda rows, column: number(_finite(rows, column).min()),
     "most": lambda rows, column: number(_finite(rows, column).max()),
     "interval": _interval,

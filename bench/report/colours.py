@@ -1,24 +1,34 @@
-"""Returns the colour and marker of an estimator in every chart, by its place among all registered estimators."""
+"""Returns the look of an estimator in every chart, by its place among all registered estimators."""
 
 from __future__ import annotations
 
 import re
 from collections import Counter
+from collections.abc import Iterable
 from functools import cache
 
 from bench.experiment.config import config_dir
+from bench.experiment.views import Style
 from bench.model import registry
-from bench.report.style import colour, marker
+from bench.report.style import VARIANTS, colour, marker
 
 
-def estimator_colour(estimator: str) -> str:
-    """Return the estimator's colour."""
-    return colour(_place(estimator))
+def estimator_style(estimator: str, variant: int = 0) -> Style:
+    """Return the look of an estimator: its colour, with a marker and dashes for each of its parameter variants, from 0."""
+    names = estimator_order()
+    place = names.index(estimator) if estimator in names else len(names)
+    return Style(colour(place), marker(place, variant), VARIANTS[variant % len(VARIANTS)])
 
 
-def estimator_marker(estimator: str, variant: int = 0) -> str:
-    """Return the estimator's marker; ``variant`` is the number of its parameter variant, from 0."""
-    return marker(_place(estimator), variant)
+def method_styles(methods: Iterable[str]) -> dict[str, Style]:
+    """Return the look of each method, named by its estimator first: ``alpha_order[gamma=1], adam``."""
+    looks: dict[str, Style] = {}
+    uses: Counter[str] = Counter()
+    for method in sorted(methods, key=lambda name: "[" in name):
+        estimator = re.split(r"[\[,]", method)[0]
+        looks[method] = estimator_style(estimator, uses[estimator])
+        uses[estimator] += 1
+    return looks
 
 
 def estimator_order() -> list[str]:
@@ -35,8 +45,3 @@ def _uses() -> Counter[str]:
     """Return in how many of the package's experiments each word occurs."""
     paths = sorted((config_dir() / "experiment").glob("*.yaml"))
     return Counter(word for path in paths for word in set(re.findall(r"\w+", path.read_text(encoding="utf-8"))))
-
-
-def _place(estimator: str) -> int:
-    names = estimator_order()
-    return names.index(estimator) if estimator in names else len(names)

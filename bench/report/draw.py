@@ -314,28 +314,47 @@ def _draw_lines(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str,
         style = styles[str(key[0]) if chart.series else ""]
         is_line, is_number = chart.kind == "lines", pd.api.types.is_numeric_dtype(points[x.name])
         points = points.sort_values(x.name, kind="stable") if is_line and is_number else points
-        values, low, high, limit = _values(points, y, log)
-        places = points[x.name].to_numpy()
         mark = style.marker if not is_line or len(points) <= MANY or style.line == "none" else ""
-        common: dict[str, Any] = {"color": style.colour, "zorder": 3 + 0.01 * order}
-        panel.plot(places, values, linestyle=style.line if is_line else "none", linewidth=style.width, **common)
-        if mark:
-            _mark(panel, places, values, limit, marker=mark, **common)
-        if chart.band:
-            panel.fill_between(places, low, high, color=style.colour, alpha=0.18, linewidth=0, zorder=2)
-        else:
-            known = np.isfinite(low)
-            panel.vlines(places[known], low[known], high[known], linewidth=1.0, **common)
-        lost = points[chart.failed].to_numpy(bool) if chart.failed else np.zeros(len(points), dtype=bool)
-        if lost.any():
-            panel.plot(
-                places[lost], np.full(lost.sum(), 0.97), "x", transform=panel.get_xaxis_transform(), markersize=5,
-                markeredgewidth=1.4, clip_on=False, **common,
-            )  # fmt: skip
+        _draw_values(chart, panel, points, y, log, points[x.name].to_numpy(), style, mark, 3 + 0.01 * order)
     if chart.front:
         known = part[np.isfinite(part[[x.name, y.name]]).all(axis=1)].sort_values(x.name)
         best = known[pareto(known[x.name], known[y.name])]
         panel.plot(best[x.name], best[y.name], zorder=2, **FRONT)
+
+
+def _draw_values(
+    chart: Chart,
+    panel: Axes,
+    points: pd.DataFrame,
+    column: Column,
+    log: bool,
+    places: np.ndarray,
+    style: Style,
+    marker: str,
+    zorder: float,
+) -> None:
+    """Draw the values of a column at ``places`` of the other axis, with intervals; limits are hollow, failures crosses at the edge."""
+    values, low, high, limit = _values(points, column, log)
+    is_flat = chart.kind == "dots"
+    look: dict[str, Any] = {"color": style.colour, "zorder": zorder}
+
+    def plot(at: Any, value: Any, **more: Any) -> None:
+        panel.plot(*((value, at) if is_flat else (at, value)), **look | more)
+
+    if chart.kind == "lines":
+        plot(places, values, linestyle=style.line, linewidth=style.width)
+    for these, face in ((~limit, {}), (limit, {"markerfacecolor": "white"})) if marker else ():
+        plot(places[these], values[these], marker=marker, linestyle="none", **face)
+    if chart.band:
+        panel.fill_between(places, low, high, color=style.colour, alpha=0.18, linewidth=0, zorder=2)
+    else:
+        known = np.isfinite(low)
+        (panel.hlines if is_flat else panel.vlines)(places[known], low[known], high[known], linewidth=1.0, **look)
+    lost = points[chart.failed].to_numpy(bool) if chart.failed else np.zeros(len(points), dtype=bool)
+    if lost.any():
+        edge = panel.get_yaxis_transform() if is_flat else panel.get_xaxis_transform()
+        plot(places[lost], np.full(lost.sum(), 0.97), marker="x", linestyle="none", transform=edge, markersize=5,
+             markeredgewidth=1.4, clip_on=False)  # fmt: skip
 
 
 def _values(points: pd.DataFrame, column: Column, log: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -350,12 +369,6 @@ def _values(points: pd.DataFrame, column: Column, log: bool) -> tuple[np.ndarray
         low, high = np.maximum(low, 1e-300), np.where(np.isinf(high), values * UNLIMITED, high)
     known = np.isfinite(values + low + high) & ~limit
     return values, np.where(known, low, np.nan), np.where(known, high, np.nan), limit
-
-
-def _mark(panel: Axes, x: np.ndarray, y: np.ndarray, limit: np.ndarray, **look: Any) -> None:
-    """Draw markers, hollow where the value is a limit."""
-    panel.plot(x[~limit], y[~limit], linestyle="none", **look)
-    panel.plot(x[limit], y[limit], linestyle="none", markerfacecolor="white", **look)
 
 
 # ----------------------------------------------------------------------------------------------- dots and grids
@@ -379,13 +392,7 @@ def _draw_dots(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str, 
         points = part[part[chart.series].astype(str) == series] if chart.series else part
         shift = -0.5 * (number - (len(styles) - 1) / 2) / max(len(styles), 2) if is_spread else 0.0
         rows = np.array([place[str(v)] for v in points[y.name]]) + shift
-        at, low, high, limit = _values(points, x, log)
-        known = np.isfinite(low)
-        panel.hlines(rows[known], low[known], high[known], linewidth=1.0, color=style.colour, zorder=3)
-        _mark(panel, at, rows, limit, marker=style.marker or "o", color=style.colour, zorder=3)
-        lost = rows[points[chart.failed].to_numpy(bool)] if chart.failed else rows[:0]
-        look = {"transform": panel.get_yaxis_transform(), "color": style.colour, "markersize": 5}
-        panel.plot(np.full(len(lost), 0.985), lost, "x", **look)
+        _draw_values(chart, panel, points, x, log, rows, style, style.marker or "o", 3)
     panel.grid(axis="y", color="#e4e4e4", linewidth=0.6)
     panel.set_axisbelow(True)
     panel.set_xlabel(plain(x.heading))

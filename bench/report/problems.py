@@ -159,15 +159,6 @@ def titled(rows: pd.DataFrame, names: Sequence[str]) -> pd.Series:
     )
 
 
-def named_values(rows: pd.DataFrame, names: Sequence[str]) -> dict[str, list[str]]:
-    """Return some columns of numbers as strings, ``sigma=0.1``; empty where they are the same for the scene and law."""
-    varying = rows.groupby(["scene", "contact"])[list(names)].transform("nunique") > 1
-    return {
-        name: [f"{name}={axis_value(x)}" if varies else "" for x, varies in zip(rows[name], varying[name], strict=True)]
-        for name in names
-    }
-
-
 def _with_name(column: Any, value: Any) -> str:
     if isinstance(value, str):
         return "" if value == "none" else value

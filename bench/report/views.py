@@ -132,8 +132,7 @@ class Curve:
     @cached_property
     def at(self) -> dict[float, dict[str, Any]]:
         """The rows as dictionaries, by ``x``."""
-        names, values = [str(name) for name in self.rows], self.rows.to_numpy(dtype=object)
-        return {float(x): dict(zip(names, row, strict=True)) for x, row in zip(self.rows.index, values, strict=True)}
+        return dict(self.rows.to_dict("index"))
 
     @property
     def label(self) -> str:
@@ -153,12 +152,10 @@ def estimator_curves(rows: pd.DataFrame, close: float | None = CLOSE) -> list[Cu
     """
     rows = attempted(rows)
     several = rows["dtype"].nunique() > 1
-    tidy = rows.drop_duplicates([*RUN, "x"], keep="last").sort_values("x", kind="stable").set_index("x")
-    parts: dict[Any, pd.DataFrame] = dict(list(tidy.groupby(list(RUN), sort=False)))
     every: dict[tuple[str, str], dict[str, pd.DataFrame]] = {}
-    for estimator, params, backend, dtype in rows[list(RUN)].drop_duplicates().itertuples(index=False, name=None):
-        name = f"{backend} {dtype}" if several else str(backend)
-        every.setdefault((estimator, params), {})[name] = parts[estimator, params, backend, dtype]
+    for (estimator, params, backend, dtype), part in rows.groupby(list(RUN), sort=False):
+        run = part.drop_duplicates("x", keep="last").sort_values("x", kind="stable").set_index("x")
+        every.setdefault((estimator, params), {})[f"{backend} {dtype}" if several else backend] = run
     result = []
     for (estimator, params), runs in every.items():
         while runs:

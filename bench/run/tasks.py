@@ -110,7 +110,7 @@ class TaskHandler:
                 result["dtype"] = "float32"
         if others := RAN - item.outside:
             remarks.append(f"this process has also run code of {printable(', '.join(sorted(others)))}")
-        self.is_tainted = bool(changes) or not registry.is_restricted()
+        self.is_tainted = bool(changes) or self._study.fresh_process or not registry.is_restricted()
         return result | {"reason": "; ".join(filter(None, (result.get("reason", ""), *remarks)))} if remarks else result
 
     def _handle(self, item: Task) -> dict[str, Any]:

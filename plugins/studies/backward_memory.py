@@ -4,29 +4,21 @@ from __future__ import annotations
 
 import ctypes
 import gc
-import json
-import os
-import pickle
-import subprocess
-import sys
-import tempfile
 import time
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bench.errors import Crashed, failure
 from bench.experiment import grid
 from bench.experiment.cell import Cell
-from bench.experiment.columns import Column, Columns, ComparisonRule, interval, numbers, text
+from bench.experiment.columns import Column, Columns, ComparisonRule, bounded, exact, interval, numbers, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.session import Session
 from bench.experiment.views import Chart, Table, Views
 from bench.measure import timing
-from bench.model import Compilations, param, registry
+from bench.model import param
 
 from . import PARTS, StudyPackage, finite_status, first_batch, relative_error
 
@@ -35,21 +27,14 @@ if TYPE_CHECKING:
 
     from bench.report.shown import Shown
 
-PROGRAM = f"import sys; sys.path[:] = sys.argv.pop().split(chr(0x1f)); from {__name__} import main; main()"
-"""The program of a cell's process, which has the import path of this one."""
-ENVIRONMENT = {
-    "OMP_NUM_THREADS": "1",
-    "OPENBLAS_NUM_THREADS": "1",
-    "MKL_NUM_THREADS": "1",
-    "NPROC": "1",
-    "MALLOC_MMAP_THRESHOLD_": str(1 << 17),
-}
-"""Variables for the cell's process: one thread for numerical libraries, and blocks of 128 KiB and more that the C library
-returns to the system when they are freed. By default it raises that limit, and keeps freed blocks for later calls."""
+M_MMAP_THRESHOLD, BLOCK = -3, 1 << 17
+"""Option of the C library and its value: blocks of 128 KiB and more return to the system when they are freed. By default the
+library raises that limit, and keeps freed blocks for later calls."""
 FLOOR = 0.3
 """Error of a measured memory in MiB: the kernel counts resident pages late, so that peaks are 0.1 to 0.25 MiB too low."""
 SMALL = 1.0
 """Memory in MiB, about three floors, below which a memory is an upper limit without ratios and orders."""
+RANGE = "the range of the calls"
 ENDS = ("", "_low", "_high")
 """Endings of the columns of a value and of the ends of its interval."""
 SHOWN = ("memory_mb", "gradient_s", "process_mb", "gradient_error_rel")
@@ -84,22 +69,19 @@ class BackwardMemory(StudyPackage):
     name = "backward_memory"
     axes = PARTS
     columns = Columns.of(
-        interval("memory_mb", "largest resident memory during `samples` gradients beyond the memory before, median over calls",
-               "MiB", label="memory", measured=True),
-        Column("memory_mb_low", "smallest of the calls: lower end of the interval", "MiB", measured=True),
-        Column("memory_mb_high", "largest of the calls: upper end of the interval", "MiB", measured=True),
-        interval("gradient_s", "processor time of `samples` gradients on one thread, median over calls", "s", label="gradients", measured=True, format="seconds"),
-        Column("gradient_s_low", "smallest of the calls: lower end of the interval", "s", measured=True),
-        Column("gradient_s_high", "largest of the calls: upper end of the interval", "s", measured=True),
+        *bounded("memory_mb", "largest resident memory during `samples` gradients beyond the memory before, median over calls",
+                 "MiB", RANGE, label="memory", measured=True),
+        *bounded("gradient_s", "processor time of `samples` gradients on one thread, median over calls", "s", RANGE,
+                 label="gradients", measured=True, format="seconds"),
         Column("process_mb", "resident memory before the gradients: libraries, compiled program, theta and noise", "MiB",
                label="process", measured=True),
-        Column("gradient_error_rel", "distance of the mean gradient from that of the backend in `compared_with`, relative to "
-               "its norm", label="difference", comparison=ComparisonRule("exact", "difference of gradients")),
+        exact("gradient_error_rel", "distance of the mean gradient from that of the backend in `compared_with`, relative to its norm",
+              "difference of gradients", "difference"),
         text("compared_with", "backend of the gradient that gradient_error_rel compares with"),
         numbers("gradient", "mean gradient of the batch, by coordinate of theta",
                 comparison=ComparisonRule("vector", "gradient")),
     )  # fmt: skip
-    timed = True
+    timed = fresh_process = True
 
     calls: int = param(
         6, "measured calls: the range of six contains the median of their distribution with probability 97%", low=6
@@ -110,18 +92,35 @@ class BackwardMemory(StudyPackage):
         return None if "grad" in cell.backend.provides else f"backend {cell.backend.name} computes no gradients"
 
     def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
-        """Return one cell's results by column. Raises :class:`Crashed` if the cell's process ends without a result."""
-        answer = in_process(cell, self.calls, session.problems.compilations.folder)
-        if "status" in answer:
-            return answer
-        gradient = np.array(answer["gradient"])
+        """Return one cell's results by column: the mean gradient, and processor times and peaks of memory of some calls.
+
+        The whole batch is one block on one thread, so that processor time is the time on an otherwise idle machine, and
+        other load hardly changes it. A first call compiles. Memory freed by earlier calls returns to the system before each.
+        """
+        problem = session.problem(cell)
+        problem.block, problem.threads = cell.samples, 1
+        theta, w = problem.program.theta0, first_batch(cell, problem.program.n_noise)
+        gradient = problem.grad(theta, w).mean(axis=1)
+        seconds, peaks, before = [], [], []
+        for _ in range(self.calls):
+            gc.collect()
+            with suppress(AttributeError, OSError):  # glibc only
+                library = ctypes.CDLL(None)
+                library.mallopt(M_MMAP_THRESHOLD, BLOCK)
+                library.malloc_trim(0)
+            timing.reset_peak_memory()
+            before.append(timing.peak_memory_mb())
+            started = time.process_time()
+            problem.grad(theta, w)
+            seconds.append(time.process_time() - started)
+            peaks.append(timing.peak_memory_mb() - before[-1])
         result = finite_status("the gradient is not finite", gradient) | {
-            "gradient": answer["gradient"], **spread("gradient_s", answer["seconds"]), **spread("memory_mb", answer["peaks"]),
-            "process_mb": float(np.median(answer["before"])), "compared_with": "",
+            "gradient": gradient.tolist(), **spread("gradient_s", seconds), **spread("memory_mb", peaks),
+            "process_mb": float(np.median(before)), "compared_with": "",
         }  # fmt: skip
         if cell.ranked_backends:
             other = session.problems.of(cell.ranked_backends[0], cell)
-            expected = other.grad(other.program.theta0, first_batch(cell, other.program.n_noise)).mean(axis=1)
+            expected = other.grad(other.program.theta0, w).mean(axis=1)
             error = relative_error(gradient, expected)
             result |= {"compared_with": cell.ranked_backends[0].name, "gradient_error_rel": error}
         return result
@@ -148,66 +147,12 @@ class BackwardMemory(StudyPackage):
         return Views([table, cells], _charts(shown, good))
 
 
-def in_process(cell: Cell, calls: int, cache: Path | None) -> dict[str, Any]:
-    """Return the results of :func:`measured` in a new process, or the status and reason of its error."""
-    with tempfile.TemporaryFile() as file:
-        given = pickle.dumps((registry.folders(), pickle.dumps((cell, calls, cache))))
-        words = [sys.executable, "-c", PROGRAM, str(file.fileno()), chr(0x1F).join(sys.path)]
-        ended = subprocess.run(words, input=given, pass_fds=[file.fileno()], env=os.environ | ENVIRONMENT, check=False)
-        file.seek(0)
-        content = file.read()
-    if ended.returncode or not content:
-        raise Crashed(f"the process that computes the gradients ended with exit status {ended.returncode}")
-    result: dict[str, Any] = json.loads(content)
-    return result
-
-
 def spread(name: str, values: list[float]) -> dict[str, float]:
     """Return the median of some values as column ``name``, and their range as ``name_low`` and ``name_high``.
 
     The range of n independent values contains their distribution's median with probability 1 - 2^(1 - n).
     """
     return {name: float(np.median(values)), f"{name}_low": min(values), f"{name}_high": max(values)}
-
-
-def main() -> None:
-    """Measure the cell on stdin, and write the result as JSON to the file descriptor in ``sys.argv``."""
-    descriptor = int(sys.argv[1])
-    folders, given = pickle.loads(sys.stdin.buffer.read())
-    try:
-        for folder in folders:
-            registry.add_folder(folder)
-        # pickled separately, since its classes may come from the folders of plugins
-        result = measured(*pickle.loads(given))
-    except BaseException as error:
-        result = dict(failure(error))
-    os.write(descriptor, json.dumps(result).encode())
-
-
-def measured(cell: Cell, calls: int, cache: Path | None) -> dict[str, Any]:
-    """Return the mean gradient, and processor times [s] and peaks of memory [MiB] of some calls after one that compiles.
-
-    The whole batch is one block on one thread. Memory freed by earlier calls is returned to the system before each call.
-    On one thread, processor time is the time on an otherwise idle machine, and other load hardly changes it.
-    """
-    problem = cell.backend.compile(cell.program())
-    problem.compilations = Compilations(cache)
-    problem.block, problem.threads = cell.samples, 1
-    theta = problem.program.theta0
-    w = first_batch(cell, problem.program.n_noise)
-    gradient = problem.grad(theta, w).mean(axis=1)
-    seconds, peaks, before = [], [], []
-    for _ in range(calls):
-        gc.collect()
-        with suppress(AttributeError, OSError):  # glibc only
-            ctypes.CDLL(None).malloc_trim(0)
-        timing.reset_peak_memory()
-        before.append(timing.peak_memory_mb())
-        started = time.process_time()
-        problem.grad(theta, w)
-        seconds.append(time.process_time() - started)
-        peaks.append(timing.peak_memory_mb() - before[-1])
-    return {"gradient": gradient.tolist(), "seconds": seconds, "peaks": peaks, "before": before}
 
 
 # ------------------------------------------------------------------------------------------------- what is shown

@@ -11,7 +11,7 @@ import numpy as np
 
 from bench.engines.problem import EngineProblem
 from bench.experiment.cell import Cell
-from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, seconds, text
+from bench.experiment.columns import Column, Columns, ComparisonRule, exact, numbers, seconds, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.session import Session
 from bench.experiment.views import Chart, Style, Views
@@ -46,14 +46,12 @@ DETAILS = (
 )  # fmt: skip
 """Further columns of the page."""
 LEVELS = {
-    "right": Style(PALETTE[3], letter="+", meaning="derivative of its program, and near the model's gradient"),
-    "own": Style(PALETTE[0], letter="o", meaning="derivative of its program, which is not near the model"),
-    "noisy": Style(PALETTE[5], letter="~", meaning="derivative of its program, but averages are no better than 0"),
-    "open": Style(
-        PALETTE[4], letter="?", meaning="derivative of its program; whether averages are better than 0 is open"
-    ),
-    "wrong": Style(PALETTE[2], letter="x", meaning="not the derivative of its program, or not finite"),
-    "none": Style("0.85", letter="-", meaning="no gradient, or the engine cannot run the scene"),
+    "right": Style(PALETTE[3], meaning="derivative of its program, and near the model's gradient"),
+    "own": Style(PALETTE[0], meaning="derivative of its program, which is not near the model"),
+    "noisy": Style(PALETTE[5], meaning="derivative of its program, but averages are no better than 0"),
+    "open": Style(PALETTE[4], meaning="derivative of its program; whether averages are better than 0 is open"),
+    "wrong": Style(PALETTE[2], meaning="not the derivative of its program, or not finite"),
+    "none": Style("0.85", meaning="no gradient, or the engine cannot run the scene"),
 }
 NOTES = (
     "Program error: distance of the gradient from differences of the engine's own cost. Model error: distance from rigid "
@@ -72,11 +70,11 @@ class Engines(StudyPackage):
     axes = PARTS
     timed = True
     columns = Columns.of(
-        Column("program_error_rel", "distance of the gradient from its best central difference, relative to that difference",
-               label="program error", comparison=ComparisonRule("exact", "program error")),
+        exact("program_error_rel", "distance of the gradient from its best central difference, relative to that difference",
+              "program error", "program error"),
         Column("difference_step", "step of the best central difference, in the units of theta"),
-        Column("model_error_rel", "distance of the gradient from the gradient named in `model`, relative to its norm",
-               label="model error", comparison=ComparisonRule("exact", "model error")),
+        exact("model_error_rel", "distance of the gradient from the gradient named in `model`, relative to its norm", "model error",
+              "model error"),
         text("model", "what model_error_rel compares with: rigid contact in closed form, or the scene's own program"),
         *(ESTIMATES.by_name[name] for name in (*SUMMARY[:2], "reference_method", "reference_spacing", *SUMMARY[2:])),
         Column("zeroth_rmse_rel", "rmse_rel from `samples` costs with scores, without gradients", label="RMSE, costs only"),
@@ -238,7 +236,7 @@ def with_limits(rows: pd.DataFrame) -> pd.DataFrame:
 def _chart(measured: pd.DataFrame) -> Chart:
     """Return the grid of engines and scenes, coloured by level, with the model error of each gradient."""
     rigid = (measured["contact"] == "impulse") & (measured["contact"].nunique() > 1)
-    letters = measured["level"].map({name: style.letter for name, style in LEVELS.items()})
+    letters = measured["level"].map(dict(zip(LEVELS, "+o~?x-", strict=True)))
     errors = (" " + measured["model_error_rel"].map(number)).mask(measured["level"] == "none", "")
     frame = measured.assign(place=measured["scene"] + rigid.map({True: ", rigid", False: ""}), cell=letters + errors)
     return Chart(

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bench.experiment.cell import Cell
-from bench.experiment.columns import COMMON, Column, Columns, ComparisonRule, interval, numbers, text
+from bench.experiment.columns import COMMON, Column, Columns, ComparisonRule, bounded, interval, numbers, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.session import Session
 from bench.experiment.views import Chart, Table, Views
@@ -36,7 +36,6 @@ QUANTILES = {"low": 0.05, "quarter": 0.25, "median": 0.5, "three_quarters": 0.75
 ORDERS = {"first_order": "first-order", "zeroth_order": "zeroth-order"}
 RATES = {"stretch": "largest singular value", "spectral": "spectral radius"}
 MEDIAN: dict[str, Any] = {"label": "norm of one gradient", "low": "gradient_low", "high": "gradient_high"}
-INTERVAL = {"low": "lower end of its 95% interval", "high": "upper end of its 95% interval"}
 VERDICT = (
     text("problem"),
     text("verdict", "what the norms do along the horizon"),
@@ -78,27 +77,22 @@ class Growth(StudyPackage):
         *(
             column
             for name, what in RATES.items()
-            for column in (
-                Column(f"{name}_rate", f"log of the {what} of dx_N/dx_0, per step", label=name, low=f"{name}_low",
-                       high=f"{name}_high",
-                       comparison=ComparisonRule("interval", "growth rate", neutral=True) if name == "stretch" else None),
-                *(Column(f"{name}_{end}", doc) for end, doc in INTERVAL.items()),
-            )
+            for column in bounded(
+                f"{name}_rate", f"log of the {what} of dx_N/dx_0, per step", stem=name, label=name,
+                comparison=ComparisonRule("interval", "growth rate", neutral=True) if name == "stretch" else None)
         ),
         *(
-            Column(f"{order}_variance{end}", f"variance of one {name} term, {what}",
-                   label="" if end else f"variance, {name}", low="" if end else f"{order}_variance_low",
-                   high="" if end else f"{order}_variance_high")
+            column
             for order, name in ORDERS.items()
-            for end, what in (("", "median over repeats"), ("_low", "5% quantile"), ("_high", "95% quantile"))
+            for column in bounded(f"{order}_variance", f"variance of one {name} term, median over repeats",
+                                  of="the range of 5% to 95% of the repeats", label=f"variance, {name}")
         ),
         *(Column(f"{order}_variance_mean", f"variance of one {name} term, mean over repeats") for order, name in ORDERS.items()),
         text("growth", "class of the Jacobian product: exploding, neutral or vanishing", label="Jacobian product"),
         text("gain_of", "inputs of the gain: controls or states"),
         numbers("lags", "steps between an input and the end of the rollout", "steps"),
-        numbers("gain", "largest singular value of the derivative of the end state by an input, per lag, median over rollouts"),
-        numbers("gain_low", "5% quantile of the gain over rollouts"),
-        numbers("gain_high", "95% quantile of the gain over rollouts"),
+        *bounded("gain", "largest singular value of the derivative of the end state by an input, per lag, median over rollouts",
+                 of="the range of 5% to 95% of the rollouts", kind=numbers),
         numbers("singular_values", "singular values of dx_N/dx_0, median over rollouts", label="singular values"),
     )  # fmt: skip
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bench.experiment.cell import Cell
-from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, seconds
+from bench.experiment.columns import Column, Columns, exact, numbers, seconds
 from bench.experiment.experiment import Experiment
 from bench.experiment.session import Session
 from bench.experiment.views import Chart, Mark, Views
@@ -41,11 +41,11 @@ class Solver(StudyPackage):
         Column("iterations", "maximum iterations of the constraint solver"),
         Column("gradient_norm", "norm of the gradient"),
         Column("converged_norm", "norm of the converged program's gradient"),
-        Column("gradient_error_rel", "norm of (gradient - converged program's gradient) / converged_norm", label="error, relative",
-               comparison=ComparisonRule("exact", "error of the gradient")),
+        exact("gradient_error_rel", "norm of (gradient - converged program's gradient) / converged_norm", "error of the gradient",
+              "error, relative"),
         Column("gradient_cosine", "cosine between the gradient and the converged program's gradient", label="cosine"),
-        Column("wrong_signs", "share of coordinates whose sign is not that of the converged program's gradient", label="wrong signs",
-               comparison=ComparisonRule("exact", "wrong signs")),
+        exact("wrong_signs", "share of coordinates whose sign is not that of the converged program's gradient", "wrong signs",
+              "wrong signs"),
         seconds("gradient_s", "time of the gradients of `samples` rollouts", "gradients"),
         seconds("compile_s", "time of compiling the gradient", "compilation"),
         numbers("gradient", "gradient at w = 0, by coordinate of theta"),

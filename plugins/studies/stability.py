@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bench.experiment.cell import Cell
-from bench.experiment.columns import COMMON, Column, Columns, ComparisonRule, numbers, text
+from bench.experiment.columns import COMMON, Column, Columns, ComparisonRule, exact, numbers, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.session import Session
 from bench.experiment.views import Chart, Style, Table, Views
@@ -87,11 +87,7 @@ class Stability(StudyPackage):
         Column("growth_factor", "measured growth of the state per step, where the motion is linear"),
         Column("spectral_radius", "of one step on the cell's oscillator, in theory"),
         Column("stiffness_limit", "stiffness at which that radius leaves 1", "N/m"),
-        Column(
-            "relative_error",
-            "norm of (gradient - truth) / norm of the truth",
-            comparison=ComparisonRule("exact", "error"),
-        ),
+        exact("relative_error", "norm of (gradient - truth) / norm of the truth", "error"),
         Column("cosine", "cosine between gradient and truth"),
         Column("grad_norm", "norm of the gradient"),
         Column("truth_norm", "norm of the truth"),

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bench.experiment.cell import Cell
-from bench.experiment.columns import COMMON, Column, Columns, ComparisonRule, numbers, text
+from bench.experiment.columns import COMMON, Column, Columns, exact, numbers, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.session import Session
 from bench.experiment.views import Chart, Style, Table, Views
@@ -75,29 +75,19 @@ class ThreeErrors(StudyPackage):
         Column("cost", "cost f at theta, without noise"),
         Column("physical_cost", "cost of the physics at theta, without noise"),
         Column("forward_error", "difference of cost and physical_cost"),
-        Column(
-            "forward_error_rel",
-            "forward_error relative to physical_cost",
-            label="forward error",
-            comparison=ComparisonRule("exact", "forward error"),
-        ),
+        exact("forward_error_rel", "forward_error relative to physical_cost", "forward error", "forward error"),
         Column("program_norm", "norm of the program's gradient"),
         Column("program_error", "norm of (program's gradient - its best central difference)"),
-        Column(
+        exact(
             "program_error_rel",
             "program_error relative to the norm of that difference",
-            label="program error",
-            comparison=ComparisonRule("exact", "program error"),
+            "program error",
+            "program error",
         ),
         Column("difference_step", "step of the best central difference, in the units of theta"),
         Column("physical_norm", "norm of the physics' gradient"),
         Column("model_error", "norm of (program's gradient - physics' gradient)"),
-        Column(
-            "model_error_rel",
-            "model_error relative to physical_norm",
-            label="model error",
-            comparison=ComparisonRule("exact", "model error"),
-        ),
+        exact("model_error_rel", "model_error relative to physical_norm", "model error", "model error"),
         Column(
             "model_cosine", "cosine between the program's gradient and the physics' gradient", label="cosine to physics"
         ),

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bench.experiment.cell import Cell
-from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, seconds, text
+from bench.experiment.columns import Column, Columns, exact, numbers, seconds, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.session import Session
 from bench.experiment.views import Chart, Mark, Views
@@ -48,16 +48,14 @@ class Twins(StudyPackage):
     timed = True
     columns = Columns.of(
         Column("state_difference", "largest difference of states over time and coordinates", label="states"),
-        Column("state_difference_rel", "largest difference of states, each coordinate in units of its largest value",
-               label="states, relative",
-               comparison=ComparisonRule("exact", "difference of states")),
+        exact("state_difference_rel", "largest difference of states, each coordinate in units of its largest value",
+              "difference of states", "states, relative"),
         Column("cost", "cost of the twin"),
         Column("own_cost", "cost of the scene's own program"),
         Column("cost_difference_rel", "relative difference of the costs", label="cost, relative"),
         Column("gradient_norm", "norm of the twin's gradient"),
         Column("own_gradient_norm", "norm of the own program's gradient"),
-        Column("gradient_difference_rel", "relative difference of the gradients", label="gradient, relative",
-               comparison=ComparisonRule("exact", "difference of gradients")),
+        exact("gradient_difference_rel", "relative difference of the gradients", "difference of gradients", "gradient, relative"),
         Column("gradient_cosine", "cosine between the gradients", label="cosine"),
         seconds("value_s", "time of the costs of `samples` rollouts", "costs"),
         seconds("gradient_s", "time of the gradients of `samples` rollouts", "gradients"),

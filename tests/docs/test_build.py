@@ -3,6 +3,7 @@
 import json
 
 from bench.experiment import config
+from bench.gradient import rules
 from docs import build
 
 
@@ -34,6 +35,11 @@ def test_answers_stand_under_their_question_and_experiments_without_rows_last(tm
         "\n## Without stored results\n\n- `twins`: How far are the engines' trajectories and gradients from the scenes' own, and what do they cost?\n"
     )
     assert (
-        "## Does it work?\n\n### quick\n\n*Does the whole path work on this machine?* [Data](quick)\n\n![quick](quick/chart.png)\n\nFirst &lt;b&gt;. Second.\n\n"
+        "## Does it work?\n\n### quick\n\n![quick](quick/chart.png)\n\nFirst &lt;b&gt;. Second. [Data](quick)\n\n"
         in text
     )
+
+
+def test_the_table_of_rules_has_the_constants_of_the_code_and_a_status_for_each_kind():
+    assert build.rule_page() == (build.DOCS / "gradcheck.md").read_text()
+    assert {rule.kind for rule in rules.RULES.values()} == set(rules.STATUS)

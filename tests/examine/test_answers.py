@@ -91,6 +91,28 @@ def test_an_error_within_the_tolerance_is_in_the_headline():
     assert report.conclusion.startswith("Derivative: right within the tolerance, off by up to 4.0%.")
 
 
+def test_the_headline_has_the_largest_error_of_all_wrong_inputs():
+    def slope(x):
+        return np.array(
+            [
+                2 * np.cos(x[0]) + np.cos(x[1]) - 0.01 * x[0] ** 2,
+                2 * x[1] - x[0] * np.sin(x[1]) - 0.3 * np.cos(3 * x[0]),
+            ]
+        )
+
+    report = examine(
+        lambda x: float(2 * np.sin(x[0]) + np.cos(x[1]) * x[0] + x[1] ** 2), np.array([0.7, 0.1]), grad=slope
+    )
+    assert list(report.frame["verdict"][:2]) == ["missing_term", "wrong_adjoint"]
+    assert "theta[1]: program 0.281570" in report.conclusion
+    assert "and 1 more" in report.conclusion
+
+
+def test_a_problem_is_said_of_the_sigmas_that_show_it():
+    report = examine(lambda x: float(x @ x + (x[0] > 1.2)), np.ones(2), grad=lambda x: 2 * x, sigma=[0.01, 0.2])
+    assert report.noise_answer.startswith("Under noise of sigma 0.20: NOT usable. biased")
+
+
 def test_an_expected_cause_that_excuses_nothing_is_said_plainly():
     report = examine(cost, THETA, grad=wrong, expect="wrong_factor")
     assert report.status == 1

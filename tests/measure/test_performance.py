@@ -1,4 +1,4 @@
-"""Intervals and rank correlations agree with SciPy's, and keep working where SciPy's raise or warn."""
+"""Intervals agree with SciPy's, and keep working where SciPy's raise or warn."""
 
 import math
 
@@ -23,24 +23,6 @@ def test_wilson_interval_is_scipys(trials):
 
 def test_wilson_interval_without_trials_is_everything():
     assert performance.wilson(0, 0) == (0.0, 1.0)
-
-
-def test_ranks_share_ties_and_put_infinities_last():
-    assert performance.ranks(np.array([3.0, np.inf, 1.0, np.inf, 1.0])).tolist() == [3.0, 4.5, 1.5, 4.5, 1.5]
-    assert performance.ranks(np.empty(0)).size == 0
-
-
-@pytest.mark.parametrize("seed", range(20))
-def test_spearman_is_scipys_with_and_without_ties(seed):
-    draw = np.random.default_rng(seed)
-    x, y = draw.integers(0, 6, 25).astype(float), draw.standard_normal(25)
-    y[draw.random(25) < 0.2] = np.inf
-    assert performance.spearman(x, y) == pytest.approx(stats.spearmanr(x, y).statistic, rel=ROUNDING, abs=ROUNDING)
-
-
-def test_spearman_is_nan_where_it_is_not_defined():
-    assert math.isnan(performance.spearman(np.ones(5), np.arange(5.0)))
-    assert math.isnan(performance.spearman(np.arange(2.0), np.arange(2.0)))
 
 
 def test_average_runtime_of_few_searches_is_covered():

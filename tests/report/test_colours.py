@@ -4,10 +4,9 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from bench.plugins.studies.optimise import views as searches
 from matplotlib.colors import to_rgb
 
-from bench.report.colours import estimator_order
+from bench.report.colours import method_styles
 from bench.report.style import PALETTE, colour, marker
 
 DEUTERANOPIA = np.array(
@@ -54,16 +53,13 @@ def test_twelve_estimators_stay_distinct_for_colour_blind_readers_too(eyes):
         assert apart(colour(a), colour(b), EYES[eyes]) > (30 if marker(a) == marker(b) else 8)
 
 
-def test_an_estimator_keeps_its_colour_in_searches_and_in_errors():
+def test_an_estimator_keeps_its_look_whatever_else_is_drawn():
     """fobg was blue in one experiment's searches, pink in another's."""
-    found = searches.styles(
-        ["cem[elites=8,population=40]", "fobg, adam", "fobg, line_search", "windowed[steps=5], adam"]
-    )
-    for method, estimator in (
-        ("fobg, adam", "fobg"),
-        ("fobg, line_search", "fobg"),
-        ("windowed[steps=5], adam", "windowed"),
-    ):
-        assert found[method].colour == colour(estimator_order().index(estimator))
-    assert found["fobg, adam"].line != found["fobg, line_search"].line
-    assert "cem[elites=8,population=40]" not in found, "a chart gives it a free colour"
+    names = ["reinforce", "fobg[a=1]", "fobg", "finite_difference", "of_my_own"]
+    found = method_styles(names)
+    assert len({(style.colour, style.marker) for style in found.values()}) == len(names)
+    for name in set(names) - {"fobg[a=1]"}:
+        assert method_styles([name]) == {name: found[name]}
+    assert found["fobg[a=1]"].colour == found["fobg"].colour
+    assert found["fobg[a=1]"].line != found["fobg"].line
+    assert method_styles(["fobg, adam"])["fobg, adam"] == found["fobg"]

@@ -10,8 +10,7 @@ import subprocess
 import numpy as np
 import pandas as pd
 import pytest
-from bench.plugins.studies.bias_variance import tables
-from bench.plugins.studies.bias_variance.charts import estimator_styles
+from bench.plugins.studies.bias_variance import views as tables
 from bench.plugins.studies.bias_variance.columns import TABLE
 from bench.plugins.studies.bias_variance.comparisons import problems_by_axis
 from helpers import (
@@ -88,7 +87,7 @@ def test_a_chart_of_speed_and_accuracy_marks_the_pareto_front():
     shown = swept.study.views(swept, pd.read_parquet(ROOT / "results/standard/stiffness_sweep" / "rows.parquet"))
     chart = next(c for c in shown.charts if c.name == "speed_accuracy")
     lines = [line for axes in draw(chart).axes for line in axes.lines if line.get_linestyle() == "--"]
-    assert len(lines) == chart.frame["problem_"].nunique()
+    assert len(lines) == chart.frame["panel"].nunique()
     for line in lines:
         x, y = map(np.asarray, line.get_data())
         assert x.size
@@ -449,18 +448,3 @@ def test_a_swept_parameter_named_like_a_column_of_lists_is_an_axis_of_its_own():
     parameters = [json.dumps({"scene": {"name": "quadruped", "gain": value}}) for value in (1.0, 2.0)]
     rows = pd.DataFrame({"parameters": parameters, "gain": [[1.0], [2.0, 3.0]]})
     assert [axis.column for axis in axes({"gain": [1.0, 2.0]}, rows)] == ["swept.gain"]
-
-
-# --------------------------------------------------------------------------------------------------------- colours
-
-
-def test_an_estimator_keeps_its_look_whatever_else_is_drawn():
-    def look(*estimators):
-        rows = table([row(estimator=name, stiffness=k) for name in estimators for k in (1e2, 1e4)])
-        return estimator_styles(rows)
-
-    every = look(*NAMES)
-    assert len({(style.colour, style.marker) for style in every.values()}) == len(NAMES)
-    for name in NAMES:
-        assert look(name) == {name: every[name]}
-    assert look("of_my_own", *NAMES) == every | look("of_my_own")

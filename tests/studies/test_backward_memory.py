@@ -1,4 +1,4 @@
-"""The study of backward passes: peaks in processes of their own, their growth along the horizon, and what it says of them."""
+"""The study of backward passes: peaks in processes of their own, and their growth along the horizon."""
 
 import math
 from dataclasses import replace
@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 import pytest
-from bench.plugins.studies.backward_memory import in_process, spread
+from bench.plugins.studies.backward_memory import spread
 
-from bench.errors import Crashed
+import bench
 from bench.experiment import config
 from bench.experiment.grid import cells
 
@@ -16,15 +16,15 @@ CLOSE = 0.03
 """Relative error of a peak: the interpreter allocates beside the planted array."""
 PLANTED_MB = 64
 PLUGIN = f'''
-"""NumPy with a planted array in each gradient, or a planted end of the process."""
+"""NumPy with a planted array in each gradient, which the process keeps."""
 
-import os
 from dataclasses import dataclass
 
 import numpy as np
 
-from bench.plugin import param
 from bench.plugins.backends.numpy import Numpy, NumpyProblem
+
+KEPT = []
 
 
 @dataclass(frozen=True)
@@ -34,55 +34,33 @@ class Greedy(Numpy):
     name = "greedy"
     reference_rank = None
 
-    ends: bool = param(False, "whether the process ends")
-
     def compile(self, program):
         """Return the problem."""
-        return GreedyProblem(program, self.dtype, 1e-6, self.ends)
+        return GreedyProblem(program, self.dtype, 1e-6)
 
 
 class GreedyProblem(NumpyProblem):
     """Fills an array."""
 
-    def __init__(self, program, dtype, step, ends):
-        super().__init__(program, dtype, step)
-        self.ends = ends
-
     def _grad(self, theta, w):
-        if self.ends:
-            os._exit(3)
-        planted = np.ones({PLANTED_MB} << 17)
-        return super()._grad(theta, w) + 0.0 * planted[0]
+        KEPT.append(np.ones({PLANTED_MB} << 17))
+        return super()._grad(theta, w)
 '''
-WORDS = ("study=backward_memory", "scenes=[mass_spring]", "scene.mass_spring.horizon=2", "samples=4")
 
 
-@pytest.fixture(scope="module")
-def greedy(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("greedy") / "backends"
-    folder.mkdir()
-    (folder / "greedy.py").write_text(PLUGIN)
-    return [
-        cells(config.load([*WORDS, f"plugins={folder}", f"backends=['greedy[ends={ends}]']"]))[0]
-        for ends in ("false", "true")
-    ]
-
-
-def test_a_planted_array_is_the_peak_of_each_call(greedy):
-    answer = in_process(greedy[0], 6, None)
-    assert answer["peaks"] == pytest.approx([PLANTED_MB] * 6, rel=CLOSE)
-    assert len(answer["seconds"]) == 6
-    assert min(answer["before"]) > 20, "an interpreter with NumPy"
-
-
-def test_the_end_of_the_process_is_a_crash(greedy):
-    with pytest.raises(Crashed, match="exit status 3"):
-        in_process(greedy[1], 6, None)
-
-
-def test_an_error_in_the_process_is_the_cells_status(greedy):
-    cell = replace(greedy[0], parts={**greedy[0].parts, "scene": None})
-    assert in_process(cell, 6, None)["status"] == "error"
+def test_a_planted_array_is_the_peak_of_each_call_in_a_process_per_cell(tmp_path):
+    (tmp_path / "backends").mkdir()
+    (tmp_path / "backends" / "greedy.py").write_text(PLUGIN)
+    rows = bench.run(
+        study="backward_memory", scenes=["mass_spring"], backends=["greedy"], sweep={"horizon": [2, 3]}, samples=4,
+        plugins=tmp_path, results_dir=tmp_path,
+    )  # fmt: skip
+    for end in ("", "_low", "_high"):
+        assert list(rows[f"memory_mb{end}"]) == pytest.approx([PLANTED_MB] * 2, rel=CLOSE)
+    assert rows["process_mb"].min() > 20, "an interpreter with NumPy"
+    assert rows["process_mb"].iloc[1] == pytest.approx(rows["process_mb"].iloc[0], abs=PLANTED_MB), (
+        "not what others kept"
+    )
 
 
 def test_the_range_of_six_calls_covers_a_median():

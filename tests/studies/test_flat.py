@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from bench.plugins.studies.bias_variance.estimates import Estimates
+from bench.plugins.studies.bias_variance.measure import Estimates
 from helpers import loaded
 
 from bench.measure import noise, statistics
@@ -54,7 +54,7 @@ def test_terms_of_a_long_theta_are_computed_in_parts(most, largest, monkeypatch)
         return terms(self, problem, theta, w)
 
     monkeypatch.setattr(type(cell.estimator), "terms", counted)
-    monkeypatch.setattr("bench.plugins.studies.bias_variance.estimates.MOST_TERMS", most)
+    monkeypatch.setattr("bench.plugins.studies.bias_variance.measure.MOST_TERMS", most)
     _, found = made(cell)
     np.testing.assert_allclose(found, expected, rtol=ROUNDED)
     assert max(sizes) == largest

@@ -4,8 +4,13 @@ import math
 
 import pandas as pd
 import pytest
-from bench.plugins.studies.bias_variance.costs import ROLLOUTS, TIME, with_gradient_cost
-from bench.plugins.studies.bias_variance.time_to_accuracy import limits, required_cost
+from bench.plugins.studies.bias_variance.time_to_accuracy import (
+    ROLLOUTS,
+    TIME,
+    limits,
+    required_cost,
+    with_gradient_cost,
+)
 from bench.plugins.studies.bias_variance.time_to_accuracy import table as table_of
 from helpers import row
 

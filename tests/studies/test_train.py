@@ -3,8 +3,7 @@
 import numpy as np
 import pandas as pd
 import pytest
-from bench.plugins.studies.train import aggregate
-from bench.plugins.studies.train.views import views
+from bench.plugins.studies.train import views as studied
 
 import bench
 from bench.errors import UserError
@@ -38,7 +37,7 @@ def made_up(final=FINAL, seeds=range(5), spread=10.0, **columns):
 
 
 def tables_of(experiment, rows):
-    return {table.name: table for table in views(experiment, rows).tables}
+    return {table.name: table for table in studied.views(experiment, rows).tables}
 
 
 def verdicts_of(experiment, rows):
@@ -60,7 +59,7 @@ def test_the_best_trainer_is_first_where_intervals_of_enough_seeds_are_apart(giv
 
 def test_few_seeds_give_no_interval_and_no_order():
     experiment, rows = made_up(seeds=range(4))
-    shown = views(experiment, rows)
+    shown = studied.views(experiment, rows)
     frames = {table.name: table.frame for table in shown.tables}
     for frame in (frames["summary"], frames["windows"], next(c.frame for c in shown.charts if c.name == "train")):
         ends = frame.filter(regex="^(final|cost)_(low|high)$")
@@ -93,10 +92,10 @@ def test_a_run_that_is_not_finite_counts_as_its_untrained_policy():
     experiment, rows = made_up({"shac": -530.0})
     rows.loc[0, ["status", "final_return"]] = ["nonfinite", -100.0]
     rows.at[0, "curve_return"], rows.at[0, "curve_step"] = [-2000.0, np.nan], [0, 5e5]
-    runs = aggregate.runs_of(experiment, rows)
-    assert aggregate.final_returns(runs)[0] == -2000.0
-    assert np.isfinite(aggregate.curves(runs)["cost"]).all()
-    assert aggregate.summarise(runs)["failed"].tolist() == [1]
+    runs = studied.runs_of(experiment, rows)
+    assert studied.final_returns(runs)[0] == -2000.0
+    assert np.isfinite(studied.curves_of(runs)["cost"]).all()
+    assert studied.summarise(runs)["failed"].tolist() == [1]
 
 
 def test_a_fault_is_reported_with_its_run_and_its_number():
@@ -111,8 +110,8 @@ def test_returns_at_equal_used_steps_are_those_of_the_last_evaluation_within_the
     experiment, rows = made_up({"shac": -530.0, "evolution": -600.0})
     for i in rows.index[rows["trainer"] == "evolution"]:
         rows.at[i, "log_used"] = [0.1, 0.5]
-    runs = aggregate.runs_of(experiment, rows)
-    summary = aggregate.summarise(runs).set_index("method")
+    runs = studied.runs_of(experiment, rows)
+    summary = studied.summarise(runs).set_index("method")
     assert summary["used"].to_dict() == {"shac": 1e6, "evolution": 3e5}
     assert summary.loc["evolution", "equal"] == summary.loc["evolution", "final"]
     assert summary.loc["shac", "equal"] == runs["curve_return"].iloc[0][0]
@@ -121,9 +120,9 @@ def test_returns_at_equal_used_steps_are_those_of_the_last_evaluation_within_the
 def test_a_return_above_another_by_less_than_noise_is_not_behind():
     best = np.array([-8.0, -7.0, -9.0, -8.5, -7.5])
     lines = pd.DataFrame({"final": [-9.0, -8.0], "returns": [best - 0.6, best], "group": "one"})
-    assert aggregate.ranked(lines, ["group"]).tolist() == ["open", "open"]
+    assert studied.ranked(lines, ["group"]).tolist() == ["open", "open"]
     # the intervals of a few seeds may overlap where a test of the difference finds one
-    assert aggregate.ranked(lines.assign(returns=[best - 1.9, best]), ["group"]).tolist() == ["behind", "first"]
+    assert studied.ranked(lines.assign(returns=[best - 1.9, best]), ["group"]).tolist() == ["behind", "first"]
 
 
 def test_rows_without_a_run_show_their_reasons():

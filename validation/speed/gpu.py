@@ -33,7 +33,7 @@ COMPARED, PROJECTIONS = 4, 8
 SECONDS, CALLS = 0.5, 20
 """Least total time [s] and largest number of a row's timed calls."""
 GYMNASIUM = "gymnasium:envs/mujoco/assets"
-HUMANOID = '''"""The task of gymnasium's humanoid: run forward (Humanoid-v5, without contact cost and end)."""
+RUN = '''"""A task of gymnasium: run forward (Ant-v5, Humanoid-v5), without contact cost and end."""
 
 
 def observation(xp, q, v):
@@ -41,7 +41,7 @@ def observation(xp, q, v):
 
 
 def stage_cost(xp, q, v, u):
-    return 0.1 * xp.sum(u * u, axis=0) - 1.25 * v[0]
+    return {effort} * xp.sum(u * u, axis=0) - {speed} * v[0]
 '''
 
 
@@ -56,8 +56,9 @@ class Unit(NamedTuple):
 
 ROBOTS = {
     "half_cheetah": (f"mjcf[file={GYMNASIUM}/half_cheetah.xml,horizon=10,substeps=2]", "mjx[iterations=10]"),
+    "ant": (f"mjcf[file={GYMNASIUM}/ant.xml,functions={{folder}}/ant.py,horizon=10,substeps=2]", "mjx[iterations=10]"),
     "quadruped": ("mjcf[file=quadruped.xml,horizon=10,substeps=2]", "mjx[iterations=10]"),
-    "humanoid": (f"mjcf[file={GYMNASIUM}/humanoid.xml,functions={{humanoid}},horizon=10,substeps=2]", "mjx[iterations=20]"),
+    "humanoid": (f"mjcf[file={GYMNASIUM}/humanoid.xml,functions={{folder}}/humanoid.py,horizon=10,substeps=2]", "mjx[iterations=20]"),
 }  # fmt: skip
 SCENES = ("pushing", "cartpole", "double_pendulum", "hopper")
 DTYPES = ("float32", "float64")
@@ -75,7 +76,7 @@ def units(options):
     scenes = [Unit(name, "jax", dtype, BATCHES) for name in SCENES for dtype in DTYPES]
     native = [Unit(name, "fused", "float64", BATCHES) for name in SCENES]
     # programs of robots take longest to compile, and the scenes fill the places that remain
-    order = [*robots[:6], *scenes, *robots[6:12], *native, *robots[12:]]
+    order = [*robots[:8], *scenes, *robots[8:16], *native, *robots[16:]]
     if options.reference:
         order = [
             Unit(name, ROBOTS[name][1] if name in ROBOTS else "jax", "float64", (COMPARED,))
@@ -90,12 +91,12 @@ def units(options):
 
 
 def problem(unit, folder):
-    """Compile the unit's scene on its backend; ``folder`` has the humanoid's task."""
+    """Compile the unit's scene on its backend; ``folder`` has the tasks of the ant and the humanoid."""
     from bench.experiment.by_name import compile_problem
 
     name, _, values = unit.backend.rstrip("]").partition("[")
     values = ",".join(filter(None, [values, f"dtype={unit.dtype}"]))
-    scene = ROBOTS.get(unit.case, (unit.case,))[0].format(humanoid=folder / "humanoid.py")
+    scene = ROBOTS.get(unit.case, (unit.case,))[0].format(folder=folder)
     return compile_problem(scene, "penalty", "semi_implicit_euler", f"{name}[{values}]")
 
 
@@ -248,7 +249,8 @@ def main():
         return
     began, options.out = time.time(), options.out.resolve()
     options.out.mkdir(parents=True, exist_ok=True)
-    (options.out / "humanoid.py").write_text(HUMANOID)
+    (options.out / "ant.py").write_text(RUN.format(effort=0.5, speed=1.0))
+    (options.out / "humanoid.py").write_text(RUN.format(effort=0.1, speed=1.25))
     os.environ |= {"XLA_PYTHON_CLIENT_PREALLOCATE": "false", "MUJOCO_GL": "disable"}  # the processes share the memory
     os.environ |= {"JAX_PLATFORMS": "cpu"} if options.device == "cpu" else {}
     sys.path.append(

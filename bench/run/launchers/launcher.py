@@ -11,6 +11,7 @@ from types import TracebackType
 from typing import Any, Protocol
 
 from bench.experiment.experiment import Experiment
+from bench.experiment.study import study_of
 from bench.run.pool import BATCH_S, Answer, Pool, ResourceLimits
 from bench.run.tasks import FAILED, Task, TaskHandler
 
@@ -77,7 +78,7 @@ class InProcessLauncher:
 def local_launcher(experiment: Experiment, timed: bool = False, n_workers: int | None = None) -> Launcher:
     """Return a launcher that runs tasks in processes of this machine, or in this process if there are 0 workers.
 
-    ``n_workers`` replaces the experiment's own setting. Timed tasks run one at a time and may use all cores.
+    ``n_workers`` replaces the experiment's own setting. Timed tasks run one at a time and may use all cores, unless each has a process of its own.
     """
     rules = experiment.execution
     workers = rules.workers if n_workers is None else n_workers
@@ -87,7 +88,7 @@ def local_launcher(experiment: Experiment, timed: bool = False, n_workers: int |
     limits = ResourceLimits(rules.timeout, rules.memory)
     return Pool(
         1 if timed else workers, TaskHandler, without_grid(experiment), limits,
-        single_thread=not timed, folders=experiment.plugins, outside=lambda task: task.outside,
+        single_thread=not timed or study_of(experiment).fresh_process, folders=experiment.plugins, outside=lambda task: task.outside,
     )  # fmt: skip
 
 

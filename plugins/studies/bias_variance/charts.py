@@ -15,16 +15,14 @@ from bench.experiment.axes import Axis
 from bench.experiment.columns import Column, text
 from bench.experiment.views import Chart, Mark, Style
 from bench.model import SURROGATE, registry
-from bench.report.colours import estimator_order
-from bench.report.problems import ProblemRows, named_values, split_by_problem, titled
-from bench.report.style import colour, marker
+from bench.report.colours import method_styles
+from bench.report.problems import ProblemRows, split_by_problem
 from bench.report.text import counted, number
 from bench.report.views import (
     Arranged,
     Curve,
     attempted,
     estimator_curves,
-    estimator_label,
     estimator_labels,
     is_bias_resolved,
     pareto,
@@ -33,8 +31,7 @@ from bench.report.views import (
 
 from .columns import COLUMNS
 from .comparisons import FAILS, NO_RESULT
-from .costs import ROLLOUTS, TIME, Cost
-from .time_to_accuracy import SAMPLES, TARGETS
+from .time_to_accuracy import ROLLOUTS, SAMPLES, TARGETS, TIME, Cost
 
 FLOOR = 1e-4
 """Relative biases below this are drawn here, as upper limits."""
@@ -42,8 +39,8 @@ SERIES = 3
 """Most estimators of a chart along an axis."""
 PANELS = 4
 """Most problems of a chart along an axis."""
-POOLED = ("horizon", "stiffness", "sigma", "smoothing")
-"""Columns that change the cost of an estimate: each value has a panel of its own."""
+FEW = 3
+"""Most points of an estimator that no line of error against cost joins."""
 DISTINCT = 1.2
 """Median factor between the errors of two estimators from which a reader distinguishes their lines."""
 RMSE = Column(
@@ -68,7 +65,7 @@ def charts(
 ) -> list[Chart]:
     """Return all charts, the main one first."""
     labelled = replace(shown, rows=with_plotted_columns(shown.rows))
-    styles = estimator_styles(shown.rows)
+    styles = method_styles(labelled.rows["series"].unique())
     subtitle = _conditions(shown)
     swept = shown.swept()
     order = sorted(swept, key=lambda a: (-swept[a], a.column != "stiffness"))
@@ -79,9 +76,9 @@ def charts(
         if axis.column != "samples" or best.empty
     ]
     if not best.empty:
-        along = [_speed_accuracy(labelled, best, styles, subtitle), *along]
+        along = [_error_and_cost(labelled, best, styles, subtitle), *along]
     elif shown.rows["backend"].nunique() > 1:
-        along += [_error_and_cost(labelled, styles, subtitle)]
+        along += [_error_and_cost(labelled, best, styles, subtitle)]
     if not swept and methods["problem"].nunique() > 1:
         along = [_estimators(methods), *along]
     return [chart for chart in along if chart is not None]
@@ -108,25 +105,9 @@ def with_plotted_columns(rows: pd.DataFrame) -> pd.DataFrame:
         **{name: column.where(good) for name, column in values.items()},
         bias_limit=limit,
         series=estimator_labels(rows),
-        problem_=titled(rows.assign(**named_values(rows, POOLED)), ["scene", "contact", *POOLED]),
         line=rows["backend"] + " " + rows["dtype"],
         failed=~good,
     )
-
-
-def estimator_styles(rows: pd.DataFrame) -> dict[str, Style]:
-    """Return the look of every estimator in the rows: its own colour in all charts; its variants have free colours."""
-    places = {name: i for i, name in enumerate(estimator_order())}
-    pairs = list(dict.fromkeys(zip(rows["estimator"], rows["estimator_params"], strict=True)))
-    names = list(dict.fromkeys(name for name, _ in pairs))
-    used = {places.get(name, len(places) + i) for i, name in enumerate(names)}
-    free = (i for i in range(1000) if i not in used)
-    styles: dict[str, Style] = {}
-    for name, params in sorted(pairs, key=lambda pair: pair[1] != ""):
-        first = not any(label.partition("[")[0] == name for label in styles)
-        place = places.get(name, len(places) + names.index(name)) if first else next(free)
-        styles[estimator_label(name, params)] = Style(colour(place), marker(place))
-    return {estimator_label(*pair): styles[estimator_label(*pair)] for pair in pairs}
 
 
 def _conditions(shown: Arranged) -> str:
@@ -221,28 +202,30 @@ def choose_problems(problems: Sequence[ProblemRows], room: int) -> tuple[list[Pr
 # ----------------------------------------------------------------------------------------------- error and cost
 
 
-def _speed_accuracy(shown: Arranged, best: pd.DataFrame, styles: Mapping[str, Style], subtitle: str) -> Chart | None:
-    """Return error against cost where samples were swept: of each estimator the best backends' front, per problem."""
-    timed = bool((best["by"] == "time").any())
+def _error_and_cost(shown: Arranged, best: pd.DataFrame, styles: Mapping[str, Style], subtitle: str) -> Chart | None:
+    """Return error against cost: where samples were swept the front of each estimator, per problem, else a point each."""
+    is_swept, parts = not best.empty, []
+    timed = not is_swept or bool((best["by"] == "time").any())
     cost, x = (TIME, SECONDS) if timed else (ROLLOUTS, ROLLOUTS_SPENT)
-    parts = []
-    for problem in split_by_problem(shown, SAMPLES, ("scene",)):
+    axis, always = (SAMPLES, ("scene",)) if is_swept else (None, ("scene", "contact"))
+    problems = split_by_problem(shown, axis, always)
+    chosen = problems if is_swept else problems[:: math.ceil(len(problems) / 3)]
+    for problem in chosen:
         rows = cost.known(problem.rows)
-        if rows["x"].nunique() < 2:
-            continue
-        for _, every in rows.groupby("series", sort=False):
+        for _, every in rows.groupby("series", sort=False) if not is_swept or rows["x"].nunique() > 1 else ():
             part = _on_fastest(every, cost)
-            front = part[pareto(cost.of(part), part["rmse_rel"])]
-            parts.append(front.assign(panel=problem.title()))
+            parts.append(part[pareto(cost.of(part), part["rmse_rel"])].assign(panel=problem.title()))
     if not parts:
         return None
-    marks = [Mark(f"{target:.0%}", target, axis="y") for target in TARGETS]
     frame = pd.concat(parts, ignore_index=True)
+    is_line = frame.groupby(["panel", "series"]).size().max() > FEW
+    shares = [f"{len(chosen)} of {counted(len(problems), 'problem')}"] if len(chosen) < len(problems) else []
+    marks = [Mark(f"{target:.0%}", target, axis="y") for target in TARGETS if is_swept]
     return Chart(
-        "speed_accuracy" if timed else "rollouts_accuracy", frame, [x], [RMSE], series="series",
-        panel="panel", styles=styles, marks=marks, across=3, height=2.0,
-        subtitle=", ".join(filter(None, [subtitle, FASTEST])),
-        text="Only estimates that no other of the same estimator beats in both error and cost are drawn.",
+        "speed_accuracy" if timed else "rollouts_accuracy", frame, [x], [RMSE], "lines" if is_line else "points", series="series",
+        panel="panel", styles=styles, marks=marks, across=3, height=2.0 if is_swept else 1.9, front=not is_swept,
+        subtitle=", ".join(filter(None, [subtitle, *shares, FASTEST])),
+        text="Only estimates that no other of the same estimator beats in both error and cost are drawn." if is_swept else "",
     )  # fmt: skip
 
 
@@ -252,19 +235,6 @@ def _on_fastest(rows: pd.DataFrame, cost: Cost) -> pd.DataFrame:
     shared = rows[rows.groupby("x")["line"].transform("nunique") == lines.nunique()]
     rows_of = shared if len(shared) else rows
     return rows[lines == cost.of(rows_of).groupby(rows_of["line"]).median().idxmin()]
-
-
-def _error_and_cost(shown: Arranged, styles: Mapping[str, Style], subtitle: str) -> Chart:
-    """Return error against time where samples were not swept: a dot per estimator, by problem."""
-    rows = TIME.known(shown.rows)
-    rows = rows.loc[rows.groupby(["problem_", "series"], sort=False)["time_s"].idxmin()]
-    problems = list(dict.fromkeys(rows["problem_"]))
-    chosen = problems[:: math.ceil(len(problems) / 3)] if problems else []
-    shares = [f"{len(chosen)} of {counted(len(problems), 'problem')}"] if len(chosen) < len(problems) else []
-    return Chart(
-        "speed_accuracy", rows[rows["problem_"].isin(chosen)], [SECONDS], [RMSE], "points", series="series", panel="problem_",
-        styles=styles, across=3, height=1.9, subtitle=", ".join(filter(None, [subtitle, *shares, FASTEST])), front=True,
-    )  # fmt: skip
 
 
 # --------------------------------------------------------------------------------------------------- estimators

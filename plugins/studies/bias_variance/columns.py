@@ -1,6 +1,6 @@
 """The columns of the main table, which users' scripts rely on."""
 
-from bench.experiment.columns import Column, Columns, ComparisonRule, interval, numbers, seconds, text
+from bench.experiment.columns import Column, Columns, ComparisonRule, bounded, interval, numbers, seconds, text
 
 TABLE = (
     "experiment", "scene", "contact", "integrator", "backend", "estimator", "estimator_params", "noise",
@@ -20,13 +20,9 @@ COLUMNS = Columns.ordered(
     Column("bias_low", "lower end of its 95% interval; 0 where the bias is not distinguishable from 0"),
     Column("bias_high", "upper end of its 95% interval"),
     Column("bias_rel", "bias / reference_norm"),
-    interval("variance", "trace of the covariance of one estimate", comparison=ComparisonRule("spread", "variance")),
-    Column("variance_low", "lower end of its 95% interval", table=False),
-    Column("variance_high", "upper end of its 95% interval", table=False),
-    Column("variance_per_sample", "variance of one sample's term, from all terms where an estimate is a mean of terms, "
-           "else samples * variance"),
-    Column("variance_per_sample_low", "lower end of its 95% interval", table=False),
-    Column("variance_per_sample_high", "upper end of its 95% interval", table=False),
+    *bounded("variance", "trace of the covariance of one estimate", has_csv=False, comparison=ComparisonRule("spread", "variance")),
+    *bounded("variance_per_sample", "variance of one sample's term, from all terms where an estimate is a mean of terms, else "
+             "samples * variance", has_csv=False),
     Column("rmse", "root mean squared distance of one estimate from the reference",
            comparison=ComparisonRule("paired", "RMSE", mean="mean_estimate", variance="variance", reference="reference_gradient")),
     Column("rmse_rel", "rmse / reference_norm; above 1 an estimate is worse than the zero estimate", label="relative RMSE"),

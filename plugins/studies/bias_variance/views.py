@@ -2,19 +2,42 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
+import numpy as np
 import pandas as pd
 
+from bench.errors import unknown
+from bench.experiment import axes
+from bench.experiment.axes import Axis
+from bench.experiment.columns import IDENTITY, Column, interval, text
 from bench.experiment.experiment import Experiment
-from bench.experiment.views import Views
-from bench.report.text import counted
-from bench.report.views import arrange
+from bench.experiment.parameters import number_problems
+from bench.experiment.views import Table, Views
+from bench.report.problems import ProblemRows, split_by_problem
+from bench.report.text import axis_value, counted, span
+from bench.report.views import Arranged, arrange, estimator_curves, pareto, rmse_interval
 
-from . import charts, tables, time_to_accuracy
+from . import charts, time_to_accuracy
 from .columns import COLUMNS
-from .comparisons import compare_errors, method_table
-from .costs import with_gradient_cost
+from .comparisons import COLUMNS as COMPARED
+from .comparisons import (
+    EQUAL_ROLLOUTS,
+    EQUAL_SAMPLES,
+    FAILS,
+    NO_RESULT,
+    ROLLOUTS,
+    compare_errors,
+    leaders,
+    method_names,
+    method_table,
+    problems_by_axis,
+    verdicts_by_estimator,
+)
+from .time_to_accuracy import limits, with_gradient_cost
 
 RESULTS = ("variance", "cosine", "rollouts", "gradients", "reference_method")
 
@@ -28,7 +51,7 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views | None:
     errors = compare_errors(methods)
     best = time_to_accuracy.table(shown)
     comparisons = errors if best.empty else pd.concat([errors, time_to_accuracy.comparisons(best)], ignore_index=True)
-    all_tables = tables.tables(experiment, rows, shown, methods, comparisons)
+    all_tables = tables(experiment, rows, shown, methods, comparisons)
     all_tables += [] if best.empty else [time_to_accuracy.accuracy_table(best)]
     return Views(
         all_tables,
@@ -54,3 +77,212 @@ def loose_references(rows: pd.DataFrame, tolerance: float) -> list[str]:
         f"the standard error of the reference is above its tolerance of {100 * tolerance:g}% in {counted(len(loose), 'cell')}, up to "
         f"{100 * loose.max():.2g}% ({good.loc[loose.idxmax(), 'scene']}): more reference.samples make it smaller"
     ]
+
+
+FAILURES = {
+    "nonfinite": ("∞", "a result that is not finite"),
+    "diverged": ("↑", "a state that diverged"),
+    "timeout": ("⧗", "the time limit"),
+    "crashed": ("†", "a process that died"),
+    "error": ("‡", "an error"),
+    "unsupported": ("–", "a combination that cannot work"),
+    "unavailable": ("∅", "a library that is not installed"),
+    "waiting": ("…", "a rung of a ladder whose lower rung has not passed"),
+}
+"""Sign and meaning of each status other than ``ok``."""
+REMARKED = "?"
+"""Mark of a cell whose row has a remark."""
+LEAST = 3
+"""Fewest estimators for which the ranking is written; the main table is enough for fewer."""
+MANY = 2.5
+"""The number of evaluations per sample is shown above this value."""
+ESTIMATOR = text("method", label="estimator")
+
+
+def tables(
+    experiment: Experiment, rows: pd.DataFrame, shown: Arranged, methods: pd.DataFrame, comparisons: pd.DataFrame
+) -> list[Table]:
+    """Return all tables but those of the cost to reach an error."""
+    result = pivots(experiment, shown)
+    result[0] = replace(result[0], data=axes.table(experiment, rows))
+    columns = [COLUMNS.by_name[name] for name in ("scene", "contact", "backend", "estimator", "rmse_rel", "time_s")]
+    result.append(Table("speed_accuracy", speed_accuracy(rows), columns, files=["csv"]))
+    if methods["estimator"].nunique() >= LEAST and methods["problem"].nunique() > 1:
+        result.append(ranking(methods))
+    errors = comparisons[comparisons["basis"].isin((EQUAL_SAMPLES, EQUAL_ROLLOUTS))]
+    result.append(recommendations(methods, errors))
+    result.append(Table("verdicts", methods.drop(columns="setting"), [], files=["csv"]))
+    joined = comparisons.drop(columns="setting").assign(tied=[", ".join(names) for names in comparisons["tied"]])
+    noted = joined.assign(factor_note=limits(joined))
+    columns = [replace(c, note="factor_note") if c.name == "factor" else c for c in COMPARED]
+    title = "the first and the next at each setting"
+    result.append(Table("comparisons", noted, columns, title, COMPARISON_NOTES, data=joined))
+    return result
+
+
+COMPARISON_NOTES = (
+    "Factor: the second over the first, with its 95% interval. Tied: not distinguishable from the first, since the interval "
+    "of the factor reaches 1 or is not known.",
+)
+
+
+# ------------------------------------------------------------------------------------------- along an axis
+
+
+def pivots(experiment: Experiment, shown: Arranged) -> list[Table]:
+    """Return a table per problem: estimators down, values of its axis across, each cell a relative RMSE.
+
+    The axis is the one that ``table.columns`` names, by default the longest. Raises an error if ``table.columns`` names
+    no swept axis.
+    """
+    parts: Sequence[tuple[Axis | None, ProblemRows]] = problems_by_axis(shown)
+    if experiment.table.columns:
+        axis = _axis(experiment.table.columns, shown)
+        parts = [(axis, problem) for problem in split_by_problem(shown, axis, ("scene", "contact"))]
+    apart = "backend" in experiment.table.rows
+    result = [_pivot(axis, problem, apart) for axis, problem in parts]
+    notes = _notes(result)
+    return [replace(table, notes=notes if table is result[-1] else ()) for table in result]
+
+
+def _axis(name: str, shown: Arranged) -> Axis:
+    swept = list(shown.swept())
+    named = [axis for axis in swept if name in (axis.column, axis.short, *axis.names)]
+    if not named:
+        raise unknown("column of the table:", name, [axis.column for axis in swept])
+    return named[0]
+
+
+def _pivot(axis: Axis | None, problem: ProblemRows, apart: bool) -> Table:
+    curves = estimator_curves(problem.rows, close=None) if apart else estimator_curves(problem.rows)
+    names = [f"{c.label} ({', '.join(c.backends)})" for c in curves] if apart else method_names(curves)
+    values = sorted({x for curve in curves for x in curve.at})
+    lines: list[dict[str, Any]] = []
+    for curve, name in zip(curves, names, strict=True):
+        line: dict[str, Any] = {"method": name}
+        for i, x in enumerate(values):
+            others = [other.at.get(x) for other in curves if other.label != curve.label]
+            line |= {f"x{i}{end}": value for end, value in _pivot_cell(curve.at.get(x), others).items()}
+        lines.append(line)
+    columns = [
+        interval(
+            f"x{i}", label=axis_value(x) if axis is not None else "relative RMSE",
+            emphasis=f"x{i}_best", note=f"x{i}_note",
+        )
+        for i, x in enumerate(values)
+    ]  # fmt: skip
+    title = problem.title() + (f", by {axis.title}" if axis is not None else "")
+    return Table(
+        "bias_variance", pd.DataFrame(lines), [ESTIMATOR, *columns], f"relative RMSE: {title}", files=["csv", "md", "tex"],
+        terminal=True,
+    )  # fmt: skip
+
+
+def _pivot_cell(row: Mapping[str, Any] | None, others: Sequence[Mapping[str, Any] | None]) -> dict[str, Any]:
+    blank = {"": math.nan, "_low": math.nan, "_high": math.nan, "_best": False, "_note": ""}
+    if row is None:
+        return blank
+    mark = REMARKED if row["reason"] else ""
+    if row["status"] != "ok":
+        return blank | {"_note": FAILURES[row["status"]][0] + mark}
+    low, high = (float(end) for end in rmse_interval(row))
+    rivals = [rmse_interval(other)[0] for other in others if other is not None and other["status"] == "ok"]
+    best = bool(row["rmse_rel"] < 1 and rivals and all(high < rival for rival in rivals))
+    return {"": float(row["rmse_rel"]), "_low": low, "_high": high, "_best": best, "_note": mark}
+
+
+def _notes(result: Sequence[Table]) -> list[str]:
+    """Return the notes below the tables: numbers, intervals, bold type and the signs that occur."""
+    seen = {str(v) for table in result for name in table.frame if name.endswith("_note") for v in table.frame[name]}
+    notes = [
+        "Relative RMSE of one estimate [95% interval], in units of the reference gradient's norm: above 1 the zero estimate "
+        "is better. Bold: below 1, with an interval apart from that of every other estimator."
+    ]
+    signs = [f"{sign}: {what}." for sign, what in FAILURES.values() if any(sign in text_ for text_ in seen)]
+    if any(REMARKED in text_ for text_ in seen):
+        signs.append(
+            f"{REMARKED}: the row has a remark, so its interval is doubtful: see the column reason of the CSV."
+        )
+    return notes + ([" ".join(signs)] if signs else [])
+
+
+# --------------------------------------------------------------------------------------------------- error and cost
+
+
+def speed_accuracy(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return errors and costs; ``pareto`` is True where no other ok row of the problem is both faster and more accurate."""
+    results = ["rmse_rel", "bias_rel", "time_s", "time_iqr_s", "compile_s", "rollouts", "gradients"]
+    table = rows[["experiment", *IDENTITY, "status", *results]].assign(pareto=False)
+    good = table[(table["status"] == "ok") & np.isfinite(table["rmse_rel"]) & np.isfinite(table["time_s"])]
+    for _, part in good.groupby(number_problems(rows).loc[good.index]):
+        table.loc[part.index[pareto(part["time_s"], part["rmse_rel"])], "pareto"] = True
+    return table
+
+
+# --------------------------------------------------------------------------------------------------- ranking
+
+
+def ranking(methods: pd.DataFrame) -> Table:
+    """Return the ranking: a line per estimator with the number of settings by verdict, and its errors by problem.
+
+    Where a problem was swept, its error is the largest along the axis: the worst case.
+    """
+    counts = verdicts_by_estimator(methods)
+    worst = methods.assign(known=methods["error"].fillna(math.inf)).sort_values("known", kind="stable")
+    worst = worst.drop_duplicates(["estimator", "problem"], keep="last")
+    shares = worst["verdict"] + np.where(worst["bias_share"] > 0.5, ", biased", "")
+    work = worst["evaluations"].map(" ({:.0f}x)".format).where(worst["evaluations"] > MANY, "")
+    worst = worst.assign(note=shares.mask(worst["status"] != "ok", worst["status"]) + work)
+    problems, parts = list(dict.fromkeys(methods["problem"])), []
+    for i, problem in enumerate(problems):
+        own = worst[worst["problem"] == problem].set_index("estimator").reindex(counts.index)
+        named = {"error": f"p{i}", "error_low": f"p{i}_low", "error_high": f"p{i}_high", "note": f"p{i}_note"}
+        parts.append(own[[*named]].rename(columns=named).fillna({f"p{i}_note": ""}))
+    frame = pd.concat([counts, *parts], axis=1).rename_axis("method").reset_index()
+    errors = frame[[f"p{i}" for i in range(len(problems))]]
+    frame["worst"] = errors.max(axis=1).where(np.isfinite(errors).all(axis=1))
+    frame = frame.sort_values("worst", kind="stable", na_position="last")
+    columns = [
+        ESTIMATOR,
+        *(Column(str(name), format="setting") for name in counts),
+        *(interval(f"p{i}", label=problem, note=f"p{i}_note") for i, problem in enumerate(problems)),
+    ]
+    notes = (
+        f"Sorted by the worst case. Relative RMSE [95% interval] at equal {_basis(methods)}; where a problem was swept, the largest along "
+        "the axis. works: the whole interval is below 1; fails: it is above 1; open: it contains 1 or is not known. biased: more "
+        "than half of the squared error is bias. (40x): it evaluates 40 costs and gradients per sample, where others take "
+        "one or two.",
+    )
+    return Table("ranking", frame, columns, "estimators by their worst case", notes)
+
+
+def _basis(methods: pd.DataFrame) -> str:
+    """Return at what errors are equal: rollouts, samples, or either by problem."""
+    along = set(methods["axis"] == ROLLOUTS.column)
+    return "samples or rollouts" if len(along) > 1 else ROLLOUTS.column if along == {True} else "samples"
+
+
+def _values(axis: str, at: pd.Series) -> str:
+    """Return the values of an axis, ``stiffness 10, 100``; empty without an axis."""
+    return f"{axis} {', '.join(map(axis_value, sorted(at.unique())))}" if axis else ""
+
+
+def recommendations(methods: pd.DataFrame, comparisons: pd.DataFrame) -> Table:
+    """Return what to use where: a line per problem and range of its axis with the same first and tied estimators."""
+    named = leaders(comparisons, methods)
+    lines = []
+    for (problem, axis), part in methods.groupby(["problem", "axis"], sort=False):
+        uses = part["setting"].map(named).map(tuple)
+        for use in filter(None, uses.unique()):
+            inside = part[uses == use]
+            errors = inside.loc[inside["estimator"].isin(use[:1]), "error"]
+            failing = dict.fromkeys(inside.loc[inside["verdict"].isin((FAILS, NO_RESULT)), "estimator"])
+            lines.append({
+                "problem": problem, "where": _values(axis, inside["at"]), "use": " or ".join(use),
+                "error": span(errors.min(), errors.max()), "fails": ", ".join(failing) or "none",
+            })  # fmt: skip
+    columns = [
+        text("problem"), text("where"), text("use"), text("error", label="relative RMSE"), text("fails", label="fails there"),
+    ]  # fmt: skip
+    notes = [f"Errors are compared at equal {_basis(methods)}."]
+    return Table("recommendations", pd.DataFrame(lines), columns, "What to use where", notes, files=(), page=True)

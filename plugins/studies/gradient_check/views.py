@@ -12,7 +12,7 @@ from bench.experiment.axes import with_axes
 from bench.experiment.columns import COMMON, IDENTITY, Column, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Style, Table, Views
-from bench.gradient import FAULTS, MEANING, TRUSTED, UNDECIDED, VERDICTS
+from bench.gradient import FAULTS, RULES, TRUSTED, UNDECIDED, VERDICTS
 from bench.report.problems import axes_of, label_columns, problem_names, problem_numbers
 from bench.report.shown import PROBLEM
 from bench.report.style import PALETTE
@@ -26,11 +26,11 @@ PER_CHECK = ["point", "sample", "direction", "derivative_program"]
 PER_STEP = ["derivative_differences", "relative_error", "mode_minus", "mode_plus"]
 PER_COMPONENT = [name for name in GradientCheck.columns.by_name if name.startswith("component")]
 KINDS: dict[str, tuple[tuple[str, ...], Style]] = {
-    "X": (FAULTS, Style(PALETTE[2], letter="X", meaning="X: not the derivative of its cost")),
-    "?": (UNDECIDED, Style("#bdbdbd", letter="?", meaning="?: undecided")),
-    "J": (("jump", "missed_slope"), Style(PALETTE[4], letter="J", meaning="J: the cost jumps or rises steeply here")),
-    "K": (("kink",), Style(PALETTE[5], letter="K", meaning="K: kink, at most a one-sided slope")),
-    "ok": (TRUSTED, Style("#cfe8df", letter="ok", meaning="ok: right")),
+    "X": (FAULTS, Style(PALETTE[2], meaning="X: not the derivative of its cost")),
+    "?": (UNDECIDED, Style("#bdbdbd", meaning="?: undecided")),
+    "J": (("jump", "missed_slope"), Style(PALETTE[4], meaning="J: the cost jumps or rises steeply here")),
+    "K": (("kink",), Style(PALETTE[5], meaning="K: kink, at most a one-sided slope")),
+    "ok": (TRUSTED, Style("#cfe8df", meaning="ok: right")),
 }
 """Verdicts and look of each letter in a cell, the worst first."""
 ERROR = Column("error", label="best error")
@@ -176,7 +176,7 @@ def _lines(shown: Arranged, points: pd.DataFrame) -> tuple[pd.DataFrame, list[Co
 def _verdicts(points: pd.DataFrame) -> tuple[pd.DataFrame, list[Column]]:
     """Return a line per verdict: its meaning, the number of points, the largest error and the scenes; and the columns."""
     lines = [
-        {"verdict": verdict, "meaning": MEANING[verdict], "trusted": _trusted(verdict, part),
+        {"verdict": verdict, "meaning": RULES[verdict].meaning, "trusted": _trusted(verdict, part),
          "points": len(part), "error": part["error"].max(), "scenes": ", ".join(dict.fromkeys(part["scene"]))}
         for verdict in VERDICTS if len(part := points[points["verdict"] == verdict])
     ]  # fmt: skip

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 from bench.errors import UserError
 from bench.experiment.cell import Cell
-from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, several, text
+from bench.experiment.columns import Column, Columns, bounded, exact, numbers, several, text
 from bench.model import Decision, Identified, MechanicalScene, Optimizer, param
 
 from .. import PARTS, StudyPackage
@@ -25,8 +25,7 @@ class Identify(StudyPackage):
     columns = Columns.of(
         text("optimizer", "identity string of the optimizer"),
         Column("rank", "directions of the parameters that the record sees"),
-        Column("condition", "largest singular value of the information over the smallest that is seen",
-               comparison=ComparisonRule("exact", "condition number")),
+        exact("condition", "largest singular value of the information over the smallest that is seen", "condition number"),
         Column("fits", "records that were fitted"),
         Column("step_shift", "largest relative change of an estimate when the model's step is halved, without noise"),
         Column("step_shift_bound", "the same in units of the Cramer-Rao bound"),
@@ -38,8 +37,7 @@ class Identify(StudyPackage):
              "correlated; empty: not all products are identifiable"),
         numbers("parameter", "identifiable products of powers of the unknowns, then unknowns that are not identifiable"),
         numbers("estimate", "estimate of the first record by single shooting; nan: not identifiable", digits=4),
-        numbers("estimate_low", "lower end of its 95% interval", digits=4, label="low"),
-        numbers("estimate_high", "its upper end", digits=4, label="high"),
+        *(numbers(f"estimate_{end}", f"{end} end of its 95% interval", digits=4, label=end) for end in ("low", "high")),
         numbers("unit", "its unit"),
         numbers("start", "value where its fit starts", format="setting"),
         numbers("identifiable", "yes, product (in products only), or no", label="seen"),
@@ -56,16 +54,12 @@ class Identify(StudyPackage):
             "shooting": "the shooting methods: single, multiple, windows",
             "optimum": "by shooting method, share of fits whose optimizer has reached an optimum",
         }),
-        numbers("converged", "by shooting method, share of fits whose residuals are consistent with the noise",
-                label="share of fits that converge", low="converged_low", high="converged_high"),
-        numbers("converged_low", "lower end of its 95% interval"),
-        numbers("converged_high", "upper end of its 95% interval"),
+        *bounded("converged", "by shooting method, share of fits whose residuals are consistent with the noise", kind=numbers,
+                 label="share of fits that converge"),
         numbers("error", "by shooting method, root mean square error of converged fits in units of the bound",
                 label="error / Cramer-Rao bound", low="error_low", high="error_high"),
-        numbers("coverage", "by shooting method, share of 95% intervals of converged fits that contain the truth",
-                label="coverage of 95% intervals", low="coverage_low", high="coverage_high"),
-        numbers("coverage_low", "lower end of its 95% interval over records"),
-        numbers("coverage_high", "upper end of its 95% interval over records"),
+        *bounded("coverage", "by shooting method, share of 95% intervals of converged fits that contain the truth", kind=numbers,
+                 of="its 95% interval over records", label="coverage of 95% intervals"),
         numbers("hidden", "by shooting method, fits with more identifiable directions than the record has"),
     )  # fmt: skip
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from bench.experiment.cell import Cell
-from bench.experiment.columns import Column, Columns, ComparisonRule, numbers, seconds, several, text
+from bench.experiment.columns import Column, Columns, exact, numbers, seconds, several, text
 from bench.model import Estimator, Optimizer, Plugin, param
 
 from .. import PARTS, StudyPackage
@@ -60,7 +60,7 @@ class Optimise(SearchStudy):
         Column("gradient_ratio", "measured time of a gradient over that of a rollout", measured=True),
         seconds("search_s", "time of the search, without compilation and scores", "search"),
         Column("start_cost", "objective at the start"),
-        Column("final_cost", "objective at the last theta", comparison=ComparisonRule("exact", "final cost")),
+        exact("final_cost", "objective at the last theta", "final cost"),
         Column("best_cost", "lowest objective on the path"),
         Column("optimum", "least known cost J*, from before the search"),
         text("optimum_status", "source of J*"),

@@ -1,24 +1,36 @@
-"""What the study of searches shows: targets reached by method, regret along the paths, errors of gradients, and tuning."""
+"""What the study of searches shows: scores, and targets reached, by method, and in how many rollouts."""
 
 from __future__ import annotations
 
-import re
-from collections import Counter
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import pandas as pd
 
-from bench.experiment.axes import table
+from bench.experiment.axes import Axis, table
 from bench.experiment.columns import Column, interval, text
 from bench.experiment.experiment import Experiment
-from bench.experiment.views import Chart, Style, Table, Views
-from bench.report.colours import estimator_colour, estimator_marker
-from bench.report.style import VARIANTS
+from bench.experiment.parameters import flatten, swept_columns
+from bench.experiment.views import Chart, Table, Views
+from bench.measure import performance
+from bench.model.parameters import remember
+from bench.report.colours import method_styles
+from bench.report.problems import problem_names, titled
+from bench.report.text import axis_value
+from bench.report.views import arrange, attempted, estimator_labels
 
-from . import aggregate
-from .aggregate import RunSet
+from .. import PARTS
+
+TARGETS = (10.0, 100.0, 1000.0)
+"""Target regrets: the first regret divided by each of these factors."""
+MIN_SEEDS_TO_SPLIT = 4
+"""Fewest seeds to split: some choose the tunings, the others score."""
+ROUNDING = 1e-12
+"""Smallest regret, as a share of the first regret: a smaller regret is rounding."""
+
 
 STEPS = 40
 """Number of points of a drawn curve."""
@@ -44,67 +56,260 @@ NOTE = (
     "median final cost of {seeds}, next to the number of tunings and the median score over all of them. Methods without "
     "an estimator (dashed in charts) are context."
 )
-EFFECT = (
-    text("scene_class", label="class"), text("verdict"), interval("rho", log=False),
-    Column("points", format="setting"), Column("chance", label="chance of a random order"),
-)  # fmt: skip
-EFFECT_NOTES = (
-    "rho: rank correlation of the error of gradients at the start and the average runtime, ranked within each problem. sooner or "
-    "later: the whole 95% interval is on one side of 0, and a random order is at least as good with a probability of 5% at most.",
-)
 PAGE = (
     "stopped", "scene_class", "final_cost", "best_known", "score", "rollouts", "gradients", "search_s", "quality_rmse_rel",
     "quality_bias_share",
 )  # fmt: skip
 
 
+@dataclass(frozen=True, eq=False)
+class RunSet:
+    """The searches of an experiment, by problem, method and tuning.
+
+    ``rows`` has the columns ``problem``, ``method``, ``tuning`` (the optimizer's swept parameters as a string),
+    ``best_known`` (J*, or the lowest cost of any search if lower), ``best_known_status`` (its source), ``score`` and ``ratio``,
+    the rollouts that take as long as one gradient: the median over searches, or what one counts as in the budget.
+    """
+
+    rows: pd.DataFrame
+
+    @cached_property
+    def tuning_seeds(self) -> tuple[int, ...]:
+        """The seeds that choose the tunings and do not score: the first third. Empty without tunings or with few seeds."""
+        seeds = sorted(int(seed) for seed in self.rows["seed"].unique())
+        several = (self.rows.groupby(["problem", "method"])["tuning"].nunique() > 1).any()
+        return tuple(seeds[: math.ceil(len(seeds) / 3)]) if several and len(seeds) >= MIN_SEEDS_TO_SPLIT else ()
+
+    @cached_property
+    def best_tunings(self) -> dict[tuple[str, str], str]:
+        """The tuning with the lowest median final cost, by problem and method.
+
+        The median is over the tuning seeds, or over all seeds if there are no tuning seeds. A failed search counts as
+        inf.
+        """
+        rows = self.rows[self.rows["seed"].isin(self.tuning_seeds)] if self.tuning_seeds else self.rows
+        final = rows["final_cost"].where(rows["status"] == "ok", math.inf).fillna(math.inf)
+        # the lower of the two middle costs, because their mean is infinite if one search failed
+        groups = final.groupby([rows[n] for n in ("problem", "method", "tuning")], sort=False)
+        middle = groups.quantile(interpolation="lower")
+        best = middle.reset_index().sort_values("final_cost", kind="stable").drop_duplicates(["problem", "method"])
+        return dict(zip(zip(best["problem"], best["method"], strict=True), best["tuning"], strict=True))
+
+    @cached_property
+    def best_runs(self) -> pd.DataFrame:
+        """The rows of each method's best tuning on each problem, without the tuning seeds."""
+        rows = self.rows[~self.rows["seed"].isin(self.tuning_seeds)]
+        best = [(*key, tuning) for key, tuning in self.best_tunings.items()]
+        return rows[pd.MultiIndex.from_frame(rows[["problem", "method", "tuning"]]).isin(best)]
+
+
+def collect_runs(experiment: Experiment, rows: pd.DataFrame) -> RunSet:
+    """Return the searches that ran, with names of problem, method and tuning, and scores."""
+    shown = arrange(experiment, rows)
+    runs = attempted(shown.rows)
+    runs = runs[np.isfinite(runs["start_cost"])]
+    tuned_axes = tuple(axis for axis in shown.axes if _is_tuned(axis, runs))
+    names = problem_names(shown, PARTS, tuned_axes, rows=runs).astype(str)
+    runs = runs.assign(problem=names, estimator_label=estimator_labels(runs), tuning=_tuning_labels(runs, tuned_axes))
+    runs = runs.assign(method=titled(runs, ["estimator_label", "optimizer"]))
+    best_known, status = _best_known_cost(runs)
+    start, final = runs["start_cost"], runs["final_cost"]
+    achievable = (start - best_known).where(start > best_known)
+    score = ((start - final) / achievable).clip(0.0, 1.0).mask(runs["status"] != "ok", 0.0)
+    ratio = runs.groupby("problem")["gradient_ratio"].transform("median").fillna(experiment.study.gradient_cost)  # type: ignore[attr-defined]
+    return RunSet(runs.assign(best_known=best_known, best_known_status=status, score=score, ratio=ratio))
+
+
+def _is_tuned(axis: Axis, rows: pd.DataFrame) -> bool:
+    """Return whether an axis sweeps a parameter of an optimizer."""
+    table = flatten(rows)
+    return any(
+        column.startswith("optimizer.") and bool((mask & table[column].notna()).any())
+        for name in axis.names
+        for column, mask in swept_columns(name, table).items()
+    )
+
+
+def _tuning_labels(rows: pd.DataFrame, axes: Sequence[Axis]) -> pd.Series:
+    labels = [
+        ", ".join(
+            f"{axis.short}={axis_value(value)}" for axis, value in zip(axes, values, strict=True) if value == value
+        )
+        for values in rows[[axis.column for axis in axes]].to_numpy(float)
+    ]
+    return pd.Series(labels, index=rows.index, dtype=object)
+
+
+def _best_known_cost(rows: pd.DataFrame) -> tuple[pd.Series, pd.Series]:
+    """Return, per row, the lowest cost known for its problem, and its source: J*, or a search that reached a lower cost."""
+    lowest = rows.groupby("problem")["best_cost"].transform("min")
+    known = rows["optimum"]
+    below = known.isna() | (lowest < known - 1e-9 * known.abs())
+    status = rows["optimum_status"].mask(known.isna(), "lowest cost of any search")
+    status = status.mask(below & known.notna(), "lowest cost of any search, below J*: " + rows["optimum_status"])
+    return known.mask(below, lowest), status
+
+
+# ------------------------------------------------------------------------------------------------------- tables
+
+
+@remember
+def hits(runs: RunSet) -> pd.DataFrame:
+    """Return a line per search and target: the rollouts until it is reached, of the whole search if not, and whether.
+
+    Reached is where the regret J(theta_t) - J* is at most the first regret over the target.
+    """
+    lines = []
+    for row in runs.best_runs.to_dict("records"):
+        spent = np.asarray(row["path_rollouts"], dtype=float) + row["ratio"] * np.asarray(
+            row["path_gradients"], dtype=float
+        )
+        rounding = ROUNDING * max(abs(row["start_cost"] - row["best_known"]), 1e-300)
+        regret = np.maximum(np.asarray(row["path_cost"], dtype=float) - row["best_known"], rounding)
+        for target in TARGETS:
+            below = np.flatnonzero(regret <= regret[0] / target)
+            lines.append([row["problem"], row["method"], target, spent[below[0] if below.size else -1], below.size > 0])
+    return pd.DataFrame(lines, columns=["problem", "method", "target", "spent", "reached"])
+
+
+@remember
+def times_to_targets(runs: RunSet) -> pd.DataFrame:
+    """Return, per problem, method and target, successes with Wilson's interval and the average runtime in rollouts."""
+    lines = []
+    for (problem, method, target), part in hits(runs).groupby(["problem", "method", "target"], sort=False):
+        costs, reached = part["spent"].to_numpy(), part["reached"].to_numpy()
+        low, high = performance.wilson(int(reached.sum()), len(reached))
+        art_low, art_high = performance.runtime_interval(costs, reached)
+        lines.append({
+            "problem": problem, "method": method, "tuning": runs.best_tunings[problem, method], "target": target,
+            "successes": int(reached.sum()), "searches": len(reached), "rate": float(reached.mean()),
+            "rate_low": low, "rate_high": high, "art": performance.average_runtime(costs, reached),
+            "art_low": art_low, "art_high": art_high,
+        })  # fmt: skip
+    return pd.DataFrame(lines)
+
+
+def runtimes(runs: RunSet) -> pd.DataFrame:
+    """Return the rollouts of each search until each target, infinite if it is missed, and the weight of the search.
+
+    The weights of a method add up to 1, in equal parts for its problems and targets.
+    """
+    table = hits(runs)
+    weight = 1.0 / table.groupby(["problem", "method", "target"])["spent"].transform("size")
+    total = weight.groupby(table["method"]).transform("sum")
+    return table.assign(runtime=table["spent"].where(table["reached"], math.inf), weight=weight / total)
+
+
+def share_of_targets(reached: pd.DataFrame) -> tuple[float, float]:
+    """Return the mean success rate of a method's lines of :func:`times_to_targets`, and a bound of its standard error.
+
+    The error is due to the seeds. The variance of each rate is that of the estimate of Agresti and Coull (1998), with two more
+    successes and two more failures, so that few searches that agree are uncertain. The targets of a problem count as fully
+    dependent, the problems as independent.
+    """
+    p = (reached["successes"] + 2.0) / (reached["searches"] + 4.0)
+    by_problem = np.sqrt(p * (1 - p) / reached["searches"]).groupby(reached["problem"]).mean()
+    return float(reached["rate"].mean()), float(np.sqrt((by_problem**2).sum()) / len(by_problem))
+
+
+@remember
+def summarise(runs: RunSet) -> pd.DataFrame:
+    """Return, per method, the share of targets reached, the score, the profile and the chance to beat the baseline.
+
+    The score is an interquartile mean, its interval a bootstrap stratified by problem. ``profile`` is the mean over tau in
+    [1, 4] of the share of targets reached within tau times the runtime of the best method.
+    """
+    reached, lines = times_to_targets(runs), []
+    slower = reached["art"] / reached.groupby(["problem", "target"])["art"].transform("min")
+    profiles = ((4.0 - slower.fillna(math.inf).clip(lower=1.0)) / 3.0).clip(lower=0.0).groupby(reached["method"]).mean()
+    better = improvement(runs)
+    for method, part in runs.best_runs.groupby("method", sort=False):
+        strata = [own.to_numpy() for _, own in part["score"].dropna().groupby(part["problem"], sort=False)]
+        low, high = performance.bootstrap(strata, _pooled_score) if strata else (math.nan, math.nan)
+        share, error = share_of_targets(reached[reached["method"] == method])
+        cells = runs.rows[runs.rows["method"] == method]
+        lines.append({
+            "method": method, "problems": part["problem"].nunique(), "searches": len(part),
+            "reached": share, "reached_low": max(0.0, share - performance.Z * error),
+            "reached_high": min(1.0, share + performance.Z * error), "reached_se": error,
+            "score": _pooled_score(strata), "score_low": low, "score_high": high,
+            **better.loc[method], "profile": profiles[method], "diverged": int((part["status"] == "diverged").sum()),
+            "tunings": int(cells["tuning"].nunique()), "median_score": float(cells["score"].median()),
+        })  # fmt: skip
+    return pd.DataFrame(lines)
+
+
+def improvement(runs: RunSet) -> pd.DataFrame:
+    """Return, per method, the probability of a lower final cost than the first method whose estimator is ``fobg``.
+
+    Searches are paired by problem and seed, and problems count the same; a tie counts half. The interval is Wilson's: where few
+    pairs all agree, that of a bootstrap would be a single point. NaN for the baseline and without pairs.
+    """
+    final = runs.best_runs.assign(final=runs.best_runs["final_cost"].where(runs.best_runs["status"] == "ok", math.inf))
+    wide = final.pivot_table(index=["problem", "seed"], columns="method", values="final", aggfunc="first", dropna=False)
+    methods = runs.rows["method"].unique()
+    base = next((m for m in methods if m.partition(",")[0].partition("[")[0] == "fobg"), None)
+    lines = {}
+    for method in methods:
+        lines[method] = (math.nan, math.nan, math.nan)
+        if base not in (None, method) and len(pairs := wide[[method, base]].dropna()):
+            wins = (pairs[method] < pairs[base]) + 0.5 * (pairs[method] == pairs[base])
+            share = float(wins.groupby(level="problem").mean().mean())
+            lines[method] = (share, *performance.wilson(round(share * len(pairs)), len(pairs)))
+    columns = ["improvement", "improvement_low", "improvement_high"]
+    return pd.DataFrame.from_dict(lines, orient="index", columns=columns)
+
+
+def _pooled_score(strata: Sequence[np.ndarray]) -> float:
+    return performance.interquartile_mean(np.concatenate(strata)) if strata else math.nan
+
+
+def is_tied(summary: pd.DataFrame) -> pd.Series:
+    """Return a mask of the methods that reach most targets, or that are not distinguishable from the first.
+
+    Methods that were not run on all problems are not compared.
+    """
+    full = summary[summary["problems"] == summary["problems"].max()]
+    best = full.loc[full["reached"].idxmax()]
+    error = np.sqrt(best["reached_se"] ** 2 + full["reached_se"] ** 2)
+    tied = (best["reached"] - full["reached"] < performance.Z * error) | (full.index == best.name)
+    return tied.reindex(summary.index, fill_value=False)
+
+
 def views(experiment: Experiment, rows: pd.DataFrame) -> Views | None:
     """Return the tables and charts of the searches; None without any."""
-    runs = aggregate.collect_runs(experiment, rows)
+    runs = collect_runs(experiment, rows)
     if runs.rows.empty:
         return None
-    name = short_names(runs.rows["method"].unique())
     cells = rows.assign(**{c: runs.rows[c] for c in ("problem", "method", "tuning", "best_known", "score")})
     cells = cells.fillna({"problem": "", "method": "", "tuning": ""}).astype({"score": float, "best_known": float})
     by_name = experiment.columns.by_name | {"best_known": Column("best_known", label="J*")}
     return Views(
-        tables(experiment, rows, runs, name), charts(runs, name), rows=cells,
+        tables(experiment, rows, runs), charts(runs), rows=cells,
         columns=[METHOD, *(by_name[column] for column in PAGE)],
     )  # fmt: skip
-
-
-def short_names(methods: Sequence[str]) -> Callable[[str], str]:
-    """Return the function that shortens a method's name by its parameters in brackets, where that leaves it unique."""
-    short = {method: re.sub(r"\[[^\]]*\]", "", method) for method in methods}
-    counts = Counter(short.values())
-    return lambda method: short[method] if counts[short[method]] == 1 else method
 
 
 # --------------------------------------------------------------------------------------------------------- tables
 
 
-def tables(experiment: Experiment, rows: pd.DataFrame, runs: RunSet, name: Callable[[str], str]) -> list[Table]:
+def tables(experiment: Experiment, rows: pd.DataFrame, runs: RunSet) -> list[Table]:
     """Return the tables of methods, of times to targets and of lowest costs."""
-    reached, summary = aggregate.times_to_targets(runs), aggregate.summarise(runs)
+    reached, summary = times_to_targets(runs), summarise(runs)
     methods = summary.sort_values(["reached", "score"], ascending=False, kind="stable")
-    methods = methods.assign(
-        name=methods["method"].map(name), verdict=np.where(aggregate.is_tied(methods), "first or tied", ""),
-    )  # fmt: skip
-    key = "; ".join(f"{name(method)}: {method}" for method in runs.rows["method"].unique() if name(method) != method)
+    methods = methods.assign(verdict=np.where(is_tied(methods), "first or tied", ""))
     chosen = runs.tuning_seeds
     seeds = f"seeds {', '.join(map(str, chosen))}, which do not score" if chosen else "the same seeds that score"
-    notes = [NOTE.format(seeds=seeds), *([f"{key}."] if key else [])]
-    effects = aggregate.effects_of_error(runs)
     return [
         Table(
             "optimise", methods,
-            [text("name", label="method"), REACHED, text("verdict"), SCORE, BETTER, PROFILE, *(Column(name, format="setting") for name in ("tunings", "searches", "diverged")), MEDIAN],
-            "methods by the share of targets they reach", notes, terminal=True, page=True,
+            [METHOD, REACHED, text("verdict"), SCORE, BETTER, PROFILE, *(Column(name, format="setting") for name in ("tunings", "searches", "diverged")), MEDIAN],
+            "methods by the share of targets they reach", [NOTE.format(seeds=seeds)], terminal=True, page=True,
             data=table(experiment, rows),
         ),
         Table(
-            "optimise", reached.assign(regret=[f"1/{t:g}" for t in reached["target"]], name=reached["method"].map(name)),
-            [PROBLEM, text("name", label="method"), text("tuning"), text("regret"), RATE, RUNTIME], "Times to targets",
+            "optimise", reached.assign(regret=[f"1/{t:g}" for t in reached["target"]]),
+            [PROBLEM, METHOD, text("tuning"), text("regret"), RATE, RUNTIME], "Times to targets",
             terminal=True,
         ),
         Table(
@@ -113,8 +318,6 @@ def tables(experiment: Experiment, rows: pd.DataFrame, runs: RunSet, name: Calla
              Column("best_known", label="J*", digits=8), text("best_known_status", label="source of J*")],
             "Lowest costs", terminal=True,
         ),
-        *([Table("effect_of_error", effects, EFFECT, "Does a smaller error reach a tenth of the first regret sooner?", EFFECT_NOTES)]
-          if len(effects) else []),
         Table("targets", reached, [], files=["csv"]),
         Table("summary", summary, [], files=["csv"]),
     ]  # fmt: skip
@@ -123,34 +326,16 @@ def tables(experiment: Experiment, rows: pd.DataFrame, runs: RunSet, name: Calla
 # --------------------------------------------------------------------------------------------------------- charts
 
 
-def styles(methods: Sequence[str], name: Callable[[str], str] = str) -> dict[str, Style]:
-    """Return the style of each method with an estimator by its short name: the estimator's colour."""
-    looks: dict[str, Style] = {}
-    uses: Counter[str] = Counter()
-    for method in methods:
-        if ", " in method:  # "estimator, optimizer"
-            estimator = re.split(r"[\[,]", method)[0]
-            turn = uses[estimator]
-            uses[estimator] += 1
-            dashes = VARIANTS[turn % len(VARIANTS)]
-            looks[name(method)] = Style(estimator_colour(estimator), estimator_marker(estimator, turn), dashes)
-    return looks
-
-
-def charts(runs: RunSet, name: Callable[[str], str]) -> list[Chart]:
+def charts(runs: RunSet) -> list[Chart]:
     """Return the charts, the shares of targets reached first."""
-    looks = styles(runs.rows["method"].unique(), name)
-    found = (_targets(runs), _progress(runs))
-    return [
-        replace(chart, frame=chart.frame.assign(method=chart.frame["method"].map(name)), series="method", styles=looks)
-        for chart in found
-        if chart is not None
-    ]
+    # a method without an estimator has no comma, and a free colour
+    looks = method_styles(method for method in runs.rows["method"].unique() if ", " in method)
+    return [replace(chart, series="method", styles=looks) for chart in (_targets(runs), *_progress(runs))]
 
 
 def _targets(runs: RunSet) -> Chart:
     """Return the share of targets that each method reaches, the largest first."""
-    frame = aggregate.summarise(runs).sort_values("reached", ascending=False, kind="stable")
+    frame = summarise(runs).sort_values("reached", ascending=False, kind="stable")
     return Chart(
         "targets", frame, [REACHED], [METHOD], "dots", height=0.24,
         subtitle=_where(runs, "targets: a tenth, a hundredth and a thousandth of the first regret"),
@@ -163,12 +348,12 @@ def _where(runs: RunSet, what: str) -> str:
     return f"{len(problems)} problems, {what}" if len(problems) > 1 else f"{problems[0]}, {what}"
 
 
-def _progress(runs: RunSet) -> Chart | None:
+def _progress(runs: RunSet) -> list[Chart]:
     """Return the share of targets that single searches reach within a number of rollouts."""
-    times = aggregate.runtimes(runs)
+    times = runtimes(runs)
     finite = times.loc[np.isfinite(times["runtime"]) & (times["runtime"] > 0), "runtime"]
     if finite.empty:
-        return None
+        return []
     grid = np.geomspace(finite.min() / 1.5, finite.max() * 1.2, STEPS)
     shares = {
         method: [float(part["weight"][part["runtime"] <= x].sum()) for x in grid]
@@ -178,8 +363,9 @@ def _progress(runs: RunSet) -> Chart | None:
         var_name="method", value_name="share", ignore_index=False
     )
     share = Column("share", label="share of targets reached", format="percent", log=False)
-    return Chart(
+    chart = Chart(
         "runtimes", frame.reset_index(), [SPENT], [share], height=2.6, panel="",
         subtitle=_where(runs, "single searches, a gradient counts as its time in rollouts"),
         text="Where a line ends is the share of targets reached in the whole budget.",
     )  # fmt: skip
+    return [chart]

@@ -5,12 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from bench.experiment.cell import Cell
-from bench.experiment.columns import Column, Columns, ComparisonRule, interval, numbers, seconds, several, text
+from bench.experiment.columns import Column, Columns, ComparisonRule, bounded, numbers, seconds, several, text
 from bench.model import Trainer, param
 from bench.model.policy import PolicyScene
 from bench.model.trainer import LOGGED
 
 from .. import PARTS, StudyPackage
+
+STARTS = "its 95% interval over starts"
 
 
 @dataclass(frozen=True)
@@ -23,9 +25,8 @@ class Train(StudyPackage):
     columns = Columns.of(
         text("trainer", "identity string of the trainer"),
         Column("first_return", "mean return of the deterministic policy before the first update"),
-        interval("final_return", "mean return of the deterministic policy after the last update", digits=3, log=False, comparison=ComparisonRule("interval", "final return", neutral=True)),
-        Column("final_return_low", "lower end of its 95% interval over starts"),
-        Column("final_return_high", "upper end of its 95% interval over starts"),
+        *bounded("final_return", "mean return of the deterministic policy after the last update", of=STARTS, digits=3, log=False,
+                 comparison=ComparisonRule("interval", "final return", neutral=True)),
         Column("final_median", "median return over starts after the last update", digits=3, log=False),
         Column("updates", "updates of the run"),
         Column("steps", "control steps of the run, over all rollouts", "steps"),
@@ -35,19 +36,16 @@ class Train(StudyPackage):
         Column("gradient_peak", "largest norm of the actor's gradient over updates", label="largest gradient"),
         Column("window_gradient", "norm of the gradient of whole episodes that is cut into windows, each of which ends in the "
                "critic's value, halfway through the run"),
-        interval("window_bias", "bias of that gradient: its distance from the gradient without cuts, relative to the latter", label="bias of the windows"),
-        Column("window_bias_low", "lower end of its 95% interval over independent batches of rollouts"),
-        Column("window_bias_high", "upper end of its 95% interval"),
+        *bounded("window_bias", "bias of that gradient: its distance from the gradient without cuts, relative to the latter",
+                 of="its 95% interval over independent batches of rollouts", label="bias of the windows"),
         numbers("slope_errors", "relative error of the gradient along which an update moves, in a random direction in each array of the "
                 "actor (weights by layer, biases by layer, log deviation), halfway in float64; NaN: not known", table=False),
         Column("gradient_zero", "share of updates with a gradient of exactly 0"),
         numbers("curve_update", "updates at which the policy was evaluated", table=False),
         numbers("curve_step", "control steps up to those updates", table=False),
         numbers("curve_s", "time up to those updates", "s", table=False, measured=True),
+        *bounded("curve_return", "mean return of the deterministic policy there", of=STARTS, kind=numbers, has_csv=False, table=False),
         *several(numbers, {
-            "curve_return": "mean return of the deterministic policy there",
-            "curve_return_low": "lower end of its 95% interval over starts",
-            "curve_return_high": "upper end of its 95% interval over starts",
             "cosine_update": "updates at which first- and zeroth-order gradients were compared",
             "cosine": "cosine between both gradients there",
             "cosine_denoised": "the same without noise, NaN where the noise is larger than a gradient",

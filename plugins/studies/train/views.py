@@ -1,19 +1,33 @@
-"""What the study of training shows: returns by trainer, windows by length, and faults."""
+"""What the study of training shows: returns by trainer over seeds, with bootstrap intervals, windows by length, and faults."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from bench.experiment.axes import table
 from bench.experiment.columns import Column, interval, text
 from bench.experiment.experiment import Experiment
+from bench.experiment.parameters import flatten
 from bench.experiment.views import Chart, Table, Views
+from bench.measure.performance import bootstrap, bootstrap_along, interquartile_mean
+from bench.report.problems import problem_names
+from bench.report.views import arrange, attempted
 
-from . import aggregate
-from .verdicts import MEANINGS
+from .. import PARTS
+from .verdicts import MEANINGS, judge, series
 
+LEVEL = 0.05
+"""Level of the test of a difference between two groups of runs."""
+MIN_SEEDS = 5
+"""Fewest seeds for an interval: a resample cannot leave the range of its values, which covers too little for fewer."""
+OF_WINDOWS = ("window_bias", "window_bias_low", "window_bias_high", "window_gradient")
+"""Columns of a run that are about its windows."""
 PROBLEM, METHOD, VERDICT = text("problem"), text("method", label="trainer"), text("verdict")
 FINAL = interval("final", label="final return", digits=3, log=False)
 SUMMARY = (
@@ -43,7 +57,7 @@ FAULTS = (
 )
 COST = interval("cost", label="cost of an episode")
 STEP = Column("step", label="control steps", log=False)
-SEEDS = f"interquartile mean over seeds, with its 95% bootstrap interval from {aggregate.MIN_SEEDS} seeds on"
+SEEDS = f"interquartile mean over seeds, with its 95% bootstrap interval from {MIN_SEEDS} seeds on"
 NOTE = (
     f"final return: the mean undiscounted return of the deterministic policy from the same starts, {SEEDS}. A run that is not "
     "finite counts as its untrained policy. used steps: control steps that updates use, median. at equal used steps: the return at "
@@ -66,22 +80,173 @@ PAGE = ("final_return", "first_return", "final_median", "updates", "steps", "tra
         "gradient_peak", "window_gradient", "window_bias")  # fmt: skip
 
 
+def runs_of(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:
+    """Return the runs that gave a curve, with the columns ``problem``, ``method``, ``family`` and ``window``.
+
+    A method is a trainer with its parameters, its family the trainer's name.
+    """
+    runs = attempted(rows)
+    runs = runs[runs["curve_return"].map(len) > 0]
+    if runs.empty:
+        return runs.assign(problem="", method="", family="", window=math.nan)
+    names = problem_names(arrange(experiment, rows), PARTS, rows=runs)
+    given = flatten(runs)
+    window = given["trainer.window"].astype(float) if "trainer.window" in given else math.nan
+    return runs.assign(
+        problem=names, method=runs["trainer"], family=runs["trainer"].str.partition("[")[0], window=window
+    )
+
+
+def final_returns(part: pd.DataFrame, column: str = "final_return") -> np.ndarray:
+    """Return the final return of each run, ``(n,)``; a run that ended early counts as its untrained policy."""
+    return np.asarray(part[column].where(part["status"] == "ok", part["first_return"]), dtype=float)
+
+
+def used_steps(run: Mapping[str, Any]) -> np.ndarray:
+    """Return the control steps that a run's updates used up to each evaluation, ``(n,)``: all, where the log has no share."""
+    share = series(run["log_used"])
+    if not share.size:
+        return np.asarray(run["curve_step"], dtype=float)
+    updates = np.append(0.0, run["log_update"])
+    used = np.append(0.0, np.cumsum(share * np.diff(updates)))
+    return np.asarray(np.interp(run["curve_update"], updates, used) * run["steps"] / run["updates"])
+
+
+def at_equal_steps(runs: pd.DataFrame) -> pd.DataFrame:
+    """Return runs with their ``used`` steps, and the return at the last evaluation within the fewest of their problem, ``equal``."""
+    used = pd.Series([used_steps(run) for run in runs.to_dict("records")], runs.index)
+    last = used.map(lambda steps: steps[-1])
+    fewest = last.where(runs["status"] == "ok").groupby(runs["problem"]).transform("min")
+    returns = [
+        curve[max((steps <= limit).sum() - 1, 0)]
+        for curve, steps, limit in zip(runs["curve_return"], used, fewest, strict=True)
+    ]
+    return runs.assign(used=last, equal=returns)
+
+
+def summarise(runs: pd.DataFrame, by: Sequence[str] = ("problem", "method")) -> pd.DataFrame:
+    """Return a line per problem and method, best first: interquartile mean of the final return over seeds, and medians."""
+    lines = []
+    for key, part in at_equal_steps(runs).groupby(list(by), sort=False):
+        final, equal = final_returns(part), final_returns(part, "equal")
+        low, high = bootstrap_interval(final)
+        cosines = np.concatenate([np.asarray(c, float) for c in part["cosine"]])
+        lines.append(dict(zip(by, key, strict=True)) | {
+            "family": part["family"].iloc[0], "seeds": len(part),
+            "failed": int((part["status"] != "ok").sum()), "returns": final, "final": interquartile_mean(final), "final_low": low,
+            "final_high": high, "worst": float(final.min()), "steps": float(part["steps"].max()), "used": float(part["used"].median()),
+            "equal": interquartile_mean(equal), **dict(zip(("equal_low", "equal_high"), bootstrap_interval(equal), strict=True)),
+            "train_s": float(part["train_s"].median()), "compile_s": float(part["compile_s"].max()),
+            "gradient_typical": float(part["gradient_typical"].median()),
+            "gradient_peak": float(part["gradient_peak"].max()),
+            "cosine": float(np.nanmean(cosines)) if np.isfinite(cosines).any() else math.nan,
+            **part[[*OF_WINDOWS]].median(),
+        })  # fmt: skip
+    frame = pd.DataFrame(lines)
+    return frame.sort_values(["problem", "final"], ascending=[True, False], kind="stable").reset_index(drop=True)
+
+
+def ranked(lines: pd.DataFrame, by: Sequence[str]) -> pd.Series:
+    """Return a verdict on the final return of each line of :func:`summarise` or :func:`windows_of`, within groups ``by``.
+
+    ``first``: the highest; ``behind``: its runs end lower than those of the first, by the test of Mann and Whitney (1947)
+    at 5%; ``tied``: the test finds no difference; ``open``: none of the group is behind; ``no result``: no run ended with a
+    finite return.
+    """
+    from scipy.stats import mannwhitneyu
+
+    verdicts = pd.Series("no result", lines.index, dtype=object)
+    has_ended = np.isfinite(lines["final"]) & (lines["failed"] < lines["seeds"] if "failed" in lines else True)
+    for _, part in lines[has_ended].groupby(list(by), sort=False):
+        best = part.loc[part["final"].idxmax()]
+        tests = [mannwhitneyu(best["returns"], returns) for returns in part["returns"]]
+        behind = np.array([
+            len(returns) >= MIN_SEEDS and test.pvalue < LEVEL and test.statistic > len(returns) * len(best["returns"]) / 2
+            for returns, test in zip(part["returns"], tests, strict=True)
+        ])  # fmt: skip
+        verdicts[part.index] = np.where(behind, "behind", "tied")
+        verdicts[best.name] = "first"
+        if len(part) > 1 and not behind.any():
+            verdicts[part.index] = "open"
+    return verdicts
+
+
+def bootstrap_interval(values: np.ndarray) -> tuple[float, float]:
+    """Return the bootstrap interval of an interquartile mean; NaN for fewer than :data:`MIN_SEEDS` values."""
+    if len(values) < MIN_SEEDS:
+        return math.nan, math.nan
+    return bootstrap([values], lambda drawn: interquartile_mean(drawn[0]))
+
+
+def curves_of(runs: pd.DataFrame) -> pd.DataFrame:
+    """Return a line per problem, method and evaluation: cost of an episode, interquartile mean over seeds with interval.
+
+    The cost is minus the return. A run that ended early keeps the cost of its untrained policy from there on.
+    """
+    parts = []
+    for (problem, method), part in runs.groupby(["problem", "method"], sort=False):
+        lengths = part["curve_return"].map(len)
+        count = lengths.max()
+        costs = np.array([_filled(-np.asarray(row, float), count) for row in part["curve_return"]])
+        timed = [np.asarray(row, float) for row in part["curve_s"] if len(row) == count]
+        ends = np.full((count, 2), math.nan)
+        if len(part) >= MIN_SEEDS:
+            ends = np.array(bootstrap_along([costs], lambda drawn: _middle(drawn[0])))
+        parts.append(pd.DataFrame({
+            "problem": problem, "method": method, "step": np.asarray(part["curve_step"][lengths.idxmax()], float),
+            "seconds": np.median(timed, axis=0) if timed else math.nan,
+            "cost": _middle(costs), "cost_low": ends[:, 0], "cost_high": ends[:, 1],
+        }))  # fmt: skip
+    columns = ["problem", "method", "step", "seconds", "cost", "cost_low", "cost_high"]
+    return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=columns)
+
+
+def _middle(costs: np.ndarray) -> np.ndarray:
+    """Return the interquartile mean of each column."""
+    return np.array([interquartile_mean(column) for column in costs.T])
+
+
+def _filled(values: np.ndarray, count: int) -> np.ndarray:
+    known = np.where(np.isfinite(values), values, values[0])
+    return np.append(known, np.full(count - len(known), values[0]))
+
+
+def windows_of(runs: pd.DataFrame) -> pd.DataFrame:
+    """Return a line per problem, family and window with a run that ended, for families with several windows."""
+    keys = ["problem", "family", "window"]
+    known = runs[runs["window"].notna() & runs["window_gradient"].notna()]
+    has_ended = (known["status"] == "ok").groupby([known[key] for key in keys]).transform("any")
+    names = [*keys, "seeds", "returns", *OF_WINDOWS, "gradient_typical", "final", "final_low", "final_high"]
+    if not has_ended.any():
+        return pd.DataFrame(columns=names)
+    frame = summarise(known[has_ended], keys)[names].sort_values(keys, ignore_index=True)
+    return frame[frame.groupby(["problem", "family"])["window"].transform("nunique") > 1]
+
+
+def faults_of(runs: pd.DataFrame) -> pd.DataFrame:
+    """Return a line per run and fault: problem, method, seed, and the fault's ``code``, ``value`` and ``update``."""
+    lines = [
+        {"problem": row["problem"], "method": row["method"], "seed": row["seed"], **fault}
+        for row in runs.to_dict("records")
+        for fault in judge(row)
+    ]
+    return pd.DataFrame(lines, columns=["problem", "method", "seed", "code", "update", "value"])
+
+
 def views(experiment: Experiment, rows: pd.DataFrame) -> Views | None:
     """Return the tables and charts of the runs; None without any."""
-    runs = aggregate.runs_of(experiment, rows)
+    runs = runs_of(experiment, rows)
     if runs.empty:
         return None
-    summary, windows, faults = aggregate.summarise(runs), aggregate.windows(runs), aggregate.faults(runs)
-    summary = summary.assign(verdict=aggregate.ranked(summary, ["problem"])).drop(
-        columns=["returns", *aggregate.WINDOW]
-    )
+    summary, windows, faults = summarise(runs), windows_of(runs), faults_of(runs)
+    summary = summary.assign(verdict=ranked(summary, ["problem"])).drop(columns=["returns", *OF_WINDOWS])
     tables = [
         Table("train", summary, SUMMARY, "final return by trainer", [NOTE, VERDICTS], terminal=True, page=True, data=table(experiment, rows),
               details=["compile_s", "gradient_typical", "gradient_peak"]),
         Table("summary", summary, [], files=["csv"]),
     ]  # fmt: skip
     if len(windows):
-        lines = windows.assign(verdict=aggregate.ranked(windows, ["problem", "family"])).drop(columns="returns")
+        lines = windows.assign(verdict=ranked(windows, ["problem", "family"])).drop(columns="returns")
         tables.append(Table("windows", lines, WINDOWS, "Windows", [WINDOW_NOTE], terminal=True, page=True,
                             details=["gradient_typical"]))  # fmt: skip
     if len(faults):
@@ -94,7 +259,7 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views | None:
 
 
 def _charts(runs: pd.DataFrame, windows: pd.DataFrame) -> list[Chart]:
-    frame = aggregate.curves(runs)
+    frame = curves_of(runs)
     cost = replace(COST, log=bool((frame["cost"] > 0).all()))
     curves = Chart(
         "train", frame.dropna(subset=["step"]), [STEP], [cost], series="method", panel="problem", band=True,
