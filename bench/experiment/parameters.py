@@ -140,6 +140,6 @@ def number_problems(rows: pd.DataFrame, parts: Collection[str] = PROBLEM, withou
     import pandas as pd
 
     table = problem_columns(rows, parts, without)
-    codes = zip(*(pd.factorize(table[column])[0].tolist() for column in table), strict=True)
-    numbers: dict[tuple[int, ...], int] = {}
-    return pd.Series([numbers.setdefault(code, len(numbers)) for code in codes] or 0, index=rows.index, dtype=int)
+    if not len(table.columns):
+        return pd.Series(0, index=rows.index)
+    return table.groupby([*table], dropna=False, sort=False).ngroup()
