@@ -18,7 +18,7 @@ from bench.experiment.by_name import compile_problem, make
 from bench.model import Backend, Decision, Estimator, Integrator, Problem, Scene, registry
 from bench.model.identity import label, text_of
 from bench.model.parameters import parameters, singular
-from bench.notebook import Estimates, NotebookProblem, for_notebook
+from bench.notebook import Estimates
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -237,7 +237,7 @@ def problem(
     backend: str = "jax",
     theta: Sequence[str] = (),
     theta0: Sequence[float] | None = None,
-) -> NotebookProblem:
+) -> Problem:
     """Compile a problem by command-line names: ``problem("pushing[sigma=0.1]", contact="penalty[stiffness=1e4]")``.
 
     ``problem.value(theta, w)``, ``.grad`` and ``.score`` take ``theta (d,)`` or ``(d, B)`` and noise ``w (n_w,)`` or
@@ -248,7 +248,7 @@ def problem(
     or a library is not installed.
     """
     at = None if theta0 is None else tuple(map(float, theta0))
-    return for_notebook(compile_problem(scene, contact, integrator, backend, Decision(tuple(theta), at)), backend)
+    return compile_problem(scene, contact, integrator, backend, Decision(tuple(theta), at))
 
 
 _problem = problem  # an argument of estimate has the same name

@@ -62,13 +62,12 @@ ANSWERS_INTRODUCTION = """\
 
 
 def results_entry(entry: Entry, folder: Path) -> str:
-    """Return an experiment's name, question, data, chart and answer; paths are relative to ``folder``."""
+    """Return an experiment's name, chart, answer (its question if it has none) and data; paths are relative to ``folder``."""
     chart, data = (os.path.relpath(path, folder) if path else "" for path in (entry.chart, entry.folder))
     parts = [
         f"### {entry.name}",
-        f"*{escape_markdown(entry.question)}* [Data]({data})",
         f"![{entry.name}]({chart})" if chart else "",
-        escape_markdown(entry.answer),
+        f"{escape_markdown(entry.answer or entry.question)} [Data]({data})",
     ]
     return "\n\n".join(filter(None, parts))
 
@@ -158,37 +157,33 @@ def table_row(column: Column) -> str:
 # ------------------------------------------------------------------------------------------------------ verdicts
 
 RULE_MARKS = "<!-- verdicts -->\n", "<!-- end of verdicts -->"
-RULE_MODULES = {
-    "gradient": "causes check diagnosis direction few roughness sampling stages", "examine": "findings smoothing", "measure": "jumps",
-}  # fmt: skip
+RULE_MODULES = (
+    "gradient.causes gradient.check gradient.diagnosis gradient.direction gradient.few gradient.roughness "
+    "gradient.sampling gradient.stages examine.findings examine.smoothing measure.jumps"
+)
 """The modules whose constants conditions of rules name."""
 
 
 RULE_HEADS = {
-    rules.DERIVATIVE: "One derivative, worst first",
-    rules.EXAMINATION: "All that `examine` finds at theta",
-    rules.NOISE: "Around theta and under noise, in `examine`",
+    "One derivative, worst first": rules.DERIVATIVE,
+    "All that `examine` finds at theta, instead of the worst of its derivatives": rules.EXAMINATION,
+    "Around theta and under noise, in `examine`": rules.NOISE,
 }
 
 
 def rule_page() -> str:
     """Return the page of `gradcheck` with the table of rules between :data:`RULE_MARKS`, with the constants of the code."""
     before, _, rest = (DOCS / "gradcheck.md").read_text().partition(RULE_MARKS[0])
-    modules = {
-        name: import_module(f"bench.{package}.{name}")
-        for package, names in RULE_MODULES.items()
-        for name in names.split()
-    }
+    modules = {name.partition(".")[2]: import_module(f"bench.{name}") for name in RULE_MODULES.split()}
     statuses = ", ".join(f"`{kind}` {status}" for kind, status in rules.STATUS.items())
     lines = [f"Exit status of `examine` by kind: {statuses}."]
-    for about, head in RULE_HEADS.items():
+    for head, table in RULE_HEADS.items():
         lines += [f"\n{head}:\n"]
-        for name, rule in rules.RULES.items():
-            if rule.about == about:
-                settings = ", ".join(f"`{one.partition('=')[0]}=`".replace("{more}", "budget") for one in rule.settings)
-                steps = [rule.advice.format(names="it"), settings]
-                text = f"- `{name}` ({rule.kind}): {rule.meaning}. *When:* {rule.condition.format(**modules)}."
-                lines.append(text + f" *Next:* {'; '.join(filter(None, steps))}." * any(steps))
+        for name, rule in table.items():
+            settings = ", ".join(f"`{one.partition('=')[0]}=`".replace("{more}", "budget") for one in rule.settings)
+            steps = [rule.advice.format(names="it"), settings]
+            text = f"- `{name}` ({rule.kind}): {rule.meaning}. *When:* {rule.condition.format(**modules)}."
+            lines.append(text + f" *Next:* {'; '.join(filter(None, steps))}." * any(steps))
     return before + RULE_MARKS[0] + "\n".join(lines) + "\n" + RULE_MARKS[1] + rest.partition(RULE_MARKS[1])[2]
 
 

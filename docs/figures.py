@@ -49,13 +49,12 @@ def span(values: Any, digits: int = 2, suffix: str = "") -> str:
 @cache
 def trusted(*estimators: str) -> dict[str, str]:
     """Return the counts of the rule on the spread: cells, trusted cells and the wrong ones among them, other cells and the right
-    ones among them. ``worst`` is the largest error of a trusted cell.
+    ones among them.
     """
     rows = trust.cells(STANDARD, estimators)
     keep, wrong = trust.spread(rows) < trust.SPREAD, rows["rmse_rel"] >= trust.WRONG
     counts = dict(cells=keep | ~keep, trusted=keep, wrong=keep & wrong, others=~keep, missed=~keep & ~wrong)
-    worst = {"worst": number(rows.loc[keep, "rmse_rel"].max())}
-    return {name: f"{keep.sum():,}" for name, keep in counts.items()} | worst
+    return {name: f"{keep.sum():,}" for name, keep in counts.items()}
 
 
 def trust_figure(name: str, *estimators: str) -> Callable[[], str]:
@@ -240,8 +239,8 @@ FIGURES: dict[str, str | Callable[[], str]] = {
     "dose-windows-missed": windows_missed,
     "dose-hash": lambda: ", ".join(sorted(set(rows_of("dose_response")["hypotheses"]) - {""})),
     "dose-costs": lambda: dose_classes({cost: f"{ROLLOUTS}{cost}" for cost in ("1", "2", "4", "measured")}),
-    **{f"trust-{name}": trust_figure(name, "fobg") for name in ("cells", "trusted", "worst", "others", "missed")},
-    **{f"trust-all-{name}": trust_figure(name, *FOUR) for name in ("cells", "trusted", "wrong", "worst")},
+    **{f"trust-{name}": trust_figure(name, "fobg") for name in ("cells", "trusted", "others", "missed")},
+    **{f"trust-all-{name}": trust_figure(name, *FOUR) for name in ("cells", "trusted", "wrong")},
     "speed-cell": lambda: number(speeds()["overhead of a cell"]),
     "speed-rollouts": rollouts_table,
     "speed-scenes": lambda: span(

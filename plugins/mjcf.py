@@ -36,58 +36,54 @@ def refusal(backend: Any, program: Program) -> str | None:
     if reason := EngineBackend.model_refusal(backend.name, program, f" {own}", MATCH[own], ("penalty",), "clipped"):
         return reason
     scene: Any = program.scene
-    if scene.model_file() is not None:
-        for name in ("cone", "impedance"):
-            if (value := getattr(backend, name)) != getattr(type(backend), name):
-                return f"contacts of scene {scene.name} are as its file says: {name}={value} would have no effect"
+    if (path := scene.model_file()) is None:
+        return None
+    if backend.impedance != type(backend).impedance:
+        return (
+            f"contacts of scene {scene.name} are as its file says: impedance={backend.impedance} would have no effect"
+        )
+    import mujoco
+
+    has_cone = mujoco.MjModel.from_xml_path(str(path)).opt.cone
+    if backend.cone == "pyramidal" and has_cone == mujoco.mjtCone.mjCONE_ELLIPTIC:
+        return f"{path.name} has elliptic cones: use {backend.name}[cone=elliptic]"
     return None
 
 
 def build(backend: Any, program: Program) -> Any:
     """Return the twin as a ``mujoco.MjModel`` with the scene's time step, the law's springs and the backend's solver.
 
-    Raises :class:`Unsupported` with the reason of :func:`refusal`. The backend's own reasons, which may need
-    the model, are not asked for.
+    The model of an MJCF file has its own contacts. Raises :class:`Unsupported` with the reason of :func:`refusal`. The
+    backend's own reasons, which may need the model, are not asked for.
     """
     import mujoco
 
     if reason := refusal(backend, program):
         raise Unsupported(reason)
-    scene, law = program.scene, program.contact
+    scene, law, bit = program.scene, program.contact, mujoco.mjtDisableBit
     assert isinstance(scene, MechanicalScene)
     assert isinstance(scene, EngineTwin)
-    if (path := scene.model_file()) is not None:
-        return _as_written(str(path), scene, backend)
-    model = mujoco.MjModel.from_xml_string(f'<mujoco><option gravity="0 0 0"/>{scene.mjcf()}</mujoco>')
-    expected = (scene.n_q, scene.n_v, scene.n_u)
-    if (model.nq, model.nv, model.nu) != expected:
-        raise ValueError(
-            f"the twin of {scene.name} has (n_q, n_v, n_u) = {(model.nq, model.nv, model.nu)}, and the scene {expected}"
-        )
+    path = scene.model_file()
+    if path is not None:
+        model = mujoco.MjModel.from_xml_path(str(path))
+        # steps must depend on the state only, and diverging states must show
+        model.opt.disableflags |= int(bit.mjDSBL_WARMSTART | bit.mjDSBL_AUTORESET)
+    else:
+        model = mujoco.MjModel.from_xml_string(f'<mujoco><option gravity="0 0 0"/>{scene.mjcf()}</mujoco>')
+        expected = (scene.n_q, scene.n_v, scene.n_u)
+        if (model.nq, model.nv, model.nu) != expected:
+            raise ValueError(
+                f"the twin of {scene.name} has (n_q, n_v, n_u) = {(model.nq, model.nv, model.nu)}, and the scene {expected}"
+            )
+        model.opt.disableflags = _disabled(bit, model, backend.lean)
     option = model.opt
-    option.timestep = scene.dt
+    option.timestep = scene.dt / scene.substeps
     option.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{backend.integrator.upper()}")
     option.solver = getattr(mujoco.mjtSolver, f"mjSOL_{backend.solver.upper()}")
     option.cone = getattr(mujoco.mjtCone, f"mjCONE_{backend.cone.upper()}")
     option.iterations, option.ls_iterations = backend.iterations, backend.ls_iterations
-    option.disableflags = _disabled(mujoco.mjtDisableBit, model, backend.lean)
-    if isinstance(law, Penalty):
+    if path is None and isinstance(law, Penalty):
         _set_springs(model, law, backend.impedance)
-    return model
-
-
-def _as_written(path: str, scene: MechanicalScene, backend: Any) -> Any:
-    """Return the model of an MJCF file with its own contacts and cone, and the backend's integrator and solver."""
-    import mujoco
-
-    model = mujoco.MjModel.from_xml_path(path)
-    option, bit = model.opt, mujoco.mjtDisableBit
-    option.timestep = scene.dt / scene.substeps
-    option.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{backend.integrator.upper()}")
-    option.solver = getattr(mujoco.mjtSolver, f"mjSOL_{backend.solver.upper()}")
-    option.iterations, option.ls_iterations = backend.iterations, backend.ls_iterations
-    # steps must depend on the state only, and diverging states must show
-    option.disableflags |= int(bit.mjDSBL_WARMSTART | bit.mjDSBL_AUTORESET)
     return model
 
 

@@ -310,7 +310,8 @@ class Findings:
                 return "staircase"
             if cause in EXCUSABLE and self.is_discretisation_gap:
                 return "adaptive"
-            if cause in (*UNEQUAL, "unsettled") and self.is_overwritten:
+            grown = grows(explained.growth, max(float(self.setup.rtol.max()), 1e-3))
+            if cause in (*UNEQUAL, "unsettled") and grown:
                 return "overwritten"
             # so small an error that adaptive steps may explain it, and the budget ended before that was known
             is_open = explained.is_adaptive is None and self.check is not None and may_be_adaptive(self.check)
@@ -354,11 +355,6 @@ class Findings:
             return True
         gradient, own = np.linalg.norm([(gap.gradient, gap.own) for gap in explained.gaps], axis=0)
         return bool(explained.steps) and bool(gradient <= AS_FAR * own)
-
-    @property
-    def is_overwritten(self) -> bool:
-        """Whether the gradient's error grows with the number of steps."""
-        return grows(self.explained.growth, max(float(self.setup.rtol.max()), 1e-3))
 
     @property
     def derivative(self) -> str:

@@ -338,7 +338,7 @@ def advice(report: Findings) -> str:
 def again(report: Findings, setting: str) -> str:
     """Return the command of a report with another setting."""
     name = setting.partition("=")[0]
-    return f"{re.sub(rf' {name}=[^ ]+', '', report.command)} {setting}" if report.command else setting
+    return f"{re.sub(rf' {name}=[^ ]+', '', report.command)} {setting}"
 
 
 # ---------------------------------------------------------------------------------------------------- the text

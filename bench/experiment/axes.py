@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
@@ -117,12 +117,10 @@ def axes(sweep: Mapping[str, Any], rows: pd.DataFrame) -> list[Axis]:
             if not clash and column in rows and column not in COUNTS:
                 is_number = pd.api.types.is_numeric_dtype(rows[column])
                 if not is_number or not np.array_equal(rows.loc[is_known, column].to_numpy(float), values[is_known]):
-                    axis = Axis(part[0] if "." in part[0] else f"swept.{own_name}", axis.names, axis.unit, axis.doc)
+                    axis = replace(axis, column=part[0] if "." in part[0] else f"swept.{own_name}")
             result.append(axis)
     together = [*_zipped_names(sweep), *([frozenset(coordinates)] if len(coordinates) > 1 else [])]
-    return [
-        Axis(axis.column, axis.names, axis.unit, axis.doc, _columns_in_step(axis, result, together)) for axis in result
-    ]
+    return [replace(axis, moves=_columns_in_step(axis, result, together)) for axis in result]
 
 
 def _has_value(name: str, table: pd.DataFrame) -> np.ndarray:
@@ -228,7 +226,7 @@ def relabel(rows: pd.DataFrame, axes: Sequence[Axis]) -> pd.DataFrame:
 
 def _labels(given: Mapping[str, Any], names: Sequence[str], views: Sequence[str]) -> dict[str, str]:
     hidden = {
-        axis: {parameter for name in names if (parameter := applies(name, registry.kind_of(axis), part["name"], part))}
+        axis: {parameter for name in names if (parameter := applies(name, axis, part["name"], part))}
         for axis, part in given.items()
         if axis not in NOT_PLUGINS and part is not None
     }

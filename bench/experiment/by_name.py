@@ -60,5 +60,5 @@ def compile_problem(
     if reason := engine.refusal(program):
         raise Unsupported(reason)
     problem = engine.compile(program)
-    problem.provides = engine.provides
+    problem.provides, problem.backend = engine.provides, backend
     return problem

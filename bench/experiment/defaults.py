@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
@@ -18,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from bench.experiment.experiment import Budget
 from bench.model import Decision, Plugin, registry
+from bench.model.identity import plain
 from bench.model.parameters import parameters, singular
 
 if TYPE_CHECKING:
@@ -75,7 +75,7 @@ def defaults_of(axis: str, given: Mapping[str, Any]) -> dict[str, Any]:
     if not isinstance(part, Mapping):
         return {}
     if axis in RECORDS:
-        return {name: _json_value(value) for name, value in dataclasses.asdict(RECORDS[axis]()).items()}
+        return {name: plain(value) for name, value in dataclasses.asdict(RECORDS[axis]()).items()}
     plugin = _plugin_class(axis, part)
     if plugin is None:
         return {}
@@ -87,7 +87,7 @@ def defaults_of(axis: str, given: Mapping[str, Any]) -> dict[str, Any]:
     if axis == "contact":
         of_scene = getattr(_plugin_class("scene", given.get("scene")), "contact_values", {})
         values |= {name: value for name, value in of_scene.items() if name in values}
-    return {name: _json_value(value) for name, value in values.items()}
+    return {name: plain(value) for name, value in values.items()}
 
 
 def _plugin_class(axis: str, part: Any) -> type[Plugin] | None:
@@ -107,9 +107,3 @@ def _with_defaults(part: Any, defaults: Mapping[str, Any]) -> Any:
         | {name: part.get(name, value) for name, value in defaults.items()}
         | {name: value for name, value in part.items() if name not in first and name not in defaults}
     )
-
-
-def _json_value(value: Any) -> Any:
-    if isinstance(value, tuple):
-        return list(value)
-    return str(value) if isinstance(value, float) and not math.isfinite(value) else value

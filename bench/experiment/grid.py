@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from functools import cache
 from typing import Any
 
@@ -179,23 +179,21 @@ def coerce_finite(values: Any, name: str) -> tuple[float, ...]:
     return numbers
 
 
-def applies(axis: str, kind: str, plugin: str, known: Mapping[str, Any]) -> str | None:
-    """Return the parameter of a plugin that a sweep axis names, or None.
+def applies(name: str, axis: str, plugin: str, known: Collection[str]) -> str | None:
+    """Return the parameter of a plugin that a name in a sweep means, or None.
 
-    ``known`` are the plugin's parameters by name. ``gamma``, ``alpha_order.gamma``, ``estimator.gamma`` and
+    ``known`` are the plugin's parameters. ``gamma``, ``alpha_order.gamma``, ``estimator.gamma`` and
     ``estimator.alpha_order.gamma`` name the same parameter.
 
-    >>> applies("alpha_order.gamma", "estimators", "alpha_order", {"gamma": 1.0})
+    >>> applies("alpha_order.gamma", "estimator", "alpha_order", {"gamma"})
     'gamma'
     """
-    *path, parameter = axis.split(".")
-    if parameter not in known:
-        return None
-    return parameter if path in ([], [plugin], [singular(kind), plugin], [singular(kind)]) else None
+    *path, parameter = name.split(".")
+    return parameter if parameter in known and path in ([], [plugin], [axis], [axis, plugin]) else None
 
 
-def _applies(axis: str, plugin: type[Plugin]) -> str | None:
-    return applies(axis, plugin.kind, plugin.name, parameters(plugin))
+def _applies(name: str, plugin: type[Plugin]) -> str | None:
+    return applies(name, singular(plugin.kind), plugin.name, parameters(plugin))
 
 
 def check_axes(axes: Sequence[str], plugins: Sequence[type[Plugin]]) -> None:

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bench.experiment.defaults import completed_json
-from bench.experiment.grid import THETA, is_theta_axis
+from bench.experiment.grid import THETA, applies, is_theta_axis
 from bench.model import registry
 
 if TYPE_CHECKING:
@@ -102,22 +102,19 @@ def swept_columns(name: str, table: pd.DataFrame) -> dict[str, pd.Series]:
     ``gamma``, ``alpha_order.gamma``, ``estimator.gamma`` and ``estimator.alpha_order.gamma`` name the same parameter.
     ``theta0`` refers to its only coordinate, and to no column in rows where theta has several.
     """
-    import pandas as pd
 
     if is_theta_axis(name):
         column = f"{THETA}.0" if name == THETA else name
         is_single = table[f"{THETA}.1"].isna() if name == THETA and f"{THETA}.1" in table else True
         return {column: table[column].notna() & is_single} if column in table else {}
-    *path, parameter = name.split(".")
+    parameter = name.rpartition(".")[2]
     columns = {}
     for axis in (column.removesuffix(".name") for column in table if column.endswith(".name")):
         if axis in NOT_PLUGINS or f"{axis}.{parameter}" not in table or parameter == "name":
             continue
         plugins = table[f"{axis}.name"]
-        if path in ([], [axis]):
-            columns[f"{axis}.{parameter}"] = plugins.notna()
-        elif path[:-1] in ([], [axis]):
-            columns[f"{axis}.{parameter}"] = pd.Series(plugins == path[-1], dtype=bool)
+        if used := [plugin for plugin in plugins.dropna().unique() if applies(name, axis, plugin, (parameter,))]:
+            columns[f"{axis}.{parameter}"] = plugins.isin(used)
     return columns
 
 

@@ -383,7 +383,7 @@ class _Checker:
         Directions that are clearly right are not scanned. A derivative of exactly 0 is not clearly right where
         differences are not 0, since it may be the slope of a tread.
         """
-        clear = ("smooth", "nonlinear", "mode_crossing", "zero", "nonfinite", "nondeterministic")
+        clear = (*PLAINLY, "zero", "nonfinite", "nondeterministic")
         to_scan = [
             m
             for m, (sample, finding) in enumerate(zip(measured, findings, strict=True))

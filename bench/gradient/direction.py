@@ -205,7 +205,8 @@ def plateau(sample: Sample, noise: np.ndarray) -> tuple[int, float]:
     changes.
     """
     differences = sample.differences
-    spread = _spread(differences)
+    between = np.abs(np.diff(differences))
+    spread = np.fmax(np.r_[between[0], between], np.r_[between, between[-1]])  # the largest distance from a neighbour
     apart = np.abs(differences[:, None] - differences)
     allowed = 3.0 * spread[:, None] + noise[:, None] + 2.0 * noise
     contradicted = (np.triu(apart > allowed, 1)).any(axis=1)
@@ -217,12 +218,6 @@ def plateau(sample: Sample, noise: np.ndarray) -> tuple[int, float]:
         worth = np.where(differences == 0.0, np.inf, worth)
     index = int(np.argmin(worth))
     return index, float(spread[index])
-
-
-def _spread(differences: np.ndarray) -> np.ndarray:
-    """Return the largest disagreement of each difference with its neighbours, ``(K,)``."""
-    apart = np.abs(np.diff(differences))
-    return np.asarray(np.fmax(np.r_[apart[0], apart], np.r_[apart, apart[-1]]))
 
 
 def _is_credible(sample: Sample, index: int, uncertainty: float, tolerance: float) -> bool:

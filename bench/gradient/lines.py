@@ -110,7 +110,11 @@ def scan(
     noise = max(
         noise, unit * float(np.abs(finite).max(initial=0.0)), LEAST * float(np.ptp(finite)) if finite.size else 0.0
     )
-    turns = _differences_of_neighbours(np.diff(f, 2))
+    bends = np.diff(f, 2)
+    padded = np.pad(bends, 1, mode="edge")
+    # from the mean of the neighbours, so that no smooth bend hides a small jump
+    turns = np.abs(bends - (padded[:-2] + padded[2:]) / 2)
+    turns = np.where(np.isfinite(turns), turns, np.abs(bends))  # beside costs that are not numbers
     order = np.argsort(np.nan_to_num(turns, nan=-1.0, posinf=-1.0))[::-1]
     places: list[int] = []
     for index in order:
@@ -120,13 +124,6 @@ def scan(
     level = np.diff(f)
     steps = bool(level.any() and (np.abs(level) <= noise).mean() > 0.5 and any(b.kind == "jump" for b in breaks))
     return LineScan(direction, t, f, tuple(sorted(breaks, key=lambda b: b.at)), steps)
-
-
-def _differences_of_neighbours(turns: np.ndarray) -> np.ndarray:
-    """Return how far changes of slope differ from the mean of their neighbours, so that no smooth bend hides a small jump."""
-    padded = np.pad(turns, 1, mode="edge")
-    apart = np.abs(turns - (padded[:-2] + padded[2:]) / 2)
-    return np.asarray(np.where(np.isfinite(apart), apart, np.abs(turns)))  # beside costs that are not numbers
 
 
 def _locate_breaks(

@@ -8,8 +8,6 @@ from typing import NamedTuple
 STATUS = {"right": 0, "fault": 1, "broken": 1, "open": 3}
 """Exit status of ``examine`` by kind. ``fault``: not the derivative; ``broken``: the cost has none, or none that sampled
 gradients show under noise; ``open``: not decided. Other commands end with 1 for every kind but ``right``."""
-DERIVATIVE, EXAMINATION, NOISE = "derivative", "examination", "noise"
-"""What a verdict is about: one derivative, in every check; all facts that ``examine`` has at theta; or the noise around theta."""
 
 
 class Rule(NamedTuple):
@@ -24,14 +22,13 @@ class Rule(NamedTuple):
     """What to do next."""
     settings: tuple[str, ...] = ()
     """The settings of ``examine`` that bear on it: they can show more, or accept it."""
-    about: str = DERIVATIVE
 
 
 FOLLOW = "follow {names} through the cost: cut it into parts until the ratio is 1"
 SMOOTHING = "estimate the gradient from costs (smoothing)"
 STEPS, EXPECTED, MORE, SIGMA = ("horizons=1,2,5",), ("expect={cause}",), ("{more}",), ("sigma=SIGMA",)
 SLOPES = (*STEPS, "refined=COST")
-RULES = {
+DERIVATIVE = {
     "nan_gradient": Rule(
         "fault", "the gradient is NaN or infinite where the cost is a number",
         "the derivative is not a number; the costs at theta and at {direction.MIN_STEPS} steps or more are",
@@ -104,7 +101,7 @@ RULES = {
     ),
     "saturated": Rule(
         "right", "exactly 0, though wider differences are not: the input is clipped or has no effect here",
-        "0, as the differences at the {direction.MIN_STEPS} smallest steps", "", SIGMA,
+        "0, as the differences at the {direction.MIN_STEPS} smallest steps; or `zero` for all, where jumps or noise around theta move the cost", "", SIGMA,
     ),
     "rounding": Rule(
         "right", "small steps have larger errors than the arithmetic explains, as with a loose solver tolerance",
@@ -126,38 +123,41 @@ RULES = {
         "right", "gradient and differences are exactly zero",
         "the cost moves at no step, and the derivative is 0, or moves it by less than {few.ROUNDED:g} u over the input's scale",
     ),
+}  # fmt: skip
+"""Verdicts on one derivative, in every check, worst first."""
+EXAMINATION = {
     "raised": Rule(
-        "fault", "the gradient could not be computed", "the gradient raises an exception at theta", about=EXAMINATION,
+        "fault", "the gradient could not be computed", "the gradient raises an exception at theta",
     ),
     "rough": Rule(
         "fault", "the cost changes as much between neighbouring thetas as over a wide step",
         "`unsettled`, and neighbours differ by {stages.ROUGH:.0%} of the largest change, which the gradient does not explain",
-        "look for a seed or hash taken from theta", about=EXAMINATION,
+        "look for a seed or hash taken from theta",
     ),
     "overwritten": Rule(
         "fault", "memory is overwritten between forward and backward, or a term acts only later",
         "wrong, and with `horizons` right at the first, and {diagnosis.GROWTH:g} times as wrong at the last as at the first wrong one",
-        "use one tape per step, or arrays of its own for each step", STEPS, EXAMINATION,
+        "use one tape per step, or arrays of its own for each step", STEPS,
     ),
     "no_effect": Rule(
         "broken", "an input has no effect on the cost, and is not in allow_zero",
         "`zero` for such an input where `allow_zero` is given, without jumps or a slope under noise around theta",
-        "check that it reaches the simulator", ("allow_zero=NAME",), EXAMINATION,
+        "check that it reaches the simulator", ("allow_zero=NAME",),
     ),
     "constant": Rule(
         "open", "no input moves the cost, and its gradient is 0, or below rounding",
         "`zero` for every input that is checked, without jumps or a slope under noise around theta, unless `allow_zero` has all of them",
-        "check that theta reaches the simulator", ("allow_zero=NAME",), EXAMINATION,
+        "check that theta reaches the simulator", ("allow_zero=NAME",),
     ),
     "undecided": Rule(
         "open", "the budget ended before the gradient was checked",
         "an input is unchecked, or wrong by less than {diagnosis.NEAR:.0%} and no search for adaptive steps was possible",
-        "the rest needs more calls", (*MORE, "refined=COST"), EXAMINATION,
+        "the rest needs more calls", (*MORE, "refined=COST"),
     ),
     "unresolved": Rule(
         "open", "rounding or noise of the cost hides its slope at every step, or contradicts a small derivative",
         "right, but the error of the difference is above {findings.DIGIT:.0%} of it, or they are {findings.CONTRADICTED:g} errors and "
-        "{findings.DIGIT:.0%} apart", about=EXAMINATION,
+        "{findings.DIGIT:.0%} apart",
     ),
     "adaptive": Rule(
         "open", "gradient and differences differ by as much as the discretisation does, as with adaptive steps: neither is "
@@ -165,32 +165,37 @@ RULES = {
         "`missing_term` or `wrong_adjoint` where the length of a loop depends on theta, and jumps explain an error up to "
         "{diagnosis.NEAR:.0%}, or {diagnosis.FAR:.0%} where they move the cost more than the error does. With `refined`: the gradient is at "
         "most {findings.AGREES:g} times as far from it as the differences at each theta, or {findings.AS_FAR:g} times beside such a loop",
-        "give the cost at a tighter tolerance; accept it if the gradient is meant to be that one's", ("refined=COST", *EXPECTED), EXAMINATION,
+        "give the cost at a tighter tolerance; accept it if the gradient is meant to be that one's", ("refined=COST", *EXPECTED),
     ),
+}  # fmt: skip
+"""Verdicts from all facts that ``examine`` has at theta, instead of the worst on a derivative."""
+NOISE = {
     "jumps": Rule(
         "broken", "the gradient is right at theta, and misses jumps around it that no gradient sees",
         "the integral of the gradient misses {smoothing.TARGET_ERROR:.0%} of the cost's change along a line, and the bias is not decided at every sigma",
-        SMOOTHING, EXPECTED, NOISE,
+        SMOOTHING, EXPECTED,
     ),
     "biased": Rule(
         "broken", "the mean of the gradients misses a part of grad J",
-        "the 95% interval of the bias is above {smoothing.TARGET_ERROR:.0%} of grad J", SMOOTHING, about=NOISE,
+        "the 95% interval of the bias is above {smoothing.TARGET_ERROR:.0%} of grad J", SMOOTHING,
     ),
     "spread": Rule(
         "open", "the gradients vary too widely to show whether their mean is grad J",
-        "that interval contains {smoothing.TARGET_ERROR:.0%}, or grad J is less than {smoothing.CLEAR:g} times its error", SMOOTHING, MORE, NOISE,
+        "that interval contains {smoothing.TARGET_ERROR:.0%}, or grad J is less than {smoothing.CLEAR:g} times its error", SMOOTHING, MORE,
     ),
     "unmeasured": Rule(
         "open", "the budget ended before the noise of sigma was measured", "fewer than {smoothing.FEWEST} pairs of costs at a sigma",
-        "the rest needs more calls", MORE, NOISE,
+        "the rest needs more calls", MORE,
     ),
 }  # fmt: skip
-"""Every verdict: first those on one derivative, worst first, then those that only ``examine`` gives."""
+"""Verdicts of ``examine`` on what is around theta, or under noise."""
+RULES = DERIVATIVE | EXAMINATION | NOISE
+"""Every verdict."""
 
 
-def of_kind(*kinds: str) -> tuple[str, ...]:
-    """Return the verdicts of these kinds on one derivative, worst first."""
-    return tuple(name for name, rule in RULES.items() if rule.kind in kinds and rule.about == DERIVATIVE)
+def of_kind(kind: str) -> tuple[str, ...]:
+    """Return the verdicts of a kind on one derivative, worst first."""
+    return tuple(name for name, rule in DERIVATIVE.items() if rule.kind == kind)
 
 
 FAULTS = of_kind("fault")
@@ -201,9 +206,9 @@ BROKEN = of_kind("broken")
 """Verdicts that the cost has no derivative at this point, or under noise none that sampled gradients show."""
 TRUSTED = of_kind("right")
 """Verdicts that the gradient is the derivative."""
-VERDICTS = of_kind(*STATUS)
+VERDICTS = tuple(DERIVATIVE)
 """All verdicts on one derivative, worst first."""
-UNEQUAL = tuple(name for name, rule in RULES.items() if rule.advice == FOLLOW)
+UNEQUAL = tuple(name for name, rule in DERIVATIVE.items() if rule.advice == FOLLOW)
 """Verdicts on a derivative that is a number other than the differences."""
 SUSPICIOUS = tuple(name for name in UNEQUAL if name != "disconnected")
 """Causes that adaptive steps and kinks imitate."""

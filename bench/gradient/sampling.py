@@ -24,21 +24,6 @@ def repeats(first: np.ndarray, second: np.ndarray, unit: float) -> np.ndarray:
     return np.asarray((first == second) | (np.isnan(first) & np.isnan(second)) | is_close)
 
 
-def shifts(unit: float, eps: np.ndarray = EPS) -> np.ndarray:
-    """Return displacements ``(S,)``, relative to a direction's length: -eps, +eps, 0 and the noise estimate's offsets."""
-    return np.concatenate([-eps, eps, [0.0], offsets(unit).ravel()])
-
-
-def points(theta: np.ndarray, vectors: np.ndarray, unit: float, eps: np.ndarray = EPS) -> np.ndarray:
-    """Return theta displaced along each column of ``vectors (d, M)`` by each of the :func:`shifts`, ``(d, M * S)``.
-
-    ``theta`` is ``(d,)``, or ``(d, M)`` for directions that start at different points.
-    """
-    start = theta.reshape(theta.shape[0], -1)
-    moved = start[:, :, None] + vectors[:, :, None] * shifts(unit, eps)
-    return np.asarray(moved.reshape(theta.shape[0], -1))
-
-
 def sampled(
     cost: Callable[[np.ndarray], np.ndarray],
     theta: np.ndarray,
@@ -53,10 +38,14 @@ def sampled(
 ) -> tuple[list[Sample], np.ndarray, np.ndarray]:
     """Return a sample per column of ``vectors (d, M)``, and the contact modes on the minus and plus sides, ``(M, K)`` each.
 
+    ``theta`` is ``(d,)``, or ``(d, M)`` for directions that start at different points. Each is displaced along its
+    vector by the steps ``eps`` to both sides, by 0, and by the offsets of the noise estimate.
     A displacement of 1 along direction m has the length ``lengths[m]``, in the unit by which ``derivatives[m]`` is
     taken. With ``twice``, costs are computed again in reverse order, which exposes columns that depend on their neighbours.
     """
-    count, at = eps.size, points(theta, vectors, unit, eps)
+    count, start = eps.size, theta.reshape(len(theta), -1, 1)
+    moves = np.concatenate([-eps, eps, [0.0], offsets(unit).ravel()])
+    at = (start + vectors[:, :, None] * moves).reshape(len(theta), -1)
     values = cost(at).reshape(lengths.size, -1)
     again = cost(at[:, ::-1])[::-1].reshape(values.shape) if twice else values
     repeatable = np.all(repeats(values, again, unit), axis=1)

@@ -96,8 +96,11 @@ def described(plugin: Plugin | None) -> dict[str, Any] | None:
     """Return a plugin's name and all parameters for strict JSON, with infinities as strings; None for None."""
     if plugin is None:
         return None
-    return {"name": plugin.name} | {name: _plain(value) for name, value in values(plugin).items()}
+    return {"name": plugin.name} | {name: plain(value) for name, value in values(plugin).items()}
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
+    """Return a parameter's value for strict JSON: infinities as strings, tuples as lists."""
+    if isinstance(value, tuple):
+        return list(value)
     return str(value) if isinstance(value, float) and not math.isfinite(value) else value

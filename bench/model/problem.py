@@ -6,13 +6,19 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from bench.errors import Unsupported
+from bench.errors import Unsupported, UserError, printable
 from bench.model import blocks
+from bench.model.identity import label
+from bench.model.parameters import parameters
 from bench.model.program import Program
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 NOT_DEFINED = "{0} computes no {1}: define {0}._{2}, or leave '{2}' out of the backend's `provides`"
 
@@ -94,6 +100,8 @@ class Problem(ABC):
     """The device that the program runs on."""
     provides: frozenset[str] = frozenset({"value", "grad", "score"})
     """Capabilities of the backend that compiled the program."""
+    backend: str = ""
+    """Identity string of that backend, where it was given as one."""
 
     def __init__(self, program: Program) -> None:
         self.program = program
@@ -127,15 +135,23 @@ class Problem(ABC):
         """Whether the noise in J acts on theta: true except for action noise under a feedback policy."""
         return self.program.noise_on_theta
 
-    def value(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """Return the costs f(theta, w), ``(B,)``."""
+    def value(self, theta: ArrayLike | None = None, w: ArrayLike | None = None) -> np.ndarray:
+        """Return the costs f(theta, w), ``(B,)``, or ``()`` for one sample ``w (n_w,)``; see :meth:`grad`."""
+        theta, w, is_single = self._arguments(theta, w)
         self.usage.rollouts += w.shape[1]
-        return self._blocks(self._value, theta, w, ())
+        costs = self._blocks(self._value, theta, w, ())
+        return costs[0] if is_single else costs
 
-    def grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        """Return the gradient df/dtheta of each sample, ``(d, B)``."""
+    def grad(self, theta: ArrayLike | None = None, w: ArrayLike | None = None) -> np.ndarray:
+        """Return the gradient df/dtheta of each sample, ``(d, B)``, or ``(d,)`` for one sample ``w (n_w,)``.
+
+        ``theta`` is ``(d,)`` or ``(d, B)``, by default ``theta0``. ``w`` is ``(n_w,)`` or ``(n_w, B)``, by default 0,
+        without noise. Both may be lists. Raises :class:`bench.UserError` for other shapes.
+        """
+        theta, w, is_single = self._arguments(theta, w)
         self.usage.gradients += w.shape[1]
-        return self._blocks(self._grad, theta, w, (self.dim,))
+        gradients = self._blocks(self._grad, theta, w, (self.dim,))
+        return gradients[:, 0] if is_single else gradients
 
     def second_gradient(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         """Return the gradient of each sample by a second method of differentiation, ``(d, B)``.
@@ -144,16 +160,32 @@ class Problem(ABC):
         """
         raise Unsupported(f"{type(self).__name__} has one method of differentiation")
 
-    def score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
+    def score(self, theta: ArrayLike | None = None, w: ArrayLike | None = None) -> np.ndarray:
         """Return the score d log p(actions | theta)/dtheta of each sample, ``(d, B)``: w / sigma for noise on theta.
 
-        Raises :class:`Unsupported` if cost times score is not the gradient, see :attr:`Program.has_score_gradient`.
+        ``(d,)`` for one sample, see :meth:`grad`. Raises :class:`Unsupported` if cost times score is not the gradient, see
+        :attr:`Program.has_score_gradient`.
         """
-        if self.noise_on_theta:
-            return w[: self.dim] / self.sigma
-        if not self.program.has_score_gradient:
+        theta, w, is_single = self._arguments(theta, w)
+        if not self.noise_on_theta and not self.program.has_score_gradient:
             raise Unsupported(self.program.no_score_gradient)
-        return self._blocks(self._score, theta, w, (self.dim,))
+        of_theta = self.noise_on_theta
+        scores = w[: self.dim] / self.sigma if of_theta else self._blocks(self._score, theta, w, (self.dim,))
+        return scores[:, 0] if is_single else scores
+
+    def _arguments(self, theta: ArrayLike | None, w: ArrayLike | None) -> tuple[np.ndarray, np.ndarray, bool]:
+        """Return theta, noise ``(n_w, B)``, and whether one sample was given as a vector."""
+        n_noise = self.program.n_noise
+        at = np.asarray(self.program.theta0 if theta is None else theta, dtype=np.float64)
+        if at.ndim not in (1, 2) or len(at) != self.dim:
+            raise UserError(f"theta has the shape {at.shape}: give ({self.dim},) or ({self.dim}, B)")
+        noise = np.zeros(n_noise) if w is None else np.asarray(w, dtype=np.float64)
+        if noise.ndim not in (1, 2) or len(noise) != n_noise:
+            raise UserError(f"noise w has the shape {noise.shape}: give ({n_noise},) or ({n_noise}, B)")
+        if noise.ndim == 2:
+            return at, noise, False
+        columns = 1 if at.ndim == 1 else at.shape[1]
+        return at, np.broadcast_to(noise[:, None], (n_noise, columns)), at.ndim == 1
 
     def trajectory(self, theta: np.ndarray, w: np.ndarray) -> Trajectory:
         """Return states and controls along each rollout; raises :class:`Unsupported` if the backend has none."""
@@ -194,8 +226,7 @@ class Problem(ABC):
     def _blocks(
         self, function: Callable[..., np.ndarray], theta: np.ndarray, w: np.ndarray, lead: tuple[int, ...]
     ) -> np.ndarray:
-        theta = np.asarray(theta, dtype=np.float64).reshape(self.dim, -1)
-        w = np.asarray(w, dtype=np.float64)
+        theta = theta.reshape(self.dim, -1)
         threads = blocks.n_threads(w.shape[1], self.threads, self.least)
         columns = blocks.block_size(w.shape[1], self.block, self.grain, threads)
 
@@ -206,6 +237,30 @@ class Problem(ABC):
             return values
 
         return blocks.evaluate(real, theta, w, columns, threads, lead)
+
+    @property
+    def title(self) -> str:
+        """Identity strings of scene, contact law, integrator and backend."""
+        return printable(", ".join([*map(label, self.program.parts.values()), self.backend]))
+
+    def __repr__(self) -> str:
+        texts = [f"{value:.4g}" for value in self.program.theta0]
+        theta = ", ".join(texts if len(texts) <= 6 else [*texts[:3], "...", *texts[-2:]])
+        on = "theta" if self.program.noise == "parameter" else "the actions"
+        noise = f"sigma = {self.sigma:g} on {on}, n_w = {self.program.n_noise}"
+        return f"Problem: {self.title}; theta = [{theta}], d = {self.dim}; noise: {noise}"
+
+    def to_frame(self) -> pd.DataFrame:
+        """Return all parameters of scene, contact law and integrator: part, plugin, name, value, unit and meaning."""
+        import pandas as pd
+
+        rows = [
+            {"part": axis, "plugin": part.name, "parameter": name, "value": getattr(part, name)}
+            | {"unit": parameter.unit, "meaning": parameter.doc}
+            for axis, part in self.program.parts.items()
+            for name, parameter in parameters(type(part)).items()
+        ]
+        return pd.DataFrame(rows, columns=["part", "plugin", "parameter", "value", "unit", "meaning"])
 
     @abstractmethod
     def _value(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray: ...

@@ -159,6 +159,10 @@ class MechanicalScene(Scene):
             return None
         return self.held(xp, xp.reshape(theta, (self.controls, self.n_u, theta.shape[1])))
 
+    def in_first_step(self, xp: Any, u: Array) -> Array:
+        """Return the controls ``u (n_u, B)`` in the first step and 0 afterwards, ``(horizon, n_u, B)``."""
+        return xp.concat([u[None], xp.zeros((self.horizon - 1, *u.shape), dtype=u.dtype)], axis=0)
+
     @property
     def controls(self) -> int:
         """Number of controls in a rollout: one per step, except in a :class:`ZeroOrderHoldScene`."""

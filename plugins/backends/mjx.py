@@ -55,7 +55,9 @@ class Mjx(Jax):
     )
     integrator: str = param("euler", "MJX's integrator", choices=("euler", "implicitfast", "rk4"))
     solver: str = param("newton", "MJX's constraint solver", choices=("newton", "cg"))
-    cone: str = param("pyramidal", "friction cone", choices=("pyramidal", "elliptic"))
+    cone: str = param(
+        "pyramidal", "friction cone; a file with elliptic cones needs elliptic", choices=("pyramidal", "elliptic")
+    )
     derivative: str = param(
         "auto",
         "through the iterations of the constraint solver, or implicit: through its converged solution; auto: implicit for iterations > 1",
@@ -77,7 +79,7 @@ class Mjx(Jax):
         is_file = isinstance(scene, EngineTwin) and scene.model_file() is not None
         if is_file and self.iterations == 1 and not self.is_implicit:
             return f"one solver iteration is exact for springs only: use {self.name}[iterations=20]"
-        if (is_file or self.cone == "elliptic") and (reason := self._elliptic_reason(mjcf.build(self, program))):
+        if self.cone == "elliptic" and (reason := self._elliptic_reason(mjcf.build(self, program))):
             return reason
         if not self.is_implicit and self.mode == "reverse" and self.iterations > 1:
             return (
@@ -88,13 +90,9 @@ class Mjx(Jax):
 
     def _elliptic_reason(self, model: Any) -> str | None:
         """Return why contacts with elliptic cones exclude the model, or None."""
-        import mujoco
-
         mjx_solver.library()
         from mujoco.mjx._src.collision_driver import make_condim
 
-        if model.opt.cone != mujoco.mjtCone.mjCONE_ELLIPTIC:
-            return None
         dimensions = make_condim(model)
         if 1 in dimensions:
             return "MJX has no contacts without friction beside elliptic cones: use pyramidal cones"

@@ -45,7 +45,9 @@ class Mujoco(Backend):
     )
     integrator: str = param("euler", "MuJoCo's integrator", choices=("euler", "implicitfast"))
     solver: str = param("newton", "MuJoCo's constraint solver", choices=("newton", "cg", "pgs"))
-    cone: str = param("pyramidal", "friction cone", choices=("pyramidal", "elliptic"))
+    cone: str = param(
+        "pyramidal", "friction cone; a file with elliptic cones needs elliptic", choices=("pyramidal", "elliptic")
+    )
     iterations: int = param(100, "maximum iterations of the constraint solver", positive=True)
     ls_iterations: int = param(50, "maximum iterations of the solver's line search", positive=True)
     lean: bool = param(True, "switch off all engine features that the scene does not use")

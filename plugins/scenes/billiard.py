@@ -37,9 +37,7 @@ class Billiard(ContactScene):
 
     def planned_controls(self, xp: Any, theta: Array) -> Array:
         """Return (push, u0) in the first step and 0 afterwards."""
-        first = xp.stack([0.0 * theta[0] + self.push, theta[0]])[None]
-        later = xp.zeros((self.horizon - 1, 2, theta.shape[1]), dtype=theta.dtype)
-        return xp.concat([first, later], axis=0)
+        return self.in_first_step(xp, xp.stack([0.0 * theta[0] + self.push, theta[0]]))
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
         return xp.concat([u / self.mass, 0.0 * u], axis=0)

@@ -44,9 +44,7 @@ class BounceOnce(EngineTwin, AxisContactScene):
 
     def planned_controls(self, xp: Any, theta: Array) -> Array:
         """Return the force in the first step and 0 afterwards."""
-        first = theta[None, 2:3, :]
-        later = xp.zeros((self.horizon - 1, 1, theta.shape[1]), dtype=theta.dtype)
-        return xp.concat([first, later], axis=0)
+        return self.in_first_step(xp, theta[2:3])
 
     def acceleration(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
         return u / self.mass

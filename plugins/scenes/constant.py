@@ -5,23 +5,20 @@ from typing import Any
 
 import numpy as np
 
-from bench.model import Array, ContactLaw, FunctionScene, Plugin, param
+from bench.model import Array, ContactLaw, Plugin, param
+
+from .spaced import SpacedScene
 
 
 @dataclass(frozen=True)
-class Constant(FunctionScene):
+class Constant(SpacedScene):
     """f = value, grad J = 0. Without a baseline, score-function terms still have variance (value / sigma)^2 each."""
 
     name = "constant"
     neglected_effects = "dynamics"
     continuous = True
 
-    dimension: int = param(5, "d, length of theta", positive=True)
     value: float = param(3.0, "the cost")
-
-    def theta0(self) -> np.ndarray:
-        """Return numbers evenly spaced from 0.5 to 1.5."""
-        return np.linspace(0.5, 1.5, self.dimension)
 
     def cost(self, xp: Any, x: Array) -> Array:
         """Return the value, with derivative 0."""

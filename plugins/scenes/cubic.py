@@ -5,11 +5,13 @@ from typing import Any
 
 import numpy as np
 
-from bench.model import Array, ContactLaw, FunctionScene, Plugin, param
+from bench.model import Array, ContactLaw, Plugin
+
+from .spaced import SpacedScene
 
 
 @dataclass(frozen=True)
-class Cubic(FunctionScene):
+class Cubic(SpacedScene):
     """f = sum_i x_i^3 / 3, with x = theta + sigma w.
 
     grad J = theta^2 + sigma^2, while the gradient of f is theta^2. theta is spaced evenly from 0.5 to 1.5.
@@ -18,12 +20,6 @@ class Cubic(FunctionScene):
     name = "cubic"
     neglected_effects = "dynamics"
     continuous = True
-
-    dimension: int = param(5, "d, length of theta", positive=True)
-
-    def theta0(self) -> np.ndarray:
-        """Return numbers evenly spaced from 0.5 to 1.5."""
-        return np.linspace(0.5, 1.5, self.dimension)
 
     def cost(self, xp: Any, x: Array) -> Array:
         """Return the sum of the cubes over 3."""

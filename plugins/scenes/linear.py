@@ -5,11 +5,13 @@ from typing import Any
 
 import numpy as np
 
-from bench.model import Array, ContactLaw, FunctionScene, Plugin, param
+from bench.model import Array, ContactLaw, Plugin, param
+
+from .spaced import SpacedScene
 
 
 @dataclass(frozen=True)
-class Linear(FunctionScene):
+class Linear(SpacedScene):
     """f = sum_i a_i x_i, with x = theta + sigma w and a_i = slope (i + 1) / d for i = 0 .. d - 1.
 
     grad J = a for any sigma and theta; first-order gradients have variance 0.
@@ -19,12 +21,7 @@ class Linear(FunctionScene):
     neglected_effects = "dynamics"
     continuous = True
 
-    dimension: int = param(5, "d, length of theta", positive=True)
     slope: float = param(2.0, "the largest of the slopes a_i")
-
-    def theta0(self) -> np.ndarray:
-        """Return numbers evenly spaced from 0.5 to 1.5."""
-        return np.linspace(0.5, 1.5, self.dimension)
 
     def cost(self, xp: Any, x: Array) -> Array:
         return self.slope * xp.sum(xp.asarray(_ramp(self.dimension)[:, None], dtype=x.dtype) * x, axis=0)

@@ -39,8 +39,8 @@ class Mjcf(PolicyScene, JointScene):
     A Python file, by default beside the MJCF file and of the same name, defines ``observation(xp, q, v)``, ``(n, B)``,
     and ``stage_cost(xp, q, v, u)``, ``(B,)``, and may define ``terminal_cost(xp, q, v)``, ``has_ended(xp, q, v)`` and
     ``random_start(xp, q0, v0, e)``, which returns (q, v) from ``n_start`` standard normal numbers e. q0, v0 and u0 are
-    the first keyframe if there is one, else the model's reference pose. Contacts, limits, friction, springs, actuators
-    and the friction cone come from the file; the backend decides integrator and solver, ``dt / substeps`` is the
+    the first keyframe if there is one, else the model's reference pose. Contacts, limits, friction, springs and
+    actuators come from the file; the backend decides integrator, solver and friction cone, ``dt / substeps`` is the
     engine's time step. Orientations are unit quaternions (w, x, y, z).
 
     Not supported: actuators with activation states, mocap bodies, plugins.

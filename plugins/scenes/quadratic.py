@@ -5,11 +5,13 @@ from typing import Any
 
 import numpy as np
 
-from bench.model import Array, ContactLaw, FunctionScene, Plugin, param
+from bench.model import Array, ContactLaw, Plugin, param
+
+from .spaced import SpacedScene
 
 
 @dataclass(frozen=True)
-class Quadratic(FunctionScene):
+class Quadratic(SpacedScene):
     """f = sum_i c_i x_i^2 / 2, with x = theta + sigma w.
 
     The curvatures c_i are spaced geometrically from 1 to ``condition``; theta is spaced evenly from 0.5 to 1.5.
@@ -20,12 +22,7 @@ class Quadratic(FunctionScene):
     neglected_effects = "dynamics"
     continuous = True
 
-    dimension: int = param(5, "d, length of theta", positive=True)
     condition: float = param(10.0, "largest curvature over the smallest", positive=True)
-
-    def theta0(self) -> np.ndarray:
-        """Return numbers evenly spaced from 0.5 to 1.5."""
-        return np.linspace(0.5, 1.5, self.dimension)
 
     def cost(self, xp: Any, x: Array) -> Array:
         exponents = xp.asarray(_exponents(self.dimension)[:, None], dtype=x.dtype)

@@ -35,7 +35,7 @@ def test_answers_stand_under_their_question_and_experiments_without_rows_last(tm
         "\n## Without stored results\n\n- `twins`: How far are the engines' trajectories and gradients from the scenes' own, and what do they cost?\n"
     )
     assert (
-        "## Does it work?\n\n### quick\n\n*Does the whole path work on this machine?* [Data](quick)\n\n![quick](quick/chart.png)\n\nFirst &lt;b&gt;. Second.\n\n"
+        "## Does it work?\n\n### quick\n\n![quick](quick/chart.png)\n\nFirst &lt;b&gt;. Second. [Data](quick)\n\n"
         in text
     )
 

@@ -208,10 +208,13 @@ def test_gradient_that_raises_is_a_finding():
 # -------------------------------------------------------------------------------------- jumps and noise
 
 
-def test_lines_find_jump_and_kink_where_they_are():
+def test_lines_find_jump_and_kink_where_they_are_and_none_in_rounding():
     line = scan(lambda t: (t > 0.37) * 0.2 + abs(t + 0.81) + np.sin(3 * t), np.ones(1), noise=1e-15)
     assert [(b.kind, round(b.at, 3)) for b in line.breaks] == [("kink", -0.81), ("jump", 0.37)]
     assert line.jumps[0].size == pytest.approx(0.2, rel=1e-3)
+    assert line.kinks[0].size == pytest.approx(2.0, rel=1e-2)
+    rough = np.random.default_rng(0)
+    assert not scan(lambda t: 1e-9 * rough.standard_normal(t.size), np.ones(1), noise=1e-9).breaks
 
 
 @pytest.mark.parametrize(
@@ -227,14 +230,6 @@ def test_a_tread_is_the_height_of_four_equal_jumps_at_even_distances(places, hei
     breaks = tuple(Break("jump", *each) for each in zip(places, heights, strict=True))
     line = LineScan(np.ones(1), np.zeros(2), np.zeros(2), breaks, steps=False)
     assert line.tread == pytest.approx(tread)
-
-
-def test_kink_has_its_change_of_slope_and_rounding_has_no_breaks():
-    line = scan(lambda t: 3.0 * abs(t - 0.4) + t**2, np.ones(1), noise=1e-15)
-    assert [(b.kind, round(b.at, 3)) for b in line.breaks] == [("kink", 0.4)]
-    assert line.kinks[0].size == pytest.approx(6.0, rel=1e-2)
-    rough = np.random.default_rng(0)
-    assert not scan(lambda t: 1e-9 * rough.standard_normal(t.size), np.ones(1), noise=1e-9).breaks
 
 
 def test_treads_that_a_gradient_misses_are_named_though_they_are_small():

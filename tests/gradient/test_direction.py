@@ -83,52 +83,48 @@ def test_a_jump_is_the_same_over_five_of_the_smallest_steps(steps, verdict):
     assert judge(sample).verdict == verdict
 
 
-def test_a_part_of_the_derivative_is_a_missing_term():
-    partly, beyond = ([Ratio(v, 1e-9) for v in values] for values in ([0.5, 0.7, 0.9, 1.2], [-3.0, 5.0, 2.5, -0.2]))
-    assert causes_of_ratios({0: partly}, [], some_right=False)[0] == "missing_term"
-    assert causes_of_ratios({0: beyond}, [], some_right=False)[0] == "wrong_adjoint"
-    assert causes_of_ratios({0: beyond}, [], some_right=True)[0] == "missing_term"
+PARTLY, BEYOND = [0.5, 0.7, 0.9, 1.2], [-3.0, 5.0, 2.5, -0.2]
+"""Ratios of a part of the derivative, and of none."""
+NEARLY, NEAR_ONE = [0.5, 0.50005, 0.49995, 0.50005], [1.001, 1.001001, 1.000999, 1.001001]
 
 
-def test_a_factor_is_named_only_where_ratios_agree_within_their_errors():
-    same, nearly, other = (
-        [Ratio(v, 1e-9) for v in r] for r in ([0.5] * 4, [0.5, 0.5001, 0.5002, 0.4999], [0.1, 0.9, 0.5])
-    )
-    assert causes_of_ratios({0: same}, [], some_right=False)[0] == "wrong_factor"
-    assert causes_of_ratios({0: nearly}, [], some_right=False)[0] == "missing_term"
-    assert causes_of_ratios({0: [Ratio(r.value, 1e-4) for r in nearly]}, [], some_right=False)[0] == "wrong_factor"
-    assert causes_of_ratios({0: same, 1: other}, [], False) == dict.fromkeys([0, 1, None], "missing_term")
-
-
-def cause(values, error, **given):
-    return causes_of_ratios({0: [Ratio(value, error) for value in values]}, [], some_right=False, **given)[0]
-
-
-def test_ratios_may_differ_by_the_programs_rounding_by_ten_errors_and_no_more():
-    """By a hundred-thousandth of their size or of their distance from 1, whichever is less."""
-    assert cause([0.5, 0.500003, 0.499997, 0.5], 1e-13) == "wrong_factor"
-    assert cause([0.5, 0.50003, 0.49997, 0.5], 1e-13) == "missing_term"
-    assert cause([1.001, 1.001001, 1.000999, 1.001001], 1e-13) == "missing_term"
-    assert cause([1.001, 1.001001, 1.000999, 1.001001], 3e-7) == "wrong_factor"
-    assert cause([0.5, 0.50005, 0.49995, 0.50005], 1e-5) == "wrong_factor"
-    assert cause([0.5, 0.50005, 0.49995, 0.50005], 1e-6) == "missing_term"
-    # and by no more than a thousandth, however little is known
-    assert cause([0.5, 0.505, 0.495, 0.505], 1e-2) == "missing_term"
-
-
-def test_one_ratio_of_five_may_be_spoilt_and_two_may_not():
-    assert cause([0.5] * 4 + [0.9], 1e-9) == "wrong_factor"
-    assert cause([0.5] * 3 + [0.9, 0.7], 1e-9) == "missing_term"
-    assert cause([0.5, 0.7, 0.9, 1.2, -3.0], 1e-9) == "missing_term"
-    assert cause([0.5, 0.7, 0.9, -1.2, -3.0], 1e-9) == "wrong_adjoint"
-    assert cause([0.5, 0.7, 0.9, -1.2, -3.0], 1e-9, right_elsewhere=True) == "missing_term"
+@pytest.mark.parametrize(
+    ("values", "error", "given", "cause"),
+    [
+        (PARTLY, 1e-9, {}, "missing_term"),
+        (BEYOND, 1e-9, {}, "wrong_adjoint"),
+        (BEYOND, 1e-9, {"some_right": True}, "missing_term"),
+        # ratios may differ by ten times their errors
+        ([0.5] * 4, 1e-9, {}, "wrong_factor"),
+        (NEARLY, 1e-5, {}, "wrong_factor"),
+        (NEARLY, 1e-6, {}, "missing_term"),
+        # and by the program's rounding, a hundred-thousandth of their size or of their distance from 1
+        ([0.5, 0.500003, 0.499997, 0.5], 1e-13, {}, "wrong_factor"),
+        ([0.5, 0.50003, 0.49997, 0.5], 1e-13, {}, "missing_term"),
+        (NEAR_ONE, 1e-13, {}, "missing_term"),
+        (NEAR_ONE, 3e-7, {}, "wrong_factor"),
+        # and by no more than a thousandth, however little is known
+        ([0.5, 0.5001, 0.5002, 0.4999], 1e-4, {}, "wrong_factor"),
+        ([0.5, 0.505, 0.495, 0.505], 1e-2, {}, "missing_term"),
+        # one of five may be spoilt, and two may not
+        ([0.5] * 4 + [0.9], 1e-9, {}, "wrong_factor"),
+        ([0.5] * 3 + [0.9, 0.7], 1e-9, {}, "missing_term"),
+        ([*PARTLY, -3.0], 1e-9, {}, "missing_term"),
+        ([*PARTLY[:3], -1.2, -3.0], 1e-9, {}, "wrong_adjoint"),
+        ([*PARTLY[:3], -1.2, -3.0], 1e-9, {"right_elsewhere": True}, "missing_term"),
+    ],
+)
+def test_ratios_and_their_errors_decide_the_cause(values, error, given, cause):
+    ratios = {0: [Ratio(value, error) for value in values]}
+    assert causes_of_ratios(ratios, [], **{"some_right": False, **given})[0] == cause
 
 
 def test_one_factor_for_several_components_is_one_and_the_most_frequent_cause_is_that_of_directions():
     """Two ratios are too few to say alone, and enough together; what most components have, random directions have."""
     few = [Ratio(0.5, 1e-9)] * 2
     assert causes_of_ratios({0: few, 1: few}, [], False) == dict.fromkeys([0, 1, None], "wrong_factor")
-    beyond, partly = ([Ratio(v, 1e-9) for v in values] for values in ([-3.0, 5.0, 2.5], [0.1, 0.9, 0.5]))
+    beyond, partly, same = ([Ratio(v, 1e-9) for v in values] for values in (BEYOND[:3], [0.1, 0.9, 0.5], [0.5] * 4))
+    assert causes_of_ratios({0: same, 1: partly}, [], False) == dict.fromkeys([0, 1, None], "missing_term")
     assert causes_of_ratios({0: beyond, 1: partly, 2: partly}, [], False)[None] == "missing_term"
     assert causes_of_ratios({0: partly, 1: beyond, 2: beyond}, [], False)[None] == "wrong_adjoint"
 

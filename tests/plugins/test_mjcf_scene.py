@@ -8,6 +8,7 @@ from bench.errors import UserError
 from bench.experiment.by_name import compile_problem, make
 from bench.experiment.keys import fingerprint
 from bench.measure import noise
+from bench.plugins import mjcf
 
 mujoco = pytest.importorskip("mujoco")
 
@@ -122,10 +123,11 @@ BAD = [
     ({}, {"backend": "mjx"}, r"use mjx\[iterations=20\]"),
     ({}, {"backend": "mjx[derivative=unrolled]"}, r"use mjx\[iterations=20\]"),
     ({}, {"backend": "mjx[iterations=5,derivative=unrolled,mode=reverse]"}, "no reverse mode with iterations=5"),
-    ({}, {"backend": "mjx[iterations=5,cone=elliptic]"}, "cone=elliptic would have no effect"),
+    (ELLIPTIC, {"backend": "mjx[iterations=5]"}, r"elliptic cones: use mjx\[cone=elliptic\]"),
+    (ELLIPTIC, {"backend": "mujoco[cone=pyramidal]"}, r"elliptic cones: use mujoco\[cone=elliptic\]"),
     ({}, {"backend": "mujoco[impedance=0.5]"}, "impedance=0.5 would have no effect"),
-    (ELLIPTIC | {"<geom": '<geom condim="1"'}, {"backend": "mjx[iterations=5]"}, "use pyramidal cones"),
-    (ELLIPTIC, {"backend": "mjx[iterations=5,derivative=unrolled]"}, "NaN with elliptic friction cones"),
+    ({"<geom": '<geom condim="1"'}, {"backend": "mjx[iterations=5,cone=elliptic]"}, "use pyramidal cones"),
+    ({}, {"backend": "mjx[iterations=5,cone=elliptic,derivative=unrolled]"}, "NaN with elliptic friction cones"),
 ]
 """Texts changed in the model and the task, settings, and the message."""
 
@@ -141,6 +143,12 @@ def changed(file, changes):
 def test_what_cannot_be_run_is_named(pendulum, changes, values, message):
     with pytest.raises(bench.Unsupported if "backend" in values else UserError, match=message):
         problem(**{"file": changed(pendulum, changes), **values})
+
+
+@pytest.mark.parametrize("changes", [{}, ELLIPTIC])
+def test_an_elliptic_cone_replaces_that_of_the_file(pendulum, changes):
+    given = problem(changed(pendulum, changes), "mujoco[cone=elliptic]")
+    assert mjcf.build(given._backend, given.program).opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
 
 
 def test_a_file_without_actuators_has_velocities_as_theta(pendulum):

@@ -123,7 +123,7 @@ def measure(cell: Cell, session: Session, search: GradientCheck) -> dict[str, An
         "derivative_program": [point.sample.derivative for point in points],
         "check_verdict": verdicts,
         "check_error": errors,
-        "check_eps": [float(gradcheck.EPS[i]) for i in best],
+        "check_eps": gradcheck.EPS[best].tolist(),
         "eps": gradcheck.EPS.tolist(),
         "derivative_differences": np.concatenate([point.sample.differences for point in points]).tolist(),
         "relative_error": np.concatenate([point.sample.errors for point in points]).tolist(),
