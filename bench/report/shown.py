@@ -55,19 +55,20 @@ class Shown:
 
     def cells(
         self,
-        columns: Sequence[Column],
+        columns: Sequence[Column | str],
         title: str,
         notes: Sequence[str],
         always: Sequence[str] = ("scene", "contact", "backend"),
         rows: pd.DataFrame | None = None,
         terminal: bool = True,
     ) -> Table:
-        """Return the table with a line per cell that was run: what identifies it, some columns, and its status."""
+        """Return the table with a line per cell that was run: what identifies it, some columns or their names, and its status."""
         rows = self.rows if rows is None else rows
+        shown = [self.column(one, digits=3) if isinstance(one, str) else one for one in columns]
         labels = label_columns(self.arranged, self.parts, self.over, always=always, rows=rows)
         heads = [COMMON.get(name, Column(name, format="setting")) for name in labels]
         return Table(
-            self.experiment.study.name, rows, [*heads, *columns, COMMON["status"]], title, notes, terminal=terminal,
+            self.experiment.study.name, rows, [*heads, *shown, COMMON["status"]], title, notes, terminal=terminal,
             data=axes.table(self.experiment, self.stored),
         )  # fmt: skip
 

@@ -6,7 +6,7 @@ import ctypes
 import gc
 import time
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -37,7 +37,7 @@ SMALL = 1.0
 RANGE = "the range of the calls"
 ENDS = ("", "_low", "_high")
 """Endings of the columns of a value and of the ends of its interval."""
-SHOWN = ("memory_mb", "gradient_s", "process_mb", "gradient_error_rel")
+SHOWN = ("gradient_s", "process_mb", "gradient_error_rel")
 LINES = (
     text("problem"),
     text("method"),
@@ -131,8 +131,7 @@ class BackwardMemory(StudyPackage):
 
         shown = Shown(experiment, rows, along=["horizon"])
         tried = with_error(shown.rows)
-        own = [shown.column(name, digits=3) for name in SHOWN]
-        own[0] = replace(own[0], limit="is_small")
+        own: list[Column | str] = [shown.column("memory_mb", digits=3, limit="is_small"), *SHOWN]
         title, always = "memory and time of a backward pass", ("scene", "backend", "horizon")
         cells = shown.cells(own, title, [CELLS_NOTE], always, tried, terminal=False)
         has_result = (tried["status"] == "ok") & tried["memory_mb"].notna()

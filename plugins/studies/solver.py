@@ -80,8 +80,9 @@ class Solver(StudyPackage):
         from bench.report.shown import Shown, floored
 
         shown = Shown(experiment, rows)
-        own = [shown.column(name, digits=3) for name in SHOWN]
-        cells = shown.cells(own, "gradients along the iterations of the constraint solver", NOTES, ("scene", "backend"))
+        cells = shown.cells(
+            SHOWN, "gradients along the iterations of the constraint solver", NOTES, ("scene", "backend")
+        )
         iterations = shown.column("iterations", label="iterations of the solver", log=True)
         error = shown.column("gradient_error_rel", label="relative error", limit="gradient_error_rel_limit", log=True)
         chart = Chart(

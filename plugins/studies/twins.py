@@ -112,8 +112,7 @@ class Twins(StudyPackage):
         from bench.report.shown import Shown, floored
 
         shown = Shown(experiment, rows)
-        own = [shown.column(name, digits=3) for name in SHOWN]
-        cells = shown.cells(own, "engines compared with the scenes' own programs", NOTES)
+        cells = shown.cells(SHOWN, "engines compared with the scenes' own programs", NOTES)
         worst = shown.good.groupby("problem")["gradient_difference_rel"].transform("max")
         frame = floored(shown.good.loc[worst.sort_values(ascending=False, kind="stable").index], FLOOR, DIFFERENCES)
         chart = Chart(

@@ -119,7 +119,7 @@ def test_searches_in_shared_calls_equal_separate_searches(bowl):
 def test_the_error_of_one_of_the_searches_that_share_calls_is_raised(bowl):
     widths = [bowl.program.n_noise, bowl.program.n_noise + 1]
     searches = [lambda lane, width=width: lane.value(np.zeros(lane.dim), np.zeros((width, 1))) for width in widths]
-    with pytest.raises(ValueError, match="dimension"):
+    with pytest.raises(bench.UserError, match=r"noise w has the shape \(9, 1\)"):
         run_batched(bowl, searches)
 
 

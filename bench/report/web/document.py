@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 import re
 import uuid
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from html import escape
 from itertools import starmap
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+import pandas as pd
 from matplotlib.figure import Figure
 
 from bench.experiment.views import Chart, Views
@@ -91,27 +92,10 @@ def _chart(chart: Chart, figure: Figure) -> str:
 
 
 def _made(record: Mapping[str, Any]) -> str:
-    """Return the run's machine, versions and configuration as HTML, as far as they are recorded."""
+    """Return all facts about the run and its configuration as HTML, as far as they are recorded."""
     if not record:
         return "<p>There is no run.json beside this page, so machine and versions are not known.</p>"
-    machine = record.get("machine") or {}
-    facts = {
-        "command": record.get("command"),
-        "finished": record.get("finished"),
-        "duration": f"{record.get('duration_s')} s",
-        "machine": ", ".join(_texts(machine.get("processor"), f"{machine.get('cores')} cores", machine.get("system"))),
-        "load average": ", ".join(f"{load:.2f}" for load in machine.get("load_average") or []),
-        "commit": record.get("git_commit"),
-        "versions": ", ".join(
-            _texts(
-                f"python {record.get('python')}", *(f"{k} {v}" for k, v in (record.get("versions") or {}).items() if v)
-            )
-        ),
-    }
-    terms = "".join(f"<dt>{escape(k)}</dt><dd>{escape(str(v))}</dd>" for k, v in facts.items() if v)
+    facts = pd.json_normalize({name: value for name, value in record.items() if name != "config"}).loc[0].dropna()
+    terms = "".join(f"<dt>{escape(str(k))}</dt><dd>{escape(str(v))}</dd>" for k, v in facts.items())
     config = escape(json.dumps(record.get("config"), indent=1))
     return f'<dl>{terms}</dl><h3>Configuration</h3><pre tabindex="0">{config}</pre>'
-
-
-def _texts(*values: Any) -> Iterable[str]:
-    return (str(value) for value in values if value)
