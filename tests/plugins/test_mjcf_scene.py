@@ -165,9 +165,34 @@ def test_small_batches_of_mjx_compute_no_padding_columns(pendulum, monkeypatch):
     assert sorted(widths) == [1, 1, 1, 1, 16, 16]
 
 
+ROBOTS = [
+    ("half_cheetah", 40, "iterations=10", 0, 0.0, -26.766339330),
+    ("half_cheetah", 40, "iterations=10,cone=elliptic", 0, 0.0, -22.726411503),
+    ("humanoid", 10, "iterations=20", 2, -3.0, 0.6046498070),
+]
+"""Gymnasium's robot, horizon, settings, one velocity at the start, and the derivative of minus the sum of forward velocities."""
+
+
 @pytest.mark.slow
-def test_mjx_and_mujoco_agree(pendulum):
-    by_c, by_xla = problem(pendulum), problem(pendulum, "mjx[iterations=20]")
-    theta, w = by_c.program.theta0, drawn(by_c)
-    assert by_xla.value(theta, w) == pytest.approx(by_c.value(theta, w), rel=1e-9)
-    assert by_xla.grad(theta, w) == pytest.approx(by_c.grad(theta, w), rel=1e-6)
+@pytest.mark.parametrize(("name", "horizon", "settings", "number", "speed", "expected"), ROBOTS)
+def test_derivatives_of_robots_are_those_of_the_c_engine(name, horizon, settings, number, speed, expected):
+    pytest.importorskip("gymnasium")
+    file = f"gymnasium:envs/mujoco/assets/{name}.xml,functions=half_cheetah.py"
+    scene = f"mjcf[file={file},horizon={horizon},substeps=1,theta=velocity,noise=parameter]"
+    given = compile_problem(scene, None, "semi_implicit_euler", f"mjx[{settings},mode=reverse]")
+    model, w = given.program.source, np.zeros((given.dim, 1))
+    model.opt.tolerance, model.opt.iterations, model.opt.ls_iterations = 0.0, 100, 50
+
+    def by_c(start):
+        data, total = mujoco.MjData(model), 0.0
+        data.qvel[:] = start
+        for _ in range(horizon):
+            total -= data.qvel[0]
+            mujoco.mj_step(model, data)
+        return total
+
+    axis = np.eye(given.dim)[number]
+    starts = [(speed + step) * axis for step in (1e-5, -1e-5)]
+    for cost in (by_c, lambda start: given.value(start, w)):
+        assert np.subtract(*map(cost, starts)) / 2e-5 == pytest.approx(expected, rel=1e-8)
+    assert given.grad(speed * axis, w)[number] == pytest.approx(expected, rel=1e-8)
