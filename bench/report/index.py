@@ -5,21 +5,25 @@ All texts come from stored files, which may be foreign: they are shown literally
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
+import pandas as pd
+
 from bench.errors import UserError, local_path
 from bench.report.text import counted
 from bench.report.web import shell
 from bench.run.files import write_whole
-from bench.run.rows import read_object
+from bench.run.rows import read_object, read_parquet
 
+YEAR_3000 = 32503680000.0
+"""Seconds since 1970 that no run has stored."""
 GOOD = ("ok", "unsupported", "unavailable", "waiting")
 """Statuses that do not count as failures: the cell has a result, or was refused with a reason."""
-BAD = ' class="bad"'
 MARKERS = ("rows.parquet", "run.json", "answer.json")
 """Files whose folder is listed."""
 LISTED = (".html", ".md", ".csv", ".tex", ".png", ".svg", ".pdf")
@@ -55,8 +59,8 @@ def _card(folder: Path, place: Path) -> str:
     name = _text(stored, "experiment") or _text(record, "experiment") or place.name
     question = _text(stored, "question") or _text(record, "question")
     chart = _chart(place, _text(stored, "chart"))
-    state = _state(record)
-    notes = [_text(record, "finished"), _text(record, "git_commit") and f"commit {_text(record, 'git_commit')[:12]}"]
+    state, when = _state(place / "rows.parquet", record)
+    notes = [when, _text(record, "git_commit") and f"commit {_text(record, 'git_commit')[:12]}"]
     parts = [_thumbnail(folder, chart, name), f"<h2>{escape(name)}</h2>"]
     if question:
         parts.append(f'<p class="hint">{escape(question)}</p>')
@@ -104,13 +108,28 @@ def _link(folder: Path, path: Path) -> str:
     return escape(quote(path.relative_to(folder).as_posix()))
 
 
-def _state(record: dict[str, Any]) -> str:
-    """Return the number of cells by status at the end of the last run as HTML, failures marked; empty without a record."""
-    counts = record.get("counts")
-    return ", ".join(
-        f"<span{'' if status in GOOD else BAD}>{escape(f'{count} {status}')}</span>"
-        for status, count in (counts.items() if isinstance(counts, dict) else ())
-    )
+def _state(path: Path, record: dict[str, Any]) -> tuple[str, str]:
+    """Return the number of cells by status as HTML, failures marked, and the date of the newest row as text.
+
+    Both are empty if neither the rows nor the record of the run know them.
+    """
+    counts, when = record.get("counts"), _text(record, "finished")
+    if path.exists():
+        try:
+            table = read_parquet(path, ["status", "stored_at"])
+            counts = table["status"].value_counts().to_dict()
+            newest = float(pd.to_numeric(table["stored_at"], errors="coerce").max())
+            if 0 <= newest < YEAR_3000:
+                when = time.strftime("newest row of %Y-%m-%d %H:%M UTC", time.gmtime(newest))
+        except Exception as error:  # any error in the file is reported on the page
+            return f'<span class="bad">rows.parquet cannot be read: {escape(str(error)[:200])}</span>', ""
+    if not isinstance(counts, dict) or not counts:
+        return "", when
+    texts = []
+    for status, count in counts.items():
+        look = "" if status in GOOD else ' class="bad"'
+        texts.append(f"<span{look}>{escape(str(count))} {escape(str(status))}</span>")
+    return ", ".join(texts), when
 
 
 def _text(content: dict[str, Any], key: str) -> str:

@@ -3,6 +3,7 @@
 import json
 
 import pytest
+from helpers import failed, row, table
 from PIL import Image
 
 from bench import cli
@@ -15,20 +16,21 @@ BANNER = '<b style="position:fixed;inset:0">banner</b><meta http-equiv="refresh"
 
 @pytest.fixture
 def folder(tmp_path):
-    """Four experiments: with page, answer, a chart and a failure; without a page; with a broken record; only an answer."""
+    """Four experiments: with page, answer, a chart and a failure; without rows; with broken rows; only an answer."""
+    rows = table([row(), failed("error", "it broke", seed=1), failed("unsupported", "cannot work", seed=2)])
     for name in ("good", "nested/bare", "broken", "published#1"):
         (tmp_path / name).mkdir(parents=True)
-        counts = {"ok": 7} if name != "good" else {"ok": 1, "error": 1, "unsupported": 1}
-        record = {"experiment": name, "question": HOSTILE, "counts": counts, "git_commit": "0123456789abcdef"}
+        record = {"experiment": name, "question": HOSTILE, "counts": {"ok": 7}, "git_commit": "0123456789abcdef"}
         (tmp_path / name / "run.json").write_text(json.dumps(record))
     (tmp_path / "published#1" / "run.json").unlink()
+    rows.to_parquet(tmp_path / "good" / "rows.parquet")
     for name in ("good", "published#1"):
         answer = {"experiment": name, "question": "why?", "answer": "use fobg < 3 & more", "chart": "second"}
         (tmp_path / name / "answer.json").write_text(json.dumps(answer))
         for stem in ("first", "second"):
             Image.new("RGB", (40, 30), "red").save(tmp_path / name / f"{stem}.png")
     (tmp_path / "good" / "report.html").write_text(f'<p class="finding" id="finding">{BANNER}</p>')
-    (tmp_path / "broken" / "run.json").write_text("not JSON")
+    (tmp_path / "broken" / "rows.parquet").write_text("not Parquet")
     return tmp_path
 
 
@@ -48,6 +50,7 @@ def test_every_experiment_is_there_with_its_state_and_answer(folder):
     assert '<span class="bad">1 error</span>' in good
     assert "<span>1 unsupported</span>" in good
     assert "<span>7 ok</span>" in card(text, "nested/bare")
+    assert "rows.parquet cannot be read" in card(text, "broken")
     assert HOSTILE not in text
 
 
