@@ -6,6 +6,8 @@ A backend's ``own_refusal`` may call :func:`refusal` and then inspect the model 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -42,12 +44,17 @@ def refusal(backend: Any, program: Program) -> str | None:
         return (
             f"contacts of scene {scene.name} are as its file says: impedance={backend.impedance} would have no effect"
         )
-    import mujoco
-
-    has_cone = mujoco.MjModel.from_xml_path(str(path)).opt.cone
-    if backend.cone == "pyramidal" and has_cone == mujoco.mjtCone.mjCONE_ELLIPTIC:
+    if backend.cone == "pyramidal" and _has_elliptic_cones(path, path.stat().st_mtime_ns):
         return f"{path.name} has elliptic cones: use {backend.name}[cone=elliptic]"
     return None
+
+
+@cache
+def _has_elliptic_cones(path: Path, changed: int) -> bool:
+    """Return whether an MJCF file that was last changed at the time ``changed`` has elliptic friction cones."""
+    import mujoco
+
+    return bool(mujoco.MjModel.from_xml_path(str(path)).opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC)
 
 
 def build(backend: Any, program: Program) -> Any:
