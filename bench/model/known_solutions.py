@@ -27,7 +27,7 @@ class KnownValue(ABC):
         """Return the optimal cost-to-go from the state before ``step``, without noise, ``(B,)``."""
 
 
-class Identified(ABC):
+class Identified:
     """A role: some parameters of the scene are to be identified from a record of its motion."""
 
     unknowns: ClassVar[tuple[str, ...]] = ()
