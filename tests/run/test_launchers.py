@@ -12,6 +12,7 @@ from trees import bench
 from bench.cli import main
 from bench.errors import UserError
 from bench.experiment import config
+from bench.experiment.grid import cells
 from bench.run import record
 from bench.run.execute import execute, store_of
 from bench.run.launchers import ray as ray_launcher
@@ -111,6 +112,15 @@ def test_shards_at_once_one_killed_give_the_rows_of_one_run(tmp_path, capsys):
     assert " 0 to run" in capsys.readouterr().out
     assert main(["report", *words, "name=parts"]) == 0
     pd.testing.assert_frame_equal(rows(tmp_path / "parts"), rows(tmp_path / "local"), check_exact=True)
+
+
+@pytest.mark.parametrize("verb", [["plan"], []])
+def test_an_empty_shard_says_so_and_how_many_cells_the_sweep_has(verb, tmp_path, capsys):
+    words = [*WORDS[:-1], "estimators=[fobg,alpha_order]", "name=few", f"results_dir={tmp_path}"]
+    keys = [cell.reference_key for cell in cells(config.load(words))]
+    number = 1 + next(n for n in range(64) if n not in [int(key, 16) % 64 for key in keys])
+    assert main([*verb, *words, f"shard={number}/64"]) == 0
+    assert f"shard {number}/64 of few is empty: the sweep has 2 cells" in capsys.readouterr().out
 
 
 def test_groups_are_cut_only_as_far_as_all_nodes_get_a_part():
