@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 import time
+from collections import deque
 
 import pandas as pd
 import pytest
@@ -123,10 +124,10 @@ def test_an_empty_shard_says_so_and_how_many_cells_the_sweep_has(verb, tmp_path,
     assert f"shard {number}/64 of few is empty: the sweep has 2 cells" in capsys.readouterr().out
 
 
-def test_groups_are_cut_only_as_far_as_all_nodes_get_a_part():
-    assert [len(part) for part in ray_launcher.split([range(10), [1]], 100, [1])] == [3, 3, 3, 1, 1]
-    assert [len(part) for part in ray_launcher.split([range(10)], 100, [8])] == [8, 2]
-    assert [len(part) for part in ray_launcher.split([range(40)], 4, [1])] == [4] * 10
+def test_a_job_is_the_first_tasks_of_one_group():
+    waiting = deque([list(range(5)), [9]])
+    assert [ray_launcher.first_tasks(waiting, 3) for _ in range(3)] == [[0, 1, 2], [3, 4], [9]]
+    assert not waiting
 
 
 def test_every_row_says_which_kind_of_machine_made_it(tmp_path):
