@@ -311,7 +311,7 @@ class _Checker:
         """Return random directions ``(n, d)``, of length 1 in units of the inputs' scales."""
         random = self.random.standard_normal((self.theta.size, self.options.directions))
         random *= self.scale[:, None] / np.linalg.norm(random, axis=0)
-        return np.asarray(random.T)
+        return random.T
 
     def _check_lines(self, lines: Sequence[_Line], doubt: np.ndarray | None = None, twice: bool = True) -> list[Part]:
         """Return a checked part for each line, from one batch of costs; ``doubt (d,)`` is the gradient's own error.
