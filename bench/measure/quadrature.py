@@ -252,7 +252,7 @@ def _bisected(integrand: Callable[[np.ndarray], np.ndarray], ends: np.ndarray) -
         half = (high - low)[:, None] / 2.0
         t = (low[:, None] + half) + half * x
         weights = half * w * np.exp(-(t**2) / 2.0) / math.sqrt(2.0 * math.pi)
-        return np.asarray((weights * integrand(t.ravel()).reshape(t.shape)).sum(axis=1))
+        return (weights * integrand(t.ravel()).reshape(t.shape)).sum(axis=1)
 
     low, high = ends[:-1], ends[1:]
     whole, total, used, changes = panels(low, high), 0.0, low.size * NODES, []

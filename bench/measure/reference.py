@@ -75,7 +75,7 @@ class Reference:
     @property
     def gradient(self) -> np.ndarray:
         """grad J_sigma, ``(d,)``."""
-        return np.asarray(self.batches.mean(axis=0))
+        return self.batches.mean(axis=0)
 
     @property
     def is_finite(self) -> bool:
@@ -515,7 +515,7 @@ def _antithetic(
     if linear is None or not linear.any():
         return mean
     step = problem.directions(sides[0])
-    return np.asarray(mean - (linear @ step) * step + linear[:, None])
+    return mean - (linear @ step) * step + linear[:, None]
 
 
 def _failed(problem: Problem, reason: str) -> Reference:

@@ -41,7 +41,7 @@ def mean_costs(problem: Problem, points: np.ndarray, w: np.ndarray) -> np.ndarra
     """Return the mean costs ``(B,)`` of points ``(d, B)`` over the same noise ``(n_w, M)``."""
     count = points.shape[1]
     costs = problem.value(np.repeat(points, w.shape[1], axis=1), np.tile(w, (1, count)))
-    return np.asarray(costs.reshape(count, -1).mean(axis=1))
+    return costs.reshape(count, -1).mean(axis=1)
 
 
 def estimates(problem: Problem, estimator: Estimator, points: np.ndarray, w: np.ndarray) -> np.ndarray:
