@@ -511,7 +511,7 @@ def _antithetic(
     mean, ``linear``, which changes no expectation.
     """
     terms = ((problem.value(theta, s) - baseline) * problem.score(theta, s) for s in sides)
-    mean = np.asarray(sum(terms) / 2)
+    mean = sum(terms) / 2
     if linear is None or not linear.any():
         return mean
     step = problem.directions(sides[0])

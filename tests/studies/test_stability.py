@@ -196,7 +196,7 @@ def test_backends_that_disagree_show_the_worse_verdict_and_no_verdict_is_no_find
 )
 def test_planted_causes_are_named(monkeypatch, own, coarse, cause):
     """A gradient of twice the truth, and a law whose own gradient is the truth, that gradient, or between."""
-    monkeypatch.setattr(stability, "law_gradient", lambda *_: (np.array(own), np.array(coarse)))
+    monkeypatch.setattr(stability, "finest", lambda *_: (np.array(own), np.array(coarse)))
     _, (cell,) = cells_of("scenes=[bouncing_ball]", "contacts=[penalty]", "integrators=[rk4]", "backends=[numpy]")
     row = stability.cause_of(cell, "physical", np.array([2.0, 0.0]), np.array([1.0, 0.0]), LIMITS)
     assert row["cause"] == cause

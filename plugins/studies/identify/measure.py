@@ -188,8 +188,7 @@ class Model:
 
     def measurements(self, states: np.ndarray) -> np.ndarray:
         """Return the measurements ``(m, B)`` of the states ``(horizon, n, B)`` after each step."""
-        measured: np.ndarray = states[np.array(self.steps) - 1][:, list(self.measured)]
-        return measured.reshape(-1, states.shape[2])
+        return states[np.array(self.steps) - 1][:, list(self.measured)].reshape(-1, states.shape[2])
 
 
 def model_of(cell: Cell, refinement: int = 1) -> Model:
