@@ -27,7 +27,7 @@ from bench.experiment.views import Chart, Mark, Style
 from bench.report.colours import looks_by_name
 from bench.report.scales import log_axis
 from bench.report.style import GREY, MARKS, SHADE, SIZE, filled, plain, width_in_inches
-from bench.report.text import axis_value, duration
+from bench.report.text import axis_value, short_duration
 from bench.report.views import is_logarithmic, pareto
 
 WIDTH, NARROW = 7.16, 3.5
@@ -212,7 +212,7 @@ def _legend_columns(labels: Sequence[str], width: float) -> int:
 def _values_text(column: Column, largest: float) -> Any:
     """Return the function that formats the numbers of an axis; None for plain numbers."""
     if column.format == "seconds":
-        return lambda value: duration(value).replace("us", "µs").replace(".0 ", " ")
+        return short_duration
     if column.format == "percent":
         return lambda value: f"{100 * value:g}%"
     return axis_value if largest >= 1e5 else None

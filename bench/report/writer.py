@@ -48,7 +48,7 @@ def drawings(experiment: Experiment, views: Views) -> list[tuple[Chart, Figure]]
     looks = looks_by_name(charts)
     with styled():
         return [
-            (chart, draw(replace(chart, title=chart.title or experiment.question, styles=looks | chart.styles)))
+            (chart, draw(replace(chart, title=chart.title or experiment.question, styles={**looks, **chart.styles})))
             for chart in charts
         ]
 

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -19,7 +18,7 @@ from bench.experiment.parameters import number_problems
 from bench.experiment.views import Table, Views
 from bench.report.problems import ProblemRows, split_by_problem
 from bench.report.text import axis_value, counted, span
-from bench.report.views import Arranged, arrange, estimator_curves, pareto, rmse_interval
+from bench.report.views import CLOSE, Arranged, arrange, estimator_curves, pareto, rmse_interval
 
 from . import charts, time_to_accuracy
 from .columns import COLUMNS
@@ -32,7 +31,6 @@ from .comparisons import (
     ROLLOUTS,
     compare_errors,
     leaders,
-    method_names,
     method_table,
     problems_by_axis,
     verdicts_by_estimator,
@@ -139,10 +137,8 @@ def pivots(experiment: Experiment, shown: Arranged) -> list[Table]:
     if experiment.table.columns:
         axis = _axis(experiment.table.columns, shown)
         parts = [(axis, problem) for problem in split_by_problem(shown, axis, ("scene", "contact"))]
-    apart = "backend" in experiment.table.rows
-    result = [_pivot(axis, problem, apart) for axis, problem in parts]
-    notes = _notes(result)
-    return [replace(table, notes=notes if table is result[-1] else ()) for table in result]
+    result = [_pivot(axis, problem, "backend" in experiment.table.rows) for axis, problem in parts]
+    return [*result[:-1], replace(result[-1], notes=_notes(result))]
 
 
 def _axis(name: str, shown: Arranged) -> Axis:
@@ -154,41 +150,33 @@ def _axis(name: str, shown: Arranged) -> Axis:
 
 
 def _pivot(axis: Axis | None, problem: ProblemRows, apart: bool) -> Table:
-    curves = estimator_curves(problem.rows, close=None) if apart else estimator_curves(problem.rows)
-    names = [f"{c.label} ({', '.join(c.backends)})" for c in curves] if apart else method_names(curves)
-    values = sorted({x for curve in curves for x in curve.at})
-    lines: list[dict[str, Any]] = []
-    for curve, name in zip(curves, names, strict=True):
-        line: dict[str, Any] = {"method": name}
-        for i, x in enumerate(values):
-            others = [other.at.get(x) for other in curves if other.label != curve.label]
-            line |= {f"x{i}{end}": value for end, value in _pivot_cell(curve.at.get(x), others).items()}
-        lines.append(line)
+    rows = estimator_curves(problem.rows, None if apart else CLOSE)
+    ok, note = rows["status"] == "ok", rows["status"].map(lambda status: FAILURES.get(status, [""])[0])
+    low, high = (pd.Series(end, rows.index).where(ok) for end in rmse_interval(rows))
+    rivals = [
+        low[ok & (rows["x"] == x) & (rows["label"] != label)] for x, label in zip(rows["x"], rows["label"], strict=True)
+    ]
+    is_apart = np.array(
+        [len(ends) > 0 and (ends > end).all() for ends, end in zip(rivals, high, strict=True)], dtype=bool
+    )
+    cells = {
+        "": rows["rmse_rel"].where(ok), "_low": low, "_high": high, "_best": ok & (rows["rmse_rel"] < 1) & is_apart,
+        "_note": note + np.where(rows["reason"] != "", REMARKED, ""),
+    }  # fmt: skip
+    name = rows["label"] + " (" + rows["backends"] + ")" if apart else rows["method"]
+    values = sorted(rows["x"].unique())
+    wide = [
+        pd.DataFrame(cells)[rows["x"] == x].set_axis(name[rows["x"] == x]).add_prefix(f"x{i}")
+        for i, x in enumerate(values)
+    ]
     columns = [
-        interval(
-            f"x{i}", label=axis_value(x) if axis is not None else "relative RMSE",
-            emphasis=f"x{i}_best", note=f"x{i}_note",
-        )
+        interval(f"x{i}", label=axis_value(x) if axis else "relative RMSE", emphasis=f"x{i}_best", note=f"x{i}_note")
         for i, x in enumerate(values)
     ]  # fmt: skip
-    title = problem.title() + (f", by {axis.title}" if axis is not None else "")
     return Table(
-        "bias_variance", pd.DataFrame(lines), [ESTIMATOR, *columns], f"relative RMSE: {title}", files=["csv", "md", "tex"],
-        terminal=True,
+        "bias_variance", pd.concat(wide, axis=1).reindex(name.unique()).rename_axis("method").reset_index(), [ESTIMATOR, *columns],
+        f"relative RMSE: {problem.title()}{f', by {axis.title}' if axis else ''}", files=["csv", "md", "tex"], terminal=True,
     )  # fmt: skip
-
-
-def _pivot_cell(row: Mapping[str, Any] | None, others: Sequence[Mapping[str, Any] | None]) -> dict[str, Any]:
-    blank = {"": math.nan, "_low": math.nan, "_high": math.nan, "_best": False, "_note": ""}
-    if row is None:
-        return blank
-    mark = REMARKED if row["reason"] else ""
-    if row["status"] != "ok":
-        return blank | {"_note": FAILURES[row["status"]][0] + mark}
-    low, high = (float(end) for end in rmse_interval(row))
-    rivals = [rmse_interval(other)[0] for other in others if other is not None and other["status"] == "ok"]
-    best = bool(row["rmse_rel"] < 1 and rivals and all(high < rival for rival in rivals))
-    return {"": float(row["rmse_rel"]), "_low": low, "_high": high, "_best": best, "_note": mark}
 
 
 def _notes(result: Sequence[Table]) -> list[str]:
@@ -269,18 +257,13 @@ def _values(axis: str, at: pd.Series) -> str:
 
 def recommendations(methods: pd.DataFrame, comparisons: pd.DataFrame) -> Table:
     """Return what to use where: a line per problem and range of its axis with the same first and tied estimators."""
-    named = leaders(comparisons, methods)
-    lines = []
-    for (problem, axis), part in methods.groupby(["problem", "axis"], sort=False):
-        uses = part["setting"].map(named).map(tuple)
-        for use in filter(None, uses.unique()):
-            inside = part[uses == use]
-            errors = inside.loc[inside["estimator"].isin(use[:1]), "error"]
-            failing = dict.fromkeys(inside.loc[inside["verdict"].isin((FAILS, NO_RESULT)), "estimator"])
-            lines.append({
-                "problem": problem, "where": _values(axis, inside["at"]), "use": " or ".join(use),
-                "error": span(errors.min(), errors.max()), "fails": ", ".join(failing) or "none",
-            })  # fmt: skip
+    named = methods.assign(use=methods["setting"].map(leaders(comparisons, methods))).dropna(subset=["use"])
+    lines = [
+        {"problem": problem, "where": _values(axis, part["at"]), "use": " or ".join(use),
+         "error": span(*part.loc[part["estimator"] == use[0], "error"].agg(["min", "max"])),
+         "fails": ", ".join(part.loc[part["verdict"].isin((FAILS, NO_RESULT)), "estimator"].unique()) or "none"}
+        for (problem, axis, use), part in named.groupby(["problem", "axis", "use"], sort=False)
+    ]  # fmt: skip
     columns = [
         text("problem"), text("where"), text("use"), text("error", label="relative RMSE"), text("fails", label="fails there"),
     ]  # fmt: skip
