@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import partial
 from typing import Any
 
 import pandas as pd
@@ -45,10 +44,7 @@ def page_data(
 def cells_data(
     cells: pd.DataFrame, own: Sequence[Column], swept: Sequence[str] = (), commands: Sequence[Sequence[str]] = ()
 ) -> dict[str, Any]:
-    """Return cells as data: identity and swept columns, the columns ``own``, ``status`` and ``reason``.
-
-    The columns of the cells are functions that return them, since all columns of many cells need a lot of memory.
-    """
+    """Return cells as data: identity and swept columns, the columns ``own``, ``status`` and ``reason``."""
     columns = _columns(own, cells, swept)
     filters = _filters(cells, columns, swept)
     identity = [name for name in dict.fromkeys((*IDENTITY, *swept)) if name in cells]
@@ -60,7 +56,7 @@ def cells_data(
     return {
         "count": len(cells),
         "statuses": cells["status"].value_counts().to_dict(),
-        "cells": {name: partial(encode, cells[name]) for name in cells if name in names},
+        "cells": {name: encode(cells[name]) for name in cells if name in names},
         "columns": columns,
         "filters": filters,
         "identity": identity,
