@@ -8,10 +8,11 @@ from typing import Any
 
 import pandas as pd
 
-from bench.experiment.columns import COMMON, IDENTITY, Column
+from bench.experiment.columns import IDENTITY, Column
 from bench.experiment.experiment import Experiment
 from bench.experiment.views import Views
 from bench.report import reproduce
+from bench.report.generic import own_columns
 from bench.report.problems import varying_identity
 from bench.report.views import arrange, unsteady
 
@@ -34,11 +35,7 @@ def page_data(
     cells = cells.assign(**{name: arranged.rows[name].to_numpy() for name in swept if name not in cells})
     if "time_s" in cells:
         cells = cells.assign(unsteady=unsteady(cells).astype(float))
-    own = views.columns or [
-        c for c in experiment.columns.all if c.table and c.name not in COMMON and c.kind != "list" and c.name in cells
-        and (cells[c.name].nunique() > 1 if c.kind == "text" else cells[c.name].notna().any())
-    ]  # fmt: skip
-    return cells_data(cells, own, swept, commands)
+    return cells_data(cells, views.columns or own_columns(experiment, cells), swept, commands)
 
 
 def cells_data(
