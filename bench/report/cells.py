@@ -62,11 +62,7 @@ def value_text(column: Column, value: float) -> str:
 
 def end_text(column: Column, value: float) -> str:
     """Return an end of an interval in the format of a column, apart from the column's boundary."""
-    if column.boundary is None or column.format not in ("number", "percent"):
-        return value_text(column, value)
-    if column.format == "percent":
-        return "-" if math.isnan(value) else f"{apart(100 * value, 100 * column.boundary, column.digits)}%"
-    return apart(value, column.boundary, column.digits)
+    return value_text(column, value) if column.boundary is None else apart(value, column.boundary, column.digits)
 
 
 def readable(table: Table) -> pd.DataFrame:
