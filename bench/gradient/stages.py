@@ -168,7 +168,7 @@ class GradientStages:
 
     def gradient_at(self, theta: np.ndarray, w: np.ndarray | None = None) -> np.ndarray:
         """Return the simulator's gradient at ``theta (d,)``."""
-        return np.asarray(self.simulator.gradients(theta[:, None], self.w if w is None else w)[:, 0])
+        return self.simulator.gradients(theta[:, None], self.w if w is None else w)[:, 0]
 
     def _stored_costs(self, space: Subspace, z: np.ndarray) -> np.ndarray:
         keys = [column.tobytes() for column in np.ascontiguousarray(z.T)]

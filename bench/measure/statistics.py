@@ -24,20 +24,6 @@ import numpy as np
 REVISION = 1
 """Raised when a stored number that this module decides moves."""
 
-__all__ = [
-    "UNEXPLAINED",
-    "Sampling",
-    "Summary",
-    "Truth",
-    "bias_interval",
-    "heavy_tails",
-    "is_unexplained",
-    "summarise",
-    "summarise_without_reference",
-    "variance_interval",
-    "variance_per_sample",
-]
-
 ROUNDING = 1e-12
 """Differences below this share of a gradient's size are rounding: no bias, and no spread of the estimates."""
 FEW_REPEATS = 8
@@ -454,49 +440,33 @@ def summarise(
     identical = bool((np.abs(estimates - estimates[0]) <= ROUNDING * np.abs(estimates[0])).all())
     mean = estimates[0] if identical else estimates.mean(axis=0)
     deviations = np.zeros_like(estimates) if identical else estimates - mean
-    difference = mean - reference.mean
-    norm = reference.norm
-
-    bias = bias_low = bias_high = variance = variance_low = variance_high = math.nan
-    per_sample = (math.nan,) * 3
-    if repeats > 1:
-        variance = float(np.vdot(deviations, deviations)) / (repeats - 1)
-        variance_low, variance_high = variance_interval(deviations)
-        sampling = Sampling(deviations / math.sqrt(repeats * (repeats - 1)), repeats - 1)
-        bias, bias_low, bias_high = bias_interval(difference, sampling, *reference.errors)
-        if identical:
-            size = max(norm, float(np.linalg.norm(mean)))
-            rare = THREE / (repeats * samples)
-            bias_low, bias_high = bias_low - rare * size, bias_high + rare * size
-            variance_high = rare * size**2 / samples
-        per_sample = (variance * samples, variance_low * samples, variance_high * samples)
-        if bias_low <= ROUNDING * (norm + float(np.linalg.norm(mean))):
-            bias_low = 0.0
+    norm, grad_norm = reference.norm, float(np.linalg.norm(mean))
+    bias, variance = _spread(deviations, mean, reference, samples, identical)
     errors = estimates - reference.mean
     squared_error = float(np.vdot(errors, errors)) / repeats - reference.standard_error**2
     rmse = math.sqrt(max(0.0, squared_error))
     relative = math.nan if norm <= ROUNDING or reference.vanishes() else norm
     cosine, signs = _directions(estimates, reference.mean)
-    notes = _interval_remarks(deviations, difference, samples, identical)
+    notes = _interval_remarks(deviations, mean - reference.mean, samples, identical)
     notes += _reference_remarks(reference, relative)
-    if unbiased and bias_low > 0.0:
+    if unbiased and bias[1] > 0.0:
         notes.append(f"declared unbiased, and its interval excludes 0: {UNEXPLAINED}, or chance (about 1 row in 30)")
-    scaled = tuple(value * unit * unit for value in per_sample)
+    scaled = tuple(value * samples * unit * unit for value in variance)
     if terms is not None:
         scaled = variance_per_sample(*terms, samples)
         if scaled[1] > 0.0 and math.log(scaled[2] / scaled[1]) < NARROW / (repeats * samples):
             notes.append("all terms are equally far from their mean: the interval of their variance is too narrow")
     return Summary(
-        grad_norm=float(np.linalg.norm(mean)) * unit,
+        grad_norm=grad_norm * unit,
         reference_norm=norm * unit,
         reference_se=reference.standard_error * unit,
-        bias=bias * unit,
-        bias_low=bias_low * unit,
-        bias_high=bias_high * unit,
-        bias_rel=bias / relative,
-        variance=variance * unit * unit,
-        variance_low=variance_low * unit * unit,
-        variance_high=variance_high * unit * unit,
+        bias=bias[0] * unit,
+        bias_low=bias[1] * unit,
+        bias_high=bias[2] * unit,
+        bias_rel=bias[0] / relative,
+        variance=variance[0] * unit * unit,
+        variance_low=variance[1] * unit * unit,
+        variance_high=variance[2] * unit * unit,
         variance_per_sample=scaled[0],
         variance_per_sample_low=scaled[1],
         variance_per_sample_high=scaled[2],
@@ -507,6 +477,25 @@ def summarise(
         finite_fraction=1.0,
         note="; ".join(notes),
     )
+
+
+def _spread(
+    deviations: np.ndarray, mean: np.ndarray, reference: Truth, samples: int, identical: bool
+) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    """Return bias and variance, each with its interval, of estimates with ``deviations (R, d)`` from their mean; NaN for R = 1."""
+    repeats = len(deviations)
+    if repeats == 1:
+        return (math.nan,) * 3, (math.nan,) * 3
+    variance = float(np.vdot(deviations, deviations)) / (repeats - 1)
+    variance_low, variance_high = variance_interval(deviations)
+    sampling = Sampling(deviations / math.sqrt(repeats * (repeats - 1)), repeats - 1)
+    bias, low, high = bias_interval(mean - reference.mean, sampling, *reference.errors)
+    norm, grad_norm = reference.norm, float(np.linalg.norm(mean))
+    if identical:
+        size, rare = max(norm, grad_norm), THREE / (repeats * samples)
+        low, high = low - rare * size, high + rare * size
+        variance_high = rare * size**2 / samples
+    return (bias, 0.0 if low <= ROUNDING * (norm + grad_norm) else low, high), (variance, variance_low, variance_high)
 
 
 def summarise_without_reference(estimates: np.ndarray, samples: int, reason: str) -> Summary:

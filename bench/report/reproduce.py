@@ -15,7 +15,7 @@ from bench.experiment.axes import build_part
 from bench.experiment.cell import Cell
 from bench.experiment.experiment import Budget, Experiment
 from bench.experiment.grid import COUNTS
-from bench.experiment.parameters import NOT_PLUGINS, parse
+from bench.experiment.parameters import NOT_PLUGINS, parsed
 from bench.experiment.study import Study
 from bench.model import Decision, MechanicalScene, Plugin
 from bench.model.identity import changed, identity
@@ -28,8 +28,7 @@ def commands(experiment: Experiment, rows: pd.DataFrame) -> list[list[str]]:
     folders = ",".join(repr(str(folder)) for folder in experiment.plugins)
     known: dict[str, Plugin] = {}
     given = rows["parameters"] if "parameters" in rows else pd.Series("", index=rows.index)
-    parts = dict(zip(given.unique(), parse(pd.DataFrame({"parameters": given.unique()})), strict=True))
-    settings = {text: _settings(part, known, experiment.timing) for text, part in parts.items()}
+    settings = {text: _settings(parsed(text), known, experiment.timing) for text in given.unique()}
     head = [shlex.quote(f"plugins=[{folders}]")] * bool(folders)
     counts = rows[list(COUNTS)].astype(int).to_dict("records")
     return [

@@ -9,16 +9,15 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 
-from bench.errors import unknown
 from bench.experiment import axes
 from bench.experiment.axes import Axis
 from bench.experiment.columns import IDENTITY, Column, interval, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.parameters import number_problems
 from bench.experiment.views import Table, Views
-from bench.report.problems import ProblemRows, split_by_problem
+from bench.report.problems import ProblemRows
 from bench.report.text import axis_value, counted, span
-from bench.report.views import CLOSE, Arranged, arrange, estimator_curves, pareto, rmse_interval
+from bench.report.views import Arranged, arrange, estimator_curves, pareto, rmse_interval
 
 from . import charts, time_to_accuracy
 from .columns import COLUMNS
@@ -101,7 +100,7 @@ def tables(
     experiment: Experiment, rows: pd.DataFrame, shown: Arranged, methods: pd.DataFrame, comparisons: pd.DataFrame
 ) -> list[Table]:
     """Return all tables but those of the cost to reach an error."""
-    result = pivots(experiment, shown)
+    result = pivots(shown)
     result[0] = replace(result[0], data=axes.table(experiment, rows))
     columns = [COLUMNS.by_name[name] for name in ("scene", "contact", "backend", "estimator", "rmse_rel", "time_s")]
     result.append(Table("speed_accuracy", speed_accuracy(rows), columns, files=["csv"]))
@@ -127,54 +126,32 @@ COMPARISON_NOTES = (
 # ------------------------------------------------------------------------------------------- along an axis
 
 
-def pivots(experiment: Experiment, shown: Arranged) -> list[Table]:
-    """Return a table per problem: estimators down, values of its axis across, each cell a relative RMSE.
-
-    The axis is the one that ``table.columns`` names, by default the longest. Raises an error if ``table.columns`` names
-    no swept axis.
-    """
-    parts: Sequence[tuple[Axis | None, ProblemRows]] = problems_by_axis(shown)
-    if experiment.table.columns:
-        axis = _axis(experiment.table.columns, shown)
-        parts = [(axis, problem) for problem in split_by_problem(shown, axis, ("scene", "contact"))]
-    result = [_pivot(axis, problem, "backend" in experiment.table.rows) for axis, problem in parts]
+def pivots(shown: Arranged) -> list[Table]:
+    """Return a table per problem: estimators down, values of its longest axis across, each cell a relative RMSE."""
+    result = [_pivot(axis, problem) for axis, problem in problems_by_axis(shown)]
     return [*result[:-1], replace(result[-1], notes=_notes(result))]
 
 
-def _axis(name: str, shown: Arranged) -> Axis:
-    swept = list(shown.swept())
-    named = [axis for axis in swept if name in (axis.column, axis.short, *axis.names)]
-    if not named:
-        raise unknown("column of the table:", name, [axis.column for axis in swept])
-    return named[0]
-
-
-def _pivot(axis: Axis | None, problem: ProblemRows, apart: bool) -> Table:
-    rows = estimator_curves(problem.rows, None if apart else CLOSE)
+def _pivot(axis: Axis | None, problem: ProblemRows) -> Table:
+    rows = estimator_curves(problem.rows)
     ok, note = rows["status"] == "ok", rows["status"].map(lambda status: FAILURES.get(status, [""])[0])
     low, high = (pd.Series(end, rows.index).where(ok) for end in rmse_interval(rows))
-    rivals = [
-        low[ok & (rows["x"] == x) & (rows["label"] != label)] for x, label in zip(rows["x"], rows["label"], strict=True)
+    others = [
+        ok & (rows["x"] == x) & (rows["label"] != label) for x, label in zip(rows["x"], rows["label"], strict=True)
     ]
-    is_apart = np.array(
-        [len(ends) > 0 and (ends > end).all() for ends, end in zip(rivals, high, strict=True)], dtype=bool
-    )
-    cells = {
-        "": rows["rmse_rel"].where(ok), "_low": low, "_high": high, "_best": ok & (rows["rmse_rel"] < 1) & is_apart,
+    is_apart = [bool(rivals.any() and (low[rivals] > end).all()) for rivals, end in zip(others, high, strict=True)]
+    cells = pd.DataFrame({
+        "": rows["rmse_rel"].where(ok), "_low": low, "_high": high, "_best": ok & (rows["rmse_rel"] < 1) & np.array(is_apart, dtype=bool),
         "_note": note + np.where(rows["reason"] != "", REMARKED, ""),
-    }  # fmt: skip
-    name = rows["label"] + " (" + rows["backends"] + ")" if apart else rows["method"]
+    }).set_axis(rows["method"])  # fmt: skip
     values = sorted(rows["x"].unique())
-    wide = [
-        pd.DataFrame(cells)[rows["x"] == x].set_axis(name[rows["x"] == x]).add_prefix(f"x{i}")
-        for i, x in enumerate(values)
-    ]
+    wide = [cells[(rows["x"] == x).to_numpy()].add_prefix(f"x{i}") for i, x in enumerate(values)]
     columns = [
         interval(f"x{i}", label=axis_value(x) if axis else "relative RMSE", emphasis=f"x{i}_best", note=f"x{i}_note")
         for i, x in enumerate(values)
     ]  # fmt: skip
     return Table(
-        "bias_variance", pd.concat(wide, axis=1).reindex(name.unique()).rename_axis("method").reset_index(), [ESTIMATOR, *columns],
+        "bias_variance", pd.concat(wide, axis=1).reindex(rows["method"].unique()).reset_index(), [ESTIMATOR, *columns],
         f"relative RMSE: {problem.title()}{f', by {axis.title}' if axis else ''}", files=["csv", "md", "tex"], terminal=True,
     )  # fmt: skip
 
