@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -23,8 +24,6 @@ from . import charts, time_to_accuracy
 from .columns import COLUMNS
 from .comparisons import COLUMNS as COMPARED
 from .comparisons import (
-    EQUAL_ROLLOUTS,
-    EQUAL_SAMPLES,
     FAILS,
     NO_RESULT,
     ROLLOUTS,
@@ -47,11 +46,8 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views | None:
         return None
     errors = compare_errors(methods)
     best = time_to_accuracy.table(shown)
-    comparisons = errors if best.empty else pd.concat([errors, time_to_accuracy.comparisons(best)], ignore_index=True)
-    all_tables = tables(experiment, rows, shown, methods, comparisons)
-    all_tables += [] if best.empty else [time_to_accuracy.accuracy_table(best)]
     return Views(
-        all_tables,
+        tables(experiment, rows, shown, methods, errors, best),
         charts.charts(shown, methods, errors, best),
         rows=charts.with_plotted_columns(with_gradient_cost(rows)),
         columns=[
@@ -97,24 +93,29 @@ ESTIMATOR = text("method", label="estimator")
 
 
 def tables(
-    experiment: Experiment, rows: pd.DataFrame, shown: Arranged, methods: pd.DataFrame, comparisons: pd.DataFrame
+    experiment: Experiment,
+    rows: pd.DataFrame,
+    shown: Arranged,
+    methods: pd.DataFrame,
+    errors: pd.DataFrame,
+    best: pd.DataFrame,
 ) -> list[Table]:
-    """Return all tables but those of the cost to reach an error."""
-    result = pivots(shown)
-    result[0] = replace(result[0], data=axes.table(experiment, rows))
-    columns = [COLUMNS.by_name[name] for name in ("scene", "contact", "backend", "estimator", "rmse_rel", "time_s")]
-    result.append(Table("speed_accuracy", speed_accuracy(rows), columns, files=["csv"]))
-    if methods["estimator"].nunique() >= LEAST and methods["problem"].nunique() > 1:
-        result.append(ranking(methods))
-    errors = comparisons[comparisons["basis"].isin((EQUAL_SAMPLES, EQUAL_ROLLOUTS))]
-    result.append(recommendations(methods, errors))
-    result.append(Table("verdicts", methods.drop(columns="setting"), [], files=["csv"]))
-    joined = comparisons.drop(columns="setting").assign(tied=[", ".join(names) for names in comparisons["tied"]])
-    noted = joined.assign(factor_note=limits(joined))
+    """Return all tables; ``best`` is the table of the cost to reach an error."""
+    main, *others = pivots(shown)
+    is_ranked = methods["estimator"].nunique() >= LEAST and methods["problem"].nunique() > 1
+    compared = errors if best.empty else pd.concat([errors, time_to_accuracy.comparisons(best)], ignore_index=True)
+    joined = compared.drop(columns="setting").assign(tied=compared["tied"].map(", ".join))
     columns = [replace(c, note="factor_note") if c.name == "factor" else c for c in COMPARED]
     title = "the first and the next at each setting"
-    result.append(Table("comparisons", noted, columns, title, COMPARISON_NOTES, data=joined))
-    return result
+    return [
+        replace(main, data=axes.table(experiment, rows)), *others,
+        Table("speed_accuracy", speed_accuracy(rows), [], files=["csv"]),
+        *([ranking(methods)] if is_ranked else []),
+        recommendations(methods, errors),
+        Table("verdicts", methods.drop(columns="setting"), [], files=["csv"]),
+        Table("comparisons", joined.assign(factor_note=limits(joined)), columns, title, COMPARISON_NOTES, data=joined),
+        *([] if best.empty else [time_to_accuracy.accuracy_table(best)]),
+    ]  # fmt: skip
 
 
 COMPARISON_NOTES = (
@@ -145,15 +146,21 @@ def _pivot(axis: Axis | None, problem: ProblemRows) -> Table:
         "_note": note + np.where(rows["reason"] != "", REMARKED, ""),
     }).set_axis(rows["method"])  # fmt: skip
     values = sorted(rows["x"].unique())
-    wide = [cells[(rows["x"] == x).to_numpy()].add_prefix(f"x{i}") for i, x in enumerate(values)]
+    wide = _across(cells, rows["x"], values, "x").reindex(rows["method"].unique())
     columns = [
         interval(f"x{i}", label=axis_value(x) if axis else "relative RMSE", emphasis=f"x{i}_best", note=f"x{i}_note")
         for i, x in enumerate(values)
     ]  # fmt: skip
     return Table(
-        "bias_variance", pd.concat(wide, axis=1).reindex(rows["method"].unique()).reset_index(), [ESTIMATOR, *columns],
+        "bias_variance", wide.reset_index(), [ESTIMATOR, *columns],
         f"relative RMSE: {problem.title()}{f', by {axis.title}' if axis else ''}", files=["csv", "md", "tex"], terminal=True,
     )  # fmt: skip
+
+
+def _across(cells: pd.DataFrame, place: pd.Series, values: Sequence[Any], prefix: str) -> pd.DataFrame:
+    """Return cells with those of each place side by side, their columns under the prefix and the number of the place."""
+    parts = [cells[(place == value).to_numpy()].add_prefix(f"{prefix}{i}") for i, value in enumerate(values)]
+    return pd.concat(parts, axis=1)
 
 
 def _notes(result: Sequence[Table]) -> list[str]:
@@ -197,13 +204,10 @@ def ranking(methods: pd.DataFrame) -> Table:
     worst = worst.drop_duplicates(["estimator", "problem"], keep="last")
     shares = worst["verdict"] + np.where(worst["bias_share"] > 0.5, ", biased", "")
     work = worst["evaluations"].map(" ({:.0f}x)".format).where(worst["evaluations"] > MANY, "")
-    worst = worst.assign(note=shares.mask(worst["status"] != "ok", worst["status"]) + work)
-    problems, parts = list(dict.fromkeys(methods["problem"])), []
-    for i, problem in enumerate(problems):
-        own = worst[worst["problem"] == problem].set_index("estimator").reindex(counts.index)
-        named = {"error": f"p{i}", "error_low": f"p{i}_low", "error_high": f"p{i}_high", "note": f"p{i}_note"}
-        parts.append(own[[*named]].rename(columns=named).fillna({f"p{i}_note": ""}))
-    frame = pd.concat([counts, *parts], axis=1).rename_axis("method").reset_index()
+    notes = shares.mask(worst["status"] != "ok", worst["status"]) + work
+    ends = {end: worst[f"error{end}"] for end in ("", "_low", "_high")}
+    problems, cells = methods["problem"].unique(), pd.DataFrame(ends | {"_note": notes}).set_axis(worst["estimator"])
+    frame = counts.join(_across(cells, worst["problem"], problems, "p")).rename_axis("method").reset_index()
     errors = frame[[f"p{i}" for i in range(len(problems))]]
     frame["worst"] = errors.max(axis=1).where(np.isfinite(errors).all(axis=1))
     frame = frame.sort_values("worst", kind="stable", na_position="last")
@@ -212,13 +216,13 @@ def ranking(methods: pd.DataFrame) -> Table:
         *(Column(str(name), format="setting") for name in counts),
         *(interval(f"p{i}", label=problem, note=f"p{i}_note") for i, problem in enumerate(problems)),
     ]
-    notes = (
+    explained = (
         f"Sorted by the worst case. Relative RMSE [95% interval] at equal {_basis(methods)}; where a problem was swept, the largest along "
         "the axis. works: the whole interval is below 1; fails: it is above 1; open: it contains 1 or is not known. biased: more "
         "than half of the squared error is bias. (40x): it evaluates 40 costs and gradients per sample, where others take "
         "one or two.",
     )
-    return Table("ranking", frame, columns, "estimators by their worst case", notes)
+    return Table("ranking", frame, columns, "estimators by their worst case", explained)
 
 
 def _basis(methods: pd.DataFrame) -> str:
