@@ -19,7 +19,7 @@ from bench.model.dynamics import Dynamics
 from bench.model.integrator import Integrator
 from bench.model.ops import Array, Ops, State
 from bench.model.parameters import Plugin, traced
-from bench.model.scene import DisturbedScene, EngineScene, FunctionScene, MechanicalScene, Scene
+from bench.model.scene import EngineScene, FunctionScene, MechanicalScene, Scene
 
 REVISION = 1
 """Raised when a stored number that this module decides moves."""
@@ -301,13 +301,10 @@ class FunctionProgram(Program):
 
     def cost(self, ops: Ops, theta: Array, w: Array) -> Array:
         """Return the scene's cost at theta + sigma w, ``(B,)``; the scene's own noise follows the first d rows of w."""
-        if self.exogenous:
-            w, own_noise = w[: self.dim], w[self.dim :]
+        w, own_noise = (w[: self.dim], [w[self.dim :]]) if self.exogenous else (w, [])
         bound, own = self._own_theta(ops.xp, theta, w) if self._named else (self, theta + self.scene.sigma * w)
-        if isinstance(bound.scene, DisturbedScene):
-            return bound.scene.disturbed_cost(ops.xp, own, own_noise)
         assert isinstance(bound.scene, FunctionScene)
-        return bound.scene.cost(ops.xp, own)
+        return bound.scene.cost(ops.xp, own, *own_noise)
 
 
 class CallableProgram(Program):
