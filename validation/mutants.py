@@ -92,7 +92,7 @@ GROUPS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("reshape(problem.dim, BATCHES, size).mean(axis=2).T", "reshape(problem.dim, size, BATCHES).mean(axis=1).T"),
     ],
     (R, OF_SCORES): [
-        ("if problem.program.has_score_gradient:", "if True:"),
+        ("if not problem.program.score_refusal:", "if True:"),
     ],
     (J, OF_REFERENCE): [
         ("changes[-1] > 0.1 * changes[-2] and", ""),
@@ -140,7 +140,7 @@ GROUPS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("math.hypot(shown, self.unseen)", "shown"),
     ],
     (P, OF_SCORES): [
-        ("return not (self.action_noise and self._moves_start)", "return True"),
+        ("if not (self.action_noise and self._moves_start):", "if True:"),
         ("and self._only_controls and not self._moves_start", "and self._only_controls"),
     ],
     ("plugins/estimators/inverse_variance.py", OF_WEIGHTS): [
@@ -440,7 +440,7 @@ GROUPS: dict[tuple[str, str], list[tuple[str, str]]] = {
         ("derivative = program.continuous and not program.surrogate", "derivative = program.continuous"),
     ],
     ("bench/model/estimator.py", OF_SCORES): [
-        ("if \"score\" in self.needs and not program.has_score_gradient:", "if False:"),
+        ("if \"score\" in self.needs and program.score_refusal:", "if False:"),
     ],
 }  # fmt: skip
 """File and tests to the lines that are replaced. Faults that change no number are omitted, such as in code that only speeds up a search, or a quadrature
