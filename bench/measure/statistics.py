@@ -35,8 +35,6 @@ SYMMETRIC = 1e-6
 """Skewness below which its correction is rounding."""
 VAGUE = 0.1
 """Error of a reference, as a share of its norm, above which a note warns that relative columns are no more accurate."""
-LARGE = 1 << 12
-"""Coordinates from which a covariance that is equal in all directions is one number: as rows it has d x d numbers."""
 NARROW = 10.0
 """Width of the interval of the log variance of terms, times their number, below which it ignores the error of their mean."""
 THREE = 3.0
@@ -62,7 +60,7 @@ class Sampling:
     degrees: float
     """Degrees of freedom: K - 1 for a sample of K, infinite for a known covariance."""
     equal: float = 0.0
-    """A variance that is added to every coordinate, so that an error without direction needs no d rows."""
+    """A variance that is added to every coordinate: that of an error without direction."""
 
     @classmethod
     def of(cls, sample: np.ndarray) -> Sampling:
@@ -73,10 +71,7 @@ class Sampling:
     @classmethod
     def without_direction(cls, error: float, dim: int) -> Sampling:
         """Return the known covariance of an error of norm ``error`` whose direction is unknown."""
-        if dim > LARGE:
-            return cls(np.zeros((0, dim)), math.inf, error**2 / dim)
-        rows = np.eye(dim) * (error / math.sqrt(max(dim, 1))) if error else np.zeros((0, dim))
-        return cls(rows, math.inf)
+        return cls(np.zeros((0, dim)), math.inf, error**2 / dim)
 
     @property
     def trace(self) -> float:
