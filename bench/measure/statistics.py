@@ -60,7 +60,7 @@ class Sampling:
     degrees: float
     """Degrees of freedom: K - 1 for a sample of K, infinite for a known covariance."""
     equal: float = 0.0
-    """A variance that is added to every coordinate: that of an error without direction."""
+    """A standard deviation of every coordinate beside the rows: that of an error without direction."""
 
     @classmethod
     def of(cls, sample: np.ndarray) -> Sampling:
@@ -71,16 +71,16 @@ class Sampling:
     @classmethod
     def without_direction(cls, error: float, dim: int) -> Sampling:
         """Return the known covariance of an error of norm ``error`` whose direction is unknown."""
-        return cls(np.zeros((0, dim)), math.inf, error**2 / dim)
+        return cls(np.zeros((0, dim)), math.inf, error / math.sqrt(dim))
 
     @property
     def trace(self) -> float:
         """Trace of the covariance: the expected squared distance of the mean from its expectation."""
-        return float(np.vdot(self.rows, self.rows) + self.equal * self.rows.shape[1])
+        return float(np.vdot(self.rows, self.rows) + self.equal**2 * self.rows.shape[1])
 
     def over(self, unit: float) -> Sampling:
         """Return the same covariance, measured in ``unit``."""
-        return replace(self, rows=self.rows / unit, equal=self.equal / unit**2)
+        return replace(self, rows=self.rows / unit, equal=self.equal / unit)
 
     def excess(self) -> float:
         """Return the upward bias of tr C^2 as an estimate, where C is the covariance of a sample's mean; 0 for a known C.
@@ -167,8 +167,8 @@ class Truth:
     @property
     def standard_error(self) -> float:
         """Square root of the trace of the covariance of the mean, including the error that sampling does not show."""
-        shown = math.sqrt(self.sampling.trace) if self.sampling.equal else _length(self.sampling.rows)
-        return math.hypot(shown, self.unseen)
+        hidden = self.sampling.equal * math.sqrt(self.mean.size)
+        return math.hypot(_length(self.sampling.rows), hidden, self.unseen)
 
     def vanishes(self) -> bool:
         """Return whether the gradient is not distinguishable from 0, so that relative quantities are undefined."""
@@ -215,7 +215,7 @@ def bias_interval(difference: np.ndarray, *errors: Sampling, level: float = 0.95
     rows = np.concatenate([error.rows for error in errors])
     doubt = sum(error.trace**2 / error.degrees for error in errors)  # Welch: the reciprocal of the degrees of freedom
     # S = rows' rows + equal I
-    equal, dim = sum(error.equal for error in errors), difference.size
+    equal, dim = sum(error.equal**2 for error in errors), difference.size
     square = _trace_square(rows) + equal * (2.0 * float(np.vdot(rows, rows)) + equal * dim)
     square = square - sum(error.excess() for error in errors)
     square = min(max(square, 1.0 / difference.size), 1.0)

@@ -64,7 +64,7 @@ def test_reference_by_batches_is_its_mean_and_covariance():
 def test_error_of_an_exact_reference_is_the_norm_of_its_error():
     truth = Truth.exact(np.zeros(5), error=0.3)
     assert truth.standard_error == pytest.approx(0.3)
-    assert truth.sampling.equal == pytest.approx(0.09 / 5)
+    assert truth.sampling.equal == pytest.approx(0.3 / math.sqrt(5))
     assert Truth.exact(np.zeros(5)).standard_error == 0.0
 
 
