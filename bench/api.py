@@ -76,9 +76,6 @@ class Settings(TypedDict, total=False):
     shard: str
     results_dir: str | Path
     formats: Names
-    table: Mapping[str, Any]
-    columns: str | None
-    rows: Names
     marks: Mapping[str, Mapping[str, float]]
 
 
@@ -148,7 +145,6 @@ def load(directory: str | Path) -> pd.DataFrame:
 
     from bench.experiment.axes import with_axes
     from bench.experiment.columns import Columns
-    from bench.experiment.defaults import completed_rows
     from bench.experiment.study import Study
     from bench.report.views import newest_rows
     from bench.run.rows import recorded_sweep
@@ -161,7 +157,7 @@ def load(directory: str | Path) -> pd.DataFrame:
         rows = Store(directory, study.plugin.columns).load()  # without rows that the study cannot have stored
     if rows.empty:
         raise UserError(f"no rows are stored in '{directory}': run an experiment first, its folder is results_dir/name")
-    return with_axes(recorded_sweep(directory), completed_rows(newest_rows(rows)))
+    return with_axes(recorded_sweep(directory), newest_rows(rows))
 
 
 def list_plugins(*names: str, plugins: str | Path | Sequence[str | Path] = ()) -> pd.DataFrame:

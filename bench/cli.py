@@ -223,11 +223,16 @@ def _load(words: Sequence[str]) -> Experiment:
 
 
 def _run(words: list[str]) -> int:
+    from bench.run.progress import empty_shard
+
     finished = _execute(_load(words), words)
     if isinstance(finished, int):
         return finished
     if finished.experiment.execution.shard is None:
         return _finish(finished, words)[0]
+    if not finished.planned:
+        print(empty_shard(finished.experiment))
+        return 0
     print(
         f"{len(finished.planned)} cells of this shard are stored in '{printable(finished.experiment.directory)}'; "
         "when all shards have run, write tables and charts with `report` and the same words, without shard="

@@ -15,7 +15,7 @@ from trees import ROOT
 
 from bench.experiment import config
 from bench.experiment.columns import IDENTITY
-from bench.experiment.experiment import Experiment, TableLayout
+from bench.experiment.experiment import Experiment
 from bench.experiment.grid import cells
 from bench.model import registry
 from bench.model.identity import parse_identity
@@ -206,7 +206,6 @@ def experiment(
     marks=None,
     name="made_up",
     formats=("png",),
-    table=None,
 ):
     """Return an experiment for reports of made-up rows; it cannot be run."""
     return Experiment(
@@ -219,7 +218,6 @@ def experiment(
         question="As contact stiffens, which gradient stays right?",
         marks={"stiffness": {"step size limit": 6400}} if marks is None else marks,
         formats=formats,
-        table=table or TableLayout(),
     )
 
 

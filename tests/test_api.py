@@ -189,7 +189,7 @@ def test_settings_are_all_settings_of_the_command_line():
     known = {
         name for name in config._known_keys() if name in yaml.safe_load((ROOT / "conf" / "config.yaml").read_text())
     }
-    assert set(Settings.__annotations__) == {*known, *config.LAYOUT}
+    assert set(Settings.__annotations__) == known
 
 
 def test_estimate_is_that_of_a_cell(rows):

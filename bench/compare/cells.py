@@ -12,7 +12,7 @@ import pandas as pd
 from bench.compare import timings
 from bench.compare.judging import Change, Row, judge_cell, rule_of
 from bench.experiment.columns import IDENTITY, Column, Columns
-from bench.experiment.defaults import completed
+from bench.experiment.parameters import completed
 
 OUTCOMES = ("worse", "better", "changed", "same")
 COUNTS = ("samples", "repeats", "seed")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import TYPE_CHECKING, Any
@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 from bench.errors import UserError
 from bench.experiment.cell import VIEWS, labels
 from bench.experiment.experiment import Experiment
-from bench.experiment.grid import COUNTS, THETA, applies, expand, is_theta_axis, parameter_name, swept
-from bench.experiment.parameters import NOT_PLUGINS, as_number, flatten, parse, swept_columns
+from bench.experiment.grid import COUNTS, THETA, expand, parameter_name, swept
+from bench.experiment.parameters import NOT_PLUGINS, of_places, parsed, places, plugin_class
 from bench.model import Plugin, registry
 from bench.model.parameters import build, parameters
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Axis:
-    """One swept quantity: its column, unit and meaning, and its names in the sweep.
+    """One swept quantity: its column and unit, and its names in the sweep.
 
     Names that mean the same parameter of different plugins (``mass_spring.damping``, ``penalty.damping``) are one axis.
     """
@@ -31,7 +31,6 @@ class Axis:
     column: str
     names: tuple[str, ...]
     unit: str = ""
-    doc: str = ""
     moves: tuple[str, ...] = ()
     """Columns of the axes that step together with this axis (a zip)."""
 
@@ -50,43 +49,26 @@ class Axis:
 def values_of(axis: Axis, rows: pd.DataFrame) -> np.ndarray:
     """Return the numbers of an axis, one per row; NaN where it does not apply or is not a number."""
     import numpy as np
-    import pandas as pd
 
     if axis.column in COUNTS:
         return np.asarray(rows[axis.column], dtype=float)
-    table = flatten(rows)
-    values = pd.Series(np.nan, index=range(len(rows)))
-    for column, mask in _places(axis.names, table):
-        numbers = table[column].map(as_number) if table[column].dtype == object else table[column]
-        values = values.fillna(numbers.where(mask).reset_index(drop=True))
-    return np.asarray(values, dtype=float)
+    return of_places(rows, axis.names, lambda found: next((p.number for p in found if p.number == p.number), np.nan))
 
 
 def shown_by(view: str, axis: Axis, rows: pd.DataFrame) -> np.ndarray:
     """Return, per row, whether the column ``view`` (``stiffness`` or ``smoothing``) shows the axis for its contact law."""
-    import numpy as np
 
-    table = flatten(rows)
-    shown = np.zeros(len(rows), dtype=bool)
-    for column, mask in _places(axis.names, table):
-        group, _, parameter = column.partition(".")
-        if group == "contact":
-            laws = table["contact.name"]
-            names = laws.map(smoothing_of, na_action="ignore") if view == "smoothing" else view
-            shown |= (mask & laws.notna() & (names == parameter)).to_numpy(bool)
-    return shown
+    def shows(law: str, parameter: str) -> bool:
+        return parameter == (smoothing_of(law) if view == "smoothing" else view)
 
-
-def _places(names: Iterable[str], table: pd.DataFrame) -> Iterator[tuple[str, pd.Series]]:
-    """Yield the columns of flattened parameters that names in a sweep refer to, each with a mask of its rows."""
-    for name in names:
-        yield from swept_columns(name, table).items()
+    return of_places(
+        rows, axis.names, lambda found: any(p.part == "contact" and shows(p.plugin, p.parameter) for p in found)
+    )
 
 
 def smoothing_of(law: str) -> str:
     """Return the parameter that the column ``smoothing`` shows for a contact law; empty if there is none."""
-    entry = registry.entries()["contacts"].get(law)
-    return str(getattr(entry and entry.plugin, "smoothing", ""))
+    return str(getattr(plugin_class("contact", law), "smoothing", ""))
 
 
 def axes(sweep: Mapping[str, Any], rows: pd.DataFrame) -> list[Axis]:
@@ -98,18 +80,20 @@ def axes(sweep: Mapping[str, Any], rows: pd.DataFrame) -> list[Axis]:
     import numpy as np
     import pandas as pd
 
-    table = flatten(rows).drop_duplicates()
-    coordinates = _varying_coordinates(table) if THETA in swept(sweep) else ()
+    coordinates = _varying_coordinates(rows) if THETA in swept(sweep) else ()
     names = [part for name in swept(sweep) for part in (coordinates if name == THETA else (name,))]
     groups: dict[str, list[str]] = {}
     for name in names:
         groups.setdefault(parameter_name(name), []).append(name)
     result = []
     for own_name, members in groups.items():
-        clash = bool((np.sum([_has_value(name, table) for name in members], axis=0) > 1).any())
+        n_values = sum(
+            of_places(rows, [n], lambda found: int(any(p.value is not None for p in found))) for n in members
+        )
+        clash = bool(np.any(n_values > 1))
         for part in [[name] for name in members] if clash else [members]:
             column = part[0] if clash else own_name
-            axis = Axis(column, tuple(part), *_unit_and_doc(part, table))
+            axis = Axis(column, tuple(part), _unit(part, rows))
             values = values_of(axis, rows)
             is_known = np.isfinite(values)
             if not is_known.any():
@@ -123,20 +107,13 @@ def axes(sweep: Mapping[str, Any], rows: pd.DataFrame) -> list[Axis]:
     return [replace(axis, moves=_columns_in_step(axis, result, together)) for axis in result]
 
 
-def _has_value(name: str, table: pd.DataFrame) -> np.ndarray:
-    """Return, per row of flattened parameters, 1 where a name in the sweep has a value and 0 elsewhere."""
-    import numpy as np
-
-    values = [mask & table[column].notna() for column, mask in _places([name], table)]
-    return np.any(values, axis=0).astype(int) if values else np.zeros(len(table), dtype=int)
-
-
-def _varying_coordinates(table: pd.DataFrame) -> tuple[str, ...]:
+def _varying_coordinates(rows: pd.DataFrame) -> tuple[str, ...]:
     """Return the names of theta0's coordinates that differ between rows; ``theta0`` if it has only one."""
-    coordinates = [column for column in table if is_theta_axis(column)]
+    points = {tuple((parsed(text).get("theta") or {}).get("at") or ()) for text in rows["parameters"].unique()}
+    coordinates = [{at[i] for at in points if i < len(at)} for i in range(max(map(len, points), default=0))]
     if len(coordinates) < 2:
         return (THETA,)
-    return tuple(column for column in coordinates if table[column].nunique() > 1)
+    return tuple(f"{THETA}.{i}" for i, values in enumerate(coordinates) if len(values) > 1)
 
 
 def _columns_in_step(axis: Axis, others: Sequence[Axis], together: Sequence[frozenset[str]]) -> tuple[str, ...]:
@@ -158,17 +135,13 @@ def _zipped_names(sweep: Mapping[str, Any]) -> list[frozenset[str]]:
     return groups
 
 
-def _unit_and_doc(names: Iterable[str], table: pd.DataFrame) -> tuple[str, str]:
-    """Return unit and meaning of a parameter, as its plugins declare them; empty strings if their units differ."""
-    meanings = {}
-    for column, mask in _places(names, table):
-        axis, _, parameter = column.partition(".")
-        for plugin in table.loc[mask, f"{axis}.name"].unique() if f"{axis}.name" in table else ():
-            entry = registry.entries().get(registry.kind_of(axis), {}).get(plugin)
-            declared = parameters(entry.plugin).get(parameter) if entry and entry.plugin else None
-            if declared is not None:
-                meanings[declared.unit] = declared.doc
-    return next(iter(meanings.items())) if len(meanings) == 1 else ("", "")
+def _unit(names: Sequence[str], rows: pd.DataFrame) -> str:
+    """Return the unit of a parameter, as its plugins declare it; empty if their units differ."""
+    found: set[tuple[str, str, str]] = set()
+    of_places(rows, names, lambda places: found.update(place[:3] for place in places))
+    plugins = [(plugin_class(part, plugin), parameter) for part, plugin, parameter in found]
+    units = {parameters(plugin)[name].unit for plugin, name in plugins if plugin and name in parameters(plugin)}
+    return units.pop() if len(units) == 1 else ""
 
 
 def with_axes(sweep: Mapping[str, Any], rows: pd.DataFrame) -> pd.DataFrame:
@@ -182,15 +155,10 @@ def table(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:
     extra = [name for name in wide if name not in rows]
     wide = wide.reindex(columns=[*experiment.columns.table, *extra, "study", "parameters"])
     texts = [name for name in experiment.columns.of_kind("text") if name in wide]
-    escaped = {name: {text: _escape_formula(text) for text in wide[name].unique()} for name in texts}
-    # a column without formulas keeps its strings, of which equal ones are one object
-    changed = [name for name in texts if any(new is not old for old, new in escaped[name].items())]
-    return wide.assign(**{name: wide[name].map(escaped[name]) for name in changed})
-
-
-def _escape_formula(text: Any) -> Any:
-    """Return text with an apostrophe before a formula's sign, so that a spreadsheet shows it instead of evaluating it."""
-    return f"'{text}" if isinstance(text, str) and text.lstrip()[:1] in ("=", "+", "-", "@") else text
+    # an apostrophe before a formula's sign, so that a spreadsheet shows the text instead of evaluating it
+    formulas = {name: wide[name].str.lstrip().str[:1].isin(["=", "+", "-", "@"]) for name in texts}
+    changed = {name: wide[name].mask(rows, "'" + wide[name]) for name, rows in formulas.items() if rows.any()}
+    return wide.assign(**changed)
 
 
 def build_plugins(given: Mapping[str, Any]) -> dict[str, Plugin | None]:
@@ -216,7 +184,7 @@ def relabel(rows: pd.DataFrame, axes: Sequence[Axis]) -> pd.DataFrame:
     read = cache(lambda text: _labels(json.loads(text), names, views))
     codes, distinct = pd.factorize(rows["parameters"])
     lines = []
-    for given in parse(pd.DataFrame({"parameters": distinct})):
+    for given in map(parsed, distinct):
         estimator = {axis: part for axis, part in given.items() if axis == "estimator"}
         problem = {axis: part for axis, part in given.items() if axis != "estimator"}
         lines.append(read(json.dumps(problem)) | read(json.dumps(estimator)))
@@ -225,12 +193,10 @@ def relabel(rows: pd.DataFrame, axes: Sequence[Axis]) -> pd.DataFrame:
 
 
 def _labels(given: Mapping[str, Any], names: Sequence[str], views: Sequence[str]) -> dict[str, str]:
-    hidden = {
-        axis: {parameter for name in names if (parameter := applies(name, axis, part["name"], part))}
-        for axis, part in given.items()
-        if axis not in NOT_PLUGINS and part is not None
-    }
-    if "estimator" in given and not hidden.get("estimator"):
+    hidden: dict[str, set[str]] = {axis: set() for axis in given}
+    for place in places(names, given):
+        hidden.setdefault(place.part, set()).add(place.parameter)
+    if "estimator" in given and not hidden["estimator"]:
         return {}
     try:
         return labels(build_plugins(given), hidden, views)

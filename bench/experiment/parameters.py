@@ -1,145 +1,190 @@
-"""Flattens the parameters of stored rows into typed columns, and identifies the problem of each row.
+"""Reads the JSON of stored rows' parameters: plugins with today's defaults, swept quantities, and problems.
 
-A row contains its plugins' parameters as JSON. :func:`flatten` turns them into columns once; swept axes, tables, charts
-and pages read these columns. Errors and costs may be compared between rows of one **problem**: rows with the same
-parameters of some parts of the grid (by default :data:`PROBLEM`) and of the study, and the same theta, see
-:func:`problem_columns`.
+A stored row contains every parameter of its plugins and of its study. If a plugin has gained a parameter since, the row
+counts as computed with that parameter's present default: all code that compares, groups or shows rows by their parameters
+reads them through :func:`completed`, :func:`parsed` or :func:`completed_rows`. Each distinct JSON text is read once.
+
+Errors and costs may be compared between rows of one **problem**: rows with the same parameters of some parts of the grid
+(by default :data:`PROBLEM`) and of the study, and the same theta, see :func:`number_problems`.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from bench.experiment.defaults import completed_json
+from bench.experiment.experiment import Budget
 from bench.experiment.grid import THETA, applies, is_theta_axis
-from bench.model import registry
+from bench.model import Decision, Plugin, registry
+from bench.model.identity import plain
+from bench.model.parameters import parameters, singular
 
 if TYPE_CHECKING:
+    import numpy as np
     import pandas as pd
 
 PROBLEM = ("scene", "contact", "integrator")
 """The parts of the grid that decide the simulation, and so the gradient that estimates are compared with."""
-NOT_PLUGINS = ("study", "theta", "reference")
+RECORDS = {"theta": Decision, "reference": Budget}
+"""Entries of a row's parameters that are dataclasses of the harness instead of plugins."""
+NOT_PLUGINS = ("study", *RECORDS)
 """Entries of a row's parameters that are not plugins on an axis of the grid."""
 
 
-def parse(rows: pd.DataFrame) -> list[Mapping[str, Any]]:
-    """Return each row's parameters by axis, with today's defaults for missing ones; empty if the row stores none."""
-    return [_parsed(text, registry.folders()) for text in rows["parameters"]]
+# ---------------------------------------------------------------------------------------------------------- defaults
+
+
+def completed(given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a row's parameters with today's defaults where a plugin, the study, theta or the reference lacks one.
+
+    Parameters are in the order in which they are declared today, followed by parameters that are no longer declared. The
+    parameters of a plugin that is not installed are unchanged. The result is empty if ``given`` is.
+    """
+    scene = (given.get("scene") or {}).get("name")
+    result = {
+        axis: part and _defaults(axis, part.get("name"), scene, registry.folders()) | part
+        for axis, part in given.items()
+    }
+    records = {name: result.pop(name, None) for name in RECORDS if given}
+    return result | records
+
+
+@lru_cache(maxsize=1000)
+def _defaults(axis: str, name: str | None, scene: str | None, folders: tuple[Path, ...]) -> dict[str, Any]:
+    """Return the name and today's defaults, for JSON, of an entry of a row's parameters.
+
+    The scene's own values of contact parameters replace the contact law's. Parameters without a default are omitted.
+    """
+    if axis in RECORDS:
+        return {field: plain(value) for field, value in dataclasses.asdict(RECORDS[axis]()).items()}
+    plugin = plugin_class(axis, name)
+    declared = parameters(plugin) if plugin else {}
+    values = {key: one.default for key, one in declared.items() if one.default is not dataclasses.MISSING}
+    if axis == "contact":
+        of_scene = getattr(plugin_class("scene", scene), "contact_values", {})
+        values |= {key: value for key, value in of_scene.items() if key in values}
+    return {"name": name} | {key: plain(value) for key, value in values.items()}
+
+
+def plugin_class(axis: str, name: str | None) -> type[Plugin] | None:
+    """Return the class of the plugin ``name`` on an axis such as ``scene``; None if it is not installed."""
+    kind = next((kind for kind in registry.kinds() if singular(kind) == axis), "")
+    entry = registry.entries().get(kind, {}).get(str(name))
+    return entry.plugin if entry is not None else None
+
+
+def parsed(text: str) -> Mapping[str, Any]:
+    """Return :func:`completed` parameters from the JSON of a row; empty if the row stores none."""
+    return _read(text, registry.folders())[0]
+
+
+def completed_json(text: str) -> str:
+    """Return :func:`completed` parameters as JSON in the format of new rows; an empty string is returned unchanged."""
+    return _read(text, registry.folders())[1]
 
 
 @lru_cache(maxsize=20_000)
-def _parsed(text: str, folders: tuple[Path, ...]) -> Mapping[str, Any]:
-    given: Mapping[str, Any] = json.loads(completed_json(text)) if text else {}
-    return given
+def _read(text: str, folders: tuple[Path, ...]) -> tuple[Mapping[str, Any], str]:
+    """Return completed parameters and their JSON, cached by plugin ``folders`` too: an added folder may define a plugin."""
+    if not text:
+        return {}, text
+    given = completed(json.loads(text))
+    return given, json.dumps(given, separators=(",", ":"))
 
 
-def flatten(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return the parameters of rows as typed columns, with the rows' index.
-
-    Columns are ``scene.mass`` for a plugin's parameter, ``scene.name`` for its name, ``theta.names`` for the parameters
-    that theta names, and ``theta0.2`` for a coordinate of the point at which gradients are taken. Numbers are float64,
-    including infinities; other values are objects. A value is missing if the row's plugin has no such parameter or the
-    parameter is null.
-    """
-    import pandas as pd
-
-    if rows.empty:
-        return pd.DataFrame(index=rows.index)
-    codes, texts = pd.factorize(rows["parameters"])
-    return _flattened(tuple(texts), registry.folders()).take(codes).set_axis(rows.index)
+def completed_rows(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return rows with the column ``parameters`` completed, so that rows stored before and after a change agree."""
+    texts = {text: completed_json(text) for text in rows["parameters"].unique()}
+    if all(text == new for text, new in texts.items()):
+        return rows
+    return rows.assign(parameters=rows["parameters"].map(texts))
 
 
-@lru_cache(maxsize=64)
-def _flattened(texts: tuple[str, ...], folders: tuple[Path, ...]) -> pd.DataFrame:
-    import pandas as pd
-
-    lines = [_flat(_parsed(text, folders)) for text in texts]
-    names = dict.fromkeys(name for line in lines for name in line)
-    return pd.DataFrame({name: _typed([line.get(name) for line in lines]) for name in names}, index=range(len(lines)))
+# --------------------------------------------------------------------------------------------------- swept quantities
 
 
-def _flat(given: Mapping[str, Any]) -> dict[str, Any]:
-    """Return one row's parameters by column."""
-    line: dict[str, Any] = {}
-    for axis, part in given.items():
-        for name, value in (part or {}).items():
-            if (axis, name) == ("theta", "at"):
-                line |= {f"{THETA}.{i}": coordinate for i, coordinate in enumerate(value or ())}
-            else:
-                line[f"{axis}.{name}"] = tuple(value) if isinstance(value, list) else value
-    return line
+class Place(NamedTuple):
+    """A swept quantity of a row: the part of the grid, its plugin and parameter, and the value."""
+
+    part: str
+    plugin: str
+    parameter: str
+    value: Any
+
+    @property
+    def number(self) -> float:
+        """The value as a float; NaN if it is not a number. Infinities are stored as strings."""
+        is_number = isinstance(self.value, int | float) and not isinstance(self.value, bool)
+        return float(self.value) if is_number or self.value in ("inf", "-inf") else math.nan
 
 
-def _typed(values: Sequence[Any]) -> pd.Series:
-    """Return values as float64 if all of them are numbers, infinities (stored as strings) or missing; else as objects."""
-    import pandas as pd
-
-    numbers = [as_number(value) for value in values]
-    is_number = [value is None or not math.isnan(number) for value, number in zip(values, numbers, strict=True)]
-    if all(is_number) and any(value is not None for value in values):
-        return pd.Series(numbers, dtype="float64")
-    return pd.Series(values, dtype=object)
-
-
-def as_number(value: Any) -> float:
-    """Return a parameter as a float; NaN if it is not a number. Infinities are stored as strings."""
-    if isinstance(value, bool) or not isinstance(value, int | float | str):
-        return math.nan
-    if isinstance(value, str):
-        return float(value) if value in ("inf", "-inf") else math.nan
-    return float(value)
-
-
-def swept_columns(name: str, table: pd.DataFrame) -> dict[str, pd.Series]:
-    """Return the columns of a flattened ``table`` that a sweep's ``name`` refers to, each with a mask of its rows.
+def places(names: Collection[str], given: Mapping[str, Any]) -> list[Place]:
+    """Return what names in a sweep refer to in a row's parameters.
 
     ``gamma``, ``alpha_order.gamma``, ``estimator.gamma`` and ``estimator.alpha_order.gamma`` name the same parameter.
-    ``theta0`` refers to its only coordinate, and to no column in rows where theta has several.
+    ``theta0`` refers to the only coordinate of theta, and to nothing where theta has several.
     """
-
-    if is_theta_axis(name):
-        column = f"{THETA}.0" if name == THETA else name
-        is_single = table[f"{THETA}.1"].isna() if name == THETA and f"{THETA}.1" in table else True
-        return {column: table[column].notna() & is_single} if column in table else {}
-    parameter = name.rpartition(".")[2]
-    columns = {}
-    for axis in (column.removesuffix(".name") for column in table if column.endswith(".name")):
-        if axis in NOT_PLUGINS or f"{axis}.{parameter}" not in table or parameter == "name":
+    result = []
+    for name in names:
+        if is_theta_axis(name):
+            at = (given.get("theta") or {}).get("at") or ()
+            index = int(name.partition(".")[2] or 0)
+            if index < len(at) and (name != THETA or len(at) == 1):
+                result.append(Place(THETA, "", name, at[index]))
             continue
-        plugins = table[f"{axis}.name"]
-        if used := [plugin for plugin in plugins.dropna().unique() if applies(name, axis, plugin, (parameter,))]:
-            columns[f"{axis}.{parameter}"] = plugins.isin(used)
-    return columns
+        parameter = name.rpartition(".")[2]
+        for part, entry in given.items():
+            is_plugin = entry and part not in NOT_PLUGINS
+            if is_plugin and parameter in entry and parameter != "name" and applies(name, part, entry["name"], entry):
+                result.append(Place(part, entry["name"], parameter, entry[parameter]))
+    return result
 
 
-def problem_columns(
-    rows: pd.DataFrame, parts: Collection[str] = PROBLEM, without: Collection[str] = ()
-) -> pd.DataFrame:
-    """Return the columns that identify the problem of each row: equal rows are the same problem.
+def of_places(rows: pd.DataFrame, names: Collection[str], value: Callable[[Sequence[Place]], Any]) -> np.ndarray:
+    """Return a value per row, computed from the places that names in a sweep refer to."""
+    import numpy as np
+    import pandas as pd
 
-    The columns are all parameters of the axes ``parts`` and of the study, and theta, except the swept names ``without``.
-    """
-    table = flatten(rows)
-    wanted = [f"{part}." for part in (*parts, "study", "theta", THETA)]
-    problem = table[[column for column in table if column.startswith(tuple(wanted))]]
-    for name in without:
-        for column, mask in swept_columns(name, table).items():
-            if column in problem:
-                problem = problem.assign(**{column: problem[column].mask(mask)})
-    return problem
+    codes, texts = pd.factorize(rows["parameters"])
+    values = [value(found) for found in _places(tuple(names), tuple(texts), registry.folders())]
+    return np.array(values)[codes] if values else np.empty(0)
+
+
+@lru_cache(maxsize=32)
+def _places(names: tuple[str, ...], texts: tuple[str, ...], folders: tuple[Path, ...]) -> list[list[Place]]:
+    return [places(names, parsed(text)) for text in texts]
+
+
+# ------------------------------------------------------------------------------------------------------------ problems
 
 
 def number_problems(rows: pd.DataFrame, parts: Collection[str] = PROBLEM, without: Collection[str] = ()) -> pd.Series:
-    """Return the number of each row's problem, counted from 0 in order of appearance; see :func:`problem_columns`."""
+    """Return the number of each row's problem, counted from 0 in order of appearance.
+
+    Rows of a problem have equal parameters of the axes ``parts`` and of the study, and equal theta, except the swept
+    names ``without``.
+    """
     import pandas as pd
 
-    table = problem_columns(rows, parts, without)
-    if not len(table.columns):
-        return pd.Series(0, index=rows.index)
-    return table.groupby([*table], dropna=False, sort=False).ngroup()
+    codes, texts = pd.factorize(rows["parameters"])
+    problems: dict[frozenset[Any], int] = {}
+    numbers = [problems.setdefault(_problem(parsed(text), parts, without), len(problems)) for text in texts]
+    return pd.Series(pd.array(numbers, dtype="int64")[codes], index=rows.index)
+
+
+def _problem(given: Mapping[str, Any], parts: Collection[str], without: Collection[str]) -> frozenset[Any]:
+    """Return what identifies the problem of a row's parameters: they count as missing if they are null."""
+    ignored = {(place.part, place.parameter) for place in places(without, given)}
+    found = []
+    for part in (*parts, "study", "theta"):
+        for name, value in (given.get(part) or {}).items():
+            if (part, name) == ("theta", "at"):
+                found += [((THETA, f"{THETA}.{i}"), coordinate) for i, coordinate in enumerate(value or ())]
+            elif value is not None:
+                found.append(((part, name), tuple(value) if isinstance(value, list) else value))
+    return frozenset(item for item in found if item[0] not in ignored)

@@ -24,8 +24,9 @@ from matplotlib.ticker import FixedLocator
 
 from bench.experiment.columns import Column
 from bench.experiment.views import Chart, Mark, Style
+from bench.report.colours import looks_by_name
 from bench.report.scales import log_axis
-from bench.report.style import GREY, MARKERS, MARKS, SHADE, SIZE, colour, filled, plain, width_in_inches
+from bench.report.style import GREY, MARKS, SHADE, SIZE, filled, plain, width_in_inches
 from bench.report.text import axis_value, duration
 from bench.report.views import is_logarithmic, pareto
 
@@ -60,7 +61,7 @@ def draw(chart: Chart, width: float | None = None) -> Figure:
         width = NARROW if len(panels) == 1 and is_plot else WIDTH
     across = _across(chart, len(panels), width)
     down = math.ceil(len(panels) / across)
-    styles = series_styles(chart)
+    styles = looks_by_name([chart])
 
     rows = [[] if is_plot else _categories(chart.y[0], part, downwards=True) for _, part in panels]
     # panels with the same rows have labels once, at the left
@@ -126,18 +127,6 @@ def draw(chart: Chart, width: float | None = None) -> Figure:
 def _across(chart: Chart, count: int, width: float) -> int:
     most = max(1, min(chart.across, count, round(chart.across * width / WIDTH)))
     return math.ceil(count / math.ceil(count / most))
-
-
-def series_styles(chart: Chart) -> dict[str, Style]:
-    """Return a style for each series or level of a chart; those without a given style get a colour each."""
-    column = chart.level if chart.kind == "grid" else chart.series
-    names = list(dict.fromkeys(chart.frame[column].astype(str))) if column else [""]
-    ordered = [name for name in chart.styles if name in names] + [name for name in names if name not in chart.styles]
-    free = (i for i in range(1000) if colour(i) not in {style.colour for style in chart.styles.values()})
-    return {
-        name: chart.styles[name] if name in chart.styles else Style(colour(i := next(free)), MARKERS[i % len(MARKERS)])
-        for name in ordered
-    }
 
 
 # ------------------------------------------------------------------------------------- title, legend and texts

@@ -16,7 +16,7 @@ from bench.experiment.axes import build_part
 from bench.experiment.cell import Cell
 from bench.experiment.experiment import Budget, Experiment
 from bench.experiment.grid import COUNTS
-from bench.experiment.parameters import NOT_PLUGINS, parse
+from bench.experiment.parameters import NOT_PLUGINS, parsed
 from bench.experiment.study import Study
 from bench.model import Decision, MechanicalScene, Plugin
 from bench.model.identity import changed, identity
@@ -29,8 +29,7 @@ def commands(experiment: Experiment, rows: pd.DataFrame) -> list[list[str]]:
     folders = [shlex.quote(word) for word in plugin_folders(experiment.plugins)]
     known: dict[str, Plugin] = {}
     given = rows["parameters"] if "parameters" in rows else pd.Series("", index=rows.index)
-    parts = dict(zip(given.unique(), parse(pd.DataFrame({"parameters": given.unique()})), strict=True))
-    around = {text: _settings_around_counts(part, known, experiment.timing) for text, part in parts.items()}
+    around = {text: _settings_around_counts(parsed(text), known, experiment.timing) for text in given.unique()}
     result = []
     for text, *counts in zip(given, *(rows[name] for name in COUNTS), strict=True):
         before, after = around[text]

@@ -18,8 +18,8 @@ import pandas as pd
 
 from bench.experiment.axes import Axis, axes, relabel, shown_by, values_of
 from bench.experiment.columns import IDENTITY
-from bench.experiment.defaults import completed_rows
 from bench.experiment.experiment import Experiment
+from bench.experiment.parameters import completed_rows
 from bench.measure.timing import NOISY
 from bench.report.text import number
 

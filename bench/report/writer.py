@@ -14,6 +14,7 @@ from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Table, Views
 from bench.report import terminal
 from bench.report.cells import TableCell, parts, readable, text_rows
+from bench.report.colours import looks_by_name
 from bench.report.draw import draw
 from bench.report.figures import save, styled
 from bench.report.latex import latex
@@ -43,11 +44,12 @@ def write(experiment: Experiment, views: Views, drawn: Sequence[tuple[Chart, Fig
 
 def drawings(experiment: Experiment, views: Views) -> list[tuple[Chart, Figure]]:
     """Return the charts with enough values to show something, drawn; those without a title have the experiment's question."""
+    charts = [chart for chart in views.charts if _is_telling(chart)]
+    looks = looks_by_name(charts)
     with styled():
         return [
-            (chart, draw(replace(chart, title=chart.title or experiment.question)))
-            for chart in views.charts
-            if _is_telling(chart)
+            (chart, draw(replace(chart, title=chart.title or experiment.question, styles={**looks, **chart.styles})))
+            for chart in charts
         ]
 
 

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 from bench.errors import StorageError, Unsupported, UserError
 from bench.experiment.cell import Cell
-from bench.experiment.defaults import completed_rows
 from bench.experiment.experiment import Experiment
+from bench.experiment.parameters import completed_rows
 from bench.experiment.study import study_of
 from bench.measure import timing
 from bench.model import Estimator, guard

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 from bench.engines.backend import EngineBackend
 from bench.errors import UserError
 from bench.experiment.cell import Cell
-from bench.experiment.defaults import completed_json
 from bench.experiment.experiment import Experiment
 from bench.experiment.grid import COUNTS, cells
+from bench.experiment.parameters import completed_json
 from bench.experiment.study import study_of
 from bench.model import Backend, Plugin, guard
 from bench.model.parameters import remember

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from bench.errors import printable
 from bench.experiment.experiment import Experiment
+from bench.experiment.grid import cells
 from bench.run import record
 from bench.run.plan import Planned, expected_seconds
 
@@ -39,9 +40,8 @@ class Progress:
         self._n_done = sum(item.stored for item in planned)
         self._current = ""
         self._failed: Counter[str] = Counter()
-        self._task = bars.add_task(
-            printable(name), total=self._n_cells, completed=self._n_done, counts=self._counts(), current=""
-        )
+        self._n_due = sum(item.runs for item in planned)  # stored and refused cells take no time
+        self._task = bars.add_task(printable(name), total=self._n_due, counts=self._counts(), current="")
         self._printed_at = time.monotonic() + FIRST_LINE_S - LINE_S
         if lines and self._n_done:
             print(f"{name}: {self._n_done} of {self._n_cells} cells are stored", file=sys.stderr)
@@ -59,7 +59,8 @@ class Progress:
         self._show()
 
     def _show(self) -> None:
-        self._bars.update(self._task, completed=self._n_done, counts=self._counts(), current=self._current)
+        n_run = max(0, self._n_done - self._n_cells + self._n_due)
+        self._bars.update(self._task, completed=n_run, counts=self._counts(), current=self._current)
         if self._lines and time.monotonic() - self._printed_at > LINE_S:
             self._printed_at = time.monotonic()
             seconds = self._bars.tasks[0].time_remaining
@@ -133,6 +134,9 @@ def print_others(experiment: Experiment, planned: Sequence[Planned], keys: Itera
 
 def print_plan(experiment: Experiment, planned: Sequence[Planned], rows: pd.DataFrame) -> None:
     """Print the number of cells, how many are stored, to run and refused, the reasons, and the expected time."""
+    if not planned:
+        print(empty_shard(experiment))
+        return
     n_stored = sum(item.stored for item in planned)
     refusals = [item.refusal for item in planned if item.refusal is not None]
     runs = [item for item in planned if item.runs]
@@ -144,3 +148,12 @@ def print_plan(experiment: Experiment, planned: Sequence[Planned], rows: pd.Data
         seconds = expected_seconds(runs, rows)
         known = f"about {seconds:.0f} s of one worker, without new references"
         print(f"expected time: {'not known before some cells have run' if math.isnan(seconds) else known}")
+
+
+def empty_shard(experiment: Experiment) -> str:
+    """Return the sentence about a shard without cells."""
+    number, count = experiment.execution.shard or (1, 1)
+    return (
+        f"shard {number}/{count} of {experiment.name} is empty: the sweep has {len(cells(experiment))} cells, and those of "
+        "one reference are in one shard; nothing to run"
+    )

@@ -1,9 +1,13 @@
-"""Parameters of stored rows as typed columns, and the columns that make rows the same problem."""
+"""Parameters of stored rows: today's defaults, what a name in a sweep refers to, and rows of the same problem."""
 
-import numpy as np
+import json
+
+import pandas as pd
+import pytest
 from helpers import loaded, rows_of
 
-from bench.experiment.parameters import flatten, number_problems, problem_columns, swept_columns
+from bench.experiment.axes import Axis, values_of
+from bench.experiment.parameters import completed, completed_json, completed_rows, number_problems, parsed, places
 
 WORDS = ("scenes=[pushing,quadratic]", "contacts=[penalty]", "backends=[numpy]", "estimators=[reinforce,alpha_order]")
 
@@ -12,28 +16,70 @@ def rows_with(*words):
     return rows_of(*loaded(*WORDS, *words))
 
 
-def test_parameters_are_columns_with_their_type():
+@pytest.fixture(scope="module")
+def text():
+    return rows_with("theta=[mass]", "scenes=[pushing]", "estimators=[alpha_order]")["parameters"].iloc[0]
+
+
+def without(text, axis, *names):
+    given = json.loads(text)
+    for name in names:
+        del given[axis][name]
+    return given
+
+
+# ---------------------------------------------------------------------------------------------------------- defaults
+
+
+@pytest.mark.parametrize(
+    ("axis", "name"),
+    [("scene", "hold"), ("estimator", "gamma"), ("study", "timed_calls"), ("backend", "dtype"), ("theta", "at"),
+     ("reference", "samples")],
+)  # fmt: skip
+def test_a_missing_parameter_is_its_present_default_in_its_declared_place(text, axis, name):
+    assert completed_json(json.dumps(without(text, axis, name))) == text
+    assert completed_json(text) == text
+
+
+def test_a_missing_contact_parameter_is_the_value_of_the_scene(text):
+    old = without(text, "contact", "stiffness")
+    old["scene"] = {"name": "bouncing_ball"}
+    assert completed(old)["contact"]["stiffness"] == 1e4
+    old["scene"] = {"name": "no_such_scene", "mass": 2.0}
+    assert completed(old)["contact"]["stiffness"] == 1e3  # the law's own
+    assert completed(old)["scene"] == old["scene"]
+
+
+def test_parameters_in_another_order_and_unknown_ones_are_kept(text):
+    given = json.loads(text)
+    given["scene"] = {"retired": 3, **dict(reversed(given["scene"].items()))}
+    assert list(completed(given)["scene"]) == [*json.loads(text)["scene"], "retired"]
+
+
+def test_rows_of_old_and_new_have_the_same_parameters(text):
+    rows = pd.DataFrame({"parameters": [json.dumps(without(text, "scene", "hold")), text, "", "{}"]})
+    assert completed_rows(rows)["parameters"].tolist() == [text, text, "", "{}"]
+
+
+# --------------------------------------------------------------------------------------------------- names of a sweep
+
+
+@pytest.mark.parametrize("name", ["delta", "alpha_order.delta", "estimator.delta", "estimator.alpha_order.delta"])
+def test_a_swept_name_means_the_parameter_of_the_plugins_that_it_names(name):
+    reinforce, alpha_order = map(parsed, rows_with("scenes=[pushing]")["parameters"])
+    assert places([name], alpha_order)[0][:3] == ("estimator", "alpha_order", "delta")
+    assert not places([name], reinforce)
+    assert not places(["study.timed_calls", "reinforce.delta", "name"], alpha_order)
+
+
+def test_the_values_of_an_axis_are_numbers():
     rows = rows_with()
-    table = flatten(rows)
-    assert list(table.index) == list(rows.index)
-    assert table["scene.name"].tolist() == ["pushing", "pushing", "quadratic", "quadratic"]
-    assert table["scene.mass"].dtype == np.float64
-    assert table["scene.mass"].tolist()[:2] == [0.1, 0.1]
-    assert table["scene.mass"].isna().tolist() == [False, False, True, True]
-    assert table["contact.damping_mode"].tolist()[0] == "clipped"
-    assert flatten(rows.iloc[:0]).empty
+    assert values_of(Axis("mass", ("mass",)), rows).tolist()[:2] == [0.1, 0.1]
+    for name in ("quadratic.mass", "damping_mode"):
+        assert pd.isna(values_of(Axis(name, (name,)), rows)).all()
 
 
-def test_a_swept_name_means_the_parameter_of_the_plugins_that_it_names():
-    table = flatten(rows_with())
-    for name in ("delta", "alpha_order.delta", "estimator.delta", "estimator.alpha_order.delta"):
-        ((column, mask),) = swept_columns(name, table).items()
-        assert column == "estimator.delta"
-        assert (mask & table[column].notna()).tolist() == [False, True, False, True], name
-    assert not swept_columns("study.timed_calls", table)
-    assert not any(
-        mask.any() and table.loc[mask, c].notna().any() for c, mask in swept_columns("reinforce.delta", table).items()
-    )
+# ------------------------------------------------------------------------------------------------------------ problems
 
 
 def test_a_problem_is_scene_law_integrator_study_and_theta_less_the_swept_names():
@@ -41,4 +87,3 @@ def test_a_problem_is_scene_law_integrator_study_and_theta_less_the_swept_names(
     assert number_problems(rows).tolist() == [0, 0, 1, 1, 2, 2]
     assert number_problems(rows, without=["mass"]).tolist() == [0, 0, 1, 1, 0, 0]
     assert number_problems(rows, ["backend"]).nunique() == 1
-    assert not any(column.startswith(("estimator.", "backend.")) for column in problem_columns(rows))

@@ -31,7 +31,6 @@ from trees import ROOT
 
 from bench.experiment import config
 from bench.experiment.axes import axes
-from bench.experiment.experiment import TableLayout
 from bench.report import latex, views, writer
 from bench.report.draw import draw
 from bench.report.figures import save, styled
@@ -351,15 +350,13 @@ def test_best_is_told_only_where_its_interval_is_apart_from_every_other_estimato
             known[f"variance_{end}"] = [ends[name][place] for name in known["estimator"]]
         return known.assign(rmse=[1.2 if name == "fobg" else 2.0 for name in known["estimator"]])
 
-    def bold(made, **more):
-        return [cell for part in paper(made, **more) for cell in part.frame["x0_best"]]
+    def bold(made):
+        return [cell for part in paper(made) for cell in part.frame["x0_best"]]
 
-    by_backend = {"table": TableLayout(rows=("estimator", "backend"))}
-    assert bold(rows((2.5, 4.0)), **by_backend) == [True, True, False, False]
-    assert not any(bold(rows((1.9, 4.0)), **by_backend))
-    assert not any(bold(rows((2.5, 4.0)).assign(variance_low=math.nan), **by_backend))
-    assert not any(bold(rows((2.5, 4.0)).assign(rmse_rel=1.5), **by_backend)), "nothing that is no better than zero"
-    assert bold(rows((2.5, 4.0))) == [True, False]
+    assert bold(rows((2.5, 4.0))) == [True, False], "backends that agree share a row"
+    assert not any(bold(rows((1.9, 4.0))))
+    assert not any(bold(rows((2.5, 4.0)).assign(variance_low=math.nan)))
+    assert not any(bold(rows((2.5, 4.0)).assign(rmse_rel=1.5))), "nothing that is no better than zero"
     made = paper(rows((2.5, 4.0)))
     assert (latex.latex(made, "made").count(r"\textbf"), writer.markdown(made, "made").count("**0.")) == (1, 1)
 
@@ -367,7 +364,7 @@ def test_best_is_told_only_where_its_interval_is_apart_from_every_other_estimato
 def paper(rows, **settings):
     """The tables of a paper from rows, one per problem."""
     found = experiment(**settings)
-    return tables.pivots(found, views.arrange(found, rows))
+    return tables.pivots(views.arrange(found, rows))
 
 
 def test_the_papers_table_continues_below_and_loses_no_column():
@@ -377,21 +374,6 @@ def test_the_papers_table_continues_below_and_loses_no_column():
     heads = re.findall(r"toprule\n & (.*) \\\\", text)
     assert [head for line in heads for head in line.split(" & ")] == [column.heading for column in made[0].columns[1:]]
     assert len(heads) == text.count(r"\resizebox") == math.ceil(50 / latex.COLUMNS)
-
-
-@pytest.mark.slow
-def test_columns_and_rows_of_the_papers_table_can_be_chosen():
-    words = ["sweep.sigma=[0.1,0.3]", "sweep.stiffness=[10,100,1000]", "estimators=[fobg]", "backends=[jax,torch]"]
-    for more, across, names in (
-        ([], ("10", "100", "1000"), 1),
-        (["table.columns=sigma"], ("0.1", "0.3"), 1),
-        (["columns=sigma"], ("0.1", "0.3"), 1),
-        (["table.rows=[estimator,backend]"], ("10", "100", "1000"), 2),
-    ):
-        given, cells = loaded(*words, *more)
-        made = tables.pivots(given, views.arrange(given, rows_of(given, cells)))
-        assert {tuple(column.heading for column in part.columns[1:]) for part in made} == {across}
-        assert {len(part.frame) for part in made} == {names}
 
 
 @pytest.mark.skipif(shutil.which("pdflatex") is None, reason="no pdflatex: apt-get install texlive-science")

@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 import time
+from collections import deque
 
 import pandas as pd
 import pytest
@@ -12,6 +13,7 @@ from trees import bench
 from bench.cli import main
 from bench.errors import UserError
 from bench.experiment import config
+from bench.experiment.grid import cells
 from bench.run import record
 from bench.run.execute import execute, store_of
 from bench.run.launchers import ray as ray_launcher
@@ -113,10 +115,19 @@ def test_shards_at_once_one_killed_give_the_rows_of_one_run(tmp_path, capsys):
     pd.testing.assert_frame_equal(rows(tmp_path / "parts"), rows(tmp_path / "local"), check_exact=True)
 
 
-def test_groups_are_cut_only_as_far_as_all_nodes_get_a_part():
-    assert [len(part) for part in ray_launcher.split([range(10), [1]], 100, [1])] == [3, 3, 3, 1, 1]
-    assert [len(part) for part in ray_launcher.split([range(10)], 100, [8])] == [8, 2]
-    assert [len(part) for part in ray_launcher.split([range(40)], 4, [1])] == [4] * 10
+@pytest.mark.parametrize("verb", [["plan"], []])
+def test_an_empty_shard_says_so_and_how_many_cells_the_sweep_has(verb, tmp_path, capsys):
+    words = [*WORDS[:-1], "estimators=[fobg,alpha_order]", "name=few", f"results_dir={tmp_path}"]
+    keys = [cell.reference_key for cell in cells(config.load(words))]
+    number = 1 + next(n for n in range(64) if n not in [int(key, 16) % 64 for key in keys])
+    assert main([*verb, *words, f"shard={number}/64"]) == 0
+    assert f"shard {number}/64 of few is empty: the sweep has 2 cells" in capsys.readouterr().out
+
+
+def test_a_job_is_the_first_tasks_of_one_group():
+    waiting = deque([list(range(5)), [9]])
+    assert [ray_launcher.first_tasks(waiting, 3) for _ in range(3)] == [[0, 1, 2], [3, 4], [9]]
+    assert not waiting
 
 
 def test_every_row_says_which_kind_of_machine_made_it(tmp_path):

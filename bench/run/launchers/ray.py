@@ -10,7 +10,6 @@ import logging
 import os
 import pickle
 import socket
-import time
 from collections import Counter, deque
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -32,7 +31,7 @@ TICK = 0.1
 ANSWER_S = 10.0
 """Seconds in which a cluster answers."""
 JOBS_PER_NODE = 4
-"""Jobs into which a node's share of the tasks is cut, so that quick nodes get more of them."""
+"""Part of a node's share of the tasks left that is one job, so that quick nodes get more of them."""
 MAX_LOSSES = 3
 """Number of losses of a node while it runs a task after which the task counts as crashed."""
 
@@ -48,15 +47,6 @@ class RaySettings(Plugin):
     cells: int = param(50, "most cells of a job per core", low=1)
 
 
-@dataclass(eq=False)
-class _SentJob:
-    """A job on the cluster: the stream of its answers, and the tasks without an answer by their index in the job."""
-
-    stream: Any
-    unanswered: dict[int, Task]
-    node: str
-
-
 class RayLauncher:
     """Runs jobs on the nodes of a Ray cluster, each on all cores of its node; timed jobs run on nodes of one kind.
 
@@ -65,166 +55,141 @@ class RayLauncher:
 
     def __init__(self, experiment: Experiment, timed: bool, kind: str) -> None:
         self._settings = cast(RaySettings, build(RaySettings, experiment.execution.cluster))
-        self._address = self._settings.address or os.environ.get("RAY_ADDRESS")
+        os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # Ray warns if this is unset
         try:
-            os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # Ray warns if this is unset
             import ray
         except ImportError as error:
             raise UserError(
                 f"launcher=ray is unavailable: {error}; pip install 'diffsim-bench[ray]' here and on the machines"
             ) from None
         self._ray: Any = ray
-        self._experiment, self._timed, self._kind = experiment, timed, kind
-        self._jobs: list[_SentJob] = []
+        self._timed, self._kind, self._folders = timed, kind, experiment.plugins
+        self._experiment = replace(without_grid(experiment), results_dir=experiment.results_dir.absolute())
+        self._jobs: dict[Any, tuple[str, dict[int, Task]]] = {}
+        """The node and the unanswered tasks of each job, by the stream of its answers."""
         self._losses: Counter[int] = Counter()
-        self._has_started_ray = False
+        self._kinds: dict[str, str] = {}
+        """The kinds of the machines, by node."""
 
     def __enter__(self) -> RayLauncher:
-        if not self._ray.is_initialized():
-            if self._address and self._address not in ("auto", "local"):
-                reach(self._address)
-            try:
-                self._ray.init(
-                    address=self._address, log_to_driver=False, logging_level=logging.ERROR,
-                    runtime_env={"env_vars": {"PYTHONPATH": _import_path()}},
-                )  # fmt: skip
-            except Exception as error:
-                raise UserError(
-                    f"no Ray cluster at {self._address or 'this machine'}: {printable(error)[:300]}; start one: ray start --head"
-                ) from None
-            self._has_started_ray = True
-        folder = self._experiment.results_dir.absolute()
-        self._packed = self._ray.put(pickle.dumps(replace(without_grid(self._experiment), results_dir=folder)))
+        address = self._settings.address or os.environ.get("RAY_ADDRESS")
+        if address and address not in ("auto", "local"):
+            reach(address)
+        # absolute paths, so that other machines with the same folders can import this package
+        inherited = filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))
+        paths = [os.path.abspath(path) for path in (str(Path(__file__).resolve().parents[3]), *inherited)]
+        try:
+            self._ray.init(
+                address=address, log_to_driver=False, logging_level=logging.ERROR,
+                runtime_env={"env_vars": {"PYTHONPATH": os.pathsep.join(dict.fromkeys(paths))}},
+            )  # fmt: skip
+        except Exception as error:
+            raise UserError(
+                f"no Ray cluster at {address or 'this machine'}: {printable(error)[:300]}; start one: ray start --head"
+            ) from None
         return self
 
     def __exit__(self, *_: object) -> None:
-        for job in self._jobs:
+        for stream in self._jobs:
             with suppress(Exception):
-                self._ray.cancel(job.stream, force=True)
+                self._ray.cancel(stream, force=True)
         self._jobs.clear()
-        if self._has_started_ray:
-            self._ray.shutdown()
-
-    @property
-    def _cores(self) -> dict[str, int]:
-        """The number of cores of each node that has some, by the node's id."""
-        cores = {node["NodeID"]: int(node["Resources"].get("CPU", 0)) for node in self._ray.nodes() if node["Alive"]}
-        return {node: count for node, count in cores.items() if count}
+        self._ray.shutdown()
 
     @property
     def current(self) -> list[Task]:
         """The first unanswered task of each of the first four jobs."""
-        return [next(iter(job.unanswered.values())) for job in self._jobs[:4] if job.unanswered]
+        return [next(iter(tasks.values())) for _, tasks in list(self._jobs.values())[:4] if tasks]
 
     def run(self, groups: Sequence[Sequence[Task]]) -> Iterator[list[Answer]]:
         """Yield answers as they arrive, one per task, and empty lists while the caller has to wait."""
-        chosen = self._of_one_kind() if self._timed else None
-        waiting = deque(split(groups, self._settings.cells, list(self._cores.values())))
+        waiting = deque(list(group) for group in groups if group)
         while waiting or self._jobs:
-            nodes = {node: n for node, n in self._cores.items() if chosen is None or node in chosen}
-            if waiting and not nodes:
-                kind = f" of the kind '{self._kind}'" if self._timed else ""
-                raise UserError(f"no node{kind} is left; run the same command again when there is one")
-            free = nodes.keys() - {job.node for job in self._jobs}
-            for node in list(free)[: len(waiting)]:
-                self._send(waiting.popleft(), nodes[node], node)
+            nodes = self._nodes() if waiting else {}
+            busy = {node for node, _ in self._jobs.values()}
+            for node, cores in nodes.items():
+                if waiting and node not in busy:
+                    share = -(-sum(map(len, waiting)) // (JOBS_PER_NODE * len(nodes)))
+                    self._send(node, cores, first_tasks(waiting, min(self._settings.cells * cores, max(cores, share))))
             yield self._collect(waiting)
 
-    def _send(self, tasks: list[Task], cores: int, node: str) -> None:
-        job = self._ray.remote(_run_job).options(
-            num_cpus=cores, num_returns="streaming", max_retries=0, scheduling_strategy=self._only_on(node)
-        )
-        stream = job.remote(self._experiment.plugins, self._packed, pickle.dumps(tasks), self._timed, cores)
-        self._jobs.append(_SentJob(stream, dict(enumerate(tasks)), node))
+    def _nodes(self) -> dict[str, int]:
+        """Return the number of cores of each node that may run jobs: of one kind, the first if none is given, if they are timed."""
+        cores = {node["NodeID"]: int(node["Resources"].get("CPU", 0)) for node in self._ray.nodes() if node["Alive"]}
+        nodes = {node: count for node, count in cores.items() if count}
+        if self._timed:
+            for node in [node for node in nodes if node not in self._kinds]:
+                with suppress(self._ray.exceptions.RayError):
+                    self._kinds[node] = self._ray.get(self._on(node, _kind_of_node, num_cpus=0).remote())
+                    self._kind = self._kind or self._kinds[node]
+            nodes = {node: count for node, count in nodes.items() if self._kinds.get(node) == self._kind}
+        if not nodes:
+            kind = f" of the kind '{self._kind}', as the times so far" if self._timed else ""
+            raise UserError(
+                f"the Ray cluster has no node{kind}; run the same command again when there is one, or choose another folder "
+                "with name=..."
+            )
+        return nodes
 
-    def _only_on(self, node: str) -> Any:
+    def _on(self, node: str, function: Any, **options: Any) -> Any:
+        """Return a function as a Ray task on a node, which is not retried."""
         from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-        return NodeAffinitySchedulingStrategy(node, soft=False)
+        place = NodeAffinitySchedulingStrategy(node, soft=False)
+        return self._ray.remote(function).options(scheduling_strategy=place, max_retries=0, **options)
+
+    def _send(self, node: str, cores: int, tasks: list[Task]) -> None:
+        job = self._on(node, _run_job, num_cpus=cores, num_returns="streaming")
+        stream = job.remote(self._folders, pickle.dumps((self._experiment, tasks)), self._timed, cores)
+        self._jobs[stream] = node, dict(enumerate(tasks))
 
     def _collect(self, waiting: deque[list[Task]]) -> list[Answer]:
         """Return the answers that have arrived; the unanswered tasks of a lost job are put back into ``waiting``."""
-        if not self._jobs:
-            time.sleep(TICK)
-            return []
         answers: list[Answer] = []
-        ready, _ = self._ray.wait([job.stream for job in self._jobs], num_returns=len(self._jobs), timeout=TICK)
-        for job in [job for job in self._jobs if any(job.stream is stream for stream in ready)]:
+        ready, _ = self._ray.wait(list(self._jobs), num_returns=len(self._jobs), timeout=TICK)
+        for stream in ready:
             try:
-                index, answer = self._ray.get(next(job.stream))
+                answer = self._ray.get(next(stream))
             except self._ray.exceptions.RayTaskError as error:
                 raise UserError(f"a job on the cluster failed: {printable(error.cause)[:300]}") from None
             except (StopIteration, self._ray.exceptions.RayError) as error:
-                self._jobs.remove(job)
-                tasks = list(job.unanswered.values())
+                tasks = list(self._jobs.pop(stream)[1].values())
                 self._losses.update(map(id, tasks[:1]))
                 if tasks and self._losses[id(tasks[0])] == MAX_LOSSES:
-                    cause = "its job ended early" if isinstance(error, StopIteration) else type(error).__name__
-                    reason = f"lost {MAX_LOSSES} times while it was running: {cause}"
+                    reason = f"lost {MAX_LOSSES} times while it was running: {type(error).__name__}"
                     answers.append(Answer(tasks.pop(0), {"status": "crashed", "reason": reason}, 0.0))
                 if tasks:
                     waiting.appendleft(tasks)
             else:
-                answers.append(Answer(job.unanswered.pop(index), **answer))
+                answers.append(replace(answer, item=self._jobs[stream][1].pop(answer.item)))
         return answers
 
-    def _of_one_kind(self) -> set[str]:
-        """Return the nodes for timed cells: those of the required kind, else of the first node's."""
-        requests = {
-            node: self._ray.remote(_kind_of_node).options(num_cpus=0, scheduling_strategy=self._only_on(node)).remote()
-            for node in self._cores
-        }
-        kinds: dict[str, str] = {}
-        for node, request in requests.items():
-            with suppress(self._ray.exceptions.RayError):
-                kinds[node] = self._ray.get(request)
-        if not kinds:
-            raise UserError("the Ray cluster has no node with a core")
-        self._kind = self._kind or next(iter(kinds.values()))
-        nodes = {node for node, kind in kinds.items() if kind == self._kind}
-        if not nodes:
-            raise UserError(
-                f"the stored times are from '{self._kind}', and the cluster has {', '.join(sorted(set(kinds.values())))}: times "
-                "of two kinds are not mixed; choose another folder with name=..."
-            )
-        return nodes
+
+def first_tasks(waiting: deque[list[Task]], size: int) -> list[Task]:
+    """Remove and return at most ``size`` tasks of the first group."""
+    group = waiting.popleft()
+    if group[size:]:
+        waiting.appendleft(group[size:])
+    return group[:size]
 
 
-def split(groups: Sequence[Sequence[Task]], cells: int, cores: Sequence[int]) -> list[list[Task]]:
-    """Split groups into jobs of at most ``cells`` tasks per core of the largest node, smaller if nodes would stay idle."""
-    n_tasks, most = sum(map(len, groups)), max(cores, default=1)
-    size = min(cells * most, max(most, -(-n_tasks // (JOBS_PER_NODE * len(cores) or 1))))
-    return [list(group[i : i + size]) for group in groups for i in range(0, len(group), size)]
-
-
-def _run_job(
-    folders: Sequence[Path], experiment: bytes, tasks: bytes, timed: bool, cores: int
-) -> Iterator[tuple[int, dict[str, Any]]]:
-    """Run tasks on this machine; yields the index of each task and the fields of its answer.
+def _run_job(folders: Sequence[Path], job: bytes, timed: bool, cores: int) -> Iterator[Answer]:
+    """Run tasks on this machine; yields their answers, with the index of the task as the item.
 
     Experiment and tasks are pickled, since their classes may come from ``folders``.
     """
     for folder in folders:
         registry.add_folder(folder)
-    own: list[Task] = pickle.loads(tasks)
-    index = {id(task): i for i, task in enumerate(own)}
-    given: Experiment = pickle.loads(experiment)
-    with local_launcher(given, timed, given.execution.workers or cores) as launcher:
-        for a in itertools.chain.from_iterable(launcher.run([own])):
-            answer = {"result": a.result, "seconds": a.seconds, "output": a.output, "machine": kind_of_machine()}
-            yield index[id(a.item)], answer
+    experiment, tasks = pickle.loads(job)
+    index = {id(task): i for i, task in enumerate(tasks)}
+    with local_launcher(experiment, timed, experiment.execution.workers or cores) as launcher:
+        for answer in itertools.chain.from_iterable(launcher.run([tasks])):
+            yield replace(answer, item=index[id(answer.item)], machine=kind_of_machine())
 
 
 def _kind_of_node() -> str:
     """Return the kind of machine of the node; a separate function, since Ray does not accept a cached function."""
     return kind_of_machine()
-
-
-def _import_path() -> str:
-    """Return a PYTHONPATH of absolute paths, so that other machines with the same folders can import this package."""
-    inherited = os.environ.get("PYTHONPATH", "").split(os.pathsep)
-    package = Path(__file__).resolve().parents[3]
-    return os.pathsep.join(dict.fromkeys([str(package), *(str(Path(path).absolute()) for path in inherited if path)]))
 
 
 def reach(address: str) -> None:

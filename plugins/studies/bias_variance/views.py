@@ -10,14 +10,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from bench.errors import unknown
 from bench.experiment import axes
 from bench.experiment.axes import Axis
 from bench.experiment.columns import IDENTITY, Column, interval, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.parameters import number_problems
 from bench.experiment.views import Table, Views
-from bench.report.problems import ProblemRows, split_by_problem
+from bench.report.problems import ProblemRows
 from bench.report.text import axis_value, counted, span
 from bench.report.views import Arranged, arrange, estimator_curves, pareto, rmse_interval
 
@@ -103,7 +102,7 @@ def tables(
     experiment: Experiment, rows: pd.DataFrame, shown: Arranged, methods: pd.DataFrame, comparisons: pd.DataFrame
 ) -> list[Table]:
     """Return all tables but those of the cost to reach an error."""
-    result = pivots(experiment, shown)
+    result = pivots(shown)
     result[0] = replace(result[0], data=axes.table(experiment, rows))
     columns = [COLUMNS.by_name[name] for name in ("scene", "contact", "backend", "estimator", "rmse_rel", "time_s")]
     result.append(Table("speed_accuracy", speed_accuracy(rows), columns, files=["csv"]))
@@ -129,33 +128,16 @@ COMPARISON_NOTES = (
 # ------------------------------------------------------------------------------------------- along an axis
 
 
-def pivots(experiment: Experiment, shown: Arranged) -> list[Table]:
-    """Return a table per problem: estimators down, values of its axis across, each cell a relative RMSE.
-
-    The axis is the one that ``table.columns`` names, by default the longest. Raises an error if ``table.columns`` names
-    no swept axis.
-    """
-    parts: Sequence[tuple[Axis | None, ProblemRows]] = problems_by_axis(shown)
-    if experiment.table.columns:
-        axis = _axis(experiment.table.columns, shown)
-        parts = [(axis, problem) for problem in split_by_problem(shown, axis, ("scene", "contact"))]
-    apart = "backend" in experiment.table.rows
-    result = [_pivot(axis, problem, apart) for axis, problem in parts]
+def pivots(shown: Arranged) -> list[Table]:
+    """Return a table per problem: estimators down, values of its longest axis across, each cell a relative RMSE."""
+    result = [_pivot(axis, problem) for axis, problem in problems_by_axis(shown)]
     notes = _notes(result)
     return [replace(table, notes=notes if table is result[-1] else ()) for table in result]
 
 
-def _axis(name: str, shown: Arranged) -> Axis:
-    swept = list(shown.swept())
-    named = [axis for axis in swept if name in (axis.column, axis.short, *axis.names)]
-    if not named:
-        raise unknown("column of the table:", name, [axis.column for axis in swept])
-    return named[0]
-
-
-def _pivot(axis: Axis | None, problem: ProblemRows, apart: bool) -> Table:
-    curves = estimator_curves(problem.rows, close=None) if apart else estimator_curves(problem.rows)
-    names = [f"{c.label} ({', '.join(c.backends)})" for c in curves] if apart else method_names(curves)
+def _pivot(axis: Axis | None, problem: ProblemRows) -> Table:
+    curves = estimator_curves(problem.rows)
+    names = method_names(curves)
     values = sorted({x for curve in curves for x in curve.at})
     lines: list[dict[str, Any]] = []
     for curve, name in zip(curves, names, strict=True):

@@ -13,7 +13,7 @@ import pandas as pd
 from bench.experiment.axes import Axis, table
 from bench.experiment.columns import Column, interval, text
 from bench.experiment.experiment import Experiment
-from bench.experiment.parameters import flatten, swept_columns
+from bench.experiment.parameters import of_places
 from bench.experiment.views import Chart, Table, Views
 from bench.measure import performance
 from bench.model.parameters import remember
@@ -122,12 +122,8 @@ def collect_runs(experiment: Experiment, rows: pd.DataFrame) -> RunSet:
 
 def _is_tuned(axis: Axis, rows: pd.DataFrame) -> bool:
     """Return whether an axis sweeps a parameter of an optimizer."""
-    table = flatten(rows)
-    return any(
-        column.startswith("optimizer.") and bool((mask & table[column].notna()).any())
-        for name in axis.names
-        for column, mask in swept_columns(name, table).items()
-    )
+    tuned = of_places(rows, axis.names, lambda found: any(p.part == "optimizer" and p.value is not None for p in found))
+    return bool(tuned.any())
 
 
 def _tuning_labels(rows: pd.DataFrame, axes: Sequence[Axis]) -> pd.Series:

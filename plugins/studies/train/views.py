@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from bench.experiment.axes import table
+from bench.experiment.axes import Axis, table, values_of
 from bench.experiment.columns import Column, interval, text
 from bench.experiment.experiment import Experiment
-from bench.experiment.parameters import flatten
 from bench.experiment.views import Chart, Table, Views
 from bench.measure.performance import bootstrap, bootstrap_along, interquartile_mean
 from bench.report.problems import problem_names
@@ -90,8 +89,7 @@ def runs_of(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:
     if runs.empty:
         return runs.assign(problem="", method="", family="", window=math.nan)
     names = problem_names(arrange(experiment, rows), PARTS, rows=runs)
-    given = flatten(runs)
-    window = given["trainer.window"].astype(float) if "trainer.window" in given else math.nan
+    window = values_of(Axis("window", ("trainer.window",)), runs)
     return runs.assign(
         problem=names, method=runs["trainer"], family=runs["trainer"].str.partition("[")[0], window=window
     )
