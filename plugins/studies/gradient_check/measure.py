@@ -80,7 +80,7 @@ def measure(cell: Cell, session: Session, search: GradientCheck) -> dict[str, An
     reached = [Place("noise", 0, 1, theta, directions[0] / np.linalg.norm(directions[0]), at)] if under_noise else []
     found = examine(problem, drawn, directions, unit, search, reached)
     points = [*at_start(whole), *(_settled(problem, point, under_noise) for point in found)]
-    checks = [
+    checks: list[dict[str, Any]] = [
         {
             "point": point.place.point, "sample": point.place.noise, "direction": point.place.number,
             "contact_switch": point.place.switch, "derivative_program": point.sample.derivative, "check_verdict": point.verdict,
