@@ -108,7 +108,7 @@ def used_steps(run: Mapping[str, Any]) -> np.ndarray:
         return np.asarray(run["curve_step"], dtype=float)
     updates = np.append(0.0, run["log_update"])
     used = np.append(0.0, np.cumsum(share * np.diff(updates)))
-    return np.asarray(np.interp(run["curve_update"], updates, used) * run["steps"] / run["updates"])
+    return np.interp(run["curve_update"], updates, used) * run["steps"] / run["updates"]
 
 
 def at_equal_steps(runs: pd.DataFrame) -> pd.DataFrame:
