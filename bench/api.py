@@ -76,9 +76,6 @@ class Settings(TypedDict, total=False):
     shard: str
     results_dir: str | Path
     formats: Names
-    table: Mapping[str, Any]
-    columns: str | None
-    rows: Names
     marks: Mapping[str, Mapping[str, float]]
 
 

@@ -13,6 +13,7 @@ lines that differ, and exits with 1 if there are any.
 from __future__ import annotations
 
 import difflib
+import itertools
 import os
 import re
 import sys
@@ -165,9 +166,9 @@ RULE_MODULES = (
 
 
 RULE_HEADS = {
-    "One derivative, worst first": rules.DERIVATIVE,
-    "All that `examine` finds at theta, instead of the worst of its derivatives": rules.EXAMINATION,
-    "Around theta and under noise, in `examine`": rules.NOISE,
+    "One derivative: the worst of all counts, the worst is listed first.": rules.DERIVATIVE,
+    "All that `examine` finds at theta, instead of the worst derivative, by kind.": rules.EXAMINATION,
+    "Around theta and under noise, in `examine`: the first of the list counts.": rules.NOISE,
 }
 
 
@@ -175,15 +176,12 @@ def rule_page() -> str:
     """Return the page of `gradcheck` with the table of rules between :data:`RULE_MARKS`, with the constants of the code."""
     before, _, rest = (DOCS / "gradcheck.md").read_text().partition(RULE_MARKS[0])
     modules = {name.partition(".")[2]: import_module(f"bench.{name}") for name in RULE_MODULES.split()}
-    statuses = ", ".join(f"`{kind}` {status}" for kind, status in rules.STATUS.items())
-    lines = [f"Exit status of `examine` by kind: {statuses}."]
+    lines = []
     for head, table in RULE_HEADS.items():
-        lines += [f"\n{head}:\n"]
-        for name, rule in table.items():
-            settings = ", ".join(f"`{one.partition('=')[0]}=`".replace("{more}", "budget") for one in rule.settings)
-            steps = [rule.advice.format(names="it"), settings]
-            text = f"- `{name}` ({rule.kind}): {rule.meaning}. *When:* {rule.condition.format(**modules)}."
-            lines.append(text + f" *Next:* {'; '.join(filter(None, steps))}." * any(steps))
+        lines += ["", head]
+        for kind, group in itertools.groupby(table.items(), lambda item: item[1].kind):
+            lines += [f"\n`{kind}`, status {rules.STATUS[kind]}:\n"]
+            lines += [f"- `{name}`: {rule.meaning}; *{rule.condition.format(**modules)}*" for name, rule in group]
     return before + RULE_MARKS[0] + "\n".join(lines) + "\n" + RULE_MARKS[1] + rest.partition(RULE_MARKS[1])[2]
 
 

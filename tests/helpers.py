@@ -15,7 +15,7 @@ from trees import ROOT
 
 from bench.experiment import config
 from bench.experiment.columns import IDENTITY
-from bench.experiment.experiment import Experiment, TableLayout
+from bench.experiment.experiment import Experiment
 from bench.experiment.grid import cells
 from bench.model import registry
 from bench.model.identity import parse_identity
@@ -206,7 +206,6 @@ def experiment(
     marks=None,
     name="made_up",
     formats=("png",),
-    table=None,
 ):
     """Return an experiment for reports of made-up rows; it cannot be run."""
     return Experiment(
@@ -219,7 +218,6 @@ def experiment(
         question="As contact stiffens, which gradient stays right?",
         marks={"stiffness": {"step size limit": 6400}} if marks is None else marks,
         formats=formats,
-        table=table or TableLayout(),
     )
 
 
@@ -240,4 +238,4 @@ def page(made, rows, views=None):
     """Return the page of an experiment's rows, with the drawings of its views."""
     views = views_of(made, rows) if views is None else views
     data = page_data(made, rows, views, [["a=1"]] * len(rows))
-    return "".join(document.blocks(made.name, made.question, views, data, writer.drawings(made, views)))
+    return document.page(made.name, made.question, views, data, writer.drawings(made, views))

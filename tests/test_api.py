@@ -189,7 +189,7 @@ def test_settings_are_all_settings_of_the_command_line():
     known = {
         name for name in config._known_keys() if name in yaml.safe_load((ROOT / "conf" / "config.yaml").read_text())
     }
-    assert set(Settings.__annotations__) == {*known, *config.LAYOUT}
+    assert set(Settings.__annotations__) == known
 
 
 def test_estimate_is_that_of_a_cell(rows):
@@ -287,7 +287,9 @@ def test_functions_stay_functions_after_all_commands_are_imported():
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-@pytest.mark.parametrize("name", ["model.parameters", "model.identity", "report.text", "experiment.grid", "errors"])
+@pytest.mark.parametrize(
+    "name", ["model.parameters", "model.identity", "report.text", "experiment.grid", "errors", "claims.claim"]
+)
 def test_examples_in_docstrings(name):
     done = doctest.testmod(importlib.import_module(f"bench.{name}"))
     assert done.attempted > 0

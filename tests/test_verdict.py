@@ -3,12 +3,13 @@
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
 
 import pytest
-from trees import INHERITED, bench, hearing_signals, processes_in, wait_for
+from trees import INHERITED, ROOT, bench, hearing_signals, processes_in, wait_for
 
 from bench.cli import main
 from bench.simulator.imports import load_module
@@ -244,13 +245,24 @@ def test_a_file_named_like_a_library_is_loaded_beside_it(tmp_path):
     assert sys.modules["json"] is json
 
 
-def test_a_verdict_that_nobody_read_is_no_zero(tmp_path):
-    """``examine ... | head -1`` under ``pipefail``: the wrong gradient ended with 0."""
+READ_BY_NOBODY = {
+    "examine": ["examine", "c.py:cost", "grad=c.py:grad"],
+    "report": ["report", "+experiment=quick"],
+    "compare": ["compare", "results/quick", "results/quick"],
+}
+
+
+@pytest.mark.parametrize("words", [pytest.param(READ_BY_NOBODY[name], id=name) for name in READ_BY_NOBODY])
+def test_output_that_nobody_read_is_no_zero(tmp_path, words):
+    """``examine ... | head -1`` under ``pipefail``: the wrong gradient ended with 0, and a report with 3."""
     (tmp_path / "c.py").write_text(COST.format(end="pass"))
-    command = [sys.executable, "-m", "bench", "examine", "c.py:cost", "grad=c.py:grad"]
+    shutil.copytree(ROOT / "results/standard/quick", tmp_path / "results/quick")
     reading, writing = os.pipe()
     os.close(reading)
     try:
-        assert subprocess.run(command, cwd=tmp_path, stdout=writing, stderr=subprocess.DEVNULL).returncode == 141
+        command = [sys.executable, "-m", "bench", *words]
+        said = subprocess.run(command, cwd=tmp_path, stdout=writing, stderr=subprocess.PIPE, text=True)
     finally:
         os.close(writing)
+    assert said.returncode == 141, said.stderr
+    assert "bench:" not in said.stderr

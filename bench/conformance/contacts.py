@@ -50,7 +50,7 @@ def _push(law: ContactLaw, gap: Any, rate: Any, ops: Ops | None = None) -> np.nd
     """Return the normal impulses of a tower's two contacts over 0.01 s [N s], for gaps and gap rates, all ``(2, B)``."""
     gaps, rates = (np.asarray(part, dtype=float).reshape(2, -1) for part in (gap, rate))
     if isinstance(law, ForceLaw):
-        return np.asarray(PUSH_DT * law.force(np, gaps, rates))
+        return PUSH_DT * law.force(np, gaps, rates)
     assert isinstance(law, ImpulseLaw)
     scene = _Tower()
     before = State(np.stack([gaps[0], gaps[0] + gaps[1] + 1.0]), np.stack([rates[0], rates[0] + rates[1]]))

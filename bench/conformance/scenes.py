@@ -320,7 +320,7 @@ def _ratios(program: Program, physical: np.ndarray) -> np.ndarray:
     cost = problem.value(theta[:, None] + shifts, np.zeros((program.n_noise, d * POINTS))).reshape(d, POINTS)
     slope = np.polynomial.polynomial.polyfit(along, cost.T, 3)[1] / span
     none = np.maximum(np.abs(slope), np.abs(physical)) <= 1e-12 * np.abs(cost).max(axis=1) / span
-    return np.asarray(np.divide(slope, physical, out=np.where(none, 1.0, np.inf), where=~none & (physical != 0.0)))
+    return np.divide(slope, physical, out=np.where(none, 1.0, np.inf), where=~none & (physical != 0.0))
 
 
 @verifies(MechanicalScene)

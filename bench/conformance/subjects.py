@@ -237,7 +237,7 @@ def standard_errors(difference: np.ndarray, error: np.ndarray, tolerance: np.nda
     The result is inf where a difference exceeds the tolerance and its error is 0.
     """
     beyond = np.maximum(np.abs(difference) - tolerance, 0.0)
-    return np.asarray(np.divide(beyond, error, out=np.where(beyond > 0, np.inf, 0.0), where=error > 0))
+    return np.divide(beyond, error, out=np.where(beyond > 0, np.inf, 0.0), where=error > 0)
 
 
 @dataclass(frozen=True)

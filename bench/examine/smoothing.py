@@ -208,7 +208,7 @@ def _terms(u: np.ndarray, d: np.ndarray) -> np.ndarray:
 
 def _means(terms: np.ndarray) -> np.ndarray:
     """Return independent means of ``terms (d, n)``, ``(GROUPS, d)``, each over equally many terms of both halves."""
-    return np.asarray(terms.reshape(terms.shape[0], GROUPS, -1).mean(axis=2).T)
+    return terms.reshape(terms.shape[0], GROUPS, -1).mean(axis=2).T
 
 
 def _methods(norm: float, bias: float, terms: np.ndarray, slopes: np.ndarray, clock: Clock) -> tuple[Method, ...]:
@@ -231,4 +231,4 @@ def directions(count: int, scale: np.ndarray, seed: int) -> np.ndarray:
     if scale.size == 1:
         return scale[None, :]
     drawn = np.random.default_rng([seed, 0x6C696E65]).standard_normal((count, scale.size))
-    return np.asarray(scale * drawn / np.linalg.norm(drawn, axis=1, keepdims=True))
+    return scale * drawn / np.linalg.norm(drawn, axis=1, keepdims=True)

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from bench.errors import STATUSES, UserError, local_path, printable, unknown
-from bench.experiment.experiment import Budget, Choice, Execution, Experiment, TableLayout
+from bench.experiment.experiment import Budget, Choice, Execution, Experiment
 from bench.experiment.grid import COUNTS, check_axes, parameter_name, refuse_too_many, swept
 from bench.experiment.overrides import LISTS_AS, TABLES, check_file, quoted, with_ranges
 from bench.experiment.study import Study
@@ -109,7 +109,6 @@ APPEARANCE = (
     "results_dir",
     "answer",
     "formats",
-    "table",
     "compile_cache",
     "plugins",
     "execution",
@@ -154,10 +153,6 @@ def _known_keys() -> frozenset[str]:
     return _settings() | {*kinds, *map(singular, kinds)}
 
 
-LAYOUT = ("columns", "rows")
-"""Settings of ``table`` that may be given without ``table.``."""
-
-
 @remember
 def _settings() -> frozenset[str]:
     import yaml
@@ -176,8 +171,6 @@ def _to_hydra(override: str, config_dirs: Sequence[Path]) -> str:
     key, _, value = override.partition("=")
     bare = key.lstrip("+~")
     value = quoted(with_ranges(bare, value))
-    if bare in LAYOUT:
-        bare = f"table.{bare}"
     head = bare.partition(".")[0]
     if head == "experiment":
         names = experiments(config_dirs)
@@ -187,14 +180,14 @@ def _to_hydra(override: str, config_dirs: Sequence[Path]) -> str:
     if head.partition("/")[0] == "hydra" or key.startswith("~"):
         raise UserError(f"'{override}': Hydra's own settings cannot be changed")
     if head not in _known_keys():
-        raise unknown("setting", bare, {*_known_keys(), *LAYOUT, "experiment"}, "--help")
+        raise unknown("setting", bare, {*_known_keys(), "experiment"}, "--help")
     kinds = registry.kinds()
     if bare in kinds:
         return f"++{bare}={_quote_identities(value)}"
     if bare == "study":
         return f"study={_quote_identities(value)[1:-1]}"
     tables = {*map(singular, kinds), *TABLES}
-    if bare != head and (head not in tables or (head in ("reference", "table") and bare.count(".") > 1)):
+    if bare != head and (head not in tables or (head == "reference" and bare.count(".") > 1)):
         whole = bare.rpartition(".")[0]
         raise UserError(f"'{bare}' is not a setting: '{whole}' has no settings of its own")
     return f"{'++' if head in tables else ''}{bare}={value}"
@@ -206,7 +199,7 @@ def _refuse_unread(experiment: Experiment, overrides: Sequence[str]) -> None:
     kinds = {kind: singular(kind) for kind in registry.kinds() if kind != "studies"}
     used = {kind: axis for kind, axis in kinds.items() if axis in experiment.choices}
     choices = [(axis, choice.entry) for e in every for axis, some in e.choices.items() for choice in some]
-    names = {*_settings() - {*kinds, *kinds.values()}, *LAYOUT, "experiment", *used, *used.values()}
+    names = {*_settings() - {*kinds, *kinds.values()}, "experiment", *used, *used.values()}
     names |= {f"{axis}.{entry.name}" for axis, entry in choices}
     plugins = _in_use([entry.plugin for _, entry in choices if entry.plugin])
     axes = {name for e in every for name in swept(e.sweep)}
@@ -287,7 +280,6 @@ def from_settings(config: Mapping[str, Any]) -> Experiment:
         answer=str(config["answer"] or ""),
         marks=_mapping(config, "marks"),
         formats=tuple(_one_of("formats", item, FORMATS) for item in _as_list(config["formats"])),
-        table=_table_layout(_mapping(config, "table", LAYOUT), sweep),
         reference=cast(Budget, build(Budget, _mapping(config, "reference", parameters(Budget)))),
         compile_cache=_compile_cache(config["compile_cache"]),
         plugins=registry.folders(),
@@ -336,20 +328,6 @@ def _folder(value: Any) -> Path:
     if not isinstance(value, str | Path) or not str(value).strip():
         raise UserError(f"results_dir={value!r} must be a folder")
     return local_path("results_dir", value)
-
-
-ROWS = ("estimator", "backend")
-
-
-def _table_layout(settings: Mapping[str, Any], sweep: Mapping[str, Any]) -> TableLayout:
-    columns = "" if settings["columns"] is None else str(settings["columns"])
-    names = {part for name in swept(sweep) for part in (name, name.rpartition(".")[2])}
-    if columns and columns not in names:
-        raise unknown("axis for table.columns:", columns, names)
-    rows = tuple(_one_of("table.rows", row, ROWS) for row in _as_list(settings["rows"]))
-    if "estimator" not in rows:
-        raise UserError(f"table.rows={list(rows)} must contain estimator; [estimator,backend] gives each backend a row")
-    return TableLayout(columns, rows)
 
 
 def _decision(config: Mapping[str, Any]) -> Decision:

@@ -65,16 +65,6 @@ class Budget(Plugin):
 
 
 @dataclass(frozen=True)
-class TableLayout:
-    """The layout of the table for a paper. It affects no number."""
-
-    columns: str = ""
-    """The swept axis whose values are columns; empty for the axis with the most values."""
-    rows: tuple[str, ...] = ("estimator",)
-    """``estimator``, so that backends that agree share a row, or ``estimator`` and ``backend``."""
-
-
-@dataclass(frozen=True)
 class Experiment:
     """A named sweep: plugins, parameters, sample counts, and the study that measures each cell."""
 
@@ -103,7 +93,6 @@ class Experiment:
     """Named values by axis, drawn as lines in the charts."""
     formats: tuple[str, ...] = ("png",)
     """File formats of the charts."""
-    table: TableLayout = TableLayout()
     reference: Budget = Budget()
     compile_cache: Path | None = None
     """Folder in which compiled programs are cached between runs."""
@@ -137,7 +126,6 @@ class Experiment:
             "theta0": None if self.decision.at is None else list(self.decision.at),
             **{name: getattr(self, name) for name in ("samples", "repeats", "seed", "timing", "marks")},
             "formats": list(self.formats),
-            "table": dataclasses.asdict(self.table),
             "reference": dataclasses.asdict(self.reference),
             "results_dir": str(self.results_dir),
             "compile_cache": None if self.compile_cache is None else str(self.compile_cache),

@@ -71,7 +71,7 @@ class Part(Finding):
     """One derivative checked: a component of the gradient, or the slope along a random direction."""
 
     name: str
-    """``component 3``, ``direction 0`` or ``draw 2 direction 0``."""
+    """``component 3``, ``direction 0`` or ``other theta 2 direction 0``."""
     component: int | None = None
     sample: Sample
     modes: tuple[Sequence[str], Sequence[str]] = ((), ())
@@ -111,7 +111,7 @@ class Check:
     """The outcome of a check."""
 
     cause: str
-    """The worst verdict, one of :data:`.rules.VERDICTS`."""
+    """The worst verdict, one of :data:`.rules.VERDICTS`; ``undecided`` without a part."""
     gradient: np.ndarray
     parts: tuple[Part, ...]
     """Components and random directions at theta."""
@@ -157,6 +157,10 @@ class Check:
             f"{text}; {part.name}: the program's {part.program:.6g}, differences {part.difference:.6g} +- {part.uncertainty:.1g} "
             f"at a step of {part.step:.1g} (ratio {part.ratio:.6g}), slopes {part.left:.6g} and {part.right:.6g}"
         )
+
+
+NOTHING = Check("undecided", np.empty(0), (), ())
+"""The outcome of a check that was not made."""
 
 
 def scales(theta: np.ndarray) -> np.ndarray:
@@ -284,7 +288,7 @@ class _Checker:
         parts = self._check_lines(lines, doubt)
         draws = self._check_lines(
             [
-                _Line(f"draw {k} direction {i}", other, gradient, vector)
+                _Line(f"other theta {k} direction {i}", other, gradient, vector)
                 for k, (other, gradient) in enumerate(zip(around.T, at_draws, strict=True))
                 for i, vector in enumerate(self._directions())
             ],
@@ -311,7 +315,7 @@ class _Checker:
         """Return random directions ``(n, d)``, of length 1 in units of the inputs' scales."""
         random = self.random.standard_normal((self.theta.size, self.options.directions))
         random *= self.scale[:, None] / np.linalg.norm(random, axis=0)
-        return np.asarray(random.T)
+        return random.T
 
     def _check_lines(self, lines: Sequence[_Line], doubt: np.ndarray | None = None, twice: bool = True) -> list[Part]:
         """Return a checked part for each line, from one batch of costs; ``doubt (d,)`` is the gradient's own error.

@@ -65,28 +65,28 @@ class Sample:
     def differences(self) -> np.ndarray:
         """Central differences, ``(K,)``."""
         with np.errstate(over="ignore", invalid="ignore"):
-            return np.asarray((self.plus - self.minus) / (2.0 * self.step))
+            return (self.plus - self.minus) / (2.0 * self.step)
 
     @property
     def right(self) -> np.ndarray:
         """One-sided slopes towards plus, ``(K,)``."""
-        return np.asarray((self.plus - self.centre) / self.step)
+        return (self.plus - self.centre) / self.step
 
     @property
     def left(self) -> np.ndarray:
         """One-sided slopes towards minus, ``(K,)``."""
-        return np.asarray((self.centre - self.minus) / self.step)
+        return (self.centre - self.minus) / self.step
 
     @property
     def errors(self) -> np.ndarray:
         """|a - b| / max(1, |a|, |b|) of derivative and differences, ``(K,)``."""
         a, b = self.derivative, self.differences
-        return np.asarray(np.abs(a - b) / np.maximum(np.maximum(1.0, abs(a)), np.abs(b)))
+        return np.abs(a - b) / np.maximum(np.maximum(1.0, abs(a)), np.abs(b))
 
     @property
     def finite(self) -> np.ndarray:
         """Whether both costs are finite at each step, boolean ``(K,)``."""
-        return np.asarray(np.isfinite(self.minus) & np.isfinite(self.plus))
+        return np.isfinite(self.minus) & np.isfinite(self.plus)
 
     def rounding(self, unit: float) -> np.ndarray:
         """Return the error of the differences that rounding explains at unit roundoff ``unit``, ``(K,)``."""
@@ -95,12 +95,12 @@ class Sample:
         costs = costs + float(np.finfo(np.float64).tiny) / unit
         # rounding theta changes the cost by the slope times the rounding; at a minimum, the slope is that of one side
         slopes = np.maximum(np.abs(self.left), np.abs(self.right))
-        return np.asarray(MEASURED * unit * (costs + slopes * self.scale) / self.step)
+        return MEASURED * unit * (costs + slopes * self.scale) / self.step
 
     @property
     def uncertainty(self) -> np.ndarray:
         """The error of the differences that rounding and measured noise explain, ``(K,)``."""
-        return np.asarray(self.rounding(self.unit) + MEASURED * self.noise / self.step)
+        return self.rounding(self.unit) + MEASURED * self.noise / self.step
 
     def size(self, index: int) -> float:
         """Return the larger of |derivative| and |difference| at one step, to which relative errors refer."""
@@ -228,7 +228,7 @@ def _is_credible(sample: Sample, index: int, uncertainty: float, tolerance: floa
     enough.
     """
     differences = sample.differences
-    near = np.asarray(np.abs(differences - differences[index]) <= ALIKE * abs(differences[index]))
+    near = np.abs(differences - differences[index]) <= ALIKE * abs(differences[index])
     lasting = np.asarray(_windows(near, SHORT_WINDOW).all(axis=1))
     settled = bool(lasting[max(0, index - SHORT_WINDOW + 1) : index + 1].any())
     if settled and uncertainty <= ALIKE * abs(differences[index]):

@@ -199,7 +199,7 @@ def _confirmed(
 
 
 def _second_difference(values: np.ndarray) -> np.ndarray:
-    return np.asarray(np.abs(values[:, 0] - 2 * values[:, 1] + values[:, 2]))
+    return np.abs(values[:, 0] - 2 * values[:, 1] + values[:, 2])
 
 
 def _without_duplicates(breaks: list[Break], near: float) -> list[Break]:

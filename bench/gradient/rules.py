@@ -22,6 +22,8 @@ class Rule(NamedTuple):
     """What to do next."""
     settings: tuple[str, ...] = ()
     """The settings of ``examine`` that bear on it: they can show more, or accept it."""
+    is_unequal: bool = False
+    """Whether the derivative is a number other than the differences."""
 
 
 FOLLOW = "follow {names} through the cost: cut it into parts until the ratio is 1"
@@ -31,25 +33,25 @@ SLOPES = (*STEPS, "refined=COST")
 DERIVATIVE = {
     "nan_gradient": Rule(
         "fault", "the gradient is NaN or infinite where the cost is a number",
-        "the derivative is not a number; the costs at theta and at {direction.MIN_STEPS} steps or more are",
+        "the costs at theta and at {direction.MIN_STEPS} step sizes or more are numbers",
         "where it overflows, take fewer steps or damp the rollout; else look for a division, log, sqrt or norm at the edge of "
         "its domain, or a branch that 'where' discards only in the value", STEPS,
     ),
     "nondeterministic": Rule(
         "fault", "the same call returns different numbers",
-        "equal calls differ by more than {sampling.LAST_DIGITS} u, in `examine` u^{stages.SMALL}, of the cost or the gradient's norm",
+        "by more than {sampling.LAST_DIGITS} u, in `examine` u^{stages.SMALL}, of the cost or the gradient's norm",
         "fix the seed, or pass the noise as w and set noise=N; reset states that persist between calls",
     ),
     "stale_gradient": Rule(
         "fault", "the gradient does not change when theta does",
-        "right at theta, wrong at others, and equal at all of them", "look for a cache, or a copy made too early",
+        "right at theta, and wrong and equal at all others", "look for a cache, or a copy made too early",
     ),
     "staircase": Rule(
         "fault", "the cost is constant between steps of its input: a cast to int, a rounding, a comparison",
         "of {roughness.SCAN} costs in a row, {roughness.EDGES} or more isolated changes exceed all others {roughness.APART:g} times, and "
-        "the gradient is not the slope over them. Around theta: lines are flat between jumps, or have jumps of one height at "
-        "even distances, without which the gradient misses {findings.SEEN:.0%} of the cost's change; or all differences are 0, and the "
-        "gradient below {findings.RESIDUE:g} of a jump",
+        "the gradient is not the slope over them. Around theta: lines are flat between jumps, or the gradient misses "
+        "{findings.SEEN:.0%} of the cost's change in jumps of one height at even distances; or all differences are 0, and the gradient "
+        "is below {findings.RESIDUE:g} of a jump",
         f"{SMOOTHING}, or remove the rounding",
     ),
     "precision": Rule(
@@ -58,50 +60,49 @@ DERIVATIVE = {
         "look for a shorter float inside, or a solver that stops early",
     ),
     "disconnected": Rule(
-        "fault", "the gradient is exactly 0 where the cost has a slope", "`wrong_adjoint` with a derivative of exactly 0", FOLLOW, STEPS,
+        "fault", "the gradient is exactly 0 where the cost has a slope", "as `wrong_adjoint`", FOLLOW, STEPS, True,
     ),
     "wrong_factor": Rule(
         "fault", "the gradient is the derivative times a constant",
-        "`wrong_adjoint`, and {causes.MOSTLY:.0%} of {causes.ENOUGH} or more ratios to the differences, at several thetas, are equal "
-        "within their errors and {causes.CONSTANT:.1%}", FOLLOW, STEPS,
+        "`wrong_adjoint`, and {causes.MOSTLY:.0%} of {causes.ENOUGH} or more ratios at several thetas are equal "
+        "within their errors and {causes.CONSTANT:.1%}", FOLLOW, STEPS, True,
     ),
     "missing_term": Rule(
         "fault", "part of the derivative is right: a term is missing, detached or counted twice",
-        "`wrong_adjoint` with ratios that differ, where other components or thetas are right, or {causes.MOSTLY:.0%} of the ratios "
-        "lie between 0 and 2", FOLLOW, SLOPES,
+        "`wrong_adjoint` with unequal ratios, where other components or thetas are right, or {causes.MOSTLY:.0%} of the ratios "
+        "lie between 0 and 2", FOLLOW, SLOPES, True,
     ),
     "wrong_adjoint": Rule(
         "fault", "the differences agree with each other, but not with the gradient",
-        "the derivative is off by more than the error of the best difference: {direction.CHANCE:g} times its distance from its neighbours, "
-        "rounding, and u^(1/3) of its size; after one to three steps, by {few.CLEAR:g} times the error", FOLLOW, SLOPES,
+        "off by more than the error of the best difference: {direction.CHANCE:g} times its distance from its neighbours, rounding, and "
+        "u^(1/3) of its size; after one to three step sizes, by {few.CLEAR:g} times the error", FOLLOW, SLOPES, True,
     ),
     "nonfinite": Rule(
         "open", "a cost is NaN or infinite",
-        "the cost is not a number at theta, or is one at fewer than {direction.MIN_STEPS} steps; in `examine` also a cost within u^(1/3) of theta, or "
-        "under noise",
+        "at theta, or a number at fewer than {direction.MIN_STEPS} step sizes; in `examine` also within u^(1/3) of theta, or under noise",
     ),
     "unsettled": Rule(
         "open", "the differences agree at no step, so the check is inconclusive",
-        "the error of the best difference is above {direction.ALIKE:.0%} of it, or smaller steps contradict it", "", MORE,
+        "the error of the best is above {direction.ALIKE:.0%} of it, or smaller steps contradict it", "", MORE,
     ),
     "jump": Rule(
         "broken", "the cost jumps here, so it has no derivative",
-        "costs on two sides differ by a constant at {direction.SHORT_WINDOW} steps, extrapolated to a step of 0. Under noise in "
-        "`gradcheck`: a change within {jumps.REACH:g} sigma that does not shrink down to {jumps.FINEST:g} of its line",
+        "the two sides differ by a constant at the {direction.SHORT_WINDOW} smallest steps, extrapolated to 0. Under noise in `gradcheck`: a "
+        "change within {jumps.REACH:g} sigma that does not shrink down to {jumps.FINEST:g} of its line",
         "choose a theta beside it", EXPECTED,
     ),
     "missed_slope": Rule(
         "broken", "under noise, a steep rise or a far kink carries part of the mean slope, and no sampled gradient meets it",
-        "under noise in `gradcheck`: gradients within {jumps.MET:g} sigma miss {jumps.MISSED:.0%} of the largest mean slope of a line",
+        "in `gradcheck`: gradients within {jumps.MET:g} sigma miss {jumps.MISSED:.0%} of the largest mean slope of a line",
     ),
     "kink": Rule(
         "broken", "the two sides have different slopes, and a gradient can match only one",
-        "one-sided slopes differ by a constant over {direction.DECADES:g} decades of steps, and the derivative is between them",
+        "by a constant over {direction.DECADES:g} decades of steps, and the derivative is between them",
         "choose a theta beside it", EXPECTED,
     ),
     "saturated": Rule(
         "right", "exactly 0, though wider differences are not: the input is clipped or has no effect here",
-        "0, as the differences at the {direction.MIN_STEPS} smallest steps; or `zero` for all, where jumps or noise around theta move the cost", "", SIGMA,
+        "as the differences at the {direction.MIN_STEPS} smallest steps; or `zero` for all, where jumps or noise around theta move the cost", "", SIGMA,
     ),
     "rounding": Rule(
         "right", "small steps have larger errors than the arithmetic explains, as with a loose solver tolerance",
@@ -110,7 +111,7 @@ DERIVATIVE = {
     ),
     "mode_crossing": Rule(
         "right", "the two sides of wide differences have different contacts",
-        "a wider difference is off by {direction.RISE:.0%}, with other contacts on its two sides", "", SIGMA,
+        "a wider difference is off by {direction.RISE:.0%}", "", SIGMA,
     ),
     "nonlinear": Rule(
         "right", "wide differences show the curvature of the cost",
@@ -127,26 +128,26 @@ DERIVATIVE = {
 """Verdicts on one derivative, in every check, worst first."""
 EXAMINATION = {
     "raised": Rule(
-        "fault", "the gradient could not be computed", "the gradient raises an exception at theta",
+        "fault", "the gradient could not be computed", "an exception at theta",
     ),
     "rough": Rule(
         "fault", "the cost changes as much between neighbouring thetas as over a wide step",
-        "`unsettled`, and neighbours differ by {stages.ROUGH:.0%} of the largest change, which the gradient does not explain",
+        "`unsettled`, and neighbours by {stages.ROUGH:.0%} of the largest change, which the gradient does not explain",
         "look for a seed or hash taken from theta",
     ),
     "overwritten": Rule(
         "fault", "memory is overwritten between forward and backward, or a term acts only later",
-        "wrong, and with `horizons` right at the first, and {diagnosis.GROWTH:g} times as wrong at the last as at the first wrong one",
+        "with `horizons` right at the first, and {diagnosis.GROWTH:g} times as wrong at the last as at the first wrong one",
         "use one tape per step, or arrays of its own for each step", STEPS,
     ),
     "no_effect": Rule(
         "broken", "an input has no effect on the cost, and is not in allow_zero",
-        "`zero` for such an input where `allow_zero` is given, without jumps or a slope under noise around theta",
+        "`zero` where `allow_zero` is given, without jumps or a slope under noise around theta",
         "check that it reaches the simulator", ("allow_zero=NAME",),
     ),
     "constant": Rule(
         "open", "no input moves the cost, and its gradient is 0, or below rounding",
-        "`zero` for every input that is checked, without jumps or a slope under noise around theta, unless `allow_zero` has all of them",
+        "`zero` for every checked input, without jumps or a slope under noise around theta, unless `allow_zero` has all",
         "check that theta reaches the simulator", ("allow_zero=NAME",),
     ),
     "undecided": Rule(
@@ -156,13 +157,13 @@ EXAMINATION = {
     ),
     "unresolved": Rule(
         "open", "rounding or noise of the cost hides its slope at every step, or contradicts a small derivative",
-        "right, but the error of the difference is above {findings.DIGIT:.0%} of it, or they are {findings.CONTRADICTED:g} errors and "
+        "right, but the error of the difference is above {findings.DIGIT:.0%} of it, or both are {findings.CONTRADICTED:g} errors and "
         "{findings.DIGIT:.0%} apart",
     ),
     "adaptive": Rule(
         "open", "gradient and differences differ by as much as the discretisation does, as with adaptive steps: neither is "
         "exactly the derivative of the solution",
-        "`missing_term` or `wrong_adjoint` where the length of a loop depends on theta, and jumps explain an error up to "
+        "`missing_term` or `wrong_adjoint` where a loop's length depends on theta, and jumps explain an error up to "
         "{diagnosis.NEAR:.0%}, or {diagnosis.FAR:.0%} where they move the cost more than the error does. With `refined`: the gradient is at "
         "most {findings.AGREES:g} times as far from it as the differences at each theta, or {findings.AS_FAR:g} times beside such a loop",
         "give the cost at a tighter tolerance; accept it if the gradient is meant to be that one's", ("refined=COST", *EXPECTED),
@@ -172,7 +173,7 @@ EXAMINATION = {
 NOISE = {
     "jumps": Rule(
         "broken", "the gradient is right at theta, and misses jumps around it that no gradient sees",
-        "the integral of the gradient misses {smoothing.TARGET_ERROR:.0%} of the cost's change along a line, and the bias is not decided at every sigma",
+        "its integral misses {smoothing.TARGET_ERROR:.0%} of the cost's change along a line, and the bias is not decided at every sigma",
         SMOOTHING, EXPECTED,
     ),
     "biased": Rule(
@@ -208,7 +209,7 @@ TRUSTED = of_kind("right")
 """Verdicts that the gradient is the derivative."""
 VERDICTS = tuple(DERIVATIVE)
 """All verdicts on one derivative, worst first."""
-UNEQUAL = tuple(name for name, rule in DERIVATIVE.items() if rule.advice == FOLLOW)
+UNEQUAL = tuple(name for name, rule in DERIVATIVE.items() if rule.is_unequal)
 """Verdicts on a derivative that is a number other than the differences."""
 SUSPICIOUS = tuple(name for name in UNEQUAL if name != "disconnected")
 """Causes that adaptive steps and kinks imitate."""

@@ -21,7 +21,7 @@ def repeats(first: np.ndarray, second: np.ndarray, unit: float) -> np.ndarray:
     with np.errstate(invalid="ignore"):
         size = np.abs(np.where(np.isfinite(first), first, 0.0)).max(axis=-1, keepdims=True, initial=0.0)
         is_close = np.abs(first - second) <= LAST_DIGITS * unit * size
-    return np.asarray((first == second) | (np.isnan(first) & np.isnan(second)) | is_close)
+    return (first == second) | (np.isnan(first) & np.isnan(second)) | is_close
 
 
 def sampled(

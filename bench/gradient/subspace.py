@@ -67,7 +67,7 @@ class Subspace:
     def project(self, gradient: np.ndarray) -> np.ndarray:
         """Return the derivatives by the coordinates ``(m,)`` from a gradient ``(d,)``."""
         along = [float(group.vector @ gradient[group.first : group.last]) for group in self.groups]
-        return np.asarray(np.r_[gradient[self.components], along])
+        return np.r_[gradient[self.components], along]
 
     def costs(self, cost: Callable[[np.ndarray], np.ndarray], z: np.ndarray, width: int) -> np.ndarray:
         """Return the costs ``(B,)`` at ``z (m, B)``, from ``cost`` of at most ``width`` thetas ``(d, width)`` at a time."""

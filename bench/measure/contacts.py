@@ -93,12 +93,12 @@ def active_contacts(
 
 def _measured_contacts(scene: ContactScene, before: State, after: State, force: np.ndarray) -> np.ndarray:
     opened = scene.dt**2 * scene.contact(np).response(np, before.q) * force
-    return np.asarray((scene.gap(np, before.q) < 0) | ((force > 0) & (opened > scene.gap(np, after.q))))
+    return (scene.gap(np, before.q) < 0) | ((force > 0) & (opened > scene.gap(np, after.q)))
 
 
 def _predicted_contacts(program: Rollout, scene: ContactScene, before: State, u: Array) -> np.ndarray:
     q, v = before
     if program.needs_root:
         free = scene.carried(v) + scene.dt * scene.acceleration(np, q, v, u)
-        return np.asarray(scene.gap(np, q + scene.dt * free) < 0)
-    return np.asarray((scene.gap(np, q + scene.dt * v) < 0) & (scene.gap_rate(np, q, v) < 0))
+        return scene.gap(np, q + scene.dt * free) < 0
+    return (scene.gap(np, q + scene.dt * v) < 0) & (scene.gap_rate(np, q, v) < 0)

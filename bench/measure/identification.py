@@ -47,7 +47,7 @@ class Information:
         is_dependent = np.diff(ranks) == 0
         result = np.eye(len(self.names))[~is_dependent]
         result[:, is_dependent] = np.linalg.pinv(self.jacobian[:, ~is_dependent]) @ self.jacobian[:, is_dependent]
-        return np.asarray(result)
+        return result
 
     @property
     def labels(self) -> list[str]:
@@ -56,13 +56,13 @@ class Information:
 
     def along(self, jacobian: np.ndarray) -> np.ndarray:
         """Return a Jacobian ``(m, p)`` by logarithms of the parameters as one by logarithms of the invariants, ``(m, rank)``."""
-        return np.asarray(jacobian @ np.linalg.pinv(self.invariants))
+        return jacobian @ np.linalg.pinv(self.invariants)
 
     @property
     def bound(self) -> np.ndarray:
         """The Cramer-Rao bound on the standard deviations of the invariants' logarithms, ``(rank,)``."""
         slopes = self.along(self.jacobian)
-        return np.asarray(np.sqrt(np.diag(np.linalg.inv(slopes.T @ slopes))))
+        return np.sqrt(np.diag(np.linalg.inv(slopes.T @ slopes)))
 
 
 def product(names: tuple[str, ...], exponents: np.ndarray) -> str:

@@ -125,7 +125,7 @@ def _lines_of_slopes(dim: int, random: np.random.Generator) -> np.ndarray:
     elif dim > SIGNED:
         rows += [*np.sign(random.standard_normal((LINES, dim))), *random.standard_normal((LINES, dim))]
     directions = np.array(rows).T
-    return np.asarray(directions / np.linalg.norm(directions, axis=0))
+    return directions / np.linalg.norm(directions, axis=0)
 
 
 def jump_under_noise(problem: Problem, theta: np.ndarray, seed: int, columns: int) -> tuple[Jump, np.ndarray]:

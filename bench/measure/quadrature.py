@@ -92,8 +92,7 @@ def integrate(problem: Problem, theta: np.ndarray, points: int, columns: int) ->
         return in_columns(lambda w: problem.value(theta, w), nodes, columns)
 
     def excess(nodes: np.ndarray) -> np.ndarray:
-        difference: np.ndarray = cost(nodes) - centre
-        return difference
+        return cost(nodes) - centre
 
     low, high, beyond, note = _limits(excess, width)
     beyond /= problem.sigma
@@ -108,18 +107,17 @@ def integrate(problem: Problem, theta: np.ndarray, points: int, columns: int) ->
     panels, previous, error, used, size = FIRST[width], None, math.inf, 0, 0.0
     peak, largest = np.zeros(width), 0.0
     while True:
-        rules = [
-            [_panels(e, round(panels * stretch[i]), shift) for shift in SHIFTS[width][i]] for i, e in enumerate(edges)
-        ]
-        count = sum(math.prod(rule[0].size for rule in axes) for axes in zip(*rules, strict=True))
+        rules = _rules(edges, panels * stretch)
+        count = sum(math.prod(rule[0].size for rule in axes) for axes in rules)
         if count > points:
             break
         gradients = []
-        for axes in zip(*rules, strict=True):
-            nodes = np.stack([axis.ravel() for axis in np.meshgrid(*(r[0] for r in axes), indexing="ij")])
-            weights = np.ones(1)
-            for _, weight in axes:
-                weights = np.outer(weights, weight).ravel()
+        for axes in rules:
+            nodes, weights = (
+                np.stack([part.ravel() for part in np.meshgrid(*each, indexing="ij")])
+                for each in zip(*axes, strict=True)
+            )
+            weights = weights.prod(axis=0)
             f = cost(nodes)
             if not np.isfinite(f).all():
                 if stretch.max() <= 1.0:
@@ -252,7 +250,7 @@ def _bisected(integrand: Callable[[np.ndarray], np.ndarray], ends: np.ndarray) -
         half = (high - low)[:, None] / 2.0
         t = (low[:, None] + half) + half * x
         weights = half * w * np.exp(-(t**2) / 2.0) / math.sqrt(2.0 * math.pi)
-        return np.asarray((weights * integrand(t.ravel()).reshape(t.shape)).sum(axis=1))
+        return (weights * integrand(t.ravel()).reshape(t.shape)).sum(axis=1)
 
     low, high = ends[:-1], ends[1:]
     whole, total, used, changes = panels(low, high), 0.0, low.size * NODES, []
@@ -280,6 +278,12 @@ def _bisected(integrand: Callable[[np.ndarray], np.ndarray], ends: np.ndarray) -
         closed = max(closed, *tail[at[-5:]])
         power = max(1.0 + float(np.polyfit(at, np.log2(tail[at]), 1)[0]), 0.0)
     return total, closed, used, power
+
+
+def _rules(edges: list[np.ndarray], counts: np.ndarray) -> list[tuple[tuple[np.ndarray, np.ndarray], ...]]:
+    """Return the rules with about ``counts`` panels per axis, each as nodes and weights by axis."""
+    shifts = zip(edges, counts, SHIFTS[len(edges)], strict=True)
+    return [*zip(*([_panels(e, round(n), shift) for shift in each] for e, n, each in shifts), strict=True)]
 
 
 def _panels(edges: np.ndarray, count: int, shift: float) -> tuple[np.ndarray, np.ndarray]:

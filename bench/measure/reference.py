@@ -75,7 +75,7 @@ class Reference:
     @property
     def gradient(self) -> np.ndarray:
         """grad J_sigma, ``(d,)``."""
-        return np.asarray(self.batches.mean(axis=0))
+        return self.batches.mean(axis=0)
 
     @property
     def is_finite(self) -> bool:
@@ -511,11 +511,11 @@ def _antithetic(
     mean, ``linear``, which changes no expectation.
     """
     terms = ((problem.value(theta, s) - baseline) * problem.score(theta, s) for s in sides)
-    mean = np.asarray(sum(terms) / 2)
+    mean = sum(terms) / 2
     if linear is None or not linear.any():
         return mean
     step = problem.directions(sides[0])
-    return np.asarray(mean - (linear @ step) * step + linear[:, None])
+    return mean - (linear @ step) * step + linear[:, None]
 
 
 def _failed(problem: Problem, reason: str) -> Reference:

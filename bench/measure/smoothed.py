@@ -37,7 +37,7 @@ def over_ball(problem: Problem, provides: frozenset[str], radius: float, samples
         u, _ = _polar(problem, w)
         still = problem.centred(w)
         change = problem.displaced(radius * u, theta, still) - problem.displaced(-radius * u, theta, still)
-        return np.asarray(d * change * u / (2 * radius))
+        return d * change * u / (2 * radius)
 
     def first(w: np.ndarray) -> np.ndarray:
         u, share = _polar(problem, w)

@@ -24,20 +24,6 @@ import numpy as np
 REVISION = 1
 """Raised when a stored number that this module decides moves."""
 
-__all__ = [
-    "UNEXPLAINED",
-    "Sampling",
-    "Summary",
-    "Truth",
-    "bias_interval",
-    "heavy_tails",
-    "is_unexplained",
-    "summarise",
-    "summarise_without_reference",
-    "variance_interval",
-    "variance_per_sample",
-]
-
 ROUNDING = 1e-12
 """Differences below this share of a gradient's size are rounding: no bias, and no spread of the estimates."""
 FEW_REPEATS = 8
@@ -49,8 +35,6 @@ SYMMETRIC = 1e-6
 """Skewness below which its correction is rounding."""
 VAGUE = 0.1
 """Error of a reference, as a share of its norm, above which a note warns that relative columns are no more accurate."""
-LARGE = 1 << 12
-"""Coordinates from which a covariance that is equal in all directions is one number: as rows it has d x d numbers."""
 NARROW = 10.0
 """Width of the interval of the log variance of terms, times their number, below which it ignores the error of their mean."""
 THREE = 3.0
@@ -76,7 +60,7 @@ class Sampling:
     degrees: float
     """Degrees of freedom: K - 1 for a sample of K, infinite for a known covariance."""
     equal: float = 0.0
-    """A variance that is added to every coordinate, so that an error without direction needs no d rows."""
+    """A standard deviation of every coordinate beside the rows: that of an error without direction."""
 
     @classmethod
     def of(cls, sample: np.ndarray) -> Sampling:
@@ -87,19 +71,16 @@ class Sampling:
     @classmethod
     def without_direction(cls, error: float, dim: int) -> Sampling:
         """Return the known covariance of an error of norm ``error`` whose direction is unknown."""
-        if dim > LARGE:
-            return cls(np.zeros((0, dim)), math.inf, error**2 / dim)
-        rows = np.eye(dim) * (error / math.sqrt(max(dim, 1))) if error else np.zeros((0, dim))
-        return cls(rows, math.inf)
+        return cls(np.zeros((0, dim)), math.inf, error / math.sqrt(dim))
 
     @property
     def trace(self) -> float:
         """Trace of the covariance: the expected squared distance of the mean from its expectation."""
-        return float(np.vdot(self.rows, self.rows) + self.equal * self.rows.shape[1])
+        return float(np.vdot(self.rows, self.rows) + self.equal**2 * self.rows.shape[1])
 
     def over(self, unit: float) -> Sampling:
         """Return the same covariance, measured in ``unit``."""
-        return replace(self, rows=self.rows / unit, equal=self.equal / unit**2)
+        return replace(self, rows=self.rows / unit, equal=self.equal / unit)
 
     def excess(self) -> float:
         """Return the upward bias of tr C^2 as an estimate, where C is the covariance of a sample's mean; 0 for a known C.
@@ -186,8 +167,8 @@ class Truth:
     @property
     def standard_error(self) -> float:
         """Square root of the trace of the covariance of the mean, including the error that sampling does not show."""
-        shown = math.sqrt(self.sampling.trace) if self.sampling.equal else _length(self.sampling.rows)
-        return math.hypot(shown, self.unseen)
+        hidden = self.sampling.equal * math.sqrt(self.mean.size)
+        return math.hypot(_length(self.sampling.rows), hidden, self.unseen)
 
     def vanishes(self) -> bool:
         """Return whether the gradient is not distinguishable from 0, so that relative quantities are undefined."""
@@ -234,7 +215,7 @@ def bias_interval(difference: np.ndarray, *errors: Sampling, level: float = 0.95
     rows = np.concatenate([error.rows for error in errors])
     doubt = sum(error.trace**2 / error.degrees for error in errors)  # Welch: the reciprocal of the degrees of freedom
     # S = rows' rows + equal I
-    equal, dim = sum(error.equal for error in errors), difference.size
+    equal, dim = sum(error.equal**2 for error in errors), difference.size
     square = _trace_square(rows) + equal * (2.0 * float(np.vdot(rows, rows)) + equal * dim)
     square = square - sum(error.excess() for error in errors)
     square = min(max(square, 1.0 / difference.size), 1.0)
@@ -454,49 +435,33 @@ def summarise(
     identical = bool((np.abs(estimates - estimates[0]) <= ROUNDING * np.abs(estimates[0])).all())
     mean = estimates[0] if identical else estimates.mean(axis=0)
     deviations = np.zeros_like(estimates) if identical else estimates - mean
-    difference = mean - reference.mean
-    norm = reference.norm
-
-    bias = bias_low = bias_high = variance = variance_low = variance_high = math.nan
-    per_sample = (math.nan,) * 3
-    if repeats > 1:
-        variance = float(np.vdot(deviations, deviations)) / (repeats - 1)
-        variance_low, variance_high = variance_interval(deviations)
-        sampling = Sampling(deviations / math.sqrt(repeats * (repeats - 1)), repeats - 1)
-        bias, bias_low, bias_high = bias_interval(difference, sampling, *reference.errors)
-        if identical:
-            size = max(norm, float(np.linalg.norm(mean)))
-            rare = THREE / (repeats * samples)
-            bias_low, bias_high = bias_low - rare * size, bias_high + rare * size
-            variance_high = rare * size**2 / samples
-        per_sample = (variance * samples, variance_low * samples, variance_high * samples)
-        if bias_low <= ROUNDING * (norm + float(np.linalg.norm(mean))):
-            bias_low = 0.0
+    norm, grad_norm = reference.norm, float(np.linalg.norm(mean))
+    bias, variance = _spread(deviations, mean, reference, samples, identical)
     errors = estimates - reference.mean
     squared_error = float(np.vdot(errors, errors)) / repeats - reference.standard_error**2
     rmse = math.sqrt(max(0.0, squared_error))
     relative = math.nan if norm <= ROUNDING or reference.vanishes() else norm
     cosine, signs = _directions(estimates, reference.mean)
-    notes = _interval_remarks(deviations, difference, samples, identical)
+    notes = _interval_remarks(deviations, mean - reference.mean, samples, identical)
     notes += _reference_remarks(reference, relative)
-    if unbiased and bias_low > 0.0:
+    if unbiased and bias[1] > 0.0:
         notes.append(f"declared unbiased, and its interval excludes 0: {UNEXPLAINED}, or chance (about 1 row in 30)")
-    scaled = tuple(value * unit * unit for value in per_sample)
+    scaled = tuple(value * samples * unit * unit for value in variance)
     if terms is not None:
         scaled = variance_per_sample(*terms, samples)
         if scaled[1] > 0.0 and math.log(scaled[2] / scaled[1]) < NARROW / (repeats * samples):
             notes.append("all terms are equally far from their mean: the interval of their variance is too narrow")
     return Summary(
-        grad_norm=float(np.linalg.norm(mean)) * unit,
+        grad_norm=grad_norm * unit,
         reference_norm=norm * unit,
         reference_se=reference.standard_error * unit,
-        bias=bias * unit,
-        bias_low=bias_low * unit,
-        bias_high=bias_high * unit,
-        bias_rel=bias / relative,
-        variance=variance * unit * unit,
-        variance_low=variance_low * unit * unit,
-        variance_high=variance_high * unit * unit,
+        bias=bias[0] * unit,
+        bias_low=bias[1] * unit,
+        bias_high=bias[2] * unit,
+        bias_rel=bias[0] / relative,
+        variance=variance[0] * unit * unit,
+        variance_low=variance[1] * unit * unit,
+        variance_high=variance[2] * unit * unit,
         variance_per_sample=scaled[0],
         variance_per_sample_low=scaled[1],
         variance_per_sample_high=scaled[2],
@@ -507,6 +472,25 @@ def summarise(
         finite_fraction=1.0,
         note="; ".join(notes),
     )
+
+
+def _spread(
+    deviations: np.ndarray, mean: np.ndarray, reference: Truth, samples: int, identical: bool
+) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    """Return bias and variance, each with its interval, of estimates with ``deviations (R, d)`` from their mean; NaN for R = 1."""
+    repeats = len(deviations)
+    if repeats == 1:
+        return (math.nan,) * 3, (math.nan,) * 3
+    variance = float(np.vdot(deviations, deviations)) / (repeats - 1)
+    variance_low, variance_high = variance_interval(deviations)
+    sampling = Sampling(deviations / math.sqrt(repeats * (repeats - 1)), repeats - 1)
+    bias, low, high = bias_interval(mean - reference.mean, sampling, *reference.errors)
+    norm, grad_norm = reference.norm, float(np.linalg.norm(mean))
+    if identical:
+        size, rare = max(norm, grad_norm), THREE / (repeats * samples)
+        low, high = low - rare * size, high + rare * size
+        variance_high = rare * size**2 / samples
+    return (bias, 0.0 if low <= ROUNDING * (norm + grad_norm) else low, high), (variance, variance_low, variance_high)
 
 
 def summarise_without_reference(estimates: np.ndarray, samples: int, reason: str) -> Summary:

@@ -27,10 +27,10 @@ class KnownValue(ABC):
         """Return the optimal cost-to-go from the state before ``step``, without noise, ``(B,)``."""
 
 
-class Identified(ABC):
+class Identified:
     """A role: some parameters of the scene are to be identified from a record of its motion."""
 
-    unknowns: ClassVar[tuple[str, ...]]
+    unknowns: ClassVar[tuple[str, ...]] = ()
     """Default names of the parameters to identify."""
     measured: ClassVar[tuple[int, ...] | None] = None
     """Indices of the entries of the state (q, v) measured after each step; None for all positions."""

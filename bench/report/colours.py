@@ -1,16 +1,31 @@
-"""Returns the look of an estimator in every chart, by its place among all registered estimators."""
+"""Returns looks by name: of an estimator the same in every chart, of other names the same in all charts of an experiment."""
 
 from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from functools import cache
+from itertools import count
 
 from bench.experiment.config import config_dir
-from bench.experiment.views import Style
+from bench.experiment.views import Chart, Style
 from bench.model import registry
-from bench.report.style import VARIANTS, colour, marker
+from bench.report.style import MARKERS, VARIANTS, colour, marker
+
+
+def looks_by_name(charts: Sequence[Chart]) -> dict[str, Style]:
+    """Return the look of each series or level of some charts; those without a given style get a free colour each, in order."""
+    given = {name: style for chart in charts for name, style in chart.styles.items()}
+    columns = [(chart, chart.level if chart.kind == "grid" else chart.series) for chart in charts]
+    drawn = [str(name) for chart, column in columns for name in (chart.frame[column].unique() if column else [""])]
+    taken = {style.colour for style in given.values()}
+    free = (place for place in count() if colour(place) not in taken)
+    others = (name for name in dict.fromkeys(drawn) if name not in given)
+    found = given | {
+        name: Style(colour(place), MARKERS[place % len(MARKERS)]) for name, place in zip(others, free, strict=False)
+    }
+    return {name: style for name, style in found.items() if name in drawn}
 
 
 def estimator_style(estimator: str, variant: int = 0) -> Style:

@@ -24,12 +24,19 @@ MOST_NAMES = 24
 """Most names of columns that are listed as left out."""
 
 
+class _Console(Console):
+    """Raises BrokenPipeError when the reader of the output has gone, where rich would exit with status 1."""
+
+    def on_broken_pipe(self) -> None:
+        raise BrokenPipeError
+
+
 def open_console() -> Console:
     """Return a console that prints names as they are, without markup. It is as wide as the terminal.
 
     ``COLUMNS`` replaces the width of the terminal, in a pipe too. A pipe without a terminal has 80 columns.
     """
-    return Console(highlight=False, markup=False, emoji=False)
+    return _Console(highlight=False, markup=False, emoji=False)
 
 
 def print_table(

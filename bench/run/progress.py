@@ -40,9 +40,8 @@ class Progress:
         self._n_done = sum(item.stored for item in planned)
         self._current = ""
         self._failed: Counter[str] = Counter()
-        self._task = bars.add_task(
-            printable(name), total=self._n_cells, completed=self._n_done, counts=self._counts(), current=""
-        )
+        self._n_due = sum(item.runs for item in planned)  # stored and refused cells take no time
+        self._task = bars.add_task(printable(name), total=self._n_due, counts=self._counts(), current="")
         self._printed_at = time.monotonic() + FIRST_LINE_S - LINE_S
         if lines and self._n_done:
             print(f"{name}: {self._n_done} of {self._n_cells} cells are stored", file=sys.stderr)
@@ -60,7 +59,8 @@ class Progress:
         self._show()
 
     def _show(self) -> None:
-        self._bars.update(self._task, completed=self._n_done, counts=self._counts(), current=self._current)
+        n_run = max(0, self._n_done - self._n_cells + self._n_due)
+        self._bars.update(self._task, completed=n_run, counts=self._counts(), current=self._current)
         if self._lines and time.monotonic() - self._printed_at > LINE_S:
             self._printed_at = time.monotonic()
             seconds = self._bars.tasks[0].time_remaining

@@ -104,7 +104,7 @@ def _impulse_forces(program: Rollout, scene: ContactScene, path: Jacobians) -> n
     units = np.eye(scene.n_contacts)[:, :, None] + np.zeros((1, 1, q.shape[1]))
     response = np.stack([scene.contact_acceleration(np, q, unit) for unit in units])
     inverse = np.linalg.pinv(np.nan_to_num(response.transpose(2, 1, 0)))
-    return np.asarray((inverse @ jump.T[:, :, None])[:, :, 0].T / scene.dt)
+    return (inverse @ jump.T[:, :, None])[:, :, 0].T / scene.dt
 
 
 def _stepped(program: Rollout, path: Jacobians) -> np.ndarray:

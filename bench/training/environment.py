@@ -51,7 +51,7 @@ class Environment:
     @property
     def scene(self) -> PolicyScene:
         """The scene."""
-        return self.program.scene  # type: ignore[no-any-return]
+        return self.program.scene
 
     @property
     def n_observations(self) -> int:
@@ -145,7 +145,7 @@ class Environment:
         it has by ``contacts(state)``.
         """
         if hasattr(self.program, "contacts"):
-            return self.program.contacts(jax.lax.stop_gradient(state))  # type: ignore[no-any-return]
+            return self.program.contacts(jax.lax.stop_gradient(state))
 
         scene, law, xp = self.scene, self.program.contact, self.ops.xp
         zero = jnp.zeros_like(state.q[0])

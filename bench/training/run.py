@@ -39,7 +39,7 @@ class Training:
 
     def update(self, state: Any) -> tuple[Any, dict[str, Any]]:
         """Return the state after one update and its log. The arrays of ``state`` are used up."""
-        return self._call("update", self.trainer.update, state)  # type: ignore[no-any-return]
+        return self._call("update", self.trainer.update, state)
 
     def compile_update(self, state: Any) -> None:
         """Compile the update without running it, so that its time is not part of the first update's."""

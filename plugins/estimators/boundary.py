@@ -36,7 +36,7 @@ class Boundary(SampleMean):
             apart = self.gap * direction[:, None]
             jump = problem.value(theta, at_limit - apart) - problem.value(theta, at_limit + apart)
             total = total + np.exp(-0.5 * limit**2) / np.sqrt(2.0 * np.pi) * slope * jump
-        return np.asarray(total)
+        return total
 
     def own_refusal(self, program: Program) -> str | None:
         missing = undeclared_jumps(program)

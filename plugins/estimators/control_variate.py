@@ -49,4 +49,4 @@ def _slope(control: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Return the regression coefficient of values on the control over samples, ``(R,)``; 0 for a constant control."""
     control = control - control.mean(axis=1, keepdims=True)
     covariance, variance = (np.einsum("rnd,rnd->r", control, other) for other in (values, control))
-    return np.asarray(np.divide(covariance, variance, out=np.zeros_like(variance), where=variance > 0))
+    return np.divide(covariance, variance, out=np.zeros_like(variance), where=variance > 0)

@@ -32,4 +32,4 @@ class MeasureValued(SampleMean):
             ahead = problem.value(theta, moved)
             moved[i] = -radius[i]
             rows.append(ahead - problem.value(theta, moved))
-        return np.asarray(np.stack(rows) / (problem.sigma * np.sqrt(2.0 * np.pi)))
+        return np.stack(rows) / (problem.sigma * np.sqrt(2.0 * np.pi))

@@ -38,4 +38,4 @@ class OptimalBaseline(Estimator):
         # centred costs sum to 0, so this is the mean of the others: a baseline must not depend on the own sample
         baseline = np.zeros_like(above) - centred / (count - 1)
         np.divide(above, below, out=baseline, where=below > 0)
-        return np.asarray((terms - baseline * score).mean(axis=1))
+        return (terms - baseline * score).mean(axis=1)

@@ -65,7 +65,7 @@ class Planted(Estimator):
             result = result + self.bias * size * u
         if self.noise:
             result = result + self.noise * size * self._unit_errors(used, problem.dim)
-        return np.asarray(result)
+        return result
 
     def _spare(self, program: Program) -> int:
         """Return the number of samples whose normal numbers make the random error."""
@@ -74,7 +74,7 @@ class Planted(Estimator):
     def _base(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
         if self.base == "best":
             return best_gradient(problem, theta, noise)
-        return np.asarray(first_order(problem, theta, noise).mean(axis=1))
+        return first_order(problem, theta, noise).mean(axis=1)
 
     def _unit_errors(self, noise: np.ndarray, d: int) -> np.ndarray:
         """Return isotropic random vectors ``(R, d)`` with a root mean square length of 1."""
@@ -84,10 +84,10 @@ class Planted(Estimator):
             return errors
         chi_square = (numbers[:, d : d + self.tails] ** 2).sum(axis=1, keepdims=True)
         # the variance of Student's t is tails / (tails - 2)
-        return np.asarray(errors * np.sqrt((self.tails - 2) / chi_square))
+        return errors * np.sqrt((self.tails - 2) / chi_square)
 
 
 def direction(d: int) -> np.ndarray:
     """Return the unit vector ``(d,)`` of biases and rotations: random, and the same for all problems of dimension d."""
     u = np.random.default_rng(d).standard_normal(d)
-    return np.asarray(u / np.linalg.norm(u))
+    return u / np.linalg.norm(u)

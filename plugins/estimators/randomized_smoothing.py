@@ -38,9 +38,9 @@ class RandomizedSmoothing(SampleMean):
         centred = problem.centred(w)
         ahead = problem.displaced(s * direction, theta, centred)
         if self.variant == "antithetic":
-            return np.asarray((ahead - problem.displaced(-s * direction, theta, centred)) * direction / (2 * s))
+            return (ahead - problem.displaced(-s * direction, theta, centred)) * direction / (2 * s)
         centre = centred if problem.program.exogenous else centred[:, :1]
-        return np.asarray((ahead - problem.value(theta, centre)) * direction / s)
+        return (ahead - problem.value(theta, centre)) * direction / s
 
     def declares_unbiased(self, program: Program) -> bool:
         """Return whether its smoothing equals its reference's: noise on theta, and J_sigma's radius or its own."""

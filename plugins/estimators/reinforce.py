@@ -31,7 +31,7 @@ class Reinforce(SampleMean):
         f = problem.value(theta, w)
         if self.baseline == "center":
             f = f - problem.value(theta, np.zeros((w.shape[0], 1)))
-        return np.asarray(f * problem.score(theta, w))
+        return f * problem.score(theta, w)
 
     def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Return the mean of the terms over samples, ``(R, d)``; ValueError if the baseline needs more samples."""
@@ -43,4 +43,4 @@ class Reinforce(SampleMean):
         f = per_repeat(problem.value(theta, w), noise)
         f = (f - f.mean(axis=1, keepdims=True)) * f.shape[1] / (f.shape[1] - 1)
         score = per_repeat(problem.score(theta, w), noise)
-        return np.asarray(np.einsum("rn,rnd->rd", f, score) / f.shape[1])
+        return np.einsum("rn,rnd->rd", f, score) / f.shape[1]

@@ -51,7 +51,7 @@ def directions(noise: np.ndarray) -> np.ndarray:
     # the mean times sqrt(N) is standard normal, so its probability is uniform, and depends on each sample
     uniform = ndtr(math.sqrt(count) * noise.mean(axis=1, keepdims=True))
     digits = np.minimum(uniform * 2.0**BITS, 2.0**BITS - 1.0).astype(np.uint64)
-    return np.asarray(ndtri(((points(count, d) ^ digits) + 0.5) / 2.0**BITS))
+    return ndtri(((points(count, d) ^ digits) + 0.5) / 2.0**BITS)
 
 
 @lru_cache(maxsize=8)

@@ -36,7 +36,7 @@ class SphereSmoothing(SampleMean):
         u = normal / np.linalg.norm(normal, axis=0)
         centred = problem.centred(w)
         change = problem.displaced(r * u, theta, centred) - problem.displaced(-r * u, theta, centred)
-        return np.asarray(d * change * u / (2.0 * r))
+        return d * change * u / (2.0 * r)
 
     def _radius(self, program: Program) -> float:
         return float(program.scene.sigma * np.sqrt(program.dim + 2.0)) if self.radius is None else self.radius

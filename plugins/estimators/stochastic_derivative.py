@@ -35,7 +35,7 @@ class StochasticDerivative(SampleMean):
             ratio = np.exp(-0.5 * limit**2 - log_ndtr(side * limit)) / np.sqrt(2.0 * np.pi)
             weight = ratio * np.maximum(0.0, -side * slope)
             total = total + weight * (problem.value(theta, changed) - cost)
-        return np.asarray(total)
+        return total
 
     def own_refusal(self, program: Program) -> str | None:
         scene = program.scene

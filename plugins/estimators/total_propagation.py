@@ -99,7 +99,7 @@ class TotalPropagation(DiagnosticEstimator):
 def _weight(v0: np.ndarray, v1: np.ndarray) -> np.ndarray:
     """Return v0 / (v0 + v1), or 1/2 if both are 0, where any weight is correct."""
     total = v0 + v1
-    return np.asarray(np.divide(v0, total, out=np.full_like(total, 0.5), where=total > 0))
+    return np.divide(v0, total, out=np.full_like(total, 0.5), where=total > 0)
 
 
 def _controls(program: Program) -> int:

@@ -61,7 +61,7 @@ class Windowed(Estimator):
     def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
         program, w = problem.program, columns(noise)
         if not isinstance(program, Rollout) or (self.steps >= program.scene.horizon and self.cut is None):
-            return np.asarray(first_order(problem, theta, noise).mean(axis=1))
+            return first_order(problem, theta, noise).mean(axis=1)
         path = slopes(problem, theta, w)
         problem.usage.gradients += w.shape[1]
         ends = self._ends(path)
@@ -73,7 +73,7 @@ class Windowed(Estimator):
             by_change = slope_by_changes(problem.program.scene, states, value(t, states))  # type: ignore[arg-type]
             return np.where(ends[t], by_change, adjoint)
 
-        return np.asarray(per_repeat(adjoint_gradient(problem, path, cut), noise).mean(axis=1))
+        return per_repeat(adjoint_gradient(problem, path, cut), noise).mean(axis=1)
 
     def _ends(self, path: Slopes) -> np.ndarray:
         """Return whether a window ends before step t, ``(T, B)``."""

@@ -36,7 +36,7 @@ class StudyPackage(Study):
 
     def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
         """Return one cell's results by column."""
-        return self._module("measure").measure(cell, session, self)  # type: ignore[no-any-return]
+        return self._module("measure").measure(cell, session, self)
 
     def views(self, experiment: Experiment, rows: pd.DataFrame) -> Views:
         """Return the tables of the rows and the charts that are not empty, and why cells have no result.
@@ -54,7 +54,7 @@ class StudyPackage(Study):
 
     def show(self, experiment: Experiment, rows: pd.DataFrame) -> Views | None:
         """Return the tables of the rows and the charts; None without any."""
-        return self._module("views").views(experiment, rows)  # type: ignore[no-any-return]
+        return self._module("views").views(experiment, rows)
 
     def _module(self, name: str) -> Any:
         package = next(c.__module__ for c in type(self).__mro__ if hasattr(sys.modules[c.__module__], "__path__"))
@@ -107,7 +107,7 @@ def mean_interval(values: np.ndarray) -> tuple[float, float, float]:
 
 def all_noise(cell: Cell, width: int) -> np.ndarray:
     """Return the noise of all rollouts of a cell, ``(repeats, samples, width)``."""
-    return np.asarray(noise.shared(cell.seed, cell.scene.name, cell.repeats, cell.samples, width))
+    return noise.shared(cell.seed, cell.scene.name, cell.repeats, cell.samples, width)
 
 
 def first_batch(cell: Cell, width: int) -> np.ndarray:

@@ -13,7 +13,7 @@ import numpy as np
 
 from bench.experiment import grid
 from bench.experiment.cell import Cell
-from bench.experiment.columns import Column, Columns, ComparisonRule, bounded, exact, interval, numbers, text
+from bench.experiment.columns import COMMON, Column, Columns, ComparisonRule, bounded, exact, interval, numbers, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.session import Session
 from bench.experiment.views import Chart, Table, Views
@@ -131,8 +131,8 @@ class BackwardMemory(StudyPackage):
 
         shown = Shown(experiment, rows, along=["horizon"])
         tried = with_error(shown.rows)
-        own: list[Column | str] = [shown.column("memory_mb", digits=3, limit="is_small"), *SHOWN]
-        title, always = "memory and time of a backward pass", ("scene", "backend", "horizon")
+        own: list[Column | str] = [COMMON["horizon"], shown.column("memory_mb", digits=3, limit="is_small"), *SHOWN]
+        title, always = "memory and time of a backward pass", ("scene", "backend")
         cells = shown.cells(own, title, [CELLS_NOTE], always, tried, terminal=False)
         has_result = (tried["status"] == "ok") & tried["memory_mb"].notna()
         if not has_result.any():

@@ -16,9 +16,9 @@ from bench.experiment.columns import COMMON, Column, Columns, ComparisonRule, bo
 from bench.experiment.experiment import Experiment
 from bench.experiment.session import Session
 from bench.experiment.views import Chart, Table, Views
-from bench.model import Jacobians, Problem, Rollout, columns, param
+from bench.model import Rollout, columns, param
 
-from . import PARTS, StudyPackage, all_noise, mean_interval, norm
+from . import PARTS, StudyPackage, all_noise, finite_status, mean_interval, norm
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -89,17 +89,12 @@ class Growth(StudyPackage):
         ),
         *(Column(f"{order}_variance_mean", f"variance of one {name} term, mean over repeats") for order, name in ORDERS.items()),
         text("growth", "class of the Jacobian product: exploding, neutral or vanishing", label="Jacobian product"),
-        text("gain_of", "inputs of the gain: controls or states"),
-        numbers("lags", "steps between an input and the end of the rollout", "steps"),
-        *bounded("gain", "largest singular value of the derivative of the end state by an input, per lag, median over rollouts",
-                 of="the range of 5% to 95% of the rollouts", kind=numbers),
         numbers("singular_values", "singular values of dx_N/dx_0, median over rollouts", label="singular values"),
     )  # fmt: skip
 
     rollouts: int = param(
         64, "rollouts whose step Jacobians are multiplied: rates are known to 1/8 of their spread", low=2
     )
-    lags: int = param(40, "most lags whose gain is stored", positive=True)
 
     def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
         """Return one cell's results by column.
@@ -114,8 +109,7 @@ class Growth(StudyPackage):
         zeroth = (problem.value(theta, w) - centre) * problem.score(theta, w)
         good = np.isfinite(first).all(axis=0) & np.isfinite(zeroth).all(axis=0)
         result: dict[str, Any] = {
-            "status": "ok" if good.all() else "nonfinite",
-            "reason": "" if good.all() else f"{(~good).sum()} of {good.size} rollouts or gradients are not finite",
+            **finite_status(f"{(~good).sum()} of {good.size} rollouts or gradients are not finite", first, zeroth),
             "finite_fraction": float(good.mean()),
             "time_horizon": program.scene.horizon * program.scene.dt if isinstance(program, Rollout) else math.nan,
         }
@@ -131,7 +125,14 @@ class Growth(StudyPackage):
             found = (np.median(totals), *np.quantile(totals, [QUANTILES["low"], QUANTILES["high"]]), totals.mean())
             ends = zip(("", "_low", "_high", "_mean"), map(float, found), strict=True)
             result |= {f"{order}_variance{end}": value for end, value in ends}
-        return result | _product_columns(problem, w[:, good][:, : self.rollouts], self.lags)
+        steps = problem.jacobians(theta, w[:, good][:, : self.rollouts]).a
+        singular, spectral = products(steps)
+        rates = {"stretch": rate(singular[:, 0], len(steps)), "spectral": rate(spectral, len(steps))}
+        return result | {
+            **{f"{name}_{end}": value for name, found in rates.items() for end, value in zip(("rate", "low", "high"), found, strict=True)},
+            "growth": classify(rates["stretch"][2], rates["spectral"][1], ROUNDING / len(steps)),
+            "singular_values": np.exp(np.median(singular, axis=0)).tolist(),
+        }  # fmt: skip
 
     def show(self, experiment: Experiment, rows: pd.DataFrame) -> Views:
         """Return a table with a line per problem and one with a line per cell, and the charts."""
@@ -169,34 +170,22 @@ class Growth(StudyPackage):
 # ------------------------------------------------------------------------------------------------ products
 
 
-@dataclass(frozen=True)
-class Products:
-    """Logarithms of the Jacobian products of B rollouts; the products themselves would overflow."""
+def products(steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return logarithms of the singular values ``(B, n)`` and spectral radii ``(B,)`` of dx_N/dx_0, -inf where it is singular.
 
-    gain: np.ndarray
-    """log of the largest singular value of dx_N/du_i (of dx_N/dx_i without controls), ``(N, B)``, row N - 1 - i."""
-    singular: np.ndarray
-    """log of the singular values of dx_N/dx_0, ``(B, n)``; -inf where the product is singular."""
-    spectral: np.ndarray
-    """log of the spectral radius of dx_N/dx_0, ``(B,)``."""
-
-
-def products(jacobians: Jacobians) -> Products:
-    """Return the products A_{N-1} ... A_{i+1} B_i for every i, by one backward scan that normalises at each step."""
-    a, b = np.moveaxis(jacobians.a, -1, 1), np.moveaxis(jacobians.b, -1, 1)
-    horizon, batch, n = a.shape[:3]
-    product, scale, gain = np.broadcast_to(np.eye(n), (batch, n, n)), np.zeros(batch), np.empty((horizon, batch))
+    The products of the Jacobians ``(N, n, n, B)`` are normalised at each step, since they would overflow.
+    """
+    n, batch = steps.shape[2:]
+    product, scale = np.broadcast_to(np.eye(n), (batch, n, n)), np.zeros(batch)
     with np.errstate(divide="ignore"):
-        for i in range(horizon - 1, -1, -1):
-            after = product @ a[i]
-            effect = product @ b[i] if b.shape[-1] else after
-            gain[horizon - 1 - i] = scale + np.log(np.linalg.norm(effect, ord=2, axis=(1, 2)))
-            size = np.linalg.norm(after, axis=(1, 2))
+        for a in np.moveaxis(steps, -1, 1)[::-1]:
+            product = product @ a
+            size = np.linalg.norm(product, axis=(1, 2))
             # a zero product stays zero and adds nothing to the scale
             size = np.where(size > 0, size, 1.0)
-            product, scale = after / size[:, None, None], scale + np.log(size)
+            product, scale = product / size[:, None, None], scale + np.log(size)
         singular = scale[:, None] + np.log(np.linalg.svd(product, compute_uv=False))
-        return Products(gain, singular, scale + np.log(np.abs(np.linalg.eigvals(product)).max(axis=1)))
+        return singular, scale + np.log(np.abs(np.linalg.eigvals(product)).max(axis=1))
 
 
 def rate(logarithms: np.ndarray, steps: int) -> tuple[float, float, float]:
@@ -216,23 +205,6 @@ def classify(stretch_high: float, spectral_low: float, tolerance: float) -> str:
     if spectral_low > tolerance:
         return "exploding"
     return "vanishing" if stretch_high < -tolerance else "neutral"
-
-
-def _product_columns(problem: Problem, w: np.ndarray, most_lags: int) -> dict[str, Any]:
-    """Return the columns of the Jacobian product for noise ``w (n_w, B)``: gains, singular values, rates and class."""
-    jacobians = problem.jacobians(problem.program.theta0, w)
-    steps = jacobians.a.shape[0]
-    product = products(jacobians)
-    lags = np.unique(np.round(np.geomspace(1, steps, most_lags)).astype(int))
-    gains = np.exp(np.quantile(product.gain[lags - 1], [0.05, 0.5, 0.95], axis=1)).tolist()
-    rates = {"stretch": rate(product.singular[:, 0], steps), "spectral": rate(product.spectral, steps)}
-    return {
-        **{f"{name}_{end}": value for name, found in rates.items() for end, value in zip(("rate", "low", "high"), found, strict=True)},
-        "growth": classify(rates["stretch"][2], rates["spectral"][1], ROUNDING / steps),
-        "gain_of": "controls" if jacobians.b.shape[2] else "states",
-        "lags": lags.tolist(), **dict(zip(("gain_low", "gain", "gain_high"), gains, strict=True)),
-        "singular_values": np.exp(np.median(product.singular, axis=0)).tolist(),
-    }  # fmt: skip
 
 
 # ------------------------------------------------------------------------------------------------ verdicts

@@ -32,7 +32,7 @@ def test_answers_stand_under_their_question_and_experiments_without_rows_last(tm
     index.write_text("| question | experiments |\n|---|---|\n| Does it work? | [all](answers.md#quick) |\n")
     text = build.answers_page(index, tmp_path)
     assert text.endswith(
-        "\n## Without stored results\n\n- `twins`: How far are the engines' trajectories and gradients from the scenes' own, and what do they cost?\n"
+        "\n## Without stored results\n\n- `twins`: How far are the engines' gradients from the scenes' own?\n"
     )
     assert (
         "## Does it work?\n\n### quick\n\n![quick](quick/chart.png)\n\nFirst &lt;b&gt;. Second. [Data](quick)\n\n"

@@ -3,9 +3,14 @@
 from itertools import combinations
 
 import numpy as np
+import pandas as pd
 import pytest
+from helpers import experiment
 from matplotlib.colors import to_rgb
 
+from bench.experiment.columns import Column
+from bench.experiment.views import Chart, Views
+from bench.report import writer
 from bench.report.colours import method_styles
 from bench.report.style import PALETTE, colour, marker
 
@@ -63,3 +68,19 @@ def test_an_estimator_keeps_its_look_whatever_else_is_drawn():
     assert found["fobg[a=1]"].colour == found["fobg"].colour
     assert found["fobg[a=1]"].line != found["fobg"].line
     assert method_styles(["fobg, adam"])["fobg, adam"] == found["fobg"]
+
+
+def test_a_name_has_one_colour_in_all_charts_of_an_experiment():
+    """A search without an estimator was orange in one chart and brown in the next, by its place."""
+    names = ["cma_es", "fobg, adam", "ppo"]
+    charts = [
+        Chart(str(turn), pd.DataFrame({"x": [1.0] * 3, "name": names[turn:] + names[:turn]}), [Column("x")], [Column("x")], "points",
+              series="name", styles=method_styles(["fobg, adam"]))
+        for turn in range(3)
+    ]  # fmt: skip
+    found = [
+        {line.get_label(): line.get_color() for line in figure.legends[0].get_lines()}
+        for _, figure in writer.drawings(experiment(), Views(charts=charts))
+    ]
+    assert found == found[:1] * 3
+    assert len(set(found[0].values())) == 3

@@ -48,6 +48,8 @@ def test_refused_and_stored_cells_are_counted_as_done(capsys):
     for status in ["unsupported"] * 50 + ["ok"] * 9 + ["error"]:
         counted.finished({"status": status})
     assert counted._counts() == "65/75, 1 error"
+    task = counted._bars.tasks[0]
+    assert (task.completed, task.total) == (10, 20), "refused cells make the rest look quick"
     assert capsys.readouterr().err == "mine: 5 of 75 cells are stored\n"
 
 

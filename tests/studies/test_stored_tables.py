@@ -4,6 +4,7 @@ import pytest
 from helpers import stored
 from trees import ROOT
 
+from bench.experiment.columns import COMMON
 from bench.report.finish import views_of
 from bench.report.writer import table_files
 
@@ -27,7 +28,14 @@ def test_tables_of_stored_rows_are_the_stored_tables(name):
     if rows.empty:
         pytest.skip("no rows are stored")
     tables = views_of(given, rows).tables
+    for table in (one for one in tables if one.data is not None):
+        places = [
+            one.name for one in table.columns if one.kind == "text" or one.format == "setting" or one.name in COMMON
+        ]
+        assert not table.frame[[*places, *filter(None, [table.split])]].astype(str).duplicated().any(), (
+            "lines of equal name"
+        )
     for table in dict.fromkeys(table.name for table in tables):
-        for file, content in table_files([one for one in tables if one.name == table], given.name):
+        for file, content in table_files([one for one in tables if one.name == table], given.name).items():
             path = given.directory / file
-            assert not path.exists() or "".join(content) == path.read_text(), file
+            assert not path.exists() or content == path.read_text(), file

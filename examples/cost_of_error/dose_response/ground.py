@@ -62,7 +62,7 @@ def scored_noise(problem: Problem, scene: str) -> np.ndarray:
     width = problem.program.n_noise
     if problem.program.continuous:
         return problem.program.noise_free
-    return noise.draw(0, scene, 1, SCORED, width, "dose_response: scores")[0].T  # type: ignore[no-any-return]
+    return noise.draw(0, scene, 1, SCORED, width, "dose_response: scores")[0].T
 
 
 def ground_of(cell: Cell, problem: Problem, session: Session, settings: Any) -> Ground:

@@ -128,7 +128,7 @@ class Estimates:
             raise TypeError(f"{self._estimator.name} returned complex numbers; gradients are real")
         result = np.asarray(result, dtype=np.float64)
         require_shape(self._estimator, meaning, result, shape)
-        return result  # type: ignore[no-any-return]
+        return result
 
 
 def measure(cell: Cell, session: Session, study: BiasVariance) -> dict[str, Any]:

@@ -18,7 +18,17 @@ from bench.experiment.cell import Cell
 from bench.experiment.session import Session
 from bench.measure import adequacy, noise, performance
 from bench.measure.identification import Information, product
-from bench.model import Answer, Decision, Identified, LoopOps, MechanicalScene, Optimizer, Rollout, State, compose
+from bench.model import (
+    Answer,
+    Decision,
+    Identified,
+    LoopOps,
+    Optimizer,
+    Rollout,
+    State,
+    compose,
+    rollout,
+)
 from bench.model.parameters import named
 
 from .. import norm
@@ -77,7 +87,7 @@ class Model:
     def values(self) -> np.ndarray:
         """The scene's own values of the unknowns, ``(p,)``."""
         theta = self.program.theta0
-        return np.append(theta, self._origin(theta[:, None])[list(self.free), 0])
+        return np.append(theta, self.initial_states(theta[:, None])[list(self.free), 0])
 
     @property
     def entries(self) -> list[str]:
@@ -89,7 +99,7 @@ class Model:
     def unit(self) -> np.ndarray:
         """The largest size of each entry of the state along the scene's own motion, ``(n,)``."""
         path, _ = self.motion(self.values[:, None])
-        return np.asarray(np.maximum(np.abs(path[1:]).max(axis=(0, 2)), 1e-6))
+        return np.maximum(np.abs(path[1:]).max(axis=(0, 2)), 1e-6)
 
     def places(self, names: Collection[str]) -> tuple[int, ...]:
         """Return the indices of entries of the state; raises :class:`UserError` for an unknown one."""
@@ -103,13 +113,13 @@ class Model:
         """Return the unknowns ``(p, B)`` of coordinates."""
         scale = self.scale[:, None]
         with np.errstate(over="ignore"):
-            return np.asarray(np.where(scale, scale * points, np.exp(points)))
+            return np.where(scale, scale * points, np.exp(points))
 
     def points(self, theta: np.ndarray) -> np.ndarray:
         """Return the coordinates ``(p, B)`` of unknowns."""
         scale = self.scale[:, None]
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.asarray(np.where(scale, theta / scale, np.log(theta)))
+            return np.where(scale, theta / scale, np.log(theta))
 
     def scaled(self, theta: np.ndarray) -> Model:
         """Return the model with the sizes in ``theta (p,)`` as scales, where they change the motion noticeably."""
@@ -134,15 +144,11 @@ class Model:
         own, state, scanned = program.start(LoopOps(), own, w)
         return program, own, state, scanned
 
-    def _origin(self, theta: np.ndarray) -> np.ndarray:
-        states = np.concatenate(self._start(theta)[2])
-        states[list(self.places(self.state))] = np.reshape([*self.state.values()], (-1, 1))
-        return states
-
     def initial_states(self, theta: np.ndarray) -> np.ndarray:
-        """Return the initial states ``(n, B)`` for ``theta (p, B)``."""
-        states = self._origin(theta)
-        states[list(self.free)] = theta[len(self.program.theta0) :]
+        """Return the initial states ``(n, B)`` for ``theta (p, B)``; entries that theta lacks are those of the scene."""
+        states, own = np.concatenate(self._start(theta)[2]), len(self.program.theta0)
+        states[list(self.places(self.state))] = np.reshape([*self.state.values()], (-1, 1))
+        states[list(self.free[: len(theta) - own])] = theta[own:]
         return states
 
     def simulate(
@@ -182,8 +188,7 @@ class Model:
 
     def measurements(self, states: np.ndarray) -> np.ndarray:
         """Return the measurements ``(m, B)`` of the states ``(horizon, n, B)`` after each step."""
-        measured: np.ndarray = states[np.array(self.steps) - 1][:, list(self.measured)]
-        return measured.reshape(-1, states.shape[2])
+        return states[np.array(self.steps) - 1][:, list(self.measured)].reshape(-1, states.shape[2])
 
 
 def model_of(cell: Cell, refinement: int = 1) -> Model:
@@ -191,16 +196,14 @@ def model_of(cell: Cell, refinement: int = 1) -> Model:
 
     Raises ValueError if an unknown entry of the initial state does not exist.
     """
-    own, settings = cell.scene, cell.study
-    assert isinstance(own, MechanicalScene)
-    assert isinstance(settings, Identify)
+    own: Any = cell.scene
+    settings: Any = cell.study
+    role: Any = own if isinstance(own, Identified) else Identified
     scene = dataclasses.replace(own, dt=own.dt / refinement, horizon=own.horizon * refinement)
-    role = own if isinstance(own, Identified) else None
-    names = settings.decision(cell.decision).names or tuple(role.unknowns if role else ())
-    program = compose(scene, cell.contact, cell.integrator, Decision(names))
-    assert isinstance(program, Rollout)
-    measured = (role and role.measured) or tuple(range(scene.n_q))
-    first = own.horizon if role and role.end_only else 1
+    names = settings.decision(cell.decision).names or role.unknowns
+    program = rollout(compose(scene, cell.contact, cell.integrator, Decision(names)))
+    measured = role.measured or tuple(range(scene.n_q))
+    first = own.horizon if role.end_only else 1
     steps = range(first * refinement, scene.horizon + 1, refinement)
     state = {entry: float(evaluate(text, {})) for entry, text in expressions(settings.state).items()}
     model = Model(program, names, measured, tuple(steps), state)
@@ -211,13 +214,12 @@ def model_of(cell: Cell, refinement: int = 1) -> Model:
     )
 
 
-def own_record(settings: Identify, model: Model) -> tuple[np.ndarray, Model]:
-    """Return the measurements ``(m, 1)`` of the study's CSV file, and the model with what they measure and when.
+def own_record(path: str, settings: Identify, model: Model) -> tuple[Model, np.ndarray]:
+    """Return the model with what the study's CSV file measures and when, and these measurements ``(m, 1)``.
 
     Raises ValueError, with the number of the first line that cannot be used.
     """
-    path, scene, columns = settings.record, model.program.scene, expressions(settings.measured)
-    assert path is not None
+    scene, columns = model.program.scene, expressions(settings.measured)
     values, steps = read(path, columns, settings.time, scene.dt, settings.interpolate)
     measured = model.places(columns) or model.measured
     if len(values.columns) != len(measured):
@@ -231,7 +233,7 @@ def own_record(settings: Identify, model: Model) -> tuple[np.ndarray, Model]:
             f"{path} has {len(values)} lines up to step {max(steps, default=0)}, scene {scene.name} is "
             f"measured {len(model.steps)} times, up to step {model.steps[-1]}: set horizon"
         )
-    return values.to_numpy().reshape(-1, 1), dataclasses.replace(model, measured=measured, steps=times)
+    return dataclasses.replace(model, measured=measured, steps=times), values.to_numpy().reshape(-1, 1)
 
 
 # ----------------------------------------------------------------------------------------------- shooting methods
@@ -284,7 +286,7 @@ class Fitting:
         shifts = STEP * np.repeat(np.eye(self.dim), batch, axis=1)
         wide, many = np.tile(points, (1, self.dim)), np.tile(data, (1, self.dim))
         change = self.residuals(wide + shifts, many) - self.residuals(wide - shifts, many)
-        return np.asarray(change.reshape(len(change), self.dim, batch) / (2 * STEP))
+        return change.reshape(len(change), self.dim, batch) / (2 * STEP)
 
     def start(self, theta: np.ndarray, data: np.ndarray) -> np.ndarray:
         """Return the initial unknowns ``(dim, B)`` for ``theta (p, B)`` and ``data (m', B)``.
@@ -324,10 +326,10 @@ def run_fits(
         queries = [optimizer.ask(states[i], no_draws) for i in active]
         counts = [points.shape[1] for points in queries]
         points, many = np.concatenate(queries, axis=1), np.repeat(data[:, active], counts, axis=1)
-        residual, jacobian = fitting.residuals(points, many), fitting.jacobians(points, many)
         ends = np.cumsum(counts)[:-1]
-        parts = np.split(residual, ends, axis=1), np.split(jacobian, ends, axis=2)
-        for i, query, own, slope in zip(active, queries, *parts, strict=True):
+        residuals = np.split(fitting.residuals(points, many), ends, axis=1)
+        slopes = np.split(fitting.jacobians(points, many), ends, axis=2)
+        for i, query, own, slope in zip(active, queries, residuals, slopes, strict=True):
             gradient = np.einsum("mdb,mb->db", slope, own)
             answer = Answer(value=0.5 * (own**2).sum(axis=0), residual=own, jacobian=slope, gradient=gradient)
             states[i] = optimizer.tell(states[i], query, answer)
@@ -352,10 +354,7 @@ def prepared(cell: Cell, settings: Identify) -> tuple[Model, np.ndarray | None]:
     model = model_of(cell)
     for text in expressions(settings.terms).values():
         evaluate(text, dict.fromkeys((*model.entries, "q", "v", "t"), np.zeros(2)))
-    if settings.record is None:
-        return model, None
-    data, model = own_record(settings, model)
-    return model, data
+    return (model, None) if settings.record is None else own_record(settings.record, settings, model)
 
 
 def measure(cell: Cell, session: Session, settings: Identify) -> dict[str, Any]:
@@ -363,8 +362,7 @@ def measure(cell: Cell, session: Session, settings: Identify) -> dict[str, Any]:
 
     Raises :class:`Unsupported` if a record without a stated noise has no more measurements than parameters.
     """
-    optimizer = cell.parts["optimizer"]
-    assert isinstance(optimizer, Optimizer)
+    optimizer: Any = cell.parts["optimizer"]
     model, measurements = prepared(cell, settings)
     is_own, data = measurements is not None, records(cell, settings) if measurements is None else measurements
     factor = np.where(np.arange(data.shape[1]) % 2 == 0, settings.start, 1.0 / settings.start)
@@ -425,12 +423,12 @@ class Fit:
     @property
     def is_finite(self) -> np.ndarray:
         """Whether residuals and derivatives are finite, ``(B,)``."""
-        return np.asarray(np.isfinite(self.jacobian).all(axis=(0, 1)) & np.isfinite(self.residual).all(axis=0))
+        return np.isfinite(self.jacobian).all(axis=(0, 1)) & np.isfinite(self.residual).all(axis=0)
 
     def slopes(self, i: int) -> np.ndarray:
         """Return the Jacobian ``(m, p)`` of fit ``i`` by the parameters, with the windows' initial states projected out."""
         own, later = np.split(self.jacobian[:, :, i], [len(self.fitting.model.names)], axis=1)
-        return np.asarray(own - later @ (np.linalg.pinv(later) @ own))
+        return own - later @ (np.linalg.pinv(later) @ own)
 
 
 def _estimates(fit: Fit, known: Information, start: np.ndarray, own: Mapping[str, str]) -> dict[str, Any]:
@@ -570,7 +568,7 @@ def missing_terms(
 def _products(theta: np.ndarray, exponents: np.ndarray) -> np.ndarray:
     """Return products of powers ``(r,)`` of ``theta (p,)``, for exponents ``(r, p)``."""
     with np.errstate(all="ignore"):
-        return np.asarray(np.prod(np.sign(theta) ** np.rint(exponents) * np.abs(theta) ** exponents, axis=1))
+        return np.prod(np.sign(theta) ** np.rint(exponents) * np.abs(theta) ** exponents, axis=1)
 
 
 def _fit_statistics(fit: Fit, known: Information, is_own: bool) -> dict[str, Any]:
@@ -619,7 +617,7 @@ def records(cell: Cell, settings: Identify) -> np.ndarray:
     source = model_of(cell, settings.refine)
     clean = source.record(source.values[:, None])
     drawn = noise.draw(cell.seed, cell.scene.name, cell.repeats, 1, len(clean), "identify: measurements")[:, 0].T
-    return np.asarray(clean + (settings.measurement or NOISE) * drawn)
+    return clean + (settings.measurement or NOISE) * drawn
 
 
 def step_dependence(cell: Cell, model: Model, theta: np.ndarray, known: Information, sigma: float) -> dict[str, float]:
