@@ -97,8 +97,8 @@ class Estimator(Plugin):
         if "grad" in self.needs and program.surrogate and "surrogate" not in provides:
             law = program.contact.name if program.contact else ""
             return f"{self.name} needs the surrogate gradient of contact law {law}, and {backend} computes differences of costs"
-        if "score" in self.needs and not program.has_score_gradient:
-            return f"{self.name} needs scores, but {program.no_score_gradient}"
+        if "score" in self.needs and program.score_refusal:
+            return f"{self.name} needs scores, but {program.score_refusal}"
         own = program.n_noise - program.exogenous
         if self.needs_directions and own < program.dim:
             return f"{self.name} needs {program.dim} normal numbers per sample, and the noise model has {own}"
@@ -138,7 +138,7 @@ class SampleMean(Estimator):
         w = columns(noise)
         terms = np.asarray(self.terms(problem, theta, w))
         require_shape(self, "(d, B)", terms, (problem.dim, w.shape[1]))
-        return np.asarray(per_repeat(terms, noise).mean(axis=1))
+        return per_repeat(terms, noise).mean(axis=1)
 
 
 def require_shape(estimator: Estimator, meaning: str, result: np.ndarray, shape: tuple[int, ...]) -> None:
@@ -190,12 +190,12 @@ def mean_difference(problem: Problem, theta: np.ndarray, directions: np.ndarray,
     s, centred = problem.sigma, problem.centred(columns(noise))
     shift = s * columns(directions)
     change = problem.displaced(shift, theta, centred) - problem.displaced(-shift, theta, centred)
-    return np.asarray(per_repeat(change * shift / (2.0 * s * s), noise).mean(axis=1))
+    return per_repeat(change * shift / (2.0 * s * s), noise).mean(axis=1)
 
 
 def best_gradient(problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
     """Return the best gradient available, ``(R, d)``: without noise, or the mean of costs times scores where the cost jumps."""
     if not problem.program.continuous:
-        return np.asarray(zeroth_order(problem, theta, noise).mean(axis=1))
+        return zeroth_order(problem, theta, noise).mean(axis=1)
     gradient = problem.grad(theta, problem.program.noise_free).mean(axis=1, keepdims=True)
     return np.repeat(gradient.T, len(noise), axis=0)

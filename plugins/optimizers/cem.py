@@ -28,7 +28,7 @@ class Cem(Population):
         return super().start(theta) | {"deviation": np.full(len(theta), self.width)}
 
     def ask(self, state: OptimizerState, noise: np.ndarray) -> np.ndarray:
-        return np.asarray(state["theta"][:, None] + state["deviation"][:, None] * noise)
+        return state["theta"][:, None] + state["deviation"][:, None] * noise
 
     def tell(self, state: OptimizerState, theta: np.ndarray, answer: Answer) -> OptimizerState:
         """Return mean and standard deviation of the elites as state; points without a finite cost rank last."""

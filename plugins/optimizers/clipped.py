@@ -25,7 +25,7 @@ class Clipped(Descent):
         if self.clip is None:
             return gradient
         if self.clip_by == "element":
-            return np.asarray(np.clip(gradient, -self.clip, self.clip))
+            return np.clip(gradient, -self.clip, self.clip)
         norm = float(np.linalg.norm(gradient))
         return gradient if norm <= self.clip else gradient * (self.clip / norm)
 

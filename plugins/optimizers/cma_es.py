@@ -67,7 +67,7 @@ class CmaEs(Population):
 
     def ask(self, state: OptimizerState, noise: np.ndarray) -> np.ndarray:
         moved = state["axes"] @ (state["lengths"][:, None] * noise)
-        return np.asarray(state["theta"][:, None] + state["sigma"] * moved)
+        return state["theta"][:, None] + state["sigma"] * moved
 
     def tell(self, state: OptimizerState, theta: np.ndarray, answer: Answer) -> OptimizerState:
         d, i = theta.shape[0], state["iteration"] + 1

@@ -60,4 +60,4 @@ class GaussNewton(Optimizer):
         _, residual, jacobian = known
         weight = np.sqrt(damping) * scale
         stacked = np.concatenate([jacobian, np.diag(weight)])
-        return np.asarray(np.linalg.lstsq(stacked, np.concatenate([residual, 0.0 * weight]), rcond=None)[0])
+        return np.linalg.lstsq(stacked, np.concatenate([residual, 0.0 * weight]), rcond=None)[0]

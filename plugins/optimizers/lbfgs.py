@@ -52,4 +52,4 @@ class Lbfgs(Searching):
         q = q * ((s @ y) / (y @ y))
         for (s, y), share in zip(pairs, reversed(shares), strict=True):
             q = q + s * (share - (y @ q) / (y @ s))
-        return np.asarray(-q)
+        return -q

@@ -23,7 +23,7 @@ class Mppi(Population):
     relative: bool = param(True, "whether the temperature is in units of the standard deviation of the costs")
 
     def ask(self, state: OptimizerState, noise: np.ndarray) -> np.ndarray:
-        return np.asarray(state["theta"][:, None] + self.width * noise)
+        return state["theta"][:, None] + self.width * noise
 
     def tell(self, state: OptimizerState, theta: np.ndarray, answer: Answer) -> OptimizerState:
         """Return the weighted mean as state; points without a finite cost have weight 0."""

@@ -35,7 +35,7 @@ class Ppo(Population):
 
     def ask(self, state: OptimizerState, noise: np.ndarray) -> np.ndarray:
         mean, log_deviation = state["policy"]
-        return np.asarray(mean[:, None] + np.exp(log_deviation)[:, None] * noise)
+        return mean[:, None] + np.exp(log_deviation)[:, None] * noise
 
     def tell(self, state: OptimizerState, theta: np.ndarray, answer: Answer) -> OptimizerState:
         """Return the state after ``epochs`` steps on the clipped objective; unchanged if all costs are equal.

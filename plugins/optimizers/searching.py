@@ -33,7 +33,7 @@ class Searching(Optimizer):
         theta = state["theta"][:, None]
         if state["gradient"] is None:
             return np.array(theta)
-        return np.asarray(theta + self.direction(state)[:, None] * np.concatenate([[0.0], self.steps(state)]))
+        return theta + self.direction(state)[:, None] * np.concatenate([[0.0], self.steps(state)])
 
     def tell(self, state: OptimizerState, theta: np.ndarray, answer: Answer) -> OptimizerState:
         if state["gradient"] is None:

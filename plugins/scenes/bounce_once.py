@@ -79,11 +79,11 @@ class BounceOnce(EngineTwin, AxisContactScene):
         slope = self._free_slope()
         spread = self.sigma * float(np.linalg.norm(slope))
         above = 0.5 * math.erfc(-self._free_end() / (math.sqrt(2) * spread))
-        return np.asarray((above - self.restitution * (1.0 - above)) * slope)
+        return (above - self.restitution * (1.0 - above)) * slope
 
     def physical_gradient(self) -> np.ndarray:
         """Return -restitution (1, T, T dt / mass) after a rigid bounce, (1, T, T dt / mass) without."""
-        return np.asarray(self._free_slope() * (1.0 if self._free_end() > 0 else -self.restitution))
+        return self._free_slope() * (1.0 if self._free_end() > 0 else -self.restitution)
 
     def physical_cost(self) -> float:
         """Return radius + z, or radius - restitution z after a rigid bounce."""

@@ -27,8 +27,8 @@ class Cubic(SpacedScene):
 
     def closed_form_gradient(self, contact: ContactLaw | None, integrator: Plugin | None) -> np.ndarray:
         """Return theta^2 + sigma^2."""
-        return np.asarray(self.theta0() ** 2 + self.sigma**2)
+        return self.theta0() ** 2 + self.sigma**2
 
     def physical_gradient(self) -> np.ndarray:
         """Return theta^2."""
-        return np.asarray(self.theta0() ** 2)
+        return self.theta0() ** 2

@@ -46,4 +46,4 @@ class Ledge(EventScene, FunctionScene):
         z = (float(_NORMAL @ theta) - self.edge) / self.sigma
         density = math.exp(-0.5 * z * z) / math.sqrt(2 * math.pi)
         jump = (self.height + float(_CHANGE @ theta)) / self.sigma - z * float(_CHANGE @ _NORMAL)
-        return np.asarray(_SLOPE + _CHANGE * 0.5 * math.erfc(-z / math.sqrt(2)) + _NORMAL * density * jump)
+        return _SLOPE + _CHANGE * 0.5 * math.erfc(-z / math.sqrt(2)) + _NORMAL * density * jump

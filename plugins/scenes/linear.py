@@ -27,7 +27,7 @@ class Linear(SpacedScene):
         return self.slope * xp.sum(xp.asarray(_ramp(self.dimension)[:, None], dtype=x.dtype) * x, axis=0)
 
     def closed_form_gradient(self, contact: ContactLaw | None, integrator: Plugin | None) -> np.ndarray:
-        return np.asarray(self.slope * _ramp(self.dimension))
+        return self.slope * _ramp(self.dimension)
 
 
 def _ramp(dimension: int) -> np.ndarray:

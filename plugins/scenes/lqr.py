@@ -58,7 +58,7 @@ class Lqr(KnownOptimum, KnownValue, MechanicalScene):
     def cost_to_go(self, q: np.ndarray, v: np.ndarray, step: int) -> np.ndarray:
         """Return x'P x with the matrix P of ``step``, ``(B,)``."""
         x = np.concatenate([q, v])
-        return np.asarray(np.einsum("ib,ij,jb->b", x, _values(self)[step], x))
+        return np.einsum("ib,ij,jb->b", x, _values(self)[step], x)
 
 
 @cache

@@ -65,4 +65,4 @@ class MassSpring(Oscillator, DampedScene):
         return self._gradient(expm(self.horizon * self.dt * system)[0])
 
     def _gradient(self, row: np.ndarray) -> np.ndarray:
-        return np.asarray(2.0 * (row @ self.theta0()) * row)
+        return 2.0 * (row @ self.theta0()) * row

@@ -29,7 +29,7 @@ class Quadratic(SpacedScene):
         return 0.5 * xp.sum(self.condition**exponents * x * x, axis=0)
 
     def closed_form_gradient(self, contact: ContactLaw | None, integrator: Plugin | None) -> np.ndarray:
-        return np.asarray(self.condition ** _exponents(self.dimension) * self.theta0())
+        return self.condition ** _exponents(self.dimension) * self.theta0()
 
 
 def _exponents(dimension: int) -> np.ndarray:

@@ -81,4 +81,4 @@ class StaticGain(KnownOptimum, KnownValue, MechanicalScene):
         p = self.end
         for _ in range(self.horizon - step):
             p = 1.0 + p - (self.dt * p) ** 2 / (self.effort + self.dt**2 * p)
-        return np.asarray(p * (v * v).sum(axis=0))
+        return p * (v * v).sum(axis=0)

@@ -107,7 +107,7 @@ def mean_interval(values: np.ndarray) -> tuple[float, float, float]:
 
 def all_noise(cell: Cell, width: int) -> np.ndarray:
     """Return the noise of all rollouts of a cell, ``(repeats, samples, width)``."""
-    return np.asarray(noise.shared(cell.seed, cell.scene.name, cell.repeats, cell.samples, width))
+    return noise.shared(cell.seed, cell.scene.name, cell.repeats, cell.samples, width)
 
 
 def first_batch(cell: Cell, width: int) -> np.ndarray:

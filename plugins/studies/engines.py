@@ -115,19 +115,19 @@ class Engines(StudyPackage):
         }  # fmt: skip
         remark = "computes no gradients"
         if has_gradient:
-            check = difference_check(problem)
+            _, gradient, difference, step = difference_check(problem)
             gradients = problem.grad(theta, w.reshape(-1, program.n_noise).T)
             means = gradients.T.reshape(cell.repeats, cell.samples, -1).mean(axis=1)
             summary = asdict(statistics.summarise(means, known, cell.samples))
             result |= {
-                "gradient": check.gradient.tolist(),
-                "program_error_rel": relative_error(check.gradient, check.difference),
-                "difference_step": check.step,
+                "gradient": gradient.tolist(),
+                "program_error_rel": relative_error(gradient, difference),
+                "difference_step": step,
                 "nan_share": float(1.0 - np.isfinite(gradients).all(axis=0).mean()),
-                **_model_error(cell, session, check.gradient), **{name: summary[name] for name in SUMMARY},
+                **_model_error(cell, session, gradient), **{name: summary[name] for name in SUMMARY},
             }  # fmt: skip
             if status["status"] == "ok":
-                status = finite_status("some gradients are not finite", gradients, check.gradient)
+                status = finite_status("some gradients are not finite", gradients, gradient)
             remark = summary["note"]
         status["reason"] = "; ".join(filter(None, (status["reason"], remark)))
         if isinstance(problem, EngineProblem):

@@ -133,14 +133,14 @@ class Stability(StudyPackage):
         if failure is not None:
             step, verdict, description = failure
             reason = f"state at step {step} of {scene.horizon} {description}"
-            result |= {"status": verdict, "verdict": verdict, "first_bad_step": step, "reason": reason}
-            return result | {"state_at_first_bad_step": states[step].tolist()}
+            bad = {"first_bad_step": step, "state_at_first_bad_step": states[step].tolist()}
+            return result | bad | {"status": verdict, "verdict": verdict, "reason": reason}
         if not np.isfinite(gradient).all():
-            return result | {
-                "status": "nonfinite",
-                "verdict": "nonfinite",
-                "reason": "the gradient of a finite rollout",
-            }
+            return (
+                result
+                | dict.fromkeys(("status", "verdict"), "nonfinite")
+                | {"reason": "the gradient of a finite rollout"}
+            )
         kind, truth, error = compute_truth(cell, self)
         result |= {"truth": kind, "truth_norm": norm(truth), "truth_error": error}
         resolved = self.inaccurate / 2
@@ -234,10 +234,19 @@ def compute_truth(cell: Cell, limits: Stability) -> tuple[str, np.ndarray, float
     physical = program.physical_gradient()
     if physical is not None:
         return "physical", np.asarray(physical), 0.0
-    steps = max(limits.fine_steps, limits.finer * program.scene.horizon)
-    coarse, fine = _gradient_at(cell, steps // 2), _gradient_at(cell, steps)
+    fine, coarse = finest(cell, limits)
     change = norm(fine - coarse)
     return "refined", fine, change / norm(fine) if change else 0.0
+
+
+def finest(cell: Cell, limits: Stability, span: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """Return the gradient ``(d,)`` at a far smaller step, and that with half as many steps; with a span, of the cell's law.
+
+    The law's own gradients are central differences of the cost over the span (twice that for the second). A derivative
+    through a contact would not converge: it jumps with the time of the impact within its step, however small the step is.
+    """
+    steps = max(limits.fine_steps, limits.finer * rollout(cell.program()).scene.horizon)
+    return _gradient_at(cell, steps, span), _gradient_at(cell, steps // 2, 2 * span)
 
 
 def _refined(cell: Cell, steps: int) -> Cell:
@@ -320,23 +329,13 @@ def cause_of(cell: Cell, truth_kind: str, gradient: np.ndarray, truth: np.ndarra
         return {"cause": "step", "step_error": error, "law_error": 0.0}
     if not size:
         return {"cause": "unknown"}
-    fine, coarse = law_gradient(cell, limits)
+    fine, coarse = finest(cell, limits, SPAN)
     step, law, change = (norm(part) / size for part in (gradient - fine, fine - truth, fine - coarse))
     errors = {"step_error": step, "law_error": law}
     if not change <= limits.inaccurate / 2:
         return {"cause": "unknown"} | errors
     causes = [name for name, error in (("step", step), ("law", law)) if error > limits.inaccurate]
     return {"cause": "both" if len(causes) == 2 else causes[0] if causes else "step" if step >= law else "law"} | errors
-
-
-def law_gradient(cell: Cell, limits: Stability) -> tuple[np.ndarray, np.ndarray]:
-    """Return the gradient ``(d,)`` of the cell's law at a far smaller step, and the gradient with half as many steps.
-
-    Both are central differences of the cost over :data:`SPAN` (twice that for the second). A derivative through a
-    contact would not converge: it jumps with the time of the impact within its step, however small the step is.
-    """
-    steps = max(limits.fine_steps, limits.finer * rollout(cell.program()).scene.horizon)
-    return _gradient_at(cell, steps, SPAN), _gradient_at(cell, steps // 2, 2 * SPAN)
 
 
 # --------------------------------------------------------------------------------------------------- theory
@@ -433,10 +432,8 @@ def shares_of(cells: pd.DataFrame) -> pd.DataFrame:
     counts = cells.groupby(groups, sort=False).size().rename("cells")
     shares = pd.concat([counts, level, why], axis=1).loc[counts.index]
     shares = shares.reindex(columns=[column.name for column in SHARES[2:]], fill_value=0.0).reset_index()
-    order = list(dict.fromkeys(cells["scene_name"]))
-    return shares.sort_values("right", ascending=False, kind="stable").sort_values(
-        "scene", key=lambda names: names.map(order.index), kind="stable", ignore_index=True
-    )
+    order = np.lexsort((-shares["right"], pd.factorize(shares["scene"])[0]))
+    return shares.iloc[order].reset_index(drop=True)
 
 
 def chart(cells: pd.DataFrame) -> Chart:

@@ -101,14 +101,14 @@ class ThreeErrors(StudyPackage):
     def measure(self, cell: Cell, session: Session) -> dict[str, Any]:
         """Return one cell's results by column: forward, program and model error at w = 0, and the bias of its estimator."""
         problem = session.problem(cell)
-        check = difference_check(problem)
+        cost, gradient, difference, step = difference_check(problem)
         truth = session.references.of(cell)
         result = {
-            "cost": check.cost, "gradient": check.gradient.tolist(), "program_norm": norm(check.gradient),
-            "program_error": norm(check.gradient - check.difference),
-            "program_error_rel": relative_error(check.gradient, check.difference), "difference_step": check.step,
+            "cost": cost, "gradient": gradient.tolist(), "program_norm": norm(gradient),
+            "program_error": norm(gradient - difference),
+            "program_error_rel": relative_error(gradient, difference), "difference_step": step,
             "reference_method": truth.method, "reference_spacing": truth.spacing,
-            **_against_physics(problem.program, check),
+            **_against_physics(problem.program, cost, gradient),
         }  # fmt: skip
         status = finite_status(truth.note or "the reference gradient is not finite", truth.batches)
         if status["status"] != "ok":
@@ -116,7 +116,7 @@ class ThreeErrors(StudyPackage):
         w = all_noise(cell, problem.program.n_noise)
         estimates = np.asarray(cell.estimator.estimate(problem, problem.program.theta0, w), dtype=np.float64)
         summary = asdict(statistics.summarise(estimates, truth.known(), cell.samples))
-        status = finite_status("", estimates, check.gradient) | {"reason": summary["note"]}
+        status = finite_status("", estimates, gradient) | {"reason": summary["note"]}
         return result | {name: summary[name] for name in SUMMARY} | status
 
     def show(self, experiment: Experiment, rows: pd.DataFrame) -> Views:
@@ -142,20 +142,8 @@ class ThreeErrors(StudyPackage):
         return Views(tables, [_dumbbells(shown, trapped)])
 
 
-@dataclass(frozen=True)
-class DifferenceCheck:
-    """A program's cost and gradient at theta0 without noise, and the central difference closest to the gradient."""
-
-    cost: float
-    gradient: np.ndarray
-    """``(d,)``."""
-    difference: np.ndarray
-    """``(d,)``."""
-    step: float
-
-
-def difference_check(problem: Problem) -> DifferenceCheck:
-    """Compare the program's gradient with its best central difference over a sweep of step sizes, at w = 0.
+def difference_check(problem: Problem) -> tuple[float, np.ndarray, np.ndarray, float]:
+    """Return cost and gradient ``(d,)`` at theta0 and w = 0, the central difference closest to the gradient, and its step.
 
     Truncation errors and jumps dominate at large steps, rounding at small steps. All costs are one batch.
     """
@@ -169,27 +157,27 @@ def difference_check(problem: Problem) -> DifferenceCheck:
     errors = np.linalg.norm(differences - gradient[:, None], axis=0)
     # without the mask, np.argmin would return the index of a NaN
     best = int(np.argmin(np.where(np.isfinite(errors), errors, np.inf)))
-    return DifferenceCheck(samples[0].centre, gradient, differences[:, best], float(STEPS[best]))
+    return samples[0].centre, gradient, differences[:, best], float(STEPS[best])
 
 
-def _against_physics(program: Program, check: DifferenceCheck) -> dict[str, Any]:
+def _against_physics(program: Program, cost: float, gradient: np.ndarray) -> dict[str, Any]:
     """Return the columns of forward and model error, as far as the scene has a physical cost and gradient.
 
     ``model_cosine`` is the cosine between the program's and the physical gradient. ``model_signs`` is the share of
     coordinates where their signs agree, among the coordinates where the physical gradient has a sign.
     """
     result: dict[str, Any] = {}
-    cost, physical = program.physical_cost(), program.physical_gradient()
-    if cost is not None:
-        error = abs(check.cost - cost)
-        result |= {"physical_cost": cost, "forward_error": error, "forward_error_rel": ratio(error, abs(cost))}
+    known, physical = program.physical_cost(), program.physical_gradient()
+    if known is not None:
+        error = abs(cost - known)
+        result |= {"physical_cost": known, "forward_error": error, "forward_error_rel": ratio(error, abs(known))}
     if physical is not None:
-        signs, physical_signs = _signs(check.gradient), _signs(physical)
+        signs, physical_signs = _signs(gradient), _signs(physical)
         has_sign = physical_signs != 0
         result |= {
             "physical_gradient": physical.tolist(), "physical_norm": norm(physical),
-            "model_error": norm(check.gradient - physical), "model_error_rel": relative_error(check.gradient, physical),
-            "model_cosine": ratio(float(check.gradient @ physical), norm(physical) * norm(check.gradient)),
+            "model_error": norm(gradient - physical), "model_error_rel": relative_error(gradient, physical),
+            "model_cosine": ratio(float(gradient @ physical), norm(physical) * norm(gradient)),
             "model_signs": float((signs == physical_signs)[has_sign].mean()) if has_sign.any() else math.nan,
         }  # fmt: skip
     return result

@@ -65,8 +65,6 @@ class Twins(StudyPackage):
         text("own_backend", "backend of the scene's own program"),
         numbers("gradient", "the twin's gradient, by coordinate of theta"),
         numbers("own_gradient", "the own program's gradient, by coordinate of theta"),
-        numbers("path", "positions of the twin along the rollout", table=False),
-        numbers("own_path", "positions of the own program along the rollout", table=False),
     )  # fmt: skip
 
     timed_calls: int = param(5, "calls timed for costs and for gradients", positive=True)
@@ -101,7 +99,6 @@ class Twins(StudyPackage):
             "gradient_norm": norm(gradient), "own_gradient_norm": norm(own_gradient),
             "gradient_difference_rel": relative_error(gradient, own_gradient),
             "gradient_cosine": float(gradient @ own_gradient / (norm(gradient) * norm(own_gradient))),
-            "path": path[:, : scene.n_q].ravel().tolist(), "own_path": own_path[:, : scene.n_q].ravel().tolist(),
             "value_s": timing.timed(lambda _: twin.value(theta, w), self.timed_calls)[1].median_s,
             **gradient_seconds(twin, w, self.timed_calls),
             "trace_s": twin.usage.trace_s, "lower_s": twin.usage.lower_s,

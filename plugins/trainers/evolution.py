@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -40,8 +41,21 @@ class PopulationTrainer(Trainer):
 
         return ravel_pytree(Network(key, [env.n_observations, self.hidden, self.hidden, env.n_actions], env.dtype))
 
+    def start(self, env: Any, seed: Any) -> Any:
+        import jax
+
+        from bench.training import normaliser
+
+        key, key_network = jax.random.split(jax.random.PRNGKey(seed))
+        theta, _ = self.network(env, key_network)
+        return self.search(env, theta, normaliser.start(env.n_observations, env.dtype), key)
+
+    @abstractmethod
+    def search(self, env: Any, theta: Any, known: Any, key: Any) -> Any:
+        """Return the state before the first update, from the parameters ``theta (d,)`` and a normaliser."""
+
     def returns(self, env: Any, state: Any, points: Any, first: Any, keys: tuple[Any, Any]) -> tuple[Any, ...]:
-        """Return the returns ``(B,)`` of policies with parameters ``points (B, d)`` from given starts, observations and log."""
+        """Return the returns ``(B,)`` of policies with parameters ``points (B, d)`` from given starts, normaliser and log."""
         import jax
         import jax.numpy as jnp
 
@@ -57,8 +71,10 @@ class PopulationTrainer(Trainer):
         _, window = windows.rollout(env, policy, first, env.length, keys[1])
         # an episode counts up to its first end
         is_running = jnp.cumsum(window.ended, axis=0) - window.ended == 0
-        log = {**windows.log_of(window), "used": is_running.mean(dtype=window.reward.dtype)}
-        return jnp.where(is_running, window.reward, 0.0).sum(axis=0), windows.flat(window.observation), log
+        total = jnp.where(is_running, window.reward, 0.0).sum(axis=0)
+        log = {"used": is_running.mean(dtype=window.reward.dtype), "loss": -total.mean() / env.length}
+        known = normaliser.updated(state.normaliser, windows.flat(window.observation))
+        return total, known, windows.log_of(window) | log
 
     def action(self, env: Any, state: Any, observation: Any) -> Any:
         import jax
@@ -88,21 +104,15 @@ class Evolution(PopulationTrainer):
 
         return adam(self.rate, self.updates(env), self.clip, 0.9, 0.999)
 
-    def start(self, env: Any, seed: Any) -> Search:
-        import jax
-
-        from bench.training import normaliser
-
-        key, key_network = jax.random.split(jax.random.PRNGKey(seed))
-        theta, _ = self.network(env, key_network)
-        return Search(theta, self._optimizer(env).init(theta), normaliser.start(env.n_observations, env.dtype), key)
+    def search(self, env: Any, theta: Any, known: Any, key: Any) -> Search:
+        return Search(theta, self._optimizer(env).init(theta), known, key)
 
     def update(self, env: Any, state: Search) -> tuple[Search, dict[str, Any]]:
         import jax
         import jax.numpy as jnp
         import optax
 
-        from bench.training import normaliser, steps
+        from bench.training.steps import step_log
 
         key, key_points, key_start, key_rollout = jax.random.split(state.key, 4)
         half = self.population // 2
@@ -110,12 +120,10 @@ class Evolution(PopulationTrainer):
         points = state.theta + self.width * jnp.concatenate([direction, -direction])
         numbers = env.normal(key_start, (env.n_start, half))
         first = env.start(jnp.concatenate([numbers, numbers], axis=1))
-        total, seen, log = self.returns(env, state, points, first, (key, key_rollout))
+        total, known, log = self.returns(env, state, points, first, (key, key_rollout))
         rank = jnp.argsort(jnp.argsort(jnp.where(jnp.isfinite(total), total, -jnp.inf))) / (2 * half - 1) - 0.5
         rank = rank.astype(state.theta.dtype)
         gradient = -(rank[:half] - rank[half:]) @ direction / (2 * half * self.width)
         change, memory = self._optimizer(env).update(gradient, state.memory)
         theta = optax.apply_updates(state.theta, change)
-        log |= {"loss": -total.mean() / env.length, **steps.step_log(gradient, change, theta)}
-        known = normaliser.updated(state.normaliser, seen)
-        return Search(theta, memory, known, key), log
+        return Search(theta, memory, known, key), log | step_log(gradient, change, theta)

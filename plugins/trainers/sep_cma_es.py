@@ -39,16 +39,10 @@ class SepCmaEs(PopulationTrainer):
 
     name = "sep_cma_es"
 
-    def start(self, env: Any, seed: Any) -> Search:
-        import jax
+    def search(self, env: Any, theta: Any, known: Any, key: Any) -> Search:
         import jax.numpy as jnp
 
-        from bench.training import normaliser
-
-        key, key_network = jax.random.split(jax.random.PRNGKey(seed))
-        theta, _ = self.network(env, key_network)
         zero = jnp.zeros_like(theta)
-        known = normaliser.start(env.n_observations, env.dtype)
         sigma = jnp.asarray(self.width, theta.dtype)
         return Search(theta, sigma, jnp.ones_like(theta), zero, zero, jnp.zeros((), jnp.int32), known, key)
 
@@ -56,14 +50,14 @@ class SepCmaEs(PopulationTrainer):
         import jax
         import jax.numpy as jnp
 
-        from bench.training import normaliser, steps
+        from bench.training.steps import step_log
 
         key, key_points, key_start, key_rollout = jax.random.split(state.key, 4)
         size, d = 2 * (self.population // 2), state.theta.size
         y = jnp.sqrt(state.variance) * env.normal(key_points, (size, d))
         numbers = jnp.broadcast_to(env.normal(key_start, (env.n_start, 1)), (env.n_start, size))
         points = state.theta + state.sigma * y
-        total, seen, log = self.returns(env, state, points, env.start(numbers), (key, key_rollout))
+        total, known, log = self.returns(env, state, points, env.start(numbers), (key, key_rollout))
 
         k = constants(d, size)
         c_1 = min(1.0, k.c_1 * (d + 2) / 3)
@@ -83,11 +77,7 @@ class SepCmaEs(PopulationTrainer):
 
         change = state.sigma * step
         theta = state.theta + change
-        log |= {
-            "loss": -total.mean() / env.length, "deviation": state.sigma * jnp.sqrt(state.variance.mean()),
-            **steps.step_log(-step, change, theta),
-        }  # fmt: skip
-        known = normaliser.updated(state.normaliser, seen)
+        log |= {"deviation": state.sigma * jnp.sqrt(state.variance.mean()), **step_log(-step, change, theta)}
         kind = state.theta.dtype
         return Search(
             theta.astype(kind), sigma.astype(kind), variance.astype(kind), path_sigma.astype(kind), path_c.astype(kind),

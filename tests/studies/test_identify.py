@@ -108,8 +108,7 @@ def test_friction_fitted_with_a_step_holds_for_that_step():
     assert exact == pytest.approx(1.529052, rel=1e-6)
     assert -exact / 0.3 == pytest.approx(-5.096840, rel=1e-6)
     fitting = Fitting(model, "single", 1, 0.01)
-    start = np.log(np.array([[0.25]]))
-    found = np.exp(run_fits(fitting, GaussNewton(), start, np.array([[exact]]), 40)[0])[0, 0]
+    found = np.exp(run_fits(fitting, GaussNewton(), np.log([[0.25]]), np.array([[exact]]), 40)[0])[0, 0]
     # the stop within a step leaves a second-order rest
     assert found / 0.3 == pytest.approx(1 - 0.02 * 0.3 * 9.81 / 3.0, abs=2e-3)
     fine = model_of(cell_of("scenes=[sliding_block[dt=0.0005,horizon=2400]]"))
@@ -382,10 +381,14 @@ def test_wrong_models_are_noticed_and_the_right_one_is_not_blamed(name, least, m
         assert inside < 0.6 < 0.8 < printed
 
 
+def without(line, data):
+    """The residuals of data that a line is fitted to."""
+    return data - line @ np.linalg.lstsq(line, data, rcond=None)[0]
+
+
 def test_one_outlier_is_noticed():
-    residual = np.random.default_rng(0).standard_normal(200)
     line = np.linspace(-1.0, 1.0, 200)[:, None]
-    residual -= line[:, 0] * (line[:, 0] @ residual) / (line[:, 0] @ line[:, 0])
+    residual = without(line, np.random.default_rng(0).standard_normal(200))
     assert adequacy.judge(residual, line, 1, {}).is_explained
     residual[100] = 6.0
     verdict = adequacy.judge(residual, line, 1, {})
@@ -396,8 +399,7 @@ def test_one_outlier_is_noticed():
 def judged(noise, records=40):
     """The share of records of 150 measurements and a line that are explained."""
     rng, line = np.random.default_rng(0), np.linspace(-1.0, 1.0, 150)[:, None]
-    residuals = noise(rng, (150, records))
-    residuals -= line @ np.linalg.lstsq(line, residuals, rcond=None)[0]
+    residuals = without(line, noise(rng, (150, records)))
     verdicts = [adequacy.judge(residuals[:, i], line, 1, {}, i) for i in range(records)]
     return np.mean([one.is_explained for one in verdicts])
 
@@ -429,11 +431,8 @@ def test_a_missing_term_of_the_stated_reach_is_noticed_at_the_stated_power():
     line, rng = np.linspace(-1.0, 1.0, 150)[:, None], np.random.default_rng(5)
     term = {"cubic": line[:, 0] ** 3}
     noise = rng.standard_normal((150, 40))
-    first = adequacy.judge(
-        noise[:, 0] - line[:, 0] * (line[:, 0] @ noise[:, 0]) / (line[:, 0] @ line[:, 0]), line, 1, term
-    )
-    data = noise + first.reach["cubic"] * term["cubic"][:, None]
-    data -= line @ np.linalg.lstsq(line, data, rcond=None)[0]
+    first = adequacy.judge(without(line, noise[:, 0]), line, 1, term)
+    data = without(line, noise + first.reach["cubic"] * term["cubic"][:, None])
     noticed = np.mean([not adequacy.judge(data[:, i], line, 1, term, i).is_explained for i in range(40)])
     assert noticed >= adequacy.POWER - 0.1  # three standard errors
 
@@ -456,23 +455,21 @@ def test_levenberg_marquardt_needs_as_few_evaluations_as_minpack_on_rosenbrock()
 
 
 def planted(**columns):
-    """The verdicts on eight equal fits, some columns replaced."""
-    lines = pd.DataFrame({
-        "fits": [64.0] * 8, "converged": 1.0, "converged_low": 0.94, "converged_high": 1.0, "error": 1.0, "coverage_high": 0.98,
-    } | columns)  # fmt: skip
-    low, high = shown.error_interval(lines["error"], lines["converged"] * lines["fits"])
-    return list(shown.verdicts(lines.assign(error_low=low, error_high=high)))
+    """The verdict on 64 fits, some columns replaced."""
+    good = {"converged": 1.0, "converged_low": 0.94, "converged_high": 1.0, "error": 1.0, "coverage_high": 0.98}
+    lines = pd.DataFrame([good | columns])
+    low, high = shown.error_interval(lines["error"], 64.0 * lines["converged"])
+    return shown.verdicts(lines.assign(error_low=low, error_high=high))[0]
 
 
 def test_verdicts_need_their_intervals():
-    assert planted() == ["precise"] * 8
+    assert planted() == "precise"
     # below the stated level, but not by the whole interval
-    assert planted(coverage_high=0.951) == ["precise"] * 8
-    assert planted(converged=0.85, converged_low=0.7, converged_high=0.93) == ["open"] * 8
-    assert planted(converged=0.7, converged_low=0.6, converged_high=0.8) == ["unconverged"] * 8
-    unknown = planted(error=math.nan, coverage_high=math.nan)
-    assert unknown == ["open"] * 8
-    assert planted(error=3.0, coverage_high=0.4) == ["narrow"] * 8
+    assert planted(coverage_high=0.951) == "precise"
+    assert planted(converged=0.85, converged_low=0.7, converged_high=0.93) == "open"
+    assert planted(converged=0.7, converged_low=0.6, converged_high=0.8) == "unconverged"
+    assert planted(error=math.nan, coverage_high=math.nan) == "open"
+    assert planted(error=3.0, coverage_high=0.4) == "narrow"
 
 
 def test_interval_of_the_error_covers():

@@ -1,6 +1,7 @@
 """The study of searches: known optima, stops, refusals, tables and charts, and the statistics that sum them up."""
 
 import math
+import re
 
 import numpy as np
 import pandas as pd
@@ -94,32 +95,25 @@ def test_two_balls():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("scene", "stiffness", "start", "least"),
+    ("scene", "contact", "start", "least"),
     [
         ("pendulum_swing[dt=0.02]", None, 2008.0153, 872.590419),
         ("pendulum_swing", None, 2022.303027, 349.49046),
         ("pendulum_swing[terminal=1]", None, 1856.154406, 349.490454),
-        ("pushing[horizon=400,dt=0.005,velocity_factor=0.998]", 10, 2374.89381, 1126.585263),
-        ("pushing[horizon=200,dt=0.005,velocity_factor=0.99]", 1000, 1821.249, None),
+        ("pushing[horizon=400,dt=0.005,velocity_factor=0.998]", "penalty[stiffness=10]", 2374.89381, 1126.585263),
+        ("pushing[horizon=200,dt=0.005,velocity_factor=0.99]", "penalty[stiffness=1000]", 1821.249, None),
     ],
 )
-def test_newton_finds_the_checked_optima(scene, stiffness, start, least):
-    given = (
-        {
-            "contact": f"penalty[stiffness={stiffness}]",
-            "theta0": [0.1] * int(scene.partition("horizon=")[2].partition(",")[0]),
-        }
-        if stiffness
-        else {}
-    )
-    problem = bench.problem(scene, **given)
+def test_newton_finds_the_checked_optima(scene, contact, start, least):
+    steps = int(re.findall(r"horizon=(\d+)|$", scene)[0] or 0)
+    problem = bench.problem(scene, contact=contact, theta0=[0.1] * steps or None)
     assert problem.value(problem.program.theta0, np.zeros((problem.program.n_noise, 1)))[0] == pytest.approx(
         start, rel=CHECKED
     )
     if least:
         found = solve(problem)
         assert found.cost == pytest.approx(least, rel=CHECKED)
-        assert found.certified or stiffness
+        assert found.certified or contact
 
 
 @pytest.mark.parametrize("steps", [4, 10, 50])

@@ -8,10 +8,8 @@ import pandas as pd
 import pytest
 from bench.plugins.studies import stability
 from bench.plugins.studies.stability import Stability
-from helpers import unmeasured
+from helpers import loaded, unmeasured
 
-from bench.experiment import config
-from bench.experiment.grid import cells
 from bench.model import MechanicalScene, State, registry
 from bench.model.parameters import build
 from bench.run import tasks
@@ -21,28 +19,24 @@ STIFFNESS = tuple(float(k) for k in np.logspace(1, 4, 13))
 HORIZON, DT = 40, 0.05
 
 
-def experiment(tmp_path, *words):
-    return config.load(
-        [
-            "study=stability",
-            "name=map",
-            f"results_dir={tmp_path}",
-            "estimators=[fobg]",
-            "backends=[implicit]",
-            "workers=0",
-            *words,
-        ]
-    )
+def cells_of(*words):
+    """The experiment of a command line, and its cells."""
+    return loaded("study=stability", "estimators=[fobg]", "backends=[implicit]", *words)
 
 
-def swept(tmp_path, integrator, *words):
+def measured(*words):
+    """The measured rows of a command line."""
+    given, cells = cells_of(*words)
+    session = Session(given)
+    return pd.DataFrame([cell.columns() | tasks.measure_cell(cell, session, cell.study) for cell in cells])
+
+
+def swept(integrator, *words):
     """Rows of mass_spring over STIFFNESS at one dt, which compiles once."""
-    given = experiment(
-        tmp_path, "scenes=[mass_spring]", f"integrators=[{integrator}]", f"sweep.stiffness={list(STIFFNESS)}",
+    return measured(
+        "scenes=[mass_spring]", f"integrators=[{integrator}]", f"sweep.stiffness={list(STIFFNESS)}",
         f"scene.mass_spring.horizon={HORIZON}", f"scene.mass_spring.dt={DT}", *words,
     )  # fmt: skip
-    session = Session(given)
-    return pd.DataFrame([cell.columns() | tasks.measure_cell(cell, session, LIMITS) for cell in cells(given)])
 
 
 def agrees(rows):
@@ -76,22 +70,14 @@ class Drop(MechanicalScene):
         return self.slope * q[0]
 
 
-def cell(tmp_path, *words):
-    return cells(experiment(tmp_path, *words))[0]
-
-
 LIMITS = Stability()
-
-
-def measured(found, given):
-    return Stability().measure(found, Session(given))
 
 
 @pytest.mark.parametrize("damping", [0.0, pytest.param(3.0, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("integrator", sorted(registry.entries()["integrators"]))
-def test_measured_boundary_is_within_a_cell_of_the_theoretical_one(tmp_path, integrator, damping):
+def test_measured_boundary_is_within_a_cell_of_the_theoretical_one(integrator, damping):
     """For every integrator, those too that grow too slowly to diverge within the rollout."""
-    rows = swept(tmp_path, integrator, f"scene.mass_spring.damping={damping}")
+    rows = swept(integrator, f"scene.mass_spring.damping={damping}")
     assert agrees(rows)
     assert rows["growth_factor"].to_numpy() == pytest.approx(rows["spectral_radius"].to_numpy(), rel=1e-6)
 
@@ -110,22 +96,20 @@ def test_growth_of_ten_percent_is_divergence():
 
 
 @pytest.mark.parametrize("backend", ["jax", "torch", "numpy"])
-def test_backends_without_step_jacobians_are_classified_alike(tmp_path, backend):
+def test_backends_without_step_jacobians_are_classified_alike(backend):
     words = [f"backends=[{backend}]", "contacts=[penalty]", "integrators=[semi_implicit_euler]"]
     sweep = ["scenes=[mass_spring,bouncing_ball]", "sweep.stiffness=[1e2,1e4]", "scene.mass_spring.damping=1"]
     scenes = [
         f"scene.{name}.{value}" for name in ("mass_spring", "bouncing_ball") for value in ("horizon=20", "dt=0.05")
     ]
-    given = experiment(tmp_path, *words, *sweep, *scenes)
-    session = Session(given)
-    rows = [tasks.measure_cell(found, session, Stability()) for found in cells(given)]
-    assert [row["verdict"] for row in rows] == ["inaccurate", "wrong_sign", "diverged", "diverged"]
-    assert all(row["reason"] for row in rows[2:])
-    assert rows[0]["growth_factor"] == pytest.approx(rows[0]["spectral_radius"], abs=1e-9)
+    rows = measured(*words, *sweep, *scenes)
+    assert list(rows["verdict"]) == ["inaccurate", "wrong_sign", "diverged", "diverged"]
+    assert all(rows["reason"][2:])
+    assert rows["growth_factor"][0] == pytest.approx(rows["spectral_radius"][0], abs=1e-9)
 
 
-def test_first_bad_step_and_its_state_are_in_the_row(tmp_path):
-    rows = swept(tmp_path, "semi_implicit_euler")
+def test_first_bad_step_and_its_state_are_in_the_row():
+    rows = swept("semi_implicit_euler")
     row = rows[rows["verdict"] == "diverged"].iloc[0]
     assert row["status"] == "diverged"
     assert f"step {int(row['first_bad_step'])} of {HORIZON}" in row["reason"]
@@ -154,10 +138,10 @@ def test_verdicts(gradient, truth, verdict):
     assert stability.compare(np.array(gradient), np.array(truth), LIMITS.inaccurate)["verdict"] == verdict
 
 
-def test_truth_is_refined_where_there_is_no_physical_gradient(tmp_path):
+def test_truth_is_refined_where_there_is_no_physical_gradient():
     """q_N = q_0 + v_0 (1 - e^(-T/10)) 10, whose Euler error is about dt T / 20 of the second component."""
-    given = cell(tmp_path, "scenes=[mass_spring]", "integrators=[semi_implicit_euler]", "backends=[jax]")
-    row = measured(given.with_part("scene", Drop(horizon=10, dt=0.1)), experiment(tmp_path))
+    given, (cell,) = cells_of("scenes=[mass_spring]", "integrators=[semi_implicit_euler]", "backends=[jax]")
+    row = LIMITS.measure(cell.with_part("scene", Drop(horizon=10, dt=0.1)), Session(given))
     assert row["truth"] == "refined"
     assert row["verdict"] == "ok"
     truth = math.hypot(1.0, 10 * (1 - math.exp(-0.1)))
@@ -165,19 +149,18 @@ def test_truth_is_refined_where_there_is_no_physical_gradient(tmp_path):
     assert row["truth_error"] < 1 / LIMITS.fine_steps
 
 
-def test_scenes_without_time_steps_are_unsupported(tmp_path):
-    given = experiment(tmp_path, "scenes=[quadratic]", "backends=[jax]")
-    row = tasks.measure_cell(cells(given)[0], Session(given), Stability())
+def test_scenes_without_time_steps_are_unsupported():
+    (row,) = measured("scenes=[quadratic]", "backends=[jax]").to_dict("records")
     assert row["status"] == "unsupported"
     assert "no time steps" in row["reason"]
 
 
-def test_contact_springs_are_oscillators_while_they_last(tmp_path):
-    given = cell(
-        tmp_path, "scenes=[bouncing_ball]", "contacts=[penalty]", "integrators=[semi_implicit_euler]",
+def test_contact_springs_are_oscillators_while_they_last():
+    _, (cell,) = cells_of(
+        "scenes=[bouncing_ball]", "contacts=[penalty]", "integrators=[semi_implicit_euler]",
         "scene.bouncing_ball.mass=2", "contact.penalty.damping=4", "contact.penalty.stiffness=100",
     )  # fmt: skip
-    assert stability.oscillator(given) == (50.0, 2.0, 1.0)
+    assert stability.oscillator(cell) == (50.0, 2.0, 1.0)
 
 
 def test_limits_hold_what_is_known():
@@ -211,34 +194,33 @@ def test_backends_that_disagree_show_the_worse_verdict_and_no_verdict_is_no_find
         ([math.nan, 0.0], [1.6, 0.0], "unknown"),
     ],
 )
-def test_planted_causes_are_named(tmp_path, monkeypatch, own, coarse, cause):
+def test_planted_causes_are_named(monkeypatch, own, coarse, cause):
     """A gradient of twice the truth, and a law whose own gradient is the truth, that gradient, or between."""
-    monkeypatch.setattr(stability, "law_gradient", lambda *_: (np.array(own), np.array(coarse)))
-    found = cell(tmp_path, "scenes=[bouncing_ball]", "contacts=[penalty]", "integrators=[rk4]", "backends=[numpy]")
-    row = stability.cause_of(found, "physical", np.array([2.0, 0.0]), np.array([1.0, 0.0]), LIMITS)
+    monkeypatch.setattr(stability, "finest", lambda *_: (np.array(own), np.array(coarse)))
+    _, (cell,) = cells_of("scenes=[bouncing_ball]", "contacts=[penalty]", "integrators=[rk4]", "backends=[numpy]")
+    row = stability.cause_of(cell, "physical", np.array([2.0, 0.0]), np.array([1.0, 0.0]), LIMITS)
     assert row["cause"] == cause
 
 
-def test_the_cause_is_the_law_or_the_step(tmp_path):
+def test_the_cause_is_the_law_or_the_step():
     """A contact as soft as 10 N/m is not rigid at any step; a fine step follows it, a coarse one does neither."""
     causes = {}
     for steps in (400, 20):
         words = [f"scene.bouncing_ball.horizon={steps}", f"scene.bouncing_ball.dt={1 / steps}"]
-        found = cell(
-            tmp_path, "scenes=[bouncing_ball]", "contacts=[penalty]", "contact.penalty.stiffness=10", "backends=[jax]",
-            "integrators=[explicit_euler]", *words,
-        )  # fmt: skip
-        row = Stability(fine_steps=1 << 12).measure(found, Session(experiment(tmp_path)))
+        (row,) = measured(
+            f"study=stability[fine_steps={1 << 12}]", "scenes=[bouncing_ball]", "contacts=[penalty]", "backends=[jax]",
+            "contact.penalty.stiffness=10", "integrators=[explicit_euler]", *words,
+        ).to_dict("records")  # fmt: skip
         causes[steps] = row["cause"]
         assert row["step_error"] + row["law_error"] >= row["relative_error"]  # the triangle over the law's gradient
         assert row["law_error"] == pytest.approx(1.2, abs=0.02)  # as at 2^14 steps with semi-implicit Euler
     assert causes == {400: "law", 20: "both"}
 
 
-def test_rigid_impacts_are_not_blamed_on_the_law(tmp_path):
+def test_rigid_impacts_are_not_blamed_on_the_law():
     """Impacts without a time of impact follow the physics; how a step at a boundary is differentiated does not."""
     words = ["scene.bouncing_ball.horizon=50", "scene.bouncing_ball.dt=0.02", "backends=[jax]"]
-    found = cell(tmp_path, "scenes=[bouncing_ball]", "contacts=[impulse]", "integrators=[semi_implicit_euler]", *words)
-    row = measured(found, experiment(tmp_path))
+    words += ["scenes=[bouncing_ball]", "contacts=[impulse]", "integrators=[semi_implicit_euler]"]
+    (row,) = measured(*words).to_dict("records")
     assert (row["verdict"], row["cause"]) == ("wrong_sign", "step")
     assert row["law_error"] < 0.05

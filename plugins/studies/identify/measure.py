@@ -99,7 +99,7 @@ class Model:
     def unit(self) -> np.ndarray:
         """The largest size of each entry of the state along the scene's own motion, ``(n,)``."""
         path, _ = self.motion(self.values[:, None])
-        return np.asarray(np.maximum(np.abs(path[1:]).max(axis=(0, 2)), 1e-6))
+        return np.maximum(np.abs(path[1:]).max(axis=(0, 2)), 1e-6)
 
     def places(self, names: Collection[str]) -> tuple[int, ...]:
         """Return the indices of entries of the state; raises :class:`UserError` for an unknown one."""
@@ -113,13 +113,13 @@ class Model:
         """Return the unknowns ``(p, B)`` of coordinates."""
         scale = self.scale[:, None]
         with np.errstate(over="ignore"):
-            return np.asarray(np.where(scale, scale * points, np.exp(points)))
+            return np.where(scale, scale * points, np.exp(points))
 
     def points(self, theta: np.ndarray) -> np.ndarray:
         """Return the coordinates ``(p, B)`` of unknowns."""
         scale = self.scale[:, None]
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.asarray(np.where(scale, theta / scale, np.log(theta)))
+            return np.where(scale, theta / scale, np.log(theta))
 
     def scaled(self, theta: np.ndarray) -> Model:
         """Return the model with the sizes in ``theta (p,)`` as scales, where they change the motion noticeably."""
@@ -188,8 +188,7 @@ class Model:
 
     def measurements(self, states: np.ndarray) -> np.ndarray:
         """Return the measurements ``(m, B)`` of the states ``(horizon, n, B)`` after each step."""
-        measured: np.ndarray = states[np.array(self.steps) - 1][:, list(self.measured)]
-        return measured.reshape(-1, states.shape[2])
+        return states[np.array(self.steps) - 1][:, list(self.measured)].reshape(-1, states.shape[2])
 
 
 def model_of(cell: Cell, refinement: int = 1) -> Model:
@@ -287,7 +286,7 @@ class Fitting:
         shifts = STEP * np.repeat(np.eye(self.dim), batch, axis=1)
         wide, many = np.tile(points, (1, self.dim)), np.tile(data, (1, self.dim))
         change = self.residuals(wide + shifts, many) - self.residuals(wide - shifts, many)
-        return np.asarray(change.reshape(len(change), self.dim, batch) / (2 * STEP))
+        return change.reshape(len(change), self.dim, batch) / (2 * STEP)
 
     def start(self, theta: np.ndarray, data: np.ndarray) -> np.ndarray:
         """Return the initial unknowns ``(dim, B)`` for ``theta (p, B)`` and ``data (m', B)``.
@@ -424,12 +423,12 @@ class Fit:
     @property
     def is_finite(self) -> np.ndarray:
         """Whether residuals and derivatives are finite, ``(B,)``."""
-        return np.asarray(np.isfinite(self.jacobian).all(axis=(0, 1)) & np.isfinite(self.residual).all(axis=0))
+        return np.isfinite(self.jacobian).all(axis=(0, 1)) & np.isfinite(self.residual).all(axis=0)
 
     def slopes(self, i: int) -> np.ndarray:
         """Return the Jacobian ``(m, p)`` of fit ``i`` by the parameters, with the windows' initial states projected out."""
         own, later = np.split(self.jacobian[:, :, i], [len(self.fitting.model.names)], axis=1)
-        return np.asarray(own - later @ (np.linalg.pinv(later) @ own))
+        return own - later @ (np.linalg.pinv(later) @ own)
 
 
 def _estimates(fit: Fit, known: Information, start: np.ndarray, own: Mapping[str, str]) -> dict[str, Any]:
@@ -569,7 +568,7 @@ def missing_terms(
 def _products(theta: np.ndarray, exponents: np.ndarray) -> np.ndarray:
     """Return products of powers ``(r,)`` of ``theta (p,)``, for exponents ``(r, p)``."""
     with np.errstate(all="ignore"):
-        return np.asarray(np.prod(np.sign(theta) ** np.rint(exponents) * np.abs(theta) ** exponents, axis=1))
+        return np.prod(np.sign(theta) ** np.rint(exponents) * np.abs(theta) ** exponents, axis=1)
 
 
 def _fit_statistics(fit: Fit, known: Information, is_own: bool) -> dict[str, Any]:
@@ -618,7 +617,7 @@ def records(cell: Cell, settings: Identify) -> np.ndarray:
     source = model_of(cell, settings.refine)
     clean = source.record(source.values[:, None])
     drawn = noise.draw(cell.seed, cell.scene.name, cell.repeats, 1, len(clean), "identify: measurements")[:, 0].T
-    return np.asarray(clean + (settings.measurement or NOISE) * drawn)
+    return clean + (settings.measurement or NOISE) * drawn
 
 
 def step_dependence(cell: Cell, model: Model, theta: np.ndarray, known: Information, sigma: float) -> dict[str, float]:

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 from bench.experiment.cell import Cell
 from bench.experiment.columns import Column, Columns, exact, numbers, seconds, several, text
-from bench.model import Estimator, Optimizer, Plugin, param
+from bench.model import Optimizer, Plugin, param
 
 from .. import PARTS, StudyPackage
 
 
-def search_parts(cell: Cell) -> tuple[Optimizer, Estimator | None]:
-    """Return the optimizer and the estimator of a search."""
-    optimizer, estimator = cell.parts["optimizer"], cell.parts["estimator"]
-    assert isinstance(optimizer, Optimizer)
-    assert estimator is None or isinstance(estimator, Estimator)
-    return optimizer, estimator
+def search_parts(cell: Cell) -> tuple[Any, Any]:
+    """Return the optimizer of a search and its estimator, which may be None."""
+    return cell.parts["optimizer"], cell.parts["estimator"]
 
 
 @dataclass(frozen=True)

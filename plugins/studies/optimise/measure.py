@@ -41,12 +41,11 @@ def mean_costs(problem: Problem, points: np.ndarray, w: np.ndarray) -> np.ndarra
     """Return the mean costs ``(B,)`` of points ``(d, B)`` over the same noise ``(n_w, M)``."""
     count = points.shape[1]
     costs = problem.value(np.repeat(points, w.shape[1], axis=1), np.tile(w, (1, count)))
-    return np.asarray(costs.reshape(count, -1).mean(axis=1))
+    return costs.reshape(count, -1).mean(axis=1)
 
 
-def estimates(problem: Problem, estimator: Estimator | None, points: np.ndarray, w: np.ndarray) -> np.ndarray:
+def estimates(problem: Problem, estimator: Estimator, points: np.ndarray, w: np.ndarray) -> np.ndarray:
     """Return an estimator's gradients ``(d, B)`` at points, all from the same noise ``(1, N, n_w)``."""
-    assert estimator is not None
     return np.stack([estimator.estimate(problem, point, w)[0] for point in points.T], axis=1)
 
 
@@ -72,19 +71,19 @@ def measure(cell: Cell, session: Session, settings: Optimise) -> dict[str, Any]:
     theta0 = problem.program.theta0
     quality = {} if settings.quality == "none" else gradient_quality(cell, problem, theta0, settings)
     path, theta, stopped = follow_path(cell, problem, theta0, settings)
-    last = {name: values[-1] for name, values in path.items()}
-    cost, is_lost = path["cost"], stopped == "diverged"
-    start, final, stored = cost[0], cost[-1], stored_indices(cost)
+    iterations, final, rollouts, gradients, seconds = path[-1]
+    cost, is_lost = [point[1] for point in path], stopped == "diverged"
+    start, stored = cost[0], [path[i] for i in stored_indices(cost)]
     score = float(np.clip((start - final) / (start - optimum), 0.0, 1.0)) if start > optimum else np.nan
     return {
         "status": "diverged" if is_lost else "ok",
         "reason": f"the cost left {settings.limit:g} (|J0| + 1) or is not finite" if is_lost else "",
         "stopped": stopped, "scene_class": scene_class(cell, problem),
-        "iterations": last["iteration"], "rollouts": last["rollouts"], "gradients": last["gradients"],
+        "iterations": iterations, "rollouts": rollouts, "gradients": gradients,
         "gradient_ratio": gradient_ratio(problem, cell) if cell.timing and cell.parts["estimator"] else np.nan,
-        "search_s": last["s"], "start_cost": start, "final_cost": final, "best_cost": float(np.nanmin(cost)),
+        "search_s": seconds, "start_cost": start, "final_cost": final, "best_cost": float(np.nanmin(cost)),
         "optimum": optimum, "optimum_status": how, "score": 0.0 if is_lost and not np.isfinite(score) else score,
-        **{f"path_{name}": np.asarray(values)[stored].tolist() for name, values in path.items()},
+        **{f"path_{name}": list(values) for name, values in zip(PATH, zip(*stored, strict=True), strict=True)},
         "theta": theta.tolist(),
         **{f"quality_{name}": value for name, value in quality.items()},
     }  # fmt: skip
@@ -100,10 +99,10 @@ def stored_indices(cost: Sequence[float]) -> np.ndarray:
 
 def follow_path(
     cell: Cell, problem: Problem, theta0: np.ndarray, settings: Optimise
-) -> tuple[dict[str, list[Any]], np.ndarray, str]:
+) -> tuple[list[tuple[float, ...]], np.ndarray, str]:
     """Iterate until the budget is spent or the cost has diverged; return the path, its last theta, and which of both.
 
-    The path has lists with an entry per iteration: iteration, cost, rollouts, gradients and time ``s``.
+    The path has the numbers of :data:`PATH` of each iteration.
     """
     (optimizer, estimator), usage = search_parts(cell), problem.usage
     still = np.zeros((problem.program.n_noise, 1))
@@ -120,15 +119,14 @@ def follow_path(
 
     state = optimizer.start(theta0)
     step(state, 1)  # compiles, untimed
-    path: dict[str, list[Any]] = {name: [] for name in PATH}
+    path: list[tuple[float, ...]] = []
     usage.rollouts = usage.gradients = 0
     most = settings.iterations if settings.iterations is not None else math.inf
     iteration, seconds = 0, 0.0
     while True:
         cost = objective(problem, state["theta"], still)
-        for name, value in zip(PATH, (iteration, cost, usage.rollouts, usage.gradients, seconds), strict=True):
-            path[name].append(value)
-        if not np.isfinite(cost) or abs(cost) > settings.limit * (abs(path["cost"][0]) + 1.0):
+        path.append((iteration, cost, usage.rollouts, usage.gradients, seconds))
+        if not np.isfinite(cost) or abs(cost) > settings.limit * (abs(path[0][1]) + 1.0):
             return path, state["theta"], "diverged"
         if usage.rollouts + settings.gradient_cost * usage.gradients >= settings.budget or iteration >= most:
             return path, state["theta"], "budget"
@@ -175,9 +173,6 @@ def stored_in(session: Session, name: str, compute: Callable[[], dict[str, Any]]
     return content
 
 
-_classes: dict[str, str] = {}
-
-
 def scene_class(cell: Cell, problem: Problem) -> str:
     """Return the class of a problem, by the reason that its gradients are difficult.
 
@@ -191,15 +186,11 @@ def scene_class(cell: Cell, problem: Problem) -> str:
         return "discontinuous"
     if isinstance(program, Rollout) and program.scene.n_contacts:
         return "stiff"
-    if cell.program_key not in _classes:
-        drawn = noise.draw(0, cell.scene.name, 1, 128, program.n_noise, "optimise: class")
-        with np.errstate(all="ignore"):
-            first = problem.grad(program.theta0, drawn[0].T).var(axis=1).sum()
-            zeroth = zeroth_order(problem, program.theta0, drawn)[0].var(axis=0).sum()
-        _classes[cell.program_key] = (
-            "smooth" if first < zeroth else "chaotic" if isinstance(program, Rollout) else "stiff"
-        )
-    return _classes[cell.program_key]
+    drawn = noise.draw(0, cell.scene.name, 1, 128, program.n_noise, "optimise: class")
+    with np.errstate(all="ignore"):
+        first = problem.grad(program.theta0, drawn[0].T).var(axis=1).sum()
+        zeroth = zeroth_order(problem, program.theta0, drawn)[0].var(axis=0).sum()
+    return "smooth" if first < zeroth else "chaotic" if isinstance(program, Rollout) else "stiff"
 
 
 _ratios: dict[tuple[str, str], float] = {}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -92,15 +92,15 @@ class RunSet:
         # the lower of the two middle costs, because their mean is infinite if one search failed
         groups = final.groupby([rows[n] for n in ("problem", "method", "tuning")], sort=False)
         middle = groups.quantile(interpolation="lower")
-        best = middle.reset_index().sort_values("final_cost", kind="stable").drop_duplicates(["problem", "method"])
-        return dict(zip(zip(best["problem"], best["method"], strict=True), best["tuning"], strict=True))
+        best = middle.reset_index("tuning").sort_values("final_cost", kind="stable")["tuning"]
+        return dict(best[~best.index.duplicated()])
 
     @cached_property
     def best_runs(self) -> pd.DataFrame:
         """The rows of each method's best tuning on each problem, without the tuning seeds."""
         rows = self.rows[~self.rows["seed"].isin(self.tuning_seeds)]
-        best = [(*key, tuning) for key, tuning in self.best_tunings.items()]
-        return rows[pd.MultiIndex.from_frame(rows[["problem", "method", "tuning"]]).isin(best)]
+        best = pd.MultiIndex.from_frame(rows[["problem", "method"]]).map(self.best_tunings)
+        return rows[rows["tuning"] == best]
 
 
 def collect_runs(experiment: Experiment, rows: pd.DataFrame) -> RunSet:
@@ -183,17 +183,6 @@ def times_to_targets(runs: RunSet) -> pd.DataFrame:
             "art_low": art_low, "art_high": art_high,
         })  # fmt: skip
     return pd.DataFrame(lines)
-
-
-def runtimes(runs: RunSet) -> pd.DataFrame:
-    """Return the rollouts of each search until each target, infinite if it is missed, and the weight of the search.
-
-    The weights of a method add up to 1, in equal parts for its problems and targets.
-    """
-    table = hits(runs)
-    weight = 1.0 / table.groupby(["problem", "method", "target"])["spent"].transform("size")
-    total = weight.groupby(table["method"]).transform("sum")
-    return table.assign(runtime=table["spent"].where(table["reached"], math.inf), weight=weight / total)
 
 
 def share_of_targets(reached: pd.DataFrame) -> tuple[float, float]:
@@ -323,45 +312,34 @@ def tables(experiment: Experiment, rows: pd.DataFrame, runs: RunSet) -> list[Tab
 
 
 def charts(runs: RunSet) -> list[Chart]:
-    """Return the charts, the shares of targets reached first."""
+    """Return the share of targets that each method reaches, the largest first, and that single searches reach in time."""
+    problems, times = runs.rows["problem"].unique(), hits(runs)
+    where = f"{len(problems)} problems" if len(problems) > 1 else problems[0]
     # a method without an estimator has no comma, and a free colour
     looks = method_styles(method for method in runs.rows["method"].unique() if ", " in method)
-    return [replace(chart, series="method", styles=looks) for chart in (_targets(runs), *_progress(runs))]
-
-
-def _targets(runs: RunSet) -> Chart:
-    """Return the share of targets that each method reaches, the largest first."""
-    frame = summarise(runs).sort_values("reached", ascending=False, kind="stable")
-    return Chart(
-        "targets", frame, [REACHED], [METHOD], "dots", height=0.24,
-        subtitle=_where(runs, "targets: a tenth, a hundredth and a thousandth of the first regret"),
-        text="Bars are 95% intervals over seeds.",
+    targets = Chart(
+        "targets", summarise(runs).sort_values("reached", ascending=False, kind="stable"), [REACHED], [METHOD], "dots",
+        series="method", styles=looks, height=0.24, text="Bars are 95% intervals over seeds.",
+        subtitle=f"{where}, targets: a tenth, a hundredth and a thousandth of the first regret",
     )  # fmt: skip
-
-
-def _where(runs: RunSet, what: str) -> str:
-    problems = runs.rows["problem"].unique()
-    return f"{len(problems)} problems, {what}" if len(problems) > 1 else f"{problems[0]}, {what}"
-
-
-def _progress(runs: RunSet) -> list[Chart]:
-    """Return the share of targets that single searches reach within a number of rollouts."""
-    times = runtimes(runs)
-    finite = times.loc[np.isfinite(times["runtime"]) & (times["runtime"] > 0), "runtime"]
+    finite = times.loc[times["reached"] & (times["spent"] > 0), "spent"]
     if finite.empty:
-        return []
+        return [targets]
+    # the weights of a method's searches add up to 1, in equal parts for its problems and targets
+    weight = 1.0 / times.groupby(["problem", "method", "target"])["spent"].transform("size")
+    weight = (weight / weight.groupby(times["method"]).transform("sum")).where(times["reached"], 0.0)
     grid = np.geomspace(finite.min() / 1.5, finite.max() * 1.2, STEPS)
     shares = {
-        method: [float(part["weight"][part["runtime"] <= x].sum()) for x in grid]
-        for method, part in times.groupby("method", sort=False)
+        method: [float(part[times["spent"][part.index] <= x].sum()) for x in grid]
+        for method, part in weight.groupby(times["method"], sort=False)
     }
     frame = pd.DataFrame(shares, index=pd.Index(grid, name="spent")).melt(
         var_name="method", value_name="share", ignore_index=False
     )
     share = Column("share", label="share of targets reached", format="percent", log=False)
-    chart = Chart(
-        "runtimes", frame.reset_index(), [SPENT], [share], height=2.6, panel="",
-        subtitle=_where(runs, "single searches, a gradient counts as its time in rollouts"),
+    runtimes = Chart(
+        "runtimes", frame.reset_index(), [SPENT], [share], series="method", styles=looks, height=2.6,
+        subtitle=f"{where}, single searches, a gradient counts as its time in rollouts",
         text="Where a line ends is the share of targets reached in the whole budget.",
     )  # fmt: skip
-    return [chart]
+    return [targets, runtimes]

@@ -118,7 +118,7 @@ def series(values: Any) -> np.ndarray:
 def _known(values: Any) -> np.ndarray:
     """Return the entries of a stored list that are not NaN."""
     numbers = series(values)
-    return np.asarray(numbers[~np.isnan(numbers)])
+    return numbers[~np.isnan(numbers)]
 
 
 def _rises(run: Mapping[str, Any], since: float) -> bool:
