@@ -72,7 +72,7 @@ def compute_history(names: Sequence[str], results: Sequence[Mapping[str, Results
         tables = [rows_by_cell(result[experiment].rows) for result in results]
         first, compared = tables[0], results[0][experiment].columns.compared
         tables = [table.reindex(first.index) for table in tables]
-        is_ok = pd.concat([table["status"] == "ok" for table in tables], axis=1, keys=names)
+        is_ok = pd.concat([table["status"] == "ok" for table in tables], axis=1, keys=range(len(tables)))
         by = "estimator" if first["estimator"].any() else "backend"
         errors = [column for by in ERRORS for column in compared if rule_of(column).by == by]
         for series, every in first.groupby(by, sort=False):
@@ -95,7 +95,7 @@ def compute_history(names: Sequence[str], results: Sequence[Mapping[str, Results
                 lines.append({
                     "result": name, "experiment": experiment, "series": series if first[by].nunique() > 1 else "",
                     "column": rule_of(error).called if error else "", "error": float(np.exp(logs.mean())) if len(logs) else math.nan,
-                    "cells": len(logs), "moved": max(moves, default=math.nan), "failed": int((~is_ok.loc[of, name]).sum()), "of": len(of),
+                    "cells": len(logs), "moved": max(moves, default=math.nan), "failed": int((~is_ok.loc[of, place]).sum()), "of": len(of),
                 })  # fmt: skip
     return History(pd.DataFrame(lines), list(names))
 

@@ -13,6 +13,7 @@ import numpy as np
 from bench.examine.smoothing import TARGET_ERROR, Method, Smoothed
 from bench.gradient import FAULTS, TRUSTED, Check, Part, Sample
 from bench.gradient.diagnosis import Explanation, grows, may_be_adaptive
+from bench.gradient.direction import CHANCE, resolution
 from bench.gradient.lines import ALIKE, LineScan
 from bench.gradient.rules import EXCUSABLE, RULES, STATUS, SUSPICIOUS, UNEQUAL
 from bench.gradient.stages import Repeats, recaused
@@ -235,7 +236,7 @@ class Findings:
         parts = [p for p in self.settled.components if p.verdict in TRUSTED and p.verdict != "zero"]
         seen = [p for p in parts if p.uncertainty < DIGIT * max(abs(p.difference), _slope_nearby(p.sample))]
         largest = max((abs(p.difference) * p.sample.scale for p in seen), default=0.0)
-        hidden = [p for p in parts if p not in seen and abs(p.program) * p.sample.scale > DIGIT * largest]
+        hidden = [p for p in parts if p not in seen and abs(p.program) * p.sample.scale >= DIGIT * largest]
         contradicted = [
             p
             for p in seen
@@ -297,7 +298,7 @@ class Findings:
     def derivative_cause(self) -> str:
         """The cause of the first problem with the derivative at theta, or the verdict on a right one."""
         check, explained, repeats = self.settled, self.explained, self.repeats
-        allowed = self.setup.allow_zero
+        allowed, tolerance = self.setup.allow_zero, max(float(self.setup.rtol.max()), 1e-3)
         if self.error:
             return "raised"
         if not check.parts:
@@ -310,8 +311,7 @@ class Findings:
                 return "staircase"
             if cause in EXCUSABLE and self.is_discretisation_gap:
                 return "adaptive"
-            grown = grows(explained.growth, max(float(self.setup.rtol.max()), 1e-3))
-            if cause in (*UNEQUAL, "unsettled") and grown:
+            if cause in (*UNEQUAL, "unsettled") and grows(explained.growth, tolerance):
                 return "overwritten"
             # so small an error that adaptive steps may explain it, and the budget ended before that was known
             is_open = explained.is_adaptive is None and may_be_adaptive(self.check)
@@ -323,6 +323,8 @@ class Findings:
             return "nonfinite"
         if self.gradient and self.unresolved:
             return "unresolved"
+        if any(one.is_wrong(tolerance) for one in explained.growth):
+            return "overwritten" if grows(explained.growth, tolerance) else "missing_term"
         is_still = not self.moves_around
         if is_still and all(part.verdict == "zero" for part in check.parts) and (allowed is None or not allowed.all()):
             return "constant"
@@ -367,10 +369,11 @@ class Findings:
     def noise_found(self) -> list[tuple[str, Smoothed | None]]:
         """The problems around theta or under noise, each with the sigma that shows it; the first one decides."""
         found: list[tuple[str, Smoothed | None]] = []
-        if self.has_steps and (self.derivative in (RIGHT, NONE) or not self.is_measured):
+        if self.has_steps and self.derivative in (RIGHT, NONE):
             found.append(("staircase", None))
         elif self.misses_jumps:
-            found.append(("staircase" if self.tread else "jumps", None))
+            has_jumps = any(line.jumps for line in self.lines if line.missed > SEEN)
+            found.append(("staircase" if self.tread else "jumps" if has_jumps else "spread", None))
         for one in self.smoothed:
             found += [(one.cause, one)] if one.cause else []
         if self.gradient and len(self.smoothed) < len(self.setup.sigmas):
@@ -472,9 +475,9 @@ class Findings:
 
     @property
     def resolution(self) -> float:
-        """The smallest relative error that the differences detect: at least u^(2/3), as for central differences."""
-        errors = [part.uncertainty / abs(part.difference) for part in self.resolved_parts]
-        return float(max([self.unit ** (2 / 3), *errors]))
+        """The smallest relative error that the differences detect."""
+        errors = [CHANCE * part.uncertainty / abs(part.difference) for part in self.resolved_parts]
+        return float(max([resolution(self.unit), *errors]))
 
     def recommended(self, one: Smoothed) -> Method | None:
         """Return the fastest usable method at a sigma; None if none is known."""

@@ -153,7 +153,8 @@ def derivative_facts(report: Findings) -> list[str]:
     if cause in own:
         return own[cause]
     if not report.wrong_checks:
-        return [n_checked(report)]
+        worst = max(explained.growth, key=lambda one: one.error, default=None)
+        return [f"after {worst.steps} steps off by {number(100 * worst.error)}%" if worst else n_checked(report)]
     facts = check_facts(report, report.wrong_checks[0])
     if cause == "undecided":
         facts.append("so little that adaptive steps may explain it")

@@ -52,6 +52,10 @@ class Horizon(NamedTuple):
     uncertainty: float
     """The error of the differences, relative to the largest."""
 
+    def is_wrong(self, tolerance: float) -> bool:
+        """Return whether the error is above a tolerance and twice its uncertainty."""
+        return self.error > tolerance + 2.0 * self.uncertainty
+
 
 class Gap(NamedTuple):
     """At one theta, the distances of the gradient and of the cost's own differences from those of a refined cost."""
@@ -133,7 +137,7 @@ def errors_by_horizon(stages: GradientStages, horizons: Sequence[int]) -> list[H
 
 def grows(horizons: Sequence[Horizon], tolerance: float) -> bool:
     """Return whether the gradient is right after few steps and its error grows with the number of steps."""
-    wrong = [one for one in horizons if one.error > tolerance + 2.0 * one.uncertainty]
+    wrong = [one for one in horizons if one.is_wrong(tolerance)]
     if len(horizons) < 2 or not wrong or horizons[0] in wrong:
         return False
     last = horizons[-1]

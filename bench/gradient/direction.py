@@ -35,6 +35,8 @@ ALIKE = 0.1
 """Relative spread within which values count as equal."""
 CHANCE = 10.0
 """Multiple of the smallest spread of neighbouring differences that counts as their error: it is partly small by chance."""
+LARGEST = 1e-3
+"""Largest relative error that counts as that of a difference in single precision."""
 MIN_STEPS = 7
 """Fewest steps with finite costs on both sides; with fewer, the verdict is ``nonfinite``."""
 
@@ -250,7 +252,7 @@ def _judge_one_sided(sample: Sample, noise: np.ndarray) -> str:
             if spread + noises > ALIKE * abs(middle):
                 continue
             settled = True
-            tolerance = 2.0 * spread + noises + float(np.cbrt(sample.unit)) * abs(middle)
+            tolerance = 2.0 * spread + noises + resolution(sample.unit) * abs(middle)
             if abs(middle - sample.derivative) <= tolerance:
                 return "kink"
     return wrong(sample) if settled else "unsettled"
@@ -270,9 +272,13 @@ def _vanishes(sample: Sample, noise: np.ndarray) -> bool:
     return bool((orders >= ORDER).all())
 
 
+def resolution(unit: float) -> float:
+    """Return the relative error below which no derivative is wrong: at the relative step u^(1/3) two errors balance."""
+    return min(float(np.cbrt(unit)), LARGEST)
+
+
 def _resolution(sample: Sample, index: int) -> float:
-    """Return u^(1/3) times the derivative's size: at the relative step u^(1/3), a difference's two errors balance."""
-    return float(np.cbrt(sample.unit)) * sample.size(index)
+    return resolution(sample.unit) * sample.size(index)
 
 
 def wrong(sample: Sample) -> str:

@@ -15,7 +15,7 @@ import numpy as np
 
 from .causes import causes_of_ratios
 from .check import NOTHING, Check, Part
-from .direction import ALIKE, MEASURED, Sample, finding_at, wrong
+from .direction import ALIKE, MEASURED, Sample, finding_at, resolution, wrong
 from .rules import most_severe
 from .subspace import Subspace
 
@@ -109,7 +109,7 @@ def _judge(sample: Sample, difference: float, uncertainty: float, is_contradicte
         return "zero"
     if is_contradicted:
         return "unsettled"
-    if apart > CLEAR * uncertainty and apart > float(np.cbrt(sample.unit)) * size:
+    if apart > CLEAR * uncertainty and apart > resolution(sample.unit) * size:
         return wrong(sample)
     return "smooth" if uncertainty <= ALIKE * size else "unsettled"
 

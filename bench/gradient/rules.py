@@ -70,12 +70,12 @@ DERIVATIVE = {
     "missing_term": Rule(
         "fault", "part of the derivative is right: a term is missing, detached or counted twice",
         "`wrong_adjoint` with unequal ratios, where other components or thetas are right, or {causes.MOSTLY:.0%} of the ratios "
-        "lie between 0 and 2", FOLLOW, SLOPES, True,
+        "lie between 0 and 2; or wrong at some of `horizons`", FOLLOW, SLOPES, True,
     ),
     "wrong_adjoint": Rule(
         "fault", "the differences agree with each other, but not with the gradient",
         "off by more than the error of the best difference: {direction.CHANCE:g} times its distance from its neighbours, rounding, and "
-        "u^(1/3) of its size; after one to three step sizes, by {few.CLEAR:g} times the error", FOLLOW, SLOPES, True,
+        "u^(1/3) of its size, in float32 {direction.LARGEST:.1%}; after one to three step sizes, by {few.CLEAR:g} times the error", FOLLOW, SLOPES, True,
     ),
     "nonfinite": Rule(
         "open", "a cost is NaN or infinite",
@@ -182,7 +182,7 @@ NOISE = {
     ),
     "spread": Rule(
         "open", "the gradients vary too widely to show whether their mean is grad J",
-        "that interval contains {smoothing.TARGET_ERROR:.0%}, or grad J is less than {smoothing.CLEAR:g} times its error", SMOOTHING, MORE,
+        "that interval contains {smoothing.TARGET_ERROR:.0%}, or grad J is less than {smoothing.CLEAR:g} times its error; or a line of `jumps` has none", SMOOTHING, MORE,
     ),
     "unmeasured": Rule(
         "open", "the budget ended before the noise of sigma was measured", "fewer than {smoothing.FEWEST} pairs of costs at a sigma",
