@@ -9,7 +9,6 @@ from functools import cache
 from pathlib import Path
 
 import pandas as pd
-from bench.plugins.studies.bias_variance import comparisons
 
 import bench
 from bench.errors import UserError
@@ -17,7 +16,6 @@ from bench.experiment import config
 from bench.experiment.experiment import Experiment
 from bench.model import registry
 from bench.report import answer
-from bench.report.views import arrange
 from bench.report.writer import ANSWER
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -94,17 +92,13 @@ def loaded(results: Path) -> dict[str, Experiment]:
 
 
 def entry_of(name: str, question: str, folder: Path) -> Entry:
-    """Return an experiment with the content of its ``answer.json``; raises :class:`UserError` if that is malformed."""
+    """Return an experiment with the content of its ``answer.json``."""
     path = folder / ANSWER
     if not path.exists():
         return Entry(name, question, folder)
     record = json.loads(path.read_text())
-    record = record if isinstance(record, dict) else {}
-    text, chart = record.get("answer"), record.get("chart")
-    if not (isinstance(text, str) and isinstance(chart, str)):
-        raise UserError(f"'{path}' is not an answer: it needs the strings 'answer' and 'chart'")
-    picture = folder / f"{Path(chart).name}.png"
-    return Entry(name, question, folder, text, picture if picture.exists() else None)
+    picture = folder / f"{Path(record['chart']).name}.png"
+    return Entry(name, question, folder, record["answer"], picture if picture.exists() else None)
 
 
 @cache
@@ -131,15 +125,15 @@ def rows_of(experiment: str, results: Path = STANDARD) -> pd.DataFrame:
 
 
 @cache
-def comparison(experiment: str, results: Path = STANDARD) -> pd.DataFrame:
+def comparison(results: Path = STANDARD) -> pd.DataFrame:
     """Return the relative RMSE of each setting of an estimator on each problem, with its 95% interval and verdict.
 
-    Verdicts are those of :mod:`bench.plugins.studies.bias_variance.comparisons`. ``best``: lowest,
-    or not distinguishable from the lowest. ``biased``: more than half of the squared error is bias.
+    They are those of the experiment ``estimators``. ``best``: lowest, or not distinguishable from the lowest. ``biased``: more
+    than half of the squared error is bias.
     """
-    methods = comparisons.method_table(arrange(loaded(results)[experiment], rows_of(experiment, results)))
-    settings = comparisons.compare_errors(methods).to_dict("records")
-    best = {(row["problem"], name) for row in settings for name in (row["first"], *row["tied"])}
+    methods, settings = (table_of(f"estimators/{name}", results) for name in ("verdicts", "comparisons"))
+    names = (settings["first"] + ", " + settings["tied"].fillna("")).str.split(", ")
+    best = set(settings.assign(name=names).explode("name")[["problem", "name"]].itertuples(index=False, name=None))
     parts = methods["estimator"].str.partition("[")
     return methods.rename(columns={"error": "rmse_rel", "error_low": "low", "error_high": "high"}).assign(
         estimator=parts[0],

@@ -245,7 +245,7 @@ def claim_pages(results: Path) -> dict[str, str]:
 
 def estimator_pages(results: Path) -> dict[str, str]:
     """Return a page per estimator: what it is, its parameters, and where it is best and where it fails."""
-    table = comparison("estimators", results)
+    table = comparison(results)
     pages = {}
     for name, entry in sorted(registry.entries()["estimators"].items()):
         if entry.plugin is not None:
@@ -340,7 +340,7 @@ def cited(text: str) -> list[str]:
 
 def estimators_page(results: Path) -> str:
     """Return the table of all estimators: what each needs, and its worst case."""
-    table = comparison("estimators", results)
+    table = comparison(results)
     lines = ["| estimator | what it is | needs | best on | fails on |", "|---|---|---|--:|--:|"]
     for name, entry in sorted(registry.entries()["estimators"].items()):
         if entry.plugin is None:

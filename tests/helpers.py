@@ -238,4 +238,4 @@ def page(made, rows, views=None):
     """Return the page of an experiment's rows, with the drawings of its views."""
     views = views_of(made, rows) if views is None else views
     data = page_data(made, rows, views, [["a=1"]] * len(rows))
-    return "".join(document.blocks(made.name, made.question, views, data, writer.drawings(made, views)))
+    return document.page(made.name, made.question, views, data, writer.drawings(made, views))

@@ -287,7 +287,9 @@ def test_functions_stay_functions_after_all_commands_are_imported():
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-@pytest.mark.parametrize("name", ["model.parameters", "model.identity", "report.text", "experiment.grid", "errors"])
+@pytest.mark.parametrize(
+    "name", ["model.parameters", "model.identity", "report.text", "experiment.grid", "errors", "claims.claim"]
+)
 def test_examples_in_docstrings(name):
     done = doctest.testmod(importlib.import_module(f"bench.{name}"))
     assert done.attempted > 0

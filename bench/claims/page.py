@@ -10,9 +10,9 @@ from bench.experiment.columns import text
 from bench.experiment.views import Views
 from bench.report.draw import draw
 from bench.report.figures import save, styled
-from bench.report.tables import csv_blocks
+from bench.report.tables import csv_text
+from bench.report.web import document
 from bench.report.web.data import cells_data
-from bench.report.web.document import blocks
 from bench.report.writer import ANSWER, answer_json
 from bench.run.files import write_all
 
@@ -32,8 +32,8 @@ def write(directory: Path, results: Results) -> list[Path]:
     views = Views([tables.claims_table(results)], headline=answer)
     content = {
         "claims.md": tables.markdown(results),
-        "claims.csv": csv_blocks(figures),
-        "claims.html": blocks(tables.TITLE, QUESTION, views, cells, drawn),
+        "claims.csv": csv_text(figures),
+        "claims.html": document.page(tables.TITLE, QUESTION, views, cells, drawn),
         ANSWER: answer_json("claims", QUESTION, answer, drawn[0][0].name if drawn else ""),
     }
-    return write_all(directory, content.items())
+    return write_all(directory, content)

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-import math
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import pandas as pd
 
 from bench.compare import timings
-from bench.compare.judging import Change, Row, judge_cell, rule_of
+from bench.compare.judging import Row, judge_cell, rule_of
 from bench.experiment.columns import IDENTITY, Column, Columns
 from bench.experiment.parameters import completed
 
@@ -22,8 +21,6 @@ FIRST = ("outcome", "change", *IDENTITY, "status_before", "status_after")
 LAST = ("parameters",)
 WORSE_IN = "worse_in"
 """Internal column, not written to files: the list of :attr:`Change.subject` of the changes for the worse."""
-
-Key = tuple[str, ...]
 
 
 def both_sides(columns: Sequence[Column]) -> list[str]:
@@ -42,25 +39,37 @@ def compare_cells(
     """
     judged = columns.compared
     old, new, *more = (rows_by_cell(rows) for rows in (before, after, *again))
-    changes = {key: judge_cell(judged, old.get(key), new.get(key)) for key in dict.fromkeys([*old, *new])}
+    every = [*dict.fromkeys([*old.index, *new.index])]
+    sides = {"before": old.reindex(every), "after": new.reindex(every)}
+    pairs = zip(every, *(side.to_dict("records") for side in sides.values()), strict=True)
+    changes = {
+        key: judge_cell(judged, was if key in old.index else None, now if key in new.index else None)
+        for key, was, now in pairs
+    }
     remarks: list[str] = []
     for column in judged if again else ():
         if rule_of(column).by == "time":
-            was, now, *runs = (_succeeded(rows) for rows in (old, new, *more))
-            of_column, of_times = timings.judge_times(column.name, rule_of(column).called, was, now, runs)
+            times = [rows.loc[rows["status"] == "ok", column.name] for rows in (old, new, *more)]
+            of_column, of_times = timings.judge_times(rule_of(column).called, *times)
             remarks += of_times
             for key, change in of_column.items():
-                changes[key].append(change)  # type: ignore[index]
-    lines = [_line(old.get(key), new.get(key), judged, own) for key, own in changes.items()]
-    return pd.DataFrame(lines, columns=[*FIRST, *both_sides(judged), *LAST, WORSE_IN]), remarks
+                changes[key].append(change)
+    known = sides["after"].where(sides["after"]["status"].notna(), sides["before"])
+    table = known[[*IDENTITY, *LAST]].assign(
+        **{f"{c.name}_{when}": side[c.name] if c.kind == "number" else side[c.name].fillna("") for c in judged for when, side in sides.items()},
+        **{f"status_{when}": side["status"].fillna("") for when, side in sides.items()},
+        outcome=[min((change.outcome for change in own), key=OUTCOMES.index, default="same") for own in changes.values()],
+        change=["; ".join(change.text for change in own) for own in changes.values()],
+        **{WORSE_IN: [[change.subject for change in own if change.outcome == "worse"] for own in changes.values()]},
+    )  # fmt: skip
+    return table[[*FIRST, *both_sides(judged), *LAST, WORSE_IN]].reset_index(drop=True), remarks
 
 
-def rows_by_cell(rows: pd.DataFrame) -> dict[Key, Row]:
+def rows_by_cell(rows: pd.DataFrame) -> pd.DataFrame:
     """Return the rows by the identity of their cell. If a cell has several rows, the last counts."""
-    records = [{str(name): value for name, value in row.items()} for row in rows.to_dict("records")]
-    return {
-        (canonical_parameters(row["parameters"]), *(repr(float(row[name])) for name in COUNTS)): row for row in records
-    }
+    parts = [rows["parameters"].map(canonical_parameters), *(rows[name].astype(float).map(repr) for name in COUNTS)]
+    frame = rows.set_axis(pd.Index([" ".join(part) for part in zip(*parts, strict=True)], dtype=object))
+    return frame[~frame.index.duplicated(keep="last")]
 
 
 def canonical_parameters(parameters: str) -> str:
@@ -76,24 +85,3 @@ def flat_parameters(row: Row) -> dict[str, Any]:
             flat |= {axis: part["name"]} if "name" in part else {}
             flat |= {f"{part.get('name', axis)}.{name}": value for name, value in part.items() if name != "name"}
     return flat | {name: float(row[name]) for name in COUNTS}
-
-
-def _succeeded(rows: Mapping[Key, Row]) -> dict[Hashable, Row]:
-    return {key: row for key, row in rows.items() if row["status"] == "ok"}
-
-
-def _line(old: Row | None, new: Row | None, judged: Sequence[Column], changes: Sequence[Change]) -> dict[str, Any]:
-    """Return the line of one cell, with the values of both sides and the worst of its changes as the outcome."""
-    row = new or old or {}
-    line = {name: row.get(name) for name in (*IDENTITY, "parameters")}
-    for when, side in (("before", old), ("after", new)):
-        line |= {
-            f"{c.name}_{when}": side.get(c.name) if side else math.nan if c.kind == "number" else "" for c in judged
-        }
-        line[f"status_{when}"] = side["status"] if side else ""
-    outcomes = {change.outcome for change in changes}
-    return line | {
-        "outcome": next((outcome for outcome in OUTCOMES if outcome in outcomes), "same"),
-        "change": "; ".join(change.text for change in changes),
-        WORSE_IN: [change.subject for change in changes if change.outcome == "worse"],
-    }

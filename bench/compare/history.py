@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from bench.compare.cells import rows_by_cell
-from bench.compare.judging import ROUNDING, Row, distance, rule_of, value
+from bench.compare.judging import ROUNDING, distance, rule_of
 from bench.compare.sources import Results, read_results
 from bench.errors import UserError, local_path
 from bench.experiment.columns import Column, text
@@ -71,32 +71,39 @@ def compute_history(names: Sequence[str], results: Sequence[Mapping[str, Results
     lines = []
     for experiment in shared:
         tables = [rows_by_cell(result[experiment].rows) for result in results]
-        compared = results[0][experiment].columns.compared
-        vectors = [column for column in compared if rule_of(column).by == "vector"]
+        first, compared = tables[0], results[0][experiment].columns.compared
+        tables = [table.reindex(first.index) for table in tables]
+        is_ok = pd.concat([table["status"] == "ok" for table in tables], axis=1, keys=names)
+        by = "estimator" if first["estimator"].any() else "backend"
         errors = [column for by in ERRORS for column in compared if rule_of(column).by == by]
-        by = "estimator" if any(row["estimator"] for row in tables[0].values()) else "backend"
-        names_of_series = dict.fromkeys(str(row[by]) for row in tables[0].values())
-        for series in names_of_series:
-            keys = [key for key, row in tables[0].items() if row[by] == series and row["status"] not in NOT_RUN]
-            ok_in_all = [key for key in keys if all(table.get(key, {}).get("status") == "ok" for table in tables)]
-            pairs = [[(tables[0][key], table[key]) for key in ok_in_all] for table in tables]
-            counts = {column.name: min(len(_log_ratios(column, own)) for own in pairs) for column in errors}
-            error = max(errors, key=lambda column: counts[column.name], default=None) if any(counts.values()) else None
-            for name, table, own in zip(names, tables, pairs, strict=True):
-                ratios = _log_ratios(error, own) if error else np.empty(0)
-                moved = max((distance(vector, *pair) for vector in vectors for pair in own), default=math.nan)
-                failed = sum(table.get(key, {}).get("status") != "ok" for key in keys)
-                shown = series if len(names_of_series) > 1 else ""
-                called = rule_of(error).called if error else ""
-                mean = float(np.exp(ratios.mean())) if len(ratios) else math.nan
-                lines.append((name, experiment, shown, called, mean, len(ratios), moved, failed, len(keys)))
-    titles = ["result", "experiment", "series", "column", "error", "cells", "moved", "failed", "of"]
-    return History(pd.DataFrame(lines, columns=titles), list(names))
+        for series, every in first.groupby(by, sort=False):
+            of = every.index[~every["status"].isin(NOT_RUN)]
+            same = of[is_ok.loc[of].all(axis=1)]
+            ratios = {
+                column: [_log_ratios(first.loc[same, column.name], table.loc[same, column.name]) for table in tables]
+                for column in errors
+            }
+            least = {column: min(map(len, own)) for column, own in ratios.items()}
+            error = max(least, key=lambda column: least[column], default=None) if any(least.values()) else None
+            for place, (name, table) in enumerate(zip(names, tables, strict=True)):
+                logs = ratios[error][place] if error else np.empty(0)
+                moves = [
+                    distance(column, *pair)
+                    for column in compared
+                    if rule_of(column).by == "vector"
+                    for pair in zip(first.loc[same].to_dict("records"), table.loc[same].to_dict("records"), strict=True)
+                ]
+                lines.append({
+                    "result": name, "experiment": experiment, "series": series if first[by].nunique() > 1 else "",
+                    "column": rule_of(error).called if error else "", "error": float(np.exp(logs.mean())) if len(logs) else math.nan,
+                    "cells": len(logs), "moved": max(moves, default=math.nan), "failed": int((~is_ok.loc[of, name]).sum()), "of": len(of),
+                })  # fmt: skip
+    return History(pd.DataFrame(lines), list(names))
 
 
-def _log_ratios(column: Column, pairs: Sequence[tuple[Row, Row]]) -> np.ndarray:
-    """Return the logarithms of the ratios of a column in the pairs of rows that have one."""
-    values = np.array([[value(row, column.name) for row in pair] for pair in pairs]).reshape(-1, 2)
+def _log_ratios(was: pd.Series, now: pd.Series) -> np.ndarray:
+    """Return the logarithms of the ratios of the values that both have."""
+    values = pd.concat([was, now], axis=1).to_numpy(float)
     values = values[(np.isfinite(values) & (values > 0)).all(axis=1)]
     return np.asarray(np.log(values[:, 1] / values[:, 0]))
 

@@ -21,8 +21,8 @@ from bench.report import terminal
 from bench.report.problems import varying_identity
 from bench.report.tables import plain_markdown
 from bench.report.text import axis_value, counted, one_line
+from bench.report.web import document
 from bench.report.web.data import cells_data
-from bench.report.web.document import blocks
 from bench.run.files import make_directory, write_all
 
 PRINTED = 30
@@ -168,4 +168,4 @@ def page(comparison: Comparison) -> str:
     ]  # fmt: skip
     shown = Views([Table("rules", rules, [text("remark")], "How cells are judged", page=True)], headline=summary(table))
     data = cells_data(cells, [text("outcome"), text("experiment"), *columns])
-    return "".join(blocks(comparison.title, "Did something get worse?", shown, data))
+    return document.page(comparison.title, "Did something get worse?", shown, data)

@@ -10,11 +10,12 @@ EFFECT. Two runs alone cannot show whether the machine or the code changed.
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Hashable
 
 import numpy as np
+import pandas as pd
 
-from bench.compare.judging import Change, Row, value
+from bench.compare.judging import Change
 from bench.report.text import duration
 
 EFFECT = 1.5
@@ -30,36 +31,38 @@ NOTE = (
     f"before (p < {2 * ALPHA:g} in Student's t)."
 )
 
-Runs = Mapping[Hashable, Row]
-
 
 def judge_times(
-    name: str, called: str, before: Runs, after: Runs, again: Sequence[Runs]
+    called: str, before: pd.Series, after: pd.Series, *again: pd.Series
 ) -> tuple[dict[Hashable, Change], list[str]]:
-    """Return the changes of the time column ``name`` by cell, and remarks.
+    """Return the changes of a time by cell, and remarks.
 
-    ``before``, ``after`` and each further run of before in ``again`` are rows by cell. ``called`` is the column's name in
-    messages.
+    ``before``, ``after`` and each further run of before in ``again`` are times by cell. ``called`` is the time's name in messages.
     """
     from scipy.special import stdtrit
 
-    keys = [key for key in before if key in after and value(before[key], name) > 0 and value(after[key], name) > 0]
-    if not keys:
+    runs = np.log(
+        pd.concat([after, before, *again], axis=1, join="outer")
+        .astype(float)
+        .pipe(lambda times: times.where(times > 0))
+    )
+    runs = runs[runs.iloc[:, :2].notna().all(axis=1)]
+    new, runs = runs.iloc[:, 0], runs.iloc[:, 1:]
+    if runs.empty:
         return {}, []
-    runs = np.log([[value(run.get(key, {}), name) for run in (before, *again)] for key in keys])
-    complete = np.isfinite(runs).all(axis=1)
-    if not complete.any():
+    complete = runs.dropna()
+    if complete.empty:
         return {}, ["no cell is in all runs of before, so times are not judged"]
-    n_unjudged = int((~complete).sum())
+    n_unjudged, count = len(runs) - len(complete), runs.shape[1]
     remark = f"times of {n_unjudged} cells are not judged, since some run of before lacks the cell"
-    count = runs.shape[1]
-    spread = max(LEAST_SPREAD, float(np.sqrt(runs[complete].var(axis=1, ddof=1).mean())))
+    spread = max(LEAST_SPREAD, float(np.sqrt(complete.var(axis=1, ddof=1).mean())))
     limit = max(math.log(EFFECT), float(stdtrit(count - 1, 1 - ALPHA)) * spread * math.sqrt(1 + 1 / count))
-    changes = {}
-    for key, usual in zip(keys, runs.mean(axis=1), strict=True):
-        new = value(after[key], name)
-        growth = math.log(new) - usual
-        if abs(growth) > limit:  # never for a missing time
-            text = f"{called} {duration(math.exp(usual))} to {duration(new)} ({math.exp(growth):.2g} times)"
-            changes[key] = Change("worse" if growth > 0 else "better", text, called)
+    growth = new[complete.index] - complete.mean(axis=1)
+    changes = {
+        key: Change(
+            "worse" if grown > 0 else "better",
+            f"{called} {duration(math.exp(new[key] - grown))} to {duration(math.exp(new[key]))} ({math.exp(grown):.2g} times)", called,
+        )
+        for key, grown in growth[growth.abs() > limit].items()
+    }  # fmt: skip
     return changes, [remark] * bool(n_unjudged)

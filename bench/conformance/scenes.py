@@ -230,7 +230,7 @@ def score_gives_the_gradient(scene: Scene) -> str:
     runs = [p for p in programs(_brief(scene)) if p.continuous and plain_backend().refusal(p) is None]
     skip_unless(runs, "no continuous program runs on the plain backend")
     program = runs[0]
-    skip_unless(program.has_score_gradient, program.no_score_gradient)
+    skip_unless(not program.score_refusal, program.score_refusal)
     problem, theta = plain_backend().compile(program), program.theta0[:, None]
     w = rng("score", scene.name).standard_normal((program.n_noise, 1 << 13))
     centre = problem.value(theta, np.zeros((program.n_noise, 1)))

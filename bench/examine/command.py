@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 import re
 import shutil
@@ -20,13 +21,12 @@ from bench.run.files import make_directory
 from bench.simulator import imports
 from bench.simulator.simulator import LIBRARIES
 
-SETTINGS = (
-    "theta", "grad", "sigma", "noise", "budget", "batch", "scale", "seed", "calls", "compile_budget", "tolerance", "atol",
-    "allow_zero", "expect", "refined", "horizons", "baseline", "save",
-)  # fmt: skip
-"""Settings of one cost."""
 FILES = ("baseline", "save")
 """Files of one cost."""
+SETTINGS = [name for name in inspect.signature(examine).parameters if name not in ("cost", "name", "progress")] + [
+    *FILES
+]
+"""Settings of one cost."""
 QUIET = "--quiet"
 WIDTH, LEAST_WIDTH = 100, 40
 """Width of the text without a terminal, and the least width, in characters."""

@@ -230,7 +230,7 @@ class _Examination:
         stages.run(self._compare_early)
         self.left_out += stages.left_out
         checked = stages.check
-        is_wrong = checked is not None and checked.cause in SUSPICIOUS
+        is_wrong = checked.cause in SUSPICIOUS
         if refined is not None and is_wrong and stages.gradient is not None:
             explained.gaps = self._attempt("the refined cost", lambda: diagnosis.refined_gaps(stages, refined)) or ()
         if setup.horizons:
@@ -238,7 +238,7 @@ class _Examination:
                 self._attempt("horizons", lambda: diagnosis.errors_by_horizon(stages, setup.horizons)) or ()
             )
         can_go_on = stages.gradient is not None or not simulator.has_gradient
-        if checked is not None and is_wrong and can_go_on and explained.is_adaptive is None:
+        if is_wrong and can_go_on and explained.is_adaptive is None:
             explained.is_adaptive = self._compare_along_lines(checked, 0.9)
         lines = self._scan_lines(checked) if can_go_on else []
         smoothed = self._measure_noise(checked) if can_go_on else []
@@ -338,18 +338,18 @@ class _Examination:
                 return points, halvings, most
         return None
 
-    def _scan_lines(self, checked: Check | None) -> list[LineScan]:
+    def _scan_lines(self, checked: Check) -> list[LineScan]:
         """Return scans of the cost over the noise, or near theta without sigma."""
         if not self.setup.levels:
             return self._scan_near(checked, 0.9)
         return self._scan(max(self.setup.levels, key=lambda level: level[0])[1], checked, 0.5)
 
-    def _scan_near(self, checked: Check | None, share: float) -> list[LineScan]:
+    def _scan_near(self, checked: Check, share: float) -> list[LineScan]:
         if self._near is None:
             self._near = self._scan(self.setup.scale * RELATIVE, checked, share)
         return self._near
 
-    def _scan(self, spread: np.ndarray, checked: Check | None, share: float) -> list[LineScan]:
+    def _scan(self, spread: np.ndarray, checked: Check, share: float) -> list[LineScan]:
         """Return scans of the cost for jumps and kinks, along random directions through theta.
 
         They take at most ``share`` of the remaining budget.
@@ -365,7 +365,7 @@ class _Examination:
                 f"fine line scans: {effort[0]} points instead of {POINTS}, and {effort[2]} places searched"
             )
         lines = []
-        measured = checked.noise if checked is not None and math.isfinite(checked.noise) else 0.0
+        measured = checked.noise if math.isfinite(checked.noise) else 0.0
         self.clock.limit(min(1.0, 2 * share))
         try:
             for direction in along:
@@ -381,14 +381,14 @@ class _Examination:
         self.clock.limit(1.0)
         return lines
 
-    def _missed_share(self, line: LineScan, checked: Check | None) -> float:
+    def _missed_share(self, line: LineScan, checked: Check) -> float:
         """Return the share of the cost's change along a line that its gradient does not explain.
 
         Without jumps, the integral of a right gradient along a line is the difference of the costs at its ends. The
         share is NaN without a right gradient, or where the integral is less accurate than both a tenth of the share and
         :data:`LEAST_MISSED`.
         """
-        if checked is None or not checked.trusted or not self.simulator.has_gradient:
+        if not checked.trusted or not self.simulator.has_gradient:
             return math.nan
         changes = np.abs(np.diff(line.costs)).sum()
         rounding = self.simulator.unit * np.abs(line.costs).max(initial=0.0) + checked.noise
@@ -406,7 +406,7 @@ class _Examination:
 
     # ------------------------------------------------------------------------------------------------ noise
 
-    def _measure_noise(self, checked: Check | None) -> list[Smoothed]:
+    def _measure_noise(self, checked: Check) -> list[Smoothed]:
         """Return the gradient's bias and the methods' costs at each sigma, which all get an equal share of the budget."""
         levels, size = list(self.setup.levels), self.stages.theta.size
         if not levels and self.simulator.noise:
@@ -414,9 +414,7 @@ class _Examination:
         if levels and size > MOST_NOISY:
             self.left_out.append(f"noise on theta: it has more than {MOST_NOISY:,} numbers")
             return []
-        plain = None
-        if checked is not None and checked.trusted and not self.simulator.noise:
-            plain = self.stages.gradient
+        plain = self.stages.gradient if checked.trusted and not self.simulator.noise else None
         results = []
         for index, (level, spread) in enumerate(levels):
             self.clock.start_stage(f"noise of sigma {level:g}")

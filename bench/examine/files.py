@@ -40,7 +40,7 @@ def write(report: Findings, directory: Path) -> list[Path]:
 def charts(report: Findings) -> list[Chart]:
     """Return the charts for which the report has data: steps, lines and sigmas."""
     found = []
-    if report.check is not None and report.gradient:
+    if report.check.parts and report.gradient:
         parts = sorted(report.check.parts, key=lambda part: -np.nan_to_num(part.error, nan=np.inf))[:SHOWN]
         steps = pd.concat([
             pd.DataFrame({"derivative": report.label(part), "step": part.sample.step / part.sample.scale,

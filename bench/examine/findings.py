@@ -150,8 +150,8 @@ class Findings:
     repeats: Repeats
     setup: Setup
     spent: Spent
-    check: Check | None
-    """The gradient check; None if it did not finish within the budget."""
+    check: Check
+    """The gradient check; without parts if it did not finish within the budget."""
     is_quick: bool
     """Whether the check has at most three steps per component."""
     is_complete: bool
@@ -193,16 +193,15 @@ class Findings:
     # ------------------------------------------------------------------------------------------ the derivative
 
     @cached_property
-    def settled(self) -> Check | None:
+    def settled(self) -> Check:
         """The check with tolerated errors counted as right."""
-        if self.check is None or self.check.cause not in UNEQUAL:
+        if self.check.cause not in UNEQUAL:
             return self.check
         return recaused(self.check, lambda part: replace(part, verdict="nonlinear") if self._is_small(part) else part)
 
     @np.errstate(all="ignore")
     def _is_small(self, part: Part) -> bool:
         """Return whether a wrong part's error is within the tolerance."""
-        assert self.check is not None
         if part.verdict not in UNEQUAL:
             return False
         rtol, atol = self.setup.rtol, self.setup.atol
@@ -222,7 +221,7 @@ class Findings:
     @property
     def small_errors(self) -> list[Part]:
         """The parts with an error within the tolerance, the largest first."""
-        if self.check is None or self.settled is self.check:
+        if self.settled is self.check:
             return []
         return sorted(filter(self._is_small, self.check.parts), key=lambda part: -part.error)
 
@@ -233,8 +232,7 @@ class Findings:
         A component is seen if its difference has one correct digit, compared with the derivative or with the slopes of
         wider steps, which are not 0 at a minimum. Unseen components that are small beside the seen ones do not count.
         """
-        components = () if self.settled is None else self.settled.components
-        parts = [p for p in components if p.verdict in TRUSTED and p.verdict != "zero"]
+        parts = [p for p in self.settled.components if p.verdict in TRUSTED and p.verdict != "zero"]
         seen = [p for p in parts if p.uncertainty < DIGIT * max(abs(p.difference), _slope_nearby(p.sample))]
         largest = max((abs(p.difference) * p.sample.scale for p in seen), default=0.0)
         hidden = [p for p in parts if p not in seen and abs(p.program) * p.sample.scale > DIGIT * largest]
@@ -251,7 +249,7 @@ class Findings:
     @property
     def hidden(self) -> float:
         """Relative error of one typical number that the check of its group may not show; 0 without groups."""
-        parts = [] if self.check is None else [part for part in self.check.parts if part.name in self.groups]
+        parts = [part for part in self.check.parts if part.name in self.groups]
         errors = [
             self.groups[part.name].hidden(
                 max(abs(part.program - part.difference), CONTRADICTED * part.uncertainty + part.sample.doubt)
@@ -265,14 +263,16 @@ class Findings:
     def zeros(self) -> list[str]:
         """The inputs without any effect that ``allow_zero`` does not name."""
         allowed = self.setup.allow_zero
-        parts = () if self.check is None else self.check.components
-        return [self.label(p) for p in parts if p.verdict == "zero" and (allowed is None or not allowed[p.component])]
+        return [
+            self.label(p)
+            for p in self.check.components
+            if p.verdict == "zero" and (allowed is None or not allowed[p.component])
+        ]
 
     @property
     def wrong_checks(self) -> list[Check]:
         """The failed checks: at theta, and under other noise."""
-        checks = [self.settled, *self.more]
-        return [one for one in checks if one is not None and not one.trusted]
+        return [one for one in [self.settled, *self.more] if one.parts and not one.trusted]
 
     @cached_property
     def failures(self) -> list[tuple[float, str, float]]:
@@ -282,7 +282,7 @@ class Findings:
         """
         ways = [
             (self.label(part), sign * part.sample.step, costs, 1.0 / part.sample.scale)
-            for part in (self.check.parts if self.check else ())
+            for part in self.check.parts
             for sign, costs in ((-1.0, part.sample.minus), (1.0, part.sample.plus))
         ]
         ways += [
@@ -300,7 +300,7 @@ class Findings:
         allowed = self.setup.allow_zero
         if self.error:
             return "raised"
-        if check is None:
+        if not check.parts:
             return "undecided"
         if not repeats.is_small and (repeats.spread > 0 or repeats.of_gradient > 0 or repeats.has_state):
             return "nondeterministic"
@@ -314,7 +314,7 @@ class Findings:
             if cause in (*UNEQUAL, "unsettled") and grown:
                 return "overwritten"
             # so small an error that adaptive steps may explain it, and the budget ended before that was known
-            is_open = explained.is_adaptive is None and self.check is not None and may_be_adaptive(self.check)
+            is_open = explained.is_adaptive is None and may_be_adaptive(self.check)
             return "undecided" if cause in SUSPICIOUS and is_open and not explained.gaps else cause
         if not check.components or not self.is_complete:
             return "undecided"
@@ -333,7 +333,6 @@ class Findings:
     @property
     def _is_residue(self) -> bool:
         """Whether the gradient is a residue beside the jumps of a cost that is constant around theta."""
-        assert self.check is not None
         wrong = [part for part in self.check.parts if part.verdict in SUSPICIOUS]
         height = max((jump.size for line in self.lines for jump in line.jumps), default=0.0)
         return bool(wrong) and all(
@@ -353,7 +352,7 @@ class Findings:
             return bool(explained.steps and explained.is_adaptive)
         if all(gap.gradient <= AGREES * gap.own for gap in explained.gaps):
             return True
-        gradient, own = np.linalg.norm([(gap.gradient, gap.own) for gap in explained.gaps], axis=0)
+        gradient, own, _ = np.linalg.norm(explained.gaps, axis=0)
         return bool(explained.steps) and bool(gradient <= AS_FAR * own)
 
     @property
@@ -453,7 +452,7 @@ class Findings:
     @property
     def size(self) -> float:
         """Largest relative error of a checked derivative, NaN if unknown."""
-        if self.check is None or not self.gradient:
+        if not self.gradient:
             return math.nan
         parts = [part for part in self.check.worst_parts if part.component is not None] or list(self.check.worst_parts)
         parts = parts if self.check.cause in FAULTS else list(self.check.components)
@@ -467,8 +466,9 @@ class Findings:
     @property
     def resolved_parts(self) -> list[Part]:
         """The components whose differences have at least one correct digit."""
-        parts = () if self.check is None else self.check.components
-        return [p for p in parts if math.isfinite(p.error) and p.uncertainty < DIGIT * abs(p.difference)]
+        return [
+            p for p in self.check.components if math.isfinite(p.error) and p.uncertainty < DIGIT * abs(p.difference)
+        ]
 
     @property
     def resolution(self) -> float:
@@ -492,7 +492,7 @@ class Findings:
     def derivative_rows(self) -> list[dict[str, Any]]:
         """Return a row per checked derivative: the program's value, the difference, and the verdict."""
         names = ("program", "difference", "uncertainty", "step", "ratio", "left", "right", "order", "verdict")
-        parts = (*self.check.parts, *self.check.draws) if self.check else ()
+        parts = *self.check.parts, *self.check.draws
         of_program = {} if self.gradient else dict.fromkeys(("program", "ratio", "order"), math.nan)
         return [{"name": self.label(p)} | {name: getattr(p, name) for name in names} | of_program for p in parts]
 

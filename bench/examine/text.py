@@ -80,7 +80,7 @@ def conclusion(report: Findings) -> str:
         return f"Derivative: {report.derivative.upper()}. {problems(report)[0]}"
     facts = [agreement(report) if report.derivative == RIGHT else "by differences the cost has one here"]
     facts += ["at few steps"] if report.is_quick else []
-    facts += [] if report.check is None or report.check.draws else ["at this theta only"]
+    facts += [] if report.check.draws else ["at this theta only"]
     small = [part for part in report.small_errors if part.component is not None] or report.small_errors
     off = max(map(_distance, small), default=0.0)
     within = " within the tolerance" * bool(small) + f", off by up to {number(100 * off)}%" * (0.0 < off < math.inf)
@@ -127,8 +127,7 @@ def agreement(report: Findings) -> str:
 
 def n_checked(report: Findings) -> str:
     """Return how many components were checked, ``2 of 3 components``."""
-    n_seen = len(report.check.components) if report.check is not None else 0
-    return f"{n_seen} of {counted(report.theta.size, 'component')}"
+    return f"{len(report.check.components)} of {counted(report.theta.size, 'component')}"
 
 
 # --------------------------------------------------------------------------------------------------------- facts
@@ -171,7 +170,7 @@ def _where_cost_fails(report: Findings) -> str:
         return f"the cost at theta itself is {as_text(report.cost)}"
     if not report.failures:
         return ""
-    inputs = [report.label(part) for part in (report.check.components if report.check else ())]
+    inputs = [report.label(part) for part in report.check.components]
     _, name, at = next((place for place in report.failures if place[1] in inputs), report.failures[0])
     return f"nearest at {name} {'+' if at > 0 else '-'} {number(abs(at))}"
 
@@ -291,7 +290,7 @@ def warnings(report: Findings) -> list[str]:
         found.append(
             f"small error, within the tolerance: {size_of(report, small[0])}, in {counted(len(small), 'derivative')}"
         )
-    if report.check is not None and report.check.trusted and report.derivative_cause not in ("constant", "no_effect"):
+    if report.check.trusted and report.derivative_cause not in ("constant", "no_effect"):
         saturated = [report.label(part) for part in report.check.components if part.verdict == "saturated"]
         is_whole = len(report.zeros) == report.theta.size and report.moves_around  # they have an effect, beside theta
         for verdict, names in (("zero", [] if is_whole else report.zeros), ("saturated", saturated)):
@@ -372,10 +371,7 @@ def write(report: Findings) -> str:
     scope = [f"checked: {_checked(report)}", f"not checked: {'; '.join(_unchecked(report))}"]
     scope += [f"next: {step}"] if (step := advice(report)) else []
     unit = "on theta" if report.setup.levels else "of each input's scale"
-    steps = [
-        {"steps": one.steps, "largest error": one.error, "error of the differences": one.uncertainty}
-        for one in report.explained.growth
-    ]
+    steps = [one._asdict() for one in report.explained.growth]
     derivatives = [
         row
         for row in report.derivative_rows()
@@ -384,7 +380,7 @@ def write(report: Findings) -> str:
     parts = [
         list(filter(None, answers)), scope, _head(report),
         table("The derivative, by the program and by differences:", derivatives, ("left", "right", "order")),
-        table("The gradient after fewer or more steps, errors relative to the largest derivative:", steps),
+        table("The gradient after fewer or more steps, error and uncertainty over the largest difference:", steps),
         table(f"Lines through theta, +-3 sigma (sigma = {sigma_text(report, report.setup.reach)} {unit}):", report.line_rows()),
         table("Jumps and kinks on these lines, at t in sigma:", report.break_rows()),
         table(f"With noise of sigma {unit}, J = E cost; samples, calls and seconds are for an error of 10%:", report.sigma_rows(),
@@ -397,9 +393,9 @@ def write(report: Findings) -> str:
 
 def _checked(report: Findings) -> str:
     facts = [n_checked(report)]
-    if report.check is not None:
+    if report.check.parts:
         whole = [part for part in report.check.parts if part.component is None]
-        n_used = max((part.sample.step.size for part in report.check.parts), default=0)
+        n_used = max(part.sample.step.size for part in report.check.parts)
         n_random = sum(part.name.startswith("direction ") for part in whole)
         counts = {
             "group": len(whole) - n_random, "random direction": n_random,
@@ -423,13 +419,13 @@ def _unchecked(report: Findings) -> list[str]:
         rest.append(
             f"an error of one number in a group below {number(100 * report.hidden)}% of the root mean square of all"
         )
-    if report.check is not None and not report.check.draws and not any("other thetas" in what for what in rest):
+    if report.check.parts and not report.check.draws and not any("other thetas" in what for what in rest):
         rest.append(f"other thetas around this one ({limit})")
     return [*rest, "thetas far from this one"]
 
 
 def _noise_text(report: Findings) -> str:
-    noise = report.check.noise if report.check is not None else 0.0
+    noise = report.check.noise
     return f"cost noise {number(noise)} (standard deviation)" * (noise > 0)
 
 

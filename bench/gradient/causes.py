@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,8 +18,7 @@ ENOUGH = 3
 """Fewest ratios that can count as constant."""
 
 
-@dataclass(frozen=True)
-class Ratio:
+class Ratio(NamedTuple):
     """The program's derivative over the difference, and the ratio's error due to the error of the difference."""
 
     value: float
@@ -41,44 +40,31 @@ def causes_of_ratios(
       where the term does not act, or the ratio lies between 0 and 2, so the gradient has part of the derivative.
     - ``wrong_adjoint``: neither applies, or there are too few ratios to decide.
     """
-    causes: dict[int | None, str] = {}
     some_right = some_right or right_elsewhere
-    for component, ratios in components.items():
-        causes[component] = _cause(ratios, some_right)
+    causes: dict[int | None, str] = {c: _cause(ratios, some_right) for c, ratios in components.items()}
     every = [ratio for ratios in components.values() for ratio in ratios]
-    if len(components) > 1 and _constant(every):
+    if len(components) > 1 and _cause(every, some_right) == "wrong_factor":
         causes = dict.fromkeys(causes, "wrong_factor")
     elif "missing_term" in causes.values():
         causes = {c: "missing_term" if cause == "wrong_factor" else cause for c, cause in causes.items()}
-    if causes:
-        kinds = [causes[c] for c in components]
-        causes[None] = max(kinds, key=kinds.count)
-    else:
-        causes[None] = _cause(directions, some_right)
+    kinds = list(causes.values())
+    causes[None] = max(kinds, key=kinds.count) if kinds else _cause(directions, some_right)
     return causes
 
 
 def _cause(ratios: list[Ratio], some_right: bool) -> str:
-    if _constant(ratios):
-        return "wrong_factor"
-    values = [ratio.value for ratio in ratios]
-    if len(values) < ENOUGH or not np.isfinite(values).all():
-        return "wrong_adjoint"
-    partly = np.mean([0.0 < value < 2.0 for value in values]) >= MOSTLY
-    return "missing_term" if some_right or partly else "wrong_adjoint"
+    """Return the cause that ratios show: a constant factor if four in five agree; a kink or noise may change the others.
 
-
-def _constant(ratios: list[Ratio]) -> bool:
-    """Return whether there are enough ratios and four in five of them agree; a kink or noise may change the others.
-
-    The ratios must agree to the accuracy of the differences, because a missing term also causes similar ratios: all
-    near 1 where the term is small, and nearly equal where it hardly varies.
+    Constant ratios agree to the accuracy of the differences, because a missing term also causes similar ratios: all near 1
+    where the term is small, and nearly equal where it hardly varies.
     """
-    values, errors = np.array([ratio.value for ratio in ratios]), np.array([ratio.error for ratio in ratios])
+    values, errors = np.reshape(ratios, (-1, 2)).T
     if len(ratios) < ENOUGH or not np.isfinite(values).all():
-        return False
+        return "wrong_adjoint"
     middle = float(np.median(values))
     apart = FINEST * min(abs(middle), abs(middle - 1.0))
     allowed = np.clip(KNOWN * errors, apart, CONSTANT * abs(middle))
-    near = np.abs(values - middle) <= allowed
-    return bool(near.mean() >= MOSTLY and abs(middle) > 0.0)
+    if (np.abs(values - middle) <= allowed).mean() >= MOSTLY and middle != 0.0:
+        return "wrong_factor"
+    partly = np.mean((values > 0.0) & (values < 2.0)) >= MOSTLY
+    return "missing_term" if some_right or partly else "wrong_adjoint"

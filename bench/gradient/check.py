@@ -111,7 +111,7 @@ class Check:
     """The outcome of a check."""
 
     cause: str
-    """The worst verdict, one of :data:`.rules.VERDICTS`."""
+    """The worst verdict, one of :data:`.rules.VERDICTS`; ``undecided`` without a part."""
     gradient: np.ndarray
     parts: tuple[Part, ...]
     """Components and random directions at theta."""
@@ -157,6 +157,10 @@ class Check:
             f"{text}; {part.name}: the program's {part.program:.6g}, differences {part.difference:.6g} +- {part.uncertainty:.1g} "
             f"at a step of {part.step:.1g} (ratio {part.ratio:.6g}), slopes {part.left:.6g} and {part.right:.6g}"
         )
+
+
+NOTHING = Check("undecided", np.empty(0), (), ())
+"""The outcome of a check that was not made."""
 
 
 def scales(theta: np.ndarray) -> np.ndarray:

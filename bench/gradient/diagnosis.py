@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -43,8 +43,7 @@ GROWTH = 1.5
 """Least ratio of errors at the largest and at the first wrong number of steps that counts as growth."""
 
 
-@dataclass(frozen=True)
-class Horizon:
+class Horizon(NamedTuple):
     """The error of a gradient after a number of steps."""
 
     steps: int
@@ -54,8 +53,7 @@ class Horizon:
     """The error of the differences, relative to the largest."""
 
 
-@dataclass(frozen=True)
-class Gap:
+class Gap(NamedTuple):
     """At one theta, the distances of the gradient and of the cost's own differences from those of a refined cost."""
 
     gradient: float
@@ -124,7 +122,7 @@ def errors_by_horizon(stages: GradientStages, horizons: Sequence[int]) -> list[H
         )  # fmt: skip
         quick.run_round(other.width)
         outcome = quick.check()
-        if outcome is None:
+        if not outcome.parts:
             continue
         numbers = [(part.program, part.difference, part.uncertainty) for part in outcome.parts]
         program, differences, doubts = np.array(numbers).T * space.scale

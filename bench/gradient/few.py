@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from .causes import causes_of_ratios
-from .check import Check, Part
+from .check import NOTHING, Check, Part
 from .direction import ALIKE, MEASURED, Sample, finding_at, wrong
 from .rules import most_severe
 from .subspace import Subspace
@@ -61,12 +61,12 @@ class FewSteps:
                 self.values[int(index)].append((float(steps[index]), float(minus), float(plus)))
         self.rounds += 1
 
-    def check(self) -> Check | None:
-        """Return the outcome for the coordinates with at least one difference; None if there are none."""
+    def check(self) -> Check:
+        """Return the outcome for the coordinates with at least one difference."""
         gradient = np.full(self.space.size, np.nan) if self.gradient is None else self.space.project(self.gradient)
         parts = [self._part(i, float(gradient[i])) for i in sorted(self.values)]
         if not parts:
-            return None
+            return NOTHING
         ratios = {i: [part.ratio_with_error] for i, part in enumerate(parts) if part.verdict == "wrong_adjoint"}
         if ratios:
             causes = causes_of_ratios(ratios, [], any(part.verdict == "smooth" for part in parts))

@@ -26,6 +26,7 @@ from bench.gradient import (
     check,
     most_severe,
 )  # fmt: skip
+from bench.gradient.check import NOTHING
 from bench.gradient.few import ROUNDS, FewSteps, is_nothing
 from bench.gradient.roughness import FINE
 from bench.gradient.subspace import Group, Subspace, choose, locate
@@ -126,7 +127,7 @@ class GradientStages:
         self.value = math.nan
         self.gradient: np.ndarray | None = None
         """The gradient at theta, ``(d,)``; None without a gradient, or where it failed."""
-        self.check: Check | None = None
+        self.check = NOTHING
         """The outcome of the last finished stage."""
         self.is_quick = True
         """Whether only few steps per component were checked."""
@@ -236,7 +237,7 @@ class GradientStages:
         except OutOfTime:
             self.left_out.append("the check at more than one step")
             return
-        if self.check is None:
+        if not self.check.parts:
             return
         self._check_in_stages(space, explain)
         self._locate(space)
@@ -271,7 +272,7 @@ class GradientStages:
                     break
         finally:
             outcome = quick.check()
-            if outcome is not None:
+            if outcome.parts:
                 self.check, self.is_quick = outcome, True
                 self.is_complete = len(outcome.parts) == space.size
 
@@ -364,7 +365,7 @@ class GradientStages:
         each = 2 * options.eps.size + NOISE_POINTS
         here = (size + options.directions) * (2 if options.repeated else int(not options.draws))
         costs = (here + options.draws * options.directions) * each
-        wrong = 0 if self.check is None else sum(part.verdict in FAULTS for part in self.check.parts)
+        wrong = sum(part.verdict in FAULTS for part in self.check.parts)
         if wrong and options.draws:
             costs += min(4, options.draws) * wrong * each + 4 * options.draws * each
         if wrong and options.scanned:
@@ -374,7 +375,6 @@ class GradientStages:
 
     def _check_in_stages(self, space: Subspace, explain: Callable[[Check], None]) -> None:
         self.clock.start_stage("checking the gradient")
-        assert self.check is not None
 
         def fits(options: Options) -> bool:
             return self.clock.can_afford(*self._cost_of(options, space.size), share=SHARE)
@@ -457,7 +457,7 @@ class GradientStages:
 
     def _locate(self, space: Subspace) -> None:
         """Find the numbers that cause the error of each wrong group."""
-        if self.check is None or self.gradient is None:
+        if self.gradient is None:
             return
         self.clock.start_stage("locating the error")
         groups = {group.name: group for group in space.groups}
@@ -479,7 +479,6 @@ class GradientStages:
 
         Its error is a small part of the slope of its group, which may be within the tolerance.
         """
-        assert self.check is not None
         assert self.gradient is not None
         space, unit = Subspace(self.layout, self.scale, [index], []), self.simulator.unit
         cost = partial(space.costs, self.costs, width=self.simulator.width)
@@ -487,13 +486,13 @@ class GradientStages:
         for _ in ROUNDS:
             quick.run_round()
         outcome = quick.check()
-        if outcome is not None and outcome.cause in FAULTS:
+        if outcome.cause in FAULTS:
             added = replace(outcome.parts[0], verdict=verdict)
             self.check = replace(self.check, parts=(added, *self.check.parts))
 
     def _check_under_other_noise(self) -> None:
         """Check the gradient along random directions under other draws of the simulator's own noise."""
-        if self.w is None or self.check is None or not self.check.trusted or self.is_quick:
+        if self.w is None or not self.check.trusted or self.is_quick:
             return
         space = choose(self.layout, self.scale, self.gradient, self.seed)
         options = replace(self._plan(space.size, True)[ALL_STEPS], components=0, scanned=0, repeated=False)

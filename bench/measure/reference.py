@@ -247,7 +247,7 @@ def _sample(problem: Problem, theta: np.ndarray, provides: frozenset[str], sampl
     still = np.zeros((problem.program.n_noise, 1))
     centre = problem.value(theta, still)
     orders: dict[str, Terms] = {}
-    if problem.program.has_score_gradient:
+    if not problem.program.score_refusal:
         orders["zeroth_order"] = lambda w: _antithetic(problem, theta, (w, -w), centre)
     if problem.program.continuous and "grad" in provides:
         orders["first_order"] = lambda w: problem.grad(theta, w)
@@ -255,7 +255,7 @@ def _sample(problem: Problem, theta: np.ndarray, provides: frozenset[str], sampl
     pilots = {name: terms(pilot) for name, terms in orders.items()}
     pilots = {name: terms for name, terms in pilots.items() if np.isfinite(terms).all()}
     if not pilots:
-        reason = "rollouts are not finite" if orders else problem.program.no_score_gradient
+        reason = "rollouts are not finite" if orders else problem.program.score_refusal
         return _failed(problem, reason)
     effect = pilot @ (problem.value(theta, pilot) - centre)
     directions = _directions(effect if np.isfinite(effect).all() else still[:, 0])

@@ -35,8 +35,6 @@ SYMMETRIC = 1e-6
 """Skewness below which its correction is rounding."""
 VAGUE = 0.1
 """Error of a reference, as a share of its norm, above which a note warns that relative columns are no more accurate."""
-LARGE = 1 << 12
-"""Coordinates from which a covariance that is equal in all directions is one number: as rows it has d x d numbers."""
 NARROW = 10.0
 """Width of the interval of the log variance of terms, times their number, below which it ignores the error of their mean."""
 THREE = 3.0
@@ -62,7 +60,7 @@ class Sampling:
     degrees: float
     """Degrees of freedom: K - 1 for a sample of K, infinite for a known covariance."""
     equal: float = 0.0
-    """A variance that is added to every coordinate, so that an error without direction needs no d rows."""
+    """A standard deviation of every coordinate beside the rows: that of an error without direction."""
 
     @classmethod
     def of(cls, sample: np.ndarray) -> Sampling:
@@ -73,19 +71,16 @@ class Sampling:
     @classmethod
     def without_direction(cls, error: float, dim: int) -> Sampling:
         """Return the known covariance of an error of norm ``error`` whose direction is unknown."""
-        if dim > LARGE:
-            return cls(np.zeros((0, dim)), math.inf, error**2 / dim)
-        rows = np.eye(dim) * (error / math.sqrt(max(dim, 1))) if error else np.zeros((0, dim))
-        return cls(rows, math.inf)
+        return cls(np.zeros((0, dim)), math.inf, error / math.sqrt(dim))
 
     @property
     def trace(self) -> float:
         """Trace of the covariance: the expected squared distance of the mean from its expectation."""
-        return float(np.vdot(self.rows, self.rows) + self.equal * self.rows.shape[1])
+        return float(np.vdot(self.rows, self.rows) + self.equal**2 * self.rows.shape[1])
 
     def over(self, unit: float) -> Sampling:
         """Return the same covariance, measured in ``unit``."""
-        return replace(self, rows=self.rows / unit, equal=self.equal / unit**2)
+        return replace(self, rows=self.rows / unit, equal=self.equal / unit)
 
     def excess(self) -> float:
         """Return the upward bias of tr C^2 as an estimate, where C is the covariance of a sample's mean; 0 for a known C.
@@ -172,8 +167,8 @@ class Truth:
     @property
     def standard_error(self) -> float:
         """Square root of the trace of the covariance of the mean, including the error that sampling does not show."""
-        shown = math.sqrt(self.sampling.trace) if self.sampling.equal else _length(self.sampling.rows)
-        return math.hypot(shown, self.unseen)
+        hidden = self.sampling.equal * math.sqrt(self.mean.size)
+        return math.hypot(_length(self.sampling.rows), hidden, self.unseen)
 
     def vanishes(self) -> bool:
         """Return whether the gradient is not distinguishable from 0, so that relative quantities are undefined."""
@@ -220,7 +215,7 @@ def bias_interval(difference: np.ndarray, *errors: Sampling, level: float = 0.95
     rows = np.concatenate([error.rows for error in errors])
     doubt = sum(error.trace**2 / error.degrees for error in errors)  # Welch: the reciprocal of the degrees of freedom
     # S = rows' rows + equal I
-    equal, dim = sum(error.equal for error in errors), difference.size
+    equal, dim = sum(error.equal**2 for error in errors), difference.size
     square = _trace_square(rows) + equal * (2.0 * float(np.vdot(rows, rows)) + equal * dim)
     square = square - sum(error.excess() for error in errors)
     square = min(max(square, 1.0 / difference.size), 1.0)

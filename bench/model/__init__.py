@@ -53,7 +53,6 @@ from bench.model.program import (
 from bench.model.scene import (
     ContactScene,
     DampedScene,
-    DisturbedScene,
     EngineScene,
     EngineTwin,
     Events,
@@ -86,7 +85,6 @@ __all__ = [
     "Decision",
     "Descent",
     "DiagnosticEstimator",
-    "DisturbedScene",
     "Dynamics",
     "EngineScene",
     "EngineTwin",

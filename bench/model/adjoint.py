@@ -171,9 +171,7 @@ def _difference_jacobians(program: Rollout, theta: np.ndarray, w: np.ndarray) ->
     """Return the step Jacobians, computed by central differences of all steps and columns together."""
     ops = LoopOps()
     with np.errstate(all="ignore"):
-        path = list(program.steps(ops, theta, w))
-    states = np.stack([np.concatenate(state) for state, _ in path])
-    controls = np.stack([u for _, u in path[:-1]])
+        states, controls = program.path(ops, theta, w)
     before, u = _flatten(states[:-1]), _flatten(controls)
 
     def after(x: np.ndarray, u: np.ndarray) -> np.ndarray:

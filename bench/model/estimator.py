@@ -97,8 +97,8 @@ class Estimator(Plugin):
         if "grad" in self.needs and program.surrogate and "surrogate" not in provides:
             law = program.contact.name if program.contact else ""
             return f"{self.name} needs the surrogate gradient of contact law {law}, and {backend} computes differences of costs"
-        if "score" in self.needs and not program.has_score_gradient:
-            return f"{self.name} needs scores, but {program.no_score_gradient}"
+        if "score" in self.needs and program.score_refusal:
+            return f"{self.name} needs scores, but {program.score_refusal}"
         own = program.n_noise - program.exogenous
         if self.needs_directions and own < program.dim:
             return f"{self.name} needs {program.dim} normal numbers per sample, and the noise model has {own}"

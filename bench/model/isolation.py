@@ -49,19 +49,19 @@ THREADS = "the threads of linear algebra"
 class ProcessState:
     """The settings of this process at one moment, to be compared with later ones.
 
-    With ``double_precision``, JAX computes in float64 from then on, whichever cell imports it. With ``single_thread``, libraries
-    of linear algebra use one thread until :meth:`close`: the number of threads changes the order of sums.
+    JAX computes in float64 from then on, whichever cell imports it. With ``single_thread``, libraries of linear algebra use
+    one thread until :meth:`close`: the number of threads changes the order of sums.
     """
 
-    def __init__(self, double_precision: bool = False, single_thread: bool = False) -> None:
-        self._double_precision, self._single_thread = double_precision, single_thread
+    def __init__(self, single_thread: bool = False) -> None:
+        self._single_thread = single_thread
         self._before: dict[str, Any] = {}
         self._threads: dict[str, tuple[Any, int]] = {}
         """The libraries of linear algebra by file, each with its number of threads."""
         self._ends = ExitStack()
-        if double_precision and "jax" in sys.modules:
+        if "jax" in sys.modules:
             sys.modules["jax"].config.update(X64.lower(), True)
-        elif double_precision:
+        else:
             given, os.environ[X64] = os.environ.get(X64), "1"
             self._ends.callback(lambda: os.environ.pop(X64) if given is None else os.environ.update({X64: given}))
         self.follow()
@@ -81,7 +81,7 @@ class ProcessState:
             self._threads.setdefault(library.filepath, (library, library.num_threads))
         self._before |= {name: _read(name) for name in new}
         if "JAX's configuration" in new:
-            self._before["JAX's configuration"]["jax_enable_x64"] |= self._double_precision
+            self._before["JAX's configuration"]["jax_enable_x64"] = True
             self._before[DRAWN] = _numpy_generator()  # the import of JAX draws from it
 
     def changes(self) -> list[str]:

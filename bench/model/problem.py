@@ -199,11 +199,11 @@ class Problem(ABC):
         """Return the score d log p(actions | theta)/dtheta of each sample, ``(d, B)``: w / sigma for noise on theta.
 
         ``(d,)`` for one sample, see :meth:`grad`. Raises :class:`Unsupported` if cost times score is not the gradient, see
-        :attr:`Program.has_score_gradient`.
+        :attr:`Program.score_refusal`.
         """
         theta, w, is_single = self._arguments(theta, w)
-        if not self.noise_on_theta and not self.program.has_score_gradient:
-            raise Unsupported(self.program.no_score_gradient)
+        if not self.noise_on_theta and self.program.score_refusal:
+            raise Unsupported(self.program.score_refusal)
         of_theta = self.noise_on_theta
         scores = w[: self.dim] / self.sigma if of_theta else self._blocks(self._score, theta, w, (self.dim,))
         return scores[:, 0] if is_single else scores

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -19,7 +19,7 @@ from bench.model.dynamics import Dynamics
 from bench.model.integrator import Integrator
 from bench.model.ops import Array, Ops, State
 from bench.model.parameters import Plugin, traced
-from bench.model.scene import DisturbedScene, EngineScene, FunctionScene, MechanicalScene, Scene
+from bench.model.scene import EngineScene, FunctionScene, MechanicalScene, Scene
 
 REVISION = 1
 """Raised when a stored number that this module decides moves."""
@@ -150,17 +150,9 @@ class Program(ABC):
         return not self.action_noise
 
     @property
-    def has_score_gradient(self) -> bool:
-        """Whether the mean of cost times score is the gradient: theta affects the cost through the noisy numbers only."""
-        return True
-
-    @property
-    def no_score_gradient(self) -> str:
-        """The reason for which cost times score is not the gradient, where :attr:`has_score_gradient` is false."""
-        return (
-            f"theta sets the initial state of scene {self.scene.name} while noise is on the actions, so that cost times "
-            "score is not the gradient"
-        )
+    def score_refusal(self) -> str:
+        """Why the mean of cost times score is not the gradient; empty if theta affects the cost through noisy numbers only."""
+        return ""
 
     @property
     def exogenous(self) -> int:
@@ -301,13 +293,10 @@ class FunctionProgram(Program):
 
     def cost(self, ops: Ops, theta: Array, w: Array) -> Array:
         """Return the scene's cost at theta + sigma w, ``(B,)``; the scene's own noise follows the first d rows of w."""
-        if self.exogenous:
-            w, own_noise = w[: self.dim], w[self.dim :]
+        w, own_noise = (w[: self.dim], [w[self.dim :]]) if self.exogenous else (w, [])
         bound, own = self._own_theta(ops.xp, theta, w) if self._named else (self, theta + self.scene.sigma * w)
-        if isinstance(bound.scene, DisturbedScene):
-            return bound.scene.disturbed_cost(ops.xp, own, own_noise)
         assert isinstance(bound.scene, FunctionScene)
-        return bound.scene.cost(ops.xp, own)
+        return bound.scene.cost(ops.xp, own, *own_noise)
 
 
 class CallableProgram(Program):
@@ -341,9 +330,14 @@ class Rollout(Program):
         return self.scene.feedback(np, theta, q, v) is None
 
     @property
-    def has_score_gradient(self) -> bool:
-        """Whether cost times score is the gradient: not if theta sets the initial state and noise is on the actions."""
-        return not (self.action_noise and self._moves_start)
+    def score_refusal(self) -> str:
+        """Why cost times score is not the gradient: theta sets the initial state and noise is on the actions; or empty."""
+        if not (self.action_noise and self._moves_start):
+            return ""
+        return (
+            f"theta sets the initial state of scene {self.scene.name} while noise is on the actions, so that cost times "
+            "score is not the gradient"
+        )
 
     @property
     def _only_controls(self) -> bool:
@@ -411,16 +405,16 @@ class Rollout(Program):
             ops = _VaryingOps(ops, [(self.parts[axis], name) for axis, name in self._varying])
         return Dynamics(ops, self.scene, self.contact)
 
-    def steps(self, ops: Ops, theta: Array, w: Array) -> Iterator[tuple[State, Array]]:
-        """Yield the state and control of each step, then the final state with the last control."""
+    def path(self, ops: Ops, theta: Array, w: Array) -> tuple[Array, Array]:
+        """Return the states ``(horizon + 1, n, B)`` and the controls ``(horizon, n_u, B)`` of rollouts, by a Python loop."""
         program, theta, w = self.resolved(ops, theta, w)
         theta, state, scanned = program.start(ops, theta, w)
-        u = None
+        states, controls = [ops.xp.concat(list(state))], []
         for t in range(self.scene.horizon):
-            u = program.control(ops, theta, state, tuple(x[t] for x in scanned))
-            yield state, u
-            state = program.step(ops, state, u)
-        yield state, u
+            controls.append(program.control(ops, theta, state, tuple(x[t] for x in scanned)))
+            state = program.step(ops, state, controls[-1])
+            states.append(ops.xp.concat(list(state)))
+        return ops.xp.stack(states), ops.xp.stack(controls)
 
     def start(self, ops: Ops, theta: Array, w: Array) -> tuple[Array, State, tuple[Array, ...]]:
         """Return theta plus its noise, the initial state, and the control law's inputs, each ``(horizon, n_u, B)``.

@@ -74,28 +74,15 @@ def _named_theta(scene: Scene) -> np.ndarray:
 
 @dataclass(frozen=True)
 class FunctionScene(Scene):
-    """A scene whose cost is a plain function of ``x = theta + sigma w``."""
+    """A scene whose cost is a plain function of ``x = theta + sigma u``, for d normal numbers u, and of its own noise e.
 
-    @abstractmethod
-    def cost(self, xp: Any, x: Array) -> Array:
-        """Return the cost f at ``x (d, B)``: ``(B,)``."""
-
-
-@dataclass(frozen=True)
-class DisturbedScene(FunctionScene):
-    """A role: a plain function with its own noise in addition to the noise on theta.
-
-    ``J_sigma(theta) = E f(theta + sigma u, e)``: the mean over d normal numbers u and the scene's ``exogenous`` normal
-    numbers e. Smoothing estimators do not shift e, and the score does not depend on it.
+    ``J_sigma(theta) = E f(theta + sigma u, e)``, where e are ``exogenous`` normal numbers. Smoothing estimators do not
+    shift e, and the score does not depend on it.
     """
 
     @abstractmethod
-    def disturbed_cost(self, xp: Any, x: Array, e: Array) -> Array:
-        """Return the cost f at ``x (d, B)`` under the scene's own noise ``e (exogenous, B)``: ``(B,)``."""
-
-    def cost(self, xp: Any, x: Array) -> Array:
-        """Return the cost f without the scene's own noise, ``(B,)``."""
-        return self.disturbed_cost(xp, x, xp.zeros((self.exogenous, x.shape[1]), dtype=x.dtype))
+    def cost(self, xp: Any, x: Array, *args: Any, **kwargs: Any) -> Array:
+        """Return the cost f at ``x (d, B)``: ``(B,)``. With ``exogenous``, its arguments are xp, x and ``e (exogenous, B)``."""
 
 
 @dataclass(frozen=True)

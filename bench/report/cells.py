@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,9 +12,6 @@ import pandas as pd
 from bench.experiment.columns import Column
 from bench.experiment.views import Table
 from bench.report.text import apart, axis_value, duration, number
-
-BLOCK = 4096
-"""Rows that are turned into dictionaries at a time."""
 
 
 @dataclass(frozen=True)
@@ -65,28 +62,23 @@ def value_text(column: Column, value: float) -> str:
 
 def end_text(column: Column, value: float) -> str:
     """Return an end of an interval in the format of a column, apart from the column's boundary."""
-    if column.boundary is None or column.format not in ("number", "percent"):
-        return value_text(column, value)
-    if column.format == "percent":
-        return "-" if math.isnan(value) else f"{apart(100 * value, 100 * column.boundary, column.digits)}%"
-    return apart(value, column.boundary, column.digits)
+    return value_text(column, value) if column.boundary is None else apart(value, column.boundary, column.digits)
 
 
 def readable(table: Table) -> pd.DataFrame:
     """Return the table as strings for readers; the headings are the names of the columns."""
-    lines = list(text_rows(table.columns, table.frame, str))
-    return pd.DataFrame(lines, columns=[column.heading for column in table.columns])
+    return pd.DataFrame(
+        text_rows(table.columns, table.frame, str), columns=[column.heading for column in table.columns]
+    )
 
 
 def text_rows(
     columns: Sequence[Column], frame: pd.DataFrame, format_cell: Callable[[TableCell], str]
-) -> Iterator[tuple[str, ...]]:
-    """Yield each row's cells, each as ``format_cell`` returns it, with few rows in memory at a time."""
-    ends = [name for c in columns for name in (c.name, c.low, c.high, c.limit, c.note, c.emphasis)]
-    needed = frame[[name for name in dict.fromkeys(ends) if name in frame]]
-    for start in range(0, len(needed), BLOCK):
-        for row in needed.iloc[start : start + BLOCK].to_dict("records"):
-            yield tuple(format_cell(cell(column, row)) for column in columns)
+) -> list[list[str]]:
+    """Return each row's cells, each as ``format_cell`` returns it."""
+    used = {name for c in columns for name in (c.name, c.low, c.high, c.limit, c.note, c.emphasis)}
+    lines = frame[[name for name in frame if name in used]].to_dict("records")
+    return [[format_cell(cell(column, line)) for column in columns] for line in lines]
 
 
 def parts(table: Table) -> list[tuple[str, pd.DataFrame]]:

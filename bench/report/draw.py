@@ -1,7 +1,6 @@
 """Draws charts, given as data, with Matplotlib.
 
-A chart is drawn at any width: the panels are laid out again, and the text keeps its size. No text is cut: a long one breaks
-into lines, and what it names gets higher.
+No text is cut: a long one breaks into lines, and what it names gets higher.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ from bench.experiment.views import Chart, Mark, Style
 from bench.report.colours import looks_by_name
 from bench.report.scales import log_axis
 from bench.report.style import GREY, MARKS, SHADE, SIZE, filled, plain, width_in_inches
-from bench.report.text import axis_value, duration
+from bench.report.text import axis_value, short_duration
 from bench.report.views import is_logarithmic, pareto
 
 WIDTH, NARROW = 7.16, 3.5
@@ -52,15 +51,14 @@ MANY = 12
 """Most points of a line that are drawn with markers; longer lines are drawn without."""
 
 
-def draw(chart: Chart, width: float | None = None) -> Figure:
-    """Return the chart as a figure of a width in inches: by default two columns of a paper, or one for a single panel."""
+def draw(chart: Chart) -> Figure:
+    """Return the chart as a figure, two columns of a paper wide, or one for a single panel with a plot."""
     panels = [(str(name), part) for name, part in chart.frame.groupby(chart.panel, sort=False)] if chart.panel else []
     panels = panels or [("", chart.frame)]
     is_plot = chart.kind in ("lines", "points")
-    if width is None:
-        width = NARROW if len(panels) == 1 and is_plot else WIDTH
-    across = _across(chart, len(panels), width)
-    down = math.ceil(len(panels) / across)
+    width = NARROW if len(panels) == 1 and is_plot else WIDTH
+    down = math.ceil(len(panels) / max(1, min(chart.across, len(panels))))
+    across = math.ceil(len(panels) / down)
     styles = looks_by_name([chart])
 
     rows = [[] if is_plot else _categories(chart.y[0], part, downwards=True) for _, part in panels]
@@ -71,8 +69,8 @@ def draw(chart: Chart, width: float | None = None) -> Figure:
     labels = [[_wrapped(name, room) for name in names] for names in rows]
     written = [text for names in labels for text in names]
     inner = (width - beside * (0.7 if is_plot else max(map(_text_width, written), default=0.0))) / across - 0.12
-    row = max([chart.height, *(LINE * (1 + text.count("\n")) + 0.015 for text in written if chart.height < 1)])
-    heights = [chart.height if is_plot or chart.height >= 1 else row * len(names) + 0.1 for names in rows]
+    row = max([chart.height, *(LINE * (1 + text.count("\n")) + 0.015 for text in written)])
+    heights = [chart.height if is_plot else row * len(names) + 0.1 for names in rows]
 
     # quantities of the same runs above each other have one scale of x, so that their features can be compared
     stacked = chart.own_scales and across == 1 and is_plot
@@ -122,11 +120,6 @@ def draw(chart: Chart, width: float | None = None) -> Figure:
     heads = sum(max(titles[i * across : (i + 1) * across]) for i in range(down))
     _frame(figure, layout, chart, _legend(chart, styles, width), sum(ratios) + LINE * heads + AXIS + below)
     return figure
-
-
-def _across(chart: Chart, count: int, width: float) -> int:
-    most = max(1, min(chart.across, count, round(chart.across * width / WIDTH)))
-    return math.ceil(count / math.ceil(count / most))
 
 
 # ------------------------------------------------------------------------------------- title, legend and texts
@@ -212,7 +205,7 @@ def _legend_columns(labels: Sequence[str], width: float) -> int:
 def _values_text(column: Column, largest: float) -> Any:
     """Return the function that formats the numbers of an axis; None for plain numbers."""
     if column.format == "seconds":
-        return lambda value: duration(value).replace("us", "µs").replace(".0 ", " ")
+        return short_duration
     if column.format == "percent":
         return lambda value: f"{100 * value:g}%"
     return axis_value if largest >= 1e5 else None

@@ -14,14 +14,19 @@ from bench.report.problems import titled
 from bench.report.views import arrange
 
 
+def own_columns(experiment: Experiment, rows: pd.DataFrame) -> list[Column]:
+    """Return the columns of the study's own table that say something: numbers that are known, and texts that vary."""
+    own = [
+        c for c in experiment.columns.all if c.table and c.name not in COMMON and c.kind != "list" and c.name in rows
+    ]
+    return [c for c in own if (rows[c.name].nunique() > 1 if c.kind == "text" else rows[c.name].notna().any())]
+
+
 def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     """Return the table of the study's own numbers, and a chart of the first of them."""
     shown = arrange(experiment, rows)
     table = shown.rows
-    own = [
-        c for c in experiment.columns.all if c.table and c.name not in COMMON and c.kind != "list" and c.name in rows
-    ]
-    own = [c for c in own if (table[c.name].notna().any() if c.kind == "number" else table[c.name].nunique() > 1)]
+    own = own_columns(experiment, table)
     labels = [COMMON[name] for name in IDENTITY if table[name].nunique(dropna=False) > 1] or [COMMON["scene"]]
     swept = [Column(axis.column, label=axis.title, format="setting") for axis in shown.swept()]
     labels = [column for column in labels if column.name not in {axis.name for axis in swept}]

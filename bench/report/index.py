@@ -55,41 +55,32 @@ def write(folder: Path) -> Path:
 
 def _card(folder: Path, place: Path) -> str:
     """Return the HTML of one experiment: chart, question, answer, state, one button, and its files folded away."""
-    record, stored = read_object(place / "run.json"), read_object(place / "answer.json")
-    name = _text(stored, "experiment") or _text(record, "experiment") or place.name
-    question = _text(stored, "question") or _text(record, "question")
-    chart = _chart(place, _text(stored, "chart"))
-    state, when = _state(place / "rows.parquet", record)
-    notes = [when, _text(record, "git_commit") and f"commit {_text(record, 'git_commit')[:12]}"]
-    parts = [_thumbnail(folder, chart, name), f"<h2>{escape(name)}</h2>"]
-    if question:
-        parts.append(f'<p class="hint">{escape(question)}</p>')
-    if answer := _text(stored, "answer"):
-        parts.append(f'<p class="answer">{escape(answer)}</p>')
-    parts += [f'<p class="state">{state}</p>' if state else "", _button(folder, place, chart, name)]
+    record, stored = (read_object(place / name) for name in ("run.json", "answer.json"))
+    texts = {key: text for source in (record, stored) for key, text in source.items() if text and isinstance(text, str)}
+    name, page, chart = texts.get("experiment", place.name), _page(place), _chart(place, texts.get("chart", ""))
+    state, when = _state(place / "rows.parquet", record.get("counts"), texts.get("finished", ""))
+    parts = ['<div class="none">no chart</div>'] if chart is None else [
+        f'<img src="{_link(folder, chart)}" alt="{escape(f"The chart {chart.stem} of {name}")}" loading="lazy">'
+    ]  # fmt: skip
+    parts.append(f"<h2>{escape(name)}</h2>")
+    for look, text in (
+        ("hint", escape(texts.get("question", ""))),
+        ("answer", escape(texts.get("answer", ""))),
+        ("state", state),
+    ):
+        parts += [f'<p class="{look}">{text}</p>'] * bool(text)
+    if target := page or chart:
+        label = "Open the page" if page else "Open the chart"
+        named = escape(f"{label} of {name}")
+        parts.append(f'<a class="button" href="{_link(folder, target)}" aria-label="{named}">{label}</a>')
+    notes = [when, *(f"commit {text[:12]}" for key, text in texts.items() if key == "git_commit")]
     files = sorted(p for p in place.iterdir() if p.suffix in LISTED and ".plotted" not in p.name)
     links = "".join(f'<li><a href="{_link(folder, path)}">{escape(path.name)}</a></li>' for path in files)
     parts.append(
         f"<details><summary>{counted(len(files), 'file')}</summary>"
         f"<p>{escape('; '.join(filter(None, notes)))}</p><ul>{links}</ul></details>"
     )
-    return "<article>\n" + "\n".join(filter(None, parts)) + "\n</article>"
-
-
-def _thumbnail(folder: Path, chart: Path | None, name: str) -> str:
-    if chart is None:
-        return '<div class="none">no chart</div>'
-    description = f"The chart {chart.stem} of {name}"
-    return f'<img src="{_link(folder, chart)}" alt="{escape(description)}" loading="lazy">'
-
-
-def _button(folder: Path, place: Path, chart: Path | None, name: str) -> str:
-    """Return a link to the page of an experiment, or without a page to its chart; empty without both."""
-    page = _page(place)
-    target, label = (page, "Open the page") if page else (chart, "Open the chart")
-    if target is None:
-        return ""
-    return f'<a class="button" href="{_link(folder, target)}" aria-label="{escape(f"{label} of {name}")}">{label}</a>'
+    return "<article>\n" + "\n".join(parts) + "\n</article>"
 
 
 def _page(place: Path) -> Path | None:
@@ -108,12 +99,11 @@ def _link(folder: Path, path: Path) -> str:
     return escape(quote(path.relative_to(folder).as_posix()))
 
 
-def _state(path: Path, record: dict[str, Any]) -> tuple[str, str]:
+def _state(path: Path, counts: Any, when: str) -> tuple[str, str]:
     """Return the number of cells by status as HTML, failures marked, and the date of the newest row as text.
 
-    Both are empty if neither the rows nor the record of the run know them.
+    Without rows they are ``counts`` and ``when`` of the record of the run.
     """
-    counts, when = record.get("counts"), _text(record, "finished")
     if path.exists():
         try:
             table = read_parquet(path, ["status", "stored_at"])
@@ -123,19 +113,10 @@ def _state(path: Path, record: dict[str, Any]) -> tuple[str, str]:
                 when = time.strftime("newest row of %Y-%m-%d %H:%M UTC", time.gmtime(newest))
         except Exception as error:  # any error in the file is reported on the page
             return f'<span class="bad">rows.parquet cannot be read: {escape(str(error)[:200])}</span>', ""
-    if not isinstance(counts, dict) or not counts:
-        return "", when
-    texts = []
-    for status, count in counts.items():
-        look = "" if status in GOOD else ' class="bad"'
-        texts.append(f"<span{look}>{escape(str(count))} {escape(str(status))}</span>")
+    known = counts.items() if isinstance(counts, dict) else ()
+    looks = {status: "" if status in GOOD else ' class="bad"' for status, _ in known}
+    texts = [f"<span{looks[status]}>{escape(f'{count} {status}')}</span>" for status, count in known]
     return ", ".join(texts), when
-
-
-def _text(content: dict[str, Any], key: str) -> str:
-    """Return a string of a mapping; empty if there is none or the value has another type."""
-    value = content.get(key)
-    return value if isinstance(value, str) else ""
 
 
 def main(words: Sequence[str]) -> int:

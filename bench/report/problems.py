@@ -28,7 +28,16 @@ class ProblemRows:
 
     def title(self) -> str:
         """Return the problem as a string: ``pushing, penalty, sigma=0.1``."""
-        return ", ".join(str(v) if k in CATEGORIES else f"{k}={axis_value(v)}" for k, v in self.identity.items())
+        return joined(self.identity)
+
+
+def joined(values: Mapping[Any, Any]) -> str:
+    """Return ``pushing, sigma=0.1``: texts as they are, numbers with their names; not what is empty, ``none`` or missing."""
+    texts = (
+        value if isinstance(value, str) else f"{name}={axis_value(value)}" if math.isfinite(value) else ""
+        for name, value in values.items()
+    )  # fmt: skip
+    return ", ".join(text for text in texts if text not in ("", "none"))
 
 
 def split_by_problem(shown: Arranged, axis: Axis | None, always: Sequence[str] = ()) -> list[ProblemRows]:
@@ -53,7 +62,10 @@ def split_by_problem(shown: Arranged, axis: Axis | None, always: Sequence[str] =
     for _, part in table.groupby(groups, sort=False):
         first = part.iloc[0]
         labels = {"smoothing": smoothing_of(first["contact"].partition("[")[0]) or "smoothing"}
-        identity = {labels.get(name, name): first[name] for name in named if _is_worth_naming(name, first[name])}
+        named_values = {name: value for name, value in first[named].items() if joined({name: value})}
+        identity = {
+            labels.get(name, name): value for name, value in named_values.items() if (name, value) != ("horizon", 0)
+        }
         result.append(ProblemRows(identity, part.reset_index(drop=True)))
     return result
 
@@ -61,12 +73,6 @@ def split_by_problem(shown: Arranged, axis: Axis | None, always: Sequence[str] =
 def problem_numbers(rows: pd.DataFrame, parts: Sequence[str], without: Sequence[Axis] = ()) -> pd.Series:
     """Return the number of each row's problem, ignoring the axes ``without``; see :func:`~.parameters.number_problems`."""
     return number_problems(rows, parts, [name for axis in without for name in axis.names])
-
-
-def _is_worth_naming(column: str, value: Any) -> bool:
-    if column in CATEGORIES:
-        return bool(value != "none")
-    return math.isfinite(value) and not (column == "horizon" and value == 0)
 
 
 def constants(rows: pd.DataFrame, groups: pd.Series, names: Sequence[str]) -> pd.DataFrame:
@@ -120,7 +126,7 @@ def problem_names(
     columns = label_columns(shown, parts, without, always, rows)
     names: dict[Any, str] = {}
     for group, line in constants(rows, groups, columns).iterrows():
-        name = ", ".join(filter(None, (_with_name(column, value) for column, value in line.items())))
+        name = joined(line.to_dict())
         names[group] = name if name not in names.values() else f"{name} ({group})"
     return groups.map(names).astype(object)
 
@@ -134,15 +140,10 @@ def label_columns(
 ) -> list[str]:
     """Return the columns that distinguish rows with different ``parts``, with the arguments of :func:`problem_names`."""
     rows = shown.rows if rows is None else rows
-    groups = problem_numbers(rows, parts, without)
-    return distinguishing_columns(rows, groups, part_columns(shown, parts, without), always)
-
-
-def part_columns(shown: Arranged, parts: Sequence[str], without: Sequence[Axis] = ()) -> list[str]:
-    """Return the columns that identify ``parts`` of the grid, strings before numbers, except the axes ``without``."""
     more = {"backend": ["dtype"], "estimator": ["estimator_params"], "scene": ["noise"]}
     labels = [*parts, *(name for part in parts for name in more.get(part, []))]
-    return [name for name in (*labels, *shown.numbers) if name not in {axis.column for axis in without}]
+    names = [name for name in (*labels, *shown.numbers) if name not in {axis.column for axis in without}]
+    return distinguishing_columns(rows, problem_numbers(rows, parts, without), names, always)
 
 
 def value_text(value: Any) -> str:
@@ -151,18 +152,8 @@ def value_text(value: Any) -> str:
 
 
 def titled(rows: pd.DataFrame, names: Sequence[str]) -> pd.Series:
-    """Return, per row, the values of some text columns joined by commas, without empty values and ``none``."""
-    return pd.Series(
-        [", ".join(text for text in map(str, row) if text not in ("", "none")) for row in rows[list(names)].to_numpy()],
-        index=rows.index,
-        dtype=object,
-    )
-
-
-def _with_name(column: Any, value: Any) -> str:
-    if isinstance(value, str):
-        return "" if value == "none" else value
-    return f"{column}={axis_value(value)}" if math.isfinite(value) else ""
+    """Return, per row, the values of some columns as :func:`joined` gives them."""
+    return pd.Series([*map(joined, rows[list(names)].to_dict("records"))], index=rows.index, dtype=object)
 
 
 def axes_of(shown: Arranged, *columns: str) -> list[Axis]:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import shlex
-from collections.abc import Collection, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import pandas as pd
@@ -26,16 +25,16 @@ HEAD = "python -m bench name=one_cell"
 
 def commands(experiment: Experiment, rows: pd.DataFrame) -> list[list[str]]:
     """Return, per row, the words after :data:`HEAD` that rerun its cell, shell-quoted; empty if a plugin is missing."""
-    folders = [shlex.quote(word) for word in plugin_folders(experiment.plugins)]
+    folders = ",".join(repr(str(folder)) for folder in experiment.plugins)
     known: dict[str, Plugin] = {}
     given = rows["parameters"] if "parameters" in rows else pd.Series("", index=rows.index)
-    around = {text: _settings_around_counts(parsed(text), known, experiment.timing) for text in given.unique()}
-    result = []
-    for text, *counts in zip(given, *(rows[name] for name in COUNTS), strict=True):
-        before, after = around[text]
-        middle = [f"{name}={int(count)}" for name, count in zip(COUNTS, counts, strict=True)]
-        result.append([*folders, *before, *middle, *after] if before else [])
-    return result
+    settings = {text: _settings(parsed(text), known, experiment.timing) for text in given.unique()}
+    head = [shlex.quote(f"plugins=[{folders}]")] * bool(folders)
+    counts = rows[list(COUNTS)].astype(int).to_dict("records")
+    return [
+        [*head, *settings[text], *(f"{name}={count}" for name, count in line.items())] if settings[text] else []
+        for text, line in zip(given, counts, strict=True)
+    ]  # fmt: skip
 
 
 def cell_of(given: Mapping[str, Any], known: dict[str, Plugin]) -> Cell:
@@ -62,27 +61,19 @@ def cell_of(given: Mapping[str, Any], known: dict[str, Plugin]) -> Cell:
     )
 
 
-def _settings_around_counts(
-    given: Mapping[str, Any], known: dict[str, Plugin], timing: bool
-) -> tuple[list[str], list[str]]:
-    """Return the settings, as shell words, of an experiment with only a row's cell: before its counts and after them.
-
-    Both are empty if a plugin is missing.
-    """
+def _settings(given: Mapping[str, Any], known: dict[str, Plugin], timing: bool) -> list[str]:
+    """Return the settings, as shell words, of an experiment with only a row's cell, without its counts; empty if a plugin is missing."""
     try:
         cell = dataclasses.replace(cell_of(given, known), timing=timing)
     except (UserError, KeyError):
-        return [], []
-    before = [f"study={_identity(cell.study)}", *plugin_settings(cell)]
-    after = theta_settings(cell)
-    if cell.budget is not None:
-        default = Budget()
-        for name in ("samples", "tolerance"):
-            if getattr(cell.budget, name) != getattr(default, name):
-                after.append(f"reference.{name}={getattr(cell.budget, name)!r}")
+        return []
+    words, default = [f"study={_identity(cell.study)}", *plugin_settings(cell), *theta_settings(cell)], Budget()
+    for name in ("samples", "tolerance") if cell.budget is not None else ():
+        if getattr(cell.budget, name) != getattr(default, name):
+            words.append(f"reference.{name}={getattr(cell.budget, name)!r}")
     if isinstance(cell.study, Study) and cell.timing != cell.study.timed:
-        after.append(f"timing={str(cell.timing).lower()}")
-    return [*map(shlex.quote, before)], [*map(shlex.quote, after)]
+        words.append(f"timing={str(cell.timing).lower()}")
+    return [*map(shlex.quote, words)]
 
 
 def plugin_settings(cell: Cell, without: Collection[str] = ()) -> list[str]:
@@ -104,11 +95,6 @@ def theta_settings(cell: Cell) -> list[str]:
     return [f"theta=[{','.join(names)}]"] * bool(names) + (
         [] if at is None else [f"theta0=[{','.join(map(repr, at))}]"]
     )
-
-
-def plugin_folders(folders: Sequence[Path]) -> list[str]:
-    """Return the setting that names the folders of plugins; empty without folders."""
-    return [f"plugins=[{','.join(repr(str(folder)) for folder in folders)}]"] if folders else []
 
 
 def check_of(cell: Cell) -> str:

@@ -16,7 +16,7 @@ VARIANTS = ("-", (0, (4, 1.5)), (0, (1, 1.2)))
 MARKS = ((0, (3, 2)), (0, (1, 1.5)), (0, (5, 1, 1, 1)))
 """Line styles of marked values on an axis."""
 GREY = "#404040"
-SHADE: dict[str, Any] = {"color": "#d9d9d9", "alpha": 0.5, "linewidth": 0}
+SHADE: dict[str, Any] = {"color": "#bfbfbf", "alpha": 0.5, "linewidth": 0}
 SIZE = 8
 STYLE: dict[str, Any] = {
     **dict.fromkeys(("font.size", "axes.titlesize", "axes.labelsize", "legend.fontsize"), SIZE),

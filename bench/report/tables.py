@@ -3,24 +3,19 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 
 import pandas as pd
 
 from bench.report.text import one_line
 
-BLOCK = 4096
-"""Rows of a block."""
 WHOLE = ("horizon", "samples", "repeats", "dim", "seed")
 """Columns of whole numbers, which pandas would write with a decimal point."""
 
 
-def csv_blocks(table: pd.DataFrame) -> Iterator[str]:
-    """Yield a table as CSV with all digits of every number, in blocks: a long one is never in memory as one string."""
+def csv_text(table: pd.DataFrame) -> str:
+    """Return a table as CSV with all digits of every number."""
     whole = [name for name in WHOLE if name in table and (table[name].dropna() % 1 == 0).all()]
-    for start in range(0, max(len(table), 1), BLOCK):
-        block = table.iloc[start : start + BLOCK].astype(dict.fromkeys(whole, "Int64"))
-        yield str(block.to_csv(index=False, header=start == 0, lineterminator="\n"))
+    return str(table.astype(dict.fromkeys(whole, "Int64")).to_csv(index=False, lineterminator="\n"))
 
 
 def plain_markdown(table: pd.DataFrame) -> str:

@@ -78,6 +78,11 @@ def duration(seconds: float) -> str:
     return f"{number(seconds)} s"
 
 
+def short_duration(seconds: float) -> str:
+    """Return a time as :func:`duration` does, with the sign of micro and without ``.0``."""
+    return duration(seconds).replace("us", "µs").replace(".0 ", " ")
+
+
 def span(low: float, high: float, digits: int = 2, suffix: str = "") -> str:
     """Return two ends as short strings, or one number where both print the same.
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -116,58 +115,35 @@ def estimator_labels(rows: pd.DataFrame) -> pd.Series:
     return pd.Series(list(labels), index=rows.index, dtype=object)
 
 
-@dataclass(frozen=True, eq=False)
-class Curve:
-    """One estimator along ``x``, on one backend or on several that agree."""
-
-    estimator: str
-    params: str
-    backends: tuple[str, ...]
-    """The merged backends."""
-    rows: pd.DataFrame
-    """The first backend's rows, indexed by ``x`` in increasing order."""
-    seconds: float
-    """Median time [s] of one estimate on the fastest of the backends; NaN if none is timed."""
-
-    @cached_property
-    def at(self) -> dict[float, dict[str, Any]]:
-        """The rows as dictionaries, by ``x``."""
-        return dict(self.rows.to_dict("index"))
-
-    @property
-    def label(self) -> str:
-        """The estimator's identity string."""
-        return estimator_label(self.estimator, self.params)
-
-
 RUN = ("estimator", "estimator_params", "backend", "dtype")
 """Columns that distinguish the runs of one problem along an axis."""
 
 
-def estimator_curves(rows: pd.DataFrame, close: float | None = CLOSE) -> list[Curve]:
-    """Return one problem's curves, one per estimator, in order of appearance; refused cells are omitted.
+def estimator_curves(rows: pd.DataFrame, close: float | None = CLOSE) -> pd.DataFrame:
+    """Return one problem's rows as curves along ``x``, one per estimator, in order of appearance; refused cells are omitted.
 
-    Backends within a relative difference of ``close`` are merged into one curve. With None, each backend has its own
-    curve.
+    Backends within a relative difference of ``close`` are merged into one curve, which has the rows of the first. With None,
+    each backend has its own curve. New columns number the curve, and give its estimator's identity string ``label``, its
+    ``backends``, the median time [s] of one estimate on the fastest of them (NaN if none is timed), and its name ``method``:
+    the label, with the backends where an estimator has several curves.
     """
     rows = attempted(rows)
     several = rows["dtype"].nunique() > 1
-    every: dict[tuple[str, str], dict[str, pd.DataFrame]] = {}
-    for (estimator, params, backend, dtype), part in rows.groupby(list(RUN), sort=False):
-        run = part.drop_duplicates("x", keep="last").sort_values("x", kind="stable").set_index("x")
-        every.setdefault((estimator, params), {})[f"{backend} {dtype}" if several else backend] = run
-    result = []
-    for (estimator, params), runs in every.items():
+    rows = rows.assign(label=estimator_labels(rows), run=rows["backend"] + (" " + rows["dtype"] if several else ""))
+    curves = [rows.assign(curve=0, backends="", seconds=math.nan)[:0]]
+    for _, part in rows.groupby("label", sort=False):
+        runs = {
+            name: run.drop_duplicates("x", keep="last").sort_values("x", kind="stable").set_index("x", drop=False)
+            for name, run in part.groupby("run", sort=False)
+        }
         while runs:
             first = next(iter(runs.values()))
-            alike = {
-                n: run for n, run in runs.items() if run is first or (close is not None and _agree(first, run, close))
-            }
-            times = [float(run["time_s"].median()) for run in alike.values()]
-            seconds = min((time for time in times if time > 0), default=math.nan)
-            result.append(Curve(estimator, params, tuple(alike), first, seconds))
-            runs = {name: run for name, run in runs.items() if name not in alike}
-    return result
+            alike = [n for n, run in runs.items() if run is first or (close is not None and _agree(first, run, close))]
+            times = pd.Series([runs.pop(name)["time_s"].median() for name in alike])
+            curves.append(first.assign(curve=len(curves), backends=", ".join(alike), seconds=times[times > 0].min()))
+    frame = pd.concat(curves, ignore_index=True)
+    is_only = frame.groupby("label")["curve"].transform("nunique") == 1
+    return frame.assign(method=frame["label"].where(is_only, frame["label"] + " (" + frame["backends"] + ")"))
 
 
 def _agree(a: pd.DataFrame, b: pd.DataFrame, tolerance: float) -> bool:

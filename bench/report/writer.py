@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,7 +18,7 @@ from bench.report.colours import looks_by_name
 from bench.report.draw import draw
 from bench.report.figures import save, styled
 from bench.report.latex import latex
-from bench.report.tables import csv_blocks, escape_markdown
+from bench.report.tables import csv_text, escape_markdown
 from bench.report.text import counted, one_line
 from bench.run.files import write_all
 
@@ -35,11 +35,10 @@ def write(experiment: Experiment, views: Views, drawn: Sequence[tuple[Chart, Fig
         for chart, figure in drawn:
             charts += save(figure, experiment.directory / chart.name, experiment.formats, chart.plotted())
     answer = answer_json(experiment.name, experiment.question, views.headline, drawn[0][0].name if drawn else "")
-    paths = write_all(experiment.directory, [(ANSWER, answer)])
+    files = {ANSWER: answer}
     for name in dict.fromkeys(table.name for table in views.tables):
-        tables = [table for table in views.tables if table.name == name]
-        paths += write_all(experiment.directory, table_files(tables, experiment.name))
-    return [*paths, *charts]
+        files |= table_files([table for table in views.tables if table.name == name], experiment.name)
+    return [*write_all(experiment.directory, files), *charts]
 
 
 def drawings(experiment: Experiment, views: Views) -> list[tuple[Chart, Figure]]:
@@ -66,16 +65,15 @@ def answer_json(experiment: str, question: str, answer: str, chart: str) -> str:
     return json.dumps(content, indent=1, ensure_ascii=False) + "\n"
 
 
-def table_files(tables: Sequence[Table], experiment: str) -> Iterator[tuple[str, str | Iterable[str]]]:
-    """Yield the name and the content of each file of tables with one name; the CSV has the first."""
+def table_files(tables: Sequence[Table], experiment: str) -> dict[str, str]:
+    """Return the content of each file of tables with one name; the CSV has the first."""
     first = tables[0]
-    makers: dict[str, Callable[[], str | Iterable[str]]] = {
-        "csv": lambda: csv_blocks(first.frame if first.data is None else first.data),
+    makers: dict[str, Callable[[], str]] = {
+        "csv": lambda: csv_text(first.frame if first.data is None else first.data),
         "md": lambda: markdown(tables, experiment),
         "tex": lambda: latex([table for table in tables if "tex" in table.files], experiment),
     }
-    for kind in first.files:
-        yield f"{first.name}.{kind}", makers[kind]()
+    return {f"{first.name}.{kind}": makers[kind]() for kind in first.files}
 
 
 # --------------------------------------------------------------------------------------------------------- files

@@ -96,8 +96,6 @@ class _Worker:
     """The file of its printed output."""
     usage: psutil.Process
     mark: str
-    first_message: bytes = b""
-    """How to build its handler; sent as soon as it reads."""
     queue: deque[Any] = field(default_factory=deque)
     """Items to send to the worker."""
     item: Any = None
@@ -184,8 +182,6 @@ class _Worker:
         """Return the answers in a message, one or none; raises :class:`StorageError`, and any error if it is malformed."""
         content = json.loads(message)
         match content["event"]:
-            case "hello":
-                self.send(self.first_message)
             case "ready":
                 self.is_ready = True
             case "started":
@@ -341,9 +337,9 @@ class Pool:
         )  # fmt: skip
         # a socket reports its end only when every copy of the other side is closed, including this copy
         theirs.close()
-        return _Worker(
-            process, Connection(ours.detach()), output, psutil.Process(process.pid), mark, self._first_message
-        )
+        worker = _Worker(process, Connection(ours.detach()), output, psutil.Process(process.pid), mark)
+        worker.send(self._first_message)  # short enough to be sent before the worker reads
+        return worker
 
     def _collect(self, worker: _Worker, waiting: deque[deque[Any]]) -> list[Answer]:
         """Return a worker's new answers. A worker that has died or exceeds a limit is removed and its items reassigned."""

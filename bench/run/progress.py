@@ -155,5 +155,5 @@ def empty_shard(experiment: Experiment) -> str:
     number, count = experiment.execution.shard or (1, 1)
     return (
         f"shard {number}/{count} of {experiment.name} is empty: the sweep has {len(cells(experiment))} cells, and those of "
-        "one reference are in one shard; nothing to run"
+        "one reference are in one shard; 0 to run"
     )

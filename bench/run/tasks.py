@@ -70,7 +70,7 @@ class TaskHandler:
     def __init__(self, experiment: Experiment, single_thread: bool = False) -> None:
         self._session = Session(experiment)
         self._study = study_of(experiment)
-        self._state = isolation.ProcessState(double_precision=True, single_thread=single_thread)
+        self._state = isolation.ProcessState(single_thread)
         RAN.update(registry.IMPORTED)
         self.is_tainted = False
         """Whether later items need a new process."""

@@ -59,7 +59,6 @@ def main() -> None:
 
 def _serve(connection: Connection) -> None:
     """Build the handler that the first message describes, then answer all later messages."""
-    _send(connection, "hello")
     # the argument is pickled separately, since its classes may come from the folders of plugins
     folders, make, argument = pickle.loads(_receive(connection))
     registry.restrict(frozenset())
@@ -85,7 +84,7 @@ def _receive(connection: Connection) -> bytes:
 
 
 def _send(connection: Connection, event: str, **content: Any) -> None:
-    """Send a message as JSON; its event is ``hello``, ``ready``, ``started``, ``answer`` or ``storage``."""
+    """Send a message as JSON; its event is ``ready``, ``started``, ``answer`` or ``storage``."""
     try:
         connection.send_bytes(ENCODER.encode({"event": event, **content}).encode())
     except OSError as error:

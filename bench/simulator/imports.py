@@ -7,6 +7,7 @@ import importlib
 import importlib.util
 import sys
 from collections.abc import Iterable
+from functools import cache
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -94,7 +95,8 @@ def _module_name(path: Path) -> str:
     return path.stem if found is not None and found.origin == str(path) else invented
 
 
-def load_simulator(cost: str, theta: str = "theta", grad: str = "", batch: str = "", noise: int = 0) -> Simulator:
+@cache
+def load_simulator(cost: str, theta: str, grad: str, batch: str, noise: int) -> Simulator:
     """Return the simulator of the cost ``FILE:NAME``. ``theta`` and ``grad`` are names in the same file.
 
     ``grad`` may also be ``jax`` or ``torch``, or empty for a simulator without a gradient.

@@ -162,18 +162,26 @@ class JaxProblem(Problem):
         return Jacobians(*self._parts(self._linearised, theta, w))
 
     def _trajectory(self, parameters: Array, theta: Array, w: Array) -> tuple[Array, Array]:
-        import jax
         import jax.numpy as jnp
+
+        last, (before, controls) = self._scanned(parameters, theta, w, lambda _, state, u: (jnp.concatenate(state), u))
+        return jnp.concatenate([before, jnp.concatenate(last)[None]]), controls
+
+    def _scanned(
+        self, parameters: Array, theta: Array, w: Array, seen: Callable[[Any, State, Array], Any]
+    ) -> tuple[State, Any]:
+        """Return the last state, and what is ``seen`` in each step from the program, the state before and the control."""
+        import jax
 
         program, theta, w = rollout(self.program.bind(parameters)).resolved(self._ops, theta, w)
 
-        def advance(state: State, slices: Any) -> tuple[State, tuple[Array, Array]]:
+        def advance(state: State, slices: Any) -> tuple[State, Any]:
             u = program.control(self._ops, theta, state, slices)
-            return program.step(self._ops, state, u), (jnp.concatenate(state), u)
+            return program.step(self._ops, state, u), seen(program, state, u)
 
         theta, first, scanned = program.start(self._ops, theta, w)
-        last, (before, controls) = jax.lax.scan(advance, first, scanned, program.scene.horizon)
-        return jnp.concatenate([before, jnp.concatenate(last)[None]]), controls
+        last, along = jax.lax.scan(advance, first, scanned, program.scene.horizon)
+        return last, along
 
     def _linearised(self, parameters: Array, theta: Array, w: Array) -> tuple[Array, Array, Array, Array]:
         import jax

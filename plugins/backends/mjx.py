@@ -153,17 +153,7 @@ class MjxProblem(JaxProblem):
 
     def _residuals(self, parameters: Array, theta: Array, w: Array) -> tuple[Array]:
         """Return the relative residual of each step's constraint solver, ``(horizon, B)``."""
-        import jax
-
-        program, theta, w = rollout(self.program.bind(parameters)).resolved(self._ops, theta, w)
-        assert isinstance(program, MjxProgram)
-
-        def advance(state: State, slices: Any) -> tuple[State, Array]:
-            u = program.control(self._ops, theta, state, slices)
-            return program.step(self._ops, state, u), program.residual(state, u)
-
-        theta, first, scanned = program.start(self._ops, theta, w)
-        return (jax.lax.scan(advance, first, scanned, program.scene.horizon)[1],)
+        return (self._scanned(parameters, theta, w, MjxProgram.residual)[1],)
 
 
 class MjxProgram(Rollout):

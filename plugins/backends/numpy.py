@@ -43,12 +43,10 @@ class NumpyProblem(Problem):
         return np.asarray(cost, dtype=np.float64)
 
     def trajectory(self, theta: np.ndarray, w: np.ndarray) -> Trajectory:
-        bound = rollout(self._bound)
         theta = np.reshape(theta, (self.dim, -1)).astype(self._dtype)
         with np.errstate(all="ignore"):
-            steps = list(bound.steps(self._ops, theta, w.astype(self._dtype)))
-        states, controls = [np.concatenate(x) for x, _ in steps], [u for _, u in steps[:-1]]
-        return Trajectory(np.stack(states).astype(np.float64), np.stack(controls).astype(np.float64))
+            parts = rollout(self._bound).path(self._ops, theta, w.astype(self._dtype))
+        return Trajectory(*(part.astype(np.float64) for part in parts))
 
     def _grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         # usage counts gradients here, not rollouts: the cost of a gradient in rollouts is measured separately

@@ -63,10 +63,8 @@ class TorchProblem(Problem):
     def trajectory(self, theta: np.ndarray, w: np.ndarray) -> Trajectory:
         theta = np.reshape(theta, (self.dim, -1))
         with self._torch.no_grad():
-            steps = list(rollout(self.program).steps(self._ops, self._tensor(theta), self._tensor(w)))
-            states = self._torch.stack([self._torch.cat(list(x)) for x, _ in steps])
-            controls = self._torch.stack([u for _, u in steps[:-1]])
-        return Trajectory(*(part.to(self._torch.float64).numpy() for part in (states, controls)))
+            parts = rollout(self.program).path(self._ops, self._tensor(theta), self._tensor(w))
+        return Trajectory(*(part.to(self._torch.float64).numpy() for part in parts))
 
     def _grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         return self._derivative(lambda full, w: self.program.cost(self._ops, full, w), theta, w)

@@ -91,7 +91,7 @@ class TotalPropagation(DiagnosticEstimator):
         one_each = (
             isinstance(program, Rollout) and program.action_noise and program.scene.controls == program.scene.horizon
         )
-        if one_each and program.has_score_gradient and not program.surrogate:
+        if one_each and not program.score_refusal and not program.surrogate:
             return None
         return f"{self.name}[per=action] needs noise on the action of every step, and a theta that acts through the actions only"
 

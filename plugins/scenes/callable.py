@@ -1,7 +1,6 @@
 """A user's own simulator, named by its file."""
 
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -27,12 +26,7 @@ class Callable(CallableScene):
 
     def simulator(self) -> Any:
         """Return the user's functions, loaded once."""
-        return _loaded(self.cost, self.theta, self.grad, self.batch, self.own_noise)
+        return load_simulator(self.cost, self.theta, self.grad, self.batch, self.own_noise)
 
     def files(self) -> tuple[Path, ...]:
         return simulator_files(self.cost)
-
-
-@cache
-def _loaded(cost: str, theta: str, grad: str, batch: str, noise: int) -> Any:
-    return load_simulator(cost, theta, grad, batch, noise)

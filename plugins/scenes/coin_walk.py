@@ -5,14 +5,14 @@ from typing import Any
 
 import numpy as np
 
-from bench.model import Array, ContactLaw, DisturbedScene, Events, EventScene, Plugin, param
+from bench.model import Array, ContactLaw, Events, EventScene, FunctionScene, Plugin, param
 
 _NODES = 24
 """Nodes of the Gauss-Hermite rule per coordinate of theta: exact for polynomials up to degree 47."""
 
 
 @dataclass(frozen=True)
-class CoinWalk(EventScene, DisturbedScene):
+class CoinWalk(EventScene, FunctionScene):
     """From 0, q takes 8 steps up (+1) or down (-1), up with the probability Phi(x_0 - x_1 q) at place q.
 
     x = theta + sigma u is (push, pull), and f = (q_end - goal)^2 + effort x_0^2. A step is up where the scene's own
@@ -34,7 +34,7 @@ class CoinWalk(EventScene, DisturbedScene):
     goal: float = param(3.0, "place where the steps should end", "steps")
     effort: float = param(2.0, "weight of the squared push", low=0.0)
 
-    def disturbed_cost(self, xp: Any, x: Array, e: Array) -> Array:
+    def cost(self, xp: Any, x: Array, e: Array) -> Array:
         q = 0.0 * x[0] + 0.0 * e[0]
         for t in range(self.exogenous):
             up = e[t] < x[0] - x[1] * q

@@ -113,11 +113,6 @@ def test_a_figure_agrees_within_its_digits_its_spread_and_its_errors():
     assert not Figure("x", "1.0", float("nan"), error=float("inf")).agrees
 
 
-@pytest.mark.parametrize(("text", "digit"), [("3.9", 0.1), ("70", 1.0), ("1.6e10", 1e9), ("4.5e-4", 1e-5), ("-7", 1.0)])
-def test_the_last_digit_of_a_printed_number(text, digit):
-    assert last_digit(text) == pytest.approx(digit)
-
-
 def test_what_cannot_fail_is_not_decidable():
     loose = Figure("x", "1.0", 1.1, error=1.0)
     assert verdict([loose]) == UNDECIDED
@@ -229,36 +224,26 @@ def test_a_claim_in_a_plugin_folder_is_found(tmp_path, capsys):
     assert "My lesson" in capsys.readouterr().out
 
 
-def install(folder, entry_points):
-    """The metadata that an installer writes, beside modules with claims."""
-    made = folder / "mine-1.0.dist-info"
+def test_an_installed_package_brings_claims_by_its_entry_points_and_a_broken_one_hides_no_other(
+    tmp_path, monkeypatch, capsys
+):
+    """An entry point names a module of claims, or a claim."""
+    made = tmp_path / "mine-1.0.dist-info"
     made.mkdir()
     (made / "METADATA").write_text("Metadata-Version: 2.1\nName: mine\nVersion: 1.0\n")
-    (made / "entry_points.txt").write_text(f"[bench.claims]\n{entry_points}\n")
-    (folder / "claims_of_mine.py").write_text(OF_ANOTHER)
-
-
-@pytest.mark.parametrize("target", ["claims_of_mine", "claims_of_mine:Mine"])
-def test_an_installed_package_brings_claims_by_its_entry_point(target, tmp_path, monkeypatch, capsys):
-    """Nothing is replaced here: the entry point names a module of claims, or a claim."""
-    install(tmp_path, f"mine = {target}")
+    names = "mine = claims_of_mine\nother = claims_of_other:Mine\nbad = no_such_module\nodd = builtins:int"
+    (made / "entry_points.txt").write_text(f"[bench.claims]\n{names}\n")
+    for name, claim in (("mine", "M1"), ("other", "M2")):
+        (tmp_path / f"claims_of_{name}.py").write_text(OF_ANOTHER.replace("M1", claim))
+        monkeypatch.delitem(sys.modules, f"claims_of_{name}", raising=False)
     monkeypatch.syspath_prepend(tmp_path)
-    try:
-        assert cli.main(["claims", "M1", f"results_dir={tmp_path}"]) == 0
-        assert "two is two" in capsys.readouterr().out
-        assert "My lesson" in (tmp_path / "claims" / "claims.html").read_text()
-        assert list(discovery.claims())[-1] == "M1", "lessons of others follow those of the course"
-    finally:
-        sys.modules.pop("claims_of_mine", None)
-
-
-def test_a_broken_package_hides_no_other_claim(tmp_path, monkeypatch, capsys):
-    install(tmp_path, "bad = no_such_module\nodd = builtins:int")
-    monkeypatch.syspath_prepend(tmp_path)
-    assert "C1" in discovery.claims()
-    printed = capsys.readouterr().err
-    assert "'bad' cannot be used: import failed: ModuleNotFoundError: No module named 'no_such_module'" in printed
-    assert "'odd' cannot be used: import failed: TypeError: builtins:int is not a plugin class" in printed
+    assert cli.main(["claims", "M1", "M2", f"results_dir={tmp_path}"]) == 0
+    printed = capsys.readouterr()
+    assert printed.out.count("two is two") == 2
+    assert "My lesson" in (tmp_path / "claims" / "claims.html").read_text()
+    assert list(discovery.claims())[-2:] == ["M1", "M2"], "lessons of others follow those of the course"
+    assert "'bad' cannot be used: import failed: ModuleNotFoundError: No module named 'no_such_module'" in printed.err
+    assert "'odd' cannot be used: import failed: TypeError: builtins:int is not a plugin class" in printed.err
 
 
 def test_every_claim_says_what_where_and_why():

@@ -13,13 +13,12 @@ import planted
 import pytest
 import yaml
 from bench.plugins.studies.bias_variance.columns import COLUMNS
-from helpers import loaded, small_rows
+from helpers import small_rows, unmeasured
 
 from bench import cli
 from bench.compare import cells, command, history, report, sources, timings
 from bench.experiment.columns import Columns
 from bench.model import registry
-from bench.run.tasks import blank_row
 
 MACHINE = {"processor": "a chip", "cores": 2, "system": "Linux", "load_average": [0.1, 0.1, 0.1]}
 
@@ -40,9 +39,8 @@ def compared(before, after, columns: Columns = COLUMNS, again=()):
 def of_study(name, *words):
     """The columns of a study, and blank rows of one of its cells per word of ``scenes``."""
     estimators = ["estimators=[fobg]"] if "estimator" in registry.usable("studies", name.partition("[")[0]).axes else []
-    made, found = loaded(f"study={name}", "backends=[jax]", *estimators, *words)
-    rows = pd.DataFrame([blank_row(made, cell) | {"status": "ok"} for cell in found])
-    return made.columns, made.columns.typed(rows)
+    made, rows = unmeasured(f"study={name}", "backends=[jax]", *estimators, *words)
+    return made.columns, rows
 
 
 def save(rows, directory, name="made_up"):
@@ -208,8 +206,7 @@ def test_times_of_unchanged_code_are_the_same_although_every_call_of_one_run_agr
     usual, alarms, cells, repeats = generator.normal(-7, 1, 40), 0, 40, 200
     for _ in range(repeats):
         logs = usual + generator.normal(0, 0.2, (2 + again, 1)) + generator.normal(0, 0.2, (2 + again, cells))
-        made = [{i: {"backend": "jax", "time_s": math.exp(log)} for i, log in enumerate(run)} for run in logs]
-        alarms += len(timings.judge_times("time_s", "time", made[0], made[1], made[2:])[0])
+        alarms += len(timings.judge_times("time", *map(pd.Series, np.exp(logs)))[0])
     assert alarms <= 0.01 * cells * repeats
 
 

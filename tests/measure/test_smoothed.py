@@ -11,7 +11,7 @@ from helpers import loaded
 from bench.experiment.session import Problems
 from bench.measure.reference import certify
 from bench.measure.smoothed import over_ball, widened
-from bench.model import DisturbedScene, FunctionScene, compose
+from bench.model import FunctionScene, compose
 from bench.run.references import References
 
 ERRORS = 4.5
@@ -21,7 +21,7 @@ DIFFERENCES = 1e-6
 
 
 @dataclass(frozen=True)
-class Windy(DisturbedScene):
+class Windy(FunctionScene):
     """f = x0^2 e0^2 + x1 e1 + 3 x1: E f has the gradient (2 theta0, 3), while f at e = 0 has (0, 3)."""
 
     name = "windy"
@@ -31,7 +31,7 @@ class Windy(DisturbedScene):
     def theta0(self):
         return np.array([1.0, 2.0])
 
-    def disturbed_cost(self, xp, x, e):
+    def cost(self, xp, x, e):
         return x[0] ** 2 * e[0] ** 2 + x[1] * e[1] + 3 * x[1]
 
 

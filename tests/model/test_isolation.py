@@ -43,7 +43,7 @@ def unchanged():
 def test_a_changed_setting_is_named(kind):
     code, words = CHANGES[kind]
     with unchanged():
-        state = ProcessState(double_precision=True)
+        state = ProcessState()
         assert state.changes() == []
         exec(code, {"np": np})
         changes = state.changes()
@@ -134,7 +134,7 @@ def test_a_worker_loads_no_file_that_its_cells_do_not_need(tmp_path):
 
 FRESH = """
 from bench.model.isolation import ProcessState
-state = ProcessState(double_precision=True)
+state = ProcessState()
 import jax
 assert jax.config.jax_enable_x64
 state.follow()

@@ -115,4 +115,4 @@ def test_no_reference_without_scores_and_gradients():
 def test_scores_of_the_scenes_here_give_the_gradient():
     for scene in sound_scenes():
         if isinstance(scene, MechanicalScene):
-            assert compose(scene, None, SemiImplicitEuler()).has_score_gradient
+            assert not compose(scene, None, SemiImplicitEuler()).score_refusal

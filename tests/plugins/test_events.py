@@ -16,7 +16,7 @@ from classes import (
 )
 from scipy import stats
 
-from bench.model import DisturbedScene, Events, EventScene, FunctionScene, compose, half_spaces
+from bench.model import Events, EventScene, FunctionScene, compose, half_spaces
 from bench.model.events import events_of
 
 LIMIT = 4.5
@@ -48,7 +48,7 @@ def test_events_of_a_problem_with_twice_the_noise_are_at_half_the_limits():
 
 
 @dataclasses.dataclass(frozen=True)
-class Coin(EventScene, DisturbedScene):
+class Coin(EventScene, FunctionScene):
     """f = a where e < x^3, else b: one coin of probability p = Phi(x^3), so that E f has the slope p' (a - b)."""
 
     name = "coin"
@@ -63,7 +63,7 @@ class Coin(EventScene, DisturbedScene):
     def theta0(self):
         return np.array([self.at])
 
-    def disturbed_cost(self, xp, x, e):
+    def cost(self, xp, x, e):
         return xp.where(e[0] < self.sign * x[0] ** 3, 0.0 * x[0] + 5.0, 0.0 * x[0] + 2.0)
 
     def events(self, theta, w):

@@ -134,18 +134,6 @@ def test_text_is_escaped_in_every_format(made):
 # -------------------------------------------------------------------------------------------------------- terminal
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("rows", [stiffness_rows(), small_rows(backends=("jax",))])
-def test_terminal_output_says_what_matters(rows, capsys, monkeypatch):
-    monkeypatch.delenv("COLUMNS", raising=False)
-    show(experiment(sweep={"stiffness": list(STIFFNESS), "sigma": [0.1, 0.3]}), rows)
-    text = capsys.readouterr().out
-    assert "As contact stiffens, which gradient stays right?" in text
-    assert f"{len(rows)} cells: " in text
-    for status, count in rows["status"].value_counts().items():
-        assert f"{count} {status}" in text
-
-
 def show(made, rows):
     writer.show(made, rows, made.study.views(made, rows))
 
@@ -165,19 +153,11 @@ def test_backends_that_agree_are_one_line():
 
     def merged():
         family = families(rows, "stiffness")[0]
-        return [line.backends for line in views.estimator_curves(family.rows)]
+        return list(views.estimator_curves(family.rows)["backends"].unique())
 
-    assert merged() == [("jax", "torch", "numpy")]
+    assert merged() == ["jax, torch, numpy"]
     rows.loc[rows["backend"] == "torch", "rmse"] *= 1.5
-    assert merged() == [("jax", "numpy"), ("torch",)]
-
-
-def test_terminal_takes_names_literally(capsys):
-    rows = table([row(estimator_params="baseline=[bold]x", scene="[red]s[/red]", samples=n) for n in (16, 64)])
-    show(experiment(sweep={"samples": [16, 64]}), rows)
-    text = capsys.readouterr().out
-    assert "fobg[baseline=[bold]x]" in text
-    assert "[red]s[/red]" in text
+    assert merged() == ["jax, numpy", "torch"]
 
 
 # ---------------------------------------------------------------------------------------------------------- charts

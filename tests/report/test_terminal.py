@@ -105,3 +105,7 @@ def test_what_a_command_prints_of_standard_results_fits(name, monkeypatch, capsy
         lines = capsys.readouterr().out.splitlines()
         assert len(lines) > 10
         assert max(map(cell_len, lines)) <= width
+        words = " ".join(lines).split()
+        counts = [f"{n} {status}" for status, n in rows["status"].value_counts().items()]
+        for said in (experiment.question, f"{len(rows)} cells:", *counts):
+            assert " ".join(said.split()) in " ".join(words)

@@ -94,7 +94,7 @@ def test_the_page_shows_the_limit_that_the_table_shows():
     named = newton.replace("cartpole", "cartpole[horizon=25]")  # tables name what differs from the defaults
     limit = shown.tables[0].frame.query(named)["rmse_rel"].item()
     assert rows["rmse_rel"].iloc[place] < limit / 5
-    assert next(column for column in data["columns"] if column["name"] == "rmse_rel")["kind"] == "limit"
-    cells = {name: data["cells"][name]() for name in ("rmse_rel", "rmse_is_limit")}
+    assert next(column for column in data["columns"] if column["name"] == "rmse_rel")["flag"] == "rmse_is_limit"
+    cells = {name: data["cells"][name] for name in ("rmse_rel", "rmse_is_limit")}
     assert cells["rmse_is_limit"][place] == 1.0
     assert cells["rmse_rel"][place] == pytest.approx(limit, rel=1e-5)  # the page has six digits

@@ -36,6 +36,6 @@ def test_tables_of_stored_rows_are_the_stored_tables(name):
             "lines of equal name"
         )
     for table in dict.fromkeys(table.name for table in tables):
-        for file, content in table_files([one for one in tables if one.name == table], given.name):
+        for file, content in table_files([one for one in tables if one.name == table], given.name).items():
             path = given.directory / file
-            assert not path.exists() or "".join(content) == path.read_text(), file
+            assert not path.exists() or content == path.read_text(), file

@@ -237,7 +237,7 @@ def test_a_study_without_a_page_gets_its_numbers_and_filters_by_what_varies(own)
     data = page_data(given, rows, views, [[]] * 3)
     assert [(chart.x[0].name, chart.y[0].heading) for chart in views.charts] == [("mass", "weight [kg]")]
     assert data["filters"] == ["mass", "outcome"]
-    assert data["cells"]["mass"]() == [1, 2, 3]
+    assert data["cells"]["mass"] == [1, 2, 3]
 
 
 def test_verdicts_and_what_was_swept_can_be_filtered_by():

@@ -17,7 +17,7 @@ from helpers import row
 from bench.cli import main
 from bench.experiment import config
 from bench.measure.statistics import UNEXPLAINED
-from bench.report.views import Curve, arrange
+from bench.report.views import arrange
 
 SAMPLES = (16, 64, 256)
 VARIANCE = 4.0
@@ -55,8 +55,7 @@ def entry(*parts, by="rollouts", target=0.1, width=1.0):
 
 
 def line(**values):
-    found = rows(**values)
-    return Curve("e", "", {"b": True}, found.set_index("samples"), {"b": 1.0})
+    return rows(**values).assign(x=SAMPLES).pipe(with_gradient_cost)
 
 
 @pytest.mark.parametrize(
@@ -78,8 +77,7 @@ def test_unbiased_methods_follow_the_law(target, how, samples):
 
 def test_the_cheapest_sufficient_samples_are_taken_not_the_fewest():
     """Where 16 samples take 120 us and 256 take 64 us, both within the error, the answer is 64 us."""
-    slow_start = line().rows.assign(time_s=[120e-6, 200e-6, 64e-6])
-    found = required_cost(Curve("e", "", {"b": True}, slow_start, {"b": 1.0}), 0.6, TIME)
+    found = required_cost(line().assign(time_s=[120e-6, 200e-6, 64e-6]), 0.6, TIME)
     assert (found.cost, found.samples) == (64e-6, 256)
 
 
@@ -90,7 +88,7 @@ def test_a_gradient_costs_what_it_takes():
     found = with_gradient_cost(
         pd.concat([first, zeroth, rows(estimator="both"), rows(backend="other")], ignore_index=True)
     )
-    assert ROLLOUTS.of(found).tolist()[::3] == pytest.approx([48, 16, 64, 32])
+    assert found[ROLLOUTS].tolist()[::3] == pytest.approx([48, 16, 64, 32])
 
 
 def test_without_times_only_rollouts_are_ranked_and_numbers_are_numbers():
@@ -123,7 +121,7 @@ def test_a_bias_decides_whether_an_error_of_10_percent_is_reached(given, how):
 @pytest.mark.parametrize("name", ["quadratic_model", "sobol", "orthogonal"])
 def test_samples_that_are_coupled_are_not_extrapolated(name):
     """The error of such an estimator need not fall as the root of 1 / N: only measured counts tell."""
-    curve = Curve(name, "", {"b": True}, line().rows, {"b": 1.0})
+    curve = line(estimator=name)
     beyond = required_cost(curve, 0.1, ROLLOUTS)
     assert (beyond.how, beyond.beyond) == ("unknown", 512)
     assert math.isnan(beyond.cost)

@@ -12,7 +12,7 @@ from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Views
 from bench.report import reproduce
 from bench.report.web.data import page_data
-from bench.report.web.document import blocks
+from bench.report.web.document import page
 from bench.run.files import write_whole
 from bench.run.rows import read_record
 
@@ -24,6 +24,6 @@ def write(
     rows = rows.reset_index(drop=True)
     path = experiment.directory / "report.html"
     data = page_data(experiment, rows, views, reproduce.commands(experiment, rows))
-    text = blocks(experiment.name, experiment.question, views, data, drawn, read_record(path.parent))
-    write_whole(path, (block.encode() for block in text))
+    text = page(experiment.name, experiment.question, views, data, drawn, read_record(path.parent))
+    write_whole(path, text.encode())
     return [path]

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import partial
 from typing import Any
 
 import pandas as pd
 
-from bench.experiment.columns import COMMON, IDENTITY, Column
+from bench.experiment.columns import IDENTITY, Column, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.views import Views
 from bench.report import reproduce
+from bench.report.generic import own_columns
 from bench.report.problems import varying_identity
 from bench.report.views import arrange, unsteady
 
@@ -35,20 +35,13 @@ def page_data(
     cells = cells.assign(**{name: arranged.rows[name].to_numpy() for name in swept if name not in cells})
     if "time_s" in cells:
         cells = cells.assign(unsteady=unsteady(cells).astype(float))
-    own = views.columns or [
-        c for c in experiment.columns.all if c.table and c.name not in COMMON and c.kind != "list" and c.name in cells
-        and (cells[c.name].nunique() > 1 if c.kind == "text" else cells[c.name].notna().any())
-    ]  # fmt: skip
-    return cells_data(cells, own, swept, commands)
+    return cells_data(cells, views.columns or own_columns(experiment, cells), swept, commands)
 
 
 def cells_data(
     cells: pd.DataFrame, own: Sequence[Column], swept: Sequence[str] = (), commands: Sequence[Sequence[str]] = ()
 ) -> dict[str, Any]:
-    """Return cells as data: identity and swept columns, the columns ``own``, ``status`` and ``reason``.
-
-    The columns of the cells are functions that return them, since all columns of many cells need a lot of memory.
-    """
+    """Return cells as data: identity and swept columns, the columns ``own``, ``status`` and ``reason``."""
     columns = _columns(own, cells, swept)
     filters = _filters(cells, columns, swept)
     identity = [name for name in dict.fromkeys((*IDENTITY, *swept)) if name in cells]
@@ -60,7 +53,7 @@ def cells_data(
     return {
         "count": len(cells),
         "statuses": cells["status"].value_counts().to_dict(),
-        "cells": {name: partial(encode, cells[name]) for name in cells if name in names},
+        "cells": {name: encode(cells[name]) for name in cells if name in names},
         "columns": columns,
         "filters": filters,
         "identity": identity,
@@ -69,31 +62,24 @@ def cells_data(
 
 
 def _columns(own: Sequence[Column], cells: pd.DataFrame, swept: Sequence[str]) -> list[dict[str, str]]:
-    """Return the columns of the table of cells: identity, the first results, status, the other results, the reason."""
+    """Return the columns of the table of cells: identity, the first results, status, the other results, the reason.
+
+    A column is of kind text, number or seconds. Where the column ``flag`` is not 0, seconds are marked with ``!`` and numbers,
+    which are limits, with ``<``.
+    """
     identity = [
-        _column(name, name.replace("_", " "), "number" if pd.api.types.is_numeric_dtype(cells[name]) else "text")
+        Column(
+            name, label=name.replace("_", " "), kind="number" if pd.api.types.is_numeric_dtype(cells[name]) else "text"
+        )
         for name in varying_identity(cells, swept)
     ]
-    results = [_result(column, cells) for column in own]
-    status, reason = (_column(name, name, "text") for name in ("status", "reason"))
-    return [*identity[:IN_SIGHT], *results[:FIRST], status, *results[FIRST:], *identity[IN_SIGHT:], reason]
-
-
-def _result(column: Column, cells: pd.DataFrame) -> dict[str, str]:
-    if column.kind == "text":
-        return _column(column.name, column.heading, "text")
-    if column.format == "seconds":
-        flag = "unsteady" if column.name == "time_s" and "unsteady" in cells else ""
-        return _column(column.name, column.heading, "seconds", flag)
-    return _column(column.name, column.heading, "limit" if column.limit else "number", column.limit)
-
-
-def _column(name: str, label: str, kind: str, flag: str = "") -> dict[str, str]:
-    """Return a column of kind text, number, seconds or limit.
-
-    Where the column ``flag`` is not 0, seconds are marked with ``!`` and limits with ``<``.
-    """
-    return {"name": name, "label": label, "kind": kind, "flag": flag}
+    status, reason = map(text, ("status", "reason"))
+    order = [*identity[:IN_SIGHT], *own[:FIRST], status, *own[FIRST:], *identity[IN_SIGHT:], reason]
+    flags = {"time_s": "unsteady"} if "unsteady" in cells else {}
+    return [
+        {"name": c.name, "label": c.heading, "kind": "seconds" if c.format == "seconds" else c.kind, "flag": c.limit or flags.get(c.name, "")}
+        for c in order
+    ]  # fmt: skip
 
 
 def _filters(cells: pd.DataFrame, columns: Sequence[dict[str, str]], swept: Sequence[str]) -> list[str]:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-import uuid
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from html import escape
 from itertools import starmap
 from pathlib import Path
@@ -22,18 +21,15 @@ from bench.report.web import shell
 HERE = Path(__file__).parent
 
 
-def blocks(
+def page(
     title: str,
     question: str,
     views: Views,
     data: Mapping[str, Any],
     drawn: Sequence[tuple[Chart, Figure]] = (),
     record: Mapping[str, Any] = MappingProxyType({}),
-) -> Iterator[str]:
-    """Yield the page as HTML in blocks, so that a long page is never in memory as one string.
-
-    ``data`` are the cells, see :func:`~bench.report.web.data.cells_data`, and ``record`` is ``run.json``.
-    """
+) -> str:
+    """Return the page as HTML. ``data`` are the cells, see :func:`~bench.report.web.data.cells_data`, and ``record`` is ``run.json``."""
     counts = [(data["count"], "cells"), *((n, str(status)) for status, n in data["statuses"].items())]
     parts = {
         "title": escape(title),
@@ -43,26 +39,10 @@ def blocks(
         "answers": _answers(views),
         "charts": "\n".join(starmap(_chart, drawn)),
         "made": _made(record),
-        "data": (place := uuid.uuid4().hex),
+        "data": in_script(json.dumps(data, separators=(",", ":"), allow_nan=False)),
     }
-    template = (HERE / "page.html").read_text()
-    body = re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], template)
-    before, after = shell.document(title, body, [shell.script("page.js")]).split(place)
-    yield before
-    yield from map(in_script, json_blocks(dict(data)))
-    yield after
-
-
-def json_blocks(value: Any) -> Iterator[str]:
-    """Yield a value as JSON: the items of nested dictionaries one by one. Of a function its result is yielded."""
-    value = value() if callable(value) else value
-    if isinstance(value, dict) and value:
-        for number, (name, inner) in enumerate(value.items()):
-            yield f"{',' if number else '{'}{json.dumps(name)}:"
-            yield from json_blocks(inner)
-        yield "}"
-    else:
-        yield json.dumps(value, separators=(",", ":"), allow_nan=False)
+    body = re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], (HERE / "page.html").read_text())
+    return shell.document(title, body, [shell.script("page.js")])
 
 
 def in_script(text: str) -> str:

@@ -20,7 +20,6 @@ from bench.report.problems import ProblemRows, split_by_problem
 from bench.report.text import counted, number
 from bench.report.views import (
     Arranged,
-    Curve,
     attempted,
     estimator_curves,
     estimator_labels,
@@ -31,7 +30,7 @@ from bench.report.views import (
 
 from .columns import COLUMNS
 from .comparisons import FAILS, NO_RESULT
-from .time_to_accuracy import ROLLOUTS, SAMPLES, TARGETS, TIME, Cost
+from .time_to_accuracy import ROLLOUTS, SAMPLES, TARGETS, TIME, with_known
 
 FLOOR = 1e-4
 """Relative biases below this are drawn here, as upper limits."""
@@ -52,7 +51,7 @@ BIAS = Column(
     above_one="larger than the gradient",
 )  # fmt: skip
 SECONDS = replace(COLUMNS.by_name["time_s"], label="time of one estimate", log=True)
-ROLLOUTS_SPENT = Column("rollouts_", label="rollouts of one estimate, a gradient at its measured cost", log=True)
+ROLLOUTS_SPENT = Column(ROLLOUTS, label="rollouts of one estimate, a gradient at its measured cost", log=True)
 FASTEST = "each estimator on its fastest backend"
 ESTIMATOR = text("series", label="")
 
@@ -98,7 +97,7 @@ def with_plotted_columns(rows: pd.DataFrame) -> pd.DataFrame:
         "bias_shown": (rows["bias"].where(~limit, rows["bias_high"]) / norm).clip(lower=FLOOR),
         "bias_from": (rows["bias_low"] / norm).clip(lower=FLOOR),
         "bias_to": rows["bias_high"] / norm,
-        "rollouts_": ROLLOUTS.of(rows),
+        ROLLOUTS: rows[ROLLOUTS],
     }
     good = rows["status"] == "ok"
     return rows.assign(
@@ -159,10 +158,8 @@ def _along(
 
 def _lines(problem: ProblemRows) -> pd.DataFrame:
     """Return the points of a problem: of each estimator the first of the backends that agree."""
-    curves: dict[str, Curve] = {}
-    for curve in estimator_curves(problem.rows, 0.03):
-        curves.setdefault(curve.label, curve)
-    return pd.concat([curve.rows.reset_index().assign(panel=problem.title()) for curve in curves.values()])
+    curves = estimator_curves(problem.rows, 0.03)
+    return curves[curves["curve"] == curves.groupby("label")["curve"].transform("min")].assign(panel=problem.title())
 
 
 def _main_series(frame: pd.DataFrame, methods: pd.DataFrame, comparisons: pd.DataFrame) -> list[str]:
@@ -211,10 +208,10 @@ def _error_and_cost(shown: Arranged, best: pd.DataFrame, styles: Mapping[str, St
     problems = split_by_problem(shown, axis, always)
     chosen = problems if is_swept else problems[:: math.ceil(len(problems) / 3)]
     for problem in chosen:
-        rows = cost.known(problem.rows)
+        rows = with_known(problem.rows, cost)
         for _, every in rows.groupby("series", sort=False) if not is_swept or rows["x"].nunique() > 1 else ():
             part = _on_fastest(every, cost)
-            parts.append(part[pareto(cost.of(part), part["rmse_rel"])].assign(panel=problem.title()))
+            parts.append(part[pareto(part[cost], part["rmse_rel"])].assign(panel=problem.title()))
     if not parts:
         return None
     frame = pd.concat(parts, ignore_index=True)
@@ -229,12 +226,12 @@ def _error_and_cost(shown: Arranged, best: pd.DataFrame, styles: Mapping[str, St
     )  # fmt: skip
 
 
-def _on_fastest(rows: pd.DataFrame, cost: Cost) -> pd.DataFrame:
+def _on_fastest(rows: pd.DataFrame, cost: str) -> pd.DataFrame:
     """Return an estimator's rows on the backend with the lowest cost, by the median over the samples that all have."""
     lines = rows["line"]
     shared = rows[rows.groupby("x")["line"].transform("nunique") == lines.nunique()]
     rows_of = shared if len(shared) else rows
-    return rows[lines == cost.of(rows_of).groupby(rows_of["line"]).median().idxmin()]
+    return rows[lines == rows_of.groupby("line")[cost].median().idxmin()]
 
 
 # --------------------------------------------------------------------------------------------------- estimators

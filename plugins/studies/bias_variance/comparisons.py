@@ -6,7 +6,6 @@ A setting is a problem at one value of its swept axis. A method is an estimator,
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -16,7 +15,7 @@ import pandas as pd
 from bench.experiment.axes import Axis
 from bench.experiment.columns import Column, interval, text
 from bench.report.problems import ProblemRows, split_by_problem
-from bench.report.views import CATEGORIES, Arranged, Curve, attempted, estimator_curves, rmse_interval
+from bench.report.views import CATEGORIES, Arranged, attempted, estimator_curves, rmse_interval
 
 WORKS, FAILS, OPEN, NO_RESULT = "works", "fails", "open", "no result"
 """Verdicts of a method at a setting: its interval is below 1, above 1, contains 1 or is not known; it has no number."""
@@ -35,7 +34,7 @@ COLUMNS = (
     text("tied", "methods that are not distinguishable from the first"),
 )
 """The columns of the table of comparisons."""
-VALUE, FACTOR = ([f"{name}{end}" for end in ("", "_low", "_high")] for name in ("value", "factor"))
+ERROR, VALUE, FACTOR = ([f"{name}{end}" for end in ("", "_low", "_high")] for name in ("error", "value", "factor"))
 
 
 def problems_by_axis(shown: Arranged) -> list[tuple[Axis | None, ProblemRows]]:
@@ -55,41 +54,29 @@ def problems_by_axis(shown: Arranged) -> list[tuple[Axis | None, ProblemRows]]:
     return parts
 
 
-def method_names(curves: Sequence[Curve]) -> list[str]:
-    """Return a name per curve: the estimator, and its backends where an estimator has several curves."""
-    labels = [curve.label for curve in curves]
-    return [
-        curve.label if labels.count(curve.label) == 1 else f"{curve.label} ({', '.join(curve.backends)})"
-        for curve in curves
-    ]
-
-
 def method_table(shown: Arranged) -> pd.DataFrame:
     """Return a line per setting and method: its relative RMSE with a 95% interval, its verdict, and its cost.
 
     The column ``setting`` identifies a setting. Along samples, estimators that use costs only, of which some take more
     rollouts per sample than others, are compared at the numbers of rollouts that all have, if there are any.
     """
-    lines = []
+    parts = [pd.DataFrame()]
     for axis, problem in problems_by_axis(shown):
         axis, problem = _at_equal_rollouts(axis, problem)
-        curves = estimator_curves(problem.rows)
-        along_samples = axis is not None and axis.column == "samples"
+        rows, title, along = estimator_curves(problem.rows), problem.title(), axis.column if axis else ""
+        low, high = rmse_interval(rows)
+        error = rows["rmse_rel"].where(rows["status"] == "ok")
+        samples = rows["x"] if along == "samples" else rows["samples"]
         kinds = {name: str(problem.rows[name].iloc[0]).partition("[")[0] for name in CATEGORIES}
-        for curve, name in zip(curves, method_names(curves), strict=True):
-            for x, row in curve.at.items():
-                low, high = (float(end) for end in rmse_interval(row))
-                error = float(row["rmse_rel"]) if row["status"] == "ok" else math.nan
-                lines.append({
-                    "setting": f"{problem.title()}; {axis.column} {x!r}" if axis else problem.title(),
-                    "problem": problem.title(), **kinds, "axis": axis.column if axis else "", "at": x if axis else math.nan,
-                    "method": name, "estimator": curve.label, "error": error, "error_low": low, "error_high": high,
-                    "verdict": verdict(row["status"], error, low, high), "status": row["status"],
-                    "remark": row["reason"], "bias_share": (row["bias_low"] / row["rmse"]) ** 2 if error > 0 else math.nan,
-                    "evaluations": (row["rollouts"] + row["gradients"]) / (x if along_samples else row["samples"]),
-                    "time_s": curve.seconds,
-                })  # fmt: skip
-    return pd.DataFrame(lines)
+        parts.append(pd.DataFrame({
+            "setting": f"{title}; {along} " + rows["x"].astype(str), "problem": title, **kinds, "axis": along,
+            "at": rows["x"] if axis else math.nan, "method": rows["method"], "estimator": rows["label"],
+            "error": error, "error_low": low, "error_high": high,
+            "verdict": verdict(rows["status"], error, low, high), "status": rows["status"], "remark": rows["reason"],
+            "bias_share": ((rows["bias_low"] / rows["rmse"]) ** 2).where(error > 0),
+            "evaluations": (rows["rollouts"] + rows["gradients"]) / samples, "time_s": rows["seconds"],
+        }))  # fmt: skip
+    return pd.concat(parts, ignore_index=True)
 
 
 ROLLOUTS = Axis("rollouts", ("rollouts",))
@@ -111,29 +98,24 @@ def _at_equal_rollouts(axis: Axis | None, problem: ProblemRows) -> tuple[Axis | 
     return ROLLOUTS, replace(problem, rows=rows[kept].assign(x=spent[kept]))
 
 
-def verdict(status: str, error: float, low: float, high: float) -> str:
-    """Return the verdict on an error with its 95% interval. A missing number or interval is never a pass."""
-    if status != "ok":
-        return NO_RESULT
-    if not all(map(math.isfinite, (error, low))) or math.isnan(high):
-        return OPEN
-    return FAILS if low > 1 else WORKS if high < 1 else OPEN
+def verdict(status: Any, error: Any, low: Any, high: Any) -> Any:
+    """Return the verdict on each error with its 95% interval. A missing number or interval is never a pass."""
+    is_known = np.isfinite(error) & np.isfinite(low) & ~np.isnan(high)
+    return np.select([status != "ok", is_known & (low > 1), is_known & (high < 1)], [NO_RESULT, FAILS, WORKS], OPEN)
 
 
-def ratio(first: Any, second: Any) -> tuple[float, float, float]:
-    """Return second over first with a 95% interval; each is a value with the ends of its own interval.
+def ratio(first: Any, second: Any) -> tuple[Any, Any, Any]:
+    """Return second over first with a 95% interval; each is a value, or values, with the ends of its own interval.
 
     The interval combines the distances to the ends as independent errors of the logarithms: the method of variance
     estimates recovery, Zou and Donner, Statistics in Medicine 27 (2008), equation 7 for log ratios.
     """
     (a, a_low, a_high), (b, b_low, b_high) = first, second
-    if not (a > 0 and b > 0):
-        return math.nan, math.nan, math.nan
     with np.errstate(all="ignore"):
+        factor = np.where((a > 0) & (b > 0), np.divide(b, a), math.nan)
         down = np.hypot(np.log(np.divide(b, b_low)), np.log(np.divide(a_high, a)))
         up = np.hypot(np.log(np.divide(b_high, b)), np.log(np.divide(a, a_low)))
-    factor = b / a
-    return factor, float(factor * np.exp(-down)), float(factor * np.exp(up))
+        return factor, factor * np.exp(-down), factor * np.exp(up)
 
 
 def compare_errors(methods: pd.DataFrame) -> pd.DataFrame:
@@ -142,38 +124,31 @@ def compare_errors(methods: pd.DataFrame) -> pd.DataFrame:
     Methods whose error is not known, or whose interval is not, cannot be first. A method is tied with the first unless
     the interval of their factor lies above 1.
     """
-    lines = []
-    for _, part in methods.groupby("setting", sort=False):
-        good = part[np.isfinite(part["error"]) & np.isfinite(part["error_low"])].sort_values("error", kind="stable")
-        line = part.iloc[0][["setting", "problem", "axis", "at"]].to_dict() | {"first": "", "second": "", "tied": ()}
-        line["basis"] = EQUAL_ROLLOUTS if line["axis"] == ROLLOUTS.column else EQUAL_SAMPLES
-        if len(good):
-            first, *others = good.to_dict("records")
-            factors = [(other, ratio(_interval(first), _interval(other))) for other in others]
-            line |= {"first": first["method"]} | dict(zip(VALUE, _interval(first), strict=True))
-            rivals = [item for item in factors if item[0]["estimator"] != first["estimator"]] or factors
-            if rivals:
-                line |= {"second": rivals[0][0]["method"]} | dict(zip(FACTOR, rivals[0][1], strict=True))
-            line["tied"] = tuple(other["method"] for other, (_, low, _) in factors if not low > 1)
-        lines.append(line)
-    names = [name for c in COLUMNS for name in (c.name, c.low, c.high) if name]
-    return pd.DataFrame(lines, columns=["setting", *names]).astype(dict.fromkeys([*VALUE, *FACTOR], float))
+    good = methods[np.isfinite(methods[["error", "error_low"]]).all(axis=1)].sort_values("error", kind="stable")
+    others = good[good.duplicated("setting")]
+    first = good.drop_duplicates("setting").set_index("setting")
+    others = others.merge(first, on="setting", suffixes=("", "_of_first"))
+    factors = ratio(*([others[f"{end}{of}"] for end in ERROR] for of in ("_of_first", "")))
+    others = others.assign(
+        same=others["estimator"] == others["estimator_of_first"], **dict(zip(FACTOR, factors, strict=True))
+    )
+    second = others.sort_values("same", kind="stable").drop_duplicates("setting").set_index("setting")
+    tied = others[~(others["factor_low"] > 1)].groupby("setting", sort=False)["method"].agg(tuple)
+    lines = methods.drop_duplicates("setting").set_index("setting")[["problem", "axis", "at"]].assign(
+        basis=lambda line: np.where(line["axis"] == ROLLOUTS.column, EQUAL_ROLLOUTS, EQUAL_SAMPLES),
+        first=first["method"], **{name: first[error] for name, error in zip(VALUE, ERROR, strict=True)},
+        second=second["method"], **{name: second[name] for name in FACTOR}, tied=tied,
+    )  # fmt: skip
+    lines["tied"] = [names if isinstance(names, tuple) else () for names in lines["tied"]]
+    return lines.fillna({"first": "", "second": ""}).reset_index()
 
 
-def _interval(row: Any) -> tuple[float, float, float]:
-    return float(row["error"]), float(row["error_low"]), float(row["error_high"])
-
-
-def leaders(comparisons: pd.DataFrame, methods: pd.DataFrame) -> dict[str, list[str]]:
-    """Return, per setting, the estimators that are first, or tied and near the first; empty if no error is known."""
-    places = zip(methods["setting"], methods["method"], strict=True)
-    known = dict(zip(places, zip(methods["estimator"], methods["error"], strict=True), strict=True))
-    result = {}
-    for row in comparisons[["setting", "first", "value", "tied"]].to_dict("records"):
-        lines = [known[row["setting"], name] for name in (row["first"], *row["tied"]) if name]
-        near = [estimator for estimator, error in lines if not error > NEAR * row["value"]]
-        result[row["setting"]] = list(dict.fromkeys(near))
-    return result
+def leaders(comparisons: pd.DataFrame, methods: pd.DataFrame) -> pd.Series:
+    """Return, per setting, the estimators that are first, or tied and near the first; settings without a known error have none."""
+    named = comparisons.assign(method=[(line.first, *line.tied) for line in comparisons.itertuples()]).explode("method")
+    near = named.merge(methods[["setting", "method", "estimator", "error"]], on=["setting", "method"])
+    near = near[~(near["error"] > NEAR * near["value"])].drop_duplicates(["setting", "estimator"])
+    return near.groupby("setting", sort=False)["estimator"].agg(tuple)
 
 
 def verdicts_by_estimator(methods: pd.DataFrame) -> pd.DataFrame:

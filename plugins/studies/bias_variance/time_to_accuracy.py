@@ -16,44 +16,21 @@ from bench.experiment.views import Table
 from bench.measure.statistics import is_unexplained
 from bench.model import registry
 from bench.report.problems import ProblemRows, split_by_problem
-from bench.report.text import axis_value, duration, number
-from bench.report.views import Arranged, Curve, estimator_curves
+from bench.report.text import axis_value, number, short_duration
+from bench.report.views import Arranged, estimator_curves
 
-
-@dataclass(frozen=True)
-class Cost:
-    """A measure of the cost of one estimate."""
-
-    of: Callable[[pd.DataFrame], pd.Series]
-    """Computes the cost of each row."""
-    text: Callable[[float], str]
-    """Formats a cost."""
-
-    def known(self, rows: pd.DataFrame) -> pd.DataFrame:
-        """Return the rows that are ok and have a finite positive error and cost."""
-        good = (rows["status"] == "ok").to_numpy(bool)
-        for values in (self.of(rows).to_numpy(float), rows["rmse_rel"].to_numpy(float)):
-            good = good & np.isfinite(values) & (values > 0)
-        return rows[good]
-
-
-def _seconds(value: float) -> str:
-    return duration(value).replace("us", "µs").replace(".0 ", " ")
-
-
-TIME = Cost(lambda rows: rows["time_s"], _seconds)
-RATIO = "gradient_cost"
-"""Column with the number of rollouts that take as long as one gradient; 1 where it is missing."""
+TIME, ROLLOUTS = "time_s", "rollouts_"
+"""Columns with the costs of an estimate: seconds, and rollouts with a gradient at its measured cost."""
 PROGRAM = (
     "scene", "contact", "integrator", "noise", "horizon", "dt", "stiffness", "sigma", "smoothing", "backend", "dtype",
 )  # fmt: skip
 
 
 def with_gradient_cost(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return rows with a column :data:`RATIO`: the measured cost of a gradient in rollouts, per program and backend.
+    """Return rows with the column :data:`ROLLOUTS`: a gradient counts as the rollouts that take as long, as one if not measured.
 
-    The ratio is seconds per gradient over seconds per rollout, from the fastest row that uses only gradients and the
-    fastest that uses only rollouts, at the largest number of samples with both. Without such rows it is NaN.
+    The ratio is seconds per gradient over seconds per rollout, per program and backend, from the fastest row that uses only
+    gradients and the fastest that uses only rollouts, at the largest number of samples with both.
     """
     program = rows.groupby([name for name in PROGRAM if name in rows], dropna=False).ngroup()
     known = rows[(rows["status"] == "ok") & (rows["time_s"] > 0)]
@@ -65,20 +42,19 @@ def with_gradient_cost(rows: pd.DataFrame) -> pd.DataFrame:
     first = least((known["time_s"] / gradients)[(gradients > 0) & (rollouts <= 0.01 * gradients)])
     zeroth = least((known["time_s"] / rollouts)[(gradients == 0) & (rollouts > 0)])
     ratios = (first / zeroth).dropna().sort_index().groupby(level=0).last()
-    return rows.assign(**{RATIO: program.map(ratios).astype(float)})
+    ratio = program.map(ratios).astype(float).fillna(1.0)
+    return rows.assign(**{ROLLOUTS: rows["rollouts"] + ratio * rows["gradients"]})
 
 
-def _rollouts(rows: pd.DataFrame) -> pd.Series:
-    ratio = rows[RATIO].fillna(1.0) if RATIO in rows else 1.0
-    return rows["rollouts"] + ratio * rows["gradients"]
-
-
-ROLLOUTS = Cost(_rollouts, axis_value)
-"""Rollouts, with a gradient at its measured cost."""
+def with_known(rows: pd.DataFrame, cost: str) -> pd.DataFrame:
+    """Return the rows that are ok and have a finite positive error and cost."""
+    values = rows[[cost, "rmse_rel"]].astype(float)
+    return rows[(rows["status"] == "ok") & (np.isfinite(values) & (values > 0)).all(axis=1)]
 
 
 SAMPLES = Axis("samples", ("samples",))
 COSTS = {"time": TIME, "rollouts": ROLLOUTS}
+TEXTS: dict[str, Callable[[float], str]] = {"time": short_duration, "rollouts": axis_value}
 TARGETS = (0.1, 0.01)
 """Target relative errors."""
 NOTES = (
@@ -113,24 +89,21 @@ class RequiredCost:
     """Interquartile range of the time of one estimate over its median; 0 for rollouts."""
 
 
-def required_cost(line: Curve, target: float, cost: Cost) -> RequiredCost:
-    """Return the cost of a curve's estimator and backend to reach a relative RMSE of ``target``, with its 95% interval."""
-    rows = cost.known(line.rows).sort_index()
+def required_cost(curve: pd.DataFrame, target: float, cost: str) -> RequiredCost:
+    """Return the cost of an estimator on a backend to reach a relative RMSE of ``target``, with its 95% interval."""
+    rows = with_known(curve, cost).sort_values("x")
     if rows.empty:
         return RequiredCost("unknown")
-    is_coupled = couples_samples(line.estimator)
-    way = _required_cost(rows, target, cost, is_coupled)
-    last = rows.iloc[-1]
-    times = float(last["time_iqr_s"] / last["time_s"]) if cost is not ROLLOUTS else 0.0
-    ends = (_at_interval_end(rows, end) for end in ("low", "high"))
-    low, high = (_required_cost(end, target, cost, is_coupled) for end in ends)
+    way, low, high = (
+        _required_cost(at, target, cost) for at in (rows, *(_at_interval_end(rows, end) for end in ("low", "high")))
+    )
+    times = float((rows["time_iqr_s"] / rows["time_s"]).iloc[-1]) if cost == TIME else 0.0
     if not math.isfinite(way.cost):
         return replace(way, beyond=low.cost if math.isfinite(low.cost) else low.beyond, times=times)
-    least, most = low.cost, high.cost
-    if way.how == "at once":  # fewer samples may be enough, down to one
-        least = _cost_of_one_sample(rows, cost)
+    # fewer samples than the fewest may be enough, down to one
+    least = _cost_of_one_sample(rows, cost) if way.how == "at once" else low.cost
     down = max(0.0, math.log(way.cost / least)) if least > 0 else math.inf
-    up = max(0.0, math.log(most / way.cost)) if math.isfinite(most) else math.inf
+    up = max(0.0, math.log(high.cost / way.cost)) if math.isfinite(high.cost) else math.inf
     return replace(way, down=down, up=up, times=times)
 
 
@@ -140,9 +113,9 @@ def couples_samples(estimator: str) -> bool:
     return bool(getattr(entry and entry.plugin, "couples_samples", False))
 
 
-def _cost_of_one_sample(rows: pd.DataFrame, cost: Cost) -> float:
+def _cost_of_one_sample(rows: pd.DataFrame, cost: str) -> float:
     """Return the cost of an estimate from one sample, extrapolated linearly from the two smallest sample counts."""
-    n, price = rows.index.to_numpy(float)[:2], cost.of(rows).to_numpy(float)[:2]
+    n, price = rows[["x", cost]].to_numpy(float)[:2].T
     slope = (price[1] - price[0]) / (n[1] - n[0]) if len(n) > 1 else price[0] / n[0]
     return float(np.clip(price[0] - slope * (n[0] - 1.0), price[0] / n[0], price[0]))
 
@@ -171,23 +144,21 @@ def lead(first: RequiredCost, second: RequiredCost, alike: bool = False) -> tupl
     return factor, factor * math.exp(-low), factor * math.exp(high)
 
 
-def _required_cost(rows: pd.DataFrame, target: float, cost: Cost, is_coupled: bool) -> RequiredCost:
-    n, error, price = (rows.index.to_numpy(float), rows["rmse_rel"].to_numpy(float), cost.of(rows).to_numpy(float))
+def _required_cost(rows: pd.DataFrame, target: float, cost: str) -> RequiredCost:
+    n, error, price = rows[["x", "rmse_rel", cost]].to_numpy(float).T
     if not (error <= target).any():
-        return _extrapolated_cost(rows.iloc[-1], n[-1], price[-1], target, is_coupled)
+        return _extrapolated_cost(rows.iloc[-1], price[-1], target)
     # more samples may cost less: the fixed cost of a call dominates small batches
-    ways = [RequiredCost("measured", price[i], n[i]) for i in range(1, len(n)) if error[i] <= target]
+    ways = [RequiredCost("measured" if i else "at once", price[i], n[i]) for i in np.flatnonzero(error <= target)]
     for i in range(1, len(n)):
         if error[i] <= target < error[i - 1]:
             share = math.log(error[i - 1] / target) / math.log(error[i - 1] / error[i])
             samples, needed = (math.exp((1 - share) * math.log(v[i - 1]) + share * math.log(v[i])) for v in (n, price))
             ways.append(RequiredCost("measured", needed, samples))
-    if error[0] <= target:
-        ways.append(RequiredCost("at once", price[0], n[0]))
     return min(ways, key=lambda way: (way.cost, way.samples))
 
 
-def _extrapolated_cost(row: Any, samples: float, price: float, target: float, is_coupled: bool) -> RequiredCost:
+def _extrapolated_cost(row: Any, price: float, target: float) -> RequiredCost:
     """Extrapolate the cost from the row with most samples: v is N times its variance, and cost is proportional to N.
 
     Coupled samples have no such law.
@@ -196,6 +167,7 @@ def _extrapolated_cost(row: Any, samples: float, price: float, target: float, is
     # an estimator without declared bias may only have heavy tails that the samples missed
     if low >= target and not is_unexplained(str(row.get("reason", ""))):
         return RequiredCost("never")
+    is_coupled, samples = couples_samples(row["estimator"]), row["x"]
     is_known = not is_coupled and high < target
     certain_bias = bias if is_known and low > 0 else 0.0
     needed = samples * row["variance"] / row["reference_norm"] ** 2 / (target**2 - certain_bias**2)
@@ -220,15 +192,14 @@ def table(shown: Arranged) -> pd.DataFrame:
     return pd.DataFrame(entries)
 
 
-def methods(problem: ProblemRows, target: float, cost: Cost) -> dict[str, RequiredCost]:
+def methods(problem: ProblemRows, target: float, cost: str) -> dict[str, RequiredCost]:
     """Return each method's cost to reach an error. For time a method is an estimator on a backend, else an estimator."""
-    reached: dict[str, RequiredCost] = {}
-    for curve in estimator_curves(problem.rows, close=None):
-        name = curve.label if cost is ROLLOUTS else f"{curve.label} on {curve.rows['backend'].iloc[0]}"
-        needed = required_cost(curve, target, cost)
-        if name not in reached or order(needed) < order(reached[name]):
-            reached[name] = needed
-    return reached
+    curves = estimator_curves(problem.rows, close=None)
+    names = curves["label"] + (" on " + curves["backend"] if cost == TIME else "")
+    costs = [
+        (name, required_cost(curve, target, cost)) for (name, _), curve in curves.groupby([names, "curve"], sort=False)
+    ]
+    return {name: min((needed for other, needed in costs if other == name), key=order) for name, _ in costs}
 
 
 def order(needed: RequiredCost) -> tuple[float, float, bool]:
@@ -285,7 +256,7 @@ def _following(first: str, known: list[str], reached: dict[str, RequiredCost]) -
 def accuracy_table(best: pd.DataFrame) -> Table:
     """Return the table of :func:`table` for readers."""
     costs = [
-        COSTS[kind].text(float(number(cost))) if math.isfinite(cost) else "-"
+        TEXTS[kind](float(number(cost))) if math.isfinite(cost) else "-"
         for kind, cost in zip(best["by"], best["cost"], strict=True)
     ]
     columns = [

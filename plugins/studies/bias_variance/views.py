@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -24,14 +24,11 @@ from . import charts, time_to_accuracy
 from .columns import COLUMNS
 from .comparisons import COLUMNS as COMPARED
 from .comparisons import (
-    EQUAL_ROLLOUTS,
-    EQUAL_SAMPLES,
     FAILS,
     NO_RESULT,
     ROLLOUTS,
     compare_errors,
     leaders,
-    method_names,
     method_table,
     problems_by_axis,
     verdicts_by_estimator,
@@ -49,11 +46,8 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views | None:
         return None
     errors = compare_errors(methods)
     best = time_to_accuracy.table(shown)
-    comparisons = errors if best.empty else pd.concat([errors, time_to_accuracy.comparisons(best)], ignore_index=True)
-    all_tables = tables(experiment, rows, shown, methods, comparisons)
-    all_tables += [] if best.empty else [time_to_accuracy.accuracy_table(best)]
     return Views(
-        all_tables,
+        tables(experiment, rows, shown, methods, errors, best),
         charts.charts(shown, methods, errors, best),
         rows=charts.with_plotted_columns(with_gradient_cost(rows)),
         columns=[
@@ -99,24 +93,29 @@ ESTIMATOR = text("method", label="estimator")
 
 
 def tables(
-    experiment: Experiment, rows: pd.DataFrame, shown: Arranged, methods: pd.DataFrame, comparisons: pd.DataFrame
+    experiment: Experiment,
+    rows: pd.DataFrame,
+    shown: Arranged,
+    methods: pd.DataFrame,
+    errors: pd.DataFrame,
+    best: pd.DataFrame,
 ) -> list[Table]:
-    """Return all tables but those of the cost to reach an error."""
-    result = pivots(shown)
-    result[0] = replace(result[0], data=axes.table(experiment, rows))
-    columns = [COLUMNS.by_name[name] for name in ("scene", "contact", "backend", "estimator", "rmse_rel", "time_s")]
-    result.append(Table("speed_accuracy", speed_accuracy(rows), columns, files=["csv"]))
-    if methods["estimator"].nunique() >= LEAST and methods["problem"].nunique() > 1:
-        result.append(ranking(methods))
-    errors = comparisons[comparisons["basis"].isin((EQUAL_SAMPLES, EQUAL_ROLLOUTS))]
-    result.append(recommendations(methods, errors))
-    result.append(Table("verdicts", methods.drop(columns="setting"), [], files=["csv"]))
-    joined = comparisons.drop(columns="setting").assign(tied=[", ".join(names) for names in comparisons["tied"]])
-    noted = joined.assign(factor_note=limits(joined))
+    """Return all tables; ``best`` is the table of the cost to reach an error."""
+    main, *others = pivots(shown)
+    is_ranked = methods["estimator"].nunique() >= LEAST and methods["problem"].nunique() > 1
+    compared = errors if best.empty else pd.concat([errors, time_to_accuracy.comparisons(best)], ignore_index=True)
+    joined = compared.drop(columns="setting").assign(tied=compared["tied"].map(", ".join))
     columns = [replace(c, note="factor_note") if c.name == "factor" else c for c in COMPARED]
     title = "the first and the next at each setting"
-    result.append(Table("comparisons", noted, columns, title, COMPARISON_NOTES, data=joined))
-    return result
+    return [
+        replace(main, data=axes.table(experiment, rows)), *others,
+        Table("speed_accuracy", speed_accuracy(rows), [], files=["csv"]),
+        *([ranking(methods)] if is_ranked else []),
+        recommendations(methods, errors),
+        Table("verdicts", methods.drop(columns="setting"), [], files=["csv"]),
+        Table("comparisons", joined.assign(factor_note=limits(joined)), columns, title, COMPARISON_NOTES, data=joined),
+        *([] if best.empty else [time_to_accuracy.accuracy_table(best)]),
+    ]  # fmt: skip
 
 
 COMPARISON_NOTES = (
@@ -131,46 +130,37 @@ COMPARISON_NOTES = (
 def pivots(shown: Arranged) -> list[Table]:
     """Return a table per problem: estimators down, values of its longest axis across, each cell a relative RMSE."""
     result = [_pivot(axis, problem) for axis, problem in problems_by_axis(shown)]
-    notes = _notes(result)
-    return [replace(table, notes=notes if table is result[-1] else ()) for table in result]
+    return [*result[:-1], replace(result[-1], notes=_notes(result))]
 
 
 def _pivot(axis: Axis | None, problem: ProblemRows) -> Table:
-    curves = estimator_curves(problem.rows)
-    names = method_names(curves)
-    values = sorted({x for curve in curves for x in curve.at})
-    lines: list[dict[str, Any]] = []
-    for curve, name in zip(curves, names, strict=True):
-        line: dict[str, Any] = {"method": name}
-        for i, x in enumerate(values):
-            others = [other.at.get(x) for other in curves if other.label != curve.label]
-            line |= {f"x{i}{end}": value for end, value in _pivot_cell(curve.at.get(x), others).items()}
-        lines.append(line)
+    rows = estimator_curves(problem.rows)
+    ok, note = rows["status"] == "ok", rows["status"].map(lambda status: FAILURES.get(status, [""])[0])
+    low, high = (pd.Series(end, rows.index).where(ok) for end in rmse_interval(rows))
+    others = [
+        ok & (rows["x"] == x) & (rows["label"] != label) for x, label in zip(rows["x"], rows["label"], strict=True)
+    ]
+    is_apart = [bool(rivals.any() and (low[rivals] > end).all()) for rivals, end in zip(others, high, strict=True)]
+    cells = pd.DataFrame({
+        "": rows["rmse_rel"].where(ok), "_low": low, "_high": high, "_best": ok & (rows["rmse_rel"] < 1) & np.array(is_apart, dtype=bool),
+        "_note": note + np.where(rows["reason"] != "", REMARKED, ""),
+    }).set_axis(rows["method"])  # fmt: skip
+    values = sorted(rows["x"].unique())
+    wide = _across(cells, rows["x"], values, "x").reindex(rows["method"].unique())
     columns = [
-        interval(
-            f"x{i}", label=axis_value(x) if axis is not None else "relative RMSE",
-            emphasis=f"x{i}_best", note=f"x{i}_note",
-        )
+        interval(f"x{i}", label=axis_value(x) if axis else "relative RMSE", emphasis=f"x{i}_best", note=f"x{i}_note")
         for i, x in enumerate(values)
     ]  # fmt: skip
-    title = problem.title() + (f", by {axis.title}" if axis is not None else "")
     return Table(
-        "bias_variance", pd.DataFrame(lines), [ESTIMATOR, *columns], f"relative RMSE: {title}", files=["csv", "md", "tex"],
-        terminal=True,
+        "bias_variance", wide.reset_index(), [ESTIMATOR, *columns],
+        f"relative RMSE: {problem.title()}{f', by {axis.title}' if axis else ''}", files=["csv", "md", "tex"], terminal=True,
     )  # fmt: skip
 
 
-def _pivot_cell(row: Mapping[str, Any] | None, others: Sequence[Mapping[str, Any] | None]) -> dict[str, Any]:
-    blank = {"": math.nan, "_low": math.nan, "_high": math.nan, "_best": False, "_note": ""}
-    if row is None:
-        return blank
-    mark = REMARKED if row["reason"] else ""
-    if row["status"] != "ok":
-        return blank | {"_note": FAILURES[row["status"]][0] + mark}
-    low, high = (float(end) for end in rmse_interval(row))
-    rivals = [rmse_interval(other)[0] for other in others if other is not None and other["status"] == "ok"]
-    best = bool(row["rmse_rel"] < 1 and rivals and all(high < rival for rival in rivals))
-    return {"": float(row["rmse_rel"]), "_low": low, "_high": high, "_best": best, "_note": mark}
+def _across(cells: pd.DataFrame, place: pd.Series, values: Sequence[Any], prefix: str) -> pd.DataFrame:
+    """Return cells with those of each place side by side, their columns under the prefix and the number of the place."""
+    parts = [cells[(place == value).to_numpy()].add_prefix(f"{prefix}{i}") for i, value in enumerate(values)]
+    return pd.concat(parts, axis=1)
 
 
 def _notes(result: Sequence[Table]) -> list[str]:
@@ -214,13 +204,10 @@ def ranking(methods: pd.DataFrame) -> Table:
     worst = worst.drop_duplicates(["estimator", "problem"], keep="last")
     shares = worst["verdict"] + np.where(worst["bias_share"] > 0.5, ", biased", "")
     work = worst["evaluations"].map(" ({:.0f}x)".format).where(worst["evaluations"] > MANY, "")
-    worst = worst.assign(note=shares.mask(worst["status"] != "ok", worst["status"]) + work)
-    problems, parts = list(dict.fromkeys(methods["problem"])), []
-    for i, problem in enumerate(problems):
-        own = worst[worst["problem"] == problem].set_index("estimator").reindex(counts.index)
-        named = {"error": f"p{i}", "error_low": f"p{i}_low", "error_high": f"p{i}_high", "note": f"p{i}_note"}
-        parts.append(own[[*named]].rename(columns=named).fillna({f"p{i}_note": ""}))
-    frame = pd.concat([counts, *parts], axis=1).rename_axis("method").reset_index()
+    notes = shares.mask(worst["status"] != "ok", worst["status"]) + work
+    ends = {end: worst[f"error{end}"] for end in ("", "_low", "_high")}
+    problems, cells = methods["problem"].unique(), pd.DataFrame(ends | {"_note": notes}).set_axis(worst["estimator"])
+    frame = counts.join(_across(cells, worst["problem"], problems, "p")).rename_axis("method").reset_index()
     errors = frame[[f"p{i}" for i in range(len(problems))]]
     frame["worst"] = errors.max(axis=1).where(np.isfinite(errors).all(axis=1))
     frame = frame.sort_values("worst", kind="stable", na_position="last")
@@ -229,13 +216,13 @@ def ranking(methods: pd.DataFrame) -> Table:
         *(Column(str(name), format="setting") for name in counts),
         *(interval(f"p{i}", label=problem, note=f"p{i}_note") for i, problem in enumerate(problems)),
     ]
-    notes = (
+    explained = (
         f"Sorted by the worst case. Relative RMSE [95% interval] at equal {_basis(methods)}; where a problem was swept, the largest along "
         "the axis. works: the whole interval is below 1; fails: it is above 1; open: it contains 1 or is not known. biased: more "
         "than half of the squared error is bias. (40x): it evaluates 40 costs and gradients per sample, where others take "
         "one or two.",
     )
-    return Table("ranking", frame, columns, "estimators by their worst case", notes)
+    return Table("ranking", frame, columns, "estimators by their worst case", explained)
 
 
 def _basis(methods: pd.DataFrame) -> str:
@@ -251,18 +238,13 @@ def _values(axis: str, at: pd.Series) -> str:
 
 def recommendations(methods: pd.DataFrame, comparisons: pd.DataFrame) -> Table:
     """Return what to use where: a line per problem and range of its axis with the same first and tied estimators."""
-    named = leaders(comparisons, methods)
-    lines = []
-    for (problem, axis), part in methods.groupby(["problem", "axis"], sort=False):
-        uses = part["setting"].map(named).map(tuple)
-        for use in filter(None, uses.unique()):
-            inside = part[uses == use]
-            errors = inside.loc[inside["estimator"].isin(use[:1]), "error"]
-            failing = dict.fromkeys(inside.loc[inside["verdict"].isin((FAILS, NO_RESULT)), "estimator"])
-            lines.append({
-                "problem": problem, "where": _values(axis, inside["at"]), "use": " or ".join(use),
-                "error": span(errors.min(), errors.max()), "fails": ", ".join(failing) or "none",
-            })  # fmt: skip
+    named = methods.assign(use=methods["setting"].map(leaders(comparisons, methods))).dropna(subset=["use"])
+    lines = [
+        {"problem": problem, "where": _values(axis, part["at"]), "use": " or ".join(use),
+         "error": span(*part.loc[part["estimator"] == use[0], "error"].agg(["min", "max"])),
+         "fails": ", ".join(part.loc[part["verdict"].isin((FAILS, NO_RESULT)), "estimator"].unique()) or "none"}
+        for (problem, axis, use), part in named.groupby(["problem", "axis", "use"], sort=False)
+    ]  # fmt: skip
     columns = [
         text("problem"), text("where"), text("use"), text("error", label="relative RMSE"), text("fails", label="fails there"),
     ]  # fmt: skip

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import zip_longest
 from typing import Any
 
 import numpy as np
@@ -127,13 +128,11 @@ def summarise(runs: pd.DataFrame, by: Sequence[str] = ("problem", "method")) -> 
     lines = []
     for key, part in at_equal_steps(runs).groupby(list(by), sort=False):
         final, equal = final_returns(part), final_returns(part, "equal")
-        low, high = bootstrap_interval(final)
         cosines = np.concatenate([np.asarray(c, float) for c in part["cosine"]])
         lines.append(dict(zip(by, key, strict=True)) | {
             "family": part["family"].iloc[0], "seeds": len(part),
-            "failed": int((part["status"] != "ok").sum()), "returns": final, "final": interquartile_mean(final), "final_low": low,
-            "final_high": high, "worst": float(final.min()), "steps": float(part["steps"].max()), "used": float(part["used"].median()),
-            "equal": interquartile_mean(equal), **dict(zip(("equal_low", "equal_high"), bootstrap_interval(equal), strict=True)),
+            "failed": int((part["status"] != "ok").sum()), "returns": final, **middle_with_interval("final", final), "worst": float(final.min()), "steps": float(part["steps"].max()), "used": float(part["used"].median()),
+            **middle_with_interval("equal", equal),
             "train_s": float(part["train_s"].median()), "compile_s": float(part["compile_s"].max()),
             "gradient_typical": float(part["gradient_typical"].median()),
             "gradient_peak": float(part["gradient_peak"].max()),
@@ -169,11 +168,12 @@ def ranked(lines: pd.DataFrame, by: Sequence[str]) -> pd.Series:
     return verdicts
 
 
-def bootstrap_interval(values: np.ndarray) -> tuple[float, float]:
-    """Return the bootstrap interval of an interquartile mean; NaN for fewer than :data:`MIN_SEEDS` values."""
-    if len(values) < MIN_SEEDS:
-        return math.nan, math.nan
-    return bootstrap([values], lambda drawn: interquartile_mean(drawn[0]))
+def middle_with_interval(name: str, values: np.ndarray) -> dict[str, float]:
+    """Return an interquartile mean and its bootstrap interval by column; no interval for fewer than :data:`MIN_SEEDS` values."""
+    ends = math.nan, math.nan
+    if len(values) >= MIN_SEEDS:
+        ends = bootstrap([values], lambda drawn: interquartile_mean(drawn[0]))
+    return dict(zip((name, f"{name}_low", f"{name}_high"), (interquartile_mean(values), *ends), strict=True))
 
 
 def curves_of(runs: pd.DataFrame) -> pd.DataFrame:
@@ -181,32 +181,22 @@ def curves_of(runs: pd.DataFrame) -> pd.DataFrame:
 
     The cost is minus the return. A run that ended early keeps the cost of its untrained policy from there on.
     """
+    names = ["problem", "method", "step", "cost", "cost_low", "cost_high"]
     parts = []
     for (problem, method), part in runs.groupby(["problem", "method"], sort=False):
-        lengths = part["curve_return"].map(len)
-        count = lengths.max()
-        costs = np.array([_filled(-np.asarray(row, float), count) for row in part["curve_return"]])
-        timed = [np.asarray(row, float) for row in part["curve_s"] if len(row) == count]
-        ends = np.full((count, 2), math.nan)
+        curves = np.array([*zip_longest(*part["curve_return"], fillvalue=math.nan)], dtype=float).T
+        costs = -np.where(np.isfinite(curves), curves, curves[:, :1])
+        low, high = np.full((2, costs.shape[1]), math.nan)
         if len(part) >= MIN_SEEDS:
-            ends = np.array(bootstrap_along([costs], lambda drawn: _middle(drawn[0])))
-        parts.append(pd.DataFrame({
-            "problem": problem, "method": method, "step": np.asarray(part["curve_step"][lengths.idxmax()], float),
-            "seconds": np.median(timed, axis=0) if timed else math.nan,
-            "cost": _middle(costs), "cost_low": ends[:, 0], "cost_high": ends[:, 1],
-        }))  # fmt: skip
-    columns = ["problem", "method", "step", "seconds", "cost", "cost_low", "cost_high"]
-    return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=columns)
+            low, high = np.transpose(bootstrap_along([costs], lambda drawn: _middle(drawn[0])))
+        steps = np.asarray(max(part["curve_step"], key=len), dtype=float)
+        parts.append(pd.DataFrame(dict(zip(names, (problem, method, steps, _middle(costs), low, high), strict=True))))
+    return pd.concat(parts, ignore_index=True)
 
 
 def _middle(costs: np.ndarray) -> np.ndarray:
     """Return the interquartile mean of each column."""
     return np.array([interquartile_mean(column) for column in costs.T])
-
-
-def _filled(values: np.ndarray, count: int) -> np.ndarray:
-    known = np.where(np.isfinite(values), values, values[0])
-    return np.append(known, np.full(count - len(known), values[0]))
 
 
 def windows_of(runs: pd.DataFrame) -> pd.DataFrame:
