@@ -352,7 +352,7 @@ def theory(cell: Cell) -> dict[str, float]:
         return {}
     assert cell.integrator is not None
     stiffness, damping, factor = parameters
-    dt = float(rollout(cell.program()).scene.dt)
+    dt = rollout(cell.program()).scene.dt
     limit = stiffness_limit(cell.integrator, dt, damping, factor)
     radius = spectral_radius(cell.integrator, dt, stiffness, damping, factor)
     return {"spectral_radius": radius, "stiffness_limit": limit * cell.columns()["stiffness"] / stiffness}
@@ -365,15 +365,14 @@ def oscillator(cell: Cell) -> tuple[float, float, float] | None:
     """
     scene, law = cell.scene, cell.contact
     if isinstance(scene, Oscillator):
-        stiffness, damping, factor = scene.oscillator()
-        return float(stiffness), float(damping), float(factor)
+        return scene.oscillator()
     if not isinstance(scene, ContactScene) or not isinstance(law, ForceLaw) or scene.n_contacts != 1:
         return None
     start = scene.initial_state(np, scene.theta0()[:, None])
     response = float(scene.gap_rate(np, start.q, scene.contact_acceleration(np, start.q, np.ones((1, 1))))[0, 0])
     spring = law.spring()
     factor = scene.velocity_factor if isinstance(scene, DampedScene) else 1.0
-    return None if spring is None else (spring[0] * response, spring[1] * response, float(factor))
+    return None if spring is None else (spring[0] * response, spring[1] * response, factor)
 
 
 def spectral_radius(integrator: Integrator, dt: float, stiffness: float, damping: float, factor: float) -> float:
