@@ -279,10 +279,9 @@ def estimate(
     estimates, diagnostics = method.estimate_with_diagnostics(problem, program.theta0, w)
     values = np.asarray(estimates, dtype=np.float64)
     truth = reference.certify(problem, problem.provides, reference_samples, tolerance)
-    unbiased = method.declares_unbiased(program)
-    if not truth.is_finite:
+    if truth.is_finite:
+        summary = statistics.summarise(values, truth.known(), samples, unbiased=method.declares_unbiased(program))
+        summary = replace(summary, note="; ".join(part for part in (summary.note, truth.note) if part))
+    else:
         summary = statistics.summarise_without_reference(values, samples, truth.note)
-        return Estimates(problem, label(method), samples, values, truth.gradient, truth.method, summary, diagnostics)
-    summary = statistics.summarise(values, truth.known(), samples, unbiased=unbiased)
-    summary = replace(summary, note="; ".join(part for part in (summary.note, truth.note) if part))
     return Estimates(problem, label(method), samples, values, truth.gradient, truth.method, summary, diagnostics)

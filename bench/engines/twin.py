@@ -35,47 +35,22 @@ def read(mjcf: str) -> dict[str, Any]:
     root = ElementTree.fromstring(f"<mujoco>{mjcf}</mujoco>")
     if strange := sorted({node.tag for node in root.iter()} - KNOWN):
         raise Unsupported(f"the twin has {', '.join(strange)}, which this engine's models do not have")
-    bodies: list[dict[str, Any]] = []
-    geoms: dict[str | None, int] = {}
-    joints: dict[str | None, int] = {}
-    springs: list[tuple[float, float, float, dict[int, float]]] = []
-    option = root.find("option")
-    gravity = [0.0, 0.0, 0.0] if option is None else _numbers(option, "gravity", "0 0 -9.81")
     world = root.find("worldbody")
     assert world is not None
-    grounds = [geom for geom in world.findall("geom") if geom.get("type") == "plane"]
-    geoms |= {geom.get("name"): -1 for geom in grounds}
-
-    def add(node: ElementTree.Element, parent: int) -> None:
-        own = node.findall("joint")
-        if len(own) != 1 or own[0].get("type") not in ("slide", "hinge"):
-            raise Unsupported("the twin has a body without exactly one slide or hinge")
-        joint, inertial, geom = own[0], node.find("inertial"), node.find("geom")
-        if strange := sorted(set(joint.keys()) - JOINT):
-            raise Unsupported(f"the twin has a joint with {', '.join(strange)}, which this engine's models do not have")
-        if geom is not None and geom.get("type") != "sphere":
-            raise Unsupported(f"the twin has a {geom.get('type')}, and this engine's models have spheres and a ground")
-        index = len(bodies)
-        joints[joint.get("name")] = index
-        springs.append((float(joint.get("stiffness", "0")), float(joint.get("damping", "0")), 0.0, {index: 1.0}))
-        radius, centre = _numbers(geom, "size", "0")[0], _numbers(geom, "pos", "0 0 0")
-        mass = _numbers(geom if inertial is None else inertial, "mass", "0")[0]
-        com, inertia = centre, [0.4 * mass * radius**2] * 3
-        if inertial is not None:
-            com, inertia = _numbers(inertial, "pos", "0 0 0"), _numbers(inertial, "diaginertia", "0 0 0")
-        bodies.append({
-            "parent": parent, "joint": joint.get("type"), "axis": _numbers(joint, "axis", "0 0 1"),
-            "mass": mass, "com": com, "inertia": inertia, "radius": radius, "centre": centre,
-        })  # fmt: skip
-        if geom is not None:
-            geoms[geom.get("name")] = index
-        for inner in node.findall("body"):
-            if inner.get("pos") is not None:
-                raise Unsupported("the twin has a body with an offset")
-            add(inner, index)
-
-    for node in world.findall("body"):
-        add(node, -1)
+    nodes, parents = list(world.iter("body")), {inner: outer for outer in world.iter() for inner in outer}
+    option, grounds = root.find("option"), [geom for geom in world.findall("geom") if geom.get("type") == "plane"]
+    geoms = {geom.get("name"): -1 for geom in grounds}
+    joints: dict[str | None, int] = {}
+    bodies: list[dict[str, Any]] = []
+    springs: list[tuple[float, float, float, dict[int, float]]] = []
+    for i, node in enumerate(nodes):
+        joint, body = _body(node)
+        bodies.append({"parent": nodes.index(parents[node]) if parents[node] in nodes else -1, **body})
+        if bodies[i]["parent"] >= 0 and node.get("pos") is not None:
+            raise Unsupported("the twin has a body with an offset")
+        joints[joint.get("name")] = i
+        geoms |= {geom.get("name"): i for geom in node.findall("geom")[:1]}
+        springs.append((float(joint.get("stiffness", "0")), float(joint.get("damping", "0")), 0.0, {i: 1.0}))
     ropes: dict[str | None, dict[int, float]] = {}
     for rope in root.findall("tendon/fixed"):
         ropes[rope.get("name")] = {joints[p.get("joint")]: float(p.get("coef", "1")) for p in rope.findall("joint")}
@@ -93,8 +68,30 @@ def read(mjcf: str) -> dict[str, Any]:
         for motor in root.findall("actuator/motor")
     ]
     return {
-        "gravity": gravity, "bodies": bodies, "has_ground": bool(grounds), "contacts": contacts,
+        "gravity": [0.0, 0.0, 0.0] if option is None else _numbers(option, "gravity", "0 0 -9.81"),
+        "bodies": bodies, "has_ground": bool(grounds), "contacts": contacts,
         "forces": _forces(len(bodies), springs, motors),
+    }  # fmt: skip
+
+
+def _body(node: ElementTree.Element) -> tuple[ElementTree.Element, dict[str, Any]]:
+    """Return the joint of a body, and the body's own numbers; raises :class:`Unsupported` for other elements."""
+    joints, inertial, geom = node.findall("joint"), node.find("inertial"), node.find("geom")
+    if len(joints) != 1 or joints[0].get("type") not in ("slide", "hinge"):
+        raise Unsupported("the twin has a body without exactly one slide or hinge")
+    joint = joints[0]
+    if strange := sorted(set(joint.keys()) - JOINT):
+        raise Unsupported(f"the twin has a joint with {', '.join(strange)}, which this engine's models do not have")
+    if geom is not None and geom.get("type") != "sphere":
+        raise Unsupported(f"the twin has a {geom.get('type')}, and this engine's models have spheres and a ground")
+    radius, centre = _numbers(geom, "size", "0")[0], _numbers(geom, "pos", "0 0 0")
+    mass = _numbers(geom if inertial is None else inertial, "mass", "0")[0]
+    com, inertia = centre, [0.4 * mass * radius**2] * 3
+    if inertial is not None:
+        com, inertia = _numbers(inertial, "pos", "0 0 0"), _numbers(inertial, "diaginertia", "0 0 0")
+    return joint, {
+        "joint": joint.get("type"), "axis": _numbers(joint, "axis", "0 0 1"), "mass": mass, "com": com,
+        "inertia": inertia, "radius": radius, "centre": centre,
     }  # fmt: skip
 
 

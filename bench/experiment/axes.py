@@ -8,6 +8,8 @@ from dataclasses import dataclass, replace
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from bench.errors import UserError
 from bench.experiment.cell import VIEWS, labels
 from bench.experiment.experiment import Experiment
@@ -17,7 +19,6 @@ from bench.model import Plugin, registry
 from bench.model.parameters import build, parameters
 
 if TYPE_CHECKING:
-    import numpy as np
     import pandas as pd
 
 
@@ -48,8 +49,6 @@ class Axis:
 
 def values_of(axis: Axis, rows: pd.DataFrame) -> np.ndarray:
     """Return the numbers of an axis, one per row; NaN where it does not apply or is not a number."""
-    import numpy as np
-
     if axis.column in COUNTS:
         return np.asarray(rows[axis.column], dtype=float)
     return of_places(rows, axis.names, lambda found: next((p.number for p in found if p.number == p.number), np.nan))
@@ -77,7 +76,6 @@ def axes(sweep: Mapping[str, Any], rows: pd.DataFrame) -> list[Axis]:
     An axis is named after its parameter. If the column of that name means something else in some row, the axis has its
     full name: for example, scene and contact law may both have a ``stiffness``.
     """
-    import numpy as np
     import pandas as pd
 
     coordinates = _varying_coordinates(rows) if THETA in swept(sweep) else ()

@@ -13,7 +13,7 @@ from bench.errors import Unsupported, UserError, unknown
 from bench.experiment.cell import Cell
 from bench.experiment.experiment import Choice, Experiment
 from bench.experiment.study import study_of
-from bench.model import Decision, MechanicalScene, Plugin, Scene, compose
+from bench.model import Decision, MechanicalScene, Plugin, compose
 from bench.model.parameters import build, coerce, parameters, singular
 from bench.model.program import OWN
 
@@ -214,21 +214,14 @@ class _Expansion:
         """Return the cell of these choices at a point of the sweep."""
         used: dict[str, str] = {}
         parts: dict[str, Plugin | None] = {}
-        scene: Plugin | None = None
         for axis, choice in choices.items():
-            given: Mapping[str, Any] | None = None
-            if axis in ("contact", "integrator") and not isinstance(scene, MechanicalScene):
+            scene = parts.get("scene")
+            moving = scene if isinstance(scene, MechanicalScene) else None
+            if (axis == "integrator" and moving is None) or (axis == "contact" and not (moving and moving.n_contacts)):
                 parts[axis] = None
-                continue
-            if axis == "contact" and isinstance(scene, MechanicalScene):
-                if not scene.n_contacts:
-                    parts[axis] = None
-                    continue
-                given = scene.contact_values
-            parts[axis] = self._plugin(axis, choice, point, used, given)
-            if axis == "scene":
-                scene = parts[axis]
-                assert isinstance(scene, Scene)
+            else:
+                given = moving.contact_values if moving and axis == "contact" else {}
+                parts[axis] = self._plugin(axis, choice, point, used, given)
         experiment = self._experiment
         return Cell(
             study_of(experiment).parts(parts), **self._counts(point), study=experiment.study,
@@ -272,7 +265,7 @@ class _Expansion:
         choice: Choice,
         point: Mapping[str, Any],
         used: dict[str, str],
-        given: Mapping[str, Any] | None,
+        given: Mapping[str, Any],
     ) -> Plugin:
         plugin = choice.entry.plugin
         if plugin is None:
@@ -285,7 +278,7 @@ class _Expansion:
                     f"write sweep.{used[axis]}.{parameter} or sweep.{plugin.name}.{parameter}"
                 )
             used[axis] = plugin.name
-        values = {k: v for k, v in (given or {}).items() if k in parameters(plugin)}
+        values = {k: v for k, v in given.items() if k in parameters(plugin)}
         # later values replace earlier ones: the scene's contact values, settings, identity string, sweep
         values |= self._experiment.values.get(group, {}).get(plugin.name, {})
         values |= dict(choice.values) | {parameter: point[axis] for axis, parameter in axes}

@@ -18,6 +18,8 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
+
 from bench.experiment.experiment import Budget
 from bench.experiment.grid import THETA, applies, is_theta_axis
 from bench.model import Decision, Plugin, registry
@@ -25,7 +27,6 @@ from bench.model.identity import plain
 from bench.model.parameters import parameters, singular
 
 if TYPE_CHECKING:
-    import numpy as np
     import pandas as pd
 
 PROBLEM = ("scene", "contact", "integrator")
@@ -147,7 +148,6 @@ def places(names: Collection[str], given: Mapping[str, Any]) -> list[Place]:
 
 def of_places(rows: pd.DataFrame, names: Collection[str], value: Callable[[Sequence[Place]], Any]) -> np.ndarray:
     """Return a value per row, computed from the places that names in a sweep refer to."""
-    import numpy as np
     import pandas as pd
 
     codes, texts = pd.factorize(rows["parameters"])

@@ -16,6 +16,8 @@ from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from bench.errors import STATUSES, StorageError, UserError, printable
 from bench.experiment.columns import Columns
 from bench.experiment.grid import expand, refuse_too_many
@@ -85,7 +87,6 @@ def read_parquet(path: Path, columns: Sequence[str] | None = None) -> pd.DataFra
 
 def _shared(values: pd.Series) -> pd.Series:
     """Return a categorical column as strings or bytes, of which equal ones are one object: most columns have few distinct ones."""
-    import numpy as np
     import pandas as pd
 
     if not isinstance(values.dtype, pd.CategoricalDtype):
@@ -136,7 +137,6 @@ def valid_rows(table: pd.DataFrame, columns: Columns, files: Sequence[Path]) -> 
 
     ``files`` has the file of each row. A line on stderr names each file with the number of rows that are left out.
     """
-    import numpy as np
 
     if len(table) and not ("key" in table and table["key"].map(lambda key: isinstance(key, str) and bool(key)).all()):
         raise StorageError(f"'{files[0]}' has no keys, so its rows belong to no cell; move it away to start afresh")
@@ -157,7 +157,6 @@ def valid_rows(table: pd.DataFrame, columns: Columns, files: Sequence[Path]) -> 
 
 def _faults(table: pd.DataFrame, columns: Columns) -> dict[int, str]:
     """Return why rows are left out, by place: values of a wrong type or out of range, or a missing value."""
-    import numpy as np
 
     reasons: dict[int, str] = {}
     for name in table:
@@ -203,7 +202,6 @@ def _rule(name: str, columns: Columns) -> tuple[Callable[[Any], bool], str]:
 
 def _is_in_range(name: str, value: Any) -> Any:
     """Return whether a number, or each number of an array, is in the range of a column; missing numbers are."""
-    import numpy as np
 
     if name in COUNTS:
         with np.errstate(invalid="ignore"):
@@ -226,7 +224,6 @@ def _is_text(value: Any) -> bool:
 
 def _is_list(value: Any, has_texts: bool = True) -> bool:
     """Return whether a value is a flat list of numbers or, with ``has_texts``, of strings too; or missing."""
-    import numpy as np
 
     if isinstance(value, np.ndarray) and value.dtype.kind in "fiub":
         return value.ndim == 1

@@ -219,33 +219,36 @@ class _Kernel:
                     self.reciprocals[below.number] = f"r{below.number}"
                     self.code.add(0, f"r{below.number} = F(1.0) / u{below.number}")
 
-    def _lanes(self, everything: list[Node], forward: dict[int, Node], starts: dict[int, Node],
-               backward: _Backward | None) -> None:  # fmt: skip
-        loop, code = self.loop, self.code
-        fast = any(node.op in ("sin", "cos") for node in everything)
-        self.fast = fast
+    def _layout(self, everything: list[Node], forward: dict[int, Node], backward: _Backward | None) -> list[Node]:
+        """Lay out the array ``lane``, and return the values from before the time loop that are read in it or after it."""
+        loop = self.loop
+        self.fast = any(node.op in ("sin", "cos") for node in everything)
         steady = [n for n in everything if self.is_wide(n) and not self.is_timed(n)]
-        late = {n.number for n in steady if any(m.op in ("final", "before", "total") for m in reached([n]))}
-        early = [n for n in steady if n.number not in late]
+        early = [n for n in steady if not any(m.op in ("final", "before", "total") for m in reached([n]))]
         inside = [*forward.values(), *(backward.inside() if backward else [])]
         after = [
             *(backward.seeds.values() if backward else [loop.result]),
             *(backward.ends.values() if backward else []),
         ]
         crossing = self._crossing(early, inside, [n for n in after if n is not None])
-
-        history = {i: j for j, i in enumerate(backward.history)} if backward else {}
+        history = backward.history if backward else []
         # the carries that the backward pass reads must be first and contiguous
-        rows: list[str] = [f"c{i}" for i in (*history, *(i for i in forward if i not in history))]
+        rows = [f"c{i}" for i in (*history, *(i for i in forward if i not in history))]
         rows += [f"k{n.number}" for n in crossing]
         if backward:
             rows += [f"a{i}" for i in backward.step] + [f"t{n.number}" for n in backward.totals]
             rows += [f"o{table}" for table in backward.tables]
-        judged = self.wrt == "theta"
-        marks = ["big"] * fast + ["wild"] * judged
-        rows += marks
+        rows += ["big"] * self.fast + ["wild"] * (self.wrt == "theta")
         self.slots = {name: i * LANES for i, name in enumerate(rows)}
-        code.add(0, f"lane = np.empty({max(len(rows), 1) * LANES}, F)")
+        return crossing
+
+    def _lanes(self, everything: list[Node], forward: dict[int, Node], starts: dict[int, Node],
+               backward: _Backward | None) -> None:  # fmt: skip
+        loop, code = self.loop, self.code
+        crossing = self._layout(everything, forward, backward)
+        history = {i: j for j, i in enumerate(backward.history)} if backward else {}
+        marks = [mark for mark in ("big", "wild") if mark in self.slots]
+        code.add(0, f"lane = np.empty({max(len(self.slots), 1) * LANES}, F)")
         if history:
             code.add(0, f"kept = np.empty(horizon * {len(history) * LANES}, F)")
         code.add(0, "small = tame = True")
@@ -292,11 +295,11 @@ class _Kernel:
             self._pass(1, [result], finals | kept_values, lambda names: [f"out[at(b + l)] = {names[result.number]}"])
         else:
             self._reverse(backward, history, finals | kept_values, kept_values)
-        if fast:
+        if self.fast:
             code.add(1, f"for l in range({LANES}):")
             code.add(2, f"if lane[{self.slots['big']} + l] > F(LIMIT):")
             code.add(3, "small = False")
-        if judged:
+        if "wild" in self.slots:
             code.add(1, f"for l in range({LANES}):")
             code.add(2, f"if lane[{self.slots['wild']} + l] > F(0.0):")
             code.add(3, "tame = False")

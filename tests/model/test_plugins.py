@@ -101,6 +101,7 @@ def test_unusable_plugin_is_listed_with_its_reason(listing, name, reason):
     assert reason in described
 
 
+@pytest.mark.slow
 def test_cells_of_an_unavailable_plugin_become_rows(rows):
     assert rows.loc["absent", "status"] == "unavailable"
     assert "pip install some-dist" in rows.loc["absent", "reason"]
