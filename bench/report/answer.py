@@ -56,15 +56,11 @@ def value_of(reference: str, table: Callable[[str], pd.DataFrame]) -> str:
 
 def select(rows: pd.DataFrame, filters: str) -> pd.DataFrame:
     """Return the rows that meet all filters, ``estimator=fobg, stiffness<=3e3``; raises :class:`LookupError` if none does."""
-    place = 0
-    for condition in CONDITION.finditer(filters):
-        if condition.start() != place:
-            break
-        rows, place = rows[_holds(rows, condition)], condition.end()
-    if place != len(filters):
-        raise UserError(
-            f"'{filters[place:]}' is not a filter: write column=value, with quotes around a value with commas"
-        )
+    conditions = [*CONDITION.finditer(filters)]
+    if "".join(condition[0] for condition in conditions) != filters:
+        raise UserError(f"'{filters}' is not a filter: write column=value, with quotes around a value with commas")
+    for condition in conditions:
+        rows = rows[_holds(rows, condition)]
     if rows.empty:
         raise LookupError(f"no rows with {filters}")
     return rows

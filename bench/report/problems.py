@@ -92,13 +92,13 @@ def distinguishing_columns(
     names = [name for name in names if name in rows]
     values = constants(rows, groups, names).astype(str)
 
-    def n_distinct(columns: Sequence[str]) -> int:
-        return len(values[list(columns)].drop_duplicates()) if columns else min(1, len(values))
-
     choice: list[str] = []
+    count = min(1, len(values))
     for name in names:
-        if name in always or n_distinct([*choice, name]) > n_distinct(choice):
+        more = len(values[[*choice, name]].drop_duplicates())
+        if name in always or more > count:
             choice.append(name)
+            count = more
     return choice
 
 

@@ -30,7 +30,9 @@ def test_tables_of_stored_rows_are_the_stored_tables(name):
     tables = views_of(given, rows).tables
     for table in (one for one in tables if one.name == given.study.name):
         places = [
-            one.name for one in table.columns if one.kind == "text" or one.format == "setting" or one.name in COMMON
+            one.name
+            for one in table.columns
+            if one.kind == "text" or one.format in ("setting", "percent") or one.name in COMMON
         ]
         assert not table.frame[[*places, *filter(None, [table.split])]].astype(str).duplicated().any(), (
             "lines of equal name"

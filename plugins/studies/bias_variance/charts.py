@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +13,7 @@ import pandas as pd
 
 from bench.experiment.axes import Axis
 from bench.experiment.columns import Column, text
-from bench.experiment.views import Chart, Mark, Style
+from bench.experiment.views import Chart, Mark
 from bench.model import SURROGATE, registry
 from bench.report.colours import method_styles
 from bench.report.problems import ProblemRows, split_by_problem
@@ -63,23 +63,23 @@ def charts(
 ) -> list[Chart]:
     """Return all charts, the main one first."""
     labelled = replace(shown, rows=with_plotted_columns(shown.rows))
-    styles = method_styles(labelled.rows["series"].unique())
     subtitle = _conditions(shown)
     swept = shown.swept()
     order = sorted(swept, key=lambda a: (-swept[a], a.column != "stiffness"))
     along = [
-        _along(labelled, axis, methods, comparisons, styles, subtitle)
+        _along(labelled, axis, methods, comparisons, subtitle)
         for i, axis in enumerate(order)
         if not any(axis.column in other.moves for other in order[:i])  # axes that step together have one chart
         if axis.column != "samples" or best.empty
     ]
     if not best.empty:
-        along = [_error_and_cost(labelled, best, styles, subtitle), *along]
+        along = [_error_and_cost(labelled, best, subtitle), *along]
     elif shown.rows["backend"].nunique() > 1:
-        along += [_error_and_cost(labelled, best, styles, subtitle)]
+        along += [_error_and_cost(labelled, best, subtitle)]
     if not swept and methods["problem"].nunique() > 1:
         along = [_estimators(methods), *along]
-    return [chart for chart in along if chart is not None]
+    styles = method_styles(labelled.rows["series"].unique())
+    return [replace(chart, styles=styles) for chart in along if chart is not None]
 
 
 # ------------------------------------------------------------------------------------------------------- frames
@@ -128,7 +128,6 @@ def _along(
     axis: Axis,
     methods: pd.DataFrame,
     comparisons: pd.DataFrame,
-    styles: Mapping[str, Style],
     subtitle: str,
 ) -> Chart | None:
     """Return the chart of errors along an axis, of the main estimators on the main problems."""
@@ -136,7 +135,7 @@ def _along(
     if not problems:
         return None
     frame = pd.concat([_lines(problem) for problem in problems], ignore_index=True)
-    drawn, notes = choose_problems(problems, PANELS)
+    drawn, notes = choose_problems(problems)
     names = _main_series(frame, methods, comparisons)
     total = frame["series"].nunique()
     panels = [problem.title() for problem in drawn]
@@ -148,7 +147,7 @@ def _along(
     x = Column("x", label=axis.title, format="setting")
     return Chart(
         "bias_variance_" + re.sub(r"\W", "_", axis.column), frame, [x], [RMSE, BIAS], series="series",
-        panel="panel", styles=styles, marks=marks, failed="failed", across=len(drawn),
+        panel="panel", marks=marks, failed="failed", across=len(drawn),
         height=2.7 if len(drawn) <= 2 else 2.1,
         subtitle=", ".join(filter(None, [subtitle, *notes, *shares])),
         text="Bars are 95% intervals. A hollow marker is the upper limit of a bias that is not distinguishable from 0.",
@@ -176,8 +175,8 @@ def _main_series(frame: pd.DataFrame, methods: pd.DataFrame, comparisons: pd.Dat
     return chosen
 
 
-def choose_problems(problems: Sequence[ProblemRows], room: int) -> tuple[list[ProblemRows], list[str]]:
-    """Return the problems to print, at most ``room``, and notes on the problems omitted.
+def choose_problems(problems: Sequence[ProblemRows]) -> tuple[list[ProblemRows], list[str]]:
+    """Return the problems to print, at most :data:`PANELS`, and notes on the problems omitted.
 
     Of problems that differ only in numbers, the first stands for all.
     """
@@ -186,7 +185,7 @@ def choose_problems(problems: Sequence[ProblemRows], room: int) -> tuple[list[Pr
     first: dict[str, ProblemRows] = {}
     for problem in problems:
         first.setdefault(", ".join(str(v) for v in problem.identity.values() if isinstance(v, str)), problem)
-    chosen = list(first.values())[:room]
+    chosen = list(first.values())[:PANELS]
     if len(chosen) == len(problems):
         return chosen, []
     numbers = {k: v for p in chosen for k, v in p.identity.items() if not isinstance(v, str)}
@@ -198,7 +197,7 @@ def choose_problems(problems: Sequence[ProblemRows], room: int) -> tuple[list[Pr
 # ----------------------------------------------------------------------------------------------- error and cost
 
 
-def _error_and_cost(shown: Arranged, best: pd.DataFrame, styles: Mapping[str, Style], subtitle: str) -> Chart | None:
+def _error_and_cost(shown: Arranged, best: pd.DataFrame, subtitle: str) -> Chart | None:
     """Return error against cost: where samples were swept the front of each estimator, per problem, else a point each."""
     is_swept, parts = not best.empty, []
     timed = not is_swept or bool((best["by"] == "time").any())
@@ -219,7 +218,7 @@ def _error_and_cost(shown: Arranged, best: pd.DataFrame, styles: Mapping[str, St
     marks = [Mark(f"{target:.0%}", target, axis="y") for target in TARGETS if is_swept]
     return Chart(
         "speed_accuracy" if timed else "rollouts_accuracy", frame, [x], [RMSE], "lines" if is_line else "points", series="series",
-        panel="panel", styles=styles, marks=marks, across=3, height=2.0 if is_swept else 1.9, front=not is_swept,
+        panel="panel", marks=marks, across=3, height=2.0 if is_swept else 1.9, front=not is_swept,
         subtitle=", ".join(filter(None, [subtitle, *shares, FASTEST])),
         text="Only estimates that no other of the same estimator beats in both error and cost are drawn." if is_swept else "",
     )  # fmt: skip

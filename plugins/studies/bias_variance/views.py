@@ -40,7 +40,8 @@ RESULTS = ("variance", "cosine", "rollouts", "gradients", "reference_method")
 
 def views(experiment: Experiment, rows: pd.DataFrame) -> Views | None:
     """Return the tables and charts of the rows; None if no cell was run."""
-    shown = arrange(experiment, with_gradient_cost(rows))
+    costed = with_gradient_cost(rows)
+    shown = arrange(experiment, costed)
     methods = method_table(shown)
     if methods.empty:
         return None
@@ -49,7 +50,7 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views | None:
     return Views(
         tables(experiment, rows, shown, methods, errors, best),
         charts.charts(shown, methods, errors, best),
-        rows=charts.with_plotted_columns(with_gradient_cost(rows)),
+        rows=charts.with_plotted_columns(costed),
         columns=[
             *(replace(c, label=label) for c, label in ((charts.RMSE, "rel. RMSE"), (charts.BIAS, "rel. bias"))),
             replace(COLUMNS.by_name["time_s"], label="time"),
