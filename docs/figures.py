@@ -189,9 +189,9 @@ def dose_unreached() -> str:
     return f"{counted - int(reached)} of {counted}"
 
 
-def switch_verdicts(point: str, folder: str = "quadruped_check") -> list[str]:
+def switch_verdicts(point: str) -> list[str]:
     """Return the verdicts of all checks of a robot's gradient at a point: ``before``, ``at`` or ``after`` a switch."""
-    rows = rows_of(folder).query("scene == 'quadruped' and status == 'ok'")
+    rows = rows_of("quadruped_check").query("scene == 'quadruped' and status == 'ok'")
     pairs = (zip(row["point"], row["check_verdict"], strict=True) for _, row in rows.iterrows())
     return [verdict for every in pairs for name, verdict in every if name == point]
 

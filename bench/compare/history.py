@@ -18,7 +18,6 @@ from bench.errors import UserError, local_path
 from bench.experiment.columns import Column, text
 from bench.experiment.views import Chart, Mark, Table, Views
 from bench.experiment.words import parse_words
-from bench.report.text import counted
 from bench.run.files import make_directory, write_all
 
 CHANGED = 1.01
@@ -140,7 +139,7 @@ def views(history: History) -> Views:
     }
     chart = Chart(
         "history", frame, [text("result", label="")], [ERROR], title=QUESTION, panel="line", panel_notes=failures, height=1.2,
-        marks=[Mark("", 1.0, axis="y")], subtitle=f"{len(moved)} of {counted(len(changes), 'series', 'series')} changed",
+        marks=[Mark("", 1.0, axis="y")], subtitle=f"{len(moved)} of {len(changes)} series changed",
     )  # fmt: skip
     columns = [
         text("result"), text("experiment"), text("series"), replace(ERROR, label="error"), text("column", label="error of"),

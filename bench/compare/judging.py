@@ -76,9 +76,9 @@ def judge_cell(columns: Sequence[Column], old: Row | None, new: Row | None) -> l
         return [Change(outcome, f"status {old['status']} to {new['status']}{reason}", "no longer ok")]
     if old["status"] != "ok":
         return []
-    pairs = {column.name: _pair(rule_of(column), old, new) for column in columns}
+    pair = next((_pair(rule_of(column), old, new) for column in columns if rule_of(column).by == "paired"), None)
     # of equal estimates only the reference can differ, which makes them neither better nor worse
-    are_same = any(pair is not None and pair.is_same for pair in pairs.values())
+    are_same = pair is not None and pair.is_same
     changes = []
     for column in columns:
         rule = rule_of(column)
@@ -86,7 +86,6 @@ def judge_cell(columns: Sequence[Column], old: Row | None, new: Row | None) -> l
         if rule.by == "time" or (is_estimated and are_same):
             continue
         if rule.by == "paired":
-            pair = pairs[column.name]
             change = _paired(column, pair, old, new) if pair else None
         else:
             change = RULES[rule.by](column, old, new)
@@ -128,8 +127,6 @@ class _Pair(NamedTuple):
 
 def _pair(rule: ComparisonRule, old: Row, new: Row) -> _Pair | None:
     """Return the stored estimates of two rows of the same noise, or None if a row does not store them."""
-    if rule.by != "paired":
-        return None
     means, references = ([numbers(row, name) for row in (old, new)] for name in (rule.mean, rule.reference))
     variances = [value(row, rule.variance) for row in (old, new)]
     if not means[0].size or not means[0].shape == means[1].shape == references[0].shape:

@@ -120,7 +120,7 @@ def show(comparison: Comparison, paths: Sequence[Path]) -> None:
         console.print(f"  {remark}")
     listed = comparison.changes
     if not listed.empty:
-        terminal.print_table(console, listed.head(PRINTED), least_important=("experiment",))
+        terminal.print_table(console, listed.head(PRINTED))
     if len(listed) > PRINTED:
         console.print(f"and {len(listed) - PRINTED} more in the files")
     print("\nWritten:", *paths, sep="\n  ")

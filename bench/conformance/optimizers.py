@@ -105,6 +105,6 @@ def descends_on_a_bowl(optimizer: Optimizer) -> str:
     """Verify that the optimizer lowers the cost of a quadratic bowl."""
     state, _ = search(optimizer, steps=4 * STEPS)
     both = np.stack([np.zeros(DIM), state["theta"]], axis=1)
-    first, last = map(float, answer(both, frozenset({"value"})).value)  # type: ignore[arg-type]
+    first, last = map(float, answer(both, frozenset({"value"})).value)
     require(last < first, f"the cost goes from {first:.3g} to {last:.3g} in {4 * STEPS} steps")
     return f"{first:.3g} to {last:.1e} in {4 * STEPS} steps"

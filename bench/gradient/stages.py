@@ -148,14 +148,13 @@ class GradientStages:
 
     # ------------------------------------------------------------------------------------------------ calls
 
-    def costs(self, thetas: np.ndarray, w: np.ndarray | None = None) -> np.ndarray:
+    def costs(self, thetas: np.ndarray) -> np.ndarray:
         """Return the costs ``(B,)`` of ``thetas (d, B)``, all under the same draw of the simulator's own noise."""
-        return self.simulator.costs(thetas, self.same_noise(thetas.shape[1], w))
+        return self.simulator.costs(thetas, self.same_noise(thetas.shape[1]))
 
-    def same_noise(self, count: int, w: np.ndarray | None = None) -> np.ndarray | None:
-        """Return one draw of the simulator's own noise for each of ``count`` thetas, ``(n, count)``; None without noise."""
-        w = self.w if w is None else w
-        return None if w is None else np.repeat(w, count, axis=1)
+    def same_noise(self, count: int) -> np.ndarray | None:
+        """Return the draw of the simulator's own noise for each of ``count`` thetas, ``(n, count)``; None without noise."""
+        return None if self.w is None else np.repeat(self.w, count, axis=1)
 
     def thetas_along(self, direction: np.ndarray, t: np.ndarray) -> Iterator[np.ndarray]:
         """Yield the thetas at theta + t * direction for ``t (n,)``, a batch at a time, since memory holds few large ones."""
@@ -167,9 +166,9 @@ class GradientStages:
         """Return the costs ``(n,)`` at theta + t * direction for t of n numbers."""
         return np.concatenate([self.costs(thetas) for thetas in self.thetas_along(direction, t.ravel())])
 
-    def gradient_at(self, theta: np.ndarray, w: np.ndarray | None = None) -> np.ndarray:
+    def gradient_at(self, theta: np.ndarray) -> np.ndarray:
         """Return the simulator's gradient at ``theta (d,)``."""
-        return self.simulator.gradients(theta[:, None], self.w if w is None else w)[:, 0]
+        return self.simulator.gradients(theta[:, None], self.w)[:, 0]
 
     def _stored_costs(self, space: Subspace, z: np.ndarray) -> np.ndarray:
         keys = [column.tobytes() for column in np.ascontiguousarray(z.T)]
@@ -414,20 +413,10 @@ class GradientStages:
             outcome = self._check_once(space, replace(options, repeated=False))
         self.check, self.is_quick = space.restore(outcome), False
 
-    def _check_once(self, space: Subspace, options: Options, w: np.ndarray | None = None) -> Check:
-        def cost(z: np.ndarray) -> np.ndarray:
-            if w is None:
-                return self._stored_costs(space, z)
-            return space.costs(lambda thetas: self.costs(thetas, w), z, self.simulator.width)
-
-        def slope(z: np.ndarray) -> np.ndarray:
-            if w is None:
-                return self._stored_gradient(space, z)
-            return space.project(self.gradient_at(space.place(z[:, None])[:, 0], w))
-
+    def _check_once(self, space: Subspace, options: Options) -> Check:
         outcome = check(
-            cost,
-            slope if self.gradient is not None else None,
+            partial(self._stored_costs, space),
+            None if self.gradient is None else partial(self._stored_gradient, space),
             np.zeros(space.size),
             replace(options, scale=space.scale),
         )
@@ -499,12 +488,16 @@ class GradientStages:
         if not self.clock.can_afford(*self._cost_of(options, 0), share=SHARE):
             self.left_out.append("checks under other noise")
             return
+        own = self.w
         try:
             for _ in range(OTHER_NOISE):
-                drawn = self._random.standard_normal((self.simulator.noise, 1))
-                self.more.append(space.restore(self._check_once(space, options, drawn)))
+                self.w = self._random.standard_normal((self.simulator.noise, 1))
+                self._costs_store, self._gradients_store = Store(), Store()
+                self.more.append(space.restore(self._check_once(space, options)))
         except OutOfTime:
             self.left_out.append("checks under other noise")
+        finally:
+            self.w = own
 
 
 def _are_equal(values: np.ndarray) -> bool:

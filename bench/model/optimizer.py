@@ -17,13 +17,13 @@ OptimizerState = dict[str, Any]
 class Answer(NamedTuple):
     """Costs, gradients and residuals at the points of :meth:`Optimizer.ask`; None for fields that were not required."""
 
-    value: np.ndarray | None = None
+    value: np.ndarray = None  # type: ignore[assignment]
     """Costs, ``(B,)``."""
-    gradient: np.ndarray | None = None
+    gradient: np.ndarray = None  # type: ignore[assignment]
     """Gradient estimates, ``(d, B)``."""
-    residual: np.ndarray | None = None
+    residual: np.ndarray = None  # type: ignore[assignment]
     """Residuals of a least-squares cost, ``(m, B)``. The cost is half the sum of their squares."""
-    jacobian: np.ndarray | None = None
+    jacobian: np.ndarray = None  # type: ignore[assignment]
     """Derivatives of the residuals with respect to theta, ``(m, d, B)``."""
 
 
@@ -74,7 +74,6 @@ class Descent(Optimizer):
 
     def tell(self, state: OptimizerState, theta: np.ndarray, answer: Answer) -> OptimizerState:
         """Return the state after one :meth:`step`."""
-        assert answer.gradient is not None
         return self.step(state, answer.gradient[:, 0])
 
     @abstractmethod
@@ -97,6 +96,5 @@ class Population(Optimizer):
     @staticmethod
     def best(theta: np.ndarray, answer: Answer, count: int) -> np.ndarray:
         """Return the ``count`` points of lowest cost, ``(d, count)``; points without a finite cost rank last."""
-        assert answer.value is not None
         cost = np.where(np.isfinite(answer.value), answer.value, np.inf)
         return theta[:, np.argsort(cost, kind="stable")[:count]]

@@ -316,7 +316,11 @@ def _draw_values(
     zorder: float,
 ) -> None:
     """Draw the values of a column at ``places`` of the other axis, with intervals; limits are hollow, failures crosses at the edge."""
-    values, low, high, limit = _values(points, column, log)
+    values = points[column.name].to_numpy(float)
+    values = np.where(values > 0, values, np.nan) if log else values
+    limit, lost = (
+        points[name].to_numpy(bool) if name else np.zeros(len(points), bool) for name in (column.limit, chart.failed)
+    )
     is_flat = chart.kind == "dots"
     look: dict[str, Any] = {"color": style.colour, "zorder": zorder}
 
@@ -327,30 +331,20 @@ def _draw_values(
         plot(places, values, linestyle=style.line, linewidth=style.width)
     for these, face in ((~limit, {}), (limit, {"markerfacecolor": "white"})) if marker else ():
         plot(places[these], values[these], marker=marker, linestyle="none", **face)
-    if chart.band:
-        panel.fill_between(places, low, high, color=style.colour, alpha=0.18, linewidth=0, zorder=2)
-    else:
-        known = np.isfinite(low)
-        (panel.hlines if is_flat else panel.vlines)(places[known], low[known], high[known], linewidth=1.0, **look)
-    lost = points[chart.failed].to_numpy(bool) if chart.failed else np.zeros(len(points), dtype=bool)
+    if column.low and column.high:
+        low, high = (points[end].to_numpy(float) for end in (column.low, column.high))
+        if log:
+            low, high = np.maximum(low, 1e-300), np.where(np.isinf(high), values * UNLIMITED, high)
+        known = np.isfinite(values + low + high) & ~limit
+        if chart.band:
+            low, high = (np.where(known, end, np.nan) for end in (low, high))
+            panel.fill_between(places, low, high, color=style.colour, alpha=0.18, linewidth=0, zorder=2)
+        else:
+            (panel.hlines if is_flat else panel.vlines)(places[known], low[known], high[known], linewidth=1.0, **look)
     if lost.any():
         edge = panel.get_yaxis_transform() if is_flat else panel.get_xaxis_transform()
         plot(places[lost], np.full(lost.sum(), 0.97), marker="x", linestyle="none", transform=edge, markersize=5,
              markeredgewidth=1.4, clip_on=False)  # fmt: skip
-
-
-def _values(points: pd.DataFrame, column: Column, log: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return a column's values, the ends of their intervals and which are limits; NaN where nothing can be drawn."""
-    values = points[column.name].to_numpy(float)
-    values = np.where(values > 0, values, np.nan) if log else values
-    limit = points[column.limit].to_numpy(bool) if column.limit else np.zeros(len(points), dtype=bool)
-    if not (column.low and column.high):
-        return values, np.full(len(points), np.nan), np.full(len(points), np.nan), limit
-    low, high = (points[end].to_numpy(float) for end in (column.low, column.high))
-    if log:
-        low, high = np.maximum(low, 1e-300), np.where(np.isinf(high), values * UNLIMITED, high)
-    known = np.isfinite(values + low + high) & ~limit
-    return values, np.where(known, low, np.nan), np.where(known, high, np.nan), limit
 
 
 # ----------------------------------------------------------------------------------------------- dots and grids

@@ -5,21 +5,20 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from textwrap import wrap
 
-import numpy as np
 import pandas as pd
 from rich.cells import cell_len
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from bench.report.text import number, one_line
+from bench.report.text import one_line
 
 GAP = 2
 """Blanks between two columns."""
 LONGEST = 24
 """Longest word, in characters, that is never broken."""
-KEPT = ("status",)
-"""Columns that are left out last, after the first column."""
+KEPT = "status"
+"""The column that is left out last, after the first column."""
 MOST_NAMES = 24
 """Most names of columns that are listed as left out."""
 
@@ -39,23 +38,16 @@ def open_console() -> Console:
     return _Console(highlight=False, markup=False, emoji=False)
 
 
-def print_table(
-    console: Console,
-    table: pd.DataFrame,
-    title: str = "",
-    right: Collection[str] = (),
-    least_important: Sequence[str] = (),
-) -> None:
-    """Print a table of strings or numbers, as wide as the console at most.
+def print_table(console: Console, table: pd.DataFrame, title: str = "", right: Collection[str] = ()) -> None:
+    """Print a table of strings, as wide as the console at most.
 
-    Columns of numbers and the columns ``right`` are right-aligned and never wrapped. Where the table is too wide, columns
-    with one value are stated once above it, then text wraps, then columns are left out and named below it: first
-    ``least_important`` in their order, then from the right. The first column and the status stay longest.
+    The columns ``right`` are right-aligned and never wrapped. Where the table is too wide, columns with one value are stated once
+    above it, then text wraps, then columns are left out, from the right, and named below it. The first column and the status
+    stay longest.
     """
     names, places = list(map(str, table)), range(table.shape[1])
-    kinds = [pd.api.types.is_numeric_dtype(kind) and not pd.api.types.is_bool_dtype(kind) for kind in table.dtypes]
-    texts = [[_text(value, kinds[i]) for value in table.iloc[:, i]] for i in places]
-    whole = [kinds[i] or names[i] in right for i in places]  # columns whose cells are not wrapped
+    texts = [["\n".join(map(one_line, text.split("\n"))) for text in table.iloc[:, i].fillna("")] for i in places]
+    whole = [name in right for name in names]  # columns whose cells are not wrapped
     least = [_least(names[i], texts[i], whole[i]) for i in places]
     visible, constant, left_out = list(places), [], []
 
@@ -65,8 +57,7 @@ def print_table(
     if spare() < 0 and len(table) > 1:
         constant = [i for i in visible[1:] if len(set(texts[i])) == 1]
         visible = [i for i in visible if i not in constant]
-    ranks = {name: rank for rank, name in enumerate(least_important, -len(least_important))}
-    for i in sorted(reversed(visible[1:]), key=lambda i: (names[i] in KEPT, ranks.get(names[i], 0))):
+    for i in sorted(reversed(visible[1:]), key=lambda i: names[i] == KEPT):
         if spare() < 0:
             left_out.append(i)
             visible.remove(i)
@@ -93,11 +84,3 @@ def _least(name: str, texts: Sequence[str], is_whole: bool) -> int:
     words = [word for text in texts for word in (text.split("\n") if is_whole else text.split())]
     cells = max(map(cell_len, words), default=0)
     return max(cells if is_whole else min(cells, LONGEST), *map(cell_len, name.split()), 1)
-
-
-def _text(value: object, is_number: bool) -> str:
-    if is_number and not isinstance(value, int | np.integer):
-        return number(float(value), 3)  # type: ignore[arg-type]
-    if pd.api.types.is_scalar(value) and pd.isna(value):
-        return ""
-    return "\n".join(map(one_line, str(value).split("\n")))

@@ -93,13 +93,13 @@ def span(low: float, high: float, digits: int = 2, suffix: str = "") -> str:
     return ends[0] if ends[0] == ends[1] else f"{ends[0]} to {ends[1]}"
 
 
-def counted(count: int, one: str, many: str = "") -> str:
+def counted(count: int, one: str) -> str:
     """Return a count with its noun in the singular or plural.
 
     >>> counted(1, "cell"), counted(3, "cell")
     ('1 cell', '3 cells')
     """
-    return f"{count} {one if count == 1 else many or one + 's'}"
+    return f"{count} {one}{'s' * (count != 1)}"
 
 
 def listed(names: Iterable[str]) -> str:

@@ -176,11 +176,6 @@ def unsteady(rows: Any) -> Any:
     return rows["time_iqr_s"] > NOISY * rows["time_s"]
 
 
-def is_bias_resolved(row: Any) -> Any:
-    """Return whether the bias is distinguishable from 0: of one row, or of each row of a table."""
-    return row["bias_low"] > 0
-
-
 def rmse_interval(row: Any) -> tuple[Any, Any]:
     """Return the 95% interval of the relative RMSE of one row or each row of a table; NaN if the variance has none.
 

@@ -33,8 +33,6 @@ class GaussNewton(Optimizer):
         return np.array(state["next"][:, None])
 
     def tell(self, state: OptimizerState, theta: np.ndarray, answer: Answer) -> OptimizerState:
-        assert answer.residual is not None
-        assert answer.jacobian is not None
         residual, jacobian = answer.residual[:, 0], answer.jacobian[..., 0]
         finite = np.isfinite(residual).all() and np.isfinite(jacobian).all()
         cost = 0.5 * float(residual @ residual) if finite else np.inf

@@ -42,7 +42,6 @@ class Ppo(Population):
 
         Points without a finite cost are ignored.
         """
-        assert answer.value is not None
         is_finite = np.isfinite(answer.value)
         cost = answer.value[is_finite]
         if not cost.size or not cost.std() > 0:

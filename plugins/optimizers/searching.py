@@ -37,9 +37,7 @@ class Searching(Optimizer):
 
     def tell(self, state: OptimizerState, theta: np.ndarray, answer: Answer) -> OptimizerState:
         if state["gradient"] is None:
-            assert answer.gradient is not None
             return self.with_gradient(state, answer.gradient[:, 0])
-        assert answer.value is not None
         predicted = self.slope * self.steps(state) * float(state["gradient"] @ self.direction(state))
         accepted = np.flatnonzero(answer.value[1:] <= answer.value[0] + predicted)
         moved = theta[:, 1 + accepted[0]] if accepted.size else state["theta"]

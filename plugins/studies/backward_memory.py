@@ -175,21 +175,19 @@ def longest(good: pd.DataFrame, first: str) -> pd.DataFrame:
     """Return a line per problem and method at the problem's longest horizon, with ratios to the method ``first``."""
     import pandas as pd
 
-    keys, most = ["problem", "method"], good.groupby("problem")["horizon"].transform("max")
-    last = good[good["horizon"] == most].drop_duplicates(keys, keep="last")
-    last = pd.concat([part for _, part in last.groupby("problem", sort=False)]).set_index(keys, drop=False)
-    is_first = last["method"] == first
-    base = last[is_first].set_index("problem").reindex(last["problem"]).set_index(last.index).mask(is_first)
-    before = good[good["horizon"] < most].sort_values("horizon").drop_duplicates(keys, keep="last")
-    before = before.set_index(keys).reindex(last.index)
-    order = np.log(ratio(last, before, "memory_mb")).div(np.log(last["horizon"] / before["horizon"]), axis=0)
-    ratios = {"less": ratio(base, last, "memory_mb"), "longer": ratio(last, base, "gradient_s"), "order": order}
     kept = [f"{name}{end}" for name in ("memory_mb", "gradient_s") for end in ENDS]
-    parts = [
-        last[["problem", "method", "horizon", "is_small", *kept]],
-        *(ratios[name].add_prefix(name) for name in ratios),
-    ]
-    return pd.concat(parts, axis=1).reset_index(drop=True)
+    lines = []
+    for _, part in good.groupby("problem", sort=False):
+        is_last = part["horizon"] == part["horizon"].max()
+        last = part[is_last].drop_duplicates("method", keep="last").set_index("method", drop=False)
+        before = part[~is_last].sort_values("horizon").drop_duplicates("method", keep="last")
+        before = before.set_index("method").reindex(last.index)
+        base = last.reindex([first] * len(last)).set_index(last.index).mask(last["method"] == first)
+        order = np.log(ratio(last, before, "memory_mb")).div(np.log(last["horizon"] / before["horizon"]), axis=0)
+        ratios = {"less": ratio(base, last, "memory_mb"), "longer": ratio(last, base, "gradient_s"), "order": order}
+        shown = last[["problem", "method", "horizon", "is_small", *kept]]
+        lines.append(pd.concat([shown, *(ratios[name].add_prefix(name) for name in ratios)], axis=1))
+    return pd.concat(lines, ignore_index=True)
 
 
 def ratio(a: pd.DataFrame, b: pd.DataFrame, name: str) -> pd.DataFrame:

@@ -177,20 +177,16 @@ def _times(cell: Cell, problem: Problem, study: Engines, has_gradient: bool) -> 
         function(theta, w)
     result = {"first_s": time.perf_counter() - started}
     for name, function in functions.items():
-        before = _inside(problem)
+        if isinstance(problem, EngineProblem):
+            engine, pipe = problem.engine_s, problem.pipe_s
         started = time.perf_counter()
         _, clock = timing.timed(lambda _, function=function: function(theta, w), study.timed_calls)  # type: ignore[misc]
         elapsed = time.perf_counter() - started
         result[name] = clock.median_s
         if name == "gradient_s" and isinstance(problem, EngineProblem):
-            engine, pipe = (after - earlier for after, earlier in zip(_inside(problem), before, strict=True))
+            engine, pipe = problem.engine_s - engine, problem.pipe_s - pipe
             result |= {"pipe_share": pipe / elapsed, "pass_share": 1.0 - (engine + pipe) / elapsed}
     return result
-
-
-def _inside(problem: Problem) -> tuple[float, float]:
-    """Return the seconds so far inside the engine's process and in pipes; 0 in this process."""
-    return (problem.engine_s, problem.pipe_s) if isinstance(problem, EngineProblem) else (0.0, 0.0)
 
 
 # ------------------------------------------------------------------------------------------------- what is shown

@@ -69,10 +69,15 @@ class Solver(StudyPackage):
         w = first_batch(cell, problem.program.n_noise)
         # both batches have the same shape, so that each program is compiled once
         gradient, target = (one.grad(problem.program.theta0, np.zeros_like(w))[:, 0] for one in (problem, limit))
+        has_sign = np.abs(target) > ROUNDING * norm(target)
         return {
             **finite_status("a gradient is not finite", gradient, target), "iterations": backend.iterations,
             "gradient": gradient.tolist(), "converged_gradient": target.tolist(),
-            **gradient_seconds(problem, w, self.timed_calls), **compare(gradient, target),
+            **gradient_seconds(problem, w, self.timed_calls),
+            "gradient_norm": norm(gradient), "converged_norm": norm(target),
+            "gradient_error_rel": relative_error(gradient, target),
+            "gradient_cosine": float(gradient @ target) / (norm(gradient) * norm(target)),
+            "wrong_signs": float((np.sign(gradient) != np.sign(target))[has_sign].mean()),
         }  # fmt: skip
 
     def show(self, experiment: Experiment, rows: pd.DataFrame) -> Views:
@@ -91,14 +96,3 @@ class Solver(StudyPackage):
             text="The error is the distance from the gradient of the program with a converged solver.",
         )  # fmt: skip
         return Views([cells], [chart])
-
-
-def compare(gradient: np.ndarray, target: np.ndarray) -> dict[str, float]:
-    """Return norms, relative error, cosine, and the share of wrong signs among coordinates of ``target`` with a sign."""
-    has_sign = np.abs(target) > ROUNDING * norm(target)
-    return {
-        "gradient_norm": norm(gradient), "converged_norm": norm(target),
-        "gradient_error_rel": relative_error(gradient, target),
-        "gradient_cosine": float(gradient @ target) / (norm(gradient) * norm(target)),
-        "wrong_signs": float((np.sign(gradient) != np.sign(target))[has_sign].mean()),
-    }  # fmt: skip

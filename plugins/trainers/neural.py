@@ -25,7 +25,8 @@ class Run(NamedTuple):
     normaliser: Any
     episodes: Any
     key: Any
-    critic: Critic | None = None
+    critic: Critic = None  # type: ignore[assignment]
+    """None for a trainer without values."""
     returns: Any = None
     """Running mean and variance of returns, where the critic's unit is their deviation."""
 

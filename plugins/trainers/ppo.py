@@ -65,7 +65,6 @@ class Ppo(ActorCritic):
 
         from bench.training import normaliser, steps, windows
 
-        assert state.critic is not None
         critic = state.critic
         key, key_window, key_actor, key_critic = jax.random.split(state.key, 4)
         episodes, window = self.window_of(env, state, state.actor, key_window)

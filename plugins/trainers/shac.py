@@ -38,7 +38,6 @@ class Shac(ActorCritic):
 
         from bench.training import normaliser, steps, windows
 
-        assert state.critic is not None
         critic = state.critic
         key, key_window, key_critic = jax.random.split(state.key, 3)
 
@@ -63,7 +62,6 @@ class Shac(ActorCritic):
     def parts(self, env: Any, state: Run, actor: Any, key: Any, every: int = 0) -> tuple[Any, Any, Any]:
         from bench.training import windows
 
-        assert state.critic is not None
         _, window = self.window_of(env, state, actor, key, self.cut, every)
         value = self.values_of(state, state.critic.target, window)
         gained = windows.gains(window, value, self.discount, every)

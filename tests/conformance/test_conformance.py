@@ -68,24 +68,29 @@ def planted(*checks):
 # ------------------------------------------------------------------------------------------- planted: estimators
 
 
+class FirstOrder(SampleMean):
+    """The mean of gradients."""
+
+    needs = frozenset({"grad"})
+
+    def terms(self, problem, theta, w):
+        return problem.grad(theta, w)
+
+
 @planted("bias_is_as_declared")
-class WrongSign(SampleMean):
+class WrongSign(FirstOrder):
     """First-order, with the wrong sign."""
 
-    needs = frozenset({"grad"})
-
     def terms(self, problem, theta, w):
-        return -problem.grad(theta, w)
+        return -super().terms(problem, theta, w)
 
 
 @planted("bias_is_as_declared")
-class WrongInManyDimensions(SampleMean):
+class WrongInManyDimensions(FirstOrder):
     """First-order, off by 30% where theta has more than five numbers."""
 
-    needs = frozenset({"grad"})
-
     def terms(self, problem, theta, w):
-        return problem.grad(theta, w) * (1.3 if theta.size > 5 else 1.0)
+        return super().terms(problem, theta, w) * (1.3 if theta.size > 5 else 1.0)
 
 
 @planted("bias_is_as_declared", "bias_across_jumps_is_as_declared")
@@ -100,13 +105,8 @@ class SigmaForSigmaSquared(SampleMean):
 
 
 @planted("uses_every_sample")
-class SecondHalfIsTheFirst(SampleMean):
+class SecondHalfIsTheFirst(FirstOrder):
     """First-order, using the first half of the noise twice."""
-
-    needs = frozenset({"grad"})
-
-    def terms(self, problem, theta, w):
-        return problem.grad(theta, w)
 
     def estimate(self, problem, theta, noise):
         half = noise[:, : noise.shape[1] // 2]
@@ -114,19 +114,19 @@ class SecondHalfIsTheFirst(SampleMean):
 
 
 @planted("repeats_are_independent")
-class RepeatsAreTheFirst(SecondHalfIsTheFirst):
+class RepeatsAreTheFirst(FirstOrder):
     """First-order, with the noise of repeat 0 in every repeat."""
 
     def estimate(self, problem, theta, noise):
-        return SampleMean.estimate(self, problem, theta, np.broadcast_to(noise[:1], noise.shape))
+        return super().estimate(problem, theta, np.broadcast_to(noise[:1], noise.shape))
 
 
 @planted("variance_falls_as_one_over_n")
-class SixteenSamples(SecondHalfIsTheFirst):
+class SixteenSamples(FirstOrder):
     """First-order, from the first 16 samples whatever their number."""
 
     def estimate(self, problem, theta, noise):
-        return SampleMean.estimate(self, problem, theta, noise[:, :16])
+        return super().estimate(problem, theta, noise[:, :16])
 
 
 @planted("variance_falls_as_one_over_n")
@@ -162,40 +162,32 @@ class OpenLoopScore(SampleMean):
 
 
 @planted("shape_and_repeatability")
-class OwnNoise(SampleMean):
+class OwnNoise(FirstOrder):
     """First-order, at noise of its own."""
 
-    needs = frozenset({"grad"})
-
     def terms(self, problem, theta, w):
-        return problem.grad(theta, np.random.default_rng().standard_normal(w.shape))
+        return super().terms(problem, theta, np.random.default_rng().standard_normal(w.shape))
 
 
 @planted("needs_are_truthful")
-class UndeclaredValue(SampleMean):
+class UndeclaredValue(FirstOrder):
     """First-order, and it looks at costs without saying so."""
 
-    needs = frozenset({"grad"})
-
     def terms(self, problem, theta, w):
-        return problem.grad(theta, w) + 0 * problem.value(theta, w)
+        return super().terms(problem, theta, w) + 0 * problem.value(theta, w)
 
 
 @planted("needs_are_truthful")
-class UnusedScore(SecondHalfIsTheFirst):
+class UnusedScore(FirstOrder):
     """First-order, and it asks for scores it never uses."""
 
     needs = frozenset({"grad", "score"})
 
-    def estimate(self, problem, theta, noise):
-        return SampleMean.estimate(self, problem, theta, noise)
-
 
 @planted("bias_across_jumps_is_as_declared")
-class ClaimsJumps(UnusedScore):
+class ClaimsJumps(FirstOrder):
     """First-order, and it claims to be right across jumps."""
 
-    needs = frozenset({"grad"})
     unbiased_at_discontinuities = True
 
 
@@ -210,18 +202,17 @@ class DeniesJumps(SampleMean):
 
 
 @planted("bias_is_as_declared")
-class LastingBias(UnusedScore):
+class LastingBias(FirstOrder):
     """First-order, two and a half times as large however many samples there are."""
 
-    needs = frozenset({"grad"})
     unbiased = False
 
     def terms(self, problem, theta, w):
-        return 2.5 * problem.grad(theta, w)
+        return 2.5 * super().terms(problem, theta, w)
 
 
 @planted("something_was_checked")
-class RefusesEverything(UnusedScore):
+class RefusesEverything(FirstOrder):
     """First-order, for programs that do not exist."""
 
     def own_refusal(self, program):
@@ -629,14 +620,13 @@ def test_planted_fault_is_caught(plugin):
 
 
 @dataclass(frozen=True)
-class Mirrored(SampleMean):
+class Mirrored(FirstOrder):
     """First-order, the mean of the gradients at w and -w."""
 
     name = "mirrored"
-    needs = frozenset({"grad"})
 
     def terms(self, problem, theta, w):
-        return (problem.grad(theta, w) + problem.grad(theta, -w)) / 2
+        return (super().terms(problem, theta, w) + super().terms(problem, theta, -w)) / 2
 
 
 def test_a_sound_estimator_passes_though_a_difference_straddles_a_jump():

@@ -29,8 +29,6 @@ def test_no_line_is_wider_than_asked(seed):
     random = np.random.default_rng(seed)
     columns = {
         f"column {index} {'long ' * int(random.integers(4))}": random.choice(WORDS, 5)
-        if random.random() < 0.6
-        else 10.0 ** random.integers(-8, 8, 5)
         for index in range(random.integers(1, 14))
     }
     table = pd.DataFrame(columns)
@@ -40,8 +38,8 @@ def test_no_line_is_wider_than_asked(seed):
 
 
 def test_nothing_is_lost_where_there_is_room():
-    table = pd.DataFrame({"estimator": ["fobg", LONG], "rel. RMSE": [0.0213, 12000.0], "samples": [16, 256]})
-    assert printed(table, 80, "Errors") == [
+    table = pd.DataFrame({"estimator": ["fobg", LONG], "rel. RMSE": ["0.0213", "1.20e4"], "samples": ["16", "256"]})
+    assert printed(table, 80, "Errors", right=["rel. RMSE", "samples"]) == [
         "Errors",
         f"{'estimator':46}  rel. RMSE  samples",
         f"{'fobg':46}     0.0213       16",
@@ -49,7 +47,7 @@ def test_nothing_is_lost_where_there_is_room():
     ]
 
 
-def test_constant_columns_are_stated_once_and_the_least_important_left_out_first():
+def test_constant_columns_are_stated_once_and_others_left_out_from_the_right():
     table = pd.DataFrame(
         {"scene": ["one", "two"], "contact": ["penalty"] * 2, "bias": ["0.1 [0.0, 0.2]", "0.2 [0.1, 0.3]"]}
         | {"extra": ["a" * 30, "b" * 30], "time": ["1 ms", "2 ms"], "status": ["ok", "error"]}
@@ -59,7 +57,6 @@ def test_constant_columns_are_stated_once_and_the_least_important_left_out_first
     assert lines[0] == "contact: penalty"
     assert lines[1].split() == ["scene", "bias", "status"]
     assert "Left out to fit 40 characters: extra, time." in " ".join(lines)
-    assert "extra" in printed(table, 45, right=right, least_important=["bias", "time"])[1]
 
 
 def test_numbers_stay_whole_and_texts_break_at_blanks():
@@ -70,15 +67,10 @@ def test_numbers_stay_whole_and_texts_break_at_blanks():
     assert len(lines) == 6
 
 
-def test_missing_values_and_booleans():
-    table = pd.DataFrame({"name": ["a", None], "value": [1.5, np.nan], "flag": [True, False]})
-    assert printed(table, 80)[1:] == ["a      1.50  True", "          -  False"]
-    assert len(printed(pd.DataFrame(columns=["a", "b"]), 80)) == 1
-
-
-def test_two_columns_of_one_name_are_both_shown():
-    table = pd.DataFrame([["a", 1, 2.5]], columns=["name", "value", "value"])
-    assert printed(table, 80) == ["name  value  value", "a         1   2.50"]
+def test_a_missing_text_is_blank_and_two_columns_of_one_name_are_both_shown():
+    table = pd.DataFrame([["a", "1", None]], columns=["name", "value", "value"])
+    assert printed(table, 80, right=["value"]) == ["name  value  value", "a         1"]
+    assert len(printed(table[:0], 80)) == 1
 
 
 def test_columns_of_the_environment_count_in_a_pipe(monkeypatch):

@@ -4,9 +4,9 @@ import math
 from dataclasses import replace
 
 import numpy as np
-import pandas as pd
 import pytest
 from bench.plugins.studies.backward_memory import spread
+from helpers import unmeasured
 
 import bench
 from bench.experiment import config
@@ -79,25 +79,18 @@ SECONDS = {"jax": 1.0, "torch": 2.0, "fused": 1.5}
 def rows():
     """An experiment, and rows of three backends at three horizons: memory T, T / 10, and the root of T."""
     words = ("scenes=[mass_spring]", "backends=[jax,torch,fused]", "sweep.horizon=[100,1000,10000]")
-    given = config.load(["study=backward_memory", *words])
-    lines = []
-    for cell in cells(given):
-        steps, name = cell.scene.horizon, cell.backend.name
-        memory = {"jax": steps, "torch": steps / 10, "fused": math.sqrt(steps)}[name]
-        lines.append(given.columns.blank() | cell.columns() | {
-            "experiment": given.name, "status": "ok", "compared_with": "jax", "gradient_error_rel": 1e-13,
-            **spread("memory_mb", [memory * 0.99, memory, memory * 1.01]),
-            **spread("gradient_s", [SECONDS[name] * k for k in (0.9, 1.0, 1.1)]),
-        })  # fmt: skip
-    return given, given.columns.typed(pd.DataFrame(lines))
-
-
-def shown(given, table):
-    return given.study.show(given, table)
+    given, rows = unmeasured("study=backward_memory", *words, compared_with="jax", gradient_error_rel=1e-13)
+    steps, name = rows["horizon"], rows["backend"]
+    memory = np.select([name == "jax", name == "torch"], [steps, steps / 10], np.sqrt(steps))
+    for column, values, reach in (("memory_mb", memory, 0.01), ("gradient_s", name.map(SECONDS), 0.1)):
+        ends = {f"{column}_low": values * (1 - reach), f"{column}_high": values * (1 + reach)}
+        rows = rows.assign(**{column: values}, **ends)
+    return given, rows
 
 
 def test_orders_and_ratios_at_the_longest_horizon_are_those_of_the_memory():
-    table = shown(*rows()).tables[0].frame
+    given, table = rows()
+    table = given.study.show(given, table).tables[0].frame
     assert list(table["method"]) == ["jax", "torch", "fused"]
     assert list(table["order"]) == pytest.approx([1.0, 1.0, 0.5])
     assert list(table["less"]) == pytest.approx([math.nan, 10.0, 100.0], nan_ok=True), "jax is not compared with itself"
@@ -109,7 +102,7 @@ def test_orders_and_ratios_at_the_longest_horizon_are_those_of_the_memory():
 def test_without_a_result_of_the_first_method_no_other_takes_its_place():
     given, table = rows()
     table.loc[table["backend"] == "jax", "status"] = "error"
-    assert shown(given, table).tables[0].frame["less"].isna().all()
+    assert given.study.show(given, table).tables[0].frame["less"].isna().all()
 
 
 def test_backends_without_gradients_are_refused():

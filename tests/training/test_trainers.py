@@ -44,21 +44,19 @@ def training(name, dtype="float64", horizon=12, substeps=1, **parameters):
 )
 def test_a_run_that_is_stored_and_resumed_takes_the_same_path_bit_for_bit(name):
     run = training(name, "float32")
-    state = run.start(3)
-    whole = []
-    for _ in range(4):
-        state, log = run.update(state)
-        whole.append({key: float(value) for key, value in log.items()})
-    last = jax.device_get(state)
-    state = run.start(3)
-    again = []
-    for update in range(4):
-        if update == 2:
-            state = pickle.loads(pickle.dumps(jax.device_get(state)))
-        state, log = run.update(state)
-        again.append({key: float(value) for key, value in log.items()})
+
+    def followed(is_stored):
+        state, logs = run.start(3), []
+        for update in range(4):
+            if update == 2 and is_stored:
+                state = pickle.loads(pickle.dumps(jax.device_get(state)))
+            state, log = run.update(state)
+            logs.append({key: float(value) for key, value in log.items()})
+        return logs, jax.tree.leaves(jax.device_get(state))
+
+    (whole, last), (again, same) = followed(False), followed(True)
     assert whole == again
-    for a, b in zip(jax.tree.leaves(last), jax.tree.leaves(jax.device_get(state)), strict=True):
+    for a, b in zip(last, same, strict=True):
         assert np.array_equal(a, b)
         assert np.asarray(a).dtype != np.float64, "a float32 run computes in float32"
 

@@ -7,7 +7,6 @@ import re
 from collections.abc import Mapping, Sequence
 from html import escape
 from itertools import starmap
-from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
@@ -17,8 +16,6 @@ from matplotlib.figure import Figure
 from bench.experiment.views import Chart, Views
 from bench.report.cells import readable
 from bench.report.web import shell
-
-HERE = Path(__file__).parent
 
 
 def page(
@@ -41,8 +38,8 @@ def page(
         "made": _made(record),
         "data": in_script(json.dumps(data, separators=(",", ":"), allow_nan=False)),
     }
-    body = re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], (HERE / "page.html").read_text())
-    return shell.document(title, body, [shell.script("page.js")])
+    body = re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], shell.file_text("page.html"))
+    return shell.document(title, body, [shell.file_text("page.js")])
 
 
 def in_script(text: str) -> str:

@@ -36,13 +36,14 @@ def document(title: str, body: str, scripts: Sequence[str] = (), has_local_image
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         f'<meta http-equiv="Content-Security-Policy" content="{policy}">\n'
         '<meta name="color-scheme" content="light dark">\n'
-        f"<title>{escape(title)}</title>\n<style>\n{_file('page.css')}</style>\n</head>\n<body>\n{body}\n"
+        f"<title>{escape(title)}</title>\n<style>\n{file_text('page.css')}</style>\n</head>\n<body>\n{body}\n"
         f"{''.join(f'<script>{script}</script>{chr(10)}' for script in scripts)}</body>\n</html>\n"
     )
 
 
 @cache
-def _file(name: str) -> str:
+def file_text(name: str) -> str:
+    """Return the text of a file of this folder."""
     return (HERE / name).read_text()
 
 
@@ -72,8 +73,3 @@ def drawing(figure: Figure, name: str, description: str) -> str:
     """Return a chart in a box that scrolls sideways where the window is narrow; no two of a page have one name."""
     drawn = inline_svg(figure, name).replace("<svg", f'<svg role="img" aria-label="{escape(description)}"', 1)
     return f'<div class="scroll drawing" tabindex="0">{drawn}</div>'
-
-
-def script(name: str) -> str:
-    """Return a script of this folder."""
-    return _file(name)

@@ -23,7 +23,6 @@ from bench.report.views import (
     attempted,
     estimator_curves,
     estimator_labels,
-    is_bias_resolved,
     pareto,
     rmse_interval,
 )
@@ -89,7 +88,7 @@ def charts(
 def with_plotted_columns(rows: pd.DataFrame) -> pd.DataFrame:
     """Return rows with the columns that charts draw: errors in units of |grad J|, and labels of points and lines."""
     norm = rows["reference_norm"].where(rows["reference_norm"] > 0)
-    limit = ~is_bias_resolved(rows)
+    limit = ~(rows["bias_low"] > 0)
     low, high = rmse_interval(rows)
     values = {
         "rmse_low": pd.Series(low, rows.index),

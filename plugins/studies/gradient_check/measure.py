@@ -80,12 +80,16 @@ def measure(cell: Cell, session: Session, search: GradientCheck) -> dict[str, An
     reached = [Place("noise", 0, 1, theta, directions[0] / np.linalg.norm(directions[0]), at)] if under_noise else []
     found = examine(problem, drawn, directions, unit, search, reached)
     points = [*at_start(whole), *(_settled(problem, point, under_noise) for point in found)]
-    places = [point.place for point in points]
-    verdicts = [point.verdict for point in points]
-    best = [gradcheck.best(point.sample) for point in points]
-    errors = [float(point.sample.errors[i]) for point, i in zip(points, best, strict=True)]
-    severest = min(range(len(points)), key=lambda i: (gradcheck.VERDICTS.index(verdicts[i]), -errors[i]))
-    lost = all(verdict == "nonfinite" for verdict in verdicts)
+    checks: list[dict[str, Any]] = [
+        {
+            "point": point.place.point, "sample": point.place.noise, "direction": point.place.number,
+            "contact_switch": point.place.switch, "derivative_program": point.sample.derivative, "check_verdict": point.verdict,
+            "check_error": float(point.sample.errors[best]), "check_eps": float(gradcheck.EPS[best]),
+        }
+        for point in points for best in [gradcheck.best(point.sample)]
+    ]  # fmt: skip
+    severest = min(checks, key=lambda check: (gradcheck.VERDICTS.index(check["check_verdict"]), -check["check_error"]))
+    lost = all(point.verdict == "nonfinite" for point in points)
     parts = whole.components
     remarks = [SURROGATE] if problem.program.surrogate else []
     remarks += [] if whole.cause in PLAIN else [whole.sentence()]
@@ -103,10 +107,10 @@ def measure(cell: Cell, session: Session, search: GradientCheck) -> dict[str, An
     return {
         "status": "nonfinite" if lost else "ok",
         "reason": "no cost is finite" if lost else "; ".join([*remarks, *beyond_stability(cell)]),
-        "verdict": verdicts[severest],
+        "verdict": severest["check_verdict"],
         "untrusted": sum(not is_trusted(point.place.point, point.verdict) for point in points),
-        "best_error": errors[severest],
-        "best_eps": float(gradcheck.EPS[best[severest]]),
+        "best_error": severest["check_error"],
+        "best_eps": severest["check_eps"],
         "scale": scale_of(theta),
         "taylor_order": whole.order,
         "jump": jump.height,
@@ -116,14 +120,7 @@ def measure(cell: Cell, session: Session, search: GradientCheck) -> dict[str, An
         "device": problem.device,
         "component": [part.component for part in parts],
         **{f"component_{name}": [getattr(part, name) for part in parts] for name in PER_COMPONENT},
-        "point": [place.point for place in places],
-        "sample": [place.noise for place in places],
-        "direction": [place.number for place in places],
-        "contact_switch": [place.switch for place in places],
-        "derivative_program": [point.sample.derivative for point in points],
-        "check_verdict": verdicts,
-        "check_error": errors,
-        "check_eps": gradcheck.EPS[best].tolist(),
+        **{name: [check[name] for check in checks] for name in checks[0]},
         "eps": gradcheck.EPS.tolist(),
         "derivative_differences": np.concatenate([point.sample.differences for point in points]).tolist(),
         "relative_error": np.concatenate([point.sample.errors for point in points]).tolist(),

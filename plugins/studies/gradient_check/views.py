@@ -16,7 +16,7 @@ from bench.gradient import FAULTS, RULES, TRUSTED, UNDECIDED, VERDICTS
 from bench.report.problems import axes_of, label_columns, problem_names, problem_numbers
 from bench.report.shown import PROBLEM
 from bench.report.style import PALETTE
-from bench.report.text import counted, listed
+from bench.report.text import counted
 from bench.report.views import Arranged, arrange
 from bench.report.writer import reasons
 
@@ -132,9 +132,7 @@ def not_right(rows: pd.DataFrame) -> str:
     found = untrusted(checks(rows)).query("point != @UNDER_NOISE", local_dict={"UNDER_NOISE": UNDER_NOISE})
     if found.empty:
         return ""
-    points = found.groupby("verdict", sort=False)["point"].unique()
-    verdicts = listed(f"{verdict} ({', '.join(at)})" for verdict, at in points.items())
-    return f"{verdicts} in {found['key'].nunique()} of {counted(len(rows), 'cell')}"
+    return f"{_tally(found)} in {found['key'].nunique()} of {counted(len(rows), 'cell')}"
 
 
 def untrusted(summary: pd.DataFrame) -> pd.DataFrame:

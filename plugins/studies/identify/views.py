@@ -14,9 +14,7 @@ from bench.experiment.axes import table
 from bench.experiment.columns import Column, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Mark, Table, Views
-from bench.report.problems import problem_names
-from bench.report.shown import PROBLEM
-from bench.report.views import arrange, attempted
+from bench.report.shown import Shown
 
 STATISTICS = (
     "converged", "converged_low", "converged_high", "error", "coverage", "coverage_low", "coverage_high", "hidden",
@@ -61,17 +59,15 @@ NOTES = (
 
 def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     """Return the tables of estimates, of what records cannot show and of fits, and the charts of the fits' precision."""
-    shown = arrange(experiment, rows)
-    given = attempted(shown.rows)
+    given = Shown(experiment, rows).good
     # rows of older versions lack the columns
-    given = given[(given["status"] == "ok") & (given["parameter"].map(np.ndim) > 0)]
-    names = problem_names(shown, PROBLEM, rows=given)
+    given = given[given["parameter"].map(np.ndim) > 0]
     doubts = {
         "unfinished": [values[0] < 1.0 for values in given["optimum"]], "not explained": given["contradictions"] != "",
         "untested": given["explained"].isna(), "time step": given["step_shift_bound"] > MAX_STEP_SHIFT,
     }  # fmt: skip
     given = given.assign(
-        problem=names + (", " + given["optimizer"] if given["optimizer"].nunique() > 1 else ""),
+        problem=given["problem"] + (", " + given["optimizer"] if given["optimizer"].nunique() > 1 else ""),
         doubt=[", ".join(name for name, holds in zip(doubts, row, strict=True) if holds) for row in zip(*doubts.values(), strict=True)],
     )  # fmt: skip
     kinds: dict[str, Any] = {"list": "number"} | dict.fromkeys(TEXTS, "text")

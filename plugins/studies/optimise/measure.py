@@ -59,9 +59,8 @@ def advance(
     """Return the optimizer's state after one more iteration: the points it asks for, and what it requires there."""
     points = optimizer.ask(state, normal)
     required = optimizer.required_fields(state)
-    value = costs(points) if "value" in required else None
-    gradient = gradients(points) if "gradient" in required else None
-    return optimizer.tell(state, points, Answer(value, gradient))
+    known = {"value": costs, "gradient": gradients}
+    return optimizer.tell(state, points, Answer(**{name: known[name](points) for name in known if name in required}))
 
 
 def measure(cell: Cell, session: Session, settings: Optimise) -> dict[str, Any]:
