@@ -172,9 +172,17 @@ def number_problems(rows: pd.DataFrame, parts: Collection[str] = PROBLEM, withou
     import pandas as pd
 
     codes, texts = pd.factorize(rows["parameters"])
+    numbers = _numbers(tuple(texts), tuple(parts), tuple(without), registry.folders())
+    return pd.Series(numbers[codes], index=rows.index)
+
+
+@lru_cache(maxsize=16)
+def _numbers(
+    texts: tuple[str, ...], parts: tuple[str, ...], without: tuple[str, ...], folders: tuple[Path, ...]
+) -> np.ndarray:
     problems: dict[frozenset[Any], int] = {}
     numbers = [problems.setdefault(_problem(parsed(text), parts, without), len(problems)) for text in texts]
-    return pd.Series(pd.array(numbers, dtype="int64")[codes], index=rows.index)
+    return np.array(numbers, dtype=np.int64)
 
 
 def _problem(given: Mapping[str, Any], parts: Collection[str], without: Collection[str]) -> frozenset[Any]:
