@@ -127,3 +127,63 @@ def test_draws_that_do_not_move_the_cost_show_no_gradient_under_noise():
     )
     assert (report.status, report.derivative, report.use) == (3, "not shown", "not shown")
     assert "no draw moves the cost" in report.noise_answer
+
+
+def spring(x, steps=50):
+    q, v = 1.0 + 0.0 * x[0], 0.0 * x[0]
+    for _ in range(steps):
+        v = v - 0.02 * (x[0] * q + x[1] * v)
+        q = q + 0.02 * v
+    return q * q
+
+
+def spring_slope(x, steps=50):
+    return np.array([spring(row, steps).imag for row in np.asarray(x) + 1e-30j * np.eye(2)]) / 1e-30
+
+
+@pytest.mark.parametrize(
+    ("is_wrong", "cause"), [(lambda n: n > 100, "overwritten"), (lambda n: n < 50, "missing_term")]
+)
+def test_a_gradient_that_is_wrong_at_one_of_the_horizons_is_wrong(is_wrong, cause):
+    def grad(x, steps=50):
+        return spring_slope(x, steps) * (1.01 if is_wrong(steps) else 1.0)
+
+    said = bench.examine(spring, [0.7, 1.2], grad=grad, horizons=(1, 5, 50, 200), calls=5000)
+    assert (said.status, said.cause) == (1, cause)
+    assert "steps off by 1" in str(said)
+
+
+def test_an_error_of_a_third_of_a_percent_shows_in_single_precision():
+    def cost(x):
+        return np.float32(x[1]) * np.float32(x[0]) ** 2
+
+    for factor, status in ((1.0, 0), (1.003, 1)):
+        said = bench.examine(cost, [1.5, 0.7], grad=lambda x, f=factor: [2 * x[0] * x[1] * f, x[0] ** 2], calls=5000)
+        assert said.status == status, said
+        assert "errors below about 0.1%" in str(said)
+
+
+def test_a_steep_smooth_cost_has_no_jumps():
+    def cost(x):
+        return np.tanh((x[0] - 1.003) / 1e-4) + 0.1 * x[0]
+
+    def grad(x):
+        return [(1.0 - np.tanh((x[0] - 1.003) / 1e-4) ** 2) / 1e-4 + 0.1]
+
+    said = bench.examine(cost, [1.0], grad=grad, sigma=0.01, calls=6000)
+    assert said.noise_cause in ("", "spread"), said
+    assert said.derivative == "right"
+
+
+@pytest.mark.parametrize("slope", [2e-8, 2e-7])
+def test_a_slope_below_the_rounding_of_the_cost_is_not_shown_to_be_zero(slope):
+    said = bench.examine(lambda x: 1e6 + slope * x[0], [1.0], grad=lambda x: [0.0], calls=4000)
+    assert (said.status, said.cause) == (3, "unresolved"), said
+
+
+def test_stairs_say_nothing_about_noise_that_was_not_measured():
+    table = np.sin(np.linspace(0.0, 2.0, 41))
+    said = bench.examine(
+        lambda x: table[round(float(x[0]) / 0.05)], [0.777], grad=lambda x: [np.cos(x[0])], sigma=0.1, calls=700
+    )
+    assert said.use == "not measured", said
