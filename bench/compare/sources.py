@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import subprocess
+import sys
 import tarfile
 import tempfile
 from dataclasses import dataclass
@@ -90,18 +91,20 @@ def _read_all(directory: Path, name: str) -> dict[str, Results]:
     folders = sorted(path.parent for path in directory.rglob("rows.parquet"))
     own = [folder for folder in folders if STANDARD not in folder.relative_to(directory).parts]
     results: dict[str, Results] = {}
-    for folder in own or folders:
-        label, read = _read(folder)
+    for label, read in filter(None, map(_read, own or folders)):
         if label in results:
             raise UserError(f"'{name}' has results of '{label}' in more than one directory: name one of them")
         results[label] = read
     if not results:
-        raise UserError(f"'{name}' has no results: no rows.parquet")
+        raise UserError(f"'{name}' has no results{'' if folders else ': no rows.parquet'}")
     return results
 
 
-def _read(folder: Path) -> tuple[str, Results]:
-    """Return the name and the results of the experiment in a folder, with the column types of its study."""
+def _read(folder: Path) -> tuple[str, Results] | None:
+    """Return the name and the results of the experiment in a folder, with the column types of its study.
+
+    None, and a line on stderr, if the study is not installed.
+    """
     path = folder / "rows.parquet"
     try:
         rows = read_parquet(path)
@@ -114,6 +117,12 @@ def _read(folder: Path) -> tuple[str, Results]:
     studies = list(rows["study"].unique())
     if len(studies) != 1:
         raise UserError(f"the rows in '{path}' are of {len(studies)} studies ({', '.join(studies)})")
+    if studies[0] not in registry.entries()["studies"]:
+        print(
+            f"bench: '{path}' is left out: study '{studies[0]}' is not installed; plugins=DIR adds yours",
+            file=sys.stderr,
+        )
+        return None
     columns = columns_of(studies[0])
     rows = valid_rows(rows, columns, [path] * len(rows))[0].reset_index(drop=True)
     label = str(rows["experiment"].iloc[0]) if "experiment" in rows and len(rows) else folder.name

@@ -374,3 +374,17 @@ def test_the_workflow_of_the_docs_runs_the_gate_as_it_is():
     assert scripts["Gate"].strip().endswith("exit $status")
     for script, folder in zip(("Before", "After"), words, strict=False):
         assert f"results_dir={folder}" in scripts[script]
+
+
+def test_results_of_a_study_that_is_not_installed_are_left_out(tmp_path, capsys):
+    """``compare HEAD~1 HEAD`` ended with 2, since a folder had results of somebody's own study."""
+    for side in ("before", "after"):
+        save(given(), tmp_path / side)
+        (tmp_path / side / "alien").mkdir()
+        given().assign(study="alien", experiment="alien").to_parquet(tmp_path / side / "alien" / "rows.parquet")
+    sides = [str(tmp_path / side) for side in ("before", "after")]
+    for verb in ("compare", "history"):
+        assert cli.main([verb, *sides, f"out={tmp_path / 'out'}"]) == 0
+        assert capsys.readouterr().err.count("study 'alien' is not installed") == 2
+    assert cli.main(["compare", *(f"{side}/alien" for side in sides)]) == 2
+    assert "has no results" in capsys.readouterr().err
