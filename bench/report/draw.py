@@ -129,7 +129,7 @@ def _frame(figure: Figure, layout: ConstrainedLayoutEngine, chart: Chart, legend
     """Write title and subtitle above panels of the height ``body``, and the legend below them."""
     width = figure.get_figwidth()
     title = _wrapped(chart.title.rstrip("."), 0.97 * width / BOLD)
-    subtitle = _wrapped(", ".join(filter(None, [chart.subtitle.rstrip("."), _grey(chart)])), 0.97 * width)
+    subtitle = _wrapped(", ".join(filter(None, [chart.subtitle.rstrip("."), *_signs(chart)])), 0.97 * width)
     first = LINE * 1.1 * (title.count("\n") + 1)
     head = 0.08 + first + (LINE * (subtitle.count("\n") + 1) if subtitle else 0.0)
     texts = [str(handle.get_label()) for handle in legend]
@@ -159,12 +159,14 @@ def _text_width(text: str) -> float:
     return max(map(width_in_inches, text.split("\n")))
 
 
-def _grey(chart: Chart) -> str:
-    """Return what the grey area of a chart means; nothing where no panel has one."""
+def _signs(chart: Chart) -> list[str]:
+    """Return what a grey area and hollow markers mean, where the chart has them."""
     column = {"lines": chart.y[0], "points": chart.y[0], "dots": chart.x[0]}.get(chart.kind)
-    if not column or not column.above_one or not _is_log(column, chart.frame[column.name]):
-        return ""
-    return f"grey: {column.above_one}" if _log_range(column, chart.frame)[1] > 1 else ""
+    if not column:
+        return []
+    is_grey = column.above_one and _is_log(column, chart.frame[column.name]) and _log_range(column, chart.frame)[1] > 1
+    is_hollow = column.limit and chart.frame[column.limit].eq(True).any()
+    return [f"grey: {column.above_one}"] * bool(is_grey) + ["hollow: an upper limit"] * bool(is_hollow)
 
 
 def _legend(chart: Chart, styles: dict[str, Style], width: float) -> list[Any]:

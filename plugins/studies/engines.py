@@ -46,12 +46,12 @@ DETAILS = (
 )  # fmt: skip
 """Further columns of the page."""
 LEVELS = {
-    "right": Style(PALETTE[3], meaning="derivative of its program, and near the model's gradient"),
-    "own": Style(PALETTE[0], meaning="derivative of its program, which is not near the model"),
-    "noisy": Style(PALETTE[5], meaning="derivative of its program, but averages are no better than 0"),
-    "open": Style(PALETTE[4], meaning="derivative of its program; whether averages are better than 0 is open"),
-    "wrong": Style(PALETTE[2], meaning="not the derivative of its program, or not finite"),
-    "none": Style("0.85", meaning="no gradient, or the engine cannot run the scene"),
+    "right": Style(PALETTE[3], meaning="+: derivative of its program, and near the model's gradient"),
+    "own": Style(PALETTE[0], meaning="o: derivative of its program, which is not near the model"),
+    "noisy": Style(PALETTE[5], meaning="~: derivative of its program, but averages are no better than 0"),
+    "open": Style(PALETTE[4], meaning="?: derivative of its program; whether averages are better than 0 is open"),
+    "wrong": Style(PALETTE[2], meaning="x: not the derivative of its program, or not finite"),
+    "none": Style("0.85", meaning="-: no gradient, or the engine cannot run the scene"),
 }
 NOTES = (
     "Program error: distance of the gradient from differences of the engine's own cost. Model error: distance from rigid "
@@ -232,12 +232,12 @@ def with_limits(rows: pd.DataFrame) -> pd.DataFrame:
 def _chart(measured: pd.DataFrame) -> Chart:
     """Return the grid of engines and scenes, coloured by level, with the model error of each gradient."""
     rigid = (measured["contact"] == "impulse") & (measured["contact"].nunique() > 1)
-    letters = measured["level"].map(dict(zip(LEVELS, "+o~?x-", strict=True)))
+    letters = measured["level"].map({name: style.meaning[0] for name, style in LEVELS.items()})
     errors = (" " + measured["model_error_rel"].map(number)).mask(measured["level"] == "none", "")
     frame = measured.assign(place=measured["scene"] + rigid.map({True: ", rigid", False: ""}), cell=letters + errors)
     return Chart(
         "engines", frame, [text("place", label="")], [text("method", label="")], "grid",
         level="level", cell="cell", styles=LEVELS, height=0.3, across=1,
-        subtitle="Number: model error, the relative distance from the model's gradient.",
-        text="A cell per engine and scene (rigid: with the law impulse). An empty cell: the engine does not run it.",
+        subtitle="Number: model error, the relative distance from the model's gradient. Blank: not supported",
+        text="A cell per engine and scene (rigid: with the law impulse).",
     )  # fmt: skip
