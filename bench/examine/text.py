@@ -11,9 +11,9 @@ import numpy as np
 
 from bench.examine.findings import RIGHT, SEEN, UNSHOWN, WRONG, Findings
 from bench.examine.smoothing import PAIRS
-from bench.gradient import EPS, FAULTS, Check, Part
+from bench.gradient import FAULTS, Check, Part
 from bench.gradient.rules import RULES, SUSPICIOUS, UNEQUAL
-from bench.gradient.stages import SINGLE_EPS, is_rough
+from bench.gradient.stages import is_rough, step_sizes
 from bench.gradient.subspace import GROUPS, MOST
 from bench.report.text import counted, duration, number, span
 
@@ -153,8 +153,10 @@ def derivative_facts(report: Findings) -> list[str]:
     if cause in own:
         return own[cause]
     if not report.wrong_checks:
-        worst = max(explained.growth, key=lambda one: one.error, default=None)
-        return [f"after {worst.steps} steps off by {number(100 * worst.error)}%" if worst else n_checked(report)]
+        if report.derivative != WRONG:
+            return [n_checked(report)]
+        worst = max(explained.growth, key=lambda one: one.error)
+        return [f"after {worst.steps} steps off by {number(100 * worst.error)}%"]
     facts = check_facts(report, report.wrong_checks[0])
     if cause == "undecided":
         facts.append("so little that adaptive steps may explain it")
@@ -402,7 +404,7 @@ def _checked(report: Findings) -> str:
             "group": len(whole) - n_random, "random direction": n_random,
             "line": len(report.lines), "direction": len(report.check.draws),
         }  # fmt: skip
-        facts.append(f"{n_used} of {(EPS if report.unit < 1e-10 else SINGLE_EPS).size} step sizes")
+        facts.append(f"{n_used} of {max(n_used, step_sizes(report.unit).size)} step sizes")
         facts += [counted(count, what) for what, count in counts.items() if count]
         facts[-1] += " at other thetas" * bool(report.check.draws)
     return ", ".join([*facts, *(f"sigma {sigma_text(report, one.sigma)}" for one in report.smoothed)])

@@ -346,7 +346,8 @@ class GradientStages:
     def _plan(self, size: int, is_right: bool) -> dict[str, Options]:
         """Return the stages after the quick one, from the cheapest to the full check."""
         unit = self.simulator.unit
-        eps, few = (EPS, EPS[::2]) if unit < 1e-10 else (SINGLE_EPS, SINGLE_EPS)
+        eps = step_sizes(unit)
+        few = eps[::2] if eps is EPS else eps
         base = Options(
             components=size, directions=0, draws=0, eps=few, unit=unit, scanned=0, repeated=False, seed=self.seed,
         )  # fmt: skip
@@ -488,7 +489,7 @@ class GradientStages:
         if not self.clock.can_afford(*self._cost_of(options, 0), share=SHARE):
             self.left_out.append("checks under other noise")
             return
-        own = self.w
+        own = self.w, self._costs_store, self._gradients_store
         try:
             for _ in range(OTHER_NOISE):
                 self.w = self._random.standard_normal((self.simulator.noise, 1))
@@ -497,7 +498,12 @@ class GradientStages:
         except OutOfTime:
             self.left_out.append("checks under other noise")
         finally:
-            self.w = own
+            self.w, self._costs_store, self._gradients_store = own
+
+
+def step_sizes(unit: float) -> np.ndarray:
+    """Return the step sizes of a check in arithmetic of a unit roundoff, in units of the natural scale."""
+    return EPS if unit < 1e-10 else SINGLE_EPS
 
 
 def _are_equal(values: np.ndarray) -> bool:

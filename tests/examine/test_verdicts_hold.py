@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import bench
+from bench.examine.text import derivative_facts
 from bench.gradient.rules import RULES
 
 START = np.array([0.5, -1.0, 8.0])
@@ -187,3 +188,10 @@ def test_stairs_say_nothing_about_noise_that_was_not_measured():
         lambda x: table[round(float(x[0]) / 0.05)], [0.777], grad=lambda x: [np.cos(x[0])], sigma=0.1, calls=700
     )
     assert said.use == "not measured", said
+
+
+def test_a_check_that_is_not_finished_names_no_error_after_other_steps():
+    said = bench.examine(spring, [0.7, 1.2], grad=spring_slope, horizons=(1, 5), calls=3000)
+    unfinished = dataclasses.replace(said, is_complete=False)
+    assert unfinished.derivative_cause == "undecided"
+    assert derivative_facts(unfinished) == ["2 of 2 components"]
