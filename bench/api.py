@@ -17,7 +17,8 @@ from bench.errors import Unsupported, UserError, failure
 from bench.experiment.by_name import compile_problem, make
 from bench.model import Backend, Decision, Estimator, Integrator, Problem, Scene, registry
 from bench.model.identity import label, text_of
-from bench.model.parameters import parameters, singular
+from bench.model.parameters import build, parameters, singular
+from bench.model.parameters import values as parameter_values
 from bench.notebook import Estimates
 
 if TYPE_CHECKING:
@@ -60,6 +61,8 @@ class Settings(TypedDict, total=False):
     samples: int
     repeats: int
     seed: int
+    draws: str | None
+    mirrored: bool | None
     reference: Mapping[str, float]
     workers: int | None
     timeout: float | str | None
@@ -258,13 +261,16 @@ def estimate(
     seed: int = 0,
     reference_samples: int = 1 << 18,
     tolerance: float = 0.005,
+    draws: str | None = None,
+    mirrored: bool | None = None,
 ) -> Estimates:
     """Compute R = ``repeats`` independent estimates of grad J_sigma at ``theta0``, with their bias and variance.
 
     ``problem`` is compiled by :func:`problem`, or the name of a scene: ``estimate("pushing", "fobg")``. Each estimate
     uses N = ``samples`` samples. The noise is the same as in the cells of an experiment with this seed. The reference
     gradient is the closed form, quadrature or long sampling of the same problem, with up to ``reference_samples``
-    samples, until its relative standard error is at most ``tolerance``. Raises :class:`bench.Unsupported` if the
+    samples, until its relative standard error is at most ``tolerance``. ``draws`` (``iid``, ``orthogonal``, ``sobol``) and
+    ``mirrored`` choose how the samples of an estimate are drawn, as the parameters of the estimator do. Raises :class:`bench.Unsupported` if the
     estimator cannot be used on the problem.
     """
     from bench.measure import noise, reference, statistics
@@ -272,10 +278,12 @@ def estimate(
     if isinstance(problem, str):
         problem = _problem(problem)
     method: Estimator = make("estimators", estimator)
+    given = {name: value for name, value in (("draws", draws), ("mirrored", mirrored)) if value is not None}
+    method = build(type(method), parameter_values(method) | given)
     program = problem.program
     if reason := method.refusal(program, problem.provides, "this backend"):
         raise Unsupported(reason)
-    w = noise.shared(seed, program.scene.name, repeats, samples, program.n_noise)
+    w = noise.shared(seed, program.scene.name, repeats, samples, program.n_noise, method.design(program, samples))
     estimates, diagnostics = method.estimate_with_diagnostics(problem, program.theta0, w)
     values = np.asarray(estimates, dtype=np.float64)
     truth = reference.certify(problem, problem.provides, reference_samples, tolerance)

@@ -6,7 +6,7 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Iterable
-from functools import cache, partialmethod
+from functools import cache, lru_cache, partialmethod
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,7 +23,18 @@ from bench.conformance.subjects import (
     standard_errors,
     stepping,
 )
-from bench.model import Estimator, FunctionScene, MechanicalScene, Problem, Program, SampleMean, compose
+from bench.measure import noise
+from bench.model import (
+    Design,
+    Estimator,
+    FunctionScene,
+    MechanicalScene,
+    Problem,
+    Program,
+    SampleMean,
+    Unsupported,
+    compose,
+)
 from bench.model.estimator import require_shape
 from bench.model.identity import identity
 from bench.model.parameters import parameters
@@ -32,6 +43,14 @@ SIGMAS = (0.1, 0.5)
 """Noise levels of the oracles. 1 is excluded, because sigma and its square would be equal."""
 DIMENSION = 20
 """Length of theta of the oracles at the last of :data:`SIGMAS` whose scene has a parameter ``dimension``."""
+DESIGNS: tuple[tuple[int, dict[str, Any]], ...] = (
+    (8, {"mirrored": True}),
+    (16, {"draws": "orthogonal"}),
+    (16, {"draws": "sobol"}),
+)
+"""Numbers of samples and designs of the noise that are checked."""
+SETS, DESIGNED = 2048, 4
+"""Numbers of estimates and of oracles of such a check."""
 APART = 1e-5
 """Distance at which a gradient is compared: ten steps of the plain backend's differences."""
 
@@ -313,6 +332,46 @@ def bias_under_action_feedback(estimator: Estimator) -> str:
     return _verify_bias(estimator, usable(estimator, [feedback_oracle()]))
 
 
+@verifies(Estimator)
+def bias_under_every_design(estimator: Estimator) -> str:
+    """Verify that an unbiased estimator is unbiased for each design of its noise; a design that it refuses is skipped.
+
+    Each single draw of a design is standard normal. An estimator that treats the samples of a unit as independent, for
+    example in a baseline, is biased.
+    """
+    skip_unless(estimator.unbiased and estimator.target == "smoothed", "declares a bias, or another target")
+    candidates = usable(estimator, [o for o in oracles() if o.program.continuous])[:DESIGNED]
+    details = []
+    for count, given in DESIGNS:
+        method = dataclasses.replace(estimator, **given)
+        worst = 0.0
+        for oracle in candidates:
+            try:
+                design = method.design(oracle.program, count)
+            except Unsupported as refusal:
+                details.append(str(refusal))
+                break
+            z, bias = _beyond_errors(method, oracle, _designed_noise(count, oracle.program.n_noise, design))
+            size = np.linalg.norm(bias)
+            require(
+                float(z.max()) <= LIMIT,
+                f"is biased with {identity(method.name, given)}: by {size:.3g}, {z.max():.1f} standard errors, on {oracle.label}: "
+                "a variance, quantile or baseline must use whole units of design(), or needs_independent_samples = True",
+            )
+            worst = max(worst, float(z.max()))
+        else:
+            details.append(f"at most {worst:.2g} standard errors with {identity('', given)}")
+    return "; ".join(details)
+
+
+@lru_cache(maxsize=32)
+def _designed_noise(count: int, width: int, design: Design) -> np.ndarray:
+    """Return read-only noise of a design, ``(SETS, count, width)``."""
+    drawn = np.stack([noise.samples_of(rng("design", i), count, width, design) for i in range(SETS)])
+    drawn.setflags(write=False)
+    return drawn
+
+
 def _verify_bias(estimator: Estimator, candidates: list[Oracle]) -> str:
     """Verify that the bias is 0 if the estimator is unbiased, else smaller than the bias of the zero estimate."""
     count, repeats = (4, 8192) if estimator.unbiased else (256, 512)
@@ -334,10 +393,14 @@ def _verify_bias(estimator: Estimator, candidates: list[Oracle]) -> str:
 
 def _standard_errors(estimator: Estimator, oracle: Oracle, count: int, repeats: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the bias beyond rounding in standard errors, and the bias itself, both ``(d,)``."""
-    values = estimates(estimator, oracle, draw_noise(oracle, repeats, count, oracle.label, count))
-    truth = target(estimator, oracle)
+    return _beyond_errors(estimator, oracle, draw_noise(oracle, repeats, count, oracle.label, count))
+
+
+def _beyond_errors(estimator: Estimator, oracle: Oracle, drawn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the bias of estimates from ``drawn (R, N, n_w)`` as :func:`_standard_errors` does."""
+    values, truth = estimates(estimator, oracle, drawn), target(estimator, oracle)
     bias = values.mean(axis=0) - truth
-    error = np.sqrt(values.var(axis=0, ddof=1) / repeats + oracle.error**2)
+    error = np.sqrt(values.var(axis=0, ddof=1) / len(drawn) + oracle.error**2)
     return standard_errors(bias, error, DIFFERENCED * (1 + np.abs(truth))), bias
 
 

@@ -17,9 +17,11 @@ from bench.experiment.keys import COMPARED, SHARED, fingerprint, hash_of_text, h
 from bench.experiment.reference_backends import capable_backends
 from bench.measure import reference
 from bench.model import (
+    IID,
     Backend,
     ContactLaw,
     Decision,
+    Design,
     Estimator,
     Integrator,
     MechanicalScene,
@@ -216,6 +218,8 @@ class Cell:
             "stiffness": self._view("stiffness", law, self.scene),
             "sigma": self.scene.sigma,
             "smoothing": smoothing,
+            "draws": getattr(self.parts.get("estimator"), "draws", "iid"),
+            "mirrored": float(getattr(self.parts.get("estimator"), "mirrored", False)),
             "samples": self.samples,
             "repeats": self.repeats,
             "dim": self._dim(),
@@ -248,6 +252,11 @@ class Cell:
         study = cast(Any, self.study)  # a Study, whose module imports this one
         return compose(self.scene, self.contact, self.integrator, study.decision(self.decision))
 
+    def design(self, program: Program) -> Design:
+        """Return how the noise of an estimate is drawn; independently in a study without estimators."""
+        estimator = self.parts.get("estimator")
+        return estimator.design(program, self.samples) if isinstance(estimator, Estimator) else IID
+
     def refusal(self) -> tuple[str, str] | None:
         """Return status and reason if this cell cannot run, or None; an error raised by a plugin is a reason."""
         try:
@@ -276,4 +285,5 @@ class Cell:
             return "unsupported", reason
         if isinstance(estimator, Estimator) and (reason := estimator.refusal(program, backend.provides, backend.name)):
             return "unsupported", reason
+        self.design(program)  # raises Unsupported where it cannot be drawn
         return None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -58,6 +58,8 @@ class Column:
     """Whether the CSV has this column; ``rows.parquet`` always does."""
     measured: bool = False
     """Whether the value depends on the machine and its load; it is missing if cells are not timed, unless ``untimed``."""
+    missing: Any = field(default=None, kw_only=True)
+    """The value of rows that were stored before the column existed; None for NaN, an empty string or an empty list."""
     label: str = field(default="", kw_only=True)
     """The name in headings and on axes; by default the column's name with spaces."""
     untimed: bool = field(default=False, kw_only=True)
@@ -168,7 +170,12 @@ LAST = (
     text("versions", "versions of the libraries that produced the numbers"),
     text("key", "hash of all parameters and code that decide the numbers"),
 )
+DRAWS = (
+    text("draws", "points of the noise of an estimate: iid, orthogonal or sobol", missing="iid"),
+    Column("mirrored", "1 if each draw w of the noise is followed by -w", format="setting", missing=0.0),
+)
 HIDDEN = (
+    *(replace(column, table=False) for column in DRAWS),
     text("study", "study that measured the row", table=False),
     text(
         "parameters", "JSON with every parameter of every plugin, defaults included: the cell's identity", table=False
@@ -255,16 +262,19 @@ class Columns:
         """Return the table with its columns in order and of their types, followed by unknown columns unchanged."""
         import pandas as pd
 
-        known = {column.name: _typed(table.get(column.name), column.kind, len(table)) for column in self.all}
+        known = {column.name: _typed(table.get(column.name), column, len(table)) for column in self.all}
         unknown = {name: table[name] for name in table if name not in self.by_name}
         return pd.DataFrame({**known, **unknown}, index=table.index)
 
 
-def _typed(values: pd.Series | None, kind: Kind, count: int) -> Any:
+def _typed(values: pd.Series | None, column: Column, count: int) -> Any:
     """Return a column converted to the type of its kind; ``count`` missing values if ``values`` is None."""
     import pandas as pd
 
+    kind = column.kind
     if values is None:
+        if column.missing is not None:
+            return pd.array([column.missing] * count, dtype="str" if kind == "text" else "float64")
         return pd.array([""] * count, dtype="str") if kind == "text" else np.full(count, math.nan)
     if kind == "number":
         return values if values.dtype == np.float64 else pd.to_numeric(values, errors="coerce").astype("float64")

@@ -264,6 +264,8 @@ def from_settings(config: Mapping[str, Any]) -> Experiment:
             "reference=null: the study decides whether there is one; reference.samples=... limits its samples"
         )
     timing, sweep = config["timing"], _mapping(config, "sweep")
+    # as axes, these settings reach every estimator
+    sweep |= {name: [config[name]] for name in ("draws", "mirrored") if config[name] is not None}
     refuse_too_many(sweep)
     return Experiment(
         name=_name(config),

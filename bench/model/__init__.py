@@ -17,6 +17,7 @@ from bench.model.backend import Backend
 from bench.model.blocks import cores
 from bench.model.callables import CallableScene
 from bench.model.contact import Contact, ContactLaw, ForceLaw, ImpulseLaw
+from bench.model.design import IID, Design, per_unit, sums_of_units
 from bench.model.dynamics import Dynamics
 from bench.model.estimator import (
     Auxiliaries,
@@ -70,6 +71,7 @@ from bench.model.trainer import Trainer
 from bench.simulator import load_module, load_simulator, simulator_files
 
 __all__ = [
+    "IID",
     "SURROGATE",
     "Answer",
     "Array",
@@ -84,6 +86,7 @@ __all__ = [
     "DampedScene",
     "Decision",
     "Descent",
+    "Design",
     "DiagnosticEstimator",
     "Dynamics",
     "EngineScene",
@@ -147,6 +150,7 @@ __all__ = [
     "n_changes",
     "param",
     "per_repeat",
+    "per_unit",
     "retract",
     "rollout",
     "simulator_files",
@@ -154,6 +158,7 @@ __all__ = [
     "slopes",
     "slopes_along",
     "stopped",
+    "sums_of_units",
     "undeclared_jumps",
     "uniform",
     "unknown",

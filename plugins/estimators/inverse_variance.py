@@ -19,13 +19,14 @@ class InverseVariance(DiagnosticEstimator):
     name = "inverse_variance"
     needs = frozenset({"value", "grad", "score"})
     unbiased = False
+    in_units = True
     diagnostics = ("weight",)
 
     def estimate_with_diagnostics(
         self, problem: Problem, theta: np.ndarray, noise: np.ndarray
     ) -> tuple[np.ndarray, Auxiliaries]:
         """Return the estimates and the first-order weights, each ``(R, d)``."""
-        first, zeroth = halves(problem, theta, noise)
+        first, zeroth = halves(problem, theta, noise, self.design(problem.program, noise.shape[1]).unit)
         v1 = first.var(axis=1, ddof=1) / first.shape[1]
         v0 = zeroth.var(axis=1, ddof=1) / zeroth.shape[1]
         total = v0 + v1

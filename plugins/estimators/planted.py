@@ -24,6 +24,7 @@ class Planted(Estimator):
     name = "planted"
     unbiased = False
     needs_directions = True
+    needs_independent_samples = True
 
     base: str = param("samples", "gradient to which the error is added", choices=("samples", "best"))
     bias: float = param(0.0, "length of the fixed error, relative to the gradient's norm", low=0.0)

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.model import Problem, SampleMean, columns, param, per_repeat
+from bench.model import Problem, SampleMean, columns, param, per_repeat, sums_of_units
 
 
 @dataclass(frozen=True)
@@ -18,6 +18,11 @@ class Reinforce(SampleMean):
     name = "reinforce"
     needs = frozenset({"value", "score"})
     unbiased_at_discontinuities = True
+
+    @property
+    def in_units(self) -> bool:  # type: ignore[override]
+        """Whether the baseline is computed from samples."""
+        return not self.separable
 
     baseline: str = param("center", "baseline subtracted from f", choices=("none", "center", "leave_one_out"))
 
@@ -41,6 +46,9 @@ class Reinforce(SampleMean):
             raise ValueError("baseline leave_one_out needs at least 2 samples")
         w = columns(noise)
         f = per_repeat(problem.value(theta, w), noise)
-        f = (f - f.mean(axis=1, keepdims=True)) * f.shape[1] / (f.shape[1] - 1)
+        n, unit = f.shape[1], self.design(problem.program, f.shape[1]).unit
+        centred = f - f.mean(axis=1, keepdims=True)
+        # the cost less the mean of the other units
+        f = centred * n / (n - unit) + (sums_of_units(centred, unit) - unit * centred) / (n - unit)
         score = per_repeat(problem.score(theta, w), noise)
         return np.einsum("rn,rnd->rd", f, score) / f.shape[1]

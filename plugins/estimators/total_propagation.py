@@ -18,6 +18,7 @@ from bench.model import (
     first_order,
     param,
     per_repeat,
+    per_unit,
     slopes,
     zeroth_order,
 )
@@ -45,9 +46,15 @@ class TotalPropagation(DiagnosticEstimator):
     uses = (adjoint,)
     needs = frozenset({"value", "grad", "score"})
     unbiased = False
+    in_units = True
     diagnostics = ("weight",)
 
     per: str = param("step", "the unit with a common weight", choices=("step", "control", "action"))
+
+    @property
+    def needs_independent_samples(self) -> bool:  # type: ignore[override]
+        """True for ``per=action``."""
+        return self.per == "action"
 
     def estimate_with_diagnostics(
         self, problem: Problem, theta: np.ndarray, noise: np.ndarray
@@ -60,7 +67,9 @@ class TotalPropagation(DiagnosticEstimator):
             raise ValueError(f"{self.name} needs at least 2 samples, got 1")
         if self.per == "action":
             return self._per_action(problem, theta, noise)
-        first, zeroth = first_order(problem, theta, noise), zeroth_order(problem, theta, noise)
+        unit = self.design(problem.program, noise.shape[1]).unit
+        orders = first_order(problem, theta, noise), zeroth_order(problem, theta, noise)
+        first, zeroth = (per_unit(terms, unit) for terms in orders)
         part = 1 if self.per == "control" else _controls(problem.program)
         v1, v0 = (_summed(terms.var(axis=1, ddof=1), part) for terms in (first, zeroth))
         weight = _weight(v0, v1)

@@ -107,7 +107,7 @@ class Engines(StudyPackage):
         truth = session.references.of(cell)
         known, noted = truth.known(), truth.note or "the reference gradient is not finite"
         status = finite_status(noted, truth.batches)
-        w = all_noise(cell, program.n_noise)
+        w = all_noise(cell, program)
         zeroth = zeroth_order(problem, theta, w).mean(axis=1)
         result |= {
             "reference_method": truth.method, "reference_spacing": truth.spacing, "device": problem.device,

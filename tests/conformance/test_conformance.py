@@ -149,6 +149,20 @@ class OwnSampleInBaseline(Estimator):
         return ((f - f.mean(axis=1, keepdims=True))[..., None] * score).mean(axis=1)
 
 
+@planted("bias_under_every_design")
+class OtherSamplesOfTheUnitInBaseline(Estimator):
+    """Zeroth-order, with the mean of the other samples as baseline, mirror images included."""
+
+    needs = frozenset({"value", "score"})
+    unbiased_at_discontinuities = True
+
+    def estimate(self, problem, theta, noise):
+        w = columns(noise)
+        f, score = (per_repeat(of(theta, w), noise) for of in (problem.value, problem.score))
+        others = (f.sum(axis=1, keepdims=True) - f) / (f.shape[1] - 1)
+        return ((f - others)[..., None] * score).mean(axis=1)
+
+
 @planted("bias_under_action_feedback")
 class OpenLoopScore(SampleMean):
     """Zeroth-order, with the score of an open-loop control under feedback too."""

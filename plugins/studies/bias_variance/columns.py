@@ -1,10 +1,10 @@
 """The columns of the main table, which users' scripts rely on."""
 
-from bench.experiment.columns import Column, Columns, ComparisonRule, bounded, interval, numbers, seconds, text
+from bench.experiment.columns import DRAWS, Column, Columns, ComparisonRule, bounded, interval, numbers, seconds, text
 
 TABLE = (
     "experiment", "scene", "contact", "integrator", "backend", "estimator", "estimator_params", "noise",
-    "horizon", "dt", "stiffness", "sigma", "smoothing", "samples", "repeats", "dim", "seed", "status", "reason",
+    "horizon", "dt", "stiffness", "sigma", "smoothing", "draws", "mirrored", "samples", "repeats", "dim", "seed", "status", "reason",
     "grad_norm", "reference_norm", "reference_method", "reference_se", "bias", "bias_low", "bias_high",
     "bias_rel", "variance", "variance_per_sample", "rmse", "rmse_rel", "cosine", "sign_agreement",
     "finite_fraction", "model_error", "time_s", "time_iqr_s", "compile_s", "rollouts", "gradients",
@@ -12,6 +12,7 @@ TABLE = (
 )  # fmt: skip
 COLUMNS = Columns.ordered(
     TABLE,
+    *DRAWS,
     Column("grad_norm", "norm of the mean estimate"),
     Column("reference_norm", "norm of the reference gradient"),
     text("reference_method", "how the reference was computed: closed_form, quadrature or sampling, with its settings"),

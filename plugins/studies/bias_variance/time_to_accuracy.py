@@ -107,10 +107,10 @@ def required_cost(curve: pd.DataFrame, target: float, cost: str) -> RequiredCost
     return replace(way, down=down, up=up, times=times)
 
 
-def couples_samples(estimator: str) -> bool:
-    """Return whether an estimator declares that its samples are not independent, so that v / N need not hold."""
-    entry = registry.entries()["estimators"].get(estimator)
-    return bool(getattr(entry and entry.plugin, "couples_samples", False))
+def couples_samples(row: Any) -> bool:
+    """Return whether the samples of a row's estimates are chosen together, so that v / N need not hold."""
+    entry = registry.entries()["estimators"].get(row["estimator"])
+    return row["draws"] != "iid" or bool(getattr(entry and entry.plugin, "couples_samples", False))
 
 
 def _cost_of_one_sample(rows: pd.DataFrame, cost: str) -> float:
@@ -167,7 +167,7 @@ def _extrapolated_cost(row: Any, price: float, target: float) -> RequiredCost:
     # an estimator without declared bias may only have heavy tails that the samples missed
     if low >= target and not is_unexplained(str(row.get("reason", ""))):
         return RequiredCost("never")
-    is_coupled, samples = couples_samples(row["estimator"]), row["x"]
+    is_coupled, samples = couples_samples(row), row["x"]
     is_known = not is_coupled and high < target
     certain_bias = bias if is_known and low > 0 else 0.0
     needed = samples * row["variance"] / row["reference_norm"] ** 2 / (target**2 - certain_bias**2)
