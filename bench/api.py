@@ -9,7 +9,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypedDict, Unpack
+from typing import TYPE_CHECKING, Any, TypedDict, Unpack, cast
 
 import numpy as np
 
@@ -279,7 +279,7 @@ def estimate(
         problem = _problem(problem)
     method: Estimator = make("estimators", estimator)
     given = {name: value for name, value in (("draws", draws), ("mirrored", mirrored)) if value is not None}
-    method = build(type(method), parameter_values(method) | given)
+    method = cast(Estimator, build(type(method), parameter_values(method) | given))
     program = problem.program
     if reason := method.refusal(program, problem.provides, "this backend"):
         raise Unsupported(reason)
