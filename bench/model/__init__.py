@@ -14,7 +14,7 @@ from bench.model import adjoint
 from bench.model.adjoint import Slopes, by_actions, by_theta, slopes, slopes_along
 from bench.model.adjoint import gradient as adjoint_gradient
 from bench.model.backend import Backend
-from bench.model.blocks import cores
+from bench.model.blocks import central_differences, cores
 from bench.model.callables import CallableScene
 from bench.model.contact import Contact, ContactLaw, ForceLaw, ImpulseLaw
 from bench.model.dynamics import Dynamics
@@ -133,6 +133,7 @@ __all__ = [
     "best_gradient",
     "by_actions",
     "by_theta",
+    "central_differences",
     "columns",
     "compose",
     "cores",

@@ -69,6 +69,10 @@ class Estimator(Plugin):
         """
         return self.estimate(problem, theta, noise), {}
 
+    def draws_noise(self, program: Program) -> bool:
+        """Return whether estimates depend on the noise on theta or actions; if not, only on the scene's own noise."""
+        return True
+
     def declares_unbiased(self, program: Program) -> bool:
         """Return whether the estimator declares that its expectation is grad J_sigma of the program."""
         derivative = program.continuous and not program.surrogate
