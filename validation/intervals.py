@@ -63,7 +63,7 @@ def bank_cells():
         scene = case.program.scene
         if "bump" not in case.label and ("jump" not in case.label or i % 2):
             pairs.append((scene, Fobg()))
-        pairs.append((scene, Reinforce() if i % 2 else RandomizedSmoothing(radius=2.0 * scene.sigma)))
+        pairs.append((scene, Reinforce(baseline="center") if i % 2 else RandomizedSmoothing(radius=2.0 * scene.sigma)))
     return [Cell("bank", *pair, *SIZES[i % len(SIZES)]) for i, pair in enumerate(pairs)]
 
 
@@ -73,7 +73,7 @@ def tail_cells():
     some = [
         registry.make("estimators", name, values)
         for name, values in (
-            ("fobg", {}), ("reinforce", {}), ("reinforce", {"baseline": "leave_one_out"}), ("control_variate", {}),
+            ("fobg", {}), ("reinforce", {}), ("reinforce", {"baseline": "center"}), ("control_variate", {}),
             ("randomized_smoothing", {}), ("randomized_smoothing", {"variant": "forward"}),
         )
     ]  # fmt: skip
@@ -169,7 +169,8 @@ def covered(cell, sets):
             sums = rest.sum(axis=1), np.einsum("rnd,rnd->r", rest, rest)
         else:
             estimates, diagnostics = method.estimate_with_diagnostics(problem, theta, noise)
-        found = summarise(estimates, truth, cell.samples, sums, is_unbiased)
+        is_random = method.draws_noise(problem.program)
+        found = summarise(estimates, truth, cell.samples, sums, is_unbiased, is_random)
         doubt = method.remark(json.loads(summarise_diagnostics([diagnostics]))) if diagnostics else ""
         low, high = np.transpose(
             [(getattr(found, f"{name}_low"), getattr(found, f"{name}_high")) for name in STATISTICS[:3]]

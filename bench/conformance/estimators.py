@@ -164,17 +164,9 @@ def varying_oracle(estimator: Estimator) -> Oracle:
 
 
 def sampled_oracle(estimator: Estimator) -> Oracle:
-    """Return :func:`varying_oracle`; skips an estimator that declares a bias and returns the gradient at w = 0.
-
-    That gradient is exact for the cost without noise, so it has no variance and uses no sample.
-    """
+    """Return :func:`varying_oracle`; skips an estimator that declares that it draws no noise there."""
     oracle = varying_oracle(estimator)
-    values = estimates(estimator, oracle, draw_noise(oracle, 2, 8, "plain"))
-    is_plain = (values == values[0]).all() and distance(values[0], oracle.plain) < DIFFERENCED
-    skip_unless(
-        estimator.unbiased or not oracle.program.continuous or not is_plain,
-        "returns the gradient at w = 0, which uses no sample",
-    )
+    skip_unless(estimator.draws_noise(oracle.program), "declares that it draws no noise")
     return oracle
 
 
@@ -234,6 +226,27 @@ def diagnostics_are_as_declared(estimator: Estimator) -> str:
         require(np.shape(array) in shapes, f"{name} has shape {np.shape(array)}, not one of {shapes}")
         require(np.isfinite(array).all(), f"{name} is not finite")
     return ", ".join(diagnostics) or "no diagnostics"
+
+
+@verifies(Estimator)
+def noise_is_drawn_as_declared(estimator: Estimator) -> str:
+    """Verify that noise on theta changes no estimate without ``draws_noise``, and with it those of the varying oracle."""
+    still = [oracle for oracle in usable(estimator, oracles()) if not estimator.draws_noise(oracle.program)]
+    for oracle in still:
+        require(not _noise_moves(estimator, oracle), f"depends on the noise on {oracle.label}, against draws_noise")
+    if still:
+        return f"no noise on {len(still)} oracles"
+    moves = _noise_moves(estimator, varying_oracle(estimator))
+    require(moves, "does not depend on the noise: draws_noise(program) has to return False")
+    return "noise"
+
+
+def _noise_moves(estimator: Estimator, oracle: Oracle) -> bool:
+    """Return whether other noise on theta, with the same noise of the scene's own, changes estimates beyond rounding."""
+    first, other = (np.array(draw_noise(oracle, 2, 8, key)) for key in ("drawn", "redrawn"))
+    own = oracle.program.n_noise - oracle.program.exogenous
+    other[..., own:] = first[..., own:]
+    return distance(*(estimates(estimator, oracle, noise) for noise in (other, first))) > DIFFERENCED
 
 
 @verifies(Estimator)
@@ -303,10 +316,14 @@ def variance_falls_as_one_over_n(estimator: Estimator) -> str:
 
 @verifies(Estimator)
 def bias_is_as_declared(estimator: Estimator) -> str:
-    """Verify the bias on continuous costs: none if ``unbiased``, else smaller than the bias of the zero estimate."""
+    """Verify the bias on continuous costs: none if ``unbiased``, else smaller than the bias of the zero estimate.
+
+    Where an estimator draws no noise, only costs whose smoothed gradient is that of the cost without noise count.
+    """
     candidates = usable(estimator, [o for o in oracles() if o.program.continuous])
-    sampled_oracle(estimator)
-    return _verify_bias(estimator, candidates)
+    able = [o for o in candidates if estimator.draws_noise(o.program) or distance(o.plain, o.truth) < DIFFERENCED]
+    skip_unless(able, "draws no noise where smoothing changes the gradient")
+    return _verify_bias(estimator, able)
 
 
 @verifies(Estimator)
@@ -407,7 +424,6 @@ def _beyond_errors(estimator: Estimator, oracle: Oracle, drawn: np.ndarray) -> t
 @verifies(Estimator)
 def needs_are_truthful(estimator: Estimator) -> str:
     """Verify that the estimator uses every capability in ``needs``, and no other capability."""
-    oracle = sampled_oracle(estimator)
     used: set[str] = set()
     for oracle in usable(estimator, oracles()):  # some capabilities may be for costs with events only
         recording = RecordingProblem(oracle.problem, estimator.needs)

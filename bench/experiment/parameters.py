@@ -23,7 +23,7 @@ import numpy as np
 from bench.experiment.experiment import Budget
 from bench.experiment.grid import THETA, applies, is_theta_axis
 from bench.model import Decision, Plugin, registry
-from bench.model.identity import plain
+from bench.model.identity import identity, plain
 from bench.model.parameters import parameters, singular
 
 if TYPE_CHECKING:
@@ -99,11 +99,29 @@ def _read(text: str, folders: tuple[Path, ...]) -> tuple[Mapping[str, Any], str]
 
 
 def completed_rows(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return rows with the column ``parameters`` completed, so that rows stored before and after a change agree."""
+    """Return rows with the column ``parameters`` completed, so that rows stored before and after a change agree.
+
+    The column ``estimator_params``, if there is one, has the parameters that differ from today's defaults.
+    """
     texts = {text: completed_json(text) for text in rows["parameters"].unique()}
-    if all(text == new for text, new in texts.items()):
+    rows = (
+        rows
+        if all(text == new for text, new in texts.items())
+        else rows.assign(parameters=rows["parameters"].map(texts))
+    )
+    if "estimator_params" not in rows:
         return rows
-    return rows.assign(parameters=rows["parameters"].map(texts))
+    labels = rows["parameters"].map({text: estimator_params(parsed(text)) for text in texts.values()})
+    return rows.assign(estimator_params=labels.fillna(rows["estimator_params"]))
+
+
+def estimator_params(given: Mapping[str, Any]) -> str | None:
+    """Return the parameters of a row's estimator that differ from today's defaults; None if it is not installed."""
+    part = given.get("estimator") or {}
+    if plugin_class("estimator", part.get("name")) is None:
+        return None
+    defaults = _defaults("estimator", part["name"], None, registry.folders())
+    return identity("", {name: value for name, value in part.items() if value != defaults.get(name, value)}).strip("[]")
 
 
 # --------------------------------------------------------------------------------------------------- swept quantities

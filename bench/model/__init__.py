@@ -14,7 +14,7 @@ from bench.model import adjoint
 from bench.model.adjoint import Slopes, by_actions, by_theta, slopes, slopes_along
 from bench.model.adjoint import gradient as adjoint_gradient
 from bench.model.backend import Backend
-from bench.model.blocks import cores
+from bench.model.blocks import central_differences, cores
 from bench.model.callables import CallableScene
 from bench.model.contact import Contact, ContactLaw, ForceLaw, ImpulseLaw
 from bench.model.design import IID, Design, per_unit, sums_of_units
@@ -136,6 +136,7 @@ __all__ = [
     "best_gradient",
     "by_actions",
     "by_theta",
+    "central_differences",
     "columns",
     "compose",
     "cores",

@@ -83,6 +83,10 @@ class Estimator(Plugin):
         """
         return self.estimate(problem, theta, noise), {}
 
+    def draws_noise(self, program: Program) -> bool:
+        """Return whether estimates depend on the noise on theta or actions; if not, only on the scene's own noise."""
+        return True
+
     def declares_unbiased(self, program: Program) -> bool:
         """Return whether the estimator declares that its expectation is grad J_sigma of the program."""
         derivative = program.continuous and not program.surrogate
@@ -114,6 +118,8 @@ class Estimator(Plugin):
         words = " and ".join(
             filter(None, [f"draws={self.draws}" * (self.draws != "iid"), "mirrored=true" * self.mirrored])
         )
+        if not self.draws_noise(program):
+            raise Unsupported(f"{self.name} depends on no noise in J, so {words} would change nothing")
         if self.needs_independent_samples:
             raise Unsupported(f"{self.name} chooses directions or fits a model from independent draws, without {words}")
         if self.mirrored and self.pairs_samples:

@@ -46,7 +46,7 @@ class Chaos(Claim):
 
     def measure(self) -> Outcome:
         """Sample both orders at several horizons."""
-        first, zeroth = estimator("fobg"), estimator("reinforce")
+        first, zeroth = estimator("fobg"), estimator("reinforce[baseline=center]")
         draw = np.random.default_rng(19)
         figures, horizons, variances = [], [1, 2, 5, 10, 14, 20], []
         for steps in horizons:

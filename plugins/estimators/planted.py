@@ -38,6 +38,9 @@ class Planted(Estimator):
         """Gradients; with ``base=best`` also costs and scores, which discontinuous costs need."""
         return frozenset({"grad"}) if self.base == "samples" else frozenset({"grad", "value", "score"})
 
+    def draws_noise(self, program: Program) -> bool:
+        return self.base == "samples" or self.noise > 0.0 or not program.continuous
+
     def own_refusal(self, program: Program) -> str | None:
         if self.angle and program.dim < 2:
             return f"{self.name}[angle={self.angle:g}] needs at least 2 coordinates, and theta has {program.dim}"

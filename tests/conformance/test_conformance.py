@@ -19,6 +19,7 @@ from classes import (
     MassSpring,
     Midpoint,
     Penalty,
+    Plain,
     Pushing,
     Quadratic,
     SemiImplicitEuler,
@@ -223,6 +224,32 @@ class LastingBias(FirstOrder):
 
     def terms(self, problem, theta, w):
         return 2.5 * super().terms(problem, theta, w)
+
+
+@planted("noise_is_drawn_as_declared")
+class ClaimsNoNoise(FirstOrder):
+    """First-order, and it claims to draw no noise."""
+
+    def draws_noise(self, program):
+        return False
+
+
+@planted("noise_is_drawn_as_declared")
+class DrawsNoNoise(FirstOrder):
+    """First-order without noise, which it does not declare."""
+
+    unbiased = False
+
+    def terms(self, problem, theta, w):
+        return super().terms(problem, theta, 0 * w)
+
+
+@planted("bias_is_as_declared")
+class PlainWithWrongSign(Plain):
+    """The gradient without noise, with the wrong sign."""
+
+    def estimate(self, problem, theta, noise):
+        return -super().estimate(problem, theta, noise)
 
 
 @planted("something_was_checked")

@@ -177,6 +177,22 @@ def test_identical_estimates_against_a_sampled_reference_keep_its_error():
     assert "identical" in summary.note
 
 
+def test_identical_estimates_that_depend_on_no_draw_allow_for_no_rare_event():
+    batches = np.random.default_rng(10).standard_normal((30, 2)) + 1.0
+    truth = Truth.from_batches(batches)
+    summary = summarise(np.ones((20, 2)), truth, 5, is_random=False)
+    assert (summary.variance, summary.variance_high) == (0.0, 0.0)
+    assert "identical" not in summary.note
+    assert summary.bias_high == bias_interval(np.ones(2) - truth.mean, *truth.errors)[2]
+    exact = summarise(np.ones((20, 2)), Truth.exact(np.array([1.0, 2.0])), 5, is_random=False)
+    assert (exact.bias, exact.bias_low, exact.bias_high) == (1.0, 1.0, 1.0)
+
+
+def test_differing_estimates_have_intervals_whatever_their_estimator_declares():
+    truth = Truth.exact(np.ones(2))
+    assert summarise(CENTRED, truth, 5, is_random=False) == summarise(CENTRED, truth, 5)
+
+
 def test_a_bias_above_the_rule_of_three_is_one():
     assert summarise(ROUNDED * 1.1, Truth.exact(ROUNDED[1]), 3).bias_low > 0
 

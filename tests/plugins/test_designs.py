@@ -16,6 +16,7 @@ REFUSED = [
     ("sobol[mirrored=true]", "pendulum", 128, "independent draws"),
     ("quadratic_model[mirrored=true]", "pendulum", 128, "independent draws"),
     ("total_propagation[per=action,draws=sobol]", "pendulum", 128, "independent draws"),
+    ("plain[mirrored=true]", "pendulum", 128, "no noise in J"),
     ("fobg[mirrored=true]", "pendulum", 99, "samples=99 is odd"),
     ("fobg[draws=sobol]", "pendulum", 100, "power of 2"),
     ("fobg[draws=sobol]", "linear[dimension=21202]", 128, "21,201 coordinates"),

@@ -71,7 +71,7 @@ def test_rare_caps_of_alpha_order_are_a_remark(method, alpha, doubtful):
 
 def test_leaving_one_out_by_hand(halves):
     problem, theta, noise, *_ = halves
-    found = Reinforce(baseline="leave_one_out").estimate(problem, theta, noise)
+    found = Reinforce().estimate(problem, theta, noise)
     for r in range(REPEATS):
         costs = problem.value(theta, noise[r].T)
         others = (costs.sum() - costs) / (SAMPLES - 1)

@@ -135,6 +135,13 @@ def test_costs_of_several_rollouts_per_sample_are_compared_at_equal_rollouts():
     assert compared["factor"].iloc[0] == pytest.approx(math.sqrt(2) / 1.2)
 
 
+@pytest.mark.parametrize(("rollouts", "first"), [(100.0, "c"), (200.0, "a")])
+def test_costs_that_do_not_grow_with_samples_are_compared_where_the_rollouts_suffice(rollouts, first):
+    fixed = [one | {"rollouts": rollouts} for one in by_samples("c", 1, scale=0.1)]
+    _, compared = made(*by_samples("a", 1), *by_samples("b", 2), *fixed, sweep={"samples": [64, 128]})
+    assert compared[["axis", "at", "first"]].values.tolist() == [["rollouts", 128.0, first]]
+
+
 def test_a_far_larger_error_does_not_share_the_first_place_of_an_error_that_is_not_sure():
     """fobg 0.90 [0.87, 0.92] is tied with smoothing 0.17 [0.10, 1.7], whose interval is wide: fobg is no leader there."""
     exact = {"reference_norm": 1.0, "variance_low": 0.0, "variance_high": 0.0}

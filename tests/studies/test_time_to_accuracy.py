@@ -75,6 +75,11 @@ def test_unbiased_methods_follow_the_law(target, how, samples):
     assert required_cost(line(), target, ROLLOUTS).cost == pytest.approx(2 * samples)
 
 
+def test_work_that_does_not_grow_with_samples_is_not_extrapolated():
+    found = required_cost(line(rollouts=1.0, gradients=0.0), 0.1, ROLLOUTS)
+    assert (found.how, found.beyond) == ("unknown", 1.0)
+
+
 def test_the_cheapest_sufficient_samples_are_taken_not_the_fewest():
     """Where 16 samples take 120 us and 256 take 64 us, both within the error, the answer is 64 us."""
     found = required_cost(line().assign(time_s=[120e-6, 200e-6, 64e-6]), 0.6, TIME)

@@ -83,19 +83,26 @@ ROLLOUTS = Axis("rollouts", ("rollouts",))
 
 
 def _at_equal_rollouts(axis: Axis | None, problem: ProblemRows) -> tuple[Axis | None, ProblemRows]:
-    """Return a problem along its rollouts instead of samples where that is needed and possible."""
+    """Return a problem along its rollouts instead of samples where that is needed and possible.
+
+    An estimator whose rollouts do not grow with the samples is at each number of rollouts that suffices for it.
+    """
     rows = attempted(problem.rows)
     # the rollout at w = 0 is shared by all repeats, a fraction of a rollout each
-    spent = rows["rollouts"].round()
-    per_sample = (spent / rows["x"]).groupby(rows["estimator"] + rows["estimator_params"]).median()
+    rows = rows.assign(spent=rows["rollouts"].round(), by=rows["estimator"] + rows["estimator_params"])
+    per_sample = (rows["spent"] / rows["x"]).groupby(rows["by"]).median()
     if axis is None or axis.column != "samples" or (rows["gradients"] > 0).any() or not per_sample.nunique() > 1:
         return axis, problem
-    methods = rows["estimator"] + rows["estimator_params"]
-    shared = methods.groupby(spent).nunique()
-    kept = spent.isin(shared.index[shared == methods.nunique()])
-    if not kept.any():
+    counts = rows.groupby("by")[["x", "spent"]].transform("nunique")
+    is_fixed = (counts["x"] > 1) & (counts["spent"] == 1)
+    fixed, growing = rows[is_fixed & (rows["x"] == rows["x"].min())], rows[~is_fixed]
+    shared = growing.groupby("spent")["by"].nunique()
+    budgets = shared.index[shared == growing["by"].nunique()]
+    if budgets.empty:
         return axis, problem
-    return ROLLOUTS, replace(problem, rows=rows[kept].assign(x=spent[kept]))
+    parts = [growing[growing["spent"].isin(budgets)].assign(x=lambda kept: kept["spent"])]
+    parts += [fixed[fixed["spent"] <= budget].assign(x=budget) for budget in budgets]
+    return ROLLOUTS, replace(problem, rows=pd.concat(parts).drop(columns=["spent", "by"]))
 
 
 def verdict(status: Any, error: Any, low: Any, high: Any) -> Any:

@@ -195,7 +195,13 @@ def measure(cell: Cell, session: Session, study: BiasVariance) -> dict[str, Any]
     if not np.isfinite(truth.batches).all():
         return result | {"status": "nonfinite", "reason": truth.note or "the reference gradient is not finite"}
     unbiased = cell.estimator.declares_unbiased(program)
-    summary = asdict(statistics.summarise(values, truth.known(), cell.samples, estimates.sums, unbiased=unbiased))
+    draws = cell.estimator.draws_noise(program)
+    summary = asdict(
+        statistics.summarise(
+            values, truth.known(), cell.samples if draws else 1, estimates.sums, unbiased=unbiased,
+            is_random=draws or program.exogenous > 0,
+        )
+    )  # fmt: skip
     surrogate = SURROGATE if program.surrogate and "grad" in cell.estimator.needs else ""
     doubt = cell.estimator.remark(json.loads(result["auxiliaries"])) if result["auxiliaries"] else ""
     remarks = (surrogate, summary.pop("note"), doubt, truth.note)

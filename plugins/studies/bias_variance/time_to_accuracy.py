@@ -39,8 +39,9 @@ def with_gradient_cost(rows: pd.DataFrame) -> pd.DataFrame:
     def least(seconds: pd.Series) -> pd.Series:
         return seconds.groupby([program, rows["samples"]]).min()
 
-    first = least((known["time_s"] / gradients)[(gradients > 0) & (rollouts <= 0.01 * gradients)])
-    zeroth = least((known["time_s"] / rollouts)[(gradients == 0) & (rollouts > 0)])
+    is_batch = gradients + rollouts >= known["samples"]  # one call for few takes as long
+    first = least((known["time_s"] / gradients)[is_batch & (rollouts <= 0.01 * gradients)])
+    zeroth = least((known["time_s"] / rollouts)[is_batch & (gradients == 0)])
     ratios = (first / zeroth).dropna().sort_index().groupby(level=0).last()
     ratio = program.map(ratios).astype(float).fillna(1.0)
     return rows.assign(**{ROLLOUTS: rows["rollouts"] + ratio * rows["gradients"]})
@@ -147,7 +148,8 @@ def lead(first: RequiredCost, second: RequiredCost, alike: bool = False) -> tupl
 def _required_cost(rows: pd.DataFrame, target: float, cost: str) -> RequiredCost:
     n, error, price = rows[["x", "rmse_rel", cost]].to_numpy(float).T
     if not (error <= target).any():
-        return _extrapolated_cost(rows.iloc[-1], price[-1], target)
+        work = rows["rollouts"] + rows["gradients"]
+        return _extrapolated_cost(rows.iloc[-1], price[-1], target, is_fixed=work.nunique() == 1 < len(rows))
     # more samples may cost less: the fixed cost of a call dominates small batches
     ways = [RequiredCost("measured" if i else "at once", price[i], n[i]) for i in np.flatnonzero(error <= target)]
     for i in range(1, len(n)):
@@ -158,16 +160,16 @@ def _required_cost(rows: pd.DataFrame, target: float, cost: str) -> RequiredCost
     return min(ways, key=lambda way: (way.cost, way.samples))
 
 
-def _extrapolated_cost(row: Any, price: float, target: float) -> RequiredCost:
+def _extrapolated_cost(row: Any, price: float, target: float, is_fixed: bool) -> RequiredCost:
     """Extrapolate the cost from the row with most samples: v is N times its variance, and cost is proportional to N.
 
-    Coupled samples have no such law.
+    Coupled samples have no such law, and neither has an estimator whose work ``is_fixed`` for all N.
     """
     low, high, bias = (row[name] / row["reference_norm"] for name in ("bias_low", "bias_high", "bias"))
     # an estimator without declared bias may only have heavy tails that the samples missed
     if low >= target and not is_unexplained(str(row.get("reason", ""))):
         return RequiredCost("never")
-    is_coupled, samples = couples_samples(row), row["x"]
+    is_coupled, samples = is_fixed or couples_samples(row), row["x"]
     is_known = not is_coupled and high < target
     certain_bias = bias if is_known and low > 0 else 0.0
     needed = samples * row["variance"] / row["reference_norm"] ** 2 / (target**2 - certain_bias**2)
