@@ -80,6 +80,10 @@ class Column:
     """The column of words that tables append to the value, or show in place of a missing one."""
     above_one: str = field(default="", kw_only=True)
     """The meaning of values above 1; charts shade that area."""
+    default: Any = field(default=None, kw_only=True)
+    """The value in rows that were stored before the column existed; None: it is missing there."""
+    ratio: tuple[str, str] | None = field(default=None, kw_only=True)
+    """The columns whose quotient it is, computed when rows are read."""
 
     @property
     def heading(self) -> str:
@@ -152,6 +156,12 @@ FIRST = (
     Column("stiffness", "stiffness of the contact law, or of the scene without one", "N/m", format="setting"),
     Column("sigma", "standard deviation of the noise in J", format="setting"),
     Column("smoothing", "smoothing parameter of the contact law: beta, kappa", format="setting"),
+    Column(
+        "descent",
+        "share of a descent from theta0 that is done where the gradient is taken",
+        format="setting",
+        default=0.0,
+    ),
     Column("samples", "samples N in one estimate", format="setting"),
     Column("repeats", "independent estimates R that measure bias and variance", format="setting"),
     Column("seed", "seed of the noise", format="setting"),
@@ -255,17 +265,26 @@ class Columns:
         """Return the table with its columns in order and of their types, followed by unknown columns unchanged."""
         import pandas as pd
 
-        known = {column.name: _typed(table.get(column.name), column.kind, len(table)) for column in self.all}
+        known = {column.name: _typed(table.get(column.name), column, len(table)) for column in self.all}
+        for column in self.all:
+            if column.ratio:
+                value, unit = (np.asarray(known[name], dtype=float) for name in column.ratio)
+                known[column.name] = value / np.where(unit > 0.0, unit, math.nan)
         unknown = {name: table[name] for name in table if name not in self.by_name}
         return pd.DataFrame({**known, **unknown}, index=table.index)
 
 
-def _typed(values: pd.Series | None, kind: Kind, count: int) -> Any:
-    """Return a column converted to the type of its kind; ``count`` missing values if ``values`` is None."""
+def _typed(values: pd.Series | None, column: Column, count: int) -> Any:
+    """Return a column converted to the type of its kind; ``count`` missing values, or defaults, if ``values`` is None."""
     import pandas as pd
 
+    kind = column.kind
     if values is None:
-        return pd.array([""] * count, dtype="str") if kind == "text" else np.full(count, math.nan)
+        if kind == "text":
+            return pd.array([column.default or ""] * count, dtype="str")
+        return np.full(count, math.nan if column.default is None else column.default)
+    if column.default is not None:
+        values = values.fillna(column.default)
     if kind == "number":
         return values if values.dtype == np.float64 else pd.to_numeric(values, errors="coerce").astype("float64")
     if kind == "text" and not (str(values.dtype) == "str" and values.notna().all()):
