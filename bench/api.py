@@ -58,6 +58,8 @@ class Settings(TypedDict, total=False):
     trainer: Values
     theta: Names
     theta0: Sequence[float] | np.ndarray | None
+    descent: float
+    path: Names
     samples: int
     repeats: int
     seed: int
@@ -115,7 +117,7 @@ def _override_words(key: str, value: Any) -> list[str]:
     head = key.partition(".")[0]
     if isinstance(value, Mapping) and (head == "reference" or head in map(singular, kinds)):
         return [word for name, inner in value.items() for word in _override_words(f"{key}.{name}", inner)]
-    return [f"{key}={_hydra_value(value, quoted=key not in (*kinds, 'study', 'experiment'))}"]
+    return [f"{key}={_hydra_value(value, quoted=key not in (*kinds, 'path', 'study', 'experiment'))}"]
 
 
 def _hydra_value(value: Any, quoted: bool = True) -> str:
@@ -236,18 +238,30 @@ def problem(
     backend: str = "jax",
     theta: Sequence[str] = (),
     theta0: Sequence[float] | None = None,
+    descent: float = 0.0,
+    path: Sequence[str] = ("penalty", "semi_implicit_euler"),
 ) -> Problem:
     """Compile a problem by command-line names: ``problem("pushing[sigma=0.1]", contact="penalty[stiffness=1e4]")``.
 
     ``problem.value(theta, w)``, ``.grad`` and ``.score`` take ``theta (d,)`` or ``(d, B)`` and noise ``w (n_w,)`` or
     ``(n_w, B)``, as arrays or lists. By default they use ``problem.program.theta0``, the point at which gradients are
     taken, and no noise. ``problem.to_frame()`` has the parameters. ``theta``
-    names float parameters of the scene and the contact law as the decision variable in place of the scene's own. Raises
+    names float parameters of the scene and the contact law as the decision variable in place of the scene's own. With
+    ``descent``, a share from 0 to below 1, ``theta0`` is where a descent that starts there has done this share of its gain,
+    as in an experiment: ``path`` is what is descended, a contact law, an integrator and, if wanted, a backend. Raises
     :class:`bench.UserError` for an invalid name or value, and :class:`bench.Unsupported` if the combination cannot run
     or a library is not installed.
     """
     at = None if theta0 is None else tuple(map(float, theta0))
-    return compile_problem(scene, contact, integrator, backend, Decision(tuple(theta), at))
+    decision = Decision(tuple(theta), at)
+    if descent:
+        from bench.experiment.grid import share_of
+        from bench.measure.descent import descend
+
+        law, step, *engine = path
+        start = compile_problem(scene, law, step, engine[0] if engine else None, decision)
+        decision = Decision(decision.names, descend(start).at(share_of(descent)).theta)
+    return compile_problem(scene, contact, integrator, backend, decision)
 
 
 _problem = problem  # an argument of estimate has the same name

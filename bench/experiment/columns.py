@@ -58,8 +58,6 @@ class Column:
     """Whether the CSV has this column; ``rows.parquet`` always does."""
     measured: bool = False
     """Whether the value depends on the machine and its load; it is missing if cells are not timed, unless ``untimed``."""
-    missing: Any = field(default=None, kw_only=True)
-    """The value of rows that were stored before the column existed; None for NaN, an empty string or an empty list."""
     label: str = field(default="", kw_only=True)
     """The name in headings and on axes; by default the column's name with spaces."""
     untimed: bool = field(default=False, kw_only=True)
@@ -82,6 +80,10 @@ class Column:
     """The column of words that tables append to the value, or show in place of a missing one."""
     above_one: str = field(default="", kw_only=True)
     """The meaning of values above 1; charts shade that area."""
+    default: Any = field(default=None, kw_only=True)
+    """The value in rows that were stored before the column existed; None: it is missing there."""
+    ratio: tuple[str, str] | None = field(default=None, kw_only=True)
+    """The columns whose quotient it is, computed when rows are read."""
 
     @property
     def heading(self) -> str:
@@ -154,6 +156,12 @@ FIRST = (
     Column("stiffness", "stiffness of the contact law, or of the scene without one", "N/m", format="setting"),
     Column("sigma", "standard deviation of the noise in J", format="setting"),
     Column("smoothing", "smoothing parameter of the contact law: beta, kappa", format="setting"),
+    Column(
+        "descent",
+        "share of a descent from theta0 that is done where the gradient is taken",
+        format="setting",
+        default=0.0,
+    ),
     Column("samples", "samples N in one estimate", format="setting"),
     Column("repeats", "independent estimates R that measure bias and variance", format="setting"),
     Column("seed", "seed of the noise", format="setting"),
@@ -171,8 +179,8 @@ LAST = (
     text("key", "hash of all parameters and code that decide the numbers"),
 )
 DRAWS = (
-    text("draws", "points of the noise of an estimate: iid, orthogonal or sobol", missing="iid"),
-    Column("mirrored", "1 if each draw w of the noise is followed by -w", format="setting", missing=0.0),
+    text("draws", "points of the noise of an estimate: iid, orthogonal or sobol", default="iid"),
+    Column("mirrored", "1 if each draw w of the noise is followed by -w", format="setting", default=0.0),
 )
 HIDDEN = (
     *(replace(column, table=False) for column in DRAWS),
@@ -263,19 +271,25 @@ class Columns:
         import pandas as pd
 
         known = {column.name: _typed(table.get(column.name), column, len(table)) for column in self.all}
+        for column in self.all:
+            if column.ratio:
+                value, unit = (np.asarray(known[name], dtype=float) for name in column.ratio)
+                known[column.name] = value / np.where(unit > 0.0, unit, math.nan)
         unknown = {name: table[name] for name in table if name not in self.by_name}
         return pd.DataFrame({**known, **unknown}, index=table.index)
 
 
 def _typed(values: pd.Series | None, column: Column, count: int) -> Any:
-    """Return a column converted to the type of its kind; ``count`` missing values if ``values`` is None."""
+    """Return a column converted to the type of its kind; ``count`` missing values, or defaults, if ``values`` is None."""
     import pandas as pd
 
     kind = column.kind
     if values is None:
-        if column.missing is not None:
-            return pd.array([column.missing] * count, dtype="str" if kind == "text" else "float64")
-        return pd.array([""] * count, dtype="str") if kind == "text" else np.full(count, math.nan)
+        if kind == "text":
+            return pd.array([column.default or ""] * count, dtype="str")
+        return np.full(count, math.nan if column.default is None else column.default)
+    if column.default is not None:
+        values = values.fillna(column.default)
     if kind == "number":
         return values if values.dtype == np.float64 else pd.to_numeric(values, errors="coerce").astype("float64")
     if kind == "text" and not (str(values.dtype) == "str" and values.notna().all()):

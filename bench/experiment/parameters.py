@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from bench.experiment.experiment import Budget
-from bench.experiment.grid import THETA, applies, is_theta_axis
+from bench.experiment.grid import DESCENT, THETA, applies, is_theta_axis
 from bench.model import Decision, Plugin, registry
 from bench.model.identity import identity, plain
 from bench.model.parameters import parameters, singular
@@ -150,6 +150,9 @@ def places(names: Collection[str], given: Mapping[str, Any]) -> list[Place]:
     """
     result = []
     for name in names:
+        if name == DESCENT:
+            result.append(Place("theta", "", name, (given.get("theta") or {}).get(name, 0.0)))
+            continue
         if is_theta_axis(name):
             at = (given.get("theta") or {}).get("at") or ()
             index = int(name.partition(".")[2] or 0)
@@ -206,11 +209,13 @@ def _numbers(
 def _problem(given: Mapping[str, Any], parts: Collection[str], without: Collection[str]) -> frozenset[Any]:
     """Return what identifies the problem of a row's parameters: they count as missing if they are null."""
     ignored = {(place.part, place.parameter) for place in places(without, given)}
+    if DESCENT in without:  # what is descended matters only where something is
+        ignored.add(("theta", "path"))
     found = []
     for part in (*parts, "study", "theta"):
         for name, value in (given.get(part) or {}).items():
             if (part, name) == ("theta", "at"):
                 found += [((THETA, f"{THETA}.{i}"), coordinate) for i, coordinate in enumerate(value or ())]
-            elif value is not None:
+            elif value is not None and (value or part != "theta"):
                 found.append(((part, name), tuple(value) if isinstance(value, list) else value))
     return frozenset(item for item in found if item[0] not in ignored)

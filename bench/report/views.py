@@ -23,7 +23,7 @@ from bench.measure.timing import NOISY
 from bench.report.text import number
 
 CATEGORIES = ("scene", "contact", "integrator", "noise")
-NUMBERS = ("horizon", "dt", "stiffness", "sigma", "smoothing", "samples", "repeats")
+NUMBERS = ("horizon", "dt", "stiffness", "sigma", "smoothing", "descent", "samples", "repeats")
 """Numeric identity columns; with the categories and the swept axes they identify the problem of a row."""
 VIEWS_OF_LAWS = ("stiffness", "smoothing")
 """Columns that repeat a parameter of the contact law, which may be swept under its own name."""

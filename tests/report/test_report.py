@@ -29,6 +29,7 @@ from helpers import (
 from matplotlib.figure import Figure
 from trees import ROOT
 
+import bench
 from bench.experiment import config
 from bench.experiment.axes import axes
 from bench.report import latex, views, writer
@@ -83,7 +84,7 @@ def test_pareto_is_what_brute_force_finds():
 
 def test_a_chart_of_speed_and_accuracy_marks_the_pareto_front():
     swept = config.load(["experiment=stiffness_sweep"])
-    shown = swept.study.views(swept, pd.read_parquet(ROOT / "results/standard/stiffness_sweep" / "rows.parquet"))
+    shown = swept.study.views(swept, bench.load(ROOT / "results/standard/stiffness_sweep"))
     chart = next(c for c in shown.charts if c.name == "speed_accuracy")
     lines = [line for axes in draw(chart).axes for line in axes.lines if line.get_linestyle() == "--"]
     assert len(lines) == chart.frame["panel"].nunique()

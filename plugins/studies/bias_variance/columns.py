@@ -4,9 +4,9 @@ from bench.experiment.columns import DRAWS, Column, Columns, ComparisonRule, bou
 
 TABLE = (
     "experiment", "scene", "contact", "integrator", "backend", "estimator", "estimator_params", "noise",
-    "horizon", "dt", "stiffness", "sigma", "smoothing", "draws", "mirrored", "samples", "repeats", "dim", "seed", "status", "reason",
+    "horizon", "dt", "stiffness", "sigma", "smoothing", "draws", "mirrored", "descent", "samples", "repeats", "dim", "seed", "status", "reason",
     "grad_norm", "reference_norm", "reference_method", "reference_se", "bias", "bias_low", "bias_high",
-    "bias_rel", "variance", "variance_per_sample", "rmse", "rmse_rel", "cosine", "sign_agreement",
+    "bias_rel", "variance", "variance_per_sample", "rmse", "rmse_rel", "start_norm", "rmse_start", "cosine", "sign_agreement",
     "finite_fraction", "model_error", "time_s", "time_iqr_s", "compile_s", "rollouts", "gradients",
     "peak_memory_mb", "dtype", "device", "versions", "key",
 )  # fmt: skip
@@ -27,6 +27,10 @@ COLUMNS = Columns.ordered(
     Column("rmse", "root mean squared distance of one estimate from the reference",
            comparison=ComparisonRule("paired", "RMSE", mean="mean_estimate", variance="variance", reference="reference_gradient")),
     Column("rmse_rel", "rmse / reference_norm; above 1 an estimate is worse than the zero estimate", label="relative RMSE"),
+    Column("start_norm", "norm of the gradient at the start of the descent, of the program that is descended: the same for all cells of a "
+           "scene, horizon and sigma; empty where descent is 0"),
+    Column("rmse_start", "rmse / start_norm: the error in units of the gradient with which the descent began", ratio=("rmse", "start_norm"),
+           label="RMSE / start gradient"),
     Column("cosine", "mean cosine between one estimate and the reference"),
     Column("sign_agreement", "share of coordinates of one estimate whose sign is the reference's"),
     Column("finite_fraction", "share of repeats that are finite"),
@@ -44,6 +48,7 @@ COLUMNS = Columns.ordered(
     Column("compilations", "number of programs compiled for the cell", table=False, measured=True),
     text("shapes", "hashes of the requested programs", table=False, measured=True),
     numbers("point", "theta at which the gradient is taken, by coordinate", table=False),
+    text("descent_path", "the descent: JSON of lists of share, norm of theta, cost, gradient norm, largest speed and largest move", table=False),
     numbers("mean_estimate", "mean estimate, signed, by coordinate of theta", table=False),
     Column("reference_spacing", "average spacing of the points of a reference by quadrature, in standard deviations of the noise",
            table=False),

@@ -192,6 +192,8 @@ def measure(cell: Cell, session: Session, study: BiasVariance) -> dict[str, Any]
         "reference_gradient": truth.gradient.tolist(),
         "auxiliaries": summarise_diagnostics([estimates.diagnostics[start] for start in sorted(estimates.diagnostics)]),
     }
+    if cell.point is not None:
+        result |= {"start_norm": cell.point.start_norm, "descent_path": json.dumps(cell.point.along)}
     if not np.isfinite(truth.batches).all():
         return result | {"status": "nonfinite", "reason": truth.note or "the reference gradient is not finite"}
     unbiased = cell.estimator.declares_unbiased(program)

@@ -20,7 +20,7 @@ from bench.report.problems import ProblemRows
 from bench.report.text import axis_value, counted, span
 from bench.report.views import Arranged, arrange, estimator_curves, pareto, rmse_interval
 
-from . import charts, time_to_accuracy
+from . import charts, descents, time_to_accuracy
 from .columns import COLUMNS
 from .comparisons import COLUMNS as COMPARED
 from .comparisons import (
@@ -40,6 +40,7 @@ RESULTS = ("variance", "cosine", "rollouts", "gradients", "reference_method")
 
 def views(experiment: Experiment, rows: pd.DataFrame) -> Views | None:
     """Return the tables and charts of the rows; None if no cell was run."""
+    rows = descents.with_start_norm(rows)
     costed = with_gradient_cost(rows)
     shown = arrange(experiment, costed)
     methods = method_table(shown)
@@ -116,6 +117,7 @@ def tables(
         Table("verdicts", methods.drop(columns="setting"), [], files=["csv"]),
         Table("comparisons", joined.assign(factor_note=limits(joined)), columns, title, COMPARISON_NOTES, data=joined),
         *([] if best.empty else [time_to_accuracy.accuracy_table(best)]),
+        *descents.tables(shown),
     ]  # fmt: skip
 
 
