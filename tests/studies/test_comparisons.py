@@ -158,11 +158,12 @@ def test_an_upper_limit_is_shown_and_never_first_nor_bold():
     """It was 0, dropped by log axes, or first by the luck of the reference's error."""
     cells = [
         *(vague(0.001, 0.1, stiffness=k, estimator="fobg") for k in (1e2, 1e4)),
-        *(cell(0.3, 0.28, 0.32, stiffness=k, estimator="reinforce") for k in (1e2, 1e4)),
+        *(cell(e, 0.9 * e, 1.1 * e, stiffness=k, estimator="reinforce") for k, e in ((1e2, 0.1), (1e4, 0.3))),
     ]
     methods, compared = made(*cells)
-    assert list(compared["first"]) == ["reinforce"] * 2
+    assert list(compared["first"]) == ["reinforce", ""], "the limit is below the other's interval at 1e4"
     assert list(compared["tied"]) == [("fobg",)] * 2
+    assert list(leaders(compared, methods)) == [("reinforce", "fobg"), ("fobg",)]
     assert compared["factor"].isna().all()
     limit = math.hypot(0.1, 0.02)
     assert methods.loc[methods["error_is_limit"], "error"].tolist() == pytest.approx([limit] * 2)
@@ -189,4 +190,4 @@ def test_a_lucky_estimate_equal_to_an_exact_reference_is_a_limit_too():
         row(reference_norm=1.0, stiffness=1e2, **exact), cell(0.3, 0.2, 0.4, stiffness=1e2, estimator="b")
     )
     assert methods["error"].iloc[0] == pytest.approx(math.hypot(0.04, 0.01))
-    assert compared["first"].tolist() == ["b"]
+    assert compared[["first", "tied"]].values.tolist() == [["", ("fobg",)]]

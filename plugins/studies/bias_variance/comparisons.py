@@ -31,7 +31,9 @@ COLUMNS = (
     interval("value", "its value"),
     text("second", "the next method, of another estimator where there is one"),
     interval("factor", "the second value over the first"),
-    text("tied", "methods that are not distinguishable from the first"),
+    text(
+        "tied", "methods that are not distinguishable from the first, or lower where only their upper limits are known"
+    ),
 )
 """The columns of the table of comparisons."""
 ERROR, VALUE, FACTOR = ([f"{name}{end}" for end in ("", "_low", "_high")] for name in ("error", "value", "factor"))
@@ -122,19 +124,23 @@ def compare_errors(methods: pd.DataFrame) -> pd.DataFrame:
     """Return a line per setting: the method of lowest error, the next estimator, their factor, and ties.
 
     Methods whose error is not known, or whose interval is not, cannot be first, nor can those with an upper limit only. A
-    method is tied with the first unless the interval of their factor lies above 1.
+    method is tied with the first unless the interval of their factor lies above 1. No method is first where upper limits
+    of others lie below its interval: these are tied.
     """
     good = methods[np.isfinite(methods[["error", "error_low"]]).all(axis=1)].sort_values("error", kind="stable")
-    first = good[~good["error_is_limit"]].drop_duplicates("setting")
-    others = good.drop(first.index).merge(first, on="setting", suffixes=("", "_of_first"))
-    first = first.set_index("setting")
+    lowest = good[~good["error_is_limit"]].drop_duplicates("setting")
+    first = lowest.set_index("setting")
+    least = good["setting"].map(first["error_low"]).astype(float).fillna(math.inf)
+    lower = good[good["error_is_limit"] & (good["error"] < least)]
+    first = first[~first.index.isin(lower["setting"])]
+    others = good.drop(lowest.index).merge(first, on="setting", suffixes=("", "_of_first"))
     factors = ratio(*([others[f"{end}{of}"] for end in ERROR] for of in ("_of_first", "")))
     factors = (np.where(others["error_is_limit"], math.nan, factors[0]), *factors[1:])
     others = others.assign(
         same=others["estimator"] == others["estimator_of_first"], **dict(zip(FACTOR, factors, strict=True))
     )
     second = others.sort_values("same", kind="stable").drop_duplicates("setting").set_index("setting")
-    tied = others[~(others["factor_low"] > 1)].groupby("setting", sort=False)["method"].agg(tuple)
+    tied = pd.concat([others[~(others["factor_low"] > 1)], lower]).groupby("setting", sort=False)["method"].agg(tuple)
     lines = methods.drop_duplicates("setting").set_index("setting")[["problem", "axis", "at"]].assign(
         basis=lambda line: np.where(line["axis"] == ROLLOUTS.column, EQUAL_ROLLOUTS, EQUAL_SAMPLES),
         first=first["method"], **{name: first[error] for name, error in zip(VALUE, ERROR, strict=True)},

@@ -17,7 +17,7 @@ from bench.experiment.experiment import Experiment
 from bench.experiment.parameters import number_problems
 from bench.experiment.views import Table, Views
 from bench.report.problems import ProblemRows
-from bench.report.text import axis_value, counted, span
+from bench.report.text import axis_value, counted, number, span
 from bench.report.views import Arranged, arrange, estimator_curves, pareto, shown_rmse
 
 from . import charts, time_to_accuracy
@@ -246,12 +246,17 @@ def _values(axis: str, at: pd.Series) -> str:
     return f"{axis} {', '.join(map(axis_value, sorted(at.unique())))}" if axis else ""
 
 
+def _errors(methods: pd.DataFrame) -> str:
+    """Return the smallest and largest error; ``< 0.12`` if some are upper limits."""
+    known = span(*methods["error"].agg(["min", "max"]))
+    return f"< {number(methods['error'].max())}" if methods["error_is_limit"].any() else known
+
+
 def recommendations(methods: pd.DataFrame, comparisons: pd.DataFrame) -> Table:
     """Return what to use where: a line per problem and range of its axis with the same first and tied estimators."""
     named = methods.assign(use=methods["setting"].map(leaders(comparisons, methods))).dropna(subset=["use"])
     lines = [
-        {"problem": problem, "where": _values(axis, part["at"]), "use": " or ".join(use),
-         "error": span(*part.loc[part["estimator"] == use[0], "error"].agg(["min", "max"])),
+        {"problem": problem, "where": _values(axis, part["at"]), "use": " or ".join(use), "error": _errors(part[part["estimator"] == use[0]]),
          "fails": ", ".join(part.loc[part["verdict"].isin((FAILS, NO_RESULT)), "estimator"].unique()) or "none"}
         for (problem, axis, use), part in named.groupby(["problem", "axis", "use"], sort=False)
     ]  # fmt: skip
