@@ -321,6 +321,7 @@ def comparison_table(table: pd.DataFrame) -> str:
         for row in part.sort_values("rmse_rel").to_dict("records"):
             setting = cell(row["estimator_params"].replace(",", ", ")) or "default"
             error = f"{number(row['rmse_rel'])} [{number(row['low'])}, {number(row['high'])}]"
+            error = f"< {number(row['rmse_rel'])}" if row.get("error_is_limit") else error
             verdict = ", ".join(filter(None, ["best" * row["best"], row["verdict"], "biased" * row["biased"]]))
             texts = [error, verdict, number(row["evaluations"])] if row["status"] == "ok" else ["", row["status"], ""]
             lines.append(f"| {cell(str(problem))} | " + " | ".join([setting, *texts]) + " |")

@@ -78,12 +78,12 @@ class Column:
     """The column that is true where tables print the value in bold."""
     note: str = field(default="", kw_only=True)
     """The column of words that tables append to the value, or show in place of a missing one."""
+    derived: Callable[[pd.DataFrame], Any] | None = field(default=None, kw_only=True)
+    """How the values follow from other columns whenever rows are read, whatever was stored; None if they do not."""
     above_one: str = field(default="", kw_only=True)
     """The meaning of values above 1; charts shade that area."""
     default: Any = field(default=None, kw_only=True)
     """The value in rows that were stored before the column existed; None: it is missing there."""
-    ratio: tuple[str, str] | None = field(default=None, kw_only=True)
-    """The columns whose quotient it is, computed when rows are read."""
 
     @property
     def heading(self) -> str:
@@ -267,16 +267,16 @@ class Columns:
         return {c.name: "" if c.kind == "text" else [] if c.kind == "list" else math.nan for c in self.all}
 
     def typed(self, table: pd.DataFrame) -> pd.DataFrame:
-        """Return the table with its columns in order and of their types, followed by unknown columns unchanged."""
+        """Return the table with its columns in order, of their types and derived, followed by unknown columns unchanged."""
         import pandas as pd
 
         known = {column.name: _typed(table.get(column.name), column, len(table)) for column in self.all}
-        for column in self.all:
-            if column.ratio:
-                value, unit = (np.asarray(known[name], dtype=float) for name in column.ratio)
-                known[column.name] = value / np.where(unit > 0.0, unit, math.nan)
         unknown = {name: table[name] for name in table if name not in self.by_name}
-        return pd.DataFrame({**known, **unknown}, index=table.index)
+        return self.derive(pd.DataFrame({**known, **unknown}, index=table.index))
+
+    def derive(self, table: pd.DataFrame) -> pd.DataFrame:
+        """Return the table with those of its columns that follow from others computed again."""
+        return table.assign(**{c.name: c.derived for c in self.all if c.derived and c.name in table})
 
 
 def _typed(values: pd.Series | None, column: Column, count: int) -> Any:

@@ -18,6 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -356,6 +357,15 @@ def _exp(exponent: float) -> float:
 # ------------------------------------------------------------------------------------------------------ summary
 
 
+def rmse(bias: Any, variance: Any) -> Any:
+    """Return the root mean squared error of one estimate, at least its standard deviation; NaN if either is not known.
+
+    Bias and variance are de-biased, so their sum is the mean squared distance to the reference less the reference's own
+    error, except that a bias below its noise counts as 0 instead of reducing the variance.
+    """
+    return np.hypot(bias, np.sqrt(variance))
+
+
 @dataclass(frozen=True)
 class Summary:
     """Statistics of R estimates of N samples each, compared with the reference. Norms are Euclidean, intervals 95%.
@@ -385,7 +395,7 @@ class Summary:
     variance_per_sample_low: float
     variance_per_sample_high: float
     rmse: float
-    """Root mean squared distance of one estimate from the reference, with the reference's own error subtracted."""
+    """:func:`rmse` of ``bias`` and ``variance``."""
     rmse_rel: float
     """``rmse / reference_norm``."""
     cosine: float
@@ -440,9 +450,7 @@ def summarise(
     is_fixed = identical and repeats > 1 and not is_random
     missed = THREE / (repeats * samples) if identical and not is_fixed else 0.0
     bias, variance = _spread(deviations, mean, reference, samples, missed)
-    errors = estimates - reference.mean
-    squared_error = float(np.vdot(errors, errors)) / repeats - reference.standard_error**2
-    rmse = math.sqrt(max(0.0, squared_error))
+    error = float(rmse(bias[0], variance[0]))
     relative = math.nan if norm <= ROUNDING or reference.vanishes() else norm
     cosine, signs = _directions(estimates, reference.mean)
     notes = [] if is_fixed else _interval_remarks(deviations, mean - reference.mean, missed)
@@ -468,8 +476,8 @@ def summarise(
         variance_per_sample=scaled[0],
         variance_per_sample_low=scaled[1],
         variance_per_sample_high=scaled[2],
-        rmse=rmse * unit,
-        rmse_rel=rmse / relative,
+        rmse=error * unit,
+        rmse_rel=error / relative,
         cosine=cosine,
         sign_agreement=signs,
         finite_fraction=1.0,

@@ -188,6 +188,18 @@ def rmse_interval(row: Any) -> tuple[Any, Any]:
     return low, high
 
 
+def shown_rmse(row: Any) -> tuple[Any, Any, Any, Any]:
+    """Return the relative RMSE of one row or each row of a table, its interval, and whether the value is an upper limit.
+
+    The value is the upper end of the interval where the bias is not distinguishable from 0 and the reference's error is at
+    least the standard deviation of one estimate, so that the reference's error decides the bias; NaN if that end is infinite.
+    """
+    low, high = rmse_interval(row)
+    is_limit = np.logical_not(row["bias_low"] > 0) & (row["reference_se"] >= np.sqrt(row["variance"]))
+    value = np.where(is_limit, np.where(np.isfinite(high), high, math.nan), row["rmse_rel"])
+    return np.where(np.isnan(row["rmse_rel"]), math.nan, value), low, high, is_limit
+
+
 def bias_text(row: Any, norm: float = 1.0) -> str:
     """Format a bias divided by a norm: ``0.500 [0.400, 0.600]``, or ``0 (< 0.124)`` if not distinguishable from 0."""
     value, low, high = (row[c] / norm if norm > 0 else math.nan for c in ("bias", "bias_low", "bias_high"))

@@ -17,6 +17,7 @@ from bench.plugins.studies.bias_variance.comparisons import (
 )
 from helpers import experiment, failed, row, table
 
+from bench.report.cells import readable
 from bench.report.views import arrange
 
 
@@ -144,7 +145,7 @@ def test_costs_that_do_not_grow_with_samples_are_compared_where_the_rollouts_suf
 
 def test_a_far_larger_error_does_not_share_the_first_place_of_an_error_that_is_not_sure():
     """fobg 0.90 [0.87, 0.92] is tied with smoothing 0.17 [0.10, 1.7], whose interval is wide: fobg is no leader there."""
-    exact = {"reference_norm": 1.0, "variance_low": 0.0, "variance_high": 0.0}
+    exact = {"reference_norm": 1.0, "variance": 0.0, "variance_low": 0.0, "variance_high": 0.0}
     biased = exact | {"rmse_rel": 0.9, "bias": 0.9, "bias_low": 0.87, "bias_high": 0.92}
     wide = exact | {"rmse_rel": 0.17, "bias": 0.17, "bias_low": 0.1, "bias_high": 1.7}
     good = exact | {"rmse_rel": 0.14, "bias": 0.14, "bias_low": 0.13, "bias_high": 0.15}
@@ -153,3 +154,47 @@ def test_a_far_larger_error_does_not_share_the_first_place_of_an_error_that_is_n
         row(stiffness=2.0, estimator="fobg", **biased), row(stiffness=2.0, estimator="smooth", **wide),
     )  # fmt: skip
     assert list(leaders(compared, methods)) == [("fobg", "smooth"), ("smooth",)]
+
+
+def vague(low, high, **values):
+    """A row without a distinguishable bias whose reference errs more than the estimates spread: an upper limit of the RMSE."""
+    return cell(0.01, low, 0.02, **values) | {"bias_high": 4.0 * high, "reference_se": 0.2}
+
+
+def test_an_upper_limit_is_shown_and_never_first_nor_bold():
+    """It was 0, dropped by log axes, or first by the luck of the reference's error."""
+    cells = [
+        *(vague(0.001, 0.1, stiffness=k, estimator="fobg") for k in (1e2, 1e4)),
+        *(cell(e, 0.9 * e, 1.1 * e, stiffness=k, estimator="reinforce") for k, e in ((1e2, 0.1), (1e4, 0.3))),
+    ]
+    methods, compared = made(*cells)
+    assert list(compared["first"]) == ["reinforce", ""], "the limit is below the other's interval at 1e4"
+    assert list(compared["tied"]) == [("fobg",)] * 2
+    assert list(leaders(compared, methods)) == [("reinforce", "fobg"), ("fobg",)]
+    assert compared["factor"].isna().all()
+    limit = math.hypot(0.1, 0.02)
+    assert methods.loc[methods["error_is_limit"], "error"].tolist() == pytest.approx([limit] * 2)
+    shown = experiment(sweep={"stiffness": [1e2, 1e4]})
+    (main, *_), (chart, *_) = (lambda views: (views.tables, views.charts))(shown.study.views(shown, table(cells)))
+    assert readable(main).iloc[0, 1:].tolist() == ["< 0.10"] * 2
+    assert not any(main.frame[f"x{i}_best"].any() for i in (0, 1))
+    drawn = chart.frame[chart.frame["series"] == "fobg"]
+    assert drawn["rmse_limit"].all()
+    assert drawn["rmse_rel"].tolist() == pytest.approx([limit] * 2)
+
+
+def test_a_lucky_estimate_equal_to_an_exact_reference_is_a_limit_too():
+    """Identical estimates leave room for a rare event, so their error is not 0."""
+    exact = {
+        "bias": 0.0,
+        "bias_low": 0.0,
+        "bias_high": 0.04,
+        "variance": 0.0,
+        "variance_low": 0.0,
+        "variance_high": 1e-4,
+    }
+    methods, compared = made(
+        row(reference_norm=1.0, stiffness=1e2, **exact), cell(0.3, 0.2, 0.4, stiffness=1e2, estimator="b")
+    )
+    assert methods["error"].iloc[0] == pytest.approx(math.hypot(0.04, 0.01))
+    assert compared[["first", "tied"]].values.tolist() == [["", ("fobg",)]]

@@ -1,6 +1,30 @@
 """The columns of the main table, which users' scripts rely on."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
 from bench.experiment.columns import DRAWS, Column, Columns, ComparisonRule, bounded, interval, numbers, seconds, text
+from bench.measure import statistics
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+def rmse(rows: pd.DataFrame) -> Any:
+    """Return the root mean squared error of each row."""
+    return statistics.rmse(rows["bias"], rows["variance"])
+
+
+def rmse_rel(rows: pd.DataFrame) -> Any:
+    """Return the relative RMSE of each row; NaN where the reference is not distinguishable from 0."""
+    return (rmse(rows) / rows["reference_norm"]).where(rows["rmse_rel"].notna())
+
+
+def rmse_start(rows: pd.DataFrame) -> Any:
+    """Return the RMSE of each row in units of the gradient at the start of its descent; NaN without a descent."""
+    return rmse(rows) / rows["start_norm"].where(rows["start_norm"] > 0)
+
 
 TABLE = (
     "experiment", "scene", "contact", "integrator", "backend", "estimator", "estimator_params", "noise",
@@ -24,12 +48,13 @@ COLUMNS = Columns.ordered(
     *bounded("variance", "trace of the covariance of one estimate", has_csv=False, comparison=ComparisonRule("spread", "variance")),
     *bounded("variance_per_sample", "variance of one sample's term, from all terms where an estimate is a mean of terms, else "
              "samples * variance", has_csv=False),
-    Column("rmse", "root mean squared distance of one estimate from the reference",
+    Column("rmse", "root mean squared error of one estimate: root of variance + bias^2", derived=rmse,
            comparison=ComparisonRule("paired", "RMSE", mean="mean_estimate", variance="variance", reference="reference_gradient")),
-    Column("rmse_rel", "rmse / reference_norm; above 1 an estimate is worse than the zero estimate", label="relative RMSE"),
+    Column("rmse_rel", "rmse / reference_norm; above 1 an estimate is worse than the zero estimate", label="relative RMSE",
+           derived=rmse_rel),
     Column("start_norm", "norm of the gradient at the start of the descent, of the program that is descended: the same for all cells of a "
            "scene, horizon and sigma; empty where descent is 0"),
-    Column("rmse_start", "rmse / start_norm: the error in units of the gradient with which the descent began", ratio=("rmse", "start_norm"),
+    Column("rmse_start", "rmse / start_norm: the error in units of the gradient with which the descent began", derived=rmse_start,
            label="RMSE / start gradient"),
     Column("cosine", "mean cosine between one estimate and the reference"),
     Column("sign_agreement", "share of coordinates of one estimate whose sign is the reference's"),

@@ -15,7 +15,7 @@ import pandas as pd
 from bench.experiment.axes import Axis
 from bench.experiment.columns import Column, interval, text
 from bench.report.problems import ProblemRows, split_by_problem
-from bench.report.views import CATEGORIES, Arranged, attempted, estimator_curves, rmse_interval
+from bench.report.views import CATEGORIES, Arranged, attempted, estimator_curves, shown_rmse
 
 WORKS, FAILS, OPEN, NO_RESULT = "works", "fails", "open", "no result"
 """Verdicts of a method at a setting: its interval is below 1, above 1, contains 1 or is not known; it has no number."""
@@ -31,7 +31,9 @@ COLUMNS = (
     interval("value", "its value"),
     text("second", "the next method, of another estimator where there is one"),
     interval("factor", "the second value over the first"),
-    text("tied", "methods that are not distinguishable from the first"),
+    text(
+        "tied", "methods that are not distinguishable from the first, or lower where only their upper limits are known"
+    ),
 )
 """The columns of the table of comparisons."""
 ERROR, VALUE, FACTOR = ([f"{name}{end}" for end in ("", "_low", "_high")] for name in ("error", "value", "factor"))
@@ -64,14 +66,14 @@ def method_table(shown: Arranged) -> pd.DataFrame:
     for axis, problem in problems_by_axis(shown):
         axis, problem = _at_equal_rollouts(axis, problem)
         rows, title, along = estimator_curves(problem.rows), problem.title(), axis.column if axis else ""
-        low, high = rmse_interval(rows)
-        error = rows["rmse_rel"].where(rows["status"] == "ok")
+        error, low, high, is_limit = shown_rmse(rows)
+        error = np.where(rows["status"] == "ok", error, math.nan)
         samples = rows["x"] if along == "samples" else rows["samples"]
         kinds = {name: str(problem.rows[name].iloc[0]).partition("[")[0] for name in CATEGORIES}
         parts.append(pd.DataFrame({
             "setting": f"{title}; {along} " + rows["x"].astype(str), "problem": title, **kinds, "axis": along,
             "at": rows["x"] if axis else math.nan, "method": rows["method"], "estimator": rows["label"],
-            "error": error, "error_low": low, "error_high": high,
+            "error": error, "error_low": low, "error_high": high, "error_is_limit": is_limit,
             "verdict": verdict(rows["status"], error, low, high), "status": rows["status"], "remark": rows["reason"],
             "bias_share": ((rows["bias_low"] / rows["rmse"]) ** 2).where(error > 0),
             "evaluations": (rows["rollouts"] + rows["gradients"]) / samples, "time_s": rows["seconds"],
@@ -128,19 +130,24 @@ def ratio(first: Any, second: Any) -> tuple[Any, Any, Any]:
 def compare_errors(methods: pd.DataFrame) -> pd.DataFrame:
     """Return a line per setting: the method of lowest error, the next estimator, their factor, and ties.
 
-    Methods whose error is not known, or whose interval is not, cannot be first. A method is tied with the first unless
-    the interval of their factor lies above 1.
+    Methods whose error is not known, or whose interval is not, cannot be first, nor can those with an upper limit only. A
+    method is tied with the first unless the interval of their factor lies above 1. No method is first where upper limits
+    of others lie below its interval: these are tied.
     """
     good = methods[np.isfinite(methods[["error", "error_low"]]).all(axis=1)].sort_values("error", kind="stable")
-    others = good[good.duplicated("setting")]
-    first = good.drop_duplicates("setting").set_index("setting")
-    others = others.merge(first, on="setting", suffixes=("", "_of_first"))
+    lowest = good[~good["error_is_limit"]].drop_duplicates("setting")
+    first = lowest.set_index("setting")
+    least = good["setting"].map(first["error_low"]).astype(float).fillna(math.inf)
+    lower = good[good["error_is_limit"] & (good["error"] < least)]
+    first = first[~first.index.isin(lower["setting"])]
+    others = good.drop(lowest.index).merge(first, on="setting", suffixes=("", "_of_first"))
     factors = ratio(*([others[f"{end}{of}"] for end in ERROR] for of in ("_of_first", "")))
+    factors = (np.where(others["error_is_limit"], math.nan, factors[0]), *factors[1:])
     others = others.assign(
         same=others["estimator"] == others["estimator_of_first"], **dict(zip(FACTOR, factors, strict=True))
     )
     second = others.sort_values("same", kind="stable").drop_duplicates("setting").set_index("setting")
-    tied = others[~(others["factor_low"] > 1)].groupby("setting", sort=False)["method"].agg(tuple)
+    tied = pd.concat([others[~(others["factor_low"] > 1)], lower]).groupby("setting", sort=False)["method"].agg(tuple)
     lines = methods.drop_duplicates("setting").set_index("setting")[["problem", "axis", "at"]].assign(
         basis=lambda line: np.where(line["axis"] == ROLLOUTS.column, EQUAL_ROLLOUTS, EQUAL_SAMPLES),
         first=first["method"], **{name: first[error] for name, error in zip(VALUE, ERROR, strict=True)},

@@ -17,7 +17,7 @@ from bench.measure.statistics import is_unexplained
 from bench.model import registry
 from bench.report.problems import ProblemRows, split_by_problem
 from bench.report.text import axis_value, number, short_duration
-from bench.report.views import Arranged, estimator_curves
+from bench.report.views import Arranged, estimator_curves, shown_rmse
 
 TIME, ROLLOUTS = "time_s", "rollouts_"
 """Columns with the costs of an estimate: seconds, and rollouts with a gradient at its measured cost."""
@@ -56,6 +56,8 @@ def with_known(rows: pd.DataFrame, cost: str) -> pd.DataFrame:
 SAMPLES = Axis("samples", ("samples",))
 COSTS = {"time": TIME, "rollouts": ROLLOUTS}
 TEXTS: dict[str, Callable[[float], str]] = {"time": short_duration, "rollouts": axis_value}
+LEAST = 1e-200
+"""Errors below this count as this much, since costs are interpolated in logarithms: identical estimates may have none."""
 TARGETS = (0.1, 0.01)
 """Target relative errors."""
 NOTES = (
@@ -92,7 +94,7 @@ class RequiredCost:
 
 def required_cost(curve: pd.DataFrame, target: float, cost: str) -> RequiredCost:
     """Return the cost of an estimator on a backend to reach a relative RMSE of ``target``, with its 95% interval."""
-    rows = with_known(curve, cost).sort_values("x")
+    rows = with_known(curve.assign(rmse_rel=shown_rmse(curve)[0]), cost).sort_values("x")
     if rows.empty:
         return RequiredCost("unknown")
     way, low, high = (
@@ -125,7 +127,7 @@ def _at_interval_end(rows: pd.DataFrame, end: str) -> pd.DataFrame:
     """Return rows with variance and bias at an end of their 95% intervals; the bias is 0 unless distinguishable from 0."""
     bias = rows[f"bias_{end}"].where(rows["bias_low"] > 0, 0.0)
     error = np.hypot(bias, np.sqrt(rows[f"variance_{end}"])) / rows["reference_norm"]
-    return rows.assign(bias=bias, variance=rows[f"variance_{end}"], rmse_rel=error)
+    return rows.assign(bias=bias, variance=rows[f"variance_{end}"], rmse_rel=np.maximum(error, LEAST))
 
 
 def lead(first: RequiredCost, second: RequiredCost, alike: bool = False) -> tuple[float, float, float]:

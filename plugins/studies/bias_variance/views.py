@@ -17,8 +17,8 @@ from bench.experiment.experiment import Experiment
 from bench.experiment.parameters import number_problems
 from bench.experiment.views import Table, Views
 from bench.report.problems import ProblemRows
-from bench.report.text import axis_value, counted, span
-from bench.report.views import Arranged, arrange, estimator_curves, pareto, rmse_interval
+from bench.report.text import axis_value, counted, number, span
+from bench.report.views import Arranged, arrange, estimator_curves, pareto, shown_rmse
 
 from . import charts, descents, time_to_accuracy
 from .columns import COLUMNS
@@ -122,8 +122,8 @@ def tables(
 
 
 COMPARISON_NOTES = (
-    "Factor: the second over the first, with its 95% interval. Tied: not distinguishable from the first, since the interval "
-    "of the factor reaches 1 or is not known.",
+    "Factor: the second over the first, with its 95% interval; none for an upper limit, which is never first. Tied: not "
+    "distinguishable from the first, since the interval of the factor reaches 1 or is not known.",
 )
 
 
@@ -139,19 +139,23 @@ def pivots(shown: Arranged) -> list[Table]:
 def _pivot(axis: Axis | None, problem: ProblemRows) -> Table:
     rows = estimator_curves(problem.rows)
     ok, note = rows["status"] == "ok", rows["status"].map(lambda status: FAILURES.get(status, [""])[0])
-    low, high = (pd.Series(end, rows.index).where(ok) for end in rmse_interval(rows))
+    error, low, high, is_limit = (pd.Series(part, rows.index) for part in shown_rmse(rows))
+    error, low, high = (part.where(ok) for part in (error, low, high))
     others = [
         ok & (rows["x"] == x) & (rows["label"] != label) for x, label in zip(rows["x"], rows["label"], strict=True)
     ]
     is_apart = [bool(rivals.any() and (low[rivals] > end).all()) for rivals, end in zip(others, high, strict=True)]
     cells = pd.DataFrame({
-        "": rows["rmse_rel"].where(ok), "_low": low, "_high": high, "_best": ok & (rows["rmse_rel"] < 1) & np.array(is_apart, dtype=bool),
+        "": error, "_low": low, "_high": high, "_limit": is_limit,
+        "_best": ok & (error < 1) & ~is_limit & np.array(is_apart, dtype=bool),
         "_note": note + np.where(rows["reason"] != "", REMARKED, ""),
     }).set_axis(rows["method"])  # fmt: skip
     values = sorted(rows["x"].unique())
     wide = _across(cells, rows["x"], values, "x").reindex(rows["method"].unique())
     columns = [
-        interval(f"x{i}", label=axis_value(x) if axis else "relative RMSE", emphasis=f"x{i}_best", note=f"x{i}_note")
+        interval(
+            f"x{i}", label=axis_value(x) if axis else "relative RMSE", limit=f"x{i}_limit", emphasis=f"x{i}_best", note=f"x{i}_note",
+        )
         for i, x in enumerate(values)
     ]  # fmt: skip
     return Table(
@@ -171,7 +175,8 @@ def _notes(result: Sequence[Table]) -> list[str]:
     seen = {str(v) for table in result for name in table.frame if name.endswith("_note") for v in table.frame[name]}
     notes = [
         "Relative RMSE of one estimate [95% interval], in units of the reference gradient's norm: above 1 the zero estimate "
-        "is better. Bold: below 1, with an interval apart from that of every other estimator."
+        "is better. Bold: below 1, with an interval apart from that of every other estimator. <: upper limit, where the bias is not "
+        "distinguishable from 0 and the reference's error is at least the standard deviation of one estimate."
     ]
     signs = [f"{sign}: {what}." for sign, what in FAILURES.values() if any(sign in text_ for text_ in seen)]
     if any(REMARKED in text_ for text_ in seen):
@@ -189,8 +194,9 @@ def speed_accuracy(rows: pd.DataFrame) -> pd.DataFrame:
     results = ["rmse_rel", "bias_rel", "time_s", "time_iqr_s", "compile_s", "rollouts", "gradients"]
     table = rows[["experiment", *IDENTITY, "status", *results]].assign(pareto=False)
     good = table[(table["status"] == "ok") & np.isfinite(table["rmse_rel"]) & np.isfinite(table["time_s"])]
+    errors = pd.Series(shown_rmse(rows)[0], rows.index)
     for _, part in good.groupby(number_problems(rows).loc[good.index]):
-        table.loc[part.index[pareto(part["time_s"], part["rmse_rel"])], "pareto"] = True
+        table.loc[part.index[pareto(part["time_s"], errors.loc[part.index])], "pareto"] = True
     return table
 
 
@@ -208,7 +214,7 @@ def ranking(methods: pd.DataFrame) -> Table:
     shares = worst["verdict"] + np.where(worst["bias_share"] > 0.5, ", biased", "")
     work = worst["evaluations"].map(" ({:.0f}x)".format).where(worst["evaluations"] > MANY, "")
     notes = shares.mask(worst["status"] != "ok", worst["status"]) + work
-    ends = {end: worst[f"error{end}"] for end in ("", "_low", "_high")}
+    ends = {end: worst[f"error{end}"] for end in ("", "_low", "_high", "_is_limit")}
     problems, cells = methods["problem"].unique(), pd.DataFrame(ends | {"_note": notes}).set_axis(worst["estimator"])
     frame = counts.join(_across(cells, worst["problem"], problems, "p")).rename_axis("method").reset_index()
     errors = frame[[f"p{i}" for i in range(len(problems))]]
@@ -217,7 +223,10 @@ def ranking(methods: pd.DataFrame) -> Table:
     columns = [
         ESTIMATOR,
         *(Column(str(name), format="setting") for name in counts),
-        *(interval(f"p{i}", label=problem, note=f"p{i}_note") for i, problem in enumerate(problems)),
+        *(
+            interval(f"p{i}", label=problem, limit=f"p{i}_is_limit", note=f"p{i}_note")
+            for i, problem in enumerate(problems)
+        ),
     ]
     explained = (
         f"Sorted by the worst case. Relative RMSE [95% interval] at equal {_basis(methods)}; where a problem was swept, the largest along "
@@ -239,12 +248,17 @@ def _values(axis: str, at: pd.Series) -> str:
     return f"{axis} {', '.join(map(axis_value, sorted(at.unique())))}" if axis else ""
 
 
+def _errors(methods: pd.DataFrame) -> str:
+    """Return the smallest and largest error; ``< 0.12`` if some are upper limits."""
+    known = span(*methods["error"].agg(["min", "max"]))
+    return f"< {number(methods['error'].max())}" if methods["error_is_limit"].any() else known
+
+
 def recommendations(methods: pd.DataFrame, comparisons: pd.DataFrame) -> Table:
     """Return what to use where: a line per problem and range of its axis with the same first and tied estimators."""
     named = methods.assign(use=methods["setting"].map(leaders(comparisons, methods))).dropna(subset=["use"])
     lines = [
-        {"problem": problem, "where": _values(axis, part["at"]), "use": " or ".join(use),
-         "error": span(*part.loc[part["estimator"] == use[0], "error"].agg(["min", "max"])),
+        {"problem": problem, "where": _values(axis, part["at"]), "use": " or ".join(use), "error": _errors(part[part["estimator"] == use[0]]),
          "fails": ", ".join(part.loc[part["verdict"].isin((FAILS, NO_RESULT)), "estimator"].unique()) or "none"}
         for (problem, axis, use), part in named.groupby(["problem", "axis", "use"], sort=False)
     ]  # fmt: skip
