@@ -29,7 +29,7 @@ def rows(bias=0.0, resolved=None, **values):
     resolved = bias > 0 if resolved is None else resolved
     return pd.DataFrame([
         row(**{
-            "backend": "b", "estimator": "e", "repeats": 8, "samples": float(n), "reference_norm": 2.0, "bias": 2 * bias,
+            "backend": "b", "estimator": "e", "draws": "iid", "repeats": 8, "samples": float(n), "reference_norm": 2.0, "bias": 2 * bias,
             "bias_low": 1.9 * bias if resolved else 0.0, "bias_high": 2.1 * bias,
             **dict.fromkeys(("variance", "variance_low", "variance_high"), 4 * VARIANCE / n),
             "rmse": 2 * math.sqrt(bias**2 + VARIANCE / n), "rmse_rel": math.sqrt(bias**2 + VARIANCE / n), "time_s": 1e-3 * n,
