@@ -42,6 +42,7 @@ SECTIONS: Mapping[str, Sequence[str]] = {
         "answers",
         "experiment/*",
         "estimators",
+        "methods",
         "claims",
         "controller",
         "dose-response",

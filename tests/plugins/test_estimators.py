@@ -50,7 +50,8 @@ def test_confidence_radius_uses_the_failure_probability():
     terms = np.array([centred.estimate(problem, scene.theta0(), w[:, i : i + 1])[0, 0] for i in range(n // 2, n)])
     log_term = math.log(2 / 0.05)
     eps = math.sqrt(2 * terms.var(ddof=1) * log_term / (n // 2)) + 2 * abs(terms).max() / (3 * (n // 2)) * log_term
-    below, above = (AlphaOrder(gamma=eps * factor).estimate(problem, scene.theta0(), w) for factor in (0.999, 1.001))
+    methods = (AlphaOrder(gamma=eps * factor, sharing="split") for factor in (0.999, 1.001))
+    below, above = (method.estimate(problem, scene.theta0(), w) for method in methods)
     assert below == pytest.approx(zeroth, rel=1e-12)
     assert above[0, 0] != below[0, 0]
     assert abs(above - below).max() <= 0.0011 * eps
@@ -75,7 +76,7 @@ def test_the_default_accuracy_leaves_alpha_order_its_first_order_share(stiffness
 def test_sharing_takes_every_sample_for_both_orders():
     problem = Torch().compile(compose(SoftHeaviside(nu=0.2)))
     theta, w = problem.program.theta0, noise.draw(5, "shared", 3, 64, 1, "cells")
-    shared, decided = AlphaOrder(sharing="shared").estimate_with_diagnostics(problem, theta, w)
+    shared, decided = AlphaOrder().estimate_with_diagnostics(problem, theta, w)
     alpha = decided["alpha"][:, None]
     zeroth = Reinforce(baseline="center").estimate(problem, theta, w)
     expected = alpha * Fobg().estimate(problem, theta, w) + (1 - alpha) * zeroth

@@ -50,7 +50,7 @@ def test_inverse_variance_by_hand(halves):
 def test_alpha_order_by_hand(halves):
     """With a generous gamma the weight is that of the variances of both means, over all coordinates."""
     problem, theta, noise, first, zeroth = halves
-    found = AlphaOrder(gamma=1e9).estimate(problem, theta, noise)
+    found = AlphaOrder(gamma=1e9, sharing="split").estimate(problem, theta, noise)
     for r in range(REPEATS):
         v1 = sum(np.var(first[r][i], ddof=1) / 5 for i in range(2))
         v0 = sum(np.var(zeroth[r][i], ddof=1) / 6 for i in range(2))
