@@ -258,9 +258,10 @@ def problem(
         from bench.experiment.grid import share_of
         from bench.measure.descent import descend
 
+        share = share_of(descent)
         law, step, *engine = path
         start = compile_problem(scene, law, step, engine[0] if engine else None, decision)
-        decision = Decision(decision.names, descend(start).at(share_of(descent)).theta)
+        decision = Decision(decision.names, descend(start).at(share).theta)
     return compile_problem(scene, contact, integrator, backend, decision)
 
 

@@ -282,7 +282,7 @@ class _Expansion:
             (at[coordinate],) = values
         return dataclasses.replace(decision, at=tuple(at))
 
-    def _counts(self, point: Mapping[str, Any]) -> dict[str, int]:
+    def _counts(self, point: Mapping[str, Any]) -> dict[str, Any]:
         counts: dict[str, int] = {}
         for name, low in (("samples", 1), ("repeats", 2), ("seed", 0)):
             count = coerce(int, point.get(name, getattr(self._experiment, name)), name)
@@ -319,8 +319,9 @@ class _Expansion:
 
 def _uses(scene: Plugin | None, axis: str) -> bool:
     """Return whether a scene has the parts of an axis: integrators step motion, and contact laws act on contacts."""
-    moves = isinstance(scene, MechanicalScene)
-    return axis not in ("integrator", "contact") or (moves and (axis == "integrator" or scene.n_contacts != 0))
+    if axis not in ("integrator", "contact"):
+        return True
+    return isinstance(scene, MechanicalScene) and (axis == "integrator" or scene.n_contacts != 0)
 
 
 @cache

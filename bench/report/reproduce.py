@@ -57,7 +57,7 @@ def cell_of(given: Mapping[str, Any], known: dict[str, Plugin]) -> Cell:
         repeats=0,
         seed=0,
         study=study,
-        decision=Decision(*(theta[name] and tuple(theta[name]) for name in ("names", "at"))) if theta else OWN,
+        decision=Decision(tuple(theta["names"]), theta["at"] and tuple(theta["at"])) if theta else OWN,
         budget=Budget(**budget) if budget else None,
     )
 

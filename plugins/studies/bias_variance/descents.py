@@ -21,7 +21,7 @@ SHOWN = ("rmse_rel", "rmse_start", "cosine", "grad_norm", "reference_norm", "sta
 PATH = (
     Column("share", label="descent", format="setting"),
     Column("theta", label="|theta|", digits=3),
-    Column("cost", label="J", digits=4),
+    Column("cost", label="J", digits=6),
     Column("gradient", label="|grad J|", digits=3),
     Column("speed", label="largest speed", digits=3),
     Column("move", label="largest move", digits=3),
