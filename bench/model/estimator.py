@@ -62,6 +62,9 @@ class Estimator(Plugin):
     needs_independent_samples: ClassVar[bool] = False
     """Whether it excludes other designs than independent draws, since it chooses directions or fits a model itself."""
 
+    fixed_work: ClassVar[bool] = False
+    """Whether an estimate takes the same work for all N, since it depends on no noise in J."""
+
     draws: str = param(
         "iid", "points of the noise of an estimate: independent, orthogonal, or a Sobol set", choices=POINTS, added=True
     )
@@ -85,7 +88,7 @@ class Estimator(Plugin):
 
     def draws_noise(self, program: Program) -> bool:
         """Return whether estimates depend on the noise on theta or actions; if not, only on the scene's own noise."""
-        return True
+        return not self.fixed_work
 
     def declares_unbiased(self, program: Program) -> bool:
         """Return whether the estimator declares that its expectation is grad J_sigma of the program."""

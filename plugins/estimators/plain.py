@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.model import Estimator, Problem, Program, columns
+from bench.model import Estimator, Problem, columns
 
 
 @dataclass(frozen=True)
@@ -20,9 +20,7 @@ class Plain(Estimator):
     name = "plain"
     needs = frozenset({"grad"})
     unbiased = False
-
-    def draws_noise(self, program: Program) -> bool:
-        return False
+    fixed_work = True
 
     def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Return the gradient at w = 0 and each repeat's first draw of the scene's own noise, ``(R, d)``."""

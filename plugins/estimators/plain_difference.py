@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.model import Estimator, Problem, Program, central_differences, columns, param
+from bench.model import Estimator, Problem, central_differences, columns, param
 
 CUBE_ROOT = float(np.cbrt(np.finfo(np.float64).eps))
 """Relative step at which rounding and truncation errors of a smooth cost balance."""
@@ -23,11 +23,9 @@ class PlainDifference(Estimator):
 
     name = "plain_difference"
     unbiased = False
+    fixed_work = True
 
     step: float = param(CUBE_ROOT, "h_i / max(1, abs(theta_i)); in float32 about 5e-3", positive=True)
-
-    def draws_noise(self, program: Program) -> bool:
-        return False
 
     def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Return the differences at w = 0 and each repeat's first draw of the scene's own noise, ``(R, d)``."""

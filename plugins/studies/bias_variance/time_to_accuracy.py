@@ -292,5 +292,5 @@ def comparisons(best: pd.DataFrame) -> pd.DataFrame:
         "first": best["fastest"].where(best["fastest"] != "-", ""), "value": best["cost"],
         "value_low": math.nan, "value_high": math.nan, "second": best["next"].where(best["next"] != "-", ""),
         "factor": best["factor"], "factor_low": best["factor_low"], "factor_high": best["factor_high"],
-        "tied": best["tied"],
+        "tied": best["tied"], "rollouts": math.nan, "not_comparable": [()] * len(best),
     })  # fmt: skip

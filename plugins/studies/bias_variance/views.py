@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -25,15 +25,18 @@ from .columns import COLUMNS
 from .comparisons import COLUMNS as COMPARED
 from .comparisons import (
     FAILS,
+    LAW,
     NO_RESULT,
-    ROLLOUTS,
+    at_equal_rollouts,
     compare_errors,
     leaders,
+    lowest,
     method_table,
     problems_by_axis,
+    setting_names,
     verdicts_by_estimator,
 )
-from .time_to_accuracy import limits, with_gradient_cost
+from .time_to_accuracy import ROLLOUTS, limits, with_gradient_cost
 
 RESULTS = ("variance", "cosine", "rollouts", "gradients", "reference_method")
 
@@ -46,11 +49,12 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views | None:
     methods = method_table(shown)
     if methods.empty:
         return None
-    errors = compare_errors(methods)
+    equal = at_equal_rollouts(methods)
+    errors = compare_errors(equal)
     best = time_to_accuracy.table(shown)
     return Views(
-        tables(experiment, rows, shown, methods, errors, best),
-        charts.charts(shown, methods, errors, best),
+        tables(experiment, rows, shown, methods, equal, errors, best),
+        charts.charts(shown, equal, errors, best),
         rows=charts.with_plotted_columns(costed),
         columns=[
             *(replace(c, label=label) for c, label in ((charts.RMSE, "rel. RMSE"), (charts.BIAS, "rel. bias"))),
@@ -99,22 +103,24 @@ def tables(
     rows: pd.DataFrame,
     shown: Arranged,
     methods: pd.DataFrame,
+    equal: pd.DataFrame,
     errors: pd.DataFrame,
     best: pd.DataFrame,
 ) -> list[Table]:
-    """Return all tables; ``best`` is the table of the cost to reach an error."""
-    main, *others = pivots(shown)
+    """Return all tables; ``equal`` has the methods at equal rollouts, ``best`` is the table of the cost to reach an error."""
+    main, *others = pivots(shown, lowest(equal))
     is_ranked = methods["estimator"].nunique() >= LEAST and methods["problem"].nunique() > 1
     compared = errors if best.empty else pd.concat([errors, time_to_accuracy.comparisons(best)], ignore_index=True)
-    joined = compared.drop(columns="setting").assign(tied=compared["tied"].map(", ".join))
+    names = {name: compared[name].map(", ".join) for name in ("tied", "not_comparable")}
+    joined = compared.drop(columns="setting").assign(**names)
     columns = [replace(c, note="factor_note") if c.name == "factor" else c for c in COMPARED]
-    title = "the first and the next at each setting"
+    title = "the first and the next at each setting, at equal rollouts"
     return [
         replace(main, data=axes.table(experiment, rows)), *others,
         Table("speed_accuracy", speed_accuracy(rows), [], files=["csv"]),
-        *([ranking(methods)] if is_ranked else []),
-        recommendations(methods, errors),
-        Table("verdicts", methods.drop(columns="setting"), [], files=["csv"]),
+        *([ranking(methods, equal)] if is_ranked else []),
+        recommendations(equal, errors),
+        Table("verdicts", methods.drop(columns=["setting", "has_law", *LAW]), [], files=["csv"]),
         Table("comparisons", joined.assign(factor_note=limits(joined)), columns, title, COMPARISON_NOTES, data=joined),
         *([] if best.empty else [time_to_accuracy.accuracy_table(best)]),
         *descents.tables(shown),
@@ -122,7 +128,10 @@ def tables(
 
 
 COMPARISON_NOTES = (
-    "Factor: the second over the first, with its 95% interval; none for an upper limit, which is never first. Tied: not "
+    "Rollouts: of one estimate of each method, the number at which most methods are known, as measured or by RMSE^2 = bias^2 + v / N; "
+    "a gradient counts as the rollouts that take as long (as one where that was not measured). Not comparable: methods that "
+    "choose samples together, or whose bias may depend on their number, at other rollouts than measured. Costs by time to "
+    "reach an error are compared where samples were swept. Factor: the second over the first, with its 95% interval; none for an upper limit, which is never first. Tied: not "
     "distinguishable from the first, since the interval of the factor reaches 1 or is not known.",
 )
 
@@ -130,37 +139,48 @@ COMPARISON_NOTES = (
 # ------------------------------------------------------------------------------------------- along an axis
 
 
-def pivots(shown: Arranged) -> list[Table]:
-    """Return a table per problem: estimators down, values of its longest axis across, each cell a relative RMSE."""
-    result = [_pivot(axis, problem) for axis, problem in problems_by_axis(shown)]
+def pivots(shown: Arranged, best: Container[tuple[str, str]]) -> list[Table]:
+    """Return a table per problem: estimators down, values of its longest axis across, each cell a relative RMSE.
+
+    Beside them stand the cost and the time of one estimate. ``best`` are the settings and methods in bold.
+    """
+    result = [_pivot(axis, problem, best) for axis, problem in problems_by_axis(shown)]
     return [*result[:-1], replace(result[-1], notes=_notes(result))]
 
 
-def _pivot(axis: Axis | None, problem: ProblemRows) -> Table:
+def _pivot(axis: Axis | None, problem: ProblemRows, best: Container[tuple[str, str]]) -> Table:
     rows = estimator_curves(problem.rows)
     ok, note = rows["status"] == "ok", rows["status"].map(lambda status: FAILURES.get(status, [""])[0])
     error, low, high, is_limit = (pd.Series(part, rows.index) for part in shown_rmse(rows))
     error, low, high = (part.where(ok) for part in (error, low, high))
-    others = [
-        ok & (rows["x"] == x) & (rows["label"] != label) for x, label in zip(rows["x"], rows["label"], strict=True)
-    ]
-    is_apart = [bool(rivals.any() and (low[rivals] > end).all()) for rivals, end in zip(others, high, strict=True)]
+    settings = setting_names(problem, axis, rows)
+    is_best = [pair in best for pair in zip(settings, rows["method"], strict=True)]
     cells = pd.DataFrame({
         "": error, "_low": low, "_high": high, "_limit": is_limit,
-        "_best": ok & (error < 1) & ~is_limit & np.array(is_apart, dtype=bool),
+        "_best": (error < 1) & np.array(is_best, dtype=bool),
         "_note": note + np.where(rows["reason"] != "", REMARKED, ""),
     }).set_axis(rows["method"])  # fmt: skip
     values = sorted(rows["x"].unique())
     wide = _across(cells, rows["x"], values, "x").reindex(rows["method"].unique())
+    is_swept = axis is not None and axis.column == "samples"
+    per = rows["x"] if is_swept else 1
+    spent = pd.DataFrame({"rollouts": rows[ROLLOUTS] / per, "time": rows["time_s"] / per}).groupby(
+        rows["method"], sort=False
+    )
+    # of few samples a call takes most of the time
+    wide = pd.concat([wide, spent.last() if is_swept else spent.median()], axis=1).copy().rename_axis("method")
     columns = [
         interval(
             f"x{i}", label=axis_value(x) if axis else "relative RMSE", limit=f"x{i}_limit", emphasis=f"x{i}_best", note=f"x{i}_note",
         )
         for i, x in enumerate(values)
     ]  # fmt: skip
+    each = "a sample" if is_swept else "an estimate"
+    costs = [Column("rollouts", label=f"rollouts {each}"), Column("time", label=f"time {each}", format="seconds")]
+    equal = "" if is_swept or rows["samples"].nunique() > 1 else f", at {axis_value(rows['samples'].iloc[0])} samples"
     return Table(
-        "bias_variance", wide.reset_index(), [ESTIMATOR, *columns],
-        f"relative RMSE: {problem.title()}{f', by {axis.title}' if axis else ''}", files=["csv", "md", "tex"], terminal=True,
+        "bias_variance", wide.reset_index(), [ESTIMATOR, *columns, *costs],
+        f"relative RMSE{equal}: {problem.title()}{f', by {axis.title}' if axis else ''}", files=["csv", "md", "tex"], terminal=True,
     )  # fmt: skip
 
 
@@ -175,7 +195,8 @@ def _notes(result: Sequence[Table]) -> list[str]:
     seen = {str(v) for table in result for name in table.frame if name.endswith("_note") for v in table.frame[name]}
     notes = [
         "Relative RMSE of one estimate [95% interval], in units of the reference gradient's norm: above 1 the zero estimate "
-        "is better. Bold: below 1, with an interval apart from that of every other estimator. <: upper limit, where the bias is not "
+        "is better. Bold: below 1, with an interval apart from that of every other estimator at equal rollouts. Rollouts: cost of one "
+        "estimate, a gradient as the rollouts that take as long (as one where that was not measured). <: upper limit, where the bias is not "
         "distinguishable from 0 and the reference's error is at least the standard deviation of one estimate."
     ]
     signs = [f"{sign}: {what}." for sign, what in FAILURES.values() if any(sign in text_ for text_ in seen)]
@@ -203,19 +224,19 @@ def speed_accuracy(rows: pd.DataFrame) -> pd.DataFrame:
 # --------------------------------------------------------------------------------------------------- ranking
 
 
-def ranking(methods: pd.DataFrame) -> Table:
+def ranking(methods: pd.DataFrame, equal: pd.DataFrame) -> Table:
     """Return the ranking: a line per estimator with the number of settings by verdict, and its errors by problem.
 
-    Where a problem was swept, its error is the largest along the axis: the worst case.
+    Verdicts are of ``methods`` as measured, errors at equal rollouts. Where a problem was swept, its error is the largest along the axis: the worst case.
     """
     counts = verdicts_by_estimator(methods)
-    worst = methods.assign(known=methods["error"].fillna(math.inf)).sort_values("known", kind="stable")
+    worst = equal.assign(known=equal["error"].fillna(math.inf)).sort_values("known", kind="stable")
     worst = worst.drop_duplicates(["estimator", "problem"], keep="last")
     shares = worst["verdict"] + np.where(worst["bias_share"] > 0.5, ", biased", "")
     work = worst["evaluations"].map(" ({:.0f}x)".format).where(worst["evaluations"] > MANY, "")
-    notes = shares.mask(worst["status"] != "ok", worst["status"]) + work
+    notes = shares.mask(worst["status"] != "ok", worst["status"]).mask(worst["not_comparable"], "not comparable") + work
     ends = {end: worst[f"error{end}"] for end in ("", "_low", "_high", "_is_limit")}
-    problems, cells = methods["problem"].unique(), pd.DataFrame(ends | {"_note": notes}).set_axis(worst["estimator"])
+    problems, cells = equal["problem"].unique(), pd.DataFrame(ends | {"_note": notes}).set_axis(worst["estimator"])
     frame = counts.join(_across(cells, worst["problem"], problems, "p")).rename_axis("method").reset_index()
     errors = frame[[f"p{i}" for i in range(len(problems))]]
     frame["worst"] = errors.max(axis=1).where(np.isfinite(errors).all(axis=1))
@@ -229,18 +250,12 @@ def ranking(methods: pd.DataFrame) -> Table:
         ),
     ]
     explained = (
-        f"Sorted by the worst case. Relative RMSE [95% interval] at equal {_basis(methods)}; where a problem was swept, the largest along "
-        "the axis. works: the whole interval is below 1; fails: it is above 1; open: it contains 1 or is not known. biased: more "
+        "Sorted by the worst case. Relative RMSE [95% interval] at equal rollouts; where a problem was swept, the largest along "
+        "the axis. At the samples of the experiment, works: the whole interval is below 1; fails: it is above 1; open: it contains 1 or is not known. biased: more "
         "than half of the squared error is bias. (40x): it evaluates 40 costs and gradients per sample, where others take "
         "one or two.",
     )
     return Table("ranking", frame, columns, "estimators by their worst case", explained)
-
-
-def _basis(methods: pd.DataFrame) -> str:
-    """Return at what errors are equal: rollouts, samples, or either by problem."""
-    along = set(methods["axis"] == ROLLOUTS.column)
-    return "samples or rollouts" if len(along) > 1 else ROLLOUTS.column if along == {True} else "samples"
 
 
 def _values(axis: str, at: pd.Series) -> str:
@@ -265,5 +280,5 @@ def recommendations(methods: pd.DataFrame, comparisons: pd.DataFrame) -> Table:
     columns = [
         text("problem"), text("where"), text("use"), text("error", label="relative RMSE"), text("fails", label="fails there"),
     ]  # fmt: skip
-    notes = [f"Errors are compared at equal {_basis(methods)}."]
+    notes = ["Errors are compared at equal rollouts."]
     return Table("recommendations", pd.DataFrame(lines), columns, "What to use where", notes, files=(), page=True)
