@@ -263,8 +263,9 @@ class Columns:
         return [column.name for column in self.all if column.kind == kind]
 
     def blank(self) -> dict[str, Any]:
-        """Return a row in which every value is missing: NaN, an empty string or an empty list."""
-        return {c.name: "" if c.kind == "text" else [] if c.kind == "list" else math.nan for c in self.all}
+        """Return a row in which every value is missing: its default, or NaN, an empty string or an empty list."""
+        empty: dict[Kind, Any] = {"text": "", "number": math.nan}
+        return {c.name: empty.get(c.kind, []) if c.default is None else c.default for c in self.all}
 
     def typed(self, table: pd.DataFrame) -> pd.DataFrame:
         """Return the table with its columns in order, of their types and derived, followed by unknown columns unchanged."""
