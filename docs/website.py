@@ -269,9 +269,9 @@ def estimator_page(name: str, plugin: Any, table: pd.DataFrame) -> str:
     else:
         parts += ["## Where it wins and fails", summary(table), comparison_table(table)]
         parts.append(
-            "Relative RMSE of one estimate with its 95% interval, at equal samples, in the experiment "
-            "[estimators](../experiment/estimators.md). *best*: not distinguishable from the lowest of all settings of all "
-            "estimators on that problem. *works* or *fails*: the whole interval is below or above 1, the error of the zero estimate. *open*: "
+            "Relative RMSE of one estimate with its 95% interval, as measured in the experiment "
+            "[estimators](../experiment/estimators.md). *best*: at equal rollouts not distinguishable from the lowest of all "
+            "settings of all estimators on that problem. *works* or *fails*: the whole interval is below or above 1, the error of the zero estimate. *open*: "
             "the interval contains 1. *biased*: more than half of the squared error is bias. Evaluations are costs and "
             "gradients per sample."
         )
