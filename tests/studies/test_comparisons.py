@@ -163,11 +163,15 @@ def test_where_no_law_gives_the_error_at_equal_rollouts_nobody_is_first(estimato
     assert compared[["first", "second", "not_comparable"]].values.tolist() == [["", "", ("orthogonal",)]]
 
 
-@pytest.mark.parametrize(("rollouts", "first"), [(100.0, "c"), (200.0, "a")])
-def test_costs_that_do_not_grow_with_samples_are_compared_where_the_rollouts_suffice(rollouts, first):
-    fixed = [one | {"rollouts": rollouts} for one in by_samples("c", 1, scale=0.1)]
+FIXED = "plain_difference"
+
+
+@pytest.mark.parametrize(("rollouts", "compared_at"), [(100.0, 128.0), (200.0, 200.0)])
+def test_costs_that_do_not_grow_with_samples_are_compared_where_the_rollouts_suffice(rollouts, compared_at):
+    fixed = [one | {"rollouts": rollouts} for one in by_samples(FIXED, 1, scale=0.1)]
     _, compared = made(*by_samples("a", 1), *by_samples("b", 2), *fixed, sweep={"samples": [64, 128]})
-    assert compared[["axis", "at", "first"]].values.tolist() == [["rollouts", 128.0, first]]
+    expected = [["rollouts", compared_at, FIXED], ["rollouts", 256.0, FIXED]]
+    assert compared[["axis", "at", "first"]].values.tolist() == expected
 
 
 def test_a_far_larger_error_does_not_share_the_first_place_of_an_error_that_is_not_sure():
