@@ -12,7 +12,7 @@ from typing import ClassVar
 import numpy as np
 
 from bench.errors import Unsupported
-from bench.model.design import IID, LEAST_UNITS, MOST_COORDINATES, POINTS, Design, block_of, per_unit
+from bench.model.design import IID, LEAST_UNITS, MOST_COORDINATES, POINTS, Design, block_of, per_unit, sums_of_units
 from bench.model.parameters import Plugin, param
 from bench.model.problem import Problem
 from bench.model.program import Program
@@ -222,18 +222,22 @@ def per_repeat(values: np.ndarray, noise: np.ndarray) -> np.ndarray:
     return np.moveaxis(values.reshape(-1, repeats, samples), 0, -1)
 
 
-def halves(problem: Problem, theta: np.ndarray, noise: np.ndarray, unit: int = 1) -> tuple[np.ndarray, np.ndarray]:
+def halves(
+    problem: Problem, theta: np.ndarray, noise: np.ndarray, unit: int = 1, leave_out: bool = False
+) -> tuple[np.ndarray, np.ndarray]:
     """Return first-order terms of the first half of the samples and zeroth-order terms of the rest, each ``(R, K, d)``.
 
     A term is the mean over a ``unit`` of samples that are drawn together, and no unit is in both halves. The zeroth-order
-    terms are (f - f at w = 0) times the score. Raises ValueError for fewer than 4 units.
+    terms are (f - b) times the score, b being f at w = 0, or with ``leave_out`` the mean cost of the other units. Raises
+    ValueError for fewer than 4 units.
     """
     units = noise.shape[1] // unit
     if units < 4:
         raise ValueError(f"needs at least 4 samples, got {units}")
     half = units // 2 * unit
-    first, zeroth = first_order(problem, theta, noise[:, :half]), zeroth_order(problem, theta, noise[:, half:])
-    return per_unit(first, unit), per_unit(zeroth, unit)
+    rest = noise[:, half:]
+    zeroth = against_others(problem, theta, rest, unit) if leave_out else zeroth_order(problem, theta, rest)
+    return per_unit(first_order(problem, theta, noise[:, :half]), unit), per_unit(zeroth, unit)
 
 
 def first_order(problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
@@ -246,6 +250,20 @@ def zeroth_order(problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.n
     w = columns(noise)
     cost = problem.value(theta, w) - problem.value(theta, np.zeros((w.shape[0], 1)))
     return per_repeat(cost * problem.score(theta, w), noise)
+
+
+def against_others(problem: Problem, theta: np.ndarray, noise: np.ndarray, unit: int = 1) -> np.ndarray:
+    """Return (f - mean f of the other units) times the score of each sample, ``(R, N, d)``."""
+    w = columns(noise)
+    cost = less_others(per_repeat(problem.value(theta, w), noise), unit)
+    return cost[..., None] * per_repeat(problem.score(theta, w), noise)
+
+
+def less_others(costs: np.ndarray, unit: int = 1) -> np.ndarray:
+    """Return costs ``(R, N)`` less the mean cost of the samples in other units than their own."""
+    n = costs.shape[1]
+    centred = costs - costs.mean(axis=1, keepdims=True)
+    return np.asarray(centred * n / (n - unit) + (sums_of_units(centred, unit) - unit * centred) / (n - unit))
 
 
 def mean_difference(problem: Problem, theta: np.ndarray, directions: np.ndarray, noise: np.ndarray) -> np.ndarray:

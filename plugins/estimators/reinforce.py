@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.model import Problem, SampleMean, columns, param, per_repeat, sums_of_units
+from bench.model import Problem, SampleMean, columns, less_others, param, per_repeat
 
 
 @dataclass(frozen=True)
@@ -49,9 +49,6 @@ class Reinforce(SampleMean):
             raise ValueError("baseline leave_one_out needs at least 2 samples")
         w = columns(noise)
         f = per_repeat(problem.value(theta, w), noise)
-        n, unit = f.shape[1], self.design(problem.program, f.shape[1]).unit
-        centred = f - f.mean(axis=1, keepdims=True)
-        # the cost less the mean of the other units
-        f = centred * n / (n - unit) + (sums_of_units(centred, unit) - unit * centred) / (n - unit)
+        f = less_others(f, self.design(problem.program, f.shape[1]).unit)
         score = per_repeat(problem.score(theta, w), noise)
         return np.einsum("rn,rnd->rd", f, score) / f.shape[1]

@@ -12,6 +12,7 @@ from bench.model import (
     Program,
     Rollout,
     adjoint,
+    against_others,
     by_actions,
     by_theta,
     columns,
@@ -20,7 +21,6 @@ from bench.model import (
     per_repeat,
     per_unit,
     slopes,
-    zeroth_order,
 )
 
 
@@ -43,6 +43,7 @@ class TotalPropagation(DiagnosticEstimator):
     """
 
     name = "total_propagation"
+    revision = 2
     uses = (adjoint,)
     needs = frozenset({"value", "grad", "score"})
     unbiased = False
@@ -68,7 +69,7 @@ class TotalPropagation(DiagnosticEstimator):
         if self.per == "action":
             return self._per_action(problem, theta, noise)
         unit = self.design(problem.program, noise.shape[1]).unit
-        orders = first_order(problem, theta, noise), zeroth_order(problem, theta, noise)
+        orders = first_order(problem, theta, noise), against_others(problem, theta, noise, unit)
         first, zeroth = (per_unit(terms, unit) for terms in orders)
         part = 1 if self.per == "control" else _controls(problem.program)
         v1, v0 = (_summed(terms.var(axis=1, ddof=1), part) for terms in (first, zeroth))
