@@ -222,13 +222,7 @@ def engines_agree() -> str:
 
 
 FIGURES: dict[str, str | Callable[[], str]] = {
-    "fobg-soft": "stiffness_sweep/bias_variance | estimator=fobg, estimator_params=, contact=penalty, backend=jax, sigma=0.1, stiffness<=3000 | rmse_rel",
-    "reinforce-soft": "stiffness_sweep/bias_variance | estimator=reinforce, estimator_params=, contact=penalty, backend=jax, sigma=0.1, stiffness<=3000 | rmse_rel",
-    "fobg-stiff": 'stiffness_sweep/verdicts | method="fobg (jax, torch, implicit)", problem="pushing, penalty, sigma=0.1", at=10000 | error | interval',
-    "smoothing-stiff": "stiffness_sweep/bias_variance | estimator=randomized_smoothing, estimator_params=, contact=penalty, backend=jax, sigma=0.1, stiffness>=10000 | rmse_rel",
-    "fobg-implicit-stiff": "stiffness_sweep/bias_variance | estimator=fobg, contact=complementarity, backend=implicit, sigma=0.1, stiffness>=10000 | rmse_rel",
-    "implicit-time": "stiffness_sweep/bias_variance | estimator=fobg, contact=complementarity, backend=implicit, sigma=0.1, stiffness>=10000 | time_s | seconds",
-    "explicit-time": "stiffness_sweep/bias_variance | estimator=fobg, estimator_params=, contact=penalty, backend=jax, sigma=0.1, stiffness>=10000 | time_s | seconds",
+    "fobg-stiff": 'stiffness_sweep/verdicts | method="fobg (jax, torch)", problem="pushing, penalty, descent=0", at=10000 | error | interval',
     "quadruped-sides": sides_right,
     "quadruped-jumps": jumps_at_switches,
     "quadruped-engines": engines_agree,
