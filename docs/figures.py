@@ -221,8 +221,16 @@ def engines_agree() -> str:
     return number(float(max(distances)))
 
 
+def pairs_gain() -> str:
+    """Return the least factor between the errors of independent and of mirrored draws, below the limit of the step."""
+    verdicts = table_of("stiffness_sweep/verdicts").query("problem.str.startswith('pushing, penalty') and at <= 3000")
+    errors = verdicts.pivot_table(index=["problem", "at"], columns="estimator", values=["error_low", "error_high"])
+    return number(float((errors["error_low"]["fobg"] / errors["error_high"]["fobg[mirrored=true]"]).min()))
+
+
 FIGURES: dict[str, str | Callable[[], str]] = {
     "fobg-stiff": 'stiffness_sweep/verdicts | method="fobg (jax, torch)", problem="pushing, penalty, descent=0", at=10000 | error | interval',
+    "pairs-gain": pairs_gain,
     "quadruped-sides": sides_right,
     "quadruped-jumps": jumps_at_switches,
     "quadruped-engines": engines_agree,

@@ -91,7 +91,7 @@ def method_table(shown: Arranged) -> pd.DataFrame:
             "verdict": verdict(rows["status"], error, low, high), "status": rows["status"], "remark": rows["reason"],
             "bias_share": ((rows["bias_low"] / rows["rmse"]) ** 2).where(error > 0),
             "evaluations": (rows["rollouts"] + rows["gradients"]) / samples, "time_s": rows["seconds"],
-            "rollouts": rows[ROLLOUTS], "has_law": has_law(rows), "has_fixed_work": has_fixed_work(rows), **{name: rows[name] for name in LAW},
+            "rollouts": rows[ROLLOUTS], "has_law": has_law(rows), **{name: rows[name] for name in LAW},
         }))  # fmt: skip
     return pd.concat(parts, ignore_index=True)
 
@@ -109,26 +109,18 @@ def has_law(rows: pd.DataFrame) -> pd.Series:
     plugins = {name: entry.plugin for name, entry in registry.entries()["estimators"].items()}
     known = {name: plugins.get(name) for name in rows["estimator"].unique()}
     means = {name: plugin is not None and issubclass(plugin, SampleMean) for name, plugin in known.items()}
+    fixed = {name: getattr(plugin, "fixed_work", False) for name, plugin in known.items()}
     is_coupled = [couples_samples(row) for row in rows[["estimator", "draws"]].to_dict("records")]
     is_known = rows["estimator"].map(means).astype(bool) | ~(rows["bias_low"] > 0)
-    return ~np.array(is_coupled, dtype=bool) & ~has_fixed_work(rows) & is_known
-
-
-def has_fixed_work(rows: pd.DataFrame) -> pd.Series:
-    """Return whether the estimate of each row takes the same work for every number of samples."""
-    plugins = registry.entries()["estimators"]
-    fixed = {
-        name: getattr(plugins[name].plugin, "fixed_work", False) if name in plugins else False
-        for name in rows["estimator"].unique()
-    }
-    return rows["estimator"].map(fixed).astype(bool)
+    return ~np.array(is_coupled, dtype=bool) & ~rows["estimator"].map(fixed).astype(bool) & is_known
 
 
 def at_equal_rollouts(methods: pd.DataFrame) -> pd.DataFrame:
     """Return the methods with their errors at equal rollouts: in each setting those at which most methods are known.
 
-    A method has the error of its row with as many rollouts, or with fewer if its work is fixed. Without one it has that of its nearest row by
-    RMSE^2 = bias^2 + v / N, or none, and ``not_comparable`` is true. Along samples a setting is a number of rollouts.
+    A method has the error of its row with as many rollouts. Without one it has that of its nearest row by RMSE^2 = bias^2 +
+    v / N. Where that law does not hold, it has the error of a row with fewer rollouts, which are allowed too; if there is
+    none, ``not_comparable`` is true. Along samples a setting is a number of rollouts.
     """
     parts = [methods.assign(not_comparable=False)[:0]]
     for _, level in methods.groupby("setting", sort=False):
@@ -142,7 +134,7 @@ def at_equal_rollouts(methods: pd.DataFrame) -> pd.DataFrame:
             if cost > 0
         }
         same = {
-            cost: (distance <= math.log(SAME_COST)) | (of["has_fixed_work"] & (spent <= cost))
+            cost: (distance <= math.log(SAME_COST)) | (~of["has_law"] & (spent <= cost))
             for cost, distance in apart.items()
         }
         cost = max(same, key=lambda c: (of.loc[same[c] | of["has_law"], "method"].nunique(), c), default=math.nan)
