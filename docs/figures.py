@@ -228,9 +228,19 @@ def pairs_gain() -> str:
     return number(float((errors["error_low"]["fobg"] / errors["error_high"]["fobg[mirrored=true]"]).min()))
 
 
+def effort_share() -> str:
+    """Return the share of the variance of fobg that the slope of the control effort, 2 sigma w per step, has at the start."""
+    rows = rows_of("stiffness_sweep").query(
+        "estimator == 'fobg' and estimator_params == '' and scene == 'pushing' and contact == 'penalty' and backend == 'jax' "
+        "and descent == 0 and stiffness <= 3000"
+    )
+    return span(100.0 * rows["dim"] * (2.0 * rows["sigma"]) ** 2 / rows["samples"] / rows["variance"], 2, "%")
+
+
 FIGURES: dict[str, str | Callable[[], str]] = {
     "fobg-stiff": 'stiffness_sweep/verdicts | method="fobg (jax, torch)", problem="pushing, penalty, descent=0", at=10000 | error | interval',
     "pairs-gain": pairs_gain,
+    "effort-share": effort_share,
     "quadruped-sides": sides_right,
     "quadruped-jumps": jumps_at_switches,
     "quadruped-engines": engines_agree,

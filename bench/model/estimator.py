@@ -12,7 +12,17 @@ from typing import ClassVar
 import numpy as np
 
 from bench.errors import Unsupported
-from bench.model.design import IID, LEAST_UNITS, MOST_COORDINATES, POINTS, Design, block_of, per_unit, sums_of_units
+from bench.model.design import (
+    IID,
+    LEAST_UNITS,
+    MOST_COORDINATES,
+    POINTS,
+    UNITS,
+    Design,
+    block_of,
+    per_unit,
+    sums_of_units,
+)
 from bench.model.parameters import Plugin, param
 from bench.model.problem import Problem
 from bench.model.program import Program
@@ -118,6 +128,10 @@ class Estimator(Plugin):
         """
         if self.draws == "iid" and not self.mirrored:
             return IID
+        if self.draws not in POINTS or not isinstance(self.mirrored, bool):
+            raise Unsupported(
+                f"{self.name} has draws={self.draws!r} and mirrored={self.mirrored!r}: parameters of its own need other names"
+            )
         words = " and ".join(
             filter(None, [f"draws={self.draws}" * (self.draws != "iid"), "mirrored=true" * self.mirrored])
         )
@@ -142,6 +156,10 @@ class Estimator(Plugin):
         if self.draws == "sobol" and (block < 1 or block & (block - 1) or count % block):
             raise Unsupported(
                 f"Sobol sets have a power of 2 of points: samples={samples} gives sets of {count / (count // max(block, 1)):g}"
+            )
+        if block == 1 < width and self.draws != "iid":
+            raise Unsupported(
+                f"{self.name} compares at least {UNITS} units of {words}, and samples={samples} has no such units of several draws"
             )
         if self.in_units and count // block < LEAST_UNITS:
             raise Unsupported(

@@ -22,6 +22,8 @@ REFUSED = [
     ("fobg[draws=sobol]", "linear[dimension=21202]", 128, "21,201 coordinates"),
     ("inverse_variance[mirrored=true]", "pendulum", 6, "4 independent units of mirrored=true"),
     ("inverse_variance[draws=sobol]", "pendulum", 96, "power of 2"),
+    ("reinforce[draws=sobol]", "pendulum", 8, "no such units"),
+    ("reinforce[draws=orthogonal]", "pendulum", 127, "no such units"),
     ("alpha_order[draws=sobol]", "pendulum", 4, "power of 2"),
     ("inverse_variance[draws=sobol,mirrored=true]", "pendulum", 128, None),
     ("optimal_baseline[draws=orthogonal]", "pendulum", 100, None),

@@ -91,7 +91,7 @@ def method_table(shown: Arranged) -> pd.DataFrame:
             "verdict": verdict(rows["status"], error, low, high), "status": rows["status"], "remark": rows["reason"],
             "bias_share": ((rows["bias_low"] / rows["rmse"]) ** 2).where(error > 0),
             "evaluations": (rows["rollouts"] + rows["gradients"]) / samples, "time_s": rows["seconds"],
-            "rollouts": rows[ROLLOUTS], "has_law": has_law(rows), **{name: rows[name] for name in LAW},
+            "rollouts": rows[ROLLOUTS], "has_law": has_law(rows), "has_fixed_work": has_fixed_work(rows), **{name: rows[name] for name in LAW},
         }))  # fmt: skip
     return pd.concat(parts, ignore_index=True)
 
@@ -108,19 +108,30 @@ def has_law(rows: pd.DataFrame) -> pd.Series:
     """
     plugins = {name: entry.plugin for name, entry in registry.entries()["estimators"].items()}
     known = {name: plugins.get(name) for name in rows["estimator"].unique()}
-    means = {name: plugin is not None and issubclass(plugin, SampleMean) for name, plugin in known.items()}
-    fixed = {name: getattr(plugin, "fixed_work", False) for name, plugin in known.items()}
+    constant = {
+        name: plugin is not None
+        and not plugin.fixed_work
+        and (issubclass(plugin, SampleMean) or plugin.unbiased is True)
+        for name, plugin in known.items()
+    }
     is_coupled = [couples_samples(row) for row in rows[["estimator", "draws"]].to_dict("records")]
-    is_known = rows["estimator"].map(means).astype(bool) | ~(rows["bias_low"] > 0)
-    return ~np.array(is_coupled, dtype=bool) & ~rows["estimator"].map(fixed).astype(bool) & is_known
+    return ~np.array(is_coupled, dtype=bool) & rows["estimator"].map(constant).astype(bool)
+
+
+def has_fixed_work(rows: pd.DataFrame) -> pd.Series:
+    """Return whether the estimate of each row takes the same work for every number of samples."""
+    plugins = {name: entry.plugin for name, entry in registry.entries()["estimators"].items()}
+    fixed = {name: getattr(plugins.get(name), "fixed_work", False) for name in rows["estimator"].unique()}
+    return rows["estimator"].map(fixed).astype(bool)
 
 
 def at_equal_rollouts(methods: pd.DataFrame) -> pd.DataFrame:
     """Return the methods with their errors at equal rollouts: in each setting those at which most methods are known.
 
     A method has the error of its row with as many rollouts. Without one it has that of its nearest row by RMSE^2 = bias^2 +
-    v / N. Where that law does not hold, it has the error of a row with fewer rollouts, which are allowed too; if there is
-    none, ``not_comparable`` is true. Along samples a setting is a number of rollouts.
+    v / N. Where that law does not hold, it has the error of a row with fewer rollouts, which are allowed too: with more of
+    them it might be lower, so its interval begins at 0. If there is none, ``not_comparable`` is true. The rollouts are the
+    fewest at which most methods are known; along samples a setting is a number of rollouts, and they are the most.
     """
     parts = [methods.assign(not_comparable=False)[:0]]
     for _, level in methods.groupby("setting", sort=False):
@@ -129,7 +140,9 @@ def at_equal_rollouts(methods: pd.DataFrame) -> pd.DataFrame:
         of = methods[(methods["axis"] == along) & (methods["problem"] == problem)] if is_swept else level
         spent = of["rollouts"].where(of["rollouts"] > 0)
         apart = {
-            cost: np.abs(np.log(spent / cost)).fillna(math.inf)
+            cost: np.abs(np.log(spent / cost))
+            .where(of["has_law"] | (spent <= SAME_COST * cost), math.inf)
+            .fillna(math.inf)
             for cost in sorted(level["rollouts"].unique())
             if cost > 0
         }
@@ -137,10 +150,15 @@ def at_equal_rollouts(methods: pd.DataFrame) -> pd.DataFrame:
             cost: (distance <= math.log(SAME_COST)) | (~of["has_law"] & (spent <= cost))
             for cost, distance in apart.items()
         }
-        cost = max(same, key=lambda c: (of.loc[same[c] | of["has_law"], "method"].nunique(), c), default=math.nan)
+        order = 1 if is_swept else -1
+        cost = max(
+            same, key=lambda c: (of.loc[same[c] | of["has_law"], "method"].nunique(), order * c), default=math.nan
+        )
         nearest = of.loc[apart[cost].groupby(of["method"], sort=False).idxmin()] if apart else level
         scale = (spent / cost).where(of["has_law"]).mask(same[cost], 1.0) if apart else spent
         found = _scaled(nearest, scale.loc[nearest.index]).assign(rollouts=cost)
+        is_less = ~found["has_law"] & ~found["has_fixed_work"] & (spent.loc[nearest.index] < cost / SAME_COST)
+        found["error_low"] = found["error_low"].mask(is_less, 0.0)
         if is_swept:
             found = found.assign(setting=f"{problem}; rollouts {cost:.3g}", axis="rollouts", at=float(f"{cost:.3g}"))
         parts.append(found)
