@@ -20,9 +20,7 @@ from bench.engines.conformance import runner
 from bench.errors import printable
 from bench.model import registry
 
-COLUMNS = (
-    "engine", "versions", "case", "term", "is_right", "digits", "looks_like", "against", "seconds", "reason", "command",
-)  # fmt: skip
+COLUMNS = ("engine", "versions", *runner.COLUMNS, "command")
 LIMIT_S = 7200.0
 """Seconds allowed for an engine's conformance set."""
 GRADIENTS = "engine_gradients"
@@ -101,7 +99,9 @@ def _page(table: pd.DataFrame) -> str:
         [name, versions, *((own["is_right"] == verdict).sum() for verdict in ("True", "False")), f"`{own['command'].iloc[0]}`"]
         for (name, versions), own in table.groupby(["engine", "versions"], sort=False)
     ]  # fmt: skip
-    reasons = table[table["reason"] != ""].drop_duplicates(["engine", "case"]).groupby(["engine", "reason"])["case"]
+    told = table[table["reason"] != ""]
+    cases = told["case"].str.cat(told["term"].where(told["is_right"] == "False", ""), sep=" ").str.strip()
+    reasons = told.assign(case=cases).drop_duplicates(["engine", "case"]).groupby(["engine", "reason"])["case"]
     notes = [f"- {', '.join([name, *filter(None, of)])}: {printable(why)[:160]}" for (name, why), of in reasons]
     return "\n".join([
         "# Conformance of physics engines", "",

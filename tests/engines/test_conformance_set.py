@@ -16,6 +16,7 @@ import pytest
 
 from bench.cli import main
 from bench.engines import conformance, table
+from bench.engines.conformance import runner
 
 pytest.importorskip("mujoco")
 ROOT = Path(__file__).resolve().parents[2]
@@ -112,6 +113,103 @@ def test_shorter_floats_than_those_of_the_cost_are_no_fault():
         _, *rows = conformance.check(Short(), moved)
         assert not [row for row in rows if row["is_right"] is False], rows
         assert [row["is_right"] for row in rows].count(True) >= 2
+
+
+@pytest.mark.parametrize("factor", [-1.0, 0.5, 0.0])
+def test_a_derivative_off_by_more_than_its_uncertainty_is_wrong(factor):
+    """Differences of short floats are uncertain by more than 1% of some terms, which are off by a multiple of that."""
+    (case,) = conformance.cases("hinge_limit")
+    n_uncertain = 0
+    for shift in np.linspace(-0.5, 0.5, 8):
+        engine, moved = Short(), dataclasses.replace(case, qpos=case.qpos + shift)
+        terms = ("qpos", "qvel")
+        right = {term: case.differences(Short(np.float64), term)[0] for term in terms}
+        engine.gradient = lambda case, right=right: {term: factor * by for term, by in right.items()}
+        _, *rows = conformance.check(engine, moved)
+        for row in rows:
+            off, margin = abs(row["obtained"] - row["expected"]), runner.DOUBTS * row["uncertainty"]
+            assert (row["is_right"] is False) == (off > margin + engine.tolerance * abs(row["expected"]))
+            n_uncertain += row["is_right"] is False and margin > runner.UNCERTAIN * abs(row["expected"])
+    assert n_uncertain
+
+
+class Planted:
+    """The set's numbers, the derivatives by qpos changed by a function."""
+
+    tolerance = "float64"
+
+    def __init__(self, change):
+        self._change = change
+
+    def rollout(self, case):
+        return case.data["expected"]["value"]
+
+    def gradient(self, case):
+        numbers = {term: np.array(case.data["expected"][term]) for term in runner.TERMS}
+        return numbers | {"qpos": self._change(numbers["qpos"], numbers)}
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda by, all: -by, "-1 times"),
+        (lambda by, all: 0.004 * by, "0.004 times"),
+        (lambda by, all: 0.0 * by, "0"),
+        (lambda by, all: all["qvel"], "the numbers of qvel"),
+        (lambda by, all: by[::-1], "in reverse order"),
+        (lambda by, all: np.append(by[1:], 0.0), "shifted by -1"),
+        (lambda by, all: np.append(by[:-1], 0.0), "qpos[5]: 0"),
+        (lambda by, all: by * [-1, 1, 1, -1, 1, 1], "qpos[0, 3]: -1 times"),
+        (lambda by, all: by + 0.25 * np.array([0, 0, 2, 0, 0, 1]), "qpos[2, 5]: 0.71 instead of 0.21"),
+        (lambda by, all: by * [1, np.nan, 1, np.inf, 1, 1], "2 of 6 numbers not finite"),
+        (lambda by, all: by * np.nan, "6 of 6 numbers not finite"),
+    ],
+)
+def test_a_wrong_derivative_has_a_reason(change, reason):
+    _, row, *others = conformance.run(Planted(change), "free_joint")
+    assert (row["is_right"], row["reason"]) == (False, reason)
+    assert all(other["is_right"] and not other["reason"] for other in others)
+    json.dumps(row, allow_nan=False)
+
+
+def test_rows_have_the_numbers_that_are_compared():
+    (case,) = conformance.cases("free_joint")
+    _, row, *_ = conformance.check(Planted(lambda by, all: 0.5 * by), case)
+    assert (row["component"], row["expected"], row["obtained"], row["ratio"]) == (1, 2.04, 1.02, 0.5)
+    assert row["uncertainty"] == case.data["certainty"]["qpos"]
+    assert tuple(row) == runner.COLUMNS
+
+
+def test_values_of_short_floats_need_the_tolerance_by_that_name():
+    engine = Planted(lambda by, all: by * (1 + 3e-4))
+    _, row, *_ = conformance.run(engine, "free_joint")
+    assert row["is_right"] is False
+    engine.tolerance = "float32"
+    conformance.verify(conformance.run(engine, "free_joint"))
+
+
+def test_an_engine_without_derivatives_fails():
+    engine = Planted(lambda by, all: by)
+    conformance.verify(conformance.run(engine, "free_joint"), judged=4)
+    with pytest.raises(AssertionError, match=re.escape("4 derivatives are judged, 5 are required")):
+        conformance.verify(conformance.run(engine, "free_joint"), judged=5)
+    engine.gradient = lambda case: {}
+    with pytest.raises(AssertionError, match="0 derivatives are judged, 1 are required"):
+        conformance.verify(conformance.run(engine))
+    with pytest.raises(AssertionError, match="free_joint qpos: -1 times"):
+        conformance.verify(conformance.run(Planted(lambda by, all: -by), "free_joint"))
+
+
+def test_an_unknown_case_is_an_error_with_the_nearest_name():
+    with pytest.raises(
+        ValueError, match=r"there is no case 'free_join', did you mean free_joint\?; cases: ball_limit,"
+    ):
+        conformance.cases("free_join")
+    words = [sys.executable, runner.__file__, "my_engine.py", "nosuchcase"]
+    done = subprocess.run(words, capture_output=True, text=True)
+    assert done.returncode == 1
+    assert done.stderr.startswith("there is no case 'nosuchcase'")
+    assert "Traceback" not in done.stderr
 
 
 @pytest.mark.parametrize(

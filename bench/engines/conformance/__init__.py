@@ -3,6 +3,6 @@
 The folder needs NumPy only and imports nothing of this package, so that it can be copied.
 """
 
-from .runner import Case, cases, check, run
+from .runner import Case, cases, check, run, verify
 
-__all__ = ["Case", "cases", "check", "run"]
+__all__ = ["Case", "cases", "check", "run", "verify"]
