@@ -160,6 +160,7 @@ class Planted:
         (lambda by, all: np.append(by[1:], 0.0), "shifted by -1"),
         (lambda by, all: np.append(by[:-1], 0.0), "qpos[5]: 0"),
         (lambda by, all: by * [-1, 1, 1, -1, 1, 1], "qpos[0, 3]: -1 times"),
+        (lambda by, all: by * [2, 2, 2, 2, 2, 1], "qpos except [5]: 2 times"),
         (lambda by, all: by + 0.25 * np.array([0, 0, 2, 0, 0, 1]), "qpos[2, 5]: 0.71 instead of 0.21"),
         (lambda by, all: by * [1, np.nan, 1, np.inf, 1, 1], "2 of 6 numbers not finite"),
         (lambda by, all: by * np.nan, "6 of 6 numbers not finite"),
@@ -251,7 +252,7 @@ def test_a_planted_fault_is_named(fault, case, engine):
 
 def test_every_case_has_sources_that_agree():
     cases = conformance.cases()
-    assert len(cases) == 28
+    assert len(cases) == 29
     for case in cases:
         sources = case.data["sources"]
         assert len(sources) >= 2, case.name
@@ -289,7 +290,12 @@ def test_mjx_is_right(names):
     """The cases of equal options are one model."""
     names = names or [case.name for case in conformance.cases()]
     rows = conformance.run(mjx(*names), *names)
-    assert {row["case"] for row in rows if row["is_right"] is None} == {"connect", "connect_fast", "weld"} & set(names)
+    assert {row["case"] for row in rows if row["is_right"] is None} == {
+        "connect",
+        "connect_fast",
+        "sparse_chain",
+        "weld",
+    } & set(names)
     assert not [row for row in rows if row["is_right"] is False]
 
 
@@ -395,4 +401,4 @@ def test_the_table_has_versions_digits_and_commands(tmp_path):
     assert "`python -m bench engines table mujoco`" in page
     assert "| stacked | " in page
     assert "bounce_once" in page
-    assert len((tmp_path / "engines.csv").read_text().splitlines()) > 5 * 28
+    assert len((tmp_path / "engines.csv").read_text().splitlines()) > 5 * 29
