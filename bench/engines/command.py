@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 import time
 from collections.abc import Sequence
@@ -9,11 +10,13 @@ from pathlib import Path
 
 from bench.engines import environments, table
 from bench.engines.backend import EngineBackend
+from bench.engines.conformance import metamorphic
 from bench.errors import UserError, local_path, printable, unknown
 from bench.model import registry
 
 USAGE = (
-    "python -m bench engines [install NAME ... [--again] | table [NAME ...] [out=DIR] [key=value ...]] [plugins=DIR]"
+    "python -m bench engines [install NAME ... [--again] | table [NAME ...] [out=DIR] [key=value ...]"
+    " | metamorphic MODEL.xml [NAME] [steps=60] [seed=0]] [plugins=DIR]"
 )
 
 
@@ -35,6 +38,8 @@ def main(words: Sequence[str]) -> int:
             registry.find("backends", name)
         print(table.write(wanted, out, settings))
         return 0
+    if names[0] == "metamorphic" and names[1:]:
+        return _metamorphic(*names[1:])
     if names[0] != "install" or not names[1:]:
         raise UserError(f"engines: {' '.join(names)} is not a request: {USAGE}")
     engines = _engines()
@@ -58,6 +63,28 @@ def _engines() -> dict[str, type[EngineBackend]]:
     """Return the engines by name."""
     entries = registry.entries()["backends"].items()
     return {name: e.plugin for name, e in entries if e.plugin is not None and issubclass(e.plugin, EngineBackend)}
+
+
+def _metamorphic(model: str, *words: str) -> int:
+    """Print a line per property of an engine on a model, by default of ``mujoco``; return 1 if one does not hold."""
+    if not Path(model).is_file():
+        raise UserError(f"engines metamorphic: the file {model} does not exist: {USAGE}")
+    settings, names = [word for word in words if "=" in word], [word for word in words if "=" not in word]
+    if unknown_names := [word for word in settings if not re.fullmatch(r"(steps|seed)=\d+", word)]:
+        raise UserError(f"engines metamorphic: {' '.join(unknown_names)} is not a setting: {USAGE}")
+    name = names[0] if names else "mujoco"
+    plugin = registry.usable("backends", name)
+    file, script = table.file_of(plugin, "metamorphic"), Path(metamorphic.__file__)
+    if not file.exists():
+        raise UserError(f"engines metamorphic: engine {name} has no file {file}")
+    rows = table.rows_of(name, plugin(), file, script, str(Path(model).resolve()), *settings)
+    for row in rows:
+        state = {True: "holds", False: "broken", None: "-"}[row.get("holds")]
+        at = f"first at step {row['step']}" if row.get("step") is not None else row["reason"]
+        size = f"{row['worst']:.1e} of {row['tolerance']:.0e}" if row.get("worst") is not None else ""
+        print(f"{row.get('property', ''):<34}{state:<8}{size:<20}{at}".rstrip())
+    print(f"{rows[0].get('versions', name)}, {Path(model).name}")
+    return int(any(row.get("holds") is False or "property" not in row for row in rows))
 
 
 def _list() -> int:

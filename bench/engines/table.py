@@ -37,7 +37,7 @@ def write(names: Collection[str], out: Path, settings: Sequence[str] = ()) -> Pa
     for name, entry in registry.entries()["backends"].items():
         if entry.plugin is None or (names and name not in names):
             continue
-        file = Path(inspect.getfile(entry.plugin)).parents[1] / "engines" / f"{name}_conformance.py"
+        file = file_of(entry.plugin, "conformance")
         if not (issubclass(entry.plugin, EngineBackend) or file.exists()):
             continue
         backend = entry.plugin()
@@ -63,6 +63,11 @@ def write(names: Collection[str], out: Path, settings: Sequence[str] = ()) -> Pa
     return page
 
 
+def file_of(plugin: Any, kind: str) -> Path:
+    """Return the file ``engines/NAME_KIND.py`` beside the folder of a backend, which may not exist."""
+    return Path(inspect.getfile(plugin)).parents[1] / "engines" / f"{plugin.name}_{kind}.py"
+
+
 def read(file: Path) -> pd.DataFrame:
     """Return stored rows, all as text."""
     return pd.read_csv(file, dtype=str, keep_default_na=False)
@@ -73,8 +78,13 @@ def conformance_rows(name: str, backend: Any, file: Path, *cases: str) -> list[d
 
     If the run fails or takes longer than :data:`LIMIT_S`, the last row has the reason.
     """
+    return rows_of(name, backend, file, Path(runner.__file__), *cases)
+
+
+def rows_of(name: str, backend: Any, file: Path, script: Path, *words: str) -> list[dict[str, Any]]:
+    """Return the rows of a script of the conformance set on an engine's file, run in the engine's own Python."""
     if not file.exists():
-        return [{"reason": f"no file {file.name} for the conformance set"}]
+        return [{"reason": f"no file {file.name}"}]
     python, environment = sys.executable, {**os.environ, "PYTHONPATH": str(Path(runner.__file__).parents[3])}
     if isinstance(backend, EngineBackend):
         python, environment = backend.python or str(environments.python_of(name)), dict(os.environ)
@@ -82,7 +92,7 @@ def conformance_rows(name: str, backend: Any, file: Path, *cases: str) -> list[d
     with tempfile.TemporaryFile("w+") as output:
         try:
             subprocess.run(
-                [python, runner.__file__, str(file), *cases],
+                [python, str(script), str(file), *words],
                 env=environment, text=True, timeout=LIMIT_S, check=True, stdout=output, stderr=subprocess.PIPE,
             )  # fmt: skip
         except (OSError, subprocess.SubprocessError) as error:
