@@ -49,6 +49,10 @@ class Model(MujocoC):
         """Return the accelerations, ``(n_v,)``."""
         return np.array(self._forward(q, v, u).qacc)
 
+    def reference(self, q: Any, v: Any, u: Any) -> np.ndarray:
+        """Return the C engine's accelerations."""
+        return super().acceleration(q, v, u)
+
     def step(self, q: Any, v: Any, u: Any) -> tuple[np.ndarray, np.ndarray]:
         """Return the next state."""
         return self._step(q, v, u)

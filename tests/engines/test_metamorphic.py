@@ -8,9 +8,14 @@ import pytest
 from bench.cli import main
 from bench.engines import conformance
 from bench.engines.conformance import metamorphic
+from bench.experiment import by_name
+from bench.model import compose
 
 pytest.importorskip("mujoco")
+from bench.plugins.backends import mjx
 from bench.plugins.engines.mujoco_metamorphic import Model
+
+from bench.plugins import mjcf
 
 LOOP = conformance.runner.FOLDER / "connect_fast.xml"
 CHAIN = conformance.runner.FOLDER / "sparse_chain.xml"
@@ -76,9 +81,14 @@ class Swirl(Model):
         return super().force(q) + 0.01 * np.roll(q, 1)
 
 
+class Parts(Model):
+    def reference(self, q, v, u):
+        return super().acceleration(q, v, 1.01 * u)
+
+
 FAULTS = (
     *map(scaled, ('jacobian="sparse"', 'island="disable"', 'solver="CG"')),
-    FirstDiffers, BatchDiffers, KeepsFirstControl, NoVelocityProduct, Skin, Stale, Swirl,
+    FirstDiffers, BatchDiffers, KeepsFirstControl, NoVelocityProduct, Skin, Stale, Swirl, Parts,
 )  # fmt: skip
 
 
@@ -131,9 +141,39 @@ def test_the_command_prints_each_property_and_fails_where_one_is_broken(capsys):
     assert "stps=6 is not a setting" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("case", "words"),
+    [
+        ("box_on_edge", ["corners within 1 mm"]),
+        ("connect", ["velocity product J-dot v"]),
+        ("weld", ["velocity product J-dot v"]),
+        ("sparse_chain", ["corners within 1 mm", "friction pyramid of a capsule"]),
+        ("stacked", []),
+        ("joint_equality", []),
+    ],
+)
+def test_what_mjx_lacks_is_remarked_from_the_model(case, words):
+    import mujoco
+
+    remarks = mjcf.mjx_remarks(mujoco.MjModel.from_xml_path(str(conformance.runner.FOLDER / f"{case}.xml")))
+    assert len(remarks) == len(words)
+    assert all(word in remark for word, remark in zip(words, remarks, strict=True))
+
+
+def test_remarks_are_printed_once_before_anything_runs(capsys):
+    """The cube's box is on a plane."""
+    backend = by_name.make("backends", "mjx[iterations=20]")
+    scene = by_name.make("scenes", "mjcf[file=cube.xml,theta=velocity,noise=parameter]")
+    program = compose(scene, by_name.make("contacts", "penalty"), by_name.make("integrators", "semi_implicit_euler"))
+    mjx._REMARKED.clear()
+    assert [backend.refusal(program) for _ in range(2)] == [None, None]
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "mjcf: MJX is not the C engine: boxes and meshes on planes touch only with corners within 1 mm" in line
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("property", "mjcf"),
+    ("property", "text"),
     [
         ("closed loops stay closed", LOOP.read_text()),
         (
@@ -143,10 +183,10 @@ def test_the_command_prints_each_property_and_fails_where_one_is_broken(capsys):
         ),
     ],
 )
-def test_what_mjx_lacks_is_found_without_a_reference(property, mjcf, tmp_path):
+def test_what_mjx_lacks_is_found_without_a_reference(property, text, tmp_path):
     """The velocity product J-dot v, and contacts of corners above 1 mm over the deepest: were they repaired, the documentation would be wrong."""
     pytest.importorskip("mujoco.mjx")
-    (tmp_path / "model.xml").write_text(mjcf)
+    (tmp_path / "model.xml").write_text(text)
     from bench.engines import table
     from bench.model import registry
 

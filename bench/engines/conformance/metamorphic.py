@@ -32,6 +32,7 @@ METHODS = {
     "gaps": "gaps(q), the gaps of all contacts and limits that act, from the geometry",
     "loops": "loops(q), the distances of equalities by component",
     "jacobian": "jacobian(q, v, u), the derivative of the next state by the state, in velocities",
+    "reference": "reference(q, v, u), accelerations of another engine",
     "force": "force(q), the generalised forces at rest without constraints",
 }
 SPACING, LENGTH, BISECTIONS = 64, 0.02, 24
@@ -149,6 +150,12 @@ def restart(subject: Subject) -> Iterator[tuple[int, float]]:
         yield step, _relative(np.concatenate(subject.states[step][:2]), ends)
 
 
+def same(subject: Subject) -> Iterator[tuple[int, float]]:
+    """Yield differences of accelerations from another engine's."""
+    for step, state in enumerate(subject.states):
+        yield step, _relative(subject.model.reference(*state), subject.model.acceleration(*state))
+
+
 def closed(subject: Subject) -> Iterator[tuple[int, float]]:
     """Yield accelerations that open closed loops, relative to those without the constraint, at closed states at speed."""
     if subject.root.find("equality") is None:
@@ -243,6 +250,7 @@ PROPERTIES: dict[str, tuple[float, Any, str]] = {
     "accelerations are continuous": (1e-3, continuous, "gaps"),
     "steps' derivatives = rollout's": (1e-4, chained, "jacobian"),
     "forces at rest have a potential": (1e-6, symmetric, "force"),
+    "accelerations = reference engine's": (1e-6, same, "reference"),
 }
 """Each property's tolerance, its check, and the method that it needs."""
 
