@@ -15,8 +15,8 @@ from bench.errors import UserError, local_path, printable, unknown
 from bench.model import registry
 
 USAGE = (
-    "python -m bench engines [install NAME ... [--again] | table [NAME ...] [out=DIR] [key=value ...]"
-    " | metamorphic MODEL.xml [NAME] [steps=60] [seed=0]] [plugins=DIR]"
+    "python -m bench engines [install NAME[==VERSION] ... [--again] | table [NAME[==VERSION] ...] [out=DIR] [key=value ...]"
+    " | metamorphic MODEL.xml [NAME[==VERSION]] [steps=60] [seed=0]] [plugins=DIR]"
 )
 
 
@@ -32,28 +32,32 @@ def main(words: Sequence[str]) -> int:
     if not names:
         return _list()
     if names[0] == "table":
-        settings = [name for name in names[1:] if "=" in name]
-        wanted = [name for name in names[1:] if "=" not in name]
+        settings = [name for name in names[1:] if "=" in name and "==" not in name]
+        wanted = [name for name in names[1:] if name not in settings]
         for name in wanted:
-            registry.find("backends", name)
+            registry.find("backends", name.partition("==")[0])
         print(table.write(wanted, out, settings))
         return 0
     if names[0] == "metamorphic" and names[1:]:
         return _metamorphic(*names[1:])
     if names[0] != "install" or not names[1:]:
         raise UserError(f"engines: {' '.join(names)} is not a request: {USAGE}")
-    engines = _engines()
-    for name in names[1:]:
-        if name not in engines:
+    engines, requirements = _engines(), {}
+    for word in names[1:]:
+        name, _, release = word.partition("==")
+        plugin = registry.find("backends", name).plugin if release else engines.get(name)
+        if plugin is None:
             raise unknown("engine", name, engines)
-        if not engines[name].requirements().exists():
-            raise UserError(f"engine {name} has no file of requirements {engines[name].requirements()}")
-    for name in names[1:]:
+        is_outside = name in engines
+        requirements[word] = engines[name].requirements() if is_outside else table.file_of(plugin, ".txt")
+        if not requirements[word].exists():
+            raise UserError(f"engine {name} has no file of requirements {requirements[word]}")
+    for word, file in requirements.items():
         started = time.perf_counter()
-        place = environments.install(name, engines[name].requirements(), again="--again" in words)
+        place = environments.install(word, file, again="--again" in words)
         size = sum(file.lstat().st_size for file in place.rglob("*"))
-        print(f"{name}: installed in {place}, {size / 2**20:.0f} MiB, {time.perf_counter() - started:.0f} s")
-        if reason := engines[name]().unavailable_reason():
+        print(f"{word}: installed in {place}, {size / 2**20:.0f} MiB, {time.perf_counter() - started:.0f} s")
+        if word in engines and (reason := engines[word]().unavailable_reason()):
             print(f"bench: {reason}", file=sys.stderr)
             return 1
     return 0
@@ -69,15 +73,19 @@ def _metamorphic(model: str, *words: str) -> int:
     """Print a line per property of an engine on a model, by default of ``mujoco``; return 1 if one does not hold."""
     if not Path(model).is_file():
         raise UserError(f"engines metamorphic: the file {model} does not exist: {USAGE}")
-    settings, names = [word for word in words if "=" in word], [word for word in words if "=" not in word]
+    settings = [word for word in words if "=" in word and "==" not in word]
+    names = [word for word in words if word not in settings]
     if unknown_names := [word for word in settings if not re.fullmatch(r"(steps|seed)=\d+", word)]:
         raise UserError(f"engines metamorphic: {' '.join(unknown_names)} is not a setting: {USAGE}")
-    name = names[0] if names else "mujoco"
-    plugin = registry.usable("backends", name)
-    file, script = table.file_of(plugin, "metamorphic"), Path(metamorphic.__file__)
+    word = names[0] if names else "mujoco"
+    name, _, release = word.partition("==")
+    plugin, python = registry.usable("backends", name), str(environments.python_of(word)) if release else ""
+    if release and (reason := environments.missing(word, python, ())):
+        raise UserError(reason)
+    file, script = table.file_of(plugin, "_metamorphic.py"), Path(metamorphic.__file__)
     if not file.exists():
         raise UserError(f"engines metamorphic: engine {name} has no file {file}")
-    rows = table.rows_of(name, plugin(), file, script, str(Path(model).resolve()), *settings)
+    rows = table.rows_of(plugin(), file, script, str(Path(model).resolve()), *settings, python=python)
     for row in rows:
         state = {True: "holds", False: "broken", None: "-"}[row.get("holds")]
         at = f"first at step {row['step']}" if row.get("step") is not None else row["reason"]

@@ -367,7 +367,7 @@ class Engine:
 
 def test_rows_of_an_engine_that_ends_stay_with_the_reason(tmp_path):
     (tmp_path / "mine_conformance.py").write_text(UNFINISHED)
-    row, last = table.conformance_rows("mine", None, tmp_path / "mine_conformance.py", "rk4", "weld")
+    row, last = table.rows_of(None, tmp_path / "mine_conformance.py", Path(runner.__file__), "rk4", "weld")
     assert (row["versions"], row["case"], row["is_right"]) == ("mine 2", "rk4", False)
     assert "exit status 3" in last["reason"]
 
@@ -378,7 +378,7 @@ def test_the_table_keeps_other_releases(tmp_path, monkeypatch):
     for version, digits in (("3.1", 1.0), ("3.2", 2.0), ("3.1", 3.0)):
         row = {"versions": f"mujoco {version}; x 1", "case": "rk4", "is_right": False, "digits": digits, "term": "qvel"}
         monkeypatch.setattr(
-            table, "conformance_rows", lambda *of, row=row: [row | {"seconds": 1, "looks_like": "a fault"}]
+            table, "rows_of", lambda *of, row=row, **settings: [row | {"seconds": 1, "looks_like": "a fault"}]
         )
         page = table.write(["mujoco"], tmp_path).read_text()
     assert "| case | mujoco 3.1 | mujoco 3.2 |" in page

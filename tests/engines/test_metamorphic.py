@@ -192,9 +192,8 @@ def test_what_mjx_lacks_is_found_without_a_reference(property, text, tmp_path):
 
     plugin = registry.usable("backends", "mjx")
     (row,) = table.rows_of(
-        "mjx",
         plugin(),
-        table.file_of(plugin, "metamorphic"),
+        table.file_of(plugin, "_metamorphic.py"),
         Path(metamorphic.__file__),
         str(tmp_path / "model.xml"),
         property,

@@ -169,7 +169,8 @@ def _explained(
     """Return how wrong numbers are related to the right ones: a factor, other numbers of the case, or an order of their own."""
     if strange := result.size - int(np.isfinite(result).sum()):
         return f"{strange} of {result.size} numbers not finite"
-    part, where = ..., ""
+    part: Any = ...
+    where = ""
     if 0 < is_off.sum() < is_off.size:
         is_few = 2 * is_off.sum() <= is_off.size
         part, where = is_off, f"{'' if is_few else ' except '}{np.flatnonzero(is_off == is_few).tolist()}"
