@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import re
+import shutil
 import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
 
+from bench import __version__
 from bench.engines import environments, table
 from bench.engines.backend import EngineBackend
 from bench.engines.conformance import metamorphic
@@ -16,7 +18,7 @@ from bench.model import registry
 
 USAGE = (
     "python -m bench engines [install NAME[==VERSION] ... [--again] | table [NAME[==VERSION] ...] [out=DIR] [key=value ...]"
-    " | metamorphic MODEL.xml [NAME[==VERSION]] [steps=60] [seed=0]] [plugins=DIR]"
+    " | metamorphic MODEL.xml [NAME[==VERSION]] [steps=60] [seed=0] | set OUT] [plugins=DIR]"
 )
 
 
@@ -40,6 +42,8 @@ def main(words: Sequence[str]) -> int:
         return 0
     if names[0] == "metamorphic" and names[1:]:
         return _metamorphic(*names[1:])
+    if names[0] == "set" and len(names) == 2:
+        return _write_set(Path(names[1]) / "conformance")
     if names[0] != "install" or not names[1:]:
         raise UserError(f"engines: {' '.join(names)} is not a request: {USAGE}")
     engines, requirements = _engines(), {}
@@ -67,6 +71,16 @@ def _engines() -> dict[str, type[EngineBackend]]:
     """Return the engines by name."""
     entries = registry.entries()["backends"].items()
     return {name: e.plugin for name, e in entries if e.plugin is not None and issubclass(e.plugin, EngineBackend)}
+
+
+def _write_set(out: Path) -> int:
+    """Copy the conformance set with its version to a new folder, for tests of an engine without this package."""
+    if out.exists():
+        raise UserError(f"engines set: {out} exists: remove it or choose another folder")
+    shutil.copytree(Path(metamorphic.__file__).parent, out, ignore=shutil.ignore_patterns("__pycache__"))
+    (out / "VERSION").write_text(f"{__version__}\n")
+    print(f"{out}: the conformance set of {__version__}")
+    return 0
 
 
 def _metamorphic(model: str, *words: str) -> int:

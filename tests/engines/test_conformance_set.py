@@ -14,6 +14,7 @@ import conformance_set
 import numpy as np
 import pytest
 
+import bench
 from bench.cli import main
 from bench.engines import conformance, table
 from bench.engines.conformance import runner
@@ -60,6 +61,40 @@ def test_an_engine_that_follows_the_page_runs_without_this_package(tmp_path):
     assert all(row["is_right"] and row["digits"] > 10 for row in rows)
     assert (last["case"], last["term"], last["is_right"]) == ("free_joint", "all", None)
     assert last["reason"] == "NotImplementedError: only a pendulum with friction loss"
+
+
+def test_the_set_in_a_new_folder_has_an_item_per_case_and_derivative(tmp_path):
+    assert main(["engines", "set", str(tmp_path)]) == 0
+    assert (tmp_path / "conformance" / "VERSION").read_text() == f"{bench.__version__}\n"
+    assert main(["engines", "set", str(tmp_path)]) == 2
+    block = re.findall(r"```python\n(.*?)```", (ROOT / "docs/conformance.md").read_text(), re.DOTALL)[0]
+    (tmp_path / "my_engine.py").write_text(block.replace('"parameter": by_p', '"parameter": -by_p'))
+    words = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "-rfsx",
+        "-p",
+        "no:cacheprovider",
+        "-p",
+        "conformance.plugin",
+        "my_engine.py",
+    ]
+
+    def run():
+        alone = os.environ | {"PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1", "PYTHONPATH": str(tmp_path)}
+        return subprocess.run(words, cwd=tmp_path, env=alone, capture_output=True, text=True).stdout
+
+    text, n = run(), len(conformance.cases())
+    assert f"1 failed, 4 passed, {5 * (n - 1)} skipped" in text
+    assert "friction_loss-parameter: -1 times" in text
+    (tmp_path / "xfails.txt").write_text("friction_loss-parameter  # the sign\n")
+    assert f"4 passed, {5 * (n - 1)} skipped, 1 xfailed" in run()
+    (tmp_path / "xfails.txt").write_text("friction_loss-qpos  # repaired\nfriction_loss-parameter\n")
+    assert f"1 failed, 3 passed, {5 * (n - 1)} skipped, 1 xfailed" in run()
+    (tmp_path / "xfails.txt").write_text("friction_los\n")
+    assert "names friction_los, which is no case or CASE-TERM" in run()
 
 
 class OwnPhysics:
