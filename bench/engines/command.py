@@ -9,7 +9,6 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from bench import __version__
 from bench.engines import environments, table
 from bench.engines.backend import EngineBackend
 from bench.engines.conformance import metamorphic
@@ -78,8 +77,9 @@ def _write_set(out: Path) -> int:
     if out.exists():
         raise UserError(f"engines set: {out} exists: remove it or choose another folder")
     shutil.copytree(Path(metamorphic.__file__).parent, out, ignore=shutil.ignore_patterns("__pycache__"))
-    (out / "VERSION").write_text(f"{__version__}\n")
-    print(f"{out}: the conformance set of {__version__}")
+    version = sys.modules["bench"].__version__
+    (out / "VERSION").write_text(f"{version}\n")
+    print(f"{out}: the conformance set of {version}")
     return 0
 
 
