@@ -27,6 +27,9 @@ NEAR = 2.0
 EQUAL = "relative RMSE at equal rollouts"
 SAME_COST = 1.05
 """Costs within this factor count as equal: a call at w = 0 that all samples share makes 101 rollouts of 100."""
+FASTEST = 2.0
+"""Power of the rollouts by which an error may fall at most without a law: N^-1.5 for a Sobol set and a smooth cost. A fitted
+model may become exact."""
 LAW = (
     "bias", "bias_low", "bias_high", "variance", "variance_low", "variance_high", "reference_norm", "reference_se", "rmse_rel",
 )  # fmt: skip
@@ -91,7 +94,8 @@ def method_table(shown: Arranged) -> pd.DataFrame:
             "verdict": verdict(rows["status"], error, low, high), "status": rows["status"], "remark": rows["reason"],
             "bias_share": ((rows["bias_low"] / rows["rmse"]) ** 2).where(error > 0),
             "evaluations": (rows["rollouts"] + rows["gradients"]) / samples, "time_s": rows["seconds"],
-            "rollouts": rows[ROLLOUTS], "has_law": has_law(rows), "has_fixed_work": has_fixed_work(rows), **{name: rows[name] for name in LAW},
+            "rollouts": rows[ROLLOUTS], "has_law": has_law(rows), "has_fixed_work": declares(rows, "fixed_work"),
+            "is_fitted": declares(rows, "couples_samples"), **{name: rows[name] for name in LAW},
         }))  # fmt: skip
     return pd.concat(parts, ignore_index=True)
 
@@ -118,11 +122,11 @@ def has_law(rows: pd.DataFrame) -> pd.Series:
     return ~np.array(is_coupled, dtype=bool) & rows["estimator"].map(constant).astype(bool)
 
 
-def has_fixed_work(rows: pd.DataFrame) -> pd.Series:
-    """Return whether the estimate of each row takes the same work for every number of samples."""
+def declares(rows: pd.DataFrame, fact: str) -> pd.Series:
+    """Return whether the estimator of each row declares a fact, such as ``fixed_work``."""
     plugins = {name: entry.plugin for name, entry in registry.entries()["estimators"].items()}
-    fixed = {name: getattr(plugins.get(name), "fixed_work", False) for name in rows["estimator"].unique()}
-    return rows["estimator"].map(fixed).astype(bool)
+    known = {name: bool(getattr(plugins.get(name), fact, False)) for name in rows["estimator"].unique()}
+    return rows["estimator"].map(known).astype(bool)
 
 
 def at_equal_rollouts(methods: pd.DataFrame) -> pd.DataFrame:
@@ -130,7 +134,7 @@ def at_equal_rollouts(methods: pd.DataFrame) -> pd.DataFrame:
 
     A method has the error of its row with as many rollouts. Without one it has that of its nearest row by RMSE^2 = bias^2 +
     v / N. Where that law does not hold, it has the error of a row with fewer rollouts, which are allowed too: with more of
-    them it might be lower, so its interval begins at 0. If there is none, ``not_comparable`` is true. The rollouts are the
+    them it might be lower, so its interval begins lower. If there is none, ``not_comparable`` is true. The rollouts are the
     fewest at which most methods are known; along samples a setting is a number of rollouts, and they are the most.
     """
     parts = [methods.assign(not_comparable=False)[:0]]
@@ -157,8 +161,10 @@ def at_equal_rollouts(methods: pd.DataFrame) -> pd.DataFrame:
         nearest = of.loc[apart[cost].groupby(of["method"], sort=False).idxmin()] if apart else level
         scale = (spent / cost).where(of["has_law"]).mask(same[cost], 1.0) if apart else spent
         found = _scaled(nearest, scale.loc[nearest.index]).assign(rollouts=cost)
-        is_less = ~found["has_law"] & ~found["has_fixed_work"] & (spent.loc[nearest.index] < cost / SAME_COST)
-        found["error_low"] = found["error_low"].mask(is_less, 0.0)
+        share = (spent.loc[nearest.index] / cost).where(~found["has_law"] & ~found["has_fixed_work"]).clip(upper=1.0)
+        found["error_low"] = found["error_low"] * (share**FASTEST).fillna(1.0).mask(
+            found["is_fitted"] & (share < 1.0), 0.0
+        )
         if is_swept:
             found = found.assign(setting=f"{problem}; rollouts {cost:.3g}", axis="rollouts", at=float(f"{cost:.3g}"))
         parts.append(found)
