@@ -251,7 +251,7 @@ def test_no_progress_is_a_row_with_a_reason(tmp_path):
 def test_rows_stored_before_the_column_existed_have_a_share_of_zero(ran):
     old = ran[1].drop(columns=["descent", "rmse_start"])
     assert COLUMNS.typed(old)["descent"].tolist() == [0.0] * len(old)
-    stored = bench.load(ROOT / "results" / "standard" / "stiffness_sweep")
+    stored = bench.load(ROOT / "results" / "standard" / "engines")
     assert (stored["descent"] == 0).all()
     assert all(json.loads(text)["theta"] is None for text in stored["parameters"])
 
