@@ -49,7 +49,7 @@ DESIGNS: tuple[tuple[int, dict[str, Any]], ...] = (
     (16, {"draws": "sobol"}),
 )
 """Numbers of samples and designs of the noise that are checked."""
-SETS, DESIGNED = 512, 2
+SETS, DESIGNED = 512, 4
 """Numbers of estimates and of oracles of such a check."""
 APART = 1e-5
 """Distance at which a gradient is compared: ten steps of the plain backend's differences."""
