@@ -114,8 +114,8 @@ def has_law(rows: pd.DataFrame) -> pd.Series:
     known = {name: plugins.get(name) for name in rows["estimator"].unique()}
     constant = {
         name: plugin is not None
-        and not plugin.fixed_work
-        and (issubclass(plugin, SampleMean) or plugin.unbiased is True)
+        and not getattr(plugin, "fixed_work", False)
+        and (issubclass(plugin, SampleMean) or getattr(plugin, "unbiased", False) is True)
         for name, plugin in known.items()
     }
     is_coupled = [couples_samples(row) for row in rows[["estimator", "draws"]].to_dict("records")]
