@@ -55,8 +55,8 @@ def written(made, rows):
 
 @pytest.fixture(scope="module")
 def full(tmp_path_factory):
-    """An experiment with many rows, the rows, and the names of its written files: for tests that only read them."""
-    found, rows = experiment(tmp_path_factory.mktemp("full")), stiffness_rows()
+    """An experiment, its rows, and the names of its written files: for tests that only read them."""
+    found, rows = experiment(tmp_path_factory.mktemp("full")), small_rows(stiffness=(1e2, 1e4, 1e6))
     found.directory.mkdir()
     return found, rows, {path.name for path in written(found, rows)}
 
@@ -84,8 +84,8 @@ def test_pareto_is_what_brute_force_finds():
 
 
 def test_a_chart_of_speed_and_accuracy_marks_the_pareto_front():
-    swept = config.load(["experiment=stiffness_sweep"])
-    shown = swept.study.views(swept, bench.load(ROOT / "results/standard/stiffness_sweep"))
+    swept, rows = config.load(["experiment=stiffness_sweep"]), bench.load(ROOT / "results/standard/stiffness_sweep")
+    shown = swept.study.views(swept, rows[rows["stiffness"].isin((1e2, 1e4)) & (rows["backend"] == "jax")])
     chart = next(c for c in shown.charts if c.name == "speed_accuracy")
     lines = [line for axes in draw(chart).axes for line in axes.lines if line.get_linestyle() == "--"]
     assert len(lines) == chart.frame["panel"].nunique()
