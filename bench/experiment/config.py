@@ -6,7 +6,9 @@ import math
 import os
 import re
 from collections.abc import Collection, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, cast
 
@@ -14,7 +16,7 @@ from bench.errors import STATUSES, UserError, local_path, printable, unknown
 from bench.experiment.cell import DESCENDED
 from bench.experiment.experiment import Budget, Choice, Execution, Experiment
 from bench.experiment.grid import COUNTS, check_axes, parameter_name, refuse_too_many, share_of, swept
-from bench.experiment.overrides import LISTS_AS, TABLES, check_file, quoted, with_ranges
+from bench.experiment.overrides import TABLES, check_file, merge, parse, quoted, with_ranges
 from bench.experiment.study import Study
 from bench.model import Decision, MechanicalScene, Plugin, guard, registry
 from bench.model.identity import parse_identity, split_items
@@ -63,11 +65,6 @@ def load(overrides: Sequence[str], config_dirs: Sequence[Path] = ()) -> Experime
 
 
 def _composed(overrides: Sequence[str], config_dirs: Sequence[Path]) -> Experiment:
-    from hydra import compose, initialize_config_dir
-    from hydra.core.override_parser.overrides_parser import OverridesParser
-    from hydra.errors import HydraException
-    from omegaconf import OmegaConf
-
     for folder in config_dirs:
         if not (folder / "experiment").is_dir():
             raise UserError(
@@ -77,31 +74,44 @@ def _composed(overrides: Sequence[str], config_dirs: Sequence[Path]) -> Experime
     if len(named) > 1:
         commands = " && ".join(f"python -m bench +experiment={name}" for name in named)
         raise UserError(f"one command runs one experiment with its sweep: {commands}")
-    parser = OverridesParser.create()
-    prepared = []
-    for override in overrides:
-        hydra_override = _to_hydra(override, config_dirs)
-        try:
-            parser.parse_override(hydra_override)
-        except (HydraException, ValueError, RecursionError):  # ValueError: a number of 5000 digits
-            raise UserError(f"'{override[:200]}' cannot be read: {LISTS_AS}") from None
-        prepared.append(hydra_override)
+    prepared = [_to_hydra(override, config_dirs) for override in overrides]
+    given = [parse(override, word) for override, word in zip(overrides, prepared, strict=True)]
     for name in named:
         check_file(_file_of(name, config_dirs))
+    experiment = next((word for word in prepared if word.startswith("+experiment=")), None)
+    settings = deepcopy(_composed_files(experiment, tuple(config_dirs), _stamps(config_dirs)))
+    for keys, value in given:
+        if keys != ["experiment"]:
+            merge(settings, keys, value)
+    joined = _joined(from_settings(settings), _as_list(settings["also"]), overrides, config_dirs)
+    return replace(joined, answer=_answer(joined, overrides, config_dirs))
+
+
+def _stamps(config_dirs: Sequence[Path]) -> tuple[tuple[Path, int, int], ...]:
+    """Return path, time of change and size of every file that an experiment may be composed of."""
+    files = [path for folder in (*config_dirs, config_dir()) for path in folder.rglob("*.yaml")]
+    return tuple((path, path.stat().st_mtime_ns, path.stat().st_size) for path in files)
+
+
+@lru_cache(maxsize=128)
+def _composed_files(experiment: str | None, config_dirs: tuple[Path, ...], stamps: object) -> dict[str, Any]:
+    """Return the settings that Hydra composes from ``config.yaml`` and an experiment's files; ``stamps`` tell their contents apart."""
+    from hydra import compose, initialize_config_dir
+    from omegaconf import OmegaConf
+
+    words = [experiment] if experiment else []
     if config_dirs:
         search_path = ",".join(f"'file://{folder.expanduser().absolute()}'" for folder in config_dirs)
-        prepared.insert(0, f"hydra.searchpath=[{search_path}]")
+        words.insert(0, f"hydra.searchpath=[{search_path}]")
     try:
         with initialize_config_dir(str(config_dir()), version_base="1.3"):
-            config = compose("config", overrides=prepared)
+            config = compose("config", overrides=words)
         plain = OmegaConf.to_container(config, resolve=False, throw_on_missing=True)
     except Exception as error:  # Hydra raises errors of many types, and only Hydra's code runs here
         lines = [str(part).strip().partition("\n")[0] for part in (error, error.__cause__) if part is not None]
-        raise UserError(printable(": ".join(lines)).replace("override ++", "")[:1000]) from None
+        raise UserError(printable(": ".join(lines))[:1000]) from None
     assert isinstance(plain, dict)
-    settings = {str(k): v for k, v in plain.items()}
-    joined = _joined(from_settings(settings), _as_list(settings["also"]), overrides, config_dirs)
-    return replace(joined, answer=_answer(joined, overrides, config_dirs))
+    return {str(k): v for k, v in plain.items()}
 
 
 APPEARANCE = (
