@@ -16,7 +16,7 @@ from bench.experiment.keys import fingerprint
 from bench.experiment.session import Problems
 from bench.measure import reference, smoothed
 from bench.measure.reference import Reference
-from bench.model import Backend
+from bench.model import Backend, reads, registry
 from bench.run.files import make_directory, write_whole
 from bench.run.rows import read_parquet
 
@@ -33,22 +33,30 @@ class References:
         self._directory = experiment.results_dir.absolute() / "references"
         self._budget = experiment.reference
         self._references: dict[str, Reference] = {}
+        self._present = reads.Present(registry.environment())
         self.stores = True
         """Whether computed references are stored for other cells."""
 
     def stored(self, cell: Cell) -> bool:
-        """Return whether the reference of the cell's program is on disk."""
-        return self._path(cell).exists()
+        """Return whether the reference of the cell's program is on disk, and all that it has read is unchanged."""
+        return self._load(cell) is not None
+
+    def _load(self, cell: Cell) -> Reference | None:
+        result, read = load(self._path(cell)), read_by(self._path(cell))
+        if result is None or self._present.change(read):
+            return None
+        reads.include(read)
+        return result
 
     def of(self, cell: Cell) -> Reference:
         """Return the reference of the cell's program, from the best backend that can run it, in arrays of the caller's own."""
         key = cell.reference_key
         if key not in self._references:
-            result = load(self._path(cell))
+            result = self._load(cell)
             if result is None:
                 result = self._compute(cell)
                 if self.stores:
-                    save(result, self._path(cell))
+                    save(result, self._path(cell), reads.manifest())
             self._references[key] = result
         return deepcopy(self._references[key])
 
@@ -105,8 +113,8 @@ class References:
         return physical
 
 
-def save(reference: Reference, path: Path) -> None:
-    """Store a reference as Parquet."""
+def save(reference: Reference, path: Path, read: str = "") -> None:
+    """Store a reference as Parquet, with what code from outside has read."""
     import pandas as pd
 
     rows = [("batch", row) for row in reference.batches]
@@ -115,7 +123,7 @@ def save(reference: Reference, path: Path) -> None:
     ]
     table = pd.DataFrame(
         {"part": [name for name, _ in rows], "gradient": [list(row) for _, row in rows],
-         **{name: getattr(reference, name) for name in SCALARS}}
+         **{name: getattr(reference, name) for name in SCALARS}, "reads": read}
     )  # fmt: skip
     buffer = io.BytesIO()
     table.to_parquet(buffer, index=False)
@@ -134,3 +142,10 @@ def load(path: Path) -> Reference | None:
         return Reference(rows["batch"], **vectors, **table.loc[0, list(SCALARS)])
     except Exception:
         return None
+
+
+def read_by(path: Path) -> str:
+    """Return what code from outside has read for a stored reference; empty if the file does not say."""
+    with suppress(Exception):
+        return str(read_parquet(path, ["reads"])["reads"][0])
+    return ""
