@@ -187,7 +187,9 @@ class Runner:
                 for answer in itertools.chain.from_iterable(self._answers(tasks, launcher)):
                     key = answer.item.cell.descent_key
                     if answer.result["status"] == "ok":
-                        known[key] = descents.save(folder, key, answer.result["descent"], answer.result.get("reads", ""))
+                        known[key] = descents.save(
+                            folder, key, answer.result["descent"], answer.result.get("reads", "")
+                        )
                     else:
                         failed[key] = result_of(answer, "its descent: ")
         placed: list[Cell] = []
