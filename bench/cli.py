@@ -56,7 +56,8 @@ EXAMINE = """\
   tolerance=1e-4       relative error that only causes a warning; by input: tolerance=mass:1e-3; absolute: atol=1e-9
   allow_zero=friction  inputs that may have no effect; true: all, false: none
   expect=kink          the known cause, with which the status is 0
-  baseline=FILE        compare with this file, which is written if absent: status 0 unless something is worse
+  baseline=FILE        status 0 unless something is worse than in this file, which is written if absent and the status 0
+  --bench-update       write the baseline
   refined=NAME         the cost at a tighter tolerance or finer step
   horizons=1,2,10      numbers of steps T: cost(theta, steps=T) and its gradient
   batch=loop           batching of thetas: loop, vmap, columns (d, B), rows (B, d), columns:64; by default detected

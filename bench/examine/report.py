@@ -15,6 +15,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+UPDATE = "--bench-update"
+"""The option that writes a baseline, also from a run that fails."""
+
+
 @dataclass(frozen=True, repr=False)
 class Report(Findings):
     """The findings about a cost and its gradient at one theta; ``print`` shows them as text.
@@ -59,16 +63,18 @@ class Report(Findings):
         if self.status:
             raise AssertionError(f"{'; '.join(self.problems)}\n\n{self}")
 
-    def compared(self, file: str | Path) -> Self:
-        """Return the report compared with a baseline file, which is written if it does not exist.
+    def compared(self, file: str | Path, update: bool = False) -> Self:
+        """Return the report compared with a baseline file: with status 0 where it is not worse than the baseline.
 
-        The compared report has status 0 where it is not worse than the baseline.
+        A missing baseline is written if the status is 0. With ``update`` the baseline is written, and nothing is compared.
         """
         path = local_path("baseline", file)
-        before = baseline.read_baseline(path)
+        before = None if update else baseline.read_baseline(path)
         if before is None:
-            baseline.write_baseline(path, self)
-            return replace(self, changes=[f"none before, written to {path}"])
+            if is_written := update or self.status == 0:
+                baseline.write_baseline(path, self)
+            done = "written" if is_written else f"not written since the status is {self.status}; {UPDATE} writes it"
+            return replace(self, changes=[f"{path}: {'' if update else 'no such file, '}{done}"], is_as_before=update)
         changes, is_worse = baseline.differences(before, self)
         return replace(self, changes=changes or ["no change"], is_as_before=not is_worse)
 

@@ -203,12 +203,18 @@ def test_a_table_with_times_may_lack_lines_and_its_noise_is_estimated(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("x.__class__", "'x.__class__': not arithmetic"),
-        ("open('a')", "not arithmetic"),
-        ("@os", "not arithmetic"),
-        ("abs", "unsupported operand"),
-        ("x*mm", "'x\\*mm': name 'mm' is not defined"),
+        ("x.__class__", "'x.__class__': x.__class__ is not arithmetic"),
+        ("x+hysteresis. __globals__. get(pd. name). read_pickle(x)", "is not arithmetic"),
+        ("open('a')", "is not arithmetic"),
+        ("@os", "invalid syntax"),
+        ("abs", "abs is not arithmetic"),
+        ("x*mm", "mm is not arithmetic"),
         ("x*", "'x\\*': invalid syntax"),
+        ("9**9**9**9", "result out of range"),
+        ("[x for x in (1,)]", "is not arithmetic"),
+        ("x if x else 1", "is not arithmetic"),
+        ("(" * 500 + "x" + ")" * 500, "nested"),
+        ("-" * 3000 + "x", "recursion|nested|stack|parser"),
     ],
 )
 def test_expressions_are_arithmetic_only(text, message):

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ast
 import itertools
 import math
+import operator
 import re
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -31,6 +33,12 @@ FUNCTIONS: dict[str, Callable[[Any], Any]] = {
 }  # fmt: skip
 
 
+OPERATIONS: dict[type[ast.AST], Callable[..., Any]] = {
+    ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv, ast.Pow: operator.pow,
+    ast.UAdd: operator.pos, ast.USub: operator.neg,
+}  # fmt: skip
+
+
 def evaluate(text: str, names: Mapping[str, Any]) -> Any:
     """Return the value of an expression of numbers, pi, ``names``, ``+ - * / **`` and :data:`FUNCTIONS`.
 
@@ -39,14 +47,28 @@ def evaluate(text: str, names: Mapping[str, Any]) -> Any:
     >>> evaluate("-2 * angle**2", {"angle": 3.0})
     -18.0
     """
-    known = {**FUNCTIONS, "pi": math.pi, **names}
+    known = {"pi": math.pi, **names}
     try:
-        if not re.fullmatch(r"([\w\s+*/()-]|\.(?![^\W\d]))+", text):
-            raise ValueError("not arithmetic")
         with np.errstate(all="ignore"):
-            return 0.0 + pd.eval(text.strip(), engine="python", local_dict={}, global_dict={}, resolvers=[known])
-    except Exception as error:  # pandas raises errors of many types
-        raise UserError(f"'{text}': {error} (numbers, operations and {', '.join(sorted(known))})") from None
+            return 0.0 + _value(ast.parse(text.strip(), mode="eval").body, known)
+    except Exception as error:  # of any operation on columns
+        allowed = ", ".join(sorted({**FUNCTIONS, **known}))
+        raise UserError(f"'{text}': {error} (numbers, operations and {allowed})") from None
+
+
+def _value(node: ast.expr, names: Mapping[str, Any]) -> Any:
+    match node:
+        case ast.Constant(value=int() | float() as number) if not isinstance(number, bool):
+            return float(number)  # a power of integers may have any length
+        case ast.Name(id=name) if name in names:
+            return names[name]
+        case ast.UnaryOp(op=operation, operand=operand) if type(operation) in OPERATIONS:
+            return OPERATIONS[type(operation)](_value(operand, names))
+        case ast.BinOp(left=left, op=operation, right=right) if type(operation) in OPERATIONS:
+            return OPERATIONS[type(operation)](_value(left, names), _value(right, names))
+        case ast.Call(func=ast.Name(id=name), args=[argument], keywords=[]) if name in FUNCTIONS:
+            return FUNCTIONS[name](_value(argument, names))
+    raise ValueError(f"{ast.unparse(node)} is not arithmetic")
 
 
 def expressions(text: str | None) -> dict[str, str]:
