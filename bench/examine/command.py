@@ -16,7 +16,7 @@ import numpy as np
 
 from bench.errors import StorageError, UserError, local_path, unknown
 from bench.examine.examination import examine
-from bench.examine.report import UPDATE, Report
+from bench.examine.report import AFTER_SIGTERM, UPDATE, Report
 from bench.run.files import make_directory
 from bench.simulator import imports
 from bench.simulator.simulator import LIBRARIES
@@ -59,10 +59,10 @@ def run(words: Sequence[str]) -> Report:
 
 
 def main(words: Sequence[str]) -> int:
-    """Run the command, and return the exit status: 0 right, 1 wrong, 3 not decided; 2 is bad input."""
-    status = run(words).status
+    """Run the command, and return the exit status: 0 right, 1 wrong, 3 not decided, 130 after SIGTERM; 2 is bad input."""
+    report = run(words)
     sys.stdout.flush()
-    return status
+    return 130 if AFTER_SIGTERM in report.left_out else report.status
 
 
 def _wrapped(text: str) -> str:

@@ -14,7 +14,7 @@ import numpy as np
 
 from bench.errors import UserError, unknown
 from bench.examine.findings import RELATIVE, GroupSize, Setup, Spent
-from bench.examine.report import Report
+from bench.examine.report import AFTER_SIGTERM, Report
 from bench.examine.smoothing import FEWEST, PAIRS, Smoothed, directions, measure_smoothed
 from bench.gradient import Check, diagnosis
 from bench.gradient.lines import HALVINGS, PLACES, POINTS, LineScan, scan
@@ -135,8 +135,9 @@ def examine(
         try:
             simulator = Simulator(cost, layout, grad, int(noise), batch, clock)
         except OutOfTime:
-            limit = "compile_budget" if not clock.is_terminated else "the time until SIGTERM"
-            took = f"the first call of the cost took longer than {limit}={clock.compile_budget:g} seconds"
+            if clock.is_terminated:
+                raise KeyboardInterrupt from None
+            took = f"the first call of the cost took longer than compile_budget={clock.compile_budget:g} seconds"
             raise UserError(f"{took}: give a larger compile_budget or a shorter rollout") from None
         examination = _Examination(simulator, setup)
         try:
@@ -243,7 +244,7 @@ class _Examination:
         lines = self._scan_lines(checked) if can_go_on else []
         smoothed = self._measure_noise(checked) if can_go_on else []
         if clock.is_terminated:
-            self.left_out.append("everything after SIGTERM")
+            self.left_out.append(AFTER_SIGTERM)
         return Report(
             **named,
             names=simulator.layout.names,

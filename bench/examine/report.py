@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+AFTER_SIGTERM = "everything after SIGTERM"
+"""What is left out when the process is asked to end."""
 UPDATE = "--bench-update"
 """The option that writes a baseline, also from a run that fails."""
 
