@@ -109,7 +109,7 @@ def _value(key: str, given: str, module: Any) -> Any:
             return theta() if callable(theta) else theta
         case "noise" | "seed" | "calls":
             if not re.fullmatch(r"\d+", given):
-                raise UserError(f"{key}={given} is not a whole number")
+                raise UserError(f"{key}={given} is not a whole number of at least {int(key == 'calls')}")
             return int(given)
         case "allow_zero":
             words = {"true": True, "false": False}

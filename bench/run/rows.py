@@ -85,7 +85,7 @@ def read_parquet(path: Path, columns: Sequence[str] | None = None) -> pd.DataFra
     table = pyarrow.parquet.read_table(content, columns=columns and list(columns), read_dictionary=texts)
     # a column is freed as soon as it is converted
     frame = table.to_pandas(split_blocks=True, self_destruct=True)
-    if not all(isinstance(name, str) for name in frame):
+    if not all(name and isinstance(name, str) for name in frame):
         raise ValueError("a column has no name")
     return frame.assign(**{name: _shared(frame[name]) for name in texts if name in frame})
 

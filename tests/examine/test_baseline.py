@@ -58,6 +58,18 @@ def test_exit_statuses(sim, capsys):
     assert f"next: choose a theta beside it\n  python -m bench examine {sim}:kinked grad=side" in out.out
 
 
+@pytest.mark.parametrize("error", ["BaseException('no')", "GeneratorExit", "ValueError('no')"])
+def test_a_file_that_raises_at_its_import_is_bad_input(tmp_path, capsys, error):
+    (tmp_path / "raises.py").write_text(f"raise {error}\n")
+    assert run(f"{tmp_path / 'raises.py'}:cost", "calls=-5") == 2
+    assert "raises.py' cannot be imported: " in capsys.readouterr().err
+
+
+def test_a_number_of_calls_below_1_is_refused(sim, capsys):
+    assert run(f"{sim}:cost", "calls=-5") == 2
+    assert "calls=-5 is not a whole number of at least 1" in capsys.readouterr().err
+
+
 def test_settings_of_the_command_line(sim, capsys):
     settings = [
         "tolerance=theta[0]:0.3",

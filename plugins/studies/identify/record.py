@@ -62,6 +62,8 @@ def _value(node: ast.expr, names: Mapping[str, Any]) -> Any:
             return float(number)  # a power of integers may have any length
         case ast.Name(id=name) if name in names:
             return names[name]
+        case ast.Name(id=name):
+            raise ValueError(f"name {name!r} is not defined")
         case ast.UnaryOp(op=operation, operand=operand) if type(operation) in OPERATIONS:
             return OPERATIONS[type(operation)](_value(operand, names))
         case ast.BinOp(left=left, op=operation, right=right) if type(operation) in OPERATIONS:
@@ -98,6 +100,8 @@ def read(
     table = words.apply(pd.to_numeric, errors="coerce").add_prefix("c")
     if table.iloc[0].isna().all():
         table = table[1:].set_axis([re.sub(r"\W", "_", name.strip()) for name in words.iloc[0]], axis=1)
+    if not time and (found := {"time", "t"} & {*table}):
+        raise ValueError(f"{path} has a column of times: write time={found.pop()}")
     columns = columns or {name: name for name in table if name != time}
     values = pd.DataFrame({name: evaluate(text, table) for name, text in columns.items()}, index=table.index)
     times = evaluate(time, table) / dt if time else pd.Series(np.arange(1.0, 1.0 + len(table)), table.index)
