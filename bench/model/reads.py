@@ -32,7 +32,9 @@ SET_BY_RUNS = frozenset((
 """Variables that a run sets in its workers."""
 LIBRARIES = (*site.getsitepackages(), site.getusersitepackages(), *map(os.path.realpath, site.getsitepackages()))
 """Folders of installed libraries."""
-IGNORED = ("/dev/", "/proc/", "/sys/", *LIBRARIES, sysconfig.get_path("stdlib"))
+INSIDE = (*LIBRARIES, str(Path(__file__).parents[1]), os.path.dirname(sysconfig.get_path("stdlib")), "<frozen")
+"""Starts of the paths of code that is not from outside: libraries, this package and the standard library."""
+IGNORED = ("/dev/", "/proc/", "/sys/", *INSIDE)
 CACHES = ("/__pycache__/", "/.cache/", os.environ.get("XDG_CACHE_HOME") or "/.cache/")
 CHANGED = "several contents"
 """Stands for the hash of a file that has changed while it was in use, which no content has."""
@@ -41,6 +43,8 @@ STARTED_NS = time.time_ns()
 _read: dict[str, str] = {}
 """Hashes by path, versions by ``package NAME``, and hashes of values by ``$NAME``; empty for what there is not."""
 _stamps: dict[str, tuple[int, ...]] = {}
+_texts: list[str] = []
+"""The manifest, while nothing is added."""
 _written: set[str] = set()
 _modules: set[str] = set()
 _packages: set[str] = set()
@@ -88,8 +92,10 @@ def manifest() -> str:
     while _packages:
         with suppress(PackageNotFoundError):
             _note_package(_packages.pop())
-    counted = {name: content for name, content in _read.items() if name not in _written}
-    return json.dumps(counted, sort_keys=True) if counted else ""
+    if not _texts:
+        counted = {name: content for name, content in _read.items() if name not in _written}
+        _texts.append(json.dumps(counted, sort_keys=True) if counted else "")
+    return _texts[0]
 
 
 def hash_of(path: str | Path) -> str:
@@ -142,8 +148,9 @@ class Present:
 
 
 def _add(name: str, content: str) -> None:
-    if _read.setdefault(name, content) != content:
-        _read[name] = CHANGED
+    if _read.get(name) != content:
+        _read[name] = CHANGED if name in _read else content
+        _texts.clear()
 
 
 def _hash_of_value(value: str | None) -> str:
@@ -176,7 +183,7 @@ def _note_package(top: str) -> None:
 
 def _is_outside(name: str, file: str) -> bool:
     top = name.partition(".")[0]
-    return not (top in (OWN, "__main__") or top in sys.stdlib_module_names or file.startswith((*LIBRARIES, "<frozen")))
+    return not (top in (OWN, "__main__") or top in sys.stdlib_module_names or file.startswith(INSIDE))
 
 
 def _is_from_outside(through_libraries: bool) -> bool:
@@ -198,7 +205,7 @@ def _hear(event: str, arguments: tuple[Any, ...]) -> None:
         return
     with suppress(Exception):  # an error would reach the code that is heard
         if event == "import":
-            if _is_from_outside(True):
+            if _is_from_outside(False):
                 _packages.add(arguments[0].partition(".")[0])
             return
         path = os.path.abspath(os.fsdecode(arguments[0]))
@@ -207,6 +214,7 @@ def _hear(event: str, arguments: tuple[Any, ...]) -> None:
                 _written.add(os.path.abspath(os.fsdecode(arguments[1])))
         elif arguments[2] & os.O_ACCMODE != os.O_RDONLY:
             _written.add(path)
+            _texts.clear()
         elif path not in _written and _is_from_outside(True) and _is_input(path):
             note(path)
 
@@ -233,7 +241,7 @@ class _Environment(os._Environ[str]):
         if _listed and _listed.pop(0) == key:  # all are copied
             pass
         elif not {name, key} & {*_read, *_written, *SET_BY_RUNS} and _is_from_outside(False):
-            _read[name] = _hash_of_value(value)
+            _add(name, _hash_of_value(value))
         if value is None:
             raise KeyError(key) from None
         return value

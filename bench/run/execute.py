@@ -147,6 +147,8 @@ class Runner:
     shown: progress.Progress
     read: dict[str, str] = field(default_factory=lambda: dict(HASHED))
     """Hashes of what code from outside has read in this run, by name."""
+    unchanged: set[str] = field(default_factory=lambda: {""})
+    """The texts in which answers give these hashes."""
 
     def run(self, planned: Sequence[Planned]) -> None:
         """Store a row for every cell that has none.
@@ -249,8 +251,13 @@ class Runner:
 
     def _changed(self, answer: Answer) -> str:
         """Return what had another content when the cells were planned or an earlier one ran; empty if there is nothing."""
-        read = json.loads(answer.result.get("reads") or "{}").items()
-        return next((name for name, content in read if self.read.setdefault(name, content) != content), "")
+        if (text := answer.result.get("reads", "")) in self.unchanged:
+            return ""
+        for name, content in json.loads(text).items():
+            if self.read.setdefault(name, content) != content:
+                return str(name)
+        self.unchanged.add(text)
+        return ""
 
     def _finish(self, results: list[tuple[Cell, dict[str, Any]]]) -> None:
         """Store rows and report them; raises :class:`Stopped` if due."""
