@@ -203,8 +203,10 @@ def settle(
     cost: Cost, theta: np.ndarray, vector: np.ndarray, length: float, sample: Sample, tangent: Tangent | None
 ) -> Finding | None:
     """Return the finding on an unsettled direction from smaller steps or from the tangent; None if it stays unsettled."""
-    length_, derivative, doubt = np.array([[length], [sample.derivative], [sample.doubt]])
-    (fine,), *_ = sampled(cost, theta, vector[:, None], length_, derivative, sample.unit, FINE, doubts=doubt)
+    length_, derivative, doubt, moved = np.array([[length], [sample.derivative], [sample.doubt], [sample.moved]])
+    (fine,), *_ = sampled(
+        cost, theta, vector[:, None], length_, derivative, sample.unit, FINE, doubts=doubt, moved=moved
+    )
     better = judge(fine)
     if better.verdict != "unsettled":
         return better
@@ -280,19 +282,19 @@ class _Checker:
         )
         # theta changes only in its last digits, so every change of the gradient is rounding
         with np.errstate(invalid="ignore"):
-            doubt = np.abs(self.gradient(theta + 4.0 * self.unit * self.scale) - first)
+            moved = np.abs(self.gradient(theta + 4.0 * self.unit * self.scale) - first)
         at_draws = [self.gradient(other) for other in around.T]
         again = self.gradient(theta)
         lines = [_Line(f"component {i}", theta, first, self._along(i), self.scale[i], i) for i in chosen]
         lines += [_Line(f"direction {i}", theta, first, vector) for i, vector in enumerate(self._directions())]
-        parts = self._check_lines(lines, doubt)
+        parts = self._check_lines(lines, moved)
         draws = self._check_lines(
             [
                 _Line(f"other theta {k} direction {i}", other, gradient, vector)
                 for k, (other, gradient) in enumerate(zip(around.T, at_draws, strict=True))
                 for i, vector in enumerate(self._directions())
             ],
-            doubt,
+            moved,
             twice=False,
         )
         parts, draws = self._with_causes(parts, draws, around, at_draws)
@@ -317,8 +319,10 @@ class _Checker:
         random *= self.scale[:, None] / np.linalg.norm(random, axis=0)
         return random.T
 
-    def _check_lines(self, lines: Sequence[_Line], doubt: np.ndarray | None = None, twice: bool = True) -> list[Part]:
-        """Return a checked part for each line, from one batch of costs; ``doubt (d,)`` is the gradient's own error.
+    def _check_lines(self, lines: Sequence[_Line], moved: np.ndarray | None = None, twice: bool = True) -> list[Part]:
+        """Return a checked part for each line, from one batch of costs.
+
+        ``moved (d,)`` is the change of the gradient where theta changes in its last digits.
 
         A component's derivative is per unit of the input. A derivative along a random direction is per unit of the
         inputs' scales.
@@ -336,11 +340,10 @@ class _Checker:
         # a component this much smaller than the others may be only their rounding, unless it is exactly 0
         whole = np.abs(np.nan_to_num(gradients, posinf=0.0, neginf=0.0)) * self.scale[:, None]
         doubts = np.where(program != 0.0, np.sqrt(self.unit) * whole.max(axis=0) / lengths, 0.0)
-        if doubt is not None:
-            doubts += np.abs(vectors).T @ np.nan_to_num(doubt, nan=0.0, posinf=0.0) / lengths
+        change = np.zeros(self.theta.size) if moved is None else np.nan_to_num(moved, nan=0.0, posinf=0.0)
         measured, minus, plus = sampled(
             self.cost, thetas, vectors, lengths, program, self.unit, self.options.eps, self._modes,
-            twice and self.options.repeated, doubts,
+            twice and self.options.repeated, doubts, np.abs(vectors).T @ change / lengths,
         )  # fmt: skip
         if self._gradient is None:
             measured = [replace(s, derivative=judge(s).difference) for s in measured]

@@ -48,7 +48,8 @@ class Sample:
     ``step (K,)`` are displacements in falling order, ``minus`` and ``plus (K,)`` the costs at -step and +step, and
     ``centre`` is the cost at the point. ``crossing (K,)`` marks steps whose two sides differ in contact mode. ``scale``
     is the size of theta, and ``unit`` the unit roundoff of the program's arithmetic. ``noise`` is the measured standard
-    deviation of the cost's noise, and ``doubt`` the error of the program's derivative from rounding theta.
+    deviation of the cost's noise, ``doubt`` the rounding error of the program's derivative, and ``moved`` the change of
+    the program's derivative where theta changes in its last digits.
     """
 
     step: np.ndarray
@@ -62,6 +63,7 @@ class Sample:
     unit: float = float(np.finfo(np.float64).eps)
     noise: float = 0.0
     doubt: float = 0.0
+    moved: float = 0.0
 
     @property
     def differences(self) -> np.ndarray:
@@ -177,12 +179,13 @@ def _judge(sample: Sample) -> Finding:
         )
     index, spread = plateau(sample, noise)
     uncertainty = spread + float(noise[index])
-    tolerance = CHANCE * spread + float(noise[index]) + _resolution(sample, index) + sample.doubt
+    doubt = sample.doubt + min(sample.moved, _change_of_slope(sample, noise, index))
+    tolerance = CHANCE * spread + float(noise[index]) + _resolution(sample, index) + doubt
     apart = abs(float(sample.differences[index]) - sample.derivative)
     alike, rounding = ALIKE * sample.size(index), GUARD * float(sample.rounding(sample.unit)[index])
     resolved = uncertainty <= max(alike, rounding)
     # a tolerance as large as the derivative would accept half of the derivative
-    if apart <= min(tolerance, alike + rounding + sample.doubt) and resolved:
+    if apart <= min(tolerance, alike + rounding + doubt) and resolved:
         return finding_at(sample, _classify_right(sample, index, still), index, uncertainty)
     if sample.crossing[index]:
         return finding_at(sample, _judge_one_sided(sample, noise), index, uncertainty)
@@ -220,6 +223,16 @@ def plateau(sample: Sample, noise: np.ndarray) -> tuple[int, float]:
         worth = np.where(differences == 0.0, np.inf, worth)
     index = int(np.argmin(worth))
     return index, float(spread[index])
+
+
+def _change_of_slope(sample: Sample, noise: np.ndarray, index: int) -> float:
+    """Return by how much the cost's own slope changes from side to side, at a step and smaller ones, beyond noise.
+
+    A derivative that changes with the last digits of theta is that of a cost whose slope does. Where the cost has one
+    slope, as at a node of a table, such a derivative is wrong at theta.
+    """
+    bend = np.abs(sample.right - sample.left) - 2.0 * noise
+    return float(np.max(bend[index:], initial=0.0))
 
 
 def _is_credible(sample: Sample, index: int, uncertainty: float, tolerance: float) -> bool:
