@@ -36,7 +36,7 @@ ALIKE = 0.1
 CHANCE = 10.0
 """Multiple of the smallest spread of neighbouring differences that counts as their error: it is partly small by chance."""
 LARGEST = 1e-3
-"""Largest relative error that counts as that of a difference in single precision."""
+"""Largest relative error that counts as that of a difference in single precision, or of a gradient by rounding theta."""
 MIN_STEPS = 7
 """Fewest steps with finite costs on both sides; with fewer, the verdict is ``nonfinite``."""
 
@@ -179,7 +179,7 @@ def _judge(sample: Sample) -> Finding:
         )
     index, spread = plateau(sample, noise)
     uncertainty = spread + float(noise[index])
-    doubt = sample.doubt + min(sample.moved, _change_of_slope(sample, noise, index))
+    doubt = sample.doubt + min(sample.moved, max(_change_of_slope(sample, noise, index), LARGEST * sample.size(index)))
     tolerance = CHANCE * spread + float(noise[index]) + _resolution(sample, index) + doubt
     apart = abs(float(sample.differences[index]) - sample.derivative)
     alike, rounding = ALIKE * sample.size(index), GUARD * float(sample.rounding(sample.unit)[index])
@@ -226,13 +226,14 @@ def plateau(sample: Sample, noise: np.ndarray) -> tuple[int, float]:
 
 
 def _change_of_slope(sample: Sample, noise: np.ndarray, index: int) -> float:
-    """Return by how much the cost's own slope changes from side to side, at a step and smaller ones, beyond noise.
+    """Return by how much the cost's own slope changes from side to side, at the smallest step that noise allows.
 
     A derivative that changes with the last digits of theta is that of a cost whose slope does. Where the cost has one
     slope, as at a node of a table, such a derivative is wrong at theta.
     """
-    bend = np.abs(sample.right - sample.left) - 2.0 * noise
-    return float(np.max(bend[index:], initial=0.0))
+    bend = np.abs(sample.right - sample.left)[index:]
+    resolved = bend[bend > 2.0 * noise[index:]]
+    return float(resolved[-1]) if resolved.size else 0.0
 
 
 def _is_credible(sample: Sample, index: int, uncertainty: float, tolerance: float) -> bool:
