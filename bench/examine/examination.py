@@ -14,11 +14,12 @@ import numpy as np
 
 from bench.errors import UserError, unknown
 from bench.examine.findings import RELATIVE, GroupSize, Setup, Spent
+from bench.examine.means import compare_means
 from bench.examine.report import Report
-from bench.examine.smoothing import FEWEST, PAIRS, Smoothed, directions, measure_smoothed
+from bench.examine.smoothing import FEWEST, OWN_PAIRS, PAIRS, Smoothed, directions, largest_unseen, measure_smoothed
 from bench.gradient import Check, diagnosis
-from bench.gradient.lines import HALVINGS, PLACES, POINTS, LineScan, scan
-from bench.gradient.rules import RULES, SUSPICIOUS
+from bench.gradient.lines import HALVINGS, PLACES, POINTS, REACH, LineScan, scan
+from bench.gradient.rules import RULES, SUSPICIOUS, UNEQUAL
 from bench.gradient.stages import GradientStages
 from bench.simulator.clock import Clock, OutOfTime, end_on_sigterm, parse_duration
 from bench.simulator.simulator import Simulator
@@ -36,6 +37,11 @@ LEAST_MISSED = 0.002
 """Largest error of the integral of the gradient, as a share of the cost's change, that is always accepted."""
 LINE_EFFORTS = ((PLACES, HALVINGS), (3, 10), (1, 10))
 """Places searched on a line and halvings of each, from the full search to the smallest."""
+MEANS_SHARE = 0.4
+"""Share of the remaining budget for the mean of a gradient over draws of the simulator's own noise."""
+OWN_LEVELS, OWN_SHARE, OWN_DRAWS = (0.01, 0.03, 0.1, 0.3, 1.0), 0.6, 64
+"""Sigmas of a cost with its own noise, in units of each input's scale; the first is taken that moves the cost by this share of
+its own standard deviation in this number of draws."""
 EARLY_SHARE = 0.5
 """Share of the remaining budget for the lines of a gradient that adaptive steps may explain."""
 FEWEST_POINTS = 17
@@ -233,15 +239,35 @@ class _Examination:
         is_wrong = checked.cause in SUSPICIOUS
         if refined is not None and is_wrong and stages.gradient is not None:
             explained.gaps = self._attempt("the refined cost", lambda: diagnosis.refined_gaps(stages, refined)) or ()
+        self._find_smooth_parts(checked)
+        if refined is not None and explained.smooth_parts:
+            explained.refined = (
+                self._attempt(
+                    "the refined cost", lambda: diagnosis.refined_slopes(stages, refined, diagnosis.doubtful(checked))
+                )
+                or {}
+            )
         if setup.horizons:
             explained.growth = (
                 self._attempt("horizons", lambda: diagnosis.errors_by_horizon(stages, setup.horizons)) or ()
             )
+        if is_wrong and stages.gradient is not None:
+            explained.difference_step = (
+                self._attempt("steps of a difference", lambda: diagnosis.step_of_difference(stages, checked)) or ""
+            )
+            explained.gradient_noise = (
+                self._attempt("noise of the gradient", lambda: diagnosis.noise_of_gradient(stages)) or 0.0
+            )
+        means = None
+        if simulator.noise and checked.cause in UNEQUAL and stages.gradient is not None:
+            clock.limit(MEANS_SHARE)
+            means = self._attempt("the mean over draws", lambda: compare_means(stages))
+            clock.limit(1.0)
         can_go_on = stages.gradient is not None or not simulator.has_gradient
         if is_wrong and can_go_on and explained.is_adaptive is None:
             explained.is_adaptive = self._compare_along_lines(checked, 0.9)
         lines = self._scan_lines(checked) if can_go_on else []
-        smoothed = self._measure_noise(checked) if can_go_on else []
+        smoothed = self._measure_noise(checked, lines) if can_go_on else []
         if clock.is_terminated:
             self.left_out.append("everything after SIGTERM")
         return Report(
@@ -265,6 +291,7 @@ class _Examination:
             groups=self._group_sizes(),
             more=stages.more,
             explained=explained,
+            means=means,
             lines=lines,
             smoothed=smoothed,
             error=simulator.gradient_error if stages.is_failed else "",
@@ -306,9 +333,16 @@ class _Examination:
     # ------------------------------------------------------------------------------------------------ lines
 
     def _compare_early(self, checked: Check) -> None:
-        """Keep whether adaptive steps explain the small error of a gradient."""
+        """Keep the smooth part of a rough cost, and whether adaptive steps explain the small error of a gradient."""
+        self._find_smooth_parts(checked)
         if diagnosis.may_be_adaptive(checked):
             self.explained.is_adaptive = self._compare_along_lines(checked, EARLY_SHARE)
+
+    def _find_smooth_parts(self, checked: Check) -> None:
+        if self.stages.gradient is not None and not self.explained.smooth_parts and diagnosis.doubtful(checked):
+            self.explained.smooth_parts = (
+                self._attempt("the smooth part of the cost", lambda: diagnosis.smooth_parts(self.stages, checked)) or {}
+            )
 
     def _compare_along_lines(self, checked: Check, share: float) -> bool | None:
         """Return whether the program's steps depend on theta and its jumps explain the gradient's error.
@@ -374,7 +408,7 @@ class _Examination:
                     measured, self.stages.repeats.spread, self.simulator.unit * (size if math.isfinite(size) else 0.0)
                 )
                 cost = partial(self.stages.costs_along, direction)
-                line = scan(cost, direction, rounding, 3.0, effort, self.simulator.unit)
+                line = scan(cost, direction, rounding, REACH, effort, self.simulator.unit)
                 lines.append(replace(line, missed=self._missed_share(line, checked)))
         except OutOfTime:
             self.left_out.append("jumps and kinks on lines")
@@ -406,11 +440,11 @@ class _Examination:
 
     # ------------------------------------------------------------------------------------------------ noise
 
-    def _measure_noise(self, checked: Check) -> list[Smoothed]:
+    def _measure_noise(self, checked: Check, lines: Sequence[LineScan]) -> list[Smoothed]:
         """Return the gradient's bias and the methods' costs at each sigma, which all get an equal share of the budget."""
         levels, size = list(self.setup.levels), self.stages.theta.size
         if not levels and self.simulator.noise:
-            levels = [(RELATIVE, RELATIVE * self.setup.scale)]
+            levels = self._attempt("the size of the cost's own noise", self._own_level) or []
         if levels and size > MOST_NOISY:
             self.left_out.append(f"noise on theta: it has more than {MOST_NOISY:,} numbers")
             return []
@@ -419,11 +453,25 @@ class _Examination:
         for index, (level, spread) in enumerate(levels):
             self.clock.start_stage(f"noise of sigma {level:g}")
             self.clock.limit(1.0 / (len(levels) - index))
-            pairs = min(PAIRS, max(FEWEST, HELD // size))
-            one = measure_smoothed(self.simulator, level, spread, plain, self.setup.seed, pairs)
+            most = OWN_PAIRS if self.simulator.noise else PAIRS
+            pairs = min(most, max(FEWEST, HELD // size))
+            unseen = partial(largest_unseen, lines, level / self.setup.reach) if self.setup.levels else None
+            one = measure_smoothed(self.simulator, level, spread, plain, self.setup.seed, pairs, unseen)
             self.clock.limit(1.0)
             if one is None:
                 self.left_out.append(f"noise of sigma {level:g}")
             else:
                 results.append(one)
         return results
+
+    def _own_level(self) -> list[tuple[float, np.ndarray]]:
+        """Return a sigma under which theta moves the cost by a share of what its own noise does."""
+        random = np.random.default_rng([self.setup.seed, 0x6F776E])
+        w, u = (random.standard_normal((n, OWN_DRAWS)) for n in (self.simulator.noise, self.stages.theta.size))
+        theta, scale, level = self.stages.theta[:, None], self.setup.scale[:, None], OWN_LEVELS[-1]
+        own = float(self.simulator.costs(np.repeat(theta, OWN_DRAWS, axis=1), w).std())
+        for level in OWN_LEVELS:
+            up, down = (self.simulator.costs(theta + sign * level * scale * u, w) for sign in (1.0, -1.0))
+            if np.sqrt(np.mean(((up - down) / 2.0) ** 2)) >= OWN_SHARE * own:
+                break
+        return [(level, level * self.setup.scale)]

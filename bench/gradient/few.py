@@ -14,9 +14,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from .causes import causes_of_ratios
-from .check import NOTHING, Check, Part
+from .check import NOTHING, Check, Part, cause_of
 from .direction import ALIKE, MEASURED, Sample, finding_at, resolution, wrong
-from .rules import most_severe
 from .subspace import Subspace
 
 ROUNDS = (1.0, 30.0, 0.1)
@@ -72,7 +71,7 @@ class FewSteps:
             causes = causes_of_ratios(ratios, [], any(part.verdict == "smooth" for part in parts))
             if set(causes.values()) == {"wrong_factor"}:
                 parts = [replace(p, verdict="wrong_factor") if i in ratios else p for i, p in enumerate(parts)]
-        return self.space.restore(Check(most_severe(part.verdict for part in parts), gradient, tuple(parts), ()))
+        return self.space.restore(Check(cause_of(parts), gradient, tuple(parts), ()))
 
     @np.errstate(all="ignore")
     def _part(self, index: int, program: float) -> Part:

@@ -15,6 +15,8 @@ import numpy as np
 
 POINTS = 97
 """Number of points of a scan. Not a power of 2 plus one, so that points rarely coincide with round numbers."""
+REACH = 4.0
+"""Distance searched on either side of theta, in standard deviations of the noise, as :data:`bench.measure.jumps.REACH`."""
 HALVINGS = 14
 """Number of halvings of an interval."""
 PLACES = 6
@@ -93,7 +95,7 @@ def scan(
     along: Callable[[np.ndarray], np.ndarray],
     direction: np.ndarray,
     noise: float,
-    reach: float = 3.0,
+    reach: float = REACH,
     effort: tuple[int, int, int] = (POINTS, HALVINGS, PLACES),
     unit: float = float(np.finfo(np.float64).eps),
 ) -> LineScan:

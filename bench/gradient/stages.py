@@ -24,9 +24,8 @@ from bench.gradient import (
     Part,
     Sample,
     check,
-    most_severe,
 )  # fmt: skip
-from bench.gradient.check import NOTHING
+from bench.gradient.check import NOTHING, cause_of
 from bench.gradient.few import ROUNDS, FewSteps, is_nothing
 from bench.gradient.roughness import FINE
 from bench.gradient.subspace import Group, Subspace, choose, locate
@@ -537,5 +536,4 @@ def is_rough(sample: Sample) -> bool:
 def recaused(outcome: Check, replaced: Callable[[Part], Part] = lambda part: part) -> Check:
     """Return a check with replaced parts and the cause that follows from its parts."""
     parts, draws = tuple(map(replaced, outcome.parts)), tuple(map(replaced, outcome.draws))
-    causes = [part.verdict for part in parts] + [part.verdict for part in draws if part.verdict in FAULTS]
-    return replace(outcome, parts=parts, draws=draws, cause=most_severe(causes))
+    return replace(outcome, parts=parts, draws=draws, cause=cause_of(parts, draws))

@@ -1,0 +1,72 @@
+"""The slope of a rough cost's smooth part, from wide steps: adaptive and iterative solvers change their steps with theta.
+
+At tiny steps the slope of such a cost is that of one sequence of steps, at wide ones that of the solution. Per scale h, a
+quadratic through costs at random displacements within h gives a slope, its standard error, and the scatter around the
+fit. The cost is rough at a scale where the scatter exceeds rounding and does not fall like h^3. The slope of least error
+among the scales where the scatter has reached a tenth of its largest value is that of the smooth part.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+SCALES = np.logspace(-1, -9, 17)
+"""Scales, two per decade, in units of the input's scale."""
+POINTS = 17
+"""Costs per scale."""
+FALL = 30.0
+"""Ratio of the scatter at a scale to that at a tenth of it, from which on it is the curvature of a smooth cost."""
+ROUGH = 100.0
+"""Multiple of the cost's rounding error above which scatter is roughness."""
+SATURATED = 0.1
+"""Least scatter, relative to the largest, of the scales whose slopes count."""
+SPREAD = 3.0
+"""Standard errors that count as the error of a slope."""
+LIMIT = 0.1
+"""Largest relative error of a slope that decides."""
+COSTS = POINTS * SCALES.size
+"""Costs for one component."""
+
+
+class SmoothPart(NamedTuple):
+    """The slope of a cost's smooth part along one input."""
+
+    slope: float
+    error: float
+    """Its standard error, and its change from the next wider scale."""
+    within: float
+    """The scale of displacements, in the input's unit."""
+
+
+def smooth_part(
+    along: Callable[[np.ndarray], np.ndarray], scale: float, unit: float, random: np.random.Generator
+) -> SmoothPart | None:
+    """Return the slope of the smooth part of ``along(t)``, ``(n,)`` to ``(n,)``; None for a cost that is not rough.
+
+    A cost that repeats exactly at tiny steps is a staircase and not rough: it has no smooth part that the program knows.
+    """
+    steps = SCALES * scale
+    drawn = random.uniform(-1.0, 1.0, (steps.size, POINTS))
+    costs = along((steps[:, None] * drawn).ravel()).reshape(drawn.shape)
+    if not np.isfinite(costs).all() or (np.ptp(costs[-4:], axis=1) == 0.0).any():
+        return None
+    rows = []
+    for h, t, f in zip(steps, drawn, costs, strict=True):
+        basis = np.stack([np.ones_like(t), t, t * t], axis=1)
+        fit, *_ = np.linalg.lstsq(basis, f - f[0], rcond=None)
+        scatter = float(np.sqrt(((f - f[0] - basis @ fit) ** 2).sum() / (POINTS - 3)))
+        error = scatter * float(np.sqrt(np.linalg.inv(basis.T @ basis)[1, 1]))
+        rows.append((fit[1] / h, error / h, scatter))
+    slopes, errors, scatters = np.array(rows).T
+    floor = 4.0 * unit * float(np.abs(costs).max())
+    rough = [j for j in range(steps.size - 2) if scatters[j] > ROUGH * floor and scatters[j] < FALL * scatters[j + 2]]
+    if not rough:
+        return None
+    most = scatters[rough].max()
+    change = np.abs(np.diff(slopes, prepend=slopes[1]))
+    error = SPREAD * errors + change / 2.0
+    best = min((j for j in rough if scatters[j] >= SATURATED * most), key=lambda j: error[j])
+    return SmoothPart(float(slopes[best]), float(error[best]), float(steps[best]))
