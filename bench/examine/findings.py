@@ -354,6 +354,8 @@ class Findings:
         """The cause of the first problem with the derivative at theta, or the verdict on a right one."""
         check, explained, repeats = self.settled, self.explained, self.repeats
         allowed, tolerance = self.setup.allow_zero, max(float(self.setup.rtol.max()), 1e-3)
+        if repeats.is_failing:
+            return "nondeterministic"
         if self.error:
             return "raised"
         if not check.parts:

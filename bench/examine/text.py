@@ -146,6 +146,7 @@ def derivative_facts(report: Findings) -> list[str]:
         "raised": [shortened(report.error)],
         "nondeterministic": [
             "the cost depends on the call before it" if repeats.has_state else "",
+            "equal calls raise an exception or return a number" if repeats.is_failing else "",
             f"costs differ by {relative(report, repeats.spread)}" if repeats.spread else "",
             f"gradients differ by {number(100 * repeats.of_gradient)}%" if repeats.of_gradient else "",
         ],

@@ -39,7 +39,8 @@ DERIVATIVE = {
     ),
     "nondeterministic": Rule(
         "fault", "the same call returns different numbers",
-        "by more than {sampling.LAST_DIGITS} u, in `examine` u^{stages.SMALL}, of the cost or the gradient's norm",
+        "by more than {sampling.LAST_DIGITS} u, in `examine` u^{stages.SMALL}, of the cost or the gradient's norm, or some calls raise an "
+        "exception",
         "fix the seed, or pass the noise as w and set noise=N; reset states that persist between calls",
     ),
     "stale_gradient": Rule(

@@ -70,6 +70,8 @@ class Repeats:
     """Largest difference between equal calls of the gradient, relative to its norm."""
     has_state: bool = False
     """Whether the cost depends on the call before it, in a repeatable way."""
+    is_failing: bool = False
+    """Whether equal calls raise an exception or return a number."""
     floor: float = 0.0
     """Largest spread that only limits the accuracy of the check."""
     floor_of_gradient: float = 0.0
@@ -77,7 +79,7 @@ class Repeats:
     @property
     def is_small(self) -> bool:
         """Whether these differences only limit the accuracy of the check."""
-        return self.spread <= self.floor and self.of_gradient <= self.floor_of_gradient
+        return not self.is_failing and self.spread <= self.floor and self.of_gradient <= self.floor_of_gradient
 
 
 class Store:
@@ -219,8 +221,25 @@ class GradientStages:
                 self.left_out.append("the cost at theta")
             self.left_out.append("the gradient check")
             return
+        try:
+            self._repeat_failures()
+            if self.is_failed:
+                return
+            self._run_stages(explain)
+            self._repeat_failures()
+        except OutOfTime:
+            self.left_out.append("calls that raised an exception, once more")
+
+    def _repeat_failures(self) -> None:
+        """Repeat calls that raised an exception, which may do so at random."""
         if self.is_failed:
-            return
+            again = self.gradient_at(self.theta)
+            self.repeats.is_failing |= bool(np.isfinite(again).all())
+        for at, *w in list(self.simulator.failed):
+            again = self.simulator.costs(at, *w)
+            self.repeats.is_failing |= bool(np.isfinite(again).any())
+
+    def _run_stages(self, explain: Callable[[Check], None]) -> None:
         space = choose(self.layout, self.scale, self.gradient, self.seed)
         self.groups = space.groups
         if self.gradient is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections import deque
 from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout
 from functools import partial
@@ -29,6 +30,8 @@ DISTINCT = 3
 """Fewest costs that show that all costs have single precision: each is one in double precision once in 2^29."""
 SIMPLE_BITS = 12
 """Costs with at most this many significant bits, such as 0.5, show nothing about the precision."""
+KEPT = 4
+"""Most failed calls that are kept, to be made again."""
 COMPARED = 10_000_000
 """Numbers of theta in all calls up to which each call is searched for changes of theta."""
 
@@ -67,6 +70,8 @@ class Simulator:
         """Notes for the user on how the cost is called."""
         self.raised: dict[str, int] = {}
         """Number of failed calls of the cost, after the first call, by exception."""
+        self.failed: deque[tuple[np.ndarray, ...]] = deque(maxlen=KEPT)
+        """The thetas of the last of these calls, and the noise w where there is some."""
         self.gradient_error = ""
         """The first exception of the gradient, or an empty string."""
         self.n_failed_gradients = 0
@@ -184,6 +189,9 @@ class Simulator:
         try:
             return np.asarray(self._values(*parts), dtype=np.float64)
         except Exception as error:
+            if self.clock.is_interrupted:
+                raise OutOfTime from None
+            self.failed.append(tuple(part.copy() for part in parts))  # whose memory is used again
             text = f"{type(error).__name__}: {error}"
             self.raised[text] = self.raised.get(text, 0) + 1
             return np.full(parts[0].shape[1], np.nan)
@@ -194,6 +202,8 @@ class Simulator:
         except UserError:
             raise
         except Exception as error:
+            if self.clock.is_interrupted:
+                raise OutOfTime from None
             reason = failure(error)["reason"]
             if isinstance(self._grad, str) and not self.clock.gradients:
                 advice = f"write it with {self._grad} alone, or give grad=FUNCTION"
