@@ -228,7 +228,7 @@ class _Examination:
         self.explained = diagnosis.Explanation()
         self._near: list[LineScan] | None = None
         """Lines at theta that do not depend on sigma."""
-        self.stages = GradientStages(simulator, setup.scale, setup.seed)
+        self.stages = GradientStages(simulator, setup.scale, setup.seed, bool(setup.levels))
 
     def run(self, named: Mapping[str, Any], refined: Any) -> Report:
         """Run the checks that the budget allows, the decisive ones first, and return the report."""

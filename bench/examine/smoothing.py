@@ -85,6 +85,8 @@ class Smoothed:
     """Number of pairs whose costs differ."""
     n_lost: int = 0
     """Number of pairs with a gradient that is not a number, where the costs are numbers."""
+    unseen: float = 0.0
+    """Part of grad J that an event which no draw meets may have: no bound on the bias is below it."""
 
     @property
     def bias_percent(self) -> tuple[float, float]:
@@ -139,7 +141,7 @@ def measure_smoothed(
     plain: np.ndarray | None,
     seed: int = 0,
     pairs: int = PAIRS,
-    unseen: Callable[[int], float] | None = None,
+    unseen: Callable[[int], tuple[float, float]] | None = None,
 ) -> Smoothed | None:
     """Return the gradient's bias and the methods' costs under noise ``spread * u`` on theta, called ``sigma``.
 
@@ -180,7 +182,7 @@ def _summary(
     drawn: np.ndarray,
     plain: np.ndarray | None,
     simulator: Simulator,
-    unseen: Callable[[int], float] | None = None,
+    unseen: Callable[[int], tuple[float, float]] | None = None,
 ) -> Smoothed:
     # SciPy's distributions are slow to import, and only this function needs them
     from bench.measure.statistics import Truth, summarise
@@ -205,13 +207,14 @@ def _summary(
     error = float(np.sqrt(groups.var(axis=0, ddof=1).sum() / GROUPS))
     norm = math.sqrt(max(float(truth @ truth) - error**2, 0.0))
     bias = low = high = moved = math.nan
+    event = 0.0
     remark = ""
     slopes = (up + down) / 2.0
     n_lost = int((~np.isfinite(slopes).all(axis=0)).sum()) if simulator.has_gradient else 0
     if np.isfinite(slopes).all():
         judged = summarise(_means(slopes) - groups, Truth.exact(np.zeros(dim)), pairs // GROUPS)
-        missed = unseen(2 * pairs) / float(spread.max()) if unseen else 0.0
-        bias, low, high = judged.bias, judged.bias_low, max(judged.bias_high, missed)
+        jumps, event = np.array(unseen(2 * pairs) if unseen else (0.0, 0.0)) / spread.max()
+        bias, low, high = judged.bias, judged.bias_low, max(judged.bias_high, float(jumps))
         # heavy tails make an interval unreliable, which does not matter for a narrow one
         remark = judged.note if high - low > SMALL_BIAS * norm else ""
     elif n_lost:
@@ -221,7 +224,7 @@ def _summary(
     methods = _methods(norm, (low, high), terms, up, simulator.clock) if norm > CLEAR * error else ()
     return Smoothed(
         sigma, truth / weight[:, 0], error, norm, pairs, bias, low, high, moved, remark, methods,
-        int((d != 0.0).sum()), n_lost,
+        int((d != 0.0).sum()), n_lost, float(event),
     )  # fmt: skip
 
 
@@ -266,21 +269,20 @@ def _method(name: str, bias: tuple[float, float], terms: np.ndarray, norm: float
     return Method(name, high, samples, calls * samples, calls * samples * seconds)
 
 
-def largest_unseen(lines: Sequence[LineScan], ratio: float, draws: int) -> float:
-    """Return the largest part of ``sigma * grad J`` that ``draws`` draws of the noise may miss, from costs on lines.
+def largest_unseen(lines: Sequence[LineScan], ratio: float, draws: int) -> tuple[float, float]:
+    """Return the largest parts of ``sigma * grad J`` that ``draws`` draws of the noise may miss, from costs on lines.
 
-    ``ratio`` is sigma over that of the lines. Draws miss jumps on a line that fewer than :data:`RARE` of them meet, and
-    any event less likely than :data:`UNMET` in all draws: across a plane at t standard deviations, a change of the cost by H is
-    a part ``H phi(t)``. The largest H of an event that no line meets is taken to be the range of the cost on the lines.
+    ``ratio`` is sigma over that of the lines. Across a plane at t standard deviations, a change of the cost by H is a part
+    ``H phi(t)``. The first part is that of the jumps on a line that fewer than :data:`RARE` draws meet. The second is that of an
+    event that no line and no draw meets, as likely as 5% of cases allow and as high as the range of the cost on the lines.
     """
-    normal, found = NormalDist(), [0.0]
+    normal, jumps, events = NormalDist(), [0.0], [0.0]
     for line in lines:
-        t, costs = line.at / ratio, line.costs
-        inside = costs[(np.abs(t) <= REACH) & np.isfinite(costs)]
-        found.append(float(np.ptp(inside)) * normal.pdf(normal.inv_cdf(UNMET / draws)) if inside.size else 0.0)
+        inside = line.costs[(np.abs(line.at / ratio) <= REACH) & np.isfinite(line.costs)]
+        events.append(float(np.ptp(inside)) * normal.pdf(normal.inv_cdf(UNMET / draws)) if inside.size else 0.0)
         at = [(abs(jump.at / ratio), jump.size) for jump in line.jumps]
-        found.append(sum(size * normal.pdf(t) for t, size in at if draws * normal.cdf(-t) < RARE))
-    return max(found)
+        jumps.append(sum(size * normal.pdf(t) for t, size in at if draws * normal.cdf(-t) < RARE))
+    return max(jumps), max(events)
 
 
 def directions(count: int, scale: np.ndarray, seed: int) -> np.ndarray:

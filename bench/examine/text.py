@@ -93,9 +93,9 @@ def conclusion(report: Findings) -> str:
 
 
 def noise_answer(report: Findings) -> str:
-    """Return the answer about the gradient under noise in one line; empty without a gradient."""
+    """Return the answer about the gradient under noise in one line; without a gradient what smoothing gives, if measured."""
     if not report.gradient:
-        return ""
+        return _noise_of_costs(report)
     levels = report.setup.sigmas
     if levels and report.noise_cause not in ("", "unmeasured"):
         # a problem is said of the sigmas that show it; lines show that of the largest
@@ -108,7 +108,9 @@ def noise_answer(report: Findings) -> str:
         usable = [sigma_text(report, one.sigma) for one in report.smoothed if one.is_usable]
         reason = noise_problems(report)[0] + f"; usable at sigma {', '.join(usable)}" * bool(usable)
     elif report.use == "usable":
-        largest = max((one.bias_percent[1] for one in report.smoothed if one.known), default=0.0)
+        largest = max(
+            (max(one.bias_percent[1], 100 * one.unseen / one.norm) for one in report.smoothed if one.known), default=0.0
+        )
         reason = f"The bias of the mean gradient is below {number(max(largest, 1e-3))}%"
         reason += "" if report.derivative == RIGHT else f", though the derivative at theta is {report.derivative}"
     elif report.smoothed and not report.noise_cause and report.use != "not measured":
@@ -119,6 +121,24 @@ def noise_answer(report: Findings) -> str:
     else:
         reason = "the gradient raised an exception" if report.error else "the budget ended"
     return f"{where}: {report.use}. {reason}"
+
+
+def _noise_of_costs(report: Findings) -> str:
+    """Return what noise does to a cost without a gradient: grad J by smoothing at each sigma, and the jumps within it."""
+    if not report.setup.levels or not report.smoothed:
+        return ""
+    facts = []
+    for one in report.smoothed:
+        size = (
+            f"|grad J| = {number(one.norm, 3)} +- {number(one.error, 1)}" if one.known else "not distinguishable from 0"
+        )
+        samples = [number(m.samples, 2) for m in one.methods if m.name == "smoothing" and math.isfinite(m.samples)]
+        facts.append(
+            f"sigma {sigma_text(report, one.sigma)}: {size}" + "".join(f", {n} samples for 10%" for n in samples)
+        )
+    jumps = [jump.size for line in report.lines for jump in line.jumps]
+    facts += [f"{counted(len(jumps), 'jump')} of up to {number(max(jumps))} within {REACH:g} sigma"] if jumps else []
+    return f"Under noise, by smoothing: {'; '.join(facts)}"
 
 
 def agreement(report: Findings) -> str:

@@ -25,7 +25,7 @@ from bench.gradient import (
     Sample,
     check,
 )  # fmt: skip
-from bench.gradient.check import NOTHING, cause_of
+from bench.gradient.check import CLEAR, NOTHING, cause_of
 from bench.gradient.few import ROUNDS, FewSteps, is_nothing
 from bench.gradient.roughness import FINE
 from bench.gradient.subspace import Group, Subspace, choose, locate
@@ -56,6 +56,8 @@ MOST_OF_IT = 0.9
 """Share of the remaining budget after which a running stage is stopped."""
 SHARE = 0.8
 """Largest share of the remaining budget of a stage, whatever is measured after it."""
+BEFORE_NOISE = 0.4
+"""Largest such share of a stage on a gradient that looks right, where noise is measured after it."""
 STATE = 0.1
 """Largest share of the difference between histories by which a cost with equal histories differs."""
 
@@ -119,7 +121,9 @@ class GradientStages:
         simulator: Simulator,
         scale: np.ndarray,
         seed: int,
+        has_noise: bool = False,
     ) -> None:
+        self._has_noise = has_noise  # whether noise on theta is measured after the stages
         self.simulator, self.scale, self.clock, self.seed = simulator, scale, simulator.clock, seed
         self.layout, self.theta = simulator.layout, simulator.layout.vector
         self._random = np.random.default_rng([seed, 0x6578616D])
@@ -386,8 +390,9 @@ class GradientStages:
         wrong = sum(part.verdict in FAULTS for part in self.check.parts)
         if wrong and options.draws:
             costs += min(4, options.draws) * wrong * each + 4 * options.draws * each
-        if wrong and options.scanned:
-            costs += min(wrong + options.directions, options.scanned) * SCAN
+        unclear = sum(part.verdict not in CLEAR for part in self.check.parts)
+        if unclear and options.scanned:
+            costs += min(unclear + options.directions, options.scanned) * SCAN
         gradients = 0 if self.gradient is None else 3 + options.draws * (3 if wrong else 1)
         return costs, gradients
 
@@ -395,7 +400,8 @@ class GradientStages:
         self.clock.start_stage("checking the gradient")
 
         def fits(options: Options) -> bool:
-            return self.clock.can_afford(*self._cost_of(options, space.size), share=SHARE)
+            share = BEFORE_NOISE if self._has_noise and self.check.trusted and not self.is_quick else SHARE
+            return self.clock.can_afford(*self._cost_of(options, space.size), share=share)
 
         for name in self._plan(space.size, True):
             plan = self._plan(space.size, self.check.trusted)

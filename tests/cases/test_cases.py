@@ -114,7 +114,11 @@ def test_a_gradient_of_another_shape_is_bad_input(words):
 def test_gradcheck_refuses_what_sampled_gradients_miss(scene, verdict, tmp_path, capsys):
     words = [scene, "backends=[jax]", "workers=0", "sweep.horizon=[100]", PLUGINS, f"results_dir={tmp_path}", "--quiet"]
     words = words if scene == "table_edge" else [word for word in words if "horizon" not in word]
-    assert main(["gradcheck", *words]) == 1, capsys.readouterr().out
+    status, said = main(["gradcheck", *words]), capsys.readouterr().out
+    assert status == 1, said
+    again = [line for line in said.splitlines() if "python -m bench gradcheck" in line]
+    assert again
+    assert all("plugins=" in line for line in again)
     rows = pd.read_parquet(tmp_path / "gradcheck" / "rows.parquet")
     assert verdict in np.concatenate(rows["check_verdict"].to_numpy())
 

@@ -1,6 +1,7 @@
 """What the report says: answers rest on what was measured, and commands can be pasted."""
 
 import math
+import re
 from functools import partial
 
 import numpy as np
@@ -118,3 +119,44 @@ def test_an_expected_cause_that_excuses_nothing_is_said_plainly():
     report = examine(cost, THETA, grad=wrong, expect="wrong_factor")
     assert report.status == 1
     assert "expect=wrong_factor does not excuse a wrong gradient" in report.warnings
+
+
+def test_a_cost_without_a_gradient_gets_what_smoothing_gives_under_noise():
+    report = examine(lambda x: float(x[0] ** 2 + (x[0] > 1.05)), [1.0], sigma=0.1, calls=6000)
+    assert report.noise_answer.startswith("Under noise, by smoothing: sigma 0.10: |grad J| = 5.")
+    assert "1 jump of up to 1.0 within 4 sigma" in report.noise_answer
+
+
+def test_a_few_calls_in_single_precision_reach_lines_and_noise():
+    def single(x):
+        x = np.asarray(x, np.float32)
+        return np.float32(np.sin(x[0]) * x[1] + np.float32(0.3) * x[2] ** 2)
+
+    def slope(x):
+        return np.array([np.cos(x[0]) * x[1], np.sin(x[0]), 0.6 * x[2]], np.float32)
+
+    report = examine(single, [0.4, 0.7, 1.2], grad=slope, sigma=0.05, calls=1500)
+    assert report.lines
+    assert report.use == "usable", str(report)
+
+
+@pytest.mark.parametrize("pairs", [128, 4096])
+def test_no_bound_on_the_bias_is_tighter_than_its_draws_support(pairs):
+    """A linear cost: an event that none of 2 n draws meets is as likely as 3 in them, and moves the cost by 8 sigma."""
+    report = examine(lambda x: float(x[0]), [1.0], grad=lambda x: [1.0], sigma=0.1, calls=4 * pairs + 2000)
+    bound = float(re.search(r"below ([\d.]+)%", report.noise_answer)[1])
+    assert bound > 100.0 * 3.0 / (2.0 * report.smoothed[0].pairs), str(report)
+
+
+def test_a_kink_is_no_wrong_derivative():
+    report = examine(lambda x: float(abs(x[0] - 1.0)), [1.0], grad=lambda x: [1.0])
+    assert (report.status, report.derivative, report.cause) == (1, "undefined", "kink")
+    assert report.conclusion.startswith("Derivative: UNDEFINED. kink")
+
+
+def test_a_straight_through_rounding_is_a_staircase():
+    report = examine(
+        lambda x: float(np.round(8.0 * x[0]) / 8.0), [0.3], grad=lambda x: [1.0], sigma=[0.01, 0.5], calls=20_000
+    )
+    assert (report.status, report.cause) == (1, "staircase"), str(report)
+    assert "usable at sigma 0.50" in report.noise_answer
