@@ -219,7 +219,7 @@ class Findings:
     @cached_property
     def judged(self) -> Check:
         """The check with derivatives of a rough cost judged by its smooth part."""
-        if not self.explained.smooth_parts or self.tread:
+        if not self.explained.smooth_parts or self.tread or self.check.cause == "rough":
             return self.check
         return recaused(self.check, self._of_smooth_part)
 

@@ -38,8 +38,6 @@ EXPLAINED = 10.0
 """Largest such error as a multiple of the sum of the cost's jumps per unit of a direction."""
 PLAINLY = ("smooth", "nonlinear", "mode_crossing")
 """Verdicts that count as right at the thetas drawn with :data:`FAR`."""
-CLEAR = (*PLAINLY, "zero", "nonfinite", "nondeterministic")
-"""Verdicts with which a direction is not scanned for a staircase."""
 
 
 @dataclass(frozen=True)
@@ -418,10 +416,11 @@ class _Checker:
         Directions that are clearly right are not scanned. A derivative of exactly 0 is not clearly right where
         differences are not 0, since it may be the slope of a tread.
         """
+        clear = (*PLAINLY, "zero", "nonfinite", "nondeterministic")
         to_scan = [
             m
             for m, (sample, finding) in enumerate(zip(measured, findings, strict=True))
-            if finding.verdict not in CLEAR
+            if finding.verdict not in clear
             or (finding.verdict == "nonlinear" and sample.derivative == 0.0 and sample.differences.any())
         ][: self.options.scanned]
         along = roughness.staircase_offsets(self.unit)

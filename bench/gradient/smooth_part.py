@@ -17,8 +17,12 @@ SCALES = np.logspace(-1, -9, 17)
 """Scales, two per decade, in units of the input's scale."""
 POINTS = 17
 """Costs per scale."""
-FALL = 30.0
-"""Ratio of the scatter at a scale to that at a tenth of it, from which on it is the curvature of a smooth cost."""
+FALL = 6.0
+"""Ratio of the scatter at a scale to that at a tenth of it, from which on it is that of a kink or of a smooth cost's curvature."""
+FIRST = np.array([2, 4, 6, 8])
+"""Scales that are tried first: without roughness at these, a cost is not rough."""
+STILL = 4
+"""Smallest scales at which a rough cost moves, and a staircase does not."""
 ROUGH = 100.0
 """Multiple of the cost's rounding error above which scatter is roughness."""
 SATURATED = 0.1
@@ -50,23 +54,32 @@ def smooth_part(
     """
     steps = SCALES * scale
     drawn = random.uniform(-1.0, 1.0, (steps.size, POINTS))
-    costs = along((steps[:, None] * drawn).ravel()).reshape(drawn.shape)
-    if not np.isfinite(costs).all() or (np.ptp(costs[-4:], axis=1) == 0.0).any():
+    fits = np.full((steps.size, 4), np.nan)
+    for part in (FIRST, np.setdiff1d(np.arange(steps.size), FIRST)):
+        costs = along((steps[part, None] * drawn[part]).ravel()).reshape(-1, POINTS)
+        if not np.isfinite(costs).all():
+            return None
+        fits[part] = [_fit(h, t, f) for h, t, f in zip(steps[part], drawn[part], costs, strict=True)]
+        floor = ROUGH * 4.0 * unit * float(np.abs(costs).max())
+        scatters = fits[:, 2]
+        # a smooth cost's scatter falls by 1,000 per decade, at a kink by 10; comparisons with scales that are not known are false
+        rough = [j for j in range(steps.size - 2) if scatters[j] > floor and scatters[j] < FALL * scatters[j + 2]]
+        if not rough:
+            return None
+    if (fits[-STILL:, 3] == 0.0).any():
         return None
-    rows = []
-    for h, t, f in zip(steps, drawn, costs, strict=True):
-        basis = np.stack([np.ones_like(t), t, t * t], axis=1)
-        fit, *_ = np.linalg.lstsq(basis, f - f[0], rcond=None)
-        scatter = float(np.sqrt(((f - f[0] - basis @ fit) ** 2).sum() / (POINTS - 3)))
-        error = scatter * float(np.sqrt(np.linalg.inv(basis.T @ basis)[1, 1]))
-        rows.append((fit[1] / h, error / h, scatter))
-    slopes, errors, scatters = np.array(rows).T
-    floor = 4.0 * unit * float(np.abs(costs).max())
-    rough = [j for j in range(steps.size - 2) if scatters[j] > ROUGH * floor and scatters[j] < FALL * scatters[j + 2]]
-    if not rough:
-        return None
+    slopes, errors = fits[:, 0], fits[:, 1]
     most = scatters[rough].max()
     change = np.abs(np.diff(slopes, prepend=slopes[1]))
     error = SPREAD * errors + change / 2.0
     best = min((j for j in rough if scatters[j] >= SATURATED * most), key=lambda j: error[j])
     return SmoothPart(float(slopes[best]), float(error[best]), float(steps[best]))
+
+
+def _fit(h: float, t: np.ndarray, costs: np.ndarray) -> tuple[float, float, float, float]:
+    """Return slope, its standard error, scatter and range of ``costs (n,)`` at displacements ``h * t``, by a quadratic."""
+    basis, rise = np.stack([np.ones_like(t), t, t * t], axis=1), costs - costs[0]
+    fit, *_ = np.linalg.lstsq(basis, rise, rcond=None)
+    scatter = float(np.sqrt(((rise - basis @ fit) ** 2).sum() / (POINTS - 3)))
+    error = scatter * float(np.sqrt(np.linalg.inv(basis.T @ basis)[1, 1]))
+    return float(fit[1]) / h, error / h, scatter, float(np.ptp(costs))

@@ -25,7 +25,7 @@ from bench.gradient import (
     Sample,
     check,
 )  # fmt: skip
-from bench.gradient.check import CLEAR, NOTHING, cause_of
+from bench.gradient.check import NOTHING, cause_of
 from bench.gradient.few import ROUNDS, FewSteps, is_nothing
 from bench.gradient.roughness import FINE
 from bench.gradient.subspace import Group, Subspace, choose, locate
@@ -390,7 +390,7 @@ class GradientStages:
         wrong = sum(part.verdict in FAULTS for part in self.check.parts)
         if wrong and options.draws:
             costs += min(4, options.draws) * wrong * each + 4 * options.draws * each
-        unclear = sum(part.verdict not in CLEAR for part in self.check.parts)
+        unclear = wrong + sum(part.verdict == "rounding" for part in self.check.parts)
         if unclear and options.scanned:
             costs += min(unclear + options.directions, options.scanned) * SCAN
         gradients = 0 if self.gradient is None else 3 + options.draws * (3 if wrong else 1)

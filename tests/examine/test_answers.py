@@ -149,7 +149,7 @@ def test_no_bound_on_the_bias_is_tighter_than_its_draws_support(pairs):
 
 
 def test_a_kink_is_no_wrong_derivative():
-    report = examine(lambda x: float(abs(x[0] - 1.0)), [1.0], grad=lambda x: [1.0])
+    report = examine(lambda x: float(abs(x[0] - 1.0)), [1.0], grad=lambda x: [1.0 if x[0] >= 1.0 else -1.0])
     assert (report.status, report.derivative, report.cause) == (1, "undefined", "kink")
     assert report.conclusion.startswith("Derivative: UNDEFINED. kink")
 
