@@ -83,9 +83,9 @@ def _along_theta(numbers: Numbers) -> str:
 
 
 def _norm(numbers: Numbers) -> str:
-    first, second = (np.linalg.norm(each, keepdims=True) for each in (numbers.program, numbers.difference))
-    is_turned = numbers.is_whole and numbers.is_wrong.sum() > 1 and _are_equal(first, second)
-    is_turned = is_turned and np.linalg.norm(numbers.program - numbers.difference) > TURNED * second[0]
+    first, second = (np.linalg.norm(each) for each in (numbers.program, numbers.difference))
+    is_turned = numbers.is_whole and numbers.is_wrong.sum() > 1 and bool(abs(first - second) <= ALIKE * second)
+    is_turned = is_turned and bool(np.linalg.norm(numbers.program - numbers.difference) > TURNED * second)
     return "its norm is that of the differences, as in another frame" if is_turned else ""
 
 
@@ -130,8 +130,9 @@ def hint_of(check: Check, theta: np.ndarray, explained: Explanation) -> Hint | N
     if check.cause not in SUSPICIOUS or not any(part.verdict in SUSPICIOUS for part in parts):
         return None
     columns = ([theta[part.component or 0], part.program, part.difference] for part in parts)
+    at, program, difference = np.array(list(columns)).T
     wrong = np.array([part.verdict in SUSPICIOUS for part in parts])
-    numbers = Numbers(*np.array(list(columns)).T, wrong, len(parts) == theta.size, explained)
+    numbers = Numbers(at, program, difference, wrong, len(parts) == theta.size, explained)
     if not np.isfinite(numbers.program).all():
         return None
     found = ((cause, explain(numbers)) for cause, explain in HINTS)

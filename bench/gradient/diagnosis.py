@@ -170,10 +170,11 @@ def smooth_parts(stages: GradientStages, outcome: Check) -> dict[int, SmoothPart
     for part in doubtful(outcome):
         if not stages.clock.can_afford(COSTS, share=MOST_OF_IT):
             break
-        direction = np.eye(1, stages.theta.size, part.component)[0]
+        index = part.component or 0
+        direction = np.eye(1, stages.theta.size, index)[0]
         one = smooth_part(partial(stages.costs_along, direction), part.sample.scale, stages.simulator.unit, random)
-        if one is not None and part.component is not None:
-            found[part.component] = one
+        if one is not None:
+            found[index] = one
     return found
 
 
