@@ -14,12 +14,12 @@ import numpy as np
 
 from bench.errors import UserError, unknown
 from bench.examine.findings import RELATIVE, GroupSize, Setup, Spent
-from bench.examine.means import compare_means
+from bench.examine.means import OF_A_DRAW, compare_means
 from bench.examine.report import Report
 from bench.examine.smoothing import FEWEST, OWN_PAIRS, PAIRS, Smoothed, directions, largest_unseen, measure_smoothed
 from bench.gradient import Check, diagnosis
 from bench.gradient.lines import HALVINGS, PLACES, POINTS, REACH, LineScan, scan
-from bench.gradient.rules import RULES, SUSPICIOUS, UNEQUAL
+from bench.gradient.rules import RULES, SUSPICIOUS
 from bench.gradient.stages import GradientStages
 from bench.simulator.clock import Clock, OutOfTime, end_on_sigterm, parse_duration
 from bench.simulator.simulator import Simulator
@@ -259,7 +259,8 @@ class _Examination:
                 self._attempt("noise of the gradient", lambda: diagnosis.noise_of_gradient(stages)) or 0.0
             )
         means = None
-        if simulator.noise and checked.cause in UNEQUAL and stages.gradient is not None:
+        is_of_a_draw = any(one.cause in OF_A_DRAW for one in (checked, *stages.more))
+        if simulator.noise and is_of_a_draw and stages.gradient is not None:
             clock.limit(MEANS_SHARE)
             means = self._attempt("the mean over draws", lambda: compare_means(stages))
             clock.limit(1.0)
@@ -291,6 +292,7 @@ class _Examination:
             groups=self._group_sizes(),
             more=stages.more,
             explained=explained,
+            is_random=simulator.noise > 0,
             means=means,
             lines=lines,
             smoothed=smoothed,

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bench.examine.hints import Hint, hint_of
-from bench.examine.means import ENOUGH, Mean
+from bench.examine.means import OF_A_DRAW, Mean
 from bench.examine.smoothing import TARGET_ERROR, Method, Smoothed
 from bench.gradient import FAULTS, TRUSTED, Check, Part, Sample, rules
 from bench.gradient.diagnosis import LOOSE, Explanation, grows, may_be_adaptive
@@ -170,6 +170,8 @@ class Findings:
     """Checks under further draws of the simulator's own noise."""
     explained: Explanation
     """Comparisons that explain a wrong gradient."""
+    is_random: bool
+    """Whether the cost has noise of its own."""
     means: Mean | None
     """The mean of a gradient that is not the derivative at a fixed draw of the cost's noise; None: not compared."""
     lines: Sequence[LineScan]
@@ -364,13 +366,8 @@ class Findings:
             return "nondeterministic"
         if self.wrong_checks:
             cause = self.wrong_checks[0].cause
-            if (
-                cause in UNEQUAL
-                and self.means is not None
-                and self.means.draws >= ENOUGH
-                and not self.means.is_of_draws
-            ):
-                return self._cause_of_mean(self.means)
+            if self.is_random and cause in OF_A_DRAW and not self._is_of_draws:
+                return self._cause_of_mean()
             if cause in SUSPICIOUS and (self._is_residue or self.has_steps):
                 return "staircase"
             if cause == "unsettled" and explained.smooth_parts:
@@ -400,10 +397,16 @@ class Findings:
             return "no_effect"
         return "saturated" if check.cause == "zero" else check.cause
 
-    def _cause_of_mean(self, means: Mean) -> str:
+    @property
+    def _is_of_draws(self) -> bool:
+        """Whether a wrong gradient is that of each draw, since it follows their slopes and its mean is off."""
+        means = self.means
+        return means is not None and means.is_of_draws and means.is_decisive and means.cause == "biased"
+
+    def _cause_of_mean(self) -> str:
         """Return the verdict on a gradient that is not the derivative of each draw, but may be an estimator."""
-        if means.is_smooth:
-            return means.cause
+        if self.means is not None and self.means.is_decisive:
+            return self.means.cause
         if not self.smoothed:
             return "unmeasured"
         causes = [one.cause or ("estimator" if one.is_usable else "spread") for one in self.smoothed]

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bench.gradient.rules import UNEQUAL
 from bench.gradient.stages import GradientStages
 from bench.simulator.clock import OutOfTime
 
@@ -25,11 +26,13 @@ CLEAR = 4.0
 ALIKE = 0.05
 """Largest relative distance of the mean wide difference from the small one where the cost has no jumps."""
 SAME = 0.01
-"""Largest share of the variance of a gradient that the slopes of the draws leave, where it follows them."""
+"""Largest share of the mean square of a gradient that a multiple of the slopes of the draws leaves, where it follows them."""
 RIGHT = 0.1
 """Largest relative error of a mean that is right."""
 CONTROLLED = 20
 """Fewest draws per control variate."""
+OF_A_DRAW = (*UNEQUAL, "staircase", "stale_gradient")
+"""Verdicts at a fixed draw that the mean of an estimator overrules."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +41,7 @@ class Mean:
 
     draws: int
     error: float
-    """Distance of the means, relative to the larger one."""
+    """Distance of the means, relative to that of the differences; infinite where that may be 0."""
     doubt: float
     """Twice its standard error."""
     is_of_draws: bool
@@ -47,6 +50,11 @@ class Mean:
     """Whether jumps carry a part of the mean slope, so that small differences do not show it."""
     is_smooth: bool
     """Whether it is known that they carry none."""
+
+    @property
+    def is_decisive(self) -> bool:
+        """Whether the draws are enough, and small differences show the mean slope."""
+        return self.draws >= ENOUGH and self.is_smooth
 
     @property
     def cause(self) -> str:
@@ -68,7 +76,7 @@ def compare_means(stages: GradientStages) -> Mean | None:
             w = random.standard_normal((stages.simulator.noise, count))
             rows.append(np.concatenate([w, _slopes(stages, vectors, w)]))
             result = _summary(np.concatenate(rows, axis=1), stages.simulator.noise)
-            if result.draws >= ENOUGH and (result.is_of_draws or (result.is_smooth and result.cause != "spread")):
+            if result.is_decisive and result.cause != "spread":
                 break
             count = result.draws
     except OutOfTime:
@@ -95,22 +103,21 @@ def _summary(drawn: np.ndarray, n_noise: int) -> Mean:
     apart, beyond = gradient - small, wide - small
     mean, error = _mean(apart, w)
     jump, jump_error = _mean(beyond, w)
-    size = max(float(np.linalg.norm(each.mean(axis=1))) for each in (gradient, small, wide))
-    is_of_draws = all(map(_follows, gradient, small))
-    distance = math.sqrt(max(mean**2 - error**2, 0.0)) / size if size > 0 else math.inf
+    slope, slope_error = _mean(small, w)
+    size = max(slope - 2.0 * slope_error, 0.0)
+    distance, doubt = (
+        np.array([math.sqrt(max(mean**2 - error**2, 0.0)), 2.0 * error]) / size if size > 0 else [math.inf] * 2
+    )
     return Mean(
-        drawn.shape[1], distance, 2.0 * error / size if size > 0 else math.inf, is_of_draws,
+        drawn.shape[1], float(distance), float(doubt), all(map(_follows, gradient, small)),
         jump > CLEAR * jump_error and jump > ALIKE * size, jump + 2.0 * jump_error <= ALIKE * size,
     )  # fmt: skip
 
 
 def _follows(gradient: np.ndarray, small: np.ndarray) -> bool:
-    """Return whether a gradient ``(K,)`` is a function of the slopes of the draws ``(K,)``, along one direction."""
-    own = float(gradient.var())
-    if not small.any() or own <= SAME**4 * float(np.mean(gradient**2)):
-        return bool(small.any()) and float(small.var()) <= SAME**4 * float(np.mean(small**2))
-    covariance = float(np.cov(gradient, small, bias=True)[0, 1])
-    return own - covariance**2 / float(small.var()) <= SAME * own
+    """Return whether a gradient ``(K,)`` is a multiple of the slopes of the draws ``(K,)``, along one direction."""
+    own, square = float(np.mean(gradient**2)), float(np.mean(small**2))
+    return (1.0 - SAME) * own * square <= float(np.mean(gradient * small)) ** 2 and (square > 0.0 or own == 0.0)
 
 
 def _mean(values: np.ndarray, w: np.ndarray) -> tuple[float, float]:

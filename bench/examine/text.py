@@ -203,7 +203,7 @@ def mean_facts(report: Findings) -> list[str]:
     means = report.means
     if means is None:
         return []
-    if means.is_smooth:
+    if means.is_decisive:
         off = span(100 * max(means.error - means.doubt, 0.0), 100 * (means.error + means.doubt))
         return [f"its mean over {means.draws} draws is off by {off}%"]
     return [

@@ -159,8 +159,8 @@ EXAMINATION = {
     "estimator": Rule(
         "right", "not the derivative of each draw of the cost's noise, but its mean is that of the mean cost",
         "with `noise`, wrong at a fixed draw, and the error of the mean and twice its standard error are together below {means.RIGHT:.0%}; "
-        "where jumps may carry {means.ALIKE:.0%} of the mean slope, the bias under noise on theta is. Not where the slopes of the draws "
-        "explain all but {means.SAME:.0%} of the gradient's variance",
+        "where jumps may carry {means.ALIKE:.0%} of the mean slope, the bias under noise on theta is. Where the mean is off, and the gradient is "
+        "a multiple of each draw's slope to {means.SAME:.0%}, the verdict is that of a draw",
     ),
     "no_effect": Rule(
         "broken", "an input has no effect on the cost, and is not in allow_zero",

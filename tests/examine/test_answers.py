@@ -160,3 +160,41 @@ def test_a_straight_through_rounding_is_a_staircase():
     )
     assert (report.status, report.cause) == (1, "staircase"), str(report)
     assert "usable at sigma 0.50" in report.noise_answer
+
+
+NARROW = 0.02
+"""Standard deviation of the noise on the input of a smoothed square."""
+
+
+def smoothed_square(x, w):
+    return float((x[0] + NARROW * w[0]) ** 2)
+
+
+@pytest.mark.parametrize(
+    ("factor", "calls", "cause"), [(1.0, 600, "unmeasured"), (1.0, 20_000, "estimator"), (2.0, 20_000, "biased")]
+)
+def test_an_estimator_without_a_baseline_is_judged_by_its_mean(factor, calls, cause):
+    """Its draws are nearly linear in w, as the slopes are."""
+    report = examine(
+        smoothed_square, [1.0], grad=lambda x, w: [factor * smoothed_square(x, w) * w[0] / NARROW], noise=1, calls=calls
+    )
+    assert report.cause == cause, str(report)
+    if factor > 1.0:
+        assert "off by 100%" in report.conclusion
+
+
+def test_an_estimator_that_is_a_multiple_of_each_slope_is_not_wrong():
+    """J = x p(x) with a Bernoulli factor: each draw's gradient is its slope times 1 + x (1 - p)."""
+
+    def chance(x):
+        return 1.0 / (1.0 + math.exp(-x[0]))
+
+    def cost(x, w):
+        return float(x[0] * math.exp(0.3 * w[1]) * (0.5 * math.erfc(-w[0] / math.sqrt(2.0)) < chance(x)))
+
+    def score(x, w):
+        return [cost(x, w) / x[0] * (1.0 + x[0] * (1.0 - chance(x)))]
+
+    for calls in (500, 20_000):
+        report = examine(cost, [1.0], grad=score, noise=2, calls=calls)
+        assert report.status == (3 if calls == 500 else 0), str(report)
