@@ -242,6 +242,9 @@ class Findings:
             slope, error = refined, min(abs(slope - refined) + error, LOOSE * size)
         size, apart = max(abs(slope), abs(part.program)), abs(part.program - slope)
         tolerance = max(float(self.setup.rtol[part.component]), resolution(self.unit))
+        is_rough = any(each.error > tolerance * abs(each.slope) for each in explained.smooth_parts.values())
+        if refined is None and is_rough and error <= tolerance * size:
+            error = LOOSE * size  # of one sequence of steps, whose changes other components show
         if error > LIMIT * size:
             verdict = "unsettled"
         elif apart > error + tolerance * size + float(self.setup.atol[part.component]):

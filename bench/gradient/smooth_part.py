@@ -70,8 +70,8 @@ def smooth_part(
         return None
     slopes, errors = fits[:, 0], fits[:, 1]
     most = scatters[rough].max()
-    change = np.abs(np.diff(slopes, prepend=slopes[1]))
-    error = SPREAD * errors + change / 2.0
+    # the widest scale has no wider one that bounds its curvature
+    error = SPREAD * errors + np.abs(np.diff(slopes, prepend=np.inf)) / 2.0
     best = min((j for j in rough if scatters[j] >= SATURATED * most), key=lambda j: error[j])
     return SmoothPart(float(slopes[best]), float(error[best]), float(steps[best]))
 
