@@ -14,7 +14,7 @@ import numpy as np
 
 from bench.errors import UserError, unknown
 from bench.examine.findings import RELATIVE, GroupSize, Setup, Spent
-from bench.examine.means import OF_A_DRAW, compare_means
+from bench.examine.means import OF_A_DRAW, Mean, compare_means
 from bench.examine.report import Report
 from bench.examine.smoothing import FEWEST, OWN_PAIRS, PAIRS, Smoothed, directions, largest_unseen, measure_smoothed
 from bench.gradient import Check, diagnosis
@@ -226,6 +226,7 @@ class _Examination:
         self.simulator, self.setup, self.clock = simulator, setup, simulator.clock
         self.left_out: list[str] = []
         self.explained = diagnosis.Explanation()
+        self.means: Mean | None = None
         self._near: list[LineScan] | None = None
         """Lines at theta that do not depend on sigma."""
         self.stages = GradientStages(simulator, setup.scale, setup.seed, bool(setup.levels))
@@ -258,12 +259,7 @@ class _Examination:
             explained.gradient_noise = (
                 self._attempt("noise of the gradient", lambda: diagnosis.noise_of_gradient(stages)) or 0.0
             )
-        means = None
-        is_of_a_draw = any(one.cause in OF_A_DRAW for one in (checked, *stages.more))
-        if simulator.noise and is_of_a_draw and stages.gradient is not None:
-            clock.limit(MEANS_SHARE)
-            means = self._attempt("the mean over draws", lambda: compare_means(stages))
-            clock.limit(1.0)
+        self._compare_means(checked)
         can_go_on = stages.gradient is not None or not simulator.has_gradient
         if is_wrong and can_go_on and explained.is_adaptive is None:
             explained.is_adaptive = self._compare_along_lines(checked, 0.9)
@@ -293,7 +289,7 @@ class _Examination:
             more=stages.more,
             explained=explained,
             is_random=simulator.noise > 0,
-            means=means,
+            means=self.means,
             lines=lines,
             smoothed=smoothed,
             error=simulator.gradient_error if stages.is_failed else "",
@@ -336,9 +332,18 @@ class _Examination:
 
     def _compare_early(self, checked: Check) -> None:
         """Keep the smooth part of a rough cost, and whether adaptive steps explain the small error of a gradient."""
+        self._compare_means(checked)
         self._find_smooth_parts(checked)
         if diagnosis.may_be_adaptive(checked):
             self.explained.is_adaptive = self._compare_along_lines(checked, EARLY_SHARE)
+
+    def _compare_means(self, checked: Check) -> None:
+        """Compare the mean over draws of a gradient that is not the derivative at one of them."""
+        is_of_a_draw = any(one.cause in OF_A_DRAW for one in (checked, *self.stages.more))
+        if self.means is None and self.simulator.noise and is_of_a_draw and self.stages.gradient is not None:
+            self.clock.limit(MEANS_SHARE)
+            self.means = self._attempt("the mean over draws", lambda: compare_means(self.stages))
+            self.clock.limit(1.0)
 
     def _find_smooth_parts(self, checked: Check) -> None:
         if self.stages.gradient is not None and not self.explained.smooth_parts and diagnosis.doubtful(checked):

@@ -29,6 +29,8 @@ SAME = 0.01
 """Largest share of the mean square of a gradient that a multiple of the slopes of the draws leaves, where it follows them."""
 RIGHT = 0.1
 """Largest relative error of a mean that is right."""
+HELD = 20_000_000
+"""Most numbers in the thetas of more draws than :data:`ENOUGH`."""
 CONTROLLED = 20
 """Fewest draws per control variate."""
 OF_A_DRAW = (*UNEQUAL, "staircase", "stale_gradient")
@@ -72,7 +74,7 @@ def compare_means(stages: GradientStages) -> Mean | None:
     rows: list[np.ndarray] = []
     count, result = FIRST, None
     try:
-        while result is None or (result.draws < MOST and not result.has_jumps):
+        while result is None or (result.draws < min(MOST, max(ENOUGH, HELD // size)) and not result.has_jumps):
             w = random.standard_normal((stages.simulator.noise, count))
             rows.append(np.concatenate([w, _slopes(stages, vectors, w)]))
             result = _summary(np.concatenate(rows, axis=1), stages.simulator.noise)
