@@ -9,7 +9,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypedDict, Unpack
+from typing import TYPE_CHECKING, Any, TypedDict, Unpack, cast
 
 import numpy as np
 
@@ -17,7 +17,8 @@ from bench.errors import Unsupported, UserError, failure
 from bench.experiment.by_name import compile_problem, make
 from bench.model import Backend, Decision, Estimator, Integrator, Problem, Scene, registry
 from bench.model.identity import label, text_of
-from bench.model.parameters import parameters, singular
+from bench.model.parameters import build, parameters, singular
+from bench.model.parameters import values as parameter_values
 from bench.notebook import Estimates
 
 if TYPE_CHECKING:
@@ -57,9 +58,13 @@ class Settings(TypedDict, total=False):
     trainer: Values
     theta: Names
     theta0: Sequence[float] | np.ndarray | None
+    descent: float
+    path: Names
     samples: int
     repeats: int
     seed: int
+    draws: str | None
+    mirrored: bool | None
     reference: Mapping[str, float]
     workers: int | None
     timeout: float | str | None
@@ -112,7 +117,7 @@ def _override_words(key: str, value: Any) -> list[str]:
     head = key.partition(".")[0]
     if isinstance(value, Mapping) and (head == "reference" or head in map(singular, kinds)):
         return [word for name, inner in value.items() for word in _override_words(f"{key}.{name}", inner)]
-    return [f"{key}={_hydra_value(value, quoted=key not in (*kinds, 'study', 'experiment'))}"]
+    return [f"{key}={_hydra_value(value, quoted=key not in (*kinds, 'path', 'study', 'experiment'))}"]
 
 
 def _hydra_value(value: Any, quoted: bool = True) -> str:
@@ -233,18 +238,31 @@ def problem(
     backend: str = "jax",
     theta: Sequence[str] = (),
     theta0: Sequence[float] | None = None,
+    descent: float = 0.0,
+    path: Sequence[str] = ("penalty", "semi_implicit_euler"),
 ) -> Problem:
     """Compile a problem by command-line names: ``problem("pushing[sigma=0.1]", contact="penalty[stiffness=1e4]")``.
 
     ``problem.value(theta, w)``, ``.grad`` and ``.score`` take ``theta (d,)`` or ``(d, B)`` and noise ``w (n_w,)`` or
     ``(n_w, B)``, as arrays or lists. By default they use ``problem.program.theta0``, the point at which gradients are
     taken, and no noise. ``problem.to_frame()`` has the parameters. ``theta``
-    names float parameters of the scene and the contact law as the decision variable in place of the scene's own. Raises
+    names float parameters of the scene and the contact law as the decision variable in place of the scene's own. With
+    ``descent``, a share from 0 to below 1, ``theta0`` is where a descent that starts there has done this share of its gain,
+    as in an experiment: ``path`` is what is descended, a contact law, an integrator and, if wanted, a backend. Raises
     :class:`bench.UserError` for an invalid name or value, and :class:`bench.Unsupported` if the combination cannot run
     or a library is not installed.
     """
     at = None if theta0 is None else tuple(map(float, theta0))
-    return compile_problem(scene, contact, integrator, backend, Decision(tuple(theta), at))
+    decision = Decision(tuple(theta), at)
+    if descent:
+        from bench.experiment.grid import share_of
+        from bench.measure.descent import descend
+
+        share = share_of(descent)
+        law, step, *engine = path
+        start = compile_problem(scene, law, step, engine[0] if engine else None, decision)
+        decision = Decision(decision.names, descend(start).at(share).theta)
+    return compile_problem(scene, contact, integrator, backend, decision)
 
 
 _problem = problem  # an argument of estimate has the same name
@@ -258,13 +276,16 @@ def estimate(
     seed: int = 0,
     reference_samples: int = 1 << 18,
     tolerance: float = 0.005,
+    draws: str | None = None,
+    mirrored: bool | None = None,
 ) -> Estimates:
     """Compute R = ``repeats`` independent estimates of grad J_sigma at ``theta0``, with their bias and variance.
 
     ``problem`` is compiled by :func:`problem`, or the name of a scene: ``estimate("pushing", "fobg")``. Each estimate
     uses N = ``samples`` samples. The noise is the same as in the cells of an experiment with this seed. The reference
     gradient is the closed form, quadrature or long sampling of the same problem, with up to ``reference_samples``
-    samples, until its relative standard error is at most ``tolerance``. Raises :class:`bench.Unsupported` if the
+    samples, until its relative standard error is at most ``tolerance``. ``draws`` (``iid``, ``orthogonal``, ``sobol``) and
+    ``mirrored`` choose how the samples of an estimate are drawn, as the parameters of the estimator do. Raises :class:`bench.Unsupported` if the
     estimator cannot be used on the problem.
     """
     from bench.measure import noise, reference, statistics
@@ -272,10 +293,12 @@ def estimate(
     if isinstance(problem, str):
         problem = _problem(problem)
     method: Estimator = make("estimators", estimator)
+    given = {name: value for name, value in (("draws", draws), ("mirrored", mirrored)) if value is not None}
+    method = cast(Estimator, build(type(method), parameter_values(method) | given))
     program = problem.program
     if reason := method.refusal(program, problem.provides, "this backend"):
         raise Unsupported(reason)
-    w = noise.shared(seed, program.scene.name, repeats, samples, program.n_noise)
+    w = noise.shared(seed, program.scene.name, repeats, samples, program.n_noise, method.design(program, samples))
     estimates, diagnostics = method.estimate_with_diagnostics(problem, program.theta0, w)
     values = np.asarray(estimates, dtype=np.float64)
     truth = reference.certify(problem, problem.provides, reference_samples, tolerance)

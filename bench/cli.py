@@ -32,7 +32,7 @@ FEW = 3
 SETTINGS = """\
 Settings:
   scenes=[..] contacts=[..] integrators=[..] backends=[..] estimators=[..]
-  study=NAME sweep.AXIS=[..] theta=[mass,..] theta0=[..]
+  study=NAME sweep.AXIS=[..] theta=[mass,..] theta0=[..] descent=0.9
   scene.NAME.PARAMETER=..  (also contact. integrator. backend. estimator.)
   samples=N repeats=R seed=S results_dir=DIR name=FOLDER formats=[png,svg,pdf]
   workers=N timeout=10m memory=4g on_error=stop timing=false retry=[timeout]

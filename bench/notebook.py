@@ -45,19 +45,19 @@ class Estimates:
     def _facts(self) -> dict[str, str]:
         """Return the statistics as text, relative to the norm of the reference unless that may be 0."""
         from bench.report.text import number
-        from bench.report.views import bias_text, rmse_interval
+        from bench.report.views import bias_text, shown_rmse
 
         row = self.as_dict()
         norm = row["reference_norm"]
         is_relative = math.isfinite(row["rmse_rel"])
-        low, high = (float(end) for end in rmse_interval(row))
         unit = 1.0 if is_relative else norm or 1.0
+        _, low, high, is_limit = shown_rmse(row)
         kind = "relative " if is_relative else ""
         interval = f" [{number(low * unit, 3)}, {number(high * unit, 3)}]" if math.isfinite(low + high) else ""
         error = number(row["rmse_rel"] if is_relative else row["rmse"], 3)
         facts = {
             f"{kind}bias": bias_text(row, norm if is_relative else 1.0),
-            f"{kind}RMSE": f"{error}{interval}",
+            f"{kind}RMSE": f"< {number(high * unit, 3)}" if is_limit and math.isfinite(high) else f"{error}{interval}",
             "cosine": number(row["cosine"], 3),
             "variance": number(row["variance"], 3),
             "|grad J|": f"{number(norm, 3)} ({self.reference_method})",

@@ -221,14 +221,51 @@ def engines_agree() -> str:
     return number(float(max(distances)))
 
 
+def pairs_gain() -> str:
+    """Return the least factor between the errors of independent and of mirrored draws, below the limit of the step."""
+    verdicts = table_of("stiffness_sweep/verdicts").query("problem.str.startswith('pushing, penalty') and at <= 3000")
+    errors = verdicts.pivot_table(index=["problem", "at"], columns="estimator", values=["error_low", "error_high"])
+    return number(float((errors["error_low"]["fobg"] / errors["error_high"]["fobg[mirrored=true]"]).min()))
+
+
+def effort_share() -> str:
+    """Return the share of the variance of fobg that the slope of the control effort, 2 sigma w per step, has at the start."""
+    rows = rows_of("stiffness_sweep").query(
+        "estimator == 'fobg' and estimator_params == '' and scene == 'pushing' and contact == 'penalty' and backend == 'jax' "
+        "and descent == 0 and stiffness <= 3000"
+    )
+    return span(100.0 * rows["dim"] * (2.0 * rows["sigma"]) ** 2 / rows["samples"] / rows["variance"], 2, "%")
+
+
 FIGURES: dict[str, str | Callable[[], str]] = {
-    "fobg-soft": "stiffness_sweep/bias_variance | estimator=fobg, estimator_params=, contact=penalty, backend=jax, sigma=0.1, stiffness<=3000 | rmse_rel",
-    "reinforce-soft": "stiffness_sweep/bias_variance | estimator=reinforce, estimator_params=, contact=penalty, backend=jax, sigma=0.1, stiffness<=3000 | rmse_rel",
-    "fobg-stiff": 'stiffness_sweep/verdicts | method="fobg (jax, torch, implicit)", problem="pushing, penalty, sigma=0.1", at=10000 | error | interval',
-    "smoothing-stiff": "stiffness_sweep/bias_variance | estimator=randomized_smoothing, estimator_params=, contact=penalty, backend=jax, sigma=0.1, stiffness>=10000 | rmse_rel",
-    "fobg-implicit-stiff": "stiffness_sweep/bias_variance | estimator=fobg, contact=complementarity, backend=implicit, sigma=0.1, stiffness>=10000 | rmse_rel",
-    "implicit-time": "stiffness_sweep/bias_variance | estimator=fobg, contact=complementarity, backend=implicit, sigma=0.1, stiffness>=10000 | time_s | seconds",
-    "explicit-time": "stiffness_sweep/bias_variance | estimator=fobg, estimator_params=, contact=penalty, backend=jax, sigma=0.1, stiffness>=10000 | time_s | seconds",
+    "fobg-stiff": 'stiffness_sweep/verdicts | method="fobg (jax, torch)", problem="pushing, penalty, descent=0", at=10000 | error | interval',
+    "plain-start": 'stiffness_sweep/verdicts | estimator="plain", problem="pushing, penalty, descent=0", at<=3000 | error_high | most',
+    "plain-later": 'stiffness_sweep/verdicts | estimator="plain", problem="pushing, penalty, descent=0.9", at<=3000 | error_high | most',
+    "plain-beyond": 'stiffness_sweep/verdicts | estimator="plain", problem="pushing, penalty, descent=0", at=10000 | error',
+    "fobg-start": 'stiffness_sweep/verdicts | estimator="fobg", problem="pushing, penalty, descent=0", at<=3000 | error',
+    "fobg-later": 'stiffness_sweep/verdicts | estimator="fobg", problem="pushing, penalty, descent=0.9", at<=3000 | error',
+    "fobg-beyond": 'stiffness_sweep/verdicts | method="fobg (jax, torch)", problem="pushing, penalty, descent=0", at=10000 | error',
+    "pairs-start": 'stiffness_sweep/verdicts | estimator="fobg[mirrored=true]", problem="pushing, penalty, descent=0", at<=3000 | error_high | most',
+    "pairs-later": 'stiffness_sweep/verdicts | estimator="fobg[mirrored=true]", problem="pushing, penalty, descent=0.9", at<=3000 | error_high | most',
+    "pairs-beyond": 'stiffness_sweep/verdicts | estimator="fobg[mirrored=true]", problem="pushing, penalty, descent=0", at=10000 | error',
+    "reinforce-start": 'stiffness_sweep/verdicts | estimator="reinforce", problem="pushing, penalty, descent=0", at<=3000 | error',
+    "reinforce-later": 'stiffness_sweep/verdicts | estimator="reinforce", problem="pushing, penalty, descent=0.9", at<=3000 | error',
+    "reinforce-beyond": 'stiffness_sweep/verdicts | estimator="reinforce", problem="pushing, penalty, descent=0", at=10000 | error',
+    "smoothing-start": 'stiffness_sweep/verdicts | estimator="randomized_smoothing", problem="pushing, penalty, descent=0", at<=3000 | error',
+    "smoothing-later": 'stiffness_sweep/verdicts | estimator="randomized_smoothing", problem="pushing, penalty, descent=0.9", at<=3000 | error',
+    "smoothing-beyond": 'stiffness_sweep/verdicts | estimator="randomized_smoothing", problem="pushing, penalty, descent=0", at=10000 | error',
+    "smoothing-sobol-start": 'stiffness_sweep/verdicts | estimator="randomized_smoothing[draws=sobol]", problem="pushing, penalty, descent=0", at<=3000 | error',
+    "smoothing-sobol-later": 'stiffness_sweep/verdicts | estimator="randomized_smoothing[draws=sobol]", problem="pushing, penalty, descent=0.9", at<=3000 | error',
+    "smoothing-sobol-beyond": 'stiffness_sweep/verdicts | estimator="randomized_smoothing[draws=sobol]", problem="pushing, penalty, descent=0", at=10000 | error',
+    "fobg-near-limit": "step_limit/verdicts | estimator=fobg, at=5000 | error",
+    "smoothing-far": 'stiffness_sweep/verdicts | estimator=randomized_smoothing, problem="pushing[hold=30,horizon=300,push=1.5,velocity_factor=0.95], penalty, descent=0", at=100000 | error',
+    "pairs-implicit": 'stiffness_sweep/verdicts | estimator="fobg[mirrored=true]", problem="pushing, complementarity[kappa=1e-06], descent=0.9" | error_high | most',
+    "cost-implicit-100": "stiffness_sweep_cost/bias_variance | estimator=fobg, contact=complementarity, backend=implicit, samples=100 | time_s | seconds",
+    "cost-explicit-100": "stiffness_sweep_cost/bias_variance | estimator=fobg, contact=penalty, backend=jax, samples=100 | time_s | seconds",
+    "cost-implicit-10000": "stiffness_sweep_cost/bias_variance | estimator=fobg, contact=complementarity, backend=implicit, samples=10000 | time_s | seconds",
+    "cost-explicit-10000": "stiffness_sweep_cost/bias_variance | estimator=fobg, contact=penalty, backend=jax, samples=10000 | time_s | seconds",
+    "pairs-gain": pairs_gain,
+    "effort-share": effort_share,
     "quadruped-sides": sides_right,
     "quadruped-jumps": jumps_at_switches,
     "quadruped-engines": engines_agree,

@@ -132,7 +132,7 @@ def comparison(results: Path = STANDARD) -> pd.DataFrame:
     than half of the squared error is bias.
     """
     methods, settings = (table_of(f"estimators/{name}", results) for name in ("verdicts", "comparisons"))
-    names = (settings["first"] + ", " + settings["tied"].fillna("")).str.split(", ")
+    names = (settings["first"].fillna("") + ", " + settings["tied"].fillna("")).str.split(", ")
     best = set(settings.assign(name=names).explode("name")[["problem", "name"]].itertuples(index=False, name=None))
     parts = methods["estimator"].str.partition("[")
     return methods.rename(columns={"error": "rmse_rel", "error_low": "low", "error_high": "high"}).assign(

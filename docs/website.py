@@ -42,6 +42,7 @@ SECTIONS: Mapping[str, Sequence[str]] = {
         "answers",
         "experiment/*",
         "estimators",
+        "methods",
         "claims",
         "controller",
         "dose-response",
@@ -268,9 +269,9 @@ def estimator_page(name: str, plugin: Any, table: pd.DataFrame) -> str:
     else:
         parts += ["## Where it wins and fails", summary(table), comparison_table(table)]
         parts.append(
-            "Relative RMSE of one estimate with its 95% interval, at equal samples, in the experiment "
-            "[estimators](../experiment/estimators.md). *best*: not distinguishable from the lowest of all settings of all "
-            "estimators on that problem. *works* or *fails*: the whole interval is below or above 1, the error of the zero estimate. *open*: "
+            "Relative RMSE of one estimate with its 95% interval, as measured in the experiment "
+            "[estimators](../experiment/estimators.md). *best*: at equal rollouts not distinguishable from the lowest of all "
+            "settings of all estimators on that problem. *works* or *fails*: the whole interval is below or above 1, the error of the zero estimate. *open*: "
             "the interval contains 1. *biased*: more than half of the squared error is bias. Evaluations are costs and "
             "gradients per sample."
         )
@@ -321,6 +322,7 @@ def comparison_table(table: pd.DataFrame) -> str:
         for row in part.sort_values("rmse_rel").to_dict("records"):
             setting = cell(row["estimator_params"].replace(",", ", ")) or "default"
             error = f"{number(row['rmse_rel'])} [{number(row['low'])}, {number(row['high'])}]"
+            error = f"< {number(row['rmse_rel'])}" if row.get("error_is_limit") else error
             verdict = ", ".join(filter(None, ["best" * row["best"], row["verdict"], "biased" * row["biased"]]))
             texts = [error, verdict, number(row["evaluations"])] if row["status"] == "ok" else ["", row["status"], ""]
             lines.append(f"| {cell(str(problem))} | " + " | ".join([setting, *texts]) + " |")

@@ -154,6 +154,28 @@ def _disabled(bit: Any, model: Any, lean: bool) -> int:
     return int(off)
 
 
+def mjx_remarks(model: Any) -> list[str]:
+    """Return the differences between MJX's physics of a model and the C engine's, by the elements that the model has."""
+    import mujoco
+
+    kinds, objects = mujoco.mjtGeom, mujoco.mjtEq
+    pairs = [{int(model.geom_type[i]) for i in pair} for pair in _pairs(model)]
+    others = {kind for pair in pairs if int(kinds.mjGEOM_PLANE) in pair for kind in pair}
+    has_pyramids = model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
+    equalities = set(model.eq_type.tolist())
+    found = {
+        "boxes and meshes on planes touch only with corners within 1 mm of the deepest": {
+            kinds.mjGEOM_BOX,
+            kinds.mjGEOM_MESH,
+        }
+        & others,
+        "the friction pyramid of a capsule on a plane is aligned with the world, also where the capsule is not": has_pyramids
+        and kinds.mjGEOM_CAPSULE in others,
+        "connect and weld lack the velocity product J-dot v": {objects.mjEQ_CONNECT, objects.mjEQ_WELD} & equalities,
+    }
+    return [f"MJX is not the C engine: {text}" for text, is_so in found.items() if is_so]
+
+
 FAR = 1e3
 """Distance up to which gaps are measured [m]."""
 

@@ -42,6 +42,7 @@ class ByTerms:
     def gradient(self, case):
         """Return the derivatives by state and controls."""
         model, data = self._engine.start(case)
+        model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
         steps, before = [], case.qvel
         for control in case.controls:
             data.ctrl = control
@@ -193,12 +194,14 @@ def numbers(case, mjx=None):
     engine = MujocoC()
     expected, certainty = {"value": np.array(engine.rollout(case))}, {"value": 1e-12}
     for term in TERMS:
-        expected[term], certainty[term] = case.differences(engine, term)
+        expected[term], doubts = case.differences(engine, term)
+        certainty[term] = float(doubts.max())
     sources = {"differences of MuJoCo C": {}}
     model, _ = engine.start(case)
     is_euler = model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
     others = {"implicit-function theorem by terms of MuJoCo C": ByTerms().gradient(case)} if is_euler else {}
-    if mjx is not None and case.name not in mjx.differs:
+    has_mjx = mjx is not None and case.name not in mjx.differs
+    if has_mjx:
         others["MJX, implicit"] = {"value": np.array(mjx.rollout(case))} | along(case, mjx.gradient(case))
     for source, result in others.items():
         sources[source] = {term: off(value, expected[term]) for term, value in result.items()}
@@ -216,7 +219,7 @@ def numbers(case, mjx=None):
     for fault, other in planted.items():
         faults[fault] = {"value": np.array(other.rollout(case))} | other.gradient(case)
     visible = {fault: seen(case, result, expected) for fault, result in faults.items()}
-    if mjx is not None and visible["one iteration"] and model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL:
+    if has_mjx and visible["one iteration"] and model.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL:
         visible["one iteration of MJX"] = one_iteration_of_mjx(mjx, case, expected)
     return {
         "expected": {term: flat(value) for term, value in expected.items()},

@@ -21,8 +21,9 @@ from bench.plugins.estimators.randomized_smoothing import RandomizedSmoothing
 from bench.plugins.estimators.reinforce import Reinforce
 from bench.plugins.studies.bias_variance.measure import summarise_diagnostics
 
+from bench.measure.noise import samples_of
 from bench.measure.statistics import Truth, summarise
-from bench.model import SampleMean, columns, compose, per_repeat, registry
+from bench.model import IID, SampleMean, Unsupported, columns, compose, per_repeat, registry
 from bench.model.identity import label
 from bench.report.views import rmse_interval
 
@@ -62,7 +63,7 @@ def bank_cells():
         scene = case.program.scene
         if "bump" not in case.label and ("jump" not in case.label or i % 2):
             pairs.append((scene, Fobg()))
-        pairs.append((scene, Reinforce() if i % 2 else RandomizedSmoothing(radius=2.0 * scene.sigma)))
+        pairs.append((scene, Reinforce(baseline="center") if i % 2 else RandomizedSmoothing(radius=2.0 * scene.sigma)))
     return [Cell("bank", *pair, *SIZES[i % len(SIZES)]) for i, pair in enumerate(pairs)]
 
 
@@ -72,14 +73,18 @@ def tail_cells():
     some = [
         registry.make("estimators", name, values)
         for name, values in (
-            ("fobg", {}), ("reinforce", {}), ("reinforce", {"baseline": "leave_one_out"}), ("control_variate", {}),
+            ("fobg", {}), ("reinforce", {}), ("reinforce", {"baseline": "center"}), ("control_variate", {}),
             ("randomized_smoothing", {}), ("randomized_smoothing", {"variant": "forward"}),
         )
     ]  # fmt: skip
     sines = bank.Ridge([bank.wave(1.0)] * 3, list(np.eye(3)), np.full(3, 0.3), 0.2)
     problem = Numpy().compile(compose(sines))
-    every = [registry.make("estimators", name, {}) for name in sorted(registry.entries()["estimators"])]
-    runs = [each for each in every if not each.refusal(problem.program, problem.provides, "numpy")]
+    every = [
+        registry.make("estimators", name, design)
+        for name in sorted(registry.entries()["estimators"])
+        for design in ({}, {"mirrored": True}, {"draws": "orthogonal"}, {"draws": "sobol"})
+    ]
+    runs = [each for each in every if can_run(each, problem, 32)]
     return [
         Cell(cost, scene, estimator, repeats, samples)
         for cost, scene, samples, estimators in (
@@ -92,9 +97,27 @@ def tail_cells():
     ]
 
 
+def can_run(estimator, problem, samples):
+    """Return whether an estimator can use its design on a problem."""
+    try:
+        estimator.design(problem.program, samples)
+    except Unsupported:
+        return False
+    return not estimator.refusal(problem.program, problem.provides, "numpy")
+
+
 def is_mean(estimator):
-    """Return whether an estimate is the mean of one term per sample."""
-    return isinstance(estimator, SampleMean) and estimator.separable
+    """Return whether an estimate is the mean of one independent term per sample."""
+    is_independent = estimator.draws == "iid" and not estimator.mirrored
+    return is_independent and isinstance(estimator, SampleMean) and estimator.separable
+
+
+def drawn(cell, problem, draw, repeats):
+    """Return noise ``(repeats, N, d)`` of the estimator's design."""
+    design = cell.estimator.design(problem.program, cell.samples)
+    if design == IID:
+        return draw.standard_normal((repeats, cell.samples, cell.scene.start.size))
+    return np.stack([samples_of(draw, cell.samples, cell.scene.start.size, design) for _ in range(repeats)])
 
 
 def moments(cell, problem):
@@ -102,9 +125,9 @@ def moments(cell, problem):
     theta, d = cell.scene.start, cell.scene.start.size
     draw = np.random.default_rng([8, d, len(cell.cost)])
     if not is_mean(cell.estimator):
-        size = PART // cell.samples, cell.samples, d
+        count = PART // cell.samples
         many = np.concatenate(
-            [cell.estimator.estimate(problem, theta, draw.standard_normal(size)) for _ in range(PRECISE // PART)]
+            [cell.estimator.estimate(problem, theta, drawn(cell, problem, draw, count)) for _ in range(PRECISE // PART)]
         )
         return many.mean(axis=0), float(many.var(axis=0).sum())
     if isinstance(cell.estimator, Fobg):
@@ -138,7 +161,7 @@ def covered(cell, sets):
     rounding = np.array([slack, slack**2, slack**2 * cell.samples, slack])
     rows = []
     for _ in range(sets):
-        noise = draw.standard_normal((cell.repeats, cell.samples, theta.size))
+        noise = drawn(cell, problem, draw, cell.repeats)
         sums, diagnostics = None, None
         if is_mean(method):
             terms = per_repeat(method.terms(problem, theta, columns(noise)), noise)
@@ -146,7 +169,8 @@ def covered(cell, sets):
             sums = rest.sum(axis=1), np.einsum("rnd,rnd->r", rest, rest)
         else:
             estimates, diagnostics = method.estimate_with_diagnostics(problem, theta, noise)
-        found = summarise(estimates, truth, cell.samples, sums, is_unbiased)
+        is_random = method.draws_noise(problem.program)
+        found = summarise(estimates, truth, cell.samples, sums, is_unbiased, is_random)
         doubt = method.remark(json.loads(summarise_diagnostics([diagnostics]))) if diagnostics else ""
         low, high = np.transpose(
             [(getattr(found, f"{name}_low"), getattr(found, f"{name}_high")) for name in STATISTICS[:3]]

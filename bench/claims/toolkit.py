@@ -136,11 +136,11 @@ def stochastic_descent(
 ) -> np.ndarray:
     """Descend on one variable in 20 independent runs. Returns their last points ``(20,)``.
 
-    A step uses the mean of 50 terms of ``fobg`` or, with ``zeroth``, of ``reinforce``.
+    A step uses the mean of 50 terms of ``fobg`` or, with ``zeroth``, of ``reinforce[baseline=center]``.
     """
     runs, samples = 20, 50
     noise = np.random.default_rng(seed).standard_normal((iterations, 1, runs * samples))
-    method = estimator("reinforce" if zeroth else "fobg")
+    method = estimator("reinforce[baseline=center]" if zeroth else "fobg")
     assert isinstance(method, SampleMean)
 
     def step(theta: np.ndarray, i: int) -> np.ndarray:

@@ -14,14 +14,14 @@ from typing import cast
 import pandas as pd
 
 from bench.errors import UserError
-from bench.experiment.columns import IDENTITY, Columns
+from bench.experiment.columns import COMMON, IDENTITY, Columns
 from bench.experiment.study import Study
 from bench.model import registry
 from bench.run.rows import read_parquet, read_record, valid_rows
 
 STANDARD = "standard"
 """The folder of committed results inside the results folder."""
-NEEDED = {*IDENTITY, "status", "key", "study", "parameters"}
+NEEDED = {name for name in IDENTITY if COMMON[name].default is None} | {"status", "key", "study", "parameters"}
 """Columns that a comparison needs."""
 BUSY = 1.5
 """Load per core above which a machine counts as busy."""

@@ -6,7 +6,7 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Iterable
-from functools import cache, partialmethod
+from functools import cache, lru_cache, partialmethod
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,7 +23,18 @@ from bench.conformance.subjects import (
     standard_errors,
     stepping,
 )
-from bench.model import Estimator, FunctionScene, MechanicalScene, Problem, Program, SampleMean, compose
+from bench.measure import noise
+from bench.model import (
+    Design,
+    Estimator,
+    FunctionScene,
+    MechanicalScene,
+    Problem,
+    Program,
+    SampleMean,
+    Unsupported,
+    compose,
+)
 from bench.model.estimator import require_shape
 from bench.model.identity import identity
 from bench.model.parameters import parameters
@@ -32,6 +43,14 @@ SIGMAS = (0.1, 0.5)
 """Noise levels of the oracles. 1 is excluded, because sigma and its square would be equal."""
 DIMENSION = 20
 """Length of theta of the oracles at the last of :data:`SIGMAS` whose scene has a parameter ``dimension``."""
+DESIGNS: tuple[tuple[int, dict[str, Any]], ...] = (
+    (8, {"mirrored": True}),
+    (16, {"draws": "orthogonal"}),
+    (16, {"draws": "sobol"}),
+)
+"""Numbers of samples and designs of the noise that are checked."""
+SETS, DESIGNED = 512, 4
+"""Numbers of estimates and of oracles of such a check."""
 APART = 1e-5
 """Distance at which a gradient is compared: ten steps of the plain backend's differences."""
 
@@ -145,17 +164,9 @@ def varying_oracle(estimator: Estimator) -> Oracle:
 
 
 def sampled_oracle(estimator: Estimator) -> Oracle:
-    """Return :func:`varying_oracle`; skips an estimator that declares a bias and returns the gradient at w = 0.
-
-    That gradient is exact for the cost without noise, so it has no variance and uses no sample.
-    """
+    """Return :func:`varying_oracle`; skips an estimator that declares that it draws no noise there."""
     oracle = varying_oracle(estimator)
-    values = estimates(estimator, oracle, draw_noise(oracle, 2, 8, "plain"))
-    is_plain = (values == values[0]).all() and distance(values[0], oracle.plain) < DIFFERENCED
-    skip_unless(
-        estimator.unbiased or not oracle.program.continuous or not is_plain,
-        "returns the gradient at w = 0, which uses no sample",
-    )
+    skip_unless(estimator.draws_noise(oracle.program), "declares that it draws no noise")
     return oracle
 
 
@@ -215,6 +226,27 @@ def diagnostics_are_as_declared(estimator: Estimator) -> str:
         require(np.shape(array) in shapes, f"{name} has shape {np.shape(array)}, not one of {shapes}")
         require(np.isfinite(array).all(), f"{name} is not finite")
     return ", ".join(diagnostics) or "no diagnostics"
+
+
+@verifies(Estimator)
+def noise_is_drawn_as_declared(estimator: Estimator) -> str:
+    """Verify that noise on theta changes no estimate without ``draws_noise``, and with it those of the varying oracle."""
+    still = [oracle for oracle in usable(estimator, oracles()) if not estimator.draws_noise(oracle.program)]
+    for oracle in still:
+        require(not _noise_moves(estimator, oracle), f"depends on the noise on {oracle.label}, against draws_noise")
+    if still:
+        return f"no noise on {len(still)} oracles"
+    moves = _noise_moves(estimator, varying_oracle(estimator))
+    require(moves, "does not depend on the noise: draws_noise(program) has to return False")
+    return "noise"
+
+
+def _noise_moves(estimator: Estimator, oracle: Oracle) -> bool:
+    """Return whether other noise on theta, with the same noise of the scene's own, changes estimates beyond rounding."""
+    first, other = (np.array(draw_noise(oracle, 2, 8, key)) for key in ("drawn", "redrawn"))
+    own = oracle.program.n_noise - oracle.program.exogenous
+    other[..., own:] = first[..., own:]
+    return distance(*(estimates(estimator, oracle, noise) for noise in (other, first))) > DIFFERENCED
 
 
 @verifies(Estimator)
@@ -284,10 +316,14 @@ def variance_falls_as_one_over_n(estimator: Estimator) -> str:
 
 @verifies(Estimator)
 def bias_is_as_declared(estimator: Estimator) -> str:
-    """Verify the bias on continuous costs: none if ``unbiased``, else smaller than the bias of the zero estimate."""
+    """Verify the bias on continuous costs: none if ``unbiased``, else smaller than the bias of the zero estimate.
+
+    Where an estimator draws no noise, only costs whose smoothed gradient is that of the cost without noise count.
+    """
     candidates = usable(estimator, [o for o in oracles() if o.program.continuous])
-    sampled_oracle(estimator)
-    return _verify_bias(estimator, candidates)
+    able = [o for o in candidates if estimator.draws_noise(o.program) or distance(o.plain, o.truth) < DIFFERENCED]
+    skip_unless(able, "draws no noise where smoothing changes the gradient")
+    return _verify_bias(estimator, able)
 
 
 @verifies(Estimator)
@@ -313,6 +349,46 @@ def bias_under_action_feedback(estimator: Estimator) -> str:
     return _verify_bias(estimator, usable(estimator, [feedback_oracle()]))
 
 
+@verifies(Estimator)
+def bias_under_every_design(estimator: Estimator) -> str:
+    """Verify that an unbiased estimator is unbiased for each design of its noise; a design that it refuses is skipped.
+
+    Each single draw of a design is standard normal. An estimator that treats the samples of a unit as independent, for
+    example in a baseline, is biased.
+    """
+    skip_unless(estimator.unbiased and estimator.target == "smoothed", "declares a bias, or another target")
+    candidates = usable(estimator, [o for o in oracles() if o.program.continuous])[:DESIGNED]
+    details = []
+    for count, given in DESIGNS:
+        method = dataclasses.replace(estimator, **given)
+        worst = 0.0
+        for oracle in candidates:
+            try:
+                design = method.design(oracle.program, count)
+            except Unsupported as refusal:
+                details.append(str(refusal))
+                break
+            z, bias = _beyond_errors(method, oracle, _designed_noise(count, oracle.program.n_noise, design))
+            size = np.linalg.norm(bias)
+            require(
+                float(z.max()) <= LIMIT,
+                f"is biased with {identity(method.name, given)}: by {size:.3g}, {z.max():.1f} standard errors, on {oracle.label}: "
+                "a variance, quantile or baseline must use whole units of design(), or needs_independent_samples = True",
+            )
+            worst = max(worst, float(z.max()))
+        else:
+            details.append(f"at most {worst:.2g} standard errors with {identity('', given)}")
+    return "; ".join(details)
+
+
+@lru_cache(maxsize=32)
+def _designed_noise(count: int, width: int, design: Design) -> np.ndarray:
+    """Return read-only noise of a design, ``(SETS, count, width)``."""
+    drawn = np.stack([noise.samples_of(rng("design", i), count, width, design) for i in range(SETS)])
+    drawn.setflags(write=False)
+    return drawn
+
+
 def _verify_bias(estimator: Estimator, candidates: list[Oracle]) -> str:
     """Verify that the bias is 0 if the estimator is unbiased, else smaller than the bias of the zero estimate."""
     count, repeats = (4, 8192) if estimator.unbiased else (256, 512)
@@ -334,17 +410,20 @@ def _verify_bias(estimator: Estimator, candidates: list[Oracle]) -> str:
 
 def _standard_errors(estimator: Estimator, oracle: Oracle, count: int, repeats: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the bias beyond rounding in standard errors, and the bias itself, both ``(d,)``."""
-    values = estimates(estimator, oracle, draw_noise(oracle, repeats, count, oracle.label, count))
-    truth = target(estimator, oracle)
+    return _beyond_errors(estimator, oracle, draw_noise(oracle, repeats, count, oracle.label, count))
+
+
+def _beyond_errors(estimator: Estimator, oracle: Oracle, drawn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the bias of estimates from ``drawn (R, N, n_w)`` as :func:`_standard_errors` does."""
+    values, truth = estimates(estimator, oracle, drawn), target(estimator, oracle)
     bias = values.mean(axis=0) - truth
-    error = np.sqrt(values.var(axis=0, ddof=1) / repeats + oracle.error**2)
+    error = np.sqrt(values.var(axis=0, ddof=1) / len(drawn) + oracle.error**2)
     return standard_errors(bias, error, DIFFERENCED * (1 + np.abs(truth))), bias
 
 
 @verifies(Estimator)
 def needs_are_truthful(estimator: Estimator) -> str:
     """Verify that the estimator uses every capability in ``needs``, and no other capability."""
-    oracle = sampled_oracle(estimator)
     used: set[str] = set()
     for oracle in usable(estimator, oracles()):  # some capabilities may be for costs with events only
         recording = RecordingProblem(oracle.problem, estimator.needs)

@@ -13,7 +13,7 @@ from typing import Any
 
 from bench.engines.backend import EngineBackend
 from bench.errors import UserError, printable, unknown
-from bench.model import Plugin, registry
+from bench.model import Estimator, Plugin, registry
 from bench.model.identity import identity
 from bench.model.parameters import build, parameters
 from bench.simulator.clock import parse_duration
@@ -154,12 +154,15 @@ _PASSED: set[type] = set()
 
 
 def variants(plugin_class: type[Plugin]) -> dict[str, Plugin]:
-    """Return instances by identity: the default, and one per other choice of a string or boolean, except ``dtype``."""
+    """Return instances by identity: the default, and one per other choice of a string or boolean.
+
+    Except ``dtype`` and the design of an estimator's noise, which have checks of their own.
+    """
     instances = {plugin_class.name: build(plugin_class, {})}
     for name, parameter in parameters(plugin_class).items():
         choices = (True, False) if parameter.type is bool else parameter.choices or ()
         for choice in choices:
-            if choice != parameter.default and name != "dtype":
+            if choice != parameter.default and name not in ("dtype", *parameters(Estimator)):
                 values = {name: choice}
                 instances[identity(plugin_class.name, values)] = build(plugin_class, values)
     return instances

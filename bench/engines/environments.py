@@ -15,6 +15,8 @@ from bench.model.parameters import remember
 
 FOLDER = "BENCH_ENGINES"
 """Environment variable with the folder that contains the environments."""
+NEWEST = "newest"
+"""The release that pip chooses without a pin."""
 LIMIT_S = 60.0
 """Seconds allowed for a Python to state its versions."""
 VERSIONS = """
@@ -77,19 +79,23 @@ def missing(engine: str, python: str | None, libraries: Sequence[str]) -> str | 
 def install(engine: str, requirements: Path, again: bool = False) -> Path:
     """Make an engine's environment from a file of requirements, and return its folder.
 
-    An environment that exists is completed, or with ``again`` made from the start. Raises :class:`UserError` if pip
-    fails; then a new folder is removed.
+    ``NAME==VERSION`` is an environment of its own with another release of the file's first distribution, or the newest
+    (``NAME==newest``), and what pip chooses for it. An environment that exists is completed, or with ``again`` made from
+    the start. Raises :class:`UserError` if pip fails; then a new folder is removed.
     """
-    place = folder() / engine
+    place, release = folder() / engine, engine.partition("==")[2]
     if again and place.exists():
         shutil.rmtree(place)
     is_new = not place.exists()
+    wanted, distribution = ["-r", str(requirements)], requirements.read_text().partition("==")[0]
+    if release:
+        wanted = ["--upgrade", distribution] if release == NEWEST else [f"{distribution}=={release}"]
     try:
         place.parent.mkdir(parents=True, exist_ok=True)
         if is_new:
             subprocess.run([sys.executable, "-m", "venv", str(place)], check=True)
         pip = [str(place / "bin" / "python"), "-m", "pip", "install", "--disable-pip-version-check", "--quiet"]
-        subprocess.run([*pip, "-r", str(requirements)], check=True)
+        subprocess.run([*pip, *wanted], check=True)
     except (OSError, subprocess.CalledProcessError) as error:
         if is_new:
             shutil.rmtree(place, ignore_errors=True)

@@ -8,7 +8,7 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,49 +20,65 @@ from bench.engines.conformance import runner
 from bench.errors import printable
 from bench.model import registry
 
-COLUMNS = (
-    "engine", "versions", "case", "term", "is_right", "digits", "looks_like", "against", "seconds", "reason", "command",
-)  # fmt: skip
+COLUMNS = ("engine", "versions", *runner.COLUMNS, "command")
 LIMIT_S = 7200.0
 """Seconds allowed for an engine's conformance set."""
 GRADIENTS = "engine_gradients"
 """The experiment whose table is on the page too."""
 
 
-def write(names: Collection[str], out: Path, settings: Sequence[str] = ()) -> Path:
+def write(names: Sequence[str], out: Path, settings: Sequence[str] = ()) -> Path:
     """Run the named engines, or all, write ``engines.csv`` and ``engines.md``, and return the page's path.
 
     An engine runs the conformance set if there is a file ``engines/NAME_conformance.py`` beside the folder of its
-    backend. Rows of other engines and of other versions, which ``out`` has already, stay. ``settings`` are the experiment's.
+    backend. ``NAME==VERSION`` is the release of an environment by that name. Rows of other engines and of other versions,
+    which ``out`` has already, stay. ``settings`` are the experiment's, which has a folder per set of releases.
     """
     rows: list[dict[str, Any]] = []
-    for name, entry in registry.entries()["backends"].items():
-        if entry.plugin is None or (names and name not in names):
+    backends: list[str] = []
+    plugins = registry.entries()["backends"]
+    for word in names or plugins:
+        name, _, release = word.partition("==")
+        plugin = plugins[name].plugin
+        if plugin is None:
             continue
-        file = Path(inspect.getfile(entry.plugin)).parents[1] / "engines" / f"{name}_conformance.py"
-        if not (issubclass(entry.plugin, EngineBackend) or file.exists()):
+        file, is_outside = file_of(plugin, "_conformance.py"), issubclass(plugin, EngineBackend)
+        if not (is_outside or file.exists()):
             continue
-        backend = entry.plugin()
-        reason = entry.reason or backend.unavailable_reason()
-        own = [{"reason": reason}] if reason else conformance_rows(name, backend, file)
+        python = str(environments.python_of(word)) if release else ""
+        backend = plugin(python=python) if release and is_outside else plugin()
+        reason = (
+            environments.missing(word, python, ()) if release else plugins[name].reason or backend.unavailable_reason()
+        )
+        own = [{"reason": reason}] if reason else rows_of(backend, file, Path(runner.__file__), python=python)
         rows += [
-            {"versions": "", **row, "engine": name, "command": f"python -m bench engines table {name}"} for row in own
+            {"versions": "", **row, "engine": name, "command": f"python -m bench engines table {word}"} for row in own
         ]
+        if "case" in own[0] and (is_outside or not release):
+            backends.append(f"{name}[python={python}]" if release else name)
     out.mkdir(parents=True, exist_ok=True)
     table, stored = pd.DataFrame(rows, columns=list(COLUMNS)), out / "engines.csv"
+    releases = sorted({versions.partition(";")[0] for versions in table["versions"]} - {""})
     if stored.exists():
         old = read(stored)
         is_new = old["engine"].isin(table["engine"]) & old["versions"].isin(["", *table["versions"]])
         table = pd.concat([old[~is_new], table]).sort_values(["engine", "versions"], kind="stable")
     table.to_csv(stored, index=False)
-    table = read(stored)
-    ran = table.loc[table["case"] != "", "engine"].unique()
-    words = [f"+experiment={GRADIENTS}", f"backends=[{','.join(ran)}]", f"results_dir={out}", *settings]
-    subprocess.run([sys.executable, "-m", "bench", *words], check=False)
-    gradients = out / GRADIENTS / "engines.md"
+    place = out / ", ".join(releases).replace(" ", "-").replace(",-", ",")
+    words = [f"+experiment={GRADIENTS}", f"backends=[{','.join(backends)}]", f"results_dir={place}", *settings]
+    if backends:
+        subprocess.run([sys.executable, "-m", "bench", *words], check=False)
     page = out / "engines.md"
-    page.write_text(_page(table) + (f"\n{gradients.read_text()}" if gradients.exists() else ""))
+    parts = [
+        f"\n# {file.parents[1].name}\n\n{file.read_text()}" for file in sorted(out.glob(f"*/{GRADIENTS}/engines.md"))
+    ]
+    page.write_text(_page(read(stored)) + "".join(parts))
     return page
+
+
+def file_of(plugin: Any, end: str) -> Path:
+    """Return the file ``engines/NAME`` + ``end`` beside the folder of a backend, which may not exist."""
+    return Path(inspect.getfile(plugin)).parents[1] / "engines" / f"{plugin.name}{end}"
 
 
 def read(file: Path) -> pd.DataFrame:
@@ -70,25 +86,27 @@ def read(file: Path) -> pd.DataFrame:
     return pd.read_csv(file, dtype=str, keep_default_na=False)
 
 
-def conformance_rows(name: str, backend: Any, file: Path, *cases: str) -> list[dict[str, Any]]:
-    """Return the rows of an engine in the named cases of the conformance set, or all, run in its own Python.
+def rows_of(backend: Any, file: Path, script: Path, *words: str, python: str = "") -> list[dict[str, Any]]:
+    """Return the rows of a script of the conformance set on an engine's file, run in the engine's own Python or another.
 
     If the run fails or takes longer than :data:`LIMIT_S`, the last row has the reason.
     """
     if not file.exists():
-        return [{"reason": f"no file {file.name} for the conformance set"}]
-    python, environment = sys.executable, {**os.environ, "PYTHONPATH": str(Path(runner.__file__).parents[3])}
+        return [{"reason": f"no file {file.name}"}]
+    environment = dict(os.environ)
     if isinstance(backend, EngineBackend):
-        python, environment = backend.python or str(environments.python_of(name)), dict(os.environ)
+        python = backend.python or str(environments.python_of(backend.name))
+    else:
+        python, environment["PYTHONPATH"] = python or sys.executable, str(Path(runner.__file__).parents[3])
     reason = ""
     with tempfile.TemporaryFile("w+") as output:
         try:
             subprocess.run(
-                [python, runner.__file__, str(file), *cases],
+                [python, str(script), str(file), *words],
                 env=environment, text=True, timeout=LIMIT_S, check=True, stdout=output, stderr=subprocess.PIPE,
             )  # fmt: skip
         except (OSError, subprocess.SubprocessError) as error:
-            reason = f"the conformance set stopped: {printable(error)[-80:]} {printable(getattr(error, 'stderr', ''))[-120:]}"
+            reason = f"{script.stem} stopped: {printable(error)[-80:]} {printable(getattr(error, 'stderr', ''))[-120:]}"
         output.seek(0)
         lines = [json.loads(line) for line in output if line.startswith("{")]
     versions = "; ".join(f"{library} {version}" for library, version in lines[0]["versions"].items()) if lines else ""
@@ -101,8 +119,10 @@ def _page(table: pd.DataFrame) -> str:
         [name, versions, *((own["is_right"] == verdict).sum() for verdict in ("True", "False")), f"`{own['command'].iloc[0]}`"]
         for (name, versions), own in table.groupby(["engine", "versions"], sort=False)
     ]  # fmt: skip
-    reasons = table[table["reason"] != ""].drop_duplicates(["engine", "case"]).groupby(["engine", "reason"])["case"]
-    notes = [f"- {', '.join([name, *filter(None, of)])}: {printable(why)[:160]}" for (name, why), of in reasons]
+    told = table[table["reason"] != ""]
+    cases = told["case"].str.cat(told["term"].where(told["is_right"] == "False", ""), sep=" ").str.strip()
+    reasons = told.assign(case=cases).drop_duplicates(["engine", "case"]).groupby(["engine", "reason"])["case"]
+    notes = [f"- {', '.join([name, *filter(None, of)])}: {printable(why)[:240]}" for (name, why), of in reasons]
     return "\n".join([
         "# Conformance of physics engines", "",
         *_markdown(["engine", "versions", "right", "not right", "command"], engines), "",
@@ -114,6 +134,8 @@ def _page(table: pd.DataFrame) -> str:
 def by_case(table: pd.DataFrame) -> list[str]:
     """Return the Markdown lines of a table of cases by engines, with a column per release, from stored rows of text."""
     run = table[table["case"] != ""]
+    if run.empty:
+        return []
     release = run["versions"].str.partition(";")[0].where(run["versions"] != "", run["engine"])
     run = run.assign(release=release, seconds=pd.to_numeric(run["seconds"]))
     cells = run.groupby(["case", "release"]).apply(_cell).unstack(fill_value="")[release.unique()]

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from bench.errors import Unsupported
+from bench.experiment.reference_backends import capable_backends
 from bench.model import (
     Backend,
     ContactLaw,
@@ -39,13 +40,13 @@ def compile_problem(
     scene: Scene | str,
     contact: ContactLaw | str | None,
     integrator: Integrator | str,
-    backend: str,
+    backend: str | None,
     decision: Decision | None = None,
     make: Callable[..., Any] = make,
 ) -> Problem:
     """Compile a scene on a backend; the contact law counts if the scene has contacts, the integrator if it has motion.
 
-    Each part is an identity string or a plugin. ``make`` builds plugins from identity strings. Raises the errors of
+    Each part is an identity string or a plugin, and the backend None for the best that computes references. ``make`` builds plugins from identity strings. Raises the errors of
     :func:`make`, and :class:`bench.Unsupported` for a combination that cannot run.
     """
     given_scene: Scene = make("scenes", scene) if isinstance(scene, str) else scene
@@ -56,9 +57,12 @@ def compile_problem(
             law = make("contacts", contact, given_scene.contact_values) if isinstance(contact, str) else contact
         step = make("integrators", integrator) if isinstance(integrator, str) else integrator
     program = compose(given_scene, law, step, decision or Decision())
-    engine: Backend = make("backends", backend)
+    capable = [make("backends", backend)] if backend else capable_backends(program, for_references=True)
+    if not capable:
+        raise Unsupported(f"no installed backend runs scene {given_scene.name} for references: name one")
+    engine: Backend = capable[0]
     if reason := engine.refusal(program):
         raise Unsupported(reason)
     problem = engine.compile(program)
-    problem.provides, problem.backend = engine.provides, backend
+    problem.provides, problem.backend = engine.provides, backend or engine.name
     return problem

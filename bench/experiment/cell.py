@@ -15,11 +15,14 @@ from bench.errors import Unsupported, UserError, failure, printable
 from bench.experiment.experiment import Budget
 from bench.experiment.keys import COMPARED, SHARED, fingerprint, hash_of_text, hashed, raised, revisions_of
 from bench.experiment.reference_backends import capable_backends
-from bench.measure import reference
+from bench.measure import descent, reference
+from bench.measure.descent import Point
 from bench.model import (
+    IID,
     Backend,
     ContactLaw,
     Decision,
+    Design,
     Estimator,
     Integrator,
     MechanicalScene,
@@ -30,10 +33,12 @@ from bench.model import (
     compose,
     registry,
 )
-from bench.model.identity import described, label
-from bench.model.parameters import parameters, singular
+from bench.model.identity import described, identity, label
+from bench.model.parameters import parameters, singular, values
 from bench.model.program import OWN
 
+DESCENDED = ("contact", "integrator", "backend")
+"""The parts of the program that is descended, besides the scene of the cell, in the order of the setting ``path``."""
 VIEWS = ("horizon", "dt", "sigma", "stiffness", "noise", "dtype", "smoothing")
 """Plugin parameters with their own columns, which are therefore omitted from identity strings."""
 
@@ -90,6 +95,10 @@ class Cell:
     """Whether the row records timings."""
     budget: Budget | None = None
     """Budget of its reference gradient; None if the study needs none."""
+    path: Cell | None = None
+    """The start of the descent that theta is on, with the program that is descended; None where nothing is descended."""
+    point: Point | None = None
+    """Theta on that descent; None before it is computed."""
 
     @property
     def scene(self) -> Scene:
@@ -127,14 +136,14 @@ class Cell:
         """Hash of everything that decides the cell's numbers, except library versions, which have a column."""
         parts = {axis: fingerprint(part) for axis, part in self.parts.items()}
         counts = json.dumps([self.samples, self.repeats, self.seed, self.timing])
-        theta = "" if self.decision is OWN else repr(self.decision)
+        theta = "" if self.decision is OWN else repr((self.decision, self._path_key))
         given = (*parts.items(), theta, repr(self.budget), fingerprint(self.study))
         if given not in _rest:
             own = None if self.budget is None else [self.reference_key, raised(revisions_of(COMPARED))]
             # a study may use this backend besides the cell's own
             best = fingerprint(next(iter(self.ranked_backends), None))
             shared = raised(revisions_of(SHARED))
-            after = [own, best, self._budget(), self._theta(), fingerprint(self.study), shared]
+            after = [own, best, self._budget(), self._theta_hashed(), fingerprint(self.study), shared]
             _rest[given] = (json.dumps(parts), json.dumps(after)[1:])
         before, rest = _rest[given]
         return hash_of_text(f"[{before}, {counts}, {rest}")
@@ -143,10 +152,30 @@ class Cell:
     def program_key(self) -> str:
         """Hash of everything that decides the program."""
         parts = [fingerprint(part) for part in (self.scene, self.contact, self.integrator)]
-        given = (*parts, repr(self.decision))
+        given = (*parts, repr((self.decision, self._path_key)))
         if given not in _program_keys:
-            _program_keys[given] = hashed(parts, self._theta(), raised(revisions_of(SHARED)))
+            _program_keys[given] = hashed(parts, self._theta_hashed(), raised(revisions_of(SHARED)))
         return _program_keys[given]
+
+    @cached_property
+    def descent_key(self) -> str:
+        """Hash of everything that decides the descent from this cell's theta0; raises :class:`Unsupported` if no backend computes it."""
+        return hashed(self.program_key, fingerprint(self.descent_backend), descent.REVISION)
+
+    @property
+    def descent_backend(self) -> Backend:
+        """The backend that computes the descent: the given one, else the best that computes references."""
+        given = self.parts["backend"]
+        ranked = self.ranked_backends if given is None else (self.backend,)
+        if not ranked:
+            raise Unsupported(f"no installed backend computes a descent of scene {self.scene.name}")
+        return ranked[0]
+
+    @property
+    def _path_key(self) -> str:
+        with suppress(Unsupported):  # the cell is refused
+            return "" if self.path is None else self.path.descent_key
+        return "none"
 
     @cached_property
     def reference_key(self) -> str:
@@ -199,7 +228,21 @@ class Cell:
         return entries | {"theta": self._theta(), "reference": self._budget()}
 
     def _theta(self) -> dict[str, Any] | None:
-        return None if self.decision == OWN else dataclasses.asdict(self.decision)
+        """Return theta for the row's parameters; on a descent, also the identity strings of what is descended."""
+        if self.decision == OWN:
+            return None
+        theta = dataclasses.asdict(self.decision)
+        if self.path is None:
+            return theta
+        parts = (self.path.parts[axis] for axis in DESCENDED)
+        return theta | {"path": ["none" if part is None else identity(part.name, values(part)) for part in parts]}
+
+    def _theta_hashed(self) -> dict[str, Any] | None:
+        """Return theta for keys, which a share of 0 leaves as they were before descents existed."""
+        theta = self._theta()
+        if theta is None or self.path is None:
+            return theta and {name: theta[name] for name in ("names", "at")}
+        return theta | {"path": self._path_key}
 
     def _budget(self) -> dict[str, Any] | None:
         return None if self.budget is None else dict(vars(self.budget))
@@ -216,6 +259,9 @@ class Cell:
             "stiffness": self._view("stiffness", law, self.scene),
             "sigma": self.scene.sigma,
             "smoothing": smoothing,
+            "draws": getattr(self.parts.get("estimator"), "draws", "iid"),
+            "mirrored": float(getattr(self.parts.get("estimator"), "mirrored", False)),
+            "descent": self.decision.descent,
             "samples": self.samples,
             "repeats": self.repeats,
             "dim": self._dim(),
@@ -246,7 +292,15 @@ class Cell:
     def program(self) -> Program:
         """Compose the program; raises :class:`Unsupported` if the parts do not fit together."""
         study = cast(Any, self.study)  # a Study, whose module imports this one
-        return compose(self.scene, self.contact, self.integrator, study.decision(self.decision))
+        decision = study.decision(self.decision)
+        if self.point is not None:
+            decision = Decision(decision.names, self.point.theta)
+        return compose(self.scene, self.contact, self.integrator, decision)
+
+    def design(self, program: Program) -> Design:
+        """Return how the noise of an estimate is drawn; independently in a study without estimators."""
+        estimator = self.parts.get("estimator")
+        return estimator.design(program, self.samples) if isinstance(estimator, Estimator) else IID
 
     def refusal(self) -> tuple[str, str] | None:
         """Return status and reason if this cell cannot run, or None; an error raised by a plugin is a reason."""
@@ -269,11 +323,18 @@ class Cell:
                     return "unavailable", reason
         try:
             program = self.program()
+            start = None if self.path is None else self.path.program()
         except (Unsupported, UserError) as error:  # another scene of the sweep may have this theta
             return "unsupported", printable(error)
+        if self.path is not None:
+            if not cast(Any, self.study).descends:
+                return "unsupported", f"study {self.study.name} starts where its own settings say: descent=0"
+            if start is not None and (reason := self.path.descent_backend.refusal(start)):
+                return "unsupported", f"its descent: {reason}"
         backend, estimator = self.backend, self.parts.get("estimator")
         if reason := backend.refusal(program):
             return "unsupported", reason
         if isinstance(estimator, Estimator) and (reason := estimator.refusal(program, backend.provides, backend.name)):
             return "unsupported", reason
+        self.design(program)  # raises Unsupported where it cannot be drawn
         return None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -78,8 +78,12 @@ class Column:
     """The column that is true where tables print the value in bold."""
     note: str = field(default="", kw_only=True)
     """The column of words that tables append to the value, or show in place of a missing one."""
+    derived: Callable[[pd.DataFrame], Any] | None = field(default=None, kw_only=True)
+    """How the values follow from other columns whenever rows are read, whatever was stored; None if they do not."""
     above_one: str = field(default="", kw_only=True)
     """The meaning of values above 1; charts shade that area."""
+    default: Any = field(default=None, kw_only=True)
+    """The value in rows that were stored before the column existed; None: it is missing there."""
 
     @property
     def heading(self) -> str:
@@ -152,6 +156,12 @@ FIRST = (
     Column("stiffness", "stiffness of the contact law, or of the scene without one", "N/m", format="setting"),
     Column("sigma", "standard deviation of the noise in J", format="setting"),
     Column("smoothing", "smoothing parameter of the contact law: beta, kappa", format="setting"),
+    Column(
+        "descent",
+        "share of a descent from theta0 that is done where the gradient is taken",
+        format="setting",
+        default=0.0,
+    ),
     Column("samples", "samples N in one estimate", format="setting"),
     Column("repeats", "independent estimates R that measure bias and variance", format="setting"),
     Column("seed", "seed of the noise", format="setting"),
@@ -168,7 +178,12 @@ LAST = (
     text("versions", "versions of the libraries that produced the numbers"),
     text("key", "hash of all parameters and code that decide the numbers"),
 )
+DRAWS = (
+    text("draws", "points of the noise of an estimate: iid, orthogonal or sobol", default="iid"),
+    Column("mirrored", "1 if each draw w of the noise is followed by -w", format="setting", default=0.0),
+)
 HIDDEN = (
+    *(replace(column, table=False) for column in DRAWS),
     text("study", "study that measured the row", table=False),
     text(
         "parameters", "JSON with every parameter of every plugin, defaults included: the cell's identity", table=False
@@ -248,24 +263,34 @@ class Columns:
         return [column.name for column in self.all if column.kind == kind]
 
     def blank(self) -> dict[str, Any]:
-        """Return a row in which every value is missing: NaN, an empty string or an empty list."""
-        return {c.name: "" if c.kind == "text" else [] if c.kind == "list" else math.nan for c in self.all}
+        """Return a row in which every value is missing: its default, or NaN, an empty string or an empty list."""
+        empty: dict[Kind, Any] = {"text": "", "number": math.nan}
+        return {c.name: empty.get(c.kind, []) if c.default is None else c.default for c in self.all}
 
     def typed(self, table: pd.DataFrame) -> pd.DataFrame:
-        """Return the table with its columns in order and of their types, followed by unknown columns unchanged."""
+        """Return the table with its columns in order, of their types and derived, followed by unknown columns unchanged."""
         import pandas as pd
 
-        known = {column.name: _typed(table.get(column.name), column.kind, len(table)) for column in self.all}
+        known = {column.name: _typed(table.get(column.name), column, len(table)) for column in self.all}
         unknown = {name: table[name] for name in table if name not in self.by_name}
-        return pd.DataFrame({**known, **unknown}, index=table.index)
+        return self.derive(pd.DataFrame({**known, **unknown}, index=table.index))
+
+    def derive(self, table: pd.DataFrame) -> pd.DataFrame:
+        """Return the table with those of its columns that follow from others computed again."""
+        return table.assign(**{c.name: c.derived for c in self.all if c.derived and c.name in table})
 
 
-def _typed(values: pd.Series | None, kind: Kind, count: int) -> Any:
-    """Return a column converted to the type of its kind; ``count`` missing values if ``values`` is None."""
+def _typed(values: pd.Series | None, column: Column, count: int) -> Any:
+    """Return a column converted to the type of its kind; ``count`` missing values, or defaults, if ``values`` is None."""
     import pandas as pd
 
+    kind = column.kind
     if values is None:
-        return pd.array([""] * count, dtype="str") if kind == "text" else np.full(count, math.nan)
+        if kind == "text":
+            return pd.array([column.default or ""] * count, dtype="str")
+        return np.full(count, math.nan if column.default is None else column.default)
+    if column.default is not None:
+        values = values.fillna(column.default)
     if kind == "number":
         return values if values.dtype == np.float64 else pd.to_numeric(values, errors="coerce").astype("float64")
     if kind == "text" and not (str(values.dtype) == "str" and values.notna().all()):

@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import Any, cast
 
 from bench.errors import STATUSES, UserError, local_path, printable, unknown
+from bench.experiment.cell import DESCENDED
 from bench.experiment.experiment import Budget, Choice, Execution, Experiment
-from bench.experiment.grid import COUNTS, check_axes, parameter_name, refuse_too_many, swept
+from bench.experiment.grid import COUNTS, check_axes, parameter_name, refuse_too_many, share_of, swept
 from bench.experiment.overrides import LISTS_AS, TABLES, check_file, quoted, with_ranges
 from bench.experiment.study import Study
 from bench.model import Decision, MechanicalScene, Plugin, guard, registry
@@ -182,7 +183,7 @@ def _to_hydra(override: str, config_dirs: Sequence[Path]) -> str:
     if head not in _known_keys():
         raise unknown("setting", bare, {*_known_keys(), "experiment"}, "--help")
     kinds = registry.kinds()
-    if bare in kinds:
+    if bare in (*kinds, "path"):
         return f"++{bare}={_quote_identities(value)}"
     if bare == "study":
         return f"study={_quote_identities(value)[1:-1]}"
@@ -264,6 +265,8 @@ def from_settings(config: Mapping[str, Any]) -> Experiment:
             "reference=null: the study decides whether there is one; reference.samples=... limits its samples"
         )
     timing, sweep = config["timing"], _mapping(config, "sweep")
+    # as axes, these settings reach every estimator
+    sweep |= {name: [config[name]] for name in ("draws", "mirrored") if config[name] is not None}
     refuse_too_many(sweep)
     return Experiment(
         name=_name(config),
@@ -275,6 +278,8 @@ def from_settings(config: Mapping[str, Any]) -> Experiment:
         values={axis: _values(config, axis, kind) for axis, kind in axes.items()},
         sweep=sweep,
         decision=_decision(config),
+        descent=share_of(config["descent"]),
+        path=_path(config["path"]),
         results_dir=_folder(config["results_dir"]),
         question=str(config["question"] or ""),
         answer=str(config["answer"] or ""),
@@ -337,6 +342,17 @@ def _decision(config: Mapping[str, Any]) -> Decision:
     if values is not None and not all(map(math.isfinite, values)):
         raise UserError(f"theta0={list(values)} must be finite")
     return Decision(tuple(names), values)
+
+
+def _path(given: Any) -> dict[str, Choice]:
+    """Return what descents are of, by axis: contact law, integrator, and a backend if there is a third item."""
+    items = _as_list(given)
+    if len(items) not in (2, 3):
+        raise UserError(
+            f"path={items} must be a contact law, an integrator and, if wanted, a backend: [penalty,semi_implicit_euler,jax]"
+        )
+    given = {axis: item for axis, item in zip(DESCENDED, items, strict=False) if item != "none"}
+    return {axis: _choice(registry.kind_of(axis), item) for axis, item in given.items()}
 
 
 def _as_list(value: Any) -> list[Any]:

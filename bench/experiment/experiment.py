@@ -82,6 +82,10 @@ class Experiment:
     """Experiments of the same study whose cells join its own."""
     decision: Decision = OWN
     """The meaning of theta, and the point at which gradients are taken."""
+    descent: float = 0.0
+    """The share of a descent from there that is done."""
+    path: Mapping[str, Choice] = field(default_factory=dict)
+    """What is descended, by axis: contact law, integrator, and the backend if one is given."""
     samples: int = 256
     repeats: int = 64
     seed: int = 0
@@ -124,7 +128,8 @@ class Experiment:
             "also": [other.record() for other in self.also],
             "theta": list(self.decision.names),
             "theta0": None if self.decision.at is None else list(self.decision.at),
-            **{name: getattr(self, name) for name in ("samples", "repeats", "seed", "timing", "marks")},
+            "path": [str(choice) for choice in self.path.values()],
+            **{name: getattr(self, name) for name in ("descent", "samples", "repeats", "seed", "timing", "marks")},
             "formats": list(self.formats),
             "reference": dataclasses.asdict(self.reference),
             "results_dir": str(self.results_dir),

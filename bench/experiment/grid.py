@@ -10,7 +10,7 @@ from functools import cache
 from typing import Any
 
 from bench.errors import Unsupported, UserError, unknown
-from bench.experiment.cell import Cell
+from bench.experiment.cell import DESCENDED, Cell
 from bench.experiment.experiment import Choice, Experiment
 from bench.experiment.study import study_of
 from bench.model import Decision, MechanicalScene, Plugin, compose
@@ -19,6 +19,8 @@ from bench.model.program import OWN
 
 MAX_CELLS = 1_000_000
 """Largest number of cells in a sweep; planning that many takes minutes."""
+DESCENT = "descent"
+"""The axis of the share of a descent that is done at theta0."""
 COUNTS = ("samples", "repeats", "seed")
 """Settings that a sweep can vary besides plugin parameters and :data:`THETA`."""
 THETA = "theta0"
@@ -179,6 +181,14 @@ def coerce_finite(values: Any, name: str) -> tuple[float, ...]:
     return numbers
 
 
+def share_of(value: Any) -> float:
+    """Return a value of the setting ``descent``; raises :class:`UserError` unless it is at least 0 and below 1."""
+    share = coerce(float, value, DESCENT)
+    if not 0.0 <= share < 1.0:
+        raise UserError(f"{DESCENT}={share:g} must be at least 0 and below 1: the share of a descent that is done")
+    return float(share)
+
+
 def applies(name: str, axis: str, plugin: str, known: Collection[str]) -> str | None:
     """Return the parameter of a plugin that a name in a sweep means, or None.
 
@@ -198,9 +208,13 @@ def _applies(name: str, plugin: type[Plugin]) -> str | None:
 
 def check_axes(axes: Sequence[str], plugins: Sequence[type[Plugin]]) -> None:
     """Raise :class:`UserError` for an axis that is a parameter of none of the plugins, nor a count or theta."""
-    names = {name for plugin in plugins for name in parameters(plugin)} | {*COUNTS, THETA}
+    names = {name for plugin in plugins for name in parameters(plugin)} | {*COUNTS, DESCENT, THETA}
     for axis in axes:
-        if axis not in COUNTS and not is_theta_axis(axis) and not any(_applies(axis, plugin) for plugin in plugins):
+        if (
+            axis not in (*COUNTS, DESCENT)
+            and not is_theta_axis(axis)
+            and not any(_applies(axis, plugin) for plugin in plugins)
+        ):
             raise unknown("sweep axis", axis, names)
 
 
@@ -209,24 +223,42 @@ class _Expansion:
 
     def __init__(self, experiment: Experiment) -> None:
         self._experiment = experiment
+        self._paths: dict[tuple[int, Decision], Cell] = {}
 
     def cell(self, point: Mapping[str, Any], choices: Mapping[str, Choice]) -> Cell:
         """Return the cell of these choices at a point of the sweep."""
         used: dict[str, str] = {}
         parts: dict[str, Plugin | None] = {}
         for axis, choice in choices.items():
-            scene = parts.get("scene")
-            moving = scene if isinstance(scene, MechanicalScene) else None
-            if (axis == "integrator" and moving is None) or (axis == "contact" and not (moving and moving.n_contacts)):
-                parts[axis] = None
-            else:
-                given = moving.contact_values if moving and axis == "contact" else {}
+            if _uses(parts.get("scene"), axis):
+                given = getattr(parts["scene"], "contact_values", {}) if axis == "contact" else {}
                 parts[axis] = self._plugin(axis, choice, point, used, given)
+            else:
+                parts[axis] = None
         experiment = self._experiment
+        decision = start = self._decision(point, parts)
+        if share := share_of(point.get(DESCENT, experiment.descent)):
+            decision = dataclasses.replace(start, descent=share)
         return Cell(
             study_of(experiment).parts(parts), **self._counts(point), study=experiment.study,
-            decision=self._decision(point, parts), timing=experiment.timing, budget=experiment.budget,
+            decision=decision, timing=experiment.timing, budget=experiment.budget,
+            path=self._path(parts["scene"], start) if share else None,
         )  # fmt: skip
+
+    def _path(self, scene: Plugin | None, start: Decision) -> Cell:
+        """Return the cell at the start of a descent; its contact law has the scene's own values, and none of the sweep's."""
+        key = (id(scene), start)
+        if key not in self._paths:
+            parts: dict[str, Plugin | None] = {"scene": scene}
+            for axis in DESCENDED:
+                choice = self._experiment.path.get(axis)
+                parts[axis] = None
+                if choice is not None and choice.entry.plugin is not None and _uses(scene, axis):
+                    own = getattr(scene, "contact_values", {}) if axis == "contact" else {}
+                    values = {k: v for k, v in own.items() if k in parameters(choice.entry.plugin)}
+                    parts[axis] = _build(choice.entry.plugin, sorted((values | dict(choice.values)).items()))
+            self._paths[key] = Cell(parts, samples=0, repeats=0, seed=0, study=self._experiment.study, decision=start)
+        return self._paths[key]
 
     def _decision(self, point: Mapping[str, Any], parts: Mapping[str, Plugin | None]) -> Decision:
         """Return theta at a point of the sweep; coordinates that are not swept keep their values."""
@@ -250,7 +282,7 @@ class _Expansion:
             (at[coordinate],) = values
         return dataclasses.replace(decision, at=tuple(at))
 
-    def _counts(self, point: Mapping[str, Any]) -> dict[str, int]:
+    def _counts(self, point: Mapping[str, Any]) -> dict[str, Any]:
         counts: dict[str, int] = {}
         for name, low in (("samples", 1), ("repeats", 2), ("seed", 0)):
             count = coerce(int, point.get(name, getattr(self._experiment, name)), name)
@@ -283,6 +315,13 @@ class _Expansion:
         values |= self._experiment.values.get(group, {}).get(plugin.name, {})
         values |= dict(choice.values) | {parameter: point[axis] for axis, parameter in axes}
         return _build(plugin, sorted(values.items()))
+
+
+def _uses(scene: Plugin | None, axis: str) -> bool:
+    """Return whether a scene has the parts of an axis: integrators step motion, and contact laws act on contacts."""
+    if axis not in ("integrator", "contact"):
+        return True
+    return isinstance(scene, MechanicalScene) and (axis == "integrator" or scene.n_contacts != 0)
 
 
 @cache

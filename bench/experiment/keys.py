@@ -20,7 +20,7 @@ from typing import Any
 from bench.engines.backend import EngineBackend
 from bench.measure import noise, statistics
 from bench.model import PolicyScene, Scene, program
-from bench.model.parameters import Plugin, remember, values
+from bench.model.parameters import Plugin, parameters, remember, values
 
 SHARED = (noise, program)
 """Modules that decide the numbers of all cells."""
@@ -46,10 +46,17 @@ def fingerprint(plugin: Plugin | None) -> str:
             plugin, "files"
         ):
             code.append(files_hash(plugin.files()))
-        text = json.dumps([plugin.kind, plugin.name, dict(sorted(values(plugin).items())), code], default=repr)
+        text = json.dumps([plugin.kind, plugin.name, _counted(plugin), code], default=repr)
         # the plugin is stored too, so that no other object gets its id
         _fingerprints[id(plugin)] = (plugin, hashlib.sha256(text.encode()).hexdigest())
     return _fingerprints[id(plugin)][1]
+
+
+def _counted(plugin: Plugin) -> dict[str, Any]:
+    """Return the parameters that identify a plugin: all but those that it gained later and that have their defaults."""
+    declared = parameters(type(plugin))
+    given = sorted(values(plugin).items())
+    return {name: value for name, value in given if not (declared[name].added and value == declared[name].default)}
 
 
 def hashed(*parts: Any) -> str:

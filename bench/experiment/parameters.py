@@ -21,9 +21,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from bench.experiment.experiment import Budget
-from bench.experiment.grid import THETA, applies, is_theta_axis
+from bench.experiment.grid import DESCENT, THETA, applies, is_theta_axis
 from bench.model import Decision, Plugin, registry
-from bench.model.identity import plain
+from bench.model.identity import identity, plain
 from bench.model.parameters import parameters, singular
 
 if TYPE_CHECKING:
@@ -99,11 +99,29 @@ def _read(text: str, folders: tuple[Path, ...]) -> tuple[Mapping[str, Any], str]
 
 
 def completed_rows(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return rows with the column ``parameters`` completed, so that rows stored before and after a change agree."""
+    """Return rows with the column ``parameters`` completed, so that rows stored before and after a change agree.
+
+    The column ``estimator_params``, if there is one, has the parameters that differ from today's defaults.
+    """
     texts = {text: completed_json(text) for text in rows["parameters"].unique()}
-    if all(text == new for text, new in texts.items()):
+    rows = (
+        rows
+        if all(text == new for text, new in texts.items())
+        else rows.assign(parameters=rows["parameters"].map(texts))
+    )
+    if "estimator_params" not in rows:
         return rows
-    return rows.assign(parameters=rows["parameters"].map(texts))
+    labels = rows["parameters"].map({text: estimator_params(parsed(text)) for text in texts.values()})
+    return rows.assign(estimator_params=labels.fillna(rows["estimator_params"]))
+
+
+def estimator_params(given: Mapping[str, Any]) -> str | None:
+    """Return the parameters of a row's estimator that differ from today's defaults; None if it is not installed."""
+    part = given.get("estimator") or {}
+    if plugin_class("estimator", part.get("name")) is None:
+        return None
+    defaults = _defaults("estimator", part["name"], None, registry.folders())
+    return identity("", {name: value for name, value in part.items() if value != defaults.get(name, value)}).strip("[]")
 
 
 # --------------------------------------------------------------------------------------------------- swept quantities
@@ -132,6 +150,9 @@ def places(names: Collection[str], given: Mapping[str, Any]) -> list[Place]:
     """
     result = []
     for name in names:
+        if name == DESCENT:
+            result.append(Place("theta", "", name, (given.get("theta") or {}).get(name, 0.0)))
+            continue
         if is_theta_axis(name):
             at = (given.get("theta") or {}).get("at") or ()
             index = int(name.partition(".")[2] or 0)
@@ -188,11 +209,13 @@ def _numbers(
 def _problem(given: Mapping[str, Any], parts: Collection[str], without: Collection[str]) -> frozenset[Any]:
     """Return what identifies the problem of a row's parameters: they count as missing if they are null."""
     ignored = {(place.part, place.parameter) for place in places(without, given)}
+    if DESCENT in without:  # what is descended matters only where something is
+        ignored.add(("theta", "path"))
     found = []
     for part in (*parts, "study", "theta"):
         for name, value in (given.get(part) or {}).items():
             if (part, name) == ("theta", "at"):
                 found += [((THETA, f"{THETA}.{i}"), coordinate) for i, coordinate in enumerate(value or ())]
-            elif value is not None:
+            elif value is not None and (value or part != "theta"):
                 found.append(((part, name), tuple(value) if isinstance(value, list) else value))
     return frozenset(item for item in found if item[0] not in ignored)

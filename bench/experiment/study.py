@@ -37,6 +37,8 @@ class Study(Plugin):
     """Whether its cells are timed by default: one at a time, with the machine to themselves."""
     fresh_process: ClassVar[bool] = False
     """Whether each cell runs in a worker of its own, with one thread, as measurements of memory need."""
+    descends: ClassVar[bool] = True
+    """Whether its cells are measured at ``program.theta0``, and so at a share of a descent."""
 
     default_plugins: ClassVar[Mapping[str, Sequence[str]]] = {"optimizers": ("adam",)}
     """Names of the plugins of a kind that the configuration leaves null, such as ``optimizers``."""

@@ -18,6 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -356,6 +357,15 @@ def _exp(exponent: float) -> float:
 # ------------------------------------------------------------------------------------------------------ summary
 
 
+def rmse(bias: Any, variance: Any) -> Any:
+    """Return the root mean squared error of one estimate, at least its standard deviation; NaN if either is not known.
+
+    Bias and variance are de-biased, so their sum is the mean squared distance to the reference less the reference's own
+    error, except that a bias below its noise counts as 0 instead of reducing the variance.
+    """
+    return np.hypot(bias, np.sqrt(variance))
+
+
 @dataclass(frozen=True)
 class Summary:
     """Statistics of R estimates of N samples each, compared with the reference. Norms are Euclidean, intervals 95%.
@@ -385,7 +395,7 @@ class Summary:
     variance_per_sample_low: float
     variance_per_sample_high: float
     rmse: float
-    """Root mean squared distance of one estimate from the reference, with the reference's own error subtracted."""
+    """:func:`rmse` of ``bias`` and ``variance``."""
     rmse_rel: float
     """``rmse / reference_norm``."""
     cosine: float
@@ -404,6 +414,7 @@ def summarise(
     samples: int,
     terms: tuple[np.ndarray, np.ndarray] | None = None,
     unbiased: bool = False,
+    is_random: bool = True,
 ) -> Summary:
     """Return the statistics of independent ``estimates (R, d)`` of ``samples`` samples each, compared with the reference.
 
@@ -412,7 +423,7 @@ def summarise(
     the estimator's declaration: a bias of an estimator declared unbiased gets the remark :data:`UNEXPLAINED`. The
     relative fields are NaN, with a remark, where the reference is not distinguishable from 0. Intervals of identical
     estimates allow for an event of the gradient's size that no estimate contains, with the probability that the rule of
-    three leaves for such an event.
+    three leaves for such an event; with ``is_random=False``, for estimates that depend on no drawn number, they do not.
     Raises ValueError for shapes that do not fit. Estimates that are not finite do not raise: see :class:`Summary`.
     """
     estimates = np.asarray(estimates, dtype=np.float64)
@@ -436,13 +447,13 @@ def summarise(
     mean = estimates[0] if identical else estimates.mean(axis=0)
     deviations = np.zeros_like(estimates) if identical else estimates - mean
     norm, grad_norm = reference.norm, float(np.linalg.norm(mean))
-    bias, variance = _spread(deviations, mean, reference, samples, identical)
-    errors = estimates - reference.mean
-    squared_error = float(np.vdot(errors, errors)) / repeats - reference.standard_error**2
-    rmse = math.sqrt(max(0.0, squared_error))
+    is_fixed = identical and repeats > 1 and not is_random
+    missed = THREE / (repeats * samples) if identical and not is_fixed else 0.0
+    bias, variance = _spread(deviations, mean, reference, samples, missed)
+    error = float(rmse(bias[0], variance[0]))
     relative = math.nan if norm <= ROUNDING or reference.vanishes() else norm
     cosine, signs = _directions(estimates, reference.mean)
-    notes = _interval_remarks(deviations, mean - reference.mean, samples, identical)
+    notes = [] if is_fixed else _interval_remarks(deviations, mean - reference.mean, missed)
     notes += _reference_remarks(reference, relative)
     if unbiased and bias[1] > 0.0:
         notes.append(f"declared unbiased, and its interval excludes 0: {UNEXPLAINED}, or chance (about 1 row in 30)")
@@ -465,8 +476,8 @@ def summarise(
         variance_per_sample=scaled[0],
         variance_per_sample_low=scaled[1],
         variance_per_sample_high=scaled[2],
-        rmse=rmse * unit,
-        rmse_rel=rmse / relative,
+        rmse=error * unit,
+        rmse_rel=error / relative,
         cosine=cosine,
         sign_agreement=signs,
         finite_fraction=1.0,
@@ -475,9 +486,12 @@ def summarise(
 
 
 def _spread(
-    deviations: np.ndarray, mean: np.ndarray, reference: Truth, samples: int, identical: bool
+    deviations: np.ndarray, mean: np.ndarray, reference: Truth, samples: int, missed: float
 ) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
-    """Return bias and variance, each with its interval, of estimates with ``deviations (R, d)`` from their mean; NaN for R = 1."""
+    """Return bias and variance, each with its interval, of estimates with ``deviations (R, d)`` from their mean; NaN for R = 1.
+
+    The intervals allow for an event of the gradient's size with the probability ``missed`` per sample.
+    """
     repeats = len(deviations)
     if repeats == 1:
         return (math.nan,) * 3, (math.nan,) * 3
@@ -486,10 +500,10 @@ def _spread(
     sampling = Sampling(deviations / math.sqrt(repeats * (repeats - 1)), repeats - 1)
     bias, low, high = bias_interval(mean - reference.mean, sampling, *reference.errors)
     norm, grad_norm = reference.norm, float(np.linalg.norm(mean))
-    if identical:
-        size, rare = max(norm, grad_norm), THREE / (repeats * samples)
-        low, high = low - rare * size, high + rare * size
-        variance_high = rare * size**2 / samples
+    if missed:
+        size = max(norm, grad_norm)
+        low, high = low - missed * size, high + missed * size
+        variance_high = missed * size**2 / samples
     return (bias, 0.0 if low <= ROUNDING * (norm + grad_norm) else low, high), (variance, variance_low, variance_high)
 
 
@@ -549,15 +563,15 @@ def heavy_tails(deviations: np.ndarray) -> float:
     return 0.0
 
 
-def _interval_remarks(deviations: np.ndarray, difference: np.ndarray, samples: int, identical: bool) -> list[str]:
+def _interval_remarks(deviations: np.ndarray, difference: np.ndarray, missed: float) -> list[str]:
     """Return remarks that question the intervals, from deviations ``(R, d)`` and a difference of means ``(d,)``."""
     repeats = len(deviations)
     if repeats == 1:
         return ["only 1 repeat: no variance, and no interval of the bias"]
-    if identical:
+    if missed:
         return [
             "all estimates are identical: the intervals allow for an event of the gradient's size, rarer than about "
-            f"{THREE / (repeats * samples):.2g} per sample, which these samples would miss"
+            f"{missed:.2g} per sample, which these samples would miss"
         ]
     if repeats < FEW_REPEATS:
         return [f"only {repeats} repeats: intervals are wide, and tails are not tested"]

@@ -14,9 +14,10 @@ from bench.model import adjoint
 from bench.model.adjoint import Slopes, by_actions, by_theta, slopes, slopes_along
 from bench.model.adjoint import gradient as adjoint_gradient
 from bench.model.backend import Backend
-from bench.model.blocks import cores
+from bench.model.blocks import central_differences, cores
 from bench.model.callables import CallableScene
 from bench.model.contact import Contact, ContactLaw, ForceLaw, ImpulseLaw
+from bench.model.design import IID, Design, per_unit, sums_of_units
 from bench.model.dynamics import Dynamics
 from bench.model.estimator import (
     Auxiliaries,
@@ -24,10 +25,12 @@ from bench.model.estimator import (
     Estimator,
     SampleMean,
     Smoothing,
+    against_others,
     best_gradient,
     columns,
     first_order,
     halves,
+    less_others,
     mean_difference,
     per_repeat,
     zeroth_order,
@@ -70,6 +73,7 @@ from bench.model.trainer import Trainer
 from bench.simulator import load_module, load_simulator, simulator_files
 
 __all__ = [
+    "IID",
     "SURROGATE",
     "Answer",
     "Array",
@@ -84,6 +88,7 @@ __all__ = [
     "DampedScene",
     "Decision",
     "Descent",
+    "Design",
     "DiagnosticEstimator",
     "Dynamics",
     "EngineScene",
@@ -130,9 +135,11 @@ __all__ = [
     "adjoint",
     "adjoint_gradient",
     "affine",
+    "against_others",
     "best_gradient",
     "by_actions",
     "by_theta",
+    "central_differences",
     "columns",
     "compose",
     "cores",
@@ -141,12 +148,14 @@ __all__ = [
     "first_order",
     "half_spaces",
     "halves",
+    "less_others",
     "load_module",
     "load_simulator",
     "mean_difference",
     "n_changes",
     "param",
     "per_repeat",
+    "per_unit",
     "retract",
     "rollout",
     "simulator_files",
@@ -154,6 +163,7 @@ __all__ = [
     "slopes",
     "slopes_along",
     "stopped",
+    "sums_of_units",
     "undeclared_jumps",
     "uniform",
     "unknown",

@@ -107,3 +107,31 @@ def _pad(part: np.ndarray, columns: int) -> np.ndarray:
 @cache
 def _pool(threads: int, process: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads)
+
+
+def central_differences(
+    function: Callable[[np.ndarray, np.ndarray], np.ndarray],
+    theta: np.ndarray,
+    w: np.ndarray,
+    step: float | np.ndarray,
+    block: int,
+) -> np.ndarray:
+    """Return (function(theta + h_i e_i, w) - function(theta - h_i e_i, w)) / 2h_i for all i, ``(d, B)``.
+
+    ``theta`` is ``(d, 1)`` or ``(d, B)``, ``w (n_w, B)`` the noise, and ``step`` h, of all coordinates or of each, ``(d,)``. One
+    call has the columns of several i, up to ``block``.
+    """
+    dim, batch = len(theta), w.shape[1]
+    theta, steps = np.broadcast_to(theta, (dim, batch)), np.broadcast_to(step, (dim,))
+    rows = np.empty((dim, batch))
+    group = max(1, block // (2 * batch))
+    for start in range(0, dim, group):
+        chosen = range(start, min(start + group, dim))
+        moved = np.tile(theta[:, None, :], (1, 2 * len(chosen), 1))
+        for j, i in enumerate(chosen):
+            moved[i, 2 * j] += steps[i]
+            moved[i, 2 * j + 1] -= steps[i]
+        f = function(moved.reshape(dim, -1), np.tile(w, (1, 2 * len(chosen))))
+        f = f.reshape(len(chosen), 2, batch)
+        rows[start : start + len(chosen)] = (f[:, 0] - f[:, 1]) / (2 * steps[start : start + len(chosen), None])
+    return rows

@@ -11,7 +11,19 @@ from typing import ClassVar
 
 import numpy as np
 
-from bench.model.parameters import Plugin
+from bench.errors import Unsupported
+from bench.model.design import (
+    IID,
+    LEAST_UNITS,
+    MOST_COORDINATES,
+    POINTS,
+    UNITS,
+    Design,
+    block_of,
+    per_unit,
+    sums_of_units,
+)
+from bench.model.parameters import Plugin, param
 from bench.model.problem import Problem
 from bench.model.program import Program
 
@@ -52,6 +64,21 @@ class Estimator(Plugin):
     """Whether its directions are chosen together or a model is fitted to them, so that the variance may fall faster than 1/N."""
     gives_gradient: ClassVar[bool] = True
     """Whether the estimate is a gradient that an optimizer can use."""
+    in_units: ClassVar[bool] = False
+    """Whether it computes a variance, a quantile or a baseline from the samples of an estimate, and does so over the units
+    of :meth:`design`, whose samples are not independent of each other."""
+    pairs_samples: ClassVar[bool] = False
+    """Whether each term evaluates both w and -w, so that mirrored draws would repeat it."""
+    needs_independent_samples: ClassVar[bool] = False
+    """Whether it excludes other designs than independent draws, since it chooses directions or fits a model itself."""
+
+    fixed_work: ClassVar[bool] = False
+    """Whether an estimate takes the same work for all N, since it depends on no noise in J."""
+
+    draws: str = param(
+        "iid", "points of the noise of an estimate: independent, orthogonal, or a Sobol set", choices=POINTS, added=True
+    )
+    mirrored: bool = param(False, "whether each draw w of the noise is followed by -w", added=True)
 
     @abstractmethod
     def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
@@ -68,6 +95,10 @@ class Estimator(Plugin):
         An estimator with diagnostics derives from :class:`DiagnosticEstimator` and defines this method.
         """
         return self.estimate(problem, theta, noise), {}
+
+    def draws_noise(self, program: Program) -> bool:
+        """Return whether estimates depend on the noise on theta or actions; if not, only on the scene's own noise."""
+        return not self.fixed_work
 
     def declares_unbiased(self, program: Program) -> bool:
         """Return whether the estimator declares that its expectation is grad J_sigma of the program."""
@@ -88,6 +119,53 @@ class Estimator(Plugin):
         if self.needs_noise_on_theta and not program.noise_on_theta:
             return f"{self.name} needs noise on theta, not on a policy's actions"
         return None
+
+    def design(self, program: Program, samples: int) -> Design:
+        """Return how the noise of an estimate of N = ``samples`` is drawn; raises :class:`Unsupported` where it cannot be.
+
+        Points cover the directions in theta space of an estimator that uses them, otherwise all noise but the scene's own.
+        An estimator that compares samples gets at least 4 units, since it may treat only these as independent.
+        """
+        if self.draws == "iid" and not self.mirrored:
+            return IID
+        if self.draws not in POINTS or not isinstance(self.mirrored, bool):
+            raise Unsupported(
+                f"{self.name} has draws={self.draws!r} and mirrored={self.mirrored!r}: parameters of its own need other names"
+            )
+        words = " and ".join(
+            filter(None, [f"draws={self.draws}" * (self.draws != "iid"), "mirrored=true" * self.mirrored])
+        )
+        if not self.draws_noise(program):
+            raise Unsupported(f"{self.name} depends on no noise in J, so {words} would change nothing")
+        if self.needs_independent_samples:
+            raise Unsupported(f"{self.name} chooses directions or fits a model from independent draws, without {words}")
+        if self.mirrored and self.pairs_samples:
+            raise Unsupported(
+                f"{self.name} evaluates each direction both ways already, so mirrored draws would repeat its terms"
+            )
+        own = program.n_noise - program.exogenous
+        width = program.dim if self.needs_directions else own
+        if not own:
+            raise Unsupported(f"{words} concerns the noise in J, and {program.scene.name} has only noise of its own")
+        if self.draws == "sobol" and width > MOST_COORDINATES:
+            raise Unsupported(f"a Sobol set has at most {MOST_COORDINATES:,} coordinates, and a sample has {width:,}")
+        if samples % (1 + self.mirrored):
+            raise Unsupported(f"mirrored draws are pairs, and samples={samples} is odd")
+        count = samples // (1 + self.mirrored)
+        block = block_of(self.draws, width, count, self.in_units)
+        if self.draws == "sobol" and (block < 1 or block & (block - 1) or count % block):
+            raise Unsupported(
+                f"Sobol sets have a power of 2 of points: samples={samples} gives sets of {count / (count // max(block, 1)):g}"
+            )
+        if block == 1 < width and self.draws != "iid":
+            raise Unsupported(
+                f"{self.name} compares at least {UNITS} units of {words}, and samples={samples} has no such units of several draws"
+            )
+        if self.in_units and count // block < LEAST_UNITS:
+            raise Unsupported(
+                f"{self.name} compares samples: it needs {LEAST_UNITS} independent units of {words}, and samples={samples} gives {count // block}"
+            )
+        return Design(self.draws, self.mirrored, width, program.exogenous, block)
 
     def refusal(self, program: Program, provides: frozenset[str], backend: str) -> str | None:
         """Return why the estimator cannot run on a program with the backend's capabilities ``provides``, or None."""
@@ -162,15 +240,22 @@ def per_repeat(values: np.ndarray, noise: np.ndarray) -> np.ndarray:
     return np.moveaxis(values.reshape(-1, repeats, samples), 0, -1)
 
 
-def halves(problem: Problem, theta: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return first-order terms of the first half of the samples, zeroth-order terms of the rest, each ``(R, N/2, d)``.
+def halves(
+    problem: Problem, theta: np.ndarray, noise: np.ndarray, unit: int = 1, leave_out: bool = False
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return first-order terms of the first half of the samples and zeroth-order terms of the rest, each ``(R, K, d)``.
 
-    The zeroth-order terms are (f - f at w = 0) times the score. Raises ValueError for fewer than 4 samples.
+    A term is the mean over a ``unit`` of samples that are drawn together, and no unit is in both halves. The zeroth-order
+    terms are (f - b) times the score, b being f at w = 0, or with ``leave_out`` the mean cost of the other units. Raises
+    ValueError for fewer than 4 units.
     """
-    half = noise.shape[1] // 2
-    if half < 2:
-        raise ValueError(f"needs at least 4 samples, got {noise.shape[1]}")
-    return first_order(problem, theta, noise[:, :half]), zeroth_order(problem, theta, noise[:, half:])
+    units = noise.shape[1] // unit
+    if units < 4:
+        raise ValueError(f"needs at least 4 samples, got {units}")
+    half = units // 2 * unit
+    rest = noise[:, half:]
+    zeroth = against_others(problem, theta, rest, unit) if leave_out else zeroth_order(problem, theta, rest)
+    return per_unit(first_order(problem, theta, noise[:, :half]), unit), per_unit(zeroth, unit)
 
 
 def first_order(problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
@@ -183,6 +268,20 @@ def zeroth_order(problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.n
     w = columns(noise)
     cost = problem.value(theta, w) - problem.value(theta, np.zeros((w.shape[0], 1)))
     return per_repeat(cost * problem.score(theta, w), noise)
+
+
+def against_others(problem: Problem, theta: np.ndarray, noise: np.ndarray, unit: int = 1) -> np.ndarray:
+    """Return (f - mean f of the other units) times the score of each sample, ``(R, N, d)``."""
+    w = columns(noise)
+    cost = less_others(per_repeat(problem.value(theta, w), noise), unit)
+    return cost[..., None] * per_repeat(problem.score(theta, w), noise)
+
+
+def less_others(costs: np.ndarray, unit: int = 1) -> np.ndarray:
+    """Return costs ``(R, N)`` less the mean cost of the samples in other units than their own."""
+    n = costs.shape[1]
+    centred = costs - costs.mean(axis=1, keepdims=True)
+    return np.asarray(centred * n / (n - unit) + (sums_of_units(centred, unit) - unit * centred) / (n - unit))
 
 
 def mean_difference(problem: Problem, theta: np.ndarray, directions: np.ndarray, noise: np.ndarray) -> np.ndarray:

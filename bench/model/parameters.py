@@ -34,14 +34,17 @@ def param(
     low: float | None = None,
     high: float | None = None,
     choices: tuple[str, ...] | None = None,
+    added: bool = False,
 ) -> Any:
     """Declare a plugin parameter: its default, meaning, unit and allowed values.
 
     ``positive`` requires a value above 0, ``low`` and ``high`` are inclusive bounds, and ``choices`` are the allowed
-    strings.
+    strings. ``added`` is for a parameter that a released plugin gains: only values other than its default count in keys,
+    so stored rows stay valid, and Python takes it by keyword only.
     """
     return dataclasses.field(
         default=default,
+        kw_only=added,
         metadata=dict(
             doc=doc,
             unit=unit,
@@ -49,6 +52,7 @@ def param(
             low=low,
             high=high,
             choices=choices,
+            added=added,
         ),
     )
 
@@ -95,6 +99,7 @@ class Parameter:
     low: float | None = None
     high: float | None = None
     choices: tuple[str, ...] | None = None
+    added: bool = False
 
 
 def _inherit(plugin: type[Plugin]) -> None:
@@ -145,7 +150,7 @@ def parameters(plugin: type[Plugin]) -> dict[str, Parameter]:
         f.name: Parameter(
             f.name, hints[f.name], f.default, **{k: v for k, v in f.metadata.items() if k in Parameter.__annotations__}
         )
-        for f in dataclasses.fields(plugin)
+        for f in sorted(dataclasses.fields(plugin), key=lambda field: field.metadata.get("added", False))
     }
 
 

@@ -115,11 +115,12 @@ class Problem(ABC):
 
     ``theta`` is ``(d,)``, shared by all samples, or ``(d, B)``; ``w`` is ``(n_w, B)``. To limit memory, batches larger
     than ``block`` columns are split into blocks. Blocks are padded to a multiple of ``grain`` columns, to limit the
-    number of compiled shapes. Up to ``threads`` blocks run in parallel, each with about ``least`` columns or more.
+    number of compiled shapes; a batch of fewer to a multiple of ``fine``. Up to ``threads`` blocks run in parallel, each with about ``least`` columns or more.
     """
 
     block: int = 1 << 16
     grain: int = 1
+    fine: int = 1
     threads: int = 1
     least: int = blocks.MIN_COLUMNS
     device: str = "cpu"
@@ -263,7 +264,8 @@ class Problem(ABC):
     ) -> np.ndarray:
         theta = theta.reshape(self.dim, -1)
         threads = blocks.n_threads(w.shape[1], self.threads, self.least)
-        columns = blocks.block_size(w.shape[1], self.block, self.grain, threads)
+        grain = self.grain if w.shape[1] >= self.grain else min(self.fine, self.grain)
+        columns = blocks.block_size(w.shape[1], self.block, grain, threads)
 
         def real(theta: np.ndarray, w: np.ndarray) -> np.ndarray:
             values = function(theta, w)

@@ -34,11 +34,13 @@ class Decision:
 
     Without ``names``, theta is the scene's own decision variable. With ``names``, theta consists of these float
     parameters of the scene or its contact law, and noise is on theta. A name is ``mass``, or ``pushing.mass`` if scene
-    and law both have a parameter ``mass``. ``at`` replaces the scene's own value of theta.
+    and law both have a parameter ``mass``. ``at`` replaces the scene's own value of theta. ``descent`` is the share of a
+    descent from there that is done: a program has no theta0 before that descent is known.
     """
 
     names: tuple[str, ...] = ()
     at: tuple[float, ...] | None = None
+    descent: float = 0.0
 
 
 N_TRIALS = 8
@@ -78,7 +80,7 @@ class Program(ABC):
             raise UserError(f"theta={names} names a parameter twice")
         if at is not None and len(at) != self.dim:
             raise UserError(f"theta0 has {len(at)} values, theta of scene {self.scene.name} has {self.dim}")
-        if not np.isfinite(self.theta0).all():
+        if not self.decision.descent and not np.isfinite(self.theta0).all():
             raise UserError(f"theta={names} starts at {self.theta0.tolist()}: give finite values by theta0=[..]")
 
     # ------------------------------------------------------------------------------------------ structure
@@ -119,6 +121,8 @@ class Program(ABC):
 
     @cached_property
     def _theta0(self) -> np.ndarray:
+        if self.decision.descent:
+            raise Unsupported("theta on a descent is known once the descent is computed")
         if self.decision.at is not None:
             return np.array(self.decision.at, dtype=np.float64)
         if self._named:
@@ -244,7 +248,9 @@ class Program(ABC):
     def _as_declared(self) -> bool:
         """Whether theta and theta0 are the scene's own, so that its known solutions apply to this program."""
         at = self.decision.at
-        return not self._named and (at is None or bool(np.array_equal(at, self.scene.theta0())))
+        return not (self._named or self.decision.descent) and (
+            at is None or bool(np.array_equal(at, self.scene.theta0()))
+        )
 
     def closed_form_gradient(self) -> np.ndarray | None:
         """Return the closed form of grad J_sigma at theta0, ``(d,)``, or None if unknown."""

@@ -19,6 +19,7 @@ from bench.experiment.parameters import NOT_PLUGINS, parsed
 from bench.experiment.study import Study
 from bench.model import Decision, MechanicalScene, Plugin
 from bench.model.identity import changed, identity
+from bench.model.program import OWN
 
 HEAD = "python -m bench name=one_cell"
 
@@ -56,7 +57,7 @@ def cell_of(given: Mapping[str, Any], known: dict[str, Plugin]) -> Cell:
         repeats=0,
         seed=0,
         study=study,
-        decision=Decision(**{name: value and tuple(value) for name, value in theta.items()}) if theta else Decision(),
+        decision=Decision(tuple(theta["names"]), theta["at"] and tuple(theta["at"])) if theta else OWN,
         budget=Budget(**budget) if budget else None,
     )
 
@@ -67,7 +68,8 @@ def _settings(given: Mapping[str, Any], known: dict[str, Plugin], timing: bool) 
         cell = dataclasses.replace(cell_of(given, known), timing=timing)
     except (UserError, KeyError):
         return []
-    words, default = [f"study={_identity(cell.study)}", *plugin_settings(cell), *theta_settings(cell)], Budget()
+    words = [f"study={_identity(cell.study)}", *plugin_settings(cell), *theta_settings(given["theta"])]
+    default = Budget()
     for name in ("samples", "tolerance") if cell.budget is not None else ():
         if getattr(cell.budget, name) != getattr(default, name):
             words.append(f"reference.{name}={getattr(cell.budget, name)!r}")
@@ -89,12 +91,12 @@ def plugin_settings(cell: Cell, without: Collection[str] = ()) -> list[str]:
     ]
 
 
-def theta_settings(cell: Cell) -> list[str]:
-    """Return the settings of theta's names and of the point of the gradients; empty if they are the scene's own."""
-    names, at = cell.decision.names, cell.decision.at
-    return [f"theta=[{','.join(names)}]"] * bool(names) + (
-        [] if at is None else [f"theta0=[{','.join(map(repr, at))}]"]
-    )
+def theta_settings(theta: Mapping[str, Any] | None) -> list[str]:
+    """Return the settings of a row's theta: its names, and the point of the gradients; empty if they are the scene's own."""
+    theta = theta or {}
+    lists = {"theta": theta.get("names"), "theta0": theta.get("at"), "path": theta.get("path")}
+    words = [f"{name}=[{','.join(map(str, items))}]" for name, items in lists.items() if items]
+    return words + [f"descent={theta.get('descent')}"] * bool(theta.get("descent"))
 
 
 def check_of(cell: Cell) -> str:
@@ -107,7 +109,8 @@ def check_of(cell: Cell) -> str:
     if isinstance(cell.scene, MechanicalScene):
         scene, line = _identity(cell.scene, {"horizon": cell.scene.horizon}), [f"sweep.horizon=[{cell.scene.horizon}]"]
     study = [f"study={_identity(cell.study)}"] * bool(changed(cell.study))
-    line += [*plugin_settings(cell, without=("scene", "estimator")), f"seed={cell.seed}", *theta_settings(cell), *study]
+    theta = theta_settings(cell.parameters["theta"])
+    line += [*plugin_settings(cell, without=("scene", "estimator")), f"seed={cell.seed}", *theta, *study]
     return shlex.join(["python", "-m", "bench", "gradcheck", scene, *line])
 
 

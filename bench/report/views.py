@@ -23,7 +23,7 @@ from bench.measure.timing import NOISY
 from bench.report.text import number
 
 CATEGORIES = ("scene", "contact", "integrator", "noise")
-NUMBERS = ("horizon", "dt", "stiffness", "sigma", "smoothing", "samples", "repeats")
+NUMBERS = ("horizon", "dt", "stiffness", "sigma", "smoothing", "descent", "samples", "repeats")
 """Numeric identity columns; with the categories and the swept axes they identify the problem of a row."""
 VIEWS_OF_LAWS = ("stiffness", "smoothing")
 """Columns that repeat a parameter of the contact law, which may be swept under its own name."""
@@ -186,6 +186,18 @@ def rmse_interval(row: Any) -> tuple[Any, Any]:
         np.hypot(row[f"bias_{end}"], np.sqrt(row.get(f"variance_{end}", math.nan))) / norm for end in ("low", "high")
     )
     return low, high
+
+
+def shown_rmse(row: Any) -> tuple[Any, Any, Any, Any]:
+    """Return the relative RMSE of one row or each row of a table, its interval, and whether the value is an upper limit.
+
+    The value is the upper end of the interval where the bias is not distinguishable from 0 and the reference's error is at
+    least the standard deviation of one estimate, so that the reference's error decides the bias; NaN if that end is infinite.
+    """
+    low, high = rmse_interval(row)
+    is_limit = np.logical_not(row["bias_low"] > 0) & (row["reference_se"] >= np.sqrt(row["variance"]))
+    value = np.where(is_limit, np.where(np.isfinite(high), high, math.nan), row["rmse_rel"])
+    return np.where(np.isnan(row["rmse_rel"]), math.nan, value), low, high, is_limit
 
 
 def bias_text(row: Any, norm: float = 1.0) -> str:

@@ -20,7 +20,7 @@ from bench.experiment.parameters import completed_rows
 from bench.experiment.study import study_of
 from bench.measure import timing
 from bench.model import Estimator, guard
-from bench.run import progress
+from bench.run import descents, progress
 from bench.run.files import remove_stale
 from bench.run.ladder import climb
 from bench.run.launchers import launcher_of
@@ -153,7 +153,7 @@ class Runner:
         refused = [(i.cell, dict(zip(("status", "reason"), i.refusal, strict=True))) for i in due if i.refusal]
         if refused:
             self._finish([(cell, result | {"machine": kind_of_machine()}) for cell, result in refused])
-        cells = [item.cell for item in due if item.refusal is None]
+        cells = self._placed([item.cell for item in due if item.refusal is None])
         with guard.contained():  # this calls backends, to find out which can compute references
             references = self._missing_references(cells)
         if not self.experiment.timing:
@@ -165,6 +165,37 @@ class Runner:
                 cells = self._compute_references(cells, references, launcher)
         with launcher_of(self.experiment, timed=True, kind=kind) as launcher:
             self._measure(cells, launcher)
+
+    def _placed(self, cells: list[Cell]) -> list[Cell]:
+        """Return cells with their places on descents; cells whose descent failed are stored with its status.
+
+        A descent is computed once, stored, and shared by all cells of its scene.
+        """
+        starts = {cell.path.descent_key: cell.path for cell in cells if cell.path is not None}
+        folder = self.experiment.results_dir.absolute() / "references"
+        known = {key: descents.load(folder, key) for key in starts}
+        due = [start.with_part("backend", start.descent_backend) for key, start in starts.items() if known[key] is None]
+        failed: dict[str, dict[str, Any]] = {}
+        if due:
+            with launcher_of(self.experiment) as launcher:
+                tasks = [Task(start, descent=True) for start in due]
+                for answer in itertools.chain.from_iterable(self._answers(tasks, launcher)):
+                    key = answer.item.cell.descent_key
+                    if answer.result["status"] == "ok":
+                        known[key] = descents.save(folder, key, answer.result["descent"])
+                    else:
+                        failed[key] = result_of(answer, "its descent: ")
+        placed: list[Cell] = []
+        for cell in cells:
+            key = "" if cell.path is None else cell.path.descent_key
+            if not key:
+                placed.append(cell)
+            elif (found := known[key]) is not None and not found.reason:
+                placed.append(replace(cell, point=found.at(cell.decision.descent)))
+            else:
+                reason = {"status": "unsupported", "reason": f"no descent: {found.reason if found else ''}"}
+                self._finish([(cell, failed.get(key, reason | {"machine": kind_of_machine()}))])
+        return placed
 
     def _missing_references(self, cells: list[Cell]) -> list[Cell]:
         """Return one cell for each reference to compute; closed forms are computed when their cells are measured."""
@@ -201,8 +232,9 @@ class Runner:
             if answers:
                 yield answers
             current = "; ".join(str(item) for item in launcher.current)
-            if tasks[0].reference:  # references are no cells, so the counts of cells stand still meanwhile
-                current += f" ({n_done} of {len(tasks)} references done)"
+            if what := "references" * tasks[0].reference or "descents" * tasks[0].descent:
+                # these are no cells, so the counts of cells stand still meanwhile
+                current += f" ({n_done} of {len(tasks)} {what} done)"
             self.shown.working(current)
 
     def _finish(self, results: list[tuple[Cell, dict[str, Any]]]) -> None:

@@ -6,7 +6,7 @@ import json
 from collections import defaultdict
 from collections.abc import Iterable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import Any
 
@@ -16,7 +16,7 @@ from bench.experiment.experiment import Experiment
 from bench.experiment.keys import fingerprint
 from bench.experiment.parameters import PROBLEM
 from bench.experiment.study import Study, study_of
-from bench.measure import noise
+from bench.measure import descent, noise
 from bench.model import Backend, Plugin, Scene, guard, isolation, registry
 from bench.run.plan import versions
 from bench.run.pool import Answer
@@ -36,15 +36,17 @@ RAN: set[str] = set()
 
 @dataclass(frozen=True)
 class Task:
-    """A cell to measure, or a cell whose reference gradient is to be computed."""
+    """A cell to measure, a cell whose reference gradient is to be computed, or the start of a descent to be computed."""
 
     cell: Cell
     reference: bool = False
+    descent: bool = False
 
     def __str__(self) -> str:
         shown = {**self.cell.parts, "integrator": None, "backend": self.backend}
         parts = [part for axis, part in shown.items() if not (self.reference and axis == "estimator")]
-        return " ".join(["reference of" if self.reference else "", *(p.name for p in parts if p is not None)]).strip()
+        what = "reference of" if self.reference else "descent of" if self.descent else ""
+        return " ".join([what, *(p.name for p in parts if p is not None)]).strip()
 
     @property
     def backend(self) -> Backend:
@@ -117,9 +119,11 @@ class TaskHandler:
         # other code may have changed what computes it
         self._session.references.stores = item.outside_of_reference >= RAN
         with guard.protect_process():
-            if not item.reference:
+            if not (item.reference or item.descent):
                 return measure_cell(item.cell, self._session, self._study)
             try:
+                if item.descent:
+                    return {"status": "ok", "descent": asdict(descent.descend(self._session.problem(item.cell)))}
                 self._session.references.of(item.cell)
             except (StorageError, KeyboardInterrupt):
                 raise

@@ -98,7 +98,7 @@ def _traced(program: Program, function: str, dtype: str) -> _Source:
 class FusedProblem(JaxProblem):
     """A program as compiled kernels for any batch and horizon; float parameters are arguments."""
 
-    grain = emit.LANES
+    grain = fine = emit.LANES
     # a thread with fewer columns takes less time than starting it
     least = 4096
 

@@ -124,7 +124,7 @@ class JaxProblem(Problem):
     step.
     """
 
-    grain = 128
+    grain, fine = 128, 8
     variant: Any = None
     """What else distinguishes the executables of a subclass."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -32,6 +33,8 @@ LARGEST = 1e10
 """Maximum absolute value in a state; MuJoCo stops a rollout at larger values (``mjMAXVAL``)."""
 RESIDUAL_SAMPLES = 16
 """Rollouts in which the residual of the constraint solver is measured."""
+_REMARKED: set[tuple[str, str, str]] = set()
+"""Scenes, files and cones whose remarks were printed."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +89,16 @@ class Mjx(Jax):
                 f"MJX's solver has no reverse mode with iterations={self.iterations} and derivative=unrolled: use "
                 "derivative=implicit, mode=forward or iterations=1"
             )
+        key = (scene.name, getattr(scene, "file", ""), self.cone)
+        if key not in _REMARKED:
+            _REMARKED.add(key)
+            for remark in self.remarks(program):
+                print(f"{scene.name}: {remark}", file=sys.stderr)
         return None
+
+    def remarks(self, program: Program) -> list[str]:
+        """Return in what MJX's physics of the program's model differ from the C engine's; known before anything runs."""
+        return mjcf.mjx_remarks(mjcf.build(self, program))
 
     def _elliptic_reason(self, model: Any) -> str | None:
         """Return why contacts with elliptic cones exclude the model, or None."""
@@ -130,6 +142,8 @@ SINGLE = 4
 
 class MjxProblem(JaxProblem):
     """A program stepped by MJX. A processor has two compiled shapes: one column, for small batches, and 16."""
+
+    fine = 16
 
     def _blocks(
         self, function: Callable[..., np.ndarray], theta: np.ndarray, w: np.ndarray, lead: tuple[int, ...]

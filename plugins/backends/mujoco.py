@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from bench.model import Backend, Problem, Program, SteppedProblem, cores, param
+from bench.model import Backend, Problem, Program, SteppedProblem, central_differences, cores, param
 
 from .. import mjcf
-from .numpy import differences
 
 SHORTER = 0.03
 """Factor between the differences of a step that straddle a switch of contact and the next shorter ones."""
@@ -84,7 +83,7 @@ class MujocoProblem(SteppedProblem):
 
     def _grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         if self._backend.gradient == "rollouts":
-            return differences(self._value, theta, w, self._backend.step, self.block)
+            return central_differences(self._value, theta, w, self._backend.step, self.block)
         return super()._grad(theta, w)
 
 

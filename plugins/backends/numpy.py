@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
-from bench.model import Backend, LoopOps, Problem, Program, Trajectory, param, rollout
+from bench.model import Backend, LoopOps, Problem, Program, Trajectory, central_differences, param, rollout
 
 
 @dataclass(frozen=True)
@@ -50,7 +49,7 @@ class NumpyProblem(Problem):
 
     def _grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         # usage counts gradients here, not rollouts: the cost of a gradient in rollouts is measured separately
-        return differences(self._value, theta, w, self._step, self.block)
+        return central_differences(self._value, theta, w, self._step, self.block)
 
     def _score(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         self.usage.rollouts += 2 * self.dim * w.shape[1]
@@ -60,24 +59,4 @@ class NumpyProblem(Problem):
             with np.errstate(all="ignore"):
                 return np.asarray(self._bound.log_probability(self._ops, fixed, moved, w), dtype=np.float64)
 
-        return differences(at, theta, w, self._step, self.block)
-
-
-def differences(
-    function: Callable[[np.ndarray, np.ndarray], np.ndarray], theta: np.ndarray, w: np.ndarray, step: float, block: int
-) -> np.ndarray:
-    """Return (function(theta + h e_i) - function(theta - h e_i)) / 2h for all i, ``(d, B)``, several i per batch."""
-    dim, batch = len(theta), w.shape[1]
-    theta = np.broadcast_to(theta, (dim, batch))
-    rows = np.empty((dim, batch))
-    group = max(1, block // (2 * batch))
-    for start in range(0, dim, group):
-        chosen = range(start, min(start + group, dim))
-        moved = np.tile(theta[:, None, :], (1, 2 * len(chosen), 1))
-        for j, i in enumerate(chosen):
-            moved[i, 2 * j] += step
-            moved[i, 2 * j + 1] -= step
-        f = function(moved.reshape(dim, -1), np.tile(w, (1, 2 * len(chosen))))
-        f = f.reshape(len(chosen), 2, batch)
-        rows[start : start + len(chosen)] = (f[:, 0] - f[:, 1]) / (2 * step)
-    return rows
+        return central_differences(at, theta, w, self._step, self.block)

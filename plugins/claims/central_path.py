@@ -51,7 +51,7 @@ class CentralPath(Claim):
         closest = minimize_scalar(lambda s: np.abs(relaxed - ndtr(a / s)).max(), bounds=(1, 3), method="bounded")
         at = problem(KINK)
         _, (first, first_error) = moments(at, estimator("fobg"))
-        _, (zeroth, zeroth_error) = moments(at, estimator("reinforce"))
+        _, (zeroth, zeroth_error) = moments(at, estimator("reinforce[baseline=center]"))
         figures = [
             Figure(
                 "largest difference of derivative and chance", "0.0", float(np.abs(relaxed - chance).max()), spread=1e-8

@@ -58,6 +58,6 @@ def _distance(stiffness: float, damping: float, steps: int) -> tuple[float, floa
         f"ground_wall[sigma=0.1,horizon={steps},dt={dt!r}]", f"penalty[stiffness={stiffness!r},damping={damping!r}]"
     )
     noise = np.random.default_rng(18).standard_normal((2, SAMPLES))
-    difference = terms(at, estimator("fobg"), noise) - terms(at, estimator("reinforce"), noise)
+    difference = terms(at, estimator("fobg"), noise) - terms(at, estimator("reinforce[baseline=center]"), noise)
     error = float(np.sqrt(difference.var(axis=0, ddof=1).sum() / SAMPLES))
     return float(np.linalg.norm(difference.mean(axis=0))), error

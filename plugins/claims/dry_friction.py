@@ -43,7 +43,7 @@ class Sticking(Claim):
         figures = [
             Figure("exact derivative at rest", "0.0", float(exact[20])),
             Figure("smoothed, first order", "0.3173", *moments(at, estimator("fobg"))[0]),
-            Figure("smoothed, zeroth order", "0.3173", *moments(at, estimator("reinforce"))[0]),
+            Figure("smoothed, zeroth order", "0.3173", *moments(at, estimator("reinforce[baseline=center]"))[0]),
             Figure(
                 "largest difference from the formula, F from -4 to 4",
                 "0.0",

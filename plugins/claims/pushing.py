@@ -22,7 +22,7 @@ TAILS = 0.25
 def sampled(at: Problem, count: int, seed: int, batches: int = 20) -> Iterator[tuple[float, float]]:
     """Yield the variances of first- and zeroth-order terms, each with its standard error."""
     w = np.random.default_rng(seed).standard_normal((at.program.n_noise, count))
-    return (spread(terms(at, estimator(name), w), batches) for name in ("fobg", "reinforce"))
+    return (spread(terms(at, estimator(name), w), batches) for name in ("fobg", "reinforce[baseline=center]"))
 
 
 def source_error(values: tuple[float, float], count: int) -> float:

@@ -32,7 +32,7 @@ class Ramp(Claim):
 
     def measure(self) -> Outcome:
         """Compute the width at which the variances are equal, and the errors of small batches."""
-        first, zeroth = estimator("fobg"), estimator("reinforce")
+        first, zeroth = estimator("fobg"), estimator("reinforce[baseline=center]")
 
         def gap(nu: float) -> float:
             at = problem(f"soft_heaviside[nu={nu!r},sigma={SIGMA}]")

@@ -22,7 +22,7 @@ class Step(Claim):
 
     def measure(self) -> Outcome:
         """Integrate both estimators over the noise."""
-        first, zeroth = estimator("fobg"), estimator("reinforce")
+        first, zeroth = estimator("fobg"), estimator("reinforce[baseline=center]")
         at = problem("heaviside[sigma=0.1]")
         mean, variance = moments(at, first)
         slope, centred = moments(at, zeroth)

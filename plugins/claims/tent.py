@@ -46,7 +46,7 @@ class Chaos(Claim):
 
     def measure(self) -> Outcome:
         """Sample both orders at several horizons."""
-        first, zeroth = estimator("fobg"), estimator("reinforce")
+        first, zeroth = estimator("fobg"), estimator("reinforce[baseline=center]")
         draw = np.random.default_rng(19)
         figures, horizons, variances = [], [1, 2, 5, 10, 14, 20], []
         for steps in horizons:
@@ -70,7 +70,11 @@ class Chaos(Claim):
             figures.append(Figure(what, text, v1 / mixed, v1 / mixed * (e0 / v0), slack))
         # the same by the estimator that splits them, on fewer steps, where its weights are not too far from one half
         at, mixture = problem(tent(WEIGHED)), estimator("inverse_variance")
-        (v1, e1), (v0, e0) = (spread(terms(at, one, draw.standard_normal((1, SAMPLES)))) for one in (first, zeroth))
+        v1, e1 = spread(terms(at, first, draw.standard_normal((1, SAMPLES))))
+        w = draw.standard_normal((1, SAMPLES))
+        cost = at.value(at.program.theta0, w)
+        # the estimator's baseline is the mean cost of the other samples
+        v0, e0 = spread(((cost - cost.mean()) * at.score(at.program.theta0, w)).T)
         ratio = v1 / (v0 + v1)
         expected = 2.0 * v0 * ratio
         noises = (draw.standard_normal((MIXED // 8, 1000, 1)) for _ in range(8))

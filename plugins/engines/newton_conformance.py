@@ -18,7 +18,7 @@ class Engine:
     """A model per case. Springs replace contacts and limits, and equalities, tendons and friction loss are missing."""
 
     versions = {name: importlib.metadata.version(name) for name in ("newton", "warp-lang")}
-    tolerance = 1e-3  # float32
+    tolerance = "float32"
 
     def __init__(self):
         self.differs, self._built = {}, {}

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.model import Auxiliaries, DiagnosticEstimator, Problem, first_order, halves, param, zeroth_order
+from bench.model import Auxiliaries, DiagnosticEstimator, Problem, first_order, halves, param, per_unit, zeroth_order
 
 RARE = 2.0
 """gamma / eps from which hardly any estimate of a smooth cost reaches the cap."""
@@ -22,14 +22,16 @@ class AlphaOrder(DiagnosticEstimator):
     eps = sqrt(2 V ln((d+1)/delta) / N) + (2 L / 3 N) ln((d+1)/delta), V the per-sample zeroth-order variance.
     By default gamma is ``ratio`` eps: a fixed gamma far below eps reduces the method to the zeroth order on fewer
     samples. A ratio of 1.25 caps a in many estimates of a smooth cost of one variable, at 4 to 20 times the variance. A
-    larger ratio admits more of a jump's bias, up to (ratio - 1) eps. The two orders use independent halves of the
-    samples, or the same samples (``sharing=shared``, as in the source). Reports a as ``alpha``, and ``eps``.
+    larger ratio admits more of a jump's bias, up to (ratio - 1) eps. The two orders use the same samples, as in the source,
+    or independent halves of them (``sharing=split``, with half of the evaluations). Of draws that are not independent, N, V
+    and L count units and the means over them. Reports a as ``alpha``, and ``eps``.
     Requires costs, gradients and scores. Biased by at most about gamma - eps, since a depends on the samples.
     """
 
     name = "alpha_order"
     needs = frozenset({"value", "grad", "score"})
     unbiased = False
+    in_units = True
     diagnostics = ("alpha", "eps")
 
     gamma: float | None = param(
@@ -38,7 +40,7 @@ class AlphaOrder(DiagnosticEstimator):
         positive=True,
     )
     ratio: float = param(1.5, "gamma / eps if gamma is null", low=1.0)
-    sharing: str = param("split", "whether both orders use the same samples", choices=("split", "shared"))
+    sharing: str = param("shared", "whether both orders use the same samples", choices=("shared", "split"))
     delta: float = param(0.05, "failure probability of the confidence radius", positive=True, high=1.0)
     bound: float | None = param(None, "L, bound on |zeroth-order term|; null: the largest in the batch", positive=True)
 
@@ -54,14 +56,16 @@ class AlphaOrder(DiagnosticEstimator):
     ) -> tuple[np.ndarray, Auxiliaries]:
         """Return the estimates ``(R, d)`` with alpha and eps, each ``(R,)``.
 
-        Raises ValueError for fewer than 4 samples, or fewer than 2 with ``sharing=shared``.
+        Raises ValueError for fewer than 2 samples, or fewer than 4 with ``sharing=split``.
         """
+        unit = self.design(problem.program, noise.shape[1]).unit
         if self.sharing == "split":
-            first, zeroth = halves(problem, theta, noise)
+            first, zeroth = halves(problem, theta, noise, unit)
         elif noise.shape[1] < 2:
             raise ValueError("needs at least 2 samples, got 1")
         else:
-            first, zeroth = first_order(problem, theta, noise), zeroth_order(problem, theta, noise)
+            orders = first_order(problem, theta, noise), zeroth_order(problem, theta, noise)
+            first, zeroth = (per_unit(terms, unit) for terms in orders)
         n = zeroth.shape[1]
         fobg, zobg = first.mean(axis=1), zeroth.mean(axis=1)
         per_sample = zeroth.var(axis=1, ddof=1).sum(axis=-1)

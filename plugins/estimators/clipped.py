@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.model import Auxiliaries, DiagnosticEstimator, Problem, first_order, param
+from bench.model import Auxiliaries, DiagnosticEstimator, Problem, first_order, param, per_unit
 
 
 @dataclass(frozen=True)
@@ -14,13 +14,15 @@ class Clipped(DiagnosticEstimator):
     ``by``: ``sample``, each sample's norm; ``element``, each coordinate of each sample; ``batch``, the norm of the
     mean. The limit is by default a quantile of the samples' sizes in the same batch, so that it follows the problem's
     scale. Requires gradients. Biased, since the clipped part is missing from the mean: on a ramp of width nu that a
-    sample hits with probability p, clipping at c gives the expectation c p instead of (2 / nu) p. Reports the clipped
+    sample hits with probability p, clipping at c gives the expectation c p instead of (2 / nu) p. Of samples that are
+    drawn together, their mean is clipped (De et al. 2022, section 3.1: augmentations of an example). Reports the clipped
     share as ``cut``.
     """
 
     name = "clipped"
     needs = frozenset({"grad"})
     unbiased = False
+    in_units = True
     diagnostics = ("cut",)
 
     by: str = param("sample", "what is clipped", choices=("sample", "batch", "element"))
@@ -33,7 +35,7 @@ class Clipped(DiagnosticEstimator):
         self, problem: Problem, theta: np.ndarray, noise: np.ndarray
     ) -> tuple[np.ndarray, Auxiliaries]:
         """Return the estimates ``(R, d)``, and the share of clipped sizes as ``cut``, ``(R,)``."""
-        terms = first_order(problem, theta, noise)
+        terms = per_unit(first_order(problem, theta, noise), self.design(problem.program, noise.shape[1]).unit)
         sizes = np.abs(terms) if self.by == "element" else np.linalg.norm(terms, axis=-1, keepdims=True)
         limit = np.quantile(sizes, self.quantile, axis=1, keepdims=True) if self.limit is None else self.limit
         if self.by == "batch":

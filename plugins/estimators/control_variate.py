@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.model import Auxiliaries, DiagnosticEstimator, Problem, columns, per_repeat, zeroth_order
+from bench.model import Auxiliaries, DiagnosticEstimator, Problem, columns, per_repeat, per_unit, zeroth_order
 
 
 @dataclass(frozen=True)
@@ -22,6 +22,7 @@ class ControlVariate(DiagnosticEstimator):
     needs_noise_on_theta = True
     needs = frozenset({"value", "grad", "score"})
     unbiased_at_discontinuities = True
+    in_units = True
     diagnostics = ("coefficient",)
 
     def estimate_with_diagnostics(
@@ -34,10 +35,11 @@ class ControlVariate(DiagnosticEstimator):
         zeroth = zeroth_order(problem, theta, noise)
         w = columns(noise)[: problem.dim]
         control = per_repeat((centre @ w) * w, noise)
-        half = noise.shape[1] // 2
+        unit = self.design(problem.program, noise.shape[1]).unit
+        half = noise.shape[1] // unit // 2 * unit
         parts = (slice(0, half), slice(half, None))
         # each half is corrected with the coefficient of the other
-        coefficients = [_slope(control[:, part], zeroth[:, part]) for part in reversed(parts)]
+        coefficients = [_slope(*(per_unit(of[:, part], unit) for of in (control, zeroth))) for part in reversed(parts)]
         corrected = [
             zeroth[:, part] - c[:, None, None] * (control[:, part] - centre)
             for part, c in zip(parts, coefficients, strict=True)

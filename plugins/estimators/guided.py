@@ -20,6 +20,7 @@ class Guided(Estimator):
 
     name = "guided"
     needs_directions = True
+    needs_independent_samples = True
     needs = frozenset({"value", "grad"})
     unbiased = False
 

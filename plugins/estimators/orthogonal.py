@@ -24,6 +24,7 @@ class Orthogonal(Estimator):
     smooths_theta = True
     unbiased_at_discontinuities = True
     couples_samples = True
+    needs_independent_samples = True
 
     lengths: str = param("drawn", "lengths of the directions", choices=("drawn", "fixed"))
 

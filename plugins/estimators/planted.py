@@ -24,6 +24,7 @@ class Planted(Estimator):
     name = "planted"
     unbiased = False
     needs_directions = True
+    needs_independent_samples = True
 
     base: str = param("samples", "gradient to which the error is added", choices=("samples", "best"))
     bias: float = param(0.0, "length of the fixed error, relative to the gradient's norm", low=0.0)
@@ -36,6 +37,9 @@ class Planted(Estimator):
     def needs(self) -> frozenset[str]:  # type: ignore[override]
         """Gradients; with ``base=best`` also costs and scores, which discontinuous costs need."""
         return frozenset({"grad"}) if self.base == "samples" else frozenset({"grad", "value", "score"})
+
+    def draws_noise(self, program: Program) -> bool:
+        return self.base == "samples" or self.noise > 0.0 or not program.continuous
 
     def own_refusal(self, program: Program) -> str | None:
         if self.angle and program.dim < 2:

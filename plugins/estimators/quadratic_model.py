@@ -33,6 +33,7 @@ class QuadraticModel(DiagnosticEstimator):
     needs_directions = True
     unbiased_at_discontinuities = True
     couples_samples = True
+    needs_independent_samples = True
     diagnostics = ("explained",)
 
     block: int = param(256, "largest number of samples in one fit", low=4)

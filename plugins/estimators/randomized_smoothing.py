@@ -32,6 +32,11 @@ class RandomizedSmoothing(SampleMean):
         choices=("sigma", "own"),
     )
 
+    @property
+    def pairs_samples(self) -> bool:  # type: ignore[override]
+        """True for central differences. Forward differences of mirrored draws are central differences."""
+        return self.variant == "antithetic"
+
     def terms(self, problem: Problem, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         s = problem.sigma if self.radius is None else self.radius
         direction = problem.directions(w)

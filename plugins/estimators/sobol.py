@@ -32,6 +32,7 @@ class Sobol(Estimator):
     smooths_theta = True
     unbiased_at_discontinuities = True
     couples_samples = True
+    needs_independent_samples = True
 
     def own_refusal(self, program: Program) -> str | None:
         if program.dim > MOST:

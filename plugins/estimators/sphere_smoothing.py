@@ -20,6 +20,7 @@ class SphereSmoothing(SampleMean):
 
     name = "sphere_smoothing"
     needs_directions = True
+    pairs_samples = True
     unbiased = False
 
     radius: float | None = param(None, "r, in units of theta; null: sigma sqrt(d + 2)", positive=True)

@@ -12,14 +12,15 @@ from bench.model import (
     Program,
     Rollout,
     adjoint,
+    against_others,
     by_actions,
     by_theta,
     columns,
     first_order,
     param,
     per_repeat,
+    per_unit,
     slopes,
-    zeroth_order,
 )
 
 
@@ -42,12 +43,19 @@ class TotalPropagation(DiagnosticEstimator):
     """
 
     name = "total_propagation"
+    revision = 2
     uses = (adjoint,)
     needs = frozenset({"value", "grad", "score"})
     unbiased = False
+    in_units = True
     diagnostics = ("weight",)
 
     per: str = param("step", "the unit with a common weight", choices=("step", "control", "action"))
+
+    @property
+    def needs_independent_samples(self) -> bool:  # type: ignore[override]
+        """True for ``per=action``."""
+        return self.per == "action"
 
     def estimate_with_diagnostics(
         self, problem: Problem, theta: np.ndarray, noise: np.ndarray
@@ -60,7 +68,9 @@ class TotalPropagation(DiagnosticEstimator):
             raise ValueError(f"{self.name} needs at least 2 samples, got 1")
         if self.per == "action":
             return self._per_action(problem, theta, noise)
-        first, zeroth = first_order(problem, theta, noise), zeroth_order(problem, theta, noise)
+        unit = self.design(problem.program, noise.shape[1]).unit
+        orders = first_order(problem, theta, noise), against_others(problem, theta, noise, unit)
+        first, zeroth = (per_unit(terms, unit) for terms in orders)
         part = 1 if self.per == "control" else _controls(problem.program)
         v1, v0 = (_summed(terms.var(axis=1, ddof=1), part) for terms in (first, zeroth))
         weight = _weight(v0, v1)

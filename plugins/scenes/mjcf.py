@@ -96,6 +96,8 @@ class Mjcf(PolicyScene, JointScene):
         robot = _read(self.path, self.path.stat().st_mtime_ns)
         if not len(robot.controls) and self.theta == "policy":
             raise UserError(f"mjcf.file={self.path} has no actuators for a policy: use theta=velocity")
+        if not len(robot.controls) and self.noise == "action":
+            raise UserError(f"mjcf.file={self.path} has no actuators for noise=action: use noise=parameter")
         return robot
 
     def files(self) -> tuple[Path, ...]:

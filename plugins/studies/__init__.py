@@ -16,7 +16,7 @@ from bench.experiment.session import Session
 from bench.experiment.study import Study
 from bench.experiment.views import Views
 from bench.measure import noise, timing
-from bench.model import Problem
+from bench.model import Problem, Program
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -105,9 +105,10 @@ def mean_interval(values: np.ndarray) -> tuple[float, float, float]:
     return mean, mean - reach, mean + reach
 
 
-def all_noise(cell: Cell, width: int) -> np.ndarray:
-    """Return the noise of all rollouts of a cell, ``(repeats, samples, width)``."""
-    return noise.shared(cell.seed, cell.scene.name, cell.repeats, cell.samples, width)
+def all_noise(cell: Cell, program: Program) -> np.ndarray:
+    """Return the noise of all rollouts of a cell, ``(repeats, samples, n_w)``."""
+    counts = (cell.repeats, cell.samples, program.n_noise)
+    return noise.shared(cell.seed, cell.scene.name, *counts, cell.design(program))
 
 
 def first_batch(cell: Cell, width: int) -> np.ndarray:

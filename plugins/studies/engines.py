@@ -19,6 +19,7 @@ from bench.measure import noise, statistics, timing
 from bench.model import Problem, param, zeroth_order
 from bench.report.style import PALETTE
 from bench.report.text import number
+from bench.report.views import rmse_interval, shown_rmse
 
 from . import PARTS, StudyPackage, all_noise, finite_status, relative_error
 from .bias_variance.columns import COLUMNS as ESTIMATES
@@ -107,7 +108,7 @@ class Engines(StudyPackage):
         truth = session.references.of(cell)
         known, noted = truth.known(), truth.note or "the reference gradient is not finite"
         status = finite_status(noted, truth.batches)
-        w = all_noise(cell, program.n_noise)
+        w = all_noise(cell, program)
         zeroth = zeroth_order(problem, theta, w).mean(axis=1)
         result |= {
             "reference_method": truth.method, "reference_spacing": truth.spacing, "device": problem.device,
@@ -194,7 +195,9 @@ def _times(cell: Cell, problem: Problem, study: Engines, has_gradient: bool) -> 
 
 def levels(rows: pd.DataFrame) -> np.ndarray:
     """Return the level of each row's gradient, a key of :data:`LEVELS`."""
-    low, high = rmse_interval(rows)
+    low, high = rmse_interval(with_variance_interval(rows))
+    reach = 2.0 * rows["reference_se"] / rows["reference_norm"]
+    low, high = low / (1.0 + reach), (high / (1.0 - reach)).where(reach < 1.0, np.inf)
     is_right = (rows["status"] == "ok") & ~(rows["nan_share"] > 0) & (rows["program_error_rel"] <= ACCURATE)
     kinds = {
         "none": rows["gradient"].map(len) == 0, "wrong": ~is_right, "noisy": low >= USELESS, "open": ~(high < USELESS),
@@ -203,30 +206,22 @@ def levels(rows: pd.DataFrame) -> np.ndarray:
     return np.select(list(kinds.values()), list(kinds), "own")
 
 
-def rmse_interval(rows: pd.DataFrame) -> tuple[pd.Series, pd.Series]:
-    """Return an interval of at least 95% of each relative RMSE, from the intervals of bias, variance and norm.
-
-    The variance's interval is that of normal numbers, one per repeat. The reference's error is in the interval of the bias,
-    and makes that of the norm two standard errors wide. The upper end is infinite where the norm may be 0.
-    """
+def with_variance_interval(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return rows with the 95% interval of the variance of normal numbers, one per repeat."""
     from scipy.special import chdtri
 
     free = np.maximum(rows["repeats"] - 1, 1)
-    low, high = (np.sqrt(rows["variance"] * free / chdtri(free, tail)) for tail in (0.025, 0.975))
-    reach, norm = 2.0 * rows["reference_se"], rows["reference_norm"]
-    upper = np.hypot(rows["bias_high"], high) / (norm - reach)
-    return np.hypot(rows["bias_low"], low) / (norm + reach), upper.where(norm > reach, np.inf)
+    ends = {end: chdtri(free, tail) for end, tail in (("low", 0.025), ("high", 0.975))}
+    return rows.assign(**{f"variance_{end}": rows["variance"] * free / value for end, value in ends.items()})
 
 
 def with_limits(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return rows with the upper end of the RMSE's interval where the reference is not known well enough for the RMSE.
+    """Return rows whose RMSE, where only an upper limit is known, is that limit: see :func:`bench.report.views.shown_rmse`.
 
     The column ``rmse_is_limit`` is true there. Where the interval has no upper end the RMSE is missing.
     """
-    known = rows["reference_norm"].notna()
-    hidden = known & ~(rows["rmse_rel"] > 2.0 * rows["reference_se"] / rows["reference_norm"])
-    limit = rmse_interval(rows)[1].replace(np.inf, np.nan)
-    return rows.assign(rmse_is_limit=hidden, rmse_rel=rows["rmse_rel"].mask(hidden, limit))
+    value, *_, is_limit = shown_rmse(with_variance_interval(rows))
+    return rows.assign(rmse_is_limit=is_limit, rmse_rel=value)
 
 
 def _chart(measured: pd.DataFrame) -> Chart:

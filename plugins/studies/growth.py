@@ -104,7 +104,7 @@ class Growth(StudyPackage):
         """
         problem = session.problem(cell)
         program, theta = problem.program, problem.program.theta0
-        w = columns(all_noise(cell, program.n_noise))
+        w = columns(all_noise(cell, program))
         first, centre = problem.grad(theta, w), problem.value(theta, np.zeros((w.shape[0], 1)))
         zeroth = (problem.value(theta, w) - centre) * problem.score(theta, w)
         good = np.isfinite(first).all(axis=0) & np.isfinite(zeroth).all(axis=0)

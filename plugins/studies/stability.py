@@ -261,7 +261,7 @@ def _refined(cell: Cell, steps: int) -> Cell:
     if isinstance(scene, DampedScene):
         values["velocity_factor"] = scene.velocity_factor ** (dt / scene.dt)
     fine = cell.with_part("scene", replace(scene, **values))
-    if fine.program().dim != program.dim:
+    if not cell.decision.names and fine.scene.theta0().size != program.dim:
         raise Unsupported(
             f"theta of scene {scene.name} depends on the horizon, so a finer step has no comparable gradient"
         )

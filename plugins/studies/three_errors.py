@@ -113,7 +113,7 @@ class ThreeErrors(StudyPackage):
         status = finite_status(truth.note or "the reference gradient is not finite", truth.batches)
         if status["status"] != "ok":
             return result | status
-        w = all_noise(cell, problem.program.n_noise)
+        w = all_noise(cell, problem.program)
         estimates = np.asarray(cell.estimator.estimate(problem, problem.program.theta0, w), dtype=np.float64)
         summary = asdict(statistics.summarise(estimates, truth.known(), cell.samples))
         status = finite_status("", estimates, gradient) | {"reason": summary["note"]}

@@ -311,8 +311,8 @@ def test_what_cannot_be_compared_is_refused(name, rows, said, tmp_path, capsys):
 
 def test_history_follows_errors_and_failures_in_the_order_given(tmp_path):
     rows = given()
-    rows["rmse"] = 1.0
-    worse = rows.assign(rmse=2.0)
+    rows = rows.assign(bias=0.6, variance=0.64)
+    worse = rows.assign(bias=1.2, variance=2.56)
     worse.loc[good(worse), "status"] = "error"
     places = [save(r, tmp_path / name) for name, r in (("a", rows), ("b", rows), ("c", worse))]
     assert cli.main(["history", *map(str, places), f"out={tmp_path / 'out'}"]) == 0

@@ -19,6 +19,7 @@ from classes import (
     MassSpring,
     Midpoint,
     Penalty,
+    Plain,
     Pushing,
     Quadratic,
     SemiImplicitEuler,
@@ -149,6 +150,20 @@ class OwnSampleInBaseline(Estimator):
         return ((f - f.mean(axis=1, keepdims=True))[..., None] * score).mean(axis=1)
 
 
+@planted("bias_under_every_design")
+class OtherSamplesOfTheUnitInBaseline(Estimator):
+    """Zeroth-order, with the mean of the other samples as baseline, mirror images included."""
+
+    needs = frozenset({"value", "score"})
+    unbiased_at_discontinuities = True
+
+    def estimate(self, problem, theta, noise):
+        w = columns(noise)
+        f, score = (per_repeat(of(theta, w), noise) for of in (problem.value, problem.score))
+        others = (f.sum(axis=1, keepdims=True) - f) / (f.shape[1] - 1)
+        return ((f - others)[..., None] * score).mean(axis=1)
+
+
 @planted("bias_under_action_feedback")
 class OpenLoopScore(SampleMean):
     """Zeroth-order, with the score of an open-loop control under feedback too."""
@@ -209,6 +224,32 @@ class LastingBias(FirstOrder):
 
     def terms(self, problem, theta, w):
         return 2.5 * super().terms(problem, theta, w)
+
+
+@planted("noise_is_drawn_as_declared")
+class ClaimsNoNoise(FirstOrder):
+    """First-order, and it claims to draw no noise."""
+
+    def draws_noise(self, program):
+        return False
+
+
+@planted("noise_is_drawn_as_declared")
+class DrawsNoNoise(FirstOrder):
+    """First-order without noise, which it does not declare."""
+
+    unbiased = False
+
+    def terms(self, problem, theta, w):
+        return super().terms(problem, theta, 0 * w)
+
+
+@planted("bias_is_as_declared")
+class PlainWithWrongSign(Plain):
+    """The gradient without noise, with the wrong sign."""
+
+    def estimate(self, problem, theta, noise):
+        return -super().estimate(problem, theta, noise)
 
 
 @planted("something_was_checked")

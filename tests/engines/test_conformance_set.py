@@ -14,8 +14,10 @@ import conformance_set
 import numpy as np
 import pytest
 
+import bench
 from bench.cli import main
 from bench.engines import conformance, table
+from bench.engines.conformance import runner
 
 pytest.importorskip("mujoco")
 ROOT = Path(__file__).resolve().parents[2]
@@ -59,6 +61,40 @@ def test_an_engine_that_follows_the_page_runs_without_this_package(tmp_path):
     assert all(row["is_right"] and row["digits"] > 10 for row in rows)
     assert (last["case"], last["term"], last["is_right"]) == ("free_joint", "all", None)
     assert last["reason"] == "NotImplementedError: only a pendulum with friction loss"
+
+
+def test_the_set_in_a_new_folder_has_an_item_per_case_and_derivative(tmp_path):
+    assert main(["engines", "set", str(tmp_path)]) == 0
+    assert (tmp_path / "conformance" / "VERSION").read_text() == f"{bench.__version__}\n"
+    assert main(["engines", "set", str(tmp_path)]) == 2
+    block = re.findall(r"```python\n(.*?)```", (ROOT / "docs/conformance.md").read_text(), re.DOTALL)[0]
+    (tmp_path / "my_engine.py").write_text(block.replace('"parameter": by_p', '"parameter": -by_p'))
+    words = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "-rfsx",
+        "-p",
+        "no:cacheprovider",
+        "-p",
+        "conformance.plugin",
+        "my_engine.py",
+    ]
+
+    def run():
+        alone = os.environ | {"PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1", "PYTHONPATH": str(tmp_path)}
+        return subprocess.run(words, cwd=tmp_path, env=alone, capture_output=True, text=True).stdout
+
+    text, n = run(), len(conformance.cases())
+    assert f"1 failed, 4 passed, {5 * (n - 1)} skipped" in text
+    assert "friction_loss-parameter: -1 times" in text
+    (tmp_path / "xfails.txt").write_text("friction_loss-parameter  # the sign\n")
+    assert f"4 passed, {5 * (n - 1)} skipped, 1 xfailed" in run()
+    (tmp_path / "xfails.txt").write_text("friction_loss-qpos  # repaired\nfriction_loss-parameter\n")
+    assert f"1 failed, 3 passed, {5 * (n - 1)} skipped, 1 xfailed" in run()
+    (tmp_path / "xfails.txt").write_text("friction_los\n")
+    assert "names friction_los, which is no case or CASE-TERM" in run()
 
 
 class OwnPhysics:
@@ -114,6 +150,104 @@ def test_shorter_floats_than_those_of_the_cost_are_no_fault():
         assert [row["is_right"] for row in rows].count(True) >= 2
 
 
+@pytest.mark.parametrize("factor", [-1.0, 0.5, 0.0])
+def test_a_derivative_off_by_more_than_its_uncertainty_is_wrong(factor):
+    """Differences of short floats are uncertain by more than 1% of some terms, which are off by a multiple of that."""
+    (case,) = conformance.cases("hinge_limit")
+    n_uncertain = 0
+    for shift in np.linspace(-0.5, 0.5, 8):
+        engine, moved = Short(), dataclasses.replace(case, qpos=case.qpos + shift)
+        terms = ("qpos", "qvel")
+        right = {term: case.differences(Short(np.float64), term)[0] for term in terms}
+        engine.gradient = lambda case, right=right: {term: factor * by for term, by in right.items()}
+        _, *rows = conformance.check(engine, moved)
+        for row in rows:
+            off, margin = abs(row["obtained"] - row["expected"]), runner.DOUBTS * row["uncertainty"]
+            assert (row["is_right"] is False) == (off > margin + engine.tolerance * abs(row["expected"]))
+            n_uncertain += row["is_right"] is False and margin > runner.UNCERTAIN * abs(row["expected"])
+    assert n_uncertain
+
+
+class Planted:
+    """The set's numbers, the derivatives by qpos changed by a function."""
+
+    tolerance = "float64"
+
+    def __init__(self, change):
+        self._change = change
+
+    def rollout(self, case):
+        return case.data["expected"]["value"]
+
+    def gradient(self, case):
+        numbers = {term: np.array(case.data["expected"][term]) for term in runner.TERMS}
+        return numbers | {"qpos": self._change(numbers["qpos"], numbers)}
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda by, all: -by, "-1 times"),
+        (lambda by, all: 0.004 * by, "0.004 times"),
+        (lambda by, all: 0.0 * by, "0"),
+        (lambda by, all: all["qvel"], "the numbers of qvel"),
+        (lambda by, all: by[::-1], "in reverse order"),
+        (lambda by, all: np.append(by[1:], 0.0), "shifted by -1"),
+        (lambda by, all: np.append(by[:-1], 0.0), "qpos[5]: 0"),
+        (lambda by, all: by * [-1, 1, 1, -1, 1, 1], "qpos[0, 3]: -1 times"),
+        (lambda by, all: by * [2, 2, 2, 2, 2, 1], "qpos except [5]: 2 times"),
+        (lambda by, all: by + 0.25 * np.array([0, 0, 2, 0, 0, 1]), "qpos[2, 5]: 0.71 instead of 0.21"),
+        (lambda by, all: by * [1, np.nan, 1, np.inf, 1, 1], "2 of 6 numbers not finite"),
+        (lambda by, all: by * np.nan, "6 of 6 numbers not finite"),
+    ],
+)
+def test_a_wrong_derivative_has_a_reason(change, reason):
+    _, row, *others = conformance.run(Planted(change), "free_joint")
+    assert (row["is_right"], row["reason"]) == (False, reason)
+    assert all(other["is_right"] and not other["reason"] for other in others)
+    json.dumps(row, allow_nan=False)
+
+
+def test_rows_have_the_numbers_that_are_compared():
+    (case,) = conformance.cases("free_joint")
+    _, row, *_ = conformance.check(Planted(lambda by, all: 0.5 * by), case)
+    assert (row["component"], row["expected"], row["obtained"], row["ratio"]) == (1, 2.04, 1.02, 0.5)
+    assert row["uncertainty"] == case.data["certainty"]["qpos"]
+    assert tuple(row) == runner.COLUMNS
+
+
+def test_values_of_short_floats_need_the_tolerance_by_that_name():
+    engine = Planted(lambda by, all: by * (1 + 3e-4))
+    _, row, *_ = conformance.run(engine, "free_joint")
+    assert row["is_right"] is False
+    engine.tolerance = "float32"
+    conformance.verify(conformance.run(engine, "free_joint"))
+
+
+def test_an_engine_without_derivatives_fails():
+    engine = Planted(lambda by, all: by)
+    conformance.verify(conformance.run(engine, "free_joint"), judged=4)
+    with pytest.raises(AssertionError, match=re.escape("4 derivatives are judged, 5 are required")):
+        conformance.verify(conformance.run(engine, "free_joint"), judged=5)
+    engine.gradient = lambda case: {}
+    with pytest.raises(AssertionError, match="0 derivatives are judged, 1 are required"):
+        conformance.verify(conformance.run(engine))
+    with pytest.raises(AssertionError, match="free_joint qpos: -1 times"):
+        conformance.verify(conformance.run(Planted(lambda by, all: -by), "free_joint"))
+
+
+def test_an_unknown_case_is_an_error_with_the_nearest_name():
+    with pytest.raises(
+        ValueError, match=r"there is no case 'free_join', did you mean free_joint\?; cases: ball_limit,"
+    ):
+        conformance.cases("free_join")
+    words = [sys.executable, runner.__file__, "my_engine.py", "nosuchcase"]
+    done = subprocess.run(words, capture_output=True, text=True)
+    assert done.returncode == 1
+    assert done.stderr.startswith("there is no case 'nosuchcase'")
+    assert "Traceback" not in done.stderr
+
+
 @pytest.mark.parametrize(
     ("gradient", "reason"),
     [
@@ -153,7 +287,7 @@ def test_a_planted_fault_is_named(fault, case, engine):
 
 def test_every_case_has_sources_that_agree():
     cases = conformance.cases()
-    assert len(cases) == 28
+    assert len(cases) == 29
     for case in cases:
         sources = case.data["sources"]
         assert len(sources) >= 2, case.name
@@ -191,7 +325,12 @@ def test_mjx_is_right(names):
     """The cases of equal options are one model."""
     names = names or [case.name for case in conformance.cases()]
     rows = conformance.run(mjx(*names), *names)
-    assert {row["case"] for row in rows if row["is_right"] is None} == {"connect", "connect_fast", "weld"} & set(names)
+    assert {row["case"] for row in rows if row["is_right"] is None} == {
+        "connect",
+        "connect_fast",
+        "sparse_chain",
+        "weld",
+    } & set(names)
     assert not [row for row in rows if row["is_right"] is False]
 
 
@@ -263,7 +402,7 @@ class Engine:
 
 def test_rows_of_an_engine_that_ends_stay_with_the_reason(tmp_path):
     (tmp_path / "mine_conformance.py").write_text(UNFINISHED)
-    row, last = table.conformance_rows("mine", None, tmp_path / "mine_conformance.py", "rk4", "weld")
+    row, last = table.rows_of(None, tmp_path / "mine_conformance.py", Path(runner.__file__), "rk4", "weld")
     assert (row["versions"], row["case"], row["is_right"]) == ("mine 2", "rk4", False)
     assert "exit status 3" in last["reason"]
 
@@ -274,7 +413,7 @@ def test_the_table_keeps_other_releases(tmp_path, monkeypatch):
     for version, digits in (("3.1", 1.0), ("3.2", 2.0), ("3.1", 3.0)):
         row = {"versions": f"mujoco {version}; x 1", "case": "rk4", "is_right": False, "digits": digits, "term": "qvel"}
         monkeypatch.setattr(
-            table, "conformance_rows", lambda *of, row=row: [row | {"seconds": 1, "looks_like": "a fault"}]
+            table, "rows_of", lambda *of, row=row, **settings: [row | {"seconds": 1, "looks_like": "a fault"}]
         )
         page = table.write(["mujoco"], tmp_path).read_text()
     assert "| case | mujoco 3.1 | mujoco 3.2 |" in page
@@ -297,4 +436,4 @@ def test_the_table_has_versions_digits_and_commands(tmp_path):
     assert "`python -m bench engines table mujoco`" in page
     assert "| stacked | " in page
     assert "bounce_once" in page
-    assert len((tmp_path / "engines.csv").read_text().splitlines()) > 5 * 28
+    assert len((tmp_path / "engines.csv").read_text().splitlines()) > 5 * 29

@@ -12,6 +12,7 @@ from classes import BounceOnce, Impulse, Numpy, Penalty, Pushing, SemiImplicitEu
 import bench.conformance
 from bench.conformance.subjects import law_for
 from bench.engines import table
+from bench.engines.conformance import runner
 from bench.experiment import by_name
 from bench.model import compose, registry
 
@@ -59,6 +60,6 @@ def test_balls_of_a_tenth_of_a_kilogram_touch_in_brax():
 def test_a_slide_on_a_hinge_is_right_except_in_brax(name):
     """Its axis does not turn in Brax: were it repaired, the documentation would be wrong."""
     file = Path(table.__file__).parents[2] / "plugins" / "engines" / f"{name}_conformance.py"
-    rows = table.conformance_rows(name, installed(name), file, "offset_slide")
+    rows = table.rows_of(installed(name), file, Path(runner.__file__), "offset_slide")
     assert [row["case"] for row in rows] == ["offset_slide"] * (1 if name == "mujoco_warp" else 4)
     assert {row["is_right"] for row in rows} == {name != "brax"}

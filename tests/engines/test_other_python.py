@@ -277,8 +277,39 @@ def test_the_command_lists_engines_and_installs_requirements(tmp_path, monkeypat
     assert "has no file of requirements" in capsys.readouterr().err
     assert main(["engines", "install", "newtom"]) == 2
     assert "did you mean 'newton'" in capsys.readouterr().err
+    assert main(["engines", "install", "jax==1"]) == 2
+    assert "has no file of requirements" in capsys.readouterr().err
     assert main(["engines", "remove"]) == 2
     assert "engines: remove is not a request" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("word", "wanted"),
+    [
+        ("mujoco", ["-r", "FILE"]),
+        ("mujoco==4.0.0", ["mujoco==4.0.0"]),
+        ("mujoco==newest", ["--upgrade", "mujoco"]),
+        ("newton==newest", ["--upgrade", "newton"]),
+    ],
+)
+def test_another_release_has_an_environment_of_its_own(word, wanted, tmp_path, monkeypatch):
+    """The other pins of a file of requirements are those of its own release."""
+    monkeypatch.setenv(environments.FOLDER, str(tmp_path))
+    calls = []
+    monkeypatch.setattr(environments.subprocess, "run", lambda words, **options: calls.append(words))
+    file = tmp_path / "requirements.txt"
+    file.write_text(f"{word.partition('==')[0]}==1.0\nwarp-lang==1.19.0\n")
+    assert environments.install(word, file) == tmp_path / word
+    assert calls[0][-1] == str(tmp_path / word)
+    assert calls[1][6:] == [str(file) if part == "FILE" else part for part in wanted]
+
+
+def test_a_release_without_an_environment_has_the_command_that_makes_it(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv(environments.FOLDER, str(tmp_path))
+    assert main(["engines", "table", "mujoco==9.9", f"out={tmp_path / 'out'}"]) == 0
+    assert "engines install mujoco==9.9" in (tmp_path / "out" / "engines.csv").read_text()
+    assert main(["engines", "metamorphic", str(TOYS / "toy.py"), "mujoco==9.9"]) == 2
+    assert "engines install mujoco==9.9" in capsys.readouterr().err
 
 
 # ------------------------------------------------------------------------------------------------------- contracts
@@ -294,7 +325,7 @@ def test_files_of_engines_are_neither_imported_nor_listed():
     names = {name for table in registry.entries().values() for name in table}
     assert {"newton", "drake", "toy"} <= names
     own = {name for name in sys.modules if name.startswith("bench.plugins.engines.")}
-    assert not [name for name in own if not name.endswith("_conformance")]
+    assert not [name for name in own if not name.endswith(("_conformance", "_metamorphic"))]
     assert "bench_engine_model" not in sys.modules
     assert not [name for name in sys.modules if name.startswith("bench_folder_") and ".engines." in name]
     assert not {"warp", "pydrake", "brax", "taichi"} & set(sys.modules)

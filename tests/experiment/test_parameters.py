@@ -61,6 +61,12 @@ def test_rows_of_old_and_new_have_the_same_parameters(text):
     assert completed_rows(rows)["parameters"].tolist() == [text, text, "", "{}"]
 
 
+def test_rows_from_before_a_changed_default_are_labelled_by_todays():
+    rows = rows_with("scenes=[pushing]", "estimators=[reinforce[baseline=center],reinforce]")
+    rows = pd.concat([rows.assign(estimator_params=["", "baseline=leave_one_out"]), rows[:1].assign(parameters="")])
+    assert list(completed_rows(rows)["estimator_params"]) == ["baseline=center", "", "baseline=center"]
+
+
 # --------------------------------------------------------------------------------------------------- names of a sweep
 
 

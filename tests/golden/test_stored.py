@@ -8,6 +8,7 @@ import pytest
 from golden_cells import is_installed, measure, moved_columns, name_of, parsed, session_of
 from trees import ROOT
 
+from bench.compare.sources import columns_of
 from bench.engines.backend import EngineBackend
 from bench.experiment import config
 from bench.experiment.axes import build_plugins
@@ -62,6 +63,7 @@ def sampled(rows):
 def test_stored_rows_come_out_again(name, is_mjx, tmp_path):
     registry.add_folder(ROOT / "examples/cost_of_error")
     rows = pd.read_parquet(ROOT / "results/standard" / name / "rows.parquet")
+    rows = columns_of(rows["study"].iloc[0]).derive(rows)
     rows = sampled(rows[rows.backend.str.startswith("mjx") == is_mjx])
     pairs = [(cell_of(row), row) for _, row in rows.iterrows()]
     pairs = [(cell, row) for cell, row in pairs if is_installed(cell)]

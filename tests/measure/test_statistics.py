@@ -4,10 +4,12 @@ import dataclasses
 import math
 
 import numpy as np
+import pandas as pd
 import pytest
 import scipy.stats
 
 from bench.measure.statistics import Sampling, Summary, Truth, bias_interval, heavy_tails, summarise, variance_interval
+from bench.report.views import rmse_interval
 
 # ---------------------------------------------------------------------------------------------- closed forms
 
@@ -49,6 +51,20 @@ def test_columns_are_their_formulas(dim, repeats):
     assert summary.finite_fraction == 1.0
     assert 0.0 <= summary.bias_low <= summary.bias <= summary.bias_high
     assert summary.variance_low <= summary.variance <= summary.variance_high
+
+
+def test_an_rmse_is_at_least_the_standard_deviation_also_where_the_reference_errs_more():
+    """The squared distance less the reference's own error may be negative: it was cut at 0, outside the interval."""
+    rng, found = np.random.default_rng(12), []
+    for _ in range(50):
+        batches = 1.0 + 3.0 * rng.standard_normal((8, 2))
+        one = summarise(1.0 + 0.1 * rng.standard_normal((16, 2)), Truth.from_batches(batches), 4)
+        found.append(dataclasses.asdict(one))
+    rows = pd.DataFrame(found)
+    low, high = rmse_interval(rows)
+    assert (rows["bias"] == 0.0).sum() > 10
+    assert (rows["rmse"] >= (1.0 - 1e-12) * np.sqrt(rows["variance"])).all()
+    assert ((low * rows["reference_norm"] <= rows["rmse"]) & (rows["rmse"] <= high * rows["reference_norm"])).all()
 
 
 def test_reference_by_batches_is_its_mean_and_covariance():
@@ -141,7 +157,7 @@ EDGES = {
     "7% off": (ROUNDED * 1.07, [0.1, -7.0, 3.0], 3, dict(bias_low=0), "identical"),
     "zero": (np.zeros((4, 2)), [0, 0], 10, dict(bias=0, bias_low=0, bias_high=0, rmse=0, variance=0), "identical"),
     "zero reference": (CENTRED, [0, 0], 1, dict(bias_rel=NAN, rmse_rel=NAN, cosine=NAN, sign_agreement=NAN), ""),
-    "one repeat": (np.array([[1.0, 2.0]]), [1, 0], 1, dict(variance=NAN, bias=NAN, bias_high=NAN, rmse=2), "1 repeat"),
+    "one repeat": (np.array([[1.0, 2.0]]), [1, 0], 1, dict(variance=NAN, bias=NAN, bias_high=NAN, rmse=NAN), "1 repeat"),
     "one that differs": (SPIKE, [1, 1], 1, dict(variance_low=0, variance_high=math.inf), "heavy tails"),
     # only the first coordinate has a sign to agree with
     "directions": (
@@ -175,6 +191,22 @@ def test_identical_estimates_against_a_sampled_reference_keep_its_error():
     assert summary.bias_low == 0
     assert summary.bias_high > truth.standard_error
     assert "identical" in summary.note
+
+
+def test_identical_estimates_that_depend_on_no_draw_allow_for_no_rare_event():
+    batches = np.random.default_rng(10).standard_normal((30, 2)) + 1.0
+    truth = Truth.from_batches(batches)
+    summary = summarise(np.ones((20, 2)), truth, 5, is_random=False)
+    assert (summary.variance, summary.variance_high) == (0.0, 0.0)
+    assert "identical" not in summary.note
+    assert summary.bias_high == bias_interval(np.ones(2) - truth.mean, *truth.errors)[2]
+    exact = summarise(np.ones((20, 2)), Truth.exact(np.array([1.0, 2.0])), 5, is_random=False)
+    assert (exact.bias, exact.bias_low, exact.bias_high) == (1.0, 1.0, 1.0)
+
+
+def test_differing_estimates_have_intervals_whatever_their_estimator_declares():
+    truth = Truth.exact(np.ones(2))
+    assert summarise(CENTRED, truth, 5, is_random=False) == summarise(CENTRED, truth, 5)
 
 
 def test_a_bias_above_the_rule_of_three_is_one():

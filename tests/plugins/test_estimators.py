@@ -15,6 +15,8 @@ from classes import (
     Numpy,
     Orthogonal,
     Penalty,
+    Plain,
+    PlainDifference,
     Pushing,
     RandomizedSmoothing,
     Reinforce,
@@ -23,11 +25,14 @@ from classes import (
     SphereSmoothing,
     Torch,
 )
+from helpers import loaded
 
+import bench
 from bench.measure import noise
 from bench.measure.reference import certify
 from bench.measure.statistics import summarise
 from bench.model import compose
+from bench.run.session import Session
 
 SIGMA, SAMPLES, REPEATS = 0.1, 200, 400
 
@@ -40,11 +45,13 @@ def test_confidence_radius_uses_the_failure_probability():
     scene, n = SoftHeaviside(nu=0.2), 400
     problem = Torch().compile(compose(scene))
     w = noise.draw(3, scene.name, 1, n, 1, "cells")
-    zeroth = Reinforce().estimate(problem, scene.theta0(), w[:, n // 2 :])
-    terms = np.array([Reinforce().estimate(problem, scene.theta0(), w[:, i : i + 1])[0, 0] for i in range(n // 2, n)])
+    centred = Reinforce(baseline="center")
+    zeroth = centred.estimate(problem, scene.theta0(), w[:, n // 2 :])
+    terms = np.array([centred.estimate(problem, scene.theta0(), w[:, i : i + 1])[0, 0] for i in range(n // 2, n)])
     log_term = math.log(2 / 0.05)
     eps = math.sqrt(2 * terms.var(ddof=1) * log_term / (n // 2)) + 2 * abs(terms).max() / (3 * (n // 2)) * log_term
-    below, above = (AlphaOrder(gamma=eps * factor).estimate(problem, scene.theta0(), w) for factor in (0.999, 1.001))
+    methods = (AlphaOrder(gamma=eps * factor, sharing="split") for factor in (0.999, 1.001))
+    below, above = (method.estimate(problem, scene.theta0(), w) for method in methods)
     assert below == pytest.approx(zeroth, rel=1e-12)
     assert above[0, 0] != below[0, 0]
     assert abs(above - below).max() <= 0.0011 * eps
@@ -69,9 +76,10 @@ def test_the_default_accuracy_leaves_alpha_order_its_first_order_share(stiffness
 def test_sharing_takes_every_sample_for_both_orders():
     problem = Torch().compile(compose(SoftHeaviside(nu=0.2)))
     theta, w = problem.program.theta0, noise.draw(5, "shared", 3, 64, 1, "cells")
-    shared, decided = AlphaOrder(sharing="shared").estimate_with_diagnostics(problem, theta, w)
+    shared, decided = AlphaOrder().estimate_with_diagnostics(problem, theta, w)
     alpha = decided["alpha"][:, None]
-    expected = alpha * Fobg().estimate(problem, theta, w) + (1 - alpha) * Reinforce().estimate(problem, theta, w)
+    zeroth = Reinforce(baseline="center").estimate(problem, theta, w)
+    expected = alpha * Fobg().estimate(problem, theta, w) + (1 - alpha) * zeroth
     np.testing.assert_allclose(shared, expected, rtol=1e-12)
     assert (alpha > 0).all()
 
@@ -116,3 +124,29 @@ def test_clipping_a_batch_cuts_its_norm():
     values, decided = Clipped(by="batch", limit=0.5).estimate_with_diagnostics(problem, problem.program.theta0, w)
     assert np.linalg.norm(values, axis=1) == pytest.approx(0.5)
     assert (decided["cut"] == 1).all()
+
+
+@pytest.mark.parametrize(("estimator", "gradients", "rollouts"), [(Plain(), 1, 0), (PlainDifference(), 0, 12)], ids=str)
+def test_the_plain_gradient_takes_one_draw_of_the_scenes_own_noise_and_no_other(estimator, gradients, rollouts):
+    problem = bench.problem("cartpole_swing[horizon=5]", backend="torch")
+    theta, w = problem.program.theta0, noise.draw(0, "plain", 3, 8, problem.program.n_noise, "cells")
+    problem.reset_usage()
+    found = estimator.estimate(problem, theta, w)
+    assert (problem.usage.gradients, problem.usage.rollouts) == (3 * gradients, 3 * rollouts)
+    own = np.where(np.arange(w.shape[2]) < w.shape[2] - problem.program.exogenous, 0.0, w[:, 0]).T
+    np.testing.assert_allclose(found, problem.grad(theta, own).T, rtol=1e-6)  # differences agree to 9 digits
+    assert len(np.unique(found[:, 0])) == 3
+
+
+@pytest.mark.parametrize("estimator", ["plain", "plain_difference"])
+@pytest.mark.parametrize("scene", ["pushing[horizon=5]", "heaviside[theta=0.05]"])
+def test_a_row_of_the_plain_gradient_has_no_variance_and_no_remark(estimator, scene, tmp_path):
+    made, (cell,) = loaded(
+        f"scenes=[{scene}]", "backends=[numpy]", f"estimators=[{estimator}]", "samples=8", "repeats=4", "timing=false",
+        "reference.samples=4096", f"results_dir={tmp_path}",
+    )  # fmt: skip
+    row = made.study.measure(cell, Session(made))
+    assert (row["variance"], row["variance_high"]) == (0.0, 0.0)
+    assert row["bias_low"] <= row["bias"] <= row["bias_high"]
+    assert row["gradients"] + row["rollouts"] == (1 if estimator == "plain" else 2 * len(row["point"]))
+    assert "identical" not in row["reason"]

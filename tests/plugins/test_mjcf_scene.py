@@ -120,6 +120,7 @@ BAD = [
     (NO_COST, {}, "defines no function stage_cost"),
     ({"<body>": "<bdy>"}, {}, r"cannot be read: (.|\n)*bdy"),
     (PASSIVE, {}, "no actuators for a policy: use theta=velocity"),
+    (PASSIVE, {"theta": "velocity"}, "no actuators for noise=action: use noise=parameter"),
     ({}, {"backend": "mjx"}, r"use mjx\[iterations=20\]"),
     ({}, {"backend": "mjx[derivative=unrolled]"}, r"use mjx\[iterations=20\]"),
     ({}, {"backend": "mjx[iterations=5,derivative=unrolled,mode=reverse]"}, "no reverse mode with iterations=5"),

@@ -63,10 +63,19 @@ def finding(text):
 
 
 def test_the_page_shows_what_to_use_where():
-    given = {"scene": "one", "estimator": "good", "rmse_rel": 0.1}
-    rows = [row(**given | {"stiffness": k}) for k in (10.0, 100.0, 1000.0)]
-    rows += [row(**given | {"stiffness": k, "estimator": "other", "rmse_rel": 0.5}) for k in (10.0, 100.0)]
-    rows += [row(**given | {"stiffness": 1000.0, "estimator": "other", "rmse_rel": 0.04})]
+    def cell(stiffness, estimator, error):
+        squares = {
+            f"variance{end}": (4.0 * error * share) ** 2 for end, share in (("", 1.0), ("_low", 0.9), ("_high", 1.1))
+        }
+        unbiased = dict.fromkeys(("bias", "bias_low", "bias_high"), 0.0)
+        return (
+            row(scene="one", stiffness=stiffness, estimator=estimator, rmse_rel=error, reference_norm=4.0)
+            | squares
+            | unbiased
+        )
+
+    rows = [cell(k, "good", 0.1) for k in (10.0, 100.0, 1000.0)]
+    rows += [cell(k, "other", 0.5) for k in (10.0, 100.0)] + [cell(1000.0, "other", 0.04)]
     rows = table(rows)
     text = page(rows, sweep={"stiffness": [10.0, 100.0, 1000.0]}, marks={})
     assert "stiffness 10, 100<" in text

@@ -12,7 +12,8 @@ import pandas as pd
 import pytest
 from bench.plugins.studies.bias_variance import views as tables
 from bench.plugins.studies.bias_variance.columns import TABLE
-from bench.plugins.studies.bias_variance.comparisons import problems_by_axis
+from bench.plugins.studies.bias_variance.comparisons import at_equal_rollouts, lowest, method_table, problems_by_axis
+from bench.plugins.studies.bias_variance.time_to_accuracy import with_gradient_cost
 from helpers import (
     BACKENDS,
     NAMES,
@@ -29,6 +30,7 @@ from helpers import (
 from matplotlib.figure import Figure
 from trees import ROOT
 
+import bench
 from bench.experiment import config
 from bench.experiment.axes import axes
 from bench.report import latex, views, writer
@@ -83,7 +85,7 @@ def test_pareto_is_what_brute_force_finds():
 
 def test_a_chart_of_speed_and_accuracy_marks_the_pareto_front():
     swept = config.load(["experiment=stiffness_sweep"])
-    shown = swept.study.views(swept, pd.read_parquet(ROOT / "results/standard/stiffness_sweep" / "rows.parquet"))
+    shown = swept.study.views(swept, bench.load(ROOT / "results/standard/stiffness_sweep"))
     chart = next(c for c in shown.charts if c.name == "speed_accuracy")
     lines = [line for axes in draw(chart).axes for line in axes.lines if line.get_linestyle() == "--"]
     assert len(lines) == chart.frame["panel"].nunique()
@@ -119,7 +121,7 @@ def test_text_is_escaped_in_every_format(made):
     assert "<script>" not in markdown
     assert "](http" not in markdown
     body = [line for line in markdown.splitlines() if line.startswith("|")]
-    assert {len(re.findall(r"(?<!\\)\|", line)) for line in body} == {3}
+    assert {len(re.findall(r"(?<!\\)\|", line)) for line in body} == {5}
     text = (made.directory / "bias_variance.tex").read_text()
     plain = re.sub(
         r"\\[a-zA-Z]+(\{\})?|\\[&%$#_{}]|\$[<>|]\$", "", "\n".join(text.replace(latex.FIT, "").splitlines()[4:])
@@ -322,7 +324,11 @@ def test_equal_figures_are_equal_files_with_their_fonts_inside(tmp_path):
 
 def test_best_is_told_only_where_its_interval_is_apart_from_every_other_estimator():
     def rows(other):
-        made = [row(estimator=name, backend=backend) for name in ("fobg", "reinforce") for backend in ("jax", "torch")]
+        made = [
+            row(estimator=name, backend=backend, gradients=0)
+            for name in ("fobg", "reinforce")
+            for backend in ("jax", "torch")
+        ]
         known = table(made)
         known[["bias_low", "bias_high"]] = 0.0
         ends = {"fobg": (1.0, 2.0), "reinforce": other}
@@ -343,8 +349,8 @@ def test_best_is_told_only_where_its_interval_is_apart_from_every_other_estimato
 
 def paper(rows, **settings):
     """The tables of a paper from rows, one per problem."""
-    found = experiment(**settings)
-    return tables.pivots(views.arrange(found, rows))
+    found = views.arrange(experiment(**settings), with_gradient_cost(rows))
+    return tables.pivots(found, lowest(at_equal_rollouts(method_table(found))))
 
 
 def test_the_papers_table_continues_below_and_loses_no_column():
@@ -353,7 +359,7 @@ def test_the_papers_table_continues_below_and_loses_no_column():
     text = latex.latex(made, "made")
     heads = re.findall(r"toprule\n & (.*) \\\\", text)
     assert [head for line in heads for head in line.split(" & ")] == [column.heading for column in made[0].columns[1:]]
-    assert len(heads) == text.count(r"\resizebox") == math.ceil(50 / latex.COLUMNS)
+    assert len(heads) == text.count(r"\resizebox") == math.ceil(52 / latex.COLUMNS)
 
 
 @pytest.mark.skipif(shutil.which("pdflatex") is None, reason="no pdflatex: apt-get install texlive-science")

@@ -104,6 +104,16 @@ def test_a_table_with_rows_that_are_left_out_is_kept_when_it_is_replaced(tmp_pat
     assert "is kept as" in capsys.readouterr().err
 
 
+def test_an_rmse_follows_from_bias_and_variance_whatever_was_stored(tmp_path):
+    rows = table([row(seed=0), row(seed=1, rmse_rel=math.nan)]).assign(
+        bias=3.0, variance=16.0, reference_norm=2.0, rmse=0.0
+    )
+    rows.to_parquet(tmp_path / "rows.parquet")
+    loaded = Store(tmp_path, COLUMNS).load()
+    assert loaded["rmse"].tolist() == [5.0, 5.0]
+    assert loaded["rmse_rel"].tolist() == pytest.approx([2.5, math.nan], nan_ok=True)  # a reference that may be 0
+
+
 def test_a_table_without_rows_is_empty(tmp_path):
     table([row()]).iloc[:0].to_parquet(tmp_path / "rows.parquet")
     assert Store(tmp_path, COLUMNS).load().empty

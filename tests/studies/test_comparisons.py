@@ -9,14 +9,17 @@ from bench.plugins.studies.bias_variance.comparisons import (
     NO_RESULT,
     OPEN,
     WORKS,
+    at_equal_rollouts,
     compare_errors,
     leaders,
     method_table,
     ratio,
     verdict,
 )
+from bench.plugins.studies.bias_variance.time_to_accuracy import with_gradient_cost
 from helpers import experiment, failed, row, table
 
+from bench.report.cells import readable
 from bench.report.views import arrange
 
 
@@ -32,12 +35,12 @@ def cell(error, low, high, **values):
 
 def made(*cells, **given):
     """Methods and comparisons of cells along the stiffness."""
-    rows = table(list(cells))
+    rows = with_gradient_cost(table(list(cells)))
     found = arrange(
         experiment(**({"sweep": {"stiffness": sorted(map(float, rows["stiffness"].unique()))}} | given)), rows
     )
     methods = method_table(found)
-    return methods, compare_errors(methods)
+    return methods, compare_errors(at_equal_rollouts(methods))
 
 
 # ------------------------------------------------------------------------------------ verdicts and comparisons
@@ -69,7 +72,7 @@ def test_the_interval_of_a_factor_covers():
 
 def test_methods_are_tied_unless_the_interval_of_their_factor_is_above_1():
     _, compared = made(
-        *(cell(e, 0.9 * e, 1.1 * e, stiffness=k, estimator=n) for k in (1e2, 1e4)
+        *(cell(e, 0.9 * e, 1.1 * e, stiffness=k, estimator=n, gradients=0) for k in (1e2, 1e4)
           for n, e in (("fobg", 0.10), ("reinforce", 0.105), ("finite_difference", 0.4)))
     )  # fmt: skip
     assert list(compared["first"]) == ["fobg", "fobg"]
@@ -117,27 +120,78 @@ def by_samples(estimator, rollouts, gradients=0.0, scale=1.0):
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("gradients", "rollouts"), [(1, 2), (0, 1)])
-def test_gradients_and_costs_of_one_rollout_per_sample_are_compared_at_equal_samples(gradients, rollouts):
-    cells = [*by_samples("a", 1 - gradients, gradients), *by_samples("b", rollouts, scale=3.0)]
-    _, compared = made(*cells, sweep={"samples": [64, 128]})
-    assert compared["at"].tolist() == [64, 128]
-    assert set(compared["basis"]) == {"relative RMSE at equal samples"}
-
-
 def test_costs_of_several_rollouts_per_sample_are_compared_at_equal_rollouts():
     """At equal samples `b` has 1 / 1.2 of the error of `a`, at equal rollouts 1.18 times."""
-    cells = [*by_samples("a", 1), *by_samples("b", 2, scale=1 / 1.2)]
+    cells = [*by_samples("fobg", 1), *by_samples("reinforce", 2, scale=1 / 1.2)]
     _, compared = made(*cells, sweep={"samples": [64, 128]})
     assert compared[["axis", "at", "basis", "first", "second"]].values.tolist() == [
-        ["rollouts", 128.0, "relative RMSE at equal rollouts", "a", "b"]
+        ["rollouts", at, "relative RMSE at equal rollouts", "fobg", "reinforce"] for at in (128.0, 256.0)
     ]
-    assert compared["factor"].iloc[0] == pytest.approx(math.sqrt(2) / 1.2)
+    assert compared["factor"].tolist() == pytest.approx([math.sqrt(2) / 1.2] * 2, rel=1e-3)
+
+
+RESCALED = {0.0: math.sqrt(2.0), 0.2: math.hypot(0.2, 0.3 * math.sqrt(2.0)) / math.hypot(0.2, 0.3)}
+
+
+@pytest.mark.parametrize("bias", RESCALED)
+def test_at_one_number_of_samples_variances_are_rescaled_and_biases_stay(bias):
+    """Both have the same error at 100 samples, which are 100 and 200 rollouts."""
+    given = {"bias": 4 * bias, "bias_low": 3.9 * bias, "bias_high": 4.1 * bias}
+    _, compared = made(
+        *(cell(0.3, 0.29, 0.31, stiffness=1e2, estimator=name, rollouts=n, gradients=0) | given
+          for name, n in (("fobg", 100), ("randomized_smoothing", 200)))
+    )  # fmt: skip
+    assert compared[["first", "rollouts"]].values.tolist() == [["fobg", 100]]
+    assert compared["factor"].item() == pytest.approx(RESCALED[bias])
+
+
+@pytest.mark.parametrize(
+    ("estimator", "given"),
+    [("sobol", {}), ("inverse_variance", {"bias": 0.4, "bias_low": 0.3, "bias_high": 0.5})],
+    ids=["coupled samples", "weights by sample"],
+)
+def test_where_no_law_gives_the_error_at_equal_rollouts_that_at_fewer_stands(estimator, given):
+    """Fewer rollouts than all may take are allowed, and the most that a method takes are the rollouts of the comparison."""
+
+    def of(name, rollouts, error=0.3, **values):
+        ends = (0.95 * error, 1.05 * error)
+        return cell(error, *ends, stiffness=1e2, rollouts=rollouts, gradients=0, estimator=name) | values
+
+    _, compared = made(of(estimator, 200, **given), of("fobg", 100, 0.1))
+    assert compared[["first", "rollouts"]].values.tolist() == [["fobg", 200]]
+    _, compared = made(of(estimator, 200, **given), of("orthogonal", 100, 0.1))
+    assert compared[["first", "rollouts", "not_comparable"]].values.tolist() == [["orthogonal", 200, ()]]
+
+
+def test_a_method_is_not_beaten_by_one_that_is_scaled_above_its_own_rollouts():
+    """With as many rollouts its error might be lower, so it ties; with a lower error at fewer rollouts it is first."""
+
+    def of(name, rollouts, error, **values):
+        return (
+            cell(error, 0.95 * error, 1.05 * error, stiffness=1e2, rollouts=rollouts, gradients=0, estimator=name)
+            | values
+        )
+
+    _, compared = made(of("sobol", 100, 0.3), of("fobg", 100, 0.3), of("guided", 400, 0.9))
+    assert compared[["first", "rollouts", "tied"]].values.tolist() == [["fobg", 400, ("sobol",)]]
+    _, compared = made(of("sobol", 100, 0.1), of("fobg", 100, 0.3), of("guided", 400, 0.9))
+    assert compared["first"].item() == "sobol"
+
+
+FIXED = "plain_difference"
+
+
+@pytest.mark.parametrize(("rollouts", "compared_at"), [(100.0, 128.0), (200.0, 200.0)])
+def test_costs_that_do_not_grow_with_samples_are_compared_where_the_rollouts_suffice(rollouts, compared_at):
+    fixed = [one | {"rollouts": rollouts} for one in by_samples(FIXED, 1, scale=0.1)]
+    _, compared = made(*by_samples("a", 1), *by_samples("b", 2), *fixed, sweep={"samples": [64, 128]})
+    expected = [["rollouts", compared_at, FIXED], ["rollouts", 256.0, FIXED]]
+    assert compared[["axis", "at", "first"]].values.tolist() == expected
 
 
 def test_a_far_larger_error_does_not_share_the_first_place_of_an_error_that_is_not_sure():
     """fobg 0.90 [0.87, 0.92] is tied with smoothing 0.17 [0.10, 1.7], whose interval is wide: fobg is no leader there."""
-    exact = {"reference_norm": 1.0, "variance_low": 0.0, "variance_high": 0.0}
+    exact = {"reference_norm": 1.0, "variance": 0.0, "variance_low": 0.0, "variance_high": 0.0}
     biased = exact | {"rmse_rel": 0.9, "bias": 0.9, "bias_low": 0.87, "bias_high": 0.92}
     wide = exact | {"rmse_rel": 0.17, "bias": 0.17, "bias_low": 0.1, "bias_high": 1.7}
     good = exact | {"rmse_rel": 0.14, "bias": 0.14, "bias_low": 0.13, "bias_high": 0.15}
@@ -146,3 +200,47 @@ def test_a_far_larger_error_does_not_share_the_first_place_of_an_error_that_is_n
         row(stiffness=2.0, estimator="fobg", **biased), row(stiffness=2.0, estimator="smooth", **wide),
     )  # fmt: skip
     assert list(leaders(compared, methods)) == [("fobg", "smooth"), ("smooth",)]
+
+
+def vague(low, high, **values):
+    """A row without a distinguishable bias whose reference errs more than the estimates spread: an upper limit of the RMSE."""
+    return cell(0.01, low, 0.02, **values) | {"bias_high": 4.0 * high, "reference_se": 0.2}
+
+
+def test_an_upper_limit_is_shown_and_never_first_nor_bold():
+    """It was 0, dropped by log axes, or first by the luck of the reference's error."""
+    cells = [
+        *(vague(0.001, 0.1, stiffness=k, estimator="fobg") for k in (1e2, 1e4)),
+        *(cell(e, 0.9 * e, 1.1 * e, stiffness=k, estimator="reinforce") for k, e in ((1e2, 0.1), (1e4, 0.3))),
+    ]
+    methods, compared = made(*cells)
+    assert list(compared["first"]) == ["reinforce", ""], "the limit is below the other's interval at 1e4"
+    assert list(compared["tied"]) == [("fobg",)] * 2
+    assert list(leaders(compared, methods)) == [("reinforce", "fobg"), ("fobg",)]
+    assert compared["factor"].isna().all()
+    limit = math.hypot(0.1, 0.02)
+    assert methods.loc[methods["error_is_limit"], "error"].tolist() == pytest.approx([limit] * 2)
+    shown = experiment(sweep={"stiffness": [1e2, 1e4]})
+    (main, *_), (chart, *_) = (lambda views: (views.tables, views.charts))(shown.study.views(shown, table(cells)))
+    assert readable(main).iloc[0, 1:3].tolist() == ["< 0.10"] * 2
+    assert not any(main.frame[f"x{i}_best"].any() for i in (0, 1))
+    drawn = chart.frame[chart.frame["series"] == "fobg"]
+    assert drawn["rmse_limit"].all()
+    assert drawn["rmse_rel"].tolist() == pytest.approx([limit] * 2)
+
+
+def test_a_lucky_estimate_equal_to_an_exact_reference_is_a_limit_too():
+    """Identical estimates leave room for a rare event, so their error is not 0."""
+    exact = {
+        "bias": 0.0,
+        "bias_low": 0.0,
+        "bias_high": 0.04,
+        "variance": 0.0,
+        "variance_low": 0.0,
+        "variance_high": 1e-4,
+    }
+    methods, compared = made(
+        row(reference_norm=1.0, stiffness=1e2, **exact), cell(0.3, 0.2, 0.4, stiffness=1e2, estimator="b")
+    )
+    assert methods["error"].iloc[0] == pytest.approx(math.hypot(0.04, 0.01))
+    assert compared[["first", "tied"]].values.tolist() == [["", ("fobg",)]]

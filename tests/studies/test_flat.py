@@ -28,7 +28,8 @@ def made(cell):
 
 
 @pytest.mark.parametrize(
-    "estimator", ["fobg", "reinforce", "reinforce[baseline=leave_one_out]", "randomized_smoothing", "inverse_variance"]
+    "estimator",
+    ["fobg", "reinforce", "reinforce[baseline=center]", "randomized_smoothing", "inverse_variance", "plain"],
 )
 def test_estimates_in_parts_are_those_in_one_go(estimator, monkeypatch):
     cell = cell_of(estimator)

@@ -8,6 +8,7 @@ from bench.plugins.studies.optimise.measure import advance, estimates, mean_cost
 from helpers import loaded
 
 import bench
+from bench.experiment.by_name import make
 from bench.measure import noise
 from bench.model import registry
 from bench.run.session import Session
@@ -19,7 +20,7 @@ def drawn(seed, count, width, what):
 
 def descended(estimator, sigma, optimizer, seeds, iterations=30):
     """The costs at w = 0 after so many steps of a pendulum's search, of which step i has gradients of noise sigma / i."""
-    estimator, optimizer, found = registry.make("estimators", estimator), registry.make("optimizers", *optimizer), []
+    estimator, optimizer, found = make("estimators", estimator), registry.make("optimizers", *optimizer), []
     problem = bench.problem("pendulum_swing[dt=0.02]", backend="jax")
     size = problem.program.n_noise
     still = np.zeros((size, 1))
@@ -40,7 +41,7 @@ def descended(estimator, sigma, optimizer, seeds, iterations=30):
 
 METHODS = {
     "fobg": ("fobg", 5.0, ("gradient_descent", {"rate": 0.01})),
-    "zeroth": ("reinforce", 0.1, ("gradient_descent", {"rate": 0.015, "decay": 0.3})),
+    "zeroth": ("reinforce[baseline=center]", 0.1, ("gradient_descent", {"rate": 0.015, "decay": 0.3})),
     "cem": ("fobg", 1.0, ("cem", {"population": 100, "elites": 20, "width": 2.0, "spread": "old"})),
 }
 """sigma 5/i at rate .01; .1/i at .015/i^.3 with the baseline at w = 0; 20 elites of 100 from a width of 2."""
@@ -59,7 +60,7 @@ def test_order_of_three_methods_at_fixed_steps():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("estimator", "low", "high"), [("fobg", 874, 877), ("reinforce", 899, 912)])
+@pytest.mark.parametrize(("estimator", "low", "high"), [("fobg", 874, 877), ("reinforce[baseline=center]", 899, 912)])
 def test_ends_with_backtracking(estimator, low, high):
     """30 steps with Armijo's rule, a gradient and a batch of costs each: gradients have sigma 1/(2 i - 1), about .5/i."""
     found = descended(estimator, 1.0, ("line_search", {}), seeds=3, iterations=60)

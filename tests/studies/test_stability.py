@@ -10,6 +10,7 @@ from bench.plugins.studies import stability
 from bench.plugins.studies.stability import Stability
 from helpers import loaded, unmeasured
 
+from bench.errors import Unsupported
 from bench.model import MechanicalScene, State, registry
 from bench.model.parameters import build
 from bench.run import tasks
@@ -153,6 +154,13 @@ def test_scenes_without_time_steps_are_unsupported():
     (row,) = measured("scenes=[quadratic]", "backends=[jax]").to_dict("records")
     assert row["status"] == "unsupported"
     assert "no time steps" in row["reason"]
+
+
+@pytest.mark.parametrize("words", [(), (f"theta0={[0.1] * 30}",)])
+def test_a_theta_that_depends_on_the_horizon_has_no_finer_step(words):
+    _, (cell,) = cells_of("scenes=[pushing]", *words)
+    with pytest.raises(Unsupported, match="depends on the horizon"):
+        stability._refined(cell, 60)
 
 
 def test_contact_springs_are_oscillators_while_they_last():

@@ -29,7 +29,7 @@ def rows(bias=0.0, resolved=None, **values):
     resolved = bias > 0 if resolved is None else resolved
     return pd.DataFrame([
         row(**{
-            "backend": "b", "estimator": "e", "repeats": 8, "samples": float(n), "reference_norm": 2.0, "bias": 2 * bias,
+            "backend": "b", "estimator": "e", "draws": "iid", "repeats": 8, "samples": float(n), "reference_norm": 2.0, "bias": 2 * bias,
             "bias_low": 1.9 * bias if resolved else 0.0, "bias_high": 2.1 * bias,
             **dict.fromkeys(("variance", "variance_low", "variance_high"), 4 * VARIANCE / n),
             "rmse": 2 * math.sqrt(bias**2 + VARIANCE / n), "rmse_rel": math.sqrt(bias**2 + VARIANCE / n), "time_s": 1e-3 * n,
@@ -73,6 +73,11 @@ def test_unbiased_methods_follow_the_law(target, how, samples):
     assert found.samples == pytest.approx(samples)
     assert found.cost == pytest.approx(1e-3 * samples)
     assert required_cost(line(), target, ROLLOUTS).cost == pytest.approx(2 * samples)
+
+
+def test_work_that_does_not_grow_with_samples_is_not_extrapolated():
+    found = required_cost(line(rollouts=1.0, gradients=0.0), 0.1, ROLLOUTS)
+    assert (found.how, found.beyond) == ("unknown", 1.0)
 
 
 def test_the_cheapest_sufficient_samples_are_taken_not_the_fewest():

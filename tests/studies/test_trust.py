@@ -10,7 +10,7 @@ def rows():
     made = table([row(seed=i) for i in range(4)])
     return made.assign(
         rmse_rel=[0.1, 2.0, 1.0, 0.2], grad_norm=[1.0, 1.0, 0.0, 1.0], variance=[0.01, 4.0, 0.0, 0.04],
-        reason=["", "", "", "heavy tails"],
+        bias=[0.0, 0.0, 1.0, 0.0], reference_norm=1.0, reason=["", "", "", "heavy tails"],
     )  # fmt: skip
 
 

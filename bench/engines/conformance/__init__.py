@@ -3,6 +3,7 @@
 The folder needs NumPy only and imports nothing of this package, so that it can be copied.
 """
 
-from .runner import Case, cases, check, run
+from . import metamorphic
+from .runner import Case, cases, check, run, verify
 
-__all__ = ["Case", "cases", "check", "run"]
+__all__ = ["Case", "cases", "check", "metamorphic", "run", "verify"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import json
 import runpy
 import sys
@@ -20,9 +21,15 @@ LADDER = 10.0 ** np.arange(-2.0, -7.1, -0.5)
 DOUBTS = 10.0
 """How many times its uncertainty a derivative may be off."""
 UNCERTAIN = 0.01
-"""Largest such margin, relative to the derivative, at which it is judged."""
+"""Largest such margin, relative to the derivative, at which it is right. At any margin it is wrong if it is off by more."""
 EXPLAINED = 0.1
 """Largest distance to a fault's numbers, as a share of the distance to the right ones, at which an engine has the fault."""
+TOLERANCES = {"float64": 1e-6, "float32": 1e-3}
+"""Relative tolerances by name. A penetration of 0.1 mm, 1 m from the origin, has 3 digits in float32."""
+COLUMNS = (
+    "case", "term", "is_right", "digits", "ratio", "component", "expected", "obtained", "uncertainty", "looks_like",
+    "against", "seconds", "reason",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -59,8 +66,8 @@ class Case:
             new[i : i + 4] /= np.linalg.norm(new[i : i + 4])
         return replace(self, **{term: new})
 
-    def differences(self, engine: Any, term: str) -> tuple[np.ndarray, float]:
-        """Return the derivative by central differences of the engine's own costs, and its uncertainty.
+    def differences(self, engine: Any, term: str) -> tuple[np.ndarray, np.ndarray]:
+        """Return the derivative by central differences of the engine's own costs, and each component's uncertainty.
 
         Each component takes the neighbouring steps of the ladder whose extrapolated differences agree best. Their disagreement
         is the uncertainty, or the disagreement at a smaller step if that is larger for its step: rounding grows as 1 / step. Steps
@@ -78,17 +85,21 @@ class Case:
         gaps = np.maximum.accumulate(gaps[::-1])[::-1] / steps[2:, None]
         gaps[(slopes[2:] == 0) & slopes.any(axis=0)] = np.inf
         best = gaps.argmin(axis=0)[None]
-        return np.take_along_axis(better[1:], best, 0)[0], float(np.take_along_axis(gaps, best, 0).max(initial=0.0))
+        return np.take_along_axis(better[1:], best, 0)[0], np.take_along_axis(gaps, best, 0)[0]
 
 
 def cases(*names: str) -> list[Case]:
-    """Return the named cases, or all."""
-    result = []
-    for file in [FOLDER / f"{name}.json" for name in names] or sorted(FOLDER.glob("*.json")):
+    """Return the named cases, or all. Raises :class:`ValueError` for a name that is not a case's."""
+    result, known = [], sorted(file.stem for file in FOLDER.glob("*.json"))
+    for name in names or known:
+        if name not in known:
+            near = "".join(f", did you mean {other}?" for other in difflib.get_close_matches(name, known, 1))
+            raise ValueError(f"there is no case {name!r}{near}; cases: {', '.join(known)}")
+        file = FOLDER / f"{name}.json"
         data = json.loads(file.read_text())
         given = (*(data[term] for term in TERMS[:3]), data["parameter"]["value"])
         inputs = (np.array(values, dtype=float) for values in given)
-        result.append(Case(file.stem, file.with_suffix(".xml"), data, *inputs))
+        result.append(Case(name, file.with_suffix(".xml"), data, *inputs))
     return result
 
 
@@ -97,8 +108,8 @@ def check(engine: Any, case: Case) -> list[dict[str, Any]]:
 
     A case in ``engine.differs``, with its reason, is compared with the engine's own differences.
     """
-    row: dict[str, Any] = {"case": case.name, "term": "all", "is_right": None, "digits": None, "looks_like": ""}
-    row |= {"against": "", "seconds": None, "reason": ""}
+    row: dict[str, Any] = dict.fromkeys(COLUMNS)
+    row |= {"case": case.name, "term": "all", "looks_like": "", "against": "", "reason": ""}
     started = time.perf_counter()
     try:
         results = {"value": engine.rollout(case), **engine.gradient(case)}
@@ -111,25 +122,72 @@ def check(engine: Any, case: Case) -> list[dict[str, Any]]:
 
 
 def _verdict(engine: Any, case: Case, term: str, found: Any, differs: str) -> dict[str, Any]:
-    """Return whether a value or derivative is right, its digits of agreement, and the faults that it looks like."""
+    """Return the columns of a value or derivative that depend on its numbers."""
     result = np.ravel(np.array(found, dtype=float))
     if term == "qpos" and result.size > case.qvel.size:
         result = result @ case.tangent()
     expected, doubt, faults = (case.data[name] for name in ("expected", "certainty", "faults"))
+    others = {other: np.ravel(numbers) for other, numbers in expected.items() if other != term}
     expected, doubt = np.ravel(expected[term]), doubt[term]
     if differs:
         expected, doubt = (expected, np.inf) if term == "value" else case.differences(engine, term)
-        faults = {}
+        faults = others = {}
     if result.size != expected.size:
         return {"is_right": False, "reason": f"{result.size} numbers instead of {expected.size}"}
-    off, scale, margin = np.abs(result - expected).max(), np.abs(expected).max(initial=1e-9), DOUBTS * doubt
-    is_right = off <= getattr(engine, "tolerance", 1e-6) * scale + margin
+    tolerance = getattr(engine, "tolerance", "float64")
+    error, scale, margin = (
+        np.abs(result - expected),
+        np.abs(expected).max(initial=1e-9),
+        DOUBTS * (doubt + 0.0 * expected),
+    )
+    is_off = error > TOLERANCES.get(tolerance, tolerance) * scale + margin
+    off, worst = error.max(), int(np.where(is_off.any(), error * is_off, error).argmax())
+    is_known, is_wrong = bool(np.isfinite(expected).all()), not np.isfinite(result).all() or bool(is_off.any())
+    is_right = False if is_wrong else True if is_known and margin.max() <= UNCERTAIN * scale else None
     near = [name for name, by in faults.items() if np.abs(result - by.get(term, np.inf)).max() <= EXPLAINED * off]
-    return {
-        "is_right": bool(is_right) if margin <= UNCERTAIN * scale else None,
-        "digits": round(float(-np.log10(max(off / scale, 1e-16))), 1) if np.isfinite(off) else None,
-        "looks_like": "" if is_right else " or ".join(near),
+    ratio = result @ expected / (expected @ expected) if expected.any() else np.nan
+    numbers = {
+        "ratio": ratio,
+        "expected": expected[worst],
+        "obtained": result[worst],
+        "uncertainty": margin[worst] / DOUBTS,
     }
+    return {
+        "is_right": is_right,
+        "digits": round(float(-np.log10(max(off / scale, 1e-16))), 1) if np.isfinite(off) else None,
+        **{name: float(f"{number:.12g}") if np.isfinite(number) else None for name, number in numbers.items()},
+        "component": worst,
+        "looks_like": " or ".join(near) if is_wrong else "",
+        **({} if is_known else {"reason": "own differences are not finite"}),
+        **({"reason": _explained(term, result, expected, is_off, others)} if is_wrong else {}),
+    }
+
+
+def _explained(
+    term: str, result: np.ndarray, expected: np.ndarray, is_off: np.ndarray, others: dict[str, np.ndarray]
+) -> str:
+    """Return how wrong numbers are related to the right ones: a factor, other numbers of the case, or an order of their own."""
+    if strange := result.size - int(np.isfinite(result).sum()):
+        return f"{strange} of {result.size} numbers not finite"
+    part: Any = ...
+    where = ""
+    if 0 < is_off.sum() < is_off.size:
+        is_few = 2 * is_off.sum() <= is_off.size
+        part, where = is_off, f"{'' if is_few else ' except '}{np.flatnonzero(is_off == is_few).tolist()}"
+    for own, place in ((..., ""), (part, where)):
+        found, right = result[own], expected[own]
+        factor = found @ right / max(right @ right, 1e-300)
+        guesses = {f"{factor:.7g} times" if found.any() else "0": factor * right}
+        if not place and found.size > 1:
+            same = {f"the numbers of {other}": number for other, number in others.items() if number.size == found.size}
+            guesses |= same | {"in reverse order": right[::-1]}
+            guesses |= {f"shifted by {step:+d}": np.roll(right, step) for step in (1, -1) if found.size > 2}
+        for guess, numbers in guesses.items():
+            inner = slice(1, -1) if guess.startswith("shifted") else ...
+            if np.abs(found - numbers)[inner].max() <= EXPLAINED * np.abs(found - right)[inner].max():
+                return f"{term}{place}: {guess}" if place else guess
+    worst = (np.abs(result - expected) * is_off).argmax()
+    return f"{term}{where or [int(worst)]}: {result[worst]:.6g} instead of {expected[worst]:.6g}"
 
 
 def run(engine: Any, *names: str) -> list[dict[str, Any]]:
@@ -137,12 +195,25 @@ def run(engine: Any, *names: str) -> list[dict[str, Any]]:
     return [row for case in cases(*names) for row in check(engine, case)]
 
 
+def verify(rows: list[dict[str, Any]], judged: int = 1) -> None:
+    """Raise :class:`AssertionError` if a row is wrong, or if fewer than ``judged`` derivatives are right or wrong."""
+    texts = [f"{row['case']} {row['term']}: {row['reason']}" for row in rows if row["is_right"] is False]
+    number = sum(row["is_right"] is not None and row["term"] in TERMS for row in rows)
+    texts += [f"{number} derivatives are judged, {judged} are required"] * (number < judged)
+    if texts:
+        raise AssertionError("\n".join(texts))
+
+
 def main(path: str, *names: str) -> None:
     """Print the versions and the rows of the class ``Engine`` of a file as JSON, each on a line as soon as it is known."""
+    try:
+        own = cases(*names)
+    except ValueError as error:
+        sys.exit(str(error))
     sys.path.append(str(Path(path).parent))  # last: a file may have the name of a library
     engine = runpy.run_path(path)["Engine"]()
     print(json.dumps({"versions": getattr(engine, "versions", {})}))
-    for case in cases(*names):
+    for case in own:
         for row in check(engine, case):
             print(json.dumps(row), flush=True)
 

@@ -16,7 +16,7 @@ from bench.errors import Unsupported
 from bench.experiment.cell import Cell
 from bench.experiment.session import Session
 from bench.measure import noise
-from bench.model import Problem
+from bench.model import IID, Problem
 
 from . import DoseResponse
 from .ground import Ground, ground_of, scored_noise
@@ -86,6 +86,8 @@ def _method(cell: Cell, problem: Problem) -> tuple[Method, np.ndarray | None]:
     optimizer, estimator = search_parts(cell)
     if estimator is None:
         return Method(optimizer, None, 1), None
+    if cell.design(problem.program) != IID:
+        raise Unsupported("this study draws independent samples only: draws=iid mirrored=false")
     w = noise.draw(cell.seed, cell.scene.name, 4, cell.samples, problem.program.n_noise, "dose_response: first")
     first = estimator.estimate(problem, problem.program.theta0, w)
     if not np.isfinite(first).all():

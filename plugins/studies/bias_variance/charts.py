@@ -24,7 +24,7 @@ from bench.report.views import (
     estimator_curves,
     estimator_labels,
     pareto,
-    rmse_interval,
+    shown_rmse,
 )
 
 from .columns import COLUMNS
@@ -42,7 +42,7 @@ FEW = 3
 DISTINCT = 1.2
 """Median factor between the errors of two estimators from which a reader distinguishes their lines."""
 RMSE = Column(
-    "rmse_rel", label="relative RMSE of one estimate", low="rmse_low", high="rmse_high", log=True,
+    "rmse_rel", label="relative RMSE of one estimate", low="rmse_low", high="rmse_high", limit="rmse_limit", log=True,
     above_one="worse than the zero estimate",
 )  # fmt: skip
 BIAS = Column(
@@ -89,8 +89,9 @@ def with_plotted_columns(rows: pd.DataFrame) -> pd.DataFrame:
     """Return rows with the columns that charts draw: errors in units of |grad J|, and labels of points and lines."""
     norm = rows["reference_norm"].where(rows["reference_norm"] > 0)
     limit = ~(rows["bias_low"] > 0)
-    low, high = rmse_interval(rows)
+    error, low, high, is_limit = shown_rmse(rows)
     values = {
+        "rmse_rel": pd.Series(error, rows.index),
         "rmse_low": pd.Series(low, rows.index),
         "rmse_high": pd.Series(high, rows.index),
         "bias_shown": (rows["bias"].where(~limit, rows["bias_high"]) / norm).clip(lower=FLOOR),
@@ -101,6 +102,7 @@ def with_plotted_columns(rows: pd.DataFrame) -> pd.DataFrame:
     good = rows["status"] == "ok"
     return rows.assign(
         **{name: column.where(good) for name, column in values.items()},
+        rmse_limit=is_limit,
         bias_limit=limit,
         series=estimator_labels(rows),
         line=rows["backend"] + " " + rows["dtype"],
@@ -150,7 +152,7 @@ def _along(
         panel="panel", marks=marks, failed="failed", across=len(drawn),
         height=2.7 if len(drawn) <= 2 else 2.1,
         subtitle=", ".join(filter(None, [subtitle, *notes, *shares])),
-        text="Bars are 95% intervals. A hollow marker is the upper limit of a bias that is not distinguishable from 0.",
+        text="Bars are 95% intervals. A hollow marker is an upper limit.",
     )  # fmt: skip
 
 

@@ -6,7 +6,6 @@ A setting is a problem at one value of its swept axis. A method is an estimator,
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,24 +13,45 @@ import pandas as pd
 
 from bench.experiment.axes import Axis
 from bench.experiment.columns import Column, interval, text
+from bench.measure import statistics
+from bench.model import SampleMean, registry
 from bench.report.problems import ProblemRows, split_by_problem
-from bench.report.views import CATEGORIES, Arranged, attempted, estimator_curves, rmse_interval
+from bench.report.views import CATEGORIES, Arranged, attempted, estimator_curves, shown_rmse
+
+from .time_to_accuracy import ROLLOUTS, couples_samples
 
 WORKS, FAILS, OPEN, NO_RESULT = "works", "fails", "open", "no result"
 """Verdicts of a method at a setting: its interval is below 1, above 1, contains 1 or is not known; it has no number."""
 NEAR = 2.0
 """A method whose error is more than this many times the lowest does not share the first place: the order is open."""
-EQUAL_SAMPLES, EQUAL_ROLLOUTS = "relative RMSE at equal samples", "relative RMSE at equal rollouts"
+EQUAL = "relative RMSE at equal rollouts"
+SAME_COST = 1.05
+"""Costs within this factor count as equal: a call at w = 0 that all samples share makes 101 rollouts of 100."""
+FASTEST = 2.0
+"""Power of the rollouts by which an error may fall at most without a law: N^-1.5 for a Sobol set and a smooth cost. A fitted
+model may become exact."""
+LAW = (
+    "bias", "bias_low", "bias_high", "variance", "variance_low", "variance_high", "reference_norm", "reference_se", "rmse_rel",
+)  # fmt: skip
+"""Columns from which the error at other numbers of samples follows: RMSE^2 = bias^2 + v / N."""
 COLUMNS = (
     text("problem", "what distinguishes the problem from the others"),
     text("axis", "the swept quantity along which the problem is reported"),
     Column("at", "its value", format="setting"),
-    text("basis", "what is compared: the error at equal samples or rollouts, or the cost of reaching an error"),
+    text("basis", "what is compared: the error at equal rollouts, or the cost of reaching an error"),
+    Column(
+        "rollouts",
+        "rollouts of one estimate at which errors are compared; a gradient counts as the rollouts that take as long",
+        digits=3,
+    ),
     text("first", "the method with the lowest value"),
     interval("value", "its value"),
     text("second", "the next method, of another estimator where there is one"),
     interval("factor", "the second value over the first"),
-    text("tied", "methods that are not distinguishable from the first"),
+    text(
+        "tied", "methods that are not distinguishable from the first, or lower where only their upper limits are known"
+    ),
+    text("not_comparable", "methods whose error at these rollouts is not known"),
 )
 """The columns of the table of comparisons."""
 ERROR, VALUE, FACTOR = ([f"{name}{end}" for end in ("", "_low", "_high")] for name in ("error", "value", "factor"))
@@ -55,47 +75,124 @@ def problems_by_axis(shown: Arranged) -> list[tuple[Axis | None, ProblemRows]]:
 
 
 def method_table(shown: Arranged) -> pd.DataFrame:
-    """Return a line per setting and method: its relative RMSE with a 95% interval, its verdict, and its cost.
+    """Return a line per setting and method: its relative RMSE as measured with a 95% interval, its verdict, and its cost.
 
-    The column ``setting`` identifies a setting. Along samples, estimators that use costs only, of which some take more
-    rollouts per sample than others, are compared at the numbers of rollouts that all have, if there are any.
+    The column ``setting`` identifies a setting. ``rollouts`` is the cost of one estimate, a gradient as the rollouts that
+    take as long.
     """
     parts = [pd.DataFrame()]
     for axis, problem in problems_by_axis(shown):
-        axis, problem = _at_equal_rollouts(axis, problem)
         rows, title, along = estimator_curves(problem.rows), problem.title(), axis.column if axis else ""
-        low, high = rmse_interval(rows)
-        error = rows["rmse_rel"].where(rows["status"] == "ok")
+        error, low, high, is_limit = shown_rmse(rows)
+        error = np.where(rows["status"] == "ok", error, math.nan)
         samples = rows["x"] if along == "samples" else rows["samples"]
         kinds = {name: str(problem.rows[name].iloc[0]).partition("[")[0] for name in CATEGORIES}
         parts.append(pd.DataFrame({
-            "setting": f"{title}; {along} " + rows["x"].astype(str), "problem": title, **kinds, "axis": along,
+            "setting": setting_names(problem, axis, rows), "problem": title, **kinds, "axis": along,
             "at": rows["x"] if axis else math.nan, "method": rows["method"], "estimator": rows["label"],
-            "error": error, "error_low": low, "error_high": high,
+            "error": error, "error_low": low, "error_high": high, "error_is_limit": is_limit,
             "verdict": verdict(rows["status"], error, low, high), "status": rows["status"], "remark": rows["reason"],
             "bias_share": ((rows["bias_low"] / rows["rmse"]) ** 2).where(error > 0),
             "evaluations": (rows["rollouts"] + rows["gradients"]) / samples, "time_s": rows["seconds"],
+            "rollouts": rows[ROLLOUTS], "has_law": has_law(rows), "has_fixed_work": declares(rows, "fixed_work"),
+            "is_fitted": declares(rows, "couples_samples"), **{name: rows[name] for name in LAW},
         }))  # fmt: skip
     return pd.concat(parts, ignore_index=True)
 
 
-ROLLOUTS = Axis("rollouts", ("rollouts",))
+def setting_names(problem: ProblemRows, axis: Axis | None, rows: pd.DataFrame) -> pd.Series:
+    """Return the name of the setting of each row of a problem along an axis."""
+    return f"{problem.title()}; {axis.column if axis else ''} " + rows["x"].astype(str)
 
 
-def _at_equal_rollouts(axis: Axis | None, problem: ProblemRows) -> tuple[Axis | None, ProblemRows]:
-    """Return a problem along its rollouts instead of samples where that is needed and possible."""
-    rows = attempted(problem.rows)
-    # the rollout at w = 0 is shared by all repeats, a fraction of a rollout each
-    spent = rows["rollouts"].round()
-    per_sample = (spent / rows["x"]).groupby(rows["estimator"] + rows["estimator_params"]).median()
-    if axis is None or axis.column != "samples" or (rows["gradients"] > 0).any() or not per_sample.nunique() > 1:
-        return axis, problem
-    methods = rows["estimator"] + rows["estimator_params"]
-    shared = methods.groupby(spent).nunique()
-    kept = spent.isin(shared.index[shared == methods.nunique()])
-    if not kept.any():
-        return axis, problem
-    return ROLLOUTS, replace(problem, rows=rows[kept].assign(x=spent[kept]))
+def has_law(rows: pd.DataFrame) -> pd.Series:
+    """Return whether the error of each row at other numbers of samples is known: they are independent, and the bias constant.
+
+    A bias is constant where an estimate is a mean of terms. Weights that depend on all samples change it with their number.
+    """
+    plugins = {name: entry.plugin for name, entry in registry.entries()["estimators"].items()}
+    known = {name: plugins.get(name) for name in rows["estimator"].unique()}
+    constant = {
+        name: plugin is not None
+        and not getattr(plugin, "fixed_work", False)
+        and (issubclass(plugin, SampleMean) or getattr(plugin, "unbiased", False) is True)
+        for name, plugin in known.items()
+    }
+    is_coupled = [couples_samples(row) for row in rows[["estimator", "draws"]].to_dict("records")]
+    return ~np.array(is_coupled, dtype=bool) & rows["estimator"].map(constant).astype(bool)
+
+
+def declares(rows: pd.DataFrame, fact: str) -> pd.Series:
+    """Return whether the estimator of each row declares a fact, such as ``fixed_work``."""
+    plugins = {name: entry.plugin for name, entry in registry.entries()["estimators"].items()}
+    known = {name: bool(getattr(plugins.get(name), fact, False)) for name in rows["estimator"].unique()}
+    return rows["estimator"].map(known).astype(bool)
+
+
+def at_equal_rollouts(methods: pd.DataFrame) -> pd.DataFrame:
+    """Return the methods with their errors at equal rollouts: in each setting those at which most methods are known.
+
+    A method has the error of its row with as many rollouts. Without one it has that of its nearest row by RMSE^2 = bias^2 +
+    v / N. Where that law does not hold, it has the error of a row with fewer rollouts, which are allowed too: with more of
+    them it might be lower, so its interval begins lower. If there is none, ``not_comparable`` is true. The rollouts are the
+    fewest at which most methods are known; along samples a setting is a number of rollouts, and they are the most.
+    """
+    parts = [methods.assign(not_comparable=False)[:0]]
+    for _, level in methods.groupby("setting", sort=False):
+        along, problem = level[["axis", "problem"]].iloc[0]
+        is_swept = along == "samples"
+        of = methods[(methods["axis"] == along) & (methods["problem"] == problem)] if is_swept else level
+        spent = of["rollouts"].where(of["rollouts"] > 0)
+        apart = {
+            cost: np.abs(np.log(spent / cost))
+            .where(of["has_law"] | (spent <= SAME_COST * cost), math.inf)
+            .fillna(math.inf)
+            for cost in sorted(level["rollouts"].unique())
+            if cost > 0
+        }
+        same = {
+            cost: (distance <= math.log(SAME_COST)) | (~of["has_law"] & (spent <= cost))
+            for cost, distance in apart.items()
+        }
+        order = 1 if is_swept else -1
+        cost = max(
+            same, key=lambda c: (of.loc[same[c] | of["has_law"], "method"].nunique(), order * c), default=math.nan
+        )
+        nearest = of.loc[apart[cost].groupby(of["method"], sort=False).idxmin()] if apart else level
+        scale = (spent / cost).where(of["has_law"]).mask(same[cost], 1.0) if apart else spent
+        found = _scaled(nearest, scale.loc[nearest.index]).assign(rollouts=cost)
+        share = (spent.loc[nearest.index] / cost).where(~found["has_law"] & ~found["has_fixed_work"]).clip(upper=1.0)
+        found["error_low"] = found["error_low"] * (share**FASTEST).fillna(1.0).mask(
+            found["is_fitted"] & (share < 1.0), 0.0
+        )
+        if is_swept:
+            found = found.assign(setting=f"{problem}; rollouts {cost:.3g}", axis="rollouts", at=float(f"{cost:.3g}"))
+        parts.append(found)
+    return pd.concat(parts).drop_duplicates(["setting", "method"], ignore_index=True)
+
+
+def _scaled(methods: pd.DataFrame, scale: pd.Series) -> pd.DataFrame:
+    """Return methods with the errors of variances ``scale`` times as large, or without errors where that is NaN."""
+    changed = methods.assign(**{name: methods[name] * scale for name in LAW if name.startswith("variance")})
+    error = statistics.rmse(changed["bias"], changed["variance"]) / changed["reference_norm"]
+    changed["rmse_rel"] = methods["rmse_rel"].where((scale == 1.0) | methods["rmse_rel"].isna(), error)
+    is_ok = methods["status"] == "ok"
+    *ends, is_limit = shown_rmse(changed)
+    errors = {
+        name: pd.Series(end, methods.index).where(is_ok & scale.notna()) for name, end in zip(ERROR, ends, strict=True)
+    }
+    return changed.assign(**errors, error_is_limit=is_limit, not_comparable=is_ok & scale.isna())
+
+
+def lowest(equal: pd.DataFrame) -> set[tuple[str, str]]:
+    """Return the settings and methods whose interval at equal rollouts lies below that of every other estimator."""
+    found = set()
+    for setting, level in equal[equal["status"] == "ok"].groupby("setting", sort=False):
+        for row in level[~level["error_is_limit"]].itertuples():
+            rivals = level.loc[level["estimator"] != row.estimator, "error_low"]
+            if len(rivals) and (rivals > row.error_high).all():
+                found.add((str(setting), str(row.method)))
+    return found
 
 
 def verdict(status: Any, error: Any, low: Any, high: Any) -> Any:
@@ -121,25 +218,32 @@ def ratio(first: Any, second: Any) -> tuple[Any, Any, Any]:
 def compare_errors(methods: pd.DataFrame) -> pd.DataFrame:
     """Return a line per setting: the method of lowest error, the next estimator, their factor, and ties.
 
-    Methods whose error is not known, or whose interval is not, cannot be first. A method is tied with the first unless
-    the interval of their factor lies above 1.
+    Methods whose error is not known, or whose interval is not, cannot be first, nor can those with an upper limit only. A
+    method is tied with the first unless the interval of their factor lies above 1. No method is first where upper limits
+    of others lie below its interval: these are tied. Nor is one with which no other can be compared.
     """
+    missing = methods[methods["not_comparable"]].groupby("setting", sort=False)["method"].agg(tuple)
     good = methods[np.isfinite(methods[["error", "error_low"]]).all(axis=1)].sort_values("error", kind="stable")
-    others = good[good.duplicated("setting")]
-    first = good.drop_duplicates("setting").set_index("setting")
-    others = others.merge(first, on="setting", suffixes=("", "_of_first"))
+    lowest = good[~good["error_is_limit"]].drop_duplicates("setting")
+    first = lowest.set_index("setting")
+    least = good["setting"].map(first["error_low"]).astype(float).fillna(math.inf)
+    lower = good[good["error_is_limit"] & (good["error"] < least)]
+    is_alone = ~first.index.isin(good.loc[good.duplicated("setting"), "setting"]) & first.index.isin(missing.index)
+    first = first[~first.index.isin(lower["setting"]) & ~is_alone]
+    others = good.drop(lowest.index).merge(first, on="setting", suffixes=("", "_of_first"))
     factors = ratio(*([others[f"{end}{of}"] for end in ERROR] for of in ("_of_first", "")))
+    factors = (np.where(others["error_is_limit"], math.nan, factors[0]), *factors[1:])
     others = others.assign(
         same=others["estimator"] == others["estimator_of_first"], **dict(zip(FACTOR, factors, strict=True))
     )
     second = others.sort_values("same", kind="stable").drop_duplicates("setting").set_index("setting")
-    tied = others[~(others["factor_low"] > 1)].groupby("setting", sort=False)["method"].agg(tuple)
-    lines = methods.drop_duplicates("setting").set_index("setting")[["problem", "axis", "at"]].assign(
-        basis=lambda line: np.where(line["axis"] == ROLLOUTS.column, EQUAL_ROLLOUTS, EQUAL_SAMPLES),
-        first=first["method"], **{name: first[error] for name, error in zip(VALUE, ERROR, strict=True)},
+    tied = pd.concat([others[~(others["factor_low"] > 1)], lower]).groupby("setting", sort=False)["method"].agg(tuple)
+    lines = methods.drop_duplicates("setting").set_index("setting")[["problem", "axis", "at", "rollouts"]].assign(
+        basis=EQUAL, not_comparable=missing, first=first["method"], **{name: first[error] for name, error in zip(VALUE, ERROR, strict=True)},
         second=second["method"], **{name: second[name] for name in FACTOR}, tied=tied,
     )  # fmt: skip
-    lines["tied"] = [names if isinstance(names, tuple) else () for names in lines["tied"]]
+    for name in ("tied", "not_comparable"):
+        lines[name] = [names if isinstance(names, tuple) else () for names in lines[name]]
     return lines.fillna({"first": "", "second": ""}).reset_index()
 
 

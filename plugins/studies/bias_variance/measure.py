@@ -19,7 +19,7 @@ from bench.experiment.cell import Cell
 from bench.experiment.session import Session
 from bench.measure import noise, statistics, timing
 from bench.measure.timing import Pause
-from bench.model import SURROGATE, Auxiliaries, Problem, SampleMean, columns, per_repeat
+from bench.model import IID, SURROGATE, Auxiliaries, Problem, SampleMean, columns, per_repeat
 from bench.model.estimator import require_shape
 
 from .. import all_noise
@@ -40,9 +40,11 @@ class Estimates:
         self._cell, self._problem, self._theta = cell, problem, theta
         self._width = problem.program.n_noise
         self._estimator = cell.estimator
+        self.design = cell.design(problem.program)
+        """How the noise of one estimate is drawn."""
         self._columns = max(1, MOST_TERMS // problem.dim)
         fits = cell.repeats * cell.samples * self._width <= noise.HELD
-        self._noise = all_noise(cell, self._width) if fits else None
+        self._noise = all_noise(cell, problem.program) if fits else None
         self._centre: np.ndarray | None = None
         self._terms: dict[int, tuple[Any, float]] = {}
         """Per repeat, the sum of (term - common centre), ``(d,)``, and the sum of its squared norms."""
@@ -67,7 +69,9 @@ class Estimates:
 
     @property
     def sums(self) -> tuple[np.ndarray, np.ndarray] | None:
-        """Per repeat, the sum of (term - common centre) and the sum of its squared norms; None without single terms."""
+        """Per repeat, the sum of (term - common centre) and the sum of its squared norms; None without independent terms."""
+        if self.design != IID:
+            return None
         ordered = [self._terms[repeat] for repeat in sorted(self._terms)]
         return (
             (np.array([rest for rest, _ in ordered]), np.array([square for _, square in ordered])) if ordered else None
@@ -79,7 +83,7 @@ class Estimates:
 
     def _draw_parts(self, repeat: int) -> Iterator[np.ndarray]:
         cell = self._cell
-        for part in noise.parts(cell.seed, cell.scene.name, repeat, cell.samples, self._width, "cells"):
+        for part in noise.parts(cell.seed, cell.scene.name, repeat, cell.samples, self._width, "cells", self.design):
             for first in range(0, part.shape[1], self._columns):
                 yield part[:, first : first + self._columns]
 
@@ -172,7 +176,9 @@ def measure(cell: Cell, session: Session, study: BiasVariance) -> dict[str, Any]
         "time_s": clock.median_s if clock else math.nan,
         "time_iqr_s": clock.iqr_s if clock else math.nan,
         "time_samples": list(clock.samples_s) if clock else [],
-        "noise_s": noise.seconds(cell.seed, cell.scene.name, cell.samples, program.n_noise) if clock else math.nan,
+        "noise_s": noise.seconds(cell.seed, cell.scene.name, cell.samples, program.n_noise, estimates.design)
+        if clock
+        else math.nan,
         "estimates_s": elapsed,
         "compile_s": usage.compile_s,
         "rollouts": usage.rollouts / n_counted,
@@ -186,10 +192,18 @@ def measure(cell: Cell, session: Session, study: BiasVariance) -> dict[str, Any]
         "reference_gradient": truth.gradient.tolist(),
         "auxiliaries": summarise_diagnostics([estimates.diagnostics[start] for start in sorted(estimates.diagnostics)]),
     }
+    if cell.point is not None:
+        result |= {"start_norm": cell.point.start_norm, "descent_path": json.dumps(cell.point.along)}
     if not np.isfinite(truth.batches).all():
         return result | {"status": "nonfinite", "reason": truth.note or "the reference gradient is not finite"}
     unbiased = cell.estimator.declares_unbiased(program)
-    summary = asdict(statistics.summarise(values, truth.known(), cell.samples, estimates.sums, unbiased=unbiased))
+    draws = cell.estimator.draws_noise(program)
+    summary = asdict(
+        statistics.summarise(
+            values, truth.known(), cell.samples if draws else 1, estimates.sums, unbiased=unbiased,
+            is_random=draws or program.exogenous > 0,
+        )
+    )  # fmt: skip
     surrogate = SURROGATE if program.surrogate and "grad" in cell.estimator.needs else ""
     doubt = cell.estimator.remark(json.loads(result["auxiliaries"])) if result["auxiliaries"] else ""
     remarks = (surrogate, summary.pop("note"), doubt, truth.note)

@@ -17,7 +17,7 @@ from bench.measure.statistics import is_unexplained
 from bench.model import registry
 from bench.report.problems import ProblemRows, split_by_problem
 from bench.report.text import axis_value, number, short_duration
-from bench.report.views import Arranged, estimator_curves
+from bench.report.views import Arranged, estimator_curves, shown_rmse
 
 TIME, ROLLOUTS = "time_s", "rollouts_"
 """Columns with the costs of an estimate: seconds, and rollouts with a gradient at its measured cost."""
@@ -39,8 +39,9 @@ def with_gradient_cost(rows: pd.DataFrame) -> pd.DataFrame:
     def least(seconds: pd.Series) -> pd.Series:
         return seconds.groupby([program, rows["samples"]]).min()
 
-    first = least((known["time_s"] / gradients)[(gradients > 0) & (rollouts <= 0.01 * gradients)])
-    zeroth = least((known["time_s"] / rollouts)[(gradients == 0) & (rollouts > 0)])
+    is_batch = gradients + rollouts >= known["samples"]  # one call for few takes as long
+    first = least((known["time_s"] / gradients)[is_batch & (rollouts <= 0.01 * gradients)])
+    zeroth = least((known["time_s"] / rollouts)[is_batch & (gradients == 0)])
     ratios = (first / zeroth).dropna().sort_index().groupby(level=0).last()
     ratio = program.map(ratios).astype(float).fillna(1.0)
     return rows.assign(**{ROLLOUTS: rows["rollouts"] + ratio * rows["gradients"]})
@@ -55,6 +56,8 @@ def with_known(rows: pd.DataFrame, cost: str) -> pd.DataFrame:
 SAMPLES = Axis("samples", ("samples",))
 COSTS = {"time": TIME, "rollouts": ROLLOUTS}
 TEXTS: dict[str, Callable[[float], str]] = {"time": short_duration, "rollouts": axis_value}
+LEAST = 1e-200
+"""Errors below this count as this much, since costs are interpolated in logarithms: identical estimates may have none."""
 TARGETS = (0.1, 0.01)
 """Target relative errors."""
 NOTES = (
@@ -91,7 +94,7 @@ class RequiredCost:
 
 def required_cost(curve: pd.DataFrame, target: float, cost: str) -> RequiredCost:
     """Return the cost of an estimator on a backend to reach a relative RMSE of ``target``, with its 95% interval."""
-    rows = with_known(curve, cost).sort_values("x")
+    rows = with_known(curve.assign(rmse_rel=shown_rmse(curve)[0]), cost).sort_values("x")
     if rows.empty:
         return RequiredCost("unknown")
     way, low, high = (
@@ -107,10 +110,10 @@ def required_cost(curve: pd.DataFrame, target: float, cost: str) -> RequiredCost
     return replace(way, down=down, up=up, times=times)
 
 
-def couples_samples(estimator: str) -> bool:
-    """Return whether an estimator declares that its samples are not independent, so that v / N need not hold."""
-    entry = registry.entries()["estimators"].get(estimator)
-    return bool(getattr(entry and entry.plugin, "couples_samples", False))
+def couples_samples(row: Any) -> bool:
+    """Return whether the samples of a row's estimates are chosen together, so that v / N need not hold."""
+    entry = registry.entries()["estimators"].get(row["estimator"])
+    return row["draws"] != "iid" or bool(getattr(entry and entry.plugin, "couples_samples", False))
 
 
 def _cost_of_one_sample(rows: pd.DataFrame, cost: str) -> float:
@@ -124,7 +127,7 @@ def _at_interval_end(rows: pd.DataFrame, end: str) -> pd.DataFrame:
     """Return rows with variance and bias at an end of their 95% intervals; the bias is 0 unless distinguishable from 0."""
     bias = rows[f"bias_{end}"].where(rows["bias_low"] > 0, 0.0)
     error = np.hypot(bias, np.sqrt(rows[f"variance_{end}"])) / rows["reference_norm"]
-    return rows.assign(bias=bias, variance=rows[f"variance_{end}"], rmse_rel=error)
+    return rows.assign(bias=bias, variance=rows[f"variance_{end}"], rmse_rel=np.maximum(error, LEAST))
 
 
 def lead(first: RequiredCost, second: RequiredCost, alike: bool = False) -> tuple[float, float, float]:
@@ -147,7 +150,8 @@ def lead(first: RequiredCost, second: RequiredCost, alike: bool = False) -> tupl
 def _required_cost(rows: pd.DataFrame, target: float, cost: str) -> RequiredCost:
     n, error, price = rows[["x", "rmse_rel", cost]].to_numpy(float).T
     if not (error <= target).any():
-        return _extrapolated_cost(rows.iloc[-1], price[-1], target)
+        work = rows["rollouts"] + rows["gradients"]
+        return _extrapolated_cost(rows.iloc[-1], price[-1], target, is_fixed=work.nunique() == 1 < len(rows))
     # more samples may cost less: the fixed cost of a call dominates small batches
     ways = [RequiredCost("measured" if i else "at once", price[i], n[i]) for i in np.flatnonzero(error <= target)]
     for i in range(1, len(n)):
@@ -158,16 +162,16 @@ def _required_cost(rows: pd.DataFrame, target: float, cost: str) -> RequiredCost
     return min(ways, key=lambda way: (way.cost, way.samples))
 
 
-def _extrapolated_cost(row: Any, price: float, target: float) -> RequiredCost:
+def _extrapolated_cost(row: Any, price: float, target: float, is_fixed: bool) -> RequiredCost:
     """Extrapolate the cost from the row with most samples: v is N times its variance, and cost is proportional to N.
 
-    Coupled samples have no such law.
+    Coupled samples have no such law, and neither has an estimator whose work ``is_fixed`` for all N.
     """
     low, high, bias = (row[name] / row["reference_norm"] for name in ("bias_low", "bias_high", "bias"))
     # an estimator without declared bias may only have heavy tails that the samples missed
     if low >= target and not is_unexplained(str(row.get("reason", ""))):
         return RequiredCost("never")
-    is_coupled, samples = couples_samples(row["estimator"]), row["x"]
+    is_coupled, samples = is_fixed or couples_samples(row), row["x"]
     is_known = not is_coupled and high < target
     certain_bias = bias if is_known and low > 0 else 0.0
     needed = samples * row["variance"] / row["reference_norm"] ** 2 / (target**2 - certain_bias**2)
@@ -288,5 +292,5 @@ def comparisons(best: pd.DataFrame) -> pd.DataFrame:
         "first": best["fastest"].where(best["fastest"] != "-", ""), "value": best["cost"],
         "value_low": math.nan, "value_high": math.nan, "second": best["next"].where(best["next"] != "-", ""),
         "factor": best["factor"], "factor_low": best["factor_low"], "factor_high": best["factor_high"],
-        "tied": best["tied"],
+        "tied": best["tied"], "rollouts": math.nan, "not_comparable": [()] * len(best),
     })  # fmt: skip

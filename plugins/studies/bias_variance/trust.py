@@ -19,6 +19,8 @@ import pandas as pd
 from bench.report.tables import plain_markdown
 from bench.report.text import number
 
+from .columns import COLUMNS
+
 WRONG = 0.5
 """Relative RMSE at and above which an estimate counts as wrong: half of the gradient."""
 SPREAD = 0.5
@@ -28,9 +30,8 @@ SPREAD = 0.5
 def cells(folder: Path, estimators: Sequence[str]) -> pd.DataFrame:
     """Return the ok rows of some estimators, from all experiments below a folder that compare estimates with a reference."""
     tables = [pd.read_parquet(path) for path in sorted(folder.rglob("rows.parquet"))]
-    rows = pd.concat(
-        [table for table in tables if {"rmse_rel", "variance", "grad_norm"} <= set(table)], ignore_index=True
-    )
+    needed = {"rmse_rel", "bias", "variance", "grad_norm"}
+    rows = pd.concat([COLUMNS.derive(table) for table in tables if needed <= set(table)], ignore_index=True)
     return rows[rows["estimator"].isin(estimators) & (rows["status"] == "ok") & np.isfinite(rows["rmse_rel"])]
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -17,39 +17,44 @@ from bench.experiment.experiment import Experiment
 from bench.experiment.parameters import number_problems
 from bench.experiment.views import Table, Views
 from bench.report.problems import ProblemRows
-from bench.report.text import axis_value, counted, span
-from bench.report.views import Arranged, arrange, estimator_curves, pareto, rmse_interval
+from bench.report.text import axis_value, counted, number, span
+from bench.report.views import Arranged, arrange, estimator_curves, pareto, shown_rmse
 
-from . import charts, time_to_accuracy
+from . import charts, descents, time_to_accuracy
 from .columns import COLUMNS
 from .comparisons import COLUMNS as COMPARED
 from .comparisons import (
     FAILS,
+    LAW,
     NO_RESULT,
-    ROLLOUTS,
+    at_equal_rollouts,
     compare_errors,
     leaders,
+    lowest,
     method_table,
     problems_by_axis,
+    setting_names,
     verdicts_by_estimator,
 )
-from .time_to_accuracy import limits, with_gradient_cost
+from .time_to_accuracy import ROLLOUTS, limits, with_gradient_cost
 
 RESULTS = ("variance", "cosine", "rollouts", "gradients", "reference_method")
 
 
 def views(experiment: Experiment, rows: pd.DataFrame) -> Views | None:
     """Return the tables and charts of the rows; None if no cell was run."""
+    rows = descents.with_start_norm(rows)
     costed = with_gradient_cost(rows)
     shown = arrange(experiment, costed)
     methods = method_table(shown)
     if methods.empty:
         return None
-    errors = compare_errors(methods)
+    equal = at_equal_rollouts(methods)
+    errors = compare_errors(equal)
     best = time_to_accuracy.table(shown)
     return Views(
-        tables(experiment, rows, shown, methods, errors, best),
-        charts.charts(shown, methods, errors, best),
+        tables(experiment, rows, shown, methods, equal, errors, best),
+        charts.charts(shown, equal, errors, best),
         rows=charts.with_plotted_columns(costed),
         columns=[
             *(replace(c, label=label) for c, label in ((charts.RMSE, "rel. RMSE"), (charts.BIAS, "rel. bias"))),
@@ -98,63 +103,84 @@ def tables(
     rows: pd.DataFrame,
     shown: Arranged,
     methods: pd.DataFrame,
+    equal: pd.DataFrame,
     errors: pd.DataFrame,
     best: pd.DataFrame,
 ) -> list[Table]:
-    """Return all tables; ``best`` is the table of the cost to reach an error."""
-    main, *others = pivots(shown)
+    """Return all tables; ``equal`` has the methods at equal rollouts, ``best`` is the table of the cost to reach an error."""
+    main, *others = pivots(shown, lowest(equal))
     is_ranked = methods["estimator"].nunique() >= LEAST and methods["problem"].nunique() > 1
     compared = errors if best.empty else pd.concat([errors, time_to_accuracy.comparisons(best)], ignore_index=True)
-    joined = compared.drop(columns="setting").assign(tied=compared["tied"].map(", ".join))
+    names = {name: compared[name].map(", ".join) for name in ("tied", "not_comparable")}
+    joined = compared.drop(columns="setting").assign(**names)
     columns = [replace(c, note="factor_note") if c.name == "factor" else c for c in COMPARED]
-    title = "the first and the next at each setting"
+    title = "the first and the next at each setting, at equal rollouts"
     return [
         replace(main, data=axes.table(experiment, rows)), *others,
         Table("speed_accuracy", speed_accuracy(rows), [], files=["csv"]),
-        *([ranking(methods)] if is_ranked else []),
-        recommendations(methods, errors),
-        Table("verdicts", methods.drop(columns="setting"), [], files=["csv"]),
+        *([ranking(methods, equal)] if is_ranked else []),
+        recommendations(equal, errors),
+        Table("verdicts", methods.drop(columns=["setting", "has_law", *LAW]), [], files=["csv"]),
         Table("comparisons", joined.assign(factor_note=limits(joined)), columns, title, COMPARISON_NOTES, data=joined),
         *([] if best.empty else [time_to_accuracy.accuracy_table(best)]),
+        *descents.tables(shown),
     ]  # fmt: skip
 
 
 COMPARISON_NOTES = (
-    "Factor: the second over the first, with its 95% interval. Tied: not distinguishable from the first, since the interval "
-    "of the factor reaches 1 or is not known.",
+    "Rollouts: of one estimate of each method, the number at which most methods are known, as measured or by RMSE^2 = bias^2 + v / N; "
+    "a gradient counts as the rollouts that take as long (as one where that was not measured). Not comparable: methods that "
+    "choose samples together, or whose bias may depend on their number, at other rollouts than measured. Costs by time to "
+    "reach an error are compared where samples were swept. Factor: the second over the first, with its 95% interval; none for an upper limit, which is never first. Tied: not "
+    "distinguishable from the first, since the interval of the factor reaches 1 or is not known.",
 )
 
 
 # ------------------------------------------------------------------------------------------- along an axis
 
 
-def pivots(shown: Arranged) -> list[Table]:
-    """Return a table per problem: estimators down, values of its longest axis across, each cell a relative RMSE."""
-    result = [_pivot(axis, problem) for axis, problem in problems_by_axis(shown)]
+def pivots(shown: Arranged, best: Container[tuple[str, str]]) -> list[Table]:
+    """Return a table per problem: estimators down, values of its longest axis across, each cell a relative RMSE.
+
+    Beside them stand the cost and the time of one estimate. ``best`` are the settings and methods in bold.
+    """
+    result = [_pivot(axis, problem, best) for axis, problem in problems_by_axis(shown)]
     return [*result[:-1], replace(result[-1], notes=_notes(result))]
 
 
-def _pivot(axis: Axis | None, problem: ProblemRows) -> Table:
+def _pivot(axis: Axis | None, problem: ProblemRows, best: Container[tuple[str, str]]) -> Table:
     rows = estimator_curves(problem.rows)
     ok, note = rows["status"] == "ok", rows["status"].map(lambda status: FAILURES.get(status, [""])[0])
-    low, high = (pd.Series(end, rows.index).where(ok) for end in rmse_interval(rows))
-    others = [
-        ok & (rows["x"] == x) & (rows["label"] != label) for x, label in zip(rows["x"], rows["label"], strict=True)
-    ]
-    is_apart = [bool(rivals.any() and (low[rivals] > end).all()) for rivals, end in zip(others, high, strict=True)]
+    error, low, high, is_limit = (pd.Series(part, rows.index) for part in shown_rmse(rows))
+    error, low, high = (part.where(ok) for part in (error, low, high))
+    settings = setting_names(problem, axis, rows)
+    is_best = [pair in best for pair in zip(settings, rows["method"], strict=True)]
     cells = pd.DataFrame({
-        "": rows["rmse_rel"].where(ok), "_low": low, "_high": high, "_best": ok & (rows["rmse_rel"] < 1) & np.array(is_apart, dtype=bool),
+        "": error, "_low": low, "_high": high, "_limit": is_limit,
+        "_best": (error < 1) & np.array(is_best, dtype=bool),
         "_note": note + np.where(rows["reason"] != "", REMARKED, ""),
     }).set_axis(rows["method"])  # fmt: skip
     values = sorted(rows["x"].unique())
     wide = _across(cells, rows["x"], values, "x").reindex(rows["method"].unique())
+    is_swept = axis is not None and axis.column == "samples"
+    per = rows["x"] if is_swept else 1
+    spent = pd.DataFrame({"rollouts": rows[ROLLOUTS] / per, "time": rows["time_s"] / per}).groupby(
+        rows["method"], sort=False
+    )
+    # of few samples a call takes most of the time
+    wide = pd.concat([wide, spent.last() if is_swept else spent.median()], axis=1).copy().rename_axis("method")
     columns = [
-        interval(f"x{i}", label=axis_value(x) if axis else "relative RMSE", emphasis=f"x{i}_best", note=f"x{i}_note")
+        interval(
+            f"x{i}", label=axis_value(x) if axis else "relative RMSE", limit=f"x{i}_limit", emphasis=f"x{i}_best", note=f"x{i}_note",
+        )
         for i, x in enumerate(values)
     ]  # fmt: skip
+    each = "a sample" if is_swept else "an estimate"
+    costs = [Column("rollouts", label=f"rollouts {each}"), Column("time", label=f"time {each}", format="seconds")]
+    equal = "" if is_swept or rows["samples"].nunique() > 1 else f", at {axis_value(rows['samples'].iloc[0])} samples"
     return Table(
-        "bias_variance", wide.reset_index(), [ESTIMATOR, *columns],
-        f"relative RMSE: {problem.title()}{f', by {axis.title}' if axis else ''}", files=["csv", "md", "tex"], terminal=True,
+        "bias_variance", wide.reset_index(), [ESTIMATOR, *columns, *costs],
+        f"relative RMSE{equal}: {problem.title()}{f', by {axis.title}' if axis else ''}", files=["csv", "md", "tex"], terminal=True,
     )  # fmt: skip
 
 
@@ -169,7 +195,9 @@ def _notes(result: Sequence[Table]) -> list[str]:
     seen = {str(v) for table in result for name in table.frame if name.endswith("_note") for v in table.frame[name]}
     notes = [
         "Relative RMSE of one estimate [95% interval], in units of the reference gradient's norm: above 1 the zero estimate "
-        "is better. Bold: below 1, with an interval apart from that of every other estimator."
+        "is better. Bold: below 1, with an interval apart from that of every other estimator at equal rollouts. Rollouts: cost of one "
+        "estimate, a gradient as the rollouts that take as long (as one where that was not measured). <: upper limit, where the bias is not "
+        "distinguishable from 0 and the reference's error is at least the standard deviation of one estimate."
     ]
     signs = [f"{sign}: {what}." for sign, what in FAILURES.values() if any(sign in text_ for text_ in seen)]
     if any(REMARKED in text_ for text_ in seen):
@@ -187,27 +215,28 @@ def speed_accuracy(rows: pd.DataFrame) -> pd.DataFrame:
     results = ["rmse_rel", "bias_rel", "time_s", "time_iqr_s", "compile_s", "rollouts", "gradients"]
     table = rows[["experiment", *IDENTITY, "status", *results]].assign(pareto=False)
     good = table[(table["status"] == "ok") & np.isfinite(table["rmse_rel"]) & np.isfinite(table["time_s"])]
+    errors = pd.Series(shown_rmse(rows)[0], rows.index)
     for _, part in good.groupby(number_problems(rows).loc[good.index]):
-        table.loc[part.index[pareto(part["time_s"], part["rmse_rel"])], "pareto"] = True
+        table.loc[part.index[pareto(part["time_s"], errors.loc[part.index])], "pareto"] = True
     return table
 
 
 # --------------------------------------------------------------------------------------------------- ranking
 
 
-def ranking(methods: pd.DataFrame) -> Table:
+def ranking(methods: pd.DataFrame, equal: pd.DataFrame) -> Table:
     """Return the ranking: a line per estimator with the number of settings by verdict, and its errors by problem.
 
-    Where a problem was swept, its error is the largest along the axis: the worst case.
+    Verdicts are of ``methods`` as measured, errors at equal rollouts. Where a problem was swept, its error is the largest along the axis: the worst case.
     """
     counts = verdicts_by_estimator(methods)
-    worst = methods.assign(known=methods["error"].fillna(math.inf)).sort_values("known", kind="stable")
+    worst = equal.assign(known=equal["error"].fillna(math.inf)).sort_values("known", kind="stable")
     worst = worst.drop_duplicates(["estimator", "problem"], keep="last")
     shares = worst["verdict"] + np.where(worst["bias_share"] > 0.5, ", biased", "")
     work = worst["evaluations"].map(" ({:.0f}x)".format).where(worst["evaluations"] > MANY, "")
-    notes = shares.mask(worst["status"] != "ok", worst["status"]) + work
-    ends = {end: worst[f"error{end}"] for end in ("", "_low", "_high")}
-    problems, cells = methods["problem"].unique(), pd.DataFrame(ends | {"_note": notes}).set_axis(worst["estimator"])
+    notes = shares.mask(worst["status"] != "ok", worst["status"]).mask(worst["not_comparable"], "not comparable") + work
+    ends = {end: worst[f"error{end}"] for end in ("", "_low", "_high", "_is_limit")}
+    problems, cells = equal["problem"].unique(), pd.DataFrame(ends | {"_note": notes}).set_axis(worst["estimator"])
     frame = counts.join(_across(cells, worst["problem"], problems, "p")).rename_axis("method").reset_index()
     errors = frame[[f"p{i}" for i in range(len(problems))]]
     frame["worst"] = errors.max(axis=1).where(np.isfinite(errors).all(axis=1))
@@ -215,21 +244,18 @@ def ranking(methods: pd.DataFrame) -> Table:
     columns = [
         ESTIMATOR,
         *(Column(str(name), format="setting") for name in counts),
-        *(interval(f"p{i}", label=problem, note=f"p{i}_note") for i, problem in enumerate(problems)),
+        *(
+            interval(f"p{i}", label=problem, limit=f"p{i}_is_limit", note=f"p{i}_note")
+            for i, problem in enumerate(problems)
+        ),
     ]
     explained = (
-        f"Sorted by the worst case. Relative RMSE [95% interval] at equal {_basis(methods)}; where a problem was swept, the largest along "
-        "the axis. works: the whole interval is below 1; fails: it is above 1; open: it contains 1 or is not known. biased: more "
+        "Sorted by the worst case. Relative RMSE [95% interval] at equal rollouts; where a problem was swept, the largest along "
+        "the axis. At the samples of the experiment, works: the whole interval is below 1; fails: it is above 1; open: it contains 1 or is not known. biased: more "
         "than half of the squared error is bias. (40x): it evaluates 40 costs and gradients per sample, where others take "
         "one or two.",
     )
     return Table("ranking", frame, columns, "estimators by their worst case", explained)
-
-
-def _basis(methods: pd.DataFrame) -> str:
-    """Return at what errors are equal: rollouts, samples, or either by problem."""
-    along = set(methods["axis"] == ROLLOUTS.column)
-    return "samples or rollouts" if len(along) > 1 else ROLLOUTS.column if along == {True} else "samples"
 
 
 def _values(axis: str, at: pd.Series) -> str:
@@ -237,17 +263,22 @@ def _values(axis: str, at: pd.Series) -> str:
     return f"{axis} {', '.join(map(axis_value, sorted(at.unique())))}" if axis else ""
 
 
+def _errors(methods: pd.DataFrame) -> str:
+    """Return the smallest and largest error; ``< 0.12`` if some are upper limits."""
+    known = span(*methods["error"].agg(["min", "max"]))
+    return f"< {number(methods['error'].max())}" if methods["error_is_limit"].any() else known
+
+
 def recommendations(methods: pd.DataFrame, comparisons: pd.DataFrame) -> Table:
     """Return what to use where: a line per problem and range of its axis with the same first and tied estimators."""
     named = methods.assign(use=methods["setting"].map(leaders(comparisons, methods))).dropna(subset=["use"])
     lines = [
-        {"problem": problem, "where": _values(axis, part["at"]), "use": " or ".join(use),
-         "error": span(*part.loc[part["estimator"] == use[0], "error"].agg(["min", "max"])),
+        {"problem": problem, "where": _values(axis, part["at"]), "use": " or ".join(use), "error": _errors(part[part["estimator"] == use[0]]),
          "fails": ", ".join(part.loc[part["verdict"].isin((FAILS, NO_RESULT)), "estimator"].unique()) or "none"}
         for (problem, axis, use), part in named.groupby(["problem", "axis", "use"], sort=False)
     ]  # fmt: skip
     columns = [
         text("problem"), text("where"), text("use"), text("error", label="relative RMSE"), text("fails", label="fails there"),
     ]  # fmt: skip
-    notes = [f"Errors are compared at equal {_basis(methods)}."]
+    notes = ["Errors are compared at equal rollouts."]
     return Table("recommendations", pd.DataFrame(lines), columns, "What to use where", notes, files=(), page=True)

@@ -86,6 +86,8 @@ class Identify(StudyPackage):
     state: str | None = param(None, "initial state of the motion, {q0: 60*pi/180, v0: 1}; null: the scene's")
     terms: str | None = param(None, "accelerations that the model may lack, {name: v*q**2, other: sign(v)*abs(q1)}")
 
+    descends = False
+
     def decision(self, given: Decision) -> Decision:
         """Return theta without entries of the initial state, such as start.q0."""
         return replace(given, names=tuple(name for name in given.names if not name.startswith(START)))

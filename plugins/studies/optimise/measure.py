@@ -15,7 +15,7 @@ from bench.experiment.cell import Cell
 from bench.experiment.session import Session
 from bench.measure import noise
 from bench.measure.solve import solve
-from bench.model import Answer, Estimator, KnownOptimum, Optimizer, Problem, Rollout, zeroth_order
+from bench.model import IID, Answer, Design, Estimator, KnownOptimum, Optimizer, Problem, Rollout, zeroth_order
 from bench.model.program import OWN
 from bench.run.files import make_directory, write_whole
 
@@ -104,16 +104,17 @@ def follow_path(
     The path has the numbers of :data:`PATH` of each iteration.
     """
     (optimizer, estimator), usage = search_parts(cell), problem.usage
+    design = cell.design(problem.program)
     still = np.zeros((problem.program.n_noise, 1))
 
     def step(state: dict[str, Any], iteration: int) -> dict[str, Any]:
-        def draw(count: int, width: int, what: str) -> np.ndarray:
-            return noise.draw(cell.seed, cell.scene.name, 1, count, width, f"optimise: {what} {iteration}")
+        def draw(count: int, width: int, what: str, design: Design = IID) -> np.ndarray:
+            return noise.draw(cell.seed, cell.scene.name, 1, count, width, f"optimise: {what} {iteration}", design)
 
         return advance(
             optimizer, state, draw(optimizer.draws(problem.dim), problem.dim, "points")[0].T,
             lambda points: mean_costs(problem, points, still),
-            lambda points: estimates(problem, estimator, points, draw(cell.samples, len(still), "samples")),
+            lambda points: estimates(problem, estimator, points, draw(cell.samples, len(still), "samples", design)),
         )  # fmt: skip
 
     state = optimizer.start(theta0)
@@ -238,7 +239,8 @@ def gradient_quality(cell: Cell, problem: Problem, theta: np.ndarray, settings: 
             if program.continuous and "grad" in cell.backend.provides:
                 first = problem.grad(theta, w[0].T)
                 terms = first if first.var(axis=1).sum() < terms.var(axis=1).sum() else terms
-        drawn = noise.draw(0, scene, max(cell.repeats, 2), cell.samples, program.n_noise, "optimise: quality")
+        counts = (max(cell.repeats, 2), cell.samples, program.n_noise)
+        drawn = noise.draw(0, scene, *counts, "optimise: quality", cell.design(program))
         _qualities[key] = compare_with_reference(estimator.estimate(problem, theta, drawn), terms)
     return _qualities[key]
 

@@ -22,6 +22,7 @@ class Train(StudyPackage):
     name = "train"
     axes = (*PARTS, "trainer")
     timed = True
+    descends = False
     columns = Columns.of(
         text("trainer", "identity string of the trainer"),
         Column("first_return", "mean return of the deterministic policy before the first update"),

@@ -1,0 +1,171 @@
+"""Follows a descent of J_sigma from theta0 to an optimum, so that gradients can be taken at any share of it.
+
+The path is that of one named program. Every contact law, stiffness, backend and estimator is compared at its thetas.
+"""
+
+from __future__ import annotations
+
+import math
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from bench.errors import Unsupported
+from bench.measure.reference import draw_columns
+from bench.model import Problem
+
+REVISION = 1
+"""Raised when a path that this module computes moves."""
+PAIRS = 1024
+"""Pairs of rollouts with noise of either sign, the same at every step: J_sigma is their mean cost."""
+STEPS = 400
+"""Most steps of a descent."""
+FIRST = 0.02
+"""Length of the first step relative to theta0, or to the noise on all of theta if that is larger."""
+FAR = 1e3
+"""Distance of theta from 0, relative to that length, beyond which costs count as unbounded below."""
+GROWTH, STRAIGHT = 1.5, 0.9
+"""The step size grows by this factor where the gradient along a step falls to no less than this share, and is halved elsewhere."""
+SMALLEST = 1e-9
+"""Step, relative to that length, below which no step lowers the cost."""
+WINDOW, ENOUGH = 10, 1e-3
+"""A descent ends where this many steps have gained less than this share of its whole gain."""
+DIGITS = 6
+"""Significant digits of thetas along a path."""
+SHARES = (0.0, 0.25, 0.5, 0.75, 0.9)
+"""Shares of a descent at which rows show its path, besides their own."""
+LEFT = 0.5
+"""Gradient at the end, on noise that the descent has not used, relative to that at theta0, above which no optimum was reached."""
+SURE = 3.0
+"""Standard errors by which the gain must exceed 0 on noise that the descent has not used."""
+
+
+class Point(NamedTuple):
+    """A share of a descent: theta there, the norm of the gradient at its start, and what the path is like."""
+
+    theta: tuple[float, ...]
+    start_norm: float
+    along: dict[str, list[float]]
+    """Lists, by share: ``share``, the norm of ``theta``, ``cost``, ``gradient``, ``speed`` and ``move``, see :class:`Descent`."""
+
+
+@dataclass(frozen=True)
+class Descent:
+    """A path of K thetas with falling costs, or the ``reason`` why there is none.
+
+    ``thetas (K, d)``, and per theta J_sigma ``costs``, the norms ``gradients`` of its gradient, the largest ``speeds``
+    of a coordinate along the rollout without noise, and the largest distances ``moves`` of a coordinate from its start:
+    NaN if the backend does not expose states, or the scene has none.
+    """
+
+    thetas: list[list[float]]
+    costs: list[float]
+    gradients: list[float]
+    speeds: list[float]
+    moves: list[float]
+    reason: str = ""
+
+    def at(self, share: float) -> Point:
+        """Return the point where this share of the gain in cost is reached, theta rounded to 6 significant digits.
+
+        Values between two thetas of the path are interpolated. Raises :class:`Unsupported` with the reason if there is no
+        path.
+        """
+        if self.reason:
+            raise Unsupported(f"no descent: {self.reason}")
+        costs, thetas = np.array(self.costs), np.array(self.thetas)
+        gained = (costs[0] - costs) / (costs[0] - costs[-1])
+        shares = sorted({*SHARES, share})
+
+        def between(values: Any) -> list[float]:
+            return [float(value) for value in np.interp(shares, gained, values)]
+
+        points = np.array([between(values) for values in thetas.T])
+        theta = points[:, shares.index(share)]
+        along = {
+            "share": shares,
+            "theta": np.linalg.norm(points, axis=0).tolist(),
+            **{name: between(getattr(self, f"{name}s")) for name in ("cost", "gradient", "speed", "move")},
+        }
+        return Point(tuple(float(f"{value:.{DIGITS}g}") for value in theta), self.gradients[0], along)
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def descend(problem: Problem) -> Descent:
+    """Return the descent of J_sigma from theta0 by gradient steps under common noise.
+
+    The gradient is the mean of the program's gradients, or of costs times scores where the cost may jump or the backend
+    has no gradients. A step that would raise the cost is halved.
+    """
+    program, theta = problem.program, problem.program.theta0
+    is_smooth = program.continuous and not program.surrogate and "grad" in problem.provides
+    if not is_smooth and program.score_refusal:
+        return _none(program.score_refusal)
+    w, fresh = (_pairs(problem, block) for block in (0, 1))
+
+    def gradient(theta: np.ndarray, w: np.ndarray = w) -> np.ndarray:
+        if is_smooth:
+            return problem.grad(theta, w).mean(axis=1)
+        costs = problem.value(theta, w)
+        return np.asarray(((costs - costs.mean()) * problem.score(theta, w)).mean(axis=1))
+
+    def cost(theta: np.ndarray) -> float:
+        return float(problem.value(theta, w).mean())
+
+    scale = max(float(np.linalg.norm(theta)), problem.sigma * math.sqrt(theta.size))
+    thetas, costs, slopes, step = [theta], [cost(theta)], [gradient(theta)], 0.0
+    while math.isfinite(costs[-1]) and (size := float(np.linalg.norm(slopes[-1]))) > 0.0 and math.isfinite(size):
+        step = step or FIRST * scale / size
+        new = thetas[-1] - step * slopes[-1]
+        while not (reached := cost(new)) < costs[-1] and step * size > SMALLEST * scale:
+            step /= 2.0
+            new = thetas[-1] - step * slopes[-1]
+        if not reached < costs[-1]:
+            break
+        thetas.append(new)
+        costs.append(reached)
+        slopes.append(gradient(new))
+        step *= GROWTH if slopes[-1] @ slopes[-2] >= STRAIGHT * size**2 else 0.5
+        if len(costs) > WINDOW and costs[-1 - WINDOW] - costs[-1] < ENOUGH * (costs[0] - costs[-1]):
+            break
+        if len(costs) > STEPS or np.linalg.norm(new) > FAR * scale:
+            return _none(f"the cost still falls after {len(costs) - 1} steps, from {costs[0]:.4g} to {costs[-1]:.4g}")
+    norms = [float(np.linalg.norm(slope)) for slope in slopes]
+    if not np.isfinite([*costs, *norms]).all():
+        return _none(f"at step {len(costs) - 1} costs or gradients are not finite")
+    gain = problem.value(theta, fresh) - problem.value(thetas[-1], fresh)
+    gain = gain.reshape(2, -1).mean(axis=0)
+    error = float(gain.std(ddof=1)) / math.sqrt(gain.size)
+    if not gain.mean() > SURE * error:
+        return _none(
+            f"from theta0 the cost falls by {gain.mean():.2g} +- {error:.2g} in {len(costs) - 1} steps: theta0 may be an optimum"
+        )
+    left = float(np.linalg.norm(gradient(thetas[-1], fresh))) / norms[0]
+    if not left < LEFT:
+        return _none(f"no optimum in {len(costs) - 1} steps: the gradient there is {left:.2g} times that at theta0")
+    path = np.array(thetas)
+    return Descent(path.tolist(), costs, norms, *_motion(problem, path))
+
+
+def _none(reason: str) -> Descent:
+    return Descent([], [], [], [], [], reason)
+
+
+def _pairs(problem: Problem, block: int) -> np.ndarray:
+    """Return noise ``(n_w, 2 PAIRS)``: a half, and the same with the opposite noise and the same own noise of the scene."""
+    half = draw_columns(problem, "descent", PAIRS, block)
+    return np.concatenate([half, 2.0 * problem.centred(half) - half], axis=1)
+
+
+def _motion(problem: Problem, path: np.ndarray) -> tuple[list[float], list[float]]:
+    """Return the largest speed, and the largest distance of a coordinate from its start, per theta, without noise."""
+    n_q = int(getattr(problem.program.scene, "n_q", 0))
+    with suppress(Unsupported):
+        still = np.repeat(problem.program.noise_free[:, :1], len(path), axis=1)
+        states = problem.trajectory(path.T.copy(), still).states
+        speeds = np.abs(states[:, n_q:]).max(axis=(0, 1))
+        moves = np.abs(states[:, :n_q] - states[:1, :n_q]).max(axis=(0, 1))
+        return speeds.tolist(), moves.tolist()
+    return [math.nan] * len(path), [math.nan] * len(path)

@@ -1,0 +1,31 @@
+"""Stores descents beside the reference gradients."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from bench.measure.descent import Descent
+from bench.run.files import make_directory, write_whole
+from bench.run.rows import read_object
+
+
+def save(folder: Path, key: str, found: Mapping[str, Any]) -> Descent:
+    """Store the fields of a descent and return it."""
+    make_directory(folder)
+    write_whole(_path(folder, key), json.dumps(found).encode())
+    return Descent(**found)
+
+
+def load(folder: Path, key: str) -> Descent | None:
+    """Return a stored descent; None if the file is missing or unreadable."""
+    try:
+        return Descent(**read_object(_path(folder, key)))
+    except TypeError:
+        return None
+
+
+def _path(folder: Path, key: str) -> Path:
+    return folder / f"descent_{key}.json"

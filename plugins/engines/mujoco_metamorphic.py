@@ -1,0 +1,83 @@
+"""MuJoCo's C engine in the checks without a reference."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mujoco
+import numpy as np
+from mujoco import rollout
+
+VERSIONS = {"mujoco": mujoco.__version__}
+
+
+class Model:
+    """A model from MJCF text. Each call starts with data of its own state only."""
+
+    def __init__(self, mjcf: str) -> None:
+        self.model = mujoco.MjModel.from_xml_string(mjcf)
+        self.data = mujoco.MjData(self.model)
+        if self.model.nkey:
+            mujoco.mj_resetDataKeyframe(self.model, self.data, 0)
+        self.start = self.data.qpos.copy(), self.data.qvel.copy()
+
+    def at(self, q: Any, v: Any = 0.0, u: Any = 0.0) -> Any:
+        """Return fresh data at a state."""
+        mujoco.mj_resetData(self.model, self.data)
+        self.data.qpos[:], self.data.qvel[:], self.data.ctrl[:] = q, v, u
+        return self.data
+
+    def acceleration(self, q: Any, v: Any, u: Any) -> np.ndarray:
+        """Return the accelerations, ``(n_v,)``."""
+        data = self.at(q, v, u)
+        mujoco.mj_forward(self.model, data)
+        return np.array(data.qacc)
+
+    def step(self, q: Any, v: Any, u: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Return the next state."""
+        return self.rollout(q, v, [u])
+
+    def rollout(self, q: Any, v: Any, controls: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Return the last state of a rollout."""
+        data = self.at(q, v)
+        for u in controls:
+            data.ctrl[:] = u
+            mujoco.mj_step(self.model, data)
+        return data.qpos.copy(), data.qvel.copy()
+
+    def steps(self, q: Any, v: Any, u: Any) -> list[np.ndarray]:
+        """Return the next states of rows of states, by threads."""
+        start, data = np.hstack([np.zeros((len(q), 1)), q, v]), [mujoco.MjData(self.model) for _ in range(2)]
+        after, _ = rollout.rollout(self.model, data, start, np.asarray(u)[:, None], nstep=1)
+        return np.split(after[:, 0, 1:], [self.model.nq], axis=1)
+
+    def jacobian(self, q: Any, v: Any, u: Any) -> np.ndarray:
+        """Return the derivative of the next state by the state, by differences in C."""
+        if self.model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
+            raise NotImplementedError("mjd_transitionFD refuses RK4")
+        result = np.empty((2 * self.model.nv, 2 * self.model.nv))
+        mujoco.mjd_transitionFD(self.model, self.at(q, v, u), 1e-6, True, result, None, None, None)
+        return result
+
+    def _constraints(self, q: Any) -> Any:
+        data = self.at(q)
+        mujoco.mj_fwdPosition(self.model, data)
+        return data
+
+    def gaps(self, q: Any) -> np.ndarray:
+        """Return the gaps of contacts and limits that act."""
+        data = self._constraints(q)
+        return np.array(
+            (data.efc_pos - data.efc_margin)[data.efc_type >= int(mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT)]
+        )
+
+    def loops(self, q: Any) -> np.ndarray:
+        """Return the distances of equalities."""
+        data = self._constraints(q)
+        return np.array(data.efc_pos[data.efc_type == int(mujoco.mjtConstraint.mjCNSTR_EQUALITY)])
+
+    def force(self, q: Any) -> np.ndarray:
+        """Return the generalised forces at rest without constraints."""
+        data = self.at(q)
+        mujoco.mj_forward(self.model, data)
+        return np.array(data.qfrc_smooth)

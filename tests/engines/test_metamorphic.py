@@ -1,0 +1,202 @@
+"""Checks without a reference: they hold for the C engine, each finds a fault of its own kind, and the command reports both."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bench.cli import main
+from bench.engines import conformance
+from bench.engines.conformance import metamorphic
+from bench.experiment import by_name
+from bench.model import compose
+
+pytest.importorskip("mujoco")
+from bench.plugins.backends import mjx
+from bench.plugins.engines.mujoco_metamorphic import Model
+
+from bench.plugins import mjcf
+
+LOOP = conformance.runner.FOLDER / "connect_fast.xml"
+CHAIN = conformance.runner.FOLDER / "sparse_chain.xml"
+ALL = tuple(metamorphic.PROPERTIES)
+
+
+@pytest.mark.parametrize(
+    "path", [LOOP, CHAIN, *(conformance.runner.FOLDER / f"{name}.xml" for name in ("rk4", "weld"))]
+)
+def test_all_properties_hold_for_the_c_engine(path):
+    rows = list(metamorphic.check(Model, path, steps=12))
+    assert [row["property"] for row in rows] == list(ALL)
+    assert not [row for row in rows if row["holds"] is False]
+    assert sum(row["holds"] is True for row in rows) >= 7
+
+
+def scaled(word):
+    """Accelerations a thousandth larger in models whose MJCF has a word."""
+
+    class Scaled(Model):
+        def __init__(self, mjcf):
+            super().__init__(mjcf)
+            self.scale = 1.001 if word in mjcf else 1.0
+
+        def acceleration(self, q, v, u):
+            return self.scale * super().acceleration(q, v, u)
+
+    return Scaled
+
+
+class FirstDiffers(Model):
+    def acceleration(self, q, v, u):
+        return super().acceleration(q, v, u) * (1 + 1e-4 * (np.arange(v.size) == 0))
+
+
+class BatchDiffers(Model):
+    def steps(self, q, v, u):
+        return [1.0001 * part for part in super().steps(q, v, u)]
+
+
+class KeepsFirstControl(Model):
+    def rollout(self, q, v, controls):
+        return super().rollout(q, v, [controls[0]] * len(controls))
+
+
+class NoVelocityProduct(Model):
+    def acceleration(self, q, v, u):
+        return super().acceleration(q, 0 * v, u)
+
+
+class Skin(Model):
+    def acceleration(self, q, v, u):
+        return super().acceleration(q, v, u) * (1.0 if q[0] % 2e-3 < 1e-3 else 1.1)
+
+
+class Stale(Model):
+    def jacobian(self, q, v, u):
+        return super().jacobian(q, 0 * v, u)
+
+
+class Swirl(Model):
+    def force(self, q):
+        return super().force(q) + 0.01 * np.roll(q, 1)
+
+
+class Parts(Model):
+    def reference(self, q, v, u):
+        return super().acceleration(q, v, 1.01 * u)
+
+
+FAULTS = (
+    *map(scaled, ('jacobian="sparse"', 'island="disable"', 'solver="CG"')),
+    FirstDiffers, BatchDiffers, KeepsFirstControl, NoVelocityProduct, Skin, Stale, Swirl, Parts,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(("property", "engine"), list(zip(ALL, FAULTS, strict=True)), ids=ALL)
+def test_a_planted_fault_breaks_its_property(property, engine):
+    (row,) = metamorphic.check(engine, LOOP, property)
+    assert row["holds"] is False
+    assert row["worst"] > row["tolerance"]
+    q, v, u = row["state"]
+    assert (len(q), len(v), len(u)) == (3, 3, 1)
+
+
+def test_what_a_model_or_an_engine_lacks_is_not_checked():
+    class Bare:
+        def __init__(self, mjcf):
+            own = Model(mjcf)
+            self.start, self.step, self.acceleration = own.start, own.step, own.acceleration
+
+    rows = {row["property"]: row for row in metamorphic.check(Bare, CHAIN, steps=3)}
+    assert rows["closed loops stay closed"]["holds"] is None
+    assert "Model has no steps(q, v, u)" in rows["batch = single"]["reason"]
+    assert rows["dense = sparse"]["holds"] is True
+    assert rows["dense = sparse"]["states"] == 3
+
+
+def test_files_that_a_model_includes_and_its_meshes_are_read(tmp_path):
+    (tmp_path / "mesh").mkdir()
+    (tmp_path / "mesh" / "cube.obj").write_text(
+        "".join(f"v {x} {y} {z}\n" for x in (0, 1) for y in (0, 1) for z in (0, 1))
+        + "f 1 2 3\nf 2 3 4\nf 5 6 7\nf 1 2 5\n"
+    )
+    (tmp_path / "options.xml").write_text('<mujoco><compiler meshdir="mesh"/><option gravity="0 0 -2"/></mujoco>')
+    (tmp_path / "model.xml").write_text(
+        '<mujoco><include file="options.xml"/><asset><mesh name="cube" file="cube.obj"/></asset><worldbody>'
+        '<body><joint axis="0 1 0"/><geom type="mesh" mesh="cube"/></body></worldbody></mujoco>'
+    )
+    subject = metamorphic.Subject(Model, tmp_path / "model.xml", steps=2)
+    assert subject.model.model.opt.gravity[2] == -2
+    assert subject.model.model.nmesh == 1
+
+
+def test_the_command_prints_each_property_and_fails_where_one_is_broken(capsys):
+    assert main(["engines", "metamorphic", str(LOOP), "steps=6"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("dense = sparse                    holds   ")
+    assert lines[-1].startswith("mujoco 3.")
+    assert main(["engines", "metamorphic", str(LOOP), "brax"]) == 2
+    assert "has no file" in capsys.readouterr().err
+    assert main(["engines", "metamorphic", str(LOOP), "stps=6"]) == 2
+    assert "stps=6 is not a setting" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("case", "words"),
+    [
+        ("box_on_edge", ["corners within 1 mm"]),
+        ("connect", ["velocity product J-dot v"]),
+        ("weld", ["velocity product J-dot v"]),
+        ("sparse_chain", ["corners within 1 mm", "friction pyramid of a capsule"]),
+        ("stacked", []),
+        ("joint_equality", []),
+    ],
+)
+def test_what_mjx_lacks_is_remarked_from_the_model(case, words):
+    import mujoco
+
+    remarks = mjcf.mjx_remarks(mujoco.MjModel.from_xml_path(str(conformance.runner.FOLDER / f"{case}.xml")))
+    assert len(remarks) == len(words)
+    assert all(word in remark for word, remark in zip(words, remarks, strict=True))
+
+
+def test_remarks_are_printed_once_before_anything_runs(capsys):
+    """The cube's box is on a plane."""
+    backend = by_name.make("backends", "mjx[iterations=20]")
+    scene = by_name.make("scenes", "mjcf[file=cube.xml,theta=velocity,noise=parameter]")
+    program = compose(scene, by_name.make("contacts", "penalty"), by_name.make("integrators", "semi_implicit_euler"))
+    mjx._REMARKED.clear()
+    assert [backend.refusal(program) for _ in range(2)] == [None, None]
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "mjcf: MJX is not the C engine: boxes and meshes on planes touch only with corners within 1 mm" in line
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("property", "text"),
+    [
+        ("closed loops stay closed", LOOP.read_text()),
+        (
+            "accelerations are continuous",
+            '<mujoco><worldbody><geom type="plane" size="5 5 1"/><body pos="0 0 .0985"><freejoint/><geom type="box" '
+            'size=".2 .15 .1"/></body></worldbody></mujoco>',
+        ),
+    ],
+)
+def test_what_mjx_lacks_is_found_without_a_reference(property, text, tmp_path):
+    """The velocity product J-dot v, and contacts of corners above 1 mm over the deepest: were they repaired, the documentation would be wrong."""
+    pytest.importorskip("mujoco.mjx")
+    (tmp_path / "model.xml").write_text(text)
+    from bench.engines import table
+    from bench.model import registry
+
+    plugin = registry.usable("backends", "mjx")
+    (row,) = table.rows_of(
+        plugin(),
+        table.file_of(plugin, "_metamorphic.py"),
+        Path(metamorphic.__file__),
+        str(tmp_path / "model.xml"),
+        property,
+    )
+    assert row["holds"] is False
+    assert row["worst"] > 0.1
