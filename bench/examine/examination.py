@@ -31,8 +31,8 @@ TOLERANCE = 1e-4
 """Default relative error of a derivative below which it only causes a warning."""
 COMPILE_S = 300.0
 """Default time limit of all first calls together [s]."""
-PANELS = (7, 12)
-"""Numbers of panels, of 4 Gauss-Legendre points each, of the two integrals of the gradient along a line."""
+NODES = (28, 48)
+"""Points of the two integrals of the gradient along a line, by Gauss-Legendre."""
 LEAST_MISSED = 0.002
 """Largest error of the integral of the gradient, as a share of the cost's change, that is always accepted."""
 LINE_EFFORTS = ((PLACES, HALVINGS), (3, 10), (1, 10))
@@ -416,34 +416,40 @@ class _Examination:
                 )
                 cost = partial(self.stages.costs_along, direction)
                 line = scan(cost, direction, rounding, REACH, effort, self.simulator.unit)
-                lines.append(replace(line, missed=self._missed_share(line, checked)))
+                lines.append(self._integrated(line, checked))
         except OutOfTime:
             self.left_out.append("jumps and kinks on lines")
         self.clock.limit(1.0)
         return lines
 
-    def _missed_share(self, line: LineScan, checked: Check) -> float:
-        """Return the share of the cost's change along a line that its gradient does not explain.
+    def _integrated(self, line: LineScan, checked: Check) -> LineScan:
+        """Return a line with the share of the cost's change that a right gradient does not explain.
 
-        Without jumps, the integral of a right gradient along a line is the difference of the costs at its ends. The
-        share is NaN without a right gradient, or where the integral is less accurate than both a tenth of the share and
-        :data:`LEAST_MISSED`.
+        Without jumps, the integral of a right gradient along a line, by Gauss-Legendre, is the difference of the costs at
+        its ends. The share is NaN without a right gradient, or where the integral is less accurate than both a tenth of
+        the share and :data:`LEAST_MISSED`. Points at which the gradient is not a number, and the cost is, are counted instead.
         """
         if not checked.trusted or not self.simulator.has_gradient:
-            return math.nan
+            return line
         changes = np.abs(np.diff(line.costs)).sum()
         rounding = self.simulator.unit * np.abs(line.costs).max(initial=0.0) + checked.noise
         # where the cost hardly changes, its rounding is all that the integral could miss
         if not (np.isfinite(changes) and changes > 0 and rounding < 0.1 * LEAST_MISSED * changes):
-            return math.nan
-        if not self.clock.can_afford(0, 4 * sum(PANELS)):
+            return line
+        if not self.clock.can_afford(0, sum(NODES)):
             self.left_out.append("the integral of the gradient along a line")
-            return math.nan
-        ends = float(line.at[0]), float(line.at[-1])
-        integrals = [self.stages.integrate(line.direction, *ends, panels) for panels in PANELS]
+            return line
+        integrals, half = [], float(line.at[-1])
+        for points in NODES:
+            x, weights = np.polynomial.legendre.leggauss(points)
+            slopes = self.stages.slopes_along(line.direction, half * x)
+            lost = half * x[~np.isfinite(slopes)]
+            if lost.size and np.isfinite(self.stages.costs_along(line.direction, lost)).any():
+                return replace(line, n_lost=lost.size)
+            integrals.append(half * float(weights @ slopes))
         missed = abs(line.costs[-1] - line.costs[0] - integrals[-1]) / changes
         doubt = abs(integrals[-1] - integrals[0]) / changes
-        return float(missed) if doubt < max(0.1 * missed, LEAST_MISSED) else math.nan
+        return replace(line, missed=float(missed)) if doubt < max(0.1 * missed, LEAST_MISSED) else line
 
     # ------------------------------------------------------------------------------------------------ noise
 

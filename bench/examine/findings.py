@@ -213,7 +213,7 @@ class Findings:
     def named(self) -> Check:
         """The check with the cause of :attr:`hint` as the verdict of wrong derivatives."""
         check = self.judged
-        if self.hint is None or check.cause not in SUSPICIOUS:
+        if self.hint is None:
             return check
         cause = self.hint.cause if self.hint.cause in SUSPICIOUS else "wrong_adjoint"
         return recaused(check, lambda part: replace(part, verdict=cause) if part.verdict in SUSPICIOUS else part)
@@ -460,6 +460,8 @@ class Findings:
         elif self.misses_jumps and not is_mean:
             has_jumps = any(line.jumps for line in self.lines if line.missed > SEEN)
             found.append(("staircase" if self.tread else "jumps" if has_jumps else "spread", None))
+        if any(line.n_lost for line in self.lines):
+            found.append(("nan_gradient", None))
         for one in self.smoothed:
             is_shown = one.cause == "spread" and is_mean and not self.setup.levels  # by draws at theta itself
             found += [(one.cause, one)] if one.cause and not is_shown else []

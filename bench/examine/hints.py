@@ -9,7 +9,7 @@ import numpy as np
 
 from bench.gradient import Check
 from bench.gradient.diagnosis import Explanation
-from bench.gradient.rules import SUSPICIOUS
+from bench.gradient.rules import EXCUSABLE, SUSPICIOUS
 from bench.report.text import counted, number
 
 ALIKE = 1e-3
@@ -61,6 +61,7 @@ def _difference(numbers: Numbers) -> str:
 
 def _order(numbers: Numbers) -> str:
     is_other = numbers.is_whole and numbers.is_wrong.sum() > 1
+    is_other = is_other and not _are_equal(numbers.program, numbers.difference)
     is_same = is_other and _are_equal(np.sort(numbers.program), np.sort(numbers.difference))
     return "its numbers are the differences in another order" if is_same else ""
 
@@ -125,9 +126,9 @@ HINTS: Sequence[tuple[str, Callable[[Numbers], str]]] = (
 
 @np.errstate(all="ignore")
 def hint_of(check: Check, theta: np.ndarray, explained: Explanation) -> Hint | None:
-    """Return the first explanation that fits a wrong gradient at ``theta (d,)``; None if none does, or nothing is wrong."""
-    parts = [part for part in check.components if part.component is not None]
-    if check.cause not in SUSPICIOUS or not any(part.verdict in SUSPICIOUS for part in parts):
+    """Return the first explanation that fits a wrong gradient at ``theta (d,)``; None if none does, or a factor is the cause."""
+    parts = check.components
+    if check.cause not in EXCUSABLE or not any(part.verdict in SUSPICIOUS for part in parts):
         return None
     columns = ([theta[part.component or 0], part.program, part.difference] for part in parts)
     at, program, difference = np.array(list(columns)).T

@@ -52,15 +52,19 @@ class Mean:
     """Whether jumps carry a part of the mean slope, so that small differences do not show it."""
     is_smooth: bool
     """Whether it is known that they carry none."""
+    n_lost: int = 0
+    """Number of draws with a gradient that is not a number, where the costs are numbers."""
 
     @property
     def is_decisive(self) -> bool:
-        """Whether the draws are enough, and small differences show the mean slope."""
-        return self.draws >= ENOUGH and self.is_smooth
+        """Whether the draws are enough, and small differences show the mean slope, or a gradient is not a number."""
+        return self.n_lost > 0 or (self.draws >= ENOUGH and self.is_smooth)
 
     @property
     def cause(self) -> str:
-        """The verdict on the mean: ``estimator``, ``biased`` or ``spread``; only without jumps."""
+        """The verdict on the mean: ``nan_gradient``, ``estimator``, ``biased`` or ``spread``; the last three only without jumps."""
+        if self.n_lost:
+            return "nan_gradient"
         if 2.0 * self.error > CLEAR * self.doubt:
             return "biased"
         return "estimator" if self.error + self.doubt <= RIGHT else "spread"
@@ -102,6 +106,9 @@ def _slopes(stages: GradientStages, vectors: np.ndarray, w: np.ndarray) -> np.nd
 def _summary(drawn: np.ndarray, n_noise: int) -> Mean:
     w, slopes = drawn[:n_noise], drawn[n_noise:]
     gradient, small, wide = np.split(slopes, 3)
+    n_lost = int((np.isfinite(small).all(axis=0) & ~np.isfinite(gradient).all(axis=0)).sum())
+    if n_lost:
+        return Mean(drawn.shape[1], math.inf, math.inf, False, False, False, n_lost)
     apart, beyond = gradient - small, wide - small
     mean, error = _mean(apart, w)
     jump, jump_error = _mean(beyond, w)

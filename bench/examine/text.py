@@ -50,6 +50,8 @@ def noise_problems(report: Findings) -> list[str]:
     found = []
     for cause, one in report.noise_found:
         fact = missed_text(report) if report.missed and cause in ("staircase", "jumps") else ""
+        if cause == "nan_gradient":
+            fact = f"at {counted(sum(line.n_lost for line in report.lines), 'point')} of lines through theta"
         if one is not None:
             bias = f"a bias of {span(*one.bias_percent)}%" if one.known else one.remark or "not distinguishable from 0"
             fact = (
@@ -106,6 +108,7 @@ def noise_answer(report: Findings) -> str:
     where = f"Under noise of sigma {sigmas}" if sigmas else "Around theta" if report.noise_cause else "Under noise"
     if report.noise_cause not in ("", "unmeasured"):
         usable = [sigma_text(report, one.sigma) for one in report.smoothed if one.is_usable]
+        usable = [] if report.noise_cause == "nan_gradient" else usable
         reason = noise_problems(report)[0] + f"; usable at sigma {', '.join(usable)}" * bool(usable)
     elif report.use == "usable":
         largest = max(
@@ -178,6 +181,8 @@ def derivative_facts(report: Findings) -> list[str]:
         "spread": mean_facts(report),
         "unmeasured": [],
     }
+    if cause == "nan_gradient" and report.means is not None and report.means.n_lost:
+        return mean_facts(report)
     if cause == "nonfinite" and (place := _where_cost_fails(report)):
         return [place]
     if cause in own:
@@ -203,6 +208,8 @@ def mean_facts(report: Findings) -> list[str]:
     means = report.means
     if means is None:
         return []
+    if means.n_lost:
+        return [f"at {means.n_lost} of {means.draws} draws"]
     if means.is_decisive:
         off = span(100 * max(means.error - means.doubt, 0.0), 100 * (means.error + means.doubt))
         return [f"its mean over {means.draws} draws is off by {off}%"]

@@ -66,6 +66,8 @@ class LineScan:
     """Whether the cost is constant between jumps everywhere: a staircase."""
     missed: float = float("nan")
     """Share of the cost's change along the line that the integral of the gradient misses; NaN if unknown."""
+    n_lost: int = 0
+    """Number of points at which the gradient is not a number, and the cost is one."""
 
     @property
     def jumps(self) -> tuple[Break, ...]:

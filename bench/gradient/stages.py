@@ -202,17 +202,12 @@ class GradientStages:
         for store in (self._costs_store, self._gradients_store):
             store.refresh()
 
-    def integrate(self, direction: np.ndarray, start: float, end: float, panels: int) -> float:
-        """Return the integral of the gradient along ``theta + t * direction`` by Gauss-Legendre, 4 points per panel."""
-        x, weight = np.polynomial.legendre.leggauss(4)
-        edges = np.linspace(start, end, panels + 1)
-        half = np.diff(edges)[:, None] / 2
-        t, weights = ((edges[:-1, None] + half) + half * x).ravel(), (half * weight).ravel()
-        slopes = [
+    def slopes_along(self, direction: np.ndarray, t: np.ndarray) -> np.ndarray:
+        """Return the program's derivatives ``(n,)`` along a direction at theta + t * direction for t of n numbers."""
+        return np.concatenate([
             direction @ self.simulator.gradients(thetas, self.same_noise(thetas.shape[1]))
             for thetas in self.thetas_along(direction, t)
-        ]
-        return float(weights @ np.concatenate(slopes))
+        ])  # fmt: skip
 
     # ------------------------------------------------------------------------------------------------ stages
 

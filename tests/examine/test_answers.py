@@ -198,3 +198,47 @@ def test_an_estimator_that_is_a_multiple_of_each_slope_is_not_wrong():
     for calls in (500, 20_000):
         report = examine(cost, [1.0], grad=score, noise=2, calls=calls)
         assert report.status == (3 if calls == 500 else 0), str(report)
+
+
+@pytest.mark.parametrize(("change", "cause"), [(lambda g: -g, "wrong_factor"), (lambda g: g * [1.0003, 1.0005], "")])
+def test_a_cheap_explanation_replaces_no_better_one(change, cause):
+    """A changed sign keeps the norm, and sorting hides a small error."""
+    report = examine(
+        lambda x: float(np.sin(x[0]) + x[1] ** 2), [1.0, 0.1], grad=lambda x: change(np.array([np.cos(x[0]), 2 * x[1]]))
+    )
+    assert report.status == 1
+    assert cause in ("", report.cause), str(report)
+    assert "in another" not in report.conclusion
+
+
+FIRST_LOST = 2.2
+"""The draw from which on a gradient is not a number: 1 in 72."""
+
+
+def lost(value, w):
+    return [value if w[0] < FIRST_LOST else math.nan]
+
+
+@pytest.mark.parametrize(
+    ("cost", "grad"),
+    [
+        (smoothed_square, lambda x, w: lost(smoothed_square(x, w) * w[0] / NARROW, w)),
+        (lambda x, w: float(x[0] ** 2 + x[0] * w[0]), lambda x, w: lost(2.0 * x[0] + w[0], w)),
+    ],
+    ids=["estimator", "derivative"],
+)
+def test_a_gradient_that_is_not_a_number_at_some_draws_is_a_fault(cost, grad):
+    report = examine(cost, [1.0], grad=grad, noise=1, calls=20_000)
+    assert (report.status, report.cause) == (1, "nan_gradient"), str(report)
+
+
+def test_a_gradient_that_is_not_a_number_in_the_tails_of_the_noise_is_a_fault():
+    """Beyond 3.5 standard deviations, which few draws reach."""
+    report = examine(
+        lambda x: float(x[0] ** 2), [1.0], grad=lambda x: [2 * x[0] if x[0] < 1.35 else math.nan], sigma=0.1
+    )
+    assert (report.status, report.cause, report.use) == (1, "nan_gradient", "NOT usable"), str(report)
+    whole = examine(
+        lambda x: float(np.sqrt(1.35 - x[0])), [1.0], grad=lambda x: [-0.5 / np.sqrt(1.35 - x[0])], sigma=0.1
+    )
+    assert whole.cause != "nan_gradient", str(whole)
