@@ -50,6 +50,8 @@ BESIDE, MOST_ROWS = 1e-3, 64
 LOOSE, MOST_OF_IT, REFINED = 0.01, 0.6, 10.0
 """Relative error of a difference that shows too little, largest share of the remaining calls for a component's smooth part,
 and step of a refined cost's differences, in multiples of the cube root of the unit roundoff: it has a tolerance too."""
+SMOOTH = 2
+"""Components along which a cost is not rough that show it smooth, so that no other is searched."""
 GROWTH = 1.5
 """Least ratio of errors at the largest and at the first wrong number of steps that counts as growth."""
 
@@ -165,16 +167,18 @@ def doubtful(outcome: Check) -> list[Part]:
 
 
 def smooth_parts(stages: GradientStages, outcome: Check) -> dict[int, SmoothPart]:
-    """Return by component the slope of a rough cost's smooth part, for all doubtful components that the budget allows."""
-    random, found = np.random.default_rng([stages.seed, 0x776964]), {}
+    """Return by component the slope of a rough cost's smooth part, for the doubtful components that the budget allows."""
+    random, found, n_smooth = np.random.default_rng([stages.seed, 0x776964]), {}, 0
     for part in doubtful(outcome):
-        if not stages.clock.can_afford(COSTS, share=MOST_OF_IT):
+        if n_smooth == SMOOTH or not stages.clock.can_afford(COSTS, share=MOST_OF_IT):
             break
         index = part.component or 0
         direction = np.eye(1, stages.theta.size, index)[0]
         one = smooth_part(partial(stages.costs_along, direction), part.sample.scale, stages.simulator.unit, random)
         if one is not None:
             found[index] = one
+        else:
+            n_smooth += 1
     return found
 
 
