@@ -13,14 +13,15 @@ from typing import Any
 import numpy as np
 
 from bench.errors import UserError, unknown
+from bench.examine import diagnosis
 from bench.examine.findings import RELATIVE, GroupSize, Setup, Spent
+from bench.examine.lines import HALVINGS, PLACES, POINTS, REACH, LineScan, scan
 from bench.examine.means import OF_A_DRAW, Mean, compare_means
 from bench.examine.report import Report
 from bench.examine.smoothing import FEWEST, OWN_PAIRS, PAIRS, Smoothed, directions, largest_unseen, measure_smoothed
-from bench.gradient import Check, diagnosis
-from bench.gradient.lines import HALVINGS, PLACES, POINTS, REACH, LineScan, scan
+from bench.examine.stages import GradientStages
+from bench.gradient import Check
 from bench.gradient.rules import RULES, SUSPICIOUS
-from bench.gradient.stages import GradientStages
 from bench.simulator.clock import Clock, OutOfTime, end_on_sigterm, parse_duration
 from bench.simulator.simulator import Simulator
 from bench.simulator.tree import ParameterTree
@@ -273,7 +274,7 @@ class _Examination:
             theta=stages.theta,
             cost=stages.value,
             precision=simulator.precision,
-            batch=simulator.batch + (f":{simulator.fixed}" if simulator.fixed else ""),
+            batch=simulator.mode,
             repeats=stages.repeats,
             setup=setup,
             spent=Spent(

@@ -10,16 +10,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from bench.examine.diagnosis import LOOSE, Explanation, grows, may_be_adaptive
 from bench.examine.hints import Hint, hint_of
+from bench.examine.lines import ALIKE, LineScan
 from bench.examine.means import OF_A_DRAW, Mean
 from bench.examine.smoothing import TARGET_ERROR, Method, Smoothed
+from bench.examine.stages import Repeats, recaused
 from bench.gradient import FAULTS, TRUSTED, Check, Part, Sample, rules
-from bench.gradient.diagnosis import LOOSE, Explanation, grows, may_be_adaptive
 from bench.gradient.direction import CHANCE, resolution
-from bench.gradient.lines import ALIKE, LineScan
 from bench.gradient.rules import EXCUSABLE, RULES, STATUS, SUSPICIOUS, UNEQUAL
 from bench.gradient.smooth_part import LIMIT
-from bench.gradient.stages import Repeats, recaused
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from bench.examine.diagnosis import Explanation
 from bench.gradient import Check
-from bench.gradient.diagnosis import Explanation
 from bench.gradient.rules import EXCUSABLE, SUSPICIOUS
 from bench.report.text import counted, number
 

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bench.examine.stages import GradientStages
 from bench.gradient.rules import UNEQUAL
-from bench.gradient.stages import GradientStages
 from bench.simulator.clock import OutOfTime
 
 FIRST, ENOUGH, MOST = 16, 256, 65536

@@ -16,7 +16,7 @@ from statistics import NormalDist
 
 import numpy as np
 
-from bench.gradient.lines import REACH, LineScan
+from bench.examine.lines import REACH, LineScan
 from bench.simulator.clock import Clock, OutOfTime
 from bench.simulator.simulator import Simulator
 

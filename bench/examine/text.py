@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 
 from bench.examine.findings import FAILED, RIGHT, SEEN, WRONG, Findings
+from bench.examine.lines import REACH
 from bench.examine.smoothing import PAIRS
-from bench.gradient import FAULTS, Check, Part
-from bench.gradient.lines import REACH
+from bench.examine.stages import is_rough
+from bench.examine.subspace import GROUPS, MOST
+from bench.gradient import FAULTS, Check, Part, step_sizes
 from bench.gradient.rules import RULES, SUSPICIOUS, UNEQUAL
-from bench.gradient.stages import is_rough, step_sizes
-from bench.gradient.subspace import GROUPS, MOST
 from bench.report.text import counted, duration, number, span
 
 SAME_FACTOR = 0.05

@@ -15,6 +15,8 @@ import numpy as np
 
 EPS = np.logspace(-2, -10, 17)
 """Step sizes, two per decade, in units of the natural scale."""
+SINGLE_EPS = np.logspace(-1, -7, 13)
+"""Steps in single precision: the best is near 5e-3."""
 FINE = np.logspace(-2, -13, 23)
 """Steps for directions that :data:`EPS` leaves unsettled, as on a long rollout that amplifies."""
 CONVERGING, ORDER = 8, 1.5
@@ -125,6 +127,11 @@ class Finding:
     uncertainty: float = float("nan")
     left: float = float("nan")
     right: float = float("nan")
+
+
+def step_sizes(unit: float) -> np.ndarray:
+    """Return the step sizes of a check in arithmetic of a unit roundoff, in units of the natural scale."""
+    return EPS if unit < 1e-10 else SINGLE_EPS
 
 
 def best(sample: Sample) -> int:

@@ -16,7 +16,7 @@ import bench
 from bench import cli
 from bench.errors import UserError
 from bench.examine import smoothing, text
-from bench.gradient.lines import Break, LineScan, scan
+from bench.examine.lines import Break, LineScan, scan
 from bench.simulator import simulator, tree
 from bench.simulator.simulator import Simulator
 from bench.simulator.tree import ParameterTree

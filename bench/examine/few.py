@@ -13,10 +13,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from .causes import causes_of_ratios
-from .check import NOTHING, Check, Part, cause_of
-from .direction import ALIKE, MEASURED, Sample, finding_at, resolution, wrong
-from .subspace import Subspace
+from bench.examine.subspace import Subspace
+from bench.gradient.causes import causes_of_ratios
+from bench.gradient.check import NOTHING, Check, Part, cause_of
+from bench.gradient.direction import ALIKE, MEASURED, Sample, finding_at, resolution, wrong
 
 ROUNDS = (1.0, 30.0, 0.1)
 """Steps of the rounds, in multiples of the cube root of the unit roundoff, at which rounding and curvature balance."""

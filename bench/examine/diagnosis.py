@@ -9,15 +9,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from bench.examine.few import FewSteps
+from bench.examine.lines import LineScan, scan
+from bench.examine.stages import GradientStages
+from bench.examine.steps import changing_loop
+from bench.examine.subspace import choose
 from bench.gradient import Check, Part, roughness
 from bench.gradient.direction import CHANCE
-from bench.gradient.few import FewSteps
-from bench.gradient.lines import LineScan, scan
 from bench.gradient.rules import SUSPICIOUS, UNEQUAL
 from bench.gradient.smooth_part import COSTS, SmoothPart, smooth_part
-from bench.gradient.stages import GradientStages
-from bench.gradient.steps import changing_loop
-from bench.gradient.subspace import choose
 from bench.simulator.simulator import Simulator
 
 NEAR = 0.05
@@ -103,11 +103,8 @@ class Explanation:
 
 def refined_gaps(stages: GradientStages, refined: Callable[..., Any]) -> list[Gap]:
     """Return the gaps at theta and at other thetas around it, along a few random directions each."""
-    other, scale, random = (
-        _simulator(stages, refined, None),
-        stages.scale,
-        np.random.default_rng([stages.seed, 0x676170]),
-    )
+    other, scale = stages.simulator.variant(refined), stages.scale
+    random = np.random.default_rng([stages.seed, 0x676170])
     eps, size, gaps = float(np.cbrt(stages.simulator.unit)), stages.theta.size, []
     for spread in (0.0, *[AROUND] * ELSEWHERE):
         theta = stages.theta + spread * scale * random.standard_normal(size)
@@ -133,8 +130,7 @@ def errors_by_horizon(stages: GradientStages, horizons: Sequence[int]) -> list[H
     result = []
     simulator = stages.simulator
     for steps in sorted(horizons):
-        grad = partial(simulator._grad, steps=steps) if callable(simulator._grad) else simulator._grad
-        other = _simulator(stages, partial(simulator._cost, steps=steps), grad)
+        other = simulator.with_steps(steps)
         gradient = other.gradients(stages.theta[:, None], stages.w)[:, 0]
         space = choose(stages.layout, stages.scale, gradient, stages.seed, most=4)
 
@@ -184,7 +180,7 @@ def smooth_parts(stages: GradientStages, outcome: Check) -> dict[int, SmoothPart
 
 def refined_slopes(stages: GradientStages, refined: Callable[..., Any], parts: Iterable[Part]) -> dict[int, float]:
     """Return by component of some parts the central difference of the refined cost."""
-    other, found = _simulator(stages, refined, None), {}
+    other, found = stages.simulator.variant(refined), {}
     for index in (part.component for part in parts if part.component is not None):
         step = float(np.cbrt(stages.simulator.unit)) * stages.scale[index] * REFINED
         moved = stages.theta[:, None] + np.outer(np.eye(1, stages.theta.size, index)[0], [-step, step])
@@ -300,9 +296,3 @@ def is_adaptive(
     is_near = error <= NEAR and ((heights < SMALL_JUMPS * changes) & (errors <= EXPLAINED * heights)).any()
     is_far = heights.sum() < FAR_JUMPS * changes.sum() and (errors <= heights).all()
     return bool(is_near or is_far)
-
-
-def _simulator(stages: GradientStages, cost: Callable[..., Any], grad: Any) -> Simulator:
-    own = stages.simulator
-    batch = own.batch + (f":{own.fixed}" if own.fixed else "")
-    return Simulator(cost, stages.layout, grad, own.noise, batch, stages.clock, own.library)

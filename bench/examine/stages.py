@@ -15,25 +15,14 @@ from functools import partial
 
 import numpy as np
 
-from bench.gradient import (
-    EPS,
-    FAULTS,
-    TRUSTED,
-    Check,
-    Options,
-    Part,
-    Sample,
-    check,
-)  # fmt: skip
+from bench.examine.few import ROUNDS, FewSteps, is_nothing
+from bench.examine.subspace import Group, Subspace, choose, locate
+from bench.gradient import EPS, FAULTS, TRUSTED, Check, Options, Part, Sample, check, step_sizes
 from bench.gradient.check import NOTHING, cause_of
-from bench.gradient.few import ROUNDS, FewSteps, is_nothing
 from bench.gradient.roughness import FINE
-from bench.gradient.subspace import Group, Subspace, choose, locate
 from bench.simulator.clock import OutOfTime
 from bench.simulator.simulator import Simulator
 
-SINGLE_EPS = np.logspace(-1, -7, 13)
-"""Steps of a check in single precision, relative to each input's scale: the best is near 5e-3."""
 NOISE_POINTS = 17
 """Costs per direction that no step needs: the centre, and the points at which the noise is measured."""
 SCAN = 7 * 65
@@ -518,11 +507,6 @@ class GradientStages:
             self.left_out.append("checks under other noise")
         finally:
             self.w, self._costs_store, self._gradients_store = own
-
-
-def step_sizes(unit: float) -> np.ndarray:
-    """Return the step sizes of a check in arithmetic of a unit roundoff, in units of the natural scale."""
-    return EPS if unit < 1e-10 else SINGLE_EPS
 
 
 def _are_equal(values: np.ndarray) -> bool:
