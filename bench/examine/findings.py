@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from bench.errors import needing_sweeps
 from bench.examine.diagnosis import LOOSE, Explanation, grows, may_be_adaptive
 from bench.examine.hints import Hint, hint_of
 from bench.examine.lines import ALIKE, LineScan
@@ -640,6 +641,7 @@ class Findings:
 
 
 def _frame(rows: list[dict[str, Any]], columns: list[str] | None = None) -> pd.DataFrame:
-    import pandas as pd
+    with needing_sweeps("a table"):
+        import pandas as pd
 
     return pd.DataFrame(rows, columns=columns)
