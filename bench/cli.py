@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bench.errors import INTERRUPTED, UserError, printable, unknown
+from bench.errors import INTERRUPTED, UserError, needing_sweeps, printable, unknown
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -93,7 +93,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command. Returns the exit status."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        with _stop_on_signals():
+        with _stop_on_signals(), needing_sweeps(" ".join(["bench", *words[:1]])):
             return _dispatch(words)
     except UserError as error:
         print("bench:", printable(error), file=sys.stderr)
