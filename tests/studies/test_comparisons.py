@@ -244,3 +244,37 @@ def test_a_lucky_estimate_equal_to_an_exact_reference_is_a_limit_too():
     )
     assert methods["error"].iloc[0] == pytest.approx(math.hypot(0.04, 0.01))
     assert compared[["first", "tied"]].values.tolist() == [["", ("fobg",)]]
+
+
+# ------------------------------------------------------------------------------------------ what to use, and what fails
+
+
+def recommended(*cells):
+    """What to use per range of the stiffness."""
+    rows = table(list(cells))
+    shown = experiment(sweep={"stiffness": sorted(map(float, rows["stiffness"].unique()))})
+    (found,) = (one for one in shown.study.views(shown, rows).tables if one.name == "recommendations")
+    return found.frame
+
+
+def test_what_does_not_work_is_never_recommended():
+    """The lowest error was recommended also at 1.13 times the gradient, where every interval lies above 1."""
+    cells = [cell(e, 0.9 * e, 1.1 * e, stiffness=k, estimator=name) for name, *errors in
+             (("fobg", 0.1, 1.3, 1.02, 0.95), ("reinforce", 0.5, 3.0, 1.4, 0.5)) for k, e in zip((1e1, 1e2, 1e3, 1e4), errors, strict=True)]  # fmt: skip
+    found = recommended(*cells)
+    assert found["use"].tolist() == ["fobg", "none works", "none is known to work", "reinforce"]
+    assert found["error"].tolist() == ["0.10", "-", "-", "0.50"]
+
+
+def test_of_backends_that_differ_only_those_are_recommended_whose_error_is_small():
+    errors = {"jax": 0.1, "mujoco": 1.5}
+    found = recommended(*(cell(e, 0.9 * e, 1.1 * e, backend=b, estimator="fobg") for b, e in errors.items()))
+    assert found["use"].tolist() == ["fobg (jax)"]
+
+
+def test_an_estimate_that_is_always_0_fails():
+    """The gradient of a step's program: its error is 1 by definition, however uncertain the reference is."""
+    zero = {"grad_norm": 0.0, "variance": 0.0, "variance_low": 0.0, "variance_high": 1e-4, "reference_norm": 1.0, "reference_se": 1e-4,
+            "bias": 1.0, "bias_low": 0.9999, "bias_high": 1.0001, "rmse_rel": 1.0, "rmse": 1.0}  # fmt: skip
+    methods, _ = made(row(stiffness=1e2, **zero), row(stiffness=1e4, **zero | {"grad_norm": 2.0}))
+    assert methods["verdict"].tolist() == [FAILS, OPEN]
