@@ -254,7 +254,11 @@ def compare_errors(methods: pd.DataFrame) -> pd.DataFrame:
 
 def leaders(comparisons: pd.DataFrame, methods: pd.DataFrame) -> pd.Series:
     """Return, per setting, the methods that are first, or tied and near the first; settings without a known error have none."""
-    named = comparisons.assign(method=[(line.first, *line.tied) for line in comparisons.itertuples()]).explode("method")
+    named = (
+        comparisons.assign(method=[(line.first, *line.tied) for line in comparisons.itertuples()])
+        .explode("method")
+        .astype({"method": object})
+    )
     near = named.merge(methods[["setting", "method", "error"]], on=["setting", "method"])
     near = near[~(near["error"] > NEAR * near["value"])]
     return near.groupby("setting", sort=False)["method"].agg(tuple)

@@ -289,7 +289,7 @@ def recommendations(methods: pd.DataFrame) -> Table:
     methods = methods.assign(failed=methods["verdict"].isin((FAILS, NO_RESULT)))
     now = verdict(methods["status"], *(methods[name] for name in ERROR))
     good = methods[(now == WORKS) & ~methods["failed"]]
-    use = methods["setting"].map(leaders(compare_errors(good), good))
+    use = methods["setting"].map(leaders(compare_errors(good), good)).astype(object)
     is_lost = methods.groupby("setting")["failed"].transform("all")
     missing = is_lost.map({True: ("none works",), False: ("none is known to work",)})
     lines = [
