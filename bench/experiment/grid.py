@@ -239,9 +239,11 @@ class _Expansion:
         decision = start = self._decision(point, parts)
         if share := share_of(point.get(DESCENT, experiment.descent)):
             decision = dataclasses.replace(start, descent=share)
+        study = study_of(experiment)
+        parts = study.parts(parts)
         return Cell(
-            study_of(experiment).parts(parts), **self._counts(point), study=experiment.study,
-            decision=decision, timing=experiment.timing, budget=experiment.budget,
+            parts, **self._counts(point), study=experiment.study, decision=decision, timing=experiment.timing,
+            budget=experiment.reference if study.compares(parts) else None,
             path=self._path(parts["scene"], start) if share else None,
         )  # fmt: skip
 
