@@ -245,6 +245,7 @@ class _Expansion:
             parts, **self._counts(point), study=experiment.study, decision=decision, timing=experiment.timing,
             budget=experiment.reference if study.compares(parts) else None,
             path=self._path(parts["scene"], start) if share else None,
+            swept=tuple(parameter_name(axis) for axis in used if parts["scene"] and used[axis] == parts["scene"].name),
         )  # fmt: skip
 
     def _path(self, scene: Plugin | None, start: Decision) -> Cell:

@@ -90,8 +90,8 @@ class References:
         unit, name = float(np.finfo(cell.backend.dtype).eps), cell.backend.name
         note = f"costs of {name} differ from those of {first.name}, so the reference is from {name}"
         try:
-            problems = (self._problem(backend, cell) for backend in (first, cell.backend))
-            found = reference.transferred(shared, *problems, self._budget.samples, unit)
+            of_first, own = self._problem(first, cell), self._problem(cell.backend, cell)
+            found = reference.transferred(shared, of_first, own, self._budget.samples, unit)
         except Exception as error:  # another backend has computed the reference
             found, note = (
                 None,
