@@ -166,7 +166,8 @@ def measure_cell(cell: Cell, session: Session, study: Study) -> dict[str, Any]:
     if not cell.timing:
         blank = study.columns.blank()
         result |= {name: blank[name] for name in study.columns.measured}
-    return result | solver_columns(cell, session, result)
+    result |= solver_columns(cell, session, result)
+    return result | {"reason": "; ".join(filter(None, (result.get("reason", ""), *cell.remarks)))}
 
 
 def solver_columns(cell: Cell, session: Session, result: dict[str, Any]) -> dict[str, Any]:
