@@ -184,8 +184,8 @@ def seen(case, result, expected):
 
 
 def one_iteration_of_mjx(mjx, case, expected):
-    """Return the numbers of MJX with one iteration, whose line search is its own; alone, since all rows share it."""
-    once = type(mjx)(case.name, is_implicit=False, iterations=1)
+    """Return the numbers of MJX with one iteration, whose line search is its own."""
+    once = type(mjx)(is_implicit=False, iterations=1)
     return seen(case, {"value": np.array(once.rollout(case))} | once.gradient(case), expected)
 
 
@@ -242,7 +242,7 @@ def main(*names):
     """Write the numbers into the files of the named cases, or of all."""
     from bench.plugins.engines.mjx_conformance import Engine as Mjx
 
-    mjx = Mjx(*names)
+    mjx = Mjx()
     for case in conformance.cases(*names):
         inputs = ("mechanism", "qpos", "qvel", "quaternions", "controls", "parameter", "weights")
         data = {key: case.data[key] for key in inputs} | numbers(case, mjx)

@@ -23,14 +23,14 @@ pytest.importorskip("mujoco")
 ROOT = Path(__file__).resolve().parents[2]
 FEW = ("connect_fast", "stacked", "impratio")
 SMALL = ("slide_limit", "connect_fast", "pyramidal_slide")
-"""Cases of a limit, an equality and friction, which MJX compiles as one model."""
+"""Cases of a limit, an equality and friction."""
 STORED = 1e-5
 """Relative difference from stored numbers allowed: faults come from single differences of terms, and add up over steps."""
 
 
-def mjx(*names, **settings):
+def mjx(**settings):
     pytest.importorskip("mujoco.mjx")
-    return importlib.import_module("bench.plugins.engines.mjx_conformance").Engine(*names, **settings)
+    return importlib.import_module("bench.plugins.engines.mjx_conformance").Engine(**settings)
 
 
 def wrong(rows):
@@ -322,9 +322,8 @@ def test_the_c_engine_is_right():
     "names", [pytest.param(SMALL, marks=pytest.mark.slow), pytest.param((), marks=pytest.mark.full)], ids=["few", "all"]
 )
 def test_mjx_is_right(names):
-    """The cases of equal options are one model."""
     names = names or [case.name for case in conformance.cases()]
-    rows = conformance.run(mjx(*names), *names)
+    rows = conformance.run(mjx(), *names)
     assert {row["case"] for row in rows if row["is_right"] is None} == {
         "connect",
         "connect_fast",
@@ -357,7 +356,7 @@ def test_faults_planted_in_mjx_are_named(monkeypatch):
     monkeypatch.setattr(collision_driver, "collision", frozen)
     monkeypatch.setattr(constraint, "make_constraint", negated)
     expected = {"stacked": "frozen normal", "joint_equality": "sign of equality"}
-    engine = mjx(*expected)
+    engine = mjx()
     for case, fault in expected.items():
         found = [row for row in wrong(conformance.run(engine, case)) if row["term"] != "parameter"]
         assert found
@@ -374,7 +373,7 @@ def test_faults_planted_in_mjx_are_named(monkeypatch):
 )
 def test_what_mjx_lacks_is_named(case, settings, fault, terms):
     """Were J-dot v repaired, the documentation and the engine's file would be wrong."""
-    engine = mjx(case, **settings)
+    engine = mjx(**settings)
     engine.differs = {}
     found = {row["term"]: row["looks_like"] for row in wrong(conformance.run(engine, case))}
     assert {found[term] for term in terms} == {fault}
@@ -402,7 +401,7 @@ class Engine:
 
 def test_rows_of_an_engine_that_ends_stay_with_the_reason(tmp_path):
     (tmp_path / "mine_conformance.py").write_text(UNFINISHED)
-    row, last = table.rows_of(None, tmp_path / "mine_conformance.py", Path(runner.__file__), "rk4", "weld")
+    row, last = table.run(sys.executable, runner, str(tmp_path / "mine_conformance.py"), "rk4", "weld")
     assert (row["versions"], row["case"], row["is_right"]) == ("mine 2", "rk4", False)
     assert "exit status 3" in last["reason"]
 

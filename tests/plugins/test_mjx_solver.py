@@ -100,4 +100,4 @@ def test_dropped_term_of_the_derivative_is_caught(dropped, monkeypatch):
         return gradient(model, data.tree_replace({dropped: jax.lax.stop_gradient(part)}), acceleration)
 
     monkeypatch.setattr(mjx_solver, "_cost_gradient", incomplete)
-    assert any(row["is_right"] is False for case in CASES for row in conformance.run(Engine(case), case))
+    assert any(row["is_right"] is False for case in CASES for row in conformance.run(Engine(), case))
