@@ -128,6 +128,10 @@ class Store:
                 return self._newest(frames), small, set().union(*(spoilt for _, spoilt in parts))
         raise StorageError(f"'{self.directory}' changes faster than it can be read: too many runs write to it")
 
+    def files(self) -> list[Path]:
+        """Return the files with rows: ``rows.parquet``, if there is one, and the small files."""
+        return [*[self._table] * self._table.is_file(), *self._small_files()]
+
     def _small_files(self) -> list[Path]:
         names: list[str] = []
         try:
