@@ -116,35 +116,51 @@ def run(
 
 
 def _page(table: pd.DataFrame) -> str:
-    """Return the page: a line per engine, a table of cases by engines, and the reasons for what is missing in it."""
+    """Return the page: a line per engine, cases by releases, verdicts that changed, and the reasons for what is missing."""
     engines = [
         [name, versions, *((own["is_right"] == verdict).sum() for verdict in ("True", "False")), f"`{own['command'].iloc[0]}`"]
         for (name, versions), own in table.groupby(["engine", "versions"], sort=False)
     ]  # fmt: skip
-    told = table[table["reason"] != ""]
+    told = _released(table[table["reason"] != ""])
     cases = told["case"].str.cat(told["term"].where(told["is_right"] == "False", ""), sep=" ").str.strip()
-    reasons = told.assign(case=cases).drop_duplicates(["engine", "case"]).groupby(["engine", "reason"])["case"]
+    reasons = told.assign(case=cases).drop_duplicates(["release", "case"]).groupby(["release", "reason"])["case"]
     notes = [f"- {', '.join([name, *filter(None, of)])}: {printable(why)[:240]}" for (name, why), of in reasons]
     return "\n".join([
         "# Conformance of physics engines", "",
         *_markdown(["engine", "versions", "right", "not right", "command"], engines), "",
         "The fewest digits of a case's derivatives. own: compared with the engine's own differences. -: not run. ?: cannot tell.", "",
-        *by_case(table), "", *notes, "",
+        *by_case(table), "", *changes(table), "", *notes, "",
     ])  # fmt: skip
+
+
+def _released(table: pd.DataFrame) -> pd.DataFrame:
+    """Return rows with their release: the engine's first library with its version, or the engine."""
+    return table.assign(release=table["versions"].str.partition(";")[0].where(table["versions"] != "", table["engine"]))
 
 
 def by_case(table: pd.DataFrame) -> list[str]:
     """Return the Markdown lines of a table of cases by engines, with a column per release, from stored rows of text."""
-    run = table[table["case"] != ""]
+    run = _released(table[table["case"] != ""])
     if run.empty:
         return []
-    release = run["versions"].str.partition(";")[0].where(run["versions"] != "", run["engine"])
-    run = run.assign(release=release, seconds=pd.to_numeric(run["seconds"]))
-    cells = run.groupby(["case", "release"]).apply(_cell).unstack(fill_value="")[release.unique()]
+    run = run.assign(seconds=pd.to_numeric(run["seconds"]))
+    cells = run.groupby(["case", "release"]).apply(_cell).unstack(fill_value="")[run["release"].unique()]
     cells.loc["seconds"] = (
         run.drop_duplicates(["release", "case"]).groupby("release")["seconds"].sum().map("{:.3g}".format)
     )
     return _markdown(["case", *cells], list(cells.itertuples()))
+
+
+def changes(table: pd.DataFrame) -> list[str]:
+    """Return the Markdown lines of a table of verdicts that differ between releases of an engine, from stored rows of text."""
+    lines = []
+    for _, own in _released(table[table["case"] != ""]).groupby("engine", sort=False):
+        verdicts = own.pivot(index=["case", "term"], columns="release", values="is_right").dropna()
+        changed = verdicts[verdicts.nunique(axis=1) > 1].replace({"True": "right", "False": "wrong", "": "?"})
+        if len(changed):
+            rows = changed.reset_index()
+            lines += _markdown(list(rows), list(rows.itertuples(index=False)))
+    return lines
 
 
 def _cell(rows: pd.DataFrame) -> str:

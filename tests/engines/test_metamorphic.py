@@ -1,6 +1,5 @@
 """Checks without a reference: they hold for the C engine, each finds a fault of its own kind, and the command reports both."""
 
-
 import numpy as np
 import pytest
 
