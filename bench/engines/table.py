@@ -135,7 +135,7 @@ def _page(table: pd.DataFrame) -> str:
 
 def _released(table: pd.DataFrame) -> pd.DataFrame:
     """Return rows with their release: the engine's first library with its version, or the engine."""
-    return table.assign(release=table["versions"].str.partition(";")[0].where(table["versions"] != "", table["engine"]))
+    return table.assign(release=table["versions"].str.split(";").str[0].where(table["versions"] != "", table["engine"]))
 
 
 def by_case(table: pd.DataFrame) -> list[str]:
