@@ -106,9 +106,11 @@ def _metamorphic(model: str, words: Sequence[str]) -> int:
         raise UserError(f"engines metamorphic: {rows[0]['reason']}")
     for row in rows:
         state = {True: "holds", False: "broken", None: "-"}[row.get("holds")]
-        at = f"first at step {row['step']}" if row.get("step") is not None else row["reason"]
+        at = [f"first at step {row['step']}"] if row.get("step") is not None else []
         size = f"{row['worst']:.1e} of {row['tolerance']:.0e}" if row.get("worst") is not None else ""
-        print(f"{row.get('property', ''):<35}{state:<8}{size:<20}{at}".rstrip())
+        print(
+            f"{row.get('property', ''):<35}{state:<8}{size:<20}{': '.join([*at, *filter(None, [row['reason']])])}".rstrip()
+        )
     print(f"{rows[0]['versions']}, {Path(model).name}")
     return int(any(row.get("holds") is False or "property" not in row for row in rows))
 

@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 from bench.plugins.engines import mujoco_conformance
 from bench.plugins.engines.mujoco_conformance import TERMS, place
+from bench.plugins.mjcf import mjx_remarks
 
 from bench.plugins import mjx_solver
 
@@ -32,6 +33,7 @@ class Model(mujoco_conformance.Model):
 
     def __init__(self, mjcf: str) -> None:
         super().__init__(mjcf)
+        self.remarks = mjx_remarks(self.model)
         model, data = on_device(self.model)
 
         def rollout(q: Any, v: Any, controls: Any) -> Any:

@@ -80,6 +80,8 @@ class Swirl(Model):
 
 
 class Parts(Model):
+    remarks = ("other bodies",)
+
     def reference(self, q, v, u):
         return super().acceleration(q, v, 1.01 * u)
 
@@ -97,6 +99,7 @@ def test_a_planted_fault_breaks_its_property(property, engine):
     assert row["worst"] > row["tolerance"]
     q, v, u = row["state"]
     assert (len(q), len(v), len(u)) == (3, 3, 1)
+    assert row["reason"] == ("other bodies" if engine is Parts else "")
 
 
 def test_what_a_model_or_an_engine_lacks_is_not_checked():
@@ -188,3 +191,4 @@ def test_what_mjx_lacks_is_found_without_a_reference(property, text, tmp_path):
     (row,) = table.rows_of("mjx", metamorphic, str(tmp_path / "model.xml"), property)
     assert row["holds"] is False
     assert row["worst"] > 0.1
+    assert "MJX is not the C engine: " in row["reason"]

@@ -2,7 +2,8 @@
 
 A class ``Model`` of the engine's file is made from MJCF text. It has ``start``, the positions and velocities at the first
 keyframe or the reference pose, ``acceleration(q, v, u)`` and ``step(q, v, u)``, which returns the next (q, v). Further methods,
-each for the property that needs it: :data:`METHODS`. Orders and units are MuJoCo's.
+each for the property that needs it: :data:`METHODS`. ``remarks``, optional, are texts on what the engine is known to do otherwise in
+this model: the reason of broken properties. Orders and units are MuJoCo's.
 """
 
 from __future__ import annotations
@@ -252,7 +253,7 @@ def check(
     """Yield a row for each named property, or all, of an engine's models made by ``make(mjcf)`` from a file.
 
     ``holds`` is None where a property was not checked, with the reason. ``step`` and ``state`` are of the first state that breaks
-    it, ``worst`` is the largest difference in all states.
+    it, ``worst`` is the largest difference in all states; then the reason has the model's remarks.
     """
     make = functools.cache(make)
     for name in names or PROPERTIES:
@@ -267,7 +268,9 @@ def check(
             broken = next((step for step, off in found if not off <= tolerance), None)
             row |= {"states": len(found), "step": broken, "reason": "" if found else "no state decides it"}
             row |= {"holds": broken is None, "worst": max(off for _, off in found)} if found else {}
-            row["state"] = None if broken is None else [part.tolist() for part in subject.states[broken]]
+            if broken is not None:
+                row["state"] = [part.tolist() for part in subject.states[broken]]
+                row["reason"] = "; ".join(getattr(subject.model, "remarks", ()))
         except Exception as error:  # another engine's code may raise anything
             row |= {"holds": None if isinstance(error, NotImplementedError) else False}
             row["reason"] = f"{type(error).__name__}: {error}"
