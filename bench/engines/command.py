@@ -50,7 +50,9 @@ def _install(words: Sequence[str], again: bool) -> int:
         plugin = registry.find("backends", name).plugin if release else engines.get(name)
         if plugin is None:
             raise unknown("engine", name, engines)
-        requirements[word] = engines[name].requirements() if name in engines else table.file_of(plugin, ".txt")
+        requirements[word] = (
+            engines[name].files()[0].with_suffix(".txt") if name in engines else table.file_of(plugin, ".txt")
+        )
         if not requirements[word].exists():
             raise UserError(f"engine {name} has no file of requirements {requirements[word]}")
     for word, file in requirements.items():
