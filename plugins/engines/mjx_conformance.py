@@ -70,7 +70,7 @@ class Engine:
     versions = VERSIONS
     differs = {
         **dict.fromkeys(("connect", "connect_fast", "weld"), "MJX has no velocity product J-dot v in these rows"),
-        **dict.fromkeys(("box_tilted", "capsule_pair", "sparse_chain"), "MJX has other contacts of boxes and capsules"),
+        **dict.fromkeys(("box_tilted", "sparse_chain"), "MJX has other contacts of boxes and capsules"),
     }
 
     def __init__(self, is_implicit: bool = True, **options: Any) -> None:
