@@ -2,7 +2,7 @@
 
 - One gradient: :func:`problem` compiles a problem, :func:`estimate` estimates its gradient.
 - Experiments: :func:`run` runs one, :func:`load` reads stored rows, :func:`compare` compares two results.
-- Your own simulator: :func:`examine` reports whether its gradient is right.
+- Your own simulator: :func:`examine` reports whether its gradient is right, :func:`watch` checks it during your loop.
 - Plugins: :func:`list` lists them, and :mod:`bench.plugin` has the contracts that their authors import.
 """
 
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from bench.api import estimate, list_plugins, load, problem, run
     from bench.compare.command import compare
     from bench.examine.examination import examine
+    from bench.examine.watch import watch
 
     list = list_plugins  # not in __all__: a star import must not replace the built-in type
 else:
@@ -35,6 +36,7 @@ __all__ = [
     "plugin",
     "problem",
     "run",
+    "watch",
 ]
 _SOURCES = {
     "compare": ("bench.compare.command", "compare"),
@@ -44,6 +46,7 @@ _SOURCES = {
     "load": ("bench.api", "load"),
     "problem": ("bench.api", "problem"),
     "run": ("bench.api", "run"),
+    "watch": ("bench.examine.watch", "watch"),
 }
 """The module and the name of each function that is imported at its first use, so that a command starts quickly."""
 
