@@ -19,7 +19,7 @@ from bench.experiment.parameters import PROBLEM
 from bench.experiment.study import Study, study_of
 from bench.measure import descent, noise
 from bench.measure.statistics import PHYSICS
-from bench.model import Backend, Plugin, Scene, guard, isolation, reads, registry
+from bench.model import Backend, Plugin, guard, isolation, reads, registry
 from bench.run.plan import versions
 from bench.run.pool import Answer
 from bench.run.record import kind_of_machine
