@@ -76,30 +76,33 @@ def _composed(overrides: Sequence[str], config_dirs: Sequence[Path]) -> Experime
         raise UserError(f"one command runs one experiment with its sweep: {commands}")
     prepared = [_to_hydra(override, config_dirs) for override in overrides]
     given = [parse(override, word) for override, word in zip(overrides, prepared, strict=True)]
-    for name in named:
-        check_file(_file_of(name, config_dirs))
-    experiment = next((word for word in prepared if word.startswith("+experiment=")), None)
-    settings = deepcopy(_composed_files(experiment, tuple(config_dirs), _stamps(config_dirs)))
+    settings = deepcopy(_composed_files(next(iter(named), ""), tuple(config_dirs), _stamps(config_dirs)))
     for keys, value in given:
-        if keys != ["experiment"]:
+        if keys not in (["experiment"], ["answer"]):
             merge(settings, keys, value)
     joined = _joined(from_settings(settings), _as_list(settings["also"]), overrides, config_dirs)
     return replace(joined, answer=_answer(joined, overrides, config_dirs))
 
 
 def _stamps(config_dirs: Sequence[Path]) -> tuple[tuple[Path, int, int], ...]:
-    """Return path, time of change and size of every file that an experiment may be composed of."""
-    files = [path for folder in (*config_dirs, config_dir()) for path in folder.rglob("*.yaml")]
+    """Return path, time of change and size of every experiment file and of ``config.yaml``."""
+    files = [path for folder in (*config_dirs, config_dir()) for path in (folder / "experiment").rglob("*.yaml")]
+    files.append(config_dir() / "config.yaml")
     return tuple((path, path.stat().st_mtime_ns, path.stat().st_size) for path in files)
 
 
 @lru_cache(maxsize=128)
-def _composed_files(experiment: str | None, config_dirs: tuple[Path, ...], stamps: object) -> dict[str, Any]:
-    """Return the settings that Hydra composes from ``config.yaml`` and an experiment's files; ``stamps`` tell their contents apart."""
+def _composed_files(name: str, config_dirs: tuple[Path, ...], stamps: object) -> dict[str, Any]:
+    """Return the settings that Hydra composes from ``config.yaml`` and, if any, an experiment's files, with its own answer only.
+
+    ``stamps`` tell contents of the files apart.
+    """
     from hydra import compose, initialize_config_dir
     from omegaconf import OmegaConf
 
-    words = [experiment] if experiment else []
+    words, own = [], {}
+    if name:
+        words, own = [f"+experiment={name}"], check_file(_file_of(name, config_dirs))
     if config_dirs:
         search_path = ",".join(f"'file://{folder.expanduser().absolute()}'" for folder in config_dirs)
         words.insert(0, f"hydra.searchpath=[{search_path}]")
@@ -111,7 +114,7 @@ def _composed_files(experiment: str | None, config_dirs: tuple[Path, ...], stamp
         lines = [str(part).strip().partition("\n")[0] for part in (error, error.__cause__) if part is not None]
         raise UserError(printable(": ".join(lines))[:1000]) from None
     assert isinstance(plain, dict)
-    return {str(k): v for k, v in plain.items()}
+    return {str(k): v for k, v in plain.items()} | {"answer": own.get("answer")}
 
 
 APPEARANCE = (
@@ -129,16 +132,11 @@ APPEARANCE = (
 
 def _answer(found: Experiment, overrides: Sequence[str], config_dirs: Sequence[Path]) -> str:
     """Return the answer in an experiment's own file; empty if the file has none or other settings."""
-    from omegaconf import OmegaConf
-
-    name = next((value for key, _, value in _split_words(overrides) if key == "experiment"), None)
-    file: Any = OmegaConf.load(_file_of(name, config_dirs)) if name else {}
-    answer = str(file.get("answer") or "")
-    if answer and len(overrides) > 1:
-        own = load([f"experiment={name}"], config_dirs)
+    if found.answer and len(overrides) > 1:
+        own = load([word for word in overrides if word.lstrip("+").startswith("experiment=")], config_dirs)
         alike = replace(found, **{field: getattr(own, field) for field in APPEARANCE})
-        return answer if alike == own and len(found.also) == len(own.also) else ""
-    return answer
+        return found.answer if alike == own and len(found.also) == len(own.also) else ""
+    return found.answer
 
 
 def _joined(
@@ -176,7 +174,9 @@ def _to_hydra(override: str, config_dirs: Sequence[Path]) -> str:
     if "=" not in override:
         if override in experiments(config_dirs):
             raise UserError(f"'{override}' is an experiment: write +experiment={override}")
-        raise UserError(f"'{override}' is not an override: write key=value (commands come first: see --help)")
+        if override.startswith("-"):
+            raise unknown("option", override, ("--config-dir", "--help", "--quiet", "--version"))
+        raise unknown("experiment", override, experiments(config_dirs), "--help; settings are key=value")
     if "${" in override:
         raise UserError(f"'{override}': interpolations are not supported, give the value itself")
     key, _, value = override.partition("=")
@@ -294,12 +294,20 @@ def from_settings(config: Mapping[str, Any]) -> Experiment:
         question=str(config["question"] or ""),
         answer=str(config["answer"] or ""),
         marks=_mapping(config, "marks"),
+        compares=_compares(config),
         formats=tuple(_one_of("formats", item, FORMATS) for item in _as_list(config["formats"])),
         reference=cast(Budget, build(Budget, _mapping(config, "reference", parameters(Budget)))),
         compile_cache=_compile_cache(config["compile_cache"]),
         plugins=registry.folders(),
         **{key: _count(config, key) for key in COUNTS},
     )
+
+
+def _compares(config: Mapping[str, Any]) -> dict[str, list[Any]]:
+    """Return what charts compare; names of plugins are identity strings as in the rows."""
+    given = {name: _as_list(values) for name, values in _mapping(config, "compares").items()}
+    kinds = registry.kinds()
+    return {name: [str(_choice(name, v)) if name in kinds else v for v in values] for name, values in given.items()}
 
 
 def _name(config: Mapping[str, Any]) -> str:
