@@ -88,7 +88,7 @@ def _stamps(config_dirs: Sequence[Path]) -> tuple[tuple[Path, int, int], ...]:
     """Return path, time of change and size of every experiment file and of ``config.yaml``."""
     files = [path for folder in (*config_dirs, config_dir()) for path in (folder / "experiment").rglob("*.yaml")]
     files.append(config_dir() / "config.yaml")
-    return tuple((path, path.stat().st_mtime_ns, path.stat().st_size) for path in files)
+    return tuple((path, path.stat().st_mtime_ns, path.stat().st_size) for path in files if path.exists())
 
 
 @lru_cache(maxsize=128)
@@ -170,7 +170,7 @@ def _settings() -> frozenset[str]:
 
 
 def _to_hydra(override: str, config_dirs: Sequence[Path]) -> str:
-    """Return an override in Hydra's syntax; experiments and plugin parameters need no ``+``."""
+    """Return an override in Hydra's syntax, without a ``+``."""
     if "=" not in override:
         if override in experiments(config_dirs):
             raise UserError(f"'{override}' is an experiment: write +experiment={override}")
@@ -187,21 +187,21 @@ def _to_hydra(override: str, config_dirs: Sequence[Path]) -> str:
         names = experiments(config_dirs)
         if value not in names:
             raise unknown("experiment", value, names, "--help")
-        return f"+experiment={value}"
+        return f"experiment={value}"
     if head.partition("/")[0] == "hydra" or key.startswith("~"):
         raise UserError(f"'{override}': Hydra's own settings cannot be changed")
     if head not in _known_keys():
         raise unknown("setting", bare, {*_known_keys(), "experiment"}, "--help")
     kinds = registry.kinds()
     if bare in (*kinds, "path"):
-        return f"++{bare}={_quote_identities(value)}"
+        return f"{bare}={_quote_identities(value)}"
     if bare == "study":
         return f"study={_quote_identities(value)[1:-1]}"
     tables = {*map(singular, kinds), *TABLES}
     if bare != head and (head not in tables or (head == "reference" and bare.count(".") > 1)):
         whole = bare.rpartition(".")[0]
         raise UserError(f"'{bare}' is not a setting: '{whole}' has no settings of its own")
-    return f"{'++' if head in tables else ''}{bare}={value}"
+    return f"{bare}={value}"
 
 
 def _refuse_unread(experiment: Experiment, overrides: Sequence[str]) -> None:

@@ -62,7 +62,7 @@ def parse(given: str, word: str) -> tuple[list[str], Any]:
 
     A list of numbers, which may be long, is read without Hydra's grammar: that takes a millisecond per number.
     """
-    key, _, value = word.lstrip("+").partition("=")
+    key, _, value = word.partition("=")
     try:
         if NUMBERS.fullmatch(value):
             return key.split("."), [float(n) if set(n) & set(".eE") else int(n) for n in value[1:-1].split(",")]
