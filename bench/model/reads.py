@@ -32,8 +32,13 @@ SET_BY_RUNS = frozenset((
 """Variables that a run sets in its workers."""
 LIBRARIES = (*site.getsitepackages(), site.getusersitepackages(), *map(os.path.realpath, site.getsitepackages()))
 """Folders of installed libraries."""
-INSIDE = (*LIBRARIES, str(Path(__file__).parents[1]), os.path.dirname(sysconfig.get_path("stdlib")), "<frozen")
-"""Starts of the paths of code that is not from outside: libraries, this package and the standard library."""
+INSIDE = (
+    *LIBRARIES,
+    *(str(Path(__file__).parents[n] / part) for n, part in ((1, ""), (2, "plugins"))),
+    os.path.dirname(sysconfig.get_path("stdlib")),
+    "<frozen",
+)
+"""Starts of the paths of code that is not from outside: libraries, this package with its plugins, the standard library."""
 IGNORED = ("/dev/", "/proc/", "/sys/", *INSIDE)
 CACHES = ("/__pycache__/", "/.cache/", os.environ.get("XDG_CACHE_HOME") or "/.cache/")
 CHANGED = "several contents"
@@ -41,7 +46,7 @@ CHANGED = "several contents"
 STARTED_NS = time.time_ns()
 
 _read: dict[str, str] = {}
-"""Hashes by path, versions by ``package NAME``, and hashes of values by ``$NAME``; empty for what there is not."""
+"""Hashes by absolute path, versions by ``package NAME``, and hashes of values by ``$NAME``; empty for what there is not."""
 _stamps: dict[str, tuple[int, ...]] = {}
 _texts: list[str] = []
 """The manifest, while nothing is added."""
@@ -57,7 +62,7 @@ def start(folder: str = "") -> None:
     """Record from now on; the files in ``folder`` are not temporary."""
     if not _folders:
         sys.addaudithook(_hear)
-        os.environ.__class__ = _Environment  # type: ignore[assignment]
+        os.environ.__class__ = _Environment
     if folder not in _folders:
         _folders.append(folder)
 
@@ -77,7 +82,7 @@ def note(path: str | Path) -> None:
 def include(reads: str) -> None:
     """Record what a stored result that is used here has read."""
     for name, content in json.loads(reads or "{}").items():
-        _add(name, content)
+        _add(_path_of(name), content)
 
 
 def manifest() -> str:
@@ -93,7 +98,7 @@ def manifest() -> str:
         with suppress(PackageNotFoundError):
             _note_package(_packages.pop())
     if not _texts:
-        counted = {name: content for name, content in _read.items() if name not in _written}
+        counted = {name_of(path): content for path, content in _read.items() if path not in _written}
         _texts.append(json.dumps(counted, sort_keys=True) if counted else "")
     return _texts[0]
 
@@ -144,7 +149,19 @@ class Present:
             with suppress(PackageNotFoundError, ValueError):
                 return distribution(name.removeprefix("package ")).version
             return ""
-        return hash_of(name)
+        return hash_of(_path_of(name))
+
+
+def name_of(path: str) -> str:
+    """Return a path as it is stored: below a folder of plugins ``<FOLDER>/FILE``, so that the folder may be moved."""
+    folder = next((folder for folder in _folders if folder and path.startswith(f"{folder}/")), "")
+    return f"<{os.path.basename(folder)}>{path.removeprefix(folder)}" if folder else path
+
+
+def _path_of(name: str) -> str:
+    base, _, rest = name.removeprefix("<").partition(">")
+    found = [folder + rest for folder in _folders if rest and os.path.basename(folder) == base]
+    return next(filter(os.path.exists, found), name)
 
 
 def _add(name: str, content: str) -> None:
@@ -177,8 +194,9 @@ def _note_package(top: str) -> None:
         _add(f"package {top}", library.version)
         if '"file:' in (library.read_text("direct_url.json") or ""):
             for name, module in [*sys.modules.items()]:
-                if name.partition(".")[0] == top and getattr(module, "__file__", None):
-                    note(module.__file__)
+                file = getattr(module, "__file__", None)
+                if file and name.partition(".")[0] == top:
+                    note(file)
 
 
 def _is_outside(name: str, file: str) -> bool:

@@ -101,8 +101,9 @@ class TaskHandler:
         The reason names code from outside that the process has run for other cells.
         """
         RAN.update(item.outside)
-        for name in filter(os.path.isabs, item.outside):
-            reads.note(name)
+        for name in item.outside:
+            if os.path.isabs(name) and not name.startswith(reads.INSIDE):  # those of this package are in the key
+                reads.note(name)
         result = self._handle(item)
         is_reduced = isolation.reduced_precision()
         if is_reduced and result.get("dtype", item.cell.backend.dtype) == "float64" and _uses_jax(item.backend):
