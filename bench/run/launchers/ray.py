@@ -32,6 +32,8 @@ ANSWER_S = 10.0
 """Seconds in which a cluster answers."""
 JOBS_PER_NODE = 4
 """Part of a node's share of the tasks left that is one job, so that quick nodes get more of them."""
+TOKEN = "; if the cluster started while ~/.ray/auth_token did not exist, or that was another one, set RAY_AUTH_MODE=token in both places"
+"""A further cause of a cluster that does not answer."""
 MAX_LOSSES = 3
 """Number of losses of a node while it runs a task after which the task counts as crashed."""
 
@@ -85,7 +87,7 @@ class RayLauncher:
             )  # fmt: skip
         except Exception as error:
             raise UserError(
-                f"no Ray cluster at {address or 'this machine'}: {printable(error)[:300]}; start one: ray start --head"
+                f"no Ray cluster at {address or 'this machine'}: {printable(error)[:300]}; start one: ray start --head{TOKEN}"
             ) from None
         return self
 
