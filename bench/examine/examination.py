@@ -275,6 +275,7 @@ class _Examination:
             changing=sorted(simulator.changing),
             notes=[
                 *simulator.notes,
+                *[f"a call of the cost or gradient had not returned after {clock.hung_s:.2g} s"] * bool(clock.hung_s),
                 *(f"the cost raised {n} times: {text}" for text, n in list(simulator.raised.items())[:3]),
             ],
             left_out=self.left_out,
