@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bench.errors import INTERRUPTED, UserError, printable, unknown
+from bench.errors import INTERRUPTED, UserError, needing_sweeps, printable, unknown
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -93,7 +93,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command. Returns the exit status."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        with _stop_on_signals():
+        with _stop_on_signals(), needing_sweeps(" ".join(["bench", *words[:1]])):
             return _dispatch(words)
     except UserError as error:
         print("bench:", printable(error), file=sys.stderr)
@@ -302,12 +302,18 @@ def _report(words: list[str]) -> int:
 
 
 def _plan(words: list[str]) -> int:
+    from dataclasses import replace
+
+    from bench.experiment import config
     from bench.run import plan, progress
     from bench.run.execute import store_of
 
     experiment = _load(words)
     store = store_of(experiment)
-    progress.print_plan(experiment, plan.plan(experiment, store), store.load())
+    rows = store.load()
+    if rows.empty:  # times of the standard results, on another machine, are better than none
+        rows = store_of(replace(experiment, results_dir=config.config_dir().parent / "results" / "standard")).load()
+    progress.print_plan(experiment, plan.plan(experiment, store), rows)
     if experiment.execution.launcher == "ray":
         from bench.run.launchers import launcher_of
 
@@ -320,7 +326,9 @@ def _plan(words: list[str]) -> int:
 
 
 def _list(words: list[str]) -> int:
-    """List the plugins of the given kinds or names, or all."""
+    """List the plugins of the given kinds or names with their parameters; without any, the names of all by kind."""
+    from textwrap import fill
+
     from bench.api import described, matching_plugins
     from bench.experiment.words import parse_words
     from bench.model.identity import text_of
@@ -328,6 +336,20 @@ def _list(words: list[str]) -> int:
 
     names, _, _ = parse_words(words, "list", {})
     for kind, listed in matching_plugins(names).items():
+        if not names:
+            given = ", ".join(
+                name if entry.available else f"{name} (unavailable)" for name, entry in sorted(listed.items())
+            )
+            print(
+                fill(
+                    printable(f"{kind}: {given}"),
+                    100,
+                    subsequent_indent="  ",
+                    break_long_words=False,
+                    break_on_hyphens=False,
+                )
+            )
+            continue
         if listed:
             print(f"\n{printable(kind)}")
         for name, entry in sorted(listed.items()):
@@ -490,7 +512,7 @@ VERBS = {
         "Cells that cannot run are listed with their reason.\n" + SETTINGS, "Experiments",
     ),
     "list": Verb(
-        _list, "list [KIND or NAME ...] [plugins=DIR]", "plugins: parameters, capabilities, availability",
+        _list, "list [KIND or NAME ...] [plugins=DIR]", "plugins: names by kind; of a KIND or NAME parameters, capabilities, availability",
         "KIND is scenes, contacts, integrators, backends, estimators, optimizers, policies, trainers or studies.\n", "Experiments",
     ),
     "engines": Verb(

@@ -1,6 +1,6 @@
-"""A pytest fixture: ``def test_gradient(examine): examine(cost, theta, grad=gradient)`` fails with the full report.
+"""A pytest plugin: ``def test_gradient(examine): examine(cost, theta, grad=gradient)`` fails with the full report.
 
-In a project's ``conftest.py``: ``pytest_plugins = ["bench.examine.fixture"]``.
+pytest loads it wherever the package is installed. ``--bench-update`` writes baselines again.
 """
 
 from __future__ import annotations
@@ -12,8 +12,7 @@ from typing import Any
 
 import pytest
 
-from bench.examine.examination import examine as _examine
-from bench.examine.report import UPDATE, Report
+from bench.examine import UPDATE
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -22,15 +21,16 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 @pytest.fixture
-def examine(record_property: Callable[[str, object], None], request: pytest.FixtureRequest) -> Callable[..., Report]:
+def examine(record_property: Callable[[str, object], None], request: pytest.FixtureRequest) -> Callable[..., Any]:
     """Return :func:`bench.examine` as a function that fails the test unless the status is 0.
 
     It also accepts ``baseline``, a file to compare with; a missing one is written only if the status is 0, with a warning, or
     with ``--bench-update``. pytest's own JUnit file gets the cause and the size of the error as properties.
     """
+    from bench.examine import examination  # pytest starts without it
 
-    def examined(cost: Callable[..., Any], theta: Any, *, baseline: str | Path = "", **settings: Any) -> Report:
-        report = _examine(cost, theta, **{"progress": False, **settings})
+    def examined(cost: Callable[..., Any], theta: Any, *, baseline: str | Path = "", **settings: Any) -> Any:
+        report = examination.examine(cost, theta, **{"progress": False, **settings})
         if baseline:
             update, is_new = request.config.getoption(UPDATE, default=False), not Path(baseline).exists()
             report = report.compared(baseline, update)

@@ -7,8 +7,8 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
-from bench.errors import UserError, local_path, unknown
-from bench.examine import baseline, text
+from bench.errors import UserError, local_path, needing_sweeps, unknown
+from bench.examine import UPDATE, baseline, text
 from bench.examine.findings import Findings
 
 if TYPE_CHECKING:
@@ -17,8 +17,6 @@ if TYPE_CHECKING:
 
 AFTER_SIGTERM = "everything after SIGTERM"
 """What is left out when the process is asked to end."""
-UPDATE = "--bench-update"
-"""The option that writes a baseline, also from a run that fails."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -47,10 +45,11 @@ class Report(Findings):
 
         Raises :class:`bench.UserError` for a chart without data.
         """
-        from bench.examine import files
-        from bench.report.displays import displayable
-        from bench.report.draw import draw
-        from bench.report.figures import styled
+        with needing_sweeps("plot"):
+            from bench.examine import files
+            from bench.report.displays import displayable
+            from bench.report.draw import draw
+            from bench.report.figures import styled
 
         figures = {one.name: one for one in files.charts(self)}
         if not figures:
@@ -83,6 +82,7 @@ class Report(Findings):
     def save(self, directory: str | Path) -> list[Path]:
         """Write text, tables and charts into a directory, and return the paths of the files."""
         # importing charts and tables takes a second, which a report without files does not need
-        from bench.examine import files
+        with needing_sweeps("save"):
+            from bench.examine import files
 
         return files.write(self, local_path("save", directory))

@@ -286,12 +286,20 @@ def from_settings(config: Mapping[str, Any]) -> Experiment:
         question=str(config["question"] or ""),
         answer=str(config["answer"] or ""),
         marks=_mapping(config, "marks"),
+        compares=_compares(config),
         formats=tuple(_one_of("formats", item, FORMATS) for item in _as_list(config["formats"])),
         reference=cast(Budget, build(Budget, _mapping(config, "reference", parameters(Budget)))),
         compile_cache=_compile_cache(config["compile_cache"]),
         plugins=registry.folders(),
         **{key: _count(config, key) for key in COUNTS},
     )
+
+
+def _compares(config: Mapping[str, Any]) -> dict[str, list[Any]]:
+    """Return what charts compare; names of plugins are identity strings as in the rows."""
+    given = {name: _as_list(values) for name, values in _mapping(config, "compares").items()}
+    kinds = registry.kinds()
+    return {name: [str(_choice(name, v)) if name in kinds else v for v in values] for name, values in given.items()}
 
 
 def _name(config: Mapping[str, Any]) -> str:

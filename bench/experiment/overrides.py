@@ -13,7 +13,7 @@ from bench.experiment.grid import MAX_CELLS
 GLOBAL = "# @package _global_"
 """The first line of an experiment file, so that Hydra does not nest its settings."""
 RANGE = re.compile(r"range\(([^()]*)\)")
-TABLES = ("sweep", "marks", "reference", "ray")
+TABLES = ("sweep", "marks", "compares", "reference", "ray")
 """Settings that are tables; the parameters of plugins are too."""
 LISTS_AS = "write key=value with lists as [a,b] and strings in quotes"
 

@@ -13,7 +13,7 @@ import numpy as np
 from bench.errors import Unsupported, UserError
 from bench.model.contact import Contact, ContactLaw
 from bench.model.ops import Array, State
-from bench.model.parameters import Plugin, param
+from bench.model.parameters import Plugin, param, traced
 
 
 @dataclass(frozen=True)
@@ -48,6 +48,10 @@ class Scene(Plugin):
     @abstractmethod
     def theta0(self) -> np.ndarray:
         """Return the decision variable at which gradients are estimated, ``(d,)``."""
+
+    def without_effect(self, contact: ContactLaw | None) -> tuple[str, ...]:
+        """Return the parameters of the scene that change no cost and no gradient under the law: those that it ignores."""
+        return () if contact is None else tuple(name for name in contact.ignores if name in traced(self))
 
     def breakpoints(self) -> tuple[tuple[float, ...], ...]:
         """Return, per coordinate of theta, the positions of the cost's jumps and kinks, which split quadrature panels."""

@@ -208,11 +208,9 @@ class Runner:
 
     def _missing_references(self, cells: list[Cell]) -> list[Cell]:
         """Return one cell for each reference to compute; closed forms are computed when their cells are measured."""
-        if self.experiment.budget is None:
-            return []
         references = Session(self.experiment).references
         # reversed twice, so that the first cell of each key remains, in the planned order
-        first = {cell.reference_key: cell for cell in reversed(cells)}
+        first = {cell.reference_key: cell for cell in reversed(cells) if cell.budget is not None}
         return [cell for cell in reversed(first.values()) if not references.stored(cell) and not _has_closed_form(cell)]
 
     def _compute_references(self, cells: list[Cell], references: list[Cell], launcher: Launcher) -> list[Cell]:

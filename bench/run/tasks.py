@@ -18,6 +18,7 @@ from bench.experiment.keys import fingerprint, names_files
 from bench.experiment.parameters import PROBLEM
 from bench.experiment.study import Study, study_of
 from bench.measure import descent, noise
+from bench.measure.statistics import PHYSICS
 from bench.model import Backend, Plugin, guard, isolation, reads, registry
 from bench.run.plan import versions
 from bench.run.pool import Answer
@@ -167,25 +168,32 @@ def measure_cell(cell: Cell, session: Session, study: Study) -> dict[str, Any]:
     if not cell.timing:
         blank = study.columns.blank()
         result |= {name: blank[name] for name in study.columns.measured}
-    return result | solver_columns(cell, session, result)
+    result |= solver_columns(cell, session, result)
+    return result | {"reason": "; ".join(filter(None, (result.get("reason", ""), *cell.remarks)))}
 
 
 def solver_columns(cell: Cell, session: Session, result: dict[str, Any]) -> dict[str, Any]:
-    """Return the residual of the backend's constraint solver, with a remark in ``reason`` where it has not converged.
+    """Return the residual of the backend's constraint solver, and its remarks in ``reason``, also where it has not converged.
 
+    A backend whose physics differ from those that its name stands for has a method ``remarks(program)``: a text for each.
     A backend whose steps solve for contact forces iteratively has a method ``solver_residual(problem, w)``: the largest
     residual along rollouts from theta0 with noise ``w (n_w, B)``, relative to the forces of a step.
     """
-    solver_residual = getattr(cell.parts.get("backend"), "solver_residual", None)
-    if solver_residual is None or result["status"] != "ok":
+    backend = cell.parts.get("backend")
+    names = [name for name in ("remarks", "solver_residual") if hasattr(backend, name)]
+    if not names or result["status"] != "ok":
         return {}
+    columns: dict[str, Any] = {}
     program = cell.program()
-    w = noise.shared(cell.seed, cell.scene.name, 1, cell.samples, program.n_noise)[0].T
-    residual = float(solver_residual(session.problem(cell), w))
-    if not residual > CONVERGED[cell.backend.dtype]:
-        return {"solver_residual": residual}
-    remark = f"the constraint solver has not converged (relative residual {residual:.1e}): more iterations give another gradient"
-    return {"solver_residual": residual, "reason": "; ".join(filter(None, (result.get("reason", ""), remark)))}
+    remarks = [f"{PHYSICS}{text}" for text in backend.remarks(program)] if "remarks" in names else []
+    if "solver_residual" in names:
+        w = noise.shared(cell.seed, cell.scene.name, 1, cell.samples, program.n_noise)[0].T
+        columns["solver_residual"] = residual = float(backend.solver_residual(session.problem(cell), w))
+        if residual > CONVERGED[cell.backend.dtype]:
+            remarks.append(
+                f"the constraint solver has not converged (relative residual {residual:.1e}): more iterations give another gradient"
+            )
+    return columns | {"reason": "; ".join(filter(None, (result.get("reason", ""), *remarks)))}
 
 
 def _fault_of(result: dict[str, Any], study: Study) -> str:

@@ -140,3 +140,11 @@ def test_the_fixture_fails_on_a_wrong_gradient_and_compares_with_a_baseline(exam
         examine(cost, [1.0, 0.5], grad=lambda x: grad(x, 1.1), calls=100)
     with pytest.raises(AssertionError, match="derivative was right, is wrong"):
         examine(cost, [1.0, 0.5], grad=lambda x: grad(x, 1.1), calls=100, baseline=path)
+
+
+def test_an_option_writes_baselines_again(examine, tmp_path, pytestconfig, monkeypatch):
+    path = tmp_path / "baseline.json"
+    path.write_text('{"status": 0, "derivative": "right", "cause": "linear"}')
+    monkeypatch.setattr(pytestconfig.option, "bench_update", True)
+    examine(cost, [1.0, 0.5], grad=grad, calls=100, baseline=path)
+    assert json.loads(path.read_text())["cause"] != "linear"

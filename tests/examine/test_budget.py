@@ -206,3 +206,44 @@ def test_a_gradient_that_is_right_at_one_theta_is_said_to_be_right_there_only():
     assert "other thetas around this one (calls)" in str(few)
     many = examine(lambda x: float(np.sin(x).sum()), [0.3, 0.7], grad=stale)
     assert many.cause == "stale_gradient"
+
+
+def test_an_interruption_that_a_compiled_library_turns_into_its_own_error_is_the_budgets():
+    def slow(x):
+        try:
+            end = time.perf_counter() + 0.2
+            while time.perf_counter() < end:
+                pass
+        except BaseException:
+            raise RuntimeError("the callback failed") from None
+        return cost(x)
+
+    report = examine(slow, THETA, grad=grad, budget=0.5)
+    assert "the callback failed" not in str(report)
+    assert report.left_out
+
+
+@pytest.mark.parametrize("share", [0.1, 0.3])
+def test_exceptions_at_random_calls_are_named_as_such(share):
+    random = np.random.default_rng(3)
+
+    def fragile(x):
+        if random.random() < share and fragile.count:
+            raise ValueError("no convergence")
+        fragile.count += 1
+        return cost(x)
+
+    fragile.count = 0
+    report = examine(fragile, THETA, grad=grad, calls=2000)
+    assert (report.status, report.cause) == (1, "nondeterministic"), str(report)
+    assert "equal calls raise an exception or return a number" in report.conclusion
+
+
+def test_exceptions_at_the_same_thetas_are_not_random():
+    def bounded(x):
+        if x[0] > 0.401:
+            raise ValueError("outside")
+        return cost(x)
+
+    report = examine(bounded, THETA, grad=grad, calls=2000)
+    assert report.cause != "nondeterministic", str(report)

@@ -16,7 +16,7 @@ import bench
 from bench import cli
 from bench.errors import UserError
 from bench.examine import smoothing, text
-from bench.gradient.lines import Break, LineScan, scan
+from bench.examine.lines import Break, LineScan, scan
 from bench.simulator import simulator, tree
 from bench.simulator.simulator import Simulator
 from bench.simulator.tree import ParameterTree
@@ -469,7 +469,7 @@ def test_a_bias_interval_decides_where_grad_j_is_known(error, low, high, cause):
 
 def test_a_method_costs_its_samples_times_the_calls_of_each():
     terms = np.array([[1.0, -1.0] * 50])
-    found = smoothing._method("smoothing", 0.06, terms, 2.0, 2, 0.5)
+    found = smoothing._method("smoothing", (0.0, 0.12), terms, 2.0, 2, 0.5)
     samples = math.ceil(terms.var(ddof=1) / 4.0 / (0.1**2 - 0.06**2))
     assert (found.samples, found.calls, found.seconds) == (samples, 2 * samples, samples)
 
