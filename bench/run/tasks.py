@@ -23,6 +23,7 @@ from bench.model import Backend, Plugin, guard, isolation, reads, registry
 from bench.run.plan import versions
 from bench.run.pool import Answer
 from bench.run.record import kind_of_machine
+from bench.run.rows import rule
 from bench.run.session import Session
 
 MAX_REASON = 2000
@@ -200,13 +201,13 @@ def _fault_of(result: dict[str, Any], study: Study) -> str:
     """Return the first value of a result that its column cannot hold, in words; empty if there is none."""
     if result["status"] not in STATUSES:
         return f"the status {printable(result['status'])[:100]!r}, which is not one of {', '.join(STATUSES)}"
-    types = {"number": (int, float, type(None)), "text": (str,), "list": (list, tuple)}
     for name, value in result.items():
         column = study.columns.by_name.get(name)
         if column is None:
             return f"{name!r}, which is not one of its columns"
-        if not isinstance(value, types[column.kind]):
-            return f"{name}={printable(repr(value))[:100]}, and that column holds a {column.kind}"
+        holds, words = rule(name, study.columns)
+        if not holds(value):
+            return f"{name}={printable(repr(value))[:100]}, which {words}"
     try:
         json.dumps(result)
     except (TypeError, ValueError) as error:
