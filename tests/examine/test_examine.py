@@ -98,6 +98,7 @@ MATRIX = np.arange(1.0, 7.0).reshape(2, 3)
 @pytest.mark.parametrize(
     ("theta", "turned", "said"),
     [
+        (np.ones(2), lambda g: g[:1], r"shape \(1,\), and theta has shape \(2,\)"),
         (MATRIX, lambda g: g.T, r"shape \(3, 2\), and theta has shape \(2, 3\): is it transposed\?"),
         (MATRIX, lambda g: g.T.tolist(), r"shape \(3, 2\), and theta has shape \(2, 3\): is it transposed\?"),
         ({"w": MATRIX}, lambda g: {"w": g["w"].T}, r"shape w \(3, 2\), and theta has shape w \(2, 3\): is it trans"),
