@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 PARTS = ("scene", "contact", "integrator", "backend")
 """Parts of the grid that identify a program: the axes of a study without estimators."""
+SPREAD = 0.5
+"""A gradient is trusted where one estimate spreads by less than this multiple of its mean, and a check finds nothing against it."""
 FINE = 1e-3
 """Spacing of a reference's points, in standard deviations, above which a remark states it: that of points in a plane."""
 
