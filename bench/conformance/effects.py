@@ -77,7 +77,7 @@ def _moving(scene: Scene, law: ContactLaw | None, axis: str) -> set[str]:
     """Return the parameters of ``scene`` or ``contact`` that move theta0 or a cost near the defaults, at several thetas."""
     draw = rng("effects", scene.name)
     given = {"scene": scene, "contact": law}
-    near = {
+    near: dict[str, Any] = {
         name: part and _with(part, {n: getattr(part, n) * (1 + NEAR * draw.uniform(-1, 1)) for n in traced(part)})
         for name, part in given.items()
     }
