@@ -2,7 +2,7 @@
 
 - One gradient: :func:`problem` compiles a problem, :func:`estimate` estimates its gradient.
 - Experiments: :func:`run` runs one, :func:`load` reads stored rows, :func:`compare` compares two results.
-- Your own simulator: :func:`examine` reports whether its gradient is right.
+- Your own simulator: :func:`examine` reports whether its gradient is right, :func:`watch` checks it during your loop.
 - Plugins: :func:`list` lists them, and :mod:`bench.plugin` has the contracts that their authors import.
 """
 
@@ -12,13 +12,14 @@ from typing import TYPE_CHECKING, Any
 import bench.compare
 import bench.examine
 import bench.run
-from bench.errors import Unsupported, UserError
+from bench.errors import Unsupported, UserError, needing_sweeps
 
 if TYPE_CHECKING:
     from bench import plugin
     from bench.api import estimate, list_plugins, load, problem, run
     from bench.compare.command import compare
     from bench.examine.examination import examine
+    from bench.examine.watch import watch
 
     list = list_plugins  # not in __all__: a star import must not replace the built-in type
 else:
@@ -35,6 +36,7 @@ __all__ = [
     "plugin",
     "problem",
     "run",
+    "watch",
 ]
 _SOURCES = {
     "compare": ("bench.compare.command", "compare"),
@@ -44,6 +46,7 @@ _SOURCES = {
     "load": ("bench.api", "load"),
     "problem": ("bench.api", "problem"),
     "run": ("bench.api", "run"),
+    "watch": ("bench.examine.watch", "watch"),
 }
 """The module and the name of each function that is imported at its first use, so that a command starts quickly."""
 
@@ -54,7 +57,8 @@ def __getattr__(name: str) -> Any:
     if name not in _SOURCES:
         raise AttributeError(f"module 'bench' has no attribute '{name}'")
     module, function = _SOURCES[name]
-    return globals().setdefault(name, getattr(importlib.import_module(module), function))
+    with needing_sweeps(f"bench.{name}"):
+        return globals().setdefault(name, getattr(importlib.import_module(module), function))
 
 
 def __dir__() -> tuple[str, ...]:

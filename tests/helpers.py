@@ -206,6 +206,7 @@ def experiment(
     marks=None,
     name="made_up",
     formats=("png",),
+    compares=None,
 ):
     """Return an experiment for reports of made-up rows; it cannot be run."""
     return Experiment(
@@ -218,6 +219,7 @@ def experiment(
         question="As contact stiffens, which gradient stays right?",
         marks={"stiffness": {"step size limit": 6400}} if marks is None else marks,
         formats=formats,
+        compares=compares or {},
     )
 
 

@@ -43,7 +43,7 @@ def compare_cells(
     sides = {"before": old.reindex(every), "after": new.reindex(every)}
     pairs = zip(every, *(side.to_dict("records") for side in sides.values()), strict=True)
     changes = {
-        key: judge_cell(judged, was if key in old.index else None, now if key in new.index else None)
+        key: judge_cell(columns, was if key in old.index else None, now if key in new.index else None)
         for key, was, now in pairs
     }
     remarks: list[str] = []

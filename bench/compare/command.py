@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import pandas as pd
@@ -45,14 +46,19 @@ def compare(before: str | Path, after: str | Path, again: Sequence[str | Path] =
     shared = [name for name in old if name in new]
     if not shared:
         raise UserError(f"{before} ({', '.join(old)}) and {after} ({', '.join(new)}) have no experiment in common")
-    alone = [name for name in {**old, **new} if name not in shared]
-    remarks = [f"{name} is only in {before if name in old else after}: not compared" for name in alone]
+    remarks = [f"{name} is only in {after}: not compared" for name in new if name not in old]
     parts = []
     judged: dict[str, Column] = {}
-    for name in shared:
-        one, two = old[name], new[name]
-        if one.study != two.study:
+    for name, one in old.items():
+        two = new.get(name, replace(one, rows=one.rows.iloc[:0]))
+        if name not in new:
+            remarks.append(f"{name} is only in {before}: its cells are gone")
+        elif one.study != two.study:
             raise UserError(f"{name} is of study {one.study} in {before} and of study {two.study} in {after}")
+        elif not one.is_installed and one.content != two.content:
+            raise UserError(
+                f"{name} cannot be judged: its study '{one.study}' is not installed, and its files differ; plugins=DIR adds yours"
+            )
         runs = [results[name].rows for results in more if name in results]
         judged |= {column.name: column for column in one.columns.compared}
         table, of_times = compare_cells(one.rows, two.rows, one.columns, runs)

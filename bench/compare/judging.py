@@ -18,13 +18,13 @@ Times (``time``) are judged by :mod:`bench.compare.timings`, over all cells toge
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from bench.experiment.columns import Column, ComparisonRule
-from bench.measure.statistics import UNEXPLAINED, is_unexplained
+from bench.experiment.columns import COMMON, Column, Columns, ComparisonRule
+from bench.measure.statistics import PHYSICS, UNEXPLAINED, is_unexplained
 from bench.report.text import number
 
 EFFECT = 1.25
@@ -44,7 +44,7 @@ NOTES = (
     f"Errors computed without noise count if they changed by a factor of {EFFECT:g} or more and by more than {ROUNDING:g}. "
     "Verdicts count by the order that their study gives them. A column for which neither more nor less is better counts "
     "as changed.",
-    "A cell that was ok and no longer is, or is gone, is worse. A new cell counts as changed. A bias or variance whose "
+    "A cell that was ok and no longer is, is gone or has lost a judged number is worse. A new cell counts as changed. A bias or variance whose "
     "interval a remark calls doubtful counts as changed, unless the paired RMSE decides.",
     "Rows are of one cell if all their parameters, samples, repeats and seed are equal. A parameter that a stored row lacks "
     "has its present default.",
@@ -64,7 +64,7 @@ class Change(NamedTuple):
     """The changed column by its name in sentences, or ``no longer ok``, or ``gone`` or ``new`` for a whole cell."""
 
 
-def judge_cell(columns: Sequence[Column], old: Row | None, new: Row | None) -> list[Change]:
+def judge_cell(columns: Columns, old: Row | None, new: Row | None) -> list[Change]:
     """Return the changes of a cell in its status and in its judged columns, except times; either row may be missing."""
     if old is None:
         return [Change("changed", "new", "new")]
@@ -76,11 +76,13 @@ def judge_cell(columns: Sequence[Column], old: Row | None, new: Row | None) -> l
         return [Change(outcome, f"status {old['status']} to {new['status']}{reason}", "no longer ok")]
     if old["status"] != "ok":
         return []
-    pair = next((_pair(rule_of(column), old, new) for column in columns if rule_of(column).by == "paired"), None)
+    judged = columns.compared
+    pair = next((_pair(rule_of(column), old, new) for column in judged if rule_of(column).by == "paired"), None)
     # of equal estimates only the reference can differ, which makes them neither better nor worse
     are_same = pair is not None and pair.is_same
-    changes = []
-    for column in columns:
+    lost = [name for name in _watched(columns) if _n_values(new, name) < _n_values(old, name)]
+    changes = [Change("worse", f"no value any more: {', '.join(lost)}", "no value")] if lost else []
+    for column in judged:
         rule = rule_of(column)
         is_estimated = rule.by in ("interval", "spread")
         if rule.by == "time" or (is_estimated and are_same):
@@ -92,11 +94,44 @@ def judge_cell(columns: Sequence[Column], old: Row | None, new: Row | None) -> l
         if change is None:
             continue
         change = change._replace(subject=rule.called, outcome="changed" if rule.neutral else change.outcome)
-        if is_estimated and (remarks := [text for row in (old, new) if (text := _remark(row))]):
+        remarks = [
+            text for row in (old, new) for text in _remark(row).split("; ") if text and not text.startswith(PHYSICS)
+        ]
+        if is_estimated and remarks:
             doubt = UNEXPLAINED if any(map(is_unexplained, remarks)) else "intervals doubtful"
             change = change._replace(outcome="changed", text=f"{change.text}, {doubt}")
         changes.append(change)
     return changes
+
+
+def _watched(columns: Columns) -> list[str]:
+    """Return the columns whose values must not be lost: those that rules use or, in a study without rules, all numbers."""
+    judged = [column for column in columns.compared if not column.measured]
+    rules = [(column, rule_of(column)) for column in judged]
+    used = [
+        name
+        for column, rule in rules
+        for name in (column.name, *_ends(column), rule.mean, rule.variance, rule.reference)
+    ]
+    own = [
+        column.name
+        for column in columns.all
+        if column.kind == "number" and not column.measured and column.name not in COMMON
+    ]
+    return [*dict.fromkeys(used)] if judged else own
+
+
+def _n_values(row: Row, name: str) -> int:
+    """Return the number of values in a column of a row: of numbers that are not NaN, or 1 for a string."""
+    stored = row.get(name)
+    if isinstance(stored, str):
+        return int(stored != "")
+    return int(np.count_nonzero(~np.isnan(np.asarray(stored, dtype=float))))
+
+
+def _ends(column: Column) -> tuple[str, str]:
+    """Return the columns of the ends of a column's 95% interval."""
+    return column.low or f"{column.name}_low", column.high or f"{column.name}_high"
 
 
 def _remark(row: Row) -> str:
@@ -184,7 +219,7 @@ def value(row: Row, name: str) -> float:
 def _size(column: Column, old: Row, new: Row) -> Change | None:
     """Judge a number by its interval, by its factor, or by both (``spread``)."""
     rule, was, now = rule_of(column), value(old, column.name), value(new, column.name)
-    low, high = column.low or f"{column.name}_low", column.high or f"{column.name}_high"
+    low, high = _ends(column)
     is_apart = value(new, low) > value(old, high) or value(new, high) < value(old, low)
     is_large = max(was, now) >= EFFECT * min(was, now)
     is_changed = {

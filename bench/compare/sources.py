@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import subprocess
-import sys
 import tarfile
 import tempfile
 from dataclasses import dataclass
@@ -14,15 +14,15 @@ from typing import cast
 import pandas as pd
 
 from bench.errors import UserError
-from bench.experiment.columns import COMMON, IDENTITY, Columns
+from bench.experiment.columns import Columns
+from bench.experiment.keys import hashed
 from bench.experiment.study import Study
 from bench.model import registry
-from bench.run.rows import read_parquet, read_record, valid_rows
+from bench.run.rows import read_record, valid_rows
+from bench.run.store import Store
 
 STANDARD = "standard"
 """The folder of committed results inside the results folder."""
-NEEDED = {name for name in IDENTITY if COMMON[name].default is None} | {"status", "key", "study", "parameters"}
-"""Columns that a comparison needs."""
 BUSY = 1.5
 """Load per core above which a machine counts as busy."""
 
@@ -33,6 +33,8 @@ class Results:
 
     rows: pd.DataFrame
     study: str
+    content: str = ""
+    """A hash of the files of its rows."""
     machine: str = ""
     busy: str = ""
     """The machine's load, if it was more than BUSY per core."""
@@ -42,9 +44,16 @@ class Results:
         """The columns of its study."""
         return columns_of(self.study)
 
+    @property
+    def is_installed(self) -> bool:
+        """Whether its study is installed."""
+        return self.study in registry.entries()["studies"]
+
 
 def columns_of(study: str) -> Columns:
-    """Return the columns of a study's rows. Raises :class:`UserError` if the study is not installed."""
+    """Return the columns of a study's rows; those of all studies if it is not installed."""
+    if study not in registry.entries()["studies"]:
+        return Columns.of()
     return cast(type[Study], registry.usable("studies", study)).columns
 
 
@@ -88,7 +97,7 @@ def _extract(name: str, revision: str, path: str, target: Path) -> None:
 
 def _read_all(directory: Path, name: str) -> dict[str, Results]:
     """Return the results of every experiment with stored rows in a directory or below it."""
-    folders = sorted(path.parent for path in directory.rglob("rows.parquet"))
+    folders = sorted({path.parent for part in ("rows.parquet", "pending") for path in directory.rglob(part)})
     own = [folder for folder in folders if STANDARD not in folder.relative_to(directory).parts]
     results: dict[str, Results] = {}
     for label, read in filter(None, map(_read, own or folders)):
@@ -96,37 +105,25 @@ def _read_all(directory: Path, name: str) -> dict[str, Results]:
             raise UserError(f"'{name}' has results of '{label}' in more than one directory: name one of them")
         results[label] = read
     if not results:
-        raise UserError(f"'{name}' has no results{'' if folders else ': no rows.parquet'}")
+        raise UserError(f"'{name}' has no results{'' if folders else ': no rows.parquet or pending'}")
     return results
 
 
 def _read(folder: Path) -> tuple[str, Results] | None:
-    """Return the name and the results of the experiment in a folder, with the column types of its study.
-
-    None, and a line on stderr, if the study is not installed.
-    """
-    path = folder / "rows.parquet"
-    try:
-        rows = read_parquet(path)
-    except Exception as error:
-        raise UserError(f"'{path}' cannot be read as Parquet ({error})") from None
-    if not set(rows) >= NEEDED or not rows[["study", "parameters"]].map(
-        lambda text: bool(text) and isinstance(text, str)
-    ).all(axis=None):
-        raise UserError(f"rows in '{path}' have no parameters: run the experiment again to compare it")
+    """Return the name and the results of the experiment in a folder, with the column types of its study; None without rows."""
+    store = Store(folder, Columns.of())
+    rows = store.load()
+    if rows.empty:
+        return None
+    if not rows[["study", "parameters"]].map(bool).all(axis=None):
+        raise UserError(f"rows in '{folder}' have no parameters: run the experiment again to compare it")
     studies = list(rows["study"].unique())
     if len(studies) != 1:
-        raise UserError(f"the rows in '{path}' are of {len(studies)} studies ({', '.join(studies)})")
-    if studies[0] not in registry.entries()["studies"]:
-        print(
-            f"bench: '{path}' is left out: study '{studies[0]}' is not installed; plugins=DIR adds yours",
-            file=sys.stderr,
-        )
-        return None
-    columns = columns_of(studies[0])
-    rows = valid_rows(rows, columns, [path] * len(rows))[0].reset_index(drop=True)
-    label = str(rows["experiment"].iloc[0]) if "experiment" in rows and len(rows) else folder.name
-    return label, Results(rows, studies[0], *_read_machine(folder))
+        raise UserError(f"the rows in '{folder}' are of {len(studies)} studies ({', '.join(studies)})")
+    content = hashed(*(hashlib.sha256(path.read_bytes()).hexdigest() for path in store.files()))
+    rows = valid_rows(rows, columns_of(studies[0]), [folder] * len(rows))[0].reset_index(drop=True)
+    label = str(rows["experiment"].iloc[0]) or folder.name
+    return label, Results(rows, studies[0], content, *_read_machine(folder))
 
 
 def _read_machine(folder: Path) -> tuple[str, str]:

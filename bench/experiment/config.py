@@ -166,7 +166,9 @@ def _to_hydra(override: str, config_dirs: Sequence[Path]) -> str:
     if "=" not in override:
         if override in experiments(config_dirs):
             raise UserError(f"'{override}' is an experiment: write +experiment={override}")
-        raise UserError(f"'{override}' is not an override: write key=value (commands come first: see --help)")
+        if override.startswith("-"):
+            raise unknown("option", override, ("--config-dir", "--help", "--quiet", "--version"))
+        raise unknown("experiment", override, experiments(config_dirs), "--help; settings are key=value")
     if "${" in override:
         raise UserError(f"'{override}': interpolations are not supported, give the value itself")
     key, _, value = override.partition("=")
@@ -284,12 +286,20 @@ def from_settings(config: Mapping[str, Any]) -> Experiment:
         question=str(config["question"] or ""),
         answer=str(config["answer"] or ""),
         marks=_mapping(config, "marks"),
+        compares=_compares(config),
         formats=tuple(_one_of("formats", item, FORMATS) for item in _as_list(config["formats"])),
         reference=cast(Budget, build(Budget, _mapping(config, "reference", parameters(Budget)))),
         compile_cache=_compile_cache(config["compile_cache"]),
         plugins=registry.folders(),
         **{key: _count(config, key) for key in COUNTS},
     )
+
+
+def _compares(config: Mapping[str, Any]) -> dict[str, list[Any]]:
+    """Return what charts compare; names of plugins are identity strings as in the rows."""
+    given = {name: _as_list(values) for name, values in _mapping(config, "compares").items()}
+    kinds = registry.kinds()
+    return {name: [str(_choice(name, v)) if name in kinds else v for v in values] for name, values in given.items()}
 
 
 def _name(config: Mapping[str, Any]) -> str:

@@ -95,6 +95,8 @@ class Experiment:
     """What a person concludes, with references to tables (:mod:`bench.report.answer`); empty if its settings were changed."""
     marks: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     """Named values by axis, drawn as lines in the charts."""
+    compares: Mapping[str, Sequence[Any]] = field(default_factory=dict)
+    """What charts show side by side: names of backends or estimators, or values of an axis, of which two are joined by arrows."""
     formats: tuple[str, ...] = ("png",)
     """File formats of the charts."""
     reference: Budget = Budget()
@@ -124,7 +126,10 @@ class Experiment:
             "theta": list(self.decision.names),
             "theta0": None if self.decision.at is None else list(self.decision.at),
             "path": [str(choice) for choice in self.path.values()],
-            **{name: getattr(self, name) for name in ("descent", "samples", "repeats", "seed", "timing", "marks")},
+            **{
+                name: getattr(self, name)
+                for name in ("descent", "samples", "repeats", "seed", "timing", "marks", "compares")
+            },
             "formats": list(self.formats),
             "reference": dataclasses.asdict(self.reference),
             "results_dir": str(self.results_dir),

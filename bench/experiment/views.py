@@ -72,6 +72,9 @@ class Chart:
     level: str = ""
     shade: str = ""
     cell: str = ""
+    limit: str = ""
+    """The column with a value of y per x, drawn as a line on a ``grid``, and named ``limit_name``."""
+    limit_name: str = ""
     text: str = ""
     """How to read the chart, for the page."""
     subtitle: str = ""
@@ -82,6 +85,9 @@ class Chart:
     """The looks of series or levels; others get a colour each."""
     marks: Sequence[Mark] = ()
     join: bool = False
+    arrow: str = ""
+    """The column whose values are two points each: ``points`` joins them by an arrow, and names their series there. Markers
+    are those of ``line``."""
     failed: str = ""
     """The column that is true where a point has no value: a cross at the upper edge."""
     across: int = 4
@@ -107,7 +113,7 @@ class Chart:
         """Return the columns of the table that the chart needs."""
         axes = [name for c in (*self.x, *self.y) for name in (c.name, c.low, c.high, c.limit)]
         names = [self.panel, self.series, self.line, self.level, self.shade, self.cell,
-                 self.failed, *axes]  # fmt: skip
+                 self.failed, self.arrow, self.limit, *axes]  # fmt: skip
         return [name for name in dict.fromkeys(names) if name]
 
 

@@ -308,8 +308,18 @@ class EngineTwin(ABC):
         """
 
     def model_file(self) -> Path | None:
-        """Return the MJCF file that is the scene's model, to be used as it is written; None: the twin of :meth:`mjcf`."""
+        """Return the MJCF file that is the scene's model, to be used as it is written; None: the twin of :meth:`mjcf`.
+
+        A scene with such a file also defines ``files()``, the paths of all files that decide its motion and cost.
+        """
         return None
+
+    def __init_subclass__(cls, **arguments: Any) -> None:
+        super().__init_subclass__(**arguments)
+        if cls.model_file is not EngineTwin.model_file and not hasattr(cls, "files"):
+            raise TypeError(
+                f"{cls.__name__} has a model_file, so it needs files(): all files that decide its motion and cost"
+            )
 
 
 @dataclass(frozen=True)

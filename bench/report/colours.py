@@ -40,7 +40,7 @@ def method_styles(methods: Iterable[str]) -> dict[str, Style]:
     looks: dict[str, Style] = {}
     uses: Counter[str] = Counter()
     for method in sorted(methods, key=lambda name: "[" in name):
-        estimator = re.split(r"[\[,]", method)[0]
+        estimator = re.split(r"[\[, ]", method)[0]
         looks[method] = estimator_style(estimator, uses[estimator])
         uses[estimator] += 1
     return looks

@@ -17,7 +17,7 @@ from bench.experiment.keys import fingerprint, hash_of_text
 from bench.experiment.session import Problems
 from bench.measure import reference, smoothed
 from bench.measure.reference import Reference
-from bench.model import Backend, Problem
+from bench.model import Backend, Problem, reads, registry
 from bench.run.files import make_directory, write_whole
 from bench.run.rows import read_parquet
 
@@ -34,12 +34,20 @@ class References:
         self._directory = experiment.results_dir.absolute() / "references"
         self._budget = experiment.reference
         self._references: dict[str, Reference] = {}
+        self._present = reads.Present(registry.environment())
         self.stores = True
         """Whether computed references are stored for other cells."""
 
     def stored(self, cell: Cell) -> bool:
-        """Return whether the reference of the cell's program is on disk."""
-        return self._path(cell).exists()
+        """Return whether the reference of the cell's program is on disk, and all that it has read is unchanged."""
+        return self._load(self._path(cell)) is not None
+
+    def _load(self, path: Path) -> Reference | None:
+        result, read = load(path), read_by(path)
+        if result is None or self._present.change(read):
+            return None
+        reads.include(read)
+        return result
 
     def of(self, cell: Cell) -> Reference:
         """Return the reference of the cell's program, from the best backend that can run it, in arrays of the caller's own.
@@ -56,11 +64,11 @@ class References:
     def _known(self, path: Path, compute: Callable[[], Reference]) -> Reference:
         """Return the reference of a path, loaded or computed at first use."""
         if path.name not in self._references:
-            result = load(path)
+            result = self._load(path)
             if result is None:
                 result = compute()
                 if self.stores:
-                    save(result, path)
+                    save(result, path, reads.manifest())
             self._references[path.name] = result
         return self._references[path.name]
 
@@ -140,8 +148,8 @@ class References:
         return physical
 
 
-def save(reference: Reference, path: Path) -> None:
-    """Store a reference as Parquet."""
+def save(reference: Reference, path: Path, read: str = "") -> None:
+    """Store a reference as Parquet, with what code from outside has read."""
     import pandas as pd
 
     rows = [("batch", row) for row in reference.batches]
@@ -150,7 +158,7 @@ def save(reference: Reference, path: Path) -> None:
     ]
     table = pd.DataFrame(
         {"part": [name for name, _ in rows], "gradient": [list(row) for _, row in rows],
-         **{name: getattr(reference, name) for name in SCALARS}}
+         **{name: getattr(reference, name) for name in SCALARS}, "reads": read}
     )  # fmt: skip
     buffer = io.BytesIO()
     table.to_parquet(buffer, index=False)
@@ -169,3 +177,10 @@ def load(path: Path) -> Reference | None:
         return Reference(rows["batch"], **vectors, **table.loc[0, list(SCALARS)])
     except Exception:
         return None
+
+
+def read_by(path: Path) -> str:
+    """Return what code from outside has read for a stored reference; empty if the file does not say."""
+    with suppress(Exception):
+        return str(read_parquet(path, ["reads"])["reads"][0])
+    return ""

@@ -22,9 +22,10 @@ class AlphaOrder(DiagnosticEstimator):
     eps = sqrt(2 V ln((d+1)/delta) / N) + (2 L / 3 N) ln((d+1)/delta), V the per-sample zeroth-order variance.
     By default gamma is ``ratio`` eps: a fixed gamma far below eps reduces the method to the zeroth order on fewer
     samples. A ratio of 1.25 caps a in many estimates of a smooth cost of one variable, at 4 to 20 times the variance. A
-    larger ratio admits more of a jump's bias, up to (ratio - 1) eps. The two orders use the same samples, as in the source,
-    or independent halves of them (``sharing=split``, with half of the evaluations). Of draws that are not independent, N, V
-    and L count units and the means over them. Reports a as ``alpha``, and ``eps``.
+    larger ratio admits more of a jump's bias, up to (ratio - 1) eps. The two orders use the same samples, or
+    independent halves of them (``sharing=split``, with half of the evaluations), where the published code draws N samples
+    for each. Of draws that are not independent, N, V and L count units and the means over them. Reports a as ``alpha``,
+    and ``eps``.
     Requires costs, gradients and scores. Biased by at most about gamma - eps, since a depends on the samples.
     """
 

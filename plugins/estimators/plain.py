@@ -11,9 +11,9 @@ from bench.model import Estimator, Problem, columns
 class Plain(Estimator):
     """Approximates grad J_sigma with df/dtheta at w = 0: the gradient of one rollout without noise.
 
-    It is the usual gradient through a differentiable simulator, in model predictive control, system identification and
-    policy learning (Hu et al. 2020; Xu et al. 2022). The scene's own noise, such as a random start, is the first sample's.
-    One gradient per estimate, whatever N. Requires gradients. Biased by what the noise of J_sigma smooths; of variance 0
+    It is the usual gradient through a differentiable simulator, in model predictive control and system identification
+    (Hu et al. 2020). The scene's own noise, such as a random start, is the first sample's. One gradient per estimate,
+    whatever N. Requires gradients. Biased by what the noise of J_sigma smooths; of variance 0
     unless the scene has noise of its own.
     """
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
+import shutil
 import subprocess
 from pathlib import Path
 
@@ -17,7 +19,7 @@ from helpers import small_rows, unmeasured
 
 from bench import cli
 from bench.compare import cells, command, history, report, sources, timings
-from bench.experiment.columns import Columns
+from bench.experiment.columns import Column, Columns
 from bench.model import registry
 
 MACHINE = {"processor": "a chip", "cores": 2, "system": "Linux", "load_average": [0.1, 0.1, 0.1]}
@@ -90,6 +92,7 @@ JUDGED = [
         for name in ("bias", "variance")
         for factor, remark, outcome, said in (
             (10.0, {}, "worse", name), (0.1, {}, "better", name), (10.0, {"reason": "heavy tails"}, "changed", "doubtful"),
+            (10.0, {"reason": "physics: no wind"}, "worse", name), (10.0, {"reason": "physics: no wind; heavy tails"}, "changed", "doubtful"),
         )
     ),
     ("bias_variance", interval("bias", 1.8, 2.0, 2.2), interval("bias", 2.1, 2.3, 2.5), "same", ""),
@@ -295,7 +298,11 @@ def test_results_kept_in_git_are_found_in_their_own_folder(tmp_path):
 @pytest.mark.parametrize(
     ("name", "rows", "said"),
     [
-        ("made_up", pd.concat([given().assign(parameters="").iloc[:3], given()]), "have no parameters"),
+        (
+            "made_up",
+            pd.concat([given().iloc[:3].assign(parameters="", key=list("abc")), given()]),
+            "have no parameters",
+        ),
         ("other", given().assign(experiment="other"), "no experiment in common"),
     ],
     ids=["parameters", "experiment"],
@@ -376,15 +383,76 @@ def test_the_workflow_of_the_docs_runs_the_gate_as_it_is():
         assert f"results_dir={folder}" in scripts[script]
 
 
-def test_results_of_a_study_that_is_not_installed_are_left_out(tmp_path, capsys):
-    """``compare HEAD~1 HEAD`` ended with 2, since a folder had results of somebody's own study."""
-    for side in ("before", "after"):
-        save(given(), tmp_path / side)
-        (tmp_path / side / "alien").mkdir()
-        given().assign(study="alien", experiment="alien").to_parquet(tmp_path / side / "alien" / "rows.parquet")
-    sides = [str(tmp_path / side) for side in ("before", "after")]
-    for verb in ("compare", "history"):
-        assert cli.main([verb, *sides, f"out={tmp_path / 'out'}"]) == 0
-        assert capsys.readouterr().err.count("study 'alien' is not installed") == 2
-    assert cli.main(["compare", *(f"{side}/alien" for side in sides)]) == 2
-    assert "has no results" in capsys.readouterr().err
+# --------------------------------------------------------------------------------------------------- fail closed
+
+
+def sides(tmp_path):
+    """Two equal results of two experiments."""
+    for side, name in itertools.product(("before", "after"), ("made_up", "other")):
+        save(given().assign(experiment=name), tmp_path / side, name)
+    return [tmp_path / "before", tmp_path / "after"]
+
+
+def pend(rows, folder):
+    """Rows as those of a run that was killed before it merged them."""
+    sources.Store(folder, sources.columns_of(rows["study"].iloc[0])).append(
+        *json.loads(rows.to_json(orient="records", double_precision=15))
+    )
+
+
+@pytest.mark.parametrize("left", ["nothing", "an empty folder", "a part", "all"])
+def test_an_experiment_that_vanishes_is_worse_and_pending_rows_are_read(tmp_path, left):
+    before, after = sides(tmp_path)
+    shutil.rmtree(after / "other")
+    rows = given().assign(experiment="other")
+    if left == "an empty folder":
+        (after / "other" / "pending").mkdir(parents=True)
+    elif left != "nothing":
+        pend(rows if left == "all" else rows.drop(index=good(rows)), after / "other")
+    assert run(before, after, out=tmp_path / "out") == (left != "all")
+    outcomes = pd.read_csv(tmp_path / "out" / "compare.csv")["outcome"]
+    gone = {"a part": 1, "all": 0}.get(left, (rows["status"] == "ok").sum())
+    assert (len(outcomes), (outcomes == "worse").sum()) == (2 * len(rows), gone)
+    assert run(after, before, out=tmp_path / "out") == 0, "an experiment that is new is no fault"
+
+
+def test_history_reads_pending_rows(tmp_path):
+    before, after = sides(tmp_path)
+    shutil.rmtree(after / "other")
+    pend(given().assign(experiment="other"), after / "other")
+    assert cli.main(["history", str(before), str(after), f"out={tmp_path / 'out'}"]) == 0
+    assert set(pd.read_csv(tmp_path / "out" / "history.csv")["experiment"]) == {"made_up", "other"}
+
+
+@pytest.mark.parametrize("study", list(registry.entries()["studies"]))
+def test_a_judged_value_that_is_lost_is_worse(study):
+    columns, rows = of_study(study, "scenes=[pushing]")
+    empty = {"number": math.nan, "text": "", "list": [math.nan]}
+    full = {"number": 1.0, "text": "ok", "list": [1.0]}
+    values = [{c.name: [kinds[c.kind]] for c in columns.compared if not c.measured} for kinds in (full, empty)]
+    before, after = (rows.iloc[:1].assign(**one) for one in values)
+    assert only(compared(before, after, columns), "worse").startswith("no value any more: ")
+    assert "worse" not in set(compared(after, before, columns)["outcome"])
+    assert set(compared(after, after, columns)["outcome"]) == {"same"}
+
+
+def test_a_number_of_a_study_without_rules_that_is_lost_is_worse():
+    columns = Columns.of(Column("size"))
+    rows = given().iloc[:1]
+    assert "size" in only(compared(rows.assign(size=1.0), rows.assign(size=math.nan), columns), "worse")
+
+
+@pytest.mark.parametrize("change", ["none", "a number", "gone"])
+def test_rows_of_a_study_that_is_not_installed_are_the_same_if_their_files_are(tmp_path, capsys, change):
+    before, after = sides(tmp_path)
+    for side in (before, after):
+        alien = given().assign(study="alien", experiment="alien")
+        if side == before or change != "gone":
+            (side / "alien").mkdir()
+            alien.assign(bias=2.0 if change == "a number" and side == after else 1.0).to_parquet(
+                side / "alien" / "rows.parquet"
+            )
+    status = {"none": 0, "a number": 2, "gone": 1}[change]
+    assert run(before, after, out=tmp_path / "out") == status
+    assert ("study 'alien' is not installed" in capsys.readouterr().err) == (change == "a number")
+    assert cli.main(["history", str(before), str(after), f"out={tmp_path / 'out'}"]) == 0

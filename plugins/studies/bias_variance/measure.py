@@ -127,10 +127,10 @@ class Estimates:
         return self._checked(estimator.terms(self._problem, self._theta, w), "(d, B)", self._problem.dim, w.shape[1])
 
     def _checked(self, result: Any, meaning: str, *shape: int) -> np.ndarray:
-        """Return a result in float64; raises an error if it is complex or has another shape."""
+        """Return a result in float64, NaN where it is masked; raises an error if it is complex or has another shape."""
         if np.iscomplexobj(result):  # a cast would silently drop the imaginary part
             raise TypeError(f"{self._estimator.name} returned complex numbers; gradients are real")
-        result = np.asarray(result, dtype=np.float64)
+        result = np.asarray(np.ma.filled(result, np.nan), dtype=np.float64)
         require_shape(self._estimator, meaning, result, shape)
         return result
 

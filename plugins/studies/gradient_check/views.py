@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 from typing import Any
 
 import numpy as np
@@ -48,10 +49,12 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     points = by_point(shown.rows)
     names = problem_names(shown, PROBLEM, axes_of(shown, "horizon"), ("scene", "contact"))
     points = points.assign(name=names.to_numpy()[points["row"].astype(int)])
+    folders = ",".join(repr(str(folder)) for folder in experiment.plugins)
+    own = [shlex.quote(f"plugins=[{folders}]")] * bool(folders)
     faults = [
         line
         for command, part in untrusted(points).groupby("command", sort=False)
-        for line in (_tally(part), f"      {command}")
+        for line in (_tally(part), " ".join([f"      {command}", *own]))
     ]
     tables = [
         Table("gradient_verdicts", *_verdicts(points), title="Verdicts", files=[], page=True, terminal=True),
