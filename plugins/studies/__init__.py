@@ -27,8 +27,6 @@ PARTS = ("scene", "contact", "integrator", "backend")
 """Parts of the grid that identify a program: the axes of a study without estimators."""
 SPREAD = 0.5
 """A gradient is trusted where one estimate spreads by less than this multiple of its mean, and a check finds nothing against it."""
-FINE = 1e-3
-"""Spacing of a reference's points, in standard deviations, above which a remark states it: that of points in a plane."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +52,7 @@ class StudyPackage(Study):
         if found is None:
             found = Views([replace(table, terminal=False) for table in generic.views(experiment, rows).tables])
         drawn = [chart for chart in found.charts if len(chart.frame)]
-        return replace(found, charts=drawn, remarks=[*found.remarks, *unseen_features(rows), *reasons(rows)])
+        return replace(found, charts=drawn, remarks=[*found.remarks, *reasons(rows)])
 
     def show(self, experiment: Experiment, rows: pd.DataFrame) -> Views | None:
         """Return the tables of the rows and the charts; None without any."""
@@ -63,20 +61,6 @@ class StudyPackage(Study):
     def _module(self, name: str) -> Any:
         package = next(c.__module__ for c in type(self).__mro__ if hasattr(sys.modules[c.__module__], "__path__"))
         return import_module(f"{package}.{name}")
-
-
-def unseen_features(rows: pd.DataFrame) -> list[str]:
-    """Return below which width references by quadrature in a plane may miss a feature of the cost, and in how many cells."""
-    from bench.report.text import counted
-
-    spacing = rows.reindex(columns=["reference_spacing"])["reference_spacing"]
-    coarse = spacing[spacing > FINE]
-    if coarse.empty:
-        return []
-    return [
-        f"in {counted(len(coarse), 'cell')} the reference is from points up to {coarse.max():.2g} standard deviations of the noise apart: "
-        "it may miss a feature of the cost that is narrower"
-    ]
 
 
 def against_reference(
