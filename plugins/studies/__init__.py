@@ -18,7 +18,7 @@ from bench.experiment.study import Study
 from bench.experiment.views import Views
 from bench.measure import noise, statistics, timing
 from bench.measure.reference import Reference
-from bench.model import SURROGATE, Estimator, Problem, Program
+from bench.model import SURROGATE, Estimator, Integrator, Problem, Program
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -139,3 +139,9 @@ def gradient_seconds(problem: Problem, w: np.ndarray, calls: int) -> dict[str, f
     problem.reset_usage()
     _, clock = timing.timed(lambda _: problem.grad(problem.program.theta0, w), calls)
     return {"gradient_s": clock.median_s, "compile_s": problem.usage.compile_s}
+
+
+def spectral_radius(integrator: Integrator, dt: float, stiffness: float, damping: float, factor: float) -> float:
+    """Return the spectral radius of one step of length ``dt`` [s] on an oscillator of mass 1."""
+    matrix = integrator.transition(dt, stiffness, damping, factor)
+    return float(np.abs(np.linalg.eigvals(matrix)).max())

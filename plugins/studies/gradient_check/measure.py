@@ -20,8 +20,7 @@ from bench.measure.contacts import active_contacts, contact_names, engine_contac
 from bench.measure.jumps import Jump, Sampled, jump_under_noise, missed_slope, sampled_gradients
 from bench.model import SURROGATE, ContactScene, EngineScene, ForceLaw, LoopOps, Problem, Rollout, Unsupported, registry
 
-from .. import SPREAD, norm
-from ..stability import spectral_radius
+from .. import SPREAD, norm, spectral_radius
 from . import GradientCheck, is_trusted
 
 COLUMNS_AT_ONCE = 128
