@@ -272,12 +272,13 @@ def first_or_tied(runs: RunSet) -> set[str]:
     Methods that were not run on all problems are not compared.
     """
     reached = times_to_targets(runs)
-    rates = reached.pivot_table(index="problem", columns="method", values="rate").dropna(axis=1)
+    rates = reached.pivot_table(index="problem", columns="method", values="rate")
+    rates = rates.loc[:, rates.count() == rates.count().max()]
     best = rates.mean().idxmax()
     errors = {method: share_of_targets(reached[reached["method"] == method])[1] for method in rates}
     tied = {str(best)}
     for method in rates:
-        lead, error = rates[best] - rates[method], math.hypot(errors[best], errors[method])
+        lead, error = (rates[best] - rates[method]).dropna(), math.hypot(errors[best], errors[method])
         if over_scenes(runs, lead, lead.mean() - error, lead.mean() + error)[0] < 0.0:
             tied.add(str(method))
     return tied
