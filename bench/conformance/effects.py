@@ -41,7 +41,7 @@ def parameters_have_an_effect(scene: Scene) -> str:
     if isinstance(scene, MechanicalScene) and scene.n_contacts:
         explicit = [law for law in sound_laws() if not law.needs_root]
         laws = {law.ignores: law_for(scene, law) for law in reversed(explicit)}
-    idle = {}
+    idle: dict[str, set[str]] = {}
     for law in laws.values():
         moving, declared = _moving(scene, law, "scene"), set(scene.without_effect(law))
         _require_idle(moving & declared, " + ".join(part.name for part in (scene, law) if part is not None))
