@@ -359,7 +359,7 @@ def _path(given: Any) -> dict[str, Choice]:
     items = _as_list(given)
     if len(items) not in (2, 3):
         raise UserError(
-            f"path={items} must be a contact law, an integrator and, if wanted, a backend: [penalty,semi_implicit_euler,jax]"
+            f"path={items} must be a contact law, an integrator and, if wanted, a backend: path=[LAW,INTEGRATOR,BACKEND]"
         )
     given = {axis: item for axis, item in zip(DESCENDED, items, strict=False) if item != "none"}
     return {axis: _choice(registry.kind_of(axis), item) for axis, item in given.items()}

@@ -157,4 +157,4 @@ class Views:
     remarks: Sequence[str] = ()
     """Lines that the terminal adds, such as the reasons of cells without results."""
     headline: str = ""
-    """What stands first and last: the experiment's answer, which :mod:`bench.report` fills in. Studies leave it empty."""
+    """What stands first and last: the experiment's answer, which :mod:`bench.report` fills in, else the study's own count."""

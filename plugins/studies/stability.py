@@ -34,7 +34,7 @@ from bench.model import (
     rollout,
 )
 
-from . import StudyPackage, norm
+from . import StudyPackage, norm, spectral_radius
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -370,12 +370,6 @@ def oscillator(cell: Cell) -> tuple[float, float, float] | None:
     spring = law.spring()
     factor = scene.velocity_factor if isinstance(scene, DampedScene) else 1.0
     return None if spring is None else (spring[0] * response, spring[1] * response, factor)
-
-
-def spectral_radius(integrator: Integrator, dt: float, stiffness: float, damping: float, factor: float) -> float:
-    """Return the spectral radius of one step of length ``dt`` [s] on the oscillator."""
-    matrix = integrator.transition(dt, stiffness, damping, factor)
-    return float(np.abs(np.linalg.eigvals(matrix)).max())
 
 
 def stiffness_limit(integrator: Integrator, dt: float, damping: float, factor: float) -> float:
