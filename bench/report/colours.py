@@ -29,8 +29,8 @@ def looks_by_name(charts: Sequence[Chart]) -> dict[str, Style]:
 
 
 def estimator_style(estimator: str, variant: int = 0) -> Style:
-    """Return the look of an estimator: its colour, with a marker and dashes for each of its parameter variants, from 0."""
-    names = estimator_order()
+    """Return the look of an estimator or trainer: its colour, with a marker and dashes for each of its parameter variants, from 0."""
+    names = order_of("trainers" if estimator in registry.entries()["trainers"] else "estimators")
     place = names.index(estimator) if estimator in names else len(names)
     return Style(colour(place), marker(place, variant), VARIANTS[variant % len(VARIANTS)])
 
@@ -46,13 +46,13 @@ def method_styles(methods: Iterable[str]) -> dict[str, Style]:
     return looks
 
 
-def estimator_order() -> list[str]:
-    """Return all registered estimators, those of most of the package's experiments first.
+def order_of(kind: str) -> list[str]:
+    """Return all registered plugins of a kind, those of most of the package's experiments first.
 
-    The first colours of the palette differ most, so they belong to the estimators that are compared most often.
+    The first colours of the palette differ most, so they belong to the plugins that are compared most often.
     """
     uses = _uses()
-    return sorted(registry.entries()["estimators"], key=lambda name: (-uses[name], name))
+    return sorted(registry.entries()[kind], key=lambda name: (-uses[name], name))
 
 
 @cache

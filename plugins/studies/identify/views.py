@@ -151,7 +151,9 @@ def charts(lines: pd.DataFrame, fits: Sequence[Column]) -> list[Chart]:
     for column, ideal, name in zip(fits, (1.0, LEVEL), ("bound", ""), strict=True):
         if lines[column.name].notna().any():
             values = {end: lines[c] for end, c in (("value", column.name), ("low", column.low), ("high", column.high))}
-            parts.append(lines.assign(**values, panel=column.heading, failed=(lines["converged"] == 0) & (name == "bound")))
+            parts.append(
+                lines.assign(**values, panel=column.heading, failed=(lines["converged"] == 0) & (name == "bound"))
+            )
             marks.append(Mark(name, ideal, panel=column.heading))
     if not parts:
         return []
