@@ -86,16 +86,14 @@ class Chart:
     marks: Sequence[Mark] = ()
     join: bool = False
     arrow: str = ""
-    """The column whose values are two points each: ``points`` joins them by an arrow, and names their series there. Markers
-    are those of ``line``."""
+    """The column whose values are one or two points each: ``points`` joins two by an arrow, and names their series there.
+    Markers are those of ``line``."""
     failed: str = ""
     """The column that is true where a point has no value: a cross at the upper edge."""
     across: int = 4
     """Most panels side by side."""
     height: float = 2.3
     """Height of a panel in inches; of a row of dots or cells, in ``dots`` and ``grid``, if below 1."""
-    front: bool = False
-    """Whether a line joins the Pareto front of a panel: the points that no other beats in x and y, smaller being better."""
     band: bool = False
     """Whether intervals are drawn as bands and not as bars."""
     own_scales: bool = False

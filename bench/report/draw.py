@@ -28,7 +28,7 @@ from bench.report.colours import looks_by_name
 from bench.report.scales import log_axis
 from bench.report.style import GREY, MARKERS, MARKS, SHADE, SIZE, filled, plain, width_in_inches
 from bench.report.text import axis_value, number, short_duration
-from bench.report.views import is_logarithmic, pareto
+from bench.report.views import is_logarithmic
 
 WIDTH, NARROW = 7.16, 3.5
 """Figure widths in inches: two columns of a paper, or one."""
@@ -46,8 +46,6 @@ UNLIMITED = 1e9
 """Factor on a value at which the bar of an interval without an upper end stops, beyond every logarithmic axis."""
 BAND: dict[str, Any] = {"color": "#D55E00", "alpha": 0.12, "linewidth": 0}
 """Look of a named range of an axis."""
-FRONT: dict[str, Any] = {"color": GREY, "linewidth": 0.8, "linestyle": "--"}
-"""Look of the Pareto front."""
 USELESS = 1e2
 """Values above this are drawn there, with their number, where a value above 1 means a failure."""
 NAME = 1.0
@@ -204,7 +202,6 @@ def _legend(chart: Chart, styles: dict[str, Style], width: float) -> list[Any]:
             handles.append(
                 Line2D([], [], color=style.colour, marker=mark, linestyle=line, linewidth=style.width, label=label)
             )
-    handles += [Line2D([], [], label="Pareto front", **FRONT)] * chart.front
     handles += [Line2D([], [], label=chart.limit_name, **LIMIT)] * bool(
         chart.limit and (chart.frame[chart.limit] > 0).any()
     )
@@ -324,10 +321,6 @@ def _draw_lines(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str,
         points = points.sort_values(x.name, kind="stable") if is_line and is_number else points
         mark = style.marker if not is_line or len(points) <= MANY or style.line == "none" else ""
         _draw_values(chart, panel, points, y, log, points[x.name].to_numpy(), style, mark, 3 + 0.01 * order)
-    if chart.front:
-        known = part[np.isfinite(part[[x.name, y.name]]).all(axis=1)].sort_values(x.name)
-        best = known[pareto(known[x.name], known[y.name])]
-        panel.plot(best[x.name], best[y.name], zorder=2, **FRONT)
 
 
 def _draw_arrows(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str, Style], size: np.ndarray) -> None:

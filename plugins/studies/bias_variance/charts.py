@@ -64,18 +64,17 @@ def charts(
     labelled = replace(shown, rows=with_plotted_columns(shown.rows))
     subtitle = _conditions(shown)
     swept = shown.swept()
-    order = sorted(swept, key=lambda a: (-swept[a], a.column != "stiffness"))
+    order = sorted(swept, key=lambda a: (-swept[a], a.column not in ("stiffness", "samples")))
     along = [
         _along(labelled, axis, methods, comparisons, subtitle)
+        if axis.column != "samples" or best.empty
+        else _cost_of_accuracy(shown, best, subtitle)
         for i, axis in enumerate(order)
         if not any(axis.column in other.moves for other in order[:i])  # axes that step together have one chart
-        if axis.column != "samples" or best.empty
     ]
     if shown.rows["time_s"].notna().any():
         along = [_contrast(labelled, subtitle), *along]
-    if not best.empty:
-        along = [_cost_of_accuracy(shown, best, subtitle), *along]
-    elif not swept and shown.rows["backend"].nunique() > 1:
+    if not swept and shown.rows["backend"].nunique() > 1:
         along += [_error_and_cost(labelled, subtitle)]
     if not swept and methods["problem"].nunique() > 1:
         along = [_estimators(methods), *along]
@@ -224,7 +223,7 @@ def _error_and_cost(shown: Arranged, subtitle: str) -> Chart | None:
         return None
     return Chart(
         "speed_accuracy", pd.concat(parts, ignore_index=True), [SECONDS], [RMSE], "points", series="series",
-        panel="panel", across=3, height=1.9, front=True, subtitle=", ".join(filter(None, [subtitle, FASTEST])),
+        panel="panel", line="line", arrow="series", across=3, height=1.9, subtitle=", ".join(filter(None, [subtitle, FASTEST])),
     )  # fmt: skip
 
 
