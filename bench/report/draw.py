@@ -341,7 +341,7 @@ def _draw_arrows(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str
         arrows.append((series, places[0]))
     for series, place in arrows:
         text = _wrapped(series, NAME)
-        extent = np.array([0.9 * _text_width(text), 0.13 * _lines([text])])
+        extent = np.array([_text_width(text), 0.14 * _lines([text])])
         middle, under = -extent / 2, -extent
         free = [
             start
@@ -355,9 +355,7 @@ def _draw_arrows(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str
         start = free[0] if free else place + 0.1
         named.append((series, place))
         taken.append((start, start + extent))
-        written = panel.text(
-            *(start / size), text, transform=panel.transAxes, fontsize=SIZE - 1, color=styles[series].colour
-        )
+        written = panel.text(*(start / size), text, transform=panel.transAxes, color=styles[series].colour)
         written.set_in_layout(False)
 
 
@@ -412,14 +410,13 @@ def _draw_values(
     if is_cut.any():
         last = int(np.nanargmax(np.where(is_cut, given, np.nan)))
         at = (values[last], places[last]) if is_flat else (places[last], values[last])
-        down = 3 + 8 * sum(text.get_gid() == "cut" for text in panel.texts)
+        down = 3 + 9 * sum(text.get_gid() == "cut" for text in panel.texts)
         where: Any = {"xytext": (0, 4), "ha": "center"} if chart.arrow else {"xytext": (4, -down), "va": "top"}
         panel.annotate(
-            f"{number(given[last])} ↑",
+            number(given[last]) + " ↑" * (not chart.arrow),
             at,
             textcoords="offset points",
             color=style.colour,
-            fontsize=SIZE - 1,
             gid="cut",
             **where,
         )
