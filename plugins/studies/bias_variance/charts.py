@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -35,12 +34,10 @@ from .time_to_accuracy import methods as methods_by_cost
 
 FLOOR = 1e-4
 """Relative biases below this are drawn here, as upper limits."""
-SERIES = 3
-"""Most estimators of a chart along an axis."""
+SERIES = 6
+"""Most estimators of a chart along an axis, where the experiment does not name them."""
 PANELS = 4
 """Most problems of a chart along an axis."""
-DISTINCT = 1.2
-"""Median factor between the errors of two estimators from which a reader distinguishes their lines."""
 RMSE = Column(
     "rmse_rel", label="relative RMSE of one estimate", low="rmse_low", high="rmse_high", limit="rmse_limit", log=True,
     above_one="worse than the zero estimate",
@@ -57,7 +54,6 @@ ESTIMATOR = text("series", label="")
 def charts(
     shown: Arranged,
     methods: pd.DataFrame,
-    comparisons: pd.DataFrame,
     best: pd.DataFrame,
 ) -> list[Chart]:
     """Return all charts, the main one first."""
@@ -66,7 +62,7 @@ def charts(
     swept = shown.swept()
     order = sorted(swept, key=lambda a: (-swept[a], a.column not in ("stiffness", "samples")))
     along = [
-        _along(labelled, axis, methods, comparisons, subtitle)
+        _along(labelled, axis, subtitle)
         if axis.column != "samples" or best.empty
         else _cost_of_accuracy(shown, best, subtitle)
         for i, axis in enumerate(order)
@@ -130,8 +126,6 @@ def _conditions(shown: Arranged) -> str:
 def _along(
     shown: Arranged,
     axis: Axis,
-    methods: pd.DataFrame,
-    comparisons: pd.DataFrame,
     subtitle: str,
 ) -> Chart | None:
     """Return the chart of errors along an axis, of the main estimators on the main problems."""
@@ -141,7 +135,7 @@ def _along(
     drawn, notes = choose_problems(problems)
     backends = shown.experiment.compares.get("backends", ())
     frame = pd.concat([_lines(problem, backends) for problem in problems], ignore_index=True)
-    names = shown.experiment.compares.get("estimators") or _main_series(frame, methods, comparisons)
+    names = shown.experiment.compares.get("estimators") or list(dict.fromkeys(frame["label"]))[:SERIES]
     total = frame["label"].nunique()
     shares = [f"{len(names)} of {total} estimators"] if len(names) < total else []
     for column, kept in (("label", names), ("panel", [problem.title() for problem in drawn])):
@@ -174,21 +168,6 @@ def _nested(names: Sequence[str]) -> dict[str, Style]:
     """Return looks in which lines on top of each other are all seen: each later one is thinner."""
     count = len(names)
     return {name: Style(colour(i), MARKERS[i], width=1.2 * (count - i)) for i, name in enumerate(names)}
-
-
-def _main_series(frame: pd.DataFrame, methods: pd.DataFrame, comparisons: pd.DataFrame) -> list[str]:
-    """Return the estimators to print: those that are most often first, then others, as far as distinct."""
-    estimator = dict(zip(methods["method"], methods["estimator"], strict=True))
-    wins = Counter(estimator[name] for name in comparisons["first"] if name)
-    names = sorted(frame["label"].unique(), key=lambda name: (-wins[name], "[" in name))
-    errors = frame.pivot_table("rmse_rel", ["panel", "x"], "label", aggfunc="first").reindex(columns=names)
-    errors = np.log(errors.where(errors > 0))
-    chosen: list[str] = []
-    for name in names:
-        apart = errors[chosen].sub(errors[name], axis=0).abs().median()
-        if len(chosen) < SERIES and not (apart < math.log(DISTINCT)).any():
-            chosen.append(name)
-    return chosen
 
 
 def choose_problems(problems: Sequence[ProblemRows]) -> tuple[list[ProblemRows], list[str]]:
