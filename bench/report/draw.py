@@ -46,8 +46,8 @@ UNLIMITED = 1e9
 """Factor on a value at which the bar of an interval without an upper end stops, beyond every logarithmic axis."""
 BAND: dict[str, Any] = {"color": "#D55E00", "alpha": 0.12, "linewidth": 0}
 """Look of a named range of an axis."""
-USELESS = 1e2
-"""Values above this are drawn there, with their number, where a value above 1 means a failure."""
+EXACT, USELESS = 1e-4, 1e2
+"""Where a value above 1 means a failure, smaller values are drawn here as upper limits, and larger ones with their number."""
 NAME = 1.0
 """Longest line of a name at a point, in inches."""
 NEAR = 0.2
@@ -173,7 +173,7 @@ def _signs(chart: Chart) -> list[str]:
     if not column:
         return []
     is_grey = column.above_one and _is_log(column, chart.frame[column.name]) and _log_range(column, chart.frame)[1] > 1
-    is_hollow = column.limit and chart.frame[column.limit].eq(True).any()
+    is_hollow = column.limit and (chart.frame[column.limit].eq(True) | (chart.frame[column.name] < EXACT)).any()
     return [f"grey: {column.above_one}"] * bool(is_grey) + ["hollow: an upper limit"] * bool(is_hollow)
 
 
@@ -252,7 +252,7 @@ def _log_range(column: Column, rows: pd.DataFrame, marks: Sequence[Mark] = ()) -
     """Return the range of a logarithmic axis: all positive values, and their intervals within a factor of 100."""
     values = rows[column.name].to_numpy(float)
     values = values[np.isfinite(values) & (values > 0)]
-    values = np.minimum(values, USELESS) if column.above_one else values
+    values = values.clip(EXACT, USELESS) if column.above_one else values
     if not values.size:
         return 0.1, 10.0
     low, high = float(values.min()), float(values.max())
@@ -332,7 +332,8 @@ def _draw_arrows(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str
     taken, named, arrows = [], [], []
     for _, points in part.groupby(chart.arrow, sort=False):
         ends = points[[chart.x[0].name, chart.y[0].name]].to_numpy(float)
-        ends = ends.clip(max=USELESS if chart.y[0].above_one else math.inf)
+        if chart.y[0].above_one:
+            ends[:, 1] = ends[:, 1].clip(EXACT, USELESS)
         series, places = str(points[chart.series].iloc[0]), (np.log(ends) - low) / (high - low) * size
         if np.ptp(places, axis=0).max() > NEAR:
             look = {"arrowstyle": "-|>", "color": styles[series].colour, "linewidth": 1.6, "shrinkA": 3, "shrinkB": 3}
@@ -375,8 +376,10 @@ def _draw_values(
     limit, lost = (
         points[name].to_numpy(bool) if name else np.zeros(len(points), bool) for name in (column.limit, chart.failed)
     )
-    is_zero, is_cut = log & (values <= 0), values > (USELESS if log and column.above_one else math.inf)
-    given, values = values, np.where(is_zero, np.nan, np.where(is_cut, USELESS, values))
+    least, most = (EXACT, USELESS) if log and column.above_one else (0.0, math.inf)
+    is_zero, is_cut = log & (values <= least), values > most
+    given, values = values, np.where(is_zero & (least == 0), np.nan, values.clip(least, most) if log else values)
+    limit, is_zero = limit | is_zero, is_zero & (least == 0)
     is_flat = chart.kind == "dots"
     edge = panel.get_yaxis_transform() if is_flat else panel.get_xaxis_transform()
     look: dict[str, Any] = {"color": style.colour, "zorder": zorder}

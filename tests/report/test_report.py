@@ -34,7 +34,7 @@ from bench.experiment.axes import axes
 from bench.experiment.columns import Column
 from bench.experiment.views import Chart
 from bench.report import latex, views, writer
-from bench.report.draw import draw
+from bench.report.draw import EXACT, draw
 from bench.report.figures import save, styled
 from bench.report.problems import split_by_problem
 
@@ -204,7 +204,7 @@ def test_a_value_of_0_is_hollow_at_the_edge_of_a_logarithmic_axis_and_a_useless_
     hollow = [
         line for line in panel.lines if line.get_markerfacecolor() == "white" and np.isfinite(line.get_ydata()).any()
     ]
-    assert [list(line.get_xdata()) for line in hollow] == [[1.0]]
+    assert [(list(line.get_xdata()), list(line.get_ydata())) for line in hollow] == [([1.0], [EXACT])]
     assert panel.get_ylim()[1] < 1e3
     assert "1.0e24 ↑" in [text.get_text() for text in panel.texts]
 
