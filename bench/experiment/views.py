@@ -49,8 +49,8 @@ class Chart:
     - ``lines``: y against x, a line per ``series``, 95% intervals where the columns have them.
     - ``points``: the same without lines.
     - ``dots``: a row per value of the text column y, and x with its interval; ``join`` connects the dots of a row.
-    - ``grid``: a cell per pair of x and y, coloured by the text column ``level`` or by the number ``shade`` from 0 to 1, with the
-      text of the column ``cell``.
+    - ``grid``: a cell per pair of x and y, coloured by the text column ``level``, with the text of the
+      column ``cell``.
     """
 
     name: str
@@ -70,7 +70,6 @@ class Chart:
     panel: str = ""
     """The column with a panel per value."""
     level: str = ""
-    shade: str = ""
     cell: str = ""
     limit: str = ""
     """The column with a value of y per x, drawn as a line on a ``grid``, and named ``limit_name``."""
@@ -110,7 +109,7 @@ class Chart:
     def _names(self) -> list[str]:
         """Return the columns of the table that the chart needs."""
         axes = [name for c in (*self.x, *self.y) for name in (c.name, c.low, c.high, c.limit)]
-        names = [self.panel, self.series, self.line, self.level, self.shade, self.cell,
+        names = [self.panel, self.series, self.line, self.level, self.cell,
                  self.failed, self.arrow, self.limit, *axes]  # fmt: skip
         return [name for name in dict.fromkeys(names) if name]
 

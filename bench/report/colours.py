@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache
 from itertools import count
+
+import numpy as np
+import pandas as pd
 
 from bench.experiment.config import config_dir
 from bench.experiment.views import Chart, Style
@@ -26,6 +29,20 @@ def looks_by_name(charts: Sequence[Chart]) -> dict[str, Style]:
         name: Style(colour(place), MARKERS[place % len(MARKERS)]) for name, place in zip(others, free, strict=False)
     }
     return {name: style for name, style in found.items() if name in drawn}
+
+
+def graded(
+    errors: pd.Series, grades: Mapping[float, str], unit: Callable[[float], str]
+) -> tuple[pd.Series, dict[str, Style]]:
+    """Return the grade of each error, and the look of each grade. ``grades`` are colours by upper end, the last of them infinite.
+
+    ``unit`` formats the ends: ``error below 10%``, ``error 100% or more``.
+    """
+    *ends, most = grades
+    names = [*(f"error below {unit(end)}" for end in ends), f"error {unit(ends[-1])} or more"]
+    place = np.searchsorted(ends, errors.fillna(most), side="right")
+    looks = {name: Style(colour) for name, colour in zip(names, grades.values(), strict=True)}
+    return pd.Series(np.array(names, dtype=object)[place], errors.index), looks
 
 
 def estimator_style(estimator: str, variant: int = 0) -> Style:

@@ -12,10 +12,9 @@ from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
-from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import to_hex, to_rgb
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
@@ -331,7 +330,7 @@ def _draw_arrows(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str
     low, high = (np.log(ends) for ends in zip(panel.get_xlim(), panel.get_ylim(), strict=True))
     taken, named, arrows = [], [], []
     for _, points in part.groupby(chart.arrow, sort=False):
-        ends = points[[chart.x[0].name, chart.y[0].name]].to_numpy(float)
+        ends = points[[chart.x[0].name, chart.y[0].name]].to_numpy(float, copy=True)
         if chart.y[0].above_one:
             ends[:, 1] = ends[:, 1].clip(EXACT, USELESS)
         series, places = str(points[chart.series].iloc[0]), (np.log(ends) - low) / (high - low) * size
@@ -459,7 +458,7 @@ def _draw_dots(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str, 
 def _draw_grid(
     chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str, Style], place: dict[str, int], width: float
 ) -> float:
-    """Draw a cell per pair of x and y, coloured by level or value, in ``width`` inches; return the height of the labels of x."""
+    """Draw a cell per pair of x and y, coloured by level, in ``width`` inches; return the height of the labels of x."""
     x, y = chart.x[0], chart.y[0]
     names = _categories(x, part if chart.own_scales else chart.frame)
     room = width / max(len(names), 1)
@@ -467,7 +466,7 @@ def _draw_grid(
     size = min(SIZE - 1, 0.8 * 72 * room, SIZE * 0.92 * room / max(widest, 0.1))
     for line in part.to_dict("records"):
         at = names.index(_category(line[x.name])), place[_category(line[y.name])]
-        face = styles[str(line[chart.level])].colour if chart.level else _shade(float(line[chart.shade]))
+        face = styles[str(line[chart.level])].colour
         panel.add_patch(Rectangle((at[0] - 0.5, at[1] - 0.5), 1, 1, facecolor=face, edgecolor="white", linewidth=0.8))
         text = plain(str(line[chart.cell])) if chart.cell else ""
         panel.text(*at, text, ha="center", va="center", color=ink_on(face), fontsize=size)
@@ -513,11 +512,6 @@ def _categories(column: Column, rows: pd.DataFrame, downwards: bool = False) -> 
     if pd.api.types.is_numeric_dtype(values):
         return list(dict.fromkeys(map(_category, sorted(values.dropna(), reverse=downwards))))
     return list(map(str, values))
-
-
-def _shade(share: float) -> str:
-    """Return the colour of a cell by a number from 0 to 1: darker is larger."""
-    return to_hex(colormaps["YlOrBr"](0.08 + 0.84 * share)) if math.isfinite(share) else "#f0f0f0"
 
 
 def ink_on(ground: str) -> str:

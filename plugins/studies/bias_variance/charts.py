@@ -15,7 +15,7 @@ from bench.experiment.axes import Axis
 from bench.experiment.columns import Column, text
 from bench.experiment.views import Chart, Mark, Style
 from bench.model import SURROGATE, registry
-from bench.report.colours import method_styles
+from bench.report.colours import graded, method_styles
 from bench.report.problems import ProblemRows, split_by_problem
 from bench.report.style import MARKERS, colour
 from bench.report.text import axis_value, counted, number
@@ -26,6 +26,7 @@ from bench.report.views import (
     estimator_labels,
     shown_rmse,
 )
+from bench.report.writer import LEAST
 
 from .columns import COLUMNS
 from .comparisons import FAILS, NO_RESULT
@@ -36,6 +37,8 @@ FLOOR = 1e-4
 """Relative biases below this are drawn here, as upper limits."""
 SERIES = 6
 """Most estimators of a chart along an axis, where the experiment does not name them."""
+GRADES = {0.1: "#08519c", 0.3: "#6baed6", 1.0: "#d6e6f4", 10.0: "#fdae61", math.inf: "#c51b1b"}
+"""Upper ends of the grades of an error, and their colours."""
 PANELS = 4
 """Most problems of a chart along an axis."""
 RMSE = Column(
@@ -72,7 +75,7 @@ def charts(
         along = [_contrast(labelled, subtitle), *along]
     if not swept and shown.rows["backend"].nunique() > 1:
         along += [_error_and_cost(labelled, subtitle)]
-    if not swept and methods["problem"].nunique() > 1:
+    if best.empty and max(swept.values(), default=0) < LEAST and methods["setting"].nunique() > 1:
         along = [_estimators(methods), *along]
     drawn = [chart for chart in along if chart is not None]
     names = [name for chart in drawn if chart.series for name in chart.frame[chart.series]]
@@ -298,15 +301,17 @@ def _estimators(methods: pd.DataFrame) -> Chart:
     families = {name: _family(name.partition("[")[0]) for name in names}
     order = sorted(names, key=lambda name: list(dict.fromkeys(families.values())).index(families[name]))
     frame = methods.iloc[methods["estimator"].map(order.index).argsort(kind="stable")]
+    at = ", " + frame["axis"] + "=" + frame["at"].map(axis_value)
     error, known = frame["error"], np.isfinite(frame["error"])
     marks = frame["status"].where(frame["verdict"] == NO_RESULT, "").mask(frame["verdict"] == FAILS, " fails")
+    grades, looks = graded(error, GRADES, "{:g}".format)
     return Chart(
         "estimators",
-        frame.assign(panel=frame["estimator"].map(families), series=frame["estimator"], shade=(np.log10(error.clip(1e-2, 1e2)) / 4 + 0.5).where(known),
-                     cell=error.map(number).where(known, marks)),
-        [text("problem", label="")], [ESTIMATOR], "grid", panel="panel", shade="shade",
+        frame.assign(panel=frame["estimator"].map(families), series=frame["estimator"], grade=grades.where(known, "no result"), problem=frame["problem"] + at.where(frame["axis"] != "", ""),
+                     cell=(pd.Series(np.where(frame["error_is_limit"], "<", ""), frame.index) + error.map(number)).where(known, marks)),
+        [text("problem", label="")], [ESTIMATOR], "grid", panel="panel", level="grade", styles=looks | {"no result": Style("#f2f2f2")},
         cell="cell", across=1, height=0.2,
-        subtitle="relative RMSE of one estimate, sorted by the worst case; above 1 the zero estimate is better",
+        subtitle="relative RMSE of one estimate, sorted by the worst case; from 1 on the zero estimate is better",
     )  # fmt: skip
 
 
