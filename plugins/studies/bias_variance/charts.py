@@ -75,7 +75,8 @@ def charts(
         along = [_contrast(labelled, subtitle), *along]
     if not swept and shown.rows["backend"].nunique() > 1:
         along += [_error_and_cost(labelled, subtitle)]
-    if best.empty and max(swept.values(), default=0) < LEAST and methods["setting"].nunique() > 1:
+    is_grid = (methods[["setting", "estimator"]].nunique() > 1).all()
+    if best.empty and max(swept.values(), default=0) < LEAST and is_grid:
         along = [_estimators(methods), *along]
     drawn = [chart for chart in along if chart is not None]
     names = [name for chart in drawn if chart.series for name in chart.frame[chart.series]]
