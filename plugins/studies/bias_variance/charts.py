@@ -133,7 +133,8 @@ def _along(
     subtitle: str,
 ) -> Chart | None:
     """Return the chart of errors along an axis, of the main estimators on the main problems."""
-    problems = [p for p in split_by_problem(shown, axis) if attempted(p.rows)["x"].nunique() > 1]
+    always = ("scene",) * (shown.rows["scene"].nunique() > 1)
+    problems = [p for p in split_by_problem(shown, axis, always) if attempted(p.rows)["x"].nunique() > 1]
     if not problems:
         return None
     drawn, notes = choose_problems(problems)
