@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bench.errors import INTERRUPTED, UserError, printable, unknown
+from bench.errors import INTERRUPTED, UserError, needing_sweeps, printable, unknown
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -56,7 +56,8 @@ EXAMINE = """\
   tolerance=1e-4       relative error that only causes a warning; by input: tolerance=mass:1e-3; absolute: atol=1e-9
   allow_zero=friction  inputs that may have no effect; true: all, false: none
   expect=kink          the known cause, with which the status is 0
-  baseline=FILE        compare with this file, which is written if absent: status 0 unless something is worse
+  baseline=FILE        status 0 unless something is worse than in this file, which is written if absent and the status 0
+  --bench-update       write the baseline
   refined=NAME         the cost at a tighter tolerance or finer step
   horizons=1,2,10      numbers of steps T: cost(theta, steps=T) and its gradient
   batch=loop           batching of thetas: loop, vmap, columns (d, B), rows (B, d), columns:64; by default detected
@@ -92,7 +93,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command. Returns the exit status."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        with _stop_on_signals():
+        with _stop_on_signals(), needing_sweeps(" ".join(["bench", *words[:1]])):
             return _dispatch(words)
     except UserError as error:
         print("bench:", printable(error), file=sys.stderr)

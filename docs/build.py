@@ -160,8 +160,8 @@ def table_row(column: Column) -> str:
 
 RULE_MARKS = "<!-- verdicts -->\n", "<!-- end of verdicts -->"
 RULE_MODULES = (
-    "gradient.causes gradient.check gradient.diagnosis gradient.direction gradient.few gradient.roughness "
-    "gradient.sampling gradient.stages examine.findings examine.smoothing measure.jumps"
+    "gradient.causes gradient.check gradient.direction gradient.roughness gradient.sampling gradient.smooth_part examine.diagnosis "
+    "examine.few examine.findings examine.hints examine.means examine.smoothing examine.stages measure.jumps"
 )
 """The modules whose constants conditions of rules name."""
 

@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bench.experiment.columns import COMMON, Column, Columns, ComparisonRule
-from bench.measure.statistics import UNEXPLAINED, is_unexplained
+from bench.measure.statistics import PHYSICS, UNEXPLAINED, is_unexplained
 from bench.report.text import number
 
 EFFECT = 1.25
@@ -94,7 +94,10 @@ def judge_cell(columns: Columns, old: Row | None, new: Row | None) -> list[Chang
         if change is None:
             continue
         change = change._replace(subject=rule.called, outcome="changed" if rule.neutral else change.outcome)
-        if is_estimated and (remarks := [text for row in (old, new) if (text := _remark(row))]):
+        remarks = [
+            text for row in (old, new) for text in _remark(row).split("; ") if text and not text.startswith(PHYSICS)
+        ]
+        if is_estimated and remarks:
             doubt = UNEXPLAINED if any(map(is_unexplained, remarks)) else "intervals doubtful"
             change = change._replace(outcome="changed", text=f"{change.text}, {doubt}")
         changes.append(change)

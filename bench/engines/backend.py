@@ -27,8 +27,6 @@ class EngineBackend(Backend):
 
     file: ClassVar[str]
     """The engine's file, relative to the folder of the backend's own file, such as ``engines/my_engine.py``."""
-    helpers: ClassVar[tuple[str, ...]] = ()
-    """Further files of the engine's folder that its file imports, by name."""
     libraries: ClassVar[tuple[str, ...]] = ()
     """Distributions that the engine needs. Rows have their versions."""
     laws: ClassVar[tuple[str, ...]] = ("penalty",)
@@ -127,11 +125,5 @@ class EngineBackend(Backend):
 
     @classmethod
     def files(cls) -> list[Path]:
-        """Return the files that run in the engine's Python: the engine's own, first, its helpers and the server's."""
-        own = Path(inspect.getfile(cls)).parent / cls.file
-        return [own, *(own.parent / name for name in cls.helpers), Path(server.__file__)]
-
-    @classmethod
-    def requirements(cls) -> Path:
-        """Return the file of the engine's requirements, beside the engine's file."""
-        return cls.files()[0].with_suffix(".txt")
+        """Return the engine's file and the server's, which run in the engine's Python."""
+        return [Path(inspect.getfile(cls)).parent / cls.file, Path(server.__file__)]

@@ -15,6 +15,8 @@ from bench.engines.conformance import metamorphic
 from bench.errors import UserError, local_path, printable, unknown
 from bench.model import registry
 
+OUT = Path("results/engines_table")
+"""Folder of the table."""
 USAGE = (
     "python -m bench engines [install NAME[==VERSION] ... [--again] | table [NAME[==VERSION] ...] [out=DIR] [key=value ...]"
     " | metamorphic MODEL.xml [NAME[==VERSION]] [steps=60] [seed=0] | set OUT] [plugins=DIR]"
@@ -23,46 +25,56 @@ USAGE = (
 
 def main(words: Sequence[str]) -> int:
     """List all engines with the state of their environments, install the named ones, or write the table; return the status."""
-    out = Path("results/engines_table")
-    for word in words:
-        if word.startswith("plugins="):
-            registry.add_folder(Path(word.partition("=")[2]))
-        elif word.startswith("out="):
-            out = local_path("out", word.partition("=")[2])
-    names = [word for word in words if not word.startswith(("plugins=", "out=", "--again"))]
-    if not names:
-        return _list()
-    if names[0] == "table":
-        settings = [name for name in names[1:] if "=" in name and "==" not in name]
-        wanted = [name for name in names[1:] if name not in settings]
-        for name in wanted:
-            registry.find("backends", name.partition("==")[0])
-        print(table.write(wanted, out, settings))
-        return 0
-    if names[0] == "metamorphic" and names[1:]:
-        return _metamorphic(*names[1:])
-    if names[0] == "set" and len(names) == 2:
-        return _write_set(Path(names[1]) / "conformance")
-    if names[0] != "install" or not names[1:]:
-        raise UserError(f"engines: {' '.join(names)} is not a request: {USAGE}")
+    given = [word for word in words if not word.startswith("plugins=")]
+    for word in set(words) - set(given):
+        registry.add_folder(Path(word.partition("=")[2]))
+    match given:
+        case []:
+            return _list()
+        case ["table", *rest]:
+            return _table(rest)
+        case ["metamorphic", model, *rest]:
+            return _metamorphic(model, rest)
+        case ["set", out]:
+            return _write_set(Path(out) / "conformance")
+        case ["install", *rest] if names := [word for word in rest if word != "--again"]:
+            return _install(names, "--again" in rest)
+    raise UserError(f"engines: {' '.join(given)} is not a request: {USAGE}")
+
+
+def _install(words: Sequence[str], again: bool) -> int:
+    """Make the environments of ``NAME`` or ``NAME==VERSION``; return 1 if an engine cannot be used then."""
     engines, requirements = _engines(), {}
-    for word in names[1:]:
+    for word in words:
         name, _, release = word.partition("==")
         plugin = registry.find("backends", name).plugin if release else engines.get(name)
         if plugin is None:
             raise unknown("engine", name, engines)
-        is_outside = name in engines
-        requirements[word] = engines[name].requirements() if is_outside else table.file_of(plugin, ".txt")
+        requirements[word] = (
+            engines[name].files()[0].with_suffix(".txt") if name in engines else table.file_of(plugin, ".txt")
+        )
         if not requirements[word].exists():
             raise UserError(f"engine {name} has no file of requirements {requirements[word]}")
     for word, file in requirements.items():
         started = time.perf_counter()
-        place = environments.install(word, file, again="--again" in words)
+        place = environments.install(word, file, again=again)
         size = sum(file.lstat().st_size for file in place.rglob("*"))
         print(f"{word}: installed in {place}, {size / 2**20:.0f} MiB, {time.perf_counter() - started:.0f} s")
         if word in engines and (reason := engines[word]().unavailable_reason()):
             print(f"bench: {reason}", file=sys.stderr)
             return 1
+    return 0
+
+
+def _table(words: Sequence[str]) -> int:
+    """Write the table of the named engines, or of all, and print the page's path."""
+    settings = [word for word in words if "=" in word and "==" not in word]
+    names = [word for word in words if word not in settings]
+    for name in names:
+        registry.find("backends", name.partition("==")[0])
+    places = [word for word in settings if word.startswith("out=")]
+    out = local_path("out", places[-1].partition("=")[2]) if places else OUT
+    print(table.write(names, out, [word for word in settings if word not in places]))
     return 0
 
 
@@ -83,29 +95,25 @@ def _write_set(out: Path) -> int:
     return 0
 
 
-def _metamorphic(model: str, *words: str) -> int:
+def _metamorphic(model: str, words: Sequence[str]) -> int:
     """Print a line per property of an engine on a model, by default of ``mujoco``; return 1 if one does not hold."""
     if not Path(model).is_file():
         raise UserError(f"engines metamorphic: the file {model} does not exist: {USAGE}")
     settings = [word for word in words if "=" in word and "==" not in word]
-    names = [word for word in words if word not in settings]
-    if unknown_names := [word for word in settings if not re.fullmatch(r"(steps|seed)=\d+", word)]:
-        raise UserError(f"engines metamorphic: {' '.join(unknown_names)} is not a setting: {USAGE}")
-    word = names[0] if names else "mujoco"
-    name, _, release = word.partition("==")
-    plugin, python = registry.usable("backends", name), str(environments.python_of(word)) if release else ""
-    if release and (reason := environments.missing(word, python, ())):
-        raise UserError(reason)
-    file, script = table.file_of(plugin, "_metamorphic.py"), Path(metamorphic.__file__)
-    if not file.exists():
-        raise UserError(f"engines metamorphic: engine {name} has no file {file}")
-    rows = table.rows_of(plugin(), file, script, str(Path(model).resolve()), *settings, python=python)
+    if strange := [word for word in settings if not re.fullmatch(r"(steps|seed)=\d+", word)]:
+        raise UserError(f"engines metamorphic: {' '.join(strange)} is not a setting: {USAGE}")
+    name = next((word for word in words if word not in settings), "mujoco")
+    rows = table.rows_of(name, metamorphic, str(Path(model).resolve()), *settings)
+    if "property" not in rows[0]:
+        raise UserError(f"engines metamorphic: {rows[0]['reason']}")
     for row in rows:
         state = {True: "holds", False: "broken", None: "-"}[row.get("holds")]
-        at = f"first at step {row['step']}" if row.get("step") is not None else row["reason"]
+        at = [f"first at step {row['step']}"] if row.get("step") is not None else []
         size = f"{row['worst']:.1e} of {row['tolerance']:.0e}" if row.get("worst") is not None else ""
-        print(f"{row.get('property', ''):<34}{state:<8}{size:<20}{at}".rstrip())
-    print(f"{rows[0].get('versions', name)}, {Path(model).name}")
+        print(
+            f"{row.get('property', ''):<35}{state:<8}{size:<20}{': '.join([*at, *filter(None, [row['reason']])])}".rstrip()
+        )
+    print(f"{rows[0]['versions']}, {Path(model).name}")
     return int(any(row.get("holds") is False or "property" not in row for row in rows))
 
 

@@ -10,6 +10,7 @@ import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import pandas as pd
@@ -36,26 +37,15 @@ def write(names: Sequence[str], out: Path, settings: Sequence[str] = ()) -> Path
     """
     rows: list[dict[str, Any]] = []
     backends: list[str] = []
-    plugins = registry.entries()["backends"]
-    for word in names or plugins:
+    for word in names or registry.entries()["backends"]:
         name, _, release = word.partition("==")
-        plugin = plugins[name].plugin
-        if plugin is None:
+        plugin = registry.entries()["backends"][name].plugin
+        if plugin is None or not (issubclass(plugin, EngineBackend) or file_of(plugin, "_conformance.py").exists()):
             continue
-        file, is_outside = file_of(plugin, "_conformance.py"), issubclass(plugin, EngineBackend)
-        if not (is_outside or file.exists()):
-            continue
-        python = str(environments.python_of(word)) if release else ""
-        backend = plugin(python=python) if release and is_outside else plugin()
-        reason = (
-            environments.missing(word, python, ()) if release else plugins[name].reason or backend.unavailable_reason()
-        )
-        own = [{"reason": reason}] if reason else rows_of(backend, file, Path(runner.__file__), python=python)
-        rows += [
-            {"versions": "", **row, "engine": name, "command": f"python -m bench engines table {word}"} for row in own
-        ]
-        if "case" in own[0] and (is_outside or not release):
-            backends.append(f"{name}[python={python}]" if release else name)
+        own, known = rows_of(word, runner), {"versions": "", "engine": name}
+        rows += [known | row | {"command": f"python -m bench engines table {word}"} for row in own]
+        if "case" in own[0] and (not release or issubclass(plugin, EngineBackend)):
+            backends.append(f"{name}[python={environments.python_of(word)}]" if release else name)
     out.mkdir(parents=True, exist_ok=True)
     table, stored = pd.DataFrame(rows, columns=list(COLUMNS)), out / "engines.csv"
     releases = sorted({versions.partition(";")[0] for versions in table["versions"]} - {""})
@@ -86,27 +76,39 @@ def read(file: Path) -> pd.DataFrame:
     return pd.read_csv(file, dtype=str, keep_default_na=False)
 
 
-def rows_of(backend: Any, file: Path, script: Path, *words: str, python: str = "") -> list[dict[str, Any]]:
-    """Return the rows of a script of the conformance set on an engine's file, run in the engine's own Python or another.
+def rows_of(engine: str, script: ModuleType, *words: str) -> list[dict[str, Any]]:
+    """Return the rows of a script of the conformance set on ``NAME`` or ``NAME==VERSION``, run in that engine's Python.
 
-    If the run fails or takes longer than :data:`LIMIT_S`, the last row has the reason.
+    If it cannot run, the run fails or takes longer than :data:`LIMIT_S`, the last row has the reason.
     """
-    if not file.exists():
-        return [{"reason": f"no file {file.name}"}]
-    environment = dict(os.environ)
-    if isinstance(backend, EngineBackend):
-        python = backend.python or str(environments.python_of(backend.name))
+    name, _, release = engine.partition("==")
+    entry, python, environment = registry.find("backends", name), str(environments.python_of(engine)), dict(os.environ)
+    is_inside = not issubclass(entry.plugin, EngineBackend)
+    if is_inside:
+        environment["PYTHONPATH"] = str(Path(runner.__file__).parents[3])
+    if is_inside and not release:
+        python, missing = sys.executable, entry.reason
     else:
-        python, environment["PYTHONPATH"] = python or sys.executable, str(Path(runner.__file__).parents[3])
+        missing = environments.missing(engine, None, getattr(entry.plugin, "libraries", ()))
+    file = file_of(entry.plugin, "_conformance.py")
+    if missing or not file.exists():
+        return [{"reason": missing or f"no file {file.name}"}]
+    return run(python, script, str(file), *words, environment=environment)
+
+
+def run(
+    python: str, script: ModuleType, *words: str, environment: dict[str, str] | None = None
+) -> list[dict[str, Any]]:
+    """Return the rows that a script of the conformance set prints in a Python."""
     reason = ""
     with tempfile.TemporaryFile("w+") as output:
         try:
             subprocess.run(
-                [python, str(script), str(file), *words],
+                [python, str(script.__file__), *words],
                 env=environment, text=True, timeout=LIMIT_S, check=True, stdout=output, stderr=subprocess.PIPE,
             )  # fmt: skip
         except (OSError, subprocess.SubprocessError) as error:
-            reason = f"{script.stem} stopped: {printable(error)[-80:]} {printable(getattr(error, 'stderr', ''))[-120:]}"
+            reason = f"{script.__name__.rpartition('.')[2]} stopped: {printable(error)[-80:]} {printable(getattr(error, 'stderr', ''))[-120:]}"
         output.seek(0)
         lines = [json.loads(line) for line in output if line.startswith("{")]
     versions = "; ".join(f"{library} {version}" for library, version in lines[0]["versions"].items()) if lines else ""
@@ -114,35 +116,51 @@ def rows_of(backend: Any, file: Path, script: Path, *words: str, python: str = "
 
 
 def _page(table: pd.DataFrame) -> str:
-    """Return the page: a line per engine, a table of cases by engines, and the reasons for what is missing in it."""
+    """Return the page: a line per engine, cases by releases, verdicts that changed, and the reasons for what is missing."""
     engines = [
         [name, versions, *((own["is_right"] == verdict).sum() for verdict in ("True", "False")), f"`{own['command'].iloc[0]}`"]
         for (name, versions), own in table.groupby(["engine", "versions"], sort=False)
     ]  # fmt: skip
-    told = table[table["reason"] != ""]
+    told = _released(table[table["reason"] != ""])
     cases = told["case"].str.cat(told["term"].where(told["is_right"] == "False", ""), sep=" ").str.strip()
-    reasons = told.assign(case=cases).drop_duplicates(["engine", "case"]).groupby(["engine", "reason"])["case"]
+    reasons = told.assign(case=cases).drop_duplicates(["release", "case"]).groupby(["release", "reason"])["case"]
     notes = [f"- {', '.join([name, *filter(None, of)])}: {printable(why)[:240]}" for (name, why), of in reasons]
     return "\n".join([
         "# Conformance of physics engines", "",
         *_markdown(["engine", "versions", "right", "not right", "command"], engines), "",
         "The fewest digits of a case's derivatives. own: compared with the engine's own differences. -: not run. ?: cannot tell.", "",
-        *by_case(table), "", *notes, "",
+        *by_case(table), "", *changes(table), "", *notes, "",
     ])  # fmt: skip
+
+
+def _released(table: pd.DataFrame) -> pd.DataFrame:
+    """Return rows with their release: the engine's first library with its version, or the engine."""
+    return table.assign(release=table["versions"].str.split(";").str[0].where(table["versions"] != "", table["engine"]))
 
 
 def by_case(table: pd.DataFrame) -> list[str]:
     """Return the Markdown lines of a table of cases by engines, with a column per release, from stored rows of text."""
-    run = table[table["case"] != ""]
+    run = _released(table[table["case"] != ""])
     if run.empty:
         return []
-    release = run["versions"].str.partition(";")[0].where(run["versions"] != "", run["engine"])
-    run = run.assign(release=release, seconds=pd.to_numeric(run["seconds"]))
-    cells = run.groupby(["case", "release"]).apply(_cell).unstack(fill_value="")[release.unique()]
+    run = run.assign(seconds=pd.to_numeric(run["seconds"]))
+    cells = run.groupby(["case", "release"]).apply(_cell).unstack(fill_value="")[run["release"].unique()]
     cells.loc["seconds"] = (
         run.drop_duplicates(["release", "case"]).groupby("release")["seconds"].sum().map("{:.3g}".format)
     )
     return _markdown(["case", *cells], list(cells.itertuples()))
+
+
+def changes(table: pd.DataFrame) -> list[str]:
+    """Return the Markdown lines of a table of verdicts that differ between releases of an engine, from stored rows of text."""
+    lines = []
+    for _, own in _released(table[table["case"] != ""]).groupby("engine", sort=False):
+        verdicts = own.pivot(index=["case", "term"], columns="release", values="is_right").dropna()
+        changed = verdicts[verdicts.nunique(axis=1) > 1].replace({"True": "right", "False": "wrong", "": "?"})
+        if len(changed):
+            rows = changed.reset_index()
+            lines += _markdown(list(rows), list(rows.itertuples(index=False)))
+    return lines
 
 
 def _cell(rows: pd.DataFrame) -> str:

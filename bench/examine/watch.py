@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 
 from bench.errors import UserError, failure
+from bench.examine.few import ROUNDS, FewSteps
+from bench.examine.lines import scan
+from bench.examine.subspace import Group, Subspace
 from bench.gradient import FAULTS, RULES
-from bench.gradient.few import ROUNDS, FewSteps
-from bench.gradient.lines import scan
-from bench.gradient.subspace import Group, Subspace
 from bench.simulator.simulator import Simulator
 from bench.simulator.tree import ParameterTree
 

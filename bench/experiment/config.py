@@ -166,7 +166,9 @@ def _to_hydra(override: str, config_dirs: Sequence[Path]) -> str:
     if "=" not in override:
         if override in experiments(config_dirs):
             raise UserError(f"'{override}' is an experiment: write +experiment={override}")
-        raise UserError(f"'{override}' is not an override: write key=value (commands come first: see --help)")
+        if override.startswith("-"):
+            raise unknown("option", override, ("--config-dir", "--help", "--quiet", "--version"))
+        raise unknown("experiment", override, experiments(config_dirs), "--help; settings are key=value")
     if "${" in override:
         raise UserError(f"'{override}': interpolations are not supported, give the value itself")
     key, _, value = override.partition("=")

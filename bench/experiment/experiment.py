@@ -109,11 +109,6 @@ class Experiment:
     execution: Execution = Execution()
 
     @property
-    def budget(self) -> Budget | None:
-        """Budget of a cell's reference gradient; None if the study needs none."""
-        return self.reference if self.columns.referenced else None
-
-    @property
     def directory(self) -> Path:
         """Folder of the experiment's files."""
         return self.results_dir / self.name

@@ -55,6 +55,10 @@ class Study(Plugin):
         """Return the part of theta that programs have; by default all of it."""
         return given
 
+    def compares(self, parts: Mapping[str, Plugin | None]) -> bool:
+        """Return whether a cell with these plugins needs a reference gradient; by default if the rows have its method."""
+        return self.columns.referenced
+
     def refusal(self, cell: Cell) -> str | None:
         """Return why the study cannot measure a cell, or None; called when a run is planned."""
         return None

@@ -36,6 +36,10 @@ FAR = 4.5
 """Distance searched for jumps on either side along a direction, in standard deviations."""
 ROUNDING = 1e-9
 """Difference of first and zeroth order, relative to the gradient, that rounding explains."""
+SAME = 1e-6
+"""Difference between two backends' costs of one draw, relative to the range of costs, that rounding explains. The root of
+the coarser unit roundoff is allowed too, and :data:`LAST` roundoffs of the cost itself."""
+LAST = 100.0
 SHARED = 1e-10
 """Relative error common to the terms of all samples, from rounding and central differences."""
 EXTREME = 1e100
@@ -129,6 +133,41 @@ def certify(
         return reference
     plain = problem.grad(theta, np.zeros((program.n_noise, 1)))[:, 0]
     return replace(reference, plain=plain, physical=np.asarray(physical, dtype=np.float64))
+
+
+def transferred(reference: Reference, problem: Problem, other: Problem, samples: int, unit: float) -> Reference | None:
+    """Return a reference that ``problem`` computed for ``other``, the program on another backend; None if it is not that one's.
+
+    Both compute the costs of the same draws, at most ``samples``, with the unit roundoff ``unit``. Where rounding decides an event, costs differ by more
+    than rounding, and grad J by the mean of difference times score. The upper end of its 95% interval is added to the
+    stated error. A reference whose stated error is smaller than that is not transferred.
+    """
+    program, theta, columns = problem.program, problem.program.theta0, min(COLUMNS, samples)
+    effects, share = [], 0.0
+    blocks = max(1, min(samples, LEAST_SAMPLES) // columns)
+    for block in range(blocks):
+        w = draw_columns(problem, "backends", columns, block)
+        with np.errstate(all="ignore"):
+            mine, others = problem.value(theta, w), other.value(theta, w)
+            spread = np.ptp(mine[np.isfinite(mine)]) if np.isfinite(mine).any() else 0.0
+            allowed = max(SAME, math.sqrt(unit)) * spread + LAST * unit * np.abs(mine)
+            agrees = (mine == others) | (np.abs(others - mine) <= allowed) | (np.isnan(mine) & np.isnan(others))
+            share += float(1.0 - agrees.mean()) / blocks
+            apart = np.where(agrees, 0.0, others - mine)
+            if agrees.all():
+                effects.append(np.zeros((columns, problem.dim)))
+            elif program.score_refusal or not problem.sigma > 0.0:
+                return None
+            else:
+                effects.append((apart * problem.score(theta, w)).T)
+    effect = np.concatenate(effects)
+    if not share or not np.isfinite(effect).all():
+        return None if share else reference
+    most = bias_interval(effect.mean(axis=0), Sampling.of(effect))[2]
+    if not most <= reference.known().standard_error:
+        return None
+    note = f"costs differ from those of the backend that computed the reference in {share:.2g} of draws, as its error allows"
+    return _with_note(replace(reference, error=math.hypot(reference.error, most)), note)
 
 
 def revisions(program: Program, provides: frozenset[str]) -> dict[str, int]:

@@ -40,6 +40,8 @@ NARROW = 10.0
 """Width of the interval of the log variance of terms, times their number, below which it ignores the error of their mean."""
 THREE = 3.0
 """Numerator of the rule of three: an event absent from n trials has a probability below 3 / n, at 95% confidence."""
+PHYSICS = "physics: "
+"""Start of a backend's remark on a row: a difference of its physics, which leaves intervals as they are."""
 UNEXPLAINED = "tails unseen or gradient wrong"
 """Remark on a row whose estimator is declared unbiased although the interval of its bias excludes 0."""
 
@@ -339,6 +341,8 @@ def variance_per_sample(
     if count < 2:
         return (math.nan,) * 3
     total, power = sums.sum(axis=0), float(squares.sum())
+    if math.isinf(power):  # of finite terms whose squares overflow
+        return math.inf, 0.0, math.inf
     # a difference below this share of the squares is rounding
     floor = 1e-14 * power
     whole = power - float(total @ total) / count

@@ -13,6 +13,7 @@ import subprocess
 import sys
 import time
 import uuid
+from collections.abc import Iterator
 from contextlib import suppress
 
 MARK = "BENCH_MARK"
@@ -63,15 +64,29 @@ def main() -> None:
 
 def kill_marked_processes(mark: str) -> int:
     """Kill all other processes whose mark is ``mark`` or starts with it, and return their number."""
-    import psutil
-
     n_killed = 0
-    for process in psutil.process_iter():
-        with suppress(psutil.Error):
-            if process.pid != os.getpid() and process.environ().get(MARK, "").startswith(mark):
-                process.kill()
+    for pid, given in _marked_processes():
+        if pid != os.getpid() and given.startswith(mark):
+            with suppress(ProcessLookupError, PermissionError):
+                os.kill(pid, signal.SIGKILL)
                 n_killed += 1
     return n_killed
+
+
+def _marked_processes() -> Iterator[tuple[int, str]]:
+    """Yield the id and the mark of each process that has one and may be read."""
+    if not os.path.exists("/proc/self/environ"):
+        import psutil  # required by the package where there is no /proc
+
+        for process in psutil.process_iter():
+            with suppress(psutil.Error, KeyError):
+                yield process.pid, process.environ()[MARK]
+        return
+    for pid in filter(str.isdigit, os.listdir("/proc")):
+        with suppress(OSError), open(f"/proc/{pid}/environ", "rb") as file:
+            for entry in file.read().split(b"\0"):
+                if entry.startswith(f"{MARK}=".encode()):
+                    yield int(pid), entry.partition(b"=")[2].decode(errors="replace")
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections import defaultdict
 from collections.abc import Iterable
 from contextlib import suppress
@@ -13,11 +14,12 @@ from typing import Any
 from bench.errors import STATUSES, StorageError, failure, printable
 from bench.experiment.cell import Cell
 from bench.experiment.experiment import Experiment
-from bench.experiment.keys import fingerprint
+from bench.experiment.keys import fingerprint, names_files
 from bench.experiment.parameters import PROBLEM
 from bench.experiment.study import Study, study_of
 from bench.measure import descent, noise
-from bench.model import Backend, Plugin, Scene, guard, isolation, registry
+from bench.measure.statistics import PHYSICS
+from bench.model import Backend, Plugin, guard, isolation, reads, registry
 from bench.run.plan import versions
 from bench.run.pool import Answer
 from bench.run.record import kind_of_machine
@@ -95,25 +97,24 @@ class TaskHandler:
         self._state.follow()
 
     def __call__(self, item: Task) -> dict[str, Any]:
-        """Return the results of the cell, or the status and reason of its failure.
+        """Return the results of the cell, or the status and reason of its failure, and what code from outside has read.
 
-        The reason names changed settings of the process, and code from outside that the process has run for other cells.
+        The reason names code from outside that the process has run for other cells.
         """
         RAN.update(item.outside)
+        for name in filter(os.path.isabs, item.outside):
+            reads.note(name)
         result = self._handle(item)
-        remarks = []
-        if changes := self._state.changes():
-            remarks.append(f"settings changed in this process: {printable('; '.join(changes))}")
-            if (
-                result.get("dtype", item.cell.backend.dtype) == "float64"
-                and isolation.reduced_precision()
-                and _uses_jax(item.backend)
-            ):
-                result["dtype"] = "float32"
+        is_reduced = isolation.reduced_precision()
+        if is_reduced and result.get("dtype", item.cell.backend.dtype) == "float64" and _uses_jax(item.backend):
+            result["dtype"] = "float32"
+        self.is_tainted = is_reduced or self._study.fresh_process or not registry.is_restricted()
+        if RAN:
+            result["reads"] = reads.manifest()
         if others := RAN - item.outside:
-            remarks.append(f"this process has also run code of {printable(', '.join(sorted(others)))}")
-        self.is_tainted = bool(changes) or self._study.fresh_process or not registry.is_restricted()
-        return result | {"reason": "; ".join(filter(None, (result.get("reason", ""), *remarks)))} if remarks else result
+            remark = f"this process has also run code of {printable(', '.join(sorted(others)))}"
+            result["reason"] = "; ".join(filter(None, (result.get("reason", ""), remark)))
+        return result
 
     def _handle(self, item: Task) -> dict[str, Any]:
         # other code may have changed what computes it
@@ -138,13 +139,13 @@ def outside_of(parts: Iterable[Plugin | None]) -> frozenset[str]:
     names = {type(part).__module__ for part in foreign}
     for part in foreign:
         with suppress(Exception):  # the error is reported when the cell is measured
-            names |= set(map(str, getattr(part, "files", tuple)()))
+            names |= set(map(str, part.files() if names_files(part) else ()))  # type: ignore[attr-defined]
     return frozenset(names)
 
 
 def is_foreign(part: Plugin) -> bool:
     """Return whether a plugin's code is from outside this package."""
-    return not type(part).__module__.startswith("bench.") or (isinstance(part, Scene) and hasattr(part, "files"))
+    return not type(part).__module__.startswith("bench.") or names_files(part)
 
 
 def _uses_jax(backend: Backend) -> bool:
@@ -166,25 +167,32 @@ def measure_cell(cell: Cell, session: Session, study: Study) -> dict[str, Any]:
     if not cell.timing:
         blank = study.columns.blank()
         result |= {name: blank[name] for name in study.columns.measured}
-    return result | solver_columns(cell, session, result)
+    result |= solver_columns(cell, session, result)
+    return result | {"reason": "; ".join(filter(None, (result.get("reason", ""), *cell.remarks)))}
 
 
 def solver_columns(cell: Cell, session: Session, result: dict[str, Any]) -> dict[str, Any]:
-    """Return the residual of the backend's constraint solver, with a remark in ``reason`` where it has not converged.
+    """Return the residual of the backend's constraint solver, and its remarks in ``reason``, also where it has not converged.
 
+    A backend whose physics differ from those that its name stands for has a method ``remarks(program)``: a text for each.
     A backend whose steps solve for contact forces iteratively has a method ``solver_residual(problem, w)``: the largest
     residual along rollouts from theta0 with noise ``w (n_w, B)``, relative to the forces of a step.
     """
-    solver_residual = getattr(cell.parts.get("backend"), "solver_residual", None)
-    if solver_residual is None or result["status"] != "ok":
+    backend = cell.parts.get("backend")
+    names = [name for name in ("remarks", "solver_residual") if hasattr(backend, name)]
+    if not names or result["status"] != "ok":
         return {}
+    columns: dict[str, Any] = {}
     program = cell.program()
-    w = noise.shared(cell.seed, cell.scene.name, 1, cell.samples, program.n_noise)[0].T
-    residual = float(solver_residual(session.problem(cell), w))
-    if not residual > CONVERGED[cell.backend.dtype]:
-        return {"solver_residual": residual}
-    remark = f"the constraint solver has not converged (relative residual {residual:.1e}): more iterations give another gradient"
-    return {"solver_residual": residual, "reason": "; ".join(filter(None, (result.get("reason", ""), remark)))}
+    remarks = [f"{PHYSICS}{text}" for text in backend.remarks(program)] if "remarks" in names else []
+    if "solver_residual" in names:
+        w = noise.shared(cell.seed, cell.scene.name, 1, cell.samples, program.n_noise)[0].T
+        columns["solver_residual"] = residual = float(backend.solver_residual(session.problem(cell), w))
+        if residual > CONVERGED[cell.backend.dtype]:
+            remarks.append(
+                f"the constraint solver has not converged (relative residual {residual:.1e}): more iterations give another gradient"
+            )
+    return columns | {"reason": "; ".join(filter(None, (result.get("reason", ""), *remarks)))}
 
 
 def _fault_of(result: dict[str, Any], study: Study) -> str:

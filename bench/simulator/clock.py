@@ -84,6 +84,8 @@ class Clock:
         self._stage, self._last_shown = "", 0.0
         self._deadline, self._last_call = math.inf, math.inf
         self._is_inside = False
+        self.is_interrupted = False
+        """Whether the running call was interrupted: compiled code that called back may have made another error of it, or none."""
 
     @property
     def spent(self) -> float:
@@ -159,7 +161,8 @@ class Clock:
     def interrupt_when_over(self, first: bool = False) -> Iterator[None]:
         """Raise :class:`OutOfTime` inside the block when the budget is spent, or ``compile_budget`` for a first call.
 
-        Compiled code is interrupted only when it returns. Only the main thread can be interrupted, and only if no other
+        Compiled code is interrupted only when it returns or calls back. Whatever it makes of the interruption, the block
+        ends with :class:`OutOfTime`, and its result does not count. Only the main thread can be interrupted, and only if no other
         code uses the alarm signal.
         """
         allowed = self.compile_budget - self.compile_s if first else self.remaining
@@ -171,15 +174,18 @@ class Clock:
         def raise_out_of_time(number: int, frame: FrameType | None) -> None:
             # time lost to other programs is not charged: the alarm repeats until the budget is really spent
             if first or self.remaining <= 0.0:
+                self.is_interrupted = True
                 raise OutOfTime
 
         try:
-            self._is_inside = True
+            self._is_inside, self.is_interrupted = True, False
             if is_free:
                 signal.signal(signal.SIGALRM, raise_out_of_time)
                 # the alarm repeats, since an exception raised in a callback may be lost
                 signal.setitimer(signal.ITIMER_REAL, max(allowed, MIN_ALARM_S), ALARM_INTERVAL_S)
             yield
+            if self.is_interrupted:
+                raise OutOfTime
         finally:
             self._is_inside = False
             if is_free:

@@ -17,7 +17,6 @@ class Brax(EngineBackend):
 
     name = "brax"
     file = "../engines/brax.py"
-    helpers = ("mujoco_twin.py",)
     damping_mode = "clipped"
     solver_error = 1e-6
     libraries = ("brax", "jax", "mujoco", "mujoco-mjx", "numpy")

@@ -12,7 +12,6 @@ class MujocoWarp(EngineBackend):
 
     name = "mujoco_warp"
     file = "../engines/mujoco_warp.py"
-    helpers = ("mujoco_twin.py",)
     damping_mode = "clipped"
     libraries = ("mujoco-warp", "warp-lang", "mujoco", "numpy")
     provides = frozenset({"value", "score", "physics"})

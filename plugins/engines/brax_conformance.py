@@ -24,7 +24,9 @@ class Engine:
         if case.name not in self._compiled:
             model = mujoco.MjModel.from_xml_path(str(case.model))
             different = {
-                "forces f >= 0 of contacts minimise |A f + b|^2": model.geom_contype.any() and model.ngeom > 1,
+                "forces f >= 0 of contacts minimise |A f + b|^2": model.npair
+                or (model.geom_contype.any() and model.ngeom > 1),
+                "no fluids and no gravity compensation": model.opt.viscosity or model.body_gravcomp.any(),
                 "no friction loss": model.dof_frictionloss.any(),
                 "no equalities": model.neq,
                 "no tendons": model.ntendon,

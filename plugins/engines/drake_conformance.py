@@ -11,6 +11,9 @@ from free_bodies import differing, in_world, without_motors
 logging.getLogger("drake").setLevel(logging.ERROR)
 DIFFERENT = {
     "geom[@condim]": "contacts are its own",
+    "geom[@type='plane']": "contacts are its own",
+    "joint[@damping]": "springs and dampers of joints are its own",
+    "body[@gravcomp]": "no gravity compensation and no fluids",
     "joint[@limited='true']": "limits are its own",
     "joint[@frictionloss]": "no friction loss",
     "equality/": "no equalities of these kinds",

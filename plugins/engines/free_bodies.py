@@ -25,7 +25,7 @@ def without_motors(case):
 
 def differing(root, reasons):
     """Return the reasons whose paths find an element in the MJCF, as text."""
-    return "; ".join(reason for path, reason in reasons.items() if root.find(f".//{path}") is not None)
+    return "; ".join(dict.fromkeys(reason for path, reason in reasons.items() if root.find(f".//{path}") is not None))
 
 
 def in_world(case, q, v, sign=1):

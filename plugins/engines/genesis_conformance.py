@@ -13,6 +13,8 @@ DIFFERENT = {
     "geom[@condim='4']": "no torsional friction",
     "geom[@condim='6']": "no rolling friction",
     "option[@cone='elliptic']": "no elliptic cones",
+    "contact/pair": "no contact pairs",
+    "body[@gravcomp]": "no fluids",
     "option[@integrator='RK4']": "the integrator is its own",
     "tendon/": "no tendons",
 }

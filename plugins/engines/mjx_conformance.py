@@ -1,99 +1,95 @@
-"""MJX in the conformance set: all cases of equal options in one model, differentiated through the converged solver."""
+"""MJX in the conformance set, differentiated through the converged solver, and in the checks without a reference."""
 
 from __future__ import annotations
 
 import contextlib
 import functools
-import re
 from typing import Any
 
 import jax
 import mujoco
 import numpy as np
+from bench.plugins.engines import mujoco_conformance
 from bench.plugins.engines.mujoco_conformance import TERMS, place
+from bench.plugins.mjcf import mjx_remarks
 
-from bench.engines.conformance import cases
 from bench.plugins import mjx_solver
 
 jax.config.update("jax_enable_x64", True)
-APART = 20.0
-"""Distance of two cases in a model [m]."""
+mjx = mjx_solver.library()
+VERSIONS = {"mujoco-mjx": mujoco.__version__, "jax": jax.__version__}
+
+
+def on_device(model: Any) -> tuple[Any, Any]:
+    """Return MJX's model, and its data in float64."""
+    data = jax.tree.map(lambda leaf: leaf.astype(float) if leaf.dtype.kind == "f" else leaf, mjx.make_data(model))
+    return mjx.put_model(model), data
+
+
+class Model(mujoco_conformance.Model):
+    """A model from MJCF text, compiled when it is first called. Gaps and loops are those of the C engine's geometry."""
+
+    jacobian = None  # type: ignore[assignment]
+
+    def __init__(self, mjcf: str) -> None:
+        super().__init__(mjcf)
+        self.remarks = mjx_remarks(self.model)
+        model, data = on_device(self.model)
+
+        def rollout(q: Any, v: Any, controls: Any) -> Any:
+            def going(data: Any, u: Any) -> Any:
+                after = mjx.step(model, data.replace(ctrl=u))
+                return jax.tree.map(lambda new, old: new.astype(old.dtype), after, data), None
+
+            end, _ = jax.lax.scan(going, data.replace(qpos=q, qvel=v), controls)
+            return end.qpos, end.qvel
+
+        self._forward = jax.jit(lambda q, v, u: mjx.forward(model, data.replace(qpos=q, qvel=v, ctrl=u)))
+        self._rollout, self._rollouts = jax.jit(rollout), jax.jit(jax.vmap(rollout))
+
+    def forward(self, q: Any, v: Any = 0.0, u: Any = 0.0) -> Any:
+        """Return data with accelerations and forces at a state."""
+        return self._forward(q, v + np.zeros(self.model.nv), u + np.zeros(self.model.nu))
+
+    def reference(self, q: Any, v: Any, u: Any) -> np.ndarray:
+        """Return the C engine's accelerations."""
+        return np.array(super().forward(q, v, u).qacc)
+
+    def rollout(self, q: Any, v: Any, controls: Any) -> Any:
+        """Return the last state of a rollout."""
+        return self._rollout(q, v, controls)
+
+    def steps(self, q: Any, v: Any, u: Any) -> Any:
+        """Return the next states of rows of states, by vmap."""
+        return self._rollouts(q, v, u[:, None])
 
 
 class Engine:
-    """Cases that share a group are compiled together. ``is_implicit`` differentiates through the converged solver."""
+    """A compiled function per case. ``is_implicit`` differentiates through the converged solver; ``options`` replace the models'."""
 
-    versions = {"mujoco-mjx": mujoco.__version__, "jax": jax.__version__}
+    versions = VERSIONS
     differs = {
         **dict.fromkeys(("connect", "connect_fast", "weld"), "MJX has no velocity product J-dot v in these rows"),
-        "sparse_chain": "MJX keeps other contacts of boxes and capsules",
+        **dict.fromkeys(("box_tilted", "sparse_chain"), "MJX has other contacts of boxes and capsules"),
     }
 
-    def __init__(self, *names: str, is_implicit: bool = True, **options: Any) -> None:
-        self._groups: dict[str, Group] = {}
-        by_options: dict[str, list[Any]] = {}
-        for case in cases(*names):
-            (own,) = re.findall("<option.*>", case.model.read_text())
-            by_options.setdefault(f"{len(case.controls)} {own}", []).append(case)
-        for members in by_options.values():
-            self._groups |= dict.fromkeys((case.name for case in members), Group(members, is_implicit, options))
-
-    def rollout(self, case: Any) -> float:
-        """Return the cost of a case."""
-        return self._groups[case.name].rollout(case)
-
-    def gradient(self, case: Any) -> dict[str, np.ndarray]:
-        """Return the derivatives, in reverse mode."""
-        return self._groups[case.name].gradient(case)
-
-
-class Group:
-    """A model of several cases, each at its own place and with contacts among its own geoms only."""
-
-    def __init__(self, members: list[Any], is_implicit: bool, options: dict[str, Any]) -> None:
-        self._members = {case.name: case for case in members}
+    def __init__(self, is_implicit: bool = True, **options: Any) -> None:
         self._solver = mjx_solver.implicit if is_implicit else contextlib.nullcontext
-        spec = mujoco.MjSpec()
-        for i, case in enumerate(members):
-            part = mujoco.MjSpec.from_file(str(case.model))
-            for geom in part.geoms:
-                geom.contype, geom.conaffinity = geom.contype << i, geom.conaffinity << i
-            for name in (
-                "timestep",
-                "integrator",
-                "cone",
-                "jacobian",
-                "impratio",
-                "tolerance",
-                "iterations",
-                "ls_iterations",
-            ):
-                setattr(spec.option, name, getattr(part.option, name))
-            spec.attach(part, prefix=f"{case.name}/", frame=spec.worldbody.add_frame(pos=[0, APART * i, 0]))
-        self._model = spec.compile()
-        for name, value in options.items():
-            setattr(self._model.opt, name, value)
-        self._shift = self._model.qpos0 - np.concatenate(
-            [mujoco.MjModel.from_xml_path(str(case.model)).qpos0 for case in members]
-        )
-        self._places = [place(self._model, case, f"{case.name}/") for case in members]
+        self._options = options
+        self._compiled: dict[str, Any] = {}
 
-    @functools.cached_property
-    def _cost(self) -> Any:
-        """Return the compiled function of start, controls, parameters and weights: the cost and its derivatives by the first four."""
-        mjx = mjx_solver.library()
-        model, data = mjx.put_model(self._model), mjx.make_data(self._model)
-        data = jax.tree.map(lambda leaf: leaf.astype(float) if leaf.dtype.kind == "f" else leaf, data)
+    def _compile(self, case: Any) -> Any:
+        """Return the compiled function of start, controls and parameter: the cost and its derivatives."""
+        source = mujoco.MjModel.from_xml_path(str(case.model))
+        for name, value in self._options.items():
+            setattr(source.opt, name, value)
+        owner, field, index = place(source, case)
+        name = f"opt.{field}" if owner is source.opt else field
+        model, data = on_device(source)
+        old = jax.numpy.asarray(functools.reduce(getattr, name.split("."), model), float)
 
-        def cost(q: Any, v: Any, controls: Any, parameters: Any, weights: Any) -> Any:
-            changed: dict[str, Any] = {}
-            for value, case, (owner, field, index) in zip(
-                parameters, self._members.values(), self._places, strict=True
-            ):
-                name = f"opt.{field}" if owner is self._model.opt else field
-                old = getattr(model.opt if owner is self._model.opt else model, field)
-                changed[name] = changed.get(name, jax.numpy.asarray(old, float)).at[index].add(value - case.parameter)
-            own = model.tree_replace(changed)
+        def cost(q: Any, v: Any, controls: Any, parameter: Any) -> Any:
+            own = model.tree_replace({name: old.at[index].set(parameter)})
 
             def step(at: Any, u: Any) -> Any:
                 with self._solver():
@@ -101,31 +97,19 @@ class Group:
                 return (after.qpos, after.qvel, jax.lax.stop_gradient(after.qacc)), None
 
             (q, v, _), _ = jax.lax.scan(step, (q, v, 0.0 * v), controls)
-            return weights[0] @ q + weights[1] @ v
+            return case.cost(q, v)
 
         return jax.jit(jax.value_and_grad(cost, (0, 1, 2, 3)))
 
-    def _slice(self, case: Any, field: str) -> slice:
-        """Return the part of all cases' values that is a case's."""
-        sizes = [len(np.atleast_1d(getattr(other, field).T)) for other in self._members.values()]
-        number = list(self._members).index(case.name)
-        return slice(sum(sizes[:number]), sum(sizes[: number + 1]))
-
     def _run(self, case: Any) -> Any:
-        """Return a case's cost and its derivatives, with all other cases as stored."""
-        members = (self._members | {case.name: case}).values()
-        q, v, *others = (np.hstack([getattr(each, term) for each in members]) for term in TERMS)
-        weights = [np.zeros(len(q)), np.zeros(len(v))]
-        for term, weight in zip(TERMS, weights, strict=False):
-            weight[self._slice(case, term)] = case.data["weights"][term]
-        value, slopes = self._cost(q + self._shift, v, *others, weights)
-        return value - weights[0] @ self._shift, slopes
+        if case.name not in self._compiled:
+            self._compiled[case.name] = self._compile(case)
+        return self._compiled[case.name](case.qpos, case.qvel, case.controls, case.parameter)
 
     def rollout(self, case: Any) -> float:
         """Return the cost of a case."""
         return float(self._run(case)[0])
 
     def gradient(self, case: Any) -> dict[str, np.ndarray]:
-        """Return the derivatives of a case's cost."""
-        slopes = zip(TERMS, self._run(case)[1], strict=True)
-        return {term: np.asarray(slope)[..., self._slice(case, term)] for term, slope in slopes}
+        """Return the derivatives, in reverse mode."""
+        return dict(zip(TERMS, map(np.asarray, self._run(case)[1]), strict=True))

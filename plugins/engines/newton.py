@@ -2,9 +2,7 @@
 
 import numpy as np
 import warp as wp
-
-wp.config.quiet = True
-import newton  # noqa: E402
+from newton_worlds import Worlds, newton
 
 GAP = 10.0
 """Distance [m] up to which contacts are generated. The solver's forces depend on the distance itself."""
@@ -37,13 +35,11 @@ class Model:
         return self._batches[width]
 
 
-class _Batch:
-    """Worlds of bodies on joints, stepped by the Featherstone solver."""
-
-    has_joints = True
+class _Batch(Worlds):
+    """Bodies on joints, stepped by the Featherstone solver."""
 
     def __init__(self, program, width):
-        self._program, self._width, self._n = program, width, len(program["bodies"])
+        self._program, self._n = program, len(program["bodies"])
         axes = np.array([body["axis"] for body in program["bodies"]])
         self._axes = axes / np.linalg.norm(axes, axis=1, keepdims=True)
         one, all_worlds = newton.ModelBuilder(up_axis="Z"), newton.ModelBuilder(up_axis="Z")
@@ -61,17 +57,12 @@ class _Batch:
         all_worlds.replicate(one, width)
         if program["has_ground"]:
             all_worlds.add_ground_plane(cfg=shape)
-        self._model = all_worlds.finalize(requires_grad=program["backend"]["solver"] != "xpbd")
-        self._model.set_gravity(tuple(program["gravity"]))
-        self._solver = self._new_solver()
-        self._before, self._after = self._model.state(), self._model.state()
-        self._control = self._model.control()
-        self._force = self._control.joint_f if self.has_joints else self._before.body_f
-        self._pipeline = newton.CollisionPipeline(self._model) if program["contacts"] else None
-        self._contacts = self._pipeline.contacts() if self._pipeline else None
+        model = all_worlds.finalize(requires_grad=program["backend"]["solver"] != "xpbd")
+        model.set_gravity(tuple(program["gravity"]))
+        super().__init__(model, self._new_solver(model), width, self._n, program["dt"], bool(program["contacts"]))
 
-    def _new_solver(self):
-        return newton.solvers.SolverFeatherstone(self._model, angular_damping=0.0)
+    def _new_solver(self, model):
+        return newton.solvers.SolverFeatherstone(model, angular_damping=0.0)
 
     def _add_bodies(self, builder, shape):
         links, chains = [], []
@@ -97,47 +88,9 @@ class _Batch:
         for chain in chains:
             builder.add_articulation(chain)
 
-    def _arrays(self, state):
-        """Return the state's arrays of positions and of velocities."""
-        return state.joint_q, state.joint_qd
-
-    def _spread(self, values, array, identity=0.0):
-        """Return values ``(n, width)`` as the array stores them; ``identity`` is the last number of its rotations."""
-        return np.float32(values.T.reshape(-1))
-
-    def _read(self, *arrays):
-        return np.concatenate([array.numpy().reshape(self._width, self._n).T for array in arrays]).astype(np.float64)
-
-    def _run(self, x, u):
-        """Set the states and forces of all worlds, and record one step."""
-        inputs = (*self._arrays(self._before), self._force)
-        for array, values in zip(inputs, (*np.split(x, 2), u), strict=True):
-            array.assign(self._spread(values, array, 1.0))
-        if self._pipeline:
-            if self.has_joints:
-                newton.eval_fk(self._model, *inputs[:2], self._before)
-            self._pipeline.collide(self._before, self._contacts)
-        with wp.Tape() as tape:
-            self._solver.step(self._before, self._after, self._control, self._contacts, self._program["dt"])
-        return tape
-
-    def step(self, x, u):
-        self._run(x, u)
-        return self._read(*self._arrays(self._after))
-
     def jacobians(self, x, u):
-        tape = self._run(x, u)
         slopes = [np.broadcast_to(row[:, None], x.shape) for row in np.eye(len(x))]
-        return [np.stack(parts) for parts in zip(*(self._back(tape, slope) for slope in slopes), strict=True)]
-
-    def _back(self, tape, slope):
-        tape.zero()
-        after = zip(self._arrays(self._after), np.split(slope, 2), strict=True)
-        tape.backward(grads={array: wp.array(self._spread(part, array), dtype=array.dtype) for array, part in after})
-        by_state = self._read(*(array.grad for array in self._arrays(self._before)))
-        result = by_state, self._read(self._force.grad)
-        tape.zero()
-        return result
+        return [np.stack(parts) for parts in zip(*self.pulls(x, u, slopes), strict=True)]
 
 
 class _FreeBatch(_Batch):
@@ -148,10 +101,10 @@ class _FreeBatch(_Batch):
 
     has_joints = False
 
-    def _new_solver(self):
+    def _new_solver(self, model):
         if self._program["backend"]["solver"] == "xpbd":
-            return newton.solvers.SolverXPBD(self._model, enable_restitution=True)
-        return newton.solvers.SolverSemiImplicit(self._model, angular_damping=0.0)
+            return newton.solvers.SolverXPBD(model, enable_restitution=True)
+        return newton.solvers.SolverSemiImplicit(model, angular_damping=0.0)
 
     def _arrays(self, state):
         return state.body_q, state.body_qd

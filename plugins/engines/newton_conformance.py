@@ -4,11 +4,8 @@ import importlib.metadata
 import xml.etree.ElementTree as ElementTree
 
 import numpy as np
-import warp as wp
 from free_bodies import in_world, without_motors
-
-wp.config.quiet = True
-import newton  # noqa: E402
+from newton_worlds import Worlds, newton
 
 STEP = 1e-6
 """Step of the differences of a change of coordinates."""
@@ -33,45 +30,22 @@ class Engine:
             )
         builder = newton.ModelBuilder()
         builder.add_mjcf(ElementTree.tostring(root, encoding="unicode"), skip_equality_constraints=True)
-        model = builder.finalize(requires_grad=True)
-        parts = model, newton.solvers.SolverFeatherstone(model, angular_damping=0.0), newton.CollisionPipeline(model)
-        self._built[case.name] = arms, float(root.find("option").get("timestep")), parts
+        model, dt = builder.finalize(requires_grad=True), float(root.find("option").get("timestep"))
+        solver = newton.solvers.SolverFeatherstone(model, angular_damping=0.0)
+        self._built[case.name] = arms, Worlds(model, solver, 1, case.qpos.size, dt, True)
         return self._built[case.name]
 
-    def _step(self, case, x, u):
-        """Return the state after a step from Newton's (q, v), and a function for products with its derivative."""
-        arms, dt, (model, solver, pipeline) = self._model(case)
-        before, after, control = model.state(), model.state(), model.control()
-        split = np.split(np.float32(x), [case.qpos.size])
-        for array, values in zip((before.joint_q, before.joint_qd, control.joint_f), (*split, arms @ u), strict=True):
-            array.assign(np.float32(values))
-        newton.eval_fk(model, before.joint_q, before.joint_qd, before)
-        contacts = pipeline.contacts()
-        pipeline.collide(before, contacts)
-        with wp.Tape() as tape:
-            solver.step(before, after, control, contacts, dt)
-
-        def pull(slope):
-            tape.zero()
-            seeds = [wp.array(np.float32(part)) for part in np.split(slope, [case.qpos.size])]
-            tape.backward(grads=dict(zip((after.joint_q, after.joint_qd), seeds, strict=True)))
-            by_state = [array.grad.numpy().astype(float) for array in (before.joint_q, before.joint_qd)]
-            by_u = arms.T @ control.joint_f.grad.numpy()
-            tape.zero()  # the solver's matrices, which all steps share
-            return np.concatenate(by_state), by_u
-
-        return np.concatenate([after.joint_q.numpy(), after.joint_qd.numpy()]).astype(float), pull
-
     def _path(self, case):
-        self._model(case)  # raises what it does not have
-        path = [_turned(case, np.concatenate([case.qpos, case.qvel]), True)]
-        for u in case.controls:
-            path.append(self._step(case, path[-1], u)[0])
-        return path
+        """Return Newton's (q, v) along the rollout, the forces, and the worlds."""
+        arms, worlds = self._model(case)
+        path, forces = [_turned(case, np.concatenate([case.qpos, case.qvel]), True)], case.controls @ arms.T
+        for force in forces:
+            path.append(worlds.step(path[-1][:, None], force[:, None])[:, 0])
+        return path, forces, worlds
 
     def rollout(self, case):
         """Return the cost of a case."""
-        return self._cost(case, self._path(case)[-1])
+        return self._cost(case, self._path(case)[0][-1])
 
     @staticmethod
     def _cost(case, x):
@@ -79,14 +53,19 @@ class Engine:
 
     def gradient(self, case):
         """Return the derivatives by state and controls."""
-        *path, end = self._path(case)
-        slope, by_control = _differences(lambda x: self._cost(case, x), end), []
-        for x, u in zip(path[::-1], case.controls[::-1], strict=True):
-            slope, by_u = self._step(case, x, u)[1](slope)
-            by_control.insert(0, by_u)
+        (*path, end), forces, worlds = self._path(case)
+        slope, by_force = _differences(lambda x: self._cost(case, x), end), []
+        for x, force in zip(path[::-1], forces[::-1], strict=True):
+            ((by_x, by_f),) = worlds.pulls(x[:, None], force[:, None], [slope[:, None]])
+            slope = by_x[:, 0]
+            by_force.insert(0, by_f[:, 0])
         start = np.concatenate([case.qpos, case.qvel])
         slope = _differences(lambda at: slope @ _turned(case, at, True), start)
-        return {"qpos": slope[: case.qpos.size], "qvel": slope[case.qpos.size :], "controls": by_control}
+        return {
+            "qpos": slope[: case.qpos.size],
+            "qvel": slope[case.qpos.size :],
+            "controls": np.array(by_force) @ self._model(case)[0],
+        }
 
 
 def _differences(function, x):

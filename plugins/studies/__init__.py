@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import math
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -15,8 +16,9 @@ from bench.experiment.experiment import Experiment
 from bench.experiment.session import Session
 from bench.experiment.study import Study
 from bench.experiment.views import Views
-from bench.measure import noise, timing
-from bench.model import Problem, Program
+from bench.measure import noise, statistics, timing
+from bench.measure.reference import Reference
+from bench.model import SURROGATE, Estimator, Problem, Program
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -73,6 +75,36 @@ def unseen_features(rows: pd.DataFrame) -> list[str]:
         f"in {counted(len(coarse), 'cell')} the reference is from points up to {coarse.max():.2g} standard deviations of the noise apart: "
         "it may miss a feature of the cost that is narrower"
     ]
+
+
+def against_reference(
+    problem: Problem,
+    estimator: Estimator | None,
+    truth: Reference,
+    estimates: np.ndarray,
+    samples: int,
+    terms: tuple[np.ndarray, np.ndarray] | None = None,
+    auxiliaries: str = "",
+) -> dict[str, Any]:
+    """Return the columns of ``estimates (R, d)`` against the certified reference: status, reason, and statistics.
+
+    Every study's biases, errors and cosines of estimates are computed here. Without an estimator, the estimates are means
+    of a sample's terms, and nothing is declared of them. ``terms`` are as in :func:`~bench.measure.statistics.summarise`,
+    ``auxiliaries`` the estimator's diagnostics as JSON.
+    """
+    result = {"reference_method": truth.method, "reference_spacing": truth.spacing}
+    if not truth.is_finite:
+        return result | {"status": "nonfinite", "reason": truth.note or "the reference gradient is not finite"}
+    program = problem.program
+    draws = estimator is None or estimator.draws_noise(program)
+    unbiased = estimator is not None and estimator.declares_unbiased(program)
+    estimates, is_random = np.asarray(estimates, dtype=np.float64), draws or program.exogenous > 0
+    summary = statistics.summarise(estimates, truth.known(), samples if draws else 1, terms, unbiased, is_random)
+    surrogate = SURROGATE if estimator and program.surrogate and "grad" in estimator.needs else ""
+    doubt = estimator.remark(json.loads(auxiliaries)) if estimator and auxiliaries else ""
+    remarks = (surrogate, summary.note, doubt, truth.note)
+    values = {name: value for name, value in asdict(summary).items() if name != "note"}
+    return result | values | finite_status("", estimates) | {"reason": "; ".join(filter(None, remarks))}
 
 
 def finite_status(reason: str, *values: Any) -> dict[str, str]:

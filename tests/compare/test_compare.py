@@ -92,6 +92,7 @@ JUDGED = [
         for name in ("bias", "variance")
         for factor, remark, outcome, said in (
             (10.0, {}, "worse", name), (0.1, {}, "better", name), (10.0, {"reason": "heavy tails"}, "changed", "doubtful"),
+            (10.0, {"reason": "physics: no wind"}, "worse", name), (10.0, {"reason": "physics: no wind; heavy tails"}, "changed", "doubtful"),
         )
     ),
     ("bias_variance", interval("bias", 1.8, 2.0, 2.2), interval("bias", 2.1, 2.3, 2.5), "same", ""),

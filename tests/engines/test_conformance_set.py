@@ -23,14 +23,14 @@ pytest.importorskip("mujoco")
 ROOT = Path(__file__).resolve().parents[2]
 FEW = ("connect_fast", "stacked", "impratio")
 SMALL = ("slide_limit", "connect_fast", "pyramidal_slide")
-"""Cases of a limit, an equality and friction, which MJX compiles as one model."""
+"""Cases of a limit, an equality and friction."""
 STORED = 1e-5
 """Relative difference from stored numbers allowed: faults come from single differences of terms, and add up over steps."""
 
 
-def mjx(*names, **settings):
+def mjx(**settings):
     pytest.importorskip("mujoco.mjx")
-    return importlib.import_module("bench.plugins.engines.mjx_conformance").Engine(*names, **settings)
+    return importlib.import_module("bench.plugins.engines.mjx_conformance").Engine(**settings)
 
 
 def wrong(rows):
@@ -88,7 +88,7 @@ def test_the_set_in_a_new_folder_has_an_item_per_case_and_derivative(tmp_path):
 
     text, n = run(), len(conformance.cases())
     assert f"1 failed, 4 passed, {5 * (n - 1)} skipped" in text
-    assert "friction_loss-parameter: -1 times" in text
+    assert "friction_loss-parameter - AssertionError: -1 times" in text
     (tmp_path / "xfails.txt").write_text("friction_loss-parameter  # the sign\n")
     assert f"4 passed, {5 * (n - 1)} skipped, 1 xfailed" in run()
     (tmp_path / "xfails.txt").write_text("friction_loss-qpos  # repaired\nfriction_loss-parameter\n")
@@ -287,7 +287,7 @@ def test_a_planted_fault_is_named(fault, case, engine):
 
 def test_every_case_has_sources_that_agree():
     cases = conformance.cases()
-    assert len(cases) == 29
+    assert len(cases) == 35
     for case in cases:
         sources = case.data["sources"]
         assert len(sources) >= 2, case.name
@@ -322,10 +322,10 @@ def test_the_c_engine_is_right():
     "names", [pytest.param(SMALL, marks=pytest.mark.slow), pytest.param((), marks=pytest.mark.full)], ids=["few", "all"]
 )
 def test_mjx_is_right(names):
-    """The cases of equal options are one model."""
     names = names or [case.name for case in conformance.cases()]
-    rows = conformance.run(mjx(*names), *names)
+    rows = conformance.run(mjx(), *names)
     assert {row["case"] for row in rows if row["is_right"] is None} == {
+        "box_tilted",
         "connect",
         "connect_fast",
         "sparse_chain",
@@ -357,7 +357,7 @@ def test_faults_planted_in_mjx_are_named(monkeypatch):
     monkeypatch.setattr(collision_driver, "collision", frozen)
     monkeypatch.setattr(constraint, "make_constraint", negated)
     expected = {"stacked": "frozen normal", "joint_equality": "sign of equality"}
-    engine = mjx(*expected)
+    engine = mjx()
     for case, fault in expected.items():
         found = [row for row in wrong(conformance.run(engine, case)) if row["term"] != "parameter"]
         assert found
@@ -374,7 +374,7 @@ def test_faults_planted_in_mjx_are_named(monkeypatch):
 )
 def test_what_mjx_lacks_is_named(case, settings, fault, terms):
     """Were J-dot v repaired, the documentation and the engine's file would be wrong."""
-    engine = mjx(case, **settings)
+    engine = mjx(**settings)
     engine.differs = {}
     found = {row["term"]: row["looks_like"] for row in wrong(conformance.run(engine, case))}
     assert {found[term] for term in terms} == {fault}
@@ -402,22 +402,31 @@ class Engine:
 
 def test_rows_of_an_engine_that_ends_stay_with_the_reason(tmp_path):
     (tmp_path / "mine_conformance.py").write_text(UNFINISHED)
-    row, last = table.rows_of(None, tmp_path / "mine_conformance.py", Path(runner.__file__), "rk4", "weld")
+    row, last = table.run(sys.executable, runner, str(tmp_path / "mine_conformance.py"), "rk4", "weld")
     assert (row["versions"], row["case"], row["is_right"]) == ("mine 2", "rk4", False)
     assert "exit status 3" in last["reason"]
 
 
 def test_the_table_keeps_other_releases(tmp_path, monkeypatch):
-    """A column per release, and a release that runs again replaces its rows."""
+    """A column per release, verdicts that changed between them, and a release that runs again replaces its rows."""
     monkeypatch.setattr(table.subprocess, "run", lambda *words, **options: None)
-    for version, digits in (("3.1", 1.0), ("3.2", 2.0), ("3.1", 3.0)):
-        row = {"versions": f"mujoco {version}; x 1", "case": "rk4", "is_right": False, "digits": digits, "term": "qvel"}
-        monkeypatch.setattr(
-            table, "rows_of", lambda *of, row=row, **settings: [row | {"seconds": 1, "looks_like": "a fault"}]
-        )
+    for version, is_right, digits in (("3.1", True, 1.0), ("3.2", True, 2.0), ("3.1", False, 3.0)):
+        row = {
+            "versions": f"mujoco {version}; x 1",
+            "case": "rk4",
+            "is_right": is_right,
+            "digits": digits,
+            "term": "qvel",
+        }
+        row |= {"reason": "" if is_right else "-1 times", "looks_like": "" if is_right else "a fault", "seconds": 1}
+        monkeypatch.setattr(table, "rows_of", lambda *of, row=row: [row])
         page = table.write(["mujoco"], tmp_path).read_text()
     assert "| case | mujoco 3.1 | mujoco 3.2 |" in page
-    assert "| rk4 | 3.0 wrong: qvel (a fault) | 2.0 wrong: qvel (a fault) |" in page
+    assert "| rk4 | 3.0 wrong: qvel (a fault) | 2.0 |" in page
+    assert (
+        "| case | term | mujoco 3.1 | mujoco 3.2 |\n| --- | --- | --- | --- |\n| rk4 | qvel | wrong | right |" in page
+    )
+    assert "- mujoco 3.1, rk4 qvel: -1 times" in page
 
 
 @pytest.mark.slow
@@ -436,4 +445,4 @@ def test_the_table_has_versions_digits_and_commands(tmp_path):
     assert "`python -m bench engines table mujoco`" in page
     assert "| stacked | " in page
     assert "bounce_once" in page
-    assert len((tmp_path / "engines.csv").read_text().splitlines()) > 5 * 29
+    assert len((tmp_path / "engines.csv").read_text().splitlines()) > 5 * 35

@@ -3,8 +3,6 @@
 ``BENCH_ENGINES=DIR`` names the folder of the environments, which ``python -m bench engines install`` makes.
 """
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from classes import BounceOnce, Impulse, Numpy, Penalty, Pushing, SemiImplicitEuler
@@ -59,7 +57,7 @@ def test_balls_of_a_tenth_of_a_kilogram_touch_in_brax():
 @pytest.mark.parametrize("name", ["brax", "drake", "mujoco_warp", "newton"])
 def test_a_slide_on_a_hinge_is_right_except_in_brax(name):
     """Its axis does not turn in Brax: were it repaired, the documentation would be wrong."""
-    file = Path(table.__file__).parents[2] / "plugins" / "engines" / f"{name}_conformance.py"
-    rows = table.rows_of(installed(name), file, Path(runner.__file__), "offset_slide")
+    assert installed(name)
+    rows = table.rows_of(name, runner, "offset_slide")
     assert [row["case"] for row in rows] == ["offset_slide"] * (1 if name == "mujoco_warp" else 4)
     assert {row["is_right"] for row in rows} == {name != "brax"}

@@ -1,19 +1,17 @@
 """Checks without a reference: they hold for the C engine, each finds a fault of its own kind, and the command reports both."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from bench.cli import main
-from bench.engines import conformance
+from bench.engines import conformance, table
 from bench.engines.conformance import metamorphic
 from bench.experiment import by_name
 from bench.model import compose
 
 pytest.importorskip("mujoco")
 from bench.plugins.backends import mjx
-from bench.plugins.engines.mujoco_metamorphic import Model
+from bench.plugins.engines.mujoco_conformance import Model
 
 from bench.plugins import mjcf
 
@@ -82,6 +80,8 @@ class Swirl(Model):
 
 
 class Parts(Model):
+    remarks = ("other bodies",)
+
     def reference(self, q, v, u):
         return super().acceleration(q, v, 1.01 * u)
 
@@ -99,6 +99,7 @@ def test_a_planted_fault_breaks_its_property(property, engine):
     assert row["worst"] > row["tolerance"]
     q, v, u = row["state"]
     assert (len(q), len(v), len(u)) == (3, 3, 1)
+    assert row["reason"] == ("other bodies" if engine is Parts else "")
 
 
 def test_what_a_model_or_an_engine_lacks_is_not_checked():
@@ -133,10 +134,10 @@ def test_files_that_a_model_includes_and_its_meshes_are_read(tmp_path):
 def test_the_command_prints_each_property_and_fails_where_one_is_broken(capsys):
     assert main(["engines", "metamorphic", str(LOOP), "steps=6"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0].startswith("dense = sparse                    holds   ")
+    assert lines[0].startswith("dense = sparse                     holds   ")
     assert lines[-1].startswith("mujoco 3.")
     assert main(["engines", "metamorphic", str(LOOP), "brax"]) == 2
-    assert "has no file" in capsys.readouterr().err
+    assert "engine brax: it is not installed" in capsys.readouterr().err
     assert main(["engines", "metamorphic", str(LOOP), "stps=6"]) == 2
     assert "stps=6 is not a setting" in capsys.readouterr().err
 
@@ -187,16 +188,7 @@ def test_what_mjx_lacks_is_found_without_a_reference(property, text, tmp_path):
     """The velocity product J-dot v, and contacts of corners above 1 mm over the deepest: were they repaired, the documentation would be wrong."""
     pytest.importorskip("mujoco.mjx")
     (tmp_path / "model.xml").write_text(text)
-    from bench.engines import table
-    from bench.model import registry
-
-    plugin = registry.usable("backends", "mjx")
-    (row,) = table.rows_of(
-        plugin(),
-        table.file_of(plugin, "_metamorphic.py"),
-        Path(metamorphic.__file__),
-        str(tmp_path / "model.xml"),
-        property,
-    )
+    (row,) = table.rows_of("mjx", metamorphic, str(tmp_path / "model.xml"), property)
     assert row["holds"] is False
     assert row["worst"] > 0.1
+    assert "MJX is not the C engine: " in row["reason"]

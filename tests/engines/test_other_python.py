@@ -325,23 +325,24 @@ def test_files_of_engines_are_neither_imported_nor_listed():
     names = {name for table in registry.entries().values() for name in table}
     assert {"newton", "drake", "toy"} <= names
     own = {name for name in sys.modules if name.startswith("bench.plugins.engines.")}
-    assert not [name for name in own if not name.endswith(("_conformance", "_metamorphic"))]
+    assert not [name for name in own if not name.endswith("_conformance")]
     assert "bench_engine_model" not in sys.modules
     assert not [name for name in sys.modules if name.startswith("bench_folder_") and ".engines." in name]
     assert not {"warp", "pydrake", "brax", "taichi"} & set(sys.modules)
 
 
-def test_a_change_of_an_engines_file_changes_the_key(tmp_path):
+def test_a_change_of_an_engines_file_or_of_what_it_imports_changes_the_key(tmp_path):
     names = []
-    for text in "", "\nCHANGED = True\n":
+    for text, imported in ("", ""), ("CHANGED = True", ""), ("import extra", ""), ("import extra", "CHANGED = True"):
         folder = tmp_path / f"toys{len(names)}"
         shutil.copytree(TOYS, folder)
         with (folder / "engines" / "toy.py").open("a") as file:
-            file.write(text)
+            file.write(f"\n{text}\n")
+        (folder / "engines" / "extra.py").write_text(imported)
         registry._folders.clear()
         registry.add_folder(folder)
         names.append(fingerprint(toy()))
-    assert names[0] != names[1]
+    assert len(set(names)) == 4
 
 
 @dataclasses.dataclass(frozen=True)

@@ -36,6 +36,7 @@ def row(residual, tmp_path, monkeypatch):
         return residual
 
     monkeypatch.setattr(Numpy, "solver_residual", solver_residual, raising=False)
+    monkeypatch.setattr(Numpy, "remarks", lambda self, program: ["no wind", "no rain"], raising=False)
     words = [
         "scenes=[double_integrator]",
         "backends=[numpy]",
@@ -54,6 +55,7 @@ def test_row_has_the_residual_and_a_remark_where_the_solver_has_not_converged(re
     assert found["solver_residual"] == residual
     remark = "the constraint solver has not converged (relative residual 1.0e-03)"
     assert ("converged" in found["reason"]) == (remark in found["reason"]) == (residual > 1e-8)
+    assert "physics: no wind; physics: no rain" in found["reason"]
     assert found["status"] == "ok"
 
 
@@ -100,4 +102,4 @@ def test_dropped_term_of_the_derivative_is_caught(dropped, monkeypatch):
         return gradient(model, data.tree_replace({dropped: jax.lax.stop_gradient(part)}), acceleration)
 
     monkeypatch.setattr(mjx_solver, "_cost_gradient", incomplete)
-    assert any(row["is_right"] is False for case in CASES for row in conformance.run(Engine(case), case))
+    assert any(row["is_right"] is False for case in CASES for row in conformance.run(Engine(), case))

@@ -124,6 +124,7 @@ UNREADABLE = {
     "bytes": (pa.table({f"column{i}": np.zeros(100_000) for i in range(40)}), "ALWAYS_BYTES", 1 << 20, "more than a run writes"),
     "names": (pa.Table.from_arrays([pa.array([1.0])] * 2, ["bias", "bias"]), "MAX_ROWS", 10, "bias"),
     "keys": (pa.table({"bias": [1.0]}), "MAX_ROWS", 10, "has no keys"),
+    "no name": (pa.table({"key": ["a"], "": ["x"]}), "MAX_ROWS", 10, "a column has no name"),
 }  # fmt: skip
 """Tables that no run writes: too many rows, too many equal values in a small file, two columns of one name, no keys."""
 

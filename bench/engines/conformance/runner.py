@@ -7,6 +7,7 @@ import json
 import runpy
 import sys
 import time
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -52,40 +53,57 @@ class Case:
 
     def tangent(self) -> np.ndarray:
         """Return the derivative of qpos by a velocity times time, ``(n_q, n_v)``: quaternions turn in their body's frame."""
-        result = np.delete(np.eye(self.qpos.size), self.data["quaternions"], axis=1)
-        for before, i in enumerate(self.data["quaternions"]):
-            w, x, y, z = self.qpos[i : i + 4] / 2
-            result[i : i + 4, i - before : i - before + 3] = [[-x, -y, -z], [w, -z, y], [z, w, -x], [-y, x, w]]
-        return result
+        return tangent(self.qpos, self.data["quaternions"])
 
     def moved(self, term: str, change: np.ndarray) -> Case:
         """Return the case with another start, controls or parameter; ``change`` is flat, and of velocities for qpos."""
         old = getattr(self, term)
-        new = old + (self.tangent() @ change if term == "qpos" else change.reshape(old.shape))
-        for i in self.data["quaternions"] if term == "qpos" else ():
-            new[i : i + 4] /= np.linalg.norm(new[i : i + 4])
+        is_turned = term == "qpos"
+        new = moved(old, self.data["quaternions"], change) if is_turned else old + change.reshape(old.shape)
         return replace(self, **{term: new})
 
     def differences(self, engine: Any, term: str) -> tuple[np.ndarray, np.ndarray]:
-        """Return the derivative by central differences of the engine's own costs, and each component's uncertainty.
+        """Return the derivative by central differences of the engine's own costs, and each component's uncertainty."""
+        is_turned = term == "qpos"
+        size = 1.0 if is_turned else max(1.0, np.abs(getattr(self, term)).max(initial=0.0))
+        basis = np.eye(self.qvel.size if is_turned else getattr(self, term).size)
+        return differences(lambda change: float(engine.rollout(self.moved(term, change))), basis, size)
 
-        Each component takes the neighbouring steps of the ladder whose extrapolated differences agree best. Their disagreement
-        is the uncertainty, or the disagreement at a smaller step if that is larger for its step: rounding grows as 1 / step. Steps
-        at which a cost no longer changes do not count.
-        """
-        basis = np.eye(self.qvel.size if term == "qpos" else getattr(self, term).size)
-        steps = LADDER * (1.0 if term == "qpos" else max(1.0, np.abs(getattr(self, term)).max(initial=0.0)))
 
-        def cost(change: np.ndarray) -> float:
-            return float(engine.rollout(self.moved(term, change)))
+def tangent(qpos: np.ndarray, quaternions: Sequence[int]) -> np.ndarray:
+    """Return the derivative of positions by a velocity times time, ``(n_q, n_v)``, with quaternions at the given places."""
+    result = np.delete(np.eye(qpos.size), quaternions, axis=1)
+    for before, i in enumerate(quaternions):
+        w, x, y, z = qpos[i : i + 4] / 2
+        result[i : i + 4, i - before : i - before + 3] = [[-x, -y, -z], [w, -z, y], [z, w, -x], [-y, x, w]]
+    return result
 
-        slopes = np.array([[(cost(h * e) - cost(-h * e)) / (2 * h) for e in basis] for h in steps])
-        better = (10 * slopes[1:] - slopes[:-1]) / 9  # the ladder's factor is the root of 10, the error of order 2
-        gaps = np.abs(np.diff(better, axis=0)) * steps[2:, None]
-        gaps = np.maximum.accumulate(gaps[::-1])[::-1] / steps[2:, None]
-        gaps[(slopes[2:] == 0) & slopes.any(axis=0)] = np.inf
-        best = gaps.argmin(axis=0)[None]
-        return np.take_along_axis(better[1:], best, 0)[0], np.take_along_axis(gaps, best, 0)[0]
+
+def moved(qpos: np.ndarray, quaternions: Sequence[int], change: np.ndarray) -> np.ndarray:
+    """Return positions after a small motion ``(n_v,)``; rotations are about axes of the body."""
+    new: np.ndarray = qpos + tangent(qpos, quaternions) @ change
+    for i in quaternions:
+        new[i : i + 4] /= np.linalg.norm(new[i : i + 4])
+    return new
+
+
+def differences(
+    function: Callable[[np.ndarray], Any], basis: Iterable[np.ndarray], size: float = 1.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return a function's derivatives at 0 along directions, by central differences, and each component's uncertainty.
+
+    Each component takes the neighbouring steps of the ladder, times ``size``, whose extrapolated differences agree best. Their
+    disagreement is the uncertainty, or the disagreement at a smaller step if that is larger for its step: rounding grows as
+    1 / step. Steps at which the function no longer changes do not count.
+    """
+    slopes = np.array([[(function(h * e) - function(-h * e)) / (2 * h) for e in basis] for h in LADDER * size])
+    better = (10 * slopes[1:] - slopes[:-1]) / 9  # the ladder's factor is the root of 10, the error of order 2
+    steps = size * LADDER[2:].reshape(-1, *[1] * (slopes.ndim - 1))
+    gaps = np.abs(np.diff(better, axis=0)) * steps
+    gaps = np.maximum.accumulate(gaps[::-1])[::-1] / steps
+    gaps[(slopes[2:] == 0) & slopes.any(axis=0)] = np.inf
+    best = gaps.argmin(axis=0)[None]
+    return np.take_along_axis(better[1:], best, 0)[0], np.take_along_axis(gaps, best, 0)[0]
 
 
 def cases(*names: str) -> list[Case]:

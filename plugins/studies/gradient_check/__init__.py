@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 POINTS = ("start", "before", "at", "after", "noise")
 """``start`` is theta0. The next three are on a line through theta0: before, at and after a switch of contact mode. ``noise``
-is theta0 under noise with which the cost jumps."""
+is theta0 under noise at which a cost or gradient is not a number, or the mean of gradients misses a part of the slope."""
 
 
 def is_trusted(point: str, verdict: str) -> bool:
@@ -65,7 +65,7 @@ class GradientCheck(StudyPackage):
                 "component_left": "of each component, the one-sided slope towards smaller values",
                 "component_right": "of each component, the one-sided slope towards larger values",
                 "component_verdict": "of each component, its verdict",
-                "point": "where each check was made: start, before, at or after a contact switch, or noise: at a jump that the noise reaches",
+                "point": "where each check was made: start, before, at or after a contact switch, or noise: at a jump or a lost number that the noise reaches",
                 "sample": "of each check, 0 without noise, 1 with it",
                 "direction": "of each check, the number of its direction; -1 - i for component i",
                 "contact_switch": "of each check at a contact switch, the contact and the first step that differ between its two sides",
