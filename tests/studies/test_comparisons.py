@@ -19,6 +19,8 @@ from bench.plugins.studies.bias_variance.comparisons import (
 from bench.plugins.studies.bias_variance.time_to_accuracy import with_gradient_cost
 from helpers import experiment, failed, row, table
 
+from bench.errors import UserError
+from bench.experiment import config
 from bench.report.cells import readable
 from bench.report.views import arrange
 
@@ -339,3 +341,14 @@ def test_two_values_of_an_axis_are_joined_by_an_arrow():
     chart = charts_of(cells, compares={"stiffness": [1e2, 1e4], "estimators": ["fobg"]})["contrast"]
     assert chart.frame["stiffness"].tolist() == [1e2, 1e4]
     assert chart.frame["arrow"].nunique() == 1
+
+
+def test_what_a_command_line_chooses_is_drawn_whatever_the_file_compares():
+    named = ["experiment=smoothing_sweep"]
+    assert "estimators" in config.load(named).compares
+    assert "estimators" not in config.load([*named, "estimators=[fobg,reinforce]"]).compares
+
+
+def test_an_unknown_axis_of_a_comparison_is_refused():
+    with pytest.raises(UserError, match="unknown axis in compares 'stifness'"):
+        charts_of(along({"jax": (0.1, 1e-3)}), compares={"stifness": [1e2, 1e4]})

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from bench.errors import unknown
 from bench.experiment.axes import Axis
 from bench.experiment.columns import Column, text
 from bench.experiment.views import Chart, Mark, Style
@@ -219,6 +220,8 @@ def _contrast(shown: Arranged, subtitle: str) -> Chart | None:
         column = (
             "series" if name == "estimators" else "backend" if name == "backends" else axis.column if axis else name
         )
+        if column not in rows:
+            raise unknown("axis in compares", name, (*shown.numbers, "estimators", "backends"))
         rows = rows[rows[column].isin(values)]
         joined_axis = (axis, values) if len(values) == 2 and axis else joined_axis
     if joined_axis is None or rows.empty:
