@@ -59,7 +59,11 @@ def load(overrides: Sequence[str], config_dirs: Sequence[Path] = ()) -> Experime
     config_dirs = [*config_dirs, *(folder for folder in registry.folders() if (folder / "experiment").is_dir())]
     loaded = _composed(overrides, config_dirs)
     _refuse_unread(loaded, overrides)
-    return loaded
+    given = {key.partition(".")[0] for key, _, _ in _split_words(overrides)}
+    if "compares" in given:
+        return loaded
+    # what a command line chooses is drawn, whatever the file compares
+    return replace(loaded, compares={name: values for name, values in loaded.compares.items() if name not in given})
 
 
 def _composed(overrides: Sequence[str], config_dirs: Sequence[Path]) -> Experiment:
@@ -109,6 +113,7 @@ APPEARANCE = (
     "also",
     "results_dir",
     "answer",
+    "compares",
     "formats",
     "compile_cache",
     "plugins",
