@@ -308,6 +308,15 @@ def test_a_case_written_again_has_the_stored_numbers(name):
             np.testing.assert_allclose(new[term], number, rtol=0, atol=STORED * np.abs(number).max(), err_msg=term)
 
 
+def test_motors_of_a_free_body_with_joints_push_the_body():
+    from bench.plugins.engines.free_bodies import without_motors
+
+    chain, tendon = conformance.cases("sparse_chain", "spatial_tendon")
+    assert without_motors(chain)[1].nonzero()[0].tolist() == [0]
+    with pytest.raises(NotImplementedError, match="motors of tendons"):
+        without_motors(tendon)
+
+
 @pytest.mark.slow
 def test_the_c_engine_is_right():
     rows = conformance.run(conformance_set.MujocoC())
