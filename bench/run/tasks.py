@@ -180,7 +180,7 @@ def solver_columns(cell: Cell, session: Session, result: dict[str, Any]) -> dict
     A backend whose steps solve for contact forces iteratively has a method ``solver_residual(problem, w)``: the largest
     residual along rollouts from theta0 with noise ``w (n_w, B)``, relative to the forces of a step.
     """
-    backend = cell.parts.get("backend")
+    backend: Any = cell.parts.get("backend")
     names = [name for name in ("remarks", "solver_residual") if hasattr(backend, name)]
     if not names or result["status"] != "ok":
         return {}
