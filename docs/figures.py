@@ -84,25 +84,26 @@ def speed(name: str) -> list[float]:
 
 
 def rollouts_table() -> str:
-    """Return microseconds per rollout by backend and batch as a Markdown table."""
-    c = speed("native C kernel, one thread, * rollouts")
+    """Return microseconds per rollout by backend and batch as a Markdown table, with times over C where both take one thread."""
+    c, loop = speed("native C kernel, one thread, * rollouts"), speed("plain NumPy loop with its adjoint, * rollouts")
+    over_c = {name: speed(f"{name} on one thread over the C kernel, * rollouts") for name in ("fused", "jax")}
     lines = [
-        ("`fused` gradient", "0.6", speed("fused grad, penalty, * rollouts")),
-        ("`jax` gradient", "1.2", speed("jax grad, penalty, * rollouts")),
-        ("`implicit` gradient", "6", speed("implicit grad, complementarity, * rollouts")),
-        ("`torch` gradient", "25", speed("torch grad, penalty, * rollouts")),
-        ("`numpy` cost", "8", speed("numpy value, penalty, * rollouts")),
-        ("plain NumPy loop, gradient", "", speed("plain NumPy loop with its adjoint, * rollouts")),
-        ("C loop, gradient", "", c),
+        ("`fused` gradient", "0.6", speed("fused grad, penalty, * rollouts"), over_c["fused"]),
+        ("`jax` gradient", "1.2", speed("jax grad, penalty, * rollouts"), over_c["jax"]),
+        ("`implicit` gradient", "6", speed("implicit grad, complementarity, * rollouts"), []),
+        ("`torch` gradient", "25", speed("torch grad, penalty, * rollouts"), []),
+        ("`numpy` cost", "8", speed("numpy value, penalty, * rollouts"), []),
+        ("plain NumPy loop, gradient, one thread", "", loop, list(np.divide(loop, c[: len(loop)]))),
+        ("C loop, gradient, one thread", "", c, [1.0]),
     ]
     head = [
-        "| microseconds per rollout | target | 1,000 | 10,000 | 100,000 | 1,000,000 | times the C loop |",
+        "| microseconds per rollout | target | 1,000 | 10,000 | 100,000 | 1,000,000 | on one thread, times the C loop |",
         "|---" + "|--:" * 6 + "|",
     ]
     return block(head + [
         f"| {name} | {target} | " + " | ".join([*map(number, values), *[""] * (4 - len(values))])
-        + f" | {span(np.divide(values, c[: len(values)]))} |"
-        for name, target, values in lines
+        + f" | {span(ratios) if ratios else ''} |"
+        for name, target, values, ratios in lines
     ])  # fmt: skip
 
 

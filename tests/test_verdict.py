@@ -271,7 +271,7 @@ def test_a_file_named_like_a_library_is_loaded_beside_it(tmp_path):
 
 READ_BY_NOBODY = {
     "examine": ["examine", "c.py:cost", "grad=c.py:grad"],
-    "report": ["report", "+experiment=quick"],
+    "report": ["report", "+experiment=quick", "formats=[]"],
     "compare": ["compare", "results/quick", "results/quick"],
 }
 

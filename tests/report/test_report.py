@@ -55,8 +55,8 @@ def written(made, rows):
 
 @pytest.fixture(scope="module")
 def full(tmp_path_factory):
-    """An experiment with many rows, the rows, and the names of its written files: for tests that only read them."""
-    found, rows = experiment(tmp_path_factory.mktemp("full")), stiffness_rows()
+    """An experiment, its rows, and the names of its written files: for tests that only read them."""
+    found, rows = experiment(tmp_path_factory.mktemp("full")), small_rows(stiffness=(1e2, 1e4, 1e6))
     found.directory.mkdir()
     return found, rows, {path.name for path in written(found, rows)}
 
