@@ -222,6 +222,16 @@ def engines_agree() -> str:
     return number(float(max(distances)))
 
 
+def stability(share: str) -> Callable[[], str]:
+    """Return the function that counts the cells of the stability map, all or those of a share."""
+
+    def count() -> str:
+        table = table_of("stability_map/stability_shares")
+        return f"{round((table['cells'] * (1.0 if share == 'cells' else table[share])).sum()):,}"
+
+    return count
+
+
 def pairs_gain() -> str:
     """Return the least factor between the errors of independent and of mirrored draws, below the limit of the step."""
     verdicts = table_of("stiffness_sweep/verdicts").query("problem.str.startswith('pushing, penalty') and at <= 3000")
@@ -246,6 +256,10 @@ FIGURES: dict[str, str | Callable[[], str]] = {
     "fobg-start": 'stiffness_sweep/verdicts | estimator="fobg", problem="pushing, penalty, descent=0", at<=3000 | error',
     "fobg-later": 'stiffness_sweep/verdicts | estimator="fobg", problem="pushing, penalty, descent=0.9", at<=3000 | error',
     "fobg-beyond": 'stiffness_sweep/verdicts | method="fobg (jax, torch)", problem="pushing, penalty, descent=0", at=10000 | error',
+    **{
+        f"stability-{name.replace(' ', '-')}": stability(name)
+        for name in ("cells", "wrong", "blows up", "grew", "by step", "by law", "by both", "by unknown")
+    },
     "pairs-start": 'stiffness_sweep/verdicts | estimator="fobg[mirrored=true]", problem="pushing, penalty, descent=0", at<=3000 | error_high | most',
     "pairs-later": 'stiffness_sweep/verdicts | estimator="fobg[mirrored=true]", problem="pushing, penalty, descent=0.9", at<=3000 | error_high | most',
     "pairs-beyond": 'stiffness_sweep/verdicts | estimator="fobg[mirrored=true]", problem="pushing, penalty, descent=0", at=10000 | error',

@@ -196,7 +196,7 @@ class Cell:
                 radius = [] if smoothing is None else [[smoothing.shape, smoothing.radius]]
                 if smoothing is None:
                     methods = reference.revisions(self.program(), self.reference_backends[0].provides)
-            budget = [self.budget.samples, self.budget.tolerance]
+            budget = list((self._budget() or {}).values())
             _reference_keys[given] = hashed(self.program_key, budget, backend, *radius, raised(methods))
         return _reference_keys[given]
 
@@ -247,7 +247,12 @@ class Cell:
         return theta | {"path": self._path_key}
 
     def _budget(self) -> dict[str, Any] | None:
-        return None if self.budget is None else dict(vars(self.budget))
+        """Return the reference's budget; the limit of quadrature only where it is set, so that keys are as before it existed."""
+        if self.budget is None:
+            return None
+        budget = {name: value for name, value in vars(self.budget).items() if name != "points"}
+        points = self.budget.points
+        return budget if points == type(self.budget)().points else budget | {"points": points}
 
     def columns(self) -> dict[str, Any]:
         """Return the identity columns of the cell's row: views of its parameters and counts."""

@@ -61,7 +61,11 @@ def load(overrides: Sequence[str], config_dirs: Sequence[Path] = ()) -> Experime
     config_dirs = [*config_dirs, *(folder for folder in registry.folders() if (folder / "experiment").is_dir())]
     loaded = _composed(overrides, config_dirs)
     _refuse_unread(loaded, overrides)
-    return loaded
+    given = {key.partition(".")[0] for key, _, _ in _split_words(overrides)}
+    if "compares" in given:
+        return loaded
+    # what a command line chooses is drawn, whatever the file compares
+    return replace(loaded, compares={name: values for name, values in loaded.compares.items() if name not in given})
 
 
 def _composed(overrides: Sequence[str], config_dirs: Sequence[Path]) -> Experiment:
@@ -122,6 +126,7 @@ APPEARANCE = (
     "also",
     "results_dir",
     "answer",
+    "compares",
     "formats",
     "compile_cache",
     "plugins",
@@ -367,7 +372,7 @@ def _path(given: Any) -> dict[str, Choice]:
     items = _as_list(given)
     if len(items) not in (2, 3):
         raise UserError(
-            f"path={items} must be a contact law, an integrator and, if wanted, a backend: [penalty,semi_implicit_euler,jax]"
+            f"path={items} must be a contact law, an integrator and, if wanted, a backend: path=[LAW,INTEGRATOR,BACKEND]"
         )
     given = {axis: item for axis, item in zip(DESCENDED, items, strict=False) if item != "none"}
     return {axis: _choice(registry.kind_of(axis), item) for axis, item in given.items()}

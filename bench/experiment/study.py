@@ -40,7 +40,7 @@ class Study(Plugin):
     descends: ClassVar[bool] = True
     """Whether its cells are measured at ``program.theta0``, and so at a share of a descent."""
 
-    default_plugins: ClassVar[Mapping[str, Sequence[str]]] = {"optimizers": ("adam",)}
+    default_plugins: ClassVar[Mapping[str, Sequence[str]]] = {}
     """Names of the plugins of a kind that the configuration leaves null, such as ``optimizers``."""
 
     @abstractmethod

@@ -33,7 +33,7 @@ SLOPES = (*STEPS, "refined=COST")
 DERIVATIVE = {
     "nan_gradient": Rule(
         "fault", "the gradient is NaN or infinite where the cost is a number",
-        "the costs at theta and at {direction.MIN_STEPS} step sizes or more are numbers; in `examine` also under noise",
+        "the costs at theta and at {direction.MIN_STEPS} step sizes or more are numbers; also under noise",
         "where it overflows, take fewer steps or damp the rollout; else look for a division, log, sqrt or norm at the edge of "
         "its domain, or a branch that 'where' discards only in the value", STEPS,
     ),
@@ -80,7 +80,7 @@ DERIVATIVE = {
     ),
     "nonfinite": Rule(
         "open", "a cost is NaN or infinite",
-        "at theta, or a number at fewer than {direction.MIN_STEPS} step sizes; in `examine` also within u^(1/3) of theta, or under noise",
+        "at theta, or a number at fewer than {direction.MIN_STEPS} step sizes, or under noise; in `examine` also within u^(1/3) of theta",
     ),
     "unsettled": Rule(
         "open", "the differences agree at no step, so the check is inconclusive",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -79,23 +80,37 @@ class Lost(NamedTuple):
     """The noise ``(n_w,)`` of the sample nearest to theta; 0 without any."""
 
 
-def lost_samples(problem: Problem, theta: np.ndarray, seed: int, columns: int) -> tuple[Lost, Lost]:
-    """Return the samples without a gradient, and those without a cost, among :data:`DRAWS` at ``theta (d,)``."""
+class Sampled(NamedTuple):
+    """What :data:`DRAWS` samples of the noise show of costs and gradients."""
+
+    gradients: Lost
+    """Samples whose cost is a number, and whose gradient is not."""
+    costs: Lost
+    spread: float
+    """Standard deviation of one gradient over the norm of their mean; infinite where that is not distinguishable from 0."""
+
+
+def sampled_gradients(problem: Problem, theta: np.ndarray, seed: int, columns: int) -> Sampled:
+    """Return what samples of the noise show of costs and gradients at ``theta (d,)``."""
     w = np.random.default_rng([seed, 0x6C6F7374]).standard_normal((problem.program.n_noise, DRAWS))
 
     def both(part: np.ndarray) -> np.ndarray:
         at = np.repeat(theta[:, None], part.shape[1], axis=1)
-        return np.stack([np.isfinite(problem.value(at, part)), np.isfinite(problem.grad(at, part)).all(axis=0)])
+        return np.concatenate([problem.value(at, part)[None], problem.grad(at, part)])
 
     with np.errstate(all="ignore"):
-        has_cost, has_gradient = in_columns(both, w, columns)
+        found = in_columns(both, w, columns)
+        variance = float(found[1:].var(axis=1, ddof=1).sum())
+        square = float(np.square(found[1:].mean(axis=1)).sum()) - variance / DRAWS
+        spread = math.sqrt(variance / square) if square > 0.0 and math.isfinite(variance) else math.inf
+    has_cost, has_gradient = np.isfinite(found[0]), np.isfinite(found[1:]).all(axis=0)
     order = np.argsort(np.linalg.norm(w, axis=0))
 
     def lost(bad: np.ndarray) -> Lost:
         nearest = order[bad[order]][:1]
         return Lost(float(bad.mean()), w[:, nearest[0]] if nearest.size else np.zeros(len(w)))
 
-    return lost(has_cost & ~has_gradient), lost(~has_cost)
+    return Sampled(lost(has_cost & ~has_gradient), lost(~has_cost), spread)
 
 
 def missed_slope(problem: Problem, theta: np.ndarray, seed: int, columns: int) -> MissedSlope:

@@ -24,6 +24,8 @@ small. The pilot, which selects the estimator of a sampled reference, is one bat
 LEAST_SAMPLES = 16384
 """Minimum samples of a sampled reference, unless the limit is lower: a small spread of few samples proves nothing."""
 QUADRATURE_POINTS = 1 << 20
+FINE = 1e-3
+"""Spacing of a reference's points, in standard deviations, above which a note states it: that of points in a plane."""
 SURE = 3.0
 """Stated errors of quadrature and sampling together beyond which they disagree."""
 TAIL_EVENTS = 10.0
@@ -104,13 +106,15 @@ def certify(
     samples: int,
     tolerance: float,
     physical: np.ndarray | None = None,
+    points: int = QUADRATURE_POINTS,
 ) -> Reference:
     """Return the reference gradient of a problem, by the best applicable method.
 
     A closed form belongs to the scene's own program, so it is not used for a backend that ``provides`` its own physics.
     Quadrature handles noise on theta of one or two dimensions, or of one only if the cost may jump at places that the
     scene does not list. If its relative error exceeds 0.1%, sampling replaces quadrature where the error of sampling is
-    smaller. Sampling stops at an error of ``tolerance`` times the gradient's norm, or after ``samples`` samples.
+    smaller. Sampling stops at an error of ``tolerance`` times the gradient's norm, or after ``samples`` samples,
+    quadrature at ``points`` points, or 64 times ``samples``.
     ``physical (d,)`` is the gradient of the physics that the program approximates, if known. Where costs are not
     finite, or J does not exist, the gradient is NaN and the note states why.
     """
@@ -124,11 +128,12 @@ def certify(
         reference = Reference(np.asarray(closed, dtype=np.float64).reshape(1, -1), "closed_form")
     else:
         unit = _unit(problem, theta)
-        if unit == 1.0:
-            reference = _compute(problem, theta, provides, samples, tolerance)
-        else:
-            scaled = _compute(cast(Problem, _Scaled(problem, unit)), theta, provides, samples, tolerance)
-            reference = replace(scaled, batches=scaled.batches * unit, error=scaled.error * unit)
+        given = problem if unit == 1.0 else cast(Problem, _Scaled(problem, unit))
+        scaled = _compute(given, theta, provides, samples, tolerance, min(points, 64 * samples))
+        reference = replace(scaled, batches=scaled.batches * unit, error=scaled.error * unit)
+        if reference.spacing > FINE:
+            note = f"the reference's points are {reference.spacing:.2g} standard deviations apart and may miss a narrower feature"
+            reference = _with_note(reference, note)
     if physical is None or "grad" not in provides:
         return reference
     plain = problem.grad(theta, np.zeros((program.n_noise, 1)))[:, 0]
@@ -185,12 +190,12 @@ def _can_integrate(program: Program) -> bool:
 
 
 def _compute(
-    problem: Problem, theta: np.ndarray, provides: frozenset[str], samples: int, tolerance: float
+    problem: Problem, theta: np.ndarray, provides: frozenset[str], samples: int, tolerance: float, points: int
 ) -> Reference:
     program = problem.program
     quadrature = None
     if _can_integrate(program):
-        integral = integrate(problem, theta, min(QUADRATURE_POINTS, 64 * samples), COLUMNS)
+        integral = integrate(problem, theta, points, COLUMNS)
         if integral is not None:
             method = f"quadrature[points={integral.points},spacing={integral.spacing:.2g}]"
             quadrature = Reference(

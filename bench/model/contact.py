@@ -35,7 +35,7 @@ class ContactLaw(Plugin):
 class ForceLaw(ContactLaw):
     """A law whose force is a function of gap and gap rate and is part of the acceleration."""
 
-    ignores = ("restitution",)
+    ignores: ClassVar[tuple[str, ...]] = ("restitution",)
 
     @abstractmethod
     def force(self, xp: Any, gap: Array, gap_rate: Array) -> Array:
@@ -69,7 +69,7 @@ class Contact(NamedTuple):
 class ImpulseLaw(ContactLaw):
     """A law that changes velocities and positions within a step instead of adding a force. It has no friction."""
 
-    ignores = ("friction", "slip_speed")
+    ignores: ClassVar[tuple[str, ...]] = ("friction", "slip_speed")
 
     @abstractmethod
     def impulse(self, ops: Ops, contact: Contact, before: State, free: State, dt: Any) -> State:

@@ -122,10 +122,11 @@ class References:
         budget, smoothing = (self._budget.samples, self._budget.tolerance), cell.smoothing()
         problem = self._problem(backend, cell)
         if smoothing is None:
-            return reference.certify(problem, backend.provides, *budget, self._physical_gradient(cell))
+            physical = self._physical_gradient(cell)
+            return reference.certify(problem, backend.provides, *budget, physical, self._budget.points)
         if smoothing.shape == "ball":
             return smoothed.over_ball(problem, backend.provides, smoothing.radius, *budget)
-        result = reference.certify(problem, backend.provides, *budget)
+        result = reference.certify(problem, backend.provides, *budget, points=self._budget.points)
         return replace(result, method=f"gaussian[radius={smoothing.radius:g}],{result.method}")
 
     def _path(self, cell: Cell, backend: str = "") -> Path:

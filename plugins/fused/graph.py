@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from functools import reduce
 from typing import Any
 
 import numpy as np
+
+from ..jaxprs import FOLD
 
 MOST = 20_000
 """Maximum number of operations in code: longer straight-line code would take too long to compile."""
@@ -37,21 +38,6 @@ class Node:
     def value(self) -> Any:
         """The value of a literal, else None."""
         return self.data if self.op == "literal" else None
-
-
-FOLD: dict[str, Callable[..., Any]] = {
-    "abs": np.abs, "acos": np.arccos, "acosh": np.arccosh, "add": np.add, "and": np.logical_and, "asin": np.arcsin,
-    "asinh": np.arcsinh, "atan": np.arctan, "atan2": np.arctan2, "atanh": np.arctanh, "ceil": np.ceil, "cos": np.cos,
-    "cosh": np.cosh, "div": np.divide, "eq": np.equal, "erf": np.vectorize(math.erf), "exp": np.exp,
-    "expm1": np.expm1, "floor": np.floor, "ge": np.greater_equal, "gt": np.greater, "is_finite": np.isfinite,
-    "le": np.less_equal, "log": np.log, "log1p": np.log1p, "logistic": lambda x: 1.0 / (1.0 + np.exp(-x)),
-    "lt": np.less, "max": np.maximum, "min": np.minimum, "mul": np.multiply, "ne": np.not_equal, "neg": np.negative,
-    "not": np.logical_not, "or": np.logical_or, "pow": np.power, "rem": np.fmod, "rsqrt": lambda x: 1.0 / np.sqrt(x),
-    "select_n": lambda which, no, yes: np.where(which, yes, no), "sign": np.sign, "sin": np.sin, "sinh": np.sinh,
-    "sqrt": np.sqrt, "square": np.square, "stop_gradient": lambda x: x, "sub": np.subtract, "tan": np.tan,
-    "tanh": np.tanh, "xor": np.logical_xor,
-}  # fmt: skip
-"""NumPy functions that evaluate operations on constants, by operation."""
 
 
 @dataclass

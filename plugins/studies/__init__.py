@@ -18,15 +18,15 @@ from bench.experiment.study import Study
 from bench.experiment.views import Views
 from bench.measure import noise, statistics, timing
 from bench.measure.reference import Reference
-from bench.model import SURROGATE, Estimator, Problem, Program
+from bench.model import SURROGATE, Estimator, Integrator, Problem, Program
 
 if TYPE_CHECKING:
     import pandas as pd
 
 PARTS = ("scene", "contact", "integrator", "backend")
 """Parts of the grid that identify a program: the axes of a study without estimators."""
-FINE = 1e-3
-"""Spacing of a reference's points, in standard deviations, above which a remark states it: that of points in a plane."""
+SPREAD = 0.5
+"""A gradient is trusted where one estimate spreads by less than this multiple of its mean, and a check finds nothing against it."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class StudyPackage(Study):
         if found is None:
             found = Views([replace(table, terminal=False) for table in generic.views(experiment, rows).tables])
         drawn = [chart for chart in found.charts if len(chart.frame)]
-        return replace(found, charts=drawn, remarks=[*found.remarks, *unseen_features(rows), *reasons(rows)])
+        return replace(found, charts=drawn, remarks=[*found.remarks, *reasons(rows)])
 
     def show(self, experiment: Experiment, rows: pd.DataFrame) -> Views | None:
         """Return the tables of the rows and the charts; None without any."""
@@ -61,20 +61,6 @@ class StudyPackage(Study):
     def _module(self, name: str) -> Any:
         package = next(c.__module__ for c in type(self).__mro__ if hasattr(sys.modules[c.__module__], "__path__"))
         return import_module(f"{package}.{name}")
-
-
-def unseen_features(rows: pd.DataFrame) -> list[str]:
-    """Return below which width references by quadrature in a plane may miss a feature of the cost, and in how many cells."""
-    from bench.report.text import counted
-
-    spacing = rows.reindex(columns=["reference_spacing"])["reference_spacing"]
-    coarse = spacing[spacing > FINE]
-    if coarse.empty:
-        return []
-    return [
-        f"in {counted(len(coarse), 'cell')} the reference is from points up to {coarse.max():.2g} standard deviations of the noise apart: "
-        "it may miss a feature of the cost that is narrower"
-    ]
 
 
 def against_reference(
@@ -153,3 +139,9 @@ def gradient_seconds(problem: Problem, w: np.ndarray, calls: int) -> dict[str, f
     problem.reset_usage()
     _, clock = timing.timed(lambda _: problem.grad(problem.program.theta0, w), calls)
     return {"gradient_s": clock.median_s, "compile_s": problem.usage.compile_s}
+
+
+def spectral_radius(integrator: Integrator, dt: float, stiffness: float, damping: float, factor: float) -> float:
+    """Return the spectral radius of one step of length ``dt`` [s] on an oscillator of mass 1."""
+    matrix = integrator.transition(dt, stiffness, damping, factor)
+    return float(np.abs(np.linalg.eigvals(matrix)).max())

@@ -100,3 +100,23 @@ def test_a_sum_that_ties_with_a_threshold_has_a_reference_of_its_own(tmp_path):
         found[backend] = truth
     assert "differ from those of" in found["torch"].note
     assert found["jax"].note == ""
+
+
+@pytest.mark.parametrize("points", [1 << 20, 600, 100_000])
+def test_the_points_of_quadrature_are_a_setting(tmp_path, points):
+    words = [
+        "scenes=[wall_penalty_1d]",
+        "contacts=[penalty]",
+        "backends=[numpy]",
+        "estimators=[fobg]",
+        "reference.samples=4096",
+    ]
+    given, (cell,) = loaded(*words, f"reference.points={points}", f"results_dir={tmp_path}")
+    references, used = References(given, Problems()), []
+    problem = references._problems.of(cell.reference_backends[0], cell)
+    value = problem.value
+    problem.value = lambda theta, w: (used.append(w.shape[1]), value(theta, w))[1]
+    references.of(cell)
+    assert sum(used) < 4 * min(points, 64 * 4096) + 8 * 16384  # all levels, and what a sampled reference takes
+    _, (default,) = loaded(*words, f"results_dir={tmp_path}")
+    assert (cell.reference_key == default.reference_key) == (points == 1 << 20)

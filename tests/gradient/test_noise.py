@@ -5,7 +5,7 @@ import pytest
 
 from bench import load
 from bench.cli import main
-from bench.measure.jumps import lost_samples
+from bench.measure.jumps import sampled_gradients
 from bench.model import compose, registry
 
 GUARDED = """
@@ -42,7 +42,18 @@ def test_share_and_nearest_sample_of_lost_gradients():
     problem = registry.make("backends", "numpy", {}).compile(compose(scene, None, None))
     right = problem._grad
     problem._grad = lambda theta, w: np.where(w[0] > 1.0, np.nan, right(theta, w))
-    gradients, costs = lost_samples(problem, problem.program.theta0, 0, 128)
+    gradients, costs, spread = sampled_gradients(problem, problem.program.theta0, 0, 128)
     assert gradients.share == pytest.approx(0.159, abs=4 * 0.016)  # 1 - Phi(1), and its standard error
     assert gradients.w[0] > 1.0
     assert costs.share == 0.0
+    assert spread == np.inf
+
+
+@pytest.mark.parametrize("samples", [1, 10_000])
+def test_trusted_is_a_column_and_the_last_line(tmp_path, samples, capsys):
+    words = ["scene.quadratic.sigma=1", f"samples={samples}", "backends=[numpy]", "workers=0", "formats=[]"]
+    assert main(["gradcheck", "quadratic", *words, f"results_dir={tmp_path}"]) == 0
+    (row,) = load(tmp_path / "gradcheck").to_dict("records")
+    answer = "yes" if row["spread"] < 0.5 else "no"
+    assert row["trusted"] == answer == ("no" if samples == 1 else "yes")
+    assert f"trusted: 1 {answer}" in capsys.readouterr().out

@@ -40,6 +40,7 @@ class GradientCheck(StudyPackage):
                 "best_eps": "step of that error, in units of the natural scale",
                 "scale": "natural scale of displacements of theta: its norm, at least 1",
                 "taylor_order": "order of the Taylor remainder along random directions: 2 for a right gradient, 1 if wrong",
+                "spread": "standard deviation of an estimate by `samples` gradients under noise over the norm of their mean",
                 "cost_noise": "measured standard deviation of the cost's own noise",
                 "jump": "largest jump of the cost that the noise reaches; 0 where none was found",
                 "jump_share": "that jump as a share of the range of the cost under the noise",
@@ -50,6 +51,11 @@ class GradientCheck(StudyPackage):
             "verdict",
             "the worst verdict of the checks",
             comparison=ComparisonRule("verdict", "verdict", order=VERDICTS),
+        ),
+        text(
+            "trusted",
+            "whether estimates by fobg can be trusted: yes where they spread by less than half of their mean, and no check "
+            "outside a contact switch finds anything against the gradient",
         ),
         text("command", "a line for the shell that repeats the checks"),
         text("device", "what the program ran on"),

@@ -17,11 +17,10 @@ from bench.experiment.session import Session
 from bench.measure import noise
 from bench.measure.batches import in_columns
 from bench.measure.contacts import active_contacts, contact_names, engine_contacts
-from bench.measure.jumps import Jump, jump_under_noise, lost_samples, missed_slope
+from bench.measure.jumps import Jump, Sampled, jump_under_noise, missed_slope, sampled_gradients
 from bench.model import SURROGATE, ContactScene, EngineScene, ForceLaw, LoopOps, Problem, Rollout, Unsupported, registry
 
-from .. import norm
-from ..stability import spectral_radius
+from .. import SPREAD, norm, spectral_radius
 from . import GradientCheck, is_trusted
 
 COLUMNS_AT_ONCE = 128
@@ -75,7 +74,8 @@ def measure(cell: Cell, session: Session, search: GradientCheck) -> dict[str, An
     directions = noise.draw(cell.seed, cell.scene.name, 1, search.drawn, theta.size, "directions")[0]
     whole = start(problem, theta, unit, search, cell.seed)
     along = directions[0] / np.linalg.norm(directions[0])
-    (jump, distance), events = under_noise(problem, theta, cell.seed)
+    sampled = sampled_gradients(problem, theta, cell.seed, COLUMNS_AT_ONCE)
+    (jump, distance), events = under_noise(problem, theta, sampled, cell.seed)
     reached = [Place("noise", 0, 1, theta, along, event.w, verdict=event.verdict) for event in events]
     found = examine(problem, drawn, directions, unit, search, reached)
     points = [*at_start(whole), *(_settled(problem, point) for point in found)]
@@ -88,6 +88,8 @@ def measure(cell: Cell, session: Session, search: GradientCheck) -> dict[str, An
         for point in points for best in [gradcheck.best(point.sample)]
     ]  # fmt: skip
     severest = min(checks, key=lambda check: (gradcheck.VERDICTS.index(check["check_verdict"]), -check["check_error"]))
+    untrusted = sum(not is_trusted(point.place.point, point.verdict) for point in points)
+    spread = sampled.spread / math.sqrt(cell.samples)
     lost = all(point.verdict == "nonfinite" for point in points)
     parts = whole.components
     remarks = [SURROGATE] if problem.program.surrogate else []
@@ -97,7 +99,9 @@ def measure(cell: Cell, session: Session, search: GradientCheck) -> dict[str, An
         "status": "nonfinite" if lost else "ok",
         "reason": "no cost is finite" if lost else "; ".join([*remarks, *beyond_stability(cell)]),
         "verdict": severest["check_verdict"],
-        "untrusted": sum(not is_trusted(point.place.point, point.verdict) for point in points),
+        "untrusted": untrusted,
+        "spread": spread,
+        "trusted": "no" if untrusted or not spread < SPREAD else "yes",
         "best_error": severest["check_error"],
         "best_eps": severest["check_eps"],
         "scale": scale_of(theta),
@@ -126,17 +130,16 @@ class Event(NamedTuple):
     remark: str
 
 
-def under_noise(problem: Problem, theta: np.ndarray, seed: int) -> tuple[tuple[Jump, float], list[Event]]:
+def under_noise(
+    problem: Problem, theta: np.ndarray, sampled: Sampled, seed: int
+) -> tuple[tuple[Jump, float], list[Event]]:
     """Return the largest jump that noise reaches at ``theta (d,)`` and its distance, and all that it reaches.
 
     A jump is a fault of its own, and the slope that it carries is no other one.
     """
     events = []
-    gradients, costs = lost_samples(problem, theta, seed, COLUMNS_AT_ONCE)
-    for verdict, name, lost in (
-        ("nan_gradient", "gradients of finite costs", gradients),
-        ("nonfinite", "costs", costs),
-    ):
+    names = {"nan_gradient": "gradients of finite costs", "nonfinite": "costs"}
+    for (verdict, name), lost in zip(names.items(), sampled[:2], strict=True):
         if lost.share:
             remark = f"{lost.share:.2g} of all {name} under noise are not numbers, from {norm(lost.w):.2g} standard deviations on"
             events.append(Event(verdict, lost.w, remark))

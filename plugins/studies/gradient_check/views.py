@@ -65,7 +65,13 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     charts = [] if points.empty else [_grid(points)]
     columns = [experiment.columns.by_name[name] for name in ("verdict", "best_error", "best_eps")]
     switches = dict.fromkeys(f"contact switch: {name}" for names in rows["contact_switch"] for name in _switches(names))
-    return Views(tables, charts, shown.rows, columns, [*switches, *faults])
+    return Views(tables, charts, shown.rows, columns, [*switches, *faults], headline(rows))
+
+
+def headline(rows: pd.DataFrame) -> str:
+    """Return in how many cells estimates can be trusted; empty for older rows, which do not say so."""
+    given = rows["trusted"][rows["trusted"] != ""]
+    return f"trusted: {', '.join(f'{n} {answer}' for answer, n in given.value_counts().items())}" if len(given) else ""
 
 
 # ------------------------------------------------------------------------------------------------------- lines

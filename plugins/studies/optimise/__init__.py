@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 from bench.experiment.cell import Cell
 from bench.experiment.columns import Column, Columns, exact, numbers, seconds, several, text
@@ -24,6 +24,7 @@ class SearchStudy(StudyPackage):
     """A study whose cells search with an optimizer."""
 
     axes = (*PARTS, "estimator", "optimizer")
+    default_plugins: ClassVar[Mapping[str, Sequence[str]]] = {"optimizers": ("adam",)}
 
     def parts(self, given: dict[str, Plugin | None]) -> dict[str, Plugin | None]:
         """Return the plugins, without the estimator if the optimizer uses only costs: it then has no effect."""
