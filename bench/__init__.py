@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import bench.compare
 import bench.examine
 import bench.run
-from bench.errors import Unsupported, UserError
+from bench.errors import Unsupported, UserError, needing_sweeps
 
 if TYPE_CHECKING:
     from bench import plugin
@@ -57,7 +57,8 @@ def __getattr__(name: str) -> Any:
     if name not in _SOURCES:
         raise AttributeError(f"module 'bench' has no attribute '{name}'")
     module, function = _SOURCES[name]
-    return globals().setdefault(name, getattr(importlib.import_module(module), function))
+    with needing_sweeps(f"bench.{name}"):
+        return globals().setdefault(name, getattr(importlib.import_module(module), function))
 
 
 def __dir__() -> tuple[str, ...]:

@@ -7,11 +7,12 @@ import signal
 import subprocess
 import sys
 import time
-import traceback
 
 from bench.errors import describe_exit
 from bench.run.reaper import MARK, Reaper
 
+INTERNAL = 70
+"""The status of a command that failed by an error of this package."""
 NO_VERDICT = 3
 """The status of a command whose process ended without one."""
 CHANNEL = "BENCH_CHANNEL"
@@ -33,7 +34,7 @@ def command() -> None:
     if not channel:
         os._exit(_watched())  # without waiting for threads
     from bench.cli import main
-    from bench.errors import printable
+    from bench.errors import failure
     from bench.model import guard, registry
 
     descriptor, parent = map(int, channel.split())
@@ -45,16 +46,10 @@ def command() -> None:
     except MemoryError:
         print("bench: not enough memory: give the process more (4 GB suffice for most runs)", file=sys.stderr)
         status = 1
-    except Exception as error:  # a bug of this package, unless a plugin has changed the process
-        if outside := sorted(registry.IMPORTED):
-            place = traceback.extract_tb(error.__traceback__)[-1]
-            where = f"{printable(error)} ({place.filename}:{place.lineno})"
-            print(
-                f"bench: {type(error).__name__}: {where}; imported from outside: {', '.join(outside)}", file=sys.stderr
-            )
-        else:
-            traceback.print_exc()
-        status = 1
+    except Exception as error:  # a bug of this package, unless code from outside has changed the process
+        outside = f"; imported from outside: {', '.join(sorted(registry.IMPORTED))}" if registry.IMPORTED else ""
+        print(f"bench: internal error: {failure(error)['reason']}{outside}", file=sys.stderr)
+        status = INTERNAL
     guard.exit_if_forked(pid)
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(Exception):  # a plugin may have closed or replaced it
@@ -67,7 +62,7 @@ def command() -> None:
 def _watched() -> int:
     """Run this command in a marked child process, and return the status that the child writes before it ends."""
     reader, writer = os.pipe()
-    reaper = Reaper()
+    reaper = Reaper(adopts=True)
     variables = {MARK: reaper.mark, CHANNEL: f"{writer} {os.getpid()}"}
     child = subprocess.Popen([sys.executable, *sys.orig_argv[1:]], env=os.environ | variables, pass_fds=[writer])
     first = 0.0

@@ -82,6 +82,7 @@ class Settings(TypedDict, total=False):
     results_dir: str | Path
     formats: Names
     marks: Mapping[str, Mapping[str, float]]
+    compares: Mapping[str, Sequence[Any]]
 
 
 SIMPLE = re.compile(r"[A-Za-z0-9_./+-]*")

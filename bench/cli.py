@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bench.errors import INTERRUPTED, UserError, printable, unknown
+from bench.errors import INTERRUPTED, UserError, needing_sweeps, printable, unknown
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -56,7 +56,8 @@ EXAMINE = """\
   tolerance=1e-4       relative error that only causes a warning; by input: tolerance=mass:1e-3; absolute: atol=1e-9
   allow_zero=friction  inputs that may have no effect; true: all, false: none
   expect=kink          the known cause, with which the status is 0
-  baseline=FILE        compare with this file, which is written if absent: status 0 unless something is worse
+  baseline=FILE        status 0 unless something is worse than in this file, which is written if absent and the status 0
+  --bench-update       write the baseline
   refined=NAME         the cost at a tighter tolerance or finer step
   horizons=1,2,10      numbers of steps T: cost(theta, steps=T) and its gradient
   batch=loop           batching of thetas: loop, vmap, columns (d, B), rows (B, d), columns:64; by default detected
@@ -92,7 +93,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command. Returns the exit status."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        with _stop_on_signals():
+        with _stop_on_signals(), needing_sweeps(" ".join(["bench", *words[:1]])):
             return _dispatch(words)
     except UserError as error:
         print("bench:", printable(error), file=sys.stderr)
@@ -301,12 +302,18 @@ def _report(words: list[str]) -> int:
 
 
 def _plan(words: list[str]) -> int:
+    from dataclasses import replace
+
+    from bench.experiment import config
     from bench.run import plan, progress
     from bench.run.execute import store_of
 
     experiment = _load(words)
     store = store_of(experiment)
-    progress.print_plan(experiment, plan.plan(experiment, store), store.load())
+    rows = store.load()
+    if rows.empty:  # times of the standard results, on another machine, are better than none
+        rows = store_of(replace(experiment, results_dir=config.config_dir().parent / "results" / "standard")).load()
+    progress.print_plan(experiment, plan.plan(experiment, store), rows)
     if experiment.execution.launcher == "ray":
         from bench.run.launchers import launcher_of
 
@@ -319,7 +326,9 @@ def _plan(words: list[str]) -> int:
 
 
 def _list(words: list[str]) -> int:
-    """List the plugins of the given kinds or names, or all."""
+    """List the plugins of the given kinds or names with their parameters; without any, the names of all by kind."""
+    from textwrap import fill
+
     from bench.api import described, matching_plugins
     from bench.experiment.words import parse_words
     from bench.model.identity import text_of
@@ -327,6 +336,20 @@ def _list(words: list[str]) -> int:
 
     names, _, _ = parse_words(words, "list", {})
     for kind, listed in matching_plugins(names).items():
+        if not names:
+            given = ", ".join(
+                name if entry.available else f"{name} (unavailable)" for name, entry in sorted(listed.items())
+            )
+            print(
+                fill(
+                    printable(f"{kind}: {given}"),
+                    100,
+                    subsequent_indent="  ",
+                    break_long_words=False,
+                    break_on_hyphens=False,
+                )
+            )
+            continue
         if listed:
             print(f"\n{printable(kind)}")
         for name, entry in sorted(listed.items()):
@@ -489,7 +512,7 @@ VERBS = {
         "Cells that cannot run are listed with their reason.\n" + SETTINGS, "Experiments",
     ),
     "list": Verb(
-        _list, "list [KIND or NAME ...] [plugins=DIR]", "plugins: parameters, capabilities, availability",
+        _list, "list [KIND or NAME ...] [plugins=DIR]", "plugins: names by kind; of a KIND or NAME parameters, capabilities, availability",
         "KIND is scenes, contacts, integrators, backends, estimators, optimizers, policies, trainers or studies.\n", "Experiments",
     ),
     "engines": Verb(

@@ -8,7 +8,8 @@ import signal
 import sys
 import threading
 import traceback
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Literal, get_args
@@ -24,6 +25,22 @@ MAX_LISTED = 80
 """Number of characters of a list of names that is not cut."""
 FOLDER = "bench_folder_"
 """Start of the name of a plugin folder's package, which :func:`printable` leaves out."""
+SWEEPS = frozenset(
+    [
+        "PIL",
+        "array_api_compat",
+        "hydra",
+        "matplotlib",
+        "omegaconf",
+        "pandas",
+        "psutil",
+        "pyarrow",
+        "rich",
+        "threadpoolctl",
+        "yaml",
+    ]
+)
+"""Packages of the extra ``sweeps``, by the names that are imported."""
 INTERRUPTED = threading.Event()
 """Set while a KeyboardInterrupt is pending, since plugin code may swallow the exception before it is handled."""
 
@@ -46,6 +63,17 @@ class Unavailable(Exception):
 
 class Crashed(Exception):
     """Raised where a process that computes a cell's numbers has ended. Its cell gets the status ``crashed``."""
+
+
+@contextmanager
+def needing_sweeps(what: str) -> Iterator[None]:
+    """Raise :class:`UserError` with the command where a package that ``what`` needs comes with the extra ``sweeps``."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] not in SWEEPS:
+            raise
+        raise UserError(f"{what} needs {error.name}: pip install 'diffsim-bench[sweeps]'") from None
 
 
 def printable(text: object) -> str:

@@ -92,8 +92,9 @@ Beside the files of [every run](reading-results.md#files), each study writes its
   stiffness above which the spectral radius of the step exceeds 1, and `growth_factor` is the measured growth per step of a
   state without contact. `cause` explains a finite but wrong gradient by comparison with the law's own gradient, from
   differences of its cost at a far finer step: `step` (the law's own gradient is right, the step or its derivative is wrong),
-  `law` (as wrong at any step size), `both`, or `unknown` where the law's gradient has not converged. `stability_map.png`
-  shows where the gradient is right, wrong or lost, and `stability_shares.csv` the share of each by integrator and law.
+  `law` (as wrong at any step size), `both`, or `unknown` where the law's gradient has not converged. `error_share` is the error over the
+  largest gradient of the scene, which cannot vanish, and `level` is what the map draws: `right`, `wrong`, `blows up`, `grew` or `open`.
+  `stability_shares.csv` has the share of each by integrator and law.
 - `three_errors.csv`: forward, program, model and estimator error, absolute and relative. `three_errors_traps.csv`: programs with an exact
   gradient and a converging cost whose gradient does not converge to that of the physics, with their errors at the largest and the smallest step.
 - `growth.csv`: gradient norms, singular values and growth rates with their intervals. `growth_verdicts.csv`: per problem the
@@ -159,8 +160,8 @@ def table_row(column: Column) -> str:
 
 RULE_MARKS = "<!-- verdicts -->\n", "<!-- end of verdicts -->"
 RULE_MODULES = (
-    "gradient.causes gradient.check gradient.diagnosis gradient.direction gradient.few gradient.roughness "
-    "gradient.sampling gradient.stages examine.findings examine.smoothing measure.jumps"
+    "gradient.causes gradient.check gradient.direction gradient.roughness gradient.sampling gradient.smooth_part examine.diagnosis "
+    "examine.few examine.findings examine.hints examine.means examine.smoothing examine.stages measure.jumps"
 )
 """The modules whose constants conditions of rules name."""
 

@@ -196,8 +196,9 @@ def stiffness_rows(
 
 
 def small_rows(**given):
-    """Return made-up rows of two stiffnesses at one sigma."""
-    return stiffness_rows(**{"stiffness": (1e2, 1e4), "sigmas": (0.1,), **given})
+    """Return made-up rows of three estimators at two stiffnesses and one sigma."""
+    few = {"stiffness": (1e2, 1e4), "sigmas": (0.1,), "estimators": ("fobg", "inverse_variance", "reinforce")}
+    return stiffness_rows(**{**few, **given})
 
 
 def experiment(
@@ -206,6 +207,7 @@ def experiment(
     marks=None,
     name="made_up",
     formats=("png",),
+    compares=None,
 ):
     """Return an experiment for reports of made-up rows; it cannot be run."""
     return Experiment(
@@ -218,6 +220,7 @@ def experiment(
         question="As contact stiffens, which gradient stays right?",
         marks={"stiffness": {"step size limit": 6400}} if marks is None else marks,
         formats=formats,
+        compares=compares or {},
     )
 
 

@@ -16,14 +16,17 @@ TINY = [
 ]  # fmt: skip
 HIDDEN = ("jax", "jaxlib", "torch", "optimistix", "lineax", "equinox", "mujoco", "numba")
 """Libraries of the extras, which the core does without."""
-BLOCK = f"""
+
+
+def hiding(names):
+    """Return a ``sitecustomize.py`` that hides packages from a process, as if they were not installed."""
+    return f"""
 from importlib.machinery import PathFinder
 found = PathFinder.find_spec
-def absent(name, path=None, target=None):
-    return None if name.partition(".")[0] in {HIDDEN!r} else found(name, path, target)
-PathFinder.find_spec = staticmethod(absent)
+def absent(cls, name, path=None, target=None):
+    return None if name.partition(".")[0] in {tuple(names)!r} else found(name, path, target)
+PathFinder.find_spec = classmethod(absent)
 """
-"""What hides them from a process, as if they were not installed."""
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +61,7 @@ def test_installed_wheel_works_in_an_empty_folder_with_numpy_only(wheel, tmp_pat
     place = "import sysconfig; print(sysconfig.get_path('purelib'))"
     site = Path(command(scripts / "python", "-c", place, cwd=tmp_path).strip())
     (site / "libraries.pth").write_text(sysconfig.get_path("purelib") + "\n")
-    (site / "sitecustomize.py").write_text(BLOCK)
+    (site / "sitecustomize.py").write_text(hiding(HIDDEN))
     assert (site / "bench" / "plugins" / "scenes" / "pushing.py").exists()
     assert not (site / "plugins").exists()
     where = command(scripts / "python", "-c", "import bench; print(bench.__file__)", cwd=tmp_path)

@@ -140,6 +140,19 @@ def test_version(capsys):
     assert capsys.readouterr().out.startswith("bench 0.")
 
 
+def test_list_without_a_kind_prints_kinds_and_names(capsys):
+    """It printed 733 lines."""
+    assert main(["list"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) < 40
+    assert {line.partition(":")[0] for line in lines if not line.startswith(" ")} >= {"scenes", "estimators", "studies"}
+
+
+def test_a_plan_without_rows_of_its_own_takes_the_times_of_the_standard_results(capsys, tmp_path):
+    assert main(["plan", "+experiment=quick", f"results_dir={tmp_path}"]) == 0
+    assert "expected time: about" in capsys.readouterr().out
+
+
 def test_list_takes_a_kind(capsys):
     assert main(["list", "scenes"]) == 0
     kinds = [line for line in capsys.readouterr().out.splitlines() if line and not line.startswith(" ")]

@@ -35,7 +35,7 @@ class Figure:
     what: str
     """The quantity in a few words."""
     published: str
-    """The number as printed in the source: its last digit shows its precision."""
+    """The number as the claim's ``origin`` gives it: its last digit shows its precision."""
     measured: float
     error: float = 0.0
     """Standard error of the measured number."""
@@ -145,6 +145,8 @@ class Claim(Plugin):
     """The source's statement, in a sentence."""
     source: ClassVar[str]
     """Authors, year, venue."""
+    origin: ClassVar[Literal["printed", "data file", "recomputed"]] = "printed"
+    """Where the figures are from: printed in the source, from its data file, or recomputed here in another way."""
     learned: ClassVar[str]
     """The conclusion for a reader, in a sentence."""
     quick: ClassVar[bool] = True

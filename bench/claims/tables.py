@@ -16,7 +16,7 @@ from bench.claims.discovery import LESSONS
 from bench.claims.results import FAILED, ClaimResult
 from bench.errors import printable
 from bench.experiment.columns import Column, text
-from bench.experiment.views import Chart, Mark, Table
+from bench.experiment.views import Chart, Mark, Style, Table
 from bench.report.cells import readable
 from bench.report.colours import estimator_style
 from bench.report.tables import escape_markdown, plain_markdown
@@ -25,7 +25,7 @@ from bench.report.text import counted, duration, number
 Results = Sequence[tuple[type[Claim], ClaimResult]]
 TITLE = "Published claims, run again"
 FIGURE = (
-    text("figure"), text("published"), text("measured", label="measured (95%)"), text("status", label="verdict"),
+    text("figure"), text("published"), text("origin"), text("measured", label="measured (95%)"), text("status", label="verdict"),
     Column("resolution", label="would fail at, relative"), text("reason", label="5% not detected for"),
 )  # fmt: skip
 """Columns of a table of figures for readers."""
@@ -44,7 +44,7 @@ def chart(claim: type[Claim], result: ClaimResult) -> Chart | None:
         return None
     (place, places), *curves = result.series.items()
     is_log = {axis: axis in claim.logarithmic for axis in "xy"}
-    parts, styles = [], {}
+    parts, drawn, styles = [], [], {}
     for label, series in curves:
         # a second column has the standard errors of means
         values = pd.DataFrame(np.reshape(series, (len(series), -1))).reindex(columns=[0, 1])
@@ -52,6 +52,11 @@ def chart(claim: type[Claim], result: ClaimResult) -> Chart | None:
         parts.append(pd.DataFrame({
             "series": label, "x": places, "y": values[0], "low": np.maximum(low, 0.1 * values[0]) if is_log["y"] else low, "high": high,
         }))  # fmt: skip
+        with np.errstate(all="ignore"):
+            height = np.log(values[0].to_numpy()) if is_log["y"] else values[0].to_numpy()
+        if any(np.isclose(height, other, rtol=0.0, atol=0.01 * np.ptp(other)).mean() > 0.5 for other in drawn):
+            styles[label] = Style("#D55E00", "", (0, (2, 2)))  # both of two lines on top of each other are seen
+        drawn.append(height)
         if estimator := ESTIMATORS.get(re.split(r"\W", label)[0]):
             styles[label] = estimator_style(estimator)
     return Chart(
@@ -90,7 +95,7 @@ def figures_table(results: Results) -> pd.DataFrame:
     rows = [
         {
             "claim": claim.name, "lesson": claim.lesson, "source": claim.source, "figure": figure.what,
-            "published": figure.published, "measured": figure.measured, "standard_error": figure.error,
+            "published": figure.published, "origin": claim.origin, "measured": figure.measured, "standard_error": figure.error,
             "slack": figure.tolerance, "agrees": figure.agrees, "resolution": figure.detectable_error,
             "sees_5_percent": figure.is_sensitive, "limited_by": figure.limitation,
             "verdict": result.verdict, "seconds": round(result.seconds, 2),
@@ -102,9 +107,11 @@ def figures_table(results: Results) -> pd.DataFrame:
 
 
 def count_verdicts(results: Results) -> str:
-    """Return the number of claims per verdict, as text."""
+    """Return the number of claims per verdict, as text, and how many of each are of figures that their source prints or stores."""
     tally = Counter(result.verdict for _, result in results)
-    counts = ", ".join(f"{tally[verdict]} {verdict}" for verdict in (*VERDICTS, FAILED) if tally[verdict])
+    ours = Counter(result.verdict for claim, result in results if claim.origin == "recomputed")
+    counts = ", ".join(f"{tally[verdict]} {verdict}" + f" ({ours[verdict]} of them with recomputed figures)" * bool(ours[verdict])
+                       for verdict in (*VERDICTS, FAILED) if tally[verdict])  # fmt: skip
     return f"{counted(len(results), 'claim')}: {counts}"
 
 

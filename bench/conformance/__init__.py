@@ -9,7 +9,17 @@ means are 4.5 standard errors: one false alarm in 150,000.
 """
 
 # importing these modules registers their checks
-from bench.conformance import backends, contacts, estimators, generic, integrators, optimizers, policies, scenes
+from bench.conformance import (
+    backends,
+    contacts,
+    effects,
+    estimators,
+    generic,
+    integrators,
+    optimizers,
+    policies,
+    scenes,
+)
 from bench.conformance.kit import Failed, Skipped, main, parametrize, verifies
 
 __all__ = [
@@ -17,6 +27,7 @@ __all__ = [
     "Skipped",
     "backends",
     "contacts",
+    "effects",
     "estimators",
     "generic",
     "integrators",

@@ -34,7 +34,7 @@ from bench.conformance.subjects import (
 )
 from bench.engines.backend import EngineBackend
 from bench.gradient import EPS, FAULTS, TRUSTED, Check, Options, check, judge, sampled
-from bench.gradient.stages import SINGLE_EPS
+from bench.gradient.direction import SINGLE_EPS
 from bench.model import (
     Array,
     Backend,

@@ -14,9 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from bench.errors import StorageError, UserError, local_path, unknown
+from bench.errors import StorageError, UserError, local_path, needing_sweeps, unknown
+from bench.examine import UPDATE
 from bench.examine.examination import examine
-from bench.examine.report import Report
+from bench.examine.report import AFTER_SIGTERM, Report
 from bench.run.files import make_directory
 from bench.simulator import imports
 from bench.simulator.simulator import LIBRARIES
@@ -37,7 +38,7 @@ def run(words: Sequence[str]) -> Report:
 
     Raises :class:`UserError` for a command line that cannot be parsed.
     """
-    names = [word for word in words if "=" not in word and word != QUIET]
+    names = [word for word in words if "=" not in word and word not in (QUIET, UPDATE)]
     if len(names) != 1:
         given = f", not {len(names)}" if names else ""
         raise UserError(f"name one cost{given}: python -m bench examine FILE:NAME [theta=1,0] [grad=jax] [sigma=0.1]")
@@ -48,6 +49,8 @@ def run(words: Sequence[str]) -> Report:
         if key in FILES:
             local_path(key, settings[key])
     report = _examined(names[0], settings, QUIET not in words)
+    if "baseline" in settings:
+        report = report.compared(settings["baseline"], UPDATE in words)
     print(_wrapped(str(report)))
     if "save" in settings:
         print("\nWritten:")
@@ -57,10 +60,10 @@ def run(words: Sequence[str]) -> Report:
 
 
 def main(words: Sequence[str]) -> int:
-    """Run the command, and return the exit status: 0 right, 1 wrong, 3 not decided; 2 is bad input."""
-    status = run(words).status
+    """Run the command, and return the exit status: 0 right, 1 wrong, 3 not decided, 130 after SIGTERM; 2 is bad input."""
+    report = run(words)
     sys.stdout.flush()
-    return status
+    return 130 if AFTER_SIGTERM in report.left_out else report.status
 
 
 def _wrapped(text: str) -> str:
@@ -87,14 +90,15 @@ def _examined(cost: str, settings: Mapping[str, str], progress: bool) -> Report:
         raise UserError("theta is missing: give theta=1,0 or define theta in the file")
     given = {key: value for key, value in {"theta": "theta", **settings}.items() if key not in FILES}
     values = {key: _value(key, value, module) for key, value in given.items()}
-    if "save" in settings:  # a folder that cannot be written is an error before the examination, not after it
+    if "save" in settings:  # what cannot be written is an error before the examination, not after it
+        with needing_sweeps("save"):
+            from bench.examine import files  # noqa: F401
         make_directory(folder := local_path("save", settings["save"]))
         if not os.access(folder, os.W_OK):
             raise StorageError(f"save={folder} cannot be written: it is read-only")
     report = examine(function, name=cost, progress=progress, **values)
     words = " ".join(f"{key}={value}" for key, value in settings.items() if key != "expect")
-    report = replace(report, command=f"python -m bench examine {cost} {words}".strip())
-    return report.compared(settings["baseline"]) if "baseline" in settings else report
+    return replace(report, command=f"python -m bench examine {cost} {words}".strip())
 
 
 def _value(key: str, given: str, module: Any) -> Any:
@@ -108,7 +112,7 @@ def _value(key: str, given: str, module: Any) -> Any:
             return theta() if callable(theta) else theta
         case "noise" | "seed" | "calls":
             if not re.fullmatch(r"\d+", given):
-                raise UserError(f"{key}={given} is not a whole number")
+                raise UserError(f"{key}={given} is not a whole number of at least {int(key == 'calls')}")
             return int(given)
         case "allow_zero":
             words = {"true": True, "false": False}

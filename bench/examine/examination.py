@@ -13,13 +13,15 @@ from typing import Any
 import numpy as np
 
 from bench.errors import UserError, unknown
+from bench.examine import diagnosis
 from bench.examine.findings import RELATIVE, GroupSize, Setup, Spent
-from bench.examine.report import Report
-from bench.examine.smoothing import FEWEST, PAIRS, Smoothed, directions, measure_smoothed
-from bench.gradient import Check, diagnosis
-from bench.gradient.lines import HALVINGS, PLACES, POINTS, LineScan, scan
+from bench.examine.lines import HALVINGS, PLACES, POINTS, REACH, LineScan, scan
+from bench.examine.means import OF_A_DRAW, Mean, compare_means
+from bench.examine.report import AFTER_SIGTERM, Report
+from bench.examine.smoothing import FEWEST, OWN_PAIRS, PAIRS, Smoothed, directions, largest_unseen, measure_smoothed
+from bench.examine.stages import GradientStages
+from bench.gradient import Check
 from bench.gradient.rules import RULES, SUSPICIOUS
-from bench.gradient.stages import GradientStages
 from bench.simulator.clock import Clock, OutOfTime, end_on_sigterm, parse_duration
 from bench.simulator.simulator import Simulator
 from bench.simulator.tree import ParameterTree
@@ -30,12 +32,17 @@ TOLERANCE = 1e-4
 """Default relative error of a derivative below which it only causes a warning."""
 COMPILE_S = 300.0
 """Default time limit of all first calls together [s]."""
-PANELS = (7, 12)
-"""Numbers of panels, of 4 Gauss-Legendre points each, of the two integrals of the gradient along a line."""
+NODES = (28, 48)
+"""Points of the two integrals of the gradient along a line, by Gauss-Legendre."""
 LEAST_MISSED = 0.002
 """Largest error of the integral of the gradient, as a share of the cost's change, that is always accepted."""
 LINE_EFFORTS = ((PLACES, HALVINGS), (3, 10), (1, 10))
 """Places searched on a line and halvings of each, from the full search to the smallest."""
+MEANS_SHARE = 0.4
+"""Share of the remaining budget for the mean of a gradient over draws of the simulator's own noise."""
+OWN_LEVELS, OWN_SHARE, OWN_DRAWS = (0.01, 0.03, 0.1, 0.3, 1.0), 0.6, 64
+"""Sigmas of a cost with its own noise, in units of each input's scale; the first is taken that moves the cost by this share of
+its own standard deviation in this number of draws."""
 EARLY_SHARE = 0.5
 """Share of the remaining budget for the lines of a gradient that adaptive steps may explain."""
 FEWEST_POINTS = 17
@@ -135,8 +142,9 @@ def examine(
         try:
             simulator = Simulator(cost, layout, grad, int(noise), batch, clock)
         except OutOfTime:
-            limit = "compile_budget" if not clock.is_terminated else "the time until SIGTERM"
-            took = f"the first call of the cost took longer than {limit}={clock.compile_budget:g} seconds"
+            if clock.is_terminated:
+                raise KeyboardInterrupt from None
+            took = f"the first call of the cost took longer than compile_budget={clock.compile_budget:g} seconds"
             raise UserError(f"{took}: give a larger compile_budget or a shorter rollout") from None
         examination = _Examination(simulator, setup)
         try:
@@ -220,9 +228,10 @@ class _Examination:
         self.simulator, self.setup, self.clock = simulator, setup, simulator.clock
         self.left_out: list[str] = []
         self.explained = diagnosis.Explanation()
+        self.means: Mean | None = None
         self._near: list[LineScan] | None = None
         """Lines at theta that do not depend on sigma."""
-        self.stages = GradientStages(simulator, setup.scale, setup.seed)
+        self.stages = GradientStages(simulator, setup.scale, setup.seed, bool(setup.levels))
 
     def run(self, named: Mapping[str, Any], refined: Any) -> Report:
         """Run the checks that the budget allows, the decisive ones first, and return the report."""
@@ -231,26 +240,32 @@ class _Examination:
         self.left_out += stages.left_out
         checked = stages.check
         is_wrong = checked.cause in SUSPICIOUS
-        if refined is not None and is_wrong and stages.gradient is not None:
-            explained.gaps = self._attempt("the refined cost", lambda: diagnosis.refined_gaps(stages, refined)) or ()
+        has_gradient = stages.gradient is not None
+        if refined is not None and is_wrong and has_gradient:
+            self._explain("gaps", "the refined cost", diagnosis.refined_gaps, refined)
+        self._find_smooth_parts(checked)
+        if refined is not None and explained.smooth_parts:
+            self._explain("refined", "the refined cost", diagnosis.refined_slopes, refined, diagnosis.doubtful(checked))
         if setup.horizons:
-            explained.growth = (
-                self._attempt("horizons", lambda: diagnosis.errors_by_horizon(stages, setup.horizons)) or ()
-            )
-        can_go_on = stages.gradient is not None or not simulator.has_gradient
+            self._explain("growth", "horizons", diagnosis.errors_by_horizon, setup.horizons)
+        if is_wrong and has_gradient:
+            self._explain("difference_step", "steps of a difference", diagnosis.step_of_difference, checked)
+            self._explain("gradient_noise", "noise of the gradient", diagnosis.noise_of_gradient)
+        self._compare_means(checked)
+        can_go_on = has_gradient or not simulator.has_gradient
         if is_wrong and can_go_on and explained.is_adaptive is None:
             explained.is_adaptive = self._compare_along_lines(checked, 0.9)
         lines = self._scan_lines(checked) if can_go_on else []
-        smoothed = self._measure_noise(checked) if can_go_on else []
+        smoothed = self._measure_noise(checked, lines) if can_go_on else []
         if clock.is_terminated:
-            self.left_out.append("everything after SIGTERM")
+            self.left_out.append(AFTER_SIGTERM)
         return Report(
             **named,
             names=simulator.layout.names,
             theta=stages.theta,
             cost=stages.value,
             precision=simulator.precision,
-            batch=simulator.batch + (f":{simulator.fixed}" if simulator.fixed else ""),
+            batch=simulator.mode,
             repeats=stages.repeats,
             setup=setup,
             spent=Spent(
@@ -265,6 +280,8 @@ class _Examination:
             groups=self._group_sizes(),
             more=stages.more,
             explained=explained,
+            is_random=simulator.noise > 0,
+            means=self.means,
             lines=lines,
             smoothed=smoothed,
             error=simulator.gradient_error if stages.is_failed else "",
@@ -274,6 +291,7 @@ class _Examination:
             changing=sorted(simulator.changing),
             notes=[
                 *simulator.notes,
+                *[f"a call of the cost or gradient had not returned after {clock.hung_s:.2g} s"] * bool(clock.hung_s),
                 *(f"the cost raised {n} times: {text}" for text, n in list(simulator.raised.items())[:3]),
             ],
             left_out=self.left_out,
@@ -303,12 +321,32 @@ class _Examination:
             self.left_out.append(what)
             return None
 
+    def _explain(self, name: str, what: str, function: Callable[..., Any], *given: Any) -> None:
+        """Set a comparison of :attr:`explained`, unless the budget ends before."""
+        found = self._attempt(what, partial(function, self.stages, *given))
+        if found is not None:
+            setattr(self.explained, name, found)
+
     # ------------------------------------------------------------------------------------------------ lines
 
     def _compare_early(self, checked: Check) -> None:
-        """Keep whether adaptive steps explain the small error of a gradient."""
+        """Keep the smooth part of a rough cost, and whether adaptive steps explain the small error of a gradient."""
+        self._compare_means(checked)
+        self._find_smooth_parts(checked)
         if diagnosis.may_be_adaptive(checked):
             self.explained.is_adaptive = self._compare_along_lines(checked, EARLY_SHARE)
+
+    def _compare_means(self, checked: Check) -> None:
+        """Compare the mean over draws of a gradient that is not the derivative at one of them."""
+        is_of_a_draw = any(one.cause in OF_A_DRAW for one in (checked, *self.stages.more))
+        if self.means is None and self.simulator.noise and is_of_a_draw and self.stages.gradient is not None:
+            self.clock.limit(MEANS_SHARE)
+            self.means = self._attempt("the mean over draws", lambda: compare_means(self.stages))
+            self.clock.limit(1.0)
+
+    def _find_smooth_parts(self, checked: Check) -> None:
+        if self.stages.gradient is not None and not self.explained.smooth_parts and diagnosis.doubtful(checked):
+            self._explain("smooth_parts", "the smooth part of the cost", diagnosis.smooth_parts, checked)
 
     def _compare_along_lines(self, checked: Check, share: float) -> bool | None:
         """Return whether the program's steps depend on theta and its jumps explain the gradient's error.
@@ -316,9 +354,7 @@ class _Examination:
         None where the budget ends before. Nothing here depends on sigma.
         """
         if self.explained.steps is None:
-            self.explained.steps = self._attempt(
-                "the loops of the program", lambda: diagnosis.changing_steps(self.stages)
-            )
+            self._explain("steps", "the loops of the program", diagnosis.changing_steps)
         if not self.explained.steps:
             return None if self.explained.steps is None else False
         near = self._scan_near(checked, share)
@@ -374,43 +410,49 @@ class _Examination:
                     measured, self.stages.repeats.spread, self.simulator.unit * (size if math.isfinite(size) else 0.0)
                 )
                 cost = partial(self.stages.costs_along, direction)
-                line = scan(cost, direction, rounding, 3.0, effort, self.simulator.unit)
-                lines.append(replace(line, missed=self._missed_share(line, checked)))
+                line = scan(cost, direction, rounding, REACH, effort, self.simulator.unit)
+                lines.append(self._integrated(line, checked))
         except OutOfTime:
             self.left_out.append("jumps and kinks on lines")
         self.clock.limit(1.0)
         return lines
 
-    def _missed_share(self, line: LineScan, checked: Check) -> float:
-        """Return the share of the cost's change along a line that its gradient does not explain.
+    def _integrated(self, line: LineScan, checked: Check) -> LineScan:
+        """Return a line with the share of the cost's change that a right gradient does not explain.
 
-        Without jumps, the integral of a right gradient along a line is the difference of the costs at its ends. The
-        share is NaN without a right gradient, or where the integral is less accurate than both a tenth of the share and
-        :data:`LEAST_MISSED`.
+        Without jumps, the integral of a right gradient along a line, by Gauss-Legendre, is the difference of the costs at
+        its ends. The share is NaN without a right gradient, or where the integral is less accurate than both a tenth of
+        the share and :data:`LEAST_MISSED`. Points at which the gradient is not a number, and the cost is, are counted instead.
         """
         if not checked.trusted or not self.simulator.has_gradient:
-            return math.nan
+            return line
         changes = np.abs(np.diff(line.costs)).sum()
         rounding = self.simulator.unit * np.abs(line.costs).max(initial=0.0) + checked.noise
         # where the cost hardly changes, its rounding is all that the integral could miss
         if not (np.isfinite(changes) and changes > 0 and rounding < 0.1 * LEAST_MISSED * changes):
-            return math.nan
-        if not self.clock.can_afford(0, 4 * sum(PANELS)):
+            return line
+        if not self.clock.can_afford(0, sum(NODES)):
             self.left_out.append("the integral of the gradient along a line")
-            return math.nan
-        ends = float(line.at[0]), float(line.at[-1])
-        integrals = [self.stages.integrate(line.direction, *ends, panels) for panels in PANELS]
+            return line
+        integrals, half = [], float(line.at[-1])
+        for points in NODES:
+            x, weights = np.polynomial.legendre.leggauss(points)
+            slopes = self.stages.slopes_along(line.direction, half * x)
+            lost = half * x[~np.isfinite(slopes)]
+            if lost.size and np.isfinite(self.stages.costs_along(line.direction, lost)).any():
+                return replace(line, n_lost=lost.size)
+            integrals.append(half * float(weights @ slopes))
         missed = abs(line.costs[-1] - line.costs[0] - integrals[-1]) / changes
         doubt = abs(integrals[-1] - integrals[0]) / changes
-        return float(missed) if doubt < max(0.1 * missed, LEAST_MISSED) else math.nan
+        return replace(line, missed=float(missed)) if doubt < max(0.1 * missed, LEAST_MISSED) else line
 
     # ------------------------------------------------------------------------------------------------ noise
 
-    def _measure_noise(self, checked: Check) -> list[Smoothed]:
+    def _measure_noise(self, checked: Check, lines: Sequence[LineScan]) -> list[Smoothed]:
         """Return the gradient's bias and the methods' costs at each sigma, which all get an equal share of the budget."""
         levels, size = list(self.setup.levels), self.stages.theta.size
         if not levels and self.simulator.noise:
-            levels = [(RELATIVE, RELATIVE * self.setup.scale)]
+            levels = self._attempt("the size of the cost's own noise", self._own_level) or []
         if levels and size > MOST_NOISY:
             self.left_out.append(f"noise on theta: it has more than {MOST_NOISY:,} numbers")
             return []
@@ -419,11 +461,25 @@ class _Examination:
         for index, (level, spread) in enumerate(levels):
             self.clock.start_stage(f"noise of sigma {level:g}")
             self.clock.limit(1.0 / (len(levels) - index))
-            pairs = min(PAIRS, max(FEWEST, HELD // size))
-            one = measure_smoothed(self.simulator, level, spread, plain, self.setup.seed, pairs)
+            most = OWN_PAIRS if self.simulator.noise else PAIRS
+            pairs = min(most, max(FEWEST, HELD // size))
+            unseen = partial(largest_unseen, lines, level / self.setup.reach) if self.setup.levels else None
+            one = measure_smoothed(self.simulator, level, spread, plain, self.setup.seed, pairs, unseen)
             self.clock.limit(1.0)
             if one is None:
                 self.left_out.append(f"noise of sigma {level:g}")
             else:
                 results.append(one)
         return results
+
+    def _own_level(self) -> list[tuple[float, np.ndarray]]:
+        """Return a sigma under which theta moves the cost by a share of what its own noise does."""
+        random = np.random.default_rng([self.setup.seed, 0x6F776E])
+        w, u = (random.standard_normal((n, OWN_DRAWS)) for n in (self.simulator.noise, self.stages.theta.size))
+        theta, scale, level = self.stages.theta[:, None], self.setup.scale[:, None], OWN_LEVELS[-1]
+        own = float(self.simulator.costs(np.repeat(theta, OWN_DRAWS, axis=1), w).std())
+        for level in OWN_LEVELS:
+            up, down = (self.simulator.costs(theta + sign * level * scale * u, w) for sign in (1.0, -1.0))
+            if np.sqrt(np.mean(((up - down) / 2.0) ** 2)) >= OWN_SHARE * own:
+                break
+        return [(level, level * self.setup.scale)]

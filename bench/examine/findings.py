@@ -10,13 +10,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from bench.errors import needing_sweeps
+from bench.examine.diagnosis import LOOSE, Explanation, grows, may_be_adaptive
+from bench.examine.hints import Hint, hint_of
+from bench.examine.lines import ALIKE, LineScan
+from bench.examine.means import OF_A_DRAW, Mean
 from bench.examine.smoothing import TARGET_ERROR, Method, Smoothed
-from bench.gradient import FAULTS, TRUSTED, Check, Part, Sample
-from bench.gradient.diagnosis import Explanation, grows, may_be_adaptive
+from bench.examine.stages import Repeats, recaused
+from bench.gradient import FAULTS, TRUSTED, Check, Part, Sample, rules
 from bench.gradient.direction import CHANCE, resolution
-from bench.gradient.lines import ALIKE, LineScan
 from bench.gradient.rules import EXCUSABLE, RULES, STATUS, SUSPICIOUS, UNEQUAL
-from bench.gradient.stages import Repeats, recaused
+from bench.gradient.smooth_part import LIMIT
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -41,9 +45,11 @@ RESIDUE = 1e-4
 """Largest change of the cost by a gradient, relative to the height of a jump, that is a residue of a solver."""
 SHOWN = 8
 """Most numbers of theta in the table of breaks."""
-RIGHT, WRONG, UNSHOWN, NONE = "right", "wrong", "not shown", "none given"
-"""Answers about the derivative."""
-NOISE_CAUSES = ("staircase", "jumps", "nonfinite", "biased", "spread", "unmeasured")
+RIGHT, WRONG, UNSHOWN, BROKEN, NONE = "right", "wrong", "not shown", "undefined", "none given"
+"""Answers about the derivative. ``undefined``: the cost has a jump or a kink at theta."""
+FAILED = (WRONG, UNSHOWN, BROKEN)
+"""Answers that decide before noise does."""
+NOISE_CAUSES = ("staircase", "jumps", "nonfinite", "nan_gradient", "biased", "spread", "unmeasured")
 """Causes around theta or under noise, the first one decides."""
 
 
@@ -165,6 +171,10 @@ class Findings:
     """Checks under further draws of the simulator's own noise."""
     explained: Explanation
     """Comparisons that explain a wrong gradient."""
+    is_random: bool
+    """Whether the cost has noise of its own."""
+    means: Mean | None
+    """The mean of a gradient that is not the derivative at a fixed draw of the cost's noise; None: not compared."""
     lines: Sequence[LineScan]
     smoothed: Sequence[Smoothed]
     error: str
@@ -196,9 +206,60 @@ class Findings:
     @cached_property
     def settled(self) -> Check:
         """The check with tolerated errors counted as right."""
-        if self.check.cause not in UNEQUAL:
+        if self.named.cause not in UNEQUAL:
+            return self.named
+        return recaused(self.named, lambda part: replace(part, verdict="nonlinear") if self._is_small(part) else part)
+
+    @cached_property
+    def named(self) -> Check:
+        """The check with the cause of :attr:`hint` as the verdict of wrong derivatives."""
+        check = self.judged
+        if self.hint is None:
+            return check
+        cause = self.hint.cause if self.hint.cause in SUSPICIOUS else "wrong_adjoint"
+        return recaused(check, lambda part: replace(part, verdict=cause) if part.verdict in SUSPICIOUS else part)
+
+    @cached_property
+    def judged(self) -> Check:
+        """The check with derivatives of a rough cost judged by its smooth part."""
+        if not self.explained.smooth_parts or self.tread or self.check.cause == "rough":
             return self.check
-        return recaused(self.check, lambda part: replace(part, verdict="nonlinear") if self._is_small(part) else part)
+        return recaused(self.check, self._of_smooth_part)
+
+    def _of_smooth_part(self, part: Part) -> Part:
+        """Return a part of a rough cost with the verdict that wide steps, or a refined cost, give.
+
+        Directions and other thetas were compared at tiny steps only, which show nothing there.
+        """
+        explained, is_open = self.explained, part.verdict in (*UNEQUAL, "unsettled")
+        if part.component is None:
+            return replace(part, verdict="smooth_part") if is_open or part.verdict in rules.BROKEN else part
+        wide, refined = explained.smooth_parts.get(part.component), explained.refined.get(part.component)
+        if wide is None and refined is None:
+            return part
+        slope, error = (part.difference, math.inf) if wide is None else (wide.slope, wide.error)
+        if refined is not None:
+            size = max(abs(refined), abs(part.program))
+            slope, error = refined, min(abs(slope - refined) + error, LOOSE * size)
+        size, apart = max(abs(slope), abs(part.program)), abs(part.program - slope)
+        tolerance = max(float(self.setup.rtol[part.component]), resolution(self.unit))
+        is_rough = any(each.error > tolerance * abs(each.slope) for each in explained.smooth_parts.values())
+        if refined is None and is_rough and error <= tolerance * size:
+            error = LOOSE * size  # of one sequence of steps, whose changes other components show
+        if error > LIMIT * size:
+            verdict = "unsettled"
+        elif apart > error + tolerance * size + float(self.setup.atol[part.component]):
+            if not is_open and abs(part.program - part.difference) <= 2.0 * part.uncertainty:
+                return part  # right of one sequence of steps
+            verdict = part.verdict if part.verdict in UNEQUAL else "wrong_adjoint"
+        else:
+            verdict = "smooth_part" if error <= tolerance * size or refined is not None else "coarse"
+        return replace(part, verdict=verdict, difference=slope, uncertainty=error)
+
+    @cached_property
+    def hint(self) -> Hint | None:
+        """The explanation of a wrong gradient that fits its numbers; None without one."""
+        return hint_of(self.judged, self.theta, self.explained)
 
     @np.errstate(all="ignore")
     def _is_small(self, part: Part) -> bool:
@@ -222,7 +283,7 @@ class Findings:
     @property
     def small_errors(self) -> list[Part]:
         """The parts with an error within the tolerance, the largest first."""
-        if self.settled is self.check:
+        if self.check.cause not in UNEQUAL:
             return []
         return sorted(filter(self._is_small, self.check.parts), key=lambda part: -part.error)
 
@@ -299,6 +360,8 @@ class Findings:
         """The cause of the first problem with the derivative at theta, or the verdict on a right one."""
         check, explained, repeats = self.settled, self.explained, self.repeats
         allowed, tolerance = self.setup.allow_zero, max(float(self.setup.rtol.max()), 1e-3)
+        if repeats.is_failing:
+            return "nondeterministic"
         if self.error:
             return "raised"
         if not check.parts:
@@ -307,12 +370,18 @@ class Findings:
             return "nondeterministic"
         if self.wrong_checks:
             cause = self.wrong_checks[0].cause
-            if cause in SUSPICIOUS and self._is_residue:
+            if self.is_random and cause in OF_A_DRAW and not self._is_of_draws:
+                return self._cause_of_mean()
+            if cause in SUSPICIOUS and (self._is_residue or self.has_steps):
                 return "staircase"
-            if cause in EXCUSABLE and self.is_discretisation_gap:
+            if cause == "unsettled" and explained.smooth_parts:
+                return "adaptive"
+            if cause in EXCUSABLE and not explained.refined and self.is_discretisation_gap:
                 return "adaptive"
             if cause in (*UNEQUAL, "unsettled") and grows(explained.growth, tolerance):
                 return "overwritten"
+            if cause in SUSPICIOUS and self.hint is not None and self.hint.cause == "continuous_adjoint":
+                return self.hint.cause
             # so small an error that adaptive steps may explain it, and the budget ended before that was known
             is_open = explained.is_adaptive is None and may_be_adaptive(self.check)
             return "undecided" if cause in SUSPICIOUS and is_open and not explained.gaps else cause
@@ -331,6 +400,21 @@ class Findings:
         if is_still and allowed is not None and self.zeros:
             return "no_effect"
         return "saturated" if check.cause == "zero" else check.cause
+
+    @property
+    def _is_of_draws(self) -> bool:
+        """Whether a wrong gradient is that of each draw, since it follows their slopes and its mean is off."""
+        means = self.means
+        return means is not None and means.is_of_draws and means.is_decisive and means.cause == "biased"
+
+    def _cause_of_mean(self) -> str:
+        """Return the verdict on a gradient that is not the derivative of each draw, but may be an estimator."""
+        if self.means is not None and self.means.is_decisive:
+            return self.means.cause
+        if not self.smoothed:
+            return "unmeasured"
+        causes = [one.cause or ("estimator" if one.is_usable else "spread") for one in self.smoothed]
+        return min(causes, key=(*NOISE_CAUSES, "estimator").index)
 
     @property
     def _is_residue(self) -> bool:
@@ -359,7 +443,9 @@ class Findings:
 
     @property
     def derivative(self) -> str:
-        """The answer about the derivative at theta: ``right``, ``wrong``, ``not shown`` or ``none given``."""
+        """The answer about the derivative at theta: one of ``right``, ``wrong``, ``not shown``, ``undefined``, ``none given``."""
+        if self.derivative_cause in rules.BROKEN:
+            return BROKEN
         kind = RULES[self.derivative_cause].kind
         return {"open": UNSHOWN, "right": RIGHT if self.gradient else NONE}.get(kind, WRONG)
 
@@ -369,13 +455,17 @@ class Findings:
     def noise_found(self) -> list[tuple[str, Smoothed | None]]:
         """The problems around theta or under noise, each with the sigma that shows it; the first one decides."""
         found: list[tuple[str, Smoothed | None]] = []
-        if self.has_steps and self.derivative in (RIGHT, NONE):
+        is_mean = self.derivative_cause == "estimator"  # not the derivative of the draw whose lines were scanned
+        if self.has_steps and self.derivative in (RIGHT, NONE) and not is_mean:
             found.append(("staircase", None))
-        elif self.misses_jumps:
+        elif self.misses_jumps and not is_mean:
             has_jumps = any(line.jumps for line in self.lines if line.missed > SEEN)
             found.append(("staircase" if self.tread else "jumps" if has_jumps else "spread", None))
+        if any(line.n_lost for line in self.lines):
+            found.append(("nan_gradient", None))
         for one in self.smoothed:
-            found += [(one.cause, one)] if one.cause else []
+            is_shown = one.cause == "spread" and is_mean and not self.setup.levels  # by draws at theta itself
+            found += [(one.cause, one)] if one.cause and not is_shown else []
         if self.gradient and len(self.smoothed) < len(self.setup.sigmas):
             found.append(("unmeasured", None))
         return sorted(found, key=lambda each: NOISE_CAUSES.index(each[0]))
@@ -401,7 +491,10 @@ class Findings:
     def misses_jumps(self) -> bool:
         """Whether a line shows jumps that bias the gradient, and no measured bias says more."""
         # a part of the cost that is rounded everywhere is a fault of its own, however small
-        return self.missed > (SEEN if self.tread else TARGET_ERROR) and not self.is_measured
+        if self.tread:
+            return self.missed > SEEN and not self.is_measured
+        is_measured = bool(self.smoothed) and all(math.isfinite(one.bias) and one.known for one in self.smoothed)
+        return self.missed > TARGET_ERROR and not is_measured
 
     @property
     def has_steps(self) -> bool:
@@ -411,7 +504,7 @@ class Findings:
     @property
     def moves_around(self) -> bool:
         """Whether theta moves the cost beside a flat part at theta: by jumps on a line, or under noise."""
-        return any(line.jumps for line in self.lines) or any(one.known for one in self.smoothed)
+        return any(line.jumps for line in self.lines) or any(one.n_moved for one in self.smoothed)
 
     @property
     def tread(self) -> float:
@@ -424,7 +517,7 @@ class Findings:
         """The answer about the gradient under noise: ``usable``, ``NOT usable``, ``not shown`` or ``not measured``."""
         if self.noise_cause not in ("", "unmeasured"):
             return "not shown" if RULES[self.noise_cause].kind == "open" else "NOT usable"
-        if self.noise_cause or not self.smoothed:
+        if self.noise_cause or not self.smoothed or any(one.cause for one in self.smoothed):
             return "not measured"
         return "usable" if all(math.isfinite(one.bias) and one.known for one in self.smoothed) else "not shown"
 
@@ -433,7 +526,7 @@ class Findings:
     @property
     def cause(self) -> str:
         """The cause of the first problem, that of theta before noise, or the verdict on a right gradient: a key of ``RULES``."""
-        if self.derivative in (WRONG, UNSHOWN):
+        if self.derivative in FAILED:
             return self.derivative_cause
         return self.noise_cause or self.derivative_cause
 
@@ -470,7 +563,7 @@ class Findings:
     def resolved_parts(self) -> list[Part]:
         """The components whose differences have at least one correct digit."""
         return [
-            p for p in self.check.components if math.isfinite(p.error) and p.uncertainty < DIGIT * abs(p.difference)
+            p for p in self.named.components if math.isfinite(p.error) and p.uncertainty < DIGIT * abs(p.difference)
         ]
 
     @property
@@ -482,7 +575,9 @@ class Findings:
     def recommended(self, one: Smoothed) -> Method | None:
         """Return the fastest usable method at a sigma; None if none is known."""
         best = one.best
-        if best is not None and best.name == "gradient" and self.derivative == WRONG:
+        if one.cause in ("spread", "nonfinite"):
+            return None
+        if best is not None and best.name != "smoothing" and self.derivative == WRONG:
             return next((m for m in one.methods if m.name == "smoothing" and math.isfinite(m.seconds)), None)
         return best
 
@@ -495,7 +590,7 @@ class Findings:
     def derivative_rows(self) -> list[dict[str, Any]]:
         """Return a row per checked derivative: the program's value, the difference, and the verdict."""
         names = ("program", "difference", "uncertainty", "step", "ratio", "left", "right", "order", "verdict")
-        parts = *self.check.parts, *self.check.draws
+        parts = *self.named.parts, *self.named.draws
         of_program = {} if self.gradient else dict.fromkeys(("program", "ratio", "order"), math.nan)
         return [{"name": self.label(p)} | {name: getattr(p, name) for name in names} | of_program for p in parts]
 
@@ -546,6 +641,7 @@ class Findings:
 
 
 def _frame(rows: list[dict[str, Any]], columns: list[str] | None = None) -> pd.DataFrame:
-    import pandas as pd
+    with needing_sweeps("a table"):
+        import pandas as pd
 
     return pd.DataFrame(rows, columns=columns)

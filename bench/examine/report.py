@@ -7,12 +7,16 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
-from bench.errors import UserError, local_path, unknown
-from bench.examine import baseline, text
+from bench.errors import UserError, local_path, needing_sweeps, unknown
+from bench.examine import UPDATE, baseline, text
 from bench.examine.findings import Findings
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+
+AFTER_SIGTERM = "everything after SIGTERM"
+"""What is left out when the process is asked to end."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -41,10 +45,11 @@ class Report(Findings):
 
         Raises :class:`bench.UserError` for a chart without data.
         """
-        from bench.examine import files
-        from bench.report.displays import displayable
-        from bench.report.draw import draw
-        from bench.report.figures import styled
+        with needing_sweeps("plot"):
+            from bench.examine import files
+            from bench.report.displays import displayable
+            from bench.report.draw import draw
+            from bench.report.figures import styled
 
         figures = {one.name: one for one in files.charts(self)}
         if not figures:
@@ -59,22 +64,25 @@ class Report(Findings):
         if self.status:
             raise AssertionError(f"{'; '.join(self.problems)}\n\n{self}")
 
-    def compared(self, file: str | Path) -> Self:
-        """Return the report compared with a baseline file, which is written if it does not exist.
+    def compared(self, file: str | Path, update: bool = False) -> Self:
+        """Return the report compared with a baseline file: with status 0 where it is not worse than the baseline.
 
-        The compared report has status 0 where it is not worse than the baseline.
+        A missing baseline is written if the status is 0. With ``update`` the baseline is written, and nothing is compared.
         """
         path = local_path("baseline", file)
-        before = baseline.read_baseline(path)
+        before = None if update else baseline.read_baseline(path)
         if before is None:
-            baseline.write_baseline(path, self)
-            return replace(self, changes=[f"none before, written to {path}"])
+            if is_written := update or self.status == 0:
+                baseline.write_baseline(path, self)
+            done = "written" if is_written else f"not written since the status is {self.status}; {UPDATE} writes it"
+            return replace(self, changes=[f"{path}: {'' if update else 'no such file, '}{done}"], is_as_before=update)
         changes, is_worse = baseline.differences(before, self)
         return replace(self, changes=changes or ["no change"], is_as_before=not is_worse)
 
     def save(self, directory: str | Path) -> list[Path]:
         """Write text, tables and charts into a directory, and return the paths of the files."""
         # importing charts and tables takes a second, which a report without files does not need
-        from bench.examine import files
+        with needing_sweeps("save"):
+            from bench.examine import files
 
         return files.write(self, local_path("save", directory))

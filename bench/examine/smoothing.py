@@ -10,15 +10,20 @@ removes most of the variance. Each half of the pairs uses the line fitted to the
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from statistics import NormalDist
 
 import numpy as np
 
-from bench.simulator.clock import Clock, OutOfTime
+from bench.examine.lines import REACH, LineScan
+from bench.simulator.clock import OutOfTime
 from bench.simulator.simulator import Simulator
 
 PAIRS = 4096
 """Most pairs of costs for one sigma."""
+OWN_PAIRS = 65536
+"""Most pairs where only the cost has noise, whose gradient may be an estimator."""
 FEWEST = 64
 """Fewest pairs for a result."""
 FIRM = 1024
@@ -31,6 +36,10 @@ CLEAR = 4.0
 """Multiple of its standard error above which grad J is distinguishable from 0."""
 SMALL_BIAS = 0.01
 """Width of the bias interval, relative to |grad J|, below which remarks on it are omitted."""
+RARE = 30.0
+"""Expected number of draws beyond a jump below which they do not measure it."""
+UNMET = 3.0
+"""Expected number of draws that an event meets in none of them in 5% of cases."""
 TARGET_ERROR = 0.1
 """Relative error at which the costs of the methods are compared."""
 
@@ -40,11 +49,12 @@ class Method:
     """A method of estimating grad J, and its cost for a relative error of 10%."""
 
     name: str
-    """``gradient``: mean of the program's gradients; ``smoothing``: pairs of costs along random directions."""
+    """``plain``: the program's gradient without noise; ``gradient``: mean of its gradients under noise; ``mirrored``: the same at
+    +u and -u; ``smoothing``: pairs of costs along random directions."""
     bias: float
     """Upper end of the 95% interval of the method's bias, relative to |grad J|."""
     samples: float
-    """Samples for a relative root-mean-square error of 10%; infinity where the bias is 10% or more."""
+    """Samples for a relative root-mean-square error of 10%; infinite where the bias is 10% or more, NaN where it may be."""
     calls: float
     """Calls of cost or gradient for these samples."""
     seconds: float
@@ -58,7 +68,7 @@ class Smoothed:
     gradient: np.ndarray
     """grad J ``(d,)``, computed from costs."""
     error: float
-    """Standard error of grad J, as a norm."""
+    """Standard error of grad J, as a norm. Norms weigh each input by its sigma, relative to the largest."""
     norm: float
     """|grad J|, with the contribution of noise subtracted."""
     pairs: int
@@ -72,6 +82,12 @@ class Smoothed:
     remark: str
     """Why the intervals may be too narrow; empty if there is no such reason."""
     methods: tuple[Method, ...]
+    n_moved: int = 0
+    """Number of pairs whose costs differ."""
+    n_lost: int = 0
+    """Number of pairs with a gradient that is not a number, where the costs are numbers."""
+    unseen: float = 0.0
+    """Part of grad J that an event which no draw meets may have: no bound on the bias is below it."""
 
     @property
     def bias_percent(self) -> tuple[float, float]:
@@ -90,24 +106,33 @@ class Smoothed:
         return not self.bias_low <= edge <= self.bias_high
 
     @property
-    def cause(self) -> str:
-        """The problem with the mean of the program's gradients: ``nonfinite``, ``biased``, ``spread``, or empty.
+    def is_usable(self) -> bool:
+        """Whether the bias is known to be below 10% of |grad J|."""
+        return self.known and self.decided and not self.cause and math.isfinite(self.bias)
 
-        It is ``biased`` where the bias interval is entirely above 10% of |grad J|, and ``spread`` where the interval contains
-        10%, or where grad J is not distinguishable from 0 though its error is not 0.
+    @property
+    def cause(self) -> str:
+        """The problem with the mean of the program's gradients: ``nonfinite``, ``nan_gradient``, ``biased``, ``spread``, or empty.
+
+        It is ``biased`` where the bias interval is entirely above 10% of |grad J|, or of its upper limit where grad J is not
+        distinguishable from 0. It is ``spread`` where the interval contains 10%, or where grad J is not distinguishable
+        from 0 though its error is not 0.
         """
         edge = TARGET_ERROR * self.norm
         if not math.isfinite(self.norm):
             return "nonfinite"
-        if self.known and self.bias_low > edge:
+        if self.n_lost:
+            return "nan_gradient"
+        if self.bias_low > (edge if self.known else TARGET_ERROR * (self.norm + 2.0 * self.error)):
             return "biased"
         return "spread" if (self.bias_high > edge if self.known else self.error > 0.0) else ""
 
     @property
     def best(self) -> Method | None:
-        """The fastest method to reach an error of 10%; None if no method reaches it."""
-        usable = [m for m in self.methods if math.isfinite(m.seconds)]
-        return min(usable, key=lambda m: m.seconds) if usable and self.known else None
+        """The fastest method to reach an error of 10%; None if no method reaches it, or the samples of gradients are not known."""
+        usable = [m for m in self.methods if m.seconds < math.inf]
+        is_open = any(math.isnan(m.seconds) for m in self.methods if m.name != "plain")
+        return min(usable, key=lambda m: m.seconds) if usable and self.known and not is_open else None
 
 
 def measure_smoothed(
@@ -117,11 +142,13 @@ def measure_smoothed(
     plain: np.ndarray | None,
     seed: int = 0,
     pairs: int = PAIRS,
+    unseen: Callable[[int], tuple[float, float]] | None = None,
 ) -> Smoothed | None:
     """Return the gradient's bias and the methods' costs under noise ``spread * u`` on theta, called ``sigma``.
 
     None where the time is too short for :data:`FEWEST` pairs. ``plain (d,)`` is the gradient at theta without noise, if
-    it is known to be right. At most ``pairs`` pairs are drawn.
+    it is known to be right. At most ``pairs`` pairs are drawn. ``unseen`` is the part of ``sigma * grad J`` that a number of
+    draws may miss.
     """
     random = np.random.default_rng([seed, 0x736D6F6F])
     drawn: list[np.ndarray] = []
@@ -129,7 +156,7 @@ def measure_smoothed(
     try:
         while size <= pairs:
             drawn.append(_draw(simulator, spread, random, size if result is None else size // 2))
-            result = _summary(sigma, spread, np.concatenate(drawn, axis=1), plain, simulator)
+            result = _summary(sigma, spread, np.concatenate(drawn, axis=1), plain, simulator, unseen)
             if size >= FIRM and result.error <= ENOUGH * result.norm and result.decided:
                 break
             size *= 2
@@ -156,6 +183,7 @@ def _summary(
     drawn: np.ndarray,
     plain: np.ndarray | None,
     simulator: Simulator,
+    unseen: Callable[[int], tuple[float, float]] | None = None,
 ) -> Smoothed:
     # SciPy's distributions are slow to import, and only this function needs them
     from bench.measure.statistics import Truth, summarise
@@ -171,26 +199,44 @@ def _summary(
         share = f"{int((~np.isfinite(d)).sum())} of {pairs} pairs have a cost that is not a number"
         nothing = np.full(dim, np.nan)
         return Smoothed(sigma, nothing, math.inf, math.nan, pairs, math.nan, math.nan, math.nan, math.nan, share, ())
-    groups = _means(_terms(u, d) / spread[:, None])
+    # in units of the largest sigma: an input's share of the bias is by how much it moves the cost under its own noise
+    weight = (spread / spread.max())[:, None]
+    up, down = weight * up, weight * down
+    terms = weight * d * u / spread[:, None]
+    groups = _means(weight * _terms(u, d) / spread[:, None])
     truth = groups.mean(axis=0)
     error = float(np.sqrt(groups.var(axis=0, ddof=1).sum() / GROUPS))
     norm = math.sqrt(max(float(truth @ truth) - error**2, 0.0))
     bias = low = high = moved = math.nan
+    jumps = event = 0.0
     remark = ""
     slopes = (up + down) / 2.0
+    n_lost = int((~np.isfinite(slopes).all(axis=0)).sum()) if simulator.has_gradient else 0
     if np.isfinite(slopes).all():
         judged = summarise(_means(slopes) - groups, Truth.exact(np.zeros(dim)), pairs // GROUPS)
-        bias, low, high = judged.bias, judged.bias_low, judged.bias_high
+        jumps, event = np.array(unseen(2 * pairs) if unseen else (0.0, 0.0)) / spread.max()
+        bias, low, high = judged.bias, judged.bias_low, max(judged.bias_high, float(jumps))
         # heavy tails make an interval unreliable, which does not matter for a narrow one
         remark = judged.note if high - low > SMALL_BIAS * norm else ""
-    elif simulator.has_gradient:
-        remark = (
-            f"{int((~np.isfinite(slopes).all(axis=0)).sum())} of {pairs} pairs have a gradient that is not a number"
-        )
+    elif n_lost:
+        remark = f"{n_lost} of {pairs} pairs have a gradient that is not a number"
     if plain is not None:
-        moved = float(np.linalg.norm(truth - plain))
-    methods = _methods(norm, high, d * u / spread[:, None], up, simulator.clock) if norm > CLEAR * error else ()
-    return Smoothed(sigma, truth, error, norm, pairs, bias, low, high, moved, remark, methods)
+        moved = float(np.linalg.norm(truth - weight[:, 0] * plain))
+    methods: list[Method] = []
+    if norm > CLEAR * error:
+        each, slope = simulator.clock.per_cost(), simulator.clock.per_gradient()
+        methods.append(_method("smoothing", (0.0, 0.0), terms, norm, 2, each))
+        if plain is not None:
+            ends = max(moved - 2.0 * error, 0.0), max(moved + 2.0 * error, float(jumps))
+            methods.append(_method("plain", ends, np.zeros((dim, 2)), norm, 1, slope))
+        if np.isfinite(slopes).all():
+            methods.append(_method("gradient", (low, high), up, norm, 1, slope))
+            methods.append(_method("mirrored", (low, high), slopes, norm, 2, slope))
+        methods.sort(key=lambda m: (math.isnan(m.seconds), m.seconds))
+    return Smoothed(
+        sigma, truth / weight[:, 0], error, norm, pairs, bias, low, high, moved, remark, tuple(methods),
+        int((d != 0.0).sum()), n_lost, float(event),
+    )  # fmt: skip
 
 
 def _terms(u: np.ndarray, d: np.ndarray) -> np.ndarray:
@@ -211,19 +257,30 @@ def _means(terms: np.ndarray) -> np.ndarray:
     return terms.reshape(terms.shape[0], GROUPS, -1).mean(axis=2).T
 
 
-def _methods(norm: float, bias: float, terms: np.ndarray, slopes: np.ndarray, clock: Clock) -> tuple[Method, ...]:
-    """Return the methods, fastest first, with their costs for a relative error of 10%, from single samples ``(d, n)``."""
-    methods = [_method("smoothing", 0.0, terms, norm, 2, clock.per_cost())]
-    if np.isfinite(slopes).all():
-        methods.append(_method("gradient", bias / norm, slopes, norm, 1, clock.per_gradient()))
-    return tuple(sorted(methods, key=lambda m: m.seconds))
-
-
-def _method(name: str, bias: float, terms: np.ndarray, norm: float, calls: int, seconds: float) -> Method:
+def _method(name: str, bias: tuple[float, float], terms: np.ndarray, norm: float, calls: int, seconds: float) -> Method:
     variance = float(terms.var(axis=1, ddof=1).sum())
-    room = TARGET_ERROR**2 - bias**2
-    samples = max(1.0, math.ceil(variance / norm**2 / room)) if room > 0 else math.inf
-    return Method(name, bias, samples, calls * samples, calls * samples * seconds)
+    low, high = (end / norm for end in bias)
+    room = TARGET_ERROR**2 - high**2
+    samples = math.inf if low >= TARGET_ERROR else math.nan
+    if room > 0:
+        samples = max(1.0, math.ceil(variance / norm**2 / room))
+    return Method(name, high, samples, calls * samples, calls * samples * seconds)
+
+
+def largest_unseen(lines: Sequence[LineScan], ratio: float, draws: int) -> tuple[float, float]:
+    """Return the largest parts of ``sigma * grad J`` that ``draws`` draws of the noise may miss, from costs on lines.
+
+    ``ratio`` is sigma over that of the lines. Across a plane at t standard deviations, a change of the cost by H is a part
+    ``H phi(t)``. The first part is that of the jumps on a line that fewer than :data:`RARE` draws meet. The second is that of an
+    event that no line and no draw meets, as likely as 5% of cases allow and as high as the range of the cost on the lines.
+    """
+    normal, jumps, events = NormalDist(), [0.0], [0.0]
+    for line in lines:
+        inside = line.costs[(np.abs(line.at / ratio) <= REACH) & np.isfinite(line.costs)]
+        events.append(float(np.ptp(inside)) * normal.pdf(normal.inv_cdf(UNMET / draws)) if inside.size else 0.0)
+        at = [(abs(jump.at / ratio), jump.size) for jump in line.jumps]
+        jumps.append(sum(size * normal.pdf(t) for t, size in at if draws * normal.cdf(-t) < RARE))
+    return max(jumps), max(events)
 
 
 def directions(count: int, scale: np.ndarray, seed: int) -> np.ndarray:

@@ -9,20 +9,19 @@ from typing import Any
 
 import numpy as np
 
-from bench.examine.findings import RIGHT, SEEN, UNSHOWN, WRONG, Findings
+from bench.examine.findings import FAILED, RIGHT, SEEN, WRONG, Findings
+from bench.examine.lines import REACH
 from bench.examine.smoothing import PAIRS
-from bench.gradient import FAULTS, Check, Part
+from bench.examine.stages import is_rough
+from bench.examine.subspace import GROUPS, MOST
+from bench.gradient import FAULTS, Check, Part, step_sizes
 from bench.gradient.rules import RULES, SUSPICIOUS, UNEQUAL
-from bench.gradient.stages import is_rough, step_sizes
-from bench.gradient.subspace import GROUPS, MOST
 from bench.report.text import counted, duration, number, span
 
 SAME_FACTOR = 0.05
 """Largest relative range of ratios that are stated as one factor."""
 OVERFLOWS = 1e100
 """Size of a derivative from which on one that is not a number is an overflow."""
-ALONG_THETA = 0.9999
-"""Least cosine between theta and an error along theta."""
 CHAOS = "as in chaos: the last digits of theta change the cost as much as a wide step"
 HEADLINE = 200
 """Most characters of an exception in a headline."""
@@ -35,7 +34,7 @@ MANY = 6
 
 def problems(report: Findings) -> list[str]:
     """Return the problems, each a cause with its meaning and facts, worst first; empty if there are none."""
-    if report.derivative not in (WRONG, UNSHOWN):
+    if report.derivative not in FAILED:
         return noise_problems(report)
     cause = report.derivative_cause
     found = [_sentence(cause, derivative_facts(report))]
@@ -51,9 +50,15 @@ def noise_problems(report: Findings) -> list[str]:
     found = []
     for cause, one in report.noise_found:
         fact = missed_text(report) if report.missed and cause in ("staircase", "jumps") else ""
+        if cause == "nan_gradient":
+            fact = f"at {counted(sum(line.n_lost for line in report.lines), 'point')} of lines through theta"
         if one is not None:
             bias = f"a bias of {span(*one.bias_percent)}%" if one.known else one.remark or "not distinguishable from 0"
-            fact = f"grad J at sigma {sigma_text(report, one.sigma)} after {one.pairs} pairs: {bias}"
+            fact = (
+                one.remark
+                if one.n_lost
+                else f"grad J at sigma {sigma_text(report, one.sigma)} after {one.pairs} pairs: {bias}"
+            )
         found.append(_sentence(cause, [fact, _why_biased(report) if cause == "biased" else ""]))
     return found
 
@@ -61,7 +66,7 @@ def noise_problems(report: Findings) -> list[str]:
 def _why_biased(report: Findings) -> str:
     if report.derivative_cause in (*UNEQUAL, "overwritten", "stale_gradient"):
         return "the gradient is wrong at theta already"
-    return "" if report.derivative == UNSHOWN else "as at a jump, which no gradient sees"
+    return "" if report.derivative in FAILED else "as at a jump, which no gradient sees"
 
 
 def sigma_text(report: Findings, level: float) -> str:
@@ -76,21 +81,23 @@ def _sentence(cause: str, facts: Sequence[str]) -> str:
 
 def conclusion(report: Findings) -> str:
     """Return the answer about the derivative in one line."""
-    if report.derivative in (WRONG, UNSHOWN):
+    if report.derivative in FAILED:
         return f"Derivative: {report.derivative.upper()}. {problems(report)[0]}"
     facts = [agreement(report) if report.derivative == RIGHT else "by differences the cost has one here"]
+    if report.derivative_cause == "estimator":
+        facts = mean_facts(report)
     facts += ["at few steps"] if report.is_quick else []
     facts += [] if report.check.draws else ["at this theta only"]
     small = [part for part in report.small_errors if part.component is not None] or report.small_errors
-    off = max(map(_distance, small), default=0.0)
+    off = max((part.distance for part in small), default=0.0)
     within = " within the tolerance" * bool(small) + f", off by up to {number(100 * off)}%" * (0.0 < off < math.inf)
     return f"Derivative: {report.derivative}{within}. {_sentence(report.derivative_cause, facts)}"
 
 
 def noise_answer(report: Findings) -> str:
-    """Return the answer about the gradient under noise in one line; empty without a gradient."""
+    """Return the answer about the gradient under noise in one line; without a gradient what smoothing gives, if measured."""
     if not report.gradient:
-        return ""
+        return _noise_of_costs(report)
     levels = report.setup.sigmas
     if levels and report.noise_cause not in ("", "unmeasured"):
         # a problem is said of the sigmas that show it; lines show that of the largest
@@ -100,12 +107,16 @@ def noise_answer(report: Findings) -> str:
     sigmas = ", ".join(sigma_text(report, one) for one in levels)
     where = f"Under noise of sigma {sigmas}" if sigmas else "Around theta" if report.noise_cause else "Under noise"
     if report.noise_cause not in ("", "unmeasured"):
-        reason = noise_problems(report)[0]
+        usable = [sigma_text(report, one.sigma) for one in report.smoothed if one.is_usable]
+        usable = [] if report.noise_cause == "nan_gradient" else usable
+        reason = noise_problems(report)[0] + f"; usable at sigma {', '.join(usable)}" * bool(usable)
     elif report.use == "usable":
-        largest = max((one.bias_percent[1] for one in report.smoothed if one.known), default=0.0)
+        largest = max(
+            (max(one.bias_percent[1], 100 * one.unseen / one.norm) for one in report.smoothed if one.known), default=0.0
+        )
         reason = f"The bias of the mean gradient is below {number(max(largest, 1e-3))}%"
         reason += "" if report.derivative == RIGHT else f", though the derivative at theta is {report.derivative}"
-    elif report.smoothed and not report.noise_cause:
+    elif report.smoothed and not report.noise_cause and report.use != "not measured":
         is_known = all(one.known for one in report.smoothed)
         reason = "a gradient there is not a number" if is_known else "no draw moves the cost"
     elif not sigmas:
@@ -113,6 +124,24 @@ def noise_answer(report: Findings) -> str:
     else:
         reason = "the gradient raised an exception" if report.error else "the budget ended"
     return f"{where}: {report.use}. {reason}"
+
+
+def _noise_of_costs(report: Findings) -> str:
+    """Return what noise does to a cost without a gradient: grad J by smoothing at each sigma, and the jumps within it."""
+    if not report.setup.levels or not report.smoothed:
+        return ""
+    facts = []
+    for one in report.smoothed:
+        size = (
+            f"|grad J| = {number(one.norm, 3)} +- {number(one.error, 1)}" if one.known else "not distinguishable from 0"
+        )
+        samples = [number(m.samples, 2) for m in one.methods if m.name == "smoothing" and math.isfinite(m.samples)]
+        facts.append(
+            f"sigma {sigma_text(report, one.sigma)}: {size}" + "".join(f", {n} samples for 10%" for n in samples)
+        )
+    jumps = [jump.size for line in report.lines for jump in line.jumps]
+    facts += [f"{counted(len(jumps), 'jump')} of up to {number(max(jumps))} within {REACH:g} sigma"] if jumps else []
+    return f"Under noise, by smoothing: {'; '.join(facts)}"
 
 
 def agreement(report: Findings) -> str:
@@ -140,6 +169,7 @@ def derivative_facts(report: Findings) -> list[str]:
         "raised": [shortened(report.error)],
         "nondeterministic": [
             "the cost depends on the call before it" if repeats.has_state else "",
+            "equal calls raise an exception or return a number" if repeats.is_failing else "",
             f"costs differ by {relative(report, repeats.spread)}" if repeats.spread else "",
             f"gradients differ by {number(100 * repeats.of_gradient)}%" if repeats.of_gradient else "",
         ],
@@ -147,7 +177,12 @@ def derivative_facts(report: Findings) -> list[str]:
         "constant": [],
         "unresolved": [size_of(report, part) for part in report.unresolved[:1]],
         "rough": [_noise_text(report)],
+        "biased": mean_facts(report),
+        "spread": mean_facts(report),
+        "unmeasured": [],
     }
+    if cause == "nan_gradient" and report.means is not None and report.means.n_lost:
+        return mean_facts(report)
     if cause == "nonfinite" and (place := _where_cost_fails(report)):
         return [place]
     if cause in own:
@@ -168,6 +203,23 @@ def derivative_facts(report: Findings) -> list[str]:
     return facts
 
 
+def mean_facts(report: Findings) -> list[str]:
+    """Return by how much the mean of a gradient over draws is off."""
+    means = report.means
+    if means is None:
+        return []
+    if means.n_lost:
+        return [f"at {means.n_lost} of {means.draws} draws"]
+    if means.is_decisive:
+        off = span(100 * max(means.error - means.doubt, 0.0), 100 * (means.error + means.doubt))
+        return [f"its mean over {means.draws} draws is off by {off}%"]
+    return [
+        f"its mean is off by {span(*one.bias_percent)}%, at sigma {sigma_text(report, one.sigma)} after {one.pairs} pairs"
+        for one in report.smoothed
+        if one.known
+    ]
+
+
 def _where_cost_fails(report: Findings) -> str:
     if not math.isfinite(report.cost):
         return f"the cost at theta itself is {as_text(report.cost)}"
@@ -183,9 +235,17 @@ def check_facts(report: Findings, check: Check) -> list[str]:
     parts = named_parts(report, check)
     if not parts:
         return [_where_not_a_number(report, check)] if check.cause == "nan_gradient" else []
-    worst = max(parts, key=_distance)
+    worst = check.worst_of(parts)
     if check.cause == "kink":
-        return [f"{report.label(worst)}: slopes {number(worst.left, 4)} and {number(worst.right, 4)}"]
+        given = f", the gradient is {number(worst.program, 4)}" if report.gradient else ""
+        return [f"{report.label(worst)}: slopes {number(worst.left, 4)} and {number(worst.right, 4)}{given}"]
+    if check.cause in ("coarse", "unsettled") and report.explained.smooth_parts:
+        known = worst.uncertainty / max(abs(worst.difference), abs(worst.program))
+        return [
+            size_of(report, worst),
+            f"and {len(parts) - 1} more" * (len(parts) > 1),
+            f"known to {number(100 * known, 2)}%",
+        ]
     if check.cause not in FAULTS or not report.gradient:
         return [report.label(worst), CHAOS * (check.cause == "unsettled" and is_rough(worst.sample))]
     facts = [size_of(report, worst), f"and {len(parts) - 1} more" if len(parts) > 1 else ""]
@@ -194,9 +254,7 @@ def check_facts(report: Findings, check: Check) -> list[str]:
     wrong = [part for part in check.components if part.verdict == check.cause]
     if check.cause in SUSPICIOUS and wrong and not any(part.sample.differences.any() for part in wrong):
         return [*facts, "the cost does not move at all"]
-    if _is_along_theta(report, check):
-        return [*facts, "the error is along theta itself, as of a normalisation that is left out"]
-    return [*facts, _factor(check)]
+    return [*facts, report.hint.text if report.hint and check.cause in SUSPICIOUS else _factor(check)]
 
 
 def _factor(check: Check) -> str:
@@ -231,17 +289,6 @@ def _where_not_a_number(report: Findings, check: Check) -> str:
     return f"{at_theta}at {n_bad} of {counted(len(check.draws), 'direction')} at other thetas" if check.draws else ""
 
 
-def _is_along_theta(report: Findings, check: Check) -> bool:
-    """Return whether the gradient's error is a multiple of theta, in at least two components."""
-    parts = list(check.components)
-    if check.cause not in SUSPICIOUS or len(parts) < max(report.theta.size, 2):
-        return False
-    error = np.array([part.program - part.difference for part in parts])
-    at = np.array([report.theta[part.component or 0] for part in parts])
-    size = float(np.linalg.norm(error) * np.linalg.norm(at))
-    return bool(np.count_nonzero(at) > 1 and size > 0 and abs(float(error @ at)) > ALONG_THETA * size)
-
-
 def named_parts(report: Findings, check: Check) -> list[Part]:
     """Return the worst parts that name an input: located groups, then components, then directions."""
     located = [part for part in check.parts if part.name in report.located]
@@ -256,14 +303,7 @@ def size_of(report: Findings, part: Part) -> str:
     if part.name in report.located:
         name = f"{report.located[part.name]}, along a random direction"
     text = f"{name}: program {as_text(part.program)}, differences {as_text(part.difference)} +- {number(part.uncertainty, 1)}"
-    return f"{text}, off by {number(100 * _distance(part))}%" if math.isfinite(_distance(part)) else text
-
-
-@np.errstate(all="ignore")
-def _distance(part: Part) -> float:
-    """Return how far a part's derivative is from its difference, relative to the difference."""
-    apart = float(np.float64(abs(part.program - part.difference)) / np.float64(abs(part.difference)))
-    return math.inf if math.isnan(apart) else apart
+    return f"{text}, off by {number(100 * part.distance)}%" if math.isfinite(part.distance) else text
 
 
 def missed_text(report: Findings) -> str:
@@ -364,7 +404,7 @@ def shortened(text: str) -> str:
 
 def write(report: Findings) -> str:
     """Return the whole report: the answers, what was checked, what to do next, and the tables."""
-    rest = problems(report)[1:] if report.derivative in (WRONG, UNSHOWN) else []
+    rest = problems(report)[1:] if report.derivative in FAILED else []
     noise = noise_problems(report)[1 if report.gradient else 0 :]
     error = report.error or report.elsewhere
     answers = [
@@ -384,7 +424,7 @@ def write(report: Findings) -> str:
         list(filter(None, answers)), scope, _head(report),
         table("The derivative, by the program and by differences:", derivatives, ("left", "right", "order")),
         table("The gradient after fewer or more steps, error and uncertainty over the largest difference:", steps),
-        table(f"Lines through theta, +-3 sigma (sigma = {sigma_text(report, report.setup.reach)} {unit}):", report.line_rows()),
+        table(f"Lines through theta, +-{REACH:g} sigma (sigma = {sigma_text(report, report.setup.reach)} {unit}):", report.line_rows()),
         table("Jumps and kinks on these lines, at t in sigma:", report.break_rows()),
         table(f"With noise of sigma {unit}, J = E cost; samples, calls and seconds are for an error of 10%:", report.sigma_rows(),
               ("remark",)),

@@ -35,7 +35,7 @@ from bench.model import (
 )
 from bench.model.identity import described, identity, label
 from bench.model.parameters import parameters, singular, values
-from bench.model.program import OWN
+from bench.model.program import OWN, idle
 
 DESCENDED = ("contact", "integrator", "backend")
 """The parts of the program that is descended, besides the scene of the cell, in the order of the setting ``path``."""
@@ -99,6 +99,8 @@ class Cell:
     """The start of the descent that theta is on, with the program that is descended; None where nothing is descended."""
     point: Point | None = None
     """Theta on that descent; None before it is computed."""
+    swept: tuple[str, ...] = ()
+    """Parameters of its scene that are axes of the sweep."""
 
     @property
     def scene(self) -> Scene:
@@ -194,7 +196,7 @@ class Cell:
                 radius = [] if smoothing is None else [[smoothing.shape, smoothing.radius]]
                 if smoothing is None:
                     methods = reference.revisions(self.program(), self.reference_backends[0].provides)
-            budget = [self.budget.samples, self.budget.tolerance]
+            budget = list((self._budget() or {}).values())
             _reference_keys[given] = hashed(self.program_key, budget, backend, *radius, raised(methods))
         return _reference_keys[given]
 
@@ -245,7 +247,12 @@ class Cell:
         return theta | {"path": self._path_key}
 
     def _budget(self) -> dict[str, Any] | None:
-        return None if self.budget is None else dict(vars(self.budget))
+        """Return the reference's budget; the limit of quadrature only where it is set, so that keys are as before it existed."""
+        if self.budget is None:
+            return None
+        budget = {name: value for name, value in vars(self.budget).items() if name != "points"}
+        points = self.budget.points
+        return budget if points == type(self.budget)().points else budget | {"points": points}
 
     def columns(self) -> dict[str, Any]:
         """Return the identity columns of the cell's row: views of its parameters and counts."""
@@ -302,6 +309,13 @@ class Cell:
         estimator = self.parts.get("estimator")
         return estimator.design(program, self.samples) if isinstance(estimator, Estimator) else IID
 
+    @property
+    def remarks(self) -> list[str]:
+        """Remarks on parameters of the scene that are set and have no effect."""
+        known = parameters(type(self.scene))
+        names = (n for n in self.scene.without_effect(self.contact) if getattr(self.scene, n) != known[n].default)
+        return [idle(name, self.scene, self.contact) for name in names]
+
     def refusal(self) -> tuple[str, str] | None:
         """Return status and reason if this cell cannot run, or None; an error raised by a plugin is a reason."""
         try:
@@ -326,6 +340,9 @@ class Cell:
             start = None if self.path is None else self.path.program()
         except (Unsupported, UserError) as error:  # another scene of the sweep may have this theta
             return "unsupported", printable(error)
+        for name in self.scene.without_effect(self.contact):
+            if name in self.swept:
+                return "unsupported", f"{idle(name, self.scene, self.contact)}, so its values are no axis"
         if self.path is not None:
             if not cast(Any, self.study).descends:
                 return "unsupported", f"study {self.study.name} starts where its own settings say: descent=0"

@@ -201,6 +201,9 @@ HIDDEN = (
         table=False,
     ),
     text("machine", "processor, cores and system of the machine that measured the row", table=False),
+    text(
+        "reads", "JSON with the hash of every file, library and variable that code from outside has read", table=False
+    ),
 )
 COMMON = {column.name: column for column in (*FIRST, DIM, *STATUS, *LAST, *HIDDEN)}
 

@@ -61,6 +61,7 @@ class Budget(Plugin):
     name: ClassVar[str] = "reference"
 
     samples: int = param(1 << 18, "largest number of samples", low=256)
+    points: int = param(1 << 20, "largest number of points of quadrature, and at most 64 times `samples`", low=256)
     tolerance: float = param(0.005, "standard error, relative to the gradient, at which sampling stops", positive=True)
 
 
@@ -95,6 +96,8 @@ class Experiment:
     """What a person concludes, with references to tables (:mod:`bench.report.answer`); empty if its settings were changed."""
     marks: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     """Named values by axis, drawn as lines in the charts."""
+    compares: Mapping[str, Sequence[Any]] = field(default_factory=dict)
+    """What charts show side by side: names of backends or estimators, or values of an axis, of which two are joined by arrows."""
     formats: tuple[str, ...] = ("png",)
     """File formats of the charts."""
     reference: Budget = Budget()
@@ -105,11 +108,6 @@ class Experiment:
     timing: bool = False
     """Whether cells are timed, and therefore run one at a time on a machine."""
     execution: Execution = Execution()
-
-    @property
-    def budget(self) -> Budget | None:
-        """Budget of a cell's reference gradient; None if the study needs none."""
-        return self.reference if self.columns.referenced else None
 
     @property
     def directory(self) -> Path:
@@ -129,7 +127,10 @@ class Experiment:
             "theta": list(self.decision.names),
             "theta0": None if self.decision.at is None else list(self.decision.at),
             "path": [str(choice) for choice in self.path.values()],
-            **{name: getattr(self, name) for name in ("descent", "samples", "repeats", "seed", "timing", "marks")},
+            **{
+                name: getattr(self, name)
+                for name in ("descent", "samples", "repeats", "seed", "timing", "marks", "compares")
+            },
             "formats": list(self.formats),
             "reference": dataclasses.asdict(self.reference),
             "results_dir": str(self.results_dir),

@@ -239,10 +239,13 @@ class _Expansion:
         decision = start = self._decision(point, parts)
         if share := share_of(point.get(DESCENT, experiment.descent)):
             decision = dataclasses.replace(start, descent=share)
+        study = study_of(experiment)
+        parts = study.parts(parts)
         return Cell(
-            study_of(experiment).parts(parts), **self._counts(point), study=experiment.study,
-            decision=decision, timing=experiment.timing, budget=experiment.budget,
+            parts, **self._counts(point), study=experiment.study, decision=decision, timing=experiment.timing,
+            budget=experiment.reference if study.compares(parts) else None,
             path=self._path(parts["scene"], start) if share else None,
+            swept=tuple(parameter_name(axis) for axis in used if parts["scene"] and used[axis] == parts["scene"].name),
         )  # fmt: skip
 
     def _path(self, scene: Plugin | None, start: Decision) -> Cell:

@@ -17,9 +17,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from bench.engines.backend import EngineBackend
 from bench.measure import noise, statistics
-from bench.model import PolicyScene, Scene, program
+from bench.model import PolicyScene, Scene, program, reads
 from bench.model.parameters import Plugin, parameters, remember, values
 
 SHARED = (noise, program)
@@ -29,6 +28,8 @@ COMPARED = (statistics,)
 PACKAGE = "bench"
 """The package whose classes count by their revisions."""
 
+HASHED: dict[str, str] = {}
+"""The hashes of files in keys, by path."""
 _fingerprints: dict[int, tuple[Plugin, str]] = {}
 """Plugins and their hashes by ``id``, since equal plugins may produce different numbers: -0.0 == 0.0, False == 0."""
 
@@ -41,15 +42,18 @@ def fingerprint(plugin: Plugin | None) -> str:
         code = [code_of(type(plugin))]
         if isinstance(plugin, PolicyScene):
             code.append(code_of(type(plugin.plugin)))
-        is_outside = not _is_own(type(plugin).__module__)
-        if (isinstance(plugin, Scene) or (isinstance(plugin, EngineBackend) and is_outside)) and hasattr(
-            plugin, "files"
-        ):
-            code.append(files_hash(plugin.files()))
+        if names_files(plugin):
+            reads.start()
+            code.append(files_hash(map(Path, getattr(plugin, "files")())))  # noqa: B009, not part of the contract
         text = json.dumps([plugin.kind, plugin.name, _counted(plugin), code], default=repr)
         # the plugin is stored too, so that no other object gets its id
         _fingerprints[id(plugin)] = (plugin, hashlib.sha256(text.encode()).hexdigest())
     return _fingerprints[id(plugin)][1]
+
+
+def names_files(plugin: Plugin) -> bool:
+    """Return whether a plugin names files from outside that it reads."""
+    return hasattr(plugin, "files") and (isinstance(plugin, Scene) or not _is_own(type(plugin).__module__))
 
 
 def _counted(plugin: Plugin) -> dict[str, Any]:
@@ -110,6 +114,7 @@ def files_hash(files: Iterable[Path]) -> str:
             content = path.read_bytes()
             hashes[path] = hashlib.sha256(content).hexdigest()
             waiting += _imported(path, content) if path.suffix == ".py" else ()
+    HASHED.update((str(path), content) for path, content in hashes.items())
     return hashed(*sorted(hashes.values())) if hashes else ""
 
 

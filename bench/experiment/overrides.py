@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +14,10 @@ from bench.experiment.grid import MAX_CELLS
 GLOBAL = "# @package _global_"
 """The first line of an experiment file, so that Hydra does not nest its settings."""
 RANGE = re.compile(r"range\(([^()]*)\)")
-TABLES = ("sweep", "marks", "reference", "ray")
+_NUMBER = r"\s*[+-]?(?:(?:0|[1-9]\d*)(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?\s*"
+NUMBERS = re.compile(rf"\[{_NUMBER}(?:,{_NUMBER})*\]")
+"""A list of numbers."""
+TABLES = ("sweep", "marks", "compares", "reference", "ray")
 """Settings that are tables; the parameters of plugins are too."""
 LISTS_AS = "write key=value with lists as [a,b] and strings in quotes"
 
@@ -52,18 +57,69 @@ def _range(key: str, match: re.Match[str]) -> range:
     return numbers
 
 
-def check_file(path: Path) -> None:
-    """Raise :class:`UserError` with the file and, as YAML gives it, the line if an experiment file cannot be read."""
+def parse(given: str, word: str) -> tuple[list[str], Any]:
+    """Return the keys and the value of an override in Hydra's syntax; ``given`` is the user's, which errors name.
+
+    A list of numbers, which may be long, is read without Hydra's grammar: that takes a millisecond per number.
+    """
+    key, _, value = word.lstrip("+").partition("=")
+    try:
+        if NUMBERS.fullmatch(value):
+            return key.split("."), [float(n) if set(n) & set(".eE") else int(n) for n in value[1:-1].split(",")]
+        from hydra.core.override_parser.overrides_parser import OverridesParser
+
+        override = OverridesParser.create().parse_override(word)
+        if override.package is None and not override.is_sweep_override():
+            return override.key_or_group.split("."), override.value()
+    except Exception:  # Hydra's of many types; ValueError for a number of 5000 digits, RecursionError
+        pass
+    raise UserError(f"'{given[:200]}' cannot be read: {LISTS_AS}") from None
+
+
+def merge(settings: dict[str, Any], keys: Sequence[str], value: Any) -> None:
+    """Put a value into nested settings in place: a table is merged into the present one, anything else replaces it."""
+    *above, last = keys
+    for key in above:
+        if not isinstance(settings.get(key), dict):
+            settings[key] = {}
+        settings = settings[key]
+    if isinstance(value, dict) and isinstance(settings.get(last), dict):
+        for key, part in value.items():
+            merge(settings[last], [key], part)
+    else:
+        settings[last] = value
+
+
+def check_file(path: Path) -> dict[str, Any]:
+    """Return the content of an experiment file; raises :class:`UserError` with the file and the line if it cannot be read."""
+    import yaml
     from omegaconf import OmegaConf
 
     try:
         text = path.read_bytes().decode()
+        _refuse_expansion(yaml.compose(text))
         content = OmegaConf.to_container(OmegaConf.load(path), resolve=False) if text.strip() else {}
     except RecursionError:
         raise UserError(f"'{path}' is nested too deeply") from None
     except Exception as error:  # of the file, of YAML, and OmegaConf's own, such as a key that is a list
         raise UserError(f"'{path}' cannot be read: {printable(error)[:400]}") from None
     _check_content(path, text, content)
+    return dict(content)  # type: ignore[arg-type]
+
+
+def _refuse_expansion(root: Any) -> None:
+    """Raise ValueError if the aliases of a YAML document, written out, are more than :data:`MAX_CELLS` values."""
+    sizes: dict[int, float] = {}
+
+    def size(node: Any) -> float:
+        if id(node) not in sizes:
+            sizes[id(node)] = math.inf  # while an alias lies inside its own value
+            parts = node.value if isinstance(node.value, list) else ()
+            sizes[id(node)] = 1 + sum(sum(map(size, part)) if isinstance(part, tuple) else size(part) for part in parts)
+        return sizes[id(node)]
+
+    if root is not None and size(root) > MAX_CELLS:
+        raise ValueError(f"its aliases stand for more than {MAX_CELLS} values")
 
 
 def _check_content(path: Path, text: str, content: Any) -> None:

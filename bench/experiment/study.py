@@ -40,7 +40,7 @@ class Study(Plugin):
     descends: ClassVar[bool] = True
     """Whether its cells are measured at ``program.theta0``, and so at a share of a descent."""
 
-    default_plugins: ClassVar[Mapping[str, Sequence[str]]] = {"optimizers": ("adam",)}
+    default_plugins: ClassVar[Mapping[str, Sequence[str]]] = {}
     """Names of the plugins of a kind that the configuration leaves null, such as ``optimizers``."""
 
     @abstractmethod
@@ -54,6 +54,10 @@ class Study(Plugin):
     def decision(self, given: Decision) -> Decision:
         """Return the part of theta that programs have; by default all of it."""
         return given
+
+    def compares(self, parts: Mapping[str, Plugin | None]) -> bool:
+        """Return whether a cell with these plugins needs a reference gradient; by default if the rows have its method."""
+        return self.columns.referenced
 
     def refusal(self, cell: Cell) -> str | None:
         """Return why the study cannot measure a cell, or None; called when a run is planned."""

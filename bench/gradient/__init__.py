@@ -1,7 +1,7 @@
 """Gradient checks: pure functions of a cost and a gradient, independent of problems."""
 
 from .check import Check, Options, Part, check, settle
-from .direction import EPS, Sample, best, judge
+from .direction import EPS, Sample, best, judge, step_sizes
 from .rules import BROKEN, FAULTS, RULES, TRUSTED, UNDECIDED, VERDICTS, most_severe
 from .sampling import sampled
 
@@ -23,4 +23,5 @@ __all__ = [
     "most_severe",
     "sampled",
     "settle",
+    "step_sizes",
 ]  # fmt: skip

@@ -13,7 +13,7 @@ import numpy as np
 from . import roughness
 from .causes import Ratio, causes_of_ratios
 from .direction import EPS, FINE, GUARD, Finding, Sample, judge
-from .rules import FAULTS, RULES, TRUSTED, UNEQUAL, most_severe
+from .rules import FAULTS, RULES, TRUSTED, UNEQUAL, VERDICTS, most_severe
 from .sampling import Modes, order, repeats, sampled
 
 Cost = Callable[[np.ndarray], np.ndarray]
@@ -100,6 +100,13 @@ class Part(Finding):
         return 0.0 if size == 0.0 else abs(self.program - self.difference) / size
 
     @property
+    def distance(self) -> float:
+        """|program - difference| over the difference; infinite where that is not a number."""
+        with np.errstate(all="ignore"):
+            apart = float(np.float64(abs(self.program - self.difference)) / np.float64(abs(self.difference)))
+        return float("inf") if np.isnan(apart) else apart
+
+    @property
     def ratio_with_error(self) -> Ratio:
         """The ratio with the error that follows from that of the difference."""
         size = abs(self.difference)
@@ -111,7 +118,7 @@ class Check:
     """The outcome of a check."""
 
     cause: str
-    """The worst verdict, one of :data:`.rules.VERDICTS`; ``undecided`` without a part."""
+    """The verdict of :func:`cause_of`, one of :data:`.rules.VERDICTS`; ``undecided`` without a part."""
     gradient: np.ndarray
     parts: tuple[Part, ...]
     """Components and random directions at theta."""
@@ -142,21 +149,40 @@ class Check:
 
     @property
     def worst_parts(self) -> tuple[Part, ...]:
-        """The parts with the worst verdict, or all unequal ones with the first of these: at theta if any, else at other thetas."""
+        """The parts with the worst verdict, or all unequal ones where it is one of these: at theta if any, else at other thetas."""
         causes = UNEQUAL if self.cause in UNEQUAL else (self.cause,)
         here = tuple(part for part in self.parts if part.verdict in causes)
         return here or tuple(part for part in self.draws if part.verdict in causes)
+
+    def worst_of(self, parts: Sequence[Part]) -> Part:
+        """Return the part with the largest error among those with the cause as their verdict, or among all."""
+        return max([part for part in parts if part.verdict == self.cause] or parts, key=lambda part: part.distance)
 
     def sentence(self) -> str:
         """Return the verdict in one sentence, with the numbers of the worst part."""
         text = f"{self.cause}: {RULES[self.cause].meaning}"
         if self.trusted or not self.worst_parts:
             return text
-        part = max(self.worst_parts, key=lambda p: (p.component is not None, np.nan_to_num(p.error, nan=np.inf)))
+        part = self.worst_of([p for p in self.worst_parts if p.component is not None] or self.worst_parts)
         return (
             f"{text}; {part.name}: the program's {part.program:.6g}, differences {part.difference:.6g} +- {part.uncertainty:.1g} "
             f"at a step of {part.step:.1g} (ratio {part.ratio:.6g}), slopes {part.left:.6g} and {part.right:.6g}"
         )
+
+
+def cause_of(parts: Sequence[Part], draws: Sequence[Part] = (), others: Sequence[str] = ()) -> str:
+    """Return the worst verdict of parts at theta, of faults at other thetas, and of ``others``.
+
+    Among the derivatives that are other numbers than the differences, it is the verdict of most components, and of most
+    directions where all components are right; of two that are as frequent, the worse.
+    """
+    worst = most_severe([p.verdict for p in parts] + [p.verdict for p in draws if p.verdict in FAULTS] + [*others])
+    if worst not in UNEQUAL:
+        return worst
+    wrong = [part for part in (*parts, *draws) if part.verdict in UNEQUAL]
+    wrong = [part for part in wrong if part.component is not None] or wrong
+    verdicts = [part.verdict for part in wrong] or [worst]
+    return min(verdicts, key=lambda verdict: (-verdicts.count(verdict), VERDICTS.index(verdict)))
 
 
 NOTHING = Check("undecided", np.empty(0), (), ())
@@ -203,8 +229,10 @@ def settle(
     cost: Cost, theta: np.ndarray, vector: np.ndarray, length: float, sample: Sample, tangent: Tangent | None
 ) -> Finding | None:
     """Return the finding on an unsettled direction from smaller steps or from the tangent; None if it stays unsettled."""
-    length_, derivative, doubt = np.array([[length], [sample.derivative], [sample.doubt]])
-    (fine,), *_ = sampled(cost, theta, vector[:, None], length_, derivative, sample.unit, FINE, doubts=doubt)
+    length_, derivative, doubt, moved = np.array([[length], [sample.derivative], [sample.doubt], [sample.moved]])
+    (fine,), *_ = sampled(
+        cost, theta, vector[:, None], length_, derivative, sample.unit, FINE, doubts=doubt, moved=moved
+    )
     better = judge(fine)
     if better.verdict != "unsettled":
         return better
@@ -280,30 +308,29 @@ class _Checker:
         )
         # theta changes only in its last digits, so every change of the gradient is rounding
         with np.errstate(invalid="ignore"):
-            doubt = np.abs(self.gradient(theta + 4.0 * self.unit * self.scale) - first)
+            moved = np.abs(self.gradient(theta + 4.0 * self.unit * self.scale) - first)
         at_draws = [self.gradient(other) for other in around.T]
         again = self.gradient(theta)
         lines = [_Line(f"component {i}", theta, first, self._along(i), self.scale[i], i) for i in chosen]
         lines += [_Line(f"direction {i}", theta, first, vector) for i, vector in enumerate(self._directions())]
-        parts = self._check_lines(lines, doubt)
+        parts = self._check_lines(lines, moved)
         draws = self._check_lines(
             [
                 _Line(f"other theta {k} direction {i}", other, gradient, vector)
                 for k, (other, gradient) in enumerate(zip(around.T, at_draws, strict=True))
                 for i, vector in enumerate(self._directions())
             ],
-            doubt,
+            moved,
             twice=False,
         )
         parts, draws = self._with_causes(parts, draws, around, at_draws)
-        causes = [part.verdict for part in parts]
-        # at other thetas only faults count: a kink at another theta is not a kink at theta
-        causes += [part.verdict for part in draws if part.verdict in FAULTS]
+        others = []
         if not np.isfinite(first).all() and self._gradient is not None and np.isfinite(self.cost(theta[:, None])).all():
-            causes.append("nan_gradient")
+            others.append("nan_gradient")
         elif not repeats(first, again, self.unit).all():
-            causes.append("nondeterministic")
-        return Check(cause=most_severe(causes), gradient=first, parts=tuple(parts), draws=tuple(draws))
+            others.append("nondeterministic")
+        # at other thetas only faults count: a kink at another theta is not a kink at theta
+        return Check(cause=cause_of(parts, draws, others), gradient=first, parts=tuple(parts), draws=tuple(draws))
 
     def _along(self, component: int) -> np.ndarray:
         """Return the vector ``(d,)`` of a component, of the length of its scale."""
@@ -317,8 +344,10 @@ class _Checker:
         random *= self.scale[:, None] / np.linalg.norm(random, axis=0)
         return random.T
 
-    def _check_lines(self, lines: Sequence[_Line], doubt: np.ndarray | None = None, twice: bool = True) -> list[Part]:
-        """Return a checked part for each line, from one batch of costs; ``doubt (d,)`` is the gradient's own error.
+    def _check_lines(self, lines: Sequence[_Line], moved: np.ndarray | None = None, twice: bool = True) -> list[Part]:
+        """Return a checked part for each line, from one batch of costs.
+
+        ``moved (d,)`` is the change of the gradient where theta changes in its last digits.
 
         A component's derivative is per unit of the input. A derivative along a random direction is per unit of the
         inputs' scales.
@@ -336,11 +365,10 @@ class _Checker:
         # a component this much smaller than the others may be only their rounding, unless it is exactly 0
         whole = np.abs(np.nan_to_num(gradients, posinf=0.0, neginf=0.0)) * self.scale[:, None]
         doubts = np.where(program != 0.0, np.sqrt(self.unit) * whole.max(axis=0) / lengths, 0.0)
-        if doubt is not None:
-            doubts += np.abs(vectors).T @ np.nan_to_num(doubt, nan=0.0, posinf=0.0) / lengths
+        change = np.zeros(self.theta.size) if moved is None else np.nan_to_num(moved, nan=0.0, posinf=0.0)
         measured, minus, plus = sampled(
             self.cost, thetas, vectors, lengths, program, self.unit, self.options.eps, self._modes,
-            twice and self.options.repeated, doubts,
+            twice and self.options.repeated, doubts, np.abs(vectors).T @ change / lengths,
         )  # fmt: skip
         if self._gradient is None:
             measured = [replace(s, derivative=judge(s).difference) for s in measured]

@@ -15,6 +15,8 @@ import numpy as np
 
 EPS = np.logspace(-2, -10, 17)
 """Step sizes, two per decade, in units of the natural scale."""
+SINGLE_EPS = np.logspace(-1, -7, 13)
+"""Steps in single precision: the best is near 5e-3."""
 FINE = np.logspace(-2, -13, 23)
 """Steps for directions that :data:`EPS` leaves unsettled, as on a long rollout that amplifies."""
 CONVERGING, ORDER = 8, 1.5
@@ -36,7 +38,7 @@ ALIKE = 0.1
 CHANCE = 10.0
 """Multiple of the smallest spread of neighbouring differences that counts as their error: it is partly small by chance."""
 LARGEST = 1e-3
-"""Largest relative error that counts as that of a difference in single precision."""
+"""Largest relative error that counts as that of a difference in single precision, or of a gradient by rounding theta."""
 MIN_STEPS = 7
 """Fewest steps with finite costs on both sides; with fewer, the verdict is ``nonfinite``."""
 
@@ -48,7 +50,8 @@ class Sample:
     ``step (K,)`` are displacements in falling order, ``minus`` and ``plus (K,)`` the costs at -step and +step, and
     ``centre`` is the cost at the point. ``crossing (K,)`` marks steps whose two sides differ in contact mode. ``scale``
     is the size of theta, and ``unit`` the unit roundoff of the program's arithmetic. ``noise`` is the measured standard
-    deviation of the cost's noise, and ``doubt`` the error of the program's derivative from rounding theta.
+    deviation of the cost's noise, ``doubt`` the rounding error of the program's derivative, and ``moved`` the change of
+    the program's derivative where theta changes in its last digits.
     """
 
     step: np.ndarray
@@ -62,6 +65,7 @@ class Sample:
     unit: float = float(np.finfo(np.float64).eps)
     noise: float = 0.0
     doubt: float = 0.0
+    moved: float = 0.0
 
     @property
     def differences(self) -> np.ndarray:
@@ -125,6 +129,11 @@ class Finding:
     right: float = float("nan")
 
 
+def step_sizes(unit: float) -> np.ndarray:
+    """Return the step sizes of a check in arithmetic of a unit roundoff, in units of the natural scale."""
+    return EPS if unit < 1e-10 else SINGLE_EPS
+
+
 def best(sample: Sample) -> int:
     """Return the index of the step with the smallest error; 0 when every error is NaN."""
     # argmin treats NaN as the smallest number
@@ -177,12 +186,13 @@ def _judge(sample: Sample) -> Finding:
         )
     index, spread = plateau(sample, noise)
     uncertainty = spread + float(noise[index])
-    tolerance = CHANCE * spread + float(noise[index]) + _resolution(sample, index) + sample.doubt
+    doubt = sample.doubt + min(sample.moved, max(_change_of_slope(sample, noise, index), LARGEST * sample.size(index)))
+    tolerance = CHANCE * spread + float(noise[index]) + _resolution(sample, index) + doubt
     apart = abs(float(sample.differences[index]) - sample.derivative)
     alike, rounding = ALIKE * sample.size(index), GUARD * float(sample.rounding(sample.unit)[index])
     resolved = uncertainty <= max(alike, rounding)
     # a tolerance as large as the derivative would accept half of the derivative
-    if apart <= min(tolerance, alike + rounding + sample.doubt) and resolved:
+    if apart <= min(tolerance, alike + rounding + doubt) and resolved:
         return finding_at(sample, _classify_right(sample, index, still), index, uncertainty)
     if sample.crossing[index]:
         return finding_at(sample, _judge_one_sided(sample, noise), index, uncertainty)
@@ -220,6 +230,17 @@ def plateau(sample: Sample, noise: np.ndarray) -> tuple[int, float]:
         worth = np.where(differences == 0.0, np.inf, worth)
     index = int(np.argmin(worth))
     return index, float(spread[index])
+
+
+def _change_of_slope(sample: Sample, noise: np.ndarray, index: int) -> float:
+    """Return by how much the cost's own slope changes from side to side, at the smallest step that noise allows.
+
+    A derivative that changes with the last digits of theta is that of a cost whose slope does. Where the cost has one
+    slope, as at a node of a table, such a derivative is wrong at theta.
+    """
+    bend = np.abs(sample.right - sample.left)[index:]
+    resolved = bend[bend > 2.0 * noise[index:]]
+    return float(resolved[-1]) if resolved.size else 0.0
 
 
 def _is_credible(sample: Sample, index: int, uncertainty: float, tolerance: float) -> bool:

@@ -33,13 +33,14 @@ SLOPES = (*STEPS, "refined=COST")
 DERIVATIVE = {
     "nan_gradient": Rule(
         "fault", "the gradient is NaN or infinite where the cost is a number",
-        "the costs at theta and at {direction.MIN_STEPS} step sizes or more are numbers",
+        "the costs at theta and at {direction.MIN_STEPS} step sizes or more are numbers; also under noise",
         "where it overflows, take fewer steps or damp the rollout; else look for a division, log, sqrt or norm at the edge of "
         "its domain, or a branch that 'where' discards only in the value", STEPS,
     ),
     "nondeterministic": Rule(
         "fault", "the same call returns different numbers",
-        "by more than {sampling.LAST_DIGITS} u, in `examine` u^{stages.SMALL}, of the cost or the gradient's norm",
+        "by more than {sampling.LAST_DIGITS} u, in `examine` u^{stages.SMALL}, of the cost or the gradient's norm, or some calls raise an "
+        "exception",
         "fix the seed, or pass the noise as w and set noise=N; reset states that persist between calls",
     ),
     "stale_gradient": Rule(
@@ -79,11 +80,17 @@ DERIVATIVE = {
     ),
     "nonfinite": Rule(
         "open", "a cost is NaN or infinite",
-        "at theta, or a number at fewer than {direction.MIN_STEPS} step sizes; in `examine` also within u^(1/3) of theta, or under noise",
+        "at theta, or a number at fewer than {direction.MIN_STEPS} step sizes, or under noise; in `examine` also within u^(1/3) of theta",
     ),
     "unsettled": Rule(
         "open", "the differences agree at no step, so the check is inconclusive",
         "the error of the best is above {direction.ALIKE:.0%} of it, or smaller steps contradict it", "", MORE,
+    ),
+    "coarse": Rule(
+        "open", "right of the cost's smooth part to the accuracy that its roughness allows, which is less than the tolerance",
+        "`adaptive` steps or a solver that stops early: scatter around quadratics does not fall with the scale. In `examine`: the gradient "
+        "is within the error of the slope over wide steps, which is above `tolerance`",
+        "give the cost a tighter tolerance", ("refined=COST", *MORE),
     ),
     "jump": Rule(
         "broken", "the cost jumps here, so it has no derivative",
@@ -99,6 +106,10 @@ DERIVATIVE = {
         "broken", "the two sides have different slopes, and a gradient can match only one",
         "by a constant over {direction.DECADES:g} decades of steps, and the derivative is between them",
         "choose a theta beside it", EXPECTED,
+    ),
+    "smooth_part": Rule(
+        "right", "the derivative of the cost's smooth part: at tiny steps the cost has that of one sequence of steps",
+        "as `coarse`, and the error is within `tolerance`, or that of the refined cost", "", SIGMA,
     ),
     "saturated": Rule(
         "right", "exactly 0, though wider differences are not: the input is clipped or has no effect here",
@@ -140,6 +151,17 @@ EXAMINATION = {
         "with `horizons` right at the first, and {diagnosis.GROWTH:g} times as wrong at the last as at the first wrong one",
         "use one tape per step, or arrays of its own for each step", STEPS,
     ),
+    "continuous_adjoint": Rule(
+        "fault", "an adjoint that is solved on its own: its error falls with the number of steps",
+        "`missing_term` or `wrong_adjoint`, and with `horizons` the error falls at each, {hints.FALLS:g} times in all",
+        "differentiate through the solver, or tighten the tolerances of both", ("refined=COST",),
+    ),
+    "estimator": Rule(
+        "right", "not the derivative of each draw of the cost's noise, but its mean is that of the mean cost",
+        "with `noise`, wrong at a fixed draw, and the error of the mean and twice its standard error are together below {means.RIGHT:.0%}; "
+        "where jumps may carry {means.ALIKE:.0%} of the mean slope, the bias under noise on theta is. Where the mean is off, and the gradient is "
+        "a multiple of each draw's slope to {means.SAME:.0%}, the verdict is that of a draw",
+    ),
     "no_effect": Rule(
         "broken", "an input has no effect on the cost, and is not in allow_zero",
         "`zero` where `allow_zero` is given, without jumps or a slope under noise around theta",
@@ -165,7 +187,8 @@ EXAMINATION = {
         "exactly the derivative of the solution",
         "`missing_term` or `wrong_adjoint` where a loop's length depends on theta, and jumps explain an error up to "
         "{diagnosis.NEAR:.0%}, or {diagnosis.FAR:.0%} where they move the cost more than the error does. With `refined`: the gradient is at "
-        "most {findings.AGREES:g} times as far from it as the differences at each theta, or {findings.AS_FAR:g} times beside such a loop",
+        "most {findings.AGREES:g} times as far from it as the differences at each theta, or {findings.AS_FAR:g} times beside such a loop. "
+        "Of a rough cost: no slope over wide steps is known to {smooth_part.LIMIT:.0%}",
         "give the cost at a tighter tolerance; accept it if the gradient is meant to be that one's", ("refined=COST", *EXPECTED),
     ),
 }  # fmt: skip
@@ -173,7 +196,7 @@ EXAMINATION = {
 NOISE = {
     "jumps": Rule(
         "broken", "the gradient is right at theta, and misses jumps around it that no gradient sees",
-        "its integral misses {smoothing.TARGET_ERROR:.0%} of the cost's change along a line, and the bias is not decided at every sigma",
+        "its integral misses {smoothing.TARGET_ERROR:.0%} of the cost's change along a line, and no bias was measured",
         SMOOTHING, EXPECTED,
     ),
     "biased": Rule(
@@ -182,7 +205,7 @@ NOISE = {
     ),
     "spread": Rule(
         "open", "the gradients vary too widely to show whether their mean is grad J",
-        "that interval contains {smoothing.TARGET_ERROR:.0%}, or grad J is less than {smoothing.CLEAR:g} times its error; or a line of `jumps` has none", SMOOTHING, MORE,
+        "that interval contains {smoothing.TARGET_ERROR:.0%}, or grad J is less than {smoothing.CLEAR:g} times its error; or a line of `jumps` has none", "", MORE,
     ),
     "unmeasured": Rule(
         "open", "the budget ended before the noise of sigma was measured", "fewer than {smoothing.FEWEST} pairs of costs at a sigma",

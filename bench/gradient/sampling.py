@@ -35,6 +35,7 @@ def sampled(
     modes: Modes | None = None,
     twice: bool = False,
     doubts: np.ndarray | None = None,
+    moved: np.ndarray | None = None,
 ) -> tuple[list[Sample], np.ndarray, np.ndarray]:
     """Return a sample per column of ``vectors (d, M)``, and the contact modes on the minus and plus sides, ``(M, K)`` each.
 
@@ -59,7 +60,7 @@ def sampled(
             sample = Sample(
                 eps * lengths[m], row[:count], float(row[2 * count]), row[count : 2 * count], float(derivatives[m]),
                 minus_modes[m] != plus_modes[m], bool(repeatable[m]), float(lengths[m]), unit, measured,
-                0.0 if doubts is None else float(doubts[m]),
+                0.0 if doubts is None else float(doubts[m]), 0.0 if moved is None else float(moved[m]),
             )  # fmt: skip
             result.append(replace(sample, noise=max(measured, scatter(sample.step, sample.differences))))
     return result, minus_modes, plus_modes

@@ -111,6 +111,23 @@ def runtime_interval(spent: np.ndarray, reached: np.ndarray, seed: int = 0, draw
     return float(low), float(high)
 
 
+def clustered_error(values: np.ndarray, clusters: np.ndarray) -> float:
+    """Return half the 95% interval of the mean of ``values (n,)``, whose errors are shared within clusters; NaN for one cluster.
+
+    Clusters are independent. Student's quantile has one degree of freedom less than there are clusters (Cameron and Miller
+    2015, *A practitioner's guide to cluster-robust inference*).
+    """
+    from scipy.special import stdtrit
+
+    known, place = np.unique(clusters, return_inverse=True)
+    count = len(known)
+    if count < 2:
+        return math.nan
+    sums = np.bincount(place, weights=values - np.mean(values))
+    error = math.sqrt(count / (count - 1) * float(sums @ sums)) / len(values)
+    return float(stdtrit(count - 1, 0.975)) * error
+
+
 def interquartile_mean(values: np.ndarray) -> float:
     """Return the mean of the middle half of the values. A value at the edge of that half is weighted by its share in it.
 

@@ -24,6 +24,8 @@ small. The pilot, which selects the estimator of a sampled reference, is one bat
 LEAST_SAMPLES = 16384
 """Minimum samples of a sampled reference, unless the limit is lower: a small spread of few samples proves nothing."""
 QUADRATURE_POINTS = 1 << 20
+FINE = 1e-3
+"""Spacing of a reference's points, in standard deviations, above which a note states it: that of points in a plane."""
 SURE = 3.0
 """Stated errors of quadrature and sampling together beyond which they disagree."""
 TAIL_EVENTS = 10.0
@@ -36,6 +38,10 @@ FAR = 4.5
 """Distance searched for jumps on either side along a direction, in standard deviations."""
 ROUNDING = 1e-9
 """Difference of first and zeroth order, relative to the gradient, that rounding explains."""
+SAME = 1e-6
+"""Difference between two backends' costs of one draw, relative to the range of costs, that rounding explains. The root of
+the coarser unit roundoff is allowed too, and :data:`LAST` roundoffs of the cost itself."""
+LAST = 100.0
 SHARED = 1e-10
 """Relative error common to the terms of all samples, from rounding and central differences."""
 EXTREME = 1e100
@@ -100,13 +106,15 @@ def certify(
     samples: int,
     tolerance: float,
     physical: np.ndarray | None = None,
+    points: int = QUADRATURE_POINTS,
 ) -> Reference:
     """Return the reference gradient of a problem, by the best applicable method.
 
     A closed form belongs to the scene's own program, so it is not used for a backend that ``provides`` its own physics.
     Quadrature handles noise on theta of one or two dimensions, or of one only if the cost may jump at places that the
     scene does not list. If its relative error exceeds 0.1%, sampling replaces quadrature where the error of sampling is
-    smaller. Sampling stops at an error of ``tolerance`` times the gradient's norm, or after ``samples`` samples.
+    smaller. Sampling stops at an error of ``tolerance`` times the gradient's norm, or after ``samples`` samples,
+    quadrature at ``points`` points, or 64 times ``samples``.
     ``physical (d,)`` is the gradient of the physics that the program approximates, if known. Where costs are not
     finite, or J does not exist, the gradient is NaN and the note states why.
     """
@@ -120,15 +128,51 @@ def certify(
         reference = Reference(np.asarray(closed, dtype=np.float64).reshape(1, -1), "closed_form")
     else:
         unit = _unit(problem, theta)
-        if unit == 1.0:
-            reference = _compute(problem, theta, provides, samples, tolerance)
-        else:
-            scaled = _compute(cast(Problem, _Scaled(problem, unit)), theta, provides, samples, tolerance)
-            reference = replace(scaled, batches=scaled.batches * unit, error=scaled.error * unit)
+        given = problem if unit == 1.0 else cast(Problem, _Scaled(problem, unit))
+        scaled = _compute(given, theta, provides, samples, tolerance, min(points, 64 * samples))
+        reference = replace(scaled, batches=scaled.batches * unit, error=scaled.error * unit)
+        if reference.spacing > FINE:
+            note = f"the reference's points are {reference.spacing:.2g} standard deviations apart and may miss a narrower feature"
+            reference = _with_note(reference, note)
     if physical is None or "grad" not in provides:
         return reference
     plain = problem.grad(theta, np.zeros((program.n_noise, 1)))[:, 0]
     return replace(reference, plain=plain, physical=np.asarray(physical, dtype=np.float64))
+
+
+def transferred(reference: Reference, problem: Problem, other: Problem, samples: int, unit: float) -> Reference | None:
+    """Return a reference that ``problem`` computed for ``other``, the program on another backend; None if it is not that one's.
+
+    Both compute the costs of the same draws, at most ``samples``, with the unit roundoff ``unit``. Where rounding decides an event, costs differ by more
+    than rounding, and grad J by the mean of difference times score. The upper end of its 95% interval is added to the
+    stated error. A reference whose stated error is smaller than that is not transferred.
+    """
+    program, theta, columns = problem.program, problem.program.theta0, min(COLUMNS, samples)
+    effects, share = [], 0.0
+    blocks = max(1, min(samples, LEAST_SAMPLES) // columns)
+    for block in range(blocks):
+        w = draw_columns(problem, "backends", columns, block)
+        with np.errstate(all="ignore"):
+            mine, others = problem.value(theta, w), other.value(theta, w)
+            spread = np.ptp(mine[np.isfinite(mine)]) if np.isfinite(mine).any() else 0.0
+            allowed = max(SAME, math.sqrt(unit)) * spread + LAST * unit * np.abs(mine)
+            agrees = (mine == others) | (np.abs(others - mine) <= allowed) | (np.isnan(mine) & np.isnan(others))
+            share += float(1.0 - agrees.mean()) / blocks
+            apart = np.where(agrees, 0.0, others - mine)
+            if agrees.all():
+                effects.append(np.zeros((columns, problem.dim)))
+            elif program.score_refusal or not problem.sigma > 0.0:
+                return None
+            else:
+                effects.append((apart * problem.score(theta, w)).T)
+    effect = np.concatenate(effects)
+    if not share or not np.isfinite(effect).all():
+        return None if share else reference
+    most = bias_interval(effect.mean(axis=0), Sampling.of(effect))[2]
+    if not most <= reference.known().standard_error:
+        return None
+    note = f"costs differ from those of the backend that computed the reference in {share:.2g} of draws, as its error allows"
+    return _with_note(replace(reference, error=math.hypot(reference.error, most)), note)
 
 
 def revisions(program: Program, provides: frozenset[str]) -> dict[str, int]:
@@ -146,12 +190,12 @@ def _can_integrate(program: Program) -> bool:
 
 
 def _compute(
-    problem: Problem, theta: np.ndarray, provides: frozenset[str], samples: int, tolerance: float
+    problem: Problem, theta: np.ndarray, provides: frozenset[str], samples: int, tolerance: float, points: int
 ) -> Reference:
     program = problem.program
     quadrature = None
     if _can_integrate(program):
-        integral = integrate(problem, theta, min(QUADRATURE_POINTS, 64 * samples), COLUMNS)
+        integral = integrate(problem, theta, points, COLUMNS)
         if integral is not None:
             method = f"quadrature[points={integral.points},spacing={integral.spacing:.2g}]"
             quadrature = Reference(

@@ -341,6 +341,8 @@ def variance_per_sample(
     if count < 2:
         return (math.nan,) * 3
     total, power = sums.sum(axis=0), float(squares.sum())
+    if math.isinf(power):  # of finite terms whose squares overflow
+        return math.inf, 0.0, math.inf
     # a difference below this share of the squares is rounding
     floor = 1e-14 * power
     whole = power - float(total @ total) / count

@@ -22,6 +22,8 @@ class ContactLaw(Plugin):
     """Whether automatic differentiation of a step intentionally gives a gradient other than the step's derivative."""
     needs_root: ClassVar[bool] = False
     """Whether the law solves an equation each step, so that only backends with ``root`` can run it."""
+    ignores: ClassVar[tuple[str, ...]] = ()
+    """Parameters of scenes that have no effect under the law, such as ``restitution``."""
 
     @property
     def continuous(self) -> bool:
@@ -32,6 +34,8 @@ class ContactLaw(Plugin):
 @dataclass(frozen=True)
 class ForceLaw(ContactLaw):
     """A law whose force is a function of gap and gap rate and is part of the acceleration."""
+
+    ignores: ClassVar[tuple[str, ...]] = ("restitution",)
 
     @abstractmethod
     def force(self, xp: Any, gap: Array, gap_rate: Array) -> Array:
@@ -63,7 +67,9 @@ class Contact(NamedTuple):
 
 @dataclass(frozen=True)
 class ImpulseLaw(ContactLaw):
-    """A law that changes velocities and positions within a step instead of adding a force."""
+    """A law that changes velocities and positions within a step instead of adding a force. It has no friction."""
+
+    ignores: ClassVar[tuple[str, ...]] = ("friction", "slip_speed")
 
     @abstractmethod
     def impulse(self, ops: Ops, contact: Contact, before: State, free: State, dt: Any) -> State:

@@ -214,7 +214,7 @@ class SampleMean(Estimator):
     def estimate(self, problem: Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Return the mean of the terms over the samples of each repeat, ``(R, d)``."""
         w = columns(noise)
-        terms = np.asarray(self.terms(problem, theta, w))
+        terms = np.asarray(np.ma.filled(self.terms(problem, theta, w), np.nan))
         require_shape(self, "(d, B)", terms, (problem.dim, w.shape[1]))
         return per_repeat(terms, noise).mean(axis=1)
 

@@ -252,4 +252,5 @@ def coerce(kind: Any, value: Any, where: str) -> Any:
     elif (kind is bool and isinstance(value, bool)) or (kind is str and isinstance(value, str)):
         return value
     article = {float: "a number", int: "a whole number", bool: "true or false", str: "a string"}.get(kind, str(kind))
-    raise UserError(f"{where}={repr(value)[:200]} must be {article}, not {type(value).__name__}")
+    given = "" if number else f", not {type(value).__name__}"
+    raise UserError(f"{where}={repr(value)[:200]} must be {article}{given}")

@@ -230,7 +230,9 @@ class Program(ABC):
         return places[0], parameter
 
     def _check_moves_program(self, parameter: str) -> None:
-        """Raise :class:`UserError` if a parameter sets the scene's own theta0 only, since its derivative would be 0."""
+        """Raise :class:`UserError` if a parameter sets the scene's own theta0 only, or nothing, since its derivative would be 0."""
+        if parameter in self.scene.without_effect(self.contact):
+            raise UserError(f"theta names '{parameter}': {idle(parameter, self.scene, self.contact)}")
         value = getattr(self.scene, parameter)
         if not np.isfinite(value):
             return
@@ -528,6 +530,12 @@ def compose(
     raise Unsupported(
         f"scene {scene.name} is neither a FunctionScene, a CallableScene nor a MechanicalScene: derive it from one of these"
     )
+
+
+def idle(parameter: str, scene: Scene, contact: ContactLaw | None) -> str:
+    """Return in words that a parameter of the scene has no effect."""
+    law = f" under contact law {contact.name}" if contact is not None else ""
+    return f"{parameter} has no effect in scene {scene.name}{law}"
 
 
 def rollout(program: Program) -> Rollout:

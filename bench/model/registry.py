@@ -29,7 +29,7 @@ from types import ModuleType
 from typing import Any
 
 from bench.errors import FOLDER, UserError, printable, unknown
-from bench.model import guard, trial
+from bench.model import guard, reads, trial
 from bench.model.parameters import Plugin, build, parameters, remember, singular
 
 BUILT_IN = "bench.plugins"
@@ -82,6 +82,7 @@ def add_folder(path: Path) -> None:
         raise UserError(f"plugins={path} is not a folder")
     if path not in _folders:
         _folders.append(path)
+        reads.start(str(path))
         package = ModuleType(_package(path), f"Plugins from {path}.")
         package.__path__ = [str(path)]
         sys.modules[package.__name__] = package
@@ -209,6 +210,7 @@ def _load(
             raise ImportError(message)
         if not module.startswith("bench."):
             IMPORTED.add(module)
+            reads.start(plugin=module)
         with _protected(module):
             part = load()
             if isinstance(part, ModuleType):

@@ -13,7 +13,7 @@ import numpy as np
 from bench.errors import Unsupported, UserError
 from bench.model.contact import Contact, ContactLaw
 from bench.model.ops import Array, State
-from bench.model.parameters import Plugin, param
+from bench.model.parameters import Plugin, param, traced
 
 
 @dataclass(frozen=True)
@@ -48,6 +48,10 @@ class Scene(Plugin):
     @abstractmethod
     def theta0(self) -> np.ndarray:
         """Return the decision variable at which gradients are estimated, ``(d,)``."""
+
+    def without_effect(self, contact: ContactLaw | None) -> tuple[str, ...]:
+        """Return the parameters of the scene that change no cost and no gradient under the law: those that it ignores."""
+        return () if contact is None else tuple(name for name in contact.ignores if name in traced(self))
 
     def breakpoints(self) -> tuple[tuple[float, ...], ...]:
         """Return, per coordinate of theta, the positions of the cost's jumps and kinks, which split quadrature panels."""
@@ -304,8 +308,18 @@ class EngineTwin(ABC):
         """
 
     def model_file(self) -> Path | None:
-        """Return the MJCF file that is the scene's model, to be used as it is written; None: the twin of :meth:`mjcf`."""
+        """Return the MJCF file that is the scene's model, to be used as it is written; None: the twin of :meth:`mjcf`.
+
+        A scene with such a file also defines ``files()``, the paths of all files that decide its motion and cost.
+        """
         return None
+
+    def __init_subclass__(cls, **arguments: Any) -> None:
+        super().__init_subclass__(**arguments)
+        if cls.model_file is not EngineTwin.model_file and not hasattr(cls, "files"):
+            raise TypeError(
+                f"{cls.__name__} has a model_file, so it needs files(): all files that decide its motion and cost"
+            )
 
 
 @dataclass(frozen=True)

@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
-from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import to_hex, to_rgb
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
@@ -25,9 +25,9 @@ from bench.experiment.columns import Column
 from bench.experiment.views import Chart, Mark, Style
 from bench.report.colours import looks_by_name
 from bench.report.scales import log_axis
-from bench.report.style import GREY, MARKS, SHADE, SIZE, filled, plain, width_in_inches
-from bench.report.text import axis_value, short_duration
-from bench.report.views import is_logarithmic, pareto
+from bench.report.style import GREY, MARKERS, MARKS, SHADE, SIZE, filled, plain, width_in_inches
+from bench.report.text import axis_value, number, short_duration
+from bench.report.views import is_logarithmic
 
 WIDTH, NARROW = 7.16, 3.5
 """Figure widths in inches: two columns of a paper, or one."""
@@ -45,8 +45,14 @@ UNLIMITED = 1e9
 """Factor on a value at which the bar of an interval without an upper end stops, beyond every logarithmic axis."""
 BAND: dict[str, Any] = {"color": "#D55E00", "alpha": 0.12, "linewidth": 0}
 """Look of a named range of an axis."""
-FRONT: dict[str, Any] = {"color": GREY, "linewidth": 0.8, "linestyle": "--"}
-"""Look of the Pareto front."""
+EXACT, USELESS = 1e-4, 1e2
+"""Where a value above 1 means a failure, smaller values are drawn here as upper limits, and larger ones with their number."""
+NAME = 1.0
+"""Longest line of a name at a point, in inches."""
+NEAR = 0.2
+"""Distance in inches from which an arrow joins two points."""
+LIMIT: dict[str, Any] = {"color": "#000000", "linewidth": 1.4}
+"""Look of a limit across a grid."""
 MANY = 12
 """Most points of a line that are drawn with markers; longer lines are drawn without."""
 
@@ -96,10 +102,11 @@ def draw(chart: Chart) -> Figure:
         titles[place] = title.count("\n") + 1 if title else 0
         if is_plot:
             _draw_lines(chart, panel, part, styles)
-            _scale_x(
-                panel, chart.x[0], part[chart.x[0].name], all(p[chart.x[0].name].nunique() <= 6 for _, p in panels)
-            )
+            few = all(p[chart.x[0].name].nunique() <= 6 for _, p in panels)
+            _scale_x(panel, chart.x[0], part[chart.x[0].name], few, bool(chart.arrow))
             _scale_values(chart, panel, "y", chart.y[0], part if chart.own_scales else chart.frame)
+            if chart.arrow:
+                _draw_arrows(chart, panel, part, styles, np.array([inner, heights[place]]))
             panel.set_xlabel("" if stacked and not is_last else _wrapped(chart.x[0].heading, inner))
             panel.set_ylabel(_wrapped(chart.y[0].heading, heights[place]) if is_left else "")
         else:
@@ -165,14 +172,21 @@ def _signs(chart: Chart) -> list[str]:
     if not column:
         return []
     is_grey = column.above_one and _is_log(column, chart.frame[column.name]) and _log_range(column, chart.frame)[1] > 1
-    is_hollow = column.limit and chart.frame[column.limit].eq(True).any()
+    is_hollow = column.limit and (chart.frame[column.limit].eq(True) | (chart.frame[column.name] < EXACT)).any()
     return [f"grey: {column.above_one}"] * bool(is_grey) + ["hollow: an upper limit"] * bool(is_hollow)
 
 
 def _legend(chart: Chart, styles: dict[str, Style], width: float) -> list[Any]:
     """Return the handles of the legend: series or levels, the front, and named values and ranges of the axes."""
-    labels = {name: _wrapped(style.meaning or name, width - 0.6) for name, style in styles.items() if name}
+    labels = {
+        name: _wrapped(style.meaning or name, width - 0.6) for name, style in styles.items() if name and not chart.arrow
+    }
     handles: list[Any] = []
+    if chart.arrow:
+        names = enumerate(chart.frame[chart.line].unique())
+        handles = [
+            Line2D([], [], color=GREY, marker=MARKERS[i], linestyle="none", label=plain(str(name))) for i, name in names
+        ]
     if chart.kind == "grid":
         looks: dict[str, Any] = {"edgecolor": "#808080", "linewidth": 0.4}
         handles = [Patch(facecolor=styles[name].colour, label=label, **looks) for name, label in labels.items()]
@@ -187,7 +201,9 @@ def _legend(chart: Chart, styles: dict[str, Style], width: float) -> list[Any]:
             handles.append(
                 Line2D([], [], color=style.colour, marker=mark, linestyle=line, linewidth=style.width, label=label)
             )
-    handles += [Line2D([], [], label="Pareto front", **FRONT)] * chart.front
+    handles += [Line2D([], [], label=chart.limit_name, **LIMIT)] * bool(
+        chart.limit and (chart.frame[chart.limit] > 0).any()
+    )
     ranges = dict.fromkeys(mark.name for mark in chart.marks if mark.to is not None)
     handles += [Line2D([], [], label=plain(name), **look) for name, look in _mark_looks(chart).items() if name]
     return handles + [Patch(label=plain(name), **BAND) for name in ranges]
@@ -235,18 +251,19 @@ def _log_range(column: Column, rows: pd.DataFrame, marks: Sequence[Mark] = ()) -
     """Return the range of a logarithmic axis: all positive values, and their intervals within a factor of 100."""
     values = rows[column.name].to_numpy(float)
     values = values[np.isfinite(values) & (values > 0)]
+    values = values.clip(EXACT, USELESS) if column.above_one else values
     if not values.size:
         return 0.1, 10.0
     low, high = float(values.min()), float(values.max())
     ends = rows[[name for name in (column.low, column.high) if name]].to_numpy(float).ravel()
-    ends = ends[np.isfinite(ends) & (ends >= low / 100) & (ends <= high * 100)]
+    ends = ends[np.isfinite(ends) & (ends >= low / 100) & (ends <= (USELESS if column.above_one else high * 100))]
     every = [low, high, *ends, *(mark.at for mark in marks)]
     margin = max((max(every) / min(every)) ** 0.06, 1.15)
     return min(every) / margin, max(every) * margin
 
 
-def _scale_x(panel: Axes, column: Column, values: pd.Series, few: bool) -> None:
-    """Set the scale of x, with a label at each of the ``values`` if all panels have ``few``."""
+def _scale_x(panel: Axes, column: Column, values: pd.Series, few: bool, is_named: bool) -> None:
+    """Set the scale of x, with a label at each of the ``values`` if all panels have ``few``, and room for names at points."""
     if not pd.api.types.is_numeric_dtype(values):
         panel.tick_params(axis="x", rotation=30)
         return
@@ -254,7 +271,7 @@ def _scale_x(panel: Axes, column: Column, values: pd.Series, few: bool) -> None:
     if not places.size:
         return
     if _is_log(column, places) and places[0] > 0:
-        margin = max((places[-1] / places[0]) ** 0.05, 1.08)
+        margin = max((places[-1] / places[0]) ** (0.25 if is_named else 0.05), 1.08)
         wanted = places if few and column.format == "setting" else ()
         log_axis(panel, "x", places[0] / margin, places[-1] * margin, wanted, _values_text(column, 0.0))
         return
@@ -294,16 +311,52 @@ def _draw_lines(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str,
     x, y = chart.x[0], chart.y[0]
     log = _is_log(y, (part if chart.own_scales else chart.frame)[y.name])
     keys = [key for key in dict.fromkeys((chart.series, chart.line)) if key]
+    laws = list(chart.frame[chart.line].unique()) if chart.arrow else []
     for order, (key, points) in enumerate(part.groupby(keys, sort=False) if keys else [(("",), part)]):
         style = styles[str(key[0]) if chart.series else ""]
+        if chart.arrow:
+            style = replace(style, marker=MARKERS[laws.index(key[1])])
         is_line, is_number = chart.kind == "lines", pd.api.types.is_numeric_dtype(points[x.name])
         points = points.sort_values(x.name, kind="stable") if is_line and is_number else points
         mark = style.marker if not is_line or len(points) <= MANY or style.line == "none" else ""
         _draw_values(chart, panel, points, y, log, points[x.name].to_numpy(), style, mark, 3 + 0.01 * order)
-    if chart.front:
-        known = part[np.isfinite(part[[x.name, y.name]]).all(axis=1)].sort_values(x.name)
-        best = known[pareto(known[x.name], known[y.name])]
-        panel.plot(best[x.name], best[y.name], zorder=2, **FRONT)
+
+
+def _draw_arrows(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str, Style], size: np.ndarray) -> None:
+    """Join the two points of each arrow of a panel of ``size`` (2,) inches, and name the series at the first of them.
+
+    A name is beside other names, points and arrows. A series is named once where its points are close to each other.
+    """
+    low, high = (np.log(ends) for ends in zip(panel.get_xlim(), panel.get_ylim(), strict=True))
+    taken, named, arrows = [], [], []
+    for _, points in part.groupby(chart.arrow, sort=False):
+        ends = points[[chart.x[0].name, chart.y[0].name]].to_numpy(float, copy=True)
+        if chart.y[0].above_one:
+            ends[:, 1] = ends[:, 1].clip(EXACT, USELESS)
+        series, places = str(points[chart.series].iloc[0]), (np.log(ends) - low) / (high - low) * size
+        if np.ptp(places, axis=0).max() > NEAR:
+            look = {"arrowstyle": "-|>", "color": styles[series].colour, "linewidth": 1.6, "shrinkA": 3, "shrinkB": 3}
+            panel.annotate("", ends[-1], ends[0], arrowprops=look, zorder=2)
+        taken.append((places.min(axis=0) - 0.05, places.max(axis=0) + 0.05))
+        arrows.append((series, places[0]))
+    for series, place in arrows:
+        text = _wrapped(series, NAME)
+        extent = np.array([_text_width(text), 0.14 * _lines([text])])
+        middle, under = -extent / 2, -extent
+        free = [
+            start
+            for far in (0.08, 0.16, 0.24, 0.35, 0.5)
+            for side in ((far, middle[1]), (under[0] - far, middle[1]), (middle[0], far), (middle[0], under[1] - far), (far, far), (far, under[1] - far))
+            if ((start := place + side) >= 0).all() and (start + extent <= size).all()
+            and not any((start < b).all() and (start + extent > a).all() for a, b in taken)
+        ]  # fmt: skip
+        if any(name == series and np.abs(other - place).max() < 2 * NEAR for name, other in named):
+            continue
+        start = free[0] if free else place + 0.1
+        named.append((series, place))
+        taken.append((start, start + extent))
+        written = panel.text(*(start / size), text, transform=panel.transAxes, color=styles[series].colour)
+        written.set_in_layout(False)
 
 
 def _draw_values(
@@ -319,11 +372,15 @@ def _draw_values(
 ) -> None:
     """Draw the values of a column at ``places`` of the other axis, with intervals; limits are hollow, failures crosses at the edge."""
     values = points[column.name].to_numpy(float)
-    values = np.where(values > 0, values, np.nan) if log else values
     limit, lost = (
         points[name].to_numpy(bool) if name else np.zeros(len(points), bool) for name in (column.limit, chart.failed)
     )
+    least, most = (EXACT, USELESS) if log and column.above_one else (0.0, math.inf)
+    is_zero, is_cut = log & (values <= least), values > most
+    given, values = values, np.where(is_zero & (least == 0), np.nan, values.clip(least, most) if log else values)
+    limit, is_zero = limit | is_zero, is_zero & (least == 0)
     is_flat = chart.kind == "dots"
+    edge = panel.get_yaxis_transform() if is_flat else panel.get_xaxis_transform()
     look: dict[str, Any] = {"color": style.colour, "zorder": zorder}
 
     def plot(at: Any, value: Any, **more: Any) -> None:
@@ -343,8 +400,29 @@ def _draw_values(
             panel.fill_between(places, low, high, color=style.colour, alpha=0.18, linewidth=0, zorder=2)
         else:
             (panel.hlines if is_flat else panel.vlines)(places[known], low[known], high[known], linewidth=1.0, **look)
+    if is_zero.any():  # below every value of the axis
+        plot(
+            places[is_zero],
+            np.full(is_zero.sum(), 0.03),
+            marker=marker or "o",
+            linestyle="none",
+            transform=edge,
+            markerfacecolor="white",
+        )
+    if is_cut.any():
+        last = int(np.nanargmax(np.where(is_cut, given, np.nan)))
+        at = (values[last], places[last]) if is_flat else (places[last], values[last])
+        down = 3 + 9 * sum(text.get_gid() == "cut" for text in panel.texts)
+        where: Any = {"xytext": (0, 4), "ha": "center"} if chart.arrow else {"xytext": (4, -down), "va": "top"}
+        panel.annotate(
+            number(given[last]) + " ↑" * (not chart.arrow),
+            at,
+            textcoords="offset points",
+            color=style.colour,
+            gid="cut",
+            **where,
+        )
     if lost.any():
-        edge = panel.get_yaxis_transform() if is_flat else panel.get_xaxis_transform()
         plot(places[lost], np.full(lost.sum(), 0.97), marker="x", linestyle="none", transform=edge, markersize=5,
              markeredgewidth=1.4, clip_on=False)  # fmt: skip
 
@@ -366,9 +444,9 @@ def _draw_dots(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str, 
                 look: dict[str, Any] = {"color": shade, "alpha": 0.45, "linewidth": 1.8, "zorder": 1}
                 panel.hlines(place[str(category)], ends.min(), ends.max(), **look)
     is_spread = not chart.join and part[y.name].nunique() < len(part)
-    for number, (series, style) in enumerate(styles.items()):
+    for order, (series, style) in enumerate(styles.items()):
         points = part[part[chart.series].astype(str) == series] if chart.series else part
-        shift = -0.5 * (number - (len(styles) - 1) / 2) / max(len(styles), 2) if is_spread else 0.0
+        shift = -0.5 * (order - (len(styles) - 1) / 2) / max(len(styles), 2) if is_spread else 0.0
         rows = np.array([place[str(v)] for v in points[y.name]]) + shift
         _draw_values(chart, panel, points, x, log, rows, style, style.marker or "o", 3)
     panel.grid(axis="y", color="#e4e4e4", linewidth=0.6)
@@ -380,7 +458,7 @@ def _draw_dots(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str, 
 def _draw_grid(
     chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str, Style], place: dict[str, int], width: float
 ) -> float:
-    """Draw a cell per pair of x and y, coloured by level or value, in ``width`` inches; return the height of the labels of x."""
+    """Draw a cell per pair of x and y, coloured by level, in ``width`` inches; return the height of the labels of x."""
     x, y = chart.x[0], chart.y[0]
     names = _categories(x, part if chart.own_scales else chart.frame)
     room = width / max(len(names), 1)
@@ -388,10 +466,21 @@ def _draw_grid(
     size = min(SIZE - 1, 0.8 * 72 * room, SIZE * 0.92 * room / max(widest, 0.1))
     for line in part.to_dict("records"):
         at = names.index(_category(line[x.name])), place[_category(line[y.name])]
-        face = styles[str(line[chart.level])].colour if chart.level else _shade(float(line[chart.shade]))
+        face = styles[str(line[chart.level])].colour
         panel.add_patch(Rectangle((at[0] - 0.5, at[1] - 0.5), 1, 1, facecolor=face, edgecolor="white", linewidth=0.8))
         text = plain(str(line[chart.cell])) if chart.cell else ""
         panel.text(*at, text, ha="center", va="center", color=ink_on(face), fontsize=size)
+    if chart.limit:
+        heights = pd.Series(
+            {value: place[_category(value)] for value in sorted(part[y.name].dropna().unique())}, dtype=float
+        )
+        ends = part.groupby(x.name)[chart.limit].first()
+        ends = ends[(ends > 0) & np.isfinite(ends)]
+        if len(heights) > 1 and len(ends):
+            slope = (len(heights) - 1) / math.log(heights.index[-1] / heights.index[0])
+            panel.plot(
+                [names.index(_category(at)) for at in ends.index], np.log(ends / heights.index[0]) * slope, **LIMIT
+            )
     panel.set_xlim(-0.5, len(names) - 0.5)
     labels, step, angle = [_wrapped(name, room - 0.06, r"_,\[ =") for name in names], 1, 0
     widest = max(map(_text_width, labels))
@@ -423,11 +512,6 @@ def _categories(column: Column, rows: pd.DataFrame, downwards: bool = False) -> 
     if pd.api.types.is_numeric_dtype(values):
         return list(dict.fromkeys(map(_category, sorted(values.dropna(), reverse=downwards))))
     return list(map(str, values))
-
-
-def _shade(share: float) -> str:
-    """Return the colour of a cell by a number from 0 to 1: darker is larger."""
-    return to_hex(colormaps["YlOrBr"](0.08 + 0.84 * share)) if math.isfinite(share) else "#f0f0f0"
 
 
 def ink_on(ground: str) -> str:

@@ -68,7 +68,7 @@ def views_of(experiment: Experiment, rows: pd.DataFrame) -> Views:
     if not rows["status"].isin(RESULTS).any():
         return replace(views, headline=NO_RESULT)
     try:
-        return replace(views, headline=answer.fill(experiment.answer, partial(_table, views)))
+        return replace(views, headline=answer.fill(experiment.answer, partial(_table, views)) or views.headline)
     except LookupError as error:
         return replace(views, remarks=[*views.remarks, f"The rows no longer carry the answer: {printable(error)}"])
 

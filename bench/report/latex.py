@@ -45,7 +45,8 @@ def latex(tables: Sequence[Table], experiment: str) -> str:
     for i, blocks in enumerate(floats):
         title = escape_latex(experiment) + (", continued" if i else "")
         out += [r"\begin{table*}[tp]", r"\centering\footnotesize\setlength{\tabcolsep}{3pt}"]
-        out += [rf"\caption{{{title}. {notes}}}", *blocks, r"\end{table*}"]
+        label = f"tab:{experiment}-{tables[0].name}" + f"-{i + 1}" * bool(i)
+        out += [rf"\caption{{{title}. {notes}}}\label{{{label}}}", *blocks, r"\end{table*}"]
     return "\n".join(out) + "\n"
 
 

@@ -70,7 +70,7 @@ def _settings(given: Mapping[str, Any], known: dict[str, Plugin], timing: bool) 
         return []
     words = [f"study={_identity(cell.study)}", *plugin_settings(cell), *theta_settings(given["theta"])]
     default = Budget()
-    for name in ("samples", "tolerance") if cell.budget is not None else ():
+    for name in ("samples", "points", "tolerance") if cell.budget is not None else ():
         if getattr(cell.budget, name) != getattr(default, name):
             words.append(f"reference.{name}={getattr(cell.budget, name)!r}")
     if isinstance(cell.study, Study) and cell.timing != cell.study.timed:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Collection, Sequence
 from textwrap import wrap
 
@@ -13,6 +14,8 @@ from rich.text import Text
 
 from bench.report.text import one_line
 
+PIPE = 10_000
+"""Characters of a line in a pipe: no table is wider."""
 GAP = 2
 """Blanks between two columns."""
 LONGEST = 24
@@ -33,17 +36,22 @@ class _Console(Console):
 def open_console() -> Console:
     """Return a console that prints names as they are, without markup. It is as wide as the terminal.
 
-    ``COLUMNS`` replaces the width of the terminal, in a pipe too. A pipe without a terminal has 80 columns.
+    ``COLUMNS`` replaces the width of the terminal, in a pipe too. A pipe without it is as wide as its tables.
     """
-    return _Console(highlight=False, markup=False, emoji=False)
+    found = _Console(highlight=False, markup=False, emoji=False)
+    if not found.is_terminal and "COLUMNS" not in os.environ:
+        found.width = PIPE
+    return found
 
 
-def print_table(console: Console, table: pd.DataFrame, title: str = "", right: Collection[str] = ()) -> None:
+def print_table(
+    console: Console, table: pd.DataFrame, title: str = "", right: Collection[str] = (), omitted: Sequence[str] = ()
+) -> None:
     """Print a table of strings, as wide as the console at most.
 
     The columns ``right`` are right-aligned and never wrapped. Where the table is too wide, columns with one value are stated once
-    above it, then text wraps, then columns are left out, from the right, and named below it. The first column and the status
-    stay longest.
+    above it, then text wraps, then columns are left out, from the right, and named below it, after what is ``omitted`` already.
+    The first column and the status stay longest.
     """
     names, places = list(map(str, table)), range(table.shape[1])
     texts = [["\n".join(map(one_line, text.split("\n"))) for text in table.iloc[:, i].fillna("")] for i in places]
@@ -72,8 +80,8 @@ def print_table(console: Console, table: pd.DataFrame, title: str = "", right: C
     for text in filter(None, (title, facts)):
         console.print(Text(text), style="bold")
     console.print(grid)
-    if left_out:
-        listed = ", ".join(names[i] for i in sorted(left_out)[:MOST_NAMES])
+    if left_out or omitted:
+        listed = ", ".join([*omitted, *(names[i] for i in sorted(left_out)[:MOST_NAMES])])
         more = f" and {len(left_out) - MOST_NAMES} more" if len(left_out) > MOST_NAMES else ""
         text = f"Left out to fit {console.width} characters: {listed}{more}. The CSV file has all columns."
         console.print(Text(text), style="dim")

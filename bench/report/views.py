@@ -165,10 +165,13 @@ def is_logarithmic(values: Any) -> bool:
 
 
 def pareto(time: pd.Series, error: pd.Series) -> np.ndarray:
-    """Return a mask of the points on the Pareto front: no other point is smaller in both time and error."""
+    """Return a mask of the points on the Pareto front: no other point is smaller in both time and error.
+
+    The zero estimate takes no time and has an error of 1, so no point of a larger error is on the front.
+    """
     points = pd.DataFrame({"time": time.to_numpy(), "error": error.to_numpy()})
     best = points.groupby("time")["error"].min().cummin().shift(fill_value=math.inf)
-    return np.asarray(points["error"] <= points["time"].map(best))
+    return np.asarray(points["error"] <= points["time"].map(best).clip(upper=1.0))
 
 
 def unsteady(rows: Any) -> Any:

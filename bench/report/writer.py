@@ -121,8 +121,8 @@ def show(experiment: Experiment, rows: pd.DataFrame, views: Views) -> None:
         if table.terminal:
             right = {column.heading for column in table.columns if column.kind == "number"}
             for place, (heading, part) in enumerate(parts(table)):
-                texts = _terminal_text(replace(table, frame=part), console.width)
-                terminal.print_table(console, texts, heading or (table.title if place == 0 else ""), right=right)
+                texts, omitted = _terminal_text(replace(table, frame=part), console.width)
+                terminal.print_table(console, texts, heading or (table.title if place == 0 else ""), right, omitted)
             for note in table.notes if "md" not in table.files else ():
                 console.print(one_line(note))
     for text in map(one_line, views.remarks):
@@ -131,14 +131,14 @@ def show(experiment: Experiment, rows: pd.DataFrame, views: Views) -> None:
         console.print(f"\n{headline}")
 
 
-def _terminal_text(table: Table, width: int) -> pd.DataFrame:
-    """Return a table as strings without its details, and without intervals where these make it wider than ``width``."""
+def _terminal_text(table: Table, width: int) -> tuple[pd.DataFrame, list[str]]:
+    """Return a table as strings without its details, and without intervals if these make it wider than ``width``, and what is omitted."""
     columns = [column for column in table.columns if column.name not in table.details]
     texts = readable(replace(table, columns=columns))
     natural = sum(max([*map(len, texts[name]), *map(len, name.split())], default=0) + 2 for name in texts)
-    if natural - 2 <= width:
-        return texts
-    return readable(replace(table, columns=[replace(column, low="", high="") for column in columns]))
+    if natural - 2 <= width or not any(column.low for column in columns):
+        return texts, []
+    return readable(replace(table, columns=[replace(column, low="", high="") for column in columns])), ["95% intervals"]
 
 
 def reasons(rows: pd.DataFrame) -> list[str]:

@@ -6,20 +6,22 @@ Cells run, their rows are stored, and then they are reported.
 from __future__ import annotations
 
 import itertools
+import json
 import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from bench.errors import StorageError, Unsupported, UserError
 from bench.experiment.cell import Cell
 from bench.experiment.experiment import Experiment
+from bench.experiment.keys import HASHED
 from bench.experiment.parameters import completed_rows
 from bench.experiment.study import study_of
 from bench.measure import timing
-from bench.model import Estimator, guard
+from bench.model import Estimator, guard, reads
 from bench.run import descents, progress
 from bench.run.files import remove_stale
 from bench.run.ladder import climb
@@ -80,6 +82,7 @@ def execute(experiment: Experiment, quiet: bool = True) -> Finished:
     _refuse_without_supported_cells(experiment, planned)
     progress.print_versions(planned, experiment.execution.versions)
     progress.print_machines(planned, experiment.execution.launcher)
+    progress.print_stale(planned)
     store.prepare()
     for folder in (experiment.directory, experiment.directory / "pending", experiment.results_dir / "references"):
         remove_stale(folder)
@@ -142,6 +145,10 @@ class Runner:
     experiment: Experiment
     store: Store
     shown: progress.Progress
+    read: dict[str, str] = field(default_factory=lambda: {reads.name_of(path): of for path, of in HASHED.items()})
+    """Hashes of what code from outside has read in this run, by name."""
+    unchanged: set[str] = field(default_factory=lambda: {""})
+    """The texts in which answers give these hashes."""
 
     def run(self, planned: Sequence[Planned]) -> None:
         """Store a row for every cell that has none.
@@ -182,7 +189,9 @@ class Runner:
                 for answer in itertools.chain.from_iterable(self._answers(tasks, launcher)):
                     key = answer.item.cell.descent_key
                     if answer.result["status"] == "ok":
-                        known[key] = descents.save(folder, key, answer.result["descent"])
+                        known[key] = descents.save(
+                            folder, key, answer.result["descent"], answer.result.get("reads", "")
+                        )
                     else:
                         failed[key] = result_of(answer, "its descent: ")
         placed: list[Cell] = []
@@ -199,11 +208,9 @@ class Runner:
 
     def _missing_references(self, cells: list[Cell]) -> list[Cell]:
         """Return one cell for each reference to compute; closed forms are computed when their cells are measured."""
-        if self.experiment.budget is None:
-            return []
         references = Session(self.experiment).references
         # reversed twice, so that the first cell of each key remains, in the planned order
-        first = {cell.reference_key: cell for cell in reversed(cells)}
+        first = {cell.reference_key: cell for cell in reversed(cells) if cell.budget is not None}
         return [cell for cell in reversed(first.values()) if not references.stored(cell) and not _has_closed_form(cell)]
 
     def _compute_references(self, cells: list[Cell], references: list[Cell], launcher: Launcher) -> list[Cell]:
@@ -229,13 +236,26 @@ class Runner:
         for answers in launcher.run(groups):
             guard.raise_pending_interrupt()
             n_done += len(answers)
-            if answers:
-                yield answers
+            current_answers = [*itertools.takewhile(lambda answer: not self._changed(answer), answers)]
+            if current_answers:
+                yield current_answers
+            if changed := next(filter(None, map(self._changed, answers[len(current_answers) :])), ""):
+                raise Stopped(f"since {changed} changed during the run")
             current = "; ".join(str(item) for item in launcher.current)
             if what := "references" * tasks[0].reference or "descents" * tasks[0].descent:
                 # these are no cells, so the counts of cells stand still meanwhile
                 current += f" ({n_done} of {len(tasks)} {what} done)"
             self.shown.working(current)
+
+    def _changed(self, answer: Answer) -> str:
+        """Return what had another content when the cells were planned or an earlier one ran; empty if there is nothing."""
+        if (text := answer.result.get("reads", "")) in self.unchanged:
+            return ""
+        for name, content in json.loads(text).items():
+            if self.read.setdefault(name, content) != content:
+                return str(name)
+        self.unchanged.add(text)
+        return ""
 
     def _finish(self, results: list[tuple[Cell, dict[str, Any]]]) -> None:
         """Store rows and report them; raises :class:`Stopped` if due."""

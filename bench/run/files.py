@@ -29,7 +29,8 @@ def remove_stale(directory: Path) -> None:
 
 
 def write_whole(path: Path, content: bytes | Iterable[bytes]) -> None:
-    """Write a file completely or not at all; raises :class:`StorageError` if it cannot be written."""
+    """Write a file completely or not at all; raises :class:`StorageError` if it cannot be written. A link stays one."""
+    path = path.resolve() if path.is_symlink() else path
     part = path.with_name(f".{path.name[:100]}-bench-{uuid.uuid4().hex}")
     try:
         with open(part, "wb") as file:

@@ -15,7 +15,7 @@ from bench.experiment.experiment import Experiment
 from bench.experiment.grid import COUNTS, cells
 from bench.experiment.parameters import completed_json
 from bench.experiment.study import study_of
-from bench.model import Backend, Plugin, guard
+from bench.model import Backend, Plugin, guard, reads, registry
 from bench.model.parameters import remember
 from bench.run.record import version_of
 from bench.run.store import Store
@@ -40,6 +40,8 @@ class Planned:
     """Library versions of the stored row, if they differ from the installed ones."""
     machine: str = ""
     """The kind of machine that timed the stored row."""
+    stale: str = ""
+    """What the stored row has read that has changed since."""
 
     @property
     def runs(self) -> bool:
@@ -53,11 +55,12 @@ def plan(experiment: Experiment, store: Store) -> list[Planned]:
     Raises :class:`UserError` for invalid values.
     """
     rows = store.load()
-    facts = zip(rows["status"], rows["versions"], rows["machine"], strict=True)
+    facts = zip(*(rows[name] for name in ("status", "versions", "machine", "reads")), strict=True)
     stored = dict(zip(rows["key"], facts, strict=True))
     with guard.contained():
         mine = [cell for cell in cells(experiment) if _is_in_shard(cell, experiment.execution.shard)]
-        return [_planned(experiment, cell, stored) for cell in mine]
+        present = reads.Present(registry.environment())
+        return [_planned(experiment, cell, stored, present) for cell in mine]
 
 
 def _is_in_shard(cell: Cell, shard: tuple[int, int] | None) -> bool:
@@ -69,21 +72,22 @@ def _is_in_shard(cell: Cell, shard: tuple[int, int] | None) -> bool:
     return int(key, 16) % count == number - 1
 
 
-def _planned(experiment: Experiment, cell: Cell, stored: dict[str, tuple[str, str, str]]) -> Planned:
+def _planned(experiment: Experiment, cell: Cell, stored: dict[str, tuple[str, ...]], present: reads.Present) -> Planned:
     refusal = cell.refusal()
     if refusal is None and (reason := study_of(experiment).refusal(cell)) is not None:
         refusal = ("unsupported", reason)
     if cell.key not in stored:
         return Planned(cell, False, refusal)
-    status, row_versions, machine = stored[cell.key]
+    status, row_versions, machine, read = stored[cell.key]
+    stale = present.change(read, row_versions)
     rules = experiment.execution
     is_current = rules.versions == "ignore" or status != "ok" or row_versions == versions(cell.backend)
     # a rung of a ladder waits for the rung below it
-    again = status in (*rules.retry, "waiting") or (not is_current and rules.versions == "rerun")
+    again = bool(stale) or status in (*rules.retry, "waiting") or (not is_current and rules.versions == "rerun")
     # a plugin that was missing when the row was stored is installed now
     is_installed = status == "unavailable" and refusal is None
     timed = machine if cell.timing and status == "ok" and not again else ""
-    return Planned(cell, not (again or is_installed), refusal, "" if is_current else row_versions, timed)
+    return Planned(cell, not (again or is_installed), refusal, "" if is_current else row_versions, timed, stale)
 
 
 def requested_rows(experiment: Experiment, rows: pd.DataFrame) -> tuple[pd.DataFrame, str]:

@@ -122,6 +122,12 @@ def print_machines(planned: Sequence[Planned], launcher: str) -> None:
             )
 
 
+def print_stale(planned: Sequence[Planned]) -> None:
+    """Print how many stored rows are run again since something that they have read has changed."""
+    for stale, count in Counter(item.stale for item in planned if item.stale).most_common():
+        print(f"bench: {count} stored rows are stale, and run again: {printable(stale)}", file=sys.stderr)
+
+
 def print_others(experiment: Experiment, planned: Sequence[Planned], keys: Iterable[str]) -> None:
     """Print how many rows of other settings are stored under the experiment's name, of the stored ``keys``."""
     n_others = len(set(keys) - {item.cell.key for item in planned})
@@ -142,6 +148,7 @@ def print_plan(experiment: Experiment, planned: Sequence[Planned], rows: pd.Data
     runs = [item for item in planned if item.runs]
     print(f"{experiment.name}: {len(planned)} cells, {n_stored} stored, {len(runs)} to run, {len(refusals)} refused")
     print_others(experiment, planned, rows["key"])
+    print_stale(planned)
     for reason, count in Counter(f"{status}: {reason}" for status, reason in refusals).most_common():
         print(f"  {count} {reason}")
     if runs:

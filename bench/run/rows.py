@@ -7,9 +7,11 @@ and the number of rows left out.
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
 import math
+import re
 import sys
 from collections.abc import Callable, Sequence
 from functools import lru_cache, partial
@@ -54,6 +56,9 @@ TABLES = ("machine", "versions", "config", "counts")
 LARGEST = 2.0**53
 """Larger counts are not exact as float64, so no run has written them."""
 
+CHECKSUM = re.compile("[0-9a-f]{64}")
+"""Names of small files: the SHA-256 of their content."""
+
 _reported: set[str] = set()
 """Sentences that were printed, since a command reads its files more than once."""
 
@@ -80,7 +85,7 @@ def read_parquet(path: Path, columns: Sequence[str] | None = None) -> pd.DataFra
     table = pyarrow.parquet.read_table(content, columns=columns and list(columns), read_dictionary=texts)
     # a column is freed as soon as it is converted
     frame = table.to_pandas(split_blocks=True, self_destruct=True)
-    if not all(isinstance(name, str) for name in frame):
+    if not all(name and isinstance(name, str) for name in frame):
         raise ValueError("a column has no name")
     return frame.assign(**{name: _shared(frame[name]) for name in texts if name in frame})
 
@@ -114,9 +119,15 @@ def read_small(paths: Sequence[Path], columns: Columns) -> tuple[pd.DataFrame, s
 
     rows: list[dict[str, Any]] = []
     files: list[Path] = []
+    damaged: set[Path] = set()
     for path in paths:
         try:
-            content = json.loads(path.read_text())
+            written = path.read_bytes()
+            if CHECKSUM.fullmatch(path.stem) and hashlib.sha256(written).hexdigest() != path.stem:
+                damaged.add(path)
+                _report(f"bench: '{path}' is damaged: its rows are left out")
+                continue
+            content = json.loads(written)
             if not all(row["key"] and isinstance(row["key"], str) for row in content):
                 raise ValueError("a row has a key")
         except FileNotFoundError:
@@ -125,7 +136,15 @@ def read_small(paths: Sequence[Path], columns: Columns) -> tuple[pd.DataFrame, s
             raise _unreadable(path, "JSON rows", error) from None
         rows += content
         files += [path] * len(content)
-    return valid_rows(pd.DataFrame(rows, dtype=object), columns, files)
+    valid, spoilt = valid_rows(pd.DataFrame(rows, dtype=object), columns, files)
+    return valid, spoilt | damaged
+
+
+def _report(sentence: str) -> None:
+    """Print a sentence on stderr, once."""
+    if sentence not in _reported:
+        _reported.add(sentence)
+        print(sentence, file=sys.stderr)
 
 
 def _unreadable(path: Path, kind: str, error: Exception) -> StorageError:
@@ -145,12 +164,8 @@ def valid_rows(table: pd.DataFrame, columns: Columns, files: Sequence[Path]) -> 
     for path in spoilt:
         own = [place for place, file in enumerate(files) if file == path]
         faulty = [number for number, place in enumerate(own) if place in reasons]
-        sentence = printable(
-            f"bench: '{path}', row {faulty[0] + 1}: {reasons[own[faulty[0]]]}; {len(faulty)} of {len(own)} rows are left out"
-        )
-        if sentence not in _reported:
-            _reported.add(sentence)
-            print(sentence, file=sys.stderr)
+        first = f"'{path}', row {faulty[0] + 1}: {reasons[own[faulty[0]]]}"
+        _report(printable(f"bench: {first}; {len(faulty)} of {len(own)} rows are left out"))
     valid = table[~np.isin(np.arange(len(table)), list(reasons))] if reasons else table
     return columns.typed(valid.infer_objects()), spoilt
 
@@ -160,7 +175,7 @@ def _faults(table: pd.DataFrame, columns: Columns) -> dict[int, str]:
 
     reasons: dict[int, str] = {}
     for name in table:
-        values, (holds, rule) = table[name], _rule(name, columns)
+        values, (holds, fault) = table[name], rule(name, columns)
         column = columns.by_name.get(name)
         if values.dtype.kind in "fiub" and (column is None or column.kind == "number"):
             is_valid: Any = _is_in_range(name, values.to_numpy(dtype=float))
@@ -170,7 +185,7 @@ def _faults(table: pd.DataFrame, columns: Columns) -> dict[int, str]:
             is_valid = np.fromiter(map(holds, values), dtype=bool)
         for place in np.flatnonzero(~np.broadcast_to(is_valid, len(table))):
             value = printable(repr(values.iloc[place]))[:60]
-            reasons.setdefault(int(place), f"{printable(name)[:60]}={value} {rule}")
+            reasons.setdefault(int(place), f"{printable(name)[:60]}={value} {fault}")
     if "parameters" in table:
         is_described = ~table["parameters"].fillna("").isin(["", "{}"])
         for name in NEEDED:
@@ -180,7 +195,7 @@ def _faults(table: pd.DataFrame, columns: Columns) -> dict[int, str]:
     return reasons
 
 
-def _rule(name: str, columns: Columns) -> tuple[Callable[[Any], bool], str]:
+def rule(name: str, columns: Columns) -> tuple[Callable[[Any], bool], str]:
     """Return the check of a value of a column, and what is wrong with a value that fails it."""
     column = columns.by_name.get(name)
     if column is None:

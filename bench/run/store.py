@@ -1,6 +1,7 @@
 """Stores rows on disk.
 
-Rows that finish together are one small JSON file under ``pending/``. At the end of a run the small files are merged
+Rows that finish together are one small JSON file under ``pending/``, whose name is the hash of its content: a damaged file is
+left out, and its cells run again. At the end of a run the small files are merged
 into ``rows.parquet``, by one run at a time, which holds a lock (``flock``). Every file is written completely under a unique
 name and then renamed into place, and a small file is deleted only after its rows are in the table. So a run can be killed at
 any moment, and several runs can write to one directory: the stored rows are the newest row of each key in all files. The
@@ -11,6 +12,7 @@ and may be wrong for an hour. Reading and adding rows need no lock. Where the fi
 from __future__ import annotations
 
 import fcntl
+import hashlib
 import io
 import json
 import os
@@ -50,6 +52,8 @@ class Store:
         self._columns = columns
         self._study = study
         self._sequence: int | None = None
+        self.left_out: set[Path] = set()
+        """The files of which :meth:`load` has left out rows."""
         self._table = directory / "rows.parquet"
         self._pending = directory / "pending"
 
@@ -69,11 +73,13 @@ class Store:
         self._sequence += 1
         stamped = [row | {"stored_at": time.time(), "sequence": self._sequence} for row in rows]
         make_directory(self._pending)
-        write_whole(self._pending / f"{uuid.uuid4().hex}.json", json.dumps(stamped).encode())
+        content = json.dumps(stamped).encode()
+        write_whole(self._pending / f"{hashlib.sha256(content).hexdigest()}.json", content)
 
     def load(self) -> pd.DataFrame:
         """Return the newest stored row of each key; rows of ``rows.parquet`` come first."""
-        return self._read_all()[0]
+        rows, _, self.left_out = self._read_all()
+        return rows
 
     def compact(self, order: Sequence[str] = ()) -> None:
         """Merge the small files into ``rows.parquet``; rows of the keys in ``order`` come last, in that order.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections import defaultdict
 from collections.abc import Iterable
 from contextlib import suppress
@@ -13,15 +14,16 @@ from typing import Any
 from bench.errors import STATUSES, StorageError, failure, printable
 from bench.experiment.cell import Cell
 from bench.experiment.experiment import Experiment
-from bench.experiment.keys import fingerprint
+from bench.experiment.keys import fingerprint, names_files
 from bench.experiment.parameters import PROBLEM
 from bench.experiment.study import Study, study_of
 from bench.measure import descent, noise
 from bench.measure.statistics import PHYSICS
-from bench.model import Backend, Plugin, Scene, guard, isolation, registry
+from bench.model import Backend, Plugin, guard, isolation, reads, registry
 from bench.run.plan import versions
 from bench.run.pool import Answer
 from bench.run.record import kind_of_machine
+from bench.run.rows import rule
 from bench.run.session import Session
 
 MAX_REASON = 2000
@@ -96,25 +98,25 @@ class TaskHandler:
         self._state.follow()
 
     def __call__(self, item: Task) -> dict[str, Any]:
-        """Return the results of the cell, or the status and reason of its failure.
+        """Return the results of the cell, or the status and reason of its failure, and what code from outside has read.
 
-        The reason names changed settings of the process, and code from outside that the process has run for other cells.
+        The reason names code from outside that the process has run for other cells.
         """
         RAN.update(item.outside)
+        for name in item.outside:
+            if os.path.isabs(name) and not name.startswith(reads.INSIDE):  # those of this package are in the key
+                reads.note(name)
         result = self._handle(item)
-        remarks = []
-        if changes := self._state.changes():
-            remarks.append(f"settings changed in this process: {printable('; '.join(changes))}")
-            if (
-                result.get("dtype", item.cell.backend.dtype) == "float64"
-                and isolation.reduced_precision()
-                and _uses_jax(item.backend)
-            ):
-                result["dtype"] = "float32"
+        is_reduced = isolation.reduced_precision()
+        if is_reduced and result.get("dtype", item.cell.backend.dtype) == "float64" and _uses_jax(item.backend):
+            result["dtype"] = "float32"
+        self.is_tainted = is_reduced or self._study.fresh_process or not registry.is_restricted()
+        if RAN:
+            result["reads"] = reads.manifest()
         if others := RAN - item.outside:
-            remarks.append(f"this process has also run code of {printable(', '.join(sorted(others)))}")
-        self.is_tainted = bool(changes) or self._study.fresh_process or not registry.is_restricted()
-        return result | {"reason": "; ".join(filter(None, (result.get("reason", ""), *remarks)))} if remarks else result
+            remark = f"this process has also run code of {printable(', '.join(sorted(others)))}"
+            result["reason"] = "; ".join(filter(None, (result.get("reason", ""), remark)))
+        return result
 
     def _handle(self, item: Task) -> dict[str, Any]:
         # other code may have changed what computes it
@@ -139,13 +141,13 @@ def outside_of(parts: Iterable[Plugin | None]) -> frozenset[str]:
     names = {type(part).__module__ for part in foreign}
     for part in foreign:
         with suppress(Exception):  # the error is reported when the cell is measured
-            names |= set(map(str, getattr(part, "files", tuple)()))
+            names |= set(map(str, part.files() if names_files(part) else ()))  # type: ignore[attr-defined]
     return frozenset(names)
 
 
 def is_foreign(part: Plugin) -> bool:
     """Return whether a plugin's code is from outside this package."""
-    return not type(part).__module__.startswith("bench.") or (isinstance(part, Scene) and hasattr(part, "files"))
+    return not type(part).__module__.startswith("bench.") or names_files(part)
 
 
 def _uses_jax(backend: Backend) -> bool:
@@ -167,7 +169,8 @@ def measure_cell(cell: Cell, session: Session, study: Study) -> dict[str, Any]:
     if not cell.timing:
         blank = study.columns.blank()
         result |= {name: blank[name] for name in study.columns.measured}
-    return result | solver_columns(cell, session, result)
+    result |= solver_columns(cell, session, result)
+    return result | {"reason": "; ".join(filter(None, (result.get("reason", ""), *cell.remarks)))}
 
 
 def solver_columns(cell: Cell, session: Session, result: dict[str, Any]) -> dict[str, Any]:
@@ -198,13 +201,13 @@ def _fault_of(result: dict[str, Any], study: Study) -> str:
     """Return the first value of a result that its column cannot hold, in words; empty if there is none."""
     if result["status"] not in STATUSES:
         return f"the status {printable(result['status'])[:100]!r}, which is not one of {', '.join(STATUSES)}"
-    types = {"number": (int, float, type(None)), "text": (str,), "list": (list, tuple)}
     for name, value in result.items():
         column = study.columns.by_name.get(name)
         if column is None:
             return f"{name!r}, which is not one of its columns"
-        if not isinstance(value, types[column.kind]):
-            return f"{name}={printable(repr(value))[:100]}, and that column holds a {column.kind}"
+        holds, words = rule(name, study.columns)
+        if not holds(value):
+            return f"{name}={printable(repr(value))[:100]}, which {words}"
     try:
         json.dumps(result)
     except (TypeError, ValueError) as error:

@@ -14,7 +14,7 @@ from multiprocessing.connection import Connection
 from typing import Any, Protocol
 
 from bench.errors import StorageError, failure
-from bench.model import guard, registry
+from bench.model import guard, reads, registry
 
 PROGRAM = "import sys; sys.path[:] = sys.argv.pop().split(chr(0x1f)); from bench.run.worker import main; main()"
 """The program of a worker. It has the import path of its run, and does not import the run's main script."""
@@ -62,6 +62,7 @@ def _serve(connection: Connection) -> None:
     # the argument is pickled separately, since its classes may come from the folders of plugins
     folders, make, argument = pickle.loads(_receive(connection))
     registry.restrict(frozenset())
+    reads.start()
     for folder in folders:
         registry.add_folder(folder)
     pid = os.getpid()

@@ -17,6 +17,8 @@ UNITS = {"ms": 1e-3, "s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0, "": 1.0}
 """Seconds per unit of a budget."""
 MIN_ALARM_S, ALARM_INTERVAL_S = 1e-3, 1.0
 """Minimum delay of the alarm, and the interval at which the alarm repeats, in seconds."""
+HANGS = 100.0
+"""Multiple of the mean time of a call above which a call that has not returned is named."""
 PROGRESS_INTERVAL_S = 0.2
 """Minimum time between two updates of the progress line, in seconds."""
 MOST_WAITED = 1.0
@@ -79,11 +81,15 @@ class Clock:
         """Seconds spent in the first call of each kind and shape."""
         self.is_terminated = False
         """Whether the process was asked to end, by SIGTERM."""
+        self.hung_s = 0.0
+        """Seconds of a call that had not returned when the budget ended, much longer than the others; else 0."""
         self._timed = {"costs": 0, "gradients": 0}
         self._shown = shown and sys.stderr.isatty()
         self._stage, self._last_shown = "", 0.0
         self._deadline, self._last_call = math.inf, math.inf
         self._is_inside = False
+        self.is_interrupted = False
+        """Whether the running call was interrupted: compiled code that called back may have made another error of it, or none."""
 
     @property
     def spent(self) -> float:
@@ -159,7 +165,8 @@ class Clock:
     def interrupt_when_over(self, first: bool = False) -> Iterator[None]:
         """Raise :class:`OutOfTime` inside the block when the budget is spent, or ``compile_budget`` for a first call.
 
-        Compiled code is interrupted only when it returns. Only the main thread can be interrupted, and only if no other
+        Compiled code is interrupted only when it returns or calls back. Whatever it makes of the interruption, the block
+        ends with :class:`OutOfTime`, and its result does not count. Only the main thread can be interrupted, and only if no other
         code uses the alarm signal.
         """
         allowed = self.compile_budget - self.compile_s if first else self.remaining
@@ -171,15 +178,23 @@ class Clock:
         def raise_out_of_time(number: int, frame: FrameType | None) -> None:
             # time lost to other programs is not charged: the alarm repeats until the budget is really spent
             if first or self.remaining <= 0.0:
+                self.is_interrupted = True
                 raise OutOfTime
 
         try:
-            self._is_inside = True
+            self._is_inside, self.is_interrupted = True, False
             if is_free:
                 signal.signal(signal.SIGALRM, raise_out_of_time)
                 # the alarm repeats, since an exception raised in a callback may be lost
                 signal.setitimer(signal.ITIMER_REAL, max(allowed, MIN_ALARM_S), ALARM_INTERVAL_S)
             yield
+            if self.is_interrupted:
+                raise OutOfTime
+        except OutOfTime:
+            took, calls = time.perf_counter() - began, sum(self._timed.values())
+            is_long = calls and took > HANGS * (self.cost_s + self.gradient_s) / calls
+            self.hung_s = took if is_long and took > HANGS * MIN_ALARM_S and not self.is_terminated else 0.0
+            raise
         finally:
             self._is_inside = False
             if is_free:

@@ -54,8 +54,8 @@ def load_module(place: str) -> ModuleType:
             raise UserError(
                 f"there is no module '{place}': give a file, mysim.py:cost, or a module ({error})"
             ) from None
-        except Exception as error:
-            raise UserError(f"'{place}' cannot be imported: {failure(error)['reason']}") from None
+        except BaseException as error:
+            raise _unusable(place, error) from None
     path = Path(place).expanduser().resolve()
     if not path.is_file():
         raise UserError(f"there is no file '{place}'")
@@ -72,15 +72,19 @@ def load_module(place: str) -> ModuleType:
     sys.modules[name] = module
     try:
         spec.loader.exec_module(module)
-    except SystemExit:
+    except BaseException as error:
         del sys.modules[name]
-        raise UserError(
-            f"'{place}' ends the process when it is imported: put that under if __name__ == \"__main__\""
-        ) from None
-    except Exception as error:
-        del sys.modules[name]
-        raise UserError(f"'{place}' cannot be imported: {failure(error)['reason']}") from None
+        raise _unusable(place, error) from None
     return module
+
+
+def _unusable(place: str, error: BaseException) -> BaseException:
+    """Return the error for a file whose import raised one; an interrupt of the command is returned as it is."""
+    if isinstance(error, KeyboardInterrupt):
+        return error
+    if isinstance(error, SystemExit):
+        return UserError(f"'{place}' ends the process when it is imported: put that under if __name__ == \"__main__\"")
+    return UserError(f"'{place}' cannot be imported: {failure(error)['reason']}")
 
 
 def _module_name(path: Path) -> str:

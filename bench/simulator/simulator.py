@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import sys
+from collections import deque
 from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout
 from functools import partial
@@ -29,6 +31,8 @@ DISTINCT = 3
 """Fewest costs that show that all costs have single precision: each is one in double precision once in 2^29."""
 SIMPLE_BITS = 12
 """Costs with at most this many significant bits, such as 0.5, show nothing about the precision."""
+KEPT = 4
+"""Most failed calls that are kept, to be made again."""
 COMPARED = 10_000_000
 """Numbers of theta in all calls up to which each call is searched for changes of theta."""
 
@@ -67,6 +71,8 @@ class Simulator:
         """Notes for the user on how the cost is called."""
         self.raised: dict[str, int] = {}
         """Number of failed calls of the cost, after the first call, by exception."""
+        self.failed: deque[tuple[np.ndarray, ...]] = deque(maxlen=KEPT)
+        """The thetas of the last of these calls, and the noise w where there is some."""
         self.gradient_error = ""
         """The first exception of the gradient, or an empty string."""
         self.n_failed_gradients = 0
@@ -113,7 +119,39 @@ class Simulator:
 
         return call
 
+    # ------------------------------------------------------------------------------------------- other calls
+
+    def variant(self, cost: Callable[..., Any], grad: Any = None) -> Simulator:
+        """Return the simulator of another cost and gradient that are called as these, on the same clock."""
+        return Simulator(cost, self.layout, grad, self.noise, self.mode, self.clock, self.library)
+
+    def with_steps(self, steps: int) -> Simulator:
+        """Return the simulator of the same cost and gradient after another number of steps."""
+        grad = partial(self._grad, steps=steps) if callable(self._grad) else self._grad
+        return self.variant(partial(self._cost, steps=steps), grad)
+
+    def call(self, vector: Any, *w: Any) -> Any:
+        """Return the user's cost of one theta, a vector ``(d,)``, as it is: not counted, timed or interrupted."""
+        return self._cost(self._build_theta(vector), *w)
+
+    def trace(self, enter: Callable[..., Any], *parts: np.ndarray) -> None:
+        """Compute the costs of theta and w, ``(d, B)`` and ``(n, B)``, under a trace function; they count, and their time does not."""
+        self.clock.check(1)
+        before = sys.gettrace()
+        with self.clock.interrupt_when_over():
+            sys.settrace(enter)
+            try:
+                self._costs(*parts)
+            finally:
+                sys.settrace(before)
+        self.clock.count("costs", 1, 0.0, warm=False)
+
     # ------------------------------------------------------------------------------------------- columns
+
+    @property
+    def mode(self) -> str:
+        """The batching mode with its fixed width, ``columns:64``."""
+        return self.batch + (f":{self.fixed}" if self.fixed else "")
 
     @property
     def unit(self) -> float:
@@ -184,6 +222,9 @@ class Simulator:
         try:
             return np.asarray(self._values(*parts), dtype=np.float64)
         except Exception as error:
+            if self.clock.is_interrupted:
+                raise OutOfTime from None
+            self.failed.append(tuple(part.copy() for part in parts))  # whose memory is used again
             text = f"{type(error).__name__}: {error}"
             self.raised[text] = self.raised.get(text, 0) + 1
             return np.full(parts[0].shape[1], np.nan)
@@ -194,6 +235,8 @@ class Simulator:
         except UserError:
             raise
         except Exception as error:
+            if self.clock.is_interrupted:
+                raise OutOfTime from None
             reason = failure(error)["reason"]
             if isinstance(self._grad, str) and not self.clock.gradients:
                 advice = f"write it with {self._grad} alone, or give grad=FUNCTION"
@@ -373,12 +416,12 @@ class Simulator:
             return self._whole(self._cost, self.batch, thetas, *w)
         if self.batch == "vmap":
             return torch.func.vmap(
-                lambda vector, *rest: self._cost(self._build_theta(vector), *rest).reshape(()),
+                lambda *parts: self.call(*parts).reshape(()),
                 in_dims=1,
                 randomness="same",
             )(thetas, *w)
         columns = range(thetas.shape[1])
-        costs = [self._cost(self._build_theta(thetas[:, i]), *(part[:, i] for part in w)) for i in columns]
+        costs = [self.call(thetas[:, i], *(part[:, i] for part in w)) for i in columns]
         # torch would convert a Python number to single precision
         doubles = [cost if torch.is_tensor(cost) else torch.as_tensor(cost, dtype=torch.float64) for cost in costs]
         return torch.stack([cost.reshape(()) for cost in doubles])
@@ -387,14 +430,11 @@ class Simulator:
         """Return cost and gradient for a batching mode as Python functions."""
         import jax
 
-        def raw(vector: Any, *rest: Any) -> Any:
-            return self._cost(self._build_theta(vector), *rest)
-
         def one(*parts: Any) -> Any:
-            return jax.numpy.reshape(raw(*parts), ())
+            return jax.numpy.reshape(self.call(*parts), ())
 
         if batch == "loop":
-            return {"cost": raw, "gradient": jax.grad(one)}
+            return {"cost": self.call, "gradient": jax.grad(one)}
         whole = jax.vmap(one, in_axes=1) if batch == "vmap" else partial(self._whole, self._cost, batch)
         return {"cost": whole, "gradient": jax.grad(lambda *parts: whole(*parts).sum())}
 

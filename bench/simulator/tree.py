@@ -198,7 +198,11 @@ class ParameterTree:
         if [part.shape if part.size > 1 else part.size for part in parts] == sizes:
             return np.concatenate([part.ravel() for part in parts])
         numeric = leaves and all(part.dtype.kind in "biufc" for _, part in leaves)
-        shapes = str(whole.shape) if whole.size else ", ".join(f"{path} {part.shape}".strip() for path, part in leaves)
+        shapes = (
+            str(tuple(getattr(value, "shape", whole.shape)))
+            if whole.size
+            else ", ".join(f"{path} {part.shape}".strip() for path, part in leaves)
+        )
         given = f"has shape {shapes}" if numeric else f"is {type(value).__name__} {value!r}"[:200]
         expected = ", ".join(f"{leaf.path} {leaf.shape}".strip() for leaf in self.leaves)
         turned = zip([whole, *parts], [self._whole, *(leaf.shape for leaf in self.leaves)], strict=False)

@@ -12,8 +12,7 @@ from typing import Any
 
 from bench.model import Array
 
-from ..fused.graph import FOLD
-from ..fused.trace import interpret
+from ..jaxprs import FOLD, interpret
 
 MAX_ROWS = 16
 """Maximum number of rows of arrays that are split."""

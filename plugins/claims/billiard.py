@@ -20,6 +20,7 @@ class Missed(Claim):
         "(contacts from distance), it is 0 nowhere."
     )
     source = "Paulus et al. 2025, arXiv 2506.14186; shares from the geometry"
+    origin = "recomputed"
     learned = (
         "A surrogate gradient sees what was missed and keeps the motion, but it is not the derivative of the program."
     )

@@ -32,7 +32,8 @@ class CentralPath(Claim):
     lesson = "The price of smoothing"
     statement = "Relaxing complementarity by kappa equals smoothing by Student t noise of two degrees of freedom."
     source = "Suh, Pang, Tedrake 2022; Pang et al. 2023"
-    learned = "Analytic smoothing and smoothing by noise are the same thing; only the analytic one has no variance."
+    learned = "Relaxed contact is contact smoothed by noise of heavy tails; only the relaxed one has no variance."
+    revision = 2
     quantity = "derivative of the gap after it"
 
     def measure(self) -> Outcome:
@@ -61,6 +62,10 @@ class CentralPath(Claim):
             Figure("first-order sd at the kink, 500 samples", "0.02236", (first / 500) ** 0.5, first_error / 20),
             Figure("zeroth-order sd at the kink, 500 samples", "0.0500", (zeroth / 500) ** 0.5, zeroth_error / 20),
         ]
-        curves = {"central path = t(2) noise": relaxed, "closest Gaussian": ndtr(a / closest.x)}
+        curves = {
+            "relaxed": relaxed,
+            "smoothed by t(2) noise": chance,
+            "smoothed by the closest Gaussian": ndtr(a / closest.x),
+        }
         series = {"gap without force / sqrt(c)": a} | curves
         return Outcome(figures, series={name: values[::8] for name, values in series.items()})

@@ -28,6 +28,7 @@ class Damper(Claim):
         "78.4 at 2e5. Without a damper they agree, and a step ten times finer changes nothing: the damper jumps at first touch."
     )
     source = "Zhong, Han, Brikis 2022, task 2; distances by an independent program"
+    origin = "recomputed"
     learned = "A stiff contact does not bias the first order; a force that jumps does, at any step."
     quantity = "distance of first from zeroth order"
 

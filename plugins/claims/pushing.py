@@ -87,6 +87,7 @@ class StiffPush(Claim):
         "stays at 1.3e7."
     )
     source = "Suh et al. 2022, ICML; recomputed with a finer step"
+    origin = "recomputed"
     learned = "Two to three of the decades at k = 1000 are the step's, not the contact's: refine before you smooth."
     quantity = "variance of one sample"
     logarithmic = "xy"

@@ -40,6 +40,7 @@ class Chaos(Claim):
         "the best mixture is 1.6e10 times better at T = 20."
     )
     source = "Metz et al. 2021; Parmas et al. 2018; figures for the tent map in closed form"
+    origin = "recomputed"
     learned = "Beyond the horizon of chaos derivatives are right and useless; sampling does not care."
     quantity = "variance of one sample"
     logarithmic = "y"

@@ -37,8 +37,10 @@ class Windows(Claim):
     )
     source = "Xu et al. 2022 (idea); closed form by Riccati steps"
     learned = "Cutting a rollout is cheap only if its end is worth something."
-    quantity = "excess cost"
-    logarithmic = "y"
+    origin = "recomputed"
+    quantity = "gain of the first control"
+    marks = (("y", GAIN, "endless problem"),)
+    revision = 2
 
     def measure(self) -> Outcome:
         """Compute the optimum of each window from its gradient, which is linear in the controls."""
@@ -47,7 +49,7 @@ class Windows(Claim):
             5: ("0.234621", "0.01129"), 6: ("0.250723", "0.00319"),
         }  # fmt: skip
         figures: list[Figure] = []
-        costs = {}
+        gains = {}
         best = _infinite_horizon_cost(GAIN)
         for steps, (gain, excess) in published.items():
             plain = _first_gain(steps)
@@ -55,10 +57,15 @@ class Windows(Claim):
             if excess:
                 off = _infinite_horizon_cost(plain) / best - 1
                 figures.append(Figure(f"excess cost of a window of {steps}", excess, off, 1e-9))
-                costs[steps] = off
             valued = _first_gain(steps, VALUE)
+            gains[steps] = plain, valued
             figures.append(Figure(f"gain of a window of {steps} with the value", "0.270156", valued, 1e-7))
-        return Outcome(figures, series={"window H": list(costs), "no value at the end": list(costs.values())})
+        names = "no value at the end", "its value at the end"
+        return Outcome(
+            figures,
+            series={"window H": list(gains)}
+            | dict(zip(names, map(list, zip(*gains.values(), strict=True)), strict=True)),
+        )
 
 
 def _first_gain(d: int, value: float = 0.0) -> float:
@@ -82,6 +89,7 @@ class OtherObjective(Claim):
     lesson = "Windows and objectives"
     statement = "iLQR swings a pendulum up in five iterations: 1856.154, 1202.106, 699.799, 423.583, 357.476, 357.297."
     source = "Suh et al. 2021, Bundled gradients, public result file"
+    origin = "data file"
     learned = "Say which objective was given and on which one it is scored; nobody can tell from the curve."
     quantity = "cost above the least, 349.49"
     logarithmic = "y"

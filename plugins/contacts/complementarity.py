@@ -11,7 +11,7 @@ class Complementarity(ImpulseLaw):
     """Solves lambda y = kappa, lambda >= 0, y >= 0 at the end of the step, with y = gap + lambda / stiffness.
 
     kappa -> 0 is hard contact, and infinite stiffness rigid contact: impacts are inelastic, and the scene's restitution
-    is ignored. A finite stiffness is a penalty spring evaluated at the end of the step instead of its start.
+    is ignored, as is its friction. A finite stiffness is a penalty spring evaluated at the end of the step instead of its start.
     Solved through the Fischer-Burmeister function p + y - sqrt(p^2 + y^2 + 2 c kappa), whose root lies on the
     central path, with p = c lambda the gap that the force opens in a step (c = dt^2 J M^-1 J^T).
     """
@@ -19,6 +19,7 @@ class Complementarity(ImpulseLaw):
     name = "complementarity"
     smoothing = "kappa"
     needs_root = True
+    ignores = (*ImpulseLaw.ignores, "restitution")
 
     kappa: float = param(1e-4, "central-path parameter, force times gap", "N m", positive=True)
     stiffness: float = param(float("inf"), "force per remaining penetration; inf: rigid", "N/m", positive=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from functools import reduce
@@ -10,8 +9,15 @@ from typing import Any
 
 import numpy as np
 
+from ..jaxprs import FOLD
+
 MOST = 20_000
-"""Maximum number of operations in a graph: longer straight-line code would take too long to compile."""
+"""Maximum number of operations in code: longer straight-line code would take too long to compile."""
+TRACED = 25 * MOST
+"""Maximum number of nodes of a trace, in which inputs of each step, such as controls, become one in the code of the loop."""
+
+
+TOO_LONG = f"code of more than {MOST} operations without a loop"
 
 
 class Refused(Exception):
@@ -34,26 +40,13 @@ class Node:
         return self.data if self.op == "literal" else None
 
 
-FOLD: dict[str, Callable[..., Any]] = {
-    "abs": np.abs, "acos": np.arccos, "acosh": np.arccosh, "add": np.add, "and": np.logical_and, "asin": np.arcsin,
-    "asinh": np.arcsinh, "atan": np.arctan, "atan2": np.arctan2, "atanh": np.arctanh, "ceil": np.ceil, "cos": np.cos,
-    "cosh": np.cosh, "div": np.divide, "eq": np.equal, "erf": np.vectorize(math.erf), "exp": np.exp,
-    "expm1": np.expm1, "floor": np.floor, "ge": np.greater_equal, "gt": np.greater, "is_finite": np.isfinite,
-    "le": np.less_equal, "log": np.log, "log1p": np.log1p, "logistic": lambda x: 1.0 / (1.0 + np.exp(-x)),
-    "lt": np.less, "max": np.maximum, "min": np.minimum, "mul": np.multiply, "ne": np.not_equal, "neg": np.negative,
-    "not": np.logical_not, "or": np.logical_or, "pow": np.power, "rem": np.fmod, "rsqrt": lambda x: 1.0 / np.sqrt(x),
-    "select_n": lambda which, no, yes: np.where(which, yes, no), "sign": np.sign, "sin": np.sin, "sinh": np.sinh,
-    "sqrt": np.sqrt, "square": np.square, "stop_gradient": lambda x: x, "sub": np.subtract, "tan": np.tan,
-    "tanh": np.tanh, "xor": np.logical_xor,
-}  # fmt: skip
-"""NumPy functions that evaluate operations on constants, by operation."""
-
-
 @dataclass
 class Graph:
     """The nodes of an expression graph. Equal nodes are the same object."""
 
     nodes: list[Node] = field(default_factory=list)
+    most: int = TRACED
+    """Maximum number of nodes."""
     _known: dict[Any, Node] = field(default_factory=dict)
 
     def leaf(self, op: str, data: Any = None) -> Node:
@@ -127,8 +120,8 @@ class Graph:
         key = (op, tuple(arg.number for arg in args), repr(data) if op == "literal" else data)
         found = self._known.get(key)
         if found is None:
-            if len(self.nodes) >= MOST * (10 if not args else 1):
-                raise Refused(f"code of more than {MOST} operations without a loop")
+            if len(self.nodes) >= self.most:
+                raise Refused(TOO_LONG)
             found = self._known[key] = Node(len(self.nodes), op, args, data)
             self.nodes.append(found)
         return found

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from .graph import FOLD, Graph, Node, Refused
+from ..jaxprs import FOLD, interpret
+from .graph import MOST, TOO_LONG, Graph, Node, Refused, reached
 
 BRANCHES = 4
 """Maximum number of different formulas for one input of a step along the horizon."""
@@ -55,8 +56,12 @@ def traced(function: Callable[..., Any], shapes: dict[str, int]) -> Loop:
     tracer = Tracer(Graph())
     inputs = [_leaves(tracer.loop.graph, name, n) for name, n in shapes.items()]
     (cost,) = tracer.run(closed.jaxpr, closed.consts, inputs)
-    tracer.loop.result = tracer.nodes(cost)[0]
-    return tracer.loop
+    loop, graph = tracer.loop, tracer.loop.graph
+    loop.result = tracer.nodes(cost)[0]
+    if len(reached([*loop.first, *loop.step, loop.result])) > MOST:
+        raise Refused(TOO_LONG)
+    graph.most = len(graph.nodes) + MOST
+    return loop
 
 
 def _leaves(graph: Graph, name: str, count: int) -> np.ndarray:
@@ -74,21 +79,6 @@ def _shaped(items: Sequence[Any], parts: Sequence[np.ndarray]) -> list[np.ndarra
     """Return the items, one after another, in the shapes of ``parts``."""
     at = iter(items)
     return [_objects([next(at) for _ in range(part.size)], part.shape) for part in parts]
-
-
-def interpret(
-    jaxpr: Any, consts: Sequence[Any], arguments: Sequence[Any], apply: Callable[[Any, list[Any]], list[Any]]
-) -> list[Any]:
-    """Return the outputs of a jaxpr of which ``apply(equation, values)`` evaluates each equation."""
-    known = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *arguments], strict=True))
-
-    def read(atom: Any) -> Any:
-        return atom.val if hasattr(atom, "val") else known[atom]
-
-    for equation in jaxpr.eqns:
-        values = [read(atom) for atom in equation.invars]
-        known.update(zip(equation.outvars, apply(equation, values), strict=True))
-    return [read(atom) for atom in jaxpr.outvars]
 
 
 class Tracer:

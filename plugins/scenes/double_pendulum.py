@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.model import Array, MechanicalScene, State, param
+from bench.model import Array, ContactLaw, MechanicalScene, State, param
 
 
 @dataclass(frozen=True)
@@ -26,6 +26,9 @@ class DoublePendulum(MechanicalScene):
     mass: float = param(0.1, "each point mass", "kg", positive=True)
     length: float = param(1.0, "length of each rod", "m", positive=True)
     gravity: float = param(9.81, "gravitational acceleration", "m/s^2")
+
+    def without_effect(self, contact: ContactLaw | None) -> tuple[str, ...]:
+        return ("mass",)
 
     def theta0(self) -> np.ndarray:
         """Return rod 1 horizontal, swinging up at 5 rad/s, and rod 2 hanging, swinging at -5 rad/s."""

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import math
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -15,16 +16,17 @@ from bench.experiment.experiment import Experiment
 from bench.experiment.session import Session
 from bench.experiment.study import Study
 from bench.experiment.views import Views
-from bench.measure import noise, timing
-from bench.model import Problem, Program
+from bench.measure import noise, statistics, timing
+from bench.measure.reference import Reference
+from bench.model import SURROGATE, Estimator, Integrator, Problem, Program
 
 if TYPE_CHECKING:
     import pandas as pd
 
 PARTS = ("scene", "contact", "integrator", "backend")
 """Parts of the grid that identify a program: the axes of a study without estimators."""
-FINE = 1e-3
-"""Spacing of a reference's points, in standard deviations, above which a remark states it: that of points in a plane."""
+SPREAD = 0.5
+"""A gradient is trusted where one estimate spreads by less than this multiple of its mean, and a check finds nothing against it."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +52,7 @@ class StudyPackage(Study):
         if found is None:
             found = Views([replace(table, terminal=False) for table in generic.views(experiment, rows).tables])
         drawn = [chart for chart in found.charts if len(chart.frame)]
-        return replace(found, charts=drawn, remarks=[*found.remarks, *unseen_features(rows), *reasons(rows)])
+        return replace(found, charts=drawn, remarks=[*found.remarks, *reasons(rows)])
 
     def show(self, experiment: Experiment, rows: pd.DataFrame) -> Views | None:
         """Return the tables of the rows and the charts; None without any."""
@@ -61,18 +63,34 @@ class StudyPackage(Study):
         return import_module(f"{package}.{name}")
 
 
-def unseen_features(rows: pd.DataFrame) -> list[str]:
-    """Return below which width references by quadrature in a plane may miss a feature of the cost, and in how many cells."""
-    from bench.report.text import counted
+def against_reference(
+    problem: Problem,
+    estimator: Estimator | None,
+    truth: Reference,
+    estimates: np.ndarray,
+    samples: int,
+    terms: tuple[np.ndarray, np.ndarray] | None = None,
+    auxiliaries: str = "",
+) -> dict[str, Any]:
+    """Return the columns of ``estimates (R, d)`` against the certified reference: status, reason, and statistics.
 
-    spacing = rows.reindex(columns=["reference_spacing"])["reference_spacing"]
-    coarse = spacing[spacing > FINE]
-    if coarse.empty:
-        return []
-    return [
-        f"in {counted(len(coarse), 'cell')} the reference is from points up to {coarse.max():.2g} standard deviations of the noise apart: "
-        "it may miss a feature of the cost that is narrower"
-    ]
+    Every study's biases, errors and cosines of estimates are computed here. Without an estimator, the estimates are means
+    of a sample's terms, and nothing is declared of them. ``terms`` are as in :func:`~bench.measure.statistics.summarise`,
+    ``auxiliaries`` the estimator's diagnostics as JSON.
+    """
+    result = {"reference_method": truth.method, "reference_spacing": truth.spacing}
+    if not truth.is_finite:
+        return result | {"status": "nonfinite", "reason": truth.note or "the reference gradient is not finite"}
+    program = problem.program
+    draws = estimator is None or estimator.draws_noise(program)
+    unbiased = estimator is not None and estimator.declares_unbiased(program)
+    estimates, is_random = np.asarray(estimates, dtype=np.float64), draws or program.exogenous > 0
+    summary = statistics.summarise(estimates, truth.known(), samples if draws else 1, terms, unbiased, is_random)
+    surrogate = SURROGATE if estimator and program.surrogate and "grad" in estimator.needs else ""
+    doubt = estimator.remark(json.loads(auxiliaries)) if estimator and auxiliaries else ""
+    remarks = (surrogate, summary.note, doubt, truth.note)
+    values = {name: value for name, value in asdict(summary).items() if name != "note"}
+    return result | values | finite_status("", estimates) | {"reason": "; ".join(filter(None, remarks))}
 
 
 def finite_status(reason: str, *values: Any) -> dict[str, str]:
@@ -121,3 +139,9 @@ def gradient_seconds(problem: Problem, w: np.ndarray, calls: int) -> dict[str, f
     problem.reset_usage()
     _, clock = timing.timed(lambda _: problem.grad(problem.program.theta0, w), calls)
     return {"gradient_s": clock.median_s, "compile_s": problem.usage.compile_s}
+
+
+def spectral_radius(integrator: Integrator, dt: float, stiffness: float, damping: float, factor: float) -> float:
+    """Return the spectral radius of one step of length ``dt`` [s] on an oscillator of mass 1."""
+    matrix = integrator.transition(dt, stiffness, damping, factor)
+    return float(np.abs(np.linalg.eigvals(matrix)).max())

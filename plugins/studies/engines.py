@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,13 +16,13 @@ from bench.experiment.columns import Column, Columns, ComparisonRule, exact, num
 from bench.experiment.experiment import Experiment
 from bench.experiment.session import Session
 from bench.experiment.views import Chart, Style, Views
-from bench.measure import noise, statistics, timing
+from bench.measure import noise, timing
 from bench.model import Problem, param, zeroth_order
 from bench.report.style import PALETTE
 from bench.report.text import number
 from bench.report.views import rmse_interval, shown_rmse
 
-from . import PARTS, StudyPackage, all_noise, finite_status, relative_error
+from . import PARTS, StudyPackage, against_reference, all_noise, finite_status, relative_error
 from .bias_variance.columns import COLUMNS as ESTIMATES
 from .three_errors import difference_check
 
@@ -106,31 +107,29 @@ class Engines(StudyPackage):
         theta, has_gradient = program.theta0, "grad" in cell.backend.provides
         result = _times(cell, problem, self, has_gradient)
         truth = session.references.of(cell)
-        known, noted = truth.known(), truth.note or "the reference gradient is not finite"
-        status = finite_status(noted, truth.batches)
         w = all_noise(cell, program)
-        zeroth = zeroth_order(problem, theta, w).mean(axis=1)
+        zeroth = against_reference(problem, None, truth, zeroth_order(problem, theta, w).mean(axis=1), cell.samples)
+        status = {"status": "ok", "reason": "computes no gradients"}
         result |= {
             "reference_method": truth.method, "reference_spacing": truth.spacing, "device": problem.device,
-            "zeroth_rmse_rel": statistics.summarise(zeroth, known, cell.samples).rmse_rel,
+            "zeroth_rmse_rel": zeroth.get("rmse_rel", math.nan),
         }  # fmt: skip
-        remark = "computes no gradients"
         if has_gradient:
             _, gradient, difference, step = difference_check(problem)
             gradients = problem.grad(theta, w.reshape(-1, program.n_noise).T)
             means = gradients.T.reshape(cell.repeats, cell.samples, -1).mean(axis=1)
-            summary = asdict(statistics.summarise(means, known, cell.samples))
+            first = against_reference(problem, None, truth, means, cell.samples)
             result |= {
                 "gradient": gradient.tolist(),
                 "program_error_rel": relative_error(gradient, difference),
                 "difference_step": step,
                 "nan_share": float(1.0 - np.isfinite(gradients).all(axis=0).mean()),
-                **_model_error(cell, session, gradient), **{name: summary[name] for name in SUMMARY},
+                **_model_error(cell, session, gradient), **{name: first.get(name, math.nan) for name in SUMMARY},
             }  # fmt: skip
-            if status["status"] == "ok":
-                status = finite_status("some gradients are not finite", gradients, gradient)
-            remark = summary["note"]
-        status["reason"] = "; ".join(filter(None, (status["reason"], remark)))
+            status = finite_status("some gradients are not finite", gradients, gradient)
+            status["reason"] = "; ".join(filter(None, (status["reason"], first["reason"])))
+        if not truth.is_finite:
+            status = {name: zeroth[name] for name in status}
         if isinstance(problem, EngineProblem):
             result["engine_settings"] = ";".join(f"{name}={value}" for name, value in problem.settings.items())
         memory = problem.peak_memory_mb if isinstance(problem, EngineProblem) else timing.peak_memory_mb()

@@ -20,7 +20,7 @@ from . import PARTS, StudyPackage, finite_status, first_batch, gradient_seconds,
 if TYPE_CHECKING:
     import pandas as pd
 
-FLOOR = 1e-16
+FLOOR = 1e-6
 """Smallest relative error that is drawn; smaller ones, 0 included, are drawn here as upper limits."""
 SHOWN = ("solver_residual", "gradient_error_rel", "gradient_cosine", "wrong_signs", "gradient_s", "compile_s")
 NOTES = (
@@ -92,7 +92,6 @@ class Solver(StudyPackage):
         error = shown.column("gradient_error_rel", label="relative error", limit="gradient_error_rel_limit", log=True)
         chart = Chart(
             "solver", floored(shown.good, FLOOR, [error.name]), [iterations], [error], series="method", panel="problem",
-            marks=[Mark("as large as the gradient", 1.0, axis="y")],
-            text="The error is the distance from the gradient of the program with a converged solver.",
+            marks=[Mark("as large as the gradient", 1.0, axis="y")], subtitle="against the gradient of the program with a converged solver",
         )  # fmt: skip
         return Views([cells], [chart])

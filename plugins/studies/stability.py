@@ -34,7 +34,7 @@ from bench.model import (
     rollout,
 )
 
-from . import StudyPackage, norm
+from . import StudyPackage, norm, spectral_radius
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -46,34 +46,30 @@ NEUTRAL = 1 + 1e-9
 REACH = np.logspace(-3, 4, 141)
 """Values of dt^2 stiffness that the search for the stability limit tries."""
 WORST_FIRST = ("nonfinite", "diverged", "wrong_sign", "zero", "inaccurate", "unresolved", "ok")
-LEVEL = {"ok": "right", "inaccurate": "wrong", "wrong_sign": "wrong", "zero": "wrong", "diverged": "diverged",
-         "nonfinite": "diverged", "unresolved": "open"}  # fmt: skip
-"""The colour of each verdict."""
-LOOKS = {
-    "diverged": Style("#3b3b3b", meaning="diverged: the state, or the gradient is not finite"),
-    "wrong": Style(
-        "#e69f00", meaning="wrong: finite, but off by more than the limit of the study, of wrong sign or zero"
-    ),
+EDGES = {1e-3: "#08519c", 1e-2: "#6baed6", 1e-1: "#d6e6f4", 1.0: "#fdae61", math.inf: "#c51b1b"}
+"""Upper ends of the grades of an error, in units of the largest gradient of the scene, and their colours."""
+LOST = {
+    "blows up": Style("#333333", meaning="blows up: the state or the gradient is not finite, or leaves its scale"),
+    "grew": Style("#a6a6a6", meaning="grew: a state that cannot grow does, slowly"),
     "open": Style("#f2f2f2", meaning="open: the truth is not resolved"),
-    "right": Style("#a6d8f5", meaning="right: within that limit of the truth"),
 }
-"""Looks of the colours, the worst first."""
+"""Looks of the cells without an error."""
 CAUSES = ("step", "law", "both", "unknown")
-BEYOND = "•"
-"""Mark of a cell whose stiffness is above the step's limit in theory."""
-MIXED = 0.05, 0.95
-"""Shares of right cells between which a law with an integrator is drawn, with its other integrators."""
+LIMIT = "stability limit of the step in theory"
+GROWN = "has grown by"
 RESULTS = (
     "verdict", "cause", "relative_error", "cosine", "spectral_radius", "stiffness_limit", "first_bad_step", "truth",
 )  # fmt: skip
 SHARES = (
     text("scene"), text("step", label="law and integrator"), Column("cells", format="setting"),
-    *(Column(name, format="percent") for name in ("right", "wrong", "diverged", "open")),
+    *(Column(name, format="percent") for name in ("right", "wrong", *LOST)),
     *(Column(f"by {cause}", label=f"wrong by {cause}", format="percent") for cause in CAUSES),
 )  # fmt: skip
 SHARE_NOTES = (
-    "wrong by step: the step or its derivative is wrong and the law is right. by law: wrong at any step. by both, by unknown: "
-    "the cause is not resolved. Shares are of the cells.",
+    "Errors are in units of the largest gradient of the scene, at any stiffness: the gradient itself passes through 0. Right: an error "
+    "below the limit of the study. Blows up: the state or the gradient is not finite, or leaves its scale. Grew: a state that cannot grow "
+    "does, slowly. Wrong by step: the step or its derivative is wrong and the law is right. By law: wrong at any step. By both, by "
+    "unknown: the cause is not resolved. Shares are of the cells.",
 )
 
 
@@ -158,11 +154,12 @@ class Stability(StudyPackage):
         cells = cells_of(experiment, rows)
         if cells.empty:
             return None
-        whole = Table("stability_map", table(experiment, rows), [], files=["csv"])
+        found = cells[["error_share", "level"]].reindex(rows.index)
+        whole = Table("stability_map", table(experiment, rows).assign(**found), [], files=["csv"])
         shares = Table("stability_shares", shares_of(cells), SHARES, "How often each contact law and step gives the right gradient",
                        SHARE_NOTES, terminal=True, page=True)  # fmt: skip
         columns = [experiment.columns.by_name[name] for name in RESULTS]
-        return Views([shares, whole], [chart(cells)], arrange(experiment, rows).rows, columns)
+        return Views([shares, whole], charts(cells), arrange(experiment, rows).rows, columns)
 
 
 # ---------------------------------------------------------------------------------------------- trajectories
@@ -186,7 +183,7 @@ def first_bad_step(
     if not np.isfinite(states[step]).all():
         return step, "nonfinite", "is not finite"
     if slow < left:
-        return step, "diverged", f"has grown by {limits.grown - 1:.0%}, {growth - 1:.2g} a step"
+        return step, "diverged", f"{GROWN} {limits.grown - 1:.0%}, {growth - 1:.2g} a step"
     beyond = limits.diverged * float((np.abs(states[step]) / largest).max())
     return step, "diverged", f"is {beyond:.3g} times the initial scale"
 
@@ -375,12 +372,6 @@ def oscillator(cell: Cell) -> tuple[float, float, float] | None:
     return None if spring is None else (spring[0] * response, spring[1] * response, factor)
 
 
-def spectral_radius(integrator: Integrator, dt: float, stiffness: float, damping: float, factor: float) -> float:
-    """Return the spectral radius of one step of length ``dt`` [s] on the oscillator."""
-    matrix = integrator.transition(dt, stiffness, damping, factor)
-    return float(np.abs(np.linalg.eigvals(matrix)).max())
-
-
 def stiffness_limit(integrator: Integrator, dt: float, damping: float, factor: float) -> float:
     """Return the stiffness [1/s^2] where the step becomes unstable; 0 if always, inf if nowhere in :data:`REACH`."""
 
@@ -413,11 +404,19 @@ def cells_of(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:
     shown = replace(shown, rows=shown.rows.assign(dt=rows["dt"], stiffness=rows["stiffness"]))
     cells = attempted(shown.rows)
     cells = cells[cells["verdict"] != ""]
+    scene = rows.loc[cells.index, "scene"]
+    size = cells["truth_norm"].groupby(scene).transform("max")
+    error = cells["relative_error"] * cells["truth_norm"] / size
+    lost = np.where(
+        cells["reason"].str.contains(GROWN) & (cells["grad_norm"] <= experiment.study.diverged * size),
+        "grew",
+        "blows up",
+    )
+    level = np.select([cells["verdict"].isin(("diverged", "nonfinite")), error.isna(), error <= experiment.study.inaccurate],
+                      [lost, "open", "right"], "wrong")  # fmt: skip
     return cells.assign(
-        problem=problem_names(shown, PROBLEM, axes_of(shown, "dt", "stiffness"), rows=cells), row=cells.index,
-        level=cells["verdict"].map(LEVEL).fillna("open"), place=titled(cells, ["scene", "contact"]),
-        step=titled(cells, ["contact", "integrator"]), scene_name=rows.loc[cells.index, "scene"].str.split("[").str[0],
-        mark=np.where(cells["stiffness"] > cells["stiffness_limit"], BEYOND, ""),
+        problem=problem_names(shown, PROBLEM, axes_of(shown, "dt", "stiffness"), rows=cells), row=cells.index, error_share=error,
+        level=level, step=titled(cells, ["contact", "integrator"]), scene_name=scene.str.split("[").str[0], dt_ms=1e3 * cells["dt"],
     )  # fmt: skip
 
 
@@ -435,26 +434,40 @@ def shares_of(cells: pd.DataFrame) -> pd.DataFrame:
     return shares.iloc[order].reset_index(drop=True)
 
 
-def chart(cells: pd.DataFrame) -> Chart:
-    """Return the map of the first variant of each scene, law and integrator."""
+def charts(cells: pd.DataFrame) -> list[Chart]:
+    """Return a map per scene, of the first variant of each law and integrator; of several laws, each with its best integrator."""
     import pandas as pd
+
+    from bench.report.colours import graded
+    from bench.report.text import number
 
     missing = cells["stiffness"].isna()  # a law without stiffness is the same at each one
     levels = pd.DataFrame({"stiffness": sorted(cells["stiffness"].dropna().unique()) or [math.nan]})
     spread = cells[missing].drop(columns="stiffness").merge(levels, how="cross")
     frame = pd.concat([cells[~missing], spread], ignore_index=True)
-    frame = frame.sort_values("level", key=lambda names: names.map(list(LOOKS).index), kind="stable")
-    frame = frame.drop_duplicates(["problem", "dt", "stiffness"]).sort_index()
-    frame = frame[frame["problem"] == frame.groupby(["integrator", "place"], sort=False)["problem"].transform("first")]
-    right = (frame["level"] == "right").groupby([frame["integrator"], frame["place"]]).transform("mean")
-    mixed = frame["place"].isin(frame["place"][right.between(*MIXED)])
-    frame = frame[mixed] if mixed.any() else frame
-    places = frame["place"].unique()
-    which = f"{places[0]}; " if len(places) == 1 else ""
-    frame["panel"] = frame["integrator"] if which else frame["place"] + ", " + frame["integrator"]
-    dt, stiffness = replace(COMMON["dt"], label="time step"), COMMON["stiffness"]
-    return Chart(
-        "stability_map", frame, [dt], [stiffness], "grid", level="level", styles=LOOKS, panel="panel",
-        cell="mark", height=0.16, subtitle=f"{which}{BEYOND} beyond the stability limit in theory",
-        text="The worst verdict where backends disagree. Scenes and laws that are right everywhere or nowhere are in the table only.",
-    )  # fmt: skip
+    worst = frame["error_share"].fillna(math.inf).where(frame["level"] != "open", -1.0)
+    frame = frame.iloc[worst.argsort(kind="stable")[::-1]].drop_duplicates(["problem", "dt", "stiffness"]).sort_index()
+    frame = frame[frame["problem"] == frame.groupby("step", sort=False)["problem"].transform("first")]
+    grades, looks = graded(frame["error_share"], EDGES, lambda end: f"{100 * end:g}%")
+    frame["grade"] = frame["level"].where(frame["level"].isin(LOST), grades)
+    frame["cell"] = ["" if e != e else f"<{100 * min(EDGES):g}" if e < min(EDGES) else number(100 * e) if e < 10 else ">999"
+                     for e in frame["error_share"]]  # fmt: skip
+    found = []
+    for scene, part in frame.groupby("scene_name", sort=False):
+        right = (part["level"] == "right").groupby(part["step"]).transform("mean")
+        if part["contact"].nunique() > 1:
+            best = (
+                part.assign(right=right)
+                .sort_values("right", ascending=False, kind="stable")
+                .groupby("contact")["step"]
+                .first()
+            )
+            part = part[part["step"].isin(best)]
+        found.append(Chart(
+            f"stability_map_{scene}" if found else "stability_map", part.assign(panel=part["step"] if part["contact"].nunique() > 1 else part["integrator"]),
+            [Column("dt_ms", "", "ms", label="time step")], [COMMON["stiffness"]], "grid", level="grade", styles=looks | LOST, panel="panel",
+            cell="cell", limit="stiffness_limit", limit_name=LIMIT, height=0.16,
+            subtitle=f"{scene}: error of the gradient in % of the largest gradient at any stiffness",
+            text="The worst where backends disagree. Of several contact laws, each is drawn with the integrator that is most often right.",
+        ))  # fmt: skip
+    return found

@@ -8,7 +8,7 @@ three are independent, and a small forward error (error of the cost) implies non
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,11 +19,10 @@ from bench.experiment.experiment import Experiment
 from bench.experiment.session import Session
 from bench.experiment.views import Chart, Style, Table, Views
 from bench.gradient import sampled
-from bench.measure import statistics
 from bench.model import Problem, Program
 from bench.report.style import PALETTE
 
-from . import PARTS, StudyPackage, all_noise, finite_status, norm, ratio, relative_error
+from . import PARTS, StudyPackage, against_reference, all_noise, norm, ratio, relative_error
 from .bias_variance.columns import COLUMNS as ESTIMATES
 
 if TYPE_CHECKING:
@@ -32,7 +31,7 @@ if TYPE_CHECKING:
     from bench.report.shown import Shown
 
 SUMMARY = (
-    "reference_norm", "reference_se", "bias", "bias_low", "bias_high", "bias_rel", "variance", "rmse_rel", "cosine",
+    "reference_norm", "reference_se", "reference_method", "reference_spacing", "bias", "bias_low", "bias_high", "bias_rel", "variance", "rmse_rel", "cosine",
     "sign_agreement",
 )  # fmt: skip
 """Columns that are statistics of the estimator."""
@@ -46,7 +45,7 @@ CONVERGED = 0.5
 """A cost or gradient converges if its error falls at least to this share from the largest to the smallest step."""
 WRONG = 0.1
 """Smallest model error of a wrong gradient."""
-FLOOR = 1e-16
+FLOOR = 1e-6
 """Smallest error that is drawn; smaller ones, 0 included, are drawn here as upper limits."""
 RESULTS = ("forward_error_rel", "program_error_rel", "model_error_rel", "model_cosine", "model_signs")
 OWN, PHYSICS, TRAP = "program error", "model error", "model error of a trap"
@@ -93,7 +92,6 @@ class ThreeErrors(StudyPackage):
         ),
         Column("model_signs", "share of coordinates in which both gradients have the same sign", label="right signs"),
         *(ESTIMATES.by_name[name] for name in SUMMARY),
-        *(ESTIMATES.by_name[name] for name in ("reference_method", "reference_spacing")),
         numbers("gradient", "the program's gradient, by coordinate of theta"),
         numbers("physical_gradient", "the physics' gradient, by coordinate of theta"),
     )
@@ -107,17 +105,12 @@ class ThreeErrors(StudyPackage):
             "cost": cost, "gradient": gradient.tolist(), "program_norm": norm(gradient),
             "program_error": norm(gradient - difference),
             "program_error_rel": relative_error(gradient, difference), "difference_step": step,
-            "reference_method": truth.method, "reference_spacing": truth.spacing,
             **_against_physics(problem.program, cost, gradient),
         }  # fmt: skip
-        status = finite_status(truth.note or "the reference gradient is not finite", truth.batches)
-        if status["status"] != "ok":
-            return result | status
-        w = all_noise(cell, problem.program)
-        estimates = np.asarray(cell.estimator.estimate(problem, problem.program.theta0, w), dtype=np.float64)
-        summary = asdict(statistics.summarise(estimates, truth.known(), cell.samples))
-        status = finite_status("", estimates, gradient) | {"reason": summary["note"]}
-        return result | {name: summary[name] for name in SUMMARY} | status
+        estimates = cell.estimator.estimate(problem, problem.program.theta0, all_noise(cell, problem.program))
+        compared = against_reference(problem, cell.estimator, truth, estimates, cell.samples)
+        status = {} if np.isfinite(gradient).all() else {"status": "nonfinite"}
+        return result | {name: value for name, value in compared.items() if name in self.columns.by_name} | status
 
     def show(self, experiment: Experiment, rows: pd.DataFrame) -> Views:
         """Return a line per cell, the traps and the chart."""

@@ -121,6 +121,20 @@ def test_first_calls_have_a_budget_of_their_own(now):
     assert report.spent.seconds < 0.4
 
 
+def test_a_call_that_hangs_is_named():
+    calls = []
+
+    def hangs(x):
+        calls.append(1)
+        if len(calls) >= 30:
+            time.sleep(60)
+        return cost(x)
+
+    report = examine(hangs, THETA, budget=3)
+    assert any("had not returned after " in note for note in report.notes)
+    assert not any("had not returned" in note for note in examine(cost, THETA, calls=100).notes)
+
+
 def test_a_gradient_that_compiles_too_long_is_tried_once():
     tried = []
 
@@ -133,7 +147,8 @@ def test_a_gradient_that_compiles_too_long_is_tried_once():
     assert len(tried) == 1
 
 
-def test_the_report_is_printed_on_sigterm(tmp_path):
+@pytest.mark.parametrize("call", [1, 20])
+def test_sigterm_ends_an_examination_with_130_and_a_report_after_the_first_call(tmp_path, call):
     path, marker = tmp_path / "slow.py", tmp_path / "called"
     path.write_text(
         textwrap.dedent(f"""
@@ -141,8 +156,8 @@ def test_the_report_is_printed_on_sigterm(tmp_path):
             theta, calls = [0.4, 0.3], []
             def cost(x):
                 calls.append(1)
-                time.sleep(0.02)
-                if len(calls) == 20: pathlib.Path({str(marker)!r}).touch()
+                if len(calls) == {call}: pathlib.Path({str(marker)!r}).touch()
+                time.sleep(0.02 if len(calls) > 1 or {call} > 1 else 60)
                 return x[0] ** 2 * x[1]
             def grad(x): return [2 * x[0] * x[1], x[0] ** 2]
         """)
@@ -153,10 +168,10 @@ def test_the_report_is_printed_on_sigterm(tmp_path):
     while not marker.exists() and process.poll() is None and time.perf_counter() - started < 60:
         time.sleep(0.05)
     process.send_signal(signal.SIGTERM)
-    out, _ = process.communicate(timeout=30)
-    assert "everything after SIGTERM" in out
-    assert "Derivative: right. smooth" in out
-    assert process.returncode == 0
+    out, err = process.communicate(timeout=30)
+    assert process.returncode == 130
+    assert ("everything after SIGTERM" in out) == ("Derivative: right. smooth" in out) == (call > 1)
+    assert ("bench: stopped" in err) == (call == 1)
 
 
 def test_time_lost_to_other_programs_is_not_charged(monkeypatch):
@@ -191,3 +206,44 @@ def test_a_gradient_that_is_right_at_one_theta_is_said_to_be_right_there_only():
     assert "other thetas around this one (calls)" in str(few)
     many = examine(lambda x: float(np.sin(x).sum()), [0.3, 0.7], grad=stale)
     assert many.cause == "stale_gradient"
+
+
+def test_an_interruption_that_a_compiled_library_turns_into_its_own_error_is_the_budgets():
+    def slow(x):
+        try:
+            end = time.perf_counter() + 0.2
+            while time.perf_counter() < end:
+                pass
+        except BaseException:
+            raise RuntimeError("the callback failed") from None
+        return cost(x)
+
+    report = examine(slow, THETA, grad=grad, budget=0.5)
+    assert "the callback failed" not in str(report)
+    assert report.left_out
+
+
+@pytest.mark.parametrize("share", [0.1, 0.3])
+def test_exceptions_at_random_calls_are_named_as_such(share):
+    random = np.random.default_rng(3)
+
+    def fragile(x):
+        if random.random() < share and fragile.count:
+            raise ValueError("no convergence")
+        fragile.count += 1
+        return cost(x)
+
+    fragile.count = 0
+    report = examine(fragile, THETA, grad=grad, calls=2000)
+    assert (report.status, report.cause) == (1, "nondeterministic"), str(report)
+    assert "equal calls raise an exception or return a number" in report.conclusion
+
+
+def test_exceptions_at_the_same_thetas_are_not_random():
+    def bounded(x):
+        if x[0] > 0.401:
+            raise ValueError("outside")
+        return cost(x)
+
+    report = examine(bounded, THETA, grad=grad, calls=2000)
+    assert report.cause != "nondeterministic", str(report)

@@ -16,7 +16,7 @@ import bench
 from bench import cli
 from bench.errors import UserError
 from bench.examine import smoothing, text
-from bench.gradient.lines import Break, LineScan, scan
+from bench.examine.lines import Break, LineScan, scan
 from bench.simulator import simulator, tree
 from bench.simulator.simulator import Simulator
 from bench.simulator.tree import ParameterTree
@@ -98,6 +98,7 @@ MATRIX = np.arange(1.0, 7.0).reshape(2, 3)
 @pytest.mark.parametrize(
     ("theta", "turned", "said"),
     [
+        (np.ones(2), lambda g: g[:1], r"shape \(1,\), and theta has shape \(2,\)"),
         (MATRIX, lambda g: g.T, r"shape \(3, 2\), and theta has shape \(2, 3\): is it transposed\?"),
         (MATRIX, lambda g: g.T.tolist(), r"shape \(3, 2\), and theta has shape \(2, 3\): is it transposed\?"),
         ({"w": MATRIX}, lambda g: {"w": g["w"].T}, r"shape w \(3, 2\), and theta has shape w \(2, 3\): is it trans"),
@@ -468,7 +469,7 @@ def test_a_bias_interval_decides_where_grad_j_is_known(error, low, high, cause):
 
 def test_a_method_costs_its_samples_times_the_calls_of_each():
     terms = np.array([[1.0, -1.0] * 50])
-    found = smoothing._method("smoothing", 0.06, terms, 2.0, 2, 0.5)
+    found = smoothing._method("smoothing", (0.0, 0.12), terms, 2.0, 2, 0.5)
     samples = math.ceil(terms.var(ddof=1) / 4.0 / (0.1**2 - 0.06**2))
     assert (found.samples, found.calls, found.seconds) == (samples, 2 * samples, samples)
 
@@ -519,3 +520,18 @@ def test_file_that_ends_the_process_is_bad_input(tmp_path, capsys):
 def test_the_next_command_replaces_a_setting(right):
     report = dataclasses.replace(right, command="python -m bench examine f.py:cost calls=300 sigma=0.1")
     assert text.again(report, "calls=600") == "python -m bench examine f.py:cost sigma=0.1 calls=600"
+
+
+def test_the_advice_compares_the_gradient_without_noise_and_mirrored_draws():
+    """Of x^3 at 1, whose smoothed gradient is 3 + 3 sigma^2, from 3 (x + sigma u)^2."""
+    reports = {
+        sigma: examine(lambda x: x[0] ** 3, [1.0], grad=lambda x: 3 * x**2, sigma=sigma, calls=20_000)
+        for sigma in (0.1, 0.5)
+    }
+    methods = {sigma: {m.name: m for m in report.smoothed[0].methods} for sigma, report in reports.items()}
+    assert set(methods[0.1]) == {"plain", "gradient", "mirrored", "smoothing"}
+    assert (methods[0.1]["plain"].samples, methods[0.1]["plain"].calls) == (1.0, 1.0)
+    assert methods[0.5]["plain"].samples == math.inf  # 0.75 of 3.75
+    assert methods[0.5]["mirrored"].calls < methods[0.5]["gradient"].calls
+    assert reports[0.1].recommended(reports[0.1].smoothed[0]).name == "plain"
+    assert reports[0.5].recommended(reports[0.5].smoothed[0]).name != "plain"

@@ -11,9 +11,9 @@ import pytest
 
 import bench
 from bench.errors import UserError
+from bench.examine import lines
 from bench.examine.findings import GroupSize
-from bench.gradient import lines
-from bench.gradient.subspace import groups_of
+from bench.examine.subspace import groups_of
 from bench.report.text import number
 from bench.simulator.tree import ParameterTree
 

@@ -26,7 +26,8 @@ REFUSED = {
     "+experiment=stifness_sweep": "did you mean 'stiffness_sweep'", "scenes=[pushng]": "did you mean 'pushing'",
     "scenes=[pushing] sweep.stifness=[1e3]": "did you mean 'stiffness'", "nonsense=1": "(allowed: ", "rum": "did you mean 'run'",
     "scenes=[pushing] scene.pushing.mas=0.2": "did you mean 'mass'", "estimators=['reinforce[baseline=centre]']": "did you mean 'center'",
-    "list fbog": "did you mean 'fobg'", "scenes=[pushing] theta=[mas]": "did you mean 'mass'", "study='stability[diverge=3]'": "did you mean 'diverged'",
+    "--verison": "unknown option '--verison'; did you mean '--version'?", "report quik": "unknown experiment 'quik'; did you mean 'quick'?",
+    "scenes=[pushing] scene.pushing.mass=nan": "pushing.mass=nan must be a number", "list fbog": "did you mean 'fobg'", "scenes=[pushing] theta=[mas]": "did you mean 'mass'", "study='stability[diverge=3]'": "did you mean 'diverged'",
     "formats=[gif]": "gif", "launcher=rai": "did you mean 'ray'", "scene.hevaside.sigma=5": "scene 'hevaside'; did you mean 'heaviside'?",
     "scene.pushing.mass=5": "unknown setting of this experiment 'scene.pushing'",
     "optimizers=[adam]": "unknown setting of this experiment 'optimizers' (allowed: ",
@@ -129,6 +130,11 @@ FILES = {
     b"1: 4\n": "line 2: 1 is not a setting",
     b"~: 4\n": "Incompatible key type",
     b"sweep: " + b"[" * 1000 + b"\n": "is nested too deeply",
+    b"marks:\n  a: &a [1, 2, 3, 4, 5, 6, 7, 8, 9]\n"
+    + b"".join(
+        b"  %c: &%c [%s]\n" % (n, n, b", ".join([b"*%c" % (n - 1)] * 9)) for n in b"bcdefghi"
+    ): "aliases stand for more than",
+    b"marks: &a {b: *a}\n": "aliases stand for more than",
     b"smaples: 4\n": "did you mean 'samples'?",
     b"samples: ${seed}\n": "must be a whole number",
     b"samples: 4\n": "must start with the line # @package _global_",

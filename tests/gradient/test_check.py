@@ -8,6 +8,7 @@ from bench.gradient.check import scales
 
 THETA = np.array([0.3, 1.2, -0.7])
 UNIT = float(np.finfo(np.float64).eps)
+FAULTS_OF_A_NUMBER = ("disconnected", "wrong_factor", "missing_term", "wrong_adjoint")
 EXACT = 1e-7
 """Relative error allowed to a difference of a cost without noise: its own tolerance is ten times less."""
 
@@ -276,3 +277,18 @@ def test_right_gradient_of_an_amplifying_rollout_is_no_fault(steps, seed):
 def test_fault_of_an_amplifying_rollout_is_seen(factor):
     final, slope = chaos(10)
     assert not check(final, lambda x: factor * slope(x), np.array([1.1, 2.3])).trusted
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.07, -0.3])
+@pytest.mark.parametrize("curvature", [0.0, 1.0, 100.0])
+def test_a_gradient_that_is_wrong_at_theta_alone_is_wrong(offset, curvature):
+    """A node of a table, a tie, a state of exactly 0: the cost has one slope, and the program's rule another one there."""
+
+    def ramp(x):
+        return 0.25 * x[0] + curvature * (x[0] - 1.0) ** 2
+
+    def slope(x):
+        return np.array([offset if x[0] == 1.0 else 0.25 + 2.0 * curvature * (x[0] - 1.0)])
+
+    assert check(ramp, slope, np.array([1.0])).cause in FAULTS_OF_A_NUMBER
+    assert check(ramp, lambda x: np.array([0.25 + 2.0 * curvature * (x[0] - 1.0)]), np.array([1.0])).trusted

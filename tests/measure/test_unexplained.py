@@ -136,6 +136,7 @@ def test_variance_per_sample_is_that_of_all_samples(repeats):
 
 def test_variance_per_sample_of_few_or_equal_terms():
     assert variance_per_sample(np.ones((2, 1)), np.ones(2), 1)[1:] == (0.0, math.inf)
+    assert variance_per_sample(np.full((4, 1), 1e200), np.full(4, math.inf), 3) == (math.inf, 0.0, math.inf)
     assert variance_per_sample(np.ones((4, 1)), np.ones(4), 1) == (0.0, 0.0, math.inf)
     assert math.isnan(variance_per_sample(np.ones((1, 1)), np.ones(1), 1)[0])
     with pytest.raises(ValueError, match=r"\(R, d\).*given"):

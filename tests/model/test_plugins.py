@@ -47,7 +47,7 @@ def tree(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def listing(tree):
-    done = tree.run("list")
+    done = tree.run("list", "estimators", "scenes", "backends", "studies")
     assert done.returncode == 0, done.stderr
     return done.stdout
 

@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from bench.plugins.studies.bias_variance import views as tables
+from bench.plugins.studies.bias_variance.charts import RMSE
 from bench.plugins.studies.bias_variance.columns import TABLE
 from bench.plugins.studies.bias_variance.comparisons import at_equal_rollouts, lowest, method_table, problems_by_axis
 from bench.plugins.studies.bias_variance.time_to_accuracy import with_gradient_cost
@@ -28,13 +29,12 @@ from helpers import (
     table,
 )
 from matplotlib.figure import Figure
-from trees import ROOT
 
-import bench
-from bench.experiment import config
 from bench.experiment.axes import axes
+from bench.experiment.columns import Column
+from bench.experiment.views import Chart
 from bench.report import latex, views, writer
-from bench.report.draw import draw
+from bench.report.draw import EXACT, draw
 from bench.report.figures import save, styled
 from bench.report.problems import split_by_problem
 
@@ -55,8 +55,8 @@ def written(made, rows):
 
 @pytest.fixture(scope="module")
 def full(tmp_path_factory):
-    """An experiment with many rows, the rows, and the names of its written files: for tests that only read them."""
-    found, rows = experiment(tmp_path_factory.mktemp("full")), stiffness_rows()
+    """An experiment, its rows, and the names of its written files: for tests that only read them."""
+    found, rows = experiment(tmp_path_factory.mktemp("full")), small_rows(stiffness=(1e2, 1e4, 1e6))
     found.directory.mkdir()
     return found, rows, {path.name for path in written(found, rows)}
 
@@ -79,21 +79,10 @@ def test_every_promised_file_is_written_and_the_csv_has_the_promised_columns_and
 
 def test_pareto_is_what_brute_force_finds():
     time, error = (pd.Series(np.random.default_rng(seed).integers(1, 6, 60) / 10) for seed in (0, 1))
-    beaten = [((time < t) & (error < e)).any() for t, e in zip(time, error, strict=True)]
+    error.iloc[::7] = 1.3  # worse than the zero estimate, which takes no time
+    beaten = [((time < t) & (error < e)).any() or e > 1 for t, e in zip(time, error, strict=True)]
     assert list(views.pareto(time, error)) == [not one for one in beaten]
-
-
-def test_a_chart_of_speed_and_accuracy_marks_the_pareto_front():
-    swept = config.load(["experiment=stiffness_sweep"])
-    shown = swept.study.views(swept, bench.load(ROOT / "results/standard/stiffness_sweep"))
-    chart = next(c for c in shown.charts if c.name == "speed_accuracy")
-    lines = [line for axes in draw(chart).axes for line in axes.lines if line.get_linestyle() == "--"]
-    assert len(lines) == chart.frame["panel"].nunique()
-    for line in lines:
-        x, y = map(np.asarray, line.get_data())
-        assert x.size
-        assert (np.diff(x) >= 0).all()
-        assert (np.diff(y) <= 0).all()
+    assert not views.pareto(pd.Series([0.1, 0.2]), pd.Series([1.2, 1.1])).any()
 
 
 def test_failed_cells_are_rows_with_their_reason(full):
@@ -197,6 +186,27 @@ def test_failed_cells_are_crosses():
     figure = figure_of(chart)
     crosses = [line for panel in figure.axes for line in panel.lines if line.get_marker() == "x"]
     assert sum(len(line.get_xdata()) for line in crosses) == len(lost)
+
+
+def test_a_value_of_0_is_hollow_at_the_edge_of_a_logarithmic_axis_and_a_useless_one_is_a_number_there():
+    """A log axis dropped what is 0, and one value of 1e24 squeezed all others."""
+    error = [0.0, 0.1, 1e24]
+    frame = pd.DataFrame(
+        {
+            "x": [1.0, 2.0, 3.0],
+            "rmse_rel": error,
+            "rmse_low": error,
+            "rmse_high": error,
+            "rmse_limit": [True, False, False],
+        }
+    )
+    (panel,) = figure_of(Chart("one", frame, [Column("x")], [RMSE])).axes
+    hollow = [
+        line for line in panel.lines if line.get_markerfacecolor() == "white" and np.isfinite(line.get_ydata()).any()
+    ]
+    assert [(list(line.get_xdata()), list(line.get_ydata())) for line in hollow] == [([1.0], [EXACT])]
+    assert panel.get_ylim()[1] < 1e3
+    assert "1.0e24 ↑" in [text.get_text() for text in panel.texts]
 
 
 def test_beyond_a_named_value_the_chart_is_shaded():

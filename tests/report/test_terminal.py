@@ -5,10 +5,13 @@ import io
 import numpy as np
 import pandas as pd
 import pytest
+from helpers import experiment
 from rich.cells import cell_len
 from rich.console import Console
 
 from bench.experiment import config
+from bench.experiment.columns import interval
+from bench.experiment.views import Table, Views
 from bench.report import finish, terminal, writer
 from bench.report.views import newest_rows
 from bench.run.execute import store_of
@@ -84,20 +87,37 @@ def test_columns_of_the_environment_count_in_a_pipe(monkeypatch):
     assert "[red]" in out.getvalue() or "[red" in out.getvalue()
 
 
+def test_a_pipe_is_as_wide_as_its_table_and_omitted_intervals_are_said(monkeypatch, capsys):
+    """Intervals were dropped in silence."""
+    frame = pd.DataFrame({f"x{i}{end}": [1.23e-5] for i in range(9) for end in ("", "_low", "_high")})
+    one = Table("one", frame, [interval(f"x{i}") for i in range(9)], terminal=True)
+    rows = pd.DataFrame({"status": ["ok"]})
+    shown = {}
+    for width in ("80", None):
+        monkeypatch.delenv("COLUMNS", raising=False)
+        if width:
+            monkeypatch.setenv("COLUMNS", width)
+        writer.show(experiment(), rows, Views([one]))
+        shown[width] = capsys.readouterr().out
+    assert "Left out to fit 80 characters: 95% intervals" in " ".join(shown["80"].split())
+    assert shown[None].count("[1.2e-5, 1.2e-5]") == 9
+    assert "Left out" not in shown[None]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["quick", "twins", "three_errors", "horizon_growth", "identify", "stability_map"])
 def test_what_a_command_prints_of_standard_results_fits(name, monkeypatch, capsys):
-    experiment = config.load([f"experiment={name}", "results_dir=results/standard"])
-    rows = newest_rows(store_of(experiment).load())
+    given = config.load([f"experiment={name}", "results_dir=results/standard"])
+    rows = newest_rows(store_of(given).load())
     rows = rows[rows["seed"] == rows["seed"].min()].head(150).reset_index(drop=True)
-    views = finish.views_of(experiment, rows)
+    views = finish.views_of(given, rows)
     for width in (40, 80):
         monkeypatch.setenv("COLUMNS", str(width))
-        writer.show(experiment, rows, views)
+        writer.show(given, rows, views)
         lines = capsys.readouterr().out.splitlines()
         assert len(lines) > 10
         assert max(map(cell_len, lines)) <= width
         words = " ".join(lines).split()
         counts = [f"{n} {status}" for status, n in rows["status"].value_counts().items()]
-        for said in (experiment.question, f"{len(rows)} cells:", *counts):
+        for said in (given.question, f"{len(rows)} cells:", *counts):
             assert " ".join(said.split()) in " ".join(words)

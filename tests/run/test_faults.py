@@ -74,6 +74,14 @@ def bad_number(self, gradient):
     return gradient
 
 
+def huge(self, gradient):
+    return gradient * 1e200
+
+
+def masks(self, gradient):
+    return np.ma.masked_array(gradient, mask=gradient > gradient.mean())
+
+
 def hangs(self, gradient):
     while True:
         time.sleep(1)
@@ -119,7 +127,7 @@ def refuses(self, gradient):
 
 
 for function in (
-    bad_shape, bad_kind, bad_number, hangs, allocates, shouts, forks, forks_and_returns, forks_and_dies, leaves, refuses,
+    bad_shape, bad_kind, bad_number, huge, masks, hangs, allocates, shouts, forks, forks_and_returns, forks_and_dies, leaves, refuses,
     swallows,
 ):
     make(function.__name__, function)
@@ -143,6 +151,8 @@ EXPECTED = {
     "bad_shape": ("error", "returned shape"),
     "bad_kind": ("error", "complex numbers"),
     "bad_number": ("nonfinite", "theta"),
+    "huge": ("ok", ""),
+    "masks": ("nonfinite", "not finite"),
     "hangs": ("timeout", "no result within 20 s"),
     "allocates": ("crashed", "GiB of memory"),
     "shouts": ("ok", ""),

@@ -214,6 +214,36 @@ def test_a_file_system_without_locks_keeps_the_small_files(tmp_path, monkeypatch
 # ------------------------------------------------------------------------------------------------ commands
 
 
+def test_a_linked_table_stays_a_link(tmp_path):
+    (tmp_path / "elsewhere").mkdir()
+    place = tmp_path / "elsewhere" / "mine.parquet"
+    (tmp_path / "rows.parquet").symlink_to(place)
+    store = Store(tmp_path, COLUMNS)
+    for number in (1, 2):
+        store.append(row(number))
+        store.compact()
+    assert (tmp_path / "rows.parquet").is_symlink()
+    assert len(pd.read_parquet(place)) == 2
+
+
+def test_a_small_file_with_a_damaged_byte_is_left_out_and_kept(tmp_path, capsys):
+    """Wherever the byte is, although most such files are still JSON with rows, as one with a misspelt column is."""
+    store = Store(tmp_path, COLUMNS)
+    store.append(row(1))
+    store.append(row(2))
+    (path,) = (path for path in (tmp_path / "pending").glob("*.json") if row(1)["key"] in path.read_text())
+    content = path.read_bytes()
+    for place in range(0, len(content), len(content) // 40):
+        path.write_bytes(content[:place] + bytes([content[place] ^ 1]) + content[place + 1 :])
+        assert keys(store) == [2]
+    assert f"'{path}' is damaged: its rows are left out" in capsys.readouterr().err
+    damaged = path.read_bytes()
+    store.compact()
+    (kept,) = tmp_path.glob("left_out-*.json")
+    assert kept.read_bytes() == damaged
+    assert keys(store) == [2]
+
+
 PLACES, VERBS = ("rows.parquet", "pending/part.parquet", "pending/row.json"), ("run", "plan", "report")
 
 

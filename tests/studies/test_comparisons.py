@@ -19,6 +19,8 @@ from bench.plugins.studies.bias_variance.comparisons import (
 from bench.plugins.studies.bias_variance.time_to_accuracy import with_gradient_cost
 from helpers import experiment, failed, row, table
 
+from bench.errors import UserError
+from bench.experiment import config
 from bench.report.cells import readable
 from bench.report.views import arrange
 
@@ -221,7 +223,8 @@ def test_an_upper_limit_is_shown_and_never_first_nor_bold():
     limit = math.hypot(0.1, 0.02)
     assert methods.loc[methods["error_is_limit"], "error"].tolist() == pytest.approx([limit] * 2)
     shown = experiment(sweep={"stiffness": [1e2, 1e4]})
-    (main, *_), (chart, *_) = (lambda views: (views.tables, views.charts))(shown.study.views(shown, table(cells)))
+    views = shown.study.views(shown, table(cells))
+    main, chart = views.tables[0], next(one for one in views.charts if one.name == "bias_variance_stiffness")
     assert readable(main).iloc[0, 1:3].tolist() == ["< 0.10"] * 2
     assert not any(main.frame[f"x{i}_best"].any() for i in (0, 1))
     drawn = chart.frame[chart.frame["series"] == "fobg"]
@@ -244,3 +247,108 @@ def test_a_lucky_estimate_equal_to_an_exact_reference_is_a_limit_too():
     )
     assert methods["error"].iloc[0] == pytest.approx(math.hypot(0.04, 0.01))
     assert compared[["first", "tied"]].values.tolist() == [["", ("fobg",)]]
+
+
+# ------------------------------------------------------------------------------------------ what to use, and what fails
+
+
+def recommended(*cells):
+    """What to use per range of the stiffness."""
+    rows = table(list(cells))
+    shown = experiment(sweep={"stiffness": sorted(map(float, rows["stiffness"].unique()))})
+    (found,) = (one for one in shown.study.views(shown, rows).tables if one.name == "recommendations")
+    return found.frame
+
+
+def test_what_does_not_work_is_never_recommended():
+    """The lowest error was recommended also at 1.13 times the gradient, where every interval lies above 1."""
+    errors = {"fobg": (0.1, 1.3, 1.02, 0.95), "reinforce": (0.5, 3.0, 1.4, 0.5)}
+    cells = [
+        cell(e, 0.9 * e, 1.1 * e, stiffness=k, estimator=name, gradients=0)
+        for name, some in errors.items()
+        for k, e in zip((1e1, 1e2, 1e3, 1e4), some, strict=True)
+    ]
+    found = recommended(*cells)
+    assert found["use"].tolist() == ["fobg", "none works", "none is known to work", "reinforce"]
+    assert found["error"].tolist() == ["0.10", "-", "-", "0.50"]
+
+
+def test_of_backends_that_differ_only_those_are_recommended_whose_error_is_small():
+    errors = {"jax": 0.1, "mujoco": 1.5}
+    found = recommended(*(cell(e, 0.9 * e, 1.1 * e, backend=b, estimator="fobg") for b, e in errors.items()))
+    assert found["use"].tolist() == ["fobg (jax)"]
+
+
+def test_an_estimate_that_is_always_0_fails():
+    """The gradient of a step's program: its error is 1 by definition, however uncertain the reference is."""
+    zero = {"grad_norm": 0.0, "variance": 0.0, "variance_low": 0.0, "variance_high": 1e-4, "reference_norm": 1.0, "reference_se": 1e-4,
+            "bias": 1.0, "bias_low": 0.9999, "bias_high": 1.0001, "rmse_rel": 1.0, "rmse": 1.0}  # fmt: skip
+    methods, _ = made(row(stiffness=1e2, **zero), row(stiffness=1e4, **zero | {"grad_norm": 2.0}))
+    assert methods["verdict"].tolist() == [FAILS, OPEN]
+
+
+# ------------------------------------------------------------------------------------------------- what charts compare
+
+
+def charts_of(cells, **given):
+    """The charts of some cells by name."""
+    rows = table(cells)
+    shown = experiment(**({"sweep": {"stiffness": sorted(map(float, rows["stiffness"].unique()))}} | given))
+    return {chart.name: chart for chart in shown.study.views(shown, rows).charts}
+
+
+def along(errors, **given):
+    """Cells along three stiffnesses with an error per backend."""
+    return [cell(e, 0.9 * e, 1.1 * e, stiffness=k, backend=b, time_s=t, **given)
+            for k in (1e2, 1e3, 1e4) for b, (e, t) in errors.items()]  # fmt: skip
+
+
+def test_a_chart_shows_the_backends_that_its_experiment_compares():
+    """A question about engines was answered by the fastest backend, the minimal model."""
+    cells = along({"jax": (0.1, 1e-3), "mujoco": (0.1, 1.0), "mjx": (0.3, 0.1)})
+    chart = charts_of(cells, compares={"backends": ["jax", "mujoco"]})["bias_variance_stiffness"]
+    assert set(chart.frame["series"]) == {"jax", "mujoco"}
+    assert chart.styles["jax"].width > chart.styles["mujoco"].width, "lines on top of each other are both seen"
+
+
+def test_a_backend_that_differs_is_a_line_of_its_own():
+    """Of 1.5e5 on one backend and 600 on another, only the first was drawn."""
+    chart = charts_of(along({"jax": (0.1, 1e-3), "numpy": (0.4, 1.0)}))["bias_variance_stiffness"]
+    assert set(chart.frame["series"]) == {"fobg", "fobg (numpy)"}
+
+
+def test_time_to_an_error_is_drawn_per_backend_that_is_compared_and_with_what_never_arrives():
+    never = {"bias": 2.0, "bias_low": 1.9, "bias_high": 2.1}
+    cells = [
+        cell(n**-0.5, 0.9 * n**-0.5, 1.1 * n**-0.5, samples=n, backend=b, estimator=name, time_s=t * n, time_iqr_s=0.0)
+        | bias
+        for n in (16, 64, 256, 1024)
+        for b, t in (("jax", 1e-5), ("mjx", 1e-3))
+        for name, bias in (("fobg", {}), ("inverse_variance", never | {"rmse_rel": 0.5}))
+    ]
+    given = {"sweep": {"samples": [16, 64, 256, 1024]}, "compares": {"backends": ["jax", "mjx"]}}
+    frame = charts_of(cells, **given)["speed_accuracy"].frame.set_index(["panel", "series"])
+    assert frame.loc[("on mjx", "fobg"), "cost"] == pytest.approx(0.1, rel=0.05)
+    assert frame.loc[("on jax", "fobg"), "cost"] == pytest.approx(1e-3, rel=0.05)
+    assert frame.loc[[("on jax", "inverse_variance"), ("on mjx", "inverse_variance")], "lost"].all()
+
+
+def test_two_values_of_an_axis_are_joined_by_an_arrow():
+    cells = [
+        one | {"rmse_rel": one["rmse_rel"] * (100 if one["stiffness"] == 1e4 else 1)}
+        for one in along({"jax": (0.1, 1e-3)})
+    ]
+    chart = charts_of(cells, compares={"stiffness": [1e2, 1e4], "estimators": ["fobg"]})["contrast"]
+    assert chart.frame["stiffness"].tolist() == [1e2, 1e4]
+    assert chart.frame["arrow"].nunique() == 1
+
+
+def test_what_a_command_line_chooses_is_drawn_whatever_the_file_compares():
+    named = ["experiment=smoothing_sweep"]
+    assert "estimators" in config.load(named).compares
+    assert "estimators" not in config.load([*named, "estimators=[fobg,reinforce]"]).compares
+
+
+def test_an_unknown_axis_of_a_comparison_is_refused():
+    with pytest.raises(UserError, match="unknown axis in compares 'stifness'"):
+        charts_of(along({"jax": (0.1, 1e-3)}), compares={"stifness": [1e2, 1e4]})

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from bench.plugins.studies.optimise import views as studied
-from bench.plugins.studies.optimise.measure import compare_with_reference, scene_class
+from bench.plugins.studies.optimise.measure import scene_class
 from classes import ExplicitEuler, Impulse, Lqr, Penalty, SemiImplicitEuler, StaticGain, TwoBalls
 from helpers import loaded, stored
 from scipy.linalg import solve_discrete_lyapunov
@@ -165,7 +165,7 @@ def test_a_saddle_at_the_start_is_left_and_named(tmp_path, start, least, saddle)
 # ------------------------------------------------------------------------------------------------------ a search
 
 WORDS = [
-    "name=small", "study=optimise[budget=600,gradient_cost=1,quality_samples=64]", "scenes=[quadratic]", "backends=[numpy]",
+    "name=small", "study=optimise[budget=600,gradient_cost=1]", "scenes=[quadratic]", "backends=[numpy]",
     "estimators=[fobg,reinforce]", "optimizers=[gradient_descent,cem[population=20,elites=5]]", "sweep.rate=[0.01,0.1]",
     "sweep.seed=[0,1]", "samples=8", "repeats=4", "workers=0",
 ]  # fmt: skip
@@ -241,22 +241,6 @@ def test_what_ends_a_search(tmp_path, words, stopped):
     assert row["status"] == ("diverged" if stopped == "diverged" else "ok")
 
 
-def test_quality_subtracts_noise():
-    rng = np.random.default_rng(0)
-    terms = 3.0 + rng.standard_normal((4, 200_000))
-    unbiased = compare_with_reference(3.0 + 0.5 * rng.standard_normal((4000, 4)), terms)
-    assert unbiased["rmse_rel"] == pytest.approx(0.5 / 3.0, rel=0.02)
-    assert unbiased["bias_share"] < 0.01
-    biased = compare_with_reference(4.0 + 0.5 * rng.standard_normal((4000, 4)), terms)
-    assert biased["bias_share"] == pytest.approx(1.0 / 1.25, rel=0.02)
-
-
-def test_quality_is_unknown_where_the_reference_is_noisier_than_the_estimates():
-    rng = np.random.default_rng(0)
-    estimates, terms = 3.0 + 0.01 * rng.standard_normal((50, 4)), 3.0 + 100.0 * rng.standard_normal((4, 1000))
-    assert np.isnan(list(compare_with_reference(estimates, terms).values())).all()
-
-
 # ---------------------------------------------------------------------------------------------------- statistics
 
 
@@ -290,7 +274,15 @@ def test_bootstrap_interval_of_a_mean_covers():
 def searches(finals):
     """One problem's searches: final costs by method and tuning, one for each seed."""
     rows = [
-        {"problem": "p", "method": method, "tuning": tuning, "seed": seed, "final_cost": cost, "status": "ok"}
+        {
+            "problem": "p",
+            "scene": "p",
+            "method": method,
+            "tuning": tuning,
+            "seed": seed,
+            "final_cost": cost,
+            "status": "ok",
+        }
         for (method, tuning), costs in finals.items()
         for seed, cost in enumerate(costs)
     ]
@@ -345,14 +337,43 @@ def test_charts_have_the_tables_numbers(standard):
     assert len(views.rows) == len(rows)
 
 
+def raced(rates, scenes):
+    """Searches whose only target is reached by a share of ten seeds, by method and problem; a problem's scene is its name's start."""
+    rows = [
+        {"problem": f"{scene}[{i}]", "scene": f"{scene}[{i}]", "method": method, "tuning": "", "seed": seed,
+         "status": "ok", "best_known": 0.0, "start_cost": 1.0, "final_cost": float(seed >= 10 * rate), "ratio": 1.0,
+         "score": float(seed < 10 * rate), "path_rollouts": [0, 1], "path_gradients": [0, 0],
+         "path_cost": [1.0, 1e-9 if seed < 10 * rate else 1.0]}
+        for method, given in rates.items() for i, (scene, rate) in enumerate(zip(scenes, given, strict=True)) for seed in range(10)
+    ]  # fmt: skip
+    return studied.RunSet(pd.DataFrame(rows))
+
+
+SAME, APART = ["a", "a", "a", "a", "a", "b"], ["a", "b", "c", "d", "e", "f"]
+
+
 @pytest.mark.parametrize(
-    ("reached", "problems", "tied"),
+    ("scenes", "lead", "tied"),
     [
-        ([1.0, 0.5], [10, 10], [True, False]),
-        ([0.7, 0.6, 0.0], [10, 10, 10], [True, True, False]),
-        ([1.0, 0.5], [3, 10], [False, True]),  # the first was run on three problems only
+        (APART, [0.6] * 6, False),
+        (SAME, [0.6] * 6, False),
+        (APART, [0.9] * 5 + [0.2], False),
+        (SAME, [0.9] * 5 + [0.2], True),
     ],
 )
-def test_who_reaches_most_targets_needs_an_interval(reached, problems, tied):
-    summary = pd.DataFrame({"reached": reached, "reached_se": 0.06, "problems": problems})
-    assert studied.is_tied(summary).tolist() == tied
+def test_a_lead_on_one_scenes_problems_is_one_observation(scenes, lead, tied):
+    runs = raced({"first": [1.0] * 6, "second": [1.0 - x for x in lead]}, scenes)
+    assert studied.first_or_tied(runs) == {"first"} | ({"second"} if tied else set())
+
+
+def test_intervals_are_over_scenes():
+    rates = [0.7, 0.7, 0.7, 0.3, 0.3, 0.3]
+    wide = {}
+    for name, scenes in (("few", ["a", "a", "a", "b", "b", "b"]), ("many", APART), ("one", ["a"] * 6)):
+        (line,) = studied.summarise(raced({"only": rates}, scenes)).to_dict("records")
+        assert line["reached"] == pytest.approx(0.5)
+        wide[name] = line["reached_high"] - line["reached_low"]
+        assert line["score_low"] <= line["score"] <= line["score_high"]
+    assert wide["few"] > wide["many"] > wide["one"]
+    # deviations of 0.2 over six scenes, and Student's quantile with 5 degrees of freedom
+    assert wide["many"] == pytest.approx(2 * 2.5706 * 0.2 / math.sqrt(5), rel=1e-4)

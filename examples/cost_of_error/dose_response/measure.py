@@ -10,12 +10,13 @@ from typing import Any
 
 import numpy as np
 from bench.plugins.studies.optimise import search_parts
-from bench.plugins.studies.optimise.measure import error_parts, fastest, scene_class
+from bench.plugins.studies.optimise.measure import fastest, scene_class
 
 from bench.errors import Unsupported
 from bench.experiment.cell import Cell
 from bench.experiment.session import Session
 from bench.measure import noise
+from bench.measure.statistics import Truth, summarise
 from bench.model import IID, Problem
 
 from . import DoseResponse
@@ -132,10 +133,10 @@ def compare(estimates: np.ndarray, gradient: np.ndarray, variance: float) -> dic
     names = ("error", "bias", "spread", "cosine", "sign_agreement")
     if not np.isfinite(estimates).all() or not norm2 > 4 * variance or not norm2 > 0:
         return dict.fromkeys(names, math.nan)
-    bias2, spread2, cosine = error_parts(estimates, gradient, variance)
+    found = summarise(estimates, Truth.exact(gradient, math.sqrt(variance)), 1)
+    parts = np.array([found.rmse, found.bias, math.sqrt(found.variance)]) / math.sqrt(norm2)
     signs = (np.sign(estimates) == np.sign(gradient)).mean()
-    values = [math.sqrt((bias2 + spread2) / norm2), math.sqrt(bias2 / norm2), math.sqrt(spread2 / norm2)]
-    return dict(zip(names, [*values, cosine, float(signs)], strict=True))
+    return dict(zip(names, [*parts.tolist(), found.cosine, float(signs)], strict=True))
 
 
 def _times(cell: Cell, problem: Problem) -> dict[str, float]:

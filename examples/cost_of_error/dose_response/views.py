@@ -20,6 +20,8 @@ STYLES = {
 }
 """The errors that are drawn; the tables have the others and the natural methods."""
 VERDICTS = {"above 1": Style(PALETTE[2]), "below 1": Style(PALETTE[0]), "not known": Style("#767676")}
+ENOUGH = 6
+"""Fewest scenes with an interval."""
 CLASS, PROBLEMS, SCENES = (
     text("scene_class", label="class"),
     Column("problems", format="setting"),
@@ -88,8 +90,9 @@ def _chart(points: pd.DataFrame, pairs: pd.DataFrame) -> Chart:
     return Chart(
         "cost_of_error", points.sort_values("method", kind="stable"), [Column("error", label="relative error", log=True)],
         [interval("time", label="updates / best gradient's", log=True)],
-        kind="lines", series="method", panel="scene_class", styles=STYLES, failed="is_missed", across=3, height=2.0,
-        panel_notes={row.Index: f"{row.problems} problems of {row.scenes} scenes" for row in sizes.itertuples()},
+        kind="points", series="method", panel="scene_class", styles=STYLES, failed="is_missed", across=3, height=2.0,
+        panel_notes={row.Index: f"{row.problems} problems of {row.scenes} scenes" + f", fewer than {ENOUGH}: no intervals" * (row.scenes < ENOUGH)
+                     for row in sizes.itertuples()},
         subtitle=f"To 1/{MAIN:g} of the first regret, each method at its best rate. Cross: half of the scenes miss it. "
         "A bar to the top: no upper end",
         text="Planted errors: noise, and a bias. Medians over scenes, with 95% intervals where there are six. The error is the median over ten thetas that all methods of a problem share.",

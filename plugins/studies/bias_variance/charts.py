@@ -4,43 +4,44 @@ from __future__ import annotations
 
 import math
 import re
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
+from bench.errors import unknown
 from bench.experiment.axes import Axis
 from bench.experiment.columns import Column, text
-from bench.experiment.views import Chart, Mark
+from bench.experiment.views import Chart, Mark, Style
 from bench.model import SURROGATE, registry
-from bench.report.colours import method_styles
+from bench.report.colours import graded, method_styles
 from bench.report.problems import ProblemRows, split_by_problem
-from bench.report.text import counted, number
+from bench.report.style import MARKERS, colour
+from bench.report.text import axis_value, counted, number
 from bench.report.views import (
     Arranged,
     attempted,
     estimator_curves,
     estimator_labels,
-    pareto,
     shown_rmse,
 )
+from bench.report.writer import LEAST
 
 from .columns import COLUMNS
 from .comparisons import FAILS, NO_RESULT
-from .time_to_accuracy import ROLLOUTS, SAMPLES, TARGETS, TIME, with_known
+from .time_to_accuracy import COSTS, ROLLOUTS, SAMPLES, TARGETS, TIME, with_known
+from .time_to_accuracy import methods as methods_by_cost
 
 FLOOR = 1e-4
 """Relative biases below this are drawn here, as upper limits."""
-SERIES = 3
-"""Most estimators of a chart along an axis."""
+SERIES = 6
+"""Most estimators of a chart along an axis, where the experiment does not name them."""
+GRADES = {0.1: "#08519c", 0.3: "#6baed6", 1.0: "#d6e6f4", 10.0: "#fdae61", math.inf: "#c51b1b"}
+"""Upper ends of the grades of an error, and their colours."""
 PANELS = 4
 """Most problems of a chart along an axis."""
-FEW = 3
-"""Most points of an estimator that no line of error against cost joins."""
-DISTINCT = 1.2
-"""Median factor between the errors of two estimators from which a reader distinguishes their lines."""
 RMSE = Column(
     "rmse_rel", label="relative RMSE of one estimate", low="rmse_low", high="rmse_high", limit="rmse_limit", log=True,
     above_one="worse than the zero estimate",
@@ -50,7 +51,6 @@ BIAS = Column(
     above_one="larger than the gradient",
 )  # fmt: skip
 SECONDS = replace(COLUMNS.by_name["time_s"], label="time of one estimate", log=True)
-ROLLOUTS_SPENT = Column(ROLLOUTS, label="rollouts of one estimate, a gradient at its measured cost", log=True)
 FASTEST = "each estimator on its fastest backend"
 ESTIMATOR = text("series", label="")
 
@@ -58,28 +58,31 @@ ESTIMATOR = text("series", label="")
 def charts(
     shown: Arranged,
     methods: pd.DataFrame,
-    comparisons: pd.DataFrame,
     best: pd.DataFrame,
 ) -> list[Chart]:
     """Return all charts, the main one first."""
     labelled = replace(shown, rows=with_plotted_columns(shown.rows))
     subtitle = _conditions(shown)
     swept = shown.swept()
-    order = sorted(swept, key=lambda a: (-swept[a], a.column != "stiffness"))
+    order = sorted(swept, key=lambda a: (-swept[a], a.column not in ("stiffness", "samples")))
     along = [
-        _along(labelled, axis, methods, comparisons, subtitle)
+        _along(labelled, axis, subtitle)
+        if axis.column != "samples" or best.empty
+        else _cost_of_accuracy(shown, best, subtitle)
         for i, axis in enumerate(order)
         if not any(axis.column in other.moves for other in order[:i])  # axes that step together have one chart
-        if axis.column != "samples" or best.empty
     ]
-    if not best.empty:
-        along = [_error_and_cost(labelled, best, subtitle), *along]
-    elif shown.rows["backend"].nunique() > 1:
-        along += [_error_and_cost(labelled, best, subtitle)]
-    if not swept and methods["problem"].nunique() > 1:
+    if shown.rows["time_s"].notna().any():
+        along = [_contrast(labelled, subtitle), *along]
+    if not swept and shown.rows["backend"].nunique() > 1:
+        along += [_error_and_cost(labelled, subtitle)]
+    is_grid = (methods[["setting", "estimator"]].nunique() > 1).all()
+    if best.empty and max(swept.values(), default=0) < LEAST and is_grid:
         along = [_estimators(methods), *along]
-    styles = method_styles(labelled.rows["series"].unique())
-    return [replace(chart, styles=styles) for chart in along if chart is not None]
+    drawn = [chart for chart in along if chart is not None]
+    names = [name for chart in drawn if chart.series for name in chart.frame[chart.series]]
+    styles = method_styles(dict.fromkeys([*labelled.rows["series"], *names]))
+    return [chart if chart.styles else replace(chart, styles=styles) for chart in drawn]
 
 
 # ------------------------------------------------------------------------------------------------------- frames
@@ -128,53 +131,49 @@ def _conditions(shown: Arranged) -> str:
 def _along(
     shown: Arranged,
     axis: Axis,
-    methods: pd.DataFrame,
-    comparisons: pd.DataFrame,
     subtitle: str,
 ) -> Chart | None:
     """Return the chart of errors along an axis, of the main estimators on the main problems."""
-    problems = [p for p in split_by_problem(shown, axis) if attempted(p.rows)["x"].nunique() > 1]
+    always = ("scene",) * (shown.rows["scene"].nunique() > 1)
+    problems = [p for p in split_by_problem(shown, axis, always) if attempted(p.rows)["x"].nunique() > 1]
     if not problems:
         return None
-    frame = pd.concat([_lines(problem) for problem in problems], ignore_index=True)
     drawn, notes = choose_problems(problems)
-    names = _main_series(frame, methods, comparisons)
-    total = frame["series"].nunique()
-    panels = [problem.title() for problem in drawn]
+    backends = shown.experiment.compares.get("backends", ())
+    frame = pd.concat([_lines(problem, backends) for problem in problems], ignore_index=True)
+    names = shown.experiment.compares.get("estimators") or list(dict.fromkeys(frame["label"]))[:SERIES]
+    total = frame["label"].nunique()
     shares = [f"{len(names)} of {total} estimators"] if len(names) < total else []
-    for column, kept in (("series", names), ("panel", panels)):
+    for column, kept in (("label", names), ("panel", [problem.title() for problem in drawn])):
         frame = frame[frame[column].isin(kept)]
         frame = frame.iloc[frame[column].map(kept.index).argsort(kind="stable")]
+    if backends:
+        frame = frame.assign(panel=frame["panel"] + ", " + frame["label"], series=frame["backend"])
     marks = [Mark(f"beyond the {name}", value, math.inf) for name, value in shown.marks(axis).items()]
     x = Column("x", label=axis.title, format="setting")
     return Chart(
         "bias_variance_" + re.sub(r"\W", "_", axis.column), frame, [x], [RMSE, BIAS], series="series",
-        panel="panel", marks=marks, failed="failed", across=len(drawn),
-        height=2.7 if len(drawn) <= 2 else 2.1,
+        panel="panel", marks=marks, failed="failed", across=len(names) if backends else len(drawn),
+        height=2.7 if len(drawn) <= 2 else 2.1, styles=_nested(backends),
         subtitle=", ".join(filter(None, [subtitle, *notes, *shares])),
         text="Bars are 95% intervals. A hollow marker is an upper limit.",
     )  # fmt: skip
 
 
-def _lines(problem: ProblemRows) -> pd.DataFrame:
-    """Return the points of a problem: of each estimator the first of the backends that agree."""
-    curves = estimator_curves(problem.rows, 0.03)
-    return curves[curves["curve"] == curves.groupby("label")["curve"].transform("min")].assign(panel=problem.title())
+def _lines(problem: ProblemRows, backends: Sequence[str]) -> pd.DataFrame:
+    """Return the points of a problem: a line per estimator and backend, those that agree as one unless these are compared."""
+    curves = estimator_curves(problem.rows, None if backends else 0.03)
+    curves = curves[curves["backend"].isin(backends)] if backends else curves
+    if not backends:  # those that differ from the first are named after their backends
+        first = curves["curve"] == curves.groupby("label")["curve"].transform("min")
+        curves = curves.assign(series=curves["label"].where(first, curves["method"]))
+    return curves.assign(panel=problem.title())
 
 
-def _main_series(frame: pd.DataFrame, methods: pd.DataFrame, comparisons: pd.DataFrame) -> list[str]:
-    """Return the estimators to print: those that are most often first, then others, as far as distinct."""
-    estimator = dict(zip(methods["method"], methods["estimator"], strict=True))
-    wins = Counter(estimator[name] for name in comparisons["first"] if name)
-    names = sorted(frame["series"].unique(), key=lambda name: (-wins[name], "[" in name))
-    errors = frame.pivot_table("rmse_rel", ["panel", "x"], "series", aggfunc="first").reindex(columns=names)
-    errors = np.log(errors.where(errors > 0))
-    chosen: list[str] = []
-    for name in names:
-        apart = errors[chosen].sub(errors[name], axis=0).abs().median()
-        if len(chosen) < SERIES and not (apart < math.log(DISTINCT)).any():
-            chosen.append(name)
-    return chosen
+def _nested(names: Sequence[str]) -> dict[str, Style]:
+    """Return looks in which lines on top of each other are all seen: each later one is thinner."""
+    count = len(names)
+    return {name: Style(colour(i), MARKERS[i], width=1.2 * (count - i)) for i, name in enumerate(names)}
 
 
 def choose_problems(problems: Sequence[ProblemRows]) -> tuple[list[ProblemRows], list[str]]:
@@ -199,39 +198,102 @@ def choose_problems(problems: Sequence[ProblemRows]) -> tuple[list[ProblemRows],
 # ----------------------------------------------------------------------------------------------- error and cost
 
 
-def _error_and_cost(shown: Arranged, best: pd.DataFrame, subtitle: str) -> Chart | None:
-    """Return error against cost: where samples were swept the front of each estimator, per problem, else a point each."""
-    is_swept, parts = not best.empty, []
-    timed = not is_swept or bool((best["by"] == "time").any())
-    cost, x = (TIME, SECONDS) if timed else (ROLLOUTS, ROLLOUTS_SPENT)
-    axis, always = (SAMPLES, ("scene",)) if is_swept else (None, ("scene", "contact"))
-    problems = split_by_problem(shown, axis, always)
-    chosen = problems if is_swept else problems[:: math.ceil(len(problems) / 3)]
-    for problem in chosen:
-        rows = with_known(problem.rows, cost)
-        for _, every in rows.groupby("series", sort=False) if not is_swept or rows["x"].nunique() > 1 else ():
-            part = _on_fastest(every, cost)
-            parts.append(part[pareto(part[cost], part["rmse_rel"])].assign(panel=problem.title()))
+def _error_and_cost(shown: Arranged, subtitle: str) -> Chart | None:
+    """Return error against time where nothing was swept: a point per estimator on its fastest backend, a panel per problem."""
+    parts = []
+    for problem in split_by_problem(shown, None, ("scene", "contact")):
+        rows = with_known(problem.rows, TIME)
+        parts += [_on_fastest(every).assign(panel=problem.title()) for _, every in rows.groupby("series", sort=False)]
     if not parts:
         return None
-    frame = pd.concat(parts, ignore_index=True)
-    is_line = frame.groupby(["panel", "series"]).size().max() > FEW
-    shares = [f"{len(chosen)} of {counted(len(problems), 'problem')}"] if len(chosen) < len(problems) else []
-    marks = [Mark(f"{target:.0%}", target, axis="y") for target in TARGETS if is_swept]
     return Chart(
-        "speed_accuracy" if timed else "rollouts_accuracy", frame, [x], [RMSE], "lines" if is_line else "points", series="series",
-        panel="panel", marks=marks, across=3, height=2.0 if is_swept else 1.9, front=not is_swept,
-        subtitle=", ".join(filter(None, [subtitle, *shares, FASTEST])),
-        text="Only estimates that no other of the same estimator beats in both error and cost are drawn." if is_swept else "",
+        "speed_accuracy", pd.concat(parts, ignore_index=True), [SECONDS], [RMSE], "points", series="series",
+        panel="panel", line="line", arrow="series", across=3, height=1.9, subtitle=", ".join(filter(None, [subtitle, FASTEST])),
     )  # fmt: skip
 
 
-def _on_fastest(rows: pd.DataFrame, cost: str) -> pd.DataFrame:
-    """Return an estimator's rows on the backend with the lowest cost, by the median over the samples that all have."""
-    lines = rows["line"]
-    shared = rows[rows.groupby("x")["line"].transform("nunique") == lines.nunique()]
-    rows_of = shared if len(shared) else rows
-    return rows[lines == rows_of.groupby("line")[cost].median().idxmin()]
+def _contrast(shown: Arranged, subtitle: str) -> Chart | None:
+    """Return error against time at two values of an axis, joined by arrows, as the experiment's ``compares`` names them."""
+    rows, joined_axis = with_known(shown.rows, TIME), None
+    for name, values in shown.experiment.compares.items():
+        axis = next((axis for axis in shown.axes if name in (axis.column, axis.short)), None)
+        column = (
+            "series" if name == "estimators" else "backend" if name == "backends" else axis.column if axis else name
+        )
+        if column not in rows:
+            raise unknown("axis in compares", name, (*shown.numbers, "estimators", "backends"))
+        rows = rows[rows[column].isin(values)]
+        joined_axis = (axis, values) if len(values) == 2 and axis else joined_axis
+    if joined_axis is None or rows.empty:
+        return None
+    axis, (start, end) = joined_axis
+    parts = [_on_fastest(part) for _, part in rows.groupby(["series", "contact"], sort=False)]
+    frame = pd.concat(parts).sort_values(axis.column, key=lambda at: at == end, kind="stable")
+    frame[TIME] = frame.groupby(["series", "contact"])[TIME].transform(
+        "median"
+    )  # the same program: what differs is noise
+    frame = frame.assign(arrow=frame["series"] + ", " + frame["contact"], line=frame["contact"].str.partition("[")[0])
+    return Chart(
+        "contrast", frame, [SECONDS], [RMSE], "points", series="series", line="line", arrow="arrow", height=2.9,
+        subtitle=", ".join(filter(None, [subtitle, f"arrows: {axis.title} {axis_value(start)} to {axis_value(end)}", FASTEST])),
+        text="An arrow joins the same estimator at two settings.",
+    )  # fmt: skip
+
+
+def _on_fastest(rows: pd.DataFrame, cost: str = TIME) -> pd.DataFrame:
+    """Return an estimator's rows on the backend with the lowest cost, by the median over its settings."""
+    return rows[rows["line"] == rows.groupby("line")[cost].median().idxmin()]
+
+
+def _cost_of_accuracy(shown: Arranged, best: pd.DataFrame, subtitle: str) -> Chart:
+    """Return the cost of each estimator to reach an error: a row per problem, with who is first and by what factor."""
+    kind, target = best["by"].iloc[0], TARGETS[0]
+    backends = shown.experiment.compares.get("backends", ()) if kind == "time" else ()
+    lead = best[(best["by"] == kind) & (best["relative error"] == target)].set_index("problem", drop=False)
+    lines = []
+    for problem in split_by_problem(shown, SAMPLES, ("scene",)):
+        found = methods_by_cost(problem, target, COSTS[kind]) if problem.title() in lead.index else {}
+        for name, needed in found.items():
+            estimator, _, backend = name.partition(" on ")
+            low, high = (needed.cost * math.exp(sign * size) for sign, size in ((-1, needed.down), (1, needed.up)))
+            lines.append({"problem": _with_lead(lead.loc[problem.title()]), "series": estimator, "panel": f"on {backend}" if backends else "",
+                          "cost": needed.cost, "low": low, "high": high, "limit": needed.how == "at once",
+                          "lost": not math.isfinite(needed.cost), "backend": backend})  # fmt: skip
+    frame = pd.DataFrame(lines)
+    frame = (
+        frame[frame["backend"].isin(backends)]
+        if backends
+        else frame.sort_values("cost").drop_duplicates(["problem", "series"]).sort_index()
+    )
+    label = f"{'time' if kind == 'time' else 'rollouts'} to a relative error of {target:.0%}"
+    cost = Column(
+        "cost",
+        label=label,
+        format="seconds" if kind == "time" else "setting",
+        low="low",
+        high="high",
+        limit="limit",
+        log=True,
+    )
+    return Chart(
+        "speed_accuracy" if kind == "time" else "rollouts_accuracy", frame, [cost], [text("problem", label="")], "dots", series="series",
+        panel="panel" if backends else "", failed="lost", across=2, height=0.42,
+        subtitle=", ".join(filter(None, [subtitle, "" if backends else FASTEST, "crosses: not known to be reached"])),
+    )  # fmt: skip
+
+
+def _with_lead(best: Any) -> str:
+    """Return a problem with the first method there, and the factor by which it leads."""
+    if best["fastest"] == "-":
+        return f"{best['problem']}\nnone"
+    others = (
+        f"{number(best['factor'])}x ahead"
+        if best["factor_low"] > 1 and best["factor"] > 0
+        else f"at least {number(best['factor_low'])}x ahead"
+        if best["factor_low"] > 1
+        else "tied"
+    )
+    return f"{best['problem']}\n{best['fastest']}, {others}"
 
 
 # --------------------------------------------------------------------------------------------------- estimators
@@ -244,15 +306,17 @@ def _estimators(methods: pd.DataFrame) -> Chart:
     families = {name: _family(name.partition("[")[0]) for name in names}
     order = sorted(names, key=lambda name: list(dict.fromkeys(families.values())).index(families[name]))
     frame = methods.iloc[methods["estimator"].map(order.index).argsort(kind="stable")]
+    at = ", " + frame["axis"] + "=" + frame["at"].map(axis_value)
     error, known = frame["error"], np.isfinite(frame["error"])
     marks = frame["status"].where(frame["verdict"] == NO_RESULT, "").mask(frame["verdict"] == FAILS, " fails")
+    grades, looks = graded(error, GRADES, "{:g}".format)
     return Chart(
         "estimators",
-        frame.assign(panel=frame["estimator"].map(families), series=frame["estimator"], shade=(np.log10(error.clip(1e-2, 1e2)) / 4 + 0.5).where(known),
-                     cell=error.map(number).where(known, marks)),
-        [text("problem", label="")], [ESTIMATOR], "grid", panel="panel", shade="shade",
+        frame.assign(panel=frame["estimator"].map(families), series=frame["estimator"], grade=grades.where(known, "no result"), problem=frame["problem"] + at.where(frame["axis"] != "", ""),
+                     cell=(pd.Series(np.where(frame["error_is_limit"], "<", ""), frame.index) + error.map(number)).where(known, marks)),
+        [text("problem", label="")], [ESTIMATOR], "grid", panel="panel", level="grade", styles=looks | {"no result": Style("#f2f2f2")},
         cell="cell", across=1, height=0.2,
-        subtitle="relative RMSE of one estimate, sorted by the worst case; above 1 the zero estimate is better",
+        subtitle="relative RMSE of one estimate, sorted by the worst case; from 1 on the zero estimate is better",
     )  # fmt: skip
 
 

@@ -21,7 +21,8 @@ from bench.report.views import CATEGORIES, Arranged, attempted, estimator_curves
 from .time_to_accuracy import ROLLOUTS, couples_samples
 
 WORKS, FAILS, OPEN, NO_RESULT = "works", "fails", "open", "no result"
-"""Verdicts of a method at a setting: its interval is below 1, above 1, contains 1 or is not known; it has no number."""
+"""Verdicts of a method at a setting: its interval is below 1; above 1, or every estimate is 0; contains 1 or is not known; it
+has no number."""
 NEAR = 2.0
 """A method whose error is more than this many times the lowest does not share the first place: the order is open."""
 EQUAL = "relative RMSE at equal rollouts"
@@ -91,7 +92,7 @@ def method_table(shown: Arranged) -> pd.DataFrame:
             "setting": setting_names(problem, axis, rows), "problem": title, **kinds, "axis": along,
             "at": rows["x"] if axis else math.nan, "method": rows["method"], "estimator": rows["label"],
             "error": error, "error_low": low, "error_high": high, "error_is_limit": is_limit,
-            "verdict": verdict(rows["status"], error, low, high), "status": rows["status"], "remark": rows["reason"],
+            "verdict": verdict(rows["status"], error, low, high, (rows["grad_norm"] == 0) & (rows["variance"] == 0)), "status": rows["status"], "remark": rows["reason"],
             "bias_share": ((rows["bias_low"] / rows["rmse"]) ** 2).where(error > 0),
             "evaluations": (rows["rollouts"] + rows["gradients"]) / samples, "time_s": rows["seconds"],
             "rollouts": rows[ROLLOUTS], "has_law": has_law(rows), "has_fixed_work": declares(rows, "fixed_work"),
@@ -195,10 +196,14 @@ def lowest(equal: pd.DataFrame) -> set[tuple[str, str]]:
     return found
 
 
-def verdict(status: Any, error: Any, low: Any, high: Any) -> Any:
-    """Return the verdict on each error with its 95% interval. A missing number or interval is never a pass."""
+def verdict(status: Any, error: Any, low: Any, high: Any, is_zero: Any = False) -> Any:
+    """Return the verdict on each error with its 95% interval. A missing number or interval is never a pass.
+
+    An estimate that ``is_zero`` has the error of the zero estimate, however well the reference is known.
+    """
     is_known = np.isfinite(error) & np.isfinite(low) & ~np.isnan(high)
-    return np.select([status != "ok", is_known & (low > 1), is_known & (high < 1)], [NO_RESULT, FAILS, WORKS], OPEN)
+    fails = is_known & ((low > 1) | is_zero)
+    return np.select([status != "ok", fails, is_known & (high < 1)], [NO_RESULT, FAILS, WORKS], OPEN)
 
 
 def ratio(first: Any, second: Any) -> tuple[Any, Any, Any]:
@@ -248,11 +253,15 @@ def compare_errors(methods: pd.DataFrame) -> pd.DataFrame:
 
 
 def leaders(comparisons: pd.DataFrame, methods: pd.DataFrame) -> pd.Series:
-    """Return, per setting, the estimators that are first, or tied and near the first; settings without a known error have none."""
-    named = comparisons.assign(method=[(line.first, *line.tied) for line in comparisons.itertuples()]).explode("method")
-    near = named.merge(methods[["setting", "method", "estimator", "error"]], on=["setting", "method"])
-    near = near[~(near["error"] > NEAR * near["value"])].drop_duplicates(["setting", "estimator"])
-    return near.groupby("setting", sort=False)["estimator"].agg(tuple)
+    """Return, per setting, the methods that are first, or tied and near the first; settings without a known error have none."""
+    named = (
+        comparisons.assign(method=[(line.first, *line.tied) for line in comparisons.itertuples()])
+        .explode("method")
+        .astype({"method": object})
+    )
+    near = named.merge(methods[["setting", "method", "error"]], on=["setting", "method"])
+    near = near[~(near["error"] > NEAR * near["value"])]
+    return near.groupby("setting", sort=False)["method"].agg(tuple)
 
 
 def verdicts_by_estimator(methods: pd.DataFrame) -> pd.DataFrame:

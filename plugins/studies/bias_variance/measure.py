@@ -10,19 +10,19 @@ import json
 import math
 import time
 from collections.abc import Iterator
-from dataclasses import asdict, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from bench.experiment.cell import Cell
 from bench.experiment.session import Session
-from bench.measure import noise, statistics, timing
+from bench.measure import noise, timing
 from bench.measure.timing import Pause
-from bench.model import IID, SURROGATE, Auxiliaries, Problem, SampleMean, columns, per_repeat
+from bench.model import IID, Auxiliaries, Problem, SampleMean, columns, per_repeat
 from bench.model.estimator import require_shape
 
-from .. import all_noise
+from .. import against_reference, all_noise
 from . import BiasVariance
 
 MOST_TERMS = 1 << 25
@@ -127,10 +127,10 @@ class Estimates:
         return self._checked(estimator.terms(self._problem, self._theta, w), "(d, B)", self._problem.dim, w.shape[1])
 
     def _checked(self, result: Any, meaning: str, *shape: int) -> np.ndarray:
-        """Return a result in float64; raises an error if it is complex or has another shape."""
+        """Return a result in float64, NaN where it is masked; raises an error if it is complex or has another shape."""
         if np.iscomplexobj(result):  # a cast would silently drop the imaginary part
             raise TypeError(f"{self._estimator.name} returned complex numbers; gradients are real")
-        result = np.asarray(result, dtype=np.float64)
+        result = np.asarray(np.ma.filled(result, np.nan), dtype=np.float64)
         require_shape(self._estimator, meaning, result, shape)
         return result
 
@@ -152,7 +152,7 @@ def measure(cell: Cell, session: Session, study: BiasVariance) -> dict[str, Any]
     calls = (cell.repeats if cell.backend.compiles else min(study.timed_calls, cell.repeats)) if cell.timing else 0
     # count only the estimates: the reference may have used the same problem
     problem.reset_usage()
-    started = time.perf_counter()
+    started, compiled_s = time.perf_counter(), session.compilations.seconds
     parts: list[np.ndarray] = []
     clock: timing.Timing | None = None
     if calls:
@@ -168,10 +168,8 @@ def measure(cell: Cell, session: Session, study: BiasVariance) -> dict[str, Any]
     elapsed = time.perf_counter() - started
     values = np.concatenate(parts)
 
+    auxiliaries = summarise_diagnostics([estimates.diagnostics[start] for start in sorted(estimates.diagnostics)])
     result: dict[str, Any] = {
-        "status": "ok",
-        "reference_method": truth.method,
-        "reference_spacing": truth.spacing,
         "model_error": truth.model_error,
         "time_s": clock.median_s if clock else math.nan,
         "time_iqr_s": clock.iqr_s if clock else math.nan,
@@ -180,7 +178,7 @@ def measure(cell: Cell, session: Session, study: BiasVariance) -> dict[str, Any]
         if clock
         else math.nan,
         "estimates_s": elapsed,
-        "compile_s": usage.compile_s,
+        "compile_s": session.compilations.seconds - compiled_s or math.nan,
         "rollouts": usage.rollouts / n_counted,
         "gradients": usage.gradients / n_counted,
         "peak_memory_mb": timing.peak_memory_mb(),
@@ -190,27 +188,13 @@ def measure(cell: Cell, session: Session, study: BiasVariance) -> dict[str, Any]
         "point": theta.tolist(),
         "mean_estimate": values.mean(axis=0).tolist(),
         "reference_gradient": truth.gradient.tolist(),
-        "auxiliaries": summarise_diagnostics([estimates.diagnostics[start] for start in sorted(estimates.diagnostics)]),
+        "auxiliaries": auxiliaries,
     }
     if cell.point is not None:
         result |= {"start_norm": cell.point.start_norm, "descent_path": json.dumps(cell.point.along)}
-    if not np.isfinite(truth.batches).all():
-        return result | {"status": "nonfinite", "reason": truth.note or "the reference gradient is not finite"}
-    unbiased = cell.estimator.declares_unbiased(program)
-    draws = cell.estimator.draws_noise(program)
-    summary = asdict(
-        statistics.summarise(
-            values, truth.known(), cell.samples if draws else 1, estimates.sums, unbiased=unbiased,
-            is_random=draws or program.exogenous > 0,
-        )
-    )  # fmt: skip
-    surrogate = SURROGATE if program.surrogate and "grad" in cell.estimator.needs else ""
-    doubt = cell.estimator.remark(json.loads(result["auxiliaries"])) if result["auxiliaries"] else ""
-    remarks = (surrogate, summary.pop("note"), doubt, truth.note)
-    result |= {"reason": "; ".join(part for part in remarks if part), **summary}
+    result |= against_reference(problem, cell.estimator, truth, values, cell.samples, estimates.sums, auxiliaries)
     bad = ~np.isfinite(values).all(axis=1)
-    if bad.any():
-        result["status"] = "nonfinite"
+    if bad.any() and truth.is_finite:
         result["reason"] += f"; {locate_first_bad(cell, problem, estimates, int(np.argmax(bad)))}"
     return result
 

@@ -19,12 +19,11 @@ import pandas as pd
 from bench.report.tables import plain_markdown
 from bench.report.text import number
 
+from .. import SPREAD
 from .columns import COLUMNS
 
 WRONG = 0.5
 """Relative RMSE at and above which an estimate counts as wrong: half of the gradient."""
-SPREAD = 0.5
-"""The rule trusts a cell if the standard deviation of one estimate is below this multiple of the mean estimate's norm."""
 
 
 def cells(folder: Path, estimators: Sequence[str]) -> pd.DataFrame:

@@ -24,9 +24,11 @@ from . import charts, descents, time_to_accuracy
 from .columns import COLUMNS
 from .comparisons import COLUMNS as COMPARED
 from .comparisons import (
+    ERROR,
     FAILS,
     LAW,
     NO_RESULT,
+    WORKS,
     at_equal_rollouts,
     compare_errors,
     leaders,
@@ -34,6 +36,7 @@ from .comparisons import (
     method_table,
     problems_by_axis,
     setting_names,
+    verdict,
     verdicts_by_estimator,
 )
 from .time_to_accuracy import ROLLOUTS, limits, with_gradient_cost
@@ -54,7 +57,7 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views | None:
     best = time_to_accuracy.table(shown)
     return Views(
         tables(experiment, rows, shown, methods, equal, errors, best),
-        charts.charts(shown, equal, errors, best),
+        charts.charts(shown, equal, best),
         rows=charts.with_plotted_columns(costed),
         columns=[
             *(replace(c, label=label) for c, label in ((charts.RMSE, "rel. RMSE"), (charts.BIAS, "rel. bias"))),
@@ -119,7 +122,7 @@ def tables(
         replace(main, data=axes.table(experiment, rows)), *others,
         Table("speed_accuracy", speed_accuracy(rows), [], files=["csv"]),
         *([ranking(methods, equal)] if is_ranked else []),
-        recommendations(equal, errors),
+        recommendations(equal),
         Table("verdicts", methods.drop(columns=["setting", "has_law", *LAW]), [], files=["csv"]),
         Table("comparisons", joined.assign(factor_note=limits(joined)), columns, title, COMPARISON_NOTES, data=joined),
         *([] if best.empty else [time_to_accuracy.accuracy_table(best)]),
@@ -251,7 +254,7 @@ def ranking(methods: pd.DataFrame, equal: pd.DataFrame) -> Table:
     ]
     explained = (
         "Sorted by the worst case. Relative RMSE [95% interval] at equal rollouts; where a problem was swept, the largest along "
-        "the axis. At the samples of the experiment, works: the whole interval is below 1; fails: it is above 1; open: it contains 1 or is not known. biased: more "
+        "the axis. At the samples of the experiment, works: the whole interval is below 1; fails: it is above 1, or every estimate is 0; open: it contains 1 or is not known. biased: more "
         "than half of the squared error is bias. (40x): it evaluates 40 costs and gradients per sample, where others take "
         "one or two.",
     )
@@ -264,21 +267,38 @@ def _values(axis: str, at: pd.Series) -> str:
 
 
 def _errors(methods: pd.DataFrame) -> str:
-    """Return the smallest and largest error; ``< 0.12`` if some are upper limits."""
+    """Return the smallest and largest error; ``< 0.12`` if some are upper limits, ``-`` without any."""
+    if methods.empty:
+        return "-"
     known = span(*methods["error"].agg(["min", "max"]))
     return f"< {number(methods['error'].max())}" if methods["error_is_limit"].any() else known
 
 
-def recommendations(methods: pd.DataFrame, comparisons: pd.DataFrame) -> Table:
-    """Return what to use where: a line per problem and range of its axis with the same first and tied estimators."""
-    named = methods.assign(use=methods["setting"].map(leaders(comparisons, methods))).dropna(subset=["use"])
+def _failing(methods: pd.DataFrame) -> Any:
+    """Return the names of what fails somewhere: an estimator's, where it does so on all backends."""
+    somewhere = methods.groupby("method")["failed"].transform("any")
+    everywhere = somewhere.groupby(methods["estimator"]).transform("all")
+    return methods["estimator"].where(everywhere, methods["method"])[somewhere].unique()
+
+
+def recommendations(methods: pd.DataFrame) -> Table:
+    """Return what to use where: a line per problem and range of its axis with the same first and tied estimators that work.
+
+    A method works if its interval is below 1 at equal rollouts, unless it fails as measured.
+    """
+    methods = methods.assign(failed=methods["verdict"].isin((FAILS, NO_RESULT)))
+    now = verdict(methods["status"], *(methods[name] for name in ERROR))
+    good = methods[(now == WORKS) & ~methods["failed"]]
+    use = methods["setting"].map(leaders(compare_errors(good), good)).astype(object)
+    is_lost = methods.groupby("setting")["failed"].transform("all")
+    missing = is_lost.map({True: ("none works",), False: ("none is known to work",)})
     lines = [
-        {"problem": problem, "where": _values(axis, part["at"]), "use": " or ".join(use), "error": _errors(part[part["estimator"] == use[0]]),
-         "fails": ", ".join(part.loc[part["verdict"].isin((FAILS, NO_RESULT)), "estimator"].unique()) or "none"}
-        for (problem, axis, use), part in named.groupby(["problem", "axis", "use"], sort=False)
+        {"problem": problem, "where": _values(axis, part["at"]), "use": " or ".join(use), "error": _errors(part[part["method"] == use[0]]),
+         "fails": ", ".join(_failing(part)) or "none"}
+        for (problem, axis, use), part in methods.assign(use=use.fillna(missing)).groupby(["problem", "axis", "use"], sort=False)
     ]  # fmt: skip
     columns = [
         text("problem"), text("where"), text("use"), text("error", label="relative RMSE"), text("fails", label="fails there"),
     ]  # fmt: skip
-    notes = ["Errors are compared at equal rollouts."]
+    notes = ["Errors are compared at equal rollouts, among methods whose interval is below 1."]
     return Table("recommendations", pd.DataFrame(lines), columns, "What to use where", notes, files=(), page=True)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 POINTS = ("start", "before", "at", "after", "noise")
 """``start`` is theta0. The next three are on a line through theta0: before, at and after a switch of contact mode. ``noise``
-is theta0 under noise with which the cost jumps."""
+is theta0 under noise at which a cost or gradient is not a number, or the mean of gradients misses a part of the slope."""
 
 
 def is_trusted(point: str, verdict: str) -> bool:
@@ -40,6 +40,7 @@ class GradientCheck(StudyPackage):
                 "best_eps": "step of that error, in units of the natural scale",
                 "scale": "natural scale of displacements of theta: its norm, at least 1",
                 "taylor_order": "order of the Taylor remainder along random directions: 2 for a right gradient, 1 if wrong",
+                "spread": "standard deviation of an estimate by `samples` gradients under noise over the norm of their mean",
                 "cost_noise": "measured standard deviation of the cost's own noise",
                 "jump": "largest jump of the cost that the noise reaches; 0 where none was found",
                 "jump_share": "that jump as a share of the range of the cost under the noise",
@@ -50,6 +51,11 @@ class GradientCheck(StudyPackage):
             "verdict",
             "the worst verdict of the checks",
             comparison=ComparisonRule("verdict", "verdict", order=VERDICTS),
+        ),
+        text(
+            "trusted",
+            "whether estimates by fobg can be trusted: yes where they spread by less than half of their mean, and no check "
+            "outside a contact switch finds anything against the gradient",
         ),
         text("command", "a line for the shell that repeats the checks"),
         text("device", "what the program ran on"),
@@ -65,7 +71,7 @@ class GradientCheck(StudyPackage):
                 "component_left": "of each component, the one-sided slope towards smaller values",
                 "component_right": "of each component, the one-sided slope towards larger values",
                 "component_verdict": "of each component, its verdict",
-                "point": "where each check was made: start, before, at or after a contact switch, or noise: at a jump that the noise reaches",
+                "point": "where each check was made: start, before, at or after a contact switch, or noise: at a jump or a lost number that the noise reaches",
                 "sample": "of each check, 0 without noise, 1 with it",
                 "direction": "of each check, the number of its direction; -1 - i for component i",
                 "contact_switch": "of each check at a contact switch, the contact and the first step that differ between its two sides",

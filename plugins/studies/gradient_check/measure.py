@@ -7,7 +7,7 @@ import math
 import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,11 +17,10 @@ from bench.experiment.session import Session
 from bench.measure import noise
 from bench.measure.batches import in_columns
 from bench.measure.contacts import active_contacts, contact_names, engine_contacts
-from bench.measure.jumps import MissedSlope, jump_under_noise, missed_slope
+from bench.measure.jumps import Jump, Sampled, jump_under_noise, missed_slope, sampled_gradients
 from bench.model import SURROGATE, ContactScene, EngineScene, ForceLaw, LoopOps, Problem, Rollout, Unsupported, registry
 
-from .. import norm
-from ..stability import spectral_radius
+from .. import SPREAD, norm, spectral_radius
 from . import GradientCheck, is_trusted
 
 COLUMNS_AT_ONCE = 128
@@ -49,6 +48,8 @@ class Place:
     w: np.ndarray
     switch: str = ""
     """The contact switch that the place is at, in words."""
+    verdict: str = ""
+    """The verdict on what noise reaches here, known before the check."""
 
 
 @dataclass(frozen=True)
@@ -72,14 +73,12 @@ def measure(cell: Cell, session: Session, search: GradientCheck) -> dict[str, An
     drawn = noise.draw(cell.seed, cell.scene.name, 1, 1, problem.program.n_noise, "gradient check")[0, 0]
     directions = noise.draw(cell.seed, cell.scene.name, 1, search.drawn, theta.size, "directions")[0]
     whole = start(problem, theta, unit, search, cell.seed)
-    jump, at_jump = jump_under_noise(problem, theta, cell.seed, COLUMNS_AT_ONCE)
-    # a jump is a fault of its own, and the slope that it carries is no other one
-    missed = MissedSlope(0.0, at_jump) if jump.height else missed_slope(problem, theta, cell.seed, COLUMNS_AT_ONCE)
-    under_noise = "jump" if jump.height else "missed_slope" if missed.share else ""
-    at = at_jump if jump.height else missed.w
-    reached = [Place("noise", 0, 1, theta, directions[0] / np.linalg.norm(directions[0]), at)] if under_noise else []
+    along = directions[0] / np.linalg.norm(directions[0])
+    sampled = sampled_gradients(problem, theta, cell.seed, COLUMNS_AT_ONCE)
+    (jump, distance), events = under_noise(problem, theta, sampled, cell.seed)
+    reached = [Place("noise", 0, 1, theta, along, event.w, verdict=event.verdict) for event in events]
     found = examine(problem, drawn, directions, unit, search, reached)
-    points = [*at_start(whole), *(_settled(problem, point, under_noise) for point in found)]
+    points = [*at_start(whole), *(_settled(problem, point) for point in found)]
     checks: list[dict[str, Any]] = [
         {
             "point": point.place.point, "sample": point.place.noise, "direction": point.place.number,
@@ -89,26 +88,20 @@ def measure(cell: Cell, session: Session, search: GradientCheck) -> dict[str, An
         for point in points for best in [gradcheck.best(point.sample)]
     ]  # fmt: skip
     severest = min(checks, key=lambda check: (gradcheck.VERDICTS.index(check["check_verdict"]), -check["check_error"]))
+    untrusted = sum(not is_trusted(point.place.point, point.verdict) for point in points)
+    spread = sampled.spread / math.sqrt(cell.samples)
     lost = all(point.verdict == "nonfinite" for point in points)
     parts = whole.components
     remarks = [SURROGATE] if problem.program.surrogate else []
     remarks += [] if whole.cause in PLAIN else [whole.sentence()]
-    distance = norm(at_jump) if jump.height else math.nan
-    if jump.height:
-        remarks.append(
-            f"the cost jumps by {jump.height:.3g}, {jump.height / jump.span:.2g} of its range, under noise of "
-            f"{distance:.2g} standard deviations: the mean of gradients misses jumps"
-        )
-    if missed.share:
-        remarks.append(
-            f"sampled gradients miss {missed.share:.2g} of the mean slope along a line through the noise, most of it near "
-            f"{norm(missed.w):.2g} standard deviations: a steep rise, or a far kink"
-        )
+    remarks += [event.remark for event in events]
     return {
         "status": "nonfinite" if lost else "ok",
         "reason": "no cost is finite" if lost else "; ".join([*remarks, *beyond_stability(cell)]),
         "verdict": severest["check_verdict"],
-        "untrusted": sum(not is_trusted(point.place.point, point.verdict) for point in points),
+        "untrusted": untrusted,
+        "spread": spread,
+        "trusted": "no" if untrusted or not spread < SPREAD else "yes",
         "best_error": severest["check_error"],
         "best_eps": severest["check_eps"],
         "scale": scale_of(theta),
@@ -127,6 +120,44 @@ def measure(cell: Cell, session: Session, search: GradientCheck) -> dict[str, An
         "mode_minus": [mode for point in points for mode in point.minus],
         "mode_plus": [mode for point in points for mode in point.plus],
     }
+
+
+class Event(NamedTuple):
+    """What noise ``w (n_w,)`` reaches: its verdict, and a remark."""
+
+    verdict: str
+    w: np.ndarray
+    remark: str
+
+
+def under_noise(
+    problem: Problem, theta: np.ndarray, sampled: Sampled, seed: int
+) -> tuple[tuple[Jump, float], list[Event]]:
+    """Return the largest jump that noise reaches at ``theta (d,)`` and its distance, and all that it reaches.
+
+    A jump is a fault of its own, and the slope that it carries is no other one.
+    """
+    events = []
+    names = {"nan_gradient": "gradients of finite costs", "nonfinite": "costs"}
+    for (verdict, name), lost in zip(names.items(), sampled[:2], strict=True):
+        if lost.share:
+            remark = f"{lost.share:.2g} of all {name} under noise are not numbers, from {norm(lost.w):.2g} standard deviations on"
+            events.append(Event(verdict, lost.w, remark))
+    jump, at = jump_under_noise(problem, theta, seed, COLUMNS_AT_ONCE)
+    if jump.height:
+        remark = (
+            f"the cost jumps by {jump.height:.3g}, {jump.height / jump.span:.2g} of its range, under noise of "
+            f"{norm(at):.2g} standard deviations: the mean of gradients misses jumps"
+        )
+        return (jump, norm(at)), [*events, Event("jump", at, remark)]
+    missed = missed_slope(problem, theta, seed, COLUMNS_AT_ONCE)
+    if missed.share:
+        remark = (
+            f"sampled gradients miss {missed.share:.2g} of the mean slope along a line through the noise, most of it near "
+            f"{norm(missed.w):.2g} standard deviations: a steep rise, or a far kink"
+        )
+        events.append(Event("missed_slope", missed.w, remark))
+    return (jump, math.nan), events
 
 
 PER_COMPONENT = ("program", "difference", "uncertainty", "step", "ratio", "left", "right", "verdict")
@@ -214,11 +245,11 @@ def _number(part: gradcheck.Part) -> int:
     return -1 - part.component if part.component is not None else int(part.name.rpartition(" ")[2])
 
 
-def _settled(problem: Problem, point: Point, under_noise: str) -> Point:
+def _settled(problem: Problem, point: Point) -> Point:
     """Return the point with its verdict under noise, or from smaller steps or a tangent if the usual steps leave it unsettled."""
     place = point.place
-    if place.point == "noise":
-        return replace(point, verdict=under_noise)
+    if place.verdict:
+        return replace(point, verdict=place.verdict)
     if point.verdict != "unsettled":
         return point
     scale, d = scale_of(problem.program.theta0), place.theta.size

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from bench.experiment.axes import with_axes
 from bench.experiment.columns import COMMON, IDENTITY, Column, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Style, Table, Views
-from bench.gradient import FAULTS, RULES, TRUSTED, UNDECIDED, VERDICTS
+from bench.gradient import BROKEN, FAULTS, RULES, TRUSTED, UNDECIDED, VERDICTS
 from bench.report.problems import axes_of, label_columns, problem_names, problem_numbers
 from bench.report.shown import PROBLEM
 from bench.report.style import PALETTE
@@ -48,10 +49,12 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     points = by_point(shown.rows)
     names = problem_names(shown, PROBLEM, axes_of(shown, "horizon"), ("scene", "contact"))
     points = points.assign(name=names.to_numpy()[points["row"].astype(int)])
+    folders = ",".join(repr(str(folder)) for folder in experiment.plugins)
+    own = [shlex.quote(f"plugins=[{folders}]")] * bool(folders)
     faults = [
         line
         for command, part in untrusted(points).groupby("command", sort=False)
-        for line in (_tally(part), f"      {command}")
+        for line in (_tally(part), " ".join([f"      {command}", *own]))
     ]
     tables = [
         Table("gradient_verdicts", *_verdicts(points), title="Verdicts", files=[], page=True, terminal=True),
@@ -62,7 +65,13 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     charts = [] if points.empty else [_grid(points)]
     columns = [experiment.columns.by_name[name] for name in ("verdict", "best_error", "best_eps")]
     switches = dict.fromkeys(f"contact switch: {name}" for names in rows["contact_switch"] for name in _switches(names))
-    return Views(tables, charts, shown.rows, columns, [*switches, *faults])
+    return Views(tables, charts, shown.rows, columns, [*switches, *faults], headline(rows))
+
+
+def headline(rows: pd.DataFrame) -> str:
+    """Return in how many cells estimates can be trusted; empty for older rows, which do not say so."""
+    given = rows["trusted"][rows["trusted"] != ""]
+    return f"trusted: {', '.join(f'{n} {answer}' for answer, n in given.value_counts().items())}" if len(given) else ""
 
 
 # ------------------------------------------------------------------------------------------------------- lines
@@ -120,16 +129,13 @@ def by_point(rows: pd.DataFrame) -> pd.DataFrame:
     return table.join(cells.drop(columns=table.columns, errors="ignore"), on="row")
 
 
-UNDER_NOISE = "noise"
-"""Point of a jump or a missed slope that only noise reaches: the gradient itself can be right."""
-
-
 def not_right(rows: pd.DataFrame) -> str:
     """Return which checks show a gradient that is wrong or open, by verdict, in words; empty without any.
 
-    What only noise reaches does not count as a fault of the gradient.
+    A jump or slope that only noise reaches does not count: the gradient itself can be right.
     """
-    found = untrusted(checks(rows)).query("point != @UNDER_NOISE", local_dict={"UNDER_NOISE": UNDER_NOISE})
+    found = untrusted(checks(rows))
+    found = found[(found["point"] != "noise") | ~found["verdict"].isin(BROKEN)]
     if found.empty:
         return ""
     return f"{_tally(found)} in {found['key'].nunique()} of {counted(len(rows), 'cell')}"

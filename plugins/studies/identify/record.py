@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ast
 import itertools
 import math
+import operator
 import re
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -31,6 +33,12 @@ FUNCTIONS: dict[str, Callable[[Any], Any]] = {
 }  # fmt: skip
 
 
+OPERATIONS: dict[type[ast.AST], Callable[..., Any]] = {
+    ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv, ast.Pow: operator.pow,
+    ast.UAdd: operator.pos, ast.USub: operator.neg,
+}  # fmt: skip
+
+
 def evaluate(text: str, names: Mapping[str, Any]) -> Any:
     """Return the value of an expression of numbers, pi, ``names``, ``+ - * / **`` and :data:`FUNCTIONS`.
 
@@ -39,14 +47,30 @@ def evaluate(text: str, names: Mapping[str, Any]) -> Any:
     >>> evaluate("-2 * angle**2", {"angle": 3.0})
     -18.0
     """
-    known = {**FUNCTIONS, "pi": math.pi, **names}
+    known = {"pi": math.pi, **names}
     try:
-        if not re.fullmatch(r"([\w\s+*/()-]|\.(?![^\W\d]))+", text):
-            raise ValueError("not arithmetic")
         with np.errstate(all="ignore"):
-            return 0.0 + pd.eval(text.strip(), engine="python", local_dict={}, global_dict={}, resolvers=[known])
-    except Exception as error:  # pandas raises errors of many types
-        raise UserError(f"'{text}': {error} (numbers, operations and {', '.join(sorted(known))})") from None
+            return 0.0 + _value(ast.parse(text.strip(), mode="eval").body, known)
+    except Exception as error:  # of any operation on columns
+        allowed = ", ".join(sorted({**FUNCTIONS, **known}))
+        raise UserError(f"'{text}': {error} (numbers, operations and {allowed})") from None
+
+
+def _value(node: ast.expr, names: Mapping[str, Any]) -> Any:
+    match node:
+        case ast.Constant(value=int() | float() as number) if not isinstance(number, bool):
+            return float(number)  # a power of integers may have any length
+        case ast.Name(id=name) if name in names:
+            return names[name]
+        case ast.Name(id=name):
+            raise ValueError(f"name {name!r} is not defined")
+        case ast.UnaryOp(op=operation, operand=operand) if type(operation) in OPERATIONS:
+            return OPERATIONS[type(operation)](_value(operand, names))
+        case ast.BinOp(left=left, op=operation, right=right) if type(operation) in OPERATIONS:
+            return OPERATIONS[type(operation)](_value(left, names), _value(right, names))
+        case ast.Call(func=ast.Name(id=name), args=[argument], keywords=[]) if name in FUNCTIONS:
+            return FUNCTIONS[name](_value(argument, names))
+    raise ValueError(f"{ast.unparse(node)} is not arithmetic")
 
 
 def expressions(text: str | None) -> dict[str, str]:
@@ -76,6 +100,8 @@ def read(
     table = words.apply(pd.to_numeric, errors="coerce").add_prefix("c")
     if table.iloc[0].isna().all():
         table = table[1:].set_axis([re.sub(r"\W", "_", name.strip()) for name in words.iloc[0]], axis=1)
+    if not time and (found := {"time", "t"} & {*table}):
+        raise ValueError(f"{path} has a column of times: write time={found.pop()}")
     columns = columns or {name: name for name in table if name != time}
     values = pd.DataFrame({name: evaluate(text, table) for name, text in columns.items()}, index=table.index)
     times = evaluate(time, table) / dt if time else pd.Series(np.arange(1.0, 1.0 + len(table)), table.index)

@@ -151,7 +151,9 @@ def charts(lines: pd.DataFrame, fits: Sequence[Column]) -> list[Chart]:
     for column, ideal, name in zip(fits, (1.0, LEVEL), ("bound", ""), strict=True):
         if lines[column.name].notna().any():
             values = {end: lines[c] for end, c in (("value", column.name), ("low", column.low), ("high", column.high))}
-            parts.append(lines.assign(**values, panel=column.heading, failed=lines["converged"] == 0))
+            parts.append(
+                lines.assign(**values, panel=column.heading, failed=(lines["converged"] == 0) & (name == "bound"))
+            )
             marks.append(Mark(name, ideal, panel=column.heading))
     if not parts:
         return []
@@ -159,6 +161,6 @@ def charts(lines: pd.DataFrame, fits: Sequence[Column]) -> list[Chart]:
         Chart(
             "identify", pd.concat(parts, ignore_index=True), [Column("value", label=" ", low="low", high="high")],
             [text("problem", label="")], "dots", series="shooting", panel="panel", marks=marks, failed="failed",
-            own_scales=True, across=2, height=0.34, subtitle="a cross: no fit converges",
+            own_scales=True, across=2, height=0.34, subtitle="a cross: no fit converges, so there is no coverage",
         )
     ]  # fmt: skip

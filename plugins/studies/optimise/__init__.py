@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 from bench.experiment.cell import Cell
 from bench.experiment.columns import Column, Columns, exact, numbers, seconds, several, text
 from bench.model import Optimizer, Plugin, param
 
 from .. import PARTS, StudyPackage
+from ..bias_variance.columns import COLUMNS as ESTIMATES
 
 
 def search_parts(cell: Cell) -> tuple[Any, Any]:
@@ -22,6 +24,7 @@ class SearchStudy(StudyPackage):
     """A study whose cells search with an optimizer."""
 
     axes = (*PARTS, "estimator", "optimizer")
+    default_plugins: ClassVar[Mapping[str, Sequence[str]]] = {"optimizers": ("adam",)}
 
     def parts(self, given: dict[str, Plugin | None]) -> dict[str, Plugin | None]:
         """Return the plugins, without the estimator if the optimizer uses only costs: it then has no effect."""
@@ -48,6 +51,7 @@ class Optimise(SearchStudy):
     name = "optimise"
     timed = True
     columns = Columns.of(
+        *(ESTIMATES.by_name[name] for name in ("reference_method", "reference_spacing")),
         text("optimizer", "identity string of the optimizer"),
         text("stopped", "reason for the end of the search: budget or diverged"),
         text("scene_class", "smooth, stiff (contact), chaotic (gradients vary more than costs), discontinuous or identification",
@@ -82,4 +86,6 @@ class Optimise(SearchStudy):
     iterations: int | None = param(None, "most iterations; null: as the budget allows", positive=True)
     limit: float = param(1e3, "a search has diverged at a cost above this many times |J0| + 1", positive=True)
     quality: str = param("start", "where the gradient's quality is measured", choices=("none", "start"))
-    quality_samples: int = param(4096, "gradients of the reference of the quality", low=64)
+
+    def compares(self, parts: Mapping[str, Plugin | None]) -> bool:
+        return self.quality != "none" and parts.get("estimator") is not None

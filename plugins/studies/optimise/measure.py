@@ -19,6 +19,7 @@ from bench.model import IID, Answer, Design, Estimator, KnownOptimum, Optimizer,
 from bench.model.program import OWN
 from bench.run.files import make_directory, write_whole
 
+from .. import against_reference, ratio
 from . import Optimise, search_parts
 
 PATH = ("iteration", "cost", "rollouts", "gradients", "s")
@@ -68,15 +69,16 @@ def measure(cell: Cell, session: Session, settings: Optimise) -> dict[str, Any]:
     problem = session.problem(cell)
     optimum, how = known_optimum(cell, problem, session)
     theta0 = problem.program.theta0
-    quality = {} if settings.quality == "none" else gradient_quality(cell, problem, theta0, settings)
+    quality = gradient_quality(cell, problem, session)
     path, theta, stopped = follow_path(cell, problem, theta0, settings)
     iterations, final, rollouts, gradients, seconds = path[-1]
     cost, is_lost = [point[1] for point in path], stopped == "diverged"
+    lost = f"the cost left {settings.limit:g} (|J0| + 1) or is not finite"
     start, stored = cost[0], [path[i] for i in stored_indices(cost)]
     score = float(np.clip((start - final) / (start - optimum), 0.0, 1.0)) if start > optimum else np.nan
     return {
-        "status": "diverged" if is_lost else "ok",
-        "reason": f"the cost left {settings.limit:g} (|J0| + 1) or is not finite" if is_lost else "",
+        **quality, "status": "diverged" if is_lost else "ok",
+        "reason": "; ".join(filter(None, (lost * is_lost, quality.get("reason", "")))),
         "stopped": stopped, "scene_class": scene_class(cell, problem),
         "iterations": iterations, "rollouts": rollouts, "gradients": gradients,
         "gradient_ratio": gradient_ratio(problem, cell) if cell.timing and cell.parts["estimator"] else np.nan,
@@ -84,7 +86,6 @@ def measure(cell: Cell, session: Session, settings: Optimise) -> dict[str, Any]:
         "optimum": optimum, "optimum_status": how, "score": 0.0 if is_lost and not np.isfinite(score) else score,
         **{f"path_{name}": list(values) for name, values in zip(PATH, zip(*stored, strict=True), strict=True)},
         "theta": theta.tolist(),
-        **{f"quality_{name}": value for name, value in quality.items()},
     }  # fmt: skip
 
 
@@ -213,66 +214,23 @@ def fastest(function: Callable[[np.ndarray, np.ndarray], Any], theta: np.ndarray
 
 # ---------------------------------------------------------------------------------------------- gradient quality
 
-MAX_REFERENCE_SHARE = 0.5
-"""Largest share of a measured squared error that the reference's own error may cause."""
-
-_qualities: dict[tuple[Any, ...], dict[str, float]] = {}
+_qualities: dict[tuple[Any, ...], dict[str, Any]] = {}
 
 
-def gradient_quality(cell: Cell, problem: Problem, theta: np.ndarray, settings: Optimise) -> dict[str, float]:
-    """Return relative error, cosine and share of bias of the estimator's gradients at ``theta (d,)``.
-
-    Empty without an estimator. The reference is the mean of many gradients or of many zeroth-order terms,
-    whichever vary less. Where the cost jumps or the backend has no gradients, it is the mean of zeroth-order terms.
-    """
-    _, estimator = search_parts(cell)
-    if estimator is None:
+def gradient_quality(cell: Cell, problem: Problem, session: Session) -> dict[str, Any]:
+    """Return the columns of the estimator's gradients at theta0 against the certified reference, and a reason; empty without one."""
+    estimator = cell.parts["estimator"]
+    if cell.budget is None or not isinstance(estimator, Estimator):
         return {}
-    key = (
-        cell.program_key, cell.backend, estimator, cell.samples, cell.repeats, settings.quality_samples, theta.tobytes(),
-    )  # fmt: skip
+    key = (cell.reference_key, cell.backend, estimator, cell.samples, cell.repeats)
     if key not in _qualities:
-        program, scene = problem.program, cell.scene.name
-        w = noise.draw(0, scene, 1, settings.quality_samples, program.n_noise, "optimise: reference")
-        with np.errstate(all="ignore"):
-            terms = zeroth_order(problem, theta, w)[0].T
-            if program.continuous and "grad" in cell.backend.provides:
-                first = problem.grad(theta, w[0].T)
-                terms = first if first.var(axis=1).sum() < terms.var(axis=1).sum() else terms
-        counts = (max(cell.repeats, 2), cell.samples, program.n_noise)
-        drawn = noise.draw(0, scene, *counts, "optimise: quality", cell.design(program))
-        _qualities[key] = compare_with_reference(estimator.estimate(problem, theta, drawn), terms)
+        counts = (max(cell.repeats, 2), cell.samples, problem.program.n_noise)
+        drawn = noise.draw(0, cell.scene.name, *counts, "optimise: quality", cell.design(problem.program))
+        estimates = estimator.estimate(problem, problem.program.theta0, drawn)
+        found = against_reference(problem, estimator, session.references.of(cell), estimates, cell.samples)
+        known = {name: found.get(name, math.nan) for name in ("rmse_rel", "cosine")}
+        known["bias_share"] = ratio(found.get("bias", math.nan), found.get("rmse", math.nan)) ** 2
+        _qualities[key] = {f"quality_{name}": value for name, value in known.items()} | {
+            name: found[name] for name in ("reason", "reference_method", "reference_spacing")
+        }
     return _qualities[key]
-
-
-def compare_with_reference(estimates: np.ndarray, terms: np.ndarray) -> dict[str, float]:
-    """Return relative RMSE, mean cosine and share of bias of estimates ``(R, d)`` against the mean of terms ``(d, M)``.
-
-    The noise of the reference and of the mean estimate is subtracted from the bias. All values are NaN if the reference
-    is too uncertain: its squared error exceeds :data:`MAX_REFERENCE_SHARE` of the measured squared error.
-    """
-    truth = terms.mean(axis=1)
-    reference_error = float(terms.var(axis=1, ddof=1).sum()) / terms.shape[1]
-    norm = float(np.linalg.norm(truth))
-    measured = float(((estimates - truth) ** 2).sum(axis=1).mean())
-    if not reference_error <= MAX_REFERENCE_SHARE * measured:
-        return dict.fromkeys(("rmse_rel", "cosine", "bias_share"), np.nan)
-    error, (bias, _, cosine) = measured - reference_error, error_parts(estimates, truth, reference_error)
-    return {
-        "rmse_rel": float(np.sqrt(error)) / norm if norm else np.nan,
-        "cosine": cosine,
-        "bias_share": min(bias / error, 1.0) if error else 0.0,
-    }
-
-
-def error_parts(estimates: np.ndarray, reference: np.ndarray, variance: float) -> tuple[float, float, float]:
-    """Return squared bias and squared spread of estimates ``(R, d)``, and their mean cosine with a reference ``(d,)``.
-
-    The noise of the mean estimate, and ``variance``, the squared standard error of the reference, are subtracted from the bias.
-    """
-    spread = float(estimates.var(axis=0, ddof=1).sum())
-    mean_error = estimates.mean(axis=0) - reference
-    bias = max(float(mean_error @ mean_error) - spread / len(estimates) - variance, 0.0)
-    sizes = np.linalg.norm(estimates, axis=1) * np.linalg.norm(reference)
-    cosines = np.divide(estimates @ reference, sizes, out=np.zeros(len(estimates)), where=sizes > 0)
-    return bias, spread, float(cosines.mean())

@@ -48,8 +48,8 @@ RATE = interval("rate", label="searches that reach it")
 SPENT = Column("spent", label="rollouts", log=True)
 NOTE = (
     "targets reached: share of searches whose regret falls to 1/10, 1/100 and 1/1000 of the first, the mean over problems and "
-    "targets. score: share of the way from the first cost to J*, interquartile mean over searches, with a bootstrap interval "
-    "stratified by problem. beats fobg: chance of a lower final cost, paired by problem and seed. profile: integral of the "
+    "targets. score: share of the way from the first cost to J*, interquartile mean over searches. Intervals are over scenes, "
+    "whose problems are not independent, and for one scene over its searches. beats fobg: chance of a lower final cost, paired by problem and seed. profile: integral of the "
     "share of targets reached within 1 to 4 times the best method's runtime. average runtime (aRT): expected rollouts per "
     "target reached, where a gradient counts as many rollouts as take its time: the rollouts of all searches over the number "
     "of searches that reached the target, inf if none did. Each method is shown at its best tuning on each problem, chosen by "
@@ -72,6 +72,11 @@ class RunSet:
     """
 
     rows: pd.DataFrame
+
+    @cached_property
+    def scenes(self) -> pd.Series:
+        """The name of each problem's scene, without its parameters."""
+        return self.rows.drop_duplicates("problem").set_index("problem")["scene"].str.partition("[")[0]
 
     @cached_property
     def tuning_seeds(self) -> tuple[int, ...]:
@@ -185,8 +190,15 @@ def times_to_targets(runs: RunSet) -> pd.DataFrame:
     return pd.DataFrame(lines)
 
 
+def over_scenes(runs: RunSet, values: pd.Series, low: float, high: float) -> tuple[float, float]:
+    """Return the interval of the mean of ``values`` by problem: over scenes, and at least that of its searches, ``low`` to ``high``."""
+    scenes = runs.scenes[values.index].to_numpy(str)
+    half = np.nan_to_num(performance.clustered_error(values.to_numpy(float), scenes))
+    return min(low, float(values.mean()) - half), max(high, float(values.mean()) + half)
+
+
 def share_of_targets(reached: pd.DataFrame) -> tuple[float, float]:
-    """Return the mean success rate of a method's lines of :func:`times_to_targets`, and a bound of its standard error.
+    """Return the mean success rate of a method's lines of :func:`times_to_targets`, and a bound of half its 95% interval.
 
     The error is due to the seeds. The variance of each rate is that of the estimate of Agresti and Coull (1998), with two more
     successes and two more failures, so that few searches that agree are uncertain. The targets of a problem count as fully
@@ -194,29 +206,32 @@ def share_of_targets(reached: pd.DataFrame) -> tuple[float, float]:
     """
     p = (reached["successes"] + 2.0) / (reached["searches"] + 4.0)
     by_problem = np.sqrt(p * (1 - p) / reached["searches"]).groupby(reached["problem"]).mean()
-    return float(reached["rate"].mean()), float(np.sqrt((by_problem**2).sum()) / len(by_problem))
+    return float(reached["rate"].mean()), performance.Z * float(np.sqrt((by_problem**2).sum()) / len(by_problem))
 
 
 @remember
 def summarise(runs: RunSet) -> pd.DataFrame:
     """Return, per method, the share of targets reached, the score, the profile and the chance to beat the baseline.
 
-    The score is an interquartile mean, its interval a bootstrap stratified by problem. ``profile`` is the mean over tau in
+    The score is an interquartile mean, its interval a bootstrap. Intervals are over scenes. ``profile`` is the mean over tau in
     [1, 4] of the share of targets reached within tau times the runtime of the best method.
     """
     reached, lines = times_to_targets(runs), []
     slower = reached["art"] / reached.groupby(["problem", "target"])["art"].transform("min")
     profiles = ((4.0 - slower.fillna(math.inf).clip(lower=1.0)) / 3.0).clip(lower=0.0).groupby(reached["method"]).mean()
     better = improvement(runs)
+    tied = first_or_tied(runs)
     for method, part in runs.best_runs.groupby("method", sort=False):
         strata = [own.to_numpy() for _, own in part["score"].dropna().groupby(part["problem"], sort=False)]
-        low, high = performance.bootstrap(strata, _pooled_score) if strata else (math.nan, math.nan)
-        share, error = share_of_targets(reached[reached["method"] == method])
+        low, high = _score_interval(runs, part.dropna(subset="score"), strata)
+        own = reached[reached["method"] == method]
+        share, error = share_of_targets(own)
+        ends = over_scenes(runs, own.groupby("problem")["rate"].mean(), share - error, share + error)
         cells = runs.rows[runs.rows["method"] == method]
         lines.append({
             "method": method, "problems": part["problem"].nunique(), "searches": len(part),
-            "reached": share, "reached_low": max(0.0, share - performance.Z * error),
-            "reached_high": min(1.0, share + performance.Z * error), "reached_se": error,
+            "reached": share, "reached_low": max(0.0, ends[0]), "reached_high": min(1.0, ends[1]),
+            "verdict": "first or tied" if method in tied else "",
             "score": _pooled_score(strata), "score_low": low, "score_high": high,
             **better.loc[method], "profile": profiles[method], "diverged": int((part["status"] == "diverged").sum()),
             "tunings": int(cells["tuning"].nunique()), "median_score": float(cells["score"].median()),
@@ -227,8 +242,8 @@ def summarise(runs: RunSet) -> pd.DataFrame:
 def improvement(runs: RunSet) -> pd.DataFrame:
     """Return, per method, the probability of a lower final cost than the first method whose estimator is ``fobg``.
 
-    Searches are paired by problem and seed, and problems count the same; a tie counts half. The interval is Wilson's: where few
-    pairs all agree, that of a bootstrap would be a single point. NaN for the baseline and without pairs.
+    Searches are paired by problem and seed, and problems count the same; a tie counts half. The interval is at least Wilson's,
+    which is no single point where few pairs all agree. NaN for the baseline and without pairs.
     """
     final = runs.best_runs.assign(final=runs.best_runs["final_cost"].where(runs.best_runs["status"] == "ok", math.inf))
     wide = final.pivot_table(index=["problem", "seed"], columns="method", values="final", aggfunc="first", dropna=False)
@@ -239,8 +254,10 @@ def improvement(runs: RunSet) -> pd.DataFrame:
         lines[method] = (math.nan, math.nan, math.nan)
         if base not in (None, method) and len(pairs := wide[[method, base]].dropna()):
             wins = (pairs[method] < pairs[base]) + 0.5 * (pairs[method] == pairs[base])
-            share = float(wins.groupby(level="problem").mean().mean())
-            lines[method] = (share, *performance.wilson(round(share * len(pairs)), len(pairs)))
+            by_problem = wins.groupby(level="problem").mean()
+            share = float(by_problem.mean())
+            low, high = over_scenes(runs, by_problem, *performance.wilson(round(share * len(pairs)), len(pairs)))
+            lines[method] = (share, max(0.0, low), min(1.0, high))
     columns = ["improvement", "improvement_low", "improvement_high"]
     return pd.DataFrame.from_dict(lines, orient="index", columns=columns)
 
@@ -249,16 +266,31 @@ def _pooled_score(strata: Sequence[np.ndarray]) -> float:
     return performance.interquartile_mean(np.concatenate(strata)) if strata else math.nan
 
 
-def is_tied(summary: pd.DataFrame) -> pd.Series:
-    """Return a mask of the methods that reach most targets, or that are not distinguishable from the first.
+def first_or_tied(runs: RunSet) -> set[str]:
+    """Return the methods that reach most targets, or that are not distinguishable from the first, paired by problem.
 
     Methods that were not run on all problems are not compared.
     """
-    full = summary[summary["problems"] == summary["problems"].max()]
-    best = full.loc[full["reached"].idxmax()]
-    error = np.sqrt(best["reached_se"] ** 2 + full["reached_se"] ** 2)
-    tied = (best["reached"] - full["reached"] < performance.Z * error) | (full.index == best.name)
-    return tied.reindex(summary.index, fill_value=False)
+    reached = times_to_targets(runs)
+    rates = reached.pivot_table(index="problem", columns="method", values="rate")
+    rates = rates.loc[:, rates.count() == rates.count().max()]
+    best = rates.mean().idxmax()
+    errors = {method: share_of_targets(reached[reached["method"] == method])[1] for method in rates}
+    tied = {str(best)}
+    for method in rates:
+        lead, error = (rates[best] - rates[method]).dropna(), math.hypot(errors[best], errors[method])
+        if over_scenes(runs, lead, lead.mean() - error, lead.mean() + error)[0] < 0.0:
+            tied.add(str(method))
+    return tied
+
+
+def _score_interval(runs: RunSet, part: pd.DataFrame, strata: Sequence[np.ndarray]) -> tuple[float, float]:
+    """Return the bootstrap interval of the pooled score: over scenes, or for one scene over the searches of each problem."""
+    by_scene = [own.to_numpy() for _, own in part.groupby(part["problem"].map(runs.scenes), sort=False)["score"]]
+    if len(by_scene) < 2:
+        return performance.bootstrap(strata, _pooled_score) if strata else (math.nan, math.nan)
+    places = np.arange(len(by_scene))
+    return performance.bootstrap([places], lambda drawn: _pooled_score([by_scene[i] for i in drawn[0]]))
 
 
 def views(experiment: Experiment, rows: pd.DataFrame) -> Views | None:
@@ -282,7 +314,6 @@ def tables(experiment: Experiment, rows: pd.DataFrame, runs: RunSet) -> list[Tab
     """Return the tables of methods, of times to targets and of lowest costs."""
     reached, summary = times_to_targets(runs), summarise(runs)
     methods = summary.sort_values(["reached", "score"], ascending=False, kind="stable")
-    methods = methods.assign(verdict=np.where(is_tied(methods), "first or tied", ""))
     chosen = runs.tuning_seeds
     seeds = f"seeds {', '.join(map(str, chosen))}, which do not score" if chosen else "the same seeds that score"
     return [
@@ -319,7 +350,7 @@ def charts(runs: RunSet) -> list[Chart]:
     looks = method_styles(method for method in runs.rows["method"].unique() if ", " in method)
     targets = Chart(
         "targets", summarise(runs).sort_values("reached", ascending=False, kind="stable"), [REACHED], [METHOD], "dots",
-        series="method", styles=looks, height=0.24, text="Bars are 95% intervals over seeds.",
+        series="method", styles=looks, height=0.24, text="Bars are 95% intervals over scenes, or over seeds of one.",
         subtitle=f"{where}, targets: a tenth, a hundredth and a thousandth of the first regret",
     )  # fmt: skip
     finite = times.loc[times["reached"] & (times["spent"] > 0), "spent"]

@@ -10,31 +10,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
-from bench.gradient import (
-    EPS,
-    FAULTS,
-    TRUSTED,
-    Check,
-    Options,
-    Part,
-    Sample,
-    check,
-    most_severe,
-)  # fmt: skip
-from bench.gradient.check import NOTHING
-from bench.gradient.few import ROUNDS, FewSteps, is_nothing
+from bench.examine.few import ROUNDS, FewSteps, is_nothing
+from bench.examine.subspace import Group, Subspace, choose, locate
+from bench.gradient import EPS, FAULTS, TRUSTED, Check, Options, Part, Sample, check, step_sizes
+from bench.gradient.check import NOTHING, cause_of
 from bench.gradient.roughness import FINE
-from bench.gradient.subspace import Group, Subspace, choose, locate
 from bench.simulator.clock import OutOfTime
 from bench.simulator.simulator import Simulator
 
-SINGLE_EPS = np.logspace(-1, -7, 13)
-"""Steps of a check in single precision, relative to each input's scale: the best is near 5e-3."""
 NOISE_POINTS = 17
 """Costs per direction that no step needs: the centre, and the points at which the noise is measured."""
 SCAN = 7 * 65
@@ -57,6 +46,8 @@ MOST_OF_IT = 0.9
 """Share of the remaining budget after which a running stage is stopped."""
 SHARE = 0.8
 """Largest share of the remaining budget of a stage, whatever is measured after it."""
+BEFORE_NOISE = 0.4
+"""Largest such share of a stage on a gradient that looks right, where noise is measured after it."""
 STATE = 0.1
 """Largest share of the difference between histories by which a cost with equal histories differs."""
 
@@ -71,6 +62,8 @@ class Repeats:
     """Largest difference between equal calls of the gradient, relative to its norm."""
     has_state: bool = False
     """Whether the cost depends on the call before it, in a repeatable way."""
+    is_failing: bool = False
+    """Whether equal calls raise an exception or return a number."""
     floor: float = 0.0
     """Largest spread that only limits the accuracy of the check."""
     floor_of_gradient: float = 0.0
@@ -78,7 +71,7 @@ class Repeats:
     @property
     def is_small(self) -> bool:
         """Whether these differences only limit the accuracy of the check."""
-        return self.spread <= self.floor and self.of_gradient <= self.floor_of_gradient
+        return not self.is_failing and self.spread <= self.floor and self.of_gradient <= self.floor_of_gradient
 
 
 class Store:
@@ -118,7 +111,9 @@ class GradientStages:
         simulator: Simulator,
         scale: np.ndarray,
         seed: int,
+        has_noise: bool = False,
     ) -> None:
+        self._has_noise = has_noise  # whether noise on theta is measured after the stages
         self.simulator, self.scale, self.clock, self.seed = simulator, scale, simulator.clock, seed
         self.layout, self.theta = simulator.layout, simulator.layout.vector
         self._random = np.random.default_rng([seed, 0x6578616D])
@@ -197,17 +192,12 @@ class GradientStages:
         for store in (self._costs_store, self._gradients_store):
             store.refresh()
 
-    def integrate(self, direction: np.ndarray, start: float, end: float, panels: int) -> float:
-        """Return the integral of the gradient along ``theta + t * direction`` by Gauss-Legendre, 4 points per panel."""
-        x, weight = np.polynomial.legendre.leggauss(4)
-        edges = np.linspace(start, end, panels + 1)
-        half = np.diff(edges)[:, None] / 2
-        t, weights = ((edges[:-1, None] + half) + half * x).ravel(), (half * weight).ravel()
-        slopes = [
+    def slopes_along(self, direction: np.ndarray, t: np.ndarray) -> np.ndarray:
+        """Return the program's derivatives ``(n,)`` along a direction at theta + t * direction for t of n numbers."""
+        return np.concatenate([
             direction @ self.simulator.gradients(thetas, self.same_noise(thetas.shape[1]))
             for thetas in self.thetas_along(direction, t)
-        ]
-        return float(weights @ np.concatenate(slopes))
+        ])  # fmt: skip
 
     # ------------------------------------------------------------------------------------------------ stages
 
@@ -220,8 +210,25 @@ class GradientStages:
                 self.left_out.append("the cost at theta")
             self.left_out.append("the gradient check")
             return
+        try:
+            self._repeat_failures()
+            if self.is_failed:
+                return
+            self._run_stages(explain)
+            self._repeat_failures()
+        except OutOfTime:
+            self.left_out.append("calls that raised an exception, once more")
+
+    def _repeat_failures(self) -> None:
+        """Repeat calls that raised an exception, which may do so at random."""
         if self.is_failed:
-            return
+            again = self.gradient_at(self.theta)
+            self.repeats.is_failing |= bool(np.isfinite(again).all())
+        for at, *w in list(self.simulator.failed):
+            again = self.simulator.costs(at, *w)
+            self.repeats.is_failing |= bool(np.isfinite(again).any())
+
+    def _run_stages(self, explain: Callable[[Check], None]) -> None:
         space = choose(self.layout, self.scale, self.gradient, self.seed)
         self.groups = space.groups
         if self.gradient is not None:
@@ -368,8 +375,9 @@ class GradientStages:
         wrong = sum(part.verdict in FAULTS for part in self.check.parts)
         if wrong and options.draws:
             costs += min(4, options.draws) * wrong * each + 4 * options.draws * each
-        if wrong and options.scanned:
-            costs += min(wrong + options.directions, options.scanned) * SCAN
+        unclear = wrong + sum(part.verdict == "rounding" for part in self.check.parts)
+        if unclear and options.scanned:
+            costs += min(unclear + options.directions, options.scanned) * SCAN
         gradients = 0 if self.gradient is None else 3 + options.draws * (3 if wrong else 1)
         return costs, gradients
 
@@ -377,7 +385,8 @@ class GradientStages:
         self.clock.start_stage("checking the gradient")
 
         def fits(options: Options) -> bool:
-            return self.clock.can_afford(*self._cost_of(options, space.size), share=SHARE)
+            share = BEFORE_NOISE if self._has_noise and self.check.trusted and not self.is_quick else SHARE
+            return self.clock.can_afford(*self._cost_of(options, space.size), share=share)
 
         for name in self._plan(space.size, True):
             plan = self._plan(space.size, self.check.trusted)
@@ -489,21 +498,14 @@ class GradientStages:
         if not self.clock.can_afford(*self._cost_of(options, 0), share=SHARE):
             self.left_out.append("checks under other noise")
             return
-        own = self.w, self._costs_store, self._gradients_store
         try:
             for _ in range(OTHER_NOISE):
-                self.w = self._random.standard_normal((self.simulator.noise, 1))
-                self._costs_store, self._gradients_store = Store(), Store()
-                self.more.append(space.restore(self._check_once(space, options)))
+                other = copy(self)  # with costs and gradients of its own
+                other.w = self._random.standard_normal((self.simulator.noise, 1))
+                other._costs_store, other._gradients_store = Store(), Store()
+                self.more.append(space.restore(other._check_once(space, options)))
         except OutOfTime:
             self.left_out.append("checks under other noise")
-        finally:
-            self.w, self._costs_store, self._gradients_store = own
-
-
-def step_sizes(unit: float) -> np.ndarray:
-    """Return the step sizes of a check in arithmetic of a unit roundoff, in units of the natural scale."""
-    return EPS if unit < 1e-10 else SINGLE_EPS
 
 
 def _are_equal(values: np.ndarray) -> bool:
@@ -537,5 +539,4 @@ def is_rough(sample: Sample) -> bool:
 def recaused(outcome: Check, replaced: Callable[[Part], Part] = lambda part: part) -> Check:
     """Return a check with replaced parts and the cause that follows from its parts."""
     parts, draws = tuple(map(replaced, outcome.parts)), tuple(map(replaced, outcome.draws))
-    causes = [part.verdict for part in parts] + [part.verdict for part in draws if part.verdict in FAULTS]
-    return replace(outcome, parts=parts, draws=draws, cause=most_severe(causes))
+    return replace(outcome, parts=parts, draws=draws, cause=cause_of(parts, draws))

@@ -13,11 +13,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from .causes import causes_of_ratios
-from .check import NOTHING, Check, Part
-from .direction import ALIKE, MEASURED, Sample, finding_at, resolution, wrong
-from .rules import most_severe
-from .subspace import Subspace
+from bench.examine.subspace import Subspace
+from bench.gradient.causes import causes_of_ratios
+from bench.gradient.check import NOTHING, Check, Part, cause_of
+from bench.gradient.direction import ALIKE, MEASURED, Sample, finding_at, resolution, wrong
 
 ROUNDS = (1.0, 30.0, 0.1)
 """Steps of the rounds, in multiples of the cube root of the unit roundoff, at which rounding and curvature balance."""
@@ -72,7 +71,7 @@ class FewSteps:
             causes = causes_of_ratios(ratios, [], any(part.verdict == "smooth" for part in parts))
             if set(causes.values()) == {"wrong_factor"}:
                 parts = [replace(p, verdict="wrong_factor") if i in ratios else p for i, p in enumerate(parts)]
-        return self.space.restore(Check(most_severe(part.verdict for part in parts), gradient, tuple(parts), ()))
+        return self.space.restore(Check(cause_of(parts), gradient, tuple(parts), ()))
 
     @np.errstate(all="ignore")
     def _part(self, index: int, program: float) -> Part:

@@ -14,9 +14,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from bench.gradient.check import Check, Part, extremes
 from bench.simulator.tree import ParameterTree
-
-from .check import Check, Part, extremes
 
 MOST = 16
 """Most components checked one by one."""

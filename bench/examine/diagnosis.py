@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from bench.gradient import Check
-from bench.gradient.few import FewSteps
-from bench.gradient.lines import LineScan, scan
-from bench.gradient.rules import SUSPICIOUS
-from bench.gradient.stages import GradientStages
-from bench.gradient.steps import changing_loop
-from bench.gradient.subspace import choose
+from bench.examine.few import FewSteps
+from bench.examine.lines import LineScan, scan
+from bench.examine.stages import GradientStages
+from bench.examine.steps import changing_loop
+from bench.examine.subspace import choose
+from bench.gradient import Check, Part, roughness
+from bench.gradient.direction import CHANCE
+from bench.gradient.rules import SUSPICIOUS, UNEQUAL
+from bench.gradient.smooth_part import COSTS, SmoothPart, smooth_part
 from bench.simulator.simulator import Simulator
 
 NEAR = 0.05
@@ -39,6 +41,17 @@ AROUND = 0.05
 """Distance of these thetas, in units of each input's scale."""
 LONGER = 10.0
 """Length of the line on which more jumps are searched, in multiples of the first line."""
+DIFFERENCED, SAME = 4, 1e-3
+"""Most components at which differences are compared with a wrong gradient, and the largest part of its error that is left."""
+DIFFERENCE_STEPS = 10.0 ** -np.arange(1.0, 9.0)
+"""Steps of these differences."""
+BESIDE, MOST_ROWS = 1e-3, 64
+"""Spacing of the thetas at which the noise of a gradient is measured, in units of each input's scale, and most numbers of it."""
+LOOSE, MOST_OF_IT, REFINED = 0.01, 0.6, 10.0
+"""Relative error of a difference that shows too little, largest share of the remaining calls for a component's smooth part,
+and step of a refined cost's differences, in multiples of the cube root of the unit roundoff: it has a tolerance too."""
+SMOOTH = 2
+"""Components along which a cost is not rough that show it smooth, so that no other is searched."""
 GROWTH = 1.5
 """Least ratio of errors at the largest and at the first wrong number of steps that counts as growth."""
 
@@ -78,15 +91,20 @@ class Explanation:
     """At theta and at others: how far gradient and cost are from the refined cost; empty without a refined cost."""
     growth: Sequence[Horizon] = ()
     """The error of the gradient by number of steps."""
+    smooth_parts: Mapping[int, SmoothPart] = field(default_factory=dict)
+    """By component whose differences disagree with the gradient, or hardly agree: the slope of a rough cost's smooth part."""
+    refined: Mapping[int, float] = field(default_factory=dict)
+    """By component of these: the refined cost's difference."""
+    gradient_noise: float = 0.0
+    """Noise of the gradient between neighbouring thetas, relative to its norm."""
+    difference_step: str = ""
+    """The step at which a difference of the cost is the gradient, ``1e-4, forward``; empty without one."""
 
 
 def refined_gaps(stages: GradientStages, refined: Callable[..., Any]) -> list[Gap]:
     """Return the gaps at theta and at other thetas around it, along a few random directions each."""
-    other, scale, random = (
-        _simulator(stages, refined, None),
-        stages.scale,
-        np.random.default_rng([stages.seed, 0x676170]),
-    )
+    other, scale = stages.simulator.variant(refined), stages.scale
+    random = np.random.default_rng([stages.seed, 0x676170])
     eps, size, gaps = float(np.cbrt(stages.simulator.unit)), stages.theta.size, []
     for spread in (0.0, *[AROUND] * ELSEWHERE):
         theta = stages.theta + spread * scale * random.standard_normal(size)
@@ -112,8 +130,7 @@ def errors_by_horizon(stages: GradientStages, horizons: Sequence[int]) -> list[H
     result = []
     simulator = stages.simulator
     for steps in sorted(horizons):
-        grad = partial(simulator._grad, steps=steps) if callable(simulator._grad) else simulator._grad
-        other = _simulator(stages, partial(simulator._cost, steps=steps), grad)
+        other = simulator.with_steps(steps)
         gradient = other.gradients(stages.theta[:, None], stages.w)[:, 0]
         space = choose(stages.layout, stages.scale, gradient, stages.seed, most=4)
 
@@ -133,6 +150,83 @@ def errors_by_horizon(stages: GradientStages, horizons: Sequence[int]) -> list[H
         size = float(np.abs(differences).max()) or 1.0
         result.append(Horizon(steps, float(np.abs(program - differences).max() / size), float(doubts.max() / size)))
     return result
+
+
+def doubtful(outcome: Check) -> list[Part]:
+    """Return the components that a rough cost may spoil: unequal, unsettled, or known to a hundredth only."""
+    return [
+        part
+        for part in outcome.components
+        if part.verdict in (*UNEQUAL, "unsettled")
+        or (part.verdict == "rounding" and CHANCE * part.uncertainty > LOOSE * abs(part.difference))
+    ]
+
+
+def smooth_parts(stages: GradientStages, outcome: Check) -> dict[int, SmoothPart]:
+    """Return by component the slope of a rough cost's smooth part, for the doubtful components that the budget allows."""
+    random, found, n_smooth = np.random.default_rng([stages.seed, 0x776964]), {}, 0
+    for part in doubtful(outcome):
+        if n_smooth == SMOOTH or not stages.clock.can_afford(COSTS, share=MOST_OF_IT):
+            break
+        index = part.component or 0
+        direction = np.eye(1, stages.theta.size, index)[0]
+        one = smooth_part(partial(stages.costs_along, direction), part.sample.scale, stages.simulator.unit, random)
+        if one is not None:
+            found[index] = one
+        else:
+            n_smooth += 1
+    return found
+
+
+def refined_slopes(stages: GradientStages, refined: Callable[..., Any], parts: Iterable[Part]) -> dict[int, float]:
+    """Return by component of some parts the central difference of the refined cost."""
+    other, found = stages.simulator.variant(refined), {}
+    for index in (part.component for part in parts if part.component is not None):
+        step = float(np.cbrt(stages.simulator.unit)) * stages.scale[index] * REFINED
+        moved = stages.theta[:, None] + np.outer(np.eye(1, stages.theta.size, index)[0], [-step, step])
+        minus, plus = other.costs(moved, stages.same_noise(2))
+        found[index] = float(plus - minus) / (2.0 * step)
+    return found
+
+
+@np.errstate(all="ignore")
+def noise_of_gradient(stages: GradientStages) -> float:
+    """Return the noise of the gradient at equally spaced thetas along a random direction, relative to its norm."""
+    random = np.random.default_rng([stages.seed, 0x6E6F6973])
+    along = BESIDE * stages.scale * random.standard_normal(stages.theta.size)
+    thetas = stages.theta[:, None] + along[:, None] * np.arange(roughness.POINTS)
+    gradients = np.stack([stages.gradient_at(theta) for theta in thetas.T], axis=1)
+    noise = [roughness.noise(row[None]) for row in gradients[:MOST_ROWS]]
+    return float(np.linalg.norm(noise) / np.linalg.norm(gradients[:MOST_ROWS, 0]))
+
+
+@np.errstate(all="ignore")
+def step_of_difference(stages: GradientStages, outcome: Check) -> str:
+    """Return the step at which a difference of the cost is the wrong gradient, ``1e-4, forward``; empty where none is.
+
+    A gradient by differences with too long or too short a step is off by the error of that step.
+    """
+    wrong = [part for part in outcome.components if part.verdict in SUSPICIOUS][:DIFFERENCED]
+    if not wrong:
+        return ""
+    program = np.array([part.program for part in wrong])
+    allowed = SAME * np.abs(program - [part.difference for part in wrong])
+    index = [part.component or 0 for part in wrong]
+    at = np.abs(stages.theta[index])
+    for size, units in (("", np.ones_like(at)), (" max(1, |x|)", np.maximum(at, 1.0)), (" |x|", at)):
+        if (units == 1.0).all() and size:
+            continue
+        steps = units[:, None] * DIFFERENCE_STEPS
+        moved = np.zeros((stages.theta.size, 2, *steps.shape))
+        for row, (component, step) in enumerate(zip(index, steps, strict=True)):
+            moved[component, :, row] = np.stack([-step, step])
+        thetas = stages.theta[:, None] + moved.reshape(stages.theta.size, -1)
+        minus, plus = stages.costs(thetas).reshape(2, *steps.shape)
+        for name, slopes in (("forward", (plus - stages.value) / steps), ("central", (plus - minus) / (2 * steps))):
+            is_same = (np.abs(slopes - program[:, None]) <= allowed[:, None]).all(axis=0)
+            if is_same.any():
+                return f"{DIFFERENCE_STEPS[int(np.argmax(is_same))]:.0e}{size}, {name}"
+    return ""
 
 
 def grows(horizons: Sequence[Horizon], tolerance: float) -> bool:
@@ -202,9 +296,3 @@ def is_adaptive(
     is_near = error <= NEAR and ((heights < SMALL_JUMPS * changes) & (errors <= EXPLAINED * heights)).any()
     is_far = heights.sum() < FAR_JUMPS * changes.sum() and (errors <= heights).all()
     return bool(is_near or is_far)
-
-
-def _simulator(stages: GradientStages, cost: Callable[..., Any], grad: Any) -> Simulator:
-    own = stages.simulator
-    batch = own.batch + (f":{own.fixed}" if own.fixed else "")
-    return Simulator(cost, stages.layout, grad, own.noise, batch, stages.clock, own.library)

@@ -15,6 +15,8 @@ import numpy as np
 
 POINTS = 97
 """Number of points of a scan. Not a power of 2 plus one, so that points rarely coincide with round numbers."""
+REACH = 4.0
+"""Distance searched on either side of theta, in standard deviations of the noise, as :data:`bench.measure.jumps.REACH`."""
 HALVINGS = 14
 """Number of halvings of an interval."""
 PLACES = 6
@@ -64,6 +66,8 @@ class LineScan:
     """Whether the cost is constant between jumps everywhere: a staircase."""
     missed: float = float("nan")
     """Share of the cost's change along the line that the integral of the gradient misses; NaN if unknown."""
+    n_lost: int = 0
+    """Number of points at which the gradient is not a number, and the cost is one."""
 
     @property
     def jumps(self) -> tuple[Break, ...]:
@@ -93,7 +97,7 @@ def scan(
     along: Callable[[np.ndarray], np.ndarray],
     direction: np.ndarray,
     noise: float,
-    reach: float = 3.0,
+    reach: float = REACH,
     effort: tuple[int, int, int] = (POINTS, HALVINGS, PLACES),
     unit: float = float(np.finfo(np.float64).eps),
 ) -> LineScan:

@@ -72,15 +72,7 @@ def traced_loops(simulator: Simulator, theta: np.ndarray, w: np.ndarray | None) 
 
         return follow
 
-    clock, before = simulator.clock, sys.gettrace()
-    clock.check(1)
-    with clock.interrupt_when_over():
-        sys.settrace(enter)
-        try:
-            simulator._costs(*(part for part in (theta[:, None], w) if part is not None))
-        finally:
-            sys.settrace(before)
-    clock.count("costs", 1, 0.0, warm=False)
+    simulator.trace(enter, *(part for part in (theta[:, None], w) if part is not None))
     return loops
 
 
@@ -108,12 +100,9 @@ def _loop_of_jax(simulator: Simulator, theta: np.ndarray, w: np.ndarray | None) 
         return ""
     import jax
 
-    def cost(vector: Any) -> Any:
-        given = (simulator._build_theta(vector),) if w is None else (simulator._build_theta(vector), w[:, 0])
-        return simulator._cost(*given)
-
+    noise = [] if w is None else [w[:, 0]]
     try:
-        closed = jax.make_jaxpr(cost)(jax.numpy.asarray(theta))
+        closed = jax.make_jaxpr(lambda vector: simulator.call(vector, *noise))(jax.numpy.asarray(theta))
     except Exception:  # a program that JAX cannot read has no such loop
         return ""
     places: list[str] = []
