@@ -77,7 +77,7 @@ REFUSED = {
     "index nowhere": "is not a folder", "index .": "no experiments", "index a b": "name one folder",
     # no file is written to an address
     "results_dir=s3://rows": ADDRESS, "compile_cache=s3://rows": ADDRESS, "claims --quick results_dir=s3://rows": ADDRESS,
-    "compare a b out=s3://rows": ADDRESS, "history a b out=s3://rows": ADDRESS, "index s3://rows": ADDRESS, "engines out=s3://rows": ADDRESS,
+    "compare a b out=s3://rows": ADDRESS, "history a b out=s3://rows": ADDRESS, "index s3://rows": ADDRESS, "engines table out=s3://rows": ADDRESS,
     "examine a.py:cost baseline=s3://rows": ADDRESS, "examine a.py:cost save=s3://rows": ADDRESS,
 }  # fmt: skip
 """Words of a command, and what its message has. Words of a run, plan or report follow those of BASE."""
