@@ -62,7 +62,7 @@ def command() -> None:
 def _watched() -> int:
     """Run this command in a marked child process, and return the status that the child writes before it ends."""
     reader, writer = os.pipe()
-    reaper = Reaper()
+    reaper = Reaper(adopts=True)
     variables = {MARK: reaper.mark, CHANNEL: f"{writer} {os.getpid()}"}
     child = subprocess.Popen([sys.executable, *sys.orig_argv[1:]], env=os.environ | variables, pass_fds=[writer])
     first = 0.0

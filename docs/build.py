@@ -92,8 +92,9 @@ Beside the files of [every run](reading-results.md#files), each study writes its
   stiffness above which the spectral radius of the step exceeds 1, and `growth_factor` is the measured growth per step of a
   state without contact. `cause` explains a finite but wrong gradient by comparison with the law's own gradient, from
   differences of its cost at a far finer step: `step` (the law's own gradient is right, the step or its derivative is wrong),
-  `law` (as wrong at any step size), `both`, or `unknown` where the law's gradient has not converged. `stability_map.png`
-  shows where the gradient is right, wrong or lost, and `stability_shares.csv` the share of each by integrator and law.
+  `law` (as wrong at any step size), `both`, or `unknown` where the law's gradient has not converged. `error_share` is the error over the
+  largest gradient of the scene, which cannot vanish, and `level` is what the map draws: `right`, `wrong`, `blows up`, `grew` or `open`.
+  `stability_shares.csv` has the share of each by integrator and law.
 - `three_errors.csv`: forward, program, model and estimator error, absolute and relative. `three_errors_traps.csv`: programs with an exact
   gradient and a converging cost whose gradient does not converge to that of the physics, with their errors at the largest and the smallest step.
 - `growth.csv`: gradient norms, singular values and growth rates with their intervals. `growth_verdicts.csv`: per problem the

@@ -84,25 +84,26 @@ def speed(name: str) -> list[float]:
 
 
 def rollouts_table() -> str:
-    """Return microseconds per rollout by backend and batch as a Markdown table."""
-    c = speed("native C kernel, one thread, * rollouts")
+    """Return microseconds per rollout by backend and batch as a Markdown table, with times over C where both take one thread."""
+    c, loop = speed("native C kernel, one thread, * rollouts"), speed("plain NumPy loop with its adjoint, * rollouts")
+    over_c = {name: speed(f"{name} on one thread over the C kernel, * rollouts") for name in ("fused", "jax")}
     lines = [
-        ("`fused` gradient", "0.6", speed("fused grad, penalty, * rollouts")),
-        ("`jax` gradient", "1.2", speed("jax grad, penalty, * rollouts")),
-        ("`implicit` gradient", "6", speed("implicit grad, complementarity, * rollouts")),
-        ("`torch` gradient", "25", speed("torch grad, penalty, * rollouts")),
-        ("`numpy` cost", "8", speed("numpy value, penalty, * rollouts")),
-        ("plain NumPy loop, gradient", "", speed("plain NumPy loop with its adjoint, * rollouts")),
-        ("C loop, gradient", "", c),
+        ("`fused` gradient", "0.6", speed("fused grad, penalty, * rollouts"), over_c["fused"]),
+        ("`jax` gradient", "1.2", speed("jax grad, penalty, * rollouts"), over_c["jax"]),
+        ("`implicit` gradient", "6", speed("implicit grad, complementarity, * rollouts"), []),
+        ("`torch` gradient", "25", speed("torch grad, penalty, * rollouts"), []),
+        ("`numpy` cost", "8", speed("numpy value, penalty, * rollouts"), []),
+        ("plain NumPy loop, gradient, one thread", "", loop, list(np.divide(loop, c[: len(loop)]))),
+        ("C loop, gradient, one thread", "", c, [1.0]),
     ]
     head = [
-        "| microseconds per rollout | target | 1,000 | 10,000 | 100,000 | 1,000,000 | times the C loop |",
+        "| microseconds per rollout | target | 1,000 | 10,000 | 100,000 | 1,000,000 | on one thread, times the C loop |",
         "|---" + "|--:" * 6 + "|",
     ]
     return block(head + [
         f"| {name} | {target} | " + " | ".join([*map(number, values), *[""] * (4 - len(values))])
-        + f" | {span(np.divide(values, c[: len(values)]))} |"
-        for name, target, values in lines
+        + f" | {span(ratios) if ratios else ''} |"
+        for name, target, values, ratios in lines
     ])  # fmt: skip
 
 
@@ -221,6 +222,16 @@ def engines_agree() -> str:
     return number(float(max(distances)))
 
 
+def stability(share: str) -> Callable[[], str]:
+    """Return the function that counts the cells of the stability map, all or those of a share."""
+
+    def count() -> str:
+        table = table_of("stability_map/stability_shares")
+        return f"{round((table['cells'] * (1.0 if share == 'cells' else table[share])).sum()):,}"
+
+    return count
+
+
 def pairs_gain() -> str:
     """Return the least factor between the errors of independent and of mirrored draws, below the limit of the step."""
     verdicts = table_of("stiffness_sweep/verdicts").query("problem.str.startswith('pushing, penalty') and at <= 3000")
@@ -245,6 +256,10 @@ FIGURES: dict[str, str | Callable[[], str]] = {
     "fobg-start": 'stiffness_sweep/verdicts | estimator="fobg", problem="pushing, penalty, descent=0", at<=3000 | error',
     "fobg-later": 'stiffness_sweep/verdicts | estimator="fobg", problem="pushing, penalty, descent=0.9", at<=3000 | error',
     "fobg-beyond": 'stiffness_sweep/verdicts | method="fobg (jax, torch)", problem="pushing, penalty, descent=0", at=10000 | error',
+    **{
+        f"stability-{name.replace(' ', '-')}": stability(name)
+        for name in ("cells", "wrong", "blows up", "grew", "by step", "by law", "by both", "by unknown")
+    },
     "pairs-start": 'stiffness_sweep/verdicts | estimator="fobg[mirrored=true]", problem="pushing, penalty, descent=0", at<=3000 | error_high | most',
     "pairs-later": 'stiffness_sweep/verdicts | estimator="fobg[mirrored=true]", problem="pushing, penalty, descent=0.9", at<=3000 | error_high | most',
     "pairs-beyond": 'stiffness_sweep/verdicts | estimator="fobg[mirrored=true]", problem="pushing, penalty, descent=0", at=10000 | error',

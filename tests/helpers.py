@@ -196,8 +196,9 @@ def stiffness_rows(
 
 
 def small_rows(**given):
-    """Return made-up rows of two stiffnesses at one sigma."""
-    return stiffness_rows(**{"stiffness": (1e2, 1e4), "sigmas": (0.1,), **given})
+    """Return made-up rows of three estimators at two stiffnesses and one sigma."""
+    few = {"stiffness": (1e2, 1e4), "sigmas": (0.1,), "estimators": ("fobg", "inverse_variance", "reinforce")}
+    return stiffness_rows(**{**few, **given})
 
 
 def experiment(

@@ -212,16 +212,37 @@ FORKS = """if os.fork():
     if len(calls) == 11: open("begun", "w").close(); time.sleep(float(os.environ["HANGS"]))"""
 
 
+ORPHAN = """if len(calls) == 11:
+        import subprocess
+        code = "import subprocess; subprocess.Popen(['sleep', '600'], env={}, start_new_session=True)"
+        subprocess.run([sys.executable, "-c", code], env={}, start_new_session=True)
+        time.sleep(2.5)
+        open("begun", "w").close(); time.sleep(float(os.environ["HANGS"]))"""
+"""Starts a process with a session and an environment of its own, whose parent has ended."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("end", [None, signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems have no process that adopts")
+def test_a_process_with_an_environment_of_its_own_ends_with_the_command(tmp_path, end):
+    check_nothing_is_left(tmp_path, end, ORPHAN, 2)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("end", [None, signal.SIGINT, signal.SIGKILL])
 def test_a_cost_that_forks_leaves_no_process(tmp_path, end):
-    (tmp_path / "mine.py").write_text(COST.format(end="pass").replace("if len(calls) == 11: pass", FORKS))
+    check_nothing_is_left(tmp_path, end, FORKS, 11)
+
+
+def check_nothing_is_left(tmp_path, end, code, least):
+    """Run an examination, end it by a signal if there is one, and find no process in its folder."""
+    (tmp_path / "mine.py").write_text(COST.format(end="pass").replace("if len(calls) == 11: pass", code))
     environment = INHERITED | {"HANGS": "600" if end else "0"}
     words = hearing_signals("examine", "mine.py:cost", "grad=grad", "calls=30", "--quiet")
     with subprocess.Popen(words, cwd=tmp_path, env=environment, stdout=subprocess.DEVNULL) as run:
         if end:
             wait_for(lambda: (tmp_path / "begun").exists())
-            assert len(processes_in(tmp_path)) > 11
+            assert len(processes_in(tmp_path)) > least
             run.send_signal(end)
         run.wait(60)
     wait_for(lambda: not processes_in(tmp_path), 10.0)
@@ -250,7 +271,7 @@ def test_a_file_named_like_a_library_is_loaded_beside_it(tmp_path):
 
 READ_BY_NOBODY = {
     "examine": ["examine", "c.py:cost", "grad=c.py:grad"],
-    "report": ["report", "+experiment=quick"],
+    "report": ["report", "+experiment=quick", "formats=[]"],
     "compare": ["compare", "results/quick", "results/quick"],
 }
 

@@ -84,7 +84,7 @@ def measure_backends():
 
 def measure_baselines():
     """Yield the time of the same gradient in a NumPy loop and in native code, which is compared with ``jax``."""
-    compiled, rival = problem("jax"), problem("fused")
+    compiled, rivals = problem("jax"), {name: problem(name) for name in ("fused", "jax")}
     scene, theta = compiled.program.scene, compiled.program.theta0
     stiffness = compiled.program.contact.stiffness
     for count in SIZES[:2]:
@@ -95,15 +95,17 @@ def measure_baselines():
     expected = compiled.grad(theta, w)
     difference = np.abs(kernel(theta, w) - expected).max() / np.abs(expected).max()
     yield "native C kernel: largest relative difference", float(difference), ""
-    rival.threads = 1  # one thread like the kernel, since two threads may share a core
+    for rival in rivals.values():
+        rival.threads = 1  # one thread like the kernel, since two threads may share a core
     for count in SIZES:
         w = batch(compiled, count)
         columns = blocks.block_size(count, NATIVE_COLUMNS, native.LANES, 1)
         call = partial(blocks.evaluate, kernel, theta[:, None], w, columns, 1, (compiled.dim,))
         each = microseconds(call, count)
         yield f"native C kernel, one thread, {count:g} rollouts", each, "us"
-        ratio = microseconds(partial(rival.grad, theta, w), count) / each
-        yield f"fused on one thread over the C kernel, {count:g} rollouts", ratio, ""
+        for name, rival in rivals.items():
+            ratio = microseconds(partial(rival.grad, theta, w), count) / each
+            yield f"{name} on one thread over the C kernel, {count:g} rollouts", ratio, ""
 
 
 def compare_backends():

@@ -113,6 +113,8 @@ def _read(folder: Path) -> tuple[str, Results] | None:
     """Return the name and the results of the experiment in a folder, with the column types of its study; None without rows."""
     store = Store(folder, Columns.of())
     rows = store.load()
+    if store.left_out:
+        raise UserError(f"'{min(store.left_out)}' has damaged rows: run the experiment again to compare it")
     if rows.empty:
         return None
     if not rows[["study", "parameters"]].map(bool).all(axis=None):
@@ -121,7 +123,9 @@ def _read(folder: Path) -> tuple[str, Results] | None:
     if len(studies) != 1:
         raise UserError(f"the rows in '{folder}' are of {len(studies)} studies ({', '.join(studies)})")
     content = hashed(*(hashlib.sha256(path.read_bytes()).hexdigest() for path in store.files()))
-    rows = valid_rows(rows, columns_of(studies[0]), [folder] * len(rows))[0].reset_index(drop=True)
+    rows, faulty = valid_rows(rows, columns_of(studies[0]), [folder] * len(rows))
+    if faulty:
+        raise UserError(f"'{folder}' has impossible values: run the experiment again to compare it")
     label = str(rows["experiment"].iloc[0]) or folder.name
     return label, Results(rows, studies[0], content, *_read_machine(folder))
 

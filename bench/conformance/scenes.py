@@ -213,7 +213,7 @@ def _all_combinations(scene: Scene) -> Iterator[Program]:
 def _sampled_gradient(program: Program) -> tuple[np.ndarray, np.ndarray]:
     """Return mean and standard error ``(d,)`` of first-order terms, or of zeroth-order terms if the program jumps."""
     problem, theta = able_backend(program).compile(program), program.theta0
-    w = rng("closed form").standard_normal((program.n_noise, 1 << 14))
+    w = rng("closed form").standard_normal((program.n_noise, 1 << 12))
     if program.continuous:
         terms = problem.grad(theta, w)
     else:

@@ -51,6 +51,7 @@ class EngineProblem(SteppedProblem):
         self.engine_s += seconds
         if answer["is_first"]:
             self._first_s[key] = seconds + (self._model.build_s if not self._first_s else 0.0)
+            self.compilations.seconds += self._first_s[key]
         self._charge(key, [self._first_s.get(key, 0.0)])
         self.device = self._model.device
         self.peak_memory_mb = max(self.peak_memory_mb, answer["peak_memory_mb"])

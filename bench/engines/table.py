@@ -83,13 +83,14 @@ def rows_of(engine: str, script: ModuleType, *words: str) -> list[dict[str, Any]
     """
     name, _, release = engine.partition("==")
     entry, python, environment = registry.find("backends", name), str(environments.python_of(engine)), dict(os.environ)
+    assert entry.plugin is not None
     is_inside = not issubclass(entry.plugin, EngineBackend)
     if is_inside:
         environment["PYTHONPATH"] = str(Path(runner.__file__).parents[3])
     if is_inside and not release:
         python, missing = sys.executable, entry.reason
     else:
-        missing = environments.missing(engine, None, getattr(entry.plugin, "libraries", ()))
+        missing = environments.missing(engine, None, getattr(entry.plugin, "libraries", ())) or ""
     file = file_of(entry.plugin, "_conformance.py")
     if missing or not file.exists():
         return [{"reason": missing or f"no file {file.name}"}]

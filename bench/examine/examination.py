@@ -240,29 +240,19 @@ class _Examination:
         self.left_out += stages.left_out
         checked = stages.check
         is_wrong = checked.cause in SUSPICIOUS
-        if refined is not None and is_wrong and stages.gradient is not None:
-            explained.gaps = self._attempt("the refined cost", lambda: diagnosis.refined_gaps(stages, refined)) or ()
+        has_gradient = stages.gradient is not None
+        if refined is not None and is_wrong and has_gradient:
+            self._explain("gaps", "the refined cost", diagnosis.refined_gaps, refined)
         self._find_smooth_parts(checked)
         if refined is not None and explained.smooth_parts:
-            explained.refined = (
-                self._attempt(
-                    "the refined cost", lambda: diagnosis.refined_slopes(stages, refined, diagnosis.doubtful(checked))
-                )
-                or {}
-            )
+            self._explain("refined", "the refined cost", diagnosis.refined_slopes, refined, diagnosis.doubtful(checked))
         if setup.horizons:
-            explained.growth = (
-                self._attempt("horizons", lambda: diagnosis.errors_by_horizon(stages, setup.horizons)) or ()
-            )
-        if is_wrong and stages.gradient is not None:
-            explained.difference_step = (
-                self._attempt("steps of a difference", lambda: diagnosis.step_of_difference(stages, checked)) or ""
-            )
-            explained.gradient_noise = (
-                self._attempt("noise of the gradient", lambda: diagnosis.noise_of_gradient(stages)) or 0.0
-            )
+            self._explain("growth", "horizons", diagnosis.errors_by_horizon, setup.horizons)
+        if is_wrong and has_gradient:
+            self._explain("difference_step", "steps of a difference", diagnosis.step_of_difference, checked)
+            self._explain("gradient_noise", "noise of the gradient", diagnosis.noise_of_gradient)
         self._compare_means(checked)
-        can_go_on = stages.gradient is not None or not simulator.has_gradient
+        can_go_on = has_gradient or not simulator.has_gradient
         if is_wrong and can_go_on and explained.is_adaptive is None:
             explained.is_adaptive = self._compare_along_lines(checked, 0.9)
         lines = self._scan_lines(checked) if can_go_on else []
@@ -301,6 +291,7 @@ class _Examination:
             changing=sorted(simulator.changing),
             notes=[
                 *simulator.notes,
+                *[f"a call of the cost or gradient had not returned after {clock.hung_s:.2g} s"] * bool(clock.hung_s),
                 *(f"the cost raised {n} times: {text}" for text, n in list(simulator.raised.items())[:3]),
             ],
             left_out=self.left_out,
@@ -330,6 +321,12 @@ class _Examination:
             self.left_out.append(what)
             return None
 
+    def _explain(self, name: str, what: str, function: Callable[..., Any], *given: Any) -> None:
+        """Set a comparison of :attr:`explained`, unless the budget ends before."""
+        found = self._attempt(what, partial(function, self.stages, *given))
+        if found is not None:
+            setattr(self.explained, name, found)
+
     # ------------------------------------------------------------------------------------------------ lines
 
     def _compare_early(self, checked: Check) -> None:
@@ -349,9 +346,7 @@ class _Examination:
 
     def _find_smooth_parts(self, checked: Check) -> None:
         if self.stages.gradient is not None and not self.explained.smooth_parts and diagnosis.doubtful(checked):
-            self.explained.smooth_parts = (
-                self._attempt("the smooth part of the cost", lambda: diagnosis.smooth_parts(self.stages, checked)) or {}
-            )
+            self._explain("smooth_parts", "the smooth part of the cost", diagnosis.smooth_parts, checked)
 
     def _compare_along_lines(self, checked: Check, share: float) -> bool | None:
         """Return whether the program's steps depend on theta and its jumps explain the gradient's error.
@@ -359,9 +354,7 @@ class _Examination:
         None where the budget ends before. Nothing here depends on sigma.
         """
         if self.explained.steps is None:
-            self.explained.steps = self._attempt(
-                "the loops of the program", lambda: diagnosis.changing_steps(self.stages)
-            )
+            self._explain("steps", "the loops of the program", diagnosis.changing_steps)
         if not self.explained.steps:
             return None if self.explained.steps is None else False
         near = self._scan_near(checked, share)

@@ -577,7 +577,7 @@ class Findings:
         best = one.best
         if one.cause in ("spread", "nonfinite"):
             return None
-        if best is not None and best.name == "gradient" and self.derivative == WRONG:
+        if best is not None and best.name != "smoothing" and self.derivative == WRONG:
             return next((m for m in one.methods if m.name == "smoothing" and math.isfinite(m.seconds)), None)
         return best
 

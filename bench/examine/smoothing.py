@@ -17,7 +17,7 @@ from statistics import NormalDist
 import numpy as np
 
 from bench.examine.lines import REACH, LineScan
-from bench.simulator.clock import Clock, OutOfTime
+from bench.simulator.clock import OutOfTime
 from bench.simulator.simulator import Simulator
 
 PAIRS = 4096
@@ -49,7 +49,8 @@ class Method:
     """A method of estimating grad J, and its cost for a relative error of 10%."""
 
     name: str
-    """``gradient``: mean of the program's gradients; ``smoothing``: pairs of costs along random directions."""
+    """``plain``: the program's gradient without noise; ``gradient``: mean of its gradients under noise; ``mirrored``: the same at
+    +u and -u; ``smoothing``: pairs of costs along random directions."""
     bias: float
     """Upper end of the 95% interval of the method's bias, relative to |grad J|."""
     samples: float
@@ -128,9 +129,9 @@ class Smoothed:
 
     @property
     def best(self) -> Method | None:
-        """The fastest method to reach an error of 10%; None if no method reaches it, or if one's samples are not known."""
+        """The fastest method to reach an error of 10%; None if no method reaches it, or the samples of gradients are not known."""
         usable = [m for m in self.methods if m.seconds < math.inf]
-        is_open = any(math.isnan(m.seconds) for m in self.methods)
+        is_open = any(math.isnan(m.seconds) for m in self.methods if m.name != "plain")
         return min(usable, key=lambda m: m.seconds) if usable and self.known and not is_open else None
 
 
@@ -207,7 +208,7 @@ def _summary(
     error = float(np.sqrt(groups.var(axis=0, ddof=1).sum() / GROUPS))
     norm = math.sqrt(max(float(truth @ truth) - error**2, 0.0))
     bias = low = high = moved = math.nan
-    event = 0.0
+    jumps = event = 0.0
     remark = ""
     slopes = (up + down) / 2.0
     n_lost = int((~np.isfinite(slopes).all(axis=0)).sum()) if simulator.has_gradient else 0
@@ -221,9 +222,19 @@ def _summary(
         remark = f"{n_lost} of {pairs} pairs have a gradient that is not a number"
     if plain is not None:
         moved = float(np.linalg.norm(truth - weight[:, 0] * plain))
-    methods = _methods(norm, (low, high), terms, up, simulator.clock) if norm > CLEAR * error else ()
+    methods: list[Method] = []
+    if norm > CLEAR * error:
+        each, slope = simulator.clock.per_cost(), simulator.clock.per_gradient()
+        methods.append(_method("smoothing", (0.0, 0.0), terms, norm, 2, each))
+        if plain is not None:
+            ends = max(moved - 2.0 * error, 0.0), max(moved + 2.0 * error, float(jumps))
+            methods.append(_method("plain", ends, np.zeros((dim, 2)), norm, 1, slope))
+        if np.isfinite(slopes).all():
+            methods.append(_method("gradient", (low, high), up, norm, 1, slope))
+            methods.append(_method("mirrored", (low, high), slopes, norm, 2, slope))
+        methods.sort(key=lambda m: (math.isnan(m.seconds), m.seconds))
     return Smoothed(
-        sigma, truth / weight[:, 0], error, norm, pairs, bias, low, high, moved, remark, methods,
+        sigma, truth / weight[:, 0], error, norm, pairs, bias, low, high, moved, remark, tuple(methods),
         int((d != 0.0).sum()), n_lost, float(event),
     )  # fmt: skip
 
@@ -244,19 +255,6 @@ def _terms(u: np.ndarray, d: np.ndarray) -> np.ndarray:
 def _means(terms: np.ndarray) -> np.ndarray:
     """Return independent means of ``terms (d, n)``, ``(GROUPS, d)``, each over equally many terms of both halves."""
     return terms.reshape(terms.shape[0], GROUPS, -1).mean(axis=2).T
-
-
-def _methods(
-    norm: float, bias: tuple[float, float], terms: np.ndarray, slopes: np.ndarray, clock: Clock
-) -> tuple[Method, ...]:
-    """Return the methods, fastest first, with their costs for a relative error of 10%, from single samples ``(d, n)``.
-
-    ``bias`` is the interval of the gradient's.
-    """
-    methods = [_method("smoothing", (0.0, 0.0), terms, norm, 2, clock.per_cost())]
-    if np.isfinite(slopes).all():
-        methods.append(_method("gradient", bias, slopes, norm, 1, clock.per_gradient()))
-    return tuple(sorted(methods, key=lambda m: (math.isnan(m.seconds), m.seconds)))
 
 
 def _method(name: str, bias: tuple[float, float], terms: np.ndarray, norm: float, calls: int, seconds: float) -> Method:

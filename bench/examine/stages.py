@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -497,16 +498,14 @@ class GradientStages:
         if not self.clock.can_afford(*self._cost_of(options, 0), share=SHARE):
             self.left_out.append("checks under other noise")
             return
-        own = self.w, self._costs_store, self._gradients_store
         try:
             for _ in range(OTHER_NOISE):
-                self.w = self._random.standard_normal((self.simulator.noise, 1))
-                self._costs_store, self._gradients_store = Store(), Store()
-                self.more.append(space.restore(self._check_once(space, options)))
+                other = copy(self)  # with costs and gradients of its own
+                other.w = self._random.standard_normal((self.simulator.noise, 1))
+                other._costs_store, other._gradients_store = Store(), Store()
+                self.more.append(space.restore(other._check_once(space, options)))
         except OutOfTime:
             self.left_out.append("checks under other noise")
-        finally:
-            self.w, self._costs_store, self._gradients_store = own
 
 
 def _are_equal(values: np.ndarray) -> bool:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.errors import UserError, failure
+from bench.errors import UserError, failure, needing_sweeps
 from bench.examine.few import ROUNDS, FewSteps
 from bench.examine.lines import scan
 from bench.examine.subspace import Group, Subspace
@@ -182,7 +182,8 @@ class Watch:
 
     def draw(self, path: str | Path) -> Path:
         """Write a chart of the log and return its path; needs Matplotlib."""
-        from matplotlib.figure import Figure
+        with needing_sweeps("a chart"):
+            from matplotlib.figure import Figure
 
         at = [row["iteration"] for row in self.rows]
         figure = Figure(figsize=(7.0, 6.0), layout="constrained")

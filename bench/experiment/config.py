@@ -6,7 +6,9 @@ import math
 import os
 import re
 from collections.abc import Collection, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, cast
 
@@ -14,7 +16,7 @@ from bench.errors import STATUSES, UserError, local_path, printable, unknown
 from bench.experiment.cell import DESCENDED
 from bench.experiment.experiment import Budget, Choice, Execution, Experiment
 from bench.experiment.grid import COUNTS, check_axes, parameter_name, refuse_too_many, share_of, swept
-from bench.experiment.overrides import LISTS_AS, TABLES, check_file, quoted, with_ranges
+from bench.experiment.overrides import TABLES, check_file, merge, parse, quoted, with_ranges
 from bench.experiment.study import Study
 from bench.model import Decision, MechanicalScene, Plugin, guard, registry
 from bench.model.identity import parse_identity, split_items
@@ -59,15 +61,14 @@ def load(overrides: Sequence[str], config_dirs: Sequence[Path] = ()) -> Experime
     config_dirs = [*config_dirs, *(folder for folder in registry.folders() if (folder / "experiment").is_dir())]
     loaded = _composed(overrides, config_dirs)
     _refuse_unread(loaded, overrides)
-    return loaded
+    given = {key.partition(".")[0] for key, _, _ in _split_words(overrides)}
+    if "compares" in given:
+        return loaded
+    # what a command line chooses is drawn, whatever the file compares
+    return replace(loaded, compares={name: values for name, values in loaded.compares.items() if name not in given})
 
 
 def _composed(overrides: Sequence[str], config_dirs: Sequence[Path]) -> Experiment:
-    from hydra import compose, initialize_config_dir
-    from hydra.core.override_parser.overrides_parser import OverridesParser
-    from hydra.errors import HydraException
-    from omegaconf import OmegaConf
-
     for folder in config_dirs:
         if not (folder / "experiment").is_dir():
             raise UserError(
@@ -77,31 +78,47 @@ def _composed(overrides: Sequence[str], config_dirs: Sequence[Path]) -> Experime
     if len(named) > 1:
         commands = " && ".join(f"python -m bench +experiment={name}" for name in named)
         raise UserError(f"one command runs one experiment with its sweep: {commands}")
-    parser = OverridesParser.create()
-    prepared = []
-    for override in overrides:
-        hydra_override = _to_hydra(override, config_dirs)
-        try:
-            parser.parse_override(hydra_override)
-        except (HydraException, ValueError, RecursionError):  # ValueError: a number of 5000 digits
-            raise UserError(f"'{override[:200]}' cannot be read: {LISTS_AS}") from None
-        prepared.append(hydra_override)
-    for name in named:
-        check_file(_file_of(name, config_dirs))
+    prepared = [_to_hydra(override, config_dirs) for override in overrides]
+    given = [parse(override, word) for override, word in zip(overrides, prepared, strict=True)]
+    settings = deepcopy(_composed_files(next(iter(named), ""), tuple(config_dirs), _stamps(config_dirs)))
+    for keys, value in given:
+        if keys not in (["experiment"], ["answer"]):
+            merge(settings, keys, value)
+    joined = _joined(from_settings(settings), _as_list(settings["also"]), overrides, config_dirs)
+    return replace(joined, answer=_answer(joined, overrides, config_dirs))
+
+
+def _stamps(config_dirs: Sequence[Path]) -> tuple[tuple[Path, int, int], ...]:
+    """Return path, time of change and size of every experiment file and of ``config.yaml``."""
+    files = [path for folder in (*config_dirs, config_dir()) for path in (folder / "experiment").rglob("*.yaml")]
+    files.append(config_dir() / "config.yaml")
+    return tuple((path, path.stat().st_mtime_ns, path.stat().st_size) for path in files)
+
+
+@lru_cache(maxsize=128)
+def _composed_files(name: str, config_dirs: tuple[Path, ...], stamps: object) -> dict[str, Any]:
+    """Return the settings that Hydra composes from ``config.yaml`` and, if any, an experiment's files, with its own answer only.
+
+    ``stamps`` tell contents of the files apart.
+    """
+    from hydra import compose, initialize_config_dir
+    from omegaconf import OmegaConf
+
+    words, own = [], {}
+    if name:
+        words, own = [f"+experiment={name}"], check_file(_file_of(name, config_dirs))
     if config_dirs:
         search_path = ",".join(f"'file://{folder.expanduser().absolute()}'" for folder in config_dirs)
-        prepared.insert(0, f"hydra.searchpath=[{search_path}]")
+        words.insert(0, f"hydra.searchpath=[{search_path}]")
     try:
         with initialize_config_dir(str(config_dir()), version_base="1.3"):
-            config = compose("config", overrides=prepared)
+            config = compose("config", overrides=words)
         plain = OmegaConf.to_container(config, resolve=False, throw_on_missing=True)
     except Exception as error:  # Hydra raises errors of many types, and only Hydra's code runs here
         lines = [str(part).strip().partition("\n")[0] for part in (error, error.__cause__) if part is not None]
-        raise UserError(printable(": ".join(lines)).replace("override ++", "")[:1000]) from None
+        raise UserError(printable(": ".join(lines))[:1000]) from None
     assert isinstance(plain, dict)
-    settings = {str(k): v for k, v in plain.items()}
-    joined = _joined(from_settings(settings), _as_list(settings["also"]), overrides, config_dirs)
-    return replace(joined, answer=_answer(joined, overrides, config_dirs))
+    return {str(k): v for k, v in plain.items()} | {"answer": own.get("answer")}
 
 
 APPEARANCE = (
@@ -109,6 +126,7 @@ APPEARANCE = (
     "also",
     "results_dir",
     "answer",
+    "compares",
     "formats",
     "compile_cache",
     "plugins",
@@ -119,16 +137,11 @@ APPEARANCE = (
 
 def _answer(found: Experiment, overrides: Sequence[str], config_dirs: Sequence[Path]) -> str:
     """Return the answer in an experiment's own file; empty if the file has none or other settings."""
-    from omegaconf import OmegaConf
-
-    name = next((value for key, _, value in _split_words(overrides) if key == "experiment"), None)
-    file: Any = OmegaConf.load(_file_of(name, config_dirs)) if name else {}
-    answer = str(file.get("answer") or "")
-    if answer and len(overrides) > 1:
-        own = load([f"experiment={name}"], config_dirs)
+    if found.answer and len(overrides) > 1:
+        own = load([word for word in overrides if word.lstrip("+").startswith("experiment=")], config_dirs)
         alike = replace(found, **{field: getattr(own, field) for field in APPEARANCE})
-        return answer if alike == own and len(found.also) == len(own.also) else ""
-    return answer
+        return found.answer if alike == own and len(found.also) == len(own.also) else ""
+    return found.answer
 
 
 def _joined(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,9 @@ from bench.experiment.grid import MAX_CELLS
 GLOBAL = "# @package _global_"
 """The first line of an experiment file, so that Hydra does not nest its settings."""
 RANGE = re.compile(r"range\(([^()]*)\)")
+_NUMBER = r"\s*[+-]?(?:(?:0|[1-9]\d*)(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?\s*"
+NUMBERS = re.compile(rf"\[{_NUMBER}(?:,{_NUMBER})*\]")
+"""A list of numbers."""
 TABLES = ("sweep", "marks", "compares", "reference", "ray")
 """Settings that are tables; the parameters of plugins are too."""
 LISTS_AS = "write key=value with lists as [a,b] and strings in quotes"
@@ -53,8 +57,41 @@ def _range(key: str, match: re.Match[str]) -> range:
     return numbers
 
 
-def check_file(path: Path) -> None:
-    """Raise :class:`UserError` with the file and, as YAML gives it, the line if an experiment file cannot be read."""
+def parse(given: str, word: str) -> tuple[list[str], Any]:
+    """Return the keys and the value of an override in Hydra's syntax; ``given`` is the user's, which errors name.
+
+    A list of numbers, which may be long, is read without Hydra's grammar: that takes a millisecond per number.
+    """
+    key, _, value = word.lstrip("+").partition("=")
+    try:
+        if NUMBERS.fullmatch(value):
+            return key.split("."), [float(n) if set(n) & set(".eE") else int(n) for n in value[1:-1].split(",")]
+        from hydra.core.override_parser.overrides_parser import OverridesParser
+
+        override = OverridesParser.create().parse_override(word)
+        if override.package is None and not override.is_sweep_override():
+            return override.key_or_group.split("."), override.value()
+    except Exception:  # Hydra's of many types; ValueError for a number of 5000 digits, RecursionError
+        pass
+    raise UserError(f"'{given[:200]}' cannot be read: {LISTS_AS}") from None
+
+
+def merge(settings: dict[str, Any], keys: Sequence[str], value: Any) -> None:
+    """Put a value into nested settings in place: a table is merged into the present one, anything else replaces it."""
+    *above, last = keys
+    for key in above:
+        if not isinstance(settings.get(key), dict):
+            settings[key] = {}
+        settings = settings[key]
+    if isinstance(value, dict) and isinstance(settings.get(last), dict):
+        for key, part in value.items():
+            merge(settings[last], [key], part)
+    else:
+        settings[last] = value
+
+
+def check_file(path: Path) -> dict[str, Any]:
+    """Return the content of an experiment file; raises :class:`UserError` with the file and the line if it cannot be read."""
     import yaml
     from omegaconf import OmegaConf
 
@@ -67,6 +104,7 @@ def check_file(path: Path) -> None:
     except Exception as error:  # of the file, of YAML, and OmegaConf's own, such as a key that is a list
         raise UserError(f"'{path}' cannot be read: {printable(error)[:400]}") from None
     _check_content(path, text, content)
+    return dict(content)  # type: ignore[arg-type]
 
 
 def _refuse_expansion(root: Any) -> None:

@@ -49,8 +49,8 @@ class Chart:
     - ``lines``: y against x, a line per ``series``, 95% intervals where the columns have them.
     - ``points``: the same without lines.
     - ``dots``: a row per value of the text column y, and x with its interval; ``join`` connects the dots of a row.
-    - ``grid``: a cell per pair of x and y, coloured by the text column ``level`` or by the number ``shade`` from 0 to 1, with the
-      text of the column ``cell``.
+    - ``grid``: a cell per pair of x and y, coloured by the text column ``level``, with the text of the
+      column ``cell``.
     """
 
     name: str
@@ -70,7 +70,6 @@ class Chart:
     panel: str = ""
     """The column with a panel per value."""
     level: str = ""
-    shade: str = ""
     cell: str = ""
     limit: str = ""
     """The column with a value of y per x, drawn as a line on a ``grid``, and named ``limit_name``."""
@@ -86,16 +85,14 @@ class Chart:
     marks: Sequence[Mark] = ()
     join: bool = False
     arrow: str = ""
-    """The column whose values are two points each: ``points`` joins them by an arrow, and names their series there. Markers
-    are those of ``line``."""
+    """The column whose values are one or two points each: ``points`` joins two by an arrow, and names their series there.
+    Markers are those of ``line``."""
     failed: str = ""
     """The column that is true where a point has no value: a cross at the upper edge."""
     across: int = 4
     """Most panels side by side."""
     height: float = 2.3
     """Height of a panel in inches; of a row of dots or cells, in ``dots`` and ``grid``, if below 1."""
-    front: bool = False
-    """Whether a line joins the Pareto front of a panel: the points that no other beats in x and y, smaller being better."""
     band: bool = False
     """Whether intervals are drawn as bands and not as bars."""
     own_scales: bool = False
@@ -112,7 +109,7 @@ class Chart:
     def _names(self) -> list[str]:
         """Return the columns of the table that the chart needs."""
         axes = [name for c in (*self.x, *self.y) for name in (c.name, c.low, c.high, c.limit)]
-        names = [self.panel, self.series, self.line, self.level, self.shade, self.cell,
+        names = [self.panel, self.series, self.line, self.level, self.cell,
                  self.failed, self.arrow, self.limit, *axes]  # fmt: skip
         return [name for name in dict.fromkeys(names) if name]
 

@@ -85,6 +85,8 @@ class Compilations:
     """Folder in which compiled programs are stored between runs; None to store none."""
     made: int = 0
     """Number of compilations, excluding programs loaded from the folder."""
+    seconds: float = 0.0
+    """Time of these compilations [s]."""
     shapes: set[str] = field(default_factory=set)
     """Hashes of the requested programs, one per program structure, function and shape."""
 
@@ -99,14 +101,16 @@ class Compilations:
         executable = known.pop(key, None)
         if executable is None or (fresh and executable.loaded):
             executable = make(None if fresh else self.folder)
-            self.made += not executable.loaded
+            if not executable.loaded:
+                self.made += 1
+                self.seconds += sum(executable.seconds)
         known[key] = executable
         self.shapes.add(executable.name)
         return executable
 
     def restart(self) -> None:
         """Reset the counts to zero."""
-        self.made = 0
+        self.made, self.seconds = 0, 0.0
         self.shapes.clear()
 
 

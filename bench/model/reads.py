@@ -20,7 +20,8 @@ import threading
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from importlib.metadata import PackageNotFoundError, distribution
+from functools import cache
+from importlib.metadata import Distribution, PackageNotFoundError, distribution, packages_distributions
 from pathlib import Path
 from typing import Any
 
@@ -30,10 +31,18 @@ SET_BY_RUNS = frozenset((
     "BENCH_MARK", "BENCH_TRIAL", "JAX_ENABLE_X64", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NPROC",
 ))  # fmt: skip
 """Variables that a run sets in its workers."""
-LIBRARIES = (*site.getsitepackages(), site.getusersitepackages(), *map(os.path.realpath, site.getsitepackages()))
-"""Folders of installed libraries."""
-INSIDE = (*LIBRARIES, str(Path(__file__).parents[1]), os.path.dirname(sysconfig.get_path("stdlib")), "<frozen")
-"""Starts of the paths of code that is not from outside: libraries, this package and the standard library."""
+_SITES = (*site.getsitepackages(), site.getusersitepackages())
+LIBRARIES = tuple(f"{place}/" for folder in _SITES for place in (folder, os.path.realpath(folder)))
+"""Starts of the paths of installed libraries."""
+PACKAGE = Path(__file__).parents[1]
+INSIDE = (
+    *LIBRARIES,
+    f"{PACKAGE}/",
+    f"{PACKAGE.parent}/plugins/",
+    f"{os.path.dirname(sysconfig.get_path('stdlib'))}/",
+    "<frozen",
+)
+"""Starts of the paths of code that is not from outside: libraries, this package with its plugins, the standard library."""
 IGNORED = ("/dev/", "/proc/", "/sys/", *INSIDE)
 CACHES = ("/__pycache__/", "/.cache/", os.environ.get("XDG_CACHE_HOME") or "/.cache/")
 CHANGED = "several contents"
@@ -41,23 +50,26 @@ CHANGED = "several contents"
 STARTED_NS = time.time_ns()
 
 _read: dict[str, str] = {}
-"""Hashes by path, versions by ``package NAME``, and hashes of values by ``$NAME``; empty for what there is not."""
+"""Hashes by absolute path, versions by ``package NAME``, and hashes of values by ``$NAME``; empty for what there is not."""
 _stamps: dict[str, tuple[int, ...]] = {}
 _texts: list[str] = []
 """The manifest, while nothing is added."""
 _written: set[str] = set()
 _modules: set[str] = set()
 _packages: set[str] = set()
+_plugins: set[str] = set()
+"""Top-level packages of plugins, which are from outside wherever they are installed."""
 _folders: list[str] = []
 _listed: list[str] = []
 """The names of variables that were listed last, whose values are copied next."""
 
 
-def start(folder: str = "") -> None:
-    """Record from now on; the files in ``folder`` are not temporary."""
+def start(folder: str = "", plugin: str = "") -> None:
+    """Record from now on. The files in ``folder`` are not temporary, and the module ``plugin`` is from outside."""
+    _plugins.add(plugin.partition(".")[0])
     if not _folders:
         sys.addaudithook(_hear)
-        os.environ.__class__ = _Environment  # type: ignore[assignment]
+        os.environ.__class__ = _Environment
     if folder not in _folders:
         _folders.append(folder)
 
@@ -77,7 +89,7 @@ def note(path: str | Path) -> None:
 def include(reads: str) -> None:
     """Record what a stored result that is used here has read."""
     for name, content in json.loads(reads or "{}").items():
-        _add(name, content)
+        _add(_path_of(name), content)
 
 
 def manifest() -> str:
@@ -93,7 +105,7 @@ def manifest() -> str:
         with suppress(PackageNotFoundError):
             _note_package(_packages.pop())
     if not _texts:
-        counted = {name: content for name, content in _read.items() if name not in _written}
+        counted = {name_of(path): content for path, content in [*_read.items()] if path not in _written}
         _texts.append(json.dumps(counted, sort_keys=True) if counted else "")
     return _texts[0]
 
@@ -113,16 +125,17 @@ class Present:
     def __init__(self, environment: Mapping[str, str]) -> None:
         self._environment = environment
         self._found: dict[str, str] = {}
-        self._changes: dict[str, str] = {}
+        self._changes: dict[tuple[str, str], str] = {}
 
     def change(self, reads: str, versions: str = "") -> str:
         """Return what has changed since a result read it, with both hashes; empty if nothing has.
 
         Libraries in ``versions``, as ``numpy=2.4;jax=0.9``, are not compared.
         """
-        if reads not in self._changes:
-            self._changes[reads] = self._change(reads, {part.partition("=")[0] for part in versions.split(";")})
-        return self._changes[reads]
+        given = reads, versions
+        if given not in self._changes:
+            self._changes[given] = self._change(reads, {part.partition("=")[0] for part in versions.split(";")})
+        return self._changes[given]
 
     def _change(self, reads: str, ignored: set[str]) -> str:
         try:
@@ -144,7 +157,19 @@ class Present:
             with suppress(PackageNotFoundError, ValueError):
                 return distribution(name.removeprefix("package ")).version
             return ""
-        return hash_of(name)
+        return hash_of(_path_of(name))
+
+
+def name_of(path: str) -> str:
+    """Return a path as it is stored: below a folder of plugins ``<FOLDER>/FILE``, so that the folder may be moved."""
+    folder = next((folder for folder in _folders if folder and path.startswith(f"{folder}/")), "")
+    return f"<{os.path.basename(folder)}>{path.removeprefix(folder)}" if folder else path
+
+
+def _path_of(name: str) -> str:
+    base, _, rest = name.removeprefix("<").partition(">")
+    found = [folder + rest for folder in _folders if rest and os.path.basename(folder) == base]
+    return next(filter(os.path.exists, found), name)
 
 
 def _add(name: str, content: str) -> None:
@@ -162,6 +187,8 @@ def _note_module(name: str, module: Any) -> None:
     file, parts = module.__file__, name.split(".")
     if not _is_outside(name, file):
         return
+    if file.startswith(LIBRARIES):
+        _packages.add(parts[0])
     packages = [sys.modules.get(".".join(parts[: n + 1])) for n in range(len(parts))]
     if not any(getattr(package, "REVISION", 0) for package in packages):
         note(file)
@@ -173,17 +200,29 @@ def _note_module(name: str, module: Any) -> None:
 def _note_package(top: str) -> None:
     """Record the version of a library, or the content of its modules if it was installed from a folder."""
     if str(getattr(sys.modules.get(top), "__file__", "")).startswith(LIBRARIES):
-        library = distribution(top)
-        _add(f"package {top}", library.version)
+        library = _distribution_of(top)
+        _add(f"package {library.name}", library.version)
         if '"file:' in (library.read_text("direct_url.json") or ""):
             for name, module in [*sys.modules.items()]:
-                if name.partition(".")[0] == top and getattr(module, "__file__", None):
-                    note(module.__file__)
+                file = getattr(module, "__file__", None)
+                if file and name.partition(".")[0] == top:
+                    note(file)
+
+
+def _distribution_of(top: str) -> Distribution:
+    try:
+        return distribution(top)
+    except PackageNotFoundError:  # a module may have another name than its distribution
+        return distribution(_distributions().get(top, [top])[0])
+
+
+_distributions = cache(packages_distributions)
 
 
 def _is_outside(name: str, file: str) -> bool:
     top = name.partition(".")[0]
-    return not (top in (OWN, "__main__") or top in sys.stdlib_module_names or file.startswith(INSIDE))
+    is_inside = top in (OWN, "__main__") or top in sys.stdlib_module_names or file.startswith(INSIDE)
+    return top in _plugins or not is_inside
 
 
 def _is_from_outside(through_libraries: bool) -> bool:
@@ -194,9 +233,9 @@ def _is_from_outside(through_libraries: bool) -> bool:
         name, file = str(frame.f_globals.get("__name__")), frame.f_code.co_filename
         if name.partition(".")[0] == OWN:
             return is_outside
+        is_outside = is_outside or _is_outside(name, file)
         if not (is_outside or through_libraries) and file.startswith(LIBRARIES):
             return False
-        is_outside = is_outside or _is_outside(name, file)
     return is_outside and threading.current_thread() is not threading.main_thread()
 
 
@@ -223,7 +262,7 @@ def _is_input(path: str) -> bool:
     """Return whether a file counts: it belongs to no library or cache and, among temporary files, it is not new."""
     if path.startswith(IGNORED) or any(cache in path for cache in CACHES):
         return False
-    is_kept = not path.startswith(tempfile.gettempdir()) or path.startswith(tuple(filter(None, _folders)))
+    is_kept = not path.startswith(f"{tempfile.gettempdir()}/") or path.startswith(tuple(filter(None, _folders)))
     return is_kept or not os.path.exists(path) or os.stat(path).st_ctime_ns < STARTED_NS
 
 
@@ -240,7 +279,7 @@ class _Environment(os._Environ[str]):
             value = super().__getitem__(key)
         if _listed and _listed.pop(0) == key:  # all are copied
             pass
-        elif not {name, key} & {*_read, *_written, *SET_BY_RUNS} and _is_from_outside(False):
+        elif not (name in _read or name in _written or key in SET_BY_RUNS) and _is_from_outside(False):
             _add(name, _hash_of_value(value))
         if value is None:
             raise KeyError(key) from None

@@ -210,7 +210,7 @@ def _load(
             raise ImportError(message)
         if not module.startswith("bench."):
             IMPORTED.add(module)
-            reads.start()
+            reads.start(plugin=module)
         with _protected(module):
             part = load()
             if isinstance(part, ModuleType):

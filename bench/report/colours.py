@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache
 from itertools import count
+
+import numpy as np
+import pandas as pd
 
 from bench.experiment.config import config_dir
 from bench.experiment.views import Chart, Style
@@ -28,9 +31,23 @@ def looks_by_name(charts: Sequence[Chart]) -> dict[str, Style]:
     return {name: style for name, style in found.items() if name in drawn}
 
 
+def graded(
+    errors: pd.Series, grades: Mapping[float, str], unit: Callable[[float], str]
+) -> tuple[pd.Series, dict[str, Style]]:
+    """Return the grade of each error, and the look of each grade. ``grades`` are colours by upper end, the last of them infinite.
+
+    ``unit`` formats the ends: ``error below 10%``, ``error 100% or more``.
+    """
+    *ends, most = grades
+    names = [*(f"error below {unit(end)}" for end in ends), f"error {unit(ends[-1])} or more"]
+    place = np.searchsorted(ends, errors.fillna(most), side="right")
+    looks = {name: Style(colour) for name, colour in zip(names, grades.values(), strict=True)}
+    return pd.Series(np.array(names, dtype=object)[place], errors.index), looks
+
+
 def estimator_style(estimator: str, variant: int = 0) -> Style:
-    """Return the look of an estimator: its colour, with a marker and dashes for each of its parameter variants, from 0."""
-    names = estimator_order()
+    """Return the look of an estimator or trainer: its colour, with a marker and dashes for each of its parameter variants, from 0."""
+    names = order_of("trainers" if estimator in registry.entries()["trainers"] else "estimators")
     place = names.index(estimator) if estimator in names else len(names)
     return Style(colour(place), marker(place, variant), VARIANTS[variant % len(VARIANTS)])
 
@@ -46,13 +63,13 @@ def method_styles(methods: Iterable[str]) -> dict[str, Style]:
     return looks
 
 
-def estimator_order() -> list[str]:
-    """Return all registered estimators, those of most of the package's experiments first.
+def order_of(kind: str) -> list[str]:
+    """Return all registered plugins of a kind, those of most of the package's experiments first.
 
-    The first colours of the palette differ most, so they belong to the estimators that are compared most often.
+    The first colours of the palette differ most, so they belong to the plugins that are compared most often.
     """
     uses = _uses()
-    return sorted(registry.entries()["estimators"], key=lambda name: (-uses[name], name))
+    return sorted(registry.entries()[kind], key=lambda name: (-uses[name], name))
 
 
 @cache

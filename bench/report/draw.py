@@ -12,10 +12,9 @@ from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
-from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import to_hex, to_rgb
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
@@ -28,7 +27,7 @@ from bench.report.colours import looks_by_name
 from bench.report.scales import log_axis
 from bench.report.style import GREY, MARKERS, MARKS, SHADE, SIZE, filled, plain, width_in_inches
 from bench.report.text import axis_value, number, short_duration
-from bench.report.views import is_logarithmic, pareto
+from bench.report.views import is_logarithmic
 
 WIDTH, NARROW = 7.16, 3.5
 """Figure widths in inches: two columns of a paper, or one."""
@@ -46,10 +45,8 @@ UNLIMITED = 1e9
 """Factor on a value at which the bar of an interval without an upper end stops, beyond every logarithmic axis."""
 BAND: dict[str, Any] = {"color": "#D55E00", "alpha": 0.12, "linewidth": 0}
 """Look of a named range of an axis."""
-FRONT: dict[str, Any] = {"color": GREY, "linewidth": 0.8, "linestyle": "--"}
-"""Look of the Pareto front."""
-USELESS = 1e2
-"""Values above this are drawn there, with their number, where a value above 1 means a failure."""
+EXACT, USELESS = 1e-4, 1e2
+"""Where a value above 1 means a failure, smaller values are drawn here as upper limits, and larger ones with their number."""
 NAME = 1.0
 """Longest line of a name at a point, in inches."""
 NEAR = 0.2
@@ -175,7 +172,7 @@ def _signs(chart: Chart) -> list[str]:
     if not column:
         return []
     is_grey = column.above_one and _is_log(column, chart.frame[column.name]) and _log_range(column, chart.frame)[1] > 1
-    is_hollow = column.limit and chart.frame[column.limit].eq(True).any()
+    is_hollow = column.limit and (chart.frame[column.limit].eq(True) | (chart.frame[column.name] < EXACT)).any()
     return [f"grey: {column.above_one}"] * bool(is_grey) + ["hollow: an upper limit"] * bool(is_hollow)
 
 
@@ -204,7 +201,6 @@ def _legend(chart: Chart, styles: dict[str, Style], width: float) -> list[Any]:
             handles.append(
                 Line2D([], [], color=style.colour, marker=mark, linestyle=line, linewidth=style.width, label=label)
             )
-    handles += [Line2D([], [], label="Pareto front", **FRONT)] * chart.front
     handles += [Line2D([], [], label=chart.limit_name, **LIMIT)] * bool(
         chart.limit and (chart.frame[chart.limit] > 0).any()
     )
@@ -255,7 +251,7 @@ def _log_range(column: Column, rows: pd.DataFrame, marks: Sequence[Mark] = ()) -
     """Return the range of a logarithmic axis: all positive values, and their intervals within a factor of 100."""
     values = rows[column.name].to_numpy(float)
     values = values[np.isfinite(values) & (values > 0)]
-    values = np.minimum(values, USELESS) if column.above_one else values
+    values = values.clip(EXACT, USELESS) if column.above_one else values
     if not values.size:
         return 0.1, 10.0
     low, high = float(values.min()), float(values.max())
@@ -324,10 +320,6 @@ def _draw_lines(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str,
         points = points.sort_values(x.name, kind="stable") if is_line and is_number else points
         mark = style.marker if not is_line or len(points) <= MANY or style.line == "none" else ""
         _draw_values(chart, panel, points, y, log, points[x.name].to_numpy(), style, mark, 3 + 0.01 * order)
-    if chart.front:
-        known = part[np.isfinite(part[[x.name, y.name]]).all(axis=1)].sort_values(x.name)
-        best = known[pareto(known[x.name], known[y.name])]
-        panel.plot(best[x.name], best[y.name], zorder=2, **FRONT)
 
 
 def _draw_arrows(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str, Style], size: np.ndarray) -> None:
@@ -338,8 +330,9 @@ def _draw_arrows(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str
     low, high = (np.log(ends) for ends in zip(panel.get_xlim(), panel.get_ylim(), strict=True))
     taken, named, arrows = [], [], []
     for _, points in part.groupby(chart.arrow, sort=False):
-        ends = points[[chart.x[0].name, chart.y[0].name]].to_numpy(float)
-        ends = ends.clip(max=USELESS if chart.y[0].above_one else math.inf)
+        ends = points[[chart.x[0].name, chart.y[0].name]].to_numpy(float, copy=True)
+        if chart.y[0].above_one:
+            ends[:, 1] = ends[:, 1].clip(EXACT, USELESS)
         series, places = str(points[chart.series].iloc[0]), (np.log(ends) - low) / (high - low) * size
         if np.ptp(places, axis=0).max() > NEAR:
             look = {"arrowstyle": "-|>", "color": styles[series].colour, "linewidth": 1.6, "shrinkA": 3, "shrinkB": 3}
@@ -348,7 +341,7 @@ def _draw_arrows(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str
         arrows.append((series, places[0]))
     for series, place in arrows:
         text = _wrapped(series, NAME)
-        extent = np.array([0.9 * _text_width(text), 0.13 * _lines([text])])
+        extent = np.array([_text_width(text), 0.14 * _lines([text])])
         middle, under = -extent / 2, -extent
         free = [
             start
@@ -362,9 +355,7 @@ def _draw_arrows(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str
         start = free[0] if free else place + 0.1
         named.append((series, place))
         taken.append((start, start + extent))
-        written = panel.text(
-            *(start / size), text, transform=panel.transAxes, fontsize=SIZE - 1, color=styles[series].colour
-        )
+        written = panel.text(*(start / size), text, transform=panel.transAxes, color=styles[series].colour)
         written.set_in_layout(False)
 
 
@@ -384,8 +375,10 @@ def _draw_values(
     limit, lost = (
         points[name].to_numpy(bool) if name else np.zeros(len(points), bool) for name in (column.limit, chart.failed)
     )
-    is_zero, is_cut = log & (values <= 0), values > (USELESS if log and column.above_one else math.inf)
-    given, values = values, np.where(is_zero, np.nan, np.where(is_cut, USELESS, values))
+    least, most = (EXACT, USELESS) if log and column.above_one else (0.0, math.inf)
+    is_zero, is_cut = log & (values <= least), values > most
+    given, values = values, np.where(is_zero & (least == 0), np.nan, values.clip(least, most) if log else values)
+    limit, is_zero = limit | is_zero, is_zero & (least == 0)
     is_flat = chart.kind == "dots"
     edge = panel.get_yaxis_transform() if is_flat else panel.get_xaxis_transform()
     look: dict[str, Any] = {"color": style.colour, "zorder": zorder}
@@ -419,14 +412,13 @@ def _draw_values(
     if is_cut.any():
         last = int(np.nanargmax(np.where(is_cut, given, np.nan)))
         at = (values[last], places[last]) if is_flat else (places[last], values[last])
-        down = 3 + 8 * sum(text.get_gid() == "cut" for text in panel.texts)
+        down = 3 + 9 * sum(text.get_gid() == "cut" for text in panel.texts)
         where: Any = {"xytext": (0, 4), "ha": "center"} if chart.arrow else {"xytext": (4, -down), "va": "top"}
         panel.annotate(
-            f"{number(given[last])} ↑",
+            number(given[last]) + " ↑" * (not chart.arrow),
             at,
             textcoords="offset points",
             color=style.colour,
-            fontsize=SIZE - 1,
             gid="cut",
             **where,
         )
@@ -466,7 +458,7 @@ def _draw_dots(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str, 
 def _draw_grid(
     chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str, Style], place: dict[str, int], width: float
 ) -> float:
-    """Draw a cell per pair of x and y, coloured by level or value, in ``width`` inches; return the height of the labels of x."""
+    """Draw a cell per pair of x and y, coloured by level, in ``width`` inches; return the height of the labels of x."""
     x, y = chart.x[0], chart.y[0]
     names = _categories(x, part if chart.own_scales else chart.frame)
     room = width / max(len(names), 1)
@@ -474,7 +466,7 @@ def _draw_grid(
     size = min(SIZE - 1, 0.8 * 72 * room, SIZE * 0.92 * room / max(widest, 0.1))
     for line in part.to_dict("records"):
         at = names.index(_category(line[x.name])), place[_category(line[y.name])]
-        face = styles[str(line[chart.level])].colour if chart.level else _shade(float(line[chart.shade]))
+        face = styles[str(line[chart.level])].colour
         panel.add_patch(Rectangle((at[0] - 0.5, at[1] - 0.5), 1, 1, facecolor=face, edgecolor="white", linewidth=0.8))
         text = plain(str(line[chart.cell])) if chart.cell else ""
         panel.text(*at, text, ha="center", va="center", color=ink_on(face), fontsize=size)
@@ -520,11 +512,6 @@ def _categories(column: Column, rows: pd.DataFrame, downwards: bool = False) -> 
     if pd.api.types.is_numeric_dtype(values):
         return list(dict.fromkeys(map(_category, sorted(values.dropna(), reverse=downwards))))
     return list(map(str, values))
-
-
-def _shade(share: float) -> str:
-    """Return the colour of a cell by a number from 0 to 1: darker is larger."""
-    return to_hex(colormaps["YlOrBr"](0.08 + 0.84 * share)) if math.isfinite(share) else "#f0f0f0"
 
 
 def ink_on(ground: str) -> str:

@@ -1,4 +1,4 @@
-"""Writes ``index.html``: a grid with a chart, the answer and the state of every experiment in a results folder.
+"""Writes ``index.html``: the questions of a results folder, and a card per experiment with a chart, the answer and the state.
 
 All texts come from stored files, which may be foreign: they are shown literally, and nothing is read from other pages.
 """
@@ -45,18 +45,29 @@ def write(folder: Path) -> Path:
     if any(_page(place) is None for place in places):
         command = f"python -m bench report +experiment=NAME results_dir={folder}"
         notes.append(f'<p class="hint">Some have no page yet: <code>{escape(command)}</code> writes one.</p>')
-    cards = "\n".join(_card(folder, place) for place in places)
-    header = f"<header><h1>{escape(title)}</h1>{''.join(notes)}</header>"
+    cards = "\n".join(f'<article id="e{i}">\n{_card(folder, place)}\n</article>' for i, place in enumerate(places))
+    asked: dict[str, list[str]] = {}
+    for i, place in enumerate(places):
+        texts = _texts(place)
+        link = f'<a href="#e{i}">{escape(texts.get("experiment", place.name))}</a>'
+        asked.setdefault(texts.get("question", ""), []).append(link)
+    listed = "".join(f"<li>{escape(question)} {', '.join(links)}</li>" for question, links in sorted(asked.items()))
+    header = f"<header><h1>{escape(title)}</h1>{''.join(notes)}<nav><ul>{listed}</ul></nav></header>"
     path = folder / "index.html"
     body = f'{header}\n<main class="cards">\n{cards}\n</main>'
     write_whole(path, shell.document(title, body, has_local_images=True).encode())
     return path
 
 
+def _texts(place: Path) -> dict[str, str]:
+    """Return the texts of an experiment's record and answer."""
+    sources = (read_object(place / name) for name in ("run.json", "answer.json"))
+    return {key: text for source in sources for key, text in source.items() if text and isinstance(text, str)}
+
+
 def _card(folder: Path, place: Path) -> str:
     """Return the HTML of one experiment: chart, question, answer, state, one button, and its files folded away."""
-    record, stored = (read_object(place / name) for name in ("run.json", "answer.json"))
-    texts = {key: text for source in (record, stored) for key, text in source.items() if text and isinstance(text, str)}
+    record, texts = read_object(place / "run.json"), _texts(place)
     name, page, chart = texts.get("experiment", place.name), _page(place), _chart(place, texts.get("chart", ""))
     state, when = _state(place / "rows.parquet", record.get("counts"), texts.get("finished", ""))
     parts = ['<div class="none">no chart</div>'] if chart is None else [
@@ -80,7 +91,7 @@ def _card(folder: Path, place: Path) -> str:
         f"<details><summary>{counted(len(files), 'file')}</summary>"
         f"<p>{escape('; '.join(filter(None, notes)))}</p><ul>{links}</ul></details>"
     )
-    return "<article>\n" + "\n".join(parts) + "\n</article>"
+    return "\n".join(parts)
 
 
 def _page(place: Path) -> Path | None:

@@ -11,7 +11,7 @@ from bench.report.text import one_line
 PALETTE = ("#0072B2", "#000000", "#D55E00", "#009E73", "#CC79A7", "#C88031", "#3598D9", "#7406BE")
 """Colours that colour-blind readers can distinguish, with contrasts above 3 on white (Okabe and Ito, the light ones replaced)."""
 MARKERS = "osD^vPX*"
-VARIANTS = ("-", (0, (4, 1.5)), (0, (1, 1.2)))
+VARIANTS = ("-", (0, (4, 1.5)), (0, (1, 1.2)), (0, (6, 1.5, 1, 1.5)))
 """Line styles of one estimator's parameter variants."""
 MARKS = ((0, (3, 2)), (0, (1, 1.5)), (0, (5, 1, 1, 1)))
 """Line styles of marked values on an axis."""

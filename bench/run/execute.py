@@ -21,7 +21,7 @@ from bench.experiment.keys import HASHED
 from bench.experiment.parameters import completed_rows
 from bench.experiment.study import study_of
 from bench.measure import timing
-from bench.model import Estimator, guard
+from bench.model import Estimator, guard, reads
 from bench.run import descents, progress
 from bench.run.files import remove_stale
 from bench.run.ladder import climb
@@ -145,7 +145,7 @@ class Runner:
     experiment: Experiment
     store: Store
     shown: progress.Progress
-    read: dict[str, str] = field(default_factory=lambda: dict(HASHED))
+    read: dict[str, str] = field(default_factory=lambda: {reads.name_of(path): of for path, of in HASHED.items()})
     """Hashes of what code from outside has read in this run, by name."""
     unchanged: set[str] = field(default_factory=lambda: {""})
     """The texts in which answers give these hashes."""

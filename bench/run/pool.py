@@ -203,10 +203,15 @@ class _Worker:
 
     def kill(self) -> None:
         """Kill the worker and all processes that it has started."""
+        with suppress(psutil.Error):
+            self.children += self.usage.children(recursive=True)
         with suppress(ProcessLookupError, PermissionError):
             os.killpg(self.process.pid, signal.SIGKILL)
         self.process.kill()
         self.process.wait()
+        for child in self.children:
+            with suppress(psutil.Error):
+                child.kill()
         kill_marked_processes(self.mark)
 
     def close(self) -> None:

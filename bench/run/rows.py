@@ -175,7 +175,7 @@ def _faults(table: pd.DataFrame, columns: Columns) -> dict[int, str]:
 
     reasons: dict[int, str] = {}
     for name in table:
-        values, (holds, rule) = table[name], _rule(name, columns)
+        values, (holds, fault) = table[name], rule(name, columns)
         column = columns.by_name.get(name)
         if values.dtype.kind in "fiub" and (column is None or column.kind == "number"):
             is_valid: Any = _is_in_range(name, values.to_numpy(dtype=float))
@@ -185,7 +185,7 @@ def _faults(table: pd.DataFrame, columns: Columns) -> dict[int, str]:
             is_valid = np.fromiter(map(holds, values), dtype=bool)
         for place in np.flatnonzero(~np.broadcast_to(is_valid, len(table))):
             value = printable(repr(values.iloc[place]))[:60]
-            reasons.setdefault(int(place), f"{printable(name)[:60]}={value} {rule}")
+            reasons.setdefault(int(place), f"{printable(name)[:60]}={value} {fault}")
     if "parameters" in table:
         is_described = ~table["parameters"].fillna("").isin(["", "{}"])
         for name in NEEDED:
@@ -195,7 +195,7 @@ def _faults(table: pd.DataFrame, columns: Columns) -> dict[int, str]:
     return reasons
 
 
-def _rule(name: str, columns: Columns) -> tuple[Callable[[Any], bool], str]:
+def rule(name: str, columns: Columns) -> tuple[Callable[[Any], bool], str]:
     """Return the check of a value of a column, and what is wrong with a value that fails it."""
     column = columns.by_name.get(name)
     if column is None:

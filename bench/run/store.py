@@ -52,6 +52,8 @@ class Store:
         self._columns = columns
         self._study = study
         self._sequence: int | None = None
+        self.left_out: set[Path] = set()
+        """The files of which :meth:`load` has left out rows."""
         self._table = directory / "rows.parquet"
         self._pending = directory / "pending"
 
@@ -76,7 +78,8 @@ class Store:
 
     def load(self) -> pd.DataFrame:
         """Return the newest stored row of each key; rows of ``rows.parquet`` come first."""
-        return self._read_all()[0]
+        rows, _, self.left_out = self._read_all()
+        return rows
 
     def compact(self, order: Sequence[str] = ()) -> None:
         """Merge the small files into ``rows.parquet``; rows of the keys in ``order`` come last, in that order.

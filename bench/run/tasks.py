@@ -23,6 +23,7 @@ from bench.model import Backend, Plugin, guard, isolation, reads, registry
 from bench.run.plan import versions
 from bench.run.pool import Answer
 from bench.run.record import kind_of_machine
+from bench.run.rows import rule
 from bench.run.session import Session
 
 MAX_REASON = 2000
@@ -102,8 +103,9 @@ class TaskHandler:
         The reason names code from outside that the process has run for other cells.
         """
         RAN.update(item.outside)
-        for name in filter(os.path.isabs, item.outside):
-            reads.note(name)
+        for name in item.outside:
+            if os.path.isabs(name) and not name.startswith(reads.INSIDE):  # those of this package are in the key
+                reads.note(name)
         result = self._handle(item)
         is_reduced = isolation.reduced_precision()
         if is_reduced and result.get("dtype", item.cell.backend.dtype) == "float64" and _uses_jax(item.backend):
@@ -178,7 +180,7 @@ def solver_columns(cell: Cell, session: Session, result: dict[str, Any]) -> dict
     A backend whose steps solve for contact forces iteratively has a method ``solver_residual(problem, w)``: the largest
     residual along rollouts from theta0 with noise ``w (n_w, B)``, relative to the forces of a step.
     """
-    backend = cell.parts.get("backend")
+    backend: Any = cell.parts.get("backend")
     names = [name for name in ("remarks", "solver_residual") if hasattr(backend, name)]
     if not names or result["status"] != "ok":
         return {}
@@ -199,13 +201,13 @@ def _fault_of(result: dict[str, Any], study: Study) -> str:
     """Return the first value of a result that its column cannot hold, in words; empty if there is none."""
     if result["status"] not in STATUSES:
         return f"the status {printable(result['status'])[:100]!r}, which is not one of {', '.join(STATUSES)}"
-    types = {"number": (int, float, type(None)), "text": (str,), "list": (list, tuple)}
     for name, value in result.items():
         column = study.columns.by_name.get(name)
         if column is None:
             return f"{name!r}, which is not one of its columns"
-        if not isinstance(value, types[column.kind]):
-            return f"{name}={printable(repr(value))[:100]}, and that column holds a {column.kind}"
+        holds, words = rule(name, study.columns)
+        if not holds(value):
+            return f"{name}={printable(repr(value))[:100]}, which {words}"
     try:
         json.dumps(result)
     except (TypeError, ValueError) as error:

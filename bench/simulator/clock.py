@@ -17,6 +17,8 @@ UNITS = {"ms": 1e-3, "s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0, "": 1.0}
 """Seconds per unit of a budget."""
 MIN_ALARM_S, ALARM_INTERVAL_S = 1e-3, 1.0
 """Minimum delay of the alarm, and the interval at which the alarm repeats, in seconds."""
+HANGS = 100.0
+"""Multiple of the mean time of a call above which a call that has not returned is named."""
 PROGRESS_INTERVAL_S = 0.2
 """Minimum time between two updates of the progress line, in seconds."""
 MOST_WAITED = 1.0
@@ -79,6 +81,8 @@ class Clock:
         """Seconds spent in the first call of each kind and shape."""
         self.is_terminated = False
         """Whether the process was asked to end, by SIGTERM."""
+        self.hung_s = 0.0
+        """Seconds of a call that had not returned when the budget ended, much longer than the others; else 0."""
         self._timed = {"costs": 0, "gradients": 0}
         self._shown = shown and sys.stderr.isatty()
         self._stage, self._last_shown = "", 0.0
@@ -186,6 +190,11 @@ class Clock:
             yield
             if self.is_interrupted:
                 raise OutOfTime
+        except OutOfTime:
+            took, calls = time.perf_counter() - began, sum(self._timed.values())
+            is_long = calls and took > HANGS * (self.cost_s + self.gradient_s) / calls
+            self.hung_s = took if is_long and took > HANGS * MIN_ALARM_S and not self.is_terminated else 0.0
+            raise
         finally:
             self._is_inside = False
             if is_free:

@@ -10,10 +10,13 @@ def without_motors(case):
     root = ElementTree.parse(case.model).getroot()
     if root.find(".//joint[@type='ball']") is not None or root.find("actuator/position") is not None:
         raise NotImplementedError("ball joints and servos are not supported")
-    joints, row, rows = root.findall(".//body/joint") + root.findall(".//freejoint"), 0, {}
-    for joint in joints:
-        rows[joint.get("name")] = row
-        row += 6 if joint.tag == "freejoint" else 1
+    if root.find("actuator/motor[@tendon]") is not None:
+        raise NotImplementedError("motors of tendons are not supported")
+    row, rows = 0, {}
+    for joint in root.find("worldbody").iter():
+        if joint.tag in ("joint", "freejoint"):
+            rows[joint.get("name")] = row
+            row += 6 if joint.tag == "freejoint" else 1
     arms = np.zeros((case.qvel.size, case.controls.shape[1]))
     for column, motor in enumerate(root.findall("actuator/motor")):
         gear = np.array(motor.get("gear", "1").split(), dtype=float)

@@ -12,7 +12,12 @@ import numpy as np
 from ..jaxprs import FOLD
 
 MOST = 20_000
-"""Maximum number of operations in a graph: longer straight-line code would take too long to compile."""
+"""Maximum number of operations in code: longer straight-line code would take too long to compile."""
+TRACED = 25 * MOST
+"""Maximum number of nodes of a trace, in which inputs of each step, such as controls, become one in the code of the loop."""
+
+
+TOO_LONG = f"code of more than {MOST} operations without a loop"
 
 
 class Refused(Exception):
@@ -40,6 +45,8 @@ class Graph:
     """The nodes of an expression graph. Equal nodes are the same object."""
 
     nodes: list[Node] = field(default_factory=list)
+    most: int = TRACED
+    """Maximum number of nodes."""
     _known: dict[Any, Node] = field(default_factory=dict)
 
     def leaf(self, op: str, data: Any = None) -> Node:
@@ -113,8 +120,8 @@ class Graph:
         key = (op, tuple(arg.number for arg in args), repr(data) if op == "literal" else data)
         found = self._known.get(key)
         if found is None:
-            if len(self.nodes) >= MOST * (10 if not args else 1):
-                raise Refused(f"code of more than {MOST} operations without a loop")
+            if len(self.nodes) >= self.most:
+                raise Refused(TOO_LONG)
             found = self._known[key] = Node(len(self.nodes), op, args, data)
             self.nodes.append(found)
         return found

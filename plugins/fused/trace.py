@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..jaxprs import FOLD, interpret
-from .graph import Graph, Node, Refused
+from .graph import MOST, TOO_LONG, Graph, Node, Refused, reached
 
 BRANCHES = 4
 """Maximum number of different formulas for one input of a step along the horizon."""
@@ -56,8 +56,12 @@ def traced(function: Callable[..., Any], shapes: dict[str, int]) -> Loop:
     tracer = Tracer(Graph())
     inputs = [_leaves(tracer.loop.graph, name, n) for name, n in shapes.items()]
     (cost,) = tracer.run(closed.jaxpr, closed.consts, inputs)
-    tracer.loop.result = tracer.nodes(cost)[0]
-    return tracer.loop
+    loop, graph = tracer.loop, tracer.loop.graph
+    loop.result = tracer.nodes(cost)[0]
+    if len(reached([*loop.first, *loop.step, loop.result])) > MOST:
+        raise Refused(TOO_LONG)
+    graph.most = len(graph.nodes) + MOST
+    return loop
 
 
 def _leaves(graph: Graph, name: str, count: int) -> np.ndarray:

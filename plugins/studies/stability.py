@@ -438,6 +438,7 @@ def charts(cells: pd.DataFrame) -> list[Chart]:
     """Return a map per scene, of the first variant of each law and integrator; of several laws, each with its best integrator."""
     import pandas as pd
 
+    from bench.report.colours import graded
     from bench.report.text import number
 
     missing = cells["stiffness"].isna()  # a law without stiffness is the same at each one
@@ -447,14 +448,10 @@ def charts(cells: pd.DataFrame) -> list[Chart]:
     worst = frame["error_share"].fillna(math.inf).where(frame["level"] != "open", -1.0)
     frame = frame.iloc[worst.argsort(kind="stable")[::-1]].drop_duplicates(["problem", "dt", "stiffness"]).sort_index()
     frame = frame[frame["problem"] == frame.groupby("step", sort=False)["problem"].transform("first")]
-    grades = [
-        f"error below {100 * edge:g}%" if edge < math.inf else f"{100 * list(EDGES)[-2]:g}% or more" for edge in EDGES
-    ]
-    place = np.searchsorted(list(EDGES), frame["error_share"].fillna(0.0))
-    frame["grade"] = frame["level"].where(frame["level"].isin(LOST), np.array(grades)[place])
+    grades, looks = graded(frame["error_share"], EDGES, lambda end: f"{100 * end:g}%")
+    frame["grade"] = frame["level"].where(frame["level"].isin(LOST), grades)
     frame["cell"] = ["" if e != e else f"<{100 * min(EDGES):g}" if e < min(EDGES) else number(100 * e) if e < 10 else ">999"
                      for e in frame["error_share"]]  # fmt: skip
-    looks = {grade: Style(colour) for grade, colour in zip(grades, EDGES.values(), strict=True)} | LOST
     found = []
     for scene, part in frame.groupby("scene_name", sort=False):
         right = (part["level"] == "right").groupby(part["step"]).transform("mean")
@@ -468,7 +465,7 @@ def charts(cells: pd.DataFrame) -> list[Chart]:
             part = part[part["step"].isin(best)]
         found.append(Chart(
             f"stability_map_{scene}" if found else "stability_map", part.assign(panel=part["step"] if part["contact"].nunique() > 1 else part["integrator"]),
-            [Column("dt_ms", "", "ms", label="time step")], [COMMON["stiffness"]], "grid", level="grade", styles=looks, panel="panel",
+            [Column("dt_ms", "", "ms", label="time step")], [COMMON["stiffness"]], "grid", level="grade", styles=looks | LOST, panel="panel",
             cell="cell", limit="stiffness_limit", limit_name=LIMIT, height=0.16,
             subtitle=f"{scene}: error of the gradient in % of the largest gradient at any stiffness",
             text="The worst where backends disagree. Of several contact laws, each is drawn with the integrator that is most often right.",

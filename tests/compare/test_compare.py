@@ -416,6 +416,17 @@ def test_an_experiment_that_vanishes_is_worse_and_pending_rows_are_read(tmp_path
     assert run(after, before, out=tmp_path / "out") == 0, "an experiment that is new is no fault"
 
 
+@pytest.mark.parametrize("value", [-1.0, "x"])
+def test_results_with_impossible_values_cannot_be_judged(tmp_path, capsys, value):
+    """On either side: a row that is left out would be new or gone."""
+    before, after = sides(tmp_path)
+    path = before / "other" / "rows.parquet"
+    pd.read_parquet(path).astype({"variance": object}).assign(variance=value).to_parquet(path)
+    for pair in ((before, after), (after, before)):
+        assert run(*pair, out=tmp_path / "out") == 2
+        assert "run the experiment again to compare it" in capsys.readouterr().err
+
+
 def test_history_reads_pending_rows(tmp_path):
     before, after = sides(tmp_path)
     shutil.rmtree(after / "other")

@@ -62,14 +62,14 @@ def kit_items(keep, is_slow=lambda subject, name: False):
 def is_long(plugin, check=""):
     """Whether a check takes long: of backends that compile each program for seconds or run it eagerly, and a few more.
 
-    A rollout of ``hopper_run`` has 1,920 steps of the integrator, ``surrogate_backward`` solves two equations each step, and
+    ``checkpointed`` has tests of its own against ``jax``. A rollout of ``hopper_run`` has 1,920 steps of the integrator, ``surrogate_backward`` solves two equations each step, and
     a search for jumps takes thousands of rollouts of an engine.
     """
     is_slow_backend = {"physics", "root"} & set(getattr(plugin, "provides", ())) or {"torch", "numba"} & set(
         plugin.requires
     )
     is_search = check == "continuity_is_as_declared" and isinstance(plugin, EngineScene)
-    return bool(is_slow_backend) or is_search or plugin.name in ("hopper_run", "surrogate_backward")
+    return bool(is_slow_backend) or is_search or plugin.name in ("checkpointed", "hopper_run", "surrogate_backward")
 
 
 def is_varied(plugin):

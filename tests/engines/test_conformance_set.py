@@ -33,6 +33,18 @@ def mjx(**settings):
     return importlib.import_module("bench.plugins.engines.mjx_conformance").Engine(**settings)
 
 
+def blocks():
+    """Return the programs on the page."""
+    return re.findall(r"```python\n(.*?)```", (ROOT / "docs/conformance.md").read_text(), re.DOTALL)
+
+
+def pytest_in(folder, *words):
+    """Return what pytest prints in a folder, which is on the path."""
+    alone = os.environ | {"PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1", "PYTHONPATH": str(folder)}  # hydra brings a plugin
+    words = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *words]
+    return subprocess.run(words, cwd=folder, env=alone, capture_output=True, text=True).stdout
+
+
 def wrong(rows):
     return [row for row in rows if not row["is_right"]]
 
@@ -41,19 +53,17 @@ def test_an_engine_that_follows_the_page_runs_without_this_package(tmp_path):
     """The page's engine has 40 lines at most, in a folder with a copy of the set."""
     (tmp_path / "tests").mkdir()
     shutil.copytree(Path(conformance.__file__).parent, tmp_path / "tests" / "conformance")
-    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs/conformance.md").read_text(), re.DOTALL)
-    assert len(blocks[0].splitlines()) <= 41
-    (tmp_path / "tests" / "my_engine.py").write_text(blocks[0])
+    engine, test, *_ = blocks()
+    assert len(engine.splitlines()) <= 41
+    (tmp_path / "tests" / "my_engine.py").write_text(engine)
     text = (
         "import sys\n"
-        + blocks[1]
+        + test
         + "\n\ndef test_alone():\n    assert not {'hydra', 'pandas', 'bench'} & set(sys.modules)\n"
     )
     (tmp_path / "tests" / "test_mine.py").write_text(text)
-    words = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "tests"]
-    alone = os.environ | {"PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}  # hydra brings a plugin
-    done = subprocess.run(words, cwd=tmp_path, env=alone, capture_output=True, text=True)
-    assert "2 passed" in done.stdout, done.stdout
+    text = pytest_in(tmp_path, "tests")
+    assert "2 passed" in text, text
     words = [sys.executable, "tests/conformance/runner.py", "tests/my_engine.py", "friction_loss", "free_joint"]
     done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=True)
     _, *rows, last = map(json.loads, done.stdout.splitlines())
@@ -67,24 +77,10 @@ def test_the_set_in_a_new_folder_has_an_item_per_case_and_derivative(tmp_path):
     assert main(["engines", "set", str(tmp_path)]) == 0
     assert (tmp_path / "conformance" / "VERSION").read_text() == f"{bench.__version__}\n"
     assert main(["engines", "set", str(tmp_path)]) == 2
-    block = re.findall(r"```python\n(.*?)```", (ROOT / "docs/conformance.md").read_text(), re.DOTALL)[0]
-    (tmp_path / "my_engine.py").write_text(block.replace('"parameter": by_p', '"parameter": -by_p'))
-    words = [
-        sys.executable,
-        "-m",
-        "pytest",
-        "-q",
-        "-rfsx",
-        "-p",
-        "no:cacheprovider",
-        "-p",
-        "conformance.plugin",
-        "my_engine.py",
-    ]
+    (tmp_path / "my_engine.py").write_text(blocks()[0].replace('"parameter": by_p', '"parameter": -by_p'))
 
     def run():
-        alone = os.environ | {"PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1", "PYTHONPATH": str(tmp_path)}
-        return subprocess.run(words, cwd=tmp_path, env=alone, capture_output=True, text=True).stdout
+        return pytest_in(tmp_path, "-rfsx", "-p", "conformance.plugin", "my_engine.py")
 
     text, n = run(), len(conformance.cases())
     assert f"1 failed, 4 passed, {5 * (n - 1)} skipped" in text
@@ -306,6 +302,15 @@ def test_a_case_written_again_has_the_stored_numbers(name):
         assert new.keys() == old.keys()
         for term, number in old.items():
             np.testing.assert_allclose(new[term], number, rtol=0, atol=STORED * np.abs(number).max(), err_msg=term)
+
+
+def test_motors_of_a_free_body_with_joints_push_the_body():
+    from bench.plugins.engines.free_bodies import without_motors
+
+    chain, tendon = conformance.cases("sparse_chain", "spatial_tendon")
+    assert without_motors(chain)[1].nonzero()[0].tolist() == [0]
+    with pytest.raises(NotImplementedError, match="motors of tendons"):
+        without_motors(tendon)
 
 
 @pytest.mark.slow

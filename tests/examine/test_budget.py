@@ -121,6 +121,20 @@ def test_first_calls_have_a_budget_of_their_own(now):
     assert report.spent.seconds < 0.4
 
 
+def test_a_call_that_hangs_is_named():
+    calls = []
+
+    def hangs(x):
+        calls.append(1)
+        if len(calls) >= 30:
+            time.sleep(60)
+        return cost(x)
+
+    report = examine(hangs, THETA, budget=3)
+    assert any("had not returned after " in note for note in report.notes)
+    assert not any("had not returned" in note for note in examine(cost, THETA, calls=100).notes)
+
+
 def test_a_gradient_that_compiles_too_long_is_tried_once():
     tried = []
 

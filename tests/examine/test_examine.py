@@ -520,3 +520,18 @@ def test_file_that_ends_the_process_is_bad_input(tmp_path, capsys):
 def test_the_next_command_replaces_a_setting(right):
     report = dataclasses.replace(right, command="python -m bench examine f.py:cost calls=300 sigma=0.1")
     assert text.again(report, "calls=600") == "python -m bench examine f.py:cost sigma=0.1 calls=600"
+
+
+def test_the_advice_compares_the_gradient_without_noise_and_mirrored_draws():
+    """Of x^3 at 1, whose smoothed gradient is 3 + 3 sigma^2, from 3 (x + sigma u)^2."""
+    reports = {
+        sigma: examine(lambda x: x[0] ** 3, [1.0], grad=lambda x: 3 * x**2, sigma=sigma, calls=20_000)
+        for sigma in (0.1, 0.5)
+    }
+    methods = {sigma: {m.name: m for m in report.smoothed[0].methods} for sigma, report in reports.items()}
+    assert set(methods[0.1]) == {"plain", "gradient", "mirrored", "smoothing"}
+    assert (methods[0.1]["plain"].samples, methods[0.1]["plain"].calls) == (1.0, 1.0)
+    assert methods[0.5]["plain"].samples == math.inf  # 0.75 of 3.75
+    assert methods[0.5]["mirrored"].calls < methods[0.5]["gradient"].calls
+    assert reports[0.1].recommended(reports[0.1].smoothed[0]).name == "plain"
+    assert reports[0.5].recommended(reports[0.5].smoothed[0]).name != "plain"

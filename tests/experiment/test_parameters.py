@@ -5,8 +5,11 @@ import json
 import pandas as pd
 import pytest
 from helpers import loaded, rows_of
+from hydra.core.override_parser.overrides_parser import OverridesParser
 
+from bench.experiment import config
 from bench.experiment.axes import Axis, values_of
+from bench.experiment.overrides import parse
 from bench.experiment.parameters import completed, completed_json, completed_rows, number_problems, parsed, places
 
 WORDS = ("scenes=[pushing,quadratic]", "contacts=[penalty]", "backends=[numpy]", "estimators=[reinforce,alpha_order]")
@@ -93,3 +96,21 @@ def test_a_problem_is_scene_law_integrator_study_and_theta_less_the_swept_names(
     assert number_problems(rows).tolist() == [0, 0, 1, 1, 2, 2]
     assert number_problems(rows, without=["mass"]).tolist() == [0, 0, 1, 1, 0, 0]
     assert number_problems(rows, ["backend"]).nunique() == 1
+
+
+@pytest.mark.parametrize(
+    "value", ["[1,-2,+3,0]", "[1.5, 2., .5,-1e3 ,1E-2, 0.0]", "[01,1_0,inf,-nan]", "[[1,2],'3',x]"]
+)
+def test_lists_of_numbers_are_read_as_by_hydras_grammar(value):
+    word = f"sweep.sigma={value}"
+    read = OverridesParser.create().parse_override(word).value()
+    keys, found = parse(word, word)
+    assert keys == ["sweep", "sigma"]
+    assert repr(found) == repr(read)
+
+
+def test_a_changed_experiment_file_is_read_again(tmp_path):
+    (tmp_path / "experiment").mkdir()
+    for seed in (1, 23):
+        (tmp_path / "experiment" / "mine.yaml").write_text(f"# @package _global_\nname: mine\nseed: {seed}\n")
+        assert config.load(["experiment=mine"], [tmp_path]).seed == seed

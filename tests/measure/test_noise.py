@@ -1,5 +1,7 @@
 """Common random numbers: what their key holds, what is kept when more are drawn, and that nobody can change them."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -43,23 +45,30 @@ DESIGNS = [
     Design("sobol", True, 2, 1, block=4),
 ]
 NAMES = [f"{design.draws}{', mirrored' * design.mirrored}" for design in DESIGNS]
+REPEATS = 2000
+
+
+@cache
+def many(design):
+    """Many estimates of 8 samples of a design."""
+    return noise.draw(**KEY | {"repeats": REPEATS, "samples": 8}, design=design)
 
 
 @pytest.mark.parametrize("design", DESIGNS, ids=NAMES)
 def test_each_draw_of_a_design_is_standard_normal(design):
-    drawn = noise.draw(**KEY | {"repeats": 4000, "samples": 8}, design=design)
+    drawn = many(design)
     for sample in range(8):
         moments = np.stack([drawn[:, sample] ** power for power in (1, 2, 3, 4)]).mean(axis=1)
-        errors = np.sqrt(np.array([1.0, 2.0, 15.0, 96.0]) / 4000)[:, None]
+        errors = np.sqrt(np.array([1.0, 2.0, 15.0, 96.0]) / REPEATS)[:, None]
         assert (np.abs(moments - np.array([0.0, 1.0, 0.0, 3.0])[:, None]) < 4.5 * errors).all()
 
 
 @pytest.mark.parametrize("design", DESIGNS, ids=NAMES)
 def test_units_are_independent_and_mirrored_draws_hold_the_own_noise(design):
-    drawn = noise.draw(**KEY | {"repeats": 4000, "samples": 8}, design=design)
+    drawn = many(design)
     first, other = drawn[:, : design.unit], drawn[:, design.unit :]
-    apart = np.einsum("ria,rjb->iajb", first, other) / 4000
-    assert (np.abs(apart) < 5.0 / np.sqrt(4000)).all()
+    apart = np.einsum("ria,rjb->iajb", first, other) / REPEATS
+    assert (np.abs(apart) < 5.0 / np.sqrt(REPEATS)).all()
     if design.mirrored:
         np.testing.assert_array_equal(drawn[:, 1::2, :2], -drawn[:, ::2, :2])
         np.testing.assert_array_equal(drawn[:, 1::2, 2:], drawn[:, ::2, 2:])

@@ -97,15 +97,18 @@ def test_what_is_remembered_of_a_block_begins_at_zero_without_a_loop_over_time_t
     assert f"lane[{place[1]} + l] = F(0.0)" in text
 
 
-def test_parameters_and_horizon_compile_nothing_again(pushing):
+@pytest.mark.parametrize("horizon", [5, 10_000])
+def test_parameters_and_horizon_compile_nothing_again(pushing, horizon):
+    """Controls of each step are data: a rollout of 10,000 was refused as code that is too long."""
     fused, _ = pushing
     w = np.zeros((3, 32))
     fused.grad(fused.program.theta0, w)
     changed, jax = (
-        bench.problem("pushing[horizon=5,mass=0.3]", "penalty[stiffness=77]", backend=name) for name in ("fused", "jax")
+        bench.problem(f"pushing[horizon={horizon},mass=0.3]", "penalty[stiffness=77]", backend=name)
+        for name in ("fused", "jax")
     )
     other = changed.program
-    w = np.random.default_rng(1).standard_normal((5, 40))
+    w = np.random.default_rng(1).standard_normal((horizon, 40))
     changed.compilations = Compilations()
     assert relative(changed.grad(other.theta0, w), jax.grad(other.theta0, w)) < SAME
     assert changed.compilations.made == 0

@@ -1,6 +1,7 @@
 """The page over all experiments of a folder: each is there with its state, literally, and it opens in a browser."""
 
 import json
+import re
 
 import pytest
 from helpers import failed, row, table
@@ -36,13 +37,13 @@ def folder(tmp_path):
 
 def card(text, name):
     """The article of an experiment."""
-    return next(part for part in text.split("<article>") if f"<h2>{name}</h2>" in part)
+    return next(part for part in text.split("<article") if f"<h2>{name}</h2>" in part)
 
 
 def test_every_experiment_is_there_with_its_state_and_answer(folder):
     assert cli.main(["index", str(folder)]) == 0
     text = (folder / "index.html").read_text()
-    assert text.count("<article>") == 4
+    assert text.count("<article") == 4
     good = card(text, "good")
     assert 'href="good/report.html"' in good
     assert "use fobg &lt; 3 &amp; more</p>" in good
@@ -52,6 +53,14 @@ def test_every_experiment_is_there_with_its_state_and_answer(folder):
     assert "<span>7 ok</span>" in card(text, "nested/bare")
     assert "rows.parquet cannot be read" in card(text, "broken")
     assert HOSTILE not in text
+
+
+def test_the_first_screen_is_the_questions_with_links_to_their_experiments(folder):
+    text = index.write(folder).read_text()
+    first, cards = text[: text.index("<main")], text[text.index("<main") :]
+    assert first.count("<li>") == 2, "one per question"
+    for link in re.findall(r'<a href="#(e\d+)">', first):
+        assert f'id="{link}"' in cards
 
 
 def test_an_answer_is_shown_without_a_page_and_its_chart_is_one_click_away(folder):

@@ -5,6 +5,8 @@ import subprocess
 import sys
 import time
 from collections import deque
+from pathlib import Path
+from types import SimpleNamespace
 
 import pandas as pd
 import pytest
@@ -87,6 +89,27 @@ def test_a_launcher_whose_library_is_absent_says_how_to_get_it(tmp_path, capsys,
     monkeypatch.setitem(sys.modules, "ray", None)
     assert main([*WORDS, "estimators=[fobg]", "launcher=ray", f"results_dir={tmp_path}"]) == 2
     assert "pip install 'diffsim-bench[ray]'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("has_token", [False, True])
+def test_a_token_that_makes_a_cluster_refuse_is_named(tmp_path, monkeypatch, has_token):
+    def refuse(**_):
+        raise RuntimeError("the cluster has another token")
+
+    monkeypatch.setitem(sys.modules, "ray", SimpleNamespace(init=refuse))
+    monkeypatch.setattr(ray_launcher, "reach", lambda _: None)
+    monkeypatch.setattr(Path, "home", lambda: tmp_path)
+    monkeypatch.delenv("RAY_AUTH_MODE", raising=False)
+    if has_token:
+        (tmp_path / ".ray").mkdir()
+        (tmp_path / ".ray" / "auth_token").touch()
+    words = ["launcher=ray", "ray.address=127.0.0.1:6379", f"results_dir={tmp_path}"]
+    launcher = ray_launcher.RayLauncher(config.load([*WORDS[:-1], "estimators=[fobg]", *words]), False, "")
+    with pytest.raises(
+        UserError, match=r"no Ray cluster at 127\.0\.0\.1:6379: the cluster has another token"
+    ) as refused:
+        launcher.__enter__()
+    assert ("RAY_AUTH_MODE=token" in str(refused.value)) == has_token
 
 
 @pytest.mark.slow

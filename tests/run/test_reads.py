@@ -11,7 +11,7 @@ from classes import Fobg
 
 from bench.experiment import keys
 from bench.experiment.config import load
-from bench.model import EngineScene
+from bench.model import EngineScene, registry
 from bench.run.execute import Runner, Stopped, execute
 from bench.run.plan import plan
 from bench.run.store import Store
@@ -140,6 +140,12 @@ def test_a_row_is_stale_while_something_that_it_has_read_differs(plugins, capsys
         assert after[column][0] == pytest.approx(20 * before[column][0])
     assert after["key"][0] == before["key"][0]
     assert plugins.plan()[0].stored
+    (plugins.root / "moved").mkdir()
+    plugins.folder = plugins.folder.rename(plugins.root / "moved" / "mine")
+    registry._folders.clear()
+    registry.entries.cache_clear()
+    (item,) = plugins.plan()
+    assert item.stored, item.stale
 
 
 @pytest.mark.parametrize("name", ["mine/read.py", "mine/mass.txt"])

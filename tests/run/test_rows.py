@@ -14,9 +14,10 @@ from helpers import row, table
 from bench import load
 from bench.cli import main
 from bench.errors import StorageError
+from bench.model import registry
 from bench.report import index
 from bench.report.web import document
-from bench.run import rows
+from bench.run import rows, tasks
 from bench.run.store import Store
 
 DEEP = 1000
@@ -166,3 +167,14 @@ def test_an_odd_date_of_a_row_does_not_end_the_index(tmp_path, stored_at):
     table([row()]).assign(stored_at=stored_at).to_parquet(tmp_path / "a" / "rows.parquet")
     assert main(["index", str(tmp_path)]) == 0
     assert "<span>1 ok</span>" in (tmp_path / "index.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [("variance", -1.0, "is negative"), ("bias", "x", "is not a number"), ("reason", 3, "is not a string")],
+)
+def test_a_result_that_no_file_may_hold_is_an_error_of_its_cell(name, value, said):
+    """Such a row was stored, left out when it was read, and run again and again."""
+    study = registry.make("studies", "bias_variance")
+    assert not tasks._fault_of({"status": "ok", "variance": 1.0}, study)
+    assert said in tasks._fault_of({"status": "ok", name: value}, study)

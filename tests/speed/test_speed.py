@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import math
 import threading
 
 import jax
@@ -10,9 +11,12 @@ import numpy as np
 import pytest
 from bench.plugins.backends import rows
 from classes import Jax, Penalty, Pushing, SemiImplicitEuler, Softplus
+from helpers import loaded
 
 from bench import cli
 from bench.model import Compilations, blocks, compose, registry
+from bench.run.session import Session
+from bench.run.tasks import measure_cell
 
 # ------------------------------------------------------------------------------------------------------------ blocks
 
@@ -144,6 +148,18 @@ def test_a_sweep_compiles_each_shape_once():
         problem.grad(theta, w)
         problem.grad(theta, w[:, :17])  # padded to as many columns
     assert compilations.made == len(compilations.shapes) == 2
+
+
+def test_a_compile_time_stands_in_the_row_of_the_cell_that_compiled():
+    """It stood in every row: the sum of a run of 152 s was 1,038 s."""
+    given, cells = loaded(
+        "scenes=[pushing]", "scene.pushing.horizon=7", "estimators=[fobg]", "sweep.stiffness=[100,1000]", "samples=8",
+        "repeats=4", "reference.samples=512", "reference.tolerance=1", "compile_cache=null",
+    )  # fmt: skip
+    session = Session(given)
+    first, second = (measure_cell(cell, session, cell.study) for cell in cells)
+    assert first["compile_s"] > 0
+    assert math.isnan(second["compile_s"])
 
 
 @pytest.mark.slow

@@ -19,6 +19,8 @@ from bench.plugins.studies.bias_variance.comparisons import (
 from bench.plugins.studies.bias_variance.time_to_accuracy import with_gradient_cost
 from helpers import experiment, failed, row, table
 
+from bench.errors import UserError
+from bench.experiment import config
 from bench.report.cells import readable
 from bench.report.views import arrange
 
@@ -221,7 +223,8 @@ def test_an_upper_limit_is_shown_and_never_first_nor_bold():
     limit = math.hypot(0.1, 0.02)
     assert methods.loc[methods["error_is_limit"], "error"].tolist() == pytest.approx([limit] * 2)
     shown = experiment(sweep={"stiffness": [1e2, 1e4]})
-    (main, *_), (chart, *_) = (lambda views: (views.tables, views.charts))(shown.study.views(shown, table(cells)))
+    views = shown.study.views(shown, table(cells))
+    main, chart = views.tables[0], next(one for one in views.charts if one.name == "bias_variance_stiffness")
     assert readable(main).iloc[0, 1:3].tolist() == ["< 0.10"] * 2
     assert not any(main.frame[f"x{i}_best"].any() for i in (0, 1))
     drawn = chart.frame[chart.frame["series"] == "fobg"]
@@ -338,3 +341,14 @@ def test_two_values_of_an_axis_are_joined_by_an_arrow():
     chart = charts_of(cells, compares={"stiffness": [1e2, 1e4], "estimators": ["fobg"]})["contrast"]
     assert chart.frame["stiffness"].tolist() == [1e2, 1e4]
     assert chart.frame["arrow"].nunique() == 1
+
+
+def test_what_a_command_line_chooses_is_drawn_whatever_the_file_compares():
+    named = ["experiment=smoothing_sweep"]
+    assert "estimators" in config.load(named).compares
+    assert "estimators" not in config.load([*named, "estimators=[fobg,reinforce]"]).compares
+
+
+def test_an_unknown_axis_of_a_comparison_is_refused():
+    with pytest.raises(UserError, match="unknown axis in compares 'stifness'"):
+        charts_of(along({"jax": (0.1, 1e-3)}), compares={"stifness": [1e2, 1e4]})

@@ -159,7 +159,7 @@ def run(tmp_path_factory):
         "scenes=[spring_record,double_integrator]",
         "workers=0",
         f"results_dir={folder}",
-        "study=dose_response[iterations=30,seeds=1,tuning_seeds=1,widenings=1]",
+        "study=dose_response[iterations=8,seeds=1,tuning_seeds=1,widenings=1]",
         "repeats=4",
     ]
     return bench.run(words)

@@ -56,7 +56,8 @@ class Subject:
 
     def __init__(self, make: Callable[[str], Any], path: str | Path, steps: int = 60, seed: int = 0) -> None:
         self._make, self._folder = make, Path(path).resolve().parent
-        self.root = root = ElementTree.parse(path).getroot()
+        self.root: Any = ElementTree.parse(path).getroot()
+        root = self.root
         while nodes := [(outer, node) for outer in root.iter() for node in outer if node.tag == "include"]:
             for outer, node in nodes:
                 place = list(outer).index(node)
@@ -124,7 +125,7 @@ def permuted(subject: Subject) -> Iterator[Any]:
     """Yield accelerations of the model with bodies and geoms in reverse order."""
     if strange := [name for name in GENERATED if subject.root.find(f".//{name}") is not None]:
         raise NotImplementedError(f"the model has {', '.join(strange)}")
-    root = copy.deepcopy(subject.root)
+    root: Any = copy.deepcopy(subject.root)
     for keyframes in root.findall("keyframe"):
         root.remove(keyframes)
     for body, tag in itertools.product([root.find("worldbody"), *root.iterfind(".//body")], ("body", "geom")):
@@ -185,7 +186,7 @@ def _jumps(subject: Subject, q: np.ndarray, v: np.ndarray, u: np.ndarray) -> Ite
     for first in np.argsort(-changes(places))[:4]:
         ends = places[first : first + 2]
         for _ in range(NARROWED):
-            inner = np.linspace(*ends, 9)
+            inner = np.linspace(ends[0], ends[1], 9)
             first = changes(inner).argmax()
             ends = inner[first : first + 2]
         if np.abs(np.concatenate([subject.model.gaps(at(s)) for s in ends])).min(initial=np.inf) > TOUCH:

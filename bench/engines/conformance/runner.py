@@ -59,7 +59,7 @@ class Case:
         """Return the case with another start, controls or parameter; ``change`` is flat, and of velocities for qpos."""
         old = getattr(self, term)
         is_turned = term == "qpos"
-        new = moved(old, self.data["quaternions"], change) if is_turned else old + change.reshape(old.shape)
+        new: Any = moved(old, self.data["quaternions"], change) if is_turned else old + change.reshape(old.shape)
         return replace(self, **{term: new})
 
     def differences(self, engine: Any, term: str) -> tuple[np.ndarray, np.ndarray]:

@@ -32,6 +32,11 @@ ANSWER_S = 10.0
 """Seconds in which a cluster answers."""
 JOBS_PER_NODE = 4
 """Part of a node's share of the tasks left that is one job, so that quick nodes get more of them."""
+TOKEN = (
+    "; ~/.ray/auth_token exists, so Ray authenticates by it here: start the cluster with RAY_AUTH_MODE=token and the same "
+    "token, or set RAY_AUTH_MODE=disabled here"
+)
+"""The likely cause of a cluster that refuses this machine: Ray writes a token when it starts a cluster of this machine."""
 MAX_LOSSES = 3
 """Number of losses of a node while it runs a task after which the task counts as crashed."""
 
@@ -84,8 +89,9 @@ class RayLauncher:
                 runtime_env={"env_vars": {"PYTHONPATH": os.pathsep.join(dict.fromkeys(paths))}},
             )  # fmt: skip
         except Exception as error:
+            has_token = "RAY_AUTH_MODE" not in os.environ and (Path.home() / ".ray" / "auth_token").exists()
             raise UserError(
-                f"no Ray cluster at {address or 'this machine'}: {printable(error)[:300]}; start one: ray start --head"
+                f"no Ray cluster at {address or 'this machine'}: {printable(error)[:300]}; start one: ray start --head{TOKEN * has_token}"
             ) from None
         return self
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -12,11 +11,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from bench.errors import unknown
 from bench.experiment.axes import Axis
 from bench.experiment.columns import Column, text
 from bench.experiment.views import Chart, Mark, Style
 from bench.model import SURROGATE, registry
-from bench.report.colours import method_styles
+from bench.report.colours import graded, method_styles
 from bench.report.problems import ProblemRows, split_by_problem
 from bench.report.style import MARKERS, colour
 from bench.report.text import axis_value, counted, number
@@ -27,6 +27,7 @@ from bench.report.views import (
     estimator_labels,
     shown_rmse,
 )
+from bench.report.writer import LEAST
 
 from .columns import COLUMNS
 from .comparisons import FAILS, NO_RESULT
@@ -35,12 +36,12 @@ from .time_to_accuracy import methods as methods_by_cost
 
 FLOOR = 1e-4
 """Relative biases below this are drawn here, as upper limits."""
-SERIES = 3
-"""Most estimators of a chart along an axis."""
+SERIES = 6
+"""Most estimators of a chart along an axis, where the experiment does not name them."""
+GRADES = {0.1: "#08519c", 0.3: "#6baed6", 1.0: "#d6e6f4", 10.0: "#fdae61", math.inf: "#c51b1b"}
+"""Upper ends of the grades of an error, and their colours."""
 PANELS = 4
 """Most problems of a chart along an axis."""
-DISTINCT = 1.2
-"""Median factor between the errors of two estimators from which a reader distinguishes their lines."""
 RMSE = Column(
     "rmse_rel", label="relative RMSE of one estimate", low="rmse_low", high="rmse_high", limit="rmse_limit", log=True,
     above_one="worse than the zero estimate",
@@ -57,27 +58,26 @@ ESTIMATOR = text("series", label="")
 def charts(
     shown: Arranged,
     methods: pd.DataFrame,
-    comparisons: pd.DataFrame,
     best: pd.DataFrame,
 ) -> list[Chart]:
     """Return all charts, the main one first."""
     labelled = replace(shown, rows=with_plotted_columns(shown.rows))
     subtitle = _conditions(shown)
     swept = shown.swept()
-    order = sorted(swept, key=lambda a: (-swept[a], a.column != "stiffness"))
+    order = sorted(swept, key=lambda a: (-swept[a], a.column not in ("stiffness", "samples")))
     along = [
-        _along(labelled, axis, methods, comparisons, subtitle)
+        _along(labelled, axis, subtitle)
+        if axis.column != "samples" or best.empty
+        else _cost_of_accuracy(shown, best, subtitle)
         for i, axis in enumerate(order)
         if not any(axis.column in other.moves for other in order[:i])  # axes that step together have one chart
-        if axis.column != "samples" or best.empty
     ]
     if shown.rows["time_s"].notna().any():
         along = [_contrast(labelled, subtitle), *along]
-    if not best.empty:
-        along = [_cost_of_accuracy(shown, best, subtitle), *along]
-    elif not swept and shown.rows["backend"].nunique() > 1:
+    if not swept and shown.rows["backend"].nunique() > 1:
         along += [_error_and_cost(labelled, subtitle)]
-    if not swept and methods["problem"].nunique() > 1:
+    is_grid = (methods[["setting", "estimator"]].nunique() > 1).all()
+    if best.empty and max(swept.values(), default=0) < LEAST and is_grid:
         along = [_estimators(methods), *along]
     drawn = [chart for chart in along if chart is not None]
     names = [name for chart in drawn if chart.series for name in chart.frame[chart.series]]
@@ -131,18 +131,17 @@ def _conditions(shown: Arranged) -> str:
 def _along(
     shown: Arranged,
     axis: Axis,
-    methods: pd.DataFrame,
-    comparisons: pd.DataFrame,
     subtitle: str,
 ) -> Chart | None:
     """Return the chart of errors along an axis, of the main estimators on the main problems."""
-    problems = [p for p in split_by_problem(shown, axis) if attempted(p.rows)["x"].nunique() > 1]
+    always = ("scene",) * (shown.rows["scene"].nunique() > 1)
+    problems = [p for p in split_by_problem(shown, axis, always) if attempted(p.rows)["x"].nunique() > 1]
     if not problems:
         return None
     drawn, notes = choose_problems(problems)
     backends = shown.experiment.compares.get("backends", ())
     frame = pd.concat([_lines(problem, backends) for problem in problems], ignore_index=True)
-    names = shown.experiment.compares.get("estimators") or _main_series(frame, methods, comparisons)
+    names = shown.experiment.compares.get("estimators") or list(dict.fromkeys(frame["label"]))[:SERIES]
     total = frame["label"].nunique()
     shares = [f"{len(names)} of {total} estimators"] if len(names) < total else []
     for column, kept in (("label", names), ("panel", [problem.title() for problem in drawn])):
@@ -177,21 +176,6 @@ def _nested(names: Sequence[str]) -> dict[str, Style]:
     return {name: Style(colour(i), MARKERS[i], width=1.2 * (count - i)) for i, name in enumerate(names)}
 
 
-def _main_series(frame: pd.DataFrame, methods: pd.DataFrame, comparisons: pd.DataFrame) -> list[str]:
-    """Return the estimators to print: those that are most often first, then others, as far as distinct."""
-    estimator = dict(zip(methods["method"], methods["estimator"], strict=True))
-    wins = Counter(estimator[name] for name in comparisons["first"] if name)
-    names = sorted(frame["label"].unique(), key=lambda name: (-wins[name], "[" in name))
-    errors = frame.pivot_table("rmse_rel", ["panel", "x"], "label", aggfunc="first").reindex(columns=names)
-    errors = np.log(errors.where(errors > 0))
-    chosen: list[str] = []
-    for name in names:
-        apart = errors[chosen].sub(errors[name], axis=0).abs().median()
-        if len(chosen) < SERIES and not (apart < math.log(DISTINCT)).any():
-            chosen.append(name)
-    return chosen
-
-
 def choose_problems(problems: Sequence[ProblemRows]) -> tuple[list[ProblemRows], list[str]]:
     """Return the problems to print, at most :data:`PANELS`, and notes on the problems omitted.
 
@@ -224,7 +208,7 @@ def _error_and_cost(shown: Arranged, subtitle: str) -> Chart | None:
         return None
     return Chart(
         "speed_accuracy", pd.concat(parts, ignore_index=True), [SECONDS], [RMSE], "points", series="series",
-        panel="panel", across=3, height=1.9, front=True, subtitle=", ".join(filter(None, [subtitle, FASTEST])),
+        panel="panel", line="line", arrow="series", across=3, height=1.9, subtitle=", ".join(filter(None, [subtitle, FASTEST])),
     )  # fmt: skip
 
 
@@ -236,6 +220,8 @@ def _contrast(shown: Arranged, subtitle: str) -> Chart | None:
         column = (
             "series" if name == "estimators" else "backend" if name == "backends" else axis.column if axis else name
         )
+        if column not in rows:
+            raise unknown("axis in compares", name, (*shown.numbers, "estimators", "backends"))
         rows = rows[rows[column].isin(values)]
         joined_axis = (axis, values) if len(values) == 2 and axis else joined_axis
     if joined_axis is None or rows.empty:
@@ -320,15 +306,17 @@ def _estimators(methods: pd.DataFrame) -> Chart:
     families = {name: _family(name.partition("[")[0]) for name in names}
     order = sorted(names, key=lambda name: list(dict.fromkeys(families.values())).index(families[name]))
     frame = methods.iloc[methods["estimator"].map(order.index).argsort(kind="stable")]
+    at = ", " + frame["axis"] + "=" + frame["at"].map(axis_value)
     error, known = frame["error"], np.isfinite(frame["error"])
     marks = frame["status"].where(frame["verdict"] == NO_RESULT, "").mask(frame["verdict"] == FAILS, " fails")
+    grades, looks = graded(error, GRADES, "{:g}".format)
     return Chart(
         "estimators",
-        frame.assign(panel=frame["estimator"].map(families), series=frame["estimator"], shade=(np.log10(error.clip(1e-2, 1e2)) / 4 + 0.5).where(known),
-                     cell=error.map(number).where(known, marks)),
-        [text("problem", label="")], [ESTIMATOR], "grid", panel="panel", shade="shade",
+        frame.assign(panel=frame["estimator"].map(families), series=frame["estimator"], grade=grades.where(known, "no result"), problem=frame["problem"] + at.where(frame["axis"] != "", ""),
+                     cell=(pd.Series(np.where(frame["error_is_limit"], "<", ""), frame.index) + error.map(number)).where(known, marks)),
+        [text("problem", label="")], [ESTIMATOR], "grid", panel="panel", level="grade", styles=looks | {"no result": Style("#f2f2f2")},
         cell="cell", across=1, height=0.2,
-        subtitle="relative RMSE of one estimate, sorted by the worst case; above 1 the zero estimate is better",
+        subtitle="relative RMSE of one estimate, sorted by the worst case; from 1 on the zero estimate is better",
     )  # fmt: skip
 
 

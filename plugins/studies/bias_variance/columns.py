@@ -62,7 +62,7 @@ COLUMNS = Columns.ordered(
     Column("model_error", "norm of (program's gradient - physics' gradient) at w = 0"),
     seconds("time_s", "one estimate of N samples without drawing noise, steady state, median over calls", "time", comparison=ComparisonRule("time", "time")),
     Column("time_iqr_s", "interquartile range over calls", "s", measured=True),
-    seconds("compile_s", "time of compiling the programs of the estimates"),
+    seconds("compile_s", "time of compiling programs of the estimates, in the row of the cell that compiled them"),
     Column("rollouts", "costs evaluated for one estimate"),
     Column("gradients", "gradients evaluated for one estimate"),
     Column("peak_memory_mb", "largest resident memory of the process, libraries included", "MB", measured=True),

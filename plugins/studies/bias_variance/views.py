@@ -57,7 +57,7 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views | None:
     best = time_to_accuracy.table(shown)
     return Views(
         tables(experiment, rows, shown, methods, equal, errors, best),
-        charts.charts(shown, equal, errors, best),
+        charts.charts(shown, equal, best),
         rows=charts.with_plotted_columns(costed),
         columns=[
             *(replace(c, label=label) for c, label in ((charts.RMSE, "rel. RMSE"), (charts.BIAS, "rel. bias"))),

@@ -16,6 +16,7 @@ from bench.experiment.columns import Column, interval, text
 from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Table, Views
 from bench.measure.performance import bootstrap, bootstrap_along, interquartile_mean
+from bench.report.colours import method_styles
 from bench.report.problems import problem_names
 from bench.report.views import arrange, attempted
 
@@ -257,4 +258,4 @@ def _charts(runs: pd.DataFrame, windows: pd.DataFrame) -> list[Chart]:
         "windows", windows, [replace(WINDOW, log=True)], [FINAL, WINDOW_BIAS, WINDOW_GRADIENT], series="family", panel="problem",
         subtitle=f"final return: {SEEDS}", text="A point per length of window.",
     )  # fmt: skip
-    return [curves, lengths]
+    return [replace(one, styles=method_styles(one.frame[one.series].unique())) for one in (curves, lengths)]
