@@ -512,7 +512,7 @@ VERBS = {
         "Cells that cannot run are listed with their reason.\n" + SETTINGS, "Experiments",
     ),
     "list": Verb(
-        _list, "list [KIND or NAME ...] [plugins=DIR]", "plugins: names by kind; of a KIND or NAME parameters, capabilities, availability",
+        _list, "list [KIND or NAME ...] [plugins=DIR]", "plugins by kind; of a KIND or NAME parameters and availability",
         "KIND is scenes, contacts, integrators, backends, estimators, optimizers, policies, trainers or studies.\n", "Experiments",
     ),
     "engines": Verb(

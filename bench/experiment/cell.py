@@ -13,7 +13,7 @@ from typing import Any, cast
 
 from bench.errors import Unsupported, UserError, failure, printable
 from bench.experiment.experiment import Budget
-from bench.experiment.keys import COMPARED, SHARED, fingerprint, hash_of_text, hashed, raised, revisions_of
+from bench.experiment.keys import COMPARED, SHARED, counted, fingerprint, hash_of_text, hashed, raised, revisions_of
 from bench.experiment.reference_backends import capable_backends
 from bench.measure import descent, reference
 from bench.measure.descent import Point
@@ -145,7 +145,7 @@ class Cell:
             # a study may use this backend besides the cell's own
             best = fingerprint(next(iter(self.ranked_backends), None))
             shared = raised(revisions_of(SHARED))
-            after = [own, best, self._budget(), self._theta_hashed(), fingerprint(self.study), shared]
+            after = [own, best, self.budget and counted(self.budget), self._theta_hashed(), fingerprint(self.study), shared]
             _rest[given] = (json.dumps(parts), json.dumps(after)[1:])
         before, rest = _rest[given]
         return hash_of_text(f"[{before}, {counts}, {rest}")
@@ -196,7 +196,7 @@ class Cell:
                 radius = [] if smoothing is None else [[smoothing.shape, smoothing.radius]]
                 if smoothing is None:
                     methods = reference.revisions(self.program(), self.reference_backends[0].provides)
-            budget = list((self._budget() or {}).values())
+            budget = list(counted(self.budget).values()) if self.budget else []
             _reference_keys[given] = hashed(self.program_key, budget, backend, *radius, raised(methods))
         return _reference_keys[given]
 
@@ -227,7 +227,7 @@ class Cell:
         """Every parameter of every plugin, defaults included, with the study, theta and the reference budget."""
         entries: dict[str, Any] = {"study": described(self.study)}
         entries |= {axis: described(part) for axis, part in self.parts.items()}
-        return entries | {"theta": self._theta(), "reference": self._budget()}
+        return entries | {"theta": self._theta(), "reference": self.budget and vars(self.budget)}
 
     def _theta(self) -> dict[str, Any] | None:
         """Return theta for the row's parameters; on a descent, also the identity strings of what is descended."""
@@ -245,14 +245,6 @@ class Cell:
         if theta is None or self.path is None:
             return theta and {name: theta[name] for name in ("names", "at")}
         return theta | {"path": self._path_key}
-
-    def _budget(self) -> dict[str, Any] | None:
-        """Return the reference's budget; the limit of quadrature only where it is set, so that keys are as before it existed."""
-        if self.budget is None:
-            return None
-        budget = {name: value for name, value in vars(self.budget).items() if name != "points"}
-        points = self.budget.points
-        return budget if points == type(self.budget)().points else budget | {"points": points}
 
     def columns(self) -> dict[str, Any]:
         """Return the identity columns of the cell's row: views of its parameters and counts."""
