@@ -13,7 +13,7 @@ from typing import Any, cast
 
 from bench.errors import Unsupported, UserError, failure, printable
 from bench.experiment.experiment import Budget
-from bench.experiment.keys import COMPARED, SHARED, fingerprint, hash_of_text, hashed, raised, revisions_of
+from bench.experiment.keys import COMPARED, SHARED, counted, fingerprint, hash_of_text, hashed, raised, revisions_of
 from bench.experiment.reference_backends import capable_backends
 from bench.measure import descent, reference
 from bench.measure.descent import Point
@@ -247,12 +247,7 @@ class Cell:
         return theta | {"path": self._path_key}
 
     def _budget(self) -> dict[str, Any] | None:
-        """Return the reference's budget; the limit of quadrature only where it is set, so that keys are as before it existed."""
-        if self.budget is None:
-            return None
-        budget = {name: value for name, value in vars(self.budget).items() if name != "points"}
-        points = self.budget.points
-        return budget if points == type(self.budget)().points else budget | {"points": points}
+        return None if self.budget is None else counted(self.budget)
 
     def columns(self) -> dict[str, Any]:
         """Return the identity columns of the cell's row: views of its parameters and counts."""

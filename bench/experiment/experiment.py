@@ -61,7 +61,9 @@ class Budget(Plugin):
     name: ClassVar[str] = "reference"
 
     samples: int = param(1 << 18, "largest number of samples", low=256)
-    points: int = param(1 << 20, "largest number of points of quadrature, and at most 64 times `samples`", low=256)
+    points: int = param(
+        1 << 20, "largest number of points of quadrature, and at most 64 times `samples`", low=256, added=True
+    )
     tolerance: float = param(0.005, "standard error, relative to the gradient, at which sampling stops", positive=True)
 
 

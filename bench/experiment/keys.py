@@ -45,7 +45,7 @@ def fingerprint(plugin: Plugin | None) -> str:
         if names_files(plugin):
             reads.start()
             code.append(files_hash(map(Path, getattr(plugin, "files")())))  # noqa: B009, not part of the contract
-        text = json.dumps([plugin.kind, plugin.name, _counted(plugin), code], default=repr)
+        text = json.dumps([plugin.kind, plugin.name, counted(plugin), code], default=repr)
         # the plugin is stored too, so that no other object gets its id
         _fingerprints[id(plugin)] = (plugin, hashlib.sha256(text.encode()).hexdigest())
     return _fingerprints[id(plugin)][1]
@@ -56,7 +56,7 @@ def names_files(plugin: Plugin) -> bool:
     return hasattr(plugin, "files") and (isinstance(plugin, Scene) or not _is_own(type(plugin).__module__))
 
 
-def _counted(plugin: Plugin) -> dict[str, Any]:
+def counted(plugin: Plugin) -> dict[str, Any]:
     """Return the parameters that identify a plugin: all but those that it gained later and that have their defaults."""
     declared = parameters(type(plugin))
     given = sorted(values(plugin).items())
