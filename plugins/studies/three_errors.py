@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from bench.report.shown import Shown
 
 SUMMARY = (
-    "reference_norm", "reference_se", "reference_method", "reference_spacing", "bias", "bias_low", "bias_high", "bias_rel", "variance", "rmse_rel", "cosine",
+    "reference_norm", "reference_se", "bias", "bias_low", "bias_high", "bias_rel", "variance", "rmse_rel", "cosine",
     "sign_agreement",
 )  # fmt: skip
 """Columns that are statistics of the estimator."""
@@ -92,6 +92,7 @@ class ThreeErrors(StudyPackage):
         ),
         Column("model_signs", "share of coordinates in which both gradients have the same sign", label="right signs"),
         *(ESTIMATES.by_name[name] for name in SUMMARY),
+        *(ESTIMATES.by_name[name] for name in ("reference_method", "reference_spacing")),
         numbers("gradient", "the program's gradient, by coordinate of theta"),
         numbers("physical_gradient", "the physics' gradient, by coordinate of theta"),
     )
