@@ -44,7 +44,8 @@ def chart(claim: type[Claim], result: ClaimResult) -> Chart | None:
         return None
     (place, places), *curves = result.series.items()
     is_log = {axis: axis in claim.logarithmic for axis in "xy"}
-    parts, drawn, styles = [], [], {}
+    parts, styles = [], {}
+    drawn: list[np.ndarray] = []
     for label, series in curves:
         # a second column has the standard errors of means
         values = pd.DataFrame(np.reshape(series, (len(series), -1))).reindex(columns=[0, 1])

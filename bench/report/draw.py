@@ -328,7 +328,9 @@ def _draw_arrows(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str
     A name is beside other names, points and arrows. A series is named once where its points are close to each other.
     """
     low, high = (np.log(ends) for ends in zip(panel.get_xlim(), panel.get_ylim(), strict=True))
-    taken, named, arrows = [], [], []
+    taken: list[tuple[np.ndarray, np.ndarray]] = []
+    named: list[tuple[str, np.ndarray]] = []
+    arrows: list[tuple[str, np.ndarray]] = []
     for _, points in part.groupby(chart.arrow, sort=False):
         ends = points[[chart.x[0].name, chart.y[0].name]].to_numpy(float, copy=True)
         if chart.y[0].above_one:
@@ -355,7 +357,8 @@ def _draw_arrows(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str
         start = free[0] if free else place + 0.1
         named.append((series, place))
         taken.append((start, start + extent))
-        written = panel.text(*(start / size), text, transform=panel.transAxes, color=styles[series].colour)
+        x, y = start / size
+        written = panel.text(x, y, text, transform=panel.transAxes, color=styles[series].colour)
         written.set_in_layout(False)
 
 

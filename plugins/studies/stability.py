@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -404,16 +404,16 @@ def cells_of(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:
     shown = replace(shown, rows=shown.rows.assign(dt=rows["dt"], stiffness=rows["stiffness"]))
     cells = attempted(shown.rows)
     cells = cells[cells["verdict"] != ""]
-    scene = rows.loc[cells.index, "scene"]
+    scene, limits = rows.loc[cells.index, "scene"], cast(Stability, experiment.study)
     size = cells["truth_norm"].groupby(scene).transform("max")
     error = cells["relative_error"] * cells["truth_norm"] / size
     lost = np.where(
-        cells["reason"].str.contains(GROWN) & (cells["grad_norm"] <= experiment.study.diverged * size),
+        cells["reason"].str.contains(GROWN) & (cells["grad_norm"] <= limits.diverged * size),
         "grew",
         "blows up",
     )
-    level = np.select([cells["verdict"].isin(("diverged", "nonfinite")), error.isna(), error <= experiment.study.inaccurate],
-                      [lost, "open", "right"], "wrong")  # fmt: skip
+    level = np.where(error.isna(), "open", np.where(error <= limits.inaccurate, "right", "wrong"))
+    level = np.where(cells["verdict"].isin(("diverged", "nonfinite")), lost, level)
     return cells.assign(
         problem=problem_names(shown, PROBLEM, axes_of(shown, "dt", "stiffness"), rows=cells), row=cells.index, error_share=error,
         level=level, step=titled(cells, ["contact", "integrator"]), scene_name=scene.str.split("[").str[0], dt_ms=1e3 * cells["dt"],
@@ -452,7 +452,7 @@ def charts(cells: pd.DataFrame) -> list[Chart]:
     frame["grade"] = frame["level"].where(frame["level"].isin(LOST), grades)
     frame["cell"] = ["" if e != e else f"<{100 * min(EDGES):g}" if e < min(EDGES) else number(100 * e) if e < 10 else ">999"
                      for e in frame["error_share"]]  # fmt: skip
-    found = []
+    found: list[Chart] = []
     for scene, part in frame.groupby("scene_name", sort=False):
         right = (part["level"] == "right").groupby(part["step"]).transform("mean")
         if part["contact"].nunique() > 1:

@@ -214,7 +214,8 @@ def _error_and_cost(shown: Arranged, subtitle: str) -> Chart | None:
 
 def _contrast(shown: Arranged, subtitle: str) -> Chart | None:
     """Return error against time at two values of an axis, joined by arrows, as the experiment's ``compares`` names them."""
-    rows, joined_axis = with_known(shown.rows, TIME), None
+    rows = with_known(shown.rows, TIME)
+    joined_axis: tuple[Axis, Sequence[Any]] | None = None
     for name, values in shown.experiment.compares.items():
         axis = next((axis for axis in shown.axes if name in (axis.column, axis.short)), None)
         column = (
@@ -226,16 +227,16 @@ def _contrast(shown: Arranged, subtitle: str) -> Chart | None:
         joined_axis = (axis, values) if len(values) == 2 and axis else joined_axis
     if joined_axis is None or rows.empty:
         return None
-    axis, (start, end) = joined_axis
+    along, (start, end) = joined_axis
     parts = [_on_fastest(part) for _, part in rows.groupby(["series", "contact"], sort=False)]
-    frame = pd.concat(parts).sort_values(axis.column, key=lambda at: at == end, kind="stable")
+    frame = pd.concat(parts).sort_values(along.column, key=lambda at: at == end, kind="stable")
     frame[TIME] = frame.groupby(["series", "contact"])[TIME].transform(
         "median"
     )  # the same program: what differs is noise
     frame = frame.assign(arrow=frame["series"] + ", " + frame["contact"], line=frame["contact"].str.partition("[")[0])
     return Chart(
         "contrast", frame, [SECONDS], [RMSE], "points", series="series", line="line", arrow="arrow", height=2.9,
-        subtitle=", ".join(filter(None, [subtitle, f"arrows: {axis.title} {axis_value(start)} to {axis_value(end)}", FASTEST])),
+        subtitle=", ".join(filter(None, [subtitle, f"arrows: {along.title} {axis_value(start)} to {axis_value(end)}", FASTEST])),
         text="An arrow joins the same estimator at two settings.",
     )  # fmt: skip
 
