@@ -71,6 +71,8 @@ def parse(given: str, word: str) -> tuple[list[str], Any]:
         override = OverridesParser.create().parse_override(word)
         if override.package is None and not override.is_sweep_override():
             return override.key_or_group.split("."), override.value()
+    except ModuleNotFoundError:
+        raise
     except Exception:  # Hydra's of many types; ValueError for a number of 5000 digits, RecursionError
         pass
     raise UserError(f"'{given[:200]}' cannot be read: {LISTS_AS}") from None
