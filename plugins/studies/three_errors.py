@@ -45,7 +45,7 @@ CONVERGED = 0.5
 """A cost or gradient converges if its error falls at least to this share from the largest to the smallest step."""
 WRONG = 0.1
 """Smallest model error of a wrong gradient."""
-FLOOR = 1e-6
+FLOOR = 1e-16
 """Smallest error that is drawn; smaller ones, 0 included, are drawn here as upper limits."""
 RESULTS = ("forward_error_rel", "program_error_rel", "model_error_rel", "model_cosine", "model_signs")
 OWN, PHYSICS, TRAP = "program error", "model error", "model error of a trap"
