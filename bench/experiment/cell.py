@@ -145,7 +145,14 @@ class Cell:
             # a study may use this backend besides the cell's own
             best = fingerprint(next(iter(self.ranked_backends), None))
             shared = raised(revisions_of(SHARED))
-            after = [own, best, self.budget and counted(self.budget), self._theta_hashed(), fingerprint(self.study), shared]
+            after = [
+                own,
+                best,
+                self.budget and counted(self.budget),
+                self._theta_hashed(),
+                fingerprint(self.study),
+                shared,
+            ]
             _rest[given] = (json.dumps(parts), json.dumps(after)[1:])
         before, rest = _rest[given]
         return hash_of_text(f"[{before}, {counts}, {rest}")
