@@ -11,7 +11,7 @@ import numpy as np
 
 from bench.examine.findings import FAILED, RIGHT, SEEN, WRONG, Findings
 from bench.examine.lines import REACH
-from bench.examine.smoothing import PAIRS
+from bench.examine.smoothing import PAIRS, TARGET_ERROR
 from bench.examine.stages import is_rough
 from bench.examine.subspace import GROUPS, MOST
 from bench.gradient import FAULTS, Check, Part, step_sizes
@@ -111,10 +111,12 @@ def noise_answer(report: Findings) -> str:
         usable = [] if report.noise_cause == "nan_gradient" else usable
         reason = noise_problems(report)[0] + f"; usable at sigma {', '.join(usable)}" * bool(usable)
     elif report.use == "usable":
-        largest = max(
-            (max(one.bias_percent[1], 100 * one.unseen / one.norm) for one in report.smoothed if one.known), default=0.0
-        )
-        reason = f"The bias of the mean gradient is below {number(max(largest, 1e-3))}%"
+        known = [one for one in report.smoothed if one.known]
+        seen = max([one.bias_percent[1] for one in known], default=0.0)
+        missed = max([100 * one.unseen / one.norm for one in known], default=0.0)
+        reason = f"The bias of the mean gradient is below {number(max(seen, missed, 1e-3))}%"
+        if missed > 100 * TARGET_ERROR:
+            reason = f"The draws show a bias below {number(max(seen, 1e-3))}%; an event that all of them miss could add {number(missed)}%"
         reason += "" if report.derivative == RIGHT else f", though the derivative at theta is {report.derivative}"
     elif report.smoothed and not report.noise_cause and report.use != "not measured":
         is_known = all(one.known for one in report.smoothed)
