@@ -62,10 +62,7 @@ def _defaults(axis: str, name: str | None, scene: str | None, folders: tuple[Pat
     The scene's own values of contact parameters replace the contact law's. Parameters without a default are omitted.
     """
     if axis in RECORDS:
-        record = RECORDS[axis]()
-        return {
-            f.name: plain(getattr(record, f.name)) for f in dataclasses.fields(record) if not f.metadata.get("added")
-        }
+        return {field: plain(value) for field, value in dataclasses.asdict(RECORDS[axis]()).items()}
     plugin = plugin_class(axis, name)
     declared = parameters(plugin) if plugin else {}
     values = {key: one.default for key, one in declared.items() if one.default is not dataclasses.MISSING}

@@ -77,12 +77,16 @@ def doubted(rows):
 def test_comparison_says_so():
     old = small_rows(backends=("jax",), estimators=("fobg",))
     new = doubted(old)
-    column = COLUMNS.by_name["bias"]
-    (change,) = judging.judge_cell([column], old.iloc[0].to_dict(), new.iloc[0].to_dict())
+    change = of_bias(old, new)
     assert change.outcome == "changed"
     assert change.text.endswith(UNEXPLAINED)
-    (change,) = judging.judge_cell([column], old.iloc[0].to_dict(), new.assign(reason="").iloc[0].to_dict())
-    assert change.outcome == "worse"
+    assert of_bias(old, new.assign(reason="")).outcome == "worse"
+
+
+def of_bias(old, new):
+    """Return the change of the bias between two tables of one row."""
+    changes = judging.judge_cell(COLUMNS, old.iloc[0].to_dict(), new.iloc[0].to_dict())
+    return next(change for change in changes if change.subject == "bias")
 
 
 # ------------------------------------------------------------------------------------------ references near zero
