@@ -37,7 +37,7 @@ PAGES: Mapping[str, str] = {
 """The site's page of each document, and its path in the repository."""
 SECTIONS: Mapping[str, Sequence[str]] = {
     "start": ("reading-results", "python"),
-    "trust": ("gradcheck", "examine", "conformance"),
+    "trust": ("gradcheck", "examine", "watch", "conformance"),
     "results": (
         "answers",
         "experiment/*",

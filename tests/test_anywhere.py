@@ -66,7 +66,7 @@ def test_installed_wheel_works_in_an_empty_folder_with_numpy_only(wheel, tmp_pat
     assert not (site / "plugins").exists()
     where = command(scripts / "python", "-c", "import bench; print(bench.__file__)", cwd=tmp_path)
     assert Path(where.strip()).is_relative_to(site)
-    assert "pip install jax" in command(scripts / "diffsim-bench", "list", cwd=tmp_path)
+    assert "pip install jax" in command(scripts / "diffsim-bench", "list", "backends", cwd=tmp_path)
     quick = ["+experiment=quick", "backends=[numpy]"]
     for words in ([*quick, "--quiet"], ["plan", *quick], ["report", *quick], ["--version"], ["check", "fobg"]):
         command(scripts / "diffsim-bench", *words, cwd=tmp_path)

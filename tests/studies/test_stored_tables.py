@@ -1,5 +1,7 @@
 """The tables of the stored rows of standard experiments are the stored tables, to the byte."""
 
+from dataclasses import replace
+
 import pytest
 from helpers import stored
 from trees import ROOT
@@ -25,6 +27,7 @@ NAMES = {
 def test_tables_of_stored_rows_are_the_stored_tables(name):
     """Where they differ on purpose, write them again: ``python -m bench report +experiment=NAME results_dir=results/standard``."""
     given, rows = stored(name, *NAMES[name])
+    given = replace(given, plugins=given.plugins if NAMES[name] else ())  # of another test in this process
     if rows.empty:
         pytest.skip("no rows are stored")
     tables = views_of(given, rows).tables

@@ -324,7 +324,9 @@ def _estimators(methods: pd.DataFrame) -> Chart:
 def _family(estimator: str) -> str:
     """Return an estimator's family by what it needs: costs, gradients or both."""
     entry = registry.entries()["estimators"].get(estimator)
-    needs = frozenset(getattr(entry and entry.plugin, "needs", frozenset()))
+    needs = getattr(entry and entry.plugin, "needs", None)
+    if not isinstance(needs, frozenset):  # of an estimator whose parameters decide what it needs
+        return "costs only"
     if "grad" in needs:
         return "gradients and costs" if needs & {"value", "score"} else "gradients of the program"
     return "costs only"
