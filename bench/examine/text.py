@@ -115,8 +115,8 @@ def noise_answer(report: Findings) -> str:
         seen = max([one.bias_percent[1] for one in known], default=0.0)
         missed = max([100 * one.unseen / one.norm for one in known], default=0.0)
         reason = f"The bias of the mean gradient is below {number(max(seen, missed, 1e-3))}%"
-        if missed > 100 * TARGET_ERROR:
-            reason = f"The draws show a bias below {number(max(seen, 1e-3))}%; an event that all of them miss could add {number(missed)}%"
+        if missed > 100 * TARGET_ERROR:  # more draws would lower the bound
+            reason += f", and below {number(max(seen, 1e-3))}% as far as these draws show"
         reason += "" if report.derivative == RIGHT else f", though the derivative at theta is {report.derivative}"
     elif report.smoothed and not report.noise_cause and report.use != "not measured":
         is_known = all(one.known for one in report.smoothed)
