@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from bench.plugins.studies import SPREAD
 from bench.plugins.studies.bias_variance import trust
 from bench.plugins.studies.gradient_check import is_trusted
 
@@ -52,7 +53,7 @@ def trusted(*estimators: str) -> dict[str, str]:
     ones among them.
     """
     rows = trust.cells(STANDARD, estimators)
-    keep, wrong = trust.spread(rows) < trust.SPREAD, rows["rmse_rel"] >= trust.WRONG
+    keep, wrong = trust.spread(rows) < SPREAD, rows["rmse_rel"] >= trust.WRONG
     counts = dict(cells=keep | ~keep, trusted=keep, wrong=keep & wrong, others=~keep, missed=~keep & ~wrong)
     return {name: f"{keep.sum():,}" for name, keep in counts.items()}
 

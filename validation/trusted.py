@@ -20,7 +20,8 @@ import numpy as np
 import pandas as pd
 from bench.plugins.backends.jax import Jax
 from bench.plugins.estimators.fobg import Fobg
-from bench.plugins.studies.bias_variance.trust import SPREAD, WRONG
+from bench.plugins.studies import SPREAD
+from bench.plugins.studies.bias_variance.trust import WRONG
 from bench.plugins.studies.gradient_check import is_trusted
 
 from bench.cli import main as command
