@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from bench.api import estimate, list_plugins, load, problem, run
     from bench.compare.command import compare
     from bench.examine.examination import examine
-    from bench.examine.watch import watch
+    from bench.examine.watch import Watch as watch
 
     list = list_plugins  # not in __all__: a star import must not replace the built-in type
 else:
@@ -46,7 +46,7 @@ _SOURCES = {
     "load": ("bench.api", "load"),
     "problem": ("bench.api", "problem"),
     "run": ("bench.api", "run"),
-    "watch": ("bench.examine.watch", "watch"),
+    "watch": ("bench.examine.watch", "Watch"),
 }
 """The module and the name of each function that is imported at its first use, so that a command starts quickly."""
 

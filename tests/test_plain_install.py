@@ -39,7 +39,6 @@ def run(request, tmp_path):
     (tmp_path / "sim.py").write_text(SIMULATOR)
     (tmp_path / "test_sim.py").write_text(TESTS)
     environment = {**os.environ, "PYTHONPATH": f"{tmp_path}{os.pathsep}{place}"}
-    environment.pop("PYTEST_DISABLE_PLUGIN_AUTOLOAD", None)  # the kit sets it for its own run of pytest
 
     def call(*words):
         done = subprocess.run([sys.executable, *words], cwd=tmp_path, env=environment, capture_output=True, text=True)

@@ -73,14 +73,16 @@ def main(names: Sequence[str], limit: str = "15m", options: Sequence[str] = ()) 
         raise registry.unknown_plugin("plugin", name, plugins, "list")
     if not (registry.installed("pytest") and registry.installed("xdist")):
         raise UserError("check needs pytest and pytest-xdist: pip install 'diffsim-bench[check]'")
+    from unittest.mock import patch
+
     import pytest
 
-    for foreign in ("PYTEST_ADDOPTS", "PYTEST_PLUGINS"):
-        os.environ.pop(foreign, None)
-    os.environ["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"
-    os.environ[CHOSEN] = json.dumps([[*names], [str(folder) for folder in registry.folders()]])
-    words = [*PYTEST, "-o", f"faulthandler_timeout={seconds}", *options]
-    status = pytest.main(words, plugins=[sys.modules[__name__]])
+    chosen = json.dumps([[*names], [str(folder) for folder in registry.folders()]])
+    with patch.dict(os.environ, {"PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1", CHOSEN: chosen}):
+        for foreign in ("PYTEST_ADDOPTS", "PYTEST_PLUGINS"):
+            os.environ.pop(foreign, None)
+        words = [*PYTEST, "-o", f"faulthandler_timeout={seconds}", *options]
+        status = pytest.main(words, plugins=[sys.modules[__name__]])
     if status == pytest.ExitCode.INTERRUPTED:
         raise KeyboardInterrupt
     return int(status) if status in (pytest.ExitCode.OK, pytest.ExitCode.TESTS_FAILED) else 2

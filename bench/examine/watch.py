@@ -48,12 +48,22 @@ MEANINGS = {
 
 
 class Watch:
-    """A log of an optimization loop: called with theta and its gradient in every iteration, it checks some of them.
+    """A log of an optimization loop, ``bench.watch``: called as ``log(theta, gradient)`` in every iteration, it checks some.
+
+    ``cost(theta)`` returns one number, or ``cost(theta, w)`` where the calls pass the noise ``w``. Every ``every``
+    iterations the gradient is checked, but not more often than takes ``share`` of the loop's time, without the first
+    check, which may compile. ``out`` is a CSV file to which each check adds a line. ``str()`` names the first iteration
+    at which the gradient was of no use.
 
     ``rows`` has a line per checked iteration: the norm of the gradient, the verdict of a check along random directions
     with the largest relative error, the difference of two equal calls of the cost, ratio and cosine of a zeroth-order estimate
     from mirrored pairs to the gradient, with 95% intervals, the jumps along the last step, and the share of its length
     at which a step against the gradient lowers the cost (0: at none).
+
+    >>> log = Watch(lambda x: float(x @ x), every=1, share=math.inf)
+    >>> log(np.array([1.0, 2.0]), np.array([2.0, 4.0]))
+    >>> print(log)
+    1 of 1 iterations checked: no fault of the gradient
     """
 
     def __init__(
@@ -131,10 +141,11 @@ class Watch:
         vectors = [scale * (one / np.linalg.norm(one)) for one in draw.standard_normal((DIRECTIONS, at.size))]
         space = Subspace(layout, scale, [], [Group(f"direction {i}", 0, at.size, v) for i, v in enumerate(vectors)])
         value, again = (float(costs(at[:, None])[0]) for _ in range(2))
-        few = FewSteps(space, lambda z: costs(space.place(z)), slopes, value, simulator.unit, abs(again - value))
+        noise = abs(again - value)
+        few = FewSteps(space, lambda z: costs(space.place(z)), slopes, value, simulator.unit, noise)
         for _ in ROUNDS:
             few.run_round(simulator.width)
-        checked, noise = few.check(), abs(again - value)
+        checked = few.check()
         row = {
             "cost": value, "gradient_norm": float(np.linalg.norm(slopes)), "verdict": checked.cause,
             "error": max(part.error for part in checked.parts), "noise": noise,
@@ -251,21 +262,3 @@ def _same_random_numbers() -> Iterator[None]:
         np.random.set_state(states[1])  # noqa: NPY002
         if torch:
             torch.random.set_rng_state(states[2])
-
-
-def watch(
-    cost: Callable[..., Any], every: int = 50, out: str | Path | None = None, share: float = 0.1, seed: int = 0
-) -> Watch:
-    """Return a log for an optimization loop, to be called as ``log(theta, gradient)`` in each iteration.
-
-    ``cost(theta)`` returns one number, or ``cost(theta, w)`` where the calls pass the noise ``w``. Every ``every``
-    iterations the gradient is checked, but not more often than takes ``share`` of the loop's time, without the first
-    check, which may compile. ``out`` is a CSV file to which each check adds a line. See :class:`Watch`; ``str()`` names
-    the first iteration at which the gradient was of no use.
-
-    >>> log = watch(lambda x: float(x @ x), every=1, share=math.inf)
-    >>> log(np.array([1.0, 2.0]), np.array([2.0, 4.0]))
-    >>> print(log)
-    1 of 1 iterations checked: no fault of the gradient
-    """
-    return Watch(cost, every, out, share, seed)

@@ -24,13 +24,18 @@ from bench.model.program import OWN
 HEAD = "python -m bench name=one_cell"
 
 
+def own_plugins(experiment: Experiment) -> list[str]:
+    """Return the word of a command that adds the experiment's folders of plugins, shell-quoted; none without folders."""
+    folders = ",".join(repr(str(folder)) for folder in experiment.plugins)
+    return [shlex.quote(f"plugins=[{folders}]")] * bool(folders)
+
+
 def commands(experiment: Experiment, rows: pd.DataFrame) -> list[list[str]]:
     """Return, per row, the words after :data:`HEAD` that rerun its cell, shell-quoted; empty if a plugin is missing."""
-    folders = ",".join(repr(str(folder)) for folder in experiment.plugins)
     known: dict[str, Plugin] = {}
     given = rows["parameters"] if "parameters" in rows else pd.Series("", index=rows.index)
     settings = {text: _settings(parsed(text), known, experiment.timing) for text in given.unique()}
-    head = [shlex.quote(f"plugins=[{folders}]")] * bool(folders)
+    head = own_plugins(experiment)
     counts = rows[list(COUNTS)].astype(int).to_dict("records")
     return [
         [*head, *settings[text], *(f"{name}={count}" for name, count in line.items())] if settings[text] else []

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import shlex
 from typing import Any
 
 import numpy as np
@@ -15,6 +14,7 @@ from bench.experiment.experiment import Experiment
 from bench.experiment.views import Chart, Style, Table, Views
 from bench.gradient import BROKEN, FAULTS, RULES, TRUSTED, UNDECIDED, VERDICTS
 from bench.report.problems import axes_of, label_columns, problem_names, problem_numbers
+from bench.report.reproduce import own_plugins
 from bench.report.shown import PROBLEM
 from bench.report.style import PALETTE
 from bench.report.text import counted
@@ -49,12 +49,10 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views:
     points = by_point(shown.rows)
     names = problem_names(shown, PROBLEM, axes_of(shown, "horizon"), ("scene", "contact"))
     points = points.assign(name=names.to_numpy()[points["row"].astype(int)])
-    folders = ",".join(repr(str(folder)) for folder in experiment.plugins)
-    own = [shlex.quote(f"plugins=[{folders}]")] * bool(folders)
     faults = [
         line
         for command, part in untrusted(points).groupby("command", sort=False)
-        for line in (_tally(part), " ".join([f"      {command}", *own]))
+        for line in (_tally(part), " ".join([f"      {command}", *own_plugins(experiment)]))
     ]
     tables = [
         Table("gradient_verdicts", *_verdicts(points), title="Verdicts", files=[], page=True, terminal=True),
