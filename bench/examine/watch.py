@@ -8,7 +8,7 @@ import random
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -99,7 +99,8 @@ class Watch:
         """
         self.iteration += 1
         if (self.iteration + 1) % self.every == 0:
-            self._before = ParameterTree(theta).vector.copy()
+            with suppress(Exception):  # the check then has no last step
+                self._before = ParameterTree(theta).vector.copy()
         if self.iteration % self.every or not self._is_affordable():
             return
         began = time.perf_counter()
@@ -119,7 +120,10 @@ class Watch:
         else:
             self._began += taken
         self.rows.append(row)
-        self._write()
+        try:
+            self._write()
+        except OSError as error:
+            row["reason"] = f"{self.out} cannot be written: {error}"
 
     def _is_affordable(self) -> bool:
         elapsed = time.perf_counter() - self._began

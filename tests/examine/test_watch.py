@@ -159,3 +159,12 @@ def test_a_chart_is_drawn(tmp_path):
 def test_bad_input_is_named(given, word):
     with pytest.raises(bench.UserError, match=word):
         bench.watch(**{"cost": abs} | given)
+
+
+def test_neither_a_theta_that_is_none_nor_a_full_disk_ends_the_loop(tmp_path):
+    log = bench.watch(lambda x: float(x @ x), every=2, out=tmp_path / "missing" / "log.csv", share=math.inf)
+    for theta in (np.ones(2), "text", np.ones(2), np.ones(2)):
+        log(theta, 2 * np.ones(2))
+    assert [row["iteration"] for row in log.rows] == [0, 2]
+    assert log.first is None
+    assert "log.csv" in str(log)
