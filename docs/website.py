@@ -37,7 +37,7 @@ PAGES: Mapping[str, str] = {
 """The site's page of each document, and its path in the repository."""
 SECTIONS: Mapping[str, Sequence[str]] = {
     "start": ("reading-results", "python"),
-    "trust": ("gradcheck", "examine", "watch", "conformance"),
+    "trust": ("gradcheck", "examine", "watch", "conformance", "atlas"),
     "results": (
         "answers",
         "experiment/*",

@@ -1,0 +1,59 @@
+"""Simulators that others wrote: their files, the stored reports and the page, and those whose packages `[all]` installs."""
+
+import json
+
+import pytest
+
+from examples.atlas import __main__ as atlas
+
+RIGHT, WRONG = 1e-3, 1e-4
+"""Distances from the truth of a right gradient, whose solver has a tolerance, and of a wrong one."""
+LINES = 40
+SLOW = ("scipy_ode", "optimistix_root")
+FACTS = {name: atlas.about(name) for name in atlas.names()}
+HERE = [
+    pytest.param(n, marks=pytest.mark.slow if n in SLOW else ()) for n, f in FACTS.items() if f["python"] == "bench"
+]
+
+
+@pytest.mark.parametrize("name", FACTS)
+def test_a_simulator_is_short_and_its_demanded_answer_is_that_of_its_truth(name):
+    facts, row = FACTS[name], json.loads((atlas.REPORTS / f"{name}.json").read_text())
+    assert facts.keys() - {"use", "jumps", "advice"} == {
+        *["name", "what", "package", "python", "requires", "examine", "derivative", "how"]
+    }
+    lines = [line for line in (atlas.FOLDER / f"{name}.py").read_text().splitlines() if line]
+    assert len(lines) <= LINES
+    off = row["off"]
+    assert off is None or off > WRONG if facts["derivative"] == "wrong" else off < RIGHT
+
+
+def test_the_page_is_that_of_the_reports():
+    assert atlas.PAGE.read_text() == atlas.page()
+
+
+@pytest.mark.parametrize("name", HERE)
+def test_an_installed_simulator_gets_the_answer_that_its_truth_demands(name, tmp_path, monkeypatch):
+    pytest.importorskip(FACTS[name]["package"])
+    monkeypatch.setattr(atlas, "REPORTS", tmp_path)
+    row = atlas.examine(name)
+    assert atlas.agreement(FACTS[name], row) == "agrees", row
+
+
+def test_a_package_without_its_python_is_unavailable(tmp_path, monkeypatch):
+    monkeypatch.setattr(atlas, "REPORTS", tmp_path)
+    monkeypatch.setenv("BENCH_ENGINES", str(tmp_path))
+    assert atlas.examine("pymunk_slide")["derivative"] == "unavailable"
+
+
+@pytest.mark.parametrize(
+    ("demanded", "reported", "word"),
+    [
+        ("right", "wrong", "FALSE ALARM"),
+        ("wrong", "right", "MISSED"),
+        ("right", "not shown", "open"),
+        ("wrong", "wrong", "agrees"),
+    ],
+)
+def test_answers_are_compared_with_the_truth(demanded, reported, word):
+    assert atlas.agreement({"derivative": demanded}, {"derivative": reported}) == word
