@@ -48,13 +48,26 @@ def verdicts_of(experiment, rows):
 @pytest.mark.parametrize(
     ("given", "verdicts"),
     [
-        ({}, ["first", "behind", "behind"]),
+        ({}, ["first", "not chosen", "behind"]),
+        # shac's other window would end below ppo: one setting of each would not tell
+        ({"final": {**FINAL, "ppo": -600.0}}, ["open", "open", "not chosen"]),
+        ({"final": {**FINAL, "ppo": -600.0, "bptt": -900.0}}, ["first", "open", "not chosen", "behind"]),
         ({"final": {"shac": -530.0, "ppo": -535.0}, "spread": 40.0}, ["open", "open"]),
-        ({"seeds": range(4)}, ["open", "open", "open"]),
+        ({"seeds": range(4)}, ["open", "not chosen", "open"]),
     ],
 )
 def test_the_best_trainer_is_first_where_intervals_of_enough_seeds_are_apart(given, verdicts):
     assert list(verdicts_of(*made_up(**given)).values()) == verdicts
+
+
+def test_a_setting_is_chosen_on_seeds_that_are_not_reported():
+    """The longer window ends highest on the seeds that choose, and the shorter on the others."""
+    experiment, rows = made_up({"shac": -530.0, "shac[window=8]": -560.0, "ppo": -900.0}, range(9), spread=1.0)
+    rows.loc[(rows["trainer"] == "shac[window=8]") & (rows["seed"] >= 3), "final_return"] += 100.0
+    summary = tables_of(experiment, rows)["summary"].frame.set_index("method")
+    assert summary["verdict"].to_dict() == {"shac": "first", "shac[window=8]": "not chosen", "ppo": "behind"}
+    assert set(summary["seeds"]) == {6}
+    assert summary.loc["shac[window=8]", "final"] > summary.loc["shac", "final"]
 
 
 def test_few_seeds_give_no_interval_and_no_order():
@@ -81,7 +94,7 @@ def test_a_trainer_without_a_run_that_ends_is_not_the_best_by_its_untrained_poli
     experiment, rows = made_up()
     planted = rows["trainer"] == "ppo"
     rows.loc[planted, ["status", "first_return"]] = ["nonfinite", -100.0]
-    assert verdicts_of(experiment, rows) == {"shac": "first", "shac[window=8]": "behind", "ppo": "no result"}
+    assert verdicts_of(experiment, rows) == {"shac": "first", "shac[window=8]": "not chosen", "ppo": "no result"}
     rows.loc[rows["trainer"] == "shac[window=8]", ["status", "first_return"]] = ["nonfinite", -100.0]
     assert "windows" not in tables_of(experiment, rows), "one window is left"
     rows["status"] = "nonfinite"
@@ -119,7 +132,8 @@ def test_returns_at_equal_used_steps_are_those_of_the_last_evaluation_within_the
 
 def test_a_return_above_another_by_less_than_noise_is_not_behind():
     best = np.array([-8.0, -7.0, -9.0, -8.5, -7.5])
-    lines = pd.DataFrame({"final": [-9.0, -8.0], "returns": [best - 0.6, best], "group": "one"})
+    lines = pd.DataFrame({"final": [-9.0, -8.0], "returns": [best - 0.6, best], "group": "one", "family": ["a", "b"]})
+    lines = lines.assign(failed=0, seeds=5, tuned=0.0)
     assert studied.ranked(lines, ["group"]).tolist() == ["open", "open"]
     # the intervals of a few seeds may overlap where a test of the difference finds one
     assert studied.ranked(lines.assign(returns=[best - 1.9, best]), ["group"]).tolist() == ["behind", "first"]

@@ -32,7 +32,8 @@ OF_WINDOWS = ("window_bias", "window_bias_low", "window_bias_high", "window_grad
 PROBLEM, METHOD, VERDICT = text("problem"), text("method", label="trainer"), text("verdict")
 FINAL = interval("final", label="final return", digits=3, log=False)
 SUMMARY = (
-    PROBLEM, METHOD, FINAL, VERDICT, Column("worst", label="worst seed", digits=3), Column("seeds", format="setting"),
+    PROBLEM, METHOD, FINAL, VERDICT, Column("settings", format="setting"),
+    Column("worst", label="worst seed", digits=3), Column("seeds", format="setting"),
     Column("failed", label="not finite", format="setting"), Column("steps", unit="steps", label="control steps", digits=3),
     Column("used", label="used steps", digits=3),
     interval("equal", label="at equal used steps", digits=3, log=False),
@@ -75,8 +76,11 @@ WINDOW_NOTE = (
 )
 FAULT_NOTE = "update: where it starts. value:"
 VERDICTS = (
-    "verdict: first, tied (not distinguishable), behind (by a Mann-Whitney test at 5%), or open where none is behind."
+    "settings: how many of the trainer were tried. The best on the first third of the seeds is chosen, the other seeds are reported. "
+    "verdict: first, tied (not distinguishable), behind (by a Mann-Whitney test at 5%), not chosen, or open: none is behind, or only "
+    "the first's larger number of settings puts it ahead (it would lead with the worst of as many settings)."
 )
+WINDOW_VERDICTS = "verdict: first, tied (not distinguishable), behind (by a Mann-Whitney test at 5%), or open where none is behind."
 PAGE = ("final_return", "first_return", "final_median", "updates", "steps", "train_s", "compile_s", "gradient_typical",
         "gradient_peak", "window_gradient", "window_bias")  # fmt: skip
 
@@ -144,29 +148,56 @@ def summarise(runs: pd.DataFrame, by: Sequence[str] = ("problem", "method")) -> 
     return frame.sort_values(["problem", "final"], ascending=[True, False], kind="stable").reset_index(drop=True)
 
 
-def ranked(lines: pd.DataFrame, by: Sequence[str]) -> pd.Series:
-    """Return a verdict on the final return of each line of :func:`summarise` or :func:`windows_of`, within groups ``by``.
+def split(runs: pd.DataFrame) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Return the runs of the first third of the seeds, which choose each trainer's setting, and those that are reported.
 
-    ``first``: the highest; ``behind``: its runs end lower than those of the first, by the test of Mann and Whitney (1947)
-    at 5%; ``tied``: the test finds no difference; ``open``: none of the group is behind; ``no result``: no run ended with a
-    finite return.
+    None chooses where each trainer has one setting, and where too few would be left for a test.
     """
+    seeds = sorted(runs["seed"].unique())
+    several = (runs.groupby(["problem", "family"])["method"].nunique() > 1).any() and len(seeds) > MIN_SEEDS
+    chooses = runs["seed"].isin(seeds[: math.ceil(len(seeds) / 3)] if several else [])
+    return runs[chooses], runs[~chooses]
+
+
+def tried(lines: pd.DataFrame, tuning: pd.DataFrame) -> pd.DataFrame:
+    """Return lines of :func:`summarise` with each trainer's number of ``settings``, and ``tuned``: the returns that choose one."""
+    returns = {key: interquartile_mean(final_returns(part)) for key, part in tuning.groupby(["problem", "method"])}
+    keys = zip(lines["problem"], lines["method"], strict=True)
+    settings = lines.groupby(["problem", "family"])["method"].transform("size")
+    return lines.assign(settings=settings, tuned=[returns.get(key, 0.0) for key in keys])
+
+
+def ranked(lines: pd.DataFrame, by: Sequence[str], trainer: str = "family") -> pd.Series:
+    """Return a verdict on each line, within groups ``by``, of which a trainer's setting with the best ``tuned`` counts.
+
+    ``first``: the highest return; ``behind``: its runs end lower than those of the first, by the test of Mann and Whitney (1947)
+    at 5%, even if the first had only its worst settings, as many as this one; ``tied``: the test finds no difference;
+    ``open``: neither, or none of the group is behind; ``no result``: no run ended with a finite return.
+    """
+    verdicts = pd.Series("no result", lines.index, dtype=object)
+    has_ended = np.isfinite(lines["final"]) & (lines["failed"] < lines["seeds"])
+    for _, part in lines[has_ended].sort_values("tuned", ascending=False, kind="stable").groupby(list(by), sort=False):
+        verdicts[part.index] = "not chosen"
+        settings, chosen = dict(iter(part.groupby(trainer)["returns"])), part.drop_duplicates(trainer)
+        best = chosen.loc[chosen["final"].idxmax()]
+        own = settings[best[trainer]]
+        for index, line in chosen.iterrows():
+            fewest = own.iloc[max(len(own) - len(settings[line[trainer]]), 0)]
+            leads = is_lower(line["returns"], best["returns"])
+            verdicts[index] = ("behind" if is_lower(line["returns"], fewest) else "open") if leads else "tied"
+        verdicts[best.name] = "first"
+        if len(chosen) > 1 and not (verdicts[chosen.index] == "behind").any():
+            verdicts[chosen.index] = "open"
+    return verdicts
+
+
+def is_lower(returns: np.ndarray, others: np.ndarray) -> bool:
+    """Return whether runs end lower than others, by the test of Mann and Whitney at 5%; few runs do not tell."""
     from scipy.stats import mannwhitneyu
 
-    verdicts = pd.Series("no result", lines.index, dtype=object)
-    has_ended = np.isfinite(lines["final"]) & (lines["failed"] < lines["seeds"] if "failed" in lines else True)
-    for _, part in lines[has_ended].groupby(list(by), sort=False):
-        best = part.loc[part["final"].idxmax()]
-        tests = [mannwhitneyu(best["returns"], returns) for returns in part["returns"]]
-        behind = np.array([
-            len(returns) >= MIN_SEEDS and test.pvalue < LEVEL and test.statistic > len(returns) * len(best["returns"]) / 2
-            for returns, test in zip(part["returns"], tests, strict=True)
-        ])  # fmt: skip
-        verdicts[part.index] = np.where(behind, "behind", "tied")
-        verdicts[best.name] = "first"
-        if len(part) > 1 and not behind.any():
-            verdicts[part.index] = "open"
-    return verdicts
+    test = mannwhitneyu(others, returns)
+    is_above = test.statistic > len(returns) * len(others) / 2
+    return bool(len(returns) >= MIN_SEEDS and test.pvalue < LEVEL and is_above)
 
 
 def middle_with_interval(name: str, values: np.ndarray) -> dict[str, float]:
@@ -205,7 +236,7 @@ def windows_of(runs: pd.DataFrame) -> pd.DataFrame:
     keys = ["problem", "family", "window"]
     known = runs[runs["window"].notna() & runs["window_gradient"].notna()]
     has_ended = (known["status"] == "ok").groupby([known[key] for key in keys]).transform("any")
-    names = [*keys, "seeds", "returns", *OF_WINDOWS, "gradient_typical", "final", "final_low", "final_high"]
+    names = [*keys, "seeds", "failed", "returns", *OF_WINDOWS, "gradient_typical", "final", "final_low", "final_high"]
     if not has_ended.any():
         return pd.DataFrame(columns=names)
     frame = summarise(known[has_ended], keys)[names].sort_values(keys, ignore_index=True)
@@ -227,16 +258,18 @@ def views(experiment: Experiment, rows: pd.DataFrame) -> Views | None:
     runs = runs_of(experiment, rows)
     if runs.empty:
         return None
-    summary, windows, faults = summarise(runs), windows_of(runs), faults_of(runs)
-    summary = summary.assign(verdict=ranked(summary, ["problem"])).drop(columns=["returns", *OF_WINDOWS])
+    tuning, reported = split(runs)
+    summary, windows, faults = tried(summarise(reported), tuning), windows_of(runs), faults_of(runs)
+    summary = summary.assign(verdict=ranked(summary, ["problem"])).drop(columns=["returns", "tuned", *OF_WINDOWS])
     tables = [
         Table("train", summary, SUMMARY, "final return by trainer", [NOTE, VERDICTS], terminal=True, page=True, data=table(experiment, rows),
               details=["compile_s", "gradient_typical", "gradient_peak"]),
         Table("summary", summary, [], files=["csv"]),
     ]  # fmt: skip
     if len(windows):
-        lines = windows.assign(verdict=ranked(windows, ["problem", "family"])).drop(columns="returns")
-        tables.append(Table("windows", lines, WINDOWS, "Windows", [WINDOW_NOTE], terminal=True, page=True,
+        verdicts = ranked(windows.assign(tuned=0.0), ["problem", "family"], "window")
+        lines = windows.assign(verdict=verdicts).drop(columns=["returns", "failed"])
+        tables.append(Table("windows", lines, WINDOWS, "Windows", [WINDOW_NOTE, WINDOW_VERDICTS], terminal=True, page=True,
                             details=["gradient_typical"]))  # fmt: skip
     if len(faults):
         notes = [FAULT_NOTE, *(f"- {code}: {MEANINGS[code]}" for code in faults["code"].unique())]
