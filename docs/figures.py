@@ -24,7 +24,6 @@ from bench.plugins.studies import SPREAD
 from bench.plugins.studies.bias_variance import trust
 from bench.plugins.studies.gradient_check import is_trusted
 
-from bench.engines import table
 from bench.model import registry
 from bench.report import answer
 from bench.report.text import interval as text_of_interval
@@ -285,7 +284,9 @@ FIGURES: dict[str, str | Callable[[], str]] = {
     "quadruped-sides": sides_right,
     "quadruped-jumps": jumps_at_switches,
     "quadruped-engines": engines_agree,
-    "engines-table": lambda: block((STANDARD / "engines_table" / "engines.md").read_text().split("\n\n")[1].split("\n")),
+    "engines-table": lambda: block(
+        (STANDARD / "engines_table" / "engines.md").read_text().split("\n\n")[1].split("\n")
+    ),
     "dose-pairs": lambda: dose_classes({name: name for name in UPDATES}),
     "dose-runs": dose_runs,
     "dose-unreached": dose_unreached,

@@ -80,7 +80,9 @@ VERDICTS = (
     "verdict: first, tied (not distinguishable), behind (by a Mann-Whitney test at 5%), not chosen, or open: none is behind, or only "
     "the first's larger number of settings puts it ahead (it would lead with the worst of as many settings)."
 )
-WINDOW_VERDICTS = "verdict: first, tied (not distinguishable), behind (by a Mann-Whitney test at 5%), or open where none is behind."
+WINDOW_VERDICTS = (
+    "verdict: first, tied (not distinguishable), behind (by a Mann-Whitney test at 5%), or open where none is behind."
+)
 PAGE = ("final_return", "first_return", "final_median", "updates", "steps", "train_s", "compile_s", "gradient_typical",
         "gradient_peak", "window_gradient", "window_bias")  # fmt: skip
 
