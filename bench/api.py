@@ -5,7 +5,6 @@ Names and settings are the same as on the command line.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -85,12 +84,6 @@ class Settings(TypedDict, total=False):
     compares: Mapping[str, Sequence[Any]]
 
 
-SIMPLE = re.compile(r"[A-Za-z0-9_./+-]*")
-"""Strings that Hydra reads without quotes."""
-SPECIAL, ESCAPED = re.compile(r"([\\()\[\]{}:=,])"), r"\\\1"
-"""Characters that need a backslash in the keys of a Hydra table."""
-
-
 def run(experiment: str | Sequence[str] = (), **settings: Unpack[Settings]) -> pd.DataFrame:
     """Run the missing cells of an experiment, write its tables and charts, and return its rows, one per cell.
 
@@ -105,40 +98,11 @@ def run(experiment: str | Sequence[str] = (), **settings: Unpack[Settings]) -> p
     from bench.run.execute import execute
 
     words = [f"experiment={experiment}"] if isinstance(experiment, str) and experiment else list(experiment)
-    words += [word for key, value in settings.items() for word in _override_words(key, value)]
-    resolved = config.load(words)
+    resolved = config.load(words, settings=settings)
     finished = execute(resolved)
-    rows = finish(finished, words)[0] if resolved.execution.shard is None else finished.rows()
+    given = [*words, *(f"{key}={value}" for key, value in settings.items())]
+    rows = finish(finished, given)[0] if resolved.execution.shard is None else finished.rows()
     return with_axes(resolved.sweep, rows).reset_index(drop=True)
-
-
-def _override_words(key: str, value: Any) -> list[str]:
-    """Return a keyword argument as command-line words. Dictionaries of plugin parameters become dotted keys."""
-    kinds = registry.kinds()
-    head = key.partition(".")[0]
-    if isinstance(value, Mapping) and (head == "reference" or head in map(singular, kinds)):
-        return [word for name, inner in value.items() for word in _override_words(f"{key}.{name}", inner)]
-    return [f"{key}={_hydra_value(value, quoted=key not in (*kinds, 'path', 'study', 'experiment'))}"]
-
-
-def _hydra_value(value: Any, quoted: bool = True) -> str:
-    """Return a value in Hydra's grammar. Identity strings stay unquoted, since the code that reads them quotes them."""
-    if isinstance(value, np.ndarray | np.generic):
-        value = value.tolist()
-    if isinstance(value, Mapping):
-        items = ((SPECIAL.sub(ESCAPED, str(name)), _hydra_value(inner, quoted)) for name, inner in value.items())
-        return "{" + ",".join(f"{name}:{inner}" for name, inner in items) + "}"
-    if isinstance(value, str | Path):
-        if not quoted or SIMPLE.fullmatch(str(value)):
-            return str(value)
-        # Hydra reads backslashes literally, except before a quote and at the end
-        escaped = re.sub(r"(\\*)('|$)", lambda match: 2 * match[1] + ("\\'" if match[2] else ""), str(value))
-        return f"'{escaped}'"
-    if isinstance(value, list | tuple | range):
-        return "[" + ",".join(_hydra_value(one, quoted) for one in value) + "]"
-    if value is None or isinstance(value, bool):
-        return {None: "null", True: "true", False: "false"}[value]
-    return str(value)
 
 
 def load(directory: str | Path) -> pd.DataFrame:

@@ -16,7 +16,7 @@ import yaml
 
 import bench
 import bench.model
-from bench.api import Settings, _override_words
+from bench.api import Settings
 from bench.experiment import by_name, config, grid
 from bench.report.text import number
 
@@ -33,9 +33,7 @@ TINY = {
 
 def cells(*words, **overrides):
     """The cells that :func:`bench.run` would run."""
-    return grid.cells(
-        config.load([*words, *(word for key, value in overrides.items() for word in _override_words(key, value))])
-    )
+    return grid.cells(config.load(words, settings=overrides))
 
 
 # ---------------------------------------------------------------------------------------------------- a notebook
@@ -66,8 +64,8 @@ def test_run_returns_a_row_per_cell_and_writes_everything(rows, results):
     names = {path.name for path in (results / "notes").iterdir()}
     assert {"rows.parquet", "bias_variance.csv", "bias_variance.md", "report.html", "run.json"} <= names
     told = json.loads((results / "notes" / "run.json").read_text())
-    assert "scene.quadratic.dimension=3" in told["argv"]
-    assert "sweep={sigma:[0.1,0.2],condition:[10.0,100]}" in told["argv"]
+    assert "scene={'quadratic': {'dimension': 3}}" in told["argv"]
+    assert told["config"]["sweep"] == {"sigma": [0.1, 0.2], "condition": [10.0, 100]}
 
 
 def test_load_gives_the_same_rows_with_a_number_for_every_swept_axis(rows, results):
@@ -249,7 +247,7 @@ def test_keywords_are_the_override_words_of_the_command_line():
     "text", ["what, if: anything [x] 'quoted' {a}? \\ b\\' c\\", "ünï", "100% $x #1", 'a "b"', "", "a b"]
 )
 def test_texts_come_through_as_they_are(text):
-    made = config.load(_override_words("question", text) + _override_words("results_dir", Path(f"/{text}")))
+    made = config.load([], settings={"question": text, "results_dir": Path(f"/{text}")})
     assert made.question == text
     assert made.results_dir == Path(f"/{text}")
 
@@ -257,7 +255,7 @@ def test_texts_come_through_as_they_are(text):
 def test_marks_are_a_table_with_names_of_any_kind():
     marks = {"stiffness": {"step size limit": 6400, "a: (b), [c]=1": 2}}
     words = ["contacts=[penalty]", "scenes=[pushing]", "sweep.stiffness=[1e3]"]
-    assert config.load([*words, *_override_words("marks", marks)]).marks == marks
+    assert config.load(words, settings={"marks": marks}).marks == marks
 
 
 # -------------------------------------------------------------------------------------------------- public names

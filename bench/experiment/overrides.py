@@ -10,6 +10,7 @@ from typing import Any
 
 from bench.errors import UserError, printable
 from bench.experiment.grid import MAX_CELLS
+from bench.model.identity import split_items
 
 GLOBAL = "# @package _global_"
 """The first line of an experiment file, so that Hydra does not nest its settings."""
@@ -20,6 +21,20 @@ NUMBERS = re.compile(rf"\[{_NUMBER}(?:,{_NUMBER})*\]")
 TABLES = ("sweep", "marks", "compares", "reference", "ray")
 """Settings that are tables; the parameters of plugins are too."""
 LISTS_AS = "write key=value with lists as [a,b] and strings in quotes"
+
+
+Override = tuple[list[str], Any]
+"""The keys of a setting, from the outermost, and its value."""
+
+
+def names_of(value: str) -> list[str]:
+    """Return the names of a value that is one name or a list, as the shell leaves it.
+
+    >>> names_of("fobg"), names_of("[fobg,'reinforce[baseline=none]']")
+    (['fobg'], ['fobg', 'reinforce[baseline=none]'])
+    """
+    inner = value[1:-1] if value.startswith("[") and value.endswith("]") else value
+    return [name for item in split_items(inner) if (name := item.strip().strip("'\""))]
 
 
 def quoted(value: str) -> str:
@@ -57,7 +72,7 @@ def _range(key: str, match: re.Match[str]) -> range:
     return numbers
 
 
-def parse(given: str, word: str) -> tuple[list[str], Any]:
+def parse(given: str, word: str) -> Override:
     """Return the keys and the value of an override in Hydra's syntax; ``given`` is the user's, which errors name.
 
     A list of numbers, which may be long, is read without Hydra's grammar: that takes a millisecond per number.
