@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -109,34 +108,15 @@ def merge(settings: dict[str, Any], keys: Sequence[str], value: Any) -> None:
 
 def check_file(path: Path) -> dict[str, Any]:
     """Return the content of an experiment file; raises :class:`UserError` with the file and the line if it cannot be read."""
-    import yaml
     from omegaconf import OmegaConf
 
     try:
         text = path.read_bytes().decode()
-        _refuse_expansion(yaml.compose(text))
         content = OmegaConf.to_container(OmegaConf.load(path), resolve=False) if text.strip() else {}
-    except RecursionError:
-        raise UserError(f"'{path}' is nested too deeply") from None
     except Exception as error:  # of the file, of YAML, and OmegaConf's own, such as a key that is a list
         raise UserError(f"'{path}' cannot be read: {printable(error)[:400]}") from None
     _check_content(path, text, content)
     return dict(content)  # type: ignore[arg-type]
-
-
-def _refuse_expansion(root: Any) -> None:
-    """Raise ValueError if the aliases of a YAML document, written out, are more than :data:`MAX_CELLS` values."""
-    sizes: dict[int, float] = {}
-
-    def size(node: Any) -> float:
-        if id(node) not in sizes:
-            sizes[id(node)] = math.inf  # while an alias lies inside its own value
-            parts = node.value if isinstance(node.value, list) else ()
-            sizes[id(node)] = 1 + sum(sum(map(size, part)) if isinstance(part, tuple) else size(part) for part in parts)
-        return sizes[id(node)]
-
-    if root is not None and size(root) > MAX_CELLS:
-        raise ValueError(f"its aliases stand for more than {MAX_CELLS} values")
 
 
 def _check_content(path: Path, text: str, content: Any) -> None:

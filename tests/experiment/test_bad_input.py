@@ -129,12 +129,6 @@ FILES = {
     b"samples: 4\n---\nsamples: 5\n": "but found another document",
     b"1: 4\n": "line 2: 1 is not a setting",
     b"~: 4\n": "Incompatible key type",
-    b"sweep: " + b"[" * 1000 + b"\n": "is nested too deeply",
-    b"marks:\n  a: &a [1, 2, 3, 4, 5, 6, 7, 8, 9]\n"
-    + b"".join(
-        b"  %c: &%c [%s]\n" % (n, n, b", ".join([b"*%c" % (n - 1)] * 9)) for n in b"bcdefghi"
-    ): "aliases stand for more than",
-    b"marks: &a {b: *a}\n": "aliases stand for more than",
     b"smaples: 4\n": "did you mean 'samples'?",
     b"samples: ${seed}\n": "must be a whole number",
     b"samples: 4\n": "must start with the line # @package _global_",
