@@ -9,7 +9,7 @@ from pathlib import Path
 import pandas as pd
 
 from bench.compare.cells import compare_cells
-from bench.compare.report import Comparison, show, write
+from bench.compare.report import Comparison, write
 from bench.compare.sources import Results, read_results
 from bench.compare.timings import RUNS
 from bench.errors import UserError, local_path
@@ -26,7 +26,7 @@ def main(words: Sequence[str]) -> int:
         )
     out = local_path("out", settings["out"])
     comparison = compare(names[0], names[1], [*filter(None, settings["again"].split(","))])
-    show(comparison, write(comparison, out))
+    print(comparison, "\nWritten:", *write(comparison, out), sep="\n  ")
     return int(comparison.worse)
 
 

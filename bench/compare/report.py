@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 
 from bench.compare import timings
-from bench.compare.cells import FIRST, LAST, OUTCOMES, WORSE_IN, both_sides, flat_parameters
+from bench.compare.cells import COUNTS, FIRST, LAST, OUTCOMES, WORSE_IN, both_sides
 from bench.compare.judging import NOTES, rule_of
 from bench.experiment.columns import Column, text
+from bench.experiment.parameters import flat_rows
 from bench.experiment.views import Table, Views
-from bench.report import terminal
-from bench.report.problems import varying_identity
+from bench.report.problems import titled, varying_identity
 from bench.report.tables import plain_markdown
-from bench.report.text import axis_value, counted, one_line
+from bench.report.text import counted, one_line
 from bench.report.web import document
 from bench.report.web.data import cells_data
 from bench.run.files import make_directory, write_all
@@ -50,6 +48,7 @@ class Comparison:
     def __str__(self) -> str:
         lines = [self.title, summary(self.table), *(f"  {remark}" for remark in self.remarks)]
         lines += [": ".join(map(str, line)) for line in self.changes.head(PRINTED).to_numpy()]
+        lines += [f"and {len(self.changes) - PRINTED} more in the files"] * (len(self.changes) > PRINTED)
         return "\n".join(map(one_line, lines))
 
     __repr__ = __str__
@@ -111,46 +110,24 @@ def markdown(comparison: Comparison) -> str:
     return "\n\n".join([*texts, "\n".join(f"- {note}" for note in (*NOTES, timings.NOTE))]) + "\n"
 
 
-def show(comparison: Comparison, paths: Sequence[Path]) -> None:
-    """Print the summary, the remarks and the first changes."""
-    console = terminal.open_console()
-    console.print(f"\n{comparison.title}", style="bold")
-    console.print(summary(comparison.table))
-    for remark in comparison.remarks:
-        console.print(f"  {remark}")
-    listed = comparison.changes
-    if not listed.empty:
-        terminal.print_table(console, listed.head(PRINTED))
-    if len(listed) > PRINTED:
-        console.print(f"and {len(listed) - PRINTED} more in the files")
-    print("\nWritten:", *paths, sep="\n  ")
-
-
 def _worst_first(table: pd.DataFrame) -> pd.DataFrame:
     return table.iloc[table["outcome"].map(OUTCOMES.index).argsort(kind="stable")]
 
 
 def cell_names(table: pd.DataFrame) -> list[str]:
     """Return a name for each cell: the identity columns that vary, and the parameters in which cells of one name differ."""
-    columns, table = varying_identity(table), table.reset_index(drop=True)
-    names = [", ".join(filter(None, map(_name_part, columns, row))) for row in table[columns].to_numpy(dtype=object)]
+    table = table.reset_index(drop=True)
+    names = titled(table, varying_identity(table))
     for _, part in table.groupby(["experiment", names], sort=False):
         if len(part) > 1:
-            flat = pd.DataFrame(
-                [flat_parameters(row) for row in part.to_dict("records")], index=part.index, dtype=object
+            flat, lines = flat_rows(part)
+            flat = flat.iloc[lines].set_axis([f"{plugin or axis}.{name}" for axis, plugin, name in flat], axis=1)
+            every = flat.set_axis(part.index).assign(**part[[*COUNTS]])
+            differing = every.loc[:, every.astype(str).nunique() > 1].map(
+                lambda one: one if isinstance(one, str | int | float) else str(one)
             )
-            differing = flat.columns[flat.astype(str).nunique() > 1]
-            for place, values in flat[differing].iterrows():
-                names[place] = ", ".join(filter(None, [names[place], *map(_name_part, differing, values)]))
-    return names
-
-
-def _name_part(name: str, value: Any) -> str:
-    if isinstance(value, str):
-        return "" if value == "none" else value
-    if isinstance(value, float) and not math.isfinite(value):
-        return ""
-    return f"{name}={axis_value(value) if isinstance(value, float) else value}"
+            names[part.index] = names[part.index] + ", " + titled(differing, [*differing])
+    return [*names]
 
 
 def page(comparison: Comparison) -> str:
