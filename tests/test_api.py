@@ -229,23 +229,19 @@ def test_what_cannot_work_is_unsupported():
 # ------------------------------------------------------------------------------------------------------ keywords
 
 
-@pytest.mark.slow
-def test_keywords_are_the_override_words_of_the_command_line():
+def test_keywords_are_the_settings_of_the_command_line():
     same = [
         (["samples=8", "sweep.stiffness=[100,1e4]"], {"samples": np.int64(8), "sweep": {"stiffness": np.array([100, 1e4])}}),
-        (["sweep.zip={stiffness:[1,2],dt:[0.01,0.001]}"], {"sweep": {"zip": {"stiffness": [1, 2], "dt": (0.01, 0.001)}}}),
-        (["estimators=[reinforce[baseline=none]]"], {"estimators": ["reinforce[baseline=none]"]}),
+        (["estimators=[reinforce[baseline=none]]"], {"estimators": "reinforce[baseline=none]"}),
         (["study=bias_variance[timed_calls=3]"], {"study": "bias_variance[timed_calls=3]"}),
-        (["theta=[mass]", "theta0=[0.3]"], {"theta": ["mass"], "theta0": np.array([0.3])}),
+        (["theta=[mass]", "theta0=[0.3]"], {"theta": ("mass",), "theta0": np.array([0.3])}),
         (["sweep.bound=[null,1.0]", "estimators=[alpha_order]"], {"sweep": {"bound": [None, 1.0]}, "estimators": ["alpha_order"]}),
     ]  # fmt: skip
-    for words, overrides in same:
-        assert [cell.key for cell in cells(*words)] == [cell.key for cell in cells(**overrides)], overrides
+    for words, settings in same:
+        assert [cell.key for cell in cells(*words)] == [cell.key for cell in cells(**settings)], settings
 
 
-@pytest.mark.parametrize(
-    "text", ["what, if: anything [x] 'quoted' {a}? \\ b\\' c\\", "ünï", "100% $x #1", 'a "b"', "", "a b"]
-)
+@pytest.mark.parametrize("text", ["what, if: anything [x] 'quoted' {a}? \\ b\\' c\\", "ünï ${x} #1"])
 def test_texts_come_through_as_they_are(text):
     made = config.load([], settings={"question": text, "results_dir": Path(f"/{text}")})
     assert made.question == text

@@ -14,15 +14,15 @@ from bench.claims import Claim, Figure, Outcome, discovery, results, tables
 from bench.claims.claim import NOT_REPRODUCED, REPRODUCED, RESERVED, UNDECIDED, last_digit, verdict
 
 STANDARD = ROOT / "results" / "standard" / "claims"
-CHEAP = ("C5", "L4")
-"""Claims that take a second or two."""
 BLIND = {"C2": 6, "C8": 1, "C10": 1, "C14": 2, "C16": 6, "C17": 12}
 """Number of figures that cannot detect an error of 5%, since the published number is less precise. It must not grow."""
 
 
 @pytest.mark.parametrize(
-    "name", [name if name in CHEAP else pytest.param(name, marks=pytest.mark.slow) for name in discovery.claims()]
-)
+    "name",
+    [pytest.param(name, marks=() if name == "L4" else pytest.mark.slow if claim.quick else pytest.mark.full)
+     for name, claim in discovery.claims().items()],
+)  # fmt: skip
 def test_a_claim_is_reproduced_again_with_the_stored_figures(name):
     claim = discovery.claims()[name]
     again, stored = results.measure(claim), results.read(STANDARD, claim)
@@ -263,13 +263,3 @@ def test_figures_of_our_own_are_counted_apart_from_printed_ones():
     assert origins == {"C9", "C15", "C17", "C18", "C19", "L1"}
     assert tables.count_verdicts(stored).count("with recomputed figures") == 2
     assert set(tables.figures_table(stored)["origin"]) == {"printed", "data file", "recomputed"}
-
-
-def test_what_counts_in_a_penalty_bounce_is_stiffness_times_step():
-    """The title said stiffness times squared step, at which errors differ 230 times."""
-    error = {figure.what: figure.measured for figure in results.read(STANDARD, discovery.claims()["C9"]).figures}
-    coarse, fine = (
-        [error[f"k = {k}, dt = 1/480"] for k in (100, 1000)],
-        [error[f"k = {k}, dt = 1/48000"] for k in (10000, 100000)],
-    )
-    assert fine == pytest.approx(coarse, rel=0.15)

@@ -70,12 +70,6 @@ def test_an_estimator_keeps_its_look_whatever_else_is_drawn():
     assert method_styles(["fobg, adam"])["fobg, adam"] == found["fobg"]
 
 
-def test_trainers_keep_their_colours_whatever_else_is_drawn():
-    """ppo and shac were both orange, each in another chart."""
-    few, many = method_styles(["ppo", "shac"]), method_styles(["evolution", "shac[window=8]", "shac", "ppo"])
-    assert few["ppo"].colour == many["ppo"].colour != many["shac[window=8]"].colour == few["shac"].colour
-
-
 def test_a_name_has_one_colour_in_all_charts_of_an_experiment():
     """A search without an estimator was orange in one chart and brown in the next, by its place."""
     names = ["cma_es", "fobg, adam", "ppo"]

@@ -155,25 +155,6 @@ def test_errors_time_and_status_are_in_sight_on_a_laptop(browser, tmp_path):
     browser.size(*WIDE)
 
 
-def test_what_to_use_where_is_in_sight_as_a_whole_on_a_laptop(browser, tmp_path):
-    """Long settings of estimators break; they pushed the last column out of sight."""
-    long = "delta=0.95,gamma=4,sharing=shared,samples=quasi_random,pilot=0.25"
-    rows = [
-        row(scene=scene, stiffness=k, estimator=e, estimator_params=p, rmse_rel=error)
-        for scene in "abcdefgh"
-        for k in (1.0, 10.0)
-        for e, p, error in (("randomized_smoothing", "", 0.1), ("alpha_order", long, 2.0), ("alpha_order", f"{long},ratio=3", 0.5), ("control_variate", "", 3.0))
-    ]  # fmt: skip
-    browser.size(1280, 900)
-    browser.show(tmp_path, page(table(rows)))
-    wider = "(b => b.scrollWidth - b.clientWidth)(document.querySelector('#answers .scroll'))"
-    assert browser.do(wider) <= 0
-    assert browser.do("document.querySelectorAll('#answers tr').length") > 8
-    higher = "(b => b.scrollHeight - b.clientHeight)(document.querySelector('#answers .scroll'))"
-    assert browser.do(higher) <= 0, "every row is visible without scrolling in a box"
-    browser.size(*WIDE)
-
-
 @pytest.mark.slow
 def test_20000_cells_open_within_three_seconds_of_processor_time_and_are_saved_as_csv(browser, tmp_path):
     rows = stiffness_rows()
