@@ -330,7 +330,7 @@ def test_history_follows_errors_and_failures_in_the_order_given(tmp_path):
 
 
 def test_history_draws_what_changed():
-    """A panel per series that moved by more than 1% or failed elsewhere, the largest change first; NaN is no change."""
+    """A panel per series that moved by more than 1% or failed elsewhere; NaN is no change."""
     lines = [
         (result, "some", series, "RMSE", error, 0 if math.isnan(error) else 3, moved, failed, 4)
         for series, errors, moves, failures in (
