@@ -115,16 +115,15 @@ def load(directory: str | Path) -> pd.DataFrame:
 
     from bench.experiment.axes import with_axes
     from bench.experiment.columns import Columns
-    from bench.experiment.study import Study
+    from bench.experiment.study import columns_of
     from bench.report.views import newest_rows
     from bench.run.rows import recorded_sweep
     from bench.run.store import Store
 
     directory = Path(directory).expanduser()
     rows = Store(directory, Columns.of()).load() if directory.is_dir() else pd.DataFrame()
-    study = None if rows.empty else registry.entries()["studies"].get(str(rows["study"].iloc[0]))
-    if study and study.plugin and issubclass(study.plugin, Study):
-        rows = Store(directory, study.plugin.columns).load()  # without rows that the study cannot have stored
+    if not rows.empty:  # without rows that the study cannot have stored
+        rows = Store(directory, columns_of(rows["study"].iloc[0])).load()
     if rows.empty:
         raise UserError(f"no rows are stored in '{directory}': run an experiment first, its folder is results_dir/name")
     return with_axes(recorded_sweep(directory), newest_rows(rows))

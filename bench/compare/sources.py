@@ -9,14 +9,13 @@ import tarfile
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import cast
 
 import pandas as pd
 
 from bench.errors import UserError
 from bench.experiment.columns import Columns
 from bench.experiment.keys import hashed
-from bench.experiment.study import Study
+from bench.experiment.study import columns_of
 from bench.model import registry
 from bench.run.rows import read_record, valid_rows
 from bench.run.store import Store
@@ -48,13 +47,6 @@ class Results:
     def is_installed(self) -> bool:
         """Whether its study is installed."""
         return self.study in registry.entries()["studies"]
-
-
-def columns_of(study: str) -> Columns:
-    """Return the columns of a study's rows; those of all studies if it is not installed."""
-    if study not in registry.entries()["studies"]:
-        return Columns.of()
-    return cast(type[Study], registry.usable("studies", study)).columns
 
 
 def read_results(name: str) -> dict[str, Results]:
