@@ -5,10 +5,10 @@ Names and settings are the same as on the command line.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypedDict, Unpack, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -23,72 +23,12 @@ from bench.notebook import Estimates
 if TYPE_CHECKING:
     import pandas as pd
 
-Names = Sequence[str] | str
-"""Identity strings of plugins, ``name`` or ``name[parameter=value]``: several, or one."""
-Values = Mapping[str, Mapping[str, Any]]
-"""Parameters of plugins: ``{"pushing": {"mass": 0.2}}``."""
 
-
-class Settings(TypedDict, total=False):
-    """The settings of an experiment, by their names on the command line; docs/commands.md has their meanings.
-
-    A setting that is omitted has the value of the experiment's file, else the default of ``conf/config.yaml``.
-    """
-
-    name: str
-    question: str
-    answer: str
-    study: str
-    scenes: Names
-    contacts: Names
-    integrators: Names
-    backends: Names
-    estimators: Names
-    optimizers: Names
-    trainers: Names
-    sweep: Mapping[str, Any]
-    also: Names
-    scene: Values
-    contact: Values
-    integrator: Values
-    backend: Values
-    estimator: Values
-    optimizer: Values
-    trainer: Values
-    theta: Names
-    theta0: Sequence[float] | np.ndarray | None
-    descent: float
-    path: Names
-    samples: int
-    repeats: int
-    seed: int
-    draws: str | None
-    mirrored: bool | None
-    reference: Mapping[str, float]
-    workers: int | None
-    timeout: float | str | None
-    memory: float | str | None
-    on_error: str
-    ladder: bool
-    retry: Names
-    versions: str
-    timing: bool | None
-    compile_cache: str | Path | None
-    plugins: str | Path | Sequence[str | Path]
-    launcher: str
-    ray: Mapping[str, Any]
-    shard: str
-    results_dir: str | Path
-    formats: Names
-    marks: Mapping[str, Mapping[str, float]]
-    compares: Mapping[str, Sequence[Any]]
-
-
-def run(experiment: str | Sequence[str] = (), **settings: Unpack[Settings]) -> pd.DataFrame:
+def run(experiment: str | Sequence[str] = (), **settings: Any) -> pd.DataFrame:
     """Run the missing cells of an experiment, write its tables and charts, and return its rows, one per cell.
 
-    ``experiment`` is the name of an experiment, or a list of command-line words. ``settings`` are the keys of
-    :class:`bench.api.Settings`: ``run("stiffness_sweep", samples=32, sweep={"stiffness": [1e2, 1e4]},
+    ``experiment`` is the name of an experiment, or a list of command-line words. ``settings`` are those of the
+    command line, see docs/commands.md: ``run("stiffness_sweep", samples=32, sweep={"stiffness": [1e2, 1e4]},
     results_dir="out")``. Parameters of plugins are nested dictionaries: ``scene={"pushing": {"mass": 0.2}}``. Raises
     :class:`bench.UserError` for invalid input.
     """

@@ -434,17 +434,16 @@ def _gradcheck(words: list[str]) -> int:
     _refer("gradcheck", words[: len(words) - len(settings)])
     experiment = _with_engine(["experiment=gradient_check", *scenes, "name=gradcheck"], settings)
     plugins = [choice.entry.plugin for choice in experiment.choices["scene"]]
-    horizons = [word for word in words if _sets_horizon(word)]
-    is_swept = _is_given("sweep.horizon", settings)
     own = {
         int(parameters(plugin)["horizon"].default) for plugin in plugins if plugin and "horizon" in parameters(plugin)
     }
-    if (horizons and not is_swept) or not own:
-        experiment = replace(experiment, sweep={k: v for k, v in experiment.sweep.items() if k != "horizon"})
-    elif not is_swept:
-        experiment = replace(
-            experiment, sweep={**experiment.sweep, "horizon": sorted({*experiment.sweep["horizon"], *own})}
-        )
+    if not _is_given("sweep.horizon", settings):
+        sweep = dict(experiment.sweep)
+        if own and not any(map(_sets_horizon, words)):
+            sweep["horizon"] = sorted({*sweep["horizon"], *own})
+        else:
+            sweep.pop("horizon", None)
+        experiment = replace(experiment, sweep=sweep)
     finished = _execute(experiment, words)
     if isinstance(finished, int):
         return finished

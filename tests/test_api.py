@@ -12,15 +12,12 @@ from types import SimpleNamespace
 import numpy as np
 import pandas as pd
 import pytest
-import yaml
 
 import bench
 import bench.model
-from bench.api import Settings
 from bench.experiment import by_name, config, grid
 from bench.report.text import number
 
-ROOT = Path(__file__).resolve().parents[1]
 TINY = {
     "backends": ["numpy"],
     "samples": 8,
@@ -181,13 +178,6 @@ def test_compare_finds_what_got_worse(rows, results, tmp_path):
     assert not bench.compare(results, results).worse
     with pytest.raises(bench.UserError, match="needs 3 or more runs"):
         bench.compare(results, results, again=[results])
-
-
-def test_settings_are_all_settings_of_the_command_line():
-    known = {
-        name for name in config._known_keys() if name in yaml.safe_load((ROOT / "conf" / "config.yaml").read_text())
-    }
-    assert set(Settings.__annotations__) == known
 
 
 def test_estimate_is_that_of_a_cell(rows):

@@ -167,16 +167,6 @@ def figure_of(chart):
         return draw(chart)
 
 
-def test_backends_that_differ_are_one_line_along_all_values():
-    rows = small_rows()
-    rows.loc[(rows["backend"] == "torch") & (rows["estimator"] == "fobg"), ["rmse", "variance"]] *= 2
-    chart = drawn(rows, ["stiffness"])["bias_variance_stiffness"]
-    assert not chart.frame.duplicated(["panel", "series", "x"]).any()
-    tried = rows[rows["status"] != "unsupported"]
-    for (_, name), line in chart.frame.groupby(["panel", "estimator"]):
-        assert set(line["x"]) == set(tried.loc[tried["estimator"] == name, "stiffness"])
-
-
 def test_failed_cells_are_crosses():
     rows = small_rows(stiffness=(1e2, 1e4, 1e6))
     chart = drawn(rows, ["stiffness"])["bias_variance_stiffness"]
