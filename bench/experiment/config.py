@@ -118,8 +118,9 @@ def _composed(overrides: Sequence[Override], config_dirs: Sequence[Path]) -> Exp
     for keys, value in overrides:
         if keys not in (["experiment"], ["answer"]):
             merge(settings, keys, value)
-    joined = _joined(from_settings(settings), _as_list(settings["also"]), overrides, config_dirs)
-    return replace(joined, answer=_answer(joined, overrides, config_dirs))
+    if any(keys[0] not in NEUTRAL for keys, _ in overrides):
+        settings["answer"] = ""
+    return _joined(from_settings(settings), _as_list(settings["also"]), overrides, config_dirs)
 
 
 def _of_file(name: str, config_dirs: Sequence[Path]) -> dict[str, Any]:
@@ -138,27 +139,11 @@ def _of_file(name: str, config_dirs: Sequence[Path]) -> dict[str, Any]:
     return settings | {"answer": content.get("answer")}
 
 
-APPEARANCE = (
-    "name",
-    "also",
-    "results_dir",
-    "answer",
-    "compares",
-    "formats",
-    "compile_cache",
-    "plugins",
-    "execution",
-)
-"""Fields of an experiment that may differ from those of its file where its answer holds; of ``also`` the number may not."""
-
-
-def _answer(found: Experiment, overrides: Sequence[Override], config_dirs: Sequence[Path]) -> str:
-    """Return the answer in an experiment's own file; empty if the file has none or other settings."""
-    if found.answer and len(overrides) > 1:
-        own = _composed([one for one in overrides if one[0] == ["experiment"]], config_dirs)
-        alike = replace(found, **{field: getattr(own, field) for field in APPEARANCE})
-        return found.answer if alike == own and len(found.also) == len(own.also) else ""
-    return found.answer
+NEUTRAL = (
+    "experiment", "name", "results_dir", "answer", "compares", "formats", "compile_cache", "plugins", "workers", "timeout",
+    "memory", "on_error", "ladder", "versions", "retry", "launcher", "ray", "shard",
+)  # fmt: skip
+"""Settings that decide no result: with others on the command line, the answer of an experiment's file does not hold."""
 
 
 def _joined(
