@@ -63,7 +63,9 @@ def chart(trace: Trace) -> Chart:
                 parts.append(parts[0].iloc[k : k + 2].assign(series=SPIKE, panel=title, line=k, value=table[name]))
             found = align(table[name], table["switch"])
             if found.spikes and table["switch"].any():
-                notes[title] = str(found)
+                notes[title] = (
+                    f"{found.near} of {found.spikes} spikes at a switch, {found.chance:.0%} by chance, p = {found.p_value:.1g}"
+                )
         elif title == "cost":
             notes[title] = f"sum {number(table[['cost_stage', 'cost_terminal']].sum().sum(), 3)}"
     frame = pd.concat(parts, ignore_index=True)

@@ -53,7 +53,10 @@ def verdict(table: pd.DataFrame) -> list[str]:
         )
         if found.spikes:
             at = sorted(np.flatnonzero(spikes(table[name])), key=lambda k: -sizes[k])
-            facts += f"; {found}{_at(np.array(at) + 1)}"
+            facts += (
+                f"; {found.near} of {found.spikes} spikes within a step of a switch, {found.chance:.0%} by chance, "
+                f"p = {found.p_value:.2g}{_at(np.array(at) + 1)}"
+            )
         lines.append(f"{title}: {conclusion(found, int(table['switch'].sum()))} ({facts})")
     return lines
 

@@ -27,10 +27,6 @@ class Alignment(NamedTuple):
     p_value: float
     """p-value of a permutation test: the probability that at least as many spikes at random steps are near a switch."""
 
-    def __str__(self) -> str:
-        share = f"{self.near} of {self.spikes} spikes within a step of a switch"
-        return f"{share}, {self.chance:.0%} by chance, p = {self.p_value:.2g}"
-
 
 def changes(values: Sequence[float] | np.ndarray) -> np.ndarray:
     """Return |log ratio| of neighbouring ``values (T + 1,)``, ``(T,)``; 0 where a value is zero or not finite."""

@@ -10,7 +10,7 @@ import pytest
 from trees import ROOT
 
 from bench import cli
-from bench.claims import Claim, Figure, Outcome, discovery, results, tables
+from bench.claims import Claim, Figure, Outcome, discovery, results
 from bench.claims.claim import NOT_REPRODUCED, REPRODUCED, RESERVED, UNDECIDED, last_digit, verdict
 
 STANDARD = ROOT / "results" / "standard" / "claims"
@@ -254,12 +254,3 @@ def test_measured_intervals_of_sampled_moments_cover():
         variance, error = spread(draw.standard_normal((2000, 2)))
         z.append((variance - 2.0) / error)
     assert np.std(z) == pytest.approx(1.0, abs=0.2)  # 0.2: 200 draws, Student with 49 degrees
-
-
-def test_figures_of_our_own_are_counted_apart_from_printed_ones():
-    """Of the published figures a third were recomputed here."""
-    stored = [(claim, results.read(STANDARD, claim)) for claim in discovery.claims().values()]
-    origins = {claim.name for claim, _ in stored if claim.origin == "recomputed"}
-    assert origins == {"C9", "C15", "C17", "C18", "C19", "L1"}
-    assert tables.count_verdicts(stored).count("with recomputed figures") == 2
-    assert set(tables.figures_table(stored)["origin"]) == {"printed", "data file", "recomputed"}
