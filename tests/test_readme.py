@@ -25,7 +25,7 @@ PAGES = [
     *(ROOT / folder / "README.md" for folder in ("plugins", "conf", "results")), *(ROOT / "docs" / name for name in DOCS),
 ]  # fmt: skip
 EXAMPLES = dict(re.findall(r"```python\n# (\S+\.py)\n(.*?)```", DOCS["extending.md"] + DOCS["training.md"], re.DOTALL))
-SOFT = "scenes: [heaviside]\nbackends: [numpy]\n"
+SOFT = "# @package _global_\nscenes: [heaviside]\nbackends: [numpy]\n"
 """The experiment that docs/experiments.md has the reader write."""
 
 

@@ -9,6 +9,7 @@ import re
 from collections.abc import Collection, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, cast
 
@@ -20,11 +21,11 @@ from bench.experiment.overrides import (
     LISTS_AS,
     TABLES,
     Override,
+    check_file,
     merge,
     names_of,
     parse,
     quoted,
-    read_settings,
     with_ranges,
 )
 from bench.experiment.study import Study
@@ -35,8 +36,6 @@ from bench.model.parameters import Parameter, build, check, coerce, parameters, 
 SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 RESERVED = ("claims", "references", "standard", "trace")
 """Names of folders under ``results_dir`` that are not experiments."""
-SELF = "_self_"
-"""The place of a file's own settings among its ``defaults``, last where it is not named."""
 SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0}
 BYTES = {"k": 2.0**10, "m": 2.0**20, "g": 2.0**30}
 
@@ -111,10 +110,9 @@ def _composed(overrides: Sequence[Override], config_dirs: Sequence[Path]) -> Exp
     if len(named) > 1:
         commands = " && ".join(f"python -m bench +experiment={name}" for name in named)
         raise UserError(f"one command runs one experiment with its sweep: {commands}")
-    settings = deepcopy(_defaults())
-    files = [([key], value) for name in named for key, value in _of_file(name, config_dirs).items()]
-    for keys, value in files:
-        merge(settings, keys, value)
+    if named and named[0] not in (known := experiments(config_dirs)):
+        raise unknown("experiment", named[0], known, "--help")
+    settings = deepcopy(_composed_files(next(iter(named), ""), tuple(config_dirs), _stamps(config_dirs)))
     for keys, value in overrides:
         if keys not in (["experiment"], ["answer"]):
             merge(settings, keys, value)
@@ -123,20 +121,37 @@ def _composed(overrides: Sequence[Override], config_dirs: Sequence[Path]) -> Exp
     return _joined(from_settings(settings), _as_list(settings["also"]), overrides, config_dirs)
 
 
-def _of_file(name: str, config_dirs: Sequence[Path]) -> dict[str, Any]:
-    """Return the settings of an experiment's file, over those of the experiments that its ``defaults`` name; its own answer only."""
-    paths = [folder / "experiment" / f"{name}.yaml" for folder in (*config_dirs, config_dir())]
-    path = next((path for path in paths if path.exists()), None)
-    if path is None:
-        raise unknown("experiment", name, experiments(config_dirs), "--help")
-    content = read_settings(path)
-    settings: dict[str, Any] = {}
-    bases = _as_list(content.pop("defaults", None))
-    for base in bases if SELF in bases else [*bases, SELF]:
-        own = content if base == SELF else _of_file(str(base).removeprefix("/experiment/"), config_dirs)
-        for key, value in own.items():
-            merge(settings, [key], value)
-    return settings | {"answer": content.get("answer")}
+def _stamps(config_dirs: Sequence[Path]) -> tuple[tuple[Path, int, int], ...]:
+    """Return path, time of change and size of every experiment file and of ``config.yaml``."""
+    files = [path for folder in (*config_dirs, config_dir()) for path in (folder / "experiment").rglob("*.yaml")]
+    files.append(config_dir() / "config.yaml")
+    return tuple((path, path.stat().st_mtime_ns, path.stat().st_size) for path in files if path.exists())
+
+
+@lru_cache(maxsize=128)
+def _composed_files(name: str, config_dirs: tuple[Path, ...], stamps: object) -> dict[str, Any]:
+    """Return the settings that Hydra composes from ``config.yaml`` and, if any, an experiment's files, with its own answer only.
+
+    ``stamps`` tell contents of the files apart.
+    """
+    from hydra import compose, initialize_config_dir
+    from omegaconf import OmegaConf
+
+    words, own = [], {}
+    if name:
+        words, own = [f"+experiment={name}"], check_file(_file_of(name, config_dirs))
+    if config_dirs:
+        search_path = ",".join(f"'file://{folder.expanduser().absolute()}'" for folder in config_dirs)
+        words.insert(0, f"hydra.searchpath=[{search_path}]")
+    try:
+        with initialize_config_dir(str(config_dir()), version_base="1.3"):
+            config = compose("config", overrides=words)
+        plain = OmegaConf.to_container(config, resolve=False, throw_on_missing=True)
+    except Exception as error:  # Hydra raises errors of many types, and only Hydra's code runs here
+        lines = [str(part).strip().partition("\n")[0] for part in (error, error.__cause__) if part is not None]
+        raise UserError(printable(": ".join(lines))[:1000]) from None
+    assert isinstance(plain, dict)
+    return {str(k): v for k, v in plain.items()} | {"answer": own.get("answer")}
 
 
 NEUTRAL = (
@@ -158,15 +173,22 @@ def _joined(
     return replace(main, also=also)
 
 
+def _file_of(name: str, config_dirs: Sequence[Path]) -> Path:
+    """Return the file of an experiment, of the user's or of this package."""
+    folders = [folder / "experiment" for folder in (*config_dirs, config_dir())]
+    return next(path for folder in folders if (path := folder / f"{name}.yaml").exists())
+
+
 def _known_keys() -> frozenset[str]:
     kinds = [kind for kind in registry.kinds() if kind != "studies"]
-    return frozenset({*_defaults(), *kinds, *map(singular, kinds)})
+    return _settings() | {*kinds, *map(singular, kinds)}
 
 
 @remember
-def _defaults() -> dict[str, Any]:
-    """Return the settings of ``config.yaml``, which no experiment need repeat."""
-    return read_settings(config_dir() / "config.yaml")
+def _settings() -> frozenset[str]:
+    import yaml
+
+    return frozenset(yaml.safe_load((config_dir() / "config.yaml").read_text())) - {"defaults"}
 
 
 def _name_lists() -> tuple[str, ...]:
@@ -215,7 +237,7 @@ def _refuse_unread(experiment: Experiment, overrides: Sequence[Override]) -> Non
     kinds = {kind: singular(kind) for kind in registry.kinds() if kind != "studies"}
     used = {kind: axis for kind, axis in kinds.items() if axis in experiment.choices}
     choices = [(axis, choice.entry) for e in every for axis, some in e.choices.items() for choice in some]
-    names = {*_defaults().keys() - {*kinds, *kinds.values()}, "experiment", *used, *used.values()}
+    names = {*_settings() - {*kinds, *kinds.values()}, "experiment", *used, *used.values()}
     names |= {f"{axis}.{entry.name}" for axis, entry in choices}
     plugins = _in_use([entry.plugin for _, entry in choices if entry.plugin])
     axes = {name for e in every for name in swept(e.sweep)}

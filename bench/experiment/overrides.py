@@ -11,6 +11,8 @@ from bench.errors import UserError, printable
 from bench.experiment.grid import MAX_CELLS
 from bench.model.identity import split_items
 
+GLOBAL = "# @package _global_"
+"""The first line of an experiment file, so that Hydra does not nest its settings."""
 RANGE = re.compile(r"range\(([^()]*)\)")
 _NUMBER = r"\s*[+-]?(?:(?:0|[1-9]\d*)(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?\s*"
 NUMBERS = re.compile(rf"\[{_NUMBER}(?:,{_NUMBER})*\]")
@@ -104,17 +106,25 @@ def merge(settings: dict[str, Any], keys: Sequence[str], value: Any) -> None:
         settings[last] = value
 
 
-def read_settings(path: Path) -> dict[str, Any]:
-    """Return the settings in a YAML file; raises :class:`UserError` with the file and the line if it cannot be read."""
+def check_file(path: Path) -> dict[str, Any]:
+    """Return the content of an experiment file; raises :class:`UserError` with the file and the line if it cannot be read."""
     from omegaconf import OmegaConf
 
     try:
         text = path.read_bytes().decode()
-        content: Any = OmegaConf.to_container(OmegaConf.load(path), resolve=False) if text.strip() else {}
+        content = OmegaConf.to_container(OmegaConf.load(path), resolve=False) if text.strip() else {}
     except Exception as error:  # of the file, of YAML, and OmegaConf's own, such as a key that is a list
         raise UserError(f"'{path}' cannot be read: {printable(error)[:400]}") from None
+    _check_content(path, text, content)
+    return dict(content)  # type: ignore[arg-type]
+
+
+def _check_content(path: Path, text: str, content: Any) -> None:
     if not isinstance(content, dict):
         raise UserError(f"'{path}' must be a table of settings, key: value, and is {type(content).__name__}")
+    first = next((line for line in text.lstrip("\ufeff").splitlines() if line.strip()), "")
+    if first.split() != GLOBAL.split():
+        raise UserError(f"'{path}' must start with the line {GLOBAL}")
     for key, value in content.items():
         line = next((n for n, row in enumerate(text.splitlines(), 1) if row.startswith(f"{key}:")), 0)
         where = f"'{path}'" + (f", line {line}" if line else "")
@@ -122,4 +132,3 @@ def read_settings(path: Path) -> dict[str, Any]:
             raise UserError(f"{where}: {key!r} is not a setting: settings are names")
         if key in TABLES and value is not None and not isinstance(value, dict):
             raise UserError(f"{where}: {key} must be a table, and is {repr(value)[:100]}: write {key}: {{name: value}}")
-    return dict(content)

@@ -124,6 +124,7 @@ FILES = {
     b"~: 4\n": "Incompatible key type",
     b"smaples: 4\n": "did you mean 'samples'?",
     b"samples: ${seed}\n": "must be a whole number",
+    b"samples: 4\n": "must start with the line # @package _global_",
 }
 
 
@@ -131,7 +132,7 @@ FILES = {
 def test_an_experiment_file_that_cannot_be_read_is_named_with_its_line(tmp_path, monkeypatch, capsys, text):
     (tmp_path / "experiment").mkdir()
     path = tmp_path / "experiment" / "mine.yaml"
-    path.write_bytes(b"# mine\n" + text)
+    path.write_bytes(b"# @package _global_\n" * (text != b"samples: 4\n") + text)
     assert main(["plan", "+experiment=mine", "--config-dir", str(tmp_path)]) == 2
     said = capsys.readouterr().err.strip()
     assert len(said.splitlines()) == 1

@@ -135,7 +135,7 @@ def test_failed_rows_run_when_they_are_retried_and_unavailable_ones_once_they_ca
 def folder_with(tmp_path, **files):
     (tmp_path / "experiment").mkdir()
     for name, lines in files.items():
-        (tmp_path / "experiment" / f"{name}.yaml").write_text("\n".join(lines) + "\n")
+        (tmp_path / "experiment" / f"{name}.yaml").write_text("# @package _global_\n" + "\n".join(lines) + "\n")
     return [tmp_path]
 
 

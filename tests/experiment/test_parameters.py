@@ -113,5 +113,5 @@ def test_lists_of_numbers_are_read_as_by_hydras_grammar(value):
 def test_a_changed_experiment_file_is_read_again(tmp_path):
     (tmp_path / "experiment").mkdir()
     for seed in (1, 23):
-        (tmp_path / "experiment" / "mine.yaml").write_text(f"name: mine\nseed: {seed}\n")
+        (tmp_path / "experiment" / "mine.yaml").write_text(f"# @package _global_\nname: mine\nseed: {seed}\n")
         assert config.load(["experiment=mine"], [tmp_path]).seed == seed

@@ -75,6 +75,6 @@ def test_an_answer_holds_for_the_settings_of_its_file_only(tmp_path):
 
 def test_an_experiment_does_not_inherit_an_answer(tmp_path):
     (tmp_path / "experiment").mkdir()
-    text = "defaults: [stiffness_sweep, _self_]\nname: mine\n"
+    text = "# @package _global_\ndefaults: [stiffness_sweep, _self_]\nname: mine\n"
     (tmp_path / "experiment" / "mine.yaml").write_text(text)
     assert not config.load(["experiment=mine"], [tmp_path]).answer
