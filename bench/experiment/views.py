@@ -85,7 +85,8 @@ class Chart:
     marks: Sequence[Mark] = ()
     join: bool = False
     arrow: str = ""
-    """The column whose values are one or two points each: ``points`` joins two by an arrow. Markers are those of ``line``."""
+    """The column whose values are one or two points each: ``points`` joins two by an arrow, and names their series there.
+    Markers are those of ``line``."""
     failed: str = ""
     """The column that is true where a point has no value: a cross at the upper edge."""
     across: int = 4

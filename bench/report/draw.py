@@ -45,8 +45,10 @@ BAND: dict[str, Any] = {"color": "#D55E00", "alpha": 0.12, "linewidth": 0}
 """Look of a named range of an axis."""
 EXACT, USELESS = 1e-4, 1e2
 """Where a value above 1 means a failure, smaller values are drawn here as upper limits, and larger ones with their number."""
-NEAR = math.log(2.0)
-"""Distance in logarithms from which an arrow joins two points."""
+NAME = 0.8
+"""Longest line of a name at a point, in inches."""
+NEAR = 0.2
+"""Distance in inches from which an arrow joins two points."""
 LIMIT: dict[str, Any] = {"color": "#000000", "linewidth": 1.4}
 """Look of a limit across a grid."""
 MANY = 12
@@ -96,10 +98,10 @@ def draw(chart: Chart) -> Figure:
         if is_plot:
             _draw_lines(chart, panel, part, styles)
             few = all(p[chart.x[0].name].nunique() <= 6 for _, p in panels)
-            _scale_x(panel, chart.x[0], part[chart.x[0].name], few)
+            _scale_x(panel, chart.x[0], part[chart.x[0].name], few, bool(chart.arrow))
             _scale_values(chart, panel, "y", chart.y[0], part if chart.own_scales else chart.frame)
             if chart.arrow:
-                _draw_arrows(chart, panel, part, styles)
+                _draw_arrows(chart, panel, part, styles, np.array([inner, heights[place]]))
             panel.set_xlabel("" if stacked and not is_last else _wrapped(chart.x[0].heading, inner))
             panel.set_ylabel(_wrapped(chart.y[0].heading, heights[place]) if is_left else "")
         else:
@@ -166,15 +168,16 @@ def _signs(chart: Chart) -> list[str]:
 
 def _legend(chart: Chart, styles: dict[str, Style], width: float) -> list[Any]:
     """Return the handles of the legend: series or levels, the front, and named values and ranges of the axes."""
-    labels = {name: _wrapped(style.meaning or name, width - 0.6) for name, style in styles.items() if name}
+    named = {name: style for name, style in styles.items() if name and not chart.arrow}
+    labels = {name: _wrapped(style.meaning or name, width - 0.6) for name, style in named.items()}
     handles: list[Any] = []
     if chart.kind == "grid":
         looks: dict[str, Any] = {"edgecolor": "#808080", "linewidth": 0.4}
         handles = [Patch(facecolor=styles[name].colour, label=label, **looks) for name, label in labels.items()]
     elif chart.kind != "dots" or chart.series != chart.y[0].name:
         keys = [key for key in dict.fromkeys((chart.panel, chart.series, chart.line)) if key]
-        is_line = chart.kind == "lines" or bool(chart.arrow)
-        bare = chart.arrow or (is_line and keys and chart.frame.groupby(keys).size().min() > MANY)
+        is_line = chart.kind == "lines"
+        bare = is_line and keys and chart.frame.groupby(keys).size().min() > MANY
         for name, label in labels.items():
             style = styles[name]
             mark = "" if bare and style.line != "none" else style.marker
@@ -248,8 +251,8 @@ def _log_range(column: Column, rows: pd.DataFrame, marks: Sequence[Mark] = ()) -
     return min(every) / margin, max(every) * margin
 
 
-def _scale_x(panel: Axes, column: Column, values: pd.Series, few: bool) -> None:
-    """Set the scale of x, with a label at each of the ``values`` if all panels have ``few``."""
+def _scale_x(panel: Axes, column: Column, values: pd.Series, few: bool, is_named: bool) -> None:
+    """Set the scale of x, with a label at each of the ``values`` if all panels have ``few``, and room for names at points."""
     if not pd.api.types.is_numeric_dtype(values):
         panel.tick_params(axis="x", rotation=30)
         return
@@ -257,7 +260,7 @@ def _scale_x(panel: Axes, column: Column, values: pd.Series, few: bool) -> None:
     if not places.size:
         return
     if _is_log(column, places) and places[0] > 0:
-        margin = max((places[-1] / places[0]) ** 0.05, 1.08)
+        margin = max((places[-1] / places[0]) ** (0.25 if is_named else 0.05), 1.08)
         wanted = places if few and column.format == "setting" else ()
         log_axis(panel, "x", places[0] / margin, places[-1] * margin, wanted, _values_text(column, 0.0))
         return
@@ -308,16 +311,36 @@ def _draw_lines(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str,
         _draw_values(chart, panel, points, y, log, points[x.name].to_numpy(), style, mark, 3 + 0.01 * order)
 
 
-def _draw_arrows(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str, Style]) -> None:
-    """Join the two points of each arrow, unless they are close to each other."""
+def _draw_arrows(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str, Style], size: np.ndarray) -> None:
+    """Join the two points of each arrow of a panel of ``size`` (2,) inches, and name the series beside the first of them.
+
+    Of the places at a point the name is where fewest points, arrows and other names are.
+    """
+    low, high = (np.log(ends) for ends in zip(panel.get_xlim(), panel.get_ylim(), strict=True))
+    taken: list[tuple[np.ndarray, np.ndarray]] = []
+    named: list[tuple[str, np.ndarray]] = []
     for _, points in part.groupby(chart.arrow, sort=False):
         ends = points[[chart.x[0].name, chart.y[0].name]].to_numpy(float, copy=True)
         if chart.y[0].above_one:
             ends[:, 1] = ends[:, 1].clip(EXACT, USELESS)
-        if np.ptp(np.log(ends), axis=0).max() > NEAR:
-            colour = styles[str(points[chart.series].iloc[0])].colour
-            look = {"arrowstyle": "-|>", "color": colour, "linewidth": 1.6, "shrinkA": 3, "shrinkB": 3}
+        series, places = str(points[chart.series].iloc[0]), (np.log(ends) - low) / (high - low) * size
+        if np.ptp(places, axis=0).max() > NEAR:
+            look = {"arrowstyle": "-|>", "color": styles[series].colour, "linewidth": 1.6, "shrinkA": 3, "shrinkB": 3}
             panel.annotate("", ends[-1], ends[0], arrowprops=look, zorder=2)
+        taken.append((places.min(axis=0) - 0.05, places.max(axis=0) + 0.05))
+        named.append((series, places[0]))
+    for series, place in named:
+        text = _wrapped(series, NAME, r"_ ,/\[")
+        width, height = extent = np.array([_text_width(text), 0.14 * (text.count("\n") + 1)])
+        sides = ((0.08, -height / 2), (-width - 0.08, -height / 2), (-width / 2, 0.08), (-width / 2, -height - 0.08))
+        starts = [place + side for side in sides]
+        outside = [((start < 0) | (start + extent > size)).any() for start in starts]
+        crossed = [sum((start < b).all() and (start + extent > a).all() for a, b in taken) for start in starts]
+        _, _, best = min(zip(outside, crossed, range(4), strict=True))
+        taken.append((starts[best], starts[best] + extent))
+        x, y = starts[best] / size
+        written = panel.text(x, y, text, transform=panel.transAxes, color=styles[series].colour)
+        written.set_in_layout(False)
 
 
 def _draw_values(
