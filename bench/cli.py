@@ -551,7 +551,7 @@ VERBS = {
         _main_of("bench.compare.command"), "compare BEFORE AFTER [again=DIR,DIR] [out=DIR]", "two results, cell by cell: 1 when something got worse",
         "BEFORE and AFTER are directories, or git revisions as REV or REV:PATH. Accuracy decides, paired on equal noise;\n"
         "times only with again=DIR,DIR, further runs of BEFORE, whose spread they are compared with.\n"
-        "Written to out=DIR (runs/compare): compare.csv, .md and .html.\n",
+        "Written to out=DIR (runs/compare): compare.csv and .md.\n",
     ),
     "index": Verb(
         _main_of("bench.report.index"), "index [DIR]", "a page over all experiments of a results folder, with the state of each",

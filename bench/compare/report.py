@@ -1,4 +1,4 @@
-"""Writes a comparison as files and as a page, and prints it."""
+"""Writes a comparison as files, and prints it."""
 
 from __future__ import annotations
 
@@ -12,15 +12,12 @@ import pandas as pd
 
 from bench.compare import timings
 from bench.compare.cells import COUNTS, FIRST, LAST, OUTCOMES, WORSE_IN, both_sides
-from bench.compare.judging import NOTES, rule_of
-from bench.experiment.columns import Column, text
+from bench.compare.judging import NOTES
+from bench.experiment.columns import Column
 from bench.experiment.parameters import flat_rows
-from bench.experiment.views import Table, Views
 from bench.report.problems import titled, varying_identity
 from bench.report.tables import plain_markdown
 from bench.report.text import counted, one_line
-from bench.report.web import document
-from bench.report.web.data import cells_data
 from bench.run.files import make_directory, write_all
 
 PRINTED = 30
@@ -67,7 +64,8 @@ class Comparison:
     def changes(self) -> pd.DataFrame:
         """The columns ``outcome``, ``experiment``, ``cell`` and ``change`` of the changed cells, the worst first."""
         named = self.table.assign(cell=self.cells)[["outcome", "experiment", "cell", "change"]]
-        return _worst_first(named[named["outcome"] != "same"])
+        named = named[named["outcome"] != "same"]
+        return named.iloc[named["outcome"].map(OUTCOMES.index).argsort(kind="stable")]
 
 
 def summary(table: pd.DataFrame) -> str:
@@ -84,14 +82,13 @@ def count_outcomes(table: pd.DataFrame) -> dict[str, int]:
 
 
 def write(comparison: Comparison, out: Path) -> list[Path]:
-    """Write ``compare`` as .csv, .md and .html. Raises :class:`StorageError` if that fails."""
+    """Write ``compare`` as .csv and .md. Raises :class:`StorageError` if that fails."""
     make_directory(out)
     return write_all(
         out,
         {
             "compare.csv": comparison.to_frame().drop(columns="cell").to_csv(index=False, lineterminator="\n"),
             "compare.md": markdown(comparison),
-            "compare.html": page(comparison),
         },
     )
 
@@ -110,10 +107,6 @@ def markdown(comparison: Comparison) -> str:
     return "\n\n".join([*texts, "\n".join(f"- {note}" for note in (*NOTES, timings.NOTE))]) + "\n"
 
 
-def _worst_first(table: pd.DataFrame) -> pd.DataFrame:
-    return table.iloc[table["outcome"].map(OUTCOMES.index).argsort(kind="stable")]
-
-
 def cell_names(table: pd.DataFrame) -> list[str]:
     """Return a name for each cell: the identity columns that vary, and the parameters in which cells of one name differ."""
     table = table.reset_index(drop=True)
@@ -128,21 +121,3 @@ def cell_names(table: pd.DataFrame) -> list[str]:
             )
             names[part.index] = names[part.index] + ", " + titled(differing, [*differing])
     return [*names]
-
-
-def page(comparison: Comparison) -> str:
-    """Return the comparison as an HTML page: summary, remarks, rules, and all cells before and after, the worst first."""
-    table = _worst_first(comparison.table).reset_index(drop=True)
-    cells = table.drop(columns=WORSE_IN).assign(status=table["status_after"], reason=table["change"])
-    rules = pd.DataFrame({"remark": [*comparison.remarks, *NOTES, timings.NOTE]})
-    columns = [
-        Column(
-            f"{column.name}_{when}", label=f"{rule_of(column).called} {when}", unit=column.unit, kind=column.kind,
-            format="seconds" if column.unit == "s" else "number",
-        )
-        for column in comparison.judged
-        for when in ("before", "after")
-    ]  # fmt: skip
-    shown = Views([Table("rules", rules, [text("remark")], "How cells are judged", page=True)], headline=summary(table))
-    data = cells_data(cells, [text("outcome"), text("experiment"), *columns])
-    return document.page(comparison.title, "Did something get worse?", shown, data)
