@@ -5,11 +5,10 @@ Names and settings are the same as on the command line.
 
 from __future__ import annotations
 
-import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypedDict, Unpack, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -24,78 +23,12 @@ from bench.notebook import Estimates
 if TYPE_CHECKING:
     import pandas as pd
 
-Names = Sequence[str] | str
-"""Identity strings of plugins, ``name`` or ``name[parameter=value]``: several, or one."""
-Values = Mapping[str, Mapping[str, Any]]
-"""Parameters of plugins: ``{"pushing": {"mass": 0.2}}``."""
 
-
-class Settings(TypedDict, total=False):
-    """The settings of an experiment, by their names on the command line; docs/commands.md has their meanings.
-
-    A setting that is omitted has the value of the experiment's file, else the default of ``conf/config.yaml``.
-    """
-
-    name: str
-    question: str
-    answer: str
-    study: str
-    scenes: Names
-    contacts: Names
-    integrators: Names
-    backends: Names
-    estimators: Names
-    optimizers: Names
-    trainers: Names
-    sweep: Mapping[str, Any]
-    also: Names
-    scene: Values
-    contact: Values
-    integrator: Values
-    backend: Values
-    estimator: Values
-    optimizer: Values
-    trainer: Values
-    theta: Names
-    theta0: Sequence[float] | np.ndarray | None
-    descent: float
-    path: Names
-    samples: int
-    repeats: int
-    seed: int
-    draws: str | None
-    mirrored: bool | None
-    reference: Mapping[str, float]
-    workers: int | None
-    timeout: float | str | None
-    memory: float | str | None
-    on_error: str
-    ladder: bool
-    retry: Names
-    versions: str
-    timing: bool | None
-    compile_cache: str | Path | None
-    plugins: str | Path | Sequence[str | Path]
-    launcher: str
-    ray: Mapping[str, Any]
-    shard: str
-    results_dir: str | Path
-    formats: Names
-    marks: Mapping[str, Mapping[str, float]]
-    compares: Mapping[str, Sequence[Any]]
-
-
-SIMPLE = re.compile(r"[A-Za-z0-9_./+-]*")
-"""Strings that Hydra reads without quotes."""
-SPECIAL, ESCAPED = re.compile(r"([\\()\[\]{}:=,])"), r"\\\1"
-"""Characters that need a backslash in the keys of a Hydra table."""
-
-
-def run(experiment: str | Sequence[str] = (), **settings: Unpack[Settings]) -> pd.DataFrame:
+def run(experiment: str | Sequence[str] = (), **settings: Any) -> pd.DataFrame:
     """Run the missing cells of an experiment, write its tables and charts, and return its rows, one per cell.
 
-    ``experiment`` is the name of an experiment, or a list of command-line words. ``settings`` are the keys of
-    :class:`bench.api.Settings`: ``run("stiffness_sweep", samples=32, sweep={"stiffness": [1e2, 1e4]},
+    ``experiment`` is the name of an experiment, or a list of command-line words. ``settings`` are those of the
+    command line, see docs/commands.md: ``run("stiffness_sweep", samples=32, sweep={"stiffness": [1e2, 1e4]},
     results_dir="out")``. Parameters of plugins are nested dictionaries: ``scene={"pushing": {"mass": 0.2}}``. Raises
     :class:`bench.UserError` for invalid input.
     """
@@ -105,40 +38,11 @@ def run(experiment: str | Sequence[str] = (), **settings: Unpack[Settings]) -> p
     from bench.run.execute import execute
 
     words = [f"experiment={experiment}"] if isinstance(experiment, str) and experiment else list(experiment)
-    words += [word for key, value in settings.items() for word in _override_words(key, value)]
-    resolved = config.load(words)
+    resolved = config.load(words, settings=settings)
     finished = execute(resolved)
-    rows = finish(finished, words)[0] if resolved.execution.shard is None else finished.rows()
+    given = [*words, *(f"{key}={value}" for key, value in settings.items())]
+    rows = finish(finished, given)[0] if resolved.execution.shard is None else finished.rows()
     return with_axes(resolved.sweep, rows).reset_index(drop=True)
-
-
-def _override_words(key: str, value: Any) -> list[str]:
-    """Return a keyword argument as command-line words. Dictionaries of plugin parameters become dotted keys."""
-    kinds = registry.kinds()
-    head = key.partition(".")[0]
-    if isinstance(value, Mapping) and (head == "reference" or head in map(singular, kinds)):
-        return [word for name, inner in value.items() for word in _override_words(f"{key}.{name}", inner)]
-    return [f"{key}={_hydra_value(value, quoted=key not in (*kinds, 'path', 'study', 'experiment'))}"]
-
-
-def _hydra_value(value: Any, quoted: bool = True) -> str:
-    """Return a value in Hydra's grammar. Identity strings stay unquoted, since the code that reads them quotes them."""
-    if isinstance(value, np.ndarray | np.generic):
-        value = value.tolist()
-    if isinstance(value, Mapping):
-        items = ((SPECIAL.sub(ESCAPED, str(name)), _hydra_value(inner, quoted)) for name, inner in value.items())
-        return "{" + ",".join(f"{name}:{inner}" for name, inner in items) + "}"
-    if isinstance(value, str | Path):
-        if not quoted or SIMPLE.fullmatch(str(value)):
-            return str(value)
-        # Hydra reads backslashes literally, except before a quote and at the end
-        escaped = re.sub(r"(\\*)('|$)", lambda match: 2 * match[1] + ("\\'" if match[2] else ""), str(value))
-        return f"'{escaped}'"
-    if isinstance(value, list | tuple | range):
-        return "[" + ",".join(_hydra_value(one, quoted) for one in value) + "]"
-    if value is None or isinstance(value, bool):
-        return {None: "null", True: "true", False: "false"}[value]
-    return str(value)
 
 
 def load(directory: str | Path) -> pd.DataFrame:
@@ -151,16 +55,15 @@ def load(directory: str | Path) -> pd.DataFrame:
 
     from bench.experiment.axes import with_axes
     from bench.experiment.columns import Columns
-    from bench.experiment.study import Study
+    from bench.experiment.study import columns_of
     from bench.report.views import newest_rows
     from bench.run.rows import recorded_sweep
     from bench.run.store import Store
 
     directory = Path(directory).expanduser()
     rows = Store(directory, Columns.of()).load() if directory.is_dir() else pd.DataFrame()
-    study = None if rows.empty else registry.entries()["studies"].get(str(rows["study"].iloc[0]))
-    if study and study.plugin and issubclass(study.plugin, Study):
-        rows = Store(directory, study.plugin.columns).load()  # without rows that the study cannot have stored
+    if not rows.empty:  # without rows that the study cannot have stored
+        rows = Store(directory, columns_of(rows["study"].iloc[0])).load()
     if rows.empty:
         raise UserError(f"no rows are stored in '{directory}': run an experiment first, its folder is results_dir/name")
     return with_axes(recorded_sweep(directory), newest_rows(rows))

@@ -434,17 +434,16 @@ def _gradcheck(words: list[str]) -> int:
     _refer("gradcheck", words[: len(words) - len(settings)])
     experiment = _with_engine(["experiment=gradient_check", *scenes, "name=gradcheck"], settings)
     plugins = [choice.entry.plugin for choice in experiment.choices["scene"]]
-    horizons = [word for word in words if _sets_horizon(word)]
-    is_swept = _is_given("sweep.horizon", settings)
     own = {
         int(parameters(plugin)["horizon"].default) for plugin in plugins if plugin and "horizon" in parameters(plugin)
     }
-    if (horizons and not is_swept) or not own:
-        experiment = replace(experiment, sweep={k: v for k, v in experiment.sweep.items() if k != "horizon"})
-    elif not is_swept:
-        experiment = replace(
-            experiment, sweep={**experiment.sweep, "horizon": sorted({*experiment.sweep["horizon"], *own})}
-        )
+    if not _is_given("sweep.horizon", settings):
+        sweep = dict(experiment.sweep)
+        if own and not any(map(_sets_horizon, words)):
+            sweep["horizon"] = sorted({*sweep["horizon"], *own})
+        else:
+            sweep.pop("horizon", None)
+        experiment = replace(experiment, sweep=sweep)
     finished = _execute(experiment, words)
     if isinstance(finished, int):
         return finished
@@ -552,7 +551,7 @@ VERBS = {
         _main_of("bench.compare.command"), "compare BEFORE AFTER [again=DIR,DIR] [out=DIR]", "two results, cell by cell: 1 when something got worse",
         "BEFORE and AFTER are directories, or git revisions as REV or REV:PATH. Accuracy decides, paired on equal noise;\n"
         "times only with again=DIR,DIR, further runs of BEFORE, whose spread they are compared with.\n"
-        "Written to out=DIR (runs/compare): compare.csv, .md and .html.\n",
+        "Written to out=DIR (runs/compare): compare.csv and .md.\n",
     ),
     "index": Verb(
         _main_of("bench.report.index"), "index [DIR]", "a page over all experiments of a results folder, with the state of each",

@@ -74,14 +74,6 @@ def measured_text(value: float, error: float) -> str:
     return f"{number(value, 5)} +- {number(half)}" if half > 1e-6 * abs(value) else number(value, 5)
 
 
-def insensitive_text(figures: Sequence[Figure]) -> str:
-    """Return a sentence on how many figures cannot detect an error of 5%, and why; empty if all can."""
-    limits = Counter(figure.limitation for figure in figures if figure.limitation)
-    reasons = ", ".join(f"{count} for {limit}" for limit, count in limits.items())
-    of_all = f"{limits.total()} of {counted(len(figures), 'figure')}"
-    return f"{of_all} cannot detect an error of 5%: {reasons}" if limits else ""
-
-
 def for_readers(figures: pd.DataFrame) -> pd.DataFrame:
     """Return the table of figures with the columns :data:`FIGURE`."""
     return figures.assign(
@@ -128,8 +120,6 @@ def markdown(results: Results) -> str:
                 parts.append(plain_markdown(readable(Table(claim.name, shown, FIGURE))) + "\n")
             if result.remark:
                 parts.append(f"*{escape_markdown(result.remark)}*\n")
-            if sentence := insensitive_text(result.figures):
-                parts.append(f"{sentence}.\n")
             parts.append(
                 f"Learned: {claim.learned} `python -m bench claims {claim.name}`, {duration(result.seconds)}.\n"
             )
@@ -148,17 +138,14 @@ def claims_table(results: Results) -> Table:
 
 
 def result_lines(claim: type[Claim], result: ClaimResult, is_stored: bool) -> Iterator[str]:
-    """Yield the lines printed for one claim; that no figure detects an error of 5% stands first."""
+    """Yield the lines printed for one claim."""
     origin = ", as stored" if is_stored else ""
-    blind = "detects no error of 5%: " if result.figures and all(f.limitation for f in result.figures) else ""
-    yield (
-        f"{claim.name:<4} {result.verdict:<29} {duration(result.seconds):>7}{origin}  {blind}{claim.source}: {claim.statement}"
-    )
+    yield f"{claim.name:<4} {result.verdict:<29} {duration(result.seconds):>7}{origin}  {claim.source}: {claim.statement}"
     for figure in result.figures:
         if not figure.agrees:
             yield f"       {figure.what}: published {figure.published}, measured {measured_text(figure.measured, figure.error)}"
-    for sentence in filter(None, (result.remark, insensitive_text(result.figures))):
-        yield f"       {sentence}"
+    if result.remark:
+        yield f"       {result.remark}"
 
 
 def list_lines(claims: Sequence[type[Claim]]) -> Iterator[str]:

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import pandas as pd
 
 from bench.compare import timings
-from bench.compare.judging import Row, judge_cell, rule_of
+from bench.compare.judging import judge_cell, rule_of
 from bench.experiment.columns import IDENTITY, Column, Columns
-from bench.experiment.parameters import completed
+from bench.experiment.parameters import parsed
 
 OUTCOMES = ("worse", "better", "changed", "same")
 COUNTS = ("samples", "repeats", "seed")
@@ -74,14 +73,4 @@ def rows_by_cell(rows: pd.DataFrame) -> pd.DataFrame:
 
 def canonical_parameters(parameters: str) -> str:
     """Return parameters as JSON with sorted names, and today's defaults where a parameter is missing."""
-    return json.dumps(completed(json.loads(parameters)), sort_keys=True)
-
-
-def flat_parameters(row: Row) -> dict[str, Any]:
-    """Return a row's plugins, parameters and counts by name: ``{"scene": "pushing", "pushing.hold": 1, "seed": 0.0}``."""
-    flat: dict[str, Any] = {}
-    for axis, part in completed(json.loads(row["parameters"])).items():
-        if isinstance(part, Mapping):
-            flat |= {axis: part["name"]} if "name" in part else {}
-            flat |= {f"{part.get('name', axis)}.{name}": value for name, value in part.items() if name != "name"}
-    return flat | {name: float(row[name]) for name in COUNTS}
+    return json.dumps(parsed(parameters), sort_keys=True)

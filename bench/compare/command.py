@@ -9,7 +9,7 @@ from pathlib import Path
 import pandas as pd
 
 from bench.compare.cells import compare_cells
-from bench.compare.report import Comparison, show, write
+from bench.compare.report import Comparison, write
 from bench.compare.sources import Results, read_results
 from bench.compare.timings import RUNS
 from bench.errors import UserError, local_path
@@ -26,7 +26,7 @@ def main(words: Sequence[str]) -> int:
         )
     out = local_path("out", settings["out"])
     comparison = compare(names[0], names[1], [*filter(None, settings["again"].split(","))])
-    show(comparison, write(comparison, out))
+    print(comparison, "\nWritten:", *write(comparison, out), sep="\n  ")
     return int(comparison.worse)
 
 
@@ -90,12 +90,8 @@ def _library_versions(rows: pd.DataFrame) -> dict[str, list[str]]:
 
 
 def machine_remarks(old: Results, new: Results, timings: bool) -> list[str]:
-    """Return remarks on different machines and, if times are compared, on reasons to doubt them."""
-    remarks = []
-    if not (old.machine and old.machine == new.machine):
-        effect = "timings are not comparable" if timings else "rounding may change the estimates of chaotic cells"
-        remarks.append(f"made on different machines ({old.machine or 'unknown'}; {new.machine or 'unknown'}): {effect}")
-    for when, results in (("before", old), ("after", new)):
-        if timings and results.busy:
-            remarks.append(f"WARNING: the machine was busy {when} ({results.busy}), so timings are doubtful")
-    return remarks
+    """Return a remark on different machines."""
+    if old.machine and old.machine == new.machine:
+        return []
+    effect = "timings are not comparable" if timings else "rounding may change the estimates of chaotic cells"
+    return [f"made on different machines ({old.machine or 'unknown'}; {new.machine or 'unknown'}): {effect}"]

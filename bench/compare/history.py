@@ -26,8 +26,7 @@ PANELS = 16
 """Most series that are drawn."""
 ERROR = Column("error", label="relative error", digits=3)
 ERRORS = ("paired", "interval", "exact")
-"""Comparison rules of columns that contain an error. A series is followed by the column that has a ratio in the most
-cells, the first of them if several have."""
+"""Comparison rules of columns that contain an error. An experiment is followed by the first such column with a value."""
 NOT_RUN = ("unsupported", "unavailable", "waiting")
 """Statuses of cells that never ran, which do not count as failures."""
 QUESTION = "Which series changed?"
@@ -37,7 +36,7 @@ NOTES = (
     "gradient moved: largest distance of a cell's gradient from that of the first result, relative to its norm.",
 )
 LONGEST = 18
-"""Largest number of characters of a result's name in the chart. The end of a longer name is shown."""
+"""Largest number of characters of a result's name in the chart, from its end."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,23 +74,17 @@ def compute_history(names: Sequence[str], results: Sequence[Mapping[str, Results
         is_ok = pd.concat([table["status"] == "ok" for table in tables], axis=1, keys=range(len(tables)))
         by = "estimator" if first["estimator"].any() else "backend"
         errors = [column for by in ERRORS for column in compared if rule_of(column).by == by]
+        error = next((column for column in errors if (first[column.name] > 0).any()), None)
+        vectors = [column for column in compared if rule_of(column).by == "vector"]
         for series, every in first.groupby(by, sort=False):
             of = every.index[~every["status"].isin(NOT_RUN)]
             same = of[is_ok.loc[of].all(axis=1)]
-            ratios = {
-                column: [_log_ratios(first.loc[same, column.name], table.loc[same, column.name]) for table in tables]
-                for column in errors
-            }
-            least = {column: min(map(len, own)) for column, own in ratios.items()}
-            error = max(least, key=lambda column: least[column], default=None) if any(least.values()) else None
+            before = first.loc[same]
             for place, (name, table) in enumerate(zip(names, tables, strict=True)):
-                logs = ratios[error][place] if error else np.empty(0)
-                moves = [
-                    distance(column, *pair)
-                    for column in compared
-                    if rule_of(column).by == "vector"
-                    for pair in zip(first.loc[same].to_dict("records"), table.loc[same].to_dict("records"), strict=True)
-                ]
+                after = table.loc[same]
+                logs = _log_ratios(before[error.name], after[error.name]) if error else np.empty(0)
+                pairs = [*zip(before.to_dict("records"), after.to_dict("records"), strict=True)]
+                moves = [distance(column, *pair) for column in vectors for pair in pairs]
                 lines.append({
                     "result": name, "experiment": experiment, "series": series if first[by].nunique() > 1 else "",
                     "column": rule_of(error).called if error else "", "error": float(np.exp(logs.mean())) if len(logs) else math.nan,
@@ -122,16 +115,15 @@ def write(history: History, out: Path) -> list[Path]:
 
 
 def views(history: History) -> Views:
-    """Return the table of all series, and small multiples of the series that changed, the largest change first."""
+    """Return the table of all series, and small multiples of the series that changed."""
     table = history.table.assign(
         line=[": ".join(filter(None, pair)) for pair in zip(history.table["experiment"], history.table["series"], strict=True)],
         failures=[f"{f} of {n}" for f, n in zip(history.table["failed"], history.table["of"], strict=True)],
         result=history.table["result"].map(_short_names(history.names)),
     )  # fmt: skip
-    changes = table.groupby("line", sort=False)[["error", "failed", "of", "moved"]].apply(_change)
-    moved = changes[changes > 0].sort_values(ascending=False, kind="stable")
-    names = list(moved.index[:PANELS]) or list(changes.index[:PANELS])
-    frame = pd.concat([table[table["line"] == name] for name in names], ignore_index=True)
+    parts = dict(iter(table.groupby("line", sort=False)))
+    moved = [name for name, part in parts.items() if _is_changed(part)]
+    frame = pd.concat([parts[name] for name in (moved or [*parts])[:PANELS]], ignore_index=True)
     failures = {
         str(name): f"failed: {', '.join(map(str, part['failed']))} of {part['of'].iloc[0]}"
         for name, part in frame.groupby("line")
@@ -139,7 +131,7 @@ def views(history: History) -> Views:
     }
     chart = Chart(
         "history", frame, [text("result", label="")], [ERROR], title=QUESTION, panel="line", panel_notes=failures, height=1.2,
-        marks=[Mark("", 1.0, axis="y")], subtitle=f"{len(moved)} of {len(changes)} series changed",
+        marks=[Mark("", 1.0, axis="y")], subtitle=f"{len(moved)} of {len(parts)} series changed",
     )  # fmt: skip
     columns = [
         text("result"), text("experiment"), text("series"), replace(ERROR, label="error"), text("column", label="error of"),
@@ -148,20 +140,15 @@ def views(history: History) -> Views:
     return Views([Table("history", table, columns, QUESTION, NOTES, data=history.table)], [chart])
 
 
-def _change(part: pd.DataFrame) -> float:
-    """Return how far a series moved: the logarithm of its largest factor, 0 below 1%, plus failures and gradients."""
-    factor = float(np.nanmax([0.0, *np.abs(np.log(part["error"]))]))
-    failures = float(np.ptp(part["failed"])) / max(int(part["of"].max()), 1)
-    moved = float(np.nanmax([0.0, *part["moved"]]))
-    return (factor if factor > math.log(CHANGED) else 0.0) + failures + (math.log1p(moved) if moved > ROUNDING else 0.0)
+def _is_changed(part: pd.DataFrame) -> bool:
+    """Return whether an error of a series moved by 1%, or its failures or gradients changed."""
+    error = part["error"].max() / part["error"].min()
+    return bool(error > CHANGED or part["failed"].nunique() > 1 or (part["moved"] > ROUNDING).any())
 
 
 def _short_names(names: Sequence[str]) -> dict[str, str]:
-    """Return the part of each name that is not common to the ends of all, such as the revision in ``REV:results/standard``."""
+    """Return the part of each name before the end that all have, such as the revision in ``REV:results/standard``."""
     parts = [re.split(r"(?=[:/])", name.rstrip("/")) for name in names]
     while all(len(part) > 1 and part[-1] == parts[0][-1] for part in parts):
         parts = [part[:-1] for part in parts]
-    short = ["".join(part) for part in parts]
-    return {
-        name: text if len(text) <= LONGEST else "..." + text[-LONGEST:] for name, text in zip(names, short, strict=True)
-    }
+    return {name: "".join(part)[-LONGEST:] for name, part in zip(names, parts, strict=True)}

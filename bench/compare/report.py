@@ -1,28 +1,23 @@
-"""Writes a comparison as files and as a page, and prints it."""
+"""Writes a comparison as files, and prints it."""
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 
 from bench.compare import timings
-from bench.compare.cells import FIRST, LAST, OUTCOMES, WORSE_IN, both_sides, flat_parameters
-from bench.compare.judging import NOTES, rule_of
-from bench.experiment.columns import Column, text
-from bench.experiment.views import Table, Views
-from bench.report import terminal
-from bench.report.problems import varying_identity
+from bench.compare.cells import COUNTS, FIRST, LAST, OUTCOMES, WORSE_IN, both_sides
+from bench.compare.judging import NOTES
+from bench.experiment.columns import Column
+from bench.experiment.parameters import flat_rows
+from bench.report.problems import titled, varying_identity
 from bench.report.tables import plain_markdown
-from bench.report.text import axis_value, counted, one_line
-from bench.report.web import document
-from bench.report.web.data import cells_data
+from bench.report.text import counted, one_line
 from bench.run.files import make_directory, write_all
 
 PRINTED = 30
@@ -50,6 +45,7 @@ class Comparison:
     def __str__(self) -> str:
         lines = [self.title, summary(self.table), *(f"  {remark}" for remark in self.remarks)]
         lines += [": ".join(map(str, line)) for line in self.changes.head(PRINTED).to_numpy()]
+        lines += [f"and {len(self.changes) - PRINTED} more in the files"] * (len(self.changes) > PRINTED)
         return "\n".join(map(one_line, lines))
 
     __repr__ = __str__
@@ -68,7 +64,8 @@ class Comparison:
     def changes(self) -> pd.DataFrame:
         """The columns ``outcome``, ``experiment``, ``cell`` and ``change`` of the changed cells, the worst first."""
         named = self.table.assign(cell=self.cells)[["outcome", "experiment", "cell", "change"]]
-        return _worst_first(named[named["outcome"] != "same"])
+        named = named[named["outcome"] != "same"]
+        return named.iloc[named["outcome"].map(OUTCOMES.index).argsort(kind="stable")]
 
 
 def summary(table: pd.DataFrame) -> str:
@@ -85,14 +82,13 @@ def count_outcomes(table: pd.DataFrame) -> dict[str, int]:
 
 
 def write(comparison: Comparison, out: Path) -> list[Path]:
-    """Write ``compare`` as .csv, .md and .html. Raises :class:`StorageError` if that fails."""
+    """Write ``compare`` as .csv and .md. Raises :class:`StorageError` if that fails."""
     make_directory(out)
     return write_all(
         out,
         {
             "compare.csv": comparison.to_frame().drop(columns="cell").to_csv(index=False, lineterminator="\n"),
             "compare.md": markdown(comparison),
-            "compare.html": page(comparison),
         },
     )
 
@@ -111,61 +107,17 @@ def markdown(comparison: Comparison) -> str:
     return "\n\n".join([*texts, "\n".join(f"- {note}" for note in (*NOTES, timings.NOTE))]) + "\n"
 
 
-def show(comparison: Comparison, paths: Sequence[Path]) -> None:
-    """Print the summary, the remarks and the first changes."""
-    console = terminal.open_console()
-    console.print(f"\n{comparison.title}", style="bold")
-    console.print(summary(comparison.table))
-    for remark in comparison.remarks:
-        console.print(f"  {remark}")
-    listed = comparison.changes
-    if not listed.empty:
-        terminal.print_table(console, listed.head(PRINTED))
-    if len(listed) > PRINTED:
-        console.print(f"and {len(listed) - PRINTED} more in the files")
-    print("\nWritten:", *paths, sep="\n  ")
-
-
-def _worst_first(table: pd.DataFrame) -> pd.DataFrame:
-    return table.iloc[table["outcome"].map(OUTCOMES.index).argsort(kind="stable")]
-
-
 def cell_names(table: pd.DataFrame) -> list[str]:
     """Return a name for each cell: the identity columns that vary, and the parameters in which cells of one name differ."""
-    columns, table = varying_identity(table), table.reset_index(drop=True)
-    names = [", ".join(filter(None, map(_name_part, columns, row))) for row in table[columns].to_numpy(dtype=object)]
+    table = table.reset_index(drop=True)
+    names = titled(table, varying_identity(table))
     for _, part in table.groupby(["experiment", names], sort=False):
         if len(part) > 1:
-            flat = pd.DataFrame(
-                [flat_parameters(row) for row in part.to_dict("records")], index=part.index, dtype=object
+            flat, lines = flat_rows(part)
+            flat = flat.iloc[lines].set_axis([f"{plugin or axis}.{name}" for axis, plugin, name in flat], axis=1)
+            every = flat.set_axis(part.index).assign(**part[[*COUNTS]])
+            differing = every.loc[:, every.astype(str).nunique() > 1].map(
+                lambda one: one if isinstance(one, str | int | float) else str(one)
             )
-            differing = flat.columns[flat.astype(str).nunique() > 1]
-            for place, values in flat[differing].iterrows():
-                names[place] = ", ".join(filter(None, [names[place], *map(_name_part, differing, values)]))
-    return names
-
-
-def _name_part(name: str, value: Any) -> str:
-    if isinstance(value, str):
-        return "" if value == "none" else value
-    if isinstance(value, float) and not math.isfinite(value):
-        return ""
-    return f"{name}={axis_value(value) if isinstance(value, float) else value}"
-
-
-def page(comparison: Comparison) -> str:
-    """Return the comparison as an HTML page: summary, remarks, rules, and all cells before and after, the worst first."""
-    table = _worst_first(comparison.table).reset_index(drop=True)
-    cells = table.drop(columns=WORSE_IN).assign(status=table["status_after"], reason=table["change"])
-    rules = pd.DataFrame({"remark": [*comparison.remarks, *NOTES, timings.NOTE]})
-    columns = [
-        Column(
-            f"{column.name}_{when}", label=f"{rule_of(column).called} {when}", unit=column.unit, kind=column.kind,
-            format="seconds" if column.unit == "s" else "number",
-        )
-        for column in comparison.judged
-        for when in ("before", "after")
-    ]  # fmt: skip
-    shown = Views([Table("rules", rules, [text("remark")], "How cells are judged", page=True)], headline=summary(table))
-    data = cells_data(cells, [text("outcome"), text("experiment"), *columns])
-    return document.page(comparison.title, "Did something get worse?", shown, data)
+            names[part.index] = names[part.index] + ", " + titled(differing, [*differing])
+    return [*names]

@@ -9,22 +9,19 @@ import tarfile
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import cast
 
 import pandas as pd
 
 from bench.errors import UserError
 from bench.experiment.columns import Columns
 from bench.experiment.keys import hashed
-from bench.experiment.study import Study
+from bench.experiment.study import columns_of
 from bench.model import registry
 from bench.run.rows import read_record, valid_rows
 from bench.run.store import Store
 
 STANDARD = "standard"
 """The folder of committed results inside the results folder."""
-BUSY = 1.5
-"""Load per core above which a machine counts as busy."""
 
 
 @dataclass(frozen=True)
@@ -36,8 +33,6 @@ class Results:
     content: str = ""
     """A hash of the files of its rows."""
     machine: str = ""
-    busy: str = ""
-    """The machine's load, if it was more than BUSY per core."""
 
     @property
     def columns(self) -> Columns:
@@ -48,13 +43,6 @@ class Results:
     def is_installed(self) -> bool:
         """Whether its study is installed."""
         return self.study in registry.entries()["studies"]
-
-
-def columns_of(study: str) -> Columns:
-    """Return the columns of a study's rows; those of all studies if it is not installed."""
-    if study not in registry.entries()["studies"]:
-        return Columns.of()
-    return cast(type[Study], registry.usable("studies", study)).columns
 
 
 def read_results(name: str) -> dict[str, Results]:
@@ -127,15 +115,11 @@ def _read(folder: Path) -> tuple[str, Results] | None:
     if faulty:
         raise UserError(f"'{folder}' has impossible values: run the experiment again to compare it")
     label = str(rows["experiment"].iloc[0]) or folder.name
-    return label, Results(rows, studies[0], content, *_read_machine(folder))
+    return label, Results(rows, studies[0], content, _read_machine(folder))
 
 
-def _read_machine(folder: Path) -> tuple[str, str]:
-    """Return processor, cores and system from ``run.json``, and the load if the machine was busy. Empty if unknown."""
-    try:
-        machine = read_record(folder)["machine"]
-        name = f"{machine['processor']}, {machine['cores']} cores, {machine['system']}"
-        load = (machine["load_average"] or [0.0])[0]
-        return name, f"load {load:.1f}" if load > BUSY * machine["cores"] else ""
-    except (KeyError, TypeError):
-        return "", ""
+def _read_machine(folder: Path) -> str:
+    """Return processor, cores and system from ``run.json``; empty if unknown."""
+    machine = read_record(folder).get("machine", {})
+    facts = [machine.get(name) for name in ("processor", "cores", "system")]
+    return "{}, {} cores, {}".format(*facts) if all(facts) else ""

@@ -47,9 +47,8 @@ class Report(Findings):
         """
         with needing_sweeps("plot"):
             from bench.examine import files
-            from bench.report.displays import displayable
             from bench.report.draw import draw
-            from bench.report.figures import styled
+            from bench.report.figures import displayable, styled
 
         figures = {one.name: one for one in files.charts(self)}
         if not figures:

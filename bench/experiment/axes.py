@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -13,10 +14,10 @@ import numpy as np
 from bench.errors import UserError
 from bench.experiment.cell import VIEWS, labels
 from bench.experiment.experiment import Experiment
-from bench.experiment.grid import COUNTS, THETA, expand, parameter_name, swept
-from bench.experiment.parameters import NOT_PLUGINS, of_places, parsed, places, plugin_class
+from bench.experiment.grid import COUNTS, THETA, applies, built, expand, parameter_name, swept
+from bench.experiment.parameters import NOT_PLUGINS, flat_rows, named, parsed, plugin_class
 from bench.model import Plugin, registry
-from bench.model.parameters import build, parameters
+from bench.model.parameters import parameters
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -51,18 +52,26 @@ def values_of(axis: Axis, rows: pd.DataFrame) -> np.ndarray:
     """Return the numbers of an axis, one per row; NaN where it does not apply or is not a number."""
     if axis.column in COUNTS:
         return np.asarray(rows[axis.column], dtype=float)
-    return of_places(rows, axis.names, lambda found: next((p.number for p in found if p.number == p.number), np.nan))
+    values = named(rows, axis.names).map(_number).assign(missing=math.nan)
+    return values.bfill(axis=1).iloc[:, 0].to_numpy(float)
+
+
+def _number(value: Any) -> float:
+    """Return a parameter as a float; NaN if it is not a number. Infinities are stored as strings."""
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    return float(value) if is_number or value in ("inf", "-inf") else math.nan
 
 
 def shown_by(view: str, axis: Axis, rows: pd.DataFrame) -> np.ndarray:
     """Return, per row, whether the column ``view`` (``stiffness`` or ``smoothing``) shows the axis for its contact law."""
 
-    def shows(law: str, parameter: str) -> bool:
-        return parameter == (smoothing_of(law) if view == "smoothing" else view)
-
-    return of_places(
-        rows, axis.names, lambda found: any(p.part == "contact" and shows(p.plugin, p.parameter) for p in found)
-    )
+    found = named(rows, axis.names)
+    of_law = [
+        (part, law, name)
+        for part, law, name in found
+        if part == "contact" and name == (smoothing_of(law) if view == "smoothing" else view)
+    ]
+    return found[of_law].notna().any(axis=1).to_numpy()
 
 
 def smoothing_of(law: str) -> str:
@@ -85,10 +94,8 @@ def axes(sweep: Mapping[str, Any], rows: pd.DataFrame) -> list[Axis]:
         groups.setdefault(parameter_name(name), []).append(name)
     result = []
     for own_name, members in groups.items():
-        n_values = sum(
-            of_places(rows, [n], lambda found: int(any(p.value is not None for p in found))) for n in members
-        )
-        clash = bool(np.any(n_values > 1))
+        given = [named(rows, [name]).notna().any(axis=1) for name in members]
+        clash = bool((sum(given) > 1).any())
         for part in [[name] for name in members] if clash else [members]:
             column = part[0] if clash else own_name
             axis = Axis(column, tuple(part), _unit(part, rows))
@@ -107,11 +114,9 @@ def axes(sweep: Mapping[str, Any], rows: pd.DataFrame) -> list[Axis]:
 
 def _varying_coordinates(rows: pd.DataFrame) -> tuple[str, ...]:
     """Return the names of theta0's coordinates that differ between rows; ``theta0`` if it has only one."""
-    points = {tuple((parsed(text).get("theta") or {}).get("at") or ()) for text in rows["parameters"].unique()}
-    coordinates = [{at[i] for at in points if i < len(at)} for i in range(max(map(len, points), default=0))]
-    if len(coordinates) < 2:
-        return (THETA,)
-    return tuple(f"{THETA}.{i}" for i, values in enumerate(coordinates) if len(values) > 1)
+    flat, _ = flat_rows(rows)
+    points = flat[[place for place in flat if place[0] == THETA]]
+    return tuple(name for _, _, name in points if points[THETA, "", name].nunique() > 1) or (THETA,)
 
 
 def _columns_in_step(axis: Axis, others: Sequence[Axis], together: Sequence[frozenset[str]]) -> tuple[str, ...]:
@@ -135,9 +140,7 @@ def _zipped_names(sweep: Mapping[str, Any]) -> list[frozenset[str]]:
 
 def _unit(names: Sequence[str], rows: pd.DataFrame) -> str:
     """Return the unit of a parameter, as its plugins declare it; empty if their units differ."""
-    found: set[tuple[str, str, str]] = set()
-    of_places(rows, names, lambda places: found.update(place[:3] for place in places))
-    plugins = [(plugin_class(part, plugin), parameter) for part, plugin, parameter in found]
+    plugins = [(plugin_class(part, plugin), parameter) for part, plugin, parameter in named(rows, names)]
     units = {parameters(plugin)[name].unit for plugin, name in plugins if plugin and name in parameters(plugin)}
     return units.pop() if len(units) == 1 else ""
 
@@ -166,7 +169,9 @@ def build_plugins(given: Mapping[str, Any]) -> dict[str, Plugin | None]:
 
 def build_part(axis: str, part: Mapping[str, Any]) -> Plugin:
     """Return the plugin of one axis from its name and parameters; raises :class:`UserError` if it is not installed."""
-    return build(registry.usable(registry.kind_of(axis), part["name"]), {k: v for k, v in part.items() if k != "name"})
+    return built(
+        registry.usable(registry.kind_of(axis), part["name"]), [item for item in part.items() if item[0] != "name"]
+    )
 
 
 def relabel(rows: pd.DataFrame, axes: Sequence[Axis]) -> pd.DataFrame:
@@ -191,10 +196,9 @@ def relabel(rows: pd.DataFrame, axes: Sequence[Axis]) -> pd.DataFrame:
 
 
 def _labels(given: Mapping[str, Any], names: Sequence[str], views: Sequence[str]) -> dict[str, str]:
-    hidden: dict[str, set[str]] = {axis: set() for axis in given}
-    for place in places(names, given):
-        hidden.setdefault(place.part, set()).add(place.parameter)
-    if "estimator" in given and not hidden["estimator"]:
+    parts = {axis: part for axis, part in given.items() if part and axis not in NOT_PLUGINS}
+    hidden = {axis: [applies(name, axis, part["name"], part) or "" for name in names] for axis, part in parts.items()}
+    if "estimator" in given and not any(hidden.get("estimator", ())):
         return {}
     try:
         return labels(build_plugins(given), hidden, views)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import re
@@ -16,10 +17,20 @@ from bench.errors import STATUSES, UserError, local_path, printable, unknown
 from bench.experiment.cell import DESCENDED
 from bench.experiment.experiment import Budget, Choice, Execution, Experiment
 from bench.experiment.grid import COUNTS, check_axes, parameter_name, refuse_too_many, share_of, swept
-from bench.experiment.overrides import TABLES, check_file, merge, parse, quoted, with_ranges
+from bench.experiment.overrides import (
+    LISTS_AS,
+    TABLES,
+    Override,
+    check_file,
+    merge,
+    names_of,
+    parse,
+    quoted,
+    with_ranges,
+)
 from bench.experiment.study import Study
 from bench.model import Decision, MechanicalScene, Plugin, guard, registry
-from bench.model.identity import parse_identity, split_items
+from bench.model.identity import parse_identity
 from bench.model.parameters import Parameter, build, check, coerce, parameters, remember, singular
 
 SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
@@ -47,45 +58,67 @@ def experiments(config_dirs: Sequence[Path] = ()) -> list[str]:
     )
 
 
-def load(overrides: Sequence[str], config_dirs: Sequence[Path] = ()) -> Experiment:
-    """Return the experiment that Hydra composes from overrides; raises :class:`UserError` if an override is invalid or not read.
+def load(
+    words: Sequence[str], config_dirs: Sequence[Path] = (), settings: Mapping[str, Any] | None = None
+) -> Experiment:
+    """Return the experiment that Hydra composes from words of the command line; raises :class:`UserError` if one is invalid or not read.
 
-    ``config_dirs`` are folders with the user's own experiments, as ``experiment/NAME.yaml``. Plugin folders may have some too.
+    ``config_dirs`` are folders with the user's own experiments, as ``experiment/NAME.yaml``. Plugin folders may have some
+    too. ``settings`` are further settings as values of Python.
     """
-    for key, _, value in _split_words(overrides):
+    folders = _as_list((settings or {}).get("plugins"))
+    for key, _, value in (word.lstrip("+").partition("=") for word in words):
         if key == "plugins":
-            for path in _split(value) or ([] if value.startswith("[") else [""]):
-                if not path.strip("'\" "):
-                    raise UserError(f"plugins={value} names no folder; the current one is plugins=.")
-                registry.add_folder(Path(path))
+            if not names_of(value) and not value.startswith("["):
+                raise UserError(f"plugins={value} names no folder; the current one is plugins=.")
+            folders += names_of(value)
+    for folder in folders:
+        registry.add_folder(Path(folder))
     config_dirs = [*config_dirs, *(folder for folder in registry.folders() if (folder / "experiment").is_dir())]
+    overrides = [_parsed(word, config_dirs) for word in words]
+    overrides += [_of_python(key, value) for key, value in (settings or {}).items()]
     loaded = _composed(overrides, config_dirs)
     _refuse_unread(loaded, overrides)
-    given = {key.partition(".")[0] for key, _, _ in _split_words(overrides)}
+    given = {keys[0] for keys, _ in overrides}
     if "compares" in given:
         return loaded
     # what a command line chooses is drawn, whatever the file compares
     return replace(loaded, compares={name: values for name, values in loaded.compares.items() if name not in given})
 
 
-def _composed(overrides: Sequence[str], config_dirs: Sequence[Path]) -> Experiment:
+def _of_python(key: str, value: Any) -> Override:
+    """Return a setting given in Python; arrays and other sequences become lists, paths strings."""
+    _check_key(key)
+    if isinstance(value, str) and key in _name_lists():
+        return [key], names_of(value)
+    plain = json.dumps(
+        value,
+        default=lambda one: (
+            one.tolist() if hasattr(one, "tolist") else list(one) if isinstance(one, range) else str(one)
+        ),
+    )
+    return key.split("."), json.loads(plain)
+
+
+def _composed(overrides: Sequence[Override], config_dirs: Sequence[Path]) -> Experiment:
     for folder in config_dirs:
         if not (folder / "experiment").is_dir():
             raise UserError(
                 f"'{folder}' has no experiments: put them into its folder experiment, as experiment/NAME.yaml"
             )
-    named = [name for key, _, value in _split_words(overrides) if key == "experiment" for name in _split(value)]
+    named = [name for keys, value in overrides if keys == ["experiment"] for name in names_of(value)]
     if len(named) > 1:
         commands = " && ".join(f"python -m bench +experiment={name}" for name in named)
         raise UserError(f"one command runs one experiment with its sweep: {commands}")
-    prepared = [_to_hydra(override, config_dirs) for override in overrides]
-    given = [parse(override, word) for override, word in zip(overrides, prepared, strict=True)]
+    if named and named[0] not in (known := experiments(config_dirs)):
+        raise unknown("experiment", named[0], known, "--help")
     settings = deepcopy(_composed_files(next(iter(named), ""), tuple(config_dirs), _stamps(config_dirs)))
-    for keys, value in given:
+    for keys, value in overrides:
         if keys not in (["experiment"], ["answer"]):
             merge(settings, keys, value)
-    joined = _joined(from_settings(settings), _as_list(settings["also"]), overrides, config_dirs)
-    return replace(joined, answer=_answer(joined, overrides, config_dirs))
+    if any(keys[0] not in NEUTRAL for keys, _ in overrides):
+        settings["answer"] = ""
+    return _joined(from_settings(settings), _as_list(settings["also"]), overrides, config_dirs)
 
 
 def _stamps(config_dirs: Sequence[Path]) -> tuple[tuple[Path, int, int], ...]:
@@ -121,35 +154,19 @@ def _composed_files(name: str, config_dirs: tuple[Path, ...], stamps: object) ->
     return {str(k): v for k, v in plain.items()} | {"answer": own.get("answer")}
 
 
-APPEARANCE = (
-    "name",
-    "also",
-    "results_dir",
-    "answer",
-    "compares",
-    "formats",
-    "compile_cache",
-    "plugins",
-    "execution",
-)
-"""Fields of an experiment that may differ from those of its file where its answer holds; of ``also`` the number may not."""
-
-
-def _answer(found: Experiment, overrides: Sequence[str], config_dirs: Sequence[Path]) -> str:
-    """Return the answer in an experiment's own file; empty if the file has none or other settings."""
-    if found.answer and len(overrides) > 1:
-        own = load([word for word in overrides if word.lstrip("+").startswith("experiment=")], config_dirs)
-        alike = replace(found, **{field: getattr(own, field) for field in APPEARANCE})
-        return found.answer if alike == own and len(found.also) == len(own.also) else ""
-    return found.answer
+NEUTRAL = (
+    "experiment", "name", "results_dir", "answer", "compares", "formats", "compile_cache", "plugins", "workers", "timeout",
+    "memory", "on_error", "ladder", "versions", "retry", "launcher", "ray", "shard",
+)  # fmt: skip
+"""Settings that decide no result: with others on the command line, the answer of an experiment's file does not hold."""
 
 
 def _joined(
-    main: Experiment, names: Sequence[Any], overrides: Sequence[str], config_dirs: Sequence[Path]
+    main: Experiment, names: Sequence[Any], overrides: Sequence[Override], config_dirs: Sequence[Path]
 ) -> Experiment:
     """Return an experiment with those that join it, which have the same settings of the command line."""
-    common = [word for word in overrides if word.lstrip("+").partition("=")[0] not in ("experiment", "also")]
-    also = tuple(_composed([f"experiment={name}", *common, "also=[]"], config_dirs) for name in names)
+    common = [one for one in overrides if one[0] not in (["experiment"], ["also"])]
+    also = tuple(_composed([(["experiment"], name), *common, (["also"], [])], config_dirs) for name in names)
     for name, other in zip(names, also, strict=True):
         if other.study != main.study:
             raise UserError(f"also: {name} has another study or other settings of it than {main.name}")
@@ -174,43 +191,48 @@ def _settings() -> frozenset[str]:
     return frozenset(yaml.safe_load((config_dir() / "config.yaml").read_text())) - {"defaults"}
 
 
-def _to_hydra(override: str, config_dirs: Sequence[Path]) -> str:
-    """Return an override in Hydra's syntax, without a ``+``."""
-    if "=" not in override:
-        if override in experiments(config_dirs):
-            raise UserError(f"'{override}' is an experiment: write +experiment={override}")
-        if override.startswith("-"):
-            raise unknown("option", override, ("--config-dir", "--help", "--quiet", "--version"))
-        raise unknown("experiment", override, experiments(config_dirs), "--help; settings are key=value")
-    if "${" in override:
-        raise UserError(f"'{override}': interpolations are not supported, give the value itself")
-    key, _, value = override.partition("=")
+def _name_lists() -> tuple[str, ...]:
+    """Return the settings whose values are lists of names, which may have brackets: Hydra would need quotes around them."""
+    return (*registry.kinds(), "path", "plugins")
+
+
+def _parsed(word: str, config_dirs: Sequence[Path]) -> Override:
+    """Return the keys and the value of a word of the command line."""
+    if "=" not in word:
+        if word in experiments(config_dirs):
+            raise UserError(f"'{word}' is an experiment: write +experiment={word}")
+        if word.startswith("-"):
+            raise unknown("option", word, ("--config-dir", "--help", "--quiet", "--version"))
+        raise unknown("experiment", word, experiments(config_dirs), "--help; settings are key=value")
+    if "${" in word:
+        raise UserError(f"'{word}': interpolations are not supported, give the value itself")
+    key, _, value = word.partition("=")
     bare = key.lstrip("+~")
-    value = quoted(with_ranges(bare, value))
-    head = bare.partition(".")[0]
-    if head == "experiment":
-        names = experiments(config_dirs)
-        if value not in names:
-            raise unknown("experiment", value, names, "--help")
-        return f"experiment={value}"
-    if head.partition("/")[0] == "hydra" or key.startswith("~"):
-        raise UserError(f"'{override}': Hydra's own settings cannot be changed")
+    if bare == "experiment":
+        return [bare], value
+    if key.startswith("~") or bare.partition(".")[0].partition("/")[0] == "hydra":
+        raise UserError(f"'{word}': Hydra's own settings cannot be changed")
+    _check_key(bare)
+    if bare == "study" or bare in _name_lists():
+        if value.count("[") != value.count("]"):
+            raise UserError(f"'{word[:200]}' cannot be read: {LISTS_AS}")
+        return [bare], value.strip("'\"") if bare == "study" else names_of(value)
+    return parse(word, f"{bare}={quoted(with_ranges(bare, value))}")
+
+
+def _check_key(key: str) -> None:
+    """Raise :class:`UserError` for a key that is no setting."""
+    head = key.partition(".")[0]
     if head not in _known_keys():
-        raise unknown("setting", bare, {*_known_keys(), "experiment"}, "--help")
-    kinds = registry.kinds()
-    if bare in (*kinds, "path"):
-        return f"{bare}={_quote_identities(value)}"
-    if bare == "study":
-        return f"study={_quote_identities(value)[1:-1]}"
-    tables = {*map(singular, kinds), *TABLES}
-    if bare != head and (head not in tables or (head == "reference" and bare.count(".") > 1)):
-        whole = bare.rpartition(".")[0]
-        raise UserError(f"'{bare}' is not a setting: '{whole}' has no settings of its own")
-    return f"{bare}={value}"
+        raise unknown("setting", key, {*_known_keys(), "experiment"}, "--help")
+    tables = {*map(singular, registry.kinds()), *TABLES}
+    if key != head and (head not in tables or (head == "reference" and key.count(".") > 1)):
+        whole = key.rpartition(".")[0]
+        raise UserError(f"'{key}' is not a setting: '{whole}' has no settings of its own")
 
 
-def _refuse_unread(experiment: Experiment, overrides: Sequence[str]) -> None:
-    """Raise :class:`UserError` for a name on the command line that nothing in the experiment reads."""
+def _refuse_unread(experiment: Experiment, overrides: Sequence[Override]) -> None:
+    """Raise :class:`UserError` for the name of an override that nothing in the experiment reads."""
     every = (experiment, *experiment.also)
     kinds = {kind: singular(kind) for kind in registry.kinds() if kind != "studies"}
     used = {kind: axis for kind, axis in kinds.items() if axis in experiment.choices}
@@ -219,11 +241,12 @@ def _refuse_unread(experiment: Experiment, overrides: Sequence[str]) -> None:
     names |= {f"{axis}.{entry.name}" for axis, entry in choices}
     plugins = _in_use([entry.plugin for _, entry in choices if entry.plugin])
     axes = {name for e in every for name in swept(e.sweep)}
-    for key, _, _ in _split_words(overrides):
-        head, _, rest = key.partition(".")
-        name = f"{head}.{rest.partition('.')[0]}" if rest and head in kinds.values() else head
-        if name not in names:
-            raise unknown("setting of this experiment", name, names, "--help")
+    for (head, *more), value in overrides:
+        tables = more[:1] or (value if isinstance(value, dict) else ())
+        for name in [f"{head}.{table}" for table in tables] if head in kinds.values() else [head]:
+            if name not in names:
+                raise unknown("setting of this experiment", name, names, "--help")
+        rest = ".".join(more)
         if head == "sweep" and rest in axes:
             check_axes([rest], plugins)
         marked = {part for axis in axes for part in (axis, parameter_name(axis))}
@@ -237,26 +260,6 @@ def _in_use(plugins: Sequence[type[Plugin]]) -> list[type[Plugin]]:
     unused = {"contacts"} if not any(plugin.n_contacts != 0 for plugin in mechanical) else set()
     unused |= set() if mechanical else {"integrators"}
     return [plugin for plugin in plugins if plugin.kind not in unused]
-
-
-def _split_words(overrides: Sequence[str]) -> list[tuple[str, str, str]]:
-    """Return key, ``=`` and value of each override."""
-    return [override.lstrip("+").partition("=") for override in overrides]
-
-
-def _split(value: str) -> list[str]:
-    """Return the items of a value that is one item or a list: ``a`` or ``[a,b]``."""
-    inner = value[1:-1] if value.startswith("[") and value.endswith("]") else value
-    return [item.strip().strip("'\"") for item in inner.split(",") if item.strip()]
-
-
-def _quote_identities(value: str) -> str:
-    """Return a list with its identity strings quoted: Hydra needs quotes around brackets, and a shell removes them."""
-    inner = value[1:-1] if value.startswith("[") and value.endswith("]") else value
-    if inner.count("[") != inner.count("]"):
-        return value
-    names = [item.strip().strip("'\"") for item in split_items(inner)]
-    return "[" + ",".join(f"'{name}'" for name in names if name) + "]"
 
 
 FORMATS = ("png", "svg", "pdf")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Any
 
 from bench.errors import UserError, printable
 from bench.experiment.grid import MAX_CELLS
+from bench.model.identity import split_items
 
 GLOBAL = "# @package _global_"
 """The first line of an experiment file, so that Hydra does not nest its settings."""
@@ -20,6 +20,20 @@ NUMBERS = re.compile(rf"\[{_NUMBER}(?:,{_NUMBER})*\]")
 TABLES = ("sweep", "marks", "compares", "reference", "ray")
 """Settings that are tables; the parameters of plugins are too."""
 LISTS_AS = "write key=value with lists as [a,b] and strings in quotes"
+
+
+Override = tuple[list[str], Any]
+"""The keys of a setting, from the outermost, and its value."""
+
+
+def names_of(value: str) -> list[str]:
+    """Return the names of a value that is one name or a list, as the shell leaves it.
+
+    >>> names_of("fobg"), names_of("[fobg,'reinforce[baseline=none]']")
+    (['fobg'], ['fobg', 'reinforce[baseline=none]'])
+    """
+    inner = value[1:-1] if value.startswith("[") and value.endswith("]") else value
+    return [name for item in split_items(inner) if (name := item.strip().strip("'\""))]
 
 
 def quoted(value: str) -> str:
@@ -57,7 +71,7 @@ def _range(key: str, match: re.Match[str]) -> range:
     return numbers
 
 
-def parse(given: str, word: str) -> tuple[list[str], Any]:
+def parse(given: str, word: str) -> Override:
     """Return the keys and the value of an override in Hydra's syntax; ``given`` is the user's, which errors name.
 
     A list of numbers, which may be long, is read without Hydra's grammar: that takes a millisecond per number.
@@ -94,34 +108,15 @@ def merge(settings: dict[str, Any], keys: Sequence[str], value: Any) -> None:
 
 def check_file(path: Path) -> dict[str, Any]:
     """Return the content of an experiment file; raises :class:`UserError` with the file and the line if it cannot be read."""
-    import yaml
     from omegaconf import OmegaConf
 
     try:
         text = path.read_bytes().decode()
-        _refuse_expansion(yaml.compose(text))
         content = OmegaConf.to_container(OmegaConf.load(path), resolve=False) if text.strip() else {}
-    except RecursionError:
-        raise UserError(f"'{path}' is nested too deeply") from None
     except Exception as error:  # of the file, of YAML, and OmegaConf's own, such as a key that is a list
         raise UserError(f"'{path}' cannot be read: {printable(error)[:400]}") from None
     _check_content(path, text, content)
     return dict(content)  # type: ignore[arg-type]
-
-
-def _refuse_expansion(root: Any) -> None:
-    """Raise ValueError if the aliases of a YAML document, written out, are more than :data:`MAX_CELLS` values."""
-    sizes: dict[int, float] = {}
-
-    def size(node: Any) -> float:
-        if id(node) not in sizes:
-            sizes[id(node)] = math.inf  # while an alias lies inside its own value
-            parts = node.value if isinstance(node.value, list) else ()
-            sizes[id(node)] = 1 + sum(sum(map(size, part)) if isinstance(part, tuple) else size(part) for part in parts)
-        return sizes[id(node)]
-
-    if root is not None and size(root) > MAX_CELLS:
-        raise ValueError(f"its aliases stand for more than {MAX_CELLS} values")
 
 
 def _check_content(path: Path, text: str, content: Any) -> None:

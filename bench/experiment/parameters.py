@@ -12,16 +12,15 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from bench.experiment.experiment import Budget
-from bench.experiment.grid import DESCENT, THETA, applies, is_theta_axis
+from bench.experiment.grid import DESCENT, THETA, applies
 from bench.model import Decision, Plugin, registry
 from bench.model.identity import identity, plain
 from bench.model.parameters import parameters, singular
@@ -124,61 +123,56 @@ def estimator_params(given: Mapping[str, Any]) -> str | None:
     return identity("", {name: value for name, value in part.items() if value != defaults.get(name, value)}).strip("[]")
 
 
-# --------------------------------------------------------------------------------------------------- swept quantities
+# ------------------------------------------------------------------------------------------------------- flat columns
 
 
-class Place(NamedTuple):
-    """A swept quantity of a row: the part of the grid, its plugin and parameter, and the value."""
+@lru_cache(maxsize=32)
+def _flat(texts: tuple[str, ...], folders: tuple[Path, ...]) -> pd.DataFrame:
+    """Return parameters as columns ``(part, plugin, parameter)``, a line per JSON text; missing where a text lacks one.
 
-    part: str
-    plugin: str
-    parameter: str
-    value: Any
+    Coordinates of theta are the columns of a part ``theta0``: ``theta0.1``, or ``theta0`` of a theta with only one.
+    """
+    import pandas as pd
 
-    @property
-    def number(self) -> float:
-        """The value as a float; NaN if it is not a number. Infinities are stored as strings."""
-        is_number = isinstance(self.value, int | float) and not isinstance(self.value, bool)
-        return float(self.value) if is_number or self.value in ("inf", "-inf") else math.nan
+    lines = []
+    for given in map(parsed, texts):
+        theta = given.get("theta") or {}
+        at = theta.get("at") or ()
+        line: dict[tuple[str, str, str], Any] = {("theta", "", DESCENT): theta.get(DESCENT, 0.0)}
+        line |= {("theta", "", name): tuple(theta[name]) for name in ("names", "path") if theta.get(name)}
+        line |= {(THETA, "", f"{THETA}.{i}" if len(at) > 1 else THETA): value for i, value in enumerate(at)}
+        for part, entry in given.items():
+            if entry and part not in RECORDS:
+                values = {name: tuple(value) if isinstance(value, list) else value for name, value in entry.items()}
+                line |= {(part, entry["name"], name): value for name, value in values.items()}
+        lines.append(line)
+    return pd.DataFrame(lines, dtype=object)
 
 
-def places(names: Collection[str], given: Mapping[str, Any]) -> list[Place]:
-    """Return what names in a sweep refer to in a row's parameters.
+def flat_rows(rows: pd.DataFrame) -> tuple[pd.DataFrame, np.ndarray]:
+    """Return the flat parameters of rows, a line per distinct JSON text, and the number of each row's line."""
+    import pandas as pd
+
+    codes, texts = pd.factorize(rows["parameters"])
+    return _flat(tuple(texts), registry.folders()), codes
+
+
+def _is_named(name: str, part: str, plugin: str, parameter: str) -> bool:
+    """Return whether a name in a sweep refers to a flat column."""
+    if part in (THETA, "theta"):
+        return name == parameter or (name, parameter) == (f"{THETA}.0", THETA)
+    return part not in NOT_PLUGINS and parameter != "name" and bool(applies(name, part, plugin, (parameter,)))
+
+
+def named(rows: pd.DataFrame, names: Collection[str]) -> pd.DataFrame:
+    """Return the columns ``(part, plugin, parameter)`` that names in a sweep refer to, with a value per row.
 
     ``gamma``, ``alpha_order.gamma``, ``estimator.gamma`` and ``estimator.alpha_order.gamma`` name the same parameter.
     ``theta0`` refers to the only coordinate of theta, and to nothing where theta has several.
     """
-    result = []
-    for name in names:
-        if name == DESCENT:
-            result.append(Place("theta", "", name, (given.get("theta") or {}).get(name, 0.0)))
-            continue
-        if is_theta_axis(name):
-            at = (given.get("theta") or {}).get("at") or ()
-            index = int(name.partition(".")[2] or 0)
-            if index < len(at) and (name != THETA or len(at) == 1):
-                result.append(Place(THETA, "", name, at[index]))
-            continue
-        parameter = name.rpartition(".")[2]
-        for part, entry in given.items():
-            is_plugin = entry and part not in NOT_PLUGINS
-            if is_plugin and parameter in entry and parameter != "name" and applies(name, part, entry["name"], entry):
-                result.append(Place(part, entry["name"], parameter, entry[parameter]))
-    return result
-
-
-def of_places(rows: pd.DataFrame, names: Collection[str], value: Callable[[Sequence[Place]], Any]) -> np.ndarray:
-    """Return a value per row, computed from the places that names in a sweep refer to."""
-    import pandas as pd
-
-    codes, texts = pd.factorize(rows["parameters"])
-    values = [value(found) for found in _places(tuple(names), tuple(texts), registry.folders())]
-    return np.array(values)[codes] if values else np.empty(0)
-
-
-@lru_cache(maxsize=32)
-def _places(names: tuple[str, ...], texts: tuple[str, ...], folders: tuple[Path, ...]) -> list[list[Place]]:
-    return [places(names, parsed(text)) for text in texts]
+    flat, codes = flat_rows(rows)
+    found = [place for name in names for place in flat if _is_named(name, *place)]
+    return flat[found].iloc[codes].set_axis(rows.index)
 
 
 # ------------------------------------------------------------------------------------------------------------ problems
@@ -188,34 +182,14 @@ def number_problems(rows: pd.DataFrame, parts: Collection[str] = PROBLEM, withou
     """Return the number of each row's problem, counted from 0 in order of appearance.
 
     Rows of a problem have equal parameters of the axes ``parts`` and of the study, and equal theta, except the swept
-    names ``without``.
+    names ``without``. A parameter that is null counts as missing.
     """
     import pandas as pd
 
-    codes, texts = pd.factorize(rows["parameters"])
-    numbers = _numbers(tuple(texts), tuple(parts), tuple(without), registry.folders())
-    return pd.Series(numbers[codes], index=rows.index)
-
-
-@lru_cache(maxsize=16)
-def _numbers(
-    texts: tuple[str, ...], parts: tuple[str, ...], without: tuple[str, ...], folders: tuple[Path, ...]
-) -> np.ndarray:
-    problems: dict[frozenset[Any], int] = {}
-    numbers = [problems.setdefault(_problem(parsed(text), parts, without), len(problems)) for text in texts]
-    return np.array(numbers, dtype=np.int64)
-
-
-def _problem(given: Mapping[str, Any], parts: Collection[str], without: Collection[str]) -> frozenset[Any]:
-    """Return what identifies the problem of a row's parameters: they count as missing if they are null."""
-    ignored = {(place.part, place.parameter) for place in places(without, given)}
-    if DESCENT in without:  # what is descended matters only where something is
-        ignored.add(("theta", "path"))
-    found = []
-    for part in (*parts, "study", "theta"):
-        for name, value in (given.get(part) or {}).items():
-            if (part, name) == ("theta", "at"):
-                found += [((THETA, f"{THETA}.{i}"), coordinate) for i, coordinate in enumerate(value or ())]
-            elif value is not None and (value or part != "theta"):
-                found.append(((part, name), tuple(value) if isinstance(value, list) else value))
-    return frozenset(item for item in found if item[0] not in ignored)
+    flat, codes = flat_rows(rows)
+    # what is descended matters only where something is
+    ignored = {*named(rows, without), *([("theta", "", "path")] if DESCENT in without else [])}
+    own = [place for place in flat if place[0] in (*parts, "study", "theta", THETA) and place not in ignored]
+    keys = [tuple(line) for line in flat[own].fillna("").to_numpy()]
+    numbers: dict[tuple[Any, ...], int] = {}
+    return pd.Series([numbers.setdefault(keys[code], len(numbers)) for code in codes], index=rows.index, dtype=np.int64)

@@ -13,7 +13,7 @@ from bench.experiment.columns import Columns
 from bench.experiment.experiment import Experiment
 from bench.experiment.session import Session
 from bench.experiment.views import Views
-from bench.model import Decision
+from bench.model import Decision, registry
 from bench.model.parameters import Plugin
 
 if TYPE_CHECKING:
@@ -83,3 +83,9 @@ def study_of(experiment: Experiment) -> Study:
     if not isinstance(study, Study):
         raise UserError(f"study {study.name} does not derive from bench.plugin.Study")
     return study
+
+
+def columns_of(study: str) -> Columns:
+    """Return the columns of a study's rows; those of all studies if it is not installed."""
+    entry = registry.entries()["studies"].get(study)
+    return entry.plugin.columns if entry and entry.plugin and issubclass(entry.plugin, Study) else Columns.of()

@@ -31,14 +31,12 @@ from bench.report.views import is_logarithmic
 
 WIDTH, NARROW = 7.16, 3.5
 """Figure widths in inches: two columns of a paper, or one."""
+PAD = 0.045
+"""Space above and below texts in inches."""
 LINE = 0.155
 """Height of a line of text in inches."""
-ENTRY = 0.142
-"""Height of a line of the legend in inches."""
 BOLD = 1.3
 """Width of a bold title relative to the same text elsewhere."""
-AXIS = 0.45
-"""Height of the numbers and the label below panels, and about their width left of panels, in inches."""
 UPWARDS = (1.0, 1.6, 2.4, 3.2)
 """Lengths in inches of labels that read upwards, the first that fits."""
 UNLIMITED = 1e9
@@ -47,7 +45,7 @@ BAND: dict[str, Any] = {"color": "#D55E00", "alpha": 0.12, "linewidth": 0}
 """Look of a named range of an axis."""
 EXACT, USELESS = 1e-4, 1e2
 """Where a value above 1 means a failure, smaller values are drawn here as upper limits, and larger ones with their number."""
-NAME = 1.0
+NAME = 0.8
 """Longest line of a name at a point, in inches."""
 NEAR = 0.2
 """Distance in inches from which an arrow joins two points."""
@@ -81,8 +79,7 @@ def draw(chart: Chart) -> Figure:
     # quantities of the same runs above each other have one scale of x, so that their features can be compared
     stacked = chart.own_scales and across == 1 and is_plot
     ratios = [max(heights[i * across : (i + 1) * across]) for i in range(down)]
-    layout = ConstrainedLayoutEngine(w_pad=0.04, h_pad=0.03)
-    figure = Figure(figsize=(width, width), layout=layout)
+    figure = Figure(figsize=(width, 4 + 2 * sum(ratios)), layout=ConstrainedLayoutEngine(w_pad=0.04, h_pad=PAD))
     FigureCanvasAgg(figure)
     grid = figure.subplots(
         down, across, squeeze=False, sharey=is_plot and shared, height_ratios=ratios,
@@ -90,7 +87,6 @@ def draw(chart: Chart) -> Figure:
     ).ravel()  # fmt: skip
     for spare in grid[len(panels) :]:
         spare.remove()
-    titles, below = [0] * len(panels), 0.0
     for place, (panel, (name, part), names) in enumerate(zip(grid, panels, rows, strict=False)):
         is_left, is_last = place % across == 0 or not shared, place + across >= len(panels)
         title = "\n".join(
@@ -99,7 +95,6 @@ def draw(chart: Chart) -> Figure:
             if text and (len(panels) > 1 or not chart.subtitle.startswith(text))
         )
         panel.set_title(title, loc="left", fontsize=SIZE)
-        titles[place] = title.count("\n") + 1 if title else 0
         if is_plot:
             _draw_lines(chart, panel, part, styles)
             few = all(p[chart.x[0].name].nunique() <= 6 for _, p in panels)
@@ -119,41 +114,36 @@ def draw(chart: Chart) -> Figure:
             if chart.kind == "dots":
                 _draw_dots(chart, panel, part, styles, cells)
             else:
-                below = max(below, _draw_grid(chart, panel, part, styles, cells, inner))
+                _draw_grid(chart, panel, part, styles, cells, inner)
             if not is_last and not chart.own_scales:
                 panel.set_xlabel("")
                 panel.tick_params(labelbottom=False)
         _draw_marks(chart, panel, name)
-    heads = sum(max(titles[i * across : (i + 1) * across]) for i in range(down))
-    _frame(figure, layout, chart, _legend(chart, styles, width), sum(ratios) + LINE * heads + AXIS + below)
+    _frame(figure, chart, _legend(chart, styles, width))
+    figure.draw_without_rendering()
+    drawn = figure.get_figheight() * sum(panel.get_position().height for panel in grid[::across])
+    figure.set_figheight(figure.get_figheight() + sum(ratios) - drawn)
+    figure.texts[0].set_y(1 - PAD / figure.get_figheight())
     return figure
 
 
 # ------------------------------------------------------------------------------------- title, legend and texts
 
 
-def _frame(figure: Figure, layout: ConstrainedLayoutEngine, chart: Chart, legend: Sequence[Any], body: float) -> None:
-    """Write title and subtitle above panels of the height ``body``, and the legend below them."""
+def _frame(figure: Figure, chart: Chart, legend: Sequence[Any]) -> None:
+    """Write title and subtitle above the panels, and the legend below them."""
     width = figure.get_figwidth()
     title = _wrapped(chart.title.rstrip("."), 0.97 * width / BOLD)
     subtitle = _wrapped(", ".join(filter(None, [chart.subtitle.rstrip("."), *_signs(chart)])), 0.97 * width)
-    first = LINE * 1.1 * (title.count("\n") + 1)
-    head = 0.08 + first + (LINE * (subtitle.count("\n") + 1) if subtitle else 0.0)
-    texts = [str(handle.get_label()) for handle in legend]
-    columns = _legend_columns(texts, width)
-    # one column if any label is broken
-    broken = sum(text.count("\n") for text in texts)
-    below = 0.09 + ENTRY * math.ceil(len(legend) / columns) + LINE * broken if legend else 0.0
-    height = head + body + below
-    figure.set_size_inches(width, height)
-    layout.set(rect=(0.005, below / height, 0.99, 1 - (below + head) / height))
-    top, left = 1 - 0.06 / height, 0.06 / width
-    figure.text(left, top, title, ha="left", va="top", fontsize=SIZE + 1, fontweight="bold")
-    figure.text(left, top - first / height, subtitle, ha="left", va="top", color=GREY)
+    look: dict[str, Any] = {"x": 0.06 / width, "ha": "left", "va": "top"}
+    figure.text(y=1, s=title, fontsize=SIZE + 1, fontweight="bold", **look)
+    # blank lines leave the place of the title
+    below = "\n" * (title.count("\n") + 1) + (subtitle or " ")
+    figure.suptitle(below, fontsize=SIZE, color=GREY, linespacing=1.35, **look)
     if legend:
         figure.legend(
-            handles=legend, loc="lower center", bbox_to_anchor=(0.5, 0), ncols=columns, frameon=False,
-            fontsize=SIZE, columnspacing=1.2, handletextpad=0.5, labelspacing=0.25, borderaxespad=0.1,
+            handles=legend, loc="outside lower center", ncols=_legend_columns([str(handle.get_label()) for handle in legend], width),
+            frameon=False, fontsize=SIZE, columnspacing=1.2, handletextpad=0.5, labelspacing=0.25, borderaxespad=0.1,
         )  # fmt: skip
 
 
@@ -178,15 +168,9 @@ def _signs(chart: Chart) -> list[str]:
 
 def _legend(chart: Chart, styles: dict[str, Style], width: float) -> list[Any]:
     """Return the handles of the legend: series or levels, the front, and named values and ranges of the axes."""
-    labels = {
-        name: _wrapped(style.meaning or name, width - 0.6) for name, style in styles.items() if name and not chart.arrow
-    }
+    named = {name: style for name, style in styles.items() if name and not chart.arrow}
+    labels = {name: _wrapped(style.meaning or name, width - 0.6) for name, style in named.items()}
     handles: list[Any] = []
-    if chart.arrow:
-        names = enumerate(chart.frame[chart.line].unique())
-        handles = [
-            Line2D([], [], color=GREY, marker=MARKERS[i], linestyle="none", label=plain(str(name))) for i, name in names
-        ]
     if chart.kind == "grid":
         looks: dict[str, Any] = {"edgecolor": "#808080", "linewidth": 0.4}
         handles = [Patch(facecolor=styles[name].colour, label=label, **looks) for name, label in labels.items()]
@@ -201,6 +185,11 @@ def _legend(chart: Chart, styles: dict[str, Style], width: float) -> list[Any]:
             handles.append(
                 Line2D([], [], color=style.colour, marker=mark, linestyle=line, linewidth=style.width, label=label)
             )
+    if chart.arrow:
+        laws = zip(MARKERS, chart.frame[chart.line].unique(), strict=False)
+        handles += [
+            Line2D([], [], color=GREY, marker=marker, linestyle="none", label=plain(str(law))) for marker, law in laws
+        ]
     handles += [Line2D([], [], label=chart.limit_name, **LIMIT)] * bool(
         chart.limit and (chart.frame[chart.limit] > 0).any()
     )
@@ -323,14 +312,13 @@ def _draw_lines(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str,
 
 
 def _draw_arrows(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str, Style], size: np.ndarray) -> None:
-    """Join the two points of each arrow of a panel of ``size`` (2,) inches, and name the series at the first of them.
+    """Join the two points of each arrow of a panel of ``size`` (2,) inches, and name the series beside the first of them.
 
-    A name is beside other names, points and arrows. A series is named once where its points are close to each other.
+    Of the places at a point the name is where fewest points, arrows and other names are.
     """
     low, high = (np.log(ends) for ends in zip(panel.get_xlim(), panel.get_ylim(), strict=True))
     taken: list[tuple[np.ndarray, np.ndarray]] = []
     named: list[tuple[str, np.ndarray]] = []
-    arrows: list[tuple[str, np.ndarray]] = []
     for _, points in part.groupby(chart.arrow, sort=False):
         ends = points[[chart.x[0].name, chart.y[0].name]].to_numpy(float, copy=True)
         if chart.y[0].above_one:
@@ -340,24 +328,17 @@ def _draw_arrows(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str
             look = {"arrowstyle": "-|>", "color": styles[series].colour, "linewidth": 1.6, "shrinkA": 3, "shrinkB": 3}
             panel.annotate("", ends[-1], ends[0], arrowprops=look, zorder=2)
         taken.append((places.min(axis=0) - 0.05, places.max(axis=0) + 0.05))
-        arrows.append((series, places[0]))
-    for series, place in arrows:
-        text = _wrapped(series, NAME)
-        extent = np.array([_text_width(text), 0.14 * _lines([text])])
-        middle, under = -extent / 2, -extent
-        free = [
-            start
-            for far in (0.08, 0.16, 0.24, 0.35, 0.5)
-            for side in ((far, middle[1]), (under[0] - far, middle[1]), (middle[0], far), (middle[0], under[1] - far), (far, far), (far, under[1] - far))
-            if ((start := place + side) >= 0).all() and (start + extent <= size).all()
-            and not any((start < b).all() and (start + extent > a).all() for a, b in taken)
-        ]  # fmt: skip
-        if any(name == series and np.abs(other - place).max() < 2 * NEAR for name, other in named):
-            continue
-        start = free[0] if free else place + 0.1
-        named.append((series, place))
-        taken.append((start, start + extent))
-        x, y = start / size
+        named.append((series, places[0]))
+    for series, place in named:
+        text = _wrapped(series, NAME, r"_ ,/\[")
+        width, height = extent = np.array([_text_width(text), 0.14 * (text.count("\n") + 1)])
+        sides = ((0.08, -height / 2), (-width - 0.08, -height / 2), (-width / 2, 0.08), (-width / 2, -height - 0.08))
+        starts = [place + side for side in sides]
+        outside = [((start < 0) | (start + extent > size)).any() for start in starts]
+        crossed = [sum((start < b).all() and (start + extent > a).all() for a, b in taken) for start in starts]
+        _, _, best = min(zip(outside, crossed, range(4), strict=True))
+        taken.append((starts[best], starts[best] + extent))
+        x, y = starts[best] / size
         written = panel.text(x, y, text, transform=panel.transAxes, color=styles[series].colour)
         written.set_in_layout(False)
 
@@ -460,8 +441,8 @@ def _draw_dots(chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str, 
 
 def _draw_grid(
     chart: Chart, panel: Axes, part: pd.DataFrame, styles: dict[str, Style], place: dict[str, int], width: float
-) -> float:
-    """Draw a cell per pair of x and y, coloured by level, in ``width`` inches; return the height of the labels of x."""
+) -> None:
+    """Draw a cell per pair of x and y, coloured by level, in ``width`` inches."""
     x, y = chart.x[0], chart.y[0]
     names = _categories(x, part if chart.own_scales else chart.frame)
     room = width / max(len(names), 1)
@@ -492,17 +473,12 @@ def _draw_grid(
     elif widest > room:
         angle = 90
         every = ([_wrapped(name, length) for name in names] for length in UPWARDS)
-        labels = next((each for each in every if _lines(each) * LINE <= room), labels)
+        labels = next((each for each in every if max(label.count("\n") + 1 for label in each) * LINE <= room), labels)
     panel.set_xticks(range(0, len(names), step), labels[::step], rotation=angle)
     panel.set_xlabel(plain(x.heading) if x.label or x.kind == "number" else "")
     panel.tick_params(length=0)
     for spine in panel.spines.values():
         spine.set_visible(False)
-    return max(map(_text_width, labels)) if angle else LINE * _lines(labels)
-
-
-def _lines(labels: Sequence[str]) -> int:
-    return max(label.count("\n") + 1 for label in labels)
 
 
 def _category(value: Any) -> str:

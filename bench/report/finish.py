@@ -15,11 +15,15 @@ from bench.experiment.experiment import Experiment
 from bench.experiment.study import study_of
 from bench.experiment.views import Views
 from bench.model import guard
-from bench.report import answer, generic, ladder, web, writer
+from bench.report import answer, generic, ladder, reproduce, writer
 from bench.report.views import newest_rows
+from bench.report.web.data import page_data
+from bench.report.web.document import page
 from bench.run.execute import Finished, store_of
+from bench.run.files import write_all
 from bench.run.plan import requested_rows
 from bench.run.record import record
+from bench.run.rows import read_record
 
 RESULTS = ("ok", "diverged", "nonfinite")
 """Statuses of cells that ran: where a method fails is a result too."""
@@ -56,7 +60,10 @@ def write(experiment: Experiment, rows: pd.DataFrame) -> tuple[Views, list[Path]
     ):  # building the commands that repeat cells runs code of plugins
         views = views_of(experiment, rows)
         drawn = writer.drawings(experiment, views)
-        return views, [*writer.write(experiment, views, drawn), *web.write(experiment, rows, views, drawn)]
+        paths = writer.write(experiment, views, drawn)
+        data = page_data(experiment, rows.reset_index(drop=True), views, reproduce.commands(experiment, rows))
+        text = page(experiment.name, experiment.question, views, data, drawn, read_record(experiment.directory))
+        return views, [*paths, *write_all(experiment.directory, {"report.html": text})]
 
 
 def views_of(experiment: Experiment, rows: pd.DataFrame) -> Views:

@@ -15,6 +15,7 @@ from urllib.parse import quote
 import pandas as pd
 
 from bench.errors import UserError, local_path
+from bench.experiment.words import parse_words
 from bench.report.text import counted
 from bench.report.web import shell
 from bench.run.files import write_whole
@@ -132,8 +133,9 @@ def _state(path: Path, counts: Any, when: str) -> tuple[str, str]:
 
 def main(words: Sequence[str]) -> int:
     """Write the index of the folder in ``words``, by default ``results``, and return the exit status 0."""
-    if len(words) > 1 or any(word.startswith("-") or "=" in word for word in words):
+    names, _, _ = parse_words(words, "index", {})
+    if len(names) > 1:
         raise UserError("name one folder of results: python -m bench index [DIR]")
-    path = write(local_path("DIR", words[0] if words else "results"))
+    path = write(local_path("DIR", next(iter(names), "results")))
     print(f"  {path}")
     return 0

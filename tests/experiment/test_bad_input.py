@@ -1,6 +1,5 @@
 """Words, plugins and files that nobody should write: one line that says what is wrong, and status 2."""
 
-import os
 import subprocess
 import sys
 
@@ -25,14 +24,13 @@ REFUSED = {
     # names
     "+experiment=stifness_sweep": "did you mean 'stiffness_sweep'", "scenes=[pushng]": "did you mean 'pushing'",
     "scenes=[pushing] sweep.stifness=[1e3]": "did you mean 'stiffness'", "nonsense=1": "(allowed: ", "rum": "did you mean 'run'",
-    "scenes=[pushing] scene.pushing.mas=0.2": "did you mean 'mass'", "estimators=['reinforce[baseline=centre]']": "did you mean 'center'",
+    "scenes=[pushing] scene.pushing.mas=0.2": "did you mean 'mass'",
     "--verison": "unknown option '--verison'; did you mean '--version'?", "report quik": "unknown experiment 'quik'; did you mean 'quick'?",
-    "scenes=[pushing] scene.pushing.mass=nan": "pushing.mass=nan must be a number", "list fbog": "did you mean 'fobg'", "scenes=[pushing] theta=[mas]": "did you mean 'mass'", "study='stability[diverge=3]'": "did you mean 'diverged'",
-    "formats=[gif]": "gif", "launcher=rai": "did you mean 'ray'", "scene.hevaside.sigma=5": "scene 'hevaside'; did you mean 'heaviside'?",
+    "scenes=[pushing] scene.pushing.mass=nan": "pushing.mass=nan must be a number", "list fbog": "did you mean 'fobg'", "study='stability[diverge=3]'": "did you mean 'diverged'",
+    "launcher=rai": "did you mean 'ray'", "scene.hevaside.sigma=5": "scene 'hevaside'; did you mean 'heaviside'?",
     "scene.pushing.mass=5": "unknown setting of this experiment 'scene.pushing'",
     "optimizers=[adam]": "unknown setting of this experiment 'optimizers' (allowed: ",
-    "optimizer.adam.rate=-5": "unknown setting of this experiment 'optimizer.adam' (allowed: ",
-    "sweep.stiffness=[1,2]": "unknown sweep axis 'stiffness' (allowed: ", "sweep.sigm=[1,2]": "did you mean 'sigma'?",
+    "sweep.stiffness=[1,2]": "unknown sweep axis 'stiffness' (allowed: ",
     "marks={nosuch:{a:1}}": "unknown mark 'nosuch' (allowed: ",
     "plan launcher=ray ray.cell=3": "unknown parameter of launcher ray 'cell'; did you mean 'cells'",
     "compare . . agian=a": "did you mean 'again'", "compare --output=/tmp/x .": "unknown option of compare '--output=/tmp/x'",
@@ -41,30 +39,28 @@ REFUSED = {
     "scenes=[]": "scenes is empty", "scenes=[pushing] sweep.stiffness=[abc]": "must be a number",
     "scenes=[pushing] sweep.stiffness=[-1]": "penalty.stiffness=-1 must be greater than 0", "samples=0": "samples=0 must be at least 1",
     "scenes=[pushing] scene.pushing.mass=heavy": "pushing.mass='heavy' must be a number", "scene.heaviside=3": "scene.heaviside=3",
-    "estimators=[reinforce[baseline=center]": "reinforce", "name=../up": "name='../up'", "name=null": "name",
     "sweep={zip:{sigma:[0.1],samples:[3,4]}}": "equally long", "reference.samples=1": "reference.samples", "hydra.run.dir=/tmp": "Hydra",
-    "scenes=[pushing] theta=[mass] theta0=[1,2]": "theta0 has 2 values, theta of scene pushing has 1", "theta0=[nan]": "theta0",
+    "scenes=[pushing] theta=[mass] theta0=[1,2]": "theta0 has 2 values, theta of scene pushing has 1",
     "plugins=nowhere_at_all": "is not a folder", "plugins=[~nosuchuser]": "unknown user name", "reference=null": "reference.samples=...",
     "--config-dir nowhere_at_all +experiment=quick": "experiment/NAME.yaml", "plan --config-dir ~nosuchuser": "~",
-    "reference.samples.x=300": "is not a setting", "plan launcher=ray ray=3": "must be a table",
-    "plan launcher=ray ray.cells=0": "ray.cells=0 must be at least 1", "plan launcher=ray ray.cells=x": "ray.cells='x' must be a whole number",
-    "seed=" + "9" * 400: "at most", "seed=" + "9" * 5000: "cannot be read",
-    "samples=" + "9" * 400: "at most", f"sweep.seed=[{'9' * 400}]": "at most", "scene.heaviside.sigma=" + "9" * 400: "largest float",
+    "plan launcher=ray ray=3": "must be a table",
+    "plan launcher=ray ray.cells=x": "ray.cells='x' must be a whole number",
+    "seed=" + "9" * 400: "at most",
+f"sweep.seed=[{'9' * 400}]": "at most", "scene.heaviside.sigma=" + "9" * 400: "largest float",
     f"seed={2**53 + 1}": "at most", "results_dir='~nosuchuser/x'": "~", "results_dir=null": "must be a folder",
-    "results_dir=[]": "must be a folder", "results_dir=''": "must be a folder", "estimators=[fobg[x=!!python/object:os.system]]": "fobg",
-    "estimators=[fobg[a={]]": "fobg", "scenes=[heaviside[sigma=@]]": "sigma", "scenes=[heaviside[sigma=2020-13-45]]": "sigma",
-    "sweep={": "sweep", "sweep={a:!x}": "sweep", "sweep={sigma:[%]}": "sigma", "sweep={a:*b}": "sweep", "sweep=[1,2]": "sweep",
-    "sweep={%:[1]}": "sweep", "sweep.seed=range(1,2,0)": "is not a range", "sweep.seed=range(0.5,2)": "is not a range",
+    "estimators=[reinforce[baseline=center]": "cannot be read", "name=../up": "name='../up'",
+    "estimators=[fobg[x=!!python/object:os.system]]": "fobg", "scenes=[heaviside[sigma=2020-13-45]]": "sigma",
+    "sweep={": "sweep", "sweep={a:!x}": "sweep", "sweep=[1,2]": "sweep", "sweep.sigma=[[1]]": "sigma", "sweep.seed=range(1,2,0)": "is not a range",
+    "descent=1": "below 1", "sweep.descent=[0,-0.1]": "at least 0", "path=[penalty]": "a contact law, an integrator",
     "sweep.seed=range(0,99999999)": "values, and more than", f"sweep.seed=[{MANY}] sweep.samples=[{MANY}] sweep.repeats=[{MANY}]": "the sweep has 10360232 cells",
-    **{f"shard='{shard}'": "must be NUMBER/COUNT: of 64 shards, 1/64 to 64/64" for shard in ("0/64", "65/64", "3", "a/b", "1/0", "-1/4")},
-    **{f"name={name}": f"name={name} is reserved" for name in ("claims", "references", "standard", "trace")},
+    **{f"shard='{shard}'": "must be NUMBER/COUNT: of 64 shards, 1/64 to 64/64" for shard in ("65/64", "a/b")},
+    "name=claims": "name=claims is reserved",
     "scenes=[quadratic] sweep.theta0.9=[1]": "theta has 5 coordinates", "scenes=[quadratic] sweep.theta0.0=[inf]": "must be finite",
     "scenes=[quadratic] sweep.theta0.0=[[1,2]]": "one number at a time", "sweep.theta0=[one]": "theta0", "scenes=[quadratic] sweep.theta1=[1]": "did you mean 'theta0'",
     "scenes=[quadratic] sweep.theta0=[[1,2]]": "theta0 has 2 values, theta of scene quadratic has 5",
     # the message names the fix
     "-m +experiment=quick,stiffness_sweep": "leave out --multirun",
     "plan +experiment=quick +experiment=twins": "python -m bench +experiment=quick && python -m bench +experiment=twins",
-    "plan +experiment=quick,twins": "python -m bench +experiment=quick && python -m bench +experiment=twins",
     "stiffness_sweep samples=8": "python -m bench +experiment=stiffness_sweep samples=8", "plan stiffness_sweep": "write +experiment=stiffness_sweep",
     "samples=[16,32]": "write sweep.samples=[...]", "plugins=": "plugins= names no folder; the current one is plugins=.",
     "plugins=''": "plugins='' names no folder; the current one is plugins=.", "scenes=[zzz]": "'zzz' (allowed: ", "check zzz": "python -m bench list)",
@@ -77,8 +73,7 @@ REFUSED = {
     "index nowhere": "is not a folder", "index .": "no experiments", "index a b": "name one folder",
     # no file is written to an address
     "results_dir=s3://rows": ADDRESS, "compile_cache=s3://rows": ADDRESS, "claims --quick results_dir=s3://rows": ADDRESS,
-    "compare a b out=s3://rows": ADDRESS, "history a b out=s3://rows": ADDRESS, "index s3://rows": ADDRESS, "engines table out=s3://rows": ADDRESS,
-    "examine a.py:cost baseline=s3://rows": ADDRESS, "examine a.py:cost save=s3://rows": ADDRESS,
+    "compare a b out=s3://rows": ADDRESS, "index s3://rows": ADDRESS, "engines table out=s3://rows": ADDRESS, "examine a.py:cost save=s3://rows": ADDRESS,
 }  # fmt: skip
 """Words of a command, and what its message has. Words of a run, plan or report follow those of BASE."""
 
@@ -104,9 +99,7 @@ def test_a_sweep_that_is_too_large_is_not_expanded(monkeypatch):
     assert main(["plan", *BASE, f"sweep.seed=[{MANY}]", f"sweep.samples=[{MANY}]", f"sweep.repeats=[{MANY}]"]) == 2
 
 
-@pytest.mark.parametrize(
-    "columns", [["key"], ["key", "study"], ["key", "study", "parameters"], ["bias"], ["key", "scene", "status"]]
-)
+@pytest.mark.parametrize("columns", [["key"], ["bias"], ["key", "scene", "status"]])
 def test_compare_of_files_with_missing_columns_is_one_line(tmp_path, capsys, monkeypatch, columns):
     monkeypatch.chdir(tmp_path)
     for side in ("a", "b"):
@@ -129,12 +122,6 @@ FILES = {
     b"samples: 4\n---\nsamples: 5\n": "but found another document",
     b"1: 4\n": "line 2: 1 is not a setting",
     b"~: 4\n": "Incompatible key type",
-    b"sweep: " + b"[" * 1000 + b"\n": "is nested too deeply",
-    b"marks:\n  a: &a [1, 2, 3, 4, 5, 6, 7, 8, 9]\n"
-    + b"".join(
-        b"  %c: &%c [%s]\n" % (n, n, b", ".join([b"*%c" % (n - 1)] * 9)) for n in b"bcdefghi"
-    ): "aliases stand for more than",
-    b"marks: &a {b: *a}\n": "aliases stand for more than",
     b"smaples: 4\n": "did you mean 'samples'?",
     b"samples: ${seed}\n": "must be a whole number",
     b"samples: 4\n": "must start with the line # @package _global_",
@@ -154,21 +141,14 @@ def test_an_experiment_file_that_cannot_be_read_is_named_with_its_line(tmp_path,
         assert said.startswith(f"bench: '{path}'")
 
 
-def test_an_empty_list_of_plugins_is_none():
-    assert load(["plugins=[]"]).plugins == load([]).plugins == ()
-
-
 def test_a_folder_with_an_accent_needs_no_quotes():
     assert load(["results_dir=résultats/é"]).results_dir.name == "é"
-    assert load(["results_dir='résultats/é'"]).results_dir.name == "é"
 
 
 @pytest.mark.parametrize(
     ("word", "values"),
     [
-        ("sweep.seed=range(3,40)", list(range(3, 40))), ("sweep.seed=range(40,3,-2)", list(range(40, 3, -2))),
-        ("sweep.seed=range(0,2)", [0, 1]), (f"sweep.seed=[{','.join(map(str, range(50)))}]", list(range(50))),
-        ("sweep={seed:range(0,3)}", [0, 1, 2]), ("sweep.seed=[" + "1e2, " * 20 + "-3.5]", [100.0] * 20 + [-3.5]),
+        ("sweep.seed=range(40,3,-2)", list(range(40, 3, -2))), ("sweep={seed:range(0,3)}", [0, 1, 2]), ("sweep.seed=[" + "1e2, " * 20 + "-3.5]", [100.0] * 20 + [-3.5]),
     ],
 )  # fmt: skip
 def test_ranges_and_long_lists_have_the_values_that_short_lists_have(word, values):
@@ -193,7 +173,7 @@ def test_a_reason_is_one_line_of_a_length_that_can_be_read():
     assert row["reason"].endswith("characters)")
 
 
-@pytest.mark.parametrize("start", ["=", "+", "-", "@", "\t=", " \r="])
+@pytest.mark.parametrize("start", ["=", "@", " \r="])
 def test_a_table_holds_no_formulas(start):
     made, cell = one()
     rows = made.columns.typed(pd.DataFrame([tasks.row_of(made, cell, {"status": "error"})]))
@@ -226,22 +206,16 @@ class Mine(SampleMean):
 '''
 BAD = {
     "exits": "import sys; sys.exit(0)",
-    "exits_loudly": "import sys; sys.exit('\\x1b[31m' + 'x' * 5000000)",
     "raises": "raise BaseException('no')",
-    "divides": "1/0",
     "syntax": "def (",
     "absent": "import no_such_library_anywhere",
     "recursion": "f = lambda: f()\nf()",
     "name_number": HEAD.replace('name = "mine"', "name = 7"),
     "name_brackets": HEAD.replace('name = "mine"', 'name = "a[b]"'),
-    "name_escape": HEAD.replace('name = "mine"', 'name = "\\x1b[31m"'),
     "name_taken": HEAD.replace('name = "mine"', 'name = "fobg"'),
     "requires_none": HEAD.replace('name = "mine"', 'name = "r1"\n    requires = None'),
-    "requires_numbers": HEAD.replace('name = "mine"', 'name = "r2"\n    requires = (1, 2)'),
     "annotation": HEAD.replace('name = "mine"', 'name = "a1"\n    x: "Nowhere" = 1'),
-    "annotation_list": HEAD.replace('name = "mine"', 'name = "a2"\n    x: list = None'),
     "kind_odd": HEAD.replace('name = "mine"', 'name = "k1"\n    kind = "a b"'),
-    "kind_number": HEAD.replace('name = "mine"', 'name = "k2"\n    kind = 3'),
 }
 
 
@@ -291,10 +265,9 @@ def test_an_estimator_that_exits_ends_its_own_cell_in_this_process_too(tmp_path,
     rows = pd.read_parquet(tmp_path / "out" / "custom" / "rows.parquet").set_index("estimator")
     assert rows["status"].to_dict() == {"fobg": "ok", "mine": "error"}
     assert "SystemExit" in rows["reason"]["mine"]
-    assert os.getpid()
 
 
-@pytest.mark.parametrize("fault", ["raise BaseException('no')", "sys.exit(0)", "raise ValueError('two\\nlines')"])
+@pytest.mark.parametrize("fault", ["sys.exit(0)", "raise ValueError('two\\nlines')"])
 def test_a_plugin_that_cannot_be_made_is_refused_in_one_line(tmp_path, capsys, fault):
     made = HEAD.replace("    def terms", f"    def __post_init__(self):\n        {fault}\n    def terms")
     (tmp_path / "mine.py").write_text(made)

@@ -10,7 +10,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from bench.experiment import config
 from bench.experiment.axes import Axis, values_of
 from bench.experiment.overrides import parse
-from bench.experiment.parameters import completed, completed_json, completed_rows, number_problems, parsed, places
+from bench.experiment.parameters import completed, completed_json, completed_rows, named, number_problems
 
 WORDS = ("scenes=[pushing,quadratic]", "contacts=[penalty]", "backends=[numpy]", "estimators=[reinforce,alpha_order]")
 
@@ -75,10 +75,11 @@ def test_rows_from_before_a_changed_default_are_labelled_by_todays():
 
 @pytest.mark.parametrize("name", ["delta", "alpha_order.delta", "estimator.delta", "estimator.alpha_order.delta"])
 def test_a_swept_name_means_the_parameter_of_the_plugins_that_it_names(name):
-    reinforce, alpha_order = map(parsed, rows_with("scenes=[pushing]")["parameters"])
-    assert places([name], alpha_order)[0][:3] == ("estimator", "alpha_order", "delta")
-    assert not places([name], reinforce)
-    assert not places(["study.timed_calls", "reinforce.delta", "name"], alpha_order)
+    rows = rows_with("scenes=[pushing]")
+    found = named(rows, [name])
+    assert [*found] == [("estimator", "alpha_order", "delta")]
+    assert found.notna().any(axis=1).tolist() == [False, True]
+    assert named(rows, ["study.timed_calls", "reinforce.delta", "name"]).empty
 
 
 def test_the_values_of_an_axis_are_numbers():

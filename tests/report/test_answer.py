@@ -67,7 +67,6 @@ def test_an_answer_holds_for_the_settings_of_its_file_only(tmp_path):
         "name=again",
         "formats=[]",
         "workers=1",
-        "samples=128",
     ]
     assert config.load(words).answer == config.load(words[:1]).answer != ""
     assert not config.load([*words, "sweep.sigma=[0.2]"]).answer

@@ -17,14 +17,8 @@ from bench.report.style import PALETTE, colour, marker
 DEUTERANOPIA = np.array(
     [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]]
 )
-PROTANOPIA = np.array(
-    [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]]
-)
-TRITANOPIA = np.array(
-    [[1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602], [0.004733, 0.691367, 0.303900]]
-)
 """On linear RGB, at full severity (Machado, Oliveira, Fernandes 2009)."""
-EYES = {"normal": np.eye(3), "deutan": DEUTERANOPIA, "protan": PROTANOPIA, "tritan": TRITANOPIA}
+EYES = {"normal": np.eye(3), "deutan": DEUTERANOPIA}
 D65 = np.array(
     [[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.0721750], [0.0193339, 0.1191920, 0.9503041]]
 )
@@ -68,12 +62,6 @@ def test_an_estimator_keeps_its_look_whatever_else_is_drawn():
     assert found["fobg[a=1]"].colour == found["fobg"].colour
     assert found["fobg[a=1]"].line != found["fobg"].line
     assert method_styles(["fobg, adam"])["fobg, adam"] == found["fobg"]
-
-
-def test_trainers_keep_their_colours_whatever_else_is_drawn():
-    """ppo and shac were both orange, each in another chart."""
-    few, many = method_styles(["ppo", "shac"]), method_styles(["evolution", "shac[window=8]", "shac", "ppo"])
-    assert few["ppo"].colour == many["ppo"].colour != many["shac[window=8]"].colour == few["shac"].colour
 
 
 def test_a_name_has_one_colour_in_all_charts_of_an_experiment():

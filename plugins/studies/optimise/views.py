@@ -13,7 +13,7 @@ import pandas as pd
 from bench.experiment.axes import Axis, table
 from bench.experiment.columns import Column, interval, text
 from bench.experiment.experiment import Experiment
-from bench.experiment.parameters import of_places
+from bench.experiment.parameters import named
 from bench.experiment.views import Chart, Table, Views
 from bench.measure import performance
 from bench.model.parameters import remember
@@ -127,8 +127,8 @@ def collect_runs(experiment: Experiment, rows: pd.DataFrame) -> RunSet:
 
 def _is_tuned(axis: Axis, rows: pd.DataFrame) -> bool:
     """Return whether an axis sweeps a parameter of an optimizer."""
-    tuned = of_places(rows, axis.names, lambda found: any(p.part == "optimizer" and p.value is not None for p in found))
-    return bool(tuned.any())
+    found = named(rows, axis.names)
+    return bool(found[[place for place in found if place[0] == "optimizer"]].notna().any(axis=None))
 
 
 def _tuning_labels(rows: pd.DataFrame, axes: Sequence[Axis]) -> pd.Series:
