@@ -76,8 +76,6 @@ class Settings(TypedDict, total=False):
     timing: bool | None
     compile_cache: str | Path | None
     plugins: str | Path | Sequence[str | Path]
-    launcher: str
-    ray: Mapping[str, Any]
     shard: str
     results_dir: str | Path
     formats: Names

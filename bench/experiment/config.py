@@ -260,7 +260,6 @@ def _quote_identities(value: str) -> str:
 
 
 FORMATS = ("png", "svg", "pdf")
-LAUNCHERS = ("local", "ray")
 
 
 def from_settings(config: Mapping[str, Any]) -> Experiment:
@@ -392,7 +391,6 @@ def _compile_cache(value: Any) -> Path | None:
 
 
 def _execution(config: Mapping[str, Any]) -> Execution:
-    launcher = _one_of("launcher", config["launcher"], LAUNCHERS)
     memory = _amount("memory", config["memory"], BYTES, "4g, 500m")
     return Execution(
         workers=check(Parameter("workers", int | None, None, low=0), config["workers"], "workers"),
@@ -402,8 +400,6 @@ def _execution(config: Mapping[str, Any]) -> Execution:
         ladder=coerce(bool, config["ladder"], "ladder"),
         versions=_one_of("versions", config["versions"], ("ignore", "warn", "rerun")),
         retry=tuple(_one_of("retry", status, STATUSES) for status in _as_list(config["retry"]) if status is not None),
-        launcher=launcher,
-        cluster={} if launcher == "local" else _mapping(config, launcher),
         shard=_shard(config),
     )
 

@@ -81,8 +81,6 @@ class Answer:
     seconds: float
     output: str = ""
     """The last lines printed while the item was handled."""
-    machine: str = ""
-    """Kind of the machine that handled the item; empty for this machine."""
 
 
 # ---------------------------------------------------------------------------------------------------------- a worker

@@ -109,11 +109,11 @@ def print_versions(planned: Sequence[Planned], policy: str) -> None:
         print(f"bench: {count} stored rows were made with {versions}: {action}", file=sys.stderr)
 
 
-def print_machines(planned: Sequence[Planned], launcher: str) -> None:
+def print_machines(planned: Sequence[Planned]) -> None:
     """Print how many stored rows were timed on another kind of machine, if this run measures times here."""
     this = record.kind_of_machine()
     others = Counter(item.machine for item in planned if item.machine not in ("", this))
-    if launcher == "local" and others and any(item.runs and item.cell.timing for item in planned):
+    if others and any(item.runs and item.cell.timing for item in planned):
         for machine, count in others.most_common():
             print(
                 f"bench: {count} stored rows were timed on '{machine}', and this machine is '{this}': times of two kinds of "

@@ -225,7 +225,7 @@ def group_by_program(tasks: list[Task]) -> list[list[Task]]:
 
 def result_of(answer: Answer, prefix: str = "") -> dict[str, Any]:
     """Return an answer's result with its time and machine; a failure's reason gets the prefix and the last output."""
-    result = answer.result | {"wall_s": answer.seconds, "machine": answer.machine or kind_of_machine()}
+    result = answer.result | {"wall_s": answer.seconds, "machine": kind_of_machine()}
     if result["status"] in FAILED:
         output = f"; last output: {answer.output}" if answer.output else ""
         result["reason"] = f"{prefix}{result['reason']}{output}"
