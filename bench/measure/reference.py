@@ -133,7 +133,7 @@ def certify(
         reference = replace(scaled, batches=scaled.batches * unit, error=scaled.error * unit)
         if reference.spacing > FINE:
             note = f"the reference's points are {reference.spacing:.2g} standard deviations apart and may miss a narrower feature"
-            reference = _with_note(reference, note)
+            reference = with_note(reference, note)
     if physical is None or "grad" not in provides:
         return reference
     plain = problem.grad(theta, np.zeros((program.n_noise, 1)))[:, 0]
@@ -172,7 +172,7 @@ def transferred(reference: Reference, problem: Problem, other: Problem, samples:
     if not most <= reference.known().standard_error:
         return None
     note = f"costs differ from those of the backend that computed the reference in {share:.2g} of draws, as its error allows"
-    return _with_note(replace(reference, error=math.hypot(reference.error, most)), note)
+    return with_note(replace(reference, error=math.hypot(reference.error, most)), note)
 
 
 def revisions(program: Program, provides: frozenset[str]) -> dict[str, int]:
@@ -214,12 +214,12 @@ def _compute(
     apart, error = float(np.linalg.norm(sampled.gradient - quadrature.gradient)), sampled.known().standard_error
     if apart > SURE * math.hypot(error, quadrature.error):
         note = f"quadrature and sampling disagree by {apart:.2g}, which is the stated error"
-        return _with_note(replace(quadrature, error=max(apart, quadrature.error)), note)
+        return with_note(replace(quadrature, error=max(apart, quadrature.error)), note)
     # doubts about the samples are doubts about their error
     if not sampled.note and 0.0 < error < quadrature.error:
         # tails may be too heavy for the spread of the samples to show, as at a pole in the plane
-        return _with_note(replace(sampled, error=max(sampled.error, apart)), quadrature.note)
-    return _with_note(quadrature, sampled.note)
+        return with_note(replace(sampled, error=max(sampled.error, apart)), quadrature.note)
+    return with_note(quadrature, sampled.note)
 
 
 def _unit(problem: Problem, theta: np.ndarray) -> float:
@@ -325,7 +325,7 @@ class _Sampler:
         if not reference.is_finite:
             return reference
         if chosen == "zeroth_order" or "zeroth_order" not in pilots:
-            return _with_note(reference, doubt)
+            return with_note(reference, doubt)
         # a pilot of a heavy-tailed distribution underestimates its variance
         error = reference.known().standard_error
         if 2.0 * spread["zeroth_order"] < reference.samples * error**2:
@@ -408,7 +408,7 @@ class _Sampler:
         check = np.concatenate(means, axis=1).T
         check = check.reshape(-1, len(check) // min(BATCHES, len(check)), problem.dim).mean(axis=1)
         if not np.isfinite(check).all():
-            return _with_note(reference, "zeroth order is not finite, so first order is not checked")
+            return with_note(reference, "zeroth order is not finite, so first order is not checked")
         apart = reference.gradient - check.mean(axis=0)
         errors = Sampling.of(reference.batches), Sampling.of(check)
         trace = sum(error.trace for error in errors)
@@ -419,12 +419,12 @@ class _Sampler:
         at = {level: bias_interval(apart, *errors, level=level)[1] > size for level in (WARNED, REFUSED)}
         disagreement = f"first and zeroth order disagree by {np.linalg.norm(apart):.2g} (check_z={z:.1f})"
         if at[REFUSED]:
-            return _with_note(self._sampled("zeroth_order"), f"{disagreement}, so zeroth order is used")
+            return with_note(self._sampled("zeroth_order"), f"{disagreement}, so zeroth order is used")
         resolved = 2.0 * math.sqrt(trace)
         facts = f"check_z={z:.1f},check_resolves={resolved:.2g}{',assumed_continuous' * assumed}"
         method = f"{reference.method.removesuffix(']')},{facts}]"
         error = math.hypot(reference.error, resolved) if assumed else reference.error
-        return _with_note(replace(reference, method=method, error=error), disagreement if at[WARNED] else "")
+        return with_note(replace(reference, method=method, error=error), disagreement if at[WARNED] else "")
 
     def _tail_error(self, terms: Terms, mean: np.ndarray, count: int) -> tuple[float, str]:
         """Return the norm of the far tails' contribution to the mean, the largest over the directions, and a note.
@@ -507,7 +507,8 @@ def _directions(effect: np.ndarray) -> np.ndarray:
     return np.column_stack([directions, effect / length]) if length and math.isfinite(length) else directions
 
 
-def _with_note(reference: Reference, note: str) -> Reference:
+def with_note(reference: Reference, note: str) -> Reference:
+    """Return a reference with a note before its own; the same if the note is empty."""
     return replace(reference, note="; ".join(part for part in (note, reference.note) if part))
 
 

@@ -17,8 +17,6 @@ import pkgutil
 import re
 import sys
 import traceback
-import types
-import typing
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -303,8 +301,7 @@ def _faults(plugin: type[Plugin]) -> str:
     if not (isinstance(plugin.requires, tuple | list) and all(isinstance(r, str) and r for r in plugin.requires)):
         return f"requires={printable(repr(plugin.requires))[:MAX_REASON_CHARACTERS]} must be a tuple of modules"
     for parameter in parameters(plugin).values():
-        kinds = typing.get_args(parameter.type) if isinstance(parameter.type, types.UnionType) else (parameter.type,)
-        if not kinds or not set(kinds) <= {bool, int, float, str, type(None)} or kinds == (type(None),):
+        if not set(parameter.kinds) - {type(None)} <= {bool, int, float, str} or set(parameter.kinds) <= {type(None)}:
             return f"parameter {parameter.name} must be annotated as bool, int, float or str"
     return ""
 
