@@ -17,8 +17,6 @@ FOLDER = "BENCH_ENGINES"
 """Environment variable with the folder that contains the environments."""
 NEWEST = "newest"
 """The release that pip chooses without a pin."""
-LIMIT_S = 60.0
-"""Seconds allowed for a Python to state its versions."""
 VERSIONS = """
 import importlib.metadata, json, platform, sys
 found = {"python": platform.python_version()}
@@ -52,7 +50,8 @@ def library_versions(python: str, libraries: tuple[str, ...]) -> dict[str, str]:
     """
     words = [python, "-I", "-c", VERSIONS, *libraries]
     try:
-        done = subprocess.run(words, capture_output=True, timeout=LIMIT_S, stdin=subprocess.DEVNULL)
+        # seconds allowed for a Python to state its versions
+        done = subprocess.run(words, capture_output=True, timeout=60.0, stdin=subprocess.DEVNULL)
         return {str(name): str(version) for name, version in json.loads(done.stdout).items()}
     except (OSError, subprocess.TimeoutExpired) as error:
         raise Unavailable(f"it cannot be started ({printable(error)[:200]})") from error

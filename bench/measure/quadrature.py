@@ -25,12 +25,8 @@ RAYS, SPACING = 96, 0.25
 """Directions in which an integrand in the plane is searched, and distance of the points on a ray."""
 NEGLIGIBLE = 1e-13
 """Share of the integral of absolute values beyond the limits that does not move the limits; the error includes it."""
-UNSETTLED = 1e-3
-"""Share of the integral of absolute values at the last finite point of a ray above which the integral may not exist."""
 MARGIN = 1.0
 """Distance of a moved limit from the last point with a share of the integral, in standard deviations."""
-POLE = 0.95
-"""Least power p of a pole, where the cost grows as 1 / distance^p. From p = 1 on, its integral over a line diverges."""
 SHIFTS = {1: ((0.0, 0.5, 0.25, 0.75),), 2: ((0.0, 0.5, 0.25, 0.75), (0.0, 0.25, 0.75, 0.5))}
 """Shift of each rule's panels, as a share of a panel, by number of noise dimensions: no two rules share their points."""
 FIRST = {1: 512, 2: 12}
@@ -38,8 +34,6 @@ FIRST = {1: 512, 2: 12}
 LEAST = {1: 1 << 15, 2: 1 << 17}
 """Fewest points, by number of noise dimensions. One: 1800 per standard deviation, enough for an event of width .001.
 Two: 20 per standard deviation in each dimension."""
-SAFETY = 2.0
-"""Stated error, as a multiple of the largest distance of a rule from the mean of all rules."""
 SETTLED = 1e-10
 """Relative error at which refinement stops."""
 TOLERANCE = 1e-3
@@ -129,7 +123,8 @@ def integrate(problem: Problem, theta: np.ndarray, points: int, columns: int) ->
             size = max(size, float(np.linalg.norm(np.abs(nodes[:dim]) @ (weights * np.abs(f))) / sigma))
         before, mean, used = mean, np.mean(gradients, axis=0), count
         spread = max(float(np.linalg.norm(gradient - mean)) for gradient in gradients)
-        error = max(SAFETY * spread, math.inf if before is None else float(np.linalg.norm(mean - before)))
+        # stated error, as a multiple of the largest distance of a rule from the mean of all rules
+        error = max(2.0 * spread, math.inf if before is None else float(np.linalg.norm(mean - before)))
         if count >= LEAST[width] and error <= SETTLED * np.linalg.norm(mean) + rounding:
             break
         panels *= 2
@@ -148,7 +143,9 @@ def integrate(problem: Problem, theta: np.ndarray, points: int, columns: int) ->
         # along each axis, the power with which the cost grows near its largest value
         lines = [lambda t, axis=axis: excess(peak[:, None] + np.outer(axis, t)) for axis in np.eye(width)]
         power = max(_bisected(line, np.linspace(-1.0, 1.0, AROUND))[3] for line in lines)
-    if power > POLE:
+    # least power p of a pole, where the cost grows as 1 / distance^p. From p = 1 on, its integral over a line
+    # diverges
+    if power > 0.95:
         place = ", ".join(f"{x:.6g}" for x in theta[:width] + sigma * peak)
         return unknown(f"the cost is infinite near theta = ({place}), a pole, so its mean may not exist", used, spacing)
     # the error falls as spacing^(1 - p), so a halving shows only a part of it
@@ -209,7 +206,9 @@ def _limits(excess: Callable[[np.ndarray], np.ndarray], width: int) -> tuple[np.
         unseen = np.where(at_end > VANISHED * total, at_end * ratio / (1.0 - ratio), 0.0)[radii[last.clip(0)] >= REACH]
     if ended.any() and radii[last.min()] >= REACH:
         note = f"costs beyond {radii[last.min()]:g} standard deviations are not finite, so the mean may not exist"
-    if float(unseen.sum()) > UNSETTLED * total:
+    # share of the integral of absolute values at the last finite point of a ray above which the integral may
+    # not exist
+    if float(unseen.sum()) > 1e-3 * total:
         note = note or "the cost grows as fast as the normal density falls, so its mean may not exist"
         return low, high, math.nan, note
     return low, high, 2.0 * (beyond + float(unseen.sum())), note

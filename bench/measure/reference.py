@@ -26,8 +26,6 @@ LEAST_SAMPLES = 16384
 QUADRATURE_POINTS = 1 << 20
 FINE = 1e-3
 """Spacing of a reference's points, in standard deviations, above which a note states it: that of points in a plane."""
-SURE = 3.0
-"""Stated errors of quadrature and sampling together beyond which they disagree."""
 TAIL_EVENTS = 10.0
 """Expected samples in the tails. Their contribution is estimated separately, as a spread may not show so few samples."""
 DEEPER = 0.2
@@ -46,8 +44,6 @@ SHARED = 1e-10
 """Relative error common to the terms of all samples, from rounding and central differences."""
 EXTREME = 1e100
 """Size of costs above which, or below the inverse of which, their squares would leave the range of float64."""
-SIZED = 4
-"""Samples that show the size of the costs."""
 REVISIONS = {"closed_form": 1, "quadrature": 1, "sampling": 1, "smoothed": 1}
 """Revision of each method. It is raised when a stored reference of that method moves."""
 CONTRACTS = "bench.model."
@@ -212,7 +208,8 @@ def _compute(
     if not sampled.is_finite:
         return quadrature
     apart, error = float(np.linalg.norm(sampled.gradient - quadrature.gradient)), sampled.known().standard_error
-    if apart > SURE * math.hypot(error, quadrature.error):
+    # stated errors of quadrature and sampling together beyond which they disagree
+    if apart > 3.0 * math.hypot(error, quadrature.error):
         note = f"quadrature and sampling disagree by {apart:.2g}, which is the stated error"
         return with_note(replace(quadrature, error=max(apart, quadrature.error)), note)
     # doubts about the samples are doubts about their error
@@ -225,7 +222,8 @@ def _compute(
 def _unit(problem: Problem, theta: np.ndarray) -> float:
     """Return the power of 2 that costs are divided by, so that their squares are in range; 1 for usual costs."""
     # one column at a time, as for the cost at w = 0, so that a compiling backend compiles no other shape
-    samples = draw_columns(problem, "unit", SIZED, 0)
+    # samples that show the size of the costs
+    samples = draw_columns(problem, "unit", 4, 0)
     values = np.abs(np.concatenate([problem.value(theta, w[:, None]) for w in samples.T]))
     size = float(values[np.isfinite(values)].max(initial=0.0))
     return 1.0 if size == 0.0 or 1.0 / EXTREME <= size <= EXTREME else 2.0 ** math.floor(math.log2(size))

@@ -36,9 +36,6 @@ from bench.run.tasks import FAILED, Task, group_by_program, result_of, row_of
 if TYPE_CHECKING:
     import pandas as pd
 
-MAX_REPAIRS = 2
-"""Number of times that cells whose rows are gone at the end of a run are run again."""
-
 
 @dataclass(frozen=True, eq=False)
 class Finished:
@@ -86,7 +83,8 @@ def execute(experiment: Experiment, quiet: bool = True) -> Finished:
     for folder in (experiment.directory, experiment.directory / "pending", experiment.results_dir / "references"):
         remove_stale(folder)
     _run(experiment, planned, store, quiet)
-    for is_last in (*[False] * MAX_REPAIRS, True):
+    # cells whose rows are gone at the end of a run are run again, at most twice
+    for is_last in (False, False, True):
         stored = set(store.load()["key"])
         rest = [replace(item, stored=item.cell.key in stored) for item in planned]
         if all(item.stored for item in rest):

@@ -47,8 +47,6 @@ SPACING, LENGTH, NARROWED = 64, 0.02, 8
 divided by 8."""
 TOUCH = 1e-6
 """Largest gap of a contact or limit at which accelerations may jump [m, rad]."""
-SMOOTH = 1e-5
-"""Largest uncertainty of differences of steps, relative to the largest of them, at which derivatives are compared with them."""
 
 
 class Subject:
@@ -207,7 +205,9 @@ def chained(subject: Subject) -> Iterator[tuple[int, float]]:
             return np.concatenate(at)
 
         (slope,), (doubt,) = runner.differences(after, [way])
-        if doubt.max() <= SMOOTH * np.abs(slope).max():
+        # largest uncertainty of differences of steps, relative to the largest of them, at which derivatives are
+        # compared with them
+        if doubt.max() <= 1e-5 * np.abs(slope).max():
             w, dv = np.split(functools.reduce(lambda end, at: subject.model.jacobian(*at) @ end, part, way), 2)
             yield step, _relative(slope, np.append(runner.tangent(last, subject.quaternions) @ w, dv))
 
