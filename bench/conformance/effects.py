@@ -25,8 +25,6 @@ from bench.model.parameters import traced
 
 COLUMNS = 16
 """Thetas, each with its noise, at which costs are compared."""
-FACTORS = (1.1, 0.5)
-"""Factors by which a parameter is moved; 0 becomes 0.1 and 0.5, infinity 1e4 and 1e3."""
 
 
 @verifies(Scene)
@@ -94,7 +92,8 @@ def _moving(scene: Scene, law: ContactLaw | None, axis: str) -> set[str]:
 
     before, moving = costs(near), set()
     for name in sorted(set(traced(near[axis])) - {"sigma"}):
-        for factor, zero in zip(FACTORS, (0.1, 0.5), strict=True):
+        # factors by which a parameter is moved; 0 becomes 0.1 and 0.5, infinity 1e4 and 1e3
+        for factor, zero in ((1.1, 0.1), (0.5, 0.5)):
             value = getattr(near[axis], name)
             changed = value * factor if value and np.isfinite(value) else zero if not value else 1e4 * factor
             moved = near | {axis: _with(near[axis], {name: changed})}

@@ -15,8 +15,6 @@ from bench.model.parameters import remember
 
 FOLDER = "BENCH_ENGINES"
 """Environment variable with the folder that contains the environments."""
-NEWEST = "newest"
-"""The release that pip chooses without a pin."""
 VERSIONS = """
 import importlib.metadata, json, platform, sys
 found = {"python": platform.python_version()}
@@ -88,7 +86,8 @@ def install(engine: str, requirements: Path, again: bool = False) -> Path:
     is_new = not place.exists()
     wanted, distribution = ["-r", str(requirements)], requirements.read_text().partition("==")[0]
     if release:
-        wanted = ["--upgrade", distribution] if release == NEWEST else [f"{distribution}=={release}"]
+        # the release that pip chooses without a pin
+        wanted = ["--upgrade", distribution] if release == "newest" else [f"{distribution}=={release}"]
     try:
         place.parent.mkdir(parents=True, exist_ok=True)
         if is_new:

@@ -28,8 +28,6 @@ GROWTH, STRAIGHT = 1.5, 0.9
 """The step size grows by this factor where the gradient along a step falls to no less than this share, and is halved elsewhere."""
 WINDOW, ENOUGH = 10, 1e-3
 """A descent ends where this many steps have gained less than this share of its whole gain."""
-SHARES = (0.0, 0.25, 0.5, 0.75, 0.9)
-"""Shares of a descent at which rows show its path, besides their own."""
 
 
 class Point(NamedTuple):
@@ -67,7 +65,8 @@ class Descent:
             raise Unsupported(f"no descent: {self.reason}")
         costs, thetas = np.array(self.costs), np.array(self.thetas)
         gained = (costs[0] - costs) / (costs[0] - costs[-1])
-        shares = sorted({*SHARES, share})
+        # shares of a descent at which rows show its path, besides their own
+        shares = sorted({0.0, 0.25, 0.5, 0.75, 0.9, share})
 
         def between(values: Any) -> list[float]:
             return [float(value) for value in np.interp(shares, gained, values)]

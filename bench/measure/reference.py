@@ -46,8 +46,6 @@ EXTREME = 1e100
 """Size of costs above which, or below the inverse of which, their squares would leave the range of float64."""
 REVISIONS = {"closed_form": 1, "quadrature": 1, "sampling": 1, "smoothed": 1}
 """Revision of each method. It is raised when a stored reference of that method moves."""
-CONTRACTS = "bench.model."
-"""Modules of the contracts, whose defaults are not declarations."""
 WARNED, REFUSED = 0.999, 1.0 - 1e-6
 """Confidence levels at which a difference of first from zeroth order adds a note, and makes zeroth order replace first."""
 
@@ -257,7 +255,8 @@ def assumes_continuity(program: Program) -> bool:
 
 def _declares_continuity(plugin: type) -> bool:
     for owner in plugin.__mro__:
-        is_contract = owner.__module__.startswith(CONTRACTS)
+        # modules of the contracts, whose defaults are not declarations
+        is_contract = owner.__module__.startswith("bench.model.")
         if "continuous" in vars(owner):
             return not is_contract
         if not is_contract and any(callable(value) for name, value in vars(owner).items() if name[0] != "_"):

@@ -26,8 +26,6 @@ FIRST_LINE_S, LINE_S = 5.0, 10.0
 """Seconds before the first line and between lines where the output is not a terminal."""
 NAME_WIDTH, BAR_WIDTH = 20, 16
 """Most characters of the experiment's name, and characters of a bar."""
-NOT_FAILED = ("ok", "unsupported", "waiting")
-"""Statuses that are not counted as failures."""
 
 
 class Progress:
@@ -49,7 +47,8 @@ class Progress:
     def finished(self, row: dict[str, Any]) -> None:
         """Count one cell that is finished and stored."""
         self._n_done += 1
-        if row["status"] not in NOT_FAILED:
+        # statuses that are not counted as failures
+        if row["status"] not in ("ok", "unsupported", "waiting"):
             self._failed[row["status"]] += 1
         self._show()
 

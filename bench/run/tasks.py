@@ -30,8 +30,6 @@ MAX_REASON = 2000
 """Length of the longest stored reason, in characters."""
 FAILED = ("error", "crashed", "timeout")
 """Statuses of cells that failed."""
-CONVERGED = {"float64": 1e-8, "float32": 1e-4}
-"""Largest relative residual of a constraint solver that has converged, by type of the simulation."""
 
 RAN: set[str] = set()
 """The modules and files from outside whose code this process has run."""
@@ -190,7 +188,8 @@ def solver_columns(cell: Cell, session: Session, result: dict[str, Any]) -> dict
     if "solver_residual" in names:
         w = noise.shared(cell.seed, cell.scene.name, 1, cell.samples, program.n_noise)[0].T
         columns["solver_residual"] = residual = float(backend.solver_residual(session.problem(cell), w))
-        if residual > CONVERGED[cell.backend.dtype]:
+        # largest relative residual of a constraint solver that has converged, by type of the simulation
+        if residual > {"float64": 1e-8, "float32": 1e-4}[cell.backend.dtype]:
             remarks.append(
                 f"the constraint solver has not converged (relative residual {residual:.1e}): more iterations give another gradient"
             )
