@@ -106,7 +106,8 @@ class TaskHandler:
                 reads.note(name)
         result = self._handle(item)
         is_reduced = isolation.reduced_precision()
-        if is_reduced and result.get("dtype", item.cell.backend.dtype) == "float64" and _uses_jax(item.backend):
+        uses_jax = any(requirement.partition("=")[0] == "jax" for requirement in item.backend.requires)
+        if is_reduced and uses_jax and result.get("dtype", item.cell.backend.dtype) == "float64":
             result["dtype"] = "float32"
         self.is_tainted = is_reduced or self._study.fresh_process or not registry.is_restricted()
         if RAN:
@@ -135,21 +136,13 @@ class TaskHandler:
 
 def outside_of(parts: Iterable[Plugin | None]) -> frozenset[str]:
     """Return the modules and files from outside this package that decide what plugins do."""
-    foreign = [part for part in parts if part is not None and is_foreign(part)]
+    known = [part for part in parts if part is not None]
+    foreign = [part for part in known if not type(part).__module__.startswith("bench.") or names_files(part)]
     names = {type(part).__module__ for part in foreign}
     for part in foreign:
         with suppress(Exception):  # the error is reported when the cell is measured
             names |= set(map(str, part.files() if names_files(part) else ()))  # type: ignore[attr-defined]
     return frozenset(names)
-
-
-def is_foreign(part: Plugin) -> bool:
-    """Return whether a plugin's code is from outside this package."""
-    return not type(part).__module__.startswith("bench.") or names_files(part)
-
-
-def _uses_jax(backend: Backend) -> bool:
-    return any(requirement.partition("=")[0] == "jax" for requirement in backend.requires)
 
 
 def measure_cell(cell: Cell, session: Session, study: Study) -> dict[str, Any]:
