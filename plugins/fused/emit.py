@@ -90,8 +90,8 @@ class _Backward:
     """Cotangents of the carries after the last step."""
     step: dict[int, Node] = field(default_factory=dict)
     """Cotangents of the carries before a step."""
-    totals: dict[Node, Node] = field(default_factory=dict)
-    """Contribution of each step to the cotangent of a value from before the loop."""
+    totals: dict[int, Node] = field(default_factory=dict)
+    """Contribution of each step to the cotangent of a value from before the loop, by the number of its node."""
     tables: dict[int, Node] = field(default_factory=dict)
     """Contribution of each step to the result, at the step's index in the table."""
     ends: dict[int, Node] = field(default_factory=dict)
@@ -127,12 +127,12 @@ class _Kernel:
         early = {n.number: n for n in self.nodes if n.number in self.wide - late}
         users = [n for n in reached([*inside, *after]) if n.number not in early]
         read = {arg.number for n in users for arg in n.args} | {n.number for n in [*inside, *after]}
-        self.crossing = [n for i, n in early.items() if i in read] if loop.length else []
+        self.crossing = {i: n for i, n in early.items() if i in read} if loop.length else {}
         """The values from before the time loop that are read in it or after it, leaves included."""
         # the carries that the backward pass reads must be first and contiguous
         names = [f"c{i}" for i in (*back.history, *(i for i in kept if i not in back.history))]
-        names += [f"k{n.number}" for n in self.crossing] + [f"a{i}" for i in back.step]
-        names += [f"t{n.number}" for n in back.totals] + [f"o{table}" for table in back.tables]
+        groups = {"k": self.crossing, "a": back.step, "t": back.totals, "o": back.tables}
+        names += [f"{prefix}{i}" for prefix, nodes in groups.items() for i in nodes]
         self.marks = ["big"] * any(n.op in ("sin", "cos") for n in self.nodes) + ["wild"] * (wrt == "theta")
         self.slots = {name: f"lane[{i * LANES} + l]" for i, name in enumerate([*names, *self.marks])}
         """Each per-lane value that is stored between loops over lanes, by name."""
@@ -195,11 +195,11 @@ class _Kernel:
             moving |= changed
         zero = graph.literal(0.0)
         step = {i: step.get(i, zero) for i in sorted(moving)}
-        totals = {node: ct for node, ct in found.items() if node.number in boundary}
+        totals = {node.number: ct for node, ct in found.items() if node.number in boundary}
         tables = {node.data: ct for node, ct in found.items() if node.op == own[1]}
         first = [(loop.first[i], ct) for i, ct in seeds.items() if i not in moving]
         first += [(loop.first[i], graph.leaf("before", i)) for i in step]
-        first += [(node, graph.leaf("total", node.number)) for node in totals]
+        first += [(graph.nodes[i], graph.leaf("total", i)) for i in totals]
         ends = {node.data: ct for node, ct in pullback(graph, first, lambda node: node.op == wrt).items()}
         for i, ct in direct.items():
             ends[i] = graph.apply("add", ends[i], ct) if i in ends else ct
@@ -217,45 +217,36 @@ class _Kernel:
         if self.adds:  # the backward pass adds to the result
             body += _block("for i in range(rows):", _block(LANE, ["out[at(i * out_row + b + l)] = F(0.0)"]))
         # before the loop over time
-        body += _block(
-            LANE, [f"{slots[name]} = F(0.0)" for name in (*(f"t{n.number}" for n in back.totals), *self.marks)]
-        )
-        stores = [(f"{slots[f'c{i}']} = {{}}", node) for i, node in self.starts.items()]
-        stores += [(f"{slots[f'k{n.number}']} = {{}}", n) for n in self.crossing]
-        body += self._pass(self.uniform_names, stores, {})
-        known = {n.number: slots[f"k{n.number}"] for n in self.crossing}
+        body += _block(LANE, [f"{slots[name]} = F(0.0)" for name in (*(f"t{i}" for i in back.totals), *self.marks)])
+        body += self._pass(self.uniform_names, self._stores("c", self.starts) + self._stores("k", self.crossing), {})
+        known = {i: slots[f"k{i}"] for i in self.crossing}
         # separate loops: with more arrays in one loop the compiler cannot prove that none overlap
         past = [
             f"past = (horizon - 1 - t) * {width}",
             *_block(f"for l in range({width}):", ["kept[at(past + l)] = lane[l]"]),
         ]
-        stores = [(f"{slots[f'c{i}']} = {{}}", node) for i, node in self.forward.items()]
         inside, names = self._at_step(self.forward.values())
-        inside += self._pass(names, stores, self._leaves("carry", {i: slots[f"c{i}"] for i in self.forward}) | known)
-        if stores:
+        inside += self._pass(names, self._stores("c", self.forward), self._leaves("carry", "c", self.forward) | known)
+        if self.forward:
             body += _block("for t in range(horizon):", past * bool(width) + inside)
-        finals = self._leaves("final", {i: slots[f"c{i}"] for i in self.forward}) | known
+        finals = self._leaves("final", "c", self.forward) | known
         if not self.wrt:
             body += self._pass(self.uniform_names, [("out[at(b + l)] = {}", self.result)], finals)
-        stores = [(f"{slots[f'a{i}']} = {{}}", node) for i, node in back.seeds.items()]
-        body += self._pass(self.uniform_names, stores, finals)
+        body += self._pass(self.uniform_names, self._stores("a", back.seeds), finals)
         # the history is stored in reading order, since loops over decreasing addresses are not vectorised
-        loads = {i: f"kept[at(back * {width} + {j * LANES} + l)]" for j, i in enumerate(back.history)}
-        stores = [(f"{slots[f'a{i}']} = {{}}", node) for i, node in back.step.items()]
-        stores += [(f"{slots[f't{of.number}']} += {{}}", node) for of, node in back.totals.items()]
-        stores += [(f"{slots[f'o{table}']} = {{}}", node) for table, node in back.tables.items()]
+        loads = known | self._leaves("adjoint", "a", back.step)
+        for j, i in enumerate(back.history):
+            loads[self.graph.leaf("carry", i).number] = f"kept[at(back * {width} + {j * LANES} + l)]"
+        stores = self._stores("a", back.step) + self._stores("t", back.totals, "+=") + self._stores("o", back.tables)
         inside, names = self._at_step(back.inside())
         inside += [f"o{table} = index[{table} * horizon + t] * out_row + b" for table in back.tables]
-        befores = {i: slots[f"a{i}"] for i in back.step}
-        loads = self._leaves("carry", loads) | self._leaves("adjoint", befores)
-        inside += self._pass(names, stores, loads | known)
+        inside += self._pass(names, stores, loads)
         for table in back.tables:
             written = self._written(f"o{table} + l", "+=" if self.adds else "=")
             inside += _block(LANE, written.format(slots[f"o{table}"]).splitlines())
         if stores:
             body += _block("for back in range(horizon):", ["t = horizon - 1 - back", *inside])
-        totals = {n.number: slots[f"t{n.number}"] for n in back.totals}
-        loads = finals | self._leaves("before", befores) | self._leaves("total", totals)
+        loads = finals | self._leaves("before", "a", back.step) | self._leaves("total", "t", back.totals)
         stores = [(self._written(f"{i} * out_row + b + l", "+="), node) for i, node in back.ends.items()]
         body += self._pass(self.uniform_names, stores, loads)
         for mark, most, name in (("big", "LIMIT", "small"), ("wild", "0.0", "tame")):
@@ -270,9 +261,13 @@ class _Kernel:
             "return small, tame",
         ]
 
-    def _leaves(self, op: str, places: dict[int, str]) -> dict[int, str]:
-        """Return the places of leaves of a kind by the numbers of their nodes."""
-        return {self.graph.leaf(op, i).number: place for i, place in places.items()}
+    def _leaves(self, op: str, prefix: str, known: Iterable[int]) -> dict[int, str]:
+        """Return the slots from which leaves of a kind are read, by the numbers of their nodes."""
+        return {self.graph.leaf(op, i).number: self.slots[f"{prefix}{i}"] for i in known}
+
+    def _stores(self, prefix: str, nodes: dict[int, Node], write: str = "=") -> list[tuple[str, Node]]:
+        """Return nodes with the statements that write or add ``{}`` to their slots."""
+        return [(f"{self.slots[f'{prefix}{i}']} {write} {{}}", node) for i, node in nodes.items()]
 
     def _written(self, place: str, write: str) -> str:
         """Return statements that write or add ``{}`` to the result and, for derivatives by theta, flag large ones."""
