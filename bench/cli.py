@@ -314,11 +314,6 @@ def _plan(words: list[str]) -> int:
     if rows.empty:  # times of the standard results, on another machine, are better than none
         rows = store_of(replace(experiment, results_dir=config.config_dir().parent / "results" / "standard")).load()
     progress.print_plan(experiment, plan.plan(experiment, store), rows)
-    if experiment.execution.launcher == "ray":
-        from bench.run.launchers import launcher_of
-
-        with launcher_of(experiment):  # raises an error if the cluster does not answer, or cannot run the jobs
-            pass
     return 0
 
 

@@ -176,10 +176,6 @@ def mjx_remarks(model: Any) -> list[str]:
     return [f"MJX is not the C engine: {text}" for text, is_so in found.items() if is_so]
 
 
-FAR = 1e3
-"""Distance up to which gaps are measured [m]."""
-
-
 class Contacts:
     """The contacts of a model: which pairs of geoms can touch, and where they do, by the C engine's collisions.
 
@@ -207,7 +203,8 @@ class Contacts:
         result = np.full((len(states), len(self._pairs), states.shape[-1]), np.nan)
         for t, column in self._placed(states):
             for i, pair in enumerate(self._pairs):
-                result[t, i, column] = self._mujoco.mj_geomDistance(self._model, self._data, *pair, FAR, None)
+                # distance up to which gaps are measured [m]
+                result[t, i, column] = self._mujoco.mj_geomDistance(self._model, self._data, *pair, 1e3, None)
         return result
 
     def forces(self, states: np.ndarray, controls: np.ndarray) -> np.ndarray:

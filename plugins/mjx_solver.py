@@ -11,8 +11,6 @@ from typing import Any
 REVISION = 1
 """Raised when a stored number that this module decides moves."""
 
-NEWTON_STEPS = 2
-"""Newton steps after the solver. The last one is differentiated; the others ensure that it starts at the minimum."""
 _tracing = threading.RLock()
 
 
@@ -44,7 +42,8 @@ def solve(model: Any, data: Any) -> Any:
 
     constants = jax.lax.stop_gradient((model, data))
     acceleration = library().solve(*constants).qacc
-    for at in [constants] * (NEWTON_STEPS - 1) + [(model, data)]:
+    # two Newton steps after the solver. The last one is differentiated; the first ensures that it starts at the minimum
+    for at in (constants, (model, data)):
         start = jax.lax.stop_gradient(acceleration)
         hessian = jax.jacfwd(lambda a: _cost_gradient(*constants, a))(start)
         newton = jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(hessian), _cost_gradient(*at, start))

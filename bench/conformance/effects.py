@@ -25,12 +25,6 @@ from bench.model.parameters import traced
 
 COLUMNS = 16
 """Thetas, each with its noise, at which costs are compared."""
-NEAR = 0.1
-"""Largest relative distance of the parameters from their defaults: a body may start in balance, where a damper is idle."""
-FACTORS = (1.1, 0.5)
-"""Factors by which a parameter is moved; 0 becomes 0.1 and 0.5, infinity 1e4 and 1e3."""
-BRIEF = 20
-"""Steps of the rollouts in which a law is checked."""
 
 
 @verifies(Scene)
@@ -56,7 +50,8 @@ def parameters_have_an_effect(scene: Scene) -> str:
 def ignored_parameters_are_declared(law: ContactLaw) -> str:
     """Verify that the law's parameters move costs, and the scene's contact parameters do unless the law ignores them."""
     scenes = [s for s in sound_scenes() if isinstance(s, FrictionScene) and not isinstance(s, EngineScene)]
-    scenes = [dataclasses.replace(scene, horizon=min(scene.horizon, BRIEF)) for scene in scenes]
+    # steps of the rollouts in which a law is checked
+    scenes = [dataclasses.replace(scene, horizon=min(scene.horizon, 20)) for scene in scenes]
     skip_unless(scenes, "no scene with friction is registered")
     own = set() if law.surrogate else set(traced(law))  # a surrogate's parameters may move gradients only
     contact = {"friction", "slip_speed", "restitution"}
@@ -79,8 +74,10 @@ def _moving(scene: Scene, law: ContactLaw | None, axis: str) -> set[str]:
     """Return the parameters of ``scene`` or ``contact`` that move theta0 or a cost near the defaults, at several thetas."""
     draw = rng("effects", scene.name)
     given = {"scene": scene, "contact": law}
+    # largest relative distance of the parameters from their defaults: a body may start in balance, where a
+    # damper is idle
     near: dict[str, Any] = {
-        name: part and _with(part, {n: getattr(part, n) * (1 + NEAR * draw.uniform(-1, 1)) for n in traced(part)})
+        name: part and _with(part, {n: getattr(part, n) * (1 + 0.1 * draw.uniform(-1, 1)) for n in traced(part)})
         for name, part in given.items()
     }
     theta, own = near["scene"].theta0(), compose(near["scene"], near["contact"], _integrator(scene))
@@ -95,7 +92,8 @@ def _moving(scene: Scene, law: ContactLaw | None, axis: str) -> set[str]:
 
     before, moving = costs(near), set()
     for name in sorted(set(traced(near[axis])) - {"sigma"}):
-        for factor, zero in zip(FACTORS, (0.1, 0.5), strict=True):
+        # factors by which a parameter is moved; 0 becomes 0.1 and 0.5, infinity 1e4 and 1e3
+        for factor, zero in ((1.1, 0.1), (0.5, 0.5)):
             value = getattr(near[axis], name)
             changed = value * factor if value and np.isfinite(value) else zero if not value else 1e4 * factor
             moved = near | {axis: _with(near[axis], {name: changed})}

@@ -41,8 +41,6 @@ from bench.model.parameters import parameters
 
 SIGMAS = (0.1, 0.5)
 """Noise levels of the oracles. 1 is excluded, because sigma and its square would be equal."""
-DIMENSION = 20
-"""Length of theta of the oracles at the last of :data:`SIGMAS` whose scene has a parameter ``dimension``."""
 DESIGNS: tuple[tuple[int, dict[str, Any]], ...] = (
     (8, {"mirrored": True}),
     (16, {"draws": "orthogonal"}),
@@ -51,8 +49,6 @@ DESIGNS: tuple[tuple[int, dict[str, Any]], ...] = (
 """Numbers of samples and designs of the noise that are checked."""
 SETS, DESIGNED = 256, 4
 """Numbers of estimates and of oracles of such a check."""
-APART = 1e-5
-"""Distance at which a gradient is compared: ten steps of the plain backend's differences."""
 
 
 class RecordingProblem(Problem):
@@ -88,7 +84,8 @@ class AwayFromJumps(Problem):
         raise NotImplementedError
 
     def _grad(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
-        here, beside = self._differences(theta, w), self._differences(theta + APART, w)
+        # distance at which a gradient is compared: ten steps of the plain backend's differences
+        here, beside = self._differences(theta, w), self._differences(theta + 1e-5, w)
         return np.where(np.abs(here) > 2 * np.abs(beside) + 1, beside, here)
 
 
@@ -118,7 +115,8 @@ def oracles() -> tuple[Oracle, ...]:
     for default, sigma in itertools.product(sound_scenes(), SIGMAS):
         if isinstance(default, FunctionScene):
             is_wide = sigma == SIGMAS[-1] and "dimension" in parameters(type(default))
-            changes: dict[str, Any] = {"dimension": DIMENSION} if is_wide else {}
+            # the oracles at the last sigma whose scene has a parameter dimension
+            changes: dict[str, Any] = {"dimension": 20} if is_wide else {}
             changes["sigma"] = sigma
             scene = dataclasses.replace(default, **changes)
             try:

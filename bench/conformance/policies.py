@@ -13,8 +13,6 @@ INPUTS, OUTPUTS, COLUMNS = 3, 2, 5
 """Numbers of observations, controls and columns of the checks."""
 MANY = 40
 """Number of columns in which every unit of a network is active somewhere."""
-ACTIVE = 0.75
-"""Least share of the parameters that must move a control."""
 
 
 def _subject(policy: Policy, columns: int = COLUMNS) -> tuple[np.ndarray, np.ndarray]:
@@ -73,5 +71,6 @@ def derivatives_agree(policy: Policy) -> str:
     found = check(cost, lambda theta: np.asarray(exact(theta)), theta[:, 0], Options(draws=0))
     require(found.trusted, found.sentence())
     share = np.mean(found.gradient != 0.0)  # a rectified unit may be always inactive
-    require(share > ACTIVE, f"only {share:.0%} of {len(theta)} parameters move a control")
+    # least share of the parameters that must move a control
+    require(share > 0.75, f"only {share:.0%} of {len(theta)} parameters move a control")
     return f"{len(theta)} parameters, {found.cause}"

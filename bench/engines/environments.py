@@ -15,10 +15,6 @@ from bench.model.parameters import remember
 
 FOLDER = "BENCH_ENGINES"
 """Environment variable with the folder that contains the environments."""
-NEWEST = "newest"
-"""The release that pip chooses without a pin."""
-LIMIT_S = 60.0
-"""Seconds allowed for a Python to state its versions."""
 VERSIONS = """
 import importlib.metadata, json, platform, sys
 found = {"python": platform.python_version()}
@@ -52,7 +48,8 @@ def library_versions(python: str, libraries: tuple[str, ...]) -> dict[str, str]:
     """
     words = [python, "-I", "-c", VERSIONS, *libraries]
     try:
-        done = subprocess.run(words, capture_output=True, timeout=LIMIT_S, stdin=subprocess.DEVNULL)
+        # seconds allowed for a Python to state its versions
+        done = subprocess.run(words, capture_output=True, timeout=60.0, stdin=subprocess.DEVNULL)
         return {str(name): str(version) for name, version in json.loads(done.stdout).items()}
     except (OSError, subprocess.TimeoutExpired) as error:
         raise Unavailable(f"it cannot be started ({printable(error)[:200]})") from error
@@ -89,7 +86,8 @@ def install(engine: str, requirements: Path, again: bool = False) -> Path:
     is_new = not place.exists()
     wanted, distribution = ["-r", str(requirements)], requirements.read_text().partition("==")[0]
     if release:
-        wanted = ["--upgrade", distribution] if release == NEWEST else [f"{distribution}=={release}"]
+        # the release that pip chooses without a pin
+        wanted = ["--upgrade", distribution] if release == "newest" else [f"{distribution}=={release}"]
     try:
         place.parent.mkdir(parents=True, exist_ok=True)
         if is_new:

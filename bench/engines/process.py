@@ -26,8 +26,6 @@ from bench.model import guard
 
 TAIL = 2000
 """Bytes of an engine's last output that a message quotes."""
-EXIT_S = 5.0
-"""Seconds allowed for an engine to end after it has closed its connection."""
 CLOSED = (EOFError, OSError)
 """Raised when an engine's process has ended."""
 
@@ -59,7 +57,8 @@ class EngineProcess:
     def end(self) -> str:
         """End the process, if it has not ended, and return how it ended, with its last output."""
         with contextlib.suppress(subprocess.TimeoutExpired):
-            self.process.wait(EXIT_S)
+            # seconds allowed for an engine to end after it has closed its connection
+            self.process.wait(5.0)
         code = self.process.poll() or 0
         text = f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit status {code}"
         size = self._output.seek(0, os.SEEK_END)

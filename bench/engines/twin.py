@@ -14,8 +14,6 @@ KNOWN = {
     "fixed",
 }  # fmt: skip
 """The elements of twins."""
-JOINT = {"name", "type", "axis", "damping", "stiffness"}
-"""The attributes of their joints."""
 
 
 def read(mjcf: str) -> dict[str, Any]:
@@ -80,7 +78,8 @@ def _body(node: ElementTree.Element) -> tuple[ElementTree.Element, dict[str, Any
     if len(joints) != 1 or joints[0].get("type") not in ("slide", "hinge"):
         raise Unsupported("the twin has a body without exactly one slide or hinge")
     joint = joints[0]
-    if strange := sorted(set(joint.keys()) - JOINT):
+    # the attributes of twins' joints
+    if strange := sorted(set(joint.keys()) - {"name", "type", "axis", "damping", "stiffness"}):
         raise Unsupported(f"the twin has a joint with {', '.join(strange)}, which this engine's models do not have")
     if geom is not None and geom.get("type") != "sphere":
         raise Unsupported(f"the twin has a {geom.get('type')}, and this engine's models have spheres and a ground")

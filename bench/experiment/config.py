@@ -263,7 +263,6 @@ def _in_use(plugins: Sequence[type[Plugin]]) -> list[type[Plugin]]:
 
 
 FORMATS = ("png", "svg", "pdf")
-LAUNCHERS = ("local", "ray")
 
 
 def from_settings(config: Mapping[str, Any]) -> Experiment:
@@ -395,7 +394,6 @@ def _compile_cache(value: Any) -> Path | None:
 
 
 def _execution(config: Mapping[str, Any]) -> Execution:
-    launcher = _one_of("launcher", config["launcher"], LAUNCHERS)
     memory = _amount("memory", config["memory"], BYTES, "4g, 500m")
     return Execution(
         workers=check(Parameter("workers", int | None, None, low=0), config["workers"], "workers"),
@@ -405,8 +403,6 @@ def _execution(config: Mapping[str, Any]) -> Execution:
         ladder=coerce(bool, config["ladder"], "ladder"),
         versions=_one_of("versions", config["versions"], ("ignore", "warn", "rerun")),
         retry=tuple(_one_of("retry", status, STATUSES) for status in _as_list(config["retry"]) if status is not None),
-        launcher=launcher,
-        cluster={} if launcher == "local" else _mapping(config, launcher),
         shard=_shard(config),
     )
 

@@ -45,10 +45,6 @@ class Execution:
     """How to treat stored rows computed with other library versions: ``ignore``, ``warn`` or ``rerun``."""
     retry: tuple[str, ...] = ()
     """Statuses of stored rows that are run again."""
-    launcher: str = "local"
-    """Where cells run: ``local`` or ``ray``."""
-    cluster: Mapping[str, Any] = field(default_factory=dict)
-    """Settings of the launcher, which validates them."""
     shard: tuple[int, int] | None = None
     """Number, from 1, and count of the parts of which this run is one; None for all cells."""
 

@@ -17,7 +17,7 @@ RANGE = re.compile(r"range\(([^()]*)\)")
 _NUMBER = r"\s*[+-]?(?:(?:0|[1-9]\d*)(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?\s*"
 NUMBERS = re.compile(rf"\[{_NUMBER}(?:,{_NUMBER})*\]")
 """A list of numbers."""
-TABLES = ("sweep", "marks", "compares", "reference", "ray")
+TABLES = ("sweep", "marks", "compares", "reference")
 """Settings that are tables; the parameters of plugins are too."""
 LISTS_AS = "write key=value with lists as [a,b] and strings in quotes"
 

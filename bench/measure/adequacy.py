@@ -22,8 +22,6 @@ DRAWS = 2000
 """Simulated residuals that determine the quantiles."""
 LAGS = 10
 """Lags of the autocorrelations that are tested together."""
-WAVES = 8
-"""Slowest cosines along the record that are tested together."""
 LEVEL = 0.05
 """Rate of false alarms of all tests of a record together."""
 POWER = 0.95
@@ -113,7 +111,8 @@ def _statistics(
         products = np.fft.irfft(power, axis=1)[:, : LAGS + 1]
         correlations = np.square(products[:, 1:] / np.maximum(products[:, :1], 1e-300)) / (length - lags)
         parts["correlation"] = correlations.sum(axis=(1, 2))
-        parts["slow change"] = np.square(dct(series, axis=1, norm="ortho")[:, :WAVES]).sum(axis=(1, 2))
+        # slowest cosines along the record that are tested together
+        parts["slow change"] = np.square(dct(series, axis=1, norm="ortho")[:, :8]).sum(axis=(1, 2))
     return parts | {name: np.abs(own @ direction) for name, direction in directions.items()}
 
 

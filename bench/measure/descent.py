@@ -24,22 +24,10 @@ STEPS = 400
 """Most steps of a descent."""
 FIRST = 0.02
 """Length of the first step relative to theta0, or to the noise on all of theta if that is larger."""
-FAR = 1e3
-"""Distance of theta from 0, relative to that length, beyond which costs count as unbounded below."""
 GROWTH, STRAIGHT = 1.5, 0.9
 """The step size grows by this factor where the gradient along a step falls to no less than this share, and is halved elsewhere."""
-SMALLEST = 1e-9
-"""Step, relative to that length, below which no step lowers the cost."""
 WINDOW, ENOUGH = 10, 1e-3
 """A descent ends where this many steps have gained less than this share of its whole gain."""
-DIGITS = 6
-"""Significant digits of thetas along a path."""
-SHARES = (0.0, 0.25, 0.5, 0.75, 0.9)
-"""Shares of a descent at which rows show its path, besides their own."""
-LEFT = 0.5
-"""Gradient at the end, on noise that the descent has not used, relative to that at theta0, above which no optimum was reached."""
-SURE = 3.0
-"""Standard errors by which the gain must exceed 0 on noise that the descent has not used."""
 
 
 class Point(NamedTuple):
@@ -77,7 +65,8 @@ class Descent:
             raise Unsupported(f"no descent: {self.reason}")
         costs, thetas = np.array(self.costs), np.array(self.thetas)
         gained = (costs[0] - costs) / (costs[0] - costs[-1])
-        shares = sorted({*SHARES, share})
+        # shares of a descent at which rows show its path, besides their own
+        shares = sorted({0.0, 0.25, 0.5, 0.75, 0.9, share})
 
         def between(values: Any) -> list[float]:
             return [float(value) for value in np.interp(shares, gained, values)]
@@ -89,7 +78,8 @@ class Descent:
             "theta": np.linalg.norm(points, axis=0).tolist(),
             **{name: between(getattr(self, f"{name}s")) for name in ("cost", "gradient", "speed", "move")},
         }
-        return Point(tuple(float(f"{value:.{DIGITS}g}") for value in theta), self.gradients[0], along)
+        # significant digits of thetas along a path
+        return Point(tuple(float(f"{value:.6g}") for value in theta), self.gradients[0], along)
 
 
 @np.errstate(over="ignore", invalid="ignore")
@@ -119,7 +109,8 @@ def descend(problem: Problem) -> Descent:
     while math.isfinite(costs[-1]) and (size := float(np.linalg.norm(slopes[-1]))) > 0.0 and math.isfinite(size):
         step = step or FIRST * scale / size
         new = thetas[-1] - step * slopes[-1]
-        while not (reached := cost(new)) < costs[-1] and step * size > SMALLEST * scale:
+        # step, relative to that length, below which no step lowers the cost
+        while not (reached := cost(new)) < costs[-1] and step * size > 1e-9 * scale:
             step /= 2.0
             new = thetas[-1] - step * slopes[-1]
         if not reached < costs[-1]:
@@ -130,7 +121,8 @@ def descend(problem: Problem) -> Descent:
         step *= GROWTH if slopes[-1] @ slopes[-2] >= STRAIGHT * size**2 else 0.5
         if len(costs) > WINDOW and costs[-1 - WINDOW] - costs[-1] < ENOUGH * (costs[0] - costs[-1]):
             break
-        if len(costs) > STEPS or np.linalg.norm(new) > FAR * scale:
+        # distance of theta from 0, relative to that length, beyond which costs count as unbounded below
+        if len(costs) > STEPS or np.linalg.norm(new) > 1e3 * scale:
             return _none(f"the cost still falls after {len(costs) - 1} steps, from {costs[0]:.4g} to {costs[-1]:.4g}")
     norms = [float(np.linalg.norm(slope)) for slope in slopes]
     if not np.isfinite([*costs, *norms]).all():
@@ -138,12 +130,15 @@ def descend(problem: Problem) -> Descent:
     gain = problem.value(theta, fresh) - problem.value(thetas[-1], fresh)
     gain = gain.reshape(2, -1).mean(axis=0)
     error = float(gain.std(ddof=1)) / math.sqrt(gain.size)
-    if not gain.mean() > SURE * error:
+    # standard errors by which the gain must exceed 0 on noise that the descent has not used
+    if not gain.mean() > 3.0 * error:
         return _none(
             f"from theta0 the cost falls by {gain.mean():.2g} +- {error:.2g} in {len(costs) - 1} steps: theta0 may be an optimum"
         )
     left = float(np.linalg.norm(gradient(thetas[-1], fresh))) / norms[0]
-    if not left < LEFT:
+    # gradient at the end, on noise that the descent has not used, relative to that at theta0, above which no
+    # optimum was reached
+    if not left < 0.5:
         return _none(f"no optimum in {len(costs) - 1} steps: the gradient there is {left:.2g} times that at theta0")
     path = np.array(thetas)
     return Descent(path.tolist(), costs, norms, *_motion(problem, path))

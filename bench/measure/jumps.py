@@ -13,14 +13,10 @@ from bench.model import Problem
 
 PARTS = 64
 """Default number of intervals of each line at the first level."""
-CUTS = 32
-"""Number of intervals into which a suspicious interval and its neighbour are divided at every further level."""
 SUSPECTS = 32
 """Number of intervals refined at each level."""
 FINEST = 1e-11
 """Interval length, as a share of the line, at which a change of the cost that no longer shrinks is a jump."""
-NO_JUMP = 1e-6
-"""Change of a cost, relative to its range on the lines, below which rounding may hide that the change still shrinks."""
 LOUD = 100.0
 """Multiple of the cost's rounding noise below which a change counts as noise."""
 SINGLE = float(np.finfo(np.float32).eps)
@@ -28,8 +24,6 @@ SINGLE = float(np.finfo(np.float32).eps)
 MOST_POINTS = 1 << 25
 """Most numbers in the points of one call of the cost (256 MiB)."""
 
-ISOLATED = 0.1
-"""Largest change of the cost beside a jump, relative to the jump. Beside a root or in chaos the changes are of one size."""
 
 REACH = 4.0
 """Distance searched on either side of theta, in standard deviations of the noise."""
@@ -45,8 +39,6 @@ MISSED = 0.25
 """Share of the mean slope that gradients must not miss: half of the error at which an estimate counts as wrong."""
 DRAWS = 512
 """Samples of the noise whose costs and gradients must be numbers: an event of 1% is in all but one of 170 such sets."""
-UNRESOLVED = 0.25
-"""Largest difference between the sums over every other point, relative to the missed slope, at which the sums decide."""
 
 
 class Jump(NamedTuple):
@@ -147,7 +139,9 @@ def missed_slope(problem: Problem, theta: np.ndarray, seed: int, columns: int) -
         largest = max(np.nanmax(np.abs(part.sum(axis=1)), initial=0.0) for part in (by_costs, by_gradients))
         unit = SINGLE if (costs == costs.astype(np.float32)).all() else float(np.finfo(np.float64).eps)
         noise = LOUD * unit * np.abs(costs).max(axis=1)
-        is_shown = (np.abs(missed) > noise) & (doubts[1] <= UNRESOLVED * np.abs(missed)) & (doubts[0] <= np.abs(missed))
+        # largest difference between the sums over every other point, relative to the missed slope, at which the
+        # sums decide
+        is_shown = (np.abs(missed) > noise) & (doubts[1] <= 0.25 * np.abs(missed)) & (doubts[0] <= np.abs(missed))
         shares = np.where(is_shown, np.abs(missed) / largest, 0.0)
     line = int(np.argmax(shares))
     if not shares[line] > MISSED:
@@ -251,11 +245,14 @@ def largest_jump(
             changes[-1] = float(isolated[best])
             break
         row, place = np.unravel_index(np.argsort(bends, axis=None)[-SUSPECTS:], bends.shape)
-        line, left, width, parts = line[row], nodes[row, place], 2.0 * width / parts, CUTS
+        # number of intervals into which a suspicious interval and its neighbour are divided at every further level
+        line, left, width, parts = line[row], nodes[row, place], 2.0 * width / parts, 32
     if single:
         # steps of rounding are flat at the last level, so that they have no median bend
         noise = max(noise, SINGLE * size)
-    stays = changes[-1] > 0.1 * changes[-2] and changes[-1] > max(NO_JUMP * span, LOUD * noise)
+    # change of a cost, relative to its range on the lines, below which rounding may hide that the change still
+    # shrinks
+    stays = changes[-1] > 0.1 * changes[-2] and changes[-1] > max(1e-6 * span, LOUD * noise)
     return Jump(changes[-1] if stays else 0.0, span, *where)
 
 
@@ -268,5 +265,7 @@ def _isolated(values: np.ndarray, steps: np.ndarray) -> np.ndarray:
     rest = steps.copy()
     rest[row, part] = 0.0
     sides = np.maximum(np.abs(values[row, part] - values[:, 0]), np.abs(values[:, -1] - values[row, part + 1]))
-    allowed = ISOLATED * steps[row, part]
+    # largest change of the cost beside a jump, relative to the jump. Beside a root or in chaos the changes are
+    # of one size
+    allowed = 0.1 * steps[row, part]
     return np.where((rest.max(axis=1) <= allowed) & (np.nan_to_num(sides) <= allowed), steps[row, part], 0.0)

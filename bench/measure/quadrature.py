@@ -25,12 +25,8 @@ RAYS, SPACING = 96, 0.25
 """Directions in which an integrand in the plane is searched, and distance of the points on a ray."""
 NEGLIGIBLE = 1e-13
 """Share of the integral of absolute values beyond the limits that does not move the limits; the error includes it."""
-UNSETTLED = 1e-3
-"""Share of the integral of absolute values at the last finite point of a ray above which the integral may not exist."""
 MARGIN = 1.0
 """Distance of a moved limit from the last point with a share of the integral, in standard deviations."""
-POLE = 0.95
-"""Least power p of a pole, where the cost grows as 1 / distance^p. From p = 1 on, its integral over a line diverges."""
 SHIFTS = {1: ((0.0, 0.5, 0.25, 0.75),), 2: ((0.0, 0.5, 0.25, 0.75), (0.0, 0.25, 0.75, 0.5))}
 """Shift of each rule's panels, as a share of a panel, by number of noise dimensions: no two rules share their points."""
 FIRST = {1: 512, 2: 12}
@@ -38,8 +34,6 @@ FIRST = {1: 512, 2: 12}
 LEAST = {1: 1 << 15, 2: 1 << 17}
 """Fewest points, by number of noise dimensions. One: 1800 per standard deviation, enough for an event of width .001.
 Two: 20 per standard deviation in each dimension."""
-SAFETY = 2.0
-"""Stated error, as a multiple of the largest distance of a rule from the mean of all rules."""
 SETTLED = 1e-10
 """Relative error at which refinement stops."""
 TOLERANCE = 1e-3
@@ -83,8 +77,7 @@ def integrate(problem: Problem, theta: np.ndarray, points: int, columns: int) ->
     the limits is not finite. A feature of the cost that is narrower than the spacing and not among the breakpoints is
     missed. The cost is evaluated ``columns`` points at a time.
     """
-    width, dim = problem.program.n_noise, problem.dim
-    breaks = problem.program.breakpoints()
+    width, dim, sigma = problem.program.n_noise, problem.dim, problem.sigma
     # E[w] = 0, so subtracting f(0) does not change the integral, and loses fewer digits
     centre = problem.value(theta, np.zeros((width, 1)))[0]
 
@@ -94,21 +87,22 @@ def integrate(problem: Problem, theta: np.ndarray, points: int, columns: int) ->
     def excess(nodes: np.ndarray) -> np.ndarray:
         return cost(nodes) - centre
 
+    def unknown(note: str, points: int = 0, spacing: float = 0.0) -> Integral:
+        return Integral(np.full(dim, math.nan), math.nan, points, spacing, note)
+
     low, high, beyond, note = _limits(excess, width)
-    beyond /= problem.sigma
     if math.isnan(beyond):
-        return Integral(np.full(dim, math.nan), math.nan, 0, 0.0, note)
-    edges = []
+        return unknown(note)
+    edges, breaks = [], problem.program.breakpoints()
     for i in range(width):
-        inner = [(b - theta[i]) / problem.sigma for b in (breaks[i] if i < len(breaks) else ())]
+        inner = [(b - theta[i]) / sigma for b in (breaks[i] if i < len(breaks) else ())]
         edges.append(np.unique([low[i], *(b for b in inner if low[i] < b < high[i]), high[i]]))
     stretch = (high - low) / (2.0 * REACH)
-    rounding = _noise(cost, width) * math.sqrt(width) / problem.sigma
-    panels, previous, error, used, size = FIRST[width], None, math.inf, 0, 0.0
-    peak, largest = np.zeros(width), 0.0
+    rounding = _noise(cost, width) * math.sqrt(width) / sigma
+    panels, mean, error, used, size, largest, peak = FIRST[width], None, math.inf, 0, 0.0, 0.0, np.zeros(width)
     while True:
         rules = _rules(edges, panels * stretch)
-        count = sum(math.prod(rule[0].size for rule in axes) for axes in rules)
+        count = sum(math.prod(axis[0].size for axis in axes) for axes in rules)
         if count > points:
             break
         gradients = []
@@ -117,57 +111,53 @@ def integrate(problem: Problem, theta: np.ndarray, points: int, columns: int) ->
                 np.stack([part.ravel() for part in np.meshgrid(*each, indexing="ij")])
                 for each in zip(*axes, strict=True)
             )
-            weights = weights.prod(axis=0)
-            f = cost(nodes)
+            f, weights = cost(nodes), weights.prod(axis=0)
             if not np.isfinite(f).all():
-                if stretch.max() <= 1.0:
-                    return None
-                # samples would miss what the wider limits contain
-                note = note or "costs far in the tails are not finite, so the mean may not exist"
-                return Integral(np.full(dim, math.nan), math.nan, 0, 0.0, note)
+                # samples would miss what limits wider than usual contain
+                wide = "costs far in the tails are not finite, so the mean may not exist"
+                return unknown(note or wide) if stretch.max() > 1.0 else None
             dense = np.abs(f - centre) * np.exp(-np.square(nodes).sum(axis=0) / 2)
             if dense.max() > largest:
                 peak, largest = nodes[:, np.argmax(dense)], float(dense.max())
-            gradients.append(nodes[:dim] @ (weights * (f - centre)) / problem.sigma)
-            size = max(size, float(np.linalg.norm(np.abs(nodes[:dim]) @ (weights * np.abs(f))) / problem.sigma))
-        mean = np.mean(gradients, axis=0)
-        spread = max(float(np.linalg.norm(g - mean)) for g in gradients)
-        change = math.inf if previous is None else float(np.linalg.norm(mean - previous))
-        previous, error, used = mean, max(SAFETY * spread, change), count
+            gradients.append(nodes[:dim] @ (weights * (f - centre)) / sigma)
+            size = max(size, float(np.linalg.norm(np.abs(nodes[:dim]) @ (weights * np.abs(f))) / sigma))
+        before, mean, used = mean, np.mean(gradients, axis=0), count
+        spread = max(float(np.linalg.norm(gradient - mean)) for gradient in gradients)
+        # stated error, as a multiple of the largest distance of a rule from the mean of all rules
+        error = max(2.0 * spread, math.inf if before is None else float(np.linalg.norm(mean - before)))
         if count >= LEAST[width] and error <= SETTLED * np.linalg.norm(mean) + rounding:
             break
         panels *= 2
-    if previous is None or used < LEAST[width] or not math.isfinite(error + rounding):
+    if mean is None or used < LEAST[width] or not math.isfinite(error + rounding):
         return None
     spacing = float(np.prod(high - low)) ** (1.0 / width) / used ** (1.0 / width)
-    settled = SETTLED * float(np.linalg.norm(previous))
-    power = 0.0
-    missed = _missed(excess, edges) / problem.sigma if width > 1 or error <= settled + rounding else 0.0
-    is_narrow = missed > min(error, TOLERANCE * float(np.linalg.norm(previous))) + settled + rounding + SOLVED * size
-    if width == 1 and (is_narrow or error > TOLERANCE * np.linalg.norm(previous)):
-        value, error, used, power = _bisected(
-            lambda t: t * excess(t[None, :]) / problem.sigma,
-            np.unique([*edges[0], *np.linspace(low[0], high[0], 2 * SEARCH[1])]),
-        )
-        previous, spacing, is_narrow = np.array([value]), float(high[0] - low[0]) / used, False
-    elif error > settled:
+    norm, power, missed, doubts = float(np.linalg.norm(mean)), 0.0, 0.0, [note] if note else []
+    if width > 1 or error <= SETTLED * norm + rounding:
+        missed = _missed(excess, edges) / sigma
+    is_narrow = missed > min(error, TOLERANCE * norm) + SETTLED * norm + rounding + SOLVED * size
+    if width == 1 and (is_narrow or error > TOLERANCE * norm):
+        ends = np.unique([*edges[0], *np.linspace(low[0], high[0], 2 * SEARCH[1])])
+        value, error, used, power = _bisected(lambda t: t * excess(t[None, :]) / sigma, ends)
+        mean, spacing, is_narrow = np.array([value]), float(high[0] - low[0]) / used, False
+    elif error > SETTLED * norm:
         # along each axis, the power with which the cost grows near its largest value
         lines = [lambda t, axis=axis: excess(peak[:, None] + np.outer(axis, t)) for axis in np.eye(width)]
         power = max(_bisected(line, np.linspace(-1.0, 1.0, AROUND))[3] for line in lines)
-    if power > POLE:
-        place = ", ".join(f"{x:.6g}" for x in theta[:width] + problem.sigma * peak)
-        note = f"the cost is infinite near theta = ({place}), a pole, so its mean may not exist"
-        return Integral(np.full(dim, math.nan), math.nan, used, spacing, note)
+    # least power p of a pole, where the cost grows as 1 / distance^p. From p = 1 on, its integral over a line
+    # diverges
+    if power > 0.95:
+        place = ", ".join(f"{x:.6g}" for x in theta[:width] + sigma * peak)
+        return unknown(f"the cost is infinite near theta = ({place}), a pole, so its mean may not exist", used, spacing)
     # the error falls as spacing^(1 - p), so a halving shows only a part of it
     error /= 2.0 ** (1.0 - power) - 1.0
-    doubts = [note] if note else []
     if is_narrow:
         error += missed
         doubts.append("the cost has a feature narrower than the spacing of the points")
     if power >= 0.5:
         doubts.append(f"the cost grows as 1 / distance^{power:.2g}, so samples have no variance")
-    error += beyond + rounding + (SOLVED if problem.program.needs_root else ROUNDED * np.finfo(float).eps) * size
-    return Integral(previous, error, used, spacing, "; ".join(doubts))
+    solved = SOLVED if problem.program.needs_root else ROUNDED * np.finfo(float).eps
+    error += beyond / sigma + rounding + solved * size
+    return Integral(mean, error, used, spacing, "; ".join(doubts))
 
 
 def _limits(excess: Callable[[np.ndarray], np.ndarray], width: int) -> tuple[np.ndarray, np.ndarray, float, str]:
@@ -216,7 +206,9 @@ def _limits(excess: Callable[[np.ndarray], np.ndarray], width: int) -> tuple[np.
         unseen = np.where(at_end > VANISHED * total, at_end * ratio / (1.0 - ratio), 0.0)[radii[last.clip(0)] >= REACH]
     if ended.any() and radii[last.min()] >= REACH:
         note = f"costs beyond {radii[last.min()]:g} standard deviations are not finite, so the mean may not exist"
-    if float(unseen.sum()) > UNSETTLED * total:
+    # share of the integral of absolute values at the last finite point of a ray above which the integral may
+    # not exist
+    if float(unseen.sum()) > 1e-3 * total:
         note = note or "the cost grows as fast as the normal density falls, so its mean may not exist"
         return low, high, math.nan, note
     return low, high, 2.0 * (beyond + float(unseen.sum())), note

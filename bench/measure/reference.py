@@ -26,8 +26,6 @@ LEAST_SAMPLES = 16384
 QUADRATURE_POINTS = 1 << 20
 FINE = 1e-3
 """Spacing of a reference's points, in standard deviations, above which a note states it: that of points in a plane."""
-SURE = 3.0
-"""Stated errors of quadrature and sampling together beyond which they disagree."""
 TAIL_EVENTS = 10.0
 """Expected samples in the tails. Their contribution is estimated separately, as a spread may not show so few samples."""
 DEEPER = 0.2
@@ -46,12 +44,8 @@ SHARED = 1e-10
 """Relative error common to the terms of all samples, from rounding and central differences."""
 EXTREME = 1e100
 """Size of costs above which, or below the inverse of which, their squares would leave the range of float64."""
-SIZED = 4
-"""Samples that show the size of the costs."""
 REVISIONS = {"closed_form": 1, "quadrature": 1, "sampling": 1, "smoothed": 1}
 """Revision of each method. It is raised when a stored reference of that method moves."""
-CONTRACTS = "bench.model."
-"""Modules of the contracts, whose defaults are not declarations."""
 WARNED, REFUSED = 0.999, 1.0 - 1e-6
 """Confidence levels at which a difference of first from zeroth order adds a note, and makes zeroth order replace first."""
 
@@ -133,7 +127,7 @@ def certify(
         reference = replace(scaled, batches=scaled.batches * unit, error=scaled.error * unit)
         if reference.spacing > FINE:
             note = f"the reference's points are {reference.spacing:.2g} standard deviations apart and may miss a narrower feature"
-            reference = _with_note(reference, note)
+            reference = with_note(reference, note)
     if physical is None or "grad" not in provides:
         return reference
     plain = problem.grad(theta, np.zeros((program.n_noise, 1)))[:, 0]
@@ -172,7 +166,7 @@ def transferred(reference: Reference, problem: Problem, other: Problem, samples:
     if not most <= reference.known().standard_error:
         return None
     note = f"costs differ from those of the backend that computed the reference in {share:.2g} of draws, as its error allows"
-    return _with_note(replace(reference, error=math.hypot(reference.error, most)), note)
+    return with_note(replace(reference, error=math.hypot(reference.error, most)), note)
 
 
 def revisions(program: Program, provides: frozenset[str]) -> dict[str, int]:
@@ -205,27 +199,29 @@ def _compute(
                 return replace(quadrature, method="quadrature[failed: the mean cost may not exist]")
             if integral.error <= TOLERANCE * np.linalg.norm(integral.gradient):
                 return quadrature
-    sampled = _sample(problem, theta, provides, samples, tolerance)
+    sampled = _Sampler(problem, theta, provides, samples, tolerance).reference()
     if quadrature is None:
         return sampled
     # a gradient near zero has no relative accuracy: there the method with the smaller error is used
     if not sampled.is_finite:
         return quadrature
     apart, error = float(np.linalg.norm(sampled.gradient - quadrature.gradient)), sampled.known().standard_error
-    if apart > SURE * math.hypot(error, quadrature.error):
+    # stated errors of quadrature and sampling together beyond which they disagree
+    if apart > 3.0 * math.hypot(error, quadrature.error):
         note = f"quadrature and sampling disagree by {apart:.2g}, which is the stated error"
-        return _with_note(replace(quadrature, error=max(apart, quadrature.error)), note)
+        return with_note(replace(quadrature, error=max(apart, quadrature.error)), note)
     # doubts about the samples are doubts about their error
     if not sampled.note and 0.0 < error < quadrature.error:
         # tails may be too heavy for the spread of the samples to show, as at a pole in the plane
-        return _with_note(replace(sampled, error=max(sampled.error, apart)), quadrature.note)
-    return _with_note(quadrature, sampled.note)
+        return with_note(replace(sampled, error=max(sampled.error, apart)), quadrature.note)
+    return with_note(quadrature, sampled.note)
 
 
 def _unit(problem: Problem, theta: np.ndarray) -> float:
     """Return the power of 2 that costs are divided by, so that their squares are in range; 1 for usual costs."""
     # one column at a time, as for the cost at w = 0, so that a compiling backend compiles no other shape
-    samples = draw_columns(problem, "unit", SIZED, 0)
+    # samples that show the size of the costs
+    samples = draw_columns(problem, "unit", 4, 0)
     values = np.abs(np.concatenate([problem.value(theta, w[:, None]) for w in samples.T]))
     size = float(values[np.isfinite(values)].max(initial=0.0))
     return 1.0 if size == 0.0 or 1.0 / EXTREME <= size <= EXTREME else 2.0 ** math.floor(math.log2(size))
@@ -259,7 +255,8 @@ def assumes_continuity(program: Program) -> bool:
 
 def _declares_continuity(plugin: type) -> bool:
     for owner in plugin.__mro__:
-        is_contract = owner.__module__.startswith(CONTRACTS)
+        # modules of the contracts, whose defaults are not declarations
+        is_contract = owner.__module__.startswith("bench.model.")
         if "continuous" in vars(owner):
             return not is_contract
         if not is_contract and any(callable(value) for name, value in vars(owner).items() if name[0] != "_"):
@@ -281,229 +278,220 @@ Terms = Callable[[np.ndarray], np.ndarray]
 """Maps noise ``(n_w, B)`` to per-sample terms ``(d, B)`` whose expectation is the gradient."""
 
 
-def _sample(problem: Problem, theta: np.ndarray, provides: frozenset[str], samples: int, tolerance: float) -> Reference:
-    """Return a sampled reference from the valid estimator of lowest variance, checked against zeroth order.
+class _Sampler:
+    """Sampled references of a problem: the orders that are valid, each with its terms of a pilot."""
 
-    First order is valid where the cost is continuous. Zeroth order replaces it, with a note, where the cost jumps on a
-    line through the samples or the two estimators disagree.
-    """
-    columns = min(COLUMNS, BATCHES * max(1, samples // (4 * BATCHES)))
-    still = np.zeros((problem.program.n_noise, 1))
-    centre = problem.value(theta, still)
-    orders: dict[str, Terms] = {}
-    if not problem.program.score_refusal:
-        orders["zeroth_order"] = lambda w: _antithetic(problem, theta, (w, -w), centre)
-    if problem.program.continuous and "grad" in provides:
-        orders["first_order"] = lambda w: problem.grad(theta, w)
-    pilot = draw_columns(problem, "pilot", columns, 0)
-    pilots = {name: terms(pilot) for name, terms in orders.items()}
-    pilots = {name: terms for name, terms in pilots.items() if np.isfinite(terms).all()}
-    if not pilots:
-        reason = "rollouts are not finite" if orders else problem.program.score_refusal
-        return _failed(problem, reason)
-    effect = pilot @ (problem.value(theta, pilot) - centre)
-    directions = _directions(effect if np.isfinite(effect).all() else still[:, 0])
-    spread = {name: float(terms.var(axis=1, ddof=1).sum()) for name, terms in pilots.items()}
-    chosen, doubt = min(spread, key=lambda name: spread[name]), ""
-    if chosen == "first_order":
-        doubt = _reason_against_first_order(problem, theta, pilots, pilot, directions, columns)
-    if doubt and "zeroth_order" in pilots:
-        chosen = "zeroth_order"
+    def __init__(
+        self, problem: Problem, theta: np.ndarray, provides: frozenset[str], samples: int, tolerance: float
+    ) -> None:
+        program = problem.program
+        self.problem, self.theta, self.samples, self.tolerance = problem, theta, samples, tolerance
+        self.columns = min(COLUMNS, BATCHES * max(1, samples // (4 * BATCHES)))
+        self.centre = problem.value(theta, np.zeros((program.n_noise, 1)))
+        self.orders: dict[str, Terms] = {}
+        if not program.score_refusal:
+            self.orders["zeroth_order"] = lambda w: self._antithetic((w, -w), self.centre)
+        if program.continuous and "grad" in provides:
+            self.orders["first_order"] = lambda w: problem.grad(theta, w)
+        self.pilot = draw_columns(problem, "pilot", self.columns, 0)
+        pilots = {name: terms(self.pilot) for name, terms in self.orders.items()}
+        self.pilots = {name: terms for name, terms in pilots.items() if np.isfinite(terms).all()}
 
-    def sample(order: str) -> Reference:
-        return _batches(problem, orders[order], order, pilots[order], directions, columns, samples, tolerance)
+    def reference(self) -> Reference:
+        """Return a sampled reference from the valid estimator of lowest variance, checked against zeroth order.
 
-    reference = sample(chosen)
-    if not reference.is_finite and chosen == "first_order" and "zeroth_order" in pilots:
-        # the cost may be finite where its gradient is not
-        chosen, doubt = "zeroth_order", "first order is not finite, so zeroth order is used"
-        reference = sample(chosen)
-    if not reference.is_finite:
-        return reference
-    if chosen == "zeroth_order" or "zeroth_order" not in pilots:
-        return _with_note(reference, doubt)
-    # a pilot of a heavy-tailed distribution underestimates its variance
-    error = reference.known().standard_error
-    if 2.0 * spread["zeroth_order"] < reference.samples * error**2:
-        other = sample("zeroth_order")
-        if other.is_finite and other.known().standard_error < error:
-            return other
-    return _cross_checked(problem, theta, reference, columns, samples, lambda: sample("zeroth_order"))
+        First order is valid where the cost is continuous. Zeroth order replaces it, with a note, where the cost jumps on a
+        line through the samples or the two estimators disagree.
+        """
+        problem, pilots = self.problem, self.pilots
+        if not pilots:
+            return _failed(problem, "rollouts are not finite" if self.orders else problem.program.score_refusal)
+        effect = self.pilot @ (problem.value(self.theta, self.pilot) - self.centre)
+        self.directions = _directions(effect if np.isfinite(effect).all() else np.zeros(len(self.pilot)))
+        spread = {name: float(terms.var(axis=1, ddof=1).sum()) for name, terms in pilots.items()}
+        chosen, doubt = min(spread, key=lambda name: spread[name]), ""
+        if chosen == "first_order":
+            doubt = self._doubt_of_first_order()
+        if doubt and "zeroth_order" in pilots:
+            chosen = "zeroth_order"
+        reference = self._sampled(chosen)
+        if not reference.is_finite and chosen == "first_order" and "zeroth_order" in pilots:
+            # the cost may be finite where its gradient is not
+            chosen, doubt = "zeroth_order", "first order is not finite, so zeroth order is used"
+            reference = self._sampled(chosen)
+        if not reference.is_finite:
+            return reference
+        if chosen == "zeroth_order" or "zeroth_order" not in pilots:
+            return with_note(reference, doubt)
+        # a pilot of a heavy-tailed distribution underestimates its variance
+        error = reference.known().standard_error
+        if 2.0 * spread["zeroth_order"] < reference.samples * error**2:
+            other = self._sampled("zeroth_order")
+            if other.is_finite and other.known().standard_error < error:
+                return other
+        return self._cross_checked(reference)
 
+    def _doubt_of_first_order(self) -> str:
+        """Return why first order is rejected: zeroth order disagrees in the pilot, or the cost jumps. Empty if neither."""
+        if "zeroth_order" in self.pilots:
+            # both use the same noise, so their differences are independent samples too
+            paired = (self.pilots["first_order"] - self.pilots["zeroth_order"]).T
+            low = bias_interval(paired.mean(axis=0), Sampling.of(paired), level=REFUSED)[1]
+            if low > ROUNDING * np.abs(paired).max():
+                return "first and zeroth order disagree in the pilot, so zeroth order is used"
+        count = min(self.directions.shape[1], self.pilot.shape[1] // 3)
+        (through, first, last), along = np.split(self.pilot[:, : 3 * count], 3, axis=1), self.directions[:, :count]
+        through = through - along * (along * through).sum(axis=0)
+        starts = np.concatenate([first, through - FAR * along], axis=1)
+        ends = np.concatenate([last, through + FAR * along], axis=1)
+        jump = largest_jump(
+            lambda w: in_columns(lambda part: self.problem.value(self.theta, part), w, self.columns), starts, ends
+        ).height
+        if jump:
+            return (
+                f"the cost jumps by {jump:.2g}, which its scene and contact law do not declare, so zeroth order is used"
+            )
+        return ""
 
-def _reason_against_first_order(
-    problem: Problem,
-    theta: np.ndarray,
-    pilots: dict[str, np.ndarray],
-    pilot: np.ndarray,
-    directions: np.ndarray,
-    columns: int,
-) -> str:
-    """Return why first order is rejected: zeroth order disagrees in the pilot, or the cost jumps. Empty if neither."""
-    if "zeroth_order" in pilots:
-        # both use the same noise, so their differences are independent samples too
-        paired = (pilots["first_order"] - pilots["zeroth_order"]).T
-        if bias_interval(paired.mean(axis=0), Sampling.of(paired), level=REFUSED)[1] > ROUNDING * np.abs(paired).max():
-            return "first and zeroth order disagree in the pilot, so zeroth order is used"
-    count = min(directions.shape[1], pilot.shape[1] // 3)
-    through, along = pilot[:, :count], directions[:, :count]
-    through = through - along * (along * through).sum(axis=0)
-    starts = np.concatenate([pilot[:, count : 2 * count], through - FAR * along], axis=1)
-    ends = np.concatenate([pilot[:, 2 * count : 3 * count], through + FAR * along], axis=1)
-    jump = largest_jump(lambda w: in_columns(lambda part: problem.value(theta, part), w, columns), starts, ends).height
-    if jump:
-        return f"the cost jumps by {jump:.2g}, which its scene and contact law do not declare, so zeroth order is used"
-    return ""
+    def _sampled(self, order: str) -> Reference:
+        """Return a sampled reference whose error, tails included, is within the tolerance, or that spends all samples."""
+        problem, terms = self.problem, self.orders[order]
+        for batches, count, error, is_last in doubling_batches(problem, terms, "reference", self.columns, self.samples):
+            if not math.isfinite(error):
+                return _failed(problem, "rollouts are not finite")
+            mean = batches.mean(axis=0)
+            allowed = self.tolerance * np.linalg.norm(mean)
+            if is_last or (error <= allowed and count >= LEAST_SAMPLES):
+                unseen, note = self._tail_error(terms, mean, count)
+                if is_last or math.hypot(error, unseen) <= allowed:
+                    break
+        if math.isinf(unseen):
+            return _failed(problem, "noise rarer than any sample dominates the mean, which may not exist")
+        if not note and heavy_tails(batches - batches.mean(axis=0)):
+            note = "the reference's batches have heavy tails, so its standard error is uncertain"
+        elif np.ptp(batches, axis=0).max() <= ROUNDING * np.abs(batches).max():
+            rare = THREE / count
+            unseen = math.hypot(unseen, rare * float(np.linalg.norm(batches[0])))
+            note = (
+                note
+                or f"all samples of the reference have the same gradient: events rarer than {rare:.1g} are not seen"
+            )
+        # the spread does not show an error that all samples share, such as that of a backend's differences
+        unseen = math.hypot(unseen, SHARED * math.sqrt(float(np.square(self.pilots[order]).sum(axis=0).mean())))
+        return Reference(batches, f"sampling[{order},n={count}]", unseen, note=note, samples=count)
 
+    def _cross_checked(self, reference: Reference) -> Reference:
+        """Return a first-order reference after comparing it with zeroth order on a quarter of its samples.
 
-def _batches(
-    problem: Problem,
-    terms: Terms,
-    order: str,
-    pilot: np.ndarray,
-    directions: np.ndarray,
-    columns: int,
-    samples: int,
-    tolerance: float,
-) -> Reference:
-    """Return a sampled reference whose error, tails included, is within ``tolerance``, or that spends all ``samples``."""
-    for batches, count in doubling_batches(problem, terms, "reference", columns):
-        if not np.isfinite(batches).all():
-            break
-        # each pass doubles the samples, so stop if the next one would exceed the budget
-        spent = 2 * count * BATCHES > samples
-        se = math.sqrt(batches.var(axis=0, ddof=1).sum() / BATCHES)
-        enough = se <= tolerance * np.linalg.norm(batches.mean(axis=0)) and count * BATCHES >= LEAST_SAMPLES
-        if spent or enough:
-            unseen, note = _tail_error(problem, terms, batches.mean(axis=0), directions, count * BATCHES, columns)
-            if spent or math.hypot(se, unseen) <= tolerance * np.linalg.norm(batches.mean(axis=0)):
-                break
-    if not np.isfinite(batches).all():
-        return _failed(problem, "rollouts are not finite")
-    if math.isinf(unseen):
-        return _failed(problem, "noise rarer than any sample dominates the mean, which may not exist")
-    if not note and heavy_tails(batches - batches.mean(axis=0)):
-        note = "the reference's batches have heavy tails, so its standard error is uncertain"
-    elif np.ptp(batches, axis=0).max() <= ROUNDING * np.abs(batches).max():
-        rare = THREE / (count * BATCHES)
-        unseen = math.hypot(unseen, rare * float(np.linalg.norm(batches[0])))
-        note = note or f"all samples of the reference have the same gradient: events rarer than {rare:.1g} are not seen"
-    # the spread does not show an error that all samples share, such as that of a backend's differences
-    unseen = math.hypot(unseen, SHARED * math.sqrt(float(np.square(pilot).sum(axis=0).mean())))
-    return Reference(batches, f"sampling[{order},n={count * BATCHES}]", unseen, note=note, samples=count * BATCHES)
+        Where the continuity of the cost is only assumed, the comparison uses all samples that the reference left, and the
+        stated error includes the comparison's resolution. The method's name records the resolution. After a clear
+        disagreement zeroth order replaces it.
+        """
+        problem, columns = self.problem, self.columns
+        assumed = assumes_continuity(problem.program)
+        n_check = max(reference.samples // 4, self.samples - reference.samples if assumed else 0)
+        # a linear part of the cost, whose zeroth-order estimate is known, only adds noise to the comparison
+        linear = reference.gradient if problem.noise_on_theta else np.zeros(problem.dim)
 
+        def zeroth(w: np.ndarray) -> np.ndarray:
+            # the same own noise on both sides and in the baseline, so that only the noise on theta moves the terms
+            own = problem.centred(w)
+            baseline = problem.value(self.theta, own) if problem.program.exogenous else self.centre
+            return self._antithetic((w, 2.0 * own - w), baseline, linear)
 
-def _cross_checked(
-    problem: Problem,
-    theta: np.ndarray,
-    reference: Reference,
-    columns: int,
-    samples: int,
-    instead: Callable[[], Reference],
-) -> Reference:
-    """Return a first-order reference after comparing it with zeroth order on a quarter of its samples.
+        blocks = range(max(1, n_check // columns))
+        terms = [in_columns(zeroth, draw_columns(problem, "check", columns, block), columns) for block in blocks]
+        means = [part.reshape(problem.dim, -1, max(1, columns // BATCHES)).mean(axis=2) for part in terms]
+        check = np.concatenate(means, axis=1).T
+        check = check.reshape(-1, len(check) // min(BATCHES, len(check)), problem.dim).mean(axis=1)
+        if not np.isfinite(check).all():
+            return with_note(reference, "zeroth order is not finite, so first order is not checked")
+        apart = reference.gradient - check.mean(axis=0)
+        errors = Sampling.of(reference.batches), Sampling.of(check)
+        trace = sum(error.trace for error in errors)
+        rows = np.concatenate([error.rows for error in errors])
+        spread = math.sqrt(2.0 * float(np.square(rows @ rows.T).sum()))
+        z = float((apart @ apart - trace) / spread) if spread else 0.0 if not apart.any() else math.inf
+        size = ROUNDING * (np.linalg.norm(reference.gradient) + np.linalg.norm(check.mean(axis=0)))
+        at = {level: bias_interval(apart, *errors, level=level)[1] > size for level in (WARNED, REFUSED)}
+        disagreement = f"first and zeroth order disagree by {np.linalg.norm(apart):.2g} (check_z={z:.1f})"
+        if at[REFUSED]:
+            return with_note(self._sampled("zeroth_order"), f"{disagreement}, so zeroth order is used")
+        resolved = 2.0 * math.sqrt(trace)
+        facts = f"check_z={z:.1f},check_resolves={resolved:.2g}{',assumed_continuous' * assumed}"
+        method = f"{reference.method.removesuffix(']')},{facts}]"
+        error = math.hypot(reference.error, resolved) if assumed else reference.error
+        return with_note(replace(reference, method=method, error=error), disagreement if at[WARNED] else "")
 
-    Where the continuity of the cost is only assumed, the comparison uses all samples that the reference left, and the
-    stated error includes the comparison's resolution. The method's name records the resolution. A clear disagreement
-    returns ``instead()``.
-    """
-    assumed = assumes_continuity(problem.program)
-    n_check = max(reference.samples // 4, samples - reference.samples if assumed else 0)
-    centre = problem.value(theta, np.zeros((problem.program.n_noise, 1)))
-    # a linear part of the cost, whose zeroth-order estimate is known, only adds noise to the comparison
-    linear = reference.gradient if problem.noise_on_theta else np.zeros(problem.dim)
+    def _tail_error(self, terms: Terms, mean: np.ndarray, count: int) -> tuple[float, str]:
+        """Return the norm of the far tails' contribution to the mean, the largest over the directions, and a note.
 
-    def zeroth(w: np.ndarray) -> np.ndarray:
-        # the same own noise on both sides and in the baseline, so that only the noise on theta moves the terms
-        own = problem.centred(w)
-        baseline = problem.value(theta, own) if problem.program.exogenous else centre
-        return _antithetic(problem, theta, (w, 2.0 * own - w), baseline, linear)
+        The tails contain few of the ``count`` samples or none, so the spread of the samples does not show the contribution.
+        Along each direction, the tails are where :data:`TAIL_EVENTS` samples are expected, and are sampled separately. What
+        lies beyond these samples, as of an exponential cost, is integrated along the direction. Where terms diverge faster
+        than the normal density falls, the note states the distance, and the contribution ends there. The contribution is
+        infinite where it exceeds the range whose squares are finite.
+        """
+        from scipy.special import ndtri
 
-    check = np.concatenate(
-        [
-            in_columns(zeroth, draw_columns(problem, "check", columns, block), columns)
-            .reshape(problem.dim, -1, max(1, columns // BATCHES))
-            .mean(axis=2)
-            for block in range(max(1, n_check // columns))
-        ],
-        axis=1,
-    ).T
-    check = check.reshape(-1, len(check) // min(BATCHES, len(check)), problem.dim).mean(axis=1)
-    if not np.isfinite(check).all():
-        return _with_note(reference, "zeroth order is not finite, so first order is not checked")
-    apart = reference.gradient - check.mean(axis=0)
-    errors = Sampling.of(reference.batches), Sampling.of(check)
-    trace = sum(error.trace for error in errors)
-    rows = np.concatenate([error.rows for error in errors])
-    spread = math.sqrt(2.0 * float(np.square(rows @ rows.T).sum()))
-    z = float((apart @ apart - trace) / spread) if spread else 0.0 if not apart.any() else math.inf
-    size = ROUNDING * (np.linalg.norm(reference.gradient) + np.linalg.norm(check.mean(axis=0)))
-    at = {level: bias_interval(apart, *errors, level=level)[1] > size for level in (WARNED, REFUSED)}
-    disagreement = f"first and zeroth order disagree by {np.linalg.norm(apart):.2g} (check_z={z:.1f})"
-    if at[REFUSED]:
-        return _with_note(instead(), f"{disagreement}, so zeroth order is used")
-    resolved = 2.0 * math.sqrt(trace)
-    method = reference.method.removesuffix("]") + f",check_z={z:.1f},check_resolves={resolved:.2g}]"
-    reference = replace(reference, method=method)
-    if assumed:
-        method = method.removesuffix("]") + ",assumed_continuous]"
-        reference = replace(reference, method=method, error=math.hypot(reference.error, resolved))
-    return _with_note(reference, disagreement if at[WARNED] else "")
+        problem, n_lines = self.problem, self.directions.shape[1]
+        share, each = min(1.0, TAIL_EVENTS / count), max(1, self.columns // n_lines)
+        along, side = np.repeat(self.directions, each, axis=1), np.where(np.arange(each) % 2, 1.0, -1.0)
+        w = draw_columns(problem, "tails", along.shape[1], 0)
 
+        def at(depth: np.ndarray) -> np.ndarray:
+            """Return the terms, ``(d, L, each)``, where the component of the noise along each direction is replaced by depths."""
+            nonlocal w
+            w = w + along * (np.tile(depth, n_lines) - (along * w).sum(axis=0))
+            with np.errstate(over="ignore", invalid="ignore"):
+                return in_columns(terms, w, self.columns).reshape(problem.dim, n_lines, each)
 
-def _tail_error(
-    problem: Problem, terms: Terms, mean: np.ndarray, directions: np.ndarray, count: int, columns: int
-) -> tuple[float, str]:
-    """Return the norm of the far tails' contribution to the mean, the largest over the directions, and a note.
+        middle = (np.arange(each) + 0.5) / each
+        depth = -ndtri(0.5 * share * middle)
+        tails = at(side * depth)
+        if not np.isfinite(tails).all():
+            return 0.0, "rollouts in the far tails of the noise are not finite, so the reference may not exist"
+        tails = np.abs(tails.mean(axis=2) - mean[:, None])
+        if tails.max() > EXTREME:
+            return math.inf, ""
+        error, note = share * float(np.linalg.norm(tails, axis=0).max()), ""
+        # the same noise across the direction, at depths beyond the deepest sample of the tails
+        depth = float(depth.max()) + DEEPER * (np.arange(each) // 2 + 0.5)
+        weight = np.exp(-(depth**2) / 2) * DEEPER / math.sqrt(2.0 * math.pi)
+        with np.errstate(over="ignore", invalid="ignore"):
+            deep = np.where(weight > 0.0, at(side * depth) * weight, 0.0)
+            sizes = np.abs(deep).max(axis=0)
+        for first in (0, 1):  # either sign of the depth
+            for ray in sizes[:, first::2]:
+                if np.isfinite(ray).all():
+                    continue
+                # the ray ends before its terms begin to diverge
+                finite = ray[: int(np.argmin(np.isfinite(ray)))]
+                end = finite.size - int(np.argmin(finite[::-1])) if finite.size else 0
+                if finite[end:].sum() > max(error, finite[:end].sum()):
+                    limit = depth[first::2][end - 1]
+                    note = f"rollouts beyond {limit:.2g} standard deviations diverge, so the mean may not exist"
+                ray[end:] = 0.0
+        deep = np.where(sizes > 0.0, deep, 0.0).sum(axis=2)
+        if np.abs(deep).max() > EXTREME:
+            return math.inf, note
+        return error + float(np.linalg.norm(deep, axis=0).max()), note
 
-    The tails contain few of the ``count`` samples or none, so the spread of the samples does not show the contribution.
-    Along each direction, the tails are where :data:`TAIL_EVENTS` samples are expected, and are sampled separately. What
-    lies beyond these samples, as of an exponential cost, is integrated along the direction. Where terms diverge faster
-    than the normal density falls, the note states the distance, and the contribution ends there. The contribution is
-    infinite where it exceeds the range whose squares are finite.
-    """
-    from scipy.special import ndtri
+    def _antithetic(
+        self, sides: tuple[np.ndarray, np.ndarray], baseline: np.ndarray, linear: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Return zeroth-order terms ``(d, B)`` averaged over noise and its mirror image, ``sides``, with a baseline of the costs.
 
-    share = min(1.0, TAIL_EVENTS / count)
-    each = max(1, columns // directions.shape[1])
-    along = np.repeat(directions, each, axis=1)
-    w = draw_columns(problem, "tails", along.shape[1], 0)
-    # replace the component of the noise along the direction by a component in the tail, of either sign
-    middle = (np.arange(each) + 0.5) / each
-    depth = -ndtri(0.5 * share * middle) * np.where(np.arange(each) % 2, 1.0, -1.0)
-    w = w + along * (np.tile(depth, directions.shape[1]) - (along * w).sum(axis=0))
-    with np.errstate(over="ignore", invalid="ignore"):
-        tails = in_columns(terms, w, columns).reshape(problem.dim, directions.shape[1], each)
-    if not np.isfinite(tails).all():
-        return 0.0, "rollouts in the far tails of the noise are not finite, so the reference may not exist"
-    tails = np.abs(tails.mean(axis=2) - mean[:, None])
-    if tails.max() > EXTREME:
-        return math.inf, ""
-    error, note = share * float(np.linalg.norm(tails, axis=0).max()), ""
-    # the same noise across the direction, at depths beyond the deepest sample of the tails
-    depth = float(np.abs(depth).max()) + DEEPER * (np.arange(each) // 2 + 0.5)
-    side = np.where(np.arange(each) % 2, 1.0, -1.0)
-    w = w + along * (np.tile(side * depth, directions.shape[1]) - (along * w).sum(axis=0))
-    weight = np.exp(-(depth**2) / 2) * DEEPER / math.sqrt(2.0 * math.pi)
-    with np.errstate(over="ignore", invalid="ignore"):
-        deep = in_columns(terms, w, columns).reshape(problem.dim, directions.shape[1], each)
-        deep = np.where(weight > 0.0, deep * weight, 0.0)
-        sizes = np.abs(deep).max(axis=0)
-    for first in (0, 1):  # either sign of the depth
-        for ray in sizes[:, first::2]:
-            if np.isfinite(ray).all():
-                continue
-            # the ray ends before its terms begin to diverge
-            finite = ray[: int(np.argmin(np.isfinite(ray)))]
-            end = finite.size - int(np.argmin(finite[::-1])) if finite.size else 0
-            if finite[end:].sum() > max(error, finite[:end].sum()):
-                limit = depth[first::2][end - 1]
-                note = f"rollouts beyond {limit:.2g} standard deviations diverge, so the mean may not exist"
-            ray[end:] = 0.0
-    deep = np.where(sizes > 0.0, deep, 0.0).sum(axis=2)
-    if np.abs(deep).max() > EXTREME:
-        return math.inf, note
-    return error + float(np.linalg.norm(deep, axis=0).max()), note
+        For noise on theta, ``linear (d,)`` is the gradient of a linear part of the cost. Its terms are replaced by their
+        mean, ``linear``, which changes no expectation.
+        """
+        problem, theta = self.problem, self.theta
+        terms = ((problem.value(theta, side) - baseline) * problem.score(theta, side) for side in sides)
+        mean = sum(terms) / 2
+        if linear is None or not linear.any():
+            return mean
+        step = problem.directions(sides[0])
+        return mean - (linear @ step) * step + linear[:, None]
 
 
 def _directions(effect: np.ndarray) -> np.ndarray:
@@ -516,14 +504,18 @@ def _directions(effect: np.ndarray) -> np.ndarray:
     return np.column_stack([directions, effect / length]) if length and math.isfinite(length) else directions
 
 
-def _with_note(reference: Reference, note: str) -> Reference:
+def with_note(reference: Reference, note: str) -> Reference:
+    """Return a reference with a note before its own; the same if the note is empty."""
     return replace(reference, note="; ".join(part for part in (note, reference.note) if part))
 
 
-def doubling_batches(problem: Problem, terms: Terms, stream: str, columns: int) -> Iterator[tuple[np.ndarray, int]]:
-    """Yield batch means ``(BATCHES, d)`` and the samples per batch, which double after each yield.
+def doubling_batches(
+    problem: Problem, terms: Terms, stream: str, columns: int, samples: int
+) -> Iterator[tuple[np.ndarray, int, float, bool]]:
+    """Yield batch means ``(BATCHES, d)``, the number of their samples, the mean's standard error, and whether they are the last.
 
-    ``terms`` are evaluated ``columns`` at a time, on noise of the named stream.
+    ``terms`` are evaluated ``columns`` at a time, on noise of the named stream. Each pass doubles the samples, at most to
+    ``samples``. Means that are not finite are the last, with an infinite error.
     """
     size, count, batches = columns // BATCHES, 0, np.zeros((BATCHES, problem.dim))
     while True:
@@ -531,7 +523,12 @@ def doubling_batches(problem: Problem, terms: Terms, stream: str, columns: int) 
         means = in_columns(terms, w, columns).reshape(problem.dim, BATCHES, size).mean(axis=2).T
         batches = (batches * count + means * size) / (count + size)
         count += size
-        yield batches, count
+        is_finite = np.isfinite(batches).all()
+        error = math.sqrt(batches.var(axis=0, ddof=1).sum() / BATCHES) if is_finite else math.inf
+        is_last = not is_finite or 2 * count * BATCHES > samples
+        yield batches, count * BATCHES, error, is_last
+        if is_last:
+            return
         size = count
 
 
@@ -540,26 +537,6 @@ def draw_columns(problem: Problem, stream: str, count: int, block: int) -> np.nd
     program = problem.program
     drawn = noise.draw(block, program.scene.name, 1, count, program.n_noise, stream)
     return np.moveaxis(drawn, -1, 0).reshape(program.n_noise, count)
-
-
-def _antithetic(
-    problem: Problem,
-    theta: np.ndarray,
-    sides: tuple[np.ndarray, np.ndarray],
-    baseline: np.ndarray,
-    linear: np.ndarray | None = None,
-) -> np.ndarray:
-    """Return zeroth-order terms ``(d, B)`` averaged over noise and its mirror image, ``sides``, with a baseline of the costs.
-
-    For noise on theta, ``linear (d,)`` is the gradient of a linear part of the cost. Its terms are replaced by their
-    mean, ``linear``, which changes no expectation.
-    """
-    terms = ((problem.value(theta, s) - baseline) * problem.score(theta, s) for s in sides)
-    mean = sum(terms) / 2
-    if linear is None or not linear.any():
-        return mean
-    step = problem.directions(sides[0])
-    return mean - (linear @ step) * step + linear[:, None]
 
 
 def _failed(problem: Problem, reason: str) -> Reference:

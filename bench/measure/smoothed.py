@@ -50,12 +50,10 @@ def over_ball(problem: Problem, provides: frozenset[str], radius: float, samples
     pilot = draw_columns(problem, "ball pilot", columns, 0)
     spread = {order: float(terms(pilot).var(axis=1).sum()) for order, terms in orders.items()}
     chosen = min(spread, key=lambda order: spread[order] if math.isfinite(spread[order]) else math.inf)
-    for batches, count in doubling_batches(problem, orders[chosen], "ball", columns):
-        error = math.sqrt(batches.var(axis=0, ddof=1).sum() / BATCHES)
-        enough = error <= tolerance * np.linalg.norm(batches.mean(axis=0)) and count * BATCHES >= LEAST_SAMPLES
-        if enough or 2 * count * BATCHES > samples or not math.isfinite(error):
+    for batches, count, error, is_last in doubling_batches(problem, orders[chosen], "ball", columns, samples):
+        if is_last or (error <= tolerance * np.linalg.norm(batches.mean(axis=0)) and count >= LEAST_SAMPLES):
             break
-    return Reference(batches, f"{name},sampling[{chosen},n={count * BATCHES}]", samples=count * BATCHES)
+    return Reference(batches, f"{name},sampling[{chosen},n={count}]", samples=count)
 
 
 def _polar(problem: Problem, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

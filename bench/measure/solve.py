@@ -9,14 +9,8 @@ from scipy.optimize import minimize
 
 from bench.model import Problem
 
-STEP = 1e-5
-"""Step, in units of theta, of the gradient differences for the Hessian, whose relative error is about 1e-10."""
 CONVERGED = 1e-8
 """Share of the first gradient below which a gradient counts as 0, because differences of costs no longer show it."""
-FAR = 1e6
-"""Multiple of the problem's theta0 beyond which theta counts as diverged, and the cost as unbounded below."""
-SIDEWAYS = 1e-3
-"""First step away from a saddle, in units of theta."""
 ROUNDING = 1e-13
 """Relative difference of two costs that rounding explains."""
 
@@ -54,7 +48,8 @@ def solve(problem: Problem, theta: np.ndarray | None = None, steps: int = 40) ->
     is_flat = _is_stationary(cost, gradient, values)
     is_saddle = is_flat and float(values.min()) < -1e-8 * float(np.abs(values).max())
     if is_saddle:
-        step = SIDEWAYS * max(1.0, float(np.abs(theta).max())) * vectors[:, np.argmin(values)]
+        # first step away from a saddle, in units of theta
+        step = 1e-3 * max(1.0, float(np.abs(theta).max())) * vectors[:, np.argmin(values)]
         theta = min(theta + step, theta - step, key=lambda x: value_and_gradient(x)[0])
         gradient = value_and_gradient(theta)[1]
     first = max(float(np.linalg.norm(gradient)), 1e-300)
@@ -83,7 +78,8 @@ def solve(problem: Problem, theta: np.ndarray | None = None, steps: int = 40) ->
         values, vectors = _curvatures(problem, theta)
     norm = float(np.linalg.norm(gradient))
     lowest = float(values.min())
-    if np.abs(theta).max() > FAR * (1.0 + np.abs(problem.program.theta0).max()):
+    # multiple of the problem's theta0 beyond which theta counts as diverged, and the cost as unbounded below
+    if np.abs(theta).max() > 1e6 * (1.0 + np.abs(problem.program.theta0).max()):
         return Solved(-np.inf, theta, norm, lowest, False)
     is_small = norm <= CONVERGED * first or (is_flat and not is_saddle)
     certified = is_small and lowest >= -1e-8 * float(np.abs(values).max())
@@ -99,7 +95,8 @@ def _is_stationary(cost: float, gradient: np.ndarray, values: np.ndarray) -> boo
 def _curvatures(problem: Problem, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return eigenvalues ``(d,)`` and eigenvectors ``(d, d)`` of the Hessian."""
     d = theta.size
-    h = STEP * max(1.0, float(np.abs(theta).max()))
+    # step, in units of theta, of the gradient differences for the Hessian, whose relative error is about 1e-10
+    h = 1e-5 * max(1.0, float(np.abs(theta).max()))
     moved = theta[:, None] + h * np.concatenate([np.eye(d), -np.eye(d)], axis=1)
     gradients = problem.grad(moved, np.zeros((problem.program.n_noise, 2 * d)))
     hessian = (gradients[:, :d] - gradients[:, d:]) / (2 * h)

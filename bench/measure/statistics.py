@@ -32,12 +32,6 @@ FEW_REPEATS = 8
 CONCENTRATION = 0.75
 """Tails are heavy when (sum y)^2 / sum y^2 of the squared deviations y is below this times sqrt(R). That holds for 5%
 of cells with normal noise at R = 8, 1% at 16, none of thousands at 64, and half of cells with kurtosis 100."""
-SYMMETRIC = 1e-6
-"""Skewness below which its correction is rounding."""
-VAGUE = 0.1
-"""Error of a reference, as a share of its norm, above which a note warns that relative columns are no more accurate."""
-NARROW = 10.0
-"""Width of the interval of the log variance of terms, times their number, below which it ignores the error of their mean."""
 THREE = 3.0
 """Numerator of the rule of three: an event absent from n trials has a probability below 3 / n, at 95% confidence."""
 PHYSICS = "physics: "
@@ -314,7 +308,8 @@ def _jackknife(whole: float, without: np.ndarray, level: float) -> tuple[float, 
     up = reach
     if spread > 0.0:
         skewness = repeats / (repeats - 2) * float((((pseudo - centre) / spread) ** 3).sum()) / (repeats - 1)
-        if skewness > SYMMETRIC:
+        # skewness below which its correction is rounding
+        if skewness > 1e-6:
             cube = 1.0 - skewness * (reach + skewness / (6.0 * repeats))
             up = max(reach, 3.0 / skewness * (1.0 - math.cbrt(cube)))
     return _exp(min(centre - reach * spread, whole)), _exp(max(centre + up * spread, whole))
@@ -464,7 +459,9 @@ def summarise(
     scaled = tuple(value * samples * unit * unit for value in variance)
     if terms is not None:
         scaled = variance_per_sample(*terms, samples)
-        if scaled[1] > 0.0 and math.log(scaled[2] / scaled[1]) < NARROW / (repeats * samples):
+        # width of the interval of the log variance of terms, times their number, below which it ignores the
+        # error of their mean
+        if scaled[1] > 0.0 and math.log(scaled[2] / scaled[1]) < 10.0 / (repeats * samples):
             notes.append("all terms are equally far from their mean: the interval of their variance is too narrow")
     return Summary(
         grad_norm=grad_norm * unit,
@@ -551,7 +548,9 @@ def _reference_remarks(reference: Truth, relative: float) -> list[str]:
         return [
             f"the reference is not distinguishable from 0, its error is {share}: relative columns, cosine and signs are meaningless"
         ]
-    if error > VAGUE * norm:
+    # error of a reference, as a share of its norm, above which a note warns that relative columns are no more
+    # accurate
+    if error > 0.1 * norm:
         return [
             f"the reference is known to {100 * error / norm:.0f}% of its norm: relative columns are no more accurate"
         ]

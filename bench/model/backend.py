@@ -38,6 +38,10 @@ class Backend(Plugin):
     def compile(self, program: Program) -> Problem:
         """Return the program compiled as a problem."""
 
+    def library_versions(self) -> dict[str, str]:
+        """Return the versions of the libraries of another Python that computes, by name; none by default."""
+        return {}
+
     def own_refusal(self, program: Program) -> str | None:
         """Return why this backend's own limits exclude the program, or None."""
         return None

@@ -101,6 +101,11 @@ class Parameter:
     choices: tuple[str, ...] | None = None
     added: bool = False
 
+    @property
+    def kinds(self) -> tuple[Any, ...]:
+        """The types of its values: ``float`` and ``NoneType`` for ``float | None``."""
+        return typing.get_args(self.type) if isinstance(self.type, types.UnionType) else (self.type,)
+
 
 def _inherit(plugin: type[Plugin]) -> None:
     """Let ``steps: int = 60`` change an inherited parameter's default only, with its meaning, unit and bounds.
@@ -207,7 +212,7 @@ def singular(kind: str) -> str:
 
 def check(parameter: Parameter, value: Any, where: str) -> Any:
     """Return ``value`` converted to the parameter's type; raises :class:`UserError` for an invalid type or value."""
-    kinds = typing.get_args(parameter.type) if isinstance(parameter.type, types.UnionType) else (parameter.type,)
+    kinds = parameter.kinds
     if value is None and type(None) in kinds:
         return None
     kind = next(k for k in kinds if k is not type(None))

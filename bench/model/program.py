@@ -43,8 +43,6 @@ class Decision:
     descent: float = 0.0
 
 
-N_TRIALS = 8
-"""Number of random thetas per perturbation size at which the initial state is compared with the one at theta0."""
 OWN_DRAWS = 8
 """Fixed draws of a scene's own noise over which a cost without noise is averaged."""
 OWN = Decision()
@@ -358,7 +356,9 @@ class Rollout(Program):
         """Whether the initial state depends on theta, tested at theta0 and at random thetas near and far from it."""
         draw = np.random.default_rng(0)
         theta = self.scene.theta0()[:, None]
-        sizes = np.repeat([1e-3, self.scene.sigma, 1.0 + float(np.abs(theta).max(initial=0.0))], N_TRIALS)
+        # number of random thetas per perturbation size at which the initial state is compared with the one at
+        # theta0
+        sizes = np.repeat([1e-3, self.scene.sigma, 1.0 + float(np.abs(theta).max(initial=0.0))], 8)
         moved = np.concatenate([theta, theta + sizes * draw.standard_normal((theta.size, sizes.size))], axis=1)
         with np.errstate(all="ignore"):
             start = self.scene.initial_state(np, moved)

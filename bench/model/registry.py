@@ -17,8 +17,6 @@ import pkgutil
 import re
 import sys
 import traceback
-import types
-import typing
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -38,11 +36,8 @@ KINDS = (
     "scenes", "contacts", "integrators", "backends", "estimators", "optimizers", "policies", "trainers", "studies",
 )  # fmt: skip
 """The built-in kinds, in listing order. A plugin may declare another kind."""
-ON_DEMAND = "bench.plugins.claims"
-"""The built-in plugins of a kind that one command uses: :func:`entries_with` has them, other commands do not import them."""
 NOT_PLUGINS = ("engines", "robots")
 """Names of the folders with files that only the Pythons of engines import, and with models of robots."""
-ENTRY_POINT_GROUP = "bench.plugins"
 NAME = re.compile(r"\w[\w.-]*")
 """Pattern of plugin names. Brackets, commas and spaces are syntax of identity strings, so names contain none."""
 MAX_REASON_CHARACTERS = 1000
@@ -118,8 +113,9 @@ def entries() -> Table:
     table: Table = {kind: {} for kind in KINDS}
     packages = {_package(path): path for path in _folders if _only is None or _is_needed(_package(path))}
     modules = [module for name in (BUILT_IN, *packages) for module in _modules(importlib.import_module(name))]
-    modules = [part for part in modules if not part[1].startswith(ON_DEMAND)]
-    points = sorted(entry_points(group=ENTRY_POINT_GROUP), key=lambda p: p.name)
+    # only one command uses these: entries_with has them, and other commands do not import them
+    modules = [part for part in modules if not part[1].startswith("bench.plugins.claims")]
+    points = sorted(entry_points(group="bench.plugins"), key=lambda p: p.name)
     if _only is not None:
         modules = [part for part in modules if part[1].startswith(BUILT_IN) or part[1] in _only]
         points = [point for point in points if point.module in _only]
@@ -303,8 +299,7 @@ def _faults(plugin: type[Plugin]) -> str:
     if not (isinstance(plugin.requires, tuple | list) and all(isinstance(r, str) and r for r in plugin.requires)):
         return f"requires={printable(repr(plugin.requires))[:MAX_REASON_CHARACTERS]} must be a tuple of modules"
     for parameter in parameters(plugin).values():
-        kinds = typing.get_args(parameter.type) if isinstance(parameter.type, types.UnionType) else (parameter.type,)
-        if not kinds or not set(kinds) <= {bool, int, float, str, type(None)} or kinds == (type(None),):
+        if not set(parameter.kinds) - {type(None)} <= {bool, int, float, str} or set(parameter.kinds) <= {type(None)}:
             return f"parameter {parameter.name} must be annotated as bool, int, float or str"
     return ""
 

@@ -205,6 +205,15 @@ class MechanicalScene(Scene):
 
 
 @dataclass(frozen=True)
+class OpenLoopScene(MechanicalScene):
+    """A role: theta is the sequence of controls, step by step, and noise is on each of them."""
+
+    open_loop: ClassVar[bool] = True
+
+    noise: str = param("action", "noise is on the actions", choices=("action",))
+
+
+@dataclass(frozen=True)
 class DampedScene(MechanicalScene):
     """A role: the velocity is multiplied by a factor each step (numerical damping)."""
 

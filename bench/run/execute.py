@@ -25,8 +25,7 @@ from bench.model import Estimator, guard, reads
 from bench.run import descents, progress
 from bench.run.files import remove_stale
 from bench.run.ladder import climb
-from bench.run.launchers import launcher_of
-from bench.run.launchers.launcher import Launcher
+from bench.run.launchers import Launcher, launcher_of
 from bench.run.plan import Planned, plan
 from bench.run.pool import Answer
 from bench.run.record import kind_of_machine
@@ -36,9 +35,6 @@ from bench.run.tasks import FAILED, Task, group_by_program, result_of, row_of
 
 if TYPE_CHECKING:
     import pandas as pd
-
-MAX_REPAIRS = 2
-"""Number of times that cells whose rows are gone at the end of a run are run again."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,13 +77,14 @@ def execute(experiment: Experiment, quiet: bool = True) -> Finished:
     planned = plan(experiment, store)
     _refuse_without_supported_cells(experiment, planned)
     progress.print_versions(planned, experiment.execution.versions)
-    progress.print_machines(planned, experiment.execution.launcher)
+    progress.print_machines(planned)
     progress.print_stale(planned)
     store.prepare()
     for folder in (experiment.directory, experiment.directory / "pending", experiment.results_dir / "references"):
         remove_stale(folder)
     _run(experiment, planned, store, quiet)
-    for is_last in (*[False] * MAX_REPAIRS, True):
+    # cells whose rows are gone at the end of a run are run again, at most twice
+    for is_last in (False, False, True):
         stored = set(store.load()["key"])
         rest = [replace(item, stored=item.cell.key in stored) for item in planned]
         if all(item.stored for item in rest):
@@ -156,7 +153,6 @@ class Runner:
         Raises :class:`Stopped` after a failed cell if the experiment has ``on_error=stop``.
         """
         due = [item for item in planned if not item.stored]
-        kind = next((item.machine for item in planned if item.machine), "")
         refused = [(i.cell, dict(zip(("status", "reason"), i.refusal, strict=True))) for i in due if i.refusal]
         if refused:
             self._finish([(cell, result | {"machine": kind_of_machine()}) for cell, result in refused])
@@ -170,7 +166,7 @@ class Runner:
         if references:
             with launcher_of(self.experiment) as launcher:
                 cells = self._compute_references(cells, references, launcher)
-        with launcher_of(self.experiment, timed=True, kind=kind) as launcher:
+        with launcher_of(self.experiment, timed=True) as launcher:
             self._measure(cells, launcher)
 
     def _placed(self, cells: list[Cell]) -> list[Cell]:

@@ -13,8 +13,6 @@ from pathlib import Path
 
 from bench.errors import StorageError
 
-STALE_S = 3600.0
-"""Age in seconds after which a half-written file is that of a killed run."""
 TEMPORARY = re.compile(r"\..+-bench-[0-9a-f]{32}")
 """Names of files being written."""
 
@@ -24,7 +22,8 @@ def remove_stale(directory: Path) -> None:
     with suppress(OSError):
         for path in directory.iterdir():
             with suppress(OSError):
-                if TEMPORARY.fullmatch(path.name) and time.time() - path.stat().st_mtime > STALE_S:
+                # age in seconds after which a half-written file is that of a killed run
+                if TEMPORARY.fullmatch(path.name) and time.time() - path.stat().st_mtime > 3600.0:
                     path.unlink()
 
 

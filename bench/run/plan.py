@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from bench.engines.backend import EngineBackend
 from bench.errors import UserError
 from bench.experiment.cell import Cell
 from bench.experiment.experiment import Experiment
@@ -149,8 +148,8 @@ def expected_seconds(runs: Sequence[Planned], rows: pd.DataFrame) -> float:
 
 def versions(backend: Backend) -> str:
     """Return the versions of the libraries that a backend's numbers depend on, also in an engine's own Python."""
-    own = backend.library_versions() if isinstance(backend, EngineBackend) else {}
-    return ";".join([_versions(type(backend)), *(f"{backend.name}:{name}={value}" for name, value in own.items())])
+    own = [f"{backend.name}:{name}={value}" for name, value in backend.library_versions().items()]
+    return ";".join([_versions(type(backend)), *own])
 
 
 @remember

@@ -34,14 +34,10 @@ from bench.run.worker import Handler, command
 
 TICK = 0.05
 """Seconds between checks of the items' time and memory."""
-CHILDREN_S = 1.0
-"""Seconds between searches for the processes that a worker has started, whose memory counts as the worker's."""
 BATCH_S = 0.05
 """Seconds for which the answers of quick items are gathered, to be stored in one file: syncing takes longer than a small cell."""
 STEAL_S = 5.0
 """Seconds of queued work above which an idle worker takes half of a queue, although it has to compile again."""
-START_S = 60.0
-"""Seconds allowed for starting a worker and importing an item's libraries, in addition to the item's time limit."""
 TAIL, MOST_OUTPUT = 16000, 1 << 26
 """Bytes that are read of the end of a worker's printed output, and bytes of a file of output that is emptied."""
 EXIT_S = 5.0
@@ -50,8 +46,6 @@ MAX_MESSAGE = 1 << 30
 """Bytes of the longest valid message."""
 LOST = "closed its connection"
 """The fault of a worker that has ended."""
-MAX_FAILED_STARTS = 3
-"""Number of consecutive workers killed during their start after which the run ends with an error."""
 SINGLE_THREAD = {
     "OMP_NUM_THREADS": "1",
     "OPENBLAS_NUM_THREADS": "1",
@@ -81,8 +75,6 @@ class Answer:
     seconds: float
     output: str = ""
     """The last lines printed while the item was handled."""
-    machine: str = ""
-    """Kind of the machine that handled the item; empty for this machine."""
 
 
 # ---------------------------------------------------------------------------------------------------------- a worker
@@ -125,7 +117,9 @@ class _Worker:
     def resident_bytes(self) -> int:
         """Return the resident memory of the worker and of the processes that it has started, such as engines."""
         now = time.monotonic()
-        if now > self.children_since + CHILDREN_S:
+        # seconds between searches for the processes that a worker has started, whose memory counts as the
+        # worker's
+        if now > self.children_since + 1.0:
             # a search through all processes, so not at each check
             self.children, self.children_since = self.usage.children(recursive=True), now
         total = int(self.usage.memory_info().rss)
@@ -360,7 +354,8 @@ class Pool:
         output = worker.take_output()
         self._remove(worker)
         self._n_failed_starts = 0 if worker.is_ready else self._n_failed_starts + 1
-        if not worker.is_ready and (self._n_failed_starts == MAX_FAILED_STARTS or not was_killed):
+        # number of consecutive workers killed during their start after which the run ends with an error
+        if not worker.is_ready and (self._n_failed_starts == 3 or not was_killed):
             raise UserError(f"a worker cannot start: {reason}; last output: {output or 'none'}")
         rest = worker.queue  # the items behind the failed item have not run
         if worker.item is not None and kind != "done":
@@ -400,7 +395,9 @@ class Pool:
         if os.fstat(worker.output.fileno()).st_size > MOST_OUTPUT:
             os.ftruncate(worker.output.fileno(), 0)
         timeout, memory = self._limits.timeout, self._limits.memory
-        if timeout is not None and now - worker.since > timeout + (0 if worker.is_prepared else START_S):
+        # seconds allowed for starting a worker and importing an item's libraries, in addition to the item's
+        # time limit
+        if timeout is not None and now - worker.since > timeout + (0 if worker.is_prepared else 60.0):
             return "timeout", f"no result within {timeout:g} s"
         with suppress(psutil.Error):
             if memory is not None and worker.resident_bytes() > memory:

@@ -26,8 +26,6 @@ FIRST_LINE_S, LINE_S = 5.0, 10.0
 """Seconds before the first line and between lines where the output is not a terminal."""
 NAME_WIDTH, BAR_WIDTH = 20, 16
 """Most characters of the experiment's name, and characters of a bar."""
-NOT_FAILED = ("ok", "unsupported", "waiting")
-"""Statuses that are not counted as failures."""
 
 
 class Progress:
@@ -49,7 +47,8 @@ class Progress:
     def finished(self, row: dict[str, Any]) -> None:
         """Count one cell that is finished and stored."""
         self._n_done += 1
-        if row["status"] not in NOT_FAILED:
+        # statuses that are not counted as failures
+        if row["status"] not in ("ok", "unsupported", "waiting"):
             self._failed[row["status"]] += 1
         self._show()
 
@@ -109,11 +108,11 @@ def print_versions(planned: Sequence[Planned], policy: str) -> None:
         print(f"bench: {count} stored rows were made with {versions}: {action}", file=sys.stderr)
 
 
-def print_machines(planned: Sequence[Planned], launcher: str) -> None:
+def print_machines(planned: Sequence[Planned]) -> None:
     """Print how many stored rows were timed on another kind of machine, if this run measures times here."""
     this = record.kind_of_machine()
     others = Counter(item.machine for item in planned if item.machine not in ("", this))
-    if launcher == "local" and others and any(item.runs and item.cell.timing for item in planned):
+    if others and any(item.runs and item.cell.timing for item in planned):
         for machine, count in others.most_common():
             print(
                 f"bench: {count} stored rows were timed on '{machine}', and this machine is '{this}': times of two kinds of "

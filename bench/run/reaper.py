@@ -21,14 +21,8 @@ from contextlib import suppress
 
 MARK = "BENCH_MARK"
 """Environment variable that marks a process and every process that it starts, even in another session."""
-DEATH_SIGNAL = 1
-"""PR_SET_PDEATHSIG of prctl(2)."""
-ADOPTS = 36
-"""PR_SET_CHILD_SUBREAPER of prctl(2)."""
 PASSES, PAUSE_S = 5, 0.2
 """Most searches for marked processes, which may start others meanwhile, and the reaper's pause in seconds after each."""
-POLL_S = 1.0
-"""Seconds between searches for descendants while the run goes on."""
 
 
 class Reaper:
@@ -44,7 +38,8 @@ class Reaper:
         self.adopts = adopts
         if adopts:
             with suppress(OSError, AttributeError):
-                ctypes.CDLL(None).prctl(ADOPTS, 1, 0, 0, 0)
+                # PR_SET_CHILD_SUBREAPER of prctl(2)
+                ctypes.CDLL(None).prctl(36, 1, 0, 0, 0)
         self.mark = f"{os.environ.get(MARK, '')}{uuid.uuid4().hex}"
         self._process: subprocess.Popen[bytes] | None = None
         if MARK not in os.environ:
@@ -84,9 +79,11 @@ def main() -> None:
     for name in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(name, signal.SIG_IGN)
     with suppress(OSError, AttributeError):  # on Linux the end of the run resumes this process if it is stopped
-        ctypes.CDLL(None).prctl(DEATH_SIGNAL, signal.SIGCONT, 0, 0, 0)
+        # PR_SET_PDEATHSIG of prctl(2)
+        ctypes.CDLL(None).prctl(1, signal.SIGCONT, 0, 0, 0)
     parent, found = os.getppid(), set()
-    while not select.select([sys.stdin], [], [], POLL_S)[0]:
+    # seconds between searches for descendants while the run goes on
+    while not select.select([sys.stdin], [], [], 1.0)[0]:
         if sys.argv[2] and os.getppid() == parent:
             with suppress(Exception):  # also without psutil, which the plain install does not bring: marks alone
                 import psutil  # not in commands of less than a second

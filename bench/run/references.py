@@ -89,7 +89,7 @@ class References:
                 return result
             failures = ", ".join(f"{name} ({type(error).__name__})" for name, error in failed)
             note = f"the reference is from {backend.name}, after a failure of {failures}"
-            return replace(result, note="; ".join(part for part in (note, result.note) if part))
+            return reference.with_note(result, note)
         raise failed[0][1]
 
     def _for_backend(self, shared: Reference, cell: Cell) -> Reference:
@@ -107,8 +107,7 @@ class References:
             )
         if found is not None:
             return found
-        result = self._compute_on(cell.backend, cell)
-        return replace(result, note="; ".join(part for part in (note, result.note) if part))
+        return reference.with_note(self._compute_on(cell.backend, cell), note)
 
     def _problem(self, backend: Backend, cell: Cell) -> Problem:
         """Return the cell's program on a backend, with the noise of the smoothing that the estimator needs."""

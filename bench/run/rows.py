@@ -35,8 +35,6 @@ MAX_TEXT = 1_000_000
 """Length of the longest string, in characters."""
 COUNTS = {"samples": 1, "repeats": 1, "seed": 0, "horizon": 0}
 """Columns of whole numbers, each with its smallest value."""
-NEEDED = ("status", "samples", "repeats", "seed")
-"""Columns with a value in every row with parameters."""
 NOT_NEGATIVE = (
     "variance",
     "rmse",
@@ -49,8 +47,6 @@ NOT_NEGATIVE = (
     "compile_s",
 )
 """Columns whose numbers are at least 0."""
-CHECKED_TEXTS = ("status", "parameters")
-"""Columns of strings with rules of their own."""
 TABLES = ("machine", "versions", "config", "counts")
 """Entries of ``run.json`` that are tables."""
 LARGEST = 2.0**53
@@ -179,7 +175,12 @@ def _faults(table: pd.DataFrame, columns: Columns) -> dict[int, str]:
         column = columns.by_name.get(name)
         if values.dtype.kind in "fiub" and (column is None or column.kind == "number"):
             is_valid: Any = _is_in_range(name, values.to_numpy(dtype=float))
-        elif str(values.dtype) == "str" and name not in CHECKED_TEXTS and (column is None or column.kind == "text"):
+        # columns of strings with rules of their own
+        elif (
+            str(values.dtype) == "str"
+            and name not in ("status", "parameters")
+            and (column is None or column.kind == "text")
+        ):
             is_valid = ~(values.str.len() > MAX_TEXT).to_numpy(dtype=bool, na_value=False)
         else:
             is_valid = np.fromiter(map(holds, values), dtype=bool)
@@ -188,7 +189,8 @@ def _faults(table: pd.DataFrame, columns: Columns) -> dict[int, str]:
             reasons.setdefault(int(place), f"{printable(name)[:60]}={value} {fault}")
     if "parameters" in table:
         is_described = ~table["parameters"].fillna("").isin(["", "{}"])
-        for name in NEEDED:
+        # columns with a value in every row with parameters
+        for name in ("status", "samples", "repeats", "seed"):
             is_missing = table[name].isna() | (table[name].astype(str) == "") if name in table else True
             for place in np.flatnonzero(is_described & is_missing):
                 reasons.setdefault(int(place), f"{name} is missing")

@@ -35,8 +35,6 @@ if TYPE_CHECKING:
 
 PATIENCE_S = 60.0
 """Seconds for which a merge is waited for, and reads are retried while other runs merge files."""
-MAX_PAUSE_S = 0.05
-"""Longest pause in seconds between two attempts. Pauses are random, so that two runs do not disturb each other again."""
 MAX_SEQUENCE = 2.0**53
 """Larger counts are not exact as float64, so no run has written them."""
 
@@ -186,4 +184,6 @@ def _attempts() -> Iterator[None]:
     until = time.monotonic() + PATIENCE_S
     while time.monotonic() < until:
         yield
-        time.sleep(random.uniform(0.0, MAX_PAUSE_S))
+        # longest pause in seconds between two attempts. Pauses are random, so that two runs do not disturb each
+        # other again
+        time.sleep(random.uniform(0.0, 0.05))

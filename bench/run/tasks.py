@@ -30,8 +30,6 @@ MAX_REASON = 2000
 """Length of the longest stored reason, in characters."""
 FAILED = ("error", "crashed", "timeout")
 """Statuses of cells that failed."""
-CONVERGED = {"float64": 1e-8, "float32": 1e-4}
-"""Largest relative residual of a constraint solver that has converged, by type of the simulation."""
 
 RAN: set[str] = set()
 """The modules and files from outside whose code this process has run."""
@@ -108,7 +106,8 @@ class TaskHandler:
                 reads.note(name)
         result = self._handle(item)
         is_reduced = isolation.reduced_precision()
-        if is_reduced and result.get("dtype", item.cell.backend.dtype) == "float64" and _uses_jax(item.backend):
+        uses_jax = any(requirement.partition("=")[0] == "jax" for requirement in item.backend.requires)
+        if is_reduced and uses_jax and result.get("dtype", item.cell.backend.dtype) == "float64":
             result["dtype"] = "float32"
         self.is_tainted = is_reduced or self._study.fresh_process or not registry.is_restricted()
         if RAN:
@@ -137,21 +136,13 @@ class TaskHandler:
 
 def outside_of(parts: Iterable[Plugin | None]) -> frozenset[str]:
     """Return the modules and files from outside this package that decide what plugins do."""
-    foreign = [part for part in parts if part is not None and is_foreign(part)]
+    known = [part for part in parts if part is not None]
+    foreign = [part for part in known if not type(part).__module__.startswith("bench.") or names_files(part)]
     names = {type(part).__module__ for part in foreign}
     for part in foreign:
         with suppress(Exception):  # the error is reported when the cell is measured
             names |= set(map(str, part.files() if names_files(part) else ()))  # type: ignore[attr-defined]
     return frozenset(names)
-
-
-def is_foreign(part: Plugin) -> bool:
-    """Return whether a plugin's code is from outside this package."""
-    return not type(part).__module__.startswith("bench.") or names_files(part)
-
-
-def _uses_jax(backend: Backend) -> bool:
-    return any(requirement.partition("=")[0] == "jax" for requirement in backend.requires)
 
 
 def measure_cell(cell: Cell, session: Session, study: Study) -> dict[str, Any]:
@@ -190,7 +181,8 @@ def solver_columns(cell: Cell, session: Session, result: dict[str, Any]) -> dict
     if "solver_residual" in names:
         w = noise.shared(cell.seed, cell.scene.name, 1, cell.samples, program.n_noise)[0].T
         columns["solver_residual"] = residual = float(backend.solver_residual(session.problem(cell), w))
-        if residual > CONVERGED[cell.backend.dtype]:
+        # largest relative residual of a constraint solver that has converged, by type of the simulation
+        if residual > {"float64": 1e-8, "float32": 1e-4}[cell.backend.dtype]:
             remarks.append(
                 f"the constraint solver has not converged (relative residual {residual:.1e}): more iterations give another gradient"
             )
@@ -225,7 +217,7 @@ def group_by_program(tasks: list[Task]) -> list[list[Task]]:
 
 def result_of(answer: Answer, prefix: str = "") -> dict[str, Any]:
     """Return an answer's result with its time and machine; a failure's reason gets the prefix and the last output."""
-    result = answer.result | {"wall_s": answer.seconds, "machine": answer.machine or kind_of_machine()}
+    result = answer.result | {"wall_s": answer.seconds, "machine": kind_of_machine()}
     if result["status"] in FAILED:
         output = f"; last output: {answer.output}" if answer.output else ""
         result["reason"] = f"{prefix}{result['reason']}{output}"

@@ -14,8 +14,6 @@ from .jax import Jax, JaxOps, use_double_precision
 
 ROUNDING = 8.0
 """Units in the last place of the unknown below which a residual counts as rounding error."""
-MIN_ITERATIONS = 8
-"""Iterations before a residual may count as rounding error. Newton's method needs fewer if it converges."""
 
 
 @dataclass(frozen=True)
@@ -120,6 +118,8 @@ def _newton() -> Any:
 
         def _is_rounding(self, y: Any, state: Any) -> Any:
             allowed = ROUNDING * jnp.finfo(y.dtype).eps * (1.0 + jnp.abs(y).max()) * state.diffsize_prev
-            return (state.step >= MIN_ITERATIONS) & jnp.isfinite(state.f).all() & (jnp.abs(state.f).max() <= allowed)
+            # iterations before a residual may count as rounding error. Newton's method needs fewer if it
+            # converges
+            return (state.step >= 8) & jnp.isfinite(state.f).all() & (jnp.abs(state.f).max() <= allowed)
 
     return Newton

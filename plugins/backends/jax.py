@@ -104,8 +104,6 @@ def loop(body: Callable[[Any, Any], Any], carry: Any, xs: Any, length: int, reco
 
 LARGE = 1 << 14
 """Length of theta from which a column is a block's worth of work: blocks then have few columns, and hardly any padding."""
-FEW = 8
-"""Columns per block from that length on: theta, per column, and its derivative fit a core's cache."""
 
 
 def _numbers(program: Program) -> int:
@@ -138,7 +136,9 @@ class JaxProblem(Problem):
         if self.device == "cpu":
             self.fit_blocks(_numbers(program) * self._dtype.itemsize)
             if program.dim >= LARGE:
-                self.grain = self.block = self.least = FEW
+                # columns per block from that length on: theta, per column, and its derivative fit a core's
+                # cache
+                self.grain = self.block = self.least = 8
 
     def _value(self, theta: np.ndarray, w: np.ndarray) -> np.ndarray:
         return self._call(self._cost, theta, w)

@@ -27,12 +27,6 @@ from bench.model import (
 from .. import mjcf, mjx_solver
 from .jax import Jax, JaxProblem
 
-FORWARD_UP_TO = 8
-"""Maximum length of theta for forward mode: reverse mode costs as much as this number of directions."""
-LARGEST = 1e10
-"""Maximum absolute value in a state; MuJoCo stops a rollout at larger values (``mjMAXVAL``)."""
-RESIDUAL_SAMPLES = 16
-"""Rollouts in which the residual of the constraint solver is measured."""
 _REMARKED: set[tuple[str, str, str]] = set()
 """Scenes, files and cones whose remarks were printed."""
 
@@ -133,11 +127,8 @@ class Mjx(Jax):
         if self.mode != "auto":
             return self.mode
         has_reverse = self.iterations == 1 or self.is_implicit
-        return "reverse" if has_reverse and program.dim > FORWARD_UP_TO else "forward"
-
-
-SINGLE = 4
-"""Maximum number of columns that run one by one, since padding columns are expensive."""
+        # maximum length of theta for forward mode: reverse mode costs as much as this number of directions
+        return "reverse" if has_reverse and program.dim > 8 else "forward"
 
 
 class MjxProblem(JaxProblem):
@@ -149,7 +140,8 @@ class MjxProblem(JaxProblem):
         self, function: Callable[..., np.ndarray], theta: np.ndarray, w: np.ndarray, lead: tuple[int, ...]
     ) -> np.ndarray:
         is_cpu = self.device == "cpu"
-        self.grain = 1 if w.shape[1] <= (SINGLE if is_cpu else 1) else 16
+        # maximum number of columns that run one by one, since padding columns are expensive
+        self.grain = 1 if w.shape[1] <= (4 if is_cpu else 1) else 16
         if is_cpu:
             self.block = self.least = self.grain
         return super()._blocks(function, theta, w, lead)
@@ -162,7 +154,8 @@ class MjxProblem(JaxProblem):
     def solver_residual(self, w: np.ndarray) -> float:
         """Return the largest relative residual of the constraint solver along rollouts from theta0 with ``w (n_w, B)``."""
         theta = self.program.theta0.reshape(self.dim, 1)
-        (residuals,) = self._parts(self._residuals, theta, w[:, :RESIDUAL_SAMPLES])
+        # rollouts in which the residual of the constraint solver is measured
+        (residuals,) = self._parts(self._residuals, theta, w[:, :16])
         return float(residuals.max())
 
     def _residuals(self, parameters: Array, theta: Array, w: Array) -> tuple[Array]:
@@ -242,7 +235,8 @@ class MjxProgram(Rollout):
 
         after: State = self._columns(column, state, u)
         largest = jnp.maximum(jnp.abs(after.q).max(axis=0), jnp.abs(after.v).max(axis=0))
-        factor = jnp.where(largest <= LARGEST, 1.0, jnp.nan).astype(after.q.dtype)  # makes the gradient NaN too
+        # maximum absolute value in a state; MuJoCo stops a rollout at larger values (mjMAXVAL)
+        factor = jnp.where(largest <= 1e10, 1.0, jnp.nan).astype(after.q.dtype)  # makes the gradient NaN too
         return State(after.q * factor, after.v * factor)
 
     def residual(self, state: State, u: Array) -> Array:

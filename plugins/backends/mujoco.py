@@ -12,14 +12,6 @@ from bench.model import Backend, Problem, Program, SteppedProblem, central_diffe
 
 from .. import mjcf
 
-SHORTER = 0.03
-"""Factor between the differences of a step that straddle a switch of contact and the next shorter ones."""
-REFINED = 2
-"""Most times that differences are taken again."""
-STRADDLED = 1e-3
-"""Difference of forward and backward differences, relative to the largest entry of their column, that shows a switch
-within them. Curvature causes 1e-5 at the default step."""
-
 
 @dataclass(frozen=True)
 class Mujoco(Backend):
@@ -139,12 +131,17 @@ class Engine:
             if not central:
                 return differences(data, eps)
             result, straddled = np.empty((n, n + n_u)), np.ones(n + n_u, dtype=bool)
-            for refined in range(REFINED + 1):
-                step = eps * SHORTER**refined
+            # at most two times again
+            for refined in range(3):
+                # factor between the differences of a step that straddle a switch of contact and the next
+                # shorter ones
+                step = eps * 0.03**refined
                 after, before = differences(data, step), differences(data, -step)
                 result[:, straddled] = ((after + before) / 2.0)[:, straddled]
                 size = np.abs(np.concatenate([after, before])).max(axis=0)
-                straddled &= np.abs(after - before).max(axis=0) > STRADDLED * size
+                # difference of forward and backward differences, relative to the largest entry of their column,
+                # that shows a switch within them. Curvature causes 1e-5 at the default step
+                straddled &= np.abs(after - before).max(axis=0) > 1e-3 * size
                 if not straddled.any():
                     break
             return result

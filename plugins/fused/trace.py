@@ -11,9 +11,6 @@ import numpy as np
 from ..jaxprs import FOLD, interpret
 from .graph import MOST, TOO_LONG, Graph, Node, Refused, reached
 
-BRANCHES = 4
-"""Maximum number of different formulas for one input of a step along the horizon."""
-
 
 @dataclass
 class Loop:
@@ -220,7 +217,8 @@ class Tracer:
         """Return a node that selects, at each step, between formulas of different form."""
         kinds = [(node.op, node.data if node.args else None) for node in nodes]
         distinct = list(dict.fromkeys(kinds))
-        if len(distinct) > BRANCHES:
+        # maximum number of different formulas for one input of a step along the horizon
+        if len(distinct) > 4:
             raise Refused("scan over inputs of too many different forms")
         graph, result = self.loop.graph, None
         for kind in distinct:

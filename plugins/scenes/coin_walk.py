@@ -7,9 +7,6 @@ import numpy as np
 
 from bench.model import Array, ContactLaw, Events, EventScene, FunctionScene, Plugin, param
 
-_NODES = 24
-"""Nodes of the Gauss-Hermite rule per coordinate of theta: exact for polynomials up to degree 47."""
-
 
 @dataclass(frozen=True)
 class CoinWalk(EventScene, FunctionScene):
@@ -53,7 +50,8 @@ class CoinWalk(EventScene, FunctionScene):
 
     def closed_form_gradient(self, contact: ContactLaw | None, integrator: Plugin | None) -> np.ndarray:
         """Return the derivative of the recursion of the places' probabilities, averaged over the noise on theta."""
-        nodes, weights = np.polynomial.hermite_e.hermegauss(_NODES)
+        # nodes of the Gauss-Hermite rule per coordinate of theta: exact for polynomials up to degree 47
+        nodes, weights = np.polynomial.hermite_e.hermegauss(24)
         weights = weights / weights.sum()
         u = np.stack(np.meshgrid(nodes, nodes, indexing="ij")).reshape(2, -1)
         slope = self._slope(self.theta0()[:, None] + self.sigma * u)

@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 
-from bench.model import Array, ContactLaw, EngineTwin, MechanicalScene, Plugin, State, param
+from bench.model import Array, ContactLaw, EngineTwin, OpenLoopScene, Plugin, State, param
 
 
 @dataclass(frozen=True)
-class DoubleIntegrator(EngineTwin, MechanicalScene):
+class DoubleIntegrator(EngineTwin, OpenLoopScene):
     """q'' = u from rest at q = 0; state (q, v), theta the controls u_0 .. u_{N-1}; f = (q_N - 1)^2 / 2.
 
     q_N = c . u with c_i = dt^2 (N - i) for semi-implicit and dt^2 (N - i - 1) for explicit Euler. Hence grad J =
@@ -20,12 +20,10 @@ class DoubleIntegrator(EngineTwin, MechanicalScene):
     theta_names = ("control",)
     neglected_effects = "contact, friction, effort in the cost"
     continuous = True
-    open_loop = True
     n_q = 1
     n_u = 1
 
     sigma: float = param(0.1, "standard deviation of the noise on each control", "m/s^2", positive=True)
-    noise: str = param("action", "noise is on the actions", choices=("action",))
     horizon: int = 20
     dt: float = 0.05
     control: float = param(1.0, "control of every step at theta", "m/s^2")

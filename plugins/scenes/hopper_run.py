@@ -10,10 +10,6 @@ from .axis_contact import AxisContactScene
 
 LEAN = math.pi / 6
 """Pitch at which the reward for an upright body is 0 [rad] (Xu et al. 2022)."""
-RAISED = 0.3
-"""Height above the free zone up to which the reward grows [m] (Xu et al. 2022)."""
-SUNK = 200.0
-"""Weight of the squared depth below the free zone [1/m^2] (Xu et al. 2022)."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +99,9 @@ class HopperRun(PolicyScene, AxisContactScene, FrictionScene):
     def stage_cost(self, xp: Any, q: Array, v: Array, u: Array) -> Array:
         """Return minus the reward of one step, 0 after the end."""
         d = q[1] - self.low - self.margin
-        height = xp.where(d > 0, xp.clip(d, 0.0, RAISED), -SUNK * d * d)
+        # height above the free zone up to which the reward grows [m] (Xu et al. 2022)
+        # weight of the squared depth below the free zone [1/m^2] (Xu et al. 2022)
+        height = xp.where(d > 0, xp.clip(d, 0.0, 0.3), -200.0 * d * d)
         effort = self.effort * (xp.tanh(u[0]) ** 2 + xp.tanh(u[1]) ** 2)
         reward = v[0] + height + 1.0 - (q[2] / LEAN) ** 2 - effort
         return xp.where(self.has_ended(xp, q, v), 0.0 * reward, -reward)

@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from bench.model import Array, ContactLaw, KnownOptimum, KnownValue, MechanicalScene, Plugin, State, param
+from bench.model import Array, ContactLaw, KnownOptimum, KnownValue, OpenLoopScene, Plugin, State, param
 
 
 @dataclass(frozen=True)
-class Lqr(KnownOptimum, KnownValue, MechanicalScene):
+class Lqr(KnownOptimum, KnownValue, OpenLoopScene):
     """q'' = u from (q, v) = (``start``, 0); f = sum of position q^2 + speed v^2 + effort u^2, plus terminal terms.
 
     theta is the control of each step (d = horizon). Made for semi-implicit Euler, whose step is x' = A x + B u with
@@ -22,12 +22,10 @@ class Lqr(KnownOptimum, KnownValue, MechanicalScene):
     theta_names = ("control",)
     neglected_effects = "contact, limits"
     continuous = True
-    open_loop = True
     n_q = 1
     n_u = 1
 
     sigma: float = param(0.1, "standard deviation of the noise on each control", "m/s^2", positive=True)
-    noise: str = param("action", "noise is on the actions", choices=("action",))
     dt: float = 0.05
     start: float = param(1.0, "q at the start", "m")
     control: float = param(0.0, "control of every step at theta", "m/s^2")

@@ -3,11 +3,11 @@
 from dataclasses import dataclass
 from typing import Any
 
-from bench.model import Array, EngineTwin, MechanicalScene, State, param
+from bench.model import Array, EngineTwin, OpenLoopScene, State, param
 
 
 @dataclass(frozen=True)
-class Pendulum(EngineTwin, MechanicalScene):
+class Pendulum(EngineTwin, OpenLoopScene):
     """A point mass on a rod, hanging at rest: m l^2 q'' = u - m g l sin q - b q'; q from the lowest point.
 
     State (q, q'); theta is the torque of each step (d = horizon). f = 1 + cos q_T + 0.1 q'_T^2 (0 at rest upright)
@@ -18,12 +18,10 @@ class Pendulum(EngineTwin, MechanicalScene):
     theta_names = ("torque",)
     neglected_effects = "the rod's mass, torque limits, contact"
     continuous = True
-    open_loop = True
     n_q = 1
     n_u = 1
 
     sigma: float = param(0.3, "standard deviation of the noise on each torque", "N m", positive=True)
-    noise: str = param("action", "noise is on the actions", choices=("action",))
     horizon: int = 50
     dt: float = 0.02
     mass: float = param(1.0, "mass at the tip", "kg", positive=True)

@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 
-from bench.model import Array, MechanicalScene, State, param
+from bench.model import Array, OpenLoopScene, State, param
 
 
 @dataclass(frozen=True)
-class PendulumSwing(MechanicalScene):
+class PendulumSwing(OpenLoopScene):
     """A pendulum of unit constants, q'' = -sin q + u, is swung from rest at q = 0 to rest at q = pi.
 
     State (q, q'); theta is the torque of each step (d = horizon). f = sum over the steps of (q - pi)^2 + q'^2 +
@@ -23,12 +23,10 @@ class PendulumSwing(MechanicalScene):
     theta_names = ("torque",)
     neglected_effects = "units, damping, torque limits, contact"
     continuous = True
-    open_loop = True
     n_q = 1
     n_u = 1
 
     sigma: float = param(0.3, "standard deviation of the noise on each torque", positive=True)
-    noise: str = param("action", "noise is on the actions", choices=("action",))
     horizon: int = 200
     dt: float = 0.05
     torque: float = param(0.1, "torque of every step at theta")

@@ -3,11 +3,11 @@
 from dataclasses import dataclass
 from typing import Any
 
-from bench.model import Array, ContactScene, DampedScene, EngineTwin, State, ZeroOrderHoldScene, param
+from bench.model import Array, ContactScene, DampedScene, EngineTwin, OpenLoopScene, State, ZeroOrderHoldScene, param
 
 
 @dataclass(frozen=True)
-class Pushing(EngineTwin, ZeroOrderHoldScene, DampedScene, ContactScene):
+class Pushing(EngineTwin, OpenLoopScene, ZeroOrderHoldScene, DampedScene, ContactScene):
     """Two bodies on a line, the first pushed by an open-loop force; they are in contact when closer than 1 m.
 
     State (x1, x2, v1, v2); theta is the force sequence (d = horizon / hold). f = sum over steps of the Q-weighted
@@ -19,7 +19,6 @@ class Pushing(EngineTwin, ZeroOrderHoldScene, DampedScene, ContactScene):
     theta_names = ("push",)
     continuous = True
     neglected_effects = "rotation, friction, the second dimension, shapes (bodies are points with a rest distance)"
-    open_loop = True
     n_q = 2
     n_u = 1
     n_contacts = 1
@@ -27,7 +26,6 @@ class Pushing(EngineTwin, ZeroOrderHoldScene, DampedScene, ContactScene):
     contact_values = {"stiffness": 1e3}
 
     sigma: float = param(0.3, "standard deviation of the noise on each force", "N", positive=True)
-    noise: str = param("action", "noise is on the actions", choices=("action",))
     horizon: int = 30
     dt: float = 0.005
     mass: float = param(0.1, "mass of each body", "kg", positive=True)

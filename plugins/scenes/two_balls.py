@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from bench.model import Array, ContactLaw, ContactScene, ImpulseLaw, KnownOptimum, Plugin, State, param
+from bench.model import Array, ContactLaw, ContactScene, ImpulseLaw, KnownOptimum, OpenLoopScene, Plugin, State, param
 
 
 @dataclass(frozen=True)
-class TwoBalls(KnownOptimum, ContactScene):
+class TwoBalls(KnownOptimum, OpenLoopScene, ContactScene):
     """Two equal balls on a table without friction; q = (x1, y1, x2, y2), a force on the first moves both.
 
     theta holds the two forces of each step (d = 2 horizon), at first (3, 3) throughout. f = squared distance of the
@@ -28,13 +28,11 @@ class TwoBalls(KnownOptimum, ContactScene):
     theta_names = ("force", "force")
     continuous = True
     neglected_effects = "spin, friction, the table's edges, further balls"
-    open_loop = True
     n_q = 4
     n_u = 2
     n_contacts = 1
 
     sigma: float = param(0.1, "standard deviation of the noise on each force", "N", positive=True)
-    noise: str = param("action", "noise is on the actions", choices=("action",))
     horizon: int = 120
     dt: float = 1 / 120
     radius: float = param(0.2, "radius of both balls", "m", positive=True)

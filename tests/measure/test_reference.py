@@ -258,7 +258,7 @@ def test_jump_that_nobody_declares_makes_the_reference_zeroth_order(jump, seen):
 
 def test_disagreement_of_the_check_is_acted_upon(monkeypatch):
     """First order wrong by 20% where neither a jump nor the pilot shows it."""
-    monkeypatch.setattr(reference, "_reason_against_first_order", lambda *given: "")
+    monkeypatch.setattr(reference._Sampler, "_doubt_of_first_order", lambda self: "")
     case = ridge(bank.power(1), bank.power(2, 0.1))
     problem = Numpy().compile(case.program)
     plain = problem.grad
@@ -335,7 +335,7 @@ def test_jumps_that_no_list_holds_are_not_for_a_rule_in_the_plane():
 def test_samples_replace_a_coarse_rule_that_they_agree_with(monkeypatch, mean, spread, chosen, error):
     """Samples that leave less error do, never ones that all missed the event. A disagreement is the stated error."""
     batches = mean + spread * np.linspace(-1.0, 1.0, BATCHES)[:, None]
-    monkeypatch.setattr(reference, "_sample", lambda *_: reference.Reference(batches, "sampling[n=64]"))
+    monkeypatch.setattr(reference._Sampler, "reference", lambda _: reference.Reference(batches, "sampling[n=64]"))
     monkeypatch.setattr(reference, "integrate", lambda *_: Integral(np.array([1.0]), 0.5, 1, 1.0))
     found = bank.certified(ridge(bank.power(1), dim=1), SAMPLES)
     assert found.method.startswith(chosen)

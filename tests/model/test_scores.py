@@ -10,7 +10,7 @@ from classes import Numpy, SemiImplicitEuler
 import bench
 from bench.conformance.kit import Skipped
 from bench.conformance.scenes import score_gives_the_gradient
-from bench.conformance.subjects import sound_scenes
+from bench.conformance.subjects import available
 from bench.measure.reference import certify
 from bench.model import MechanicalScene, State, compose, param
 
@@ -113,6 +113,6 @@ def test_no_reference_without_scores_and_gradients():
 
 
 def test_scores_of_the_scenes_here_give_the_gradient():
-    for scene in sound_scenes():
-        if isinstance(scene, MechanicalScene):
-            assert not compose(scene, None, SemiImplicitEuler()).score_refusal
+    for scene in available("scenes"):
+        if issubclass(scene, MechanicalScene):
+            assert not compose(scene(), None, SemiImplicitEuler()).score_refusal

@@ -8,9 +8,8 @@ from rich.cells import cell_len
 from rich.console import Console
 
 from bench.experiment import config
-from bench.run import progress
+from bench.run import launchers, progress
 from bench.run.execute import execute
-from bench.run.launchers import launcher
 
 PUSHING = [
     "scenes=[pushing]", "scene.pushing.horizon=2", "backends=[numpy]", "estimators=[reinforce]", "samples=8", "repeats=4",
@@ -65,7 +64,7 @@ def test_a_run_says_after_5_s_which_reference_it_computes(monkeypatch, capsys):
 
 def test_references_are_counted_while_they_are_computed(tmp_path, monkeypatch):
     lines = []
-    monkeypatch.setattr(launcher, "BATCH_S", -1.0)  # otherwise answers of quick tasks come together
+    monkeypatch.setattr(launchers, "BATCH_S", -1.0)  # otherwise answers of quick tasks come together
     monkeypatch.setattr(progress.Progress, "working", lambda self, text: lines.append(text))
     execute(config.load([*PUSHING, "sweep.sigma=[0.1,0.2]", f"results_dir={tmp_path}"]), quiet=True)
     counted = [line for line in lines if line.startswith("reference of pushing")]

@@ -11,7 +11,7 @@ from classes import Fobg
 
 from bench.experiment import keys
 from bench.experiment.config import load
-from bench.model import EngineScene, registry
+from bench.model import EngineScene, reads, registry
 from bench.run.execute import Runner, Stopped, execute
 from bench.run.plan import plan
 from bench.run.store import Store
@@ -123,16 +123,16 @@ def test_a_row_is_stale_while_something_that_it_has_read_differs(plugins, capsys
     """Its reference too. Files that it has written, new temporary files and copies of the environment do not count."""
     before = plugins.run()
     assert list(before["status"]) == ["ok"], before["reason"][0]
+    assert plugins.plan()[0].stored
     for name in SOURCES:
-        (item,) = plugins.plan()
-        assert item.stored, item.stale
-        plugins.write(name, 20)
-        (item,) = plugins.plan()
-        assert not item.stored
-        assert Path(name).name in item.stale
-        assert " changed: " in item.stale
-        plugins.write(name, 1)
+        for mass, said in ((20, f"{Path(name).name} changed: "), (1, "")):
+            plugins.write(name, mass)
+            stale = reads.Present(registry.environment()).change(before["reads"][0])
+            assert said in stale if said else not stale
     plugins.write("mine/mass.txt", 20)
+    (item,) = plugins.plan()
+    assert not item.stored
+    assert "mass.txt changed: " in item.stale
     capsys.readouterr()
     after = plugins.run()
     assert "1 stored rows are stale, and run again: " in capsys.readouterr().err

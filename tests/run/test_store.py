@@ -20,9 +20,8 @@ from trees import bench
 
 from bench.cli import main
 from bench.errors import StorageError
-from bench.run import files
+from bench.run import files, launchers
 from bench.run import store as store_module
-from bench.run.launchers import launcher
 from bench.run.store import Store
 
 TINY = ["scenes=[heaviside]", "backends=[numpy]", "estimators=[fobg]", "samples=8", "repeats=4", "timing=false"]
@@ -269,7 +268,7 @@ def test_unreadable_file_is_named_and_left_alone(tmp_path, capsys, place, conten
 @pytest.mark.parametrize("after", [0, 1, 2])
 def test_disk_that_fills(tmp_path, capsys, monkeypatch, after):
     """The disk is full after so many files of rows: exit status 2, what was stored stays, and the run goes on later."""
-    monkeypatch.setattr(launcher, "BATCH_S", 0.0)  # a file per row
+    monkeypatch.setattr(launchers, "BATCH_S", 0.0)  # a file per row
     words = [*TINY, "name=tiny", "sweep.sigma=[0.1,0.2,0.3,0.4]", f"results_dir={tmp_path}", "workers=0"]
     real, left = files.write_whole, [after]
 
@@ -362,7 +361,7 @@ def test_a_folder_that_goes_during_a_run_costs_no_row(tmp_path, capsys, monkeypa
             self.directory.rename(tmp_path / "elsewhere") if change == "rename" else shutil.rmtree(self.directory)
 
     monkeypatch.setattr(Store, "append", append_and_lose)
-    monkeypatch.setattr(launcher, "BATCH_S", 0.0)
+    monkeypatch.setattr(launchers, "BATCH_S", 0.0)
     words = [*TINY, "workers=0", "sweep.seed=[0,1,2,3]", f"results_dir={tmp_path}", "--quiet"]
     assert main(words) == 0
     assert calls == [1] * 6

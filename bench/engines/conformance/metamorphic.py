@@ -27,12 +27,6 @@ try:
 except ImportError:  # this file is the script
     import runner  # type: ignore[no-redef]
 
-CONVERGED = {"tolerance": "1e-14", "iterations": "100", "ls_iterations": "50"}
-"""Options of all models: other settings of a solver have to lead to the same solution."""
-HARD = ".9999 .9999 .001"
-"""Impedance of equalities where a loop has to stay closed; the engine's own leaves a tenth of the acceleration without them."""
-GENERATED = ("replicate", "composite", "flexcomp", "attach")
-"""Elements from which an engine makes bodies of its own."""
 METHODS = {
     "steps": "steps(q, v, u), rows of states in and (q, v) out",
     "rollout": "rollout(q, v, controls), the last (q, v) of steps that go on with the engine's own data",
@@ -47,8 +41,6 @@ SPACING, LENGTH, NARROWED = 64, 0.02, 8
 divided by 8."""
 TOUCH = 1e-6
 """Largest gap of a contact or limit at which accelerations may jump [m, rad]."""
-SMOOTH = 1e-5
-"""Largest uncertainty of differences of steps, relative to the largest of them, at which derivatives are compared with them."""
 
 
 class Subject:
@@ -65,7 +57,8 @@ class Subject:
         for number, joint in enumerate(_joints(root.find("worldbody"))):
             joint.set("name", joint.get("name", f"joint {number}"))
         options = _first(root, "option")
-        options.attrib.update(CONVERGED)
+        # options of all models: other settings of a solver have to lead to the same solution
+        options.attrib.update({"tolerance": "1e-14", "iterations": "100", "ls_iterations": "50"})
         _first(options, "flag").set("warmstart", "disable")
         self.model, self.layout = self.variant(), _layout(root)
         self.quaternions = [int(of_q[-4]) for of_q, of_v in self.layout.values() if of_q.size > of_v.size]
@@ -123,7 +116,10 @@ def accelerations(path: str = "", /, **attributes: str) -> Results:
 
 def permuted(subject: Subject) -> Iterator[Any]:
     """Yield accelerations of the model with bodies and geoms in reverse order."""
-    if strange := [name for name in GENERATED if subject.root.find(f".//{name}") is not None]:
+    # elements from which an engine makes bodies of its own
+    if strange := [
+        name for name in ("replicate", "composite", "flexcomp", "attach") if subject.root.find(f".//{name}") is not None
+    ]:
         raise NotImplementedError(f"the model has {', '.join(strange)}")
     root: Any = copy.deepcopy(subject.root)
     for keyframes in root.findall("keyframe"):
@@ -149,7 +145,9 @@ def closed(subject: Subject) -> Iterator[tuple[int, float]]:
     """Yield accelerations that open closed loops, relative to those without the constraint, at closed states at speed."""
     if subject.root.find("equality") is None:
         raise NotImplementedError("the model has no equality")
-    model = subject.variant("equality/*", solimp=HARD)
+    # impedance of equalities where a loop has to stay closed; the engine's own leaves a tenth of the
+    # acceleration without them
+    model = subject.variant("equality/*", solimp=".9999 .9999 .001")
 
     def opened(q: np.ndarray, v: np.ndarray, a: Any, t: float = 1e-4) -> float:
         ends = [model.loops(subject.moved(q, s * v + t * t / 2 * a)) for s in (t, -t)]
@@ -207,7 +205,9 @@ def chained(subject: Subject) -> Iterator[tuple[int, float]]:
             return np.concatenate(at)
 
         (slope,), (doubt,) = runner.differences(after, [way])
-        if doubt.max() <= SMOOTH * np.abs(slope).max():
+        # largest uncertainty of differences of steps, relative to the largest of them, at which derivatives are
+        # compared with them
+        if doubt.max() <= 1e-5 * np.abs(slope).max():
             w, dv = np.split(functools.reduce(lambda end, at: subject.model.jacobian(*at) @ end, part, way), 2)
             yield step, _relative(slope, np.append(runner.tangent(last, subject.quaternions) @ w, dv))
 

@@ -1,39 +1,22 @@
-"""The interface of launchers, which run tasks, and the launchers of this machine."""
+"""Launchers, which run tasks in this process or in processes of this machine.
+
+A launcher is a context manager that ends all its processes on exit. ``run(groups)`` yields answers as they arrive, one per
+task, and empty lists while the caller has to wait; ``current`` are the tasks being worked on. The tasks of a group share a
+compilation, and run in one worker unless another worker is idle.
+"""
 
 from __future__ import annotations
 
 import itertools
 import os
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from types import TracebackType
-from typing import Any, Protocol
 
 from bench.experiment.experiment import Experiment
 from bench.experiment.study import study_of
 from bench.run.pool import BATCH_S, Answer, Pool, ResourceLimits
 from bench.run.tasks import FAILED, Task, TaskHandler
-
-
-class Launcher(Protocol):
-    """Runs groups of tasks: a context manager that ends all its processes and jobs on exit."""
-
-    def __enter__(self) -> Launcher: ...
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> Any: ...
-
-    def run(self, groups: Sequence[Sequence[Task]]) -> Iterator[list[Answer]]:
-        """Yield answers as they arrive, one per task, and empty lists while the caller has to wait.
-
-        The tasks of a group share a compilation, and run in one worker unless another worker is idle.
-        """
-
-    @property
-    def current(self) -> list[Task]:
-        """The tasks being worked on."""
 
 
 class InProcessLauncher:
@@ -75,23 +58,21 @@ class InProcessLauncher:
             yield answers
 
 
-def local_launcher(experiment: Experiment, timed: bool = False, n_workers: int | None = None) -> Launcher:
+Launcher = Pool | InProcessLauncher
+
+
+def launcher_of(experiment: Experiment, timed: bool = False) -> Launcher:
     """Return a launcher that runs tasks in processes of this machine, or in this process if there are 0 workers.
 
-    ``n_workers`` replaces the experiment's own setting. Timed tasks run one at a time and may use all cores, unless each has a process of its own.
+    Timed tasks run one at a time and may use all cores, unless each has a process of its own. Workers get the experiment without
+    its grid, which they do not need since tasks contain their plugins.
     """
     rules = experiment.execution
-    workers = rules.workers if n_workers is None else n_workers
-    workers = (os.cpu_count() or 1) if workers is None else workers
+    workers = (os.cpu_count() or 1) if rules.workers is None else rules.workers
     if not workers:
         return InProcessLauncher(TaskHandler(experiment, single_thread=not timed))
     limits = ResourceLimits(rules.timeout, rules.memory)
     return Pool(
-        1 if timed else workers, TaskHandler, without_grid(experiment), limits,
+        1 if timed else workers, TaskHandler, replace(experiment, choices={}, values={}, sweep={}, also=(), marks={}), limits,
         single_thread=not timed or study_of(experiment).fresh_process, folders=experiment.plugins, outside=lambda task: task.outside,
     )  # fmt: skip
-
-
-def without_grid(experiment: Experiment) -> Experiment:
-    """Return the experiment without its grid, which workers do not need since tasks contain their plugins."""
-    return replace(experiment, choices={}, values={}, sweep={}, also=(), marks={})
