@@ -42,8 +42,6 @@ REFUSED = {
     "scenes=[pushing] theta=[mass] theta0=[1,2]": "theta0 has 2 values, theta of scene pushing has 1",
     "plugins=nowhere_at_all": "is not a folder", "plugins=[~nosuchuser]": "unknown user name", "reference=null": "reference.samples=...",
     "--config-dir nowhere_at_all +experiment=quick": "experiment/NAME.yaml", "plan --config-dir ~nosuchuser": "~",
-    "plan launcher=ray ray=3": "must be a table",
-    "plan launcher=ray ray.cells=x": "ray.cells='x' must be a whole number",
     "seed=" + "9" * 400: "at most",
 f"sweep.seed=[{'9' * 400}]": "at most", "scene.heaviside.sigma=" + "9" * 400: "largest float",
     f"seed={2**53 + 1}": "at most", "results_dir='~nosuchuser/x'": "~", "results_dir=null": "must be a folder",
