@@ -35,8 +35,8 @@ GOOD = ("right", "usable", "no jumps")
 INTRODUCTION = """\
 # Simulators that others wrote
 
-`bench.examine` on {count} packages, used as their documentation shows. The truth is computed without the package, by `truth()` in the simulator's
-file in `examples/atlas`: {score}.
+`bench.examine` on {count} packages, used as their documentation shows, beside the truth, which `truth()` in the simulator's file in
+`examples/atlas` computes: {score}.
 
     python -m examples.atlas install NAME    # into a Python that it shares with others of its kind
     python -m examples.atlas examine NAME    # or without names: all, then `page` writes this page
@@ -105,7 +105,7 @@ def report(name, place):
     parts = found.check.components
     gradient = np.array([part.program if found.gradient else part.difference for part in parts])
     truth = np.ravel(np.asarray(imports.load_module(file).truth(), float))[[part.component for part in parts]]
-    off = float(np.max(np.abs(gradient - truth)) / np.max(np.abs(truth)))
+    off = float(np.max(np.abs(gradient - truth)) / (np.max(np.abs(truth)) or 1.0))
     used = resource.getrusage(resource.RUSAGE_SELF)
     facts = {
         "bench": bench.__version__, "seconds": round(used.ru_utime + used.ru_stime, 1), "status": found.status,
@@ -144,7 +144,7 @@ def page():
     words = {each["name"]: agreement(each, rows[each["name"]]) for each in facts}
     intro = INTRODUCTION.format(
         count=len({each["package"] for each in facts}), date=max(row["date"] for row in rows.values()),
-        score=", ".join(f"{n} {word}" for word, n in Counter(words.values()).most_common()),
+        score=", ".join(f"{n} {word.removesuffix('s')}" for word, n in Counter(words.values()).most_common()),
     )  # fmt: skip
     table = ["| package | simulator | `examine` says | truth | off | | s |", "|---|---|---|---|--:|---|--:|"]
     for each in facts:

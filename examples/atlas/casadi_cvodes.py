@@ -11,6 +11,8 @@ about = {
     "examine": "grad=gradient refined=refined calls=2500",
     "derivative": "right",
     "how": "complex step, SciPy's DOP853 at a tolerance of 1e-12",
+    "advice": "At a tolerance of 1e-6 the gradient is right to 0.03%, but differences of the cost are off by up to 33% and decide nothing. At 1e-9 "
+    "`examine` shows that it is right.",
 }
 theta = np.array([5.0, 2.0, 0.1])  # mu, first state
 x, p = ca.SX.sym("x", 2), ca.SX.sym("p", 3)
