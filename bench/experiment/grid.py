@@ -5,13 +5,14 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import Any
 
 from bench.errors import Unsupported, UserError, unknown
 from bench.experiment.cell import DESCENDED, Cell
 from bench.experiment.experiment import Choice, Experiment
+from bench.experiment.parameters import DESCENT, THETA, applies
 from bench.experiment.study import study_of
 from bench.model import Decision, MechanicalScene, Plugin, compose
 from bench.model.parameters import build, coerce, parameters, singular
@@ -19,12 +20,8 @@ from bench.model.program import OWN
 
 MAX_CELLS = 1_000_000
 """Largest number of cells in a sweep; planning that many takes minutes."""
-DESCENT = "descent"
-"""The axis of the share of a descent that is done at theta0."""
 COUNTS = ("samples", "repeats", "seed")
 """Settings that a sweep can vary besides plugin parameters and :data:`THETA`."""
-THETA = "theta0"
-"""The axis of the point at which gradients are taken: ``theta0``, or ``theta0.2`` for one of its coordinates."""
 
 
 def is_theta_axis(axis: str) -> bool:
@@ -187,19 +184,6 @@ def share_of(value: Any) -> float:
     if not 0.0 <= share < 1.0:
         raise UserError(f"{DESCENT}={share:g} must be at least 0 and below 1: the share of a descent that is done")
     return float(share)
-
-
-def applies(name: str, axis: str, plugin: str, known: Collection[str]) -> str | None:
-    """Return the parameter of a plugin that a name in a sweep means, or None.
-
-    ``known`` are the plugin's parameters. ``gamma``, ``alpha_order.gamma``, ``estimator.gamma`` and
-    ``estimator.alpha_order.gamma`` name the same parameter.
-
-    >>> applies("alpha_order.gamma", "estimator", "alpha_order", {"gamma"})
-    'gamma'
-    """
-    *path, parameter = name.split(".")
-    return parameter if parameter in known and path in ([], [plugin], [axis], [axis, plugin]) else None
 
 
 def _applies(name: str, plugin: type[Plugin]) -> str | None:

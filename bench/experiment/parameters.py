@@ -15,12 +15,12 @@ import json
 from collections.abc import Collection, Mapping
 from functools import lru_cache
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from bench.experiment.experiment import Budget
-from bench.experiment.grid import DESCENT, THETA, applies
 from bench.model import Decision, Plugin, registry
 from bench.model.identity import identity, plain
 from bench.model.parameters import parameters, singular
@@ -28,6 +28,12 @@ from bench.model.parameters import parameters, singular
 if TYPE_CHECKING:
     import pandas as pd
 
+DESCENT = "descent"
+"""The axis of the share of a descent that is done at theta0."""
+THETA = "theta0"
+"""The axis of the point at which gradients are taken: ``theta0``, or ``theta0.2`` for one of its coordinates."""
+VIEWS = ("horizon", "dt", "sigma", "stiffness", "noise", "dtype", "smoothing")
+"""Plugin parameters with their own columns, which are therefore omitted from identity strings."""
 PROBLEM = ("scene", "contact", "integrator")
 """The parts of the grid that decide the simulation, and so the gradient that estimates are compared with."""
 RECORDS = {"theta": Decision, "reference": Budget}
@@ -110,17 +116,52 @@ def completed_rows(rows: pd.DataFrame) -> pd.DataFrame:
     )
     if "estimator_params" not in rows:
         return rows
-    labels = rows["parameters"].map({text: estimator_params(parsed(text)) for text in texts.values()})
-    return rows.assign(estimator_params=labels.fillna(rows["estimator_params"]))
+    found = rows["parameters"].map({text: labels(parsed(text)).get("estimator_params") for text in texts.values()})
+    return rows.assign(estimator_params=found.fillna(rows["estimator_params"]))
 
 
-def estimator_params(given: Mapping[str, Any]) -> str | None:
-    """Return the parameters of a row's estimator that differ from today's defaults; None if it is not installed."""
-    part = given.get("estimator") or {}
-    if plugin_class("estimator", part.get("name")) is None:
-        return None
-    defaults = _defaults("estimator", part["name"], None, registry.folders())
-    return identity("", {name: value for name, value in part.items() if value != defaults.get(name, value)}).strip("[]")
+def labels(
+    given: Mapping[str, Any],
+    hidden: Mapping[str, Collection[str]] = MappingProxyType({}),
+    views: Collection[str] = VIEWS,
+) -> dict[str, str]:
+    """Return identity strings by column, of parameters that differ from today's defaults, without ``views`` and, by axis, ``hidden``.
+
+    Plugins that are not installed have none.
+    """
+    scene, law = (plugin_class(axis, (given.get(axis) or {}).get("name")) for axis in ("scene", "contact"))
+    strings = {}
+    for axis, part in given.items():
+        if axis in NOT_PLUGINS:
+            continue
+        plugin = plugin_class(axis, part["name"]) if part else None
+        omitted = {*hidden.get(axis, ()), *(views if axis != "estimator" else ())}
+        if axis == "contact" and "smoothing" in views:
+            omitted.add(getattr(law, "smoothing", ""))
+        if axis == "scene" and law and "stiffness" in parameters(law) and "stiffness" not in hidden.get("scene", ()):
+            omitted.discard("stiffness")  # the column of that name is the law's
+        if plugin:
+            defaults = _defaults(axis, plugin.name, scene and scene.name, registry.folders())
+            known = {name: value for name, value in part.items() if name in parameters(plugin) and name not in omitted}
+            changed = {name: value for name, value in known.items() if value != defaults.get(name, dataclasses.MISSING)}
+            strings[axis] = identity(plugin.name, changed)
+        elif not part and axis != "estimator":
+            strings[axis] = "none"
+    name, _, params = strings.get("estimator", "").partition("[")
+    return strings | ({"estimator": name, "estimator_params": params.removesuffix("]")} if name else {})
+
+
+def applies(name: str, axis: str, plugin: str, known: Collection[str]) -> str | None:
+    """Return the parameter of a plugin that a name in a sweep means, or None.
+
+    ``known`` are the plugin's parameters. ``gamma``, ``alpha_order.gamma``, ``estimator.gamma`` and
+    ``estimator.alpha_order.gamma`` name the same parameter.
+
+    >>> applies("alpha_order.gamma", "estimator", "alpha_order", {"gamma"})
+    'gamma'
+    """
+    *path, parameter = name.split(".")
+    return parameter if parameter in known and path in ([], [plugin], [axis], [axis, plugin]) else None
 
 
 # ------------------------------------------------------------------------------------------------------- flat columns
