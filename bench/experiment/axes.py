@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bench.experiment.experiment import Experiment
-from bench.experiment.grid import COUNTS, built, expand, parameter_name, swept
+from bench.experiment.grid import COUNTS, expand, parameter_name, swept
 from bench.experiment.parameters import (
     NOT_PLUGINS,
     THETA,
@@ -22,7 +22,6 @@ from bench.experiment.parameters import (
     parsed,
     plugin_class,
 )
-from bench.model import Plugin, registry
 from bench.model.parameters import parameters
 
 if TYPE_CHECKING:
@@ -166,18 +165,6 @@ def table(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:
     formulas = {name: wide[name].str.lstrip().str[:1].isin(["=", "+", "-", "@"]) for name in texts}
     changed = {name: wide[name].mask(rows, "'" + wide[name]) for name, rows in formulas.items() if rows.any()}
     return wide.assign(**changed)
-
-
-def build_plugins(given: Mapping[str, Any]) -> dict[str, Plugin | None]:
-    """Build the plugins described by a row's parameters, by axis; raises :class:`UserError` if one is not installed."""
-    return {a: None if p is None else build_part(a, p) for a, p in given.items() if a not in NOT_PLUGINS}
-
-
-def build_part(axis: str, part: Mapping[str, Any]) -> Plugin:
-    """Return the plugin of one axis from its name and parameters; raises :class:`UserError` if it is not installed."""
-    return built(
-        registry.usable(registry.kind_of(axis), part["name"]), [item for item in part.items() if item[0] != "name"]
-    )
 
 
 def relabel(rows: pd.DataFrame, axes: Sequence[Axis]) -> pd.DataFrame:

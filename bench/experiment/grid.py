@@ -243,7 +243,7 @@ class _Expansion:
                 if choice is not None and choice.entry.plugin is not None and _uses(scene, axis):
                     own = getattr(scene, "contact_values", {}) if axis == "contact" else {}
                     values = {k: v for k, v in own.items() if k in parameters(choice.entry.plugin)}
-                    parts[axis] = built(choice.entry.plugin, sorted((values | dict(choice.values)).items()))
+                    parts[axis] = _build(choice.entry.plugin, sorted((values | dict(choice.values)).items()))
             self._paths[key] = Cell(parts, samples=0, repeats=0, seed=0, study=self._experiment.study, decision=start)
         return self._paths[key]
 
@@ -301,7 +301,7 @@ class _Expansion:
         # later values replace earlier ones: the scene's contact values, settings, identity string, sweep
         values |= self._experiment.values.get(group, {}).get(plugin.name, {})
         values |= dict(choice.values) | {parameter: point[axis] for axis, parameter in axes}
-        return built(plugin, sorted(values.items()))
+        return _build(plugin, sorted(values.items()))
 
 
 def _uses(scene: Plugin | None, axis: str) -> bool:
@@ -321,7 +321,7 @@ def _axes_of(plugin: type[Plugin], names: tuple[str, ...]) -> list[tuple[str, st
 _built: dict[tuple[type[Plugin], str], Plugin] = {}
 
 
-def built(plugin: type[Plugin], values: Sequence[tuple[str, Any]]) -> Plugin:
+def _build(plugin: type[Plugin], values: Sequence[tuple[str, Any]]) -> Plugin:
     """Return the plugin with these values, built once. 1, 1.0 and True differ: a parameter may accept only one."""
     key = (plugin, repr(values))
     if key not in _built:

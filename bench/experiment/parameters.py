@@ -120,35 +120,40 @@ def completed_rows(rows: pd.DataFrame) -> pd.DataFrame:
     return rows.assign(estimator_params=found.fillna(rows["estimator_params"]))
 
 
+def identity_of(given: Mapping[str, Any], axis: str, omitted: Collection[str] = ()) -> str | None:
+    """Return the identity string of a plugin in a row's parameters, without its defaults of today and what is ``omitted``.
+
+    It is ``none`` where the row has no plugin, and None if the plugin is not installed, or not with all these parameters.
+    """
+    if not (part := given.get(axis)):
+        return "none"
+    plugin, scene = plugin_class(axis, part["name"]), (given.get("scene") or {}).get("name")
+    if plugin is None or not part.keys() <= {"name", *parameters(plugin)}:
+        return None
+    defaults = _defaults(axis, plugin.name, scene, registry.folders())
+    kept = {name: value for name, value in part.items() if name != "name" and name not in omitted}
+    return identity(plugin.name, {k: v for k, v in kept.items() if v != defaults.get(k, dataclasses.MISSING)})
+
+
 def labels(
     given: Mapping[str, Any],
     hidden: Mapping[str, Collection[str]] = MappingProxyType({}),
     views: Collection[str] = VIEWS,
 ) -> dict[str, str]:
-    """Return identity strings by column, of parameters that differ from today's defaults, without ``views`` and, by axis, ``hidden``.
-
-    Plugins that are not installed have none.
-    """
-    scene, law = (plugin_class(axis, (given.get(axis) or {}).get("name")) for axis in ("scene", "contact"))
-    strings = {}
-    for axis, part in given.items():
-        if axis in NOT_PLUGINS:
-            continue
-        plugin = plugin_class(axis, part["name"]) if part else None
-        omitted = {*hidden.get(axis, ()), *(views if axis != "estimator" else ())}
-        if axis == "contact" and "smoothing" in views:
-            omitted.add(getattr(law, "smoothing", ""))
-        if axis == "scene" and law and "stiffness" in parameters(law) and "stiffness" not in hidden.get("scene", ()):
-            omitted.discard("stiffness")  # the column of that name is the law's
-        if plugin:
-            defaults = _defaults(axis, plugin.name, scene and scene.name, registry.folders())
-            known = {name: value for name, value in part.items() if name in parameters(plugin) and name not in omitted}
-            changed = {name: value for name, value in known.items() if value != defaults.get(name, dataclasses.MISSING)}
-            strings[axis] = identity(plugin.name, changed)
-        elif not part and axis != "estimator":
-            strings[axis] = "none"
-    name, _, params = strings.get("estimator", "").partition("[")
-    return strings | ({"estimator": name, "estimator_params": params.removesuffix("]")} if name else {})
+    """Return identity strings by column, without ``views`` and, by axis, ``hidden`` parameters; none of plugins that are not installed."""
+    law = plugin_class("contact", (given.get("contact") or {}).get("name"))
+    omitted = {
+        axis: {*hidden.get(axis, ()), *(() if axis == "estimator" else views)}
+        for axis in given
+        if axis not in NOT_PLUGINS
+    }
+    if law and "smoothing" in views:
+        omitted["contact"].add(getattr(law, "smoothing", ""))
+    if law and "stiffness" in parameters(law) and "stiffness" not in hidden.get("scene", ()):
+        omitted["scene"].discard("stiffness")  # the column of that name is the law's
+    found = {axis: text for axis, names in omitted.items() if (text := identity_of(given, axis, names))}
+    name, _, params = found.pop("estimator", "none").partition("[")
+    return found | ({"estimator": name, "estimator_params": params.removesuffix("]")} if name != "none" else {})
 
 
 def applies(name: str, axis: str, plugin: str, known: Collection[str]) -> str | None:
