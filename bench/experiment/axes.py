@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bench.errors import UserError
-from bench.experiment.cell import VIEWS, labels
 from bench.experiment.experiment import Experiment
-from bench.experiment.grid import COUNTS, THETA, applies, built, expand, parameter_name, swept
-from bench.experiment.parameters import NOT_PLUGINS, flat_rows, named, parsed, plugin_class
-from bench.model import Plugin, registry
+from bench.experiment.grid import COUNTS, expand, parameter_name, swept
+from bench.experiment.parameters import (
+    NOT_PLUGINS,
+    THETA,
+    VIEWS,
+    applies,
+    flat_rows,
+    labels,
+    named,
+    parsed,
+    plugin_class,
+)
 from bench.model.parameters import parameters
 
 if TYPE_CHECKING:
@@ -162,18 +167,6 @@ def table(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:
     return wide.assign(**changed)
 
 
-def build_plugins(given: Mapping[str, Any]) -> dict[str, Plugin | None]:
-    """Build the plugins described by a row's parameters, by axis; raises :class:`UserError` if one is not installed."""
-    return {a: None if p is None else build_part(a, p) for a, p in given.items() if a not in NOT_PLUGINS}
-
-
-def build_part(axis: str, part: Mapping[str, Any]) -> Plugin:
-    """Return the plugin of one axis from its name and parameters; raises :class:`UserError` if it is not installed."""
-    return built(
-        registry.usable(registry.kind_of(axis), part["name"]), [item for item in part.items() if item[0] != "name"]
-    )
-
-
 def relabel(rows: pd.DataFrame, axes: Sequence[Axis]) -> pd.DataFrame:
     """Return rows whose identity strings omit the parameters of swept axes, since these have their own columns.
 
@@ -184,23 +177,13 @@ def relabel(rows: pd.DataFrame, axes: Sequence[Axis]) -> pd.DataFrame:
 
     names = [name for axis in axes for name in axis.names]
     views = [name for name in VIEWS if (rows.groupby(["scene", "contact"])[name].nunique() > 1).any()]
-    read = cache(lambda text: _labels(json.loads(text), names, views))
     codes, distinct = pd.factorize(rows["parameters"])
     lines = []
     for given in map(parsed, distinct):
-        estimator = {axis: part for axis, part in given.items() if axis == "estimator"}
-        problem = {axis: part for axis, part in given.items() if axis != "estimator"}
-        lines.append(read(json.dumps(problem)) | read(json.dumps(estimator)))
+        parts = {axis: part for axis, part in given.items() if part and axis not in NOT_PLUGINS}
+        hidden = {
+            axis: [applies(name, axis, part["name"], part) or "" for name in names] for axis, part in parts.items()
+        }
+        lines.append(labels(given, hidden, views))
     found = pd.DataFrame(lines, dtype=object).iloc[codes].set_axis(rows.index)
     return rows.assign(**{name: found[name].fillna(rows[name]) for name in found if name in rows})
-
-
-def _labels(given: Mapping[str, Any], names: Sequence[str], views: Sequence[str]) -> dict[str, str]:
-    parts = {axis: part for axis, part in given.items() if part and axis not in NOT_PLUGINS}
-    hidden = {axis: [applies(name, axis, part["name"], part) or "" for name in names] for axis, part in parts.items()}
-    if "estimator" in given and not any(hidden.get("estimator", ())):
-        return {}
-    try:
-        return labels(build_plugins(given), hidden, views)
-    except UserError:
-        return {}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,6 +14,7 @@ from typing import Any, cast
 from bench.errors import Unsupported, UserError, failure, printable
 from bench.experiment.experiment import Budget
 from bench.experiment.keys import COMPARED, SHARED, counted, fingerprint, hash_of_text, hashed, raised, revisions_of
+from bench.experiment.parameters import labels
 from bench.experiment.reference_backends import capable_backends
 from bench.measure import descent, reference
 from bench.measure.descent import Point
@@ -25,7 +26,6 @@ from bench.model import (
     Design,
     Estimator,
     Integrator,
-    MechanicalScene,
     Plugin,
     Program,
     Scene,
@@ -33,43 +33,12 @@ from bench.model import (
     compose,
     registry,
 )
-from bench.model.identity import described, identity, label
+from bench.model.identity import described, identity
 from bench.model.parameters import parameters, singular, values
 from bench.model.program import OWN, idle
 
 DESCENDED = ("contact", "integrator", "backend")
 """The parts of the program that is descended, besides the scene of the cell, in the order of the setting ``path``."""
-VIEWS = ("horizon", "dt", "sigma", "stiffness", "noise", "dtype", "smoothing")
-"""Plugin parameters with their own columns, which are therefore omitted from identity strings."""
-
-
-def labels(
-    parts: Mapping[str, Plugin | None],
-    without: Mapping[str, Collection[str]] | None = None,
-    views: Collection[str] = VIEWS,
-) -> dict[str, str]:
-    """Return identity strings by column, without the parameters in ``views`` and, by axis, in ``without``."""
-    without = without or {}
-    scene, law = parts.get("scene"), parts.get("contact")
-    scene_values = dict(scene.contact_values) if isinstance(scene, MechanicalScene) else {}
-    omitted = {axis: {*views, *without.get(axis, ())} for axis in parts}
-    if isinstance(law, ContactLaw):
-        omitted["contact"] |= {law.smoothing} if "smoothing" in views else set()
-        if "stiffness" in parameters(type(law)) and "stiffness" not in without.get("scene", ()):
-            omitted["scene"].discard("stiffness")  # the column of that name is the law's
-    strings = {
-        axis: label(part, scene_values if axis == "contact" else None, tuple(omitted[axis]))
-        for axis, part in parts.items()
-        if axis != "estimator"
-    }
-    estimator = parts.get("estimator")
-    if estimator is not None:
-        strings["estimator"] = estimator.name
-        hidden = without.get("estimator", ())
-        strings["estimator_params"] = label(estimator, None, tuple(hidden)).removeprefix(estimator.name).strip("[]")
-    return strings
-
-
 _ranked: dict[str, tuple[Backend, ...]] = {}
 """Cache of the backends that can compute references, best first, by program key."""
 _program_keys: dict[tuple[str, ...], str] = {}
@@ -258,7 +227,7 @@ class Cell:
         law = self.contact
         smoothing = getattr(law, law.smoothing) if law is not None and law.smoothing else math.nan
         return {
-            **labels(self.parts),
+            **labels(self.parameters),
             "noise": "parameter" if self.decision.names else self.scene.noise,
             "horizon": self._view("horizon", self.scene, default=0),
             "dt": self._view("dt", self.scene),

@@ -5,13 +5,14 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import Any
 
 from bench.errors import Unsupported, UserError, unknown
 from bench.experiment.cell import DESCENDED, Cell
 from bench.experiment.experiment import Choice, Experiment
+from bench.experiment.parameters import DESCENT, THETA, applies
 from bench.experiment.study import study_of
 from bench.model import Decision, MechanicalScene, Plugin, compose
 from bench.model.parameters import build, coerce, parameters, singular
@@ -19,12 +20,8 @@ from bench.model.program import OWN
 
 MAX_CELLS = 1_000_000
 """Largest number of cells in a sweep; planning that many takes minutes."""
-DESCENT = "descent"
-"""The axis of the share of a descent that is done at theta0."""
 COUNTS = ("samples", "repeats", "seed")
 """Settings that a sweep can vary besides plugin parameters and :data:`THETA`."""
-THETA = "theta0"
-"""The axis of the point at which gradients are taken: ``theta0``, or ``theta0.2`` for one of its coordinates."""
 
 
 def is_theta_axis(axis: str) -> bool:
@@ -189,19 +186,6 @@ def share_of(value: Any) -> float:
     return float(share)
 
 
-def applies(name: str, axis: str, plugin: str, known: Collection[str]) -> str | None:
-    """Return the parameter of a plugin that a name in a sweep means, or None.
-
-    ``known`` are the plugin's parameters. ``gamma``, ``alpha_order.gamma``, ``estimator.gamma`` and
-    ``estimator.alpha_order.gamma`` name the same parameter.
-
-    >>> applies("alpha_order.gamma", "estimator", "alpha_order", {"gamma"})
-    'gamma'
-    """
-    *path, parameter = name.split(".")
-    return parameter if parameter in known and path in ([], [plugin], [axis], [axis, plugin]) else None
-
-
 def _applies(name: str, plugin: type[Plugin]) -> str | None:
     return applies(name, singular(plugin.kind), plugin.name, parameters(plugin))
 
@@ -259,7 +243,7 @@ class _Expansion:
                 if choice is not None and choice.entry.plugin is not None and _uses(scene, axis):
                     own = getattr(scene, "contact_values", {}) if axis == "contact" else {}
                     values = {k: v for k, v in own.items() if k in parameters(choice.entry.plugin)}
-                    parts[axis] = built(choice.entry.plugin, sorted((values | dict(choice.values)).items()))
+                    parts[axis] = _build(choice.entry.plugin, sorted((values | dict(choice.values)).items()))
             self._paths[key] = Cell(parts, samples=0, repeats=0, seed=0, study=self._experiment.study, decision=start)
         return self._paths[key]
 
@@ -317,7 +301,7 @@ class _Expansion:
         # later values replace earlier ones: the scene's contact values, settings, identity string, sweep
         values |= self._experiment.values.get(group, {}).get(plugin.name, {})
         values |= dict(choice.values) | {parameter: point[axis] for axis, parameter in axes}
-        return built(plugin, sorted(values.items()))
+        return _build(plugin, sorted(values.items()))
 
 
 def _uses(scene: Plugin | None, axis: str) -> bool:
@@ -337,7 +321,7 @@ def _axes_of(plugin: type[Plugin], names: tuple[str, ...]) -> list[tuple[str, st
 _built: dict[tuple[type[Plugin], str], Plugin] = {}
 
 
-def built(plugin: type[Plugin], values: Sequence[tuple[str, Any]]) -> Plugin:
+def _build(plugin: type[Plugin], values: Sequence[tuple[str, Any]]) -> Plugin:
     """Return the plugin with these values, built once. 1, 1.0 and True differ: a parameter may accept only one."""
     key = (plugin, repr(values))
     if key not in _built:

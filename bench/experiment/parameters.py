@@ -15,12 +15,12 @@ import json
 from collections.abc import Collection, Mapping
 from functools import lru_cache
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from bench.experiment.experiment import Budget
-from bench.experiment.grid import DESCENT, THETA, applies
 from bench.model import Decision, Plugin, registry
 from bench.model.identity import identity, plain
 from bench.model.parameters import parameters, singular
@@ -28,6 +28,12 @@ from bench.model.parameters import parameters, singular
 if TYPE_CHECKING:
     import pandas as pd
 
+DESCENT = "descent"
+"""The axis of the share of a descent that is done at theta0."""
+THETA = "theta0"
+"""The axis of the point at which gradients are taken: ``theta0``, or ``theta0.2`` for one of its coordinates."""
+VIEWS = ("horizon", "dt", "sigma", "stiffness", "noise", "dtype", "smoothing")
+"""Plugin parameters with their own columns, which are therefore omitted from identity strings."""
 PROBLEM = ("scene", "contact", "integrator")
 """The parts of the grid that decide the simulation, and so the gradient that estimates are compared with."""
 RECORDS = {"theta": Decision, "reference": Budget}
@@ -110,17 +116,57 @@ def completed_rows(rows: pd.DataFrame) -> pd.DataFrame:
     )
     if "estimator_params" not in rows:
         return rows
-    labels = rows["parameters"].map({text: estimator_params(parsed(text)) for text in texts.values()})
-    return rows.assign(estimator_params=labels.fillna(rows["estimator_params"]))
+    found = rows["parameters"].map({text: labels(parsed(text)).get("estimator_params") for text in texts.values()})
+    return rows.assign(estimator_params=found.fillna(rows["estimator_params"]))
 
 
-def estimator_params(given: Mapping[str, Any]) -> str | None:
-    """Return the parameters of a row's estimator that differ from today's defaults; None if it is not installed."""
-    part = given.get("estimator") or {}
-    if plugin_class("estimator", part.get("name")) is None:
+def identity_of(given: Mapping[str, Any], axis: str, omitted: Collection[str] = ()) -> str | None:
+    """Return the identity string of a plugin in a row's parameters, without its defaults of today and what is ``omitted``.
+
+    It is ``none`` where the row has no plugin, and None if the plugin is not installed, or not with all these parameters.
+    """
+    if not (part := given.get(axis)):
+        return "none"
+    plugin, scene = plugin_class(axis, part["name"]), (given.get("scene") or {}).get("name")
+    if plugin is None or not part.keys() <= {"name", *parameters(plugin)}:
         return None
-    defaults = _defaults("estimator", part["name"], None, registry.folders())
-    return identity("", {name: value for name, value in part.items() if value != defaults.get(name, value)}).strip("[]")
+    defaults = _defaults(axis, plugin.name, scene, registry.folders())
+    kept = {name: value for name, value in part.items() if name != "name" and name not in omitted}
+    return identity(plugin.name, {k: v for k, v in kept.items() if v != defaults.get(k, dataclasses.MISSING)})
+
+
+def labels(
+    given: Mapping[str, Any],
+    hidden: Mapping[str, Collection[str]] = MappingProxyType({}),
+    views: Collection[str] = VIEWS,
+) -> dict[str, str]:
+    """Return identity strings by column, without ``views`` and, by axis, ``hidden`` parameters; none of plugins that are not installed."""
+    law = plugin_class("contact", (given.get("contact") or {}).get("name"))
+    omitted = {
+        axis: {*hidden.get(axis, ()), *(() if axis == "estimator" else views)}
+        for axis in given
+        if axis not in NOT_PLUGINS
+    }
+    if law and "smoothing" in views:
+        omitted["contact"].add(getattr(law, "smoothing", ""))
+    if law and "stiffness" in parameters(law) and "stiffness" not in hidden.get("scene", ()):
+        omitted["scene"].discard("stiffness")  # the column of that name is the law's
+    found = {axis: text for axis, names in omitted.items() if (text := identity_of(given, axis, names))}
+    name, _, params = found.pop("estimator", "none").partition("[")
+    return found | ({"estimator": name, "estimator_params": params.removesuffix("]")} if name != "none" else {})
+
+
+def applies(name: str, axis: str, plugin: str, known: Collection[str]) -> str | None:
+    """Return the parameter of a plugin that a name in a sweep means, or None.
+
+    ``known`` are the plugin's parameters. ``gamma``, ``alpha_order.gamma``, ``estimator.gamma`` and
+    ``estimator.alpha_order.gamma`` name the same parameter.
+
+    >>> applies("alpha_order.gamma", "estimator", "alpha_order", {"gamma"})
+    'gamma'
+    """
+    *path, parameter = name.split(".")
+    return parameter if parameter in known and path in ([], [plugin], [axis], [axis, plugin]) else None
 
 
 # ------------------------------------------------------------------------------------------------------- flat columns

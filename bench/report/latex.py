@@ -18,21 +18,11 @@ LINES = 46
 """Most lines of a float, two per row: they fit one page at footnotesize, with the caption."""
 FIT = r"\resizebox{\ifdim\width>\textwidth\textwidth\else\width\fi}{!}{%"
 """Shrinks a table that is wider than the page."""
-SIGNS = {
-    "∞": r"$\infty$",
-    "↑": r"$\uparrow$",
-    "⧗": r"$\ominus$",
-    "†": r"\dag",
-    "‡": r"\ddag",
-    "–": "--",
-    "∅": r"$\emptyset$",
-}
-"""LaTeX for the signs of failed cells."""
 
 
 def latex(tables: Sequence[Table], experiment: str) -> str:
     """Return tables as floats; the notes of all tables stand in each caption."""
-    notes = " ".join(dict.fromkeys(_text(note) for table in tables for note in table.notes))
+    notes = " ".join(dict.fromkeys(escape_latex(note) for table in tables for note in table.notes))
     floats: list[list[str]] = []
     used = math.inf
     for lines, block in (block for table in tables for block in _blocks(table)):
@@ -58,7 +48,7 @@ def _blocks(table: Table) -> Iterable[tuple[int, str]]:
         for start in range(0, len(rest), COLUMNS):
             shown = rest[start : start + COLUMNS]
             heads = " & ".join(escape_latex(text) for text in ("", *(column.heading for column in shown)))
-            names = [_text(str(cell(first, row))).replace(",", r",\allowbreak ") for row in rows]
+            names = [escape_latex(str(cell(first, row))).replace(",", r",\allowbreak ") for row in rows]
             lines = [
                 [name, *(_in_latex(cell(column, row)) for column in shown)]
                 for name, row in zip(names, rows, strict=True)
@@ -70,17 +60,8 @@ def _blocks(table: Table) -> Iterable[tuple[int, str]]:
             ])  # fmt: skip
 
 
-def _text(text: str) -> str:
-    for sign in SIGNS:
-        text = text.replace(sign, f"\0{sign}")
-    return "".join(
-        SIGNS[piece[0]] + escape_latex(piece[1:]) if i else escape_latex(piece)
-        for i, piece in enumerate(text.split("\0"))
-    )
-
-
 def _in_latex(one: TableCell) -> str:
-    note = _text(one.note)
-    value = _text(one.value)
+    note = escape_latex(one.note)
+    value = escape_latex(one.value)
     value = (rf"\textbf{{{value}}}" if one.bold else value) + (f" {note}" if len(one.note) > 1 else note)
     return rf"\shortstack{{{value}\\{{\tiny {escape_latex(one.interval)}}}}}" if one.interval else value

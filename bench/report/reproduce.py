@@ -8,15 +8,11 @@ from typing import Any
 
 import pandas as pd
 
-from bench.errors import UserError
-from bench.experiment.axes import build_part, build_plugins
 from bench.experiment.cell import Cell
 from bench.experiment.experiment import Budget, Experiment
 from bench.experiment.grid import COUNTS
-from bench.experiment.parameters import parsed
-from bench.experiment.study import Study
-from bench.model import MechanicalScene, Plugin
-from bench.model.identity import changed, identity
+from bench.experiment.parameters import NOT_PLUGINS, identity_of, parsed, plugin_class
+from bench.model import MechanicalScene, registry
 
 HEAD = "python -m bench name=one_cell"
 
@@ -41,31 +37,23 @@ def commands(experiment: Experiment, rows: pd.DataFrame) -> list[list[str]]:
 
 def _settings(given: Mapping[str, Any], timing: bool) -> list[str]:
     """Return the settings, as shell words, of an experiment with only a row's cell, without its counts; empty if a plugin is missing."""
-    try:
-        study, parts = build_part("study", given["study"]), build_plugins(given)
-    except (UserError, KeyError):
+    study, plugins = identity_of(given, "study"), plugin_settings(given)
+    if not given or study is None or plugins is None:
         return []
-    cell = Cell(parts, samples=0, repeats=0, seed=0, study=study)
-    words = [f"study={_identity(study)}", *plugin_settings(cell), *theta_settings(given["theta"])]
+    words = [f"study={study}", *plugins, *theta_settings(given["theta"])]
     default = vars(Budget())
     budget = {name: value for name, value in (given["reference"] or {}).items() if value != default.get(name, value)}
     words += [f"reference.{name}={value!r}" for name, value in budget.items()]
-    if isinstance(study, Study) and timing != study.timed:
+    if timing != getattr(plugin_class("study", given["study"]["name"]), "timed", timing):
         words.append(f"timing={str(timing).lower()}")
     return [*map(shlex.quote, words)]
 
 
-def plugin_settings(cell: Cell, without: Collection[str] = ()) -> list[str]:
-    """Return a setting for the plugin on each axis, ``contacts=[penalty[stiffness=100]]``, except axes ``without``.
-
-    Parameters at their defaults are omitted. The scene's contact values count as defaults of its contact law.
-    """
-    given = dict(cell.scene.contact_values) if isinstance(cell.scene, MechanicalScene) else {}
-    return [
-        f"{part.kind}=[{_identity(part, given if axis == 'contact' else {})}]"
-        for axis, part in cell.parts.items()
-        if part is not None and axis not in without
-    ]
+def plugin_settings(given: Mapping[str, Any], without: Collection[str] = ()) -> list[str] | None:
+    """Return a setting for the plugin on each axis, ``contacts=[penalty[stiffness=100]]``, except axes ``without``; None if one is missing."""
+    axes = [axis for axis, part in given.items() if part and axis not in (*NOT_PLUGINS, *without)]
+    found = [identity_of(given, axis) for axis in axes]
+    return None if None in found else [f"{registry.kind_of(a)}=[{text}]" for a, text in zip(axes, found, strict=True)]
 
 
 def theta_settings(theta: Mapping[str, Any] | None) -> list[str]:
@@ -82,14 +70,14 @@ def check_of(cell: Cell) -> str:
     The cell's horizon replaces the default sweep of ``gradcheck``. Counts and estimator are omitted: no check depends
     on them.
     """
-    scene, line = _identity(cell.scene), []
+    given, line = cell.parameters, []
     if isinstance(cell.scene, MechanicalScene):
-        scene, line = _identity(cell.scene, {"horizon": cell.scene.horizon}), [f"sweep.horizon=[{cell.scene.horizon}]"]
-    study = [f"study={_identity(cell.study)}"] * bool(changed(cell.study))
-    theta = theta_settings(cell.parameters["theta"])
-    line += [*plugin_settings(cell, without=("scene", "estimator")), f"seed={cell.seed}", *theta, *study]
-    return shlex.join(["python", "-m", "bench", "gradcheck", scene, *line])
-
-
-def _identity(plugin: Plugin, given: Mapping[str, Any] | None = None) -> str:
-    return identity(plugin.name, changed(plugin, given))
+        line.append(f"sweep.horizon=[{cell.scene.horizon}]")
+    line += [
+        *(plugin_settings(given, ("scene", "estimator")) or ()),
+        f"seed={cell.seed}",
+        *theta_settings(given["theta"]),
+    ]
+    study = identity_of(given, "study") or ""
+    line += [f"study={study}"] * ("[" in study)
+    return shlex.join(["python", "-m", "bench", "gradcheck", str(identity_of(given, "scene", ("horizon",))), *line])

@@ -40,9 +40,15 @@ def escape_markdown(text: str) -> str:
     return re.sub(r"(?<!\w)_|_(?!\w)", r"\\_", text)
 
 
+SIGNS = {
+    "∞": r"$\infty$", "↑": r"$\uparrow$", "⧗": r"$\ominus$", "†": r"\dag", "‡": r"\ddag", "–": "--", "∅": r"$\emptyset$",
+}  # fmt: skip
+"""LaTeX for the signs of failed cells."""
+
+
 def escape_latex(text: str) -> str:
     """Return text escaped so that LaTeX prints it verbatim."""
-    special = {c: rf"\{c}" for c in "&%$#_{}"} | {
+    special = SIGNS | {c: rf"\{c}" for c in "&%$#_{}"} | {
         "\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "<": "$<$", ">": "$>$",
         "|": "$|$", "[": "{[}", "]": "{]}",
     }  # fmt: skip

@@ -23,13 +23,9 @@ from bench.model import registry
 MACHINE = {"processor": "a chip", "cores": 2, "system": "Linux", "load_average": [0.1, 0.1, 0.1]}
 
 
-def given(calls=20, seed=1):
-    """Rows with times of single calls, spread by 5%."""
-    rows = small_rows(backends=("jax",), estimators=("fobg", "reinforce"))
-    generator = np.random.default_rng(seed)
-    rows["time_samples"] = [time * (1 + 0.05 * generator.standard_normal(calls)) for time in rows["time_s"]]
-    rows["time_s"] = [float(np.median(samples)) for samples in rows["time_samples"]]
-    return rows
+def given():
+    """Made-up rows of two estimators."""
+    return small_rows(backends=("jax",), estimators=("fobg", "reinforce"))
 
 
 def compared(before, after, columns: Columns = COLUMNS, again=()):
@@ -185,7 +181,7 @@ def test_planted_faults_of_the_gradient_are_caught():
 
 
 def runs(count, seed=0, spread=0.1, cells=40):
-    """Rows of one experiment run several times: times of a cell spread between runs, and not within one."""
+    """Rows of one experiment run several times: times of a cell spread between runs."""
     generator = np.random.default_rng(seed)
     two = given().iloc[:2]
     rows = pd.concat([two.assign(seed=i) for i in range(cells // 2)], ignore_index=True)
@@ -195,7 +191,7 @@ def runs(count, seed=0, spread=0.1, cells=40):
     for _ in range(count):
         load = generator.normal(0, spread)
         time = usual * np.exp(load + generator.normal(0, spread, len(rows)))
-        made.append(rows.assign(time_s=time, time_iqr_s=1e-9, time_samples=[np.full(20, t) for t in time]))
+        made.append(rows.assign(time_s=time))
     return made
 
 

@@ -11,7 +11,6 @@ from trees import ROOT
 from bench.compare.sources import columns_of
 from bench.engines.backend import EngineBackend
 from bench.experiment import config
-from bench.experiment.axes import build_plugins
 from bench.experiment.cell import Cell
 from bench.experiment.experiment import Budget
 from bench.model import Decision, registry
@@ -37,7 +36,7 @@ def cell_of(row):
     given = json.loads(row["parameters"])
     study, theta, budget = given.pop("study"), given.pop("theta"), given.pop("reference")
     return Cell(
-        build_plugins(given),
+        {axis: part and registry.make(registry.kind_of(axis), part.pop("name"), part) for axis, part in given.items()},
         int(row["samples"]),
         int(row["repeats"]),
         int(row["seed"]),

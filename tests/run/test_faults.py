@@ -5,14 +5,9 @@ import subprocess
 
 import pandas as pd
 import pytest
-from bench.plugins.scenes.quadratic import Quadratic
 from trees import Tree, hearing_signals, processes_in, wait_for
 
 from bench.errors import UserError
-from bench.experiment import config
-from bench.model.parameters import build
-from bench.report import reproduce
-from bench.run.execute import execute, store_of
 from bench.run.pool import Pool, ResourceLimits
 
 FAULTS = '''
@@ -268,19 +263,3 @@ def nothing_starts(argument):
 def test_workers_that_cannot_start_end_the_run_at_once():
     with Pool(2, nothing_starts, None, ResourceLimits()) as pool, pytest.raises(UserError, match="no handler today"):
         list(pool.run([[1, 2], [3]]))
-
-
-def test_a_plugin_that_cannot_be_built_again_for_the_page_leaves_a_line_without_its_command(tmp_path, monkeypatch):
-    words = ["scenes=[quadratic]", "backends=[numpy]", "estimators=[fobg]", "samples=2", "repeats=3", "timing=false"]
-    experiment = config.load([*words, "workers=0", f"results_dir={tmp_path}"])
-    execute(experiment)
-    rows = store_of(experiment).load()
-    assert reproduce.commands(experiment, rows)[0]
-
-    def refuse(self, **values):
-        raise OSError(9, "Bad file descriptor")
-
-    monkeypatch.setattr(Quadratic, "__init__", refuse)
-    assert reproduce.commands(experiment, rows) == [[]]
-    with pytest.raises(UserError, match="scene 'quadratic' cannot be built"):
-        build(Quadratic, {})

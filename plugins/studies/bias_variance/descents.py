@@ -9,8 +9,7 @@ import numpy as np
 import pandas as pd
 
 from bench.experiment.columns import Column, text
-from bench.experiment.grid import DESCENT
-from bench.experiment.parameters import number_problems
+from bench.experiment.parameters import DESCENT, number_problems
 from bench.experiment.views import Table
 from bench.report.problems import label_columns, titled
 from bench.report.views import Arranged, attempted, estimator_labels, merge_seeds
