@@ -6,6 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from classes import Torch
 from pairwise import pairwise
 
 from bench import conformance
@@ -13,6 +14,7 @@ from bench.conformance import kit, parametrize
 from bench.conformance.kit import something_was_checked
 from bench.conformance.subjects import (
     all_programs,
+    available,
     backends,
     can_run,
     distinguishing_programs,
@@ -30,6 +32,7 @@ from bench.model import (
     ImpulseLaw,
     MechanicalScene,
     Plugin,
+    Scene,
     compose,
     registry,
 )
@@ -134,22 +137,37 @@ def sort_of_law(program):
     return isinstance(program.scene, MechanicalScene), *law
 
 
+class Eager(Torch):
+    """Torch in place of ``jax``, which compiles a scene's gradient for a tenth of a second and is in the golden cells."""
+
+    compiles = True
+
+
+oracles = conformance.estimators.oracles
+
+
 @pytest.fixture
 def on_few_programs(monkeypatch):
     """Return what runs a check on one short program of each sort, or every fourth scene with contacts, and few backends."""
     touching = [scene for scene in sound_scenes() if isinstance(scene, ContactScene) and scene.continuous]
-    monkeypatch.setattr(conformance.scenes, "backends", lambda: [b for b in backends() if b.name == "jax"])
-    monkeypatch.setattr(conformance.contacts, "sound_scenes", lambda: list(map(shortened, touching[::4])))
+    explicit = [method for method in available("integrators") if not method.needs_root]
+    monkeypatch.setattr(conformance.scenes, "available", lambda kind: explicit)
+    monkeypatch.setattr(conformance.scenes, "backends", lambda: [Eager()])
+    # each function at one of the two sizes of the noise, in turn
+    monkeypatch.setattr(conformance.estimators, "oracles", lambda: [*oracles()[::4], *oracles()[3::4]])
+    monkeypatch.setattr(conformance.estimators, "DESIGNED", 3)
+
+    def few(scene):
+        return distinguishing_programs(explicit_programs(shortened(scene)))
 
     def run(plugin, check):
-        compared = check.args[0].__name__ == "backends_agree"
-
-        def few(scene):
-            programs = explicit_programs if compared else programs_of
-            return distinguishing_programs(programs(shortened(scene)))[: 1 if compared else None]
-
+        scenes = [shortened(scene) for scene in touching[::4]][: 1 if getattr(plugin, "needs_root", False) else None]
+        monkeypatch.setattr(conformance.contacts, "sound_scenes", lambda: scenes)
         monkeypatch.setattr(conformance.scenes, "programs", few)
         monkeypatch.setattr(conformance.backends, "all_programs", lambda: few_programs(plugin))
+        if isinstance(plugin, Scene):
+            monkeypatch.setattr(conformance.subjects, "PARTS", 64)
+            plugin = shortened(plugin)
         check(plugin)
 
     return run
@@ -217,7 +235,7 @@ def is_wider(plugin, check):
         return False
     if check == "gradient_is_that_of_value":
         return not is_varied(plugin) and plugin.name != plain_backend().name
-    if check == "costs_are_finite":
+    if check in ("costs_are_finite", "gradient_is_finite"):
         return isinstance(plugin, ContactScene)
     if check == "continuity_is_as_declared":
         is_shortened = plugin.continuous and getattr(plugin, "horizon", 0) > STEPS
