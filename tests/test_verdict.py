@@ -276,7 +276,13 @@ READ_BY_NOBODY = {
 }
 
 
-@pytest.mark.parametrize("words", [pytest.param(READ_BY_NOBODY[name], id=name) for name in READ_BY_NOBODY])
+@pytest.mark.parametrize(
+    "words",
+    [
+        pytest.param(words, id=name, marks=[pytest.mark.slow] * (name == "report"))
+        for name, words in READ_BY_NOBODY.items()
+    ],
+)
 def test_output_that_nobody_read_is_no_zero(tmp_path, words):
     """``examine ... | head -1`` under ``pipefail``: the wrong gradient ended with 0, and a report with 3."""
     (tmp_path / "c.py").write_text(COST.format(end="pass"))

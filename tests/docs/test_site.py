@@ -29,17 +29,20 @@ def test_every_page_is_once_in_the_navigation_of_five_entries(pages):
     assert len(re.findall(r"^[A-Z].* <|^[a-z]+$", block, re.MULTILINE)) == len(website.SECTIONS) == 5
 
 
+@pytest.mark.slow
 def test_every_experiment_with_results_has_a_page(pages):
     for entry in results.entries_of(results.STANDARD):
         assert (entry.page in pages) == entry.has_results
 
 
+@pytest.mark.slow
 def test_every_claim_with_a_result_has_a_page(pages):
     names = {path.stem for path in (results.STANDARD / "claims").glob("[A-Z]*.json")}
     assert {name for name in pages if name.startswith("claim/")} == {f"claim/{name}" for name in names}
     assert website.expand("claim/*", ["claim/C10", "claim/L1", "claim/C2"]) == ["claim/C2", "claim/C10", "claim/L1"]
 
 
+@pytest.mark.slow
 def test_every_estimator_has_a_page_with_its_source(pages):
     for name, entry in registry.entries()["estimators"].items():
         if not entry.plugin.__module__.startswith("bench.plugins."):

@@ -36,6 +36,11 @@ SETTINGS = ["scenes=[bouncing_ball]", "contacts=[penalty]", "scene.bouncing_ball
 @pytest.fixture(autouse=True)
 def toys():
     registry.add_folder(TOYS)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def ended():
+    """End the engine, which the tests share, after the last one."""
     yield
     close_engines()
 
@@ -83,6 +88,7 @@ def test_calls_are_counted_and_compilation_is_charged_once():
 
 
 def test_settings_that_change_the_last_digits_are_those_of_the_engines_process(monkeypatch):
+    close_engines()
     monkeypatch.setenv("XLA_FLAGS", "--xla_a=1")
     problem = toy().compile(program(BouncingBall()))
     assert problem.settings == {}
@@ -192,6 +198,7 @@ time.sleep(100)
 )
 def test_limits_of_a_cell_count_its_engine(tmp_path, fault, limit, status, reason):
     """A cell whose engine hangs or takes too much memory is stopped with its engine, and the other cells run."""
+    close_engines()
     backends = f"backends=[numpy,'toy[python={HERE},fault={fault}]']"
     words = ["name=limits", *SETTINGS, backends, "estimators=[fobg]", "workers=1", limit, f"results_dir={tmp_path}"]
     before = {child.pid for child in psutil.Process().children(recursive=True)}

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from trees import bench
 
 from bench import api
+from bench.cli import main
 from bench.errors import Unsupported
 from bench.experiment.by_name import make
 from bench.measure import noise
@@ -99,7 +99,6 @@ def test_only_a_design_other_than_the_default_counts_in_keys():
     )
 
 
-def test_a_wrong_design_is_named(tmp_path):
-    found = bench("name=x", "draws=sobl", "scenes=[quadratic]", f"results_dir={tmp_path}")
-    assert found.returncode == 2
-    assert "did you mean 'sobol'" in found.stderr
+def test_a_wrong_design_is_named(tmp_path, capsys):
+    assert main(["name=x", "draws=sobl", "scenes=[quadratic]", f"results_dir={tmp_path}"]) == 2
+    assert "did you mean 'sobol'" in capsys.readouterr().err

@@ -104,14 +104,14 @@ It is (d + 1) / N of a normal, (d - 1) / N of a sphere, d / N - 1 of orthogonal 
 
 def error_on_a_plane(estimator, samples):
     problem = Numpy().compile(compose(Linear(dimension=8)))
-    truth, w = problem.program.closed_form_gradient(), noise.draw(2, "plane", 20_000, samples, 8, "cells")
+    truth, w = problem.program.closed_form_gradient(), noise.draw(2, "plane", 5000, samples, 8, "cells")
     values = estimator.estimate(problem, problem.program.theta0, w)
     return ((values - truth) ** 2).sum(axis=1).mean() / (truth @ truth)
 
 
 @pytest.mark.parametrize(("estimator", "samples", "error"), ON_A_PLANE, ids=str)
 def test_errors_on_a_plane_are_their_closed_forms(estimator, samples, error):
-    assert error_on_a_plane(estimator, samples) == pytest.approx(error, rel=0.03, abs=1e-16)  # 2.7 varies by 1%
+    assert error_on_a_plane(estimator, samples) == pytest.approx(error, rel=0.06, abs=1e-16)  # 2.7 varies by 2%
 
 
 def test_orthogonal_directions_halve_the_error_on_a_plane():
