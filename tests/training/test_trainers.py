@@ -201,7 +201,7 @@ def test_the_critic_of_ppo_stays_within_the_returns_that_rewards_allow():
     assert float(log["value_loss"]) < (largest / (1 - run.trainer.discount)) ** 2
 
 
-# a half and a quarter of the steps of results/standard/train. The independent PPO of validation/ppo_level.py ends at -631 and -647
+# a half and a quarter of the steps of results/standard/train. An independent PPO ended at -631 and -647
 SWING_UP = {
     "shac": ({"rollouts": 64, "window": 32, "passes": 16, "batches": 4, "steps": 512_000}, -800),
     "ppo": ({"rollouts": 8, "window": 256, "passes": 10, "batches": 32, "steps": 256_000}, -700),
