@@ -66,6 +66,14 @@ def pytest_collection_modifyitems(items):
             item.add_marker(pytest.mark.slow)
 
 
+@pytest.fixture(autouse=True, scope="session")
+def one_width():
+    """Pad small batches to one width, so that JAX compiles each function of a program once; padding changes no digit."""
+    from bench.plugins.backends.jax import JaxProblem
+
+    JaxProblem.fine = JaxProblem.grain
+
+
 @pytest.fixture(autouse=True)
 def untried(monkeypatch):
     """Import plugin files without a trial in a separate process; tests of the trial override this fixture."""
