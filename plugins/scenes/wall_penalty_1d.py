@@ -69,14 +69,14 @@ class WallPenalty1d(EngineTwin, AxisContactScene):
     def breakpoints(self) -> tuple[tuple[float, ...], ...]:
         """Return the kinks of the physical cost, as values of q0.
 
-        In the order of a long rollout: the point starts at the wall, ends at q = 1 after a bounce, ends as it leaves the
-        wall, ends at first touch, and ends at q = 1 without touching the wall.
+        In order: the point starts at the wall, ends at q = 1 after a bounce, ends as it leaves the wall, ends at first
+        touch, and ends at q = 1 without touching the wall.
 
         A program also jumps, by O(dt), wherever contact begins or ends on the boundary between two steps.
         """
         end = self.horizon * self.dt
         _, duration, speed = self._wall()
-        return (tuple(sorted((0.0, end - duration - 1.0 / speed, end - duration, end, end + 1.0))),)
+        return ((0.0, end - duration - 1.0 / speed, end - duration, end, end + 1.0),)
 
     def physical_gradient(self) -> np.ndarray | None:
         """Return the exact gradient for dt -> 0 under the penalty wall; None for a start inside the wall."""
