@@ -158,14 +158,6 @@ def test_a_file_without_actuators_has_velocities_as_theta(pendulum):
     assert given.program.theta0 == 0.3
 
 
-def test_small_batches_of_mjx_compute_no_padding_columns(pendulum, monkeypatch):
-    given, widths = problem(pendulum, "mjx[iterations=5]"), []
-    monkeypatch.setattr(given, "_grad", lambda theta, w: widths.append(w.shape[1]) or np.zeros((3, w.shape[1])))
-    for count in (1, 3, 20):
-        given.grad(given.program.theta0, drawn(given, count))
-    assert sorted(widths) == [1, 1, 1, 1, 16, 16]
-
-
 ROBOTS = [
     pytest.param("hopper", 20, "iterations=20", 1, -1.0, -0.36013607490, marks=pytest.mark.slow),
     pytest.param("half_cheetah", 40, "iterations=10", 0, 0.0, -26.766339330, marks=pytest.mark.full),

@@ -6,7 +6,6 @@ from classes import (
     Billiard,
     BounceOnce,
     Complementarity,
-    ControlVariate,
     Fobg,
     Implicit,
     Jax,
@@ -18,9 +17,8 @@ from classes import (
     Torch,
 )
 
-import bench
 from bench.measure.reference import certify
-from bench.model import SURROGATE, compose
+from bench.model import compose
 
 U = np.linspace(-50, 50, 100)[None]
 STILL = np.zeros_like(U)
@@ -85,33 +83,3 @@ def test_a_rigid_motion_is_that_of_its_kappa_and_one_step_has_the_derivative_of_
     assert (np.abs(found - other)[0] > 0.01).any()
     wrong = ball(SurrogateBackward(kappa=1e-7, soft_kappa=0.105)).grad(NEAR, still)
     assert np.abs(wrong - expected).max() > 1e-3  # an error of 5% in kappa is seen
-
-
-@pytest.mark.slow
-def test_control_variate_stays_unbiased_with_a_surrogate_gradient():
-    surrogate = ball(SurrogateBackward(soft_kappa=0.1), 60)
-    assert surrogate.program.surrogate
-    assert not Fobg().declares_unbiased(surrogate.program)
-    assert ControlVariate().declares_unbiased(surrogate.program)
-    theta = np.array([0.2, -1.0, 0.0])
-    w = np.random.default_rng(0).standard_normal((200, 32, 3))
-    estimates = ControlVariate().estimate(surrogate, theta, w)
-    samples = w.reshape(-1, 3).T
-    # without jumps, the first order of the motion's own law is unbiased, with an error far below that of the estimates
-    true = ball(Complementarity(kappa=1e-6), 60).grad(theta, samples)
-    bias = np.abs(estimates.mean(axis=0) - true.mean(axis=1))
-    assert (bias < 4.5 * estimates.std(axis=0) / np.sqrt(len(estimates))).all()
-    error = surrogate.grad(theta, samples) - true
-    standard_error = error.std(axis=1) / np.sqrt(samples.shape[1])
-    assert (np.abs(error.mean(axis=1)) > 4.5 * standard_error).any()  # the surrogate itself is biased
-
-
-@pytest.mark.slow
-def test_rows_name_a_surrogate_gradient(tmp_path):
-    rows = bench.run(
-        scenes=["billiard"], contacts=["penalty", "straight_through"], backends=["torch"], estimators=["fobg", "reinforce"],
-        samples=8, repeats=8, timing=False, workers=0, results_dir=tmp_path,
-        scene={"billiard": {"horizon": 12, "push": 40.0, "start": 10.0}}, reference={"samples": 256},
-    )  # fmt: skip
-    said = rows["reason"].str.contains(SURROGATE)
-    assert (said == ((rows["contact"] == "straight_through") & (rows["estimator"] == "fobg"))).all()

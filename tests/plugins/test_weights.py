@@ -7,12 +7,10 @@ from classes import (
     AlphaOrder,
     Cartpole,
     Clipped,
-    ControlVariate,
     Cubic,
     InverseVariance,
     Numpy,
     Penalty,
-    Reinforce,
     SemiImplicitEuler,
     SphereSmoothing,
     TwoBalls,
@@ -74,16 +72,6 @@ def test_rare_caps_of_alpha_order_are_a_remark(method, alpha, doubtful):
     assert bool(method.remark({"alpha": {"median": alpha}, "eps": {"median": 1.0}})) == doubtful
 
 
-def test_leaving_one_out_by_hand(halves):
-    problem, theta, noise, *_ = halves
-    found = Reinforce().estimate(problem, theta, noise)
-    for r in range(REPEATS):
-        costs = problem.value(theta, noise[r].T)
-        others = (costs.sum() - costs) / (SAMPLES - 1)
-        # sums of terms 10 times the result
-        assert found[r] == pytest.approx(((costs - others) * noise[r].T / 0.4).mean(axis=1), rel=1e-11)
-
-
 @pytest.mark.parametrize("by", ["sample", "element"])
 def test_clipped_by_hand(halves, by):
     """Of 11 gradients of two coordinates, each is cut to the batch's quantile: its norm, or each coordinate alone."""
@@ -98,25 +86,6 @@ def test_clipped_by_hand(halves, by):
             for i in range(2)
         ]
         assert found[r] == pytest.approx(np.mean(cut, axis=1), rel=EXACT)
-
-
-def test_control_variate_by_hand(halves):
-    """Each half takes the regression coefficient of the other one, which it has no part in."""
-    problem, theta, noise, *_ = halves
-    found, said = ControlVariate().estimate_with_diagnostics(problem, theta, noise)
-    g = problem.grad(theta, np.zeros((2, 1)))[:, 0]
-    centre = problem.value(theta, np.zeros((2, 1)))[0]
-    for r in range(REPEATS):
-        w = noise[r]
-        values = np.array([(problem.value(theta, x[:, None])[0] - centre) * x / 0.4 for x in w])
-        control = np.array([(g @ x) * x for x in w])
-        slopes = []
-        for part in (slice(5, None), slice(0, 5)):
-            spread = control[part] - control[part].mean(axis=0)
-            slopes.append((spread * values[part]).sum() / (spread**2).sum())
-        left = [v - slopes[n >= 5] * (c - g) for n, (v, c) in enumerate(zip(values, control, strict=True))]
-        assert found[r] == pytest.approx(np.mean(left, axis=0), rel=1e-10)
-        assert said["coefficient"][r] == pytest.approx(np.mean(slopes), rel=1e-10)
 
 
 def test_the_default_sphere_smoothes_a_cubic_as_the_normal_does():
