@@ -1,6 +1,5 @@
 """Gradients per second of MJX and JAX scenes against the batch, in float32 and float64, on a GPU or the CPU.
 
-    python validation/speed/gpu.py --device cpu --reference    # gradients of a few samples on the CPU, kept beside this file
     python validation/speed/gpu.py --out FOLDER --seconds 500  # the rows: FOLDER/gpu.csv
     python validation/speed/gpu.py --draw FOLDER               # their chart: FOLDER/gpu.png
 
@@ -14,7 +13,6 @@ import json
 import multiprocessing
 import os
 import platform
-import resource
 import sys
 import time
 from pathlib import Path
@@ -26,7 +24,7 @@ import pandas as pd
 REFERENCE = Path(__file__).with_name("gpu_reference.json")
 COLUMNS = (
     "case", "backend", "dtype", "device", "batch", "gradients_per_s", "call_s", "spread", "calls", "with_transfer_s",
-    "compile_s", "trace_s", "temporary_mib", "peak_mib", "host_mib", "agreement", "finite", "status", "at_s",
+    "compile_s", "agreement", "finite", "status", "at_s",
 )  # fmt: skip
 COMPARED, PROJECTIONS = 4, 8
 """Samples whose gradients are compared with the CPU's, and random directions on which they are projected."""
@@ -77,12 +75,7 @@ def units(options):
     native = [Unit(name, "fused", "float64", BATCHES) for name in SCENES]
     # programs of robots take longest to compile, and the scenes fill the places that remain
     order = [*robots[:8], *scenes, *robots[8:16], *native, *robots[16:]]
-    if options.reference:
-        order = [
-            Unit(name, ROBOTS[name][1] if name in ROBOTS else "jax", "float64", (COMPARED,))
-            for name in (*SCENES, *ROBOTS)
-        ]
-    cases, batches = options.cases.split(","), [COMPARED, *map(int, options.batches.split(","))]
+    cases, batches = options.cases.split(","), [*map(int, options.batches.split(","))]
     chosen = [Unit(*u[:3], tuple(b for b in u.batches if b in batches)) for u in order if u.case in cases]
     return [unit for unit in chosen if unit.batches]
 
@@ -108,15 +101,13 @@ def drawn(given, batch):
     return np.ascontiguousarray(np.tile(columns, (1, -(-batch // columns.shape[1])))[:, :batch])
 
 
-def projected(gradients):
-    """Return a few random projections of the first samples' gradients ``(d, B)``."""
-    directions = np.random.default_rng(0).standard_normal((PROJECTIONS, len(gradients)))
-    return directions @ gradients[:, :COMPARED] / np.sqrt(len(gradients))
-
-
 def agreement(unit, gradients):
-    """Return the largest difference from the CPU's gradients in float64, relative to the largest of them."""
-    found = projected(gradients)
+    """Return the largest difference from the CPU's gradients in float64, relative to the largest of them.
+
+    Compared are a few random projections of the first samples' gradients ``(d, B)``.
+    """
+    directions = np.random.default_rng(0).standard_normal((PROJECTIONS, len(gradients)))
+    found = directions @ gradients[:, :COMPARED] / np.sqrt(len(gradients))
     expected = np.array(json.loads(REFERENCE.read_text())[unit.case])[:, : found.shape[1]]
     return float(np.abs(found - expected).max() / np.abs(expected).max())
 
@@ -136,13 +127,6 @@ def work(unit, options, lock, began):
     import jax
 
     given = problem(unit, options.out)
-    if options.reference:
-        gradients = given.grad(given.program.theta0, drawn(given, COMPARED))
-        with lock:
-            kept = json.loads(REFERENCE.read_text())
-            kept[unit.case] = projected(gradients).tolist()
-            REFERENCE.write_text(json.dumps(kept) + "\n")
-        return
     device = "cpu" if unit.backend == "fused" else jax.default_backend()
     whole = device != "cpu"
     for batch in unit.batches:
@@ -161,19 +145,16 @@ def measured(given, unit, batch, whole, lock):
     import jax
 
     theta, w = given.program.theta0, drawn(given, batch)
-    numbers = {}
     if whole:
         from bench.plugins.backends.compiling import compiled
 
         arguments = (given._parameters, theta.reshape(-1, 1).astype(given._dtype), w.astype(given._dtype))
         program = compiled((*unit[:3], batch), given._cost_gradient, arguments, True, given.compilations)
-        numbers |= {"compile_s": sum(program.seconds), "trace_s": program.seconds[0]}
-        if analysis := program.call.memory_analysis():
-            numbers["temporary_mib"] = analysis.temp_size_in_bytes / 2**20
+        numbers = {"compile_s": sum(program.seconds)}
     else:
         given.reset_usage()
         gradients = given.grad(theta, w)
-        numbers |= {"compile_s": given.usage.compile_s, "trace_s": given.usage.trace_s}
+        numbers = {"compile_s": given.usage.compile_s}
     with lock:
         if whole:
             gradients = np.asarray(program.call(*arguments), dtype=float)
@@ -183,15 +164,11 @@ def measured(given, unit, batch, whole, lock):
         else:
             times = timed(lambda: given.grad(theta, w))
     middle, low, high = (float(x) for x in np.percentile(times, (50, 25, 75)))
-    memory = jax.devices()[0].memory_stats() or {}
-    if "peak_bytes_in_use" in memory:
-        numbers["peak_mib"] = memory["peak_bytes_in_use"] / 2**20
     return numbers | {
         "gradients_per_s": batch / middle,
         "call_s": middle,
         "spread": (high - low) / middle,
         "calls": len(times),
-        "host_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         "agreement": agreement(unit, gradients),
         "finite": float(np.isfinite(gradients).all(axis=0).mean()),
         "status": "ok",
@@ -241,7 +218,6 @@ def main():
     parser.add_argument("--jobs", type=int, default=max(1, (os.cpu_count() or 1) - 2), help="processes at once")
     parser.add_argument("--batches", default=",".join(map(str, BATCHES)))
     parser.add_argument("--cases", default=",".join((*ROBOTS, *SCENES)))
-    parser.add_argument("--reference", action="store_true", help=f"write {REFERENCE.name} instead of rows")
     parser.add_argument("--draw", type=Path, help="draw the rows of a folder")
     options = parser.parse_args()
     if options.draw:
