@@ -183,6 +183,12 @@ def test_inputs_of_very_different_size_have_steps_of_their_own():
     assert np.array_equal(scales(theta), [1e6, 1e-6, 1.0])
 
 
+@pytest.mark.parametrize("size", [1e200, 1e300])
+def test_a_square_that_overflows_blames_no_gradient_and_hides_no_fault(size):
+    assert check(lambda x: size * cost(x), lambda x: size * gradient(x), THETA).trusted
+    assert check(lambda x: size * cost(x), lambda x: 1.1 * size * gradient(x), THETA).cause == "wrong_factor"
+
+
 def test_cost_that_has_decayed_below_the_smallest_number_is_no_fault():
     found = check(lambda x: 5e-320 * x[0] ** 2, lambda x: 1e-319 * x, np.array([1.0]))
     assert found.trusted, found.sentence()
