@@ -225,15 +225,6 @@ def test_the_foot_that_switches_is_named_and_both_sides_are_checked(tmp_path, ca
 
 
 @pytest.mark.slow
-def test_horizon_set_for_a_scene_is_checked(tmp_path):
-    words = ["backends=[numpy]", f"results_dir={tmp_path}", "formats=[]", "workers=0"]
-    assert main(["gradcheck", "pendulum", "scene.pendulum.horizon=3", *words]) == 0
-    assert set(pd.read_csv(tmp_path / "gradcheck" / "gradient_check.csv")["horizon"]) == {3}
-    assert main(["gradcheck", "pendulum[horizon=3]", "sweep.horizon=[2]", *words]) == 0
-    assert set(pd.read_csv(tmp_path / "gradcheck" / "gradient_check.csv")["horizon"]) == {2}
-
-
-@pytest.mark.slow
 def test_step_beyond_the_stability_limit_is_said(tmp_path, capsys):
     words = ["contacts=[penalty]", "backends=[numpy]", "sweep.horizon=[2]", "workers=0", "formats=[]"]
     main(["gradcheck", "pushing", *words, "contact.penalty.stiffness=1e4", f"results_dir={tmp_path}"])
