@@ -277,8 +277,10 @@ class _Examination:
 
     def _group_sizes(self) -> dict[str, GroupSize]:
         """Return, by name of a group of numbers, what errors of its numbers do to the slope along its direction."""
-        gradient, setup, sizes = self.stages.gradient, self.setup, {}
-        for group in self.stages.groups if gradient is not None else ():
+        gradient, setup, sizes = self.stages.gradient, self.setup, dict[str, GroupSize]()
+        if gradient is None:
+            return sizes
+        for group in self.stages.groups:
             part = slice(group.first, group.last)
             slope, scale = np.abs(gradient[part]), setup.scale[part]
             errors = setup.atol[part] + setup.rtol[part] * slope
@@ -342,16 +344,16 @@ class _Examination:
         near = self._scan_near(checked, share)
         effort = self._effort(self.clock.affordable(0.9))
         decide = partial(diagnosis.is_adaptive, self.stages, checked, near, effort)
-        return self._attempt("the comparison along lines", decide) if near and effort else None
+        return self._attempt("the comparison along lines", decide) if near and effort[0] else None
 
     @staticmethod
-    def _effort(room: float) -> tuple[int, int, int] | None:
-        """Return points, halvings and places of a line scan with at most ``room`` costs; None if there are too few."""
+    def _effort(room: float) -> tuple[int, int, int]:
+        """Return points, halvings and places of a line scan with at most ``room`` costs; no points if these are too few."""
         for most, halvings in LINE_EFFORTS:
             points = int(min(POINTS, room - most * (2 * halvings + 8)))
             if points >= FEWEST_POINTS:
                 return points, halvings, most
-        return None
+        return 0, 0, 0
 
     def _scan_lines(self, checked: Check) -> list[LineScan]:
         """Return scans of the cost over the noise, or near theta without sigma."""
@@ -376,7 +378,7 @@ class _Examination:
         rounding = float(np.nan_to_num(sizes, posinf=0.0).max())
         self.clock.limit(min(1.0, 2 * share))
         try:
-            for direction in along if effort else ():
+            for direction in along if effort[0] else ():
                 cost = partial(self.stages.costs_along, direction)
                 lines.append(self._integrated(scan(cost, direction, rounding, REACH, effort, unit), checked))
         except OutOfTime:
@@ -384,7 +386,7 @@ class _Examination:
         self.clock.limit(1.0)
         if len(lines) < len(along):
             self.left_out.append("jumps and kinks on lines")
-        elif effort and effort[0] < POINTS:
+        elif effort[0] < POINTS:
             self.left_out.append(
                 f"fine line scans: {effort[0]} points instead of {POINTS}, {effort[2]} places searched"
             )

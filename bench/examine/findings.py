@@ -276,11 +276,11 @@ class Findings:
     @cached_property
     def _tolerated(self) -> float:
         """Largest error of a slope along a random direction of components and groups that are all within their tolerance."""
-        sizes = [
-            part.sample.scale
-            * (self.setup.atol[part.component] + self.setup.rtol[part.component] * abs(part.difference))
-            for part in self.check.components
-        ]
+        setup, parts = self.setup, self.check.components
+        index = [part.component for part in parts]
+        differences = np.abs([part.difference for part in parts])
+        allowed = setup.atol[index] + setup.rtol[index] * differences
+        sizes = [part.sample.scale * one for part, one in zip(parts, allowed.tolist(), strict=True)]
         sizes += [group.allowed for group in self.groups.values()]
         return GroupSize(max(len(sizes), 1), float(np.linalg.norm(np.nan_to_num(sizes))), 0.0).tolerated
 

@@ -38,10 +38,10 @@ def hint_of(check: Check, theta: np.ndarray, explained: Explanation) -> Hint | N
     wrong = np.array([part.verdict in SUSPICIOUS for part in parts])
     if check.cause not in EXCUSABLE or not wrong.any():
         return None
-    columns = np.array([[theta[part.component or 0], part.program, part.difference] for part in parts])
-    if not np.isfinite(columns[:, 1]).all():
+    at, program, difference = np.array([[theta[p.component or 0], p.program, p.difference] for p in parts]).T
+    if not np.isfinite(program).all():
         return None
-    rows = _explanations(*columns.T, wrong, len(parts) == theta.size, explained)
+    rows = _explanations(at, program, difference, wrong, len(parts) == theta.size, explained)
     return next((Hint(cause, text) for cause, holds, text in rows if holds), None)
 
 
@@ -67,7 +67,7 @@ def _explanations(
     is_along = np.count_nonzero(at) > 1 and sizes > 0 and abs(float(error @ at)) > ALONG_THETA * sizes
     yield (
         "missing_term",
-        is_whole and is_along,
+        bool(is_whole and is_along),
         "the error is along theta itself, as of a normalisation that is left out",
     )
     ends = [f"{number(100 * one.error)}% after {counted(one.steps, 'step')}" for one in (*growth[:1], *growth[1:][-1:])]

@@ -2,9 +2,11 @@
 
 import dataclasses
 import sys
+from functools import partial
 
 import numpy as np
 import pytest
+from mechanisms import swinging
 
 import bench
 from bench.gradient.rules import RULES
@@ -98,18 +100,6 @@ def test_the_right_gradient_of_the_same_program_passes_with_every_hint():
         assert report.derivative == "right", f"{name}\n{report}"
 
 
-def spring(x, steps=50):
-    q, v = 1.0 + 0.0 * x[0], 0.0 * x[0]
-    for _ in range(steps):
-        v = v - 0.02 * (x[0] * q + x[1] * v)
-        q = q + 0.02 * v
-    return q * q
-
-
-def spring_slope(x, steps=50):
-    return np.array([spring(row, steps).imag for row in np.asarray(x) + 1e-30j * np.eye(2)]) / 1e-30
-
-
 def test_stairs_say_nothing_about_noise_that_was_not_measured():
     table = np.sin(np.linspace(0.0, 2.0, 41))
     said = bench.examine(
@@ -119,7 +109,9 @@ def test_stairs_say_nothing_about_noise_that_was_not_measured():
 
 
 def test_a_check_that_is_not_finished_names_no_error_after_other_steps():
-    said = bench.examine(spring, [0.7, 1.2], grad=spring_slope, horizons=(1, 5), calls=3000)
-    unfinished = dataclasses.replace(said, is_complete=False)
+    grad = partial(swinging, slope=True)
+    unfinished = dataclasses.replace(
+        bench.examine(swinging, [0.7, 1.2], grad=grad, horizons=(1, 5), calls=1000), is_complete=False
+    )
     assert unfinished.derivative_cause == "undecided"
     assert unfinished.fact == "2 of 2 components"

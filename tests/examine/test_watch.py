@@ -57,12 +57,6 @@ def test_a_sound_loop_is_silent(seed):
     assert [row["iteration"] for row in log.rows] == list(range(0, 200, 20))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(3))
-def test_a_long_sound_loop_is_silent(seed):
-    assert adam(True, seed)[0].first is None
-
-
 def test_a_term_that_is_detached_is_named_from_its_iteration_on():
     log, _ = adam(True, updates=260, fault="detached", at=200)
     iteration, reason = log.first
