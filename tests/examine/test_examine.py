@@ -415,13 +415,6 @@ def test_a_bias_interval_decides_where_grad_j_is_known(error, low, high, cause):
     assert smoothing.Smoothed(0.1, np.zeros(2), error, norm, 64, 0.0, low, high, math.nan, "", ()).cause == cause
 
 
-def test_a_method_costs_its_samples_times_the_calls_of_each():
-    terms = np.array([[1.0, -1.0] * 50])
-    found = smoothing._method("smoothing", (0.0, 0.12), terms, 2.0, 2, 0.5)
-    samples = math.ceil(terms.var(ddof=1) / 4.0 / (0.1**2 - 0.06**2))
-    assert (found.samples, found.calls, found.seconds) == (samples, 2 * samples, samples)
-
-
 def test_the_line_taken_out_of_the_terms_leaves_their_mean():
     """d = u^3 has E[d u] = 3. A line fitted to the terms that it is taken out of would lean to what they happen to be."""
     draw = np.random.default_rng(0).standard_normal((4000, 1, 16))
