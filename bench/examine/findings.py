@@ -277,7 +277,7 @@ class Findings:
     def _tolerated(self) -> float:
         """Largest error of a slope along a random direction of components and groups that are all within their tolerance."""
         setup, parts = self.setup, self.check.components
-        index = [part.component for part in parts]
+        index = [part.component or 0 for part in parts]
         differences = np.abs([part.difference for part in parts])
         allowed = setup.atol[index] + setup.rtol[index] * differences
         sizes = [part.sample.scale * one for part, one in zip(parts, allowed.tolist(), strict=True)]

@@ -178,7 +178,7 @@ def _confirmed(
     """
     away, confirmed = WIDER * np.arange(1, SIDES + 1), []
     at = [one.at + width * np.concatenate([-away, away]) for one, width in found]
-    sides = along(np.concatenate(at)).reshape(-1, 2, SIDES) if found else []
+    sides = along(np.concatenate(at)).reshape(-1, 2, SIDES) if found else np.empty((0, 2, SIDES))
     for (one, width), both in zip(found, sides, strict=True):
         size = one.size if one.kind == "jump" else one.size * width * WIDER
         if np.abs(np.diff(both, 2)).max() <= CONFIRMED * size + 4.0 * noise:

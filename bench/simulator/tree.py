@@ -310,7 +310,7 @@ def _parts(value: Any) -> tuple[list[tuple[str, Any]], Callable[[list[Any]], Any
             dict(zip(value, parts, strict=True))
         )  # type: ignore[call-arg]
     if fields is not None:
-        made: Any = partial(dataclasses.replace, value) if dataclasses.is_dataclass(value) else type(value)  # type: ignore[type-var]
+        made: Any = partial(dataclasses.replace, value) if dataclasses.is_dataclass(value) else type(value)
         named = [(f".{name}", getattr(value, name)) for name in fields]
         return named, lambda parts: made(**dict(zip(fields, parts, strict=True)))
     return ([(f"[{i}]", part) for i, part in enumerate(value)], type(value)) if _is_structure(value) else None
