@@ -144,7 +144,7 @@ def test_switch_of_a_damped_contact_is_a_jump():
 # ------------------------------------------------------------------------------------------------- contact modes
 
 
-@pytest.mark.parametrize("law", ["penalty", "impulse", "complementarity"])
+@pytest.mark.parametrize("law", ["penalty", "impulse"])
 def test_every_kind_of_law_shows_when_it_acts(bounce, law):
     """A ball 5.3 steps above the ground, at 1 step's worth a step, is first pushed in step 5 or the one after."""
     problem = compiled(bounce.program.scene, plugin("contacts", law), "implicit")
