@@ -5,9 +5,6 @@ from __future__ import annotations
 import inspect
 import os
 import re
-import shutil
-import sys
-import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -17,7 +14,7 @@ import numpy as np
 from bench.errors import StorageError, UserError, local_path, needing_sweeps, unknown
 from bench.examine import UPDATE
 from bench.examine.examination import examine
-from bench.examine.report import AFTER_SIGTERM, Report
+from bench.examine.report import Report
 from bench.run.files import make_directory
 from bench.simulator import imports
 from bench.simulator.simulator import LIBRARIES
@@ -29,8 +26,6 @@ SETTINGS = [name for name in inspect.signature(examine).parameters if name not i
 ]
 """Settings of one cost."""
 QUIET = "--quiet"
-WIDTH, LEAST_WIDTH = 100, 40
-"""Width of the text without a terminal, and the least width, in characters."""
 
 
 def run(words: Sequence[str]) -> Report:
@@ -51,7 +46,7 @@ def run(words: Sequence[str]) -> Report:
     report = _examined(names[0], settings, QUIET not in words)
     if "baseline" in settings:
         report = report.compared(settings["baseline"], UPDATE in words)
-    print(_wrapped(str(report)))
+    print(report)
     if "save" in settings:
         print("\nWritten:")
         for path in report.save(settings["save"]):
@@ -60,26 +55,8 @@ def run(words: Sequence[str]) -> Report:
 
 
 def main(words: Sequence[str]) -> int:
-    """Run the command, and return the exit status: 0 right, 1 wrong, 3 not decided, 130 after SIGTERM; 2 is bad input."""
-    report = run(words)
-    sys.stdout.flush()
-    return 130 if AFTER_SIGTERM in report.left_out else report.status
-
-
-def _wrapped(text: str) -> str:
-    """Return text with its sentences wrapped to the width of the terminal; rows of tables and commands stay whole."""
-    width = max(shutil.get_terminal_size((WIDTH, 0)).columns, LEAST_WIDTH)
-    lines = []
-    for line in text.splitlines():
-        bare = line.lstrip()
-        if len(line) <= width or "  " in bare or "python -m bench " in bare:
-            lines.append(line)
-        else:
-            indent = " " * (len(line) - len(bare) + 2)
-            lines += textwrap.wrap(
-                line, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False
-            )
-    return "\n".join(lines)
+    """Run the command, and return the exit status: 0 right, 1 wrong, 3 not decided; 2 is bad input."""
+    return run(words).status
 
 
 def _examined(cost: str, settings: Mapping[str, str], progress: bool) -> Report:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -101,9 +101,9 @@ class Explanation:
     """The step at which a difference of the cost is the gradient, ``1e-4, forward``; empty without one."""
 
 
-def refined_gaps(stages: GradientStages, refined: Callable[..., Any]) -> list[Gap]:
-    """Return the gaps at theta and at other thetas around it, along a few random directions each."""
-    other, scale = stages.simulator.variant(refined), stages.scale
+def refined_gaps(stages: GradientStages, other: Simulator) -> list[Gap]:
+    """Return the gaps of a refined cost at theta and at other thetas around it, along a few random directions each."""
+    scale = stages.scale
     random = np.random.default_rng([stages.seed, 0x676170])
     eps, size, gaps = float(np.cbrt(stages.simulator.unit)), stages.theta.size, []
     for spread in (0.0, *[AROUND] * ELSEWHERE):
@@ -178,9 +178,9 @@ def smooth_parts(stages: GradientStages, outcome: Check) -> dict[int, SmoothPart
     return found
 
 
-def refined_slopes(stages: GradientStages, refined: Callable[..., Any], parts: Iterable[Part]) -> dict[int, float]:
+def refined_slopes(stages: GradientStages, other: Simulator, parts: Iterable[Part]) -> dict[int, float]:
     """Return by component of some parts the central difference of the refined cost."""
-    other, found = stages.simulator.variant(refined), {}
+    found = {}
     for index in (part.component for part in parts if part.component is not None):
         step = float(np.cbrt(stages.simulator.unit)) * stages.scale[index] * REFINED
         moved = stages.theta[:, None] + np.outer(np.eye(1, stages.theta.size, index)[0], [-step, step])

@@ -6,6 +6,7 @@ import inspect
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial, wraps
 from typing import Any
@@ -17,12 +18,12 @@ from bench.examine import diagnosis
 from bench.examine.findings import RELATIVE, GroupSize, Setup, Spent
 from bench.examine.lines import HALVINGS, PLACES, POINTS, REACH, LineScan, scan
 from bench.examine.means import OF_A_DRAW, Mean, compare_means
-from bench.examine.report import AFTER_SIGTERM, Report
+from bench.examine.report import Report
 from bench.examine.smoothing import FEWEST, OWN_PAIRS, PAIRS, Smoothed, directions, largest_unseen, measure_smoothed
 from bench.examine.stages import GradientStages
 from bench.gradient import Check
 from bench.gradient.rules import RULES, SUSPICIOUS
-from bench.simulator.clock import Clock, OutOfTime, end_on_sigterm, parse_duration
+from bench.simulator.clock import Clock, OutOfTime, parse_duration
 from bench.simulator.simulator import Simulator
 from bench.simulator.tree import ParameterTree
 
@@ -138,12 +139,10 @@ def examine(
     cost, grad, refined = map(_with_own_warnings, (cost, grad, refined))
     clock.start_stage("first call")
     # a cost of huge or infinite numbers overflows in the differences too, where a warning would tell nothing
-    with end_on_sigterm(clock), np.errstate(all="ignore"):
+    with np.errstate(all="ignore"):
         try:
             simulator = Simulator(cost, layout, grad, int(noise), batch, clock)
         except OutOfTime:
-            if clock.is_terminated:
-                raise KeyboardInterrupt from None
             took = f"the first call of the cost took longer than compile_budget={clock.compile_budget:g} seconds"
             raise UserError(f"{took}: give a larger compile_budget or a shorter rollout") from None
         examination = _Examination(simulator, setup)
@@ -154,15 +153,8 @@ def examine(
 
 
 def _levels(sigma: Any, layout: ParameterTree) -> list[tuple[float, np.ndarray]]:
-    size = layout.vector.size
-    if isinstance(sigma, Mapping) or (isinstance(sigma, Sequence) and sigma and isinstance(sigma[0], Mapping)):
-        every = [layout.spread(one, "sigma", 0.0) for one in ([sigma] if isinstance(sigma, Mapping) else sigma)]
-    else:
-        try:
-            given = np.asarray([] if sigma is None else sigma, float)
-        except (TypeError, ValueError):
-            given = np.array([math.nan])
-        every = list(given) if given.shape[1:] == (size,) else [np.full(size, one) for one in given.ravel()]
+    rows = [sigma] if isinstance(sigma, Mapping | str) else np.atleast_1d([] if sigma is None else sigma)
+    every = [layout.spread(one, "sigma", 0.0) for one in rows]
     if not all(np.isfinite(one).all() and (one >= 0).all() and one.any() for one in every):
         raise UserError(f"sigma={sigma} is not valid: sigma has standard deviations of noise on theta, numbers above 0")
     return [(float(one.max()), one) for one in every]
@@ -181,9 +173,8 @@ def _allowed(layout: ParameterTree, given: bool | str | Sequence[str] | None) ->
     if given is None:
         return None
     allowed = np.full(layout.vector.size, given is True)
-    if not isinstance(given, bool):
-        for name in [given] if isinstance(given, str) else given:
-            allowed[layout.match(name)] = True
+    for name in [] if isinstance(given, bool) else [given] if isinstance(given, str) else given:
+        allowed[layout.match(name)] = True
     return allowed
 
 
@@ -202,24 +193,17 @@ def _with_own_warnings(function: Any) -> Any:
 
 
 def _takes_steps(function: Callable[..., Any]) -> bool:
-    try:
-        inspect.signature(function).bind_partial(steps=1)
-    except (TypeError, ValueError):  # a built-in function may have no signature
-        return False
-    return True
+    with suppress(TypeError, ValueError):  # a built-in function may have no signature
+        return bool(inspect.signature(function).bind_partial(steps=1))
+    return False
 
 
 def _function_name(function: Any) -> str:
     """Return the name of a function, such as ``mysim.cost``, or of the library that differentiates."""
     if function is None or isinstance(function, str):
         return function or ""
-    module = getattr(function, "__module__", "") or ""
-    name = (
-        getattr(function, "__qualname__", type(function).__name__)
-        .replace("<locals>.", "")
-        .replace("<lambda>", "lambda")
-    )
-    module = GENERATED_SUFFIX.sub("", module)
+    module = GENERATED_SUFFIX.sub("", getattr(function, "__module__", "") or "")
+    name = re.sub(r"<locals>\.|[<>]", "", getattr(function, "__qualname__", type(function).__name__))
     return name if module in ("__main__", "builtins", "") else f"{module}.{name}"
 
 
@@ -241,11 +225,9 @@ class _Examination:
         checked = stages.check
         is_wrong = checked.cause in SUSPICIOUS
         has_gradient = stages.gradient is not None
-        if refined is not None and is_wrong and has_gradient:
-            self._explain("gaps", "the refined cost", diagnosis.refined_gaps, refined)
         self._find_smooth_parts(checked)
-        if refined is not None and explained.smooth_parts:
-            self._explain("refined", "the refined cost", diagnosis.refined_slopes, refined, diagnosis.doubtful(checked))
+        if refined is not None and has_gradient and (is_wrong or explained.smooth_parts):
+            self._compare_refined(refined, checked, is_wrong)
         if setup.horizons:
             self._explain("growth", "horizons", diagnosis.errors_by_horizon, setup.horizons)
         if is_wrong and has_gradient:
@@ -257,12 +239,9 @@ class _Examination:
             explained.is_adaptive = self._compare_along_lines(checked, 0.9)
         lines = self._scan_lines(checked) if can_go_on else []
         smoothed = self._measure_noise(checked, lines) if can_go_on else []
-        if clock.is_terminated:
-            self.left_out.append(AFTER_SIGTERM)
         return Report(
             **named,
-            names=simulator.layout.names,
-            theta=stages.theta,
+            layout=simulator.layout,
             cost=stages.value,
             precision=simulator.precision,
             batch=simulator.mode,
@@ -291,7 +270,6 @@ class _Examination:
             changing=sorted(simulator.changing),
             notes=[
                 *simulator.notes,
-                *[f"a call of the cost or gradient had not returned after {clock.hung_s:.2g} s"] * bool(clock.hung_s),
                 *(f"the cost raised {n} times: {text}" for text, n in list(simulator.raised.items())[:3]),
             ],
             left_out=self.left_out,
@@ -299,17 +277,15 @@ class _Examination:
 
     def _group_sizes(self) -> dict[str, GroupSize]:
         """Return, by name of a group of numbers, what errors of its numbers do to the slope along its direction."""
-        gradient, setup = self.stages.gradient, self.setup
+        gradient, setup, sizes = self.stages.gradient, self.setup, dict[str, GroupSize]()
         if gradient is None:
-            return {}
-        sizes = {}
+            return sizes
         for group in self.stages.groups:
             part = slice(group.first, group.last)
             slope, scale = np.abs(gradient[part]), setup.scale[part]
-            allowed, whole = (
-                float(np.linalg.norm(scale * each)) for each in (setup.atol[part] + setup.rtol[part] * slope, slope)
-            )
-            sizes[group.name] = GroupSize(group.last - group.first, allowed, whole)
+            errors = setup.atol[part] + setup.rtol[part] * slope
+            allowed, whole = (float(np.linalg.norm(scale * each)) for each in (errors, slope))
+            sizes[group.name] = GroupSize(slope.size, allowed, whole)
         return sizes
 
     def _attempt(self, what: str, function: Callable[[], Any]) -> Any:
@@ -326,6 +302,14 @@ class _Examination:
         found = self._attempt(what, partial(function, self.stages, *given))
         if found is not None:
             setattr(self.explained, name, found)
+
+    def _compare_refined(self, refined: Any, checked: Check, is_wrong: bool) -> None:
+        """Compare gradient and cost with a refined cost, whose program is compiled once."""
+        other = self._attempt("the refined cost", lambda: self.simulator.variant(refined))
+        if other is not None and is_wrong:
+            self._explain("gaps", "the refined cost", diagnosis.refined_gaps, other)
+        if other is not None and self.explained.smooth_parts:
+            self._explain("refined", "the refined cost", diagnosis.refined_slopes, other, diagnosis.doubtful(checked))
 
     # ------------------------------------------------------------------------------------------------ lines
 
@@ -358,21 +342,18 @@ class _Examination:
         if not self.explained.steps:
             return None if self.explained.steps is None else False
         near = self._scan_near(checked, share)
-
-        def decide() -> bool | None:
-            effort = self._effort(self.clock.affordable(0.9))
-            return None if effort is None else diagnosis.is_adaptive(self.stages, checked, near, effort)
-
-        return self._attempt("the comparison along lines", decide) if near else None
+        effort = self._effort(self.clock.affordable(0.9))
+        decide = partial(diagnosis.is_adaptive, self.stages, checked, near, effort)
+        return self._attempt("the comparison along lines", decide) if near and effort[0] else None
 
     @staticmethod
-    def _effort(room: float) -> tuple[int, int, int] | None:
-        """Return points, halvings and places of a line scan with at most ``room`` costs; None if there are too few."""
+    def _effort(room: float) -> tuple[int, int, int]:
+        """Return points, halvings and places of a line scan with at most ``room`` costs; no points if these are too few."""
         for most, halvings in LINE_EFFORTS:
             points = int(min(POINTS, room - most * (2 * halvings + 8)))
             if points >= FEWEST_POINTS:
                 return points, halvings, most
-        return None
+        return 0, 0, 0
 
     def _scan_lines(self, checked: Check) -> list[LineScan]:
         """Return scans of the cost over the noise, or near theta without sigma."""
@@ -391,30 +372,24 @@ class _Examination:
         They take at most ``share`` of the remaining budget.
         """
         self.clock.start_stage("scanning lines")
-        along = directions(2, spread, self.setup.seed)
+        along, unit, lines = directions(2, spread, self.setup.seed), self.simulator.unit, list[LineScan]()
         effort = self._effort(self.clock.affordable(share) / len(along))
-        if effort is None:
-            self.left_out.append("jumps and kinks on lines")
-            return []
-        if effort[0] < POINTS:
-            self.left_out.append(
-                f"fine line scans: {effort[0]} points instead of {POINTS}, and {effort[2]} places searched"
-            )
-        lines = []
-        measured = checked.noise if math.isfinite(checked.noise) else 0.0
+        sizes = [checked.noise, self.stages.repeats.spread, unit * abs(self.stages.value)]
+        rounding = float(np.nan_to_num(sizes, posinf=0.0).max())
         self.clock.limit(min(1.0, 2 * share))
         try:
-            for direction in along:
-                size = abs(self.stages.value)
-                rounding = max(
-                    measured, self.stages.repeats.spread, self.simulator.unit * (size if math.isfinite(size) else 0.0)
-                )
+            for direction in along if effort[0] else ():
                 cost = partial(self.stages.costs_along, direction)
-                line = scan(cost, direction, rounding, REACH, effort, self.simulator.unit)
-                lines.append(self._integrated(line, checked))
+                lines.append(self._integrated(scan(cost, direction, rounding, REACH, effort, unit), checked))
         except OutOfTime:
-            self.left_out.append("jumps and kinks on lines")
+            pass
         self.clock.limit(1.0)
+        if len(lines) < len(along):
+            self.left_out.append("jumps and kinks on lines")
+        elif effort[0] < POINTS:
+            self.left_out.append(
+                f"fine line scans: {effort[0]} points instead of {POINTS}, {effort[2]} places searched"
+            )
         return lines
 
     def _integrated(self, line: LineScan, checked: Check) -> LineScan:
@@ -458,18 +433,15 @@ class _Examination:
             return []
         plain = self.stages.gradient if checked.trusted and not self.simulator.noise else None
         results = []
+        pairs = min(OWN_PAIRS if self.simulator.noise else PAIRS, max(FEWEST, HELD // size))
         for index, (level, spread) in enumerate(levels):
-            self.clock.start_stage(f"noise of sigma {level:g}")
+            self.clock.start_stage(what := f"noise of sigma {level:g}")
             self.clock.limit(1.0 / (len(levels) - index))
-            most = OWN_PAIRS if self.simulator.noise else PAIRS
-            pairs = min(most, max(FEWEST, HELD // size))
             unseen = partial(largest_unseen, lines, level / self.setup.reach) if self.setup.levels else None
             one = measure_smoothed(self.simulator, level, spread, plain, self.setup.seed, pairs, unseen)
             self.clock.limit(1.0)
-            if one is None:
-                self.left_out.append(f"noise of sigma {level:g}")
-            else:
-                results.append(one)
+            results += [one] if one else []
+            self.left_out += [] if one else [what]
         return results
 
     def _own_level(self) -> list[tuple[float, np.ndarray]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -21,6 +21,8 @@ from bench.gradient import FAULTS, TRUSTED, Check, Part, Sample, rules
 from bench.gradient.direction import CHANCE, resolution
 from bench.gradient.rules import EXCUSABLE, RULES, STATUS, SUSPICIOUS, UNEQUAL
 from bench.gradient.smooth_part import LIMIT
+from bench.report.text import counted, number, span
+from bench.simulator.tree import ParameterTree
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -45,12 +47,25 @@ RESIDUE = 1e-4
 """Largest change of the cost by a gradient, relative to the height of a jump, that is a residue of a solver."""
 SHOWN = 8
 """Most numbers of theta in the table of breaks."""
+HEADLINE = 200
+"""Most characters of an exception in a headline."""
 RIGHT, WRONG, UNSHOWN, BROKEN, NONE = "right", "wrong", "not shown", "undefined", "none given"
 """Answers about the derivative. ``undefined``: the cost has a jump or a kink at theta."""
 FAILED = (WRONG, UNSHOWN, BROKEN)
 """Answers that decide before noise does."""
 NOISE_CAUSES = ("staircase", "jumps", "nonfinite", "nan_gradient", "biased", "spread", "unmeasured")
 """Causes around theta or under noise, the first one decides."""
+
+
+def as_text(value: float, digits: int = 6) -> str:
+    """Return a number as text; ``NaN`` where it is not a number."""
+    return "NaN" if math.isnan(value) else number(value, digits)
+
+
+def shortened(text: str) -> str:
+    """Return the first characters of a text on one line, for a headline."""
+    line = " ".join(text.split())
+    return line if len(line) <= HEADLINE else f"{line[:HEADLINE]} ..."
 
 
 @np.errstate(all="ignore")
@@ -105,10 +120,10 @@ class Setup:
         """The given values of sigma."""
         return [level for level, _ in self.levels]
 
-    def spread(self, level: float) -> tuple[float, float]:
-        """Return the smallest and the largest standard deviation above 0 of a sigma, which tables call ``level``."""
+    def shown(self, level: float) -> str:
+        """Return a sigma as text: its smallest and largest standard deviation above 0, or one number where they are the same."""
         each = next((spread[spread > 0] for one, spread in self.levels if one == level), np.array([level]))
-        return float(each.min()), float(each.max())
+        return span(float(each.min()), float(each.max()))
 
     @property
     def reach(self) -> float:
@@ -147,10 +162,7 @@ class Findings:
     """Name of the cost."""
     gradient: str
     """Source of the gradient: ``jax``, ``torch``, a function's name, or empty for differences only."""
-    names: Sequence[str]
-    """A name for each of theta's d numbers."""
-    theta: np.ndarray
-    """``(d,)``."""
+    layout: ParameterTree
     cost: float
     precision: str
     batch: str
@@ -261,23 +273,26 @@ class Findings:
         """The explanation of a wrong gradient that fits its numbers; None without one."""
         return hint_of(self.judged, self.theta, self.explained)
 
-    @np.errstate(all="ignore")
+    @cached_property
+    def _tolerated(self) -> float:
+        """Largest error of a slope along a random direction of components and groups that are all within their tolerance."""
+        setup, parts = self.setup, self.check.components
+        index = [part.component or 0 for part in parts]
+        differences = np.abs([part.difference for part in parts])
+        allowed = setup.atol[index] + setup.rtol[index] * differences
+        sizes = [part.sample.scale * one for part, one in zip(parts, allowed.tolist(), strict=True)]
+        sizes += [group.allowed for group in self.groups.values()]
+        return GroupSize(max(len(sizes), 1), float(np.linalg.norm(np.nan_to_num(sizes))), 0.0).tolerated
+
     def _is_small(self, part: Part) -> bool:
         """Return whether a wrong part's error is within the tolerance."""
         if part.verdict not in UNEQUAL:
             return False
-        rtol, atol = self.setup.rtol, self.setup.atol
+        rtol, size, group = self.setup.rtol, abs(part.difference), self.groups.get(part.name)
         if part.component is not None:
-            allowed = atol[part.component] + rtol[part.component] * abs(part.difference)
-        elif part.name in self.groups:
-            allowed = self.groups[part.name].tolerated
-        else:  # along a direction of length 1 in units of the scales
-            sizes = [p.difference * p.sample.scale for p in self.check.components]
-            along = max(float(np.linalg.norm(np.nan_to_num(sizes))), abs(part.difference))
-            parts = [p.sample.scale * atol[p.component] for p in self.check.components if p.component is not None]
-            parts += [group.allowed for group in self.groups.values()] if atol.any() else []
-            absolute = GroupSize(max(len(parts), 1), float(np.linalg.norm(parts)), 0.0).tolerated
-            allowed = float(rtol.max()) * along + absolute
+            allowed = self.setup.atol[part.component] + rtol[part.component] * size
+        else:
+            allowed = group.tolerated if group else max(self._tolerated, rtol.max() * size)
         return bool(abs(part.program - part.difference) <= allowed)
 
     @property
@@ -342,64 +357,117 @@ class Findings:
 
         The nearest place is first.
         """
-        ways = [
-            (self.label(part), sign * part.sample.step, costs, 1.0 / part.sample.scale)
-            for part in self.check.parts
-            for sign, costs in ((-1.0, part.sample.minus), (1.0, part.sample.plus))
-        ]
-        ways += [
-            (f"t on line {index + 1}", line.at, line.costs, float(np.linalg.norm(line.direction / self.setup.scale)))
-            for index, line in enumerate(self.lines)
-        ]
-        return sorted(
-            (abs(at) * length, name, at) for name, t, costs, length in ways for at in t[~np.isfinite(costs)].tolist()
-        )
+        ways = []
+        for part in self.check.parts:
+            one = part.sample
+            steps, costs = np.r_[-one.step, one.step], np.r_[one.minus, one.plus]
+            ways.append((self.label(part), steps, costs, 1.0 / one.scale))
+        for index, line in enumerate(self.lines, 1):
+            length = float(np.linalg.norm(line.direction / self.setup.scale))
+            ways.append((f"t on line {index}", line.at, line.costs, length))
+        lost = ((name, at, length) for name, t, costs, length in ways for at in t[~np.isfinite(costs)].tolist())
+        return sorted((abs(at) * length, name, at) for name, at, length in lost)
+
+    def _verdicts(self) -> Iterator[tuple[str, bool, str]]:
+        """Yield each verdict about the derivative at theta, whether it holds, and its facts: the first that holds decides."""
+        check, explained, repeats, growth = self.settled, self.explained, self.repeats, self.explained.growth
+        allowed, tolerance = self.setup.allow_zero, max(float(self.setup.rtol.max()), 1e-3)
+        failed = self.wrong_checks[0].cause if self.wrong_checks else ""
+        is_grown, scope = grows(growth, tolerance), self.n_checked
+        yield "nondeterministic", repeats.is_failing, "equal calls raise an exception or return a number"
+        yield "raised", bool(self.error), shortened(self.error)
+        yield "undecided", not check.parts, scope
+        yield "nondeterministic", repeats.is_large, self.spread_text
+        if failed:
+            numbers = self.place if failed == "nonfinite" else self._failed_numbers
+            is_of_a_draw = self.is_random and failed in OF_A_DRAW and not self._is_of_draws
+            yield self._cause_of_mean, is_of_a_draw, self.mean_text
+            yield "staircase", failed in SUSPICIOUS and (self._is_residue or self.has_steps), numbers
+            yield "adaptive", failed == "unsettled" and bool(explained.smooth_parts), numbers
+            is_gap = failed in EXCUSABLE and not explained.refined and self.is_discretisation_gap
+            yield "adaptive", is_gap, f"{numbers}, a loop of changing length at {explained.steps or 'no known place'}"
+            yield "overwritten", is_grown and failed in (*UNEQUAL, "unsettled"), numbers
+            is_falling = self.hint is not None and self.hint.cause == "continuous_adjoint"
+            yield "continuous_adjoint", is_falling and failed in SUSPICIOUS, numbers
+            # so small an error that adaptive steps may explain it, and the budget ended before that was known
+            is_open = explained.is_adaptive is None and not explained.gaps and may_be_adaptive(self.check)
+            yield "undecided", is_open and failed in SUSPICIOUS, f"{numbers}: adaptive steps may explain it"
+            yield failed, True, numbers
+        yield "undecided", not check.components or not self.is_complete, scope
+        # no larger step is left than that with the best central difference
+        yield "nonfinite", bool(self.failures) and self.failures[0][0] <= self.unit ** (1 / 3), self.place
+        yield "unresolved", bool(self.gradient and self.unresolved), "".join(map(self.numbers, self.unresolved[:1]))
+        late = max(growth, key=lambda one: one.error, default=None)
+        is_late = any(one.is_wrong(tolerance) for one in growth)
+        text = f"after {late.steps} steps off by {number(100 * late.error)}%" if late else ""
+        yield "overwritten" if is_grown else "missing_term", is_late, text
+        is_still = not self.moves_around
+        is_zero = all(part.verdict == "zero" for part in check.parts)
+        yield "constant", is_still and is_zero and (allowed is None or not allowed.all()), ""
+        yield "no_effect", is_still and allowed is not None and bool(self.zeros), ", ".join(self.zeros[:SHOWN])
+        yield "saturated" if check.cause == "zero" else check.cause, True, ""
 
     @cached_property
+    def _verdict(self) -> tuple[str, str]:
+        return next((cause, fact) for cause, holds, fact in self._verdicts() if holds)
+
+    @property
     def derivative_cause(self) -> str:
         """The cause of the first problem with the derivative at theta, or the verdict on a right one."""
-        check, explained, repeats = self.settled, self.explained, self.repeats
-        allowed, tolerance = self.setup.allow_zero, max(float(self.setup.rtol.max()), 1e-3)
-        if repeats.is_failing:
-            return "nondeterministic"
-        if self.error:
-            return "raised"
-        if not check.parts:
-            return "undecided"
-        if not repeats.is_small and (repeats.spread > 0 or repeats.of_gradient > 0 or repeats.has_state):
-            return "nondeterministic"
-        if self.wrong_checks:
-            cause = self.wrong_checks[0].cause
-            if self.is_random and cause in OF_A_DRAW and not self._is_of_draws:
-                return self._cause_of_mean()
-            if cause in SUSPICIOUS and (self._is_residue or self.has_steps):
-                return "staircase"
-            if cause == "unsettled" and explained.smooth_parts:
-                return "adaptive"
-            if cause in EXCUSABLE and not explained.refined and self.is_discretisation_gap:
-                return "adaptive"
-            if cause in (*UNEQUAL, "unsettled") and grows(explained.growth, tolerance):
-                return "overwritten"
-            if cause in SUSPICIOUS and self.hint is not None and self.hint.cause == "continuous_adjoint":
-                return self.hint.cause
-            # so small an error that adaptive steps may explain it, and the budget ended before that was known
-            is_open = explained.is_adaptive is None and may_be_adaptive(self.check)
-            return "undecided" if cause in SUSPICIOUS and is_open and not explained.gaps else cause
-        if not check.components or not self.is_complete:
-            return "undecided"
-        # no larger step is left than that with the best central difference
-        if self.failures and self.failures[0][0] <= self.unit ** (1 / 3):
-            return "nonfinite"
-        if self.gradient and self.unresolved:
-            return "unresolved"
-        if any(one.is_wrong(tolerance) for one in explained.growth):
-            return "overwritten" if grows(explained.growth, tolerance) else "missing_term"
-        is_still = not self.moves_around
-        if is_still and all(part.verdict == "zero" for part in check.parts) and (allowed is None or not allowed.all()):
-            return "constant"
-        if is_still and allowed is not None and self.zeros:
-            return "no_effect"
-        return "saturated" if check.cause == "zero" else check.cause
+        return self._verdict[0]
+
+    @property
+    def fact(self) -> str:
+        """The numbers behind :attr:`derivative_cause`."""
+        return self._verdict[1]
+
+    @property
+    def n_checked(self) -> str:
+        """How many components were checked, ``2 of 3 components``."""
+        return f"{len(self.check.components)} of {counted(self.theta.size, 'component')}"
+
+    @property
+    def spread_text(self) -> str:
+        """How far equal calls differ."""
+        costs, gradients = number(self.repeats.spread), number(100 * self.repeats.of_gradient)
+        state = ", the cost depends on the call before it" * self.repeats.has_state
+        return f"costs differ by {costs}, gradients by {gradients}%{state}"
+
+    @property
+    def place(self) -> str:
+        """The nearest place where the cost is not a number; empty without one."""
+        if not math.isfinite(self.cost):
+            return f"the cost at theta itself is {as_text(self.cost)}"
+        inputs = [self.label(part) for part in self.check.components]
+        known = [place for place in self.failures if place[1] in inputs] or self.failures
+        return "".join(f"nearest at {name} {at:+.2g}" for _, name, at in known[:1])
+
+    @property
+    def culprits(self) -> list[Part]:
+        """The worst parts of the failed check that name an input: located groups, then components, then directions."""
+        if not self.wrong_checks:
+            return []
+        check = self.wrong_checks[0]
+        located = [part for part in check.parts if part.name in self.located]
+        inside = [part for part in check.worst_parts if part.component is not None]
+        exact = [part for part in inside if self.label(part) in self.located.values()]
+        return exact or [*located, *inside] or list(check.worst_parts)
+
+    @property
+    def _failed_numbers(self) -> str:
+        """The numbers of the worst part of the failed check, and the explanation that fits."""
+        check, hint = self.wrong_checks[0], self.hint
+        text = self.numbers(check.worst_of(self.culprits)) if self.culprits else ""
+        return f"{text}, {hint.text}" if hint and check.cause in SUSPICIOUS else text
+
+    def numbers(self, part: Part) -> str:
+        """Return a part's numbers: the program's, the difference, and how far they are apart; at a kink both slopes."""
+        name = f"{self.located[part.name]}, along a random direction" if part.name in self.located else self.label(part)
+        if part.verdict == "kink":
+            return f"{name}: slopes {number(part.left, 4)} and {number(part.right, 4)}"
+        given = f"program {as_text(part.program)}, " if self.gradient else ""
+        off = f", off by {number(100 * part.distance)}%" if self.gradient and math.isfinite(part.distance) else ""
+        return f"{name}: {given}differences {as_text(part.difference)} +- {number(part.uncertainty, 1)}{off}"
 
     @property
     def _is_of_draws(self) -> bool:
@@ -407,14 +475,25 @@ class Findings:
         means = self.means
         return means is not None and means.is_of_draws and means.is_decisive and means.cause == "biased"
 
+    @property
     def _cause_of_mean(self) -> str:
-        """Return the verdict on a gradient that is not the derivative of each draw, but may be an estimator."""
+        """The verdict on a gradient that is not the derivative of each draw, but may be an estimator."""
         if self.means is not None and self.means.is_decisive:
             return self.means.cause
-        if not self.smoothed:
-            return "unmeasured"
         causes = [one.cause or ("estimator" if one.is_usable else "spread") for one in self.smoothed]
-        return min(causes, key=(*NOISE_CAUSES, "estimator").index)
+        return min(causes, key=(*NOISE_CAUSES, "estimator").index, default="unmeasured")
+
+    @property
+    def mean_text(self) -> str:
+        """By how much the mean of a gradient over draws is off."""
+        means = self.means
+        if means is not None and means.n_lost:
+            return f"at {means.n_lost} of {means.draws} draws"
+        if means is not None and means.is_decisive:
+            off = span(100 * max(means.error - means.doubt, 0.0), 100 * (means.error + means.doubt))
+            return f"its mean over {means.draws} draws is off by {off}%"
+        known = [one for one in self.smoothed if one.known]
+        return "".join(f"its mean is off by {span(*one.bias_percent)}%, at sigma {one.sigma:g}" for one in known[:1])
 
     @property
     def _is_residue(self) -> bool:
@@ -452,23 +531,31 @@ class Findings:
     # ---------------------------------------------------------------------------------------------- under noise
 
     @cached_property
-    def noise_found(self) -> list[tuple[str, Smoothed | None]]:
-        """The problems around theta or under noise, each with the sigma that shows it; the first one decides."""
-        found: list[tuple[str, Smoothed | None]] = []
+    def noise_found(self) -> list[tuple[str, Smoothed | None, str]]:
+        """The problems around theta or under noise, each with the sigma that shows it and its facts; the first one decides."""
         is_mean = self.derivative_cause == "estimator"  # not the derivative of the draw whose lines were scanned
-        if self.has_steps and self.derivative in (RIGHT, NONE) and not is_mean:
-            found.append(("staircase", None))
-        elif self.misses_jumps and not is_mean:
-            has_jumps = any(line.jumps for line in self.lines if line.missed > SEEN)
-            found.append(("staircase" if self.tread else "jumps" if has_jumps else "spread", None))
-        if any(line.n_lost for line in self.lines):
-            found.append(("nan_gradient", None))
+        is_stairs, n_lost = self.has_steps and self.derivative in (RIGHT, NONE), sum(line.n_lost for line in self.lines)
+        has_jumps = any(line.jumps for line in self.lines if line.missed > SEEN)
+        kind = "staircase" if is_stairs or self.tread else "jumps" if has_jumps else "spread"
+        found: list[tuple[str, Smoothed | None, str]] = []
+        if not is_mean and (is_stairs or self.misses_jumps):
+            found.append((kind, None, self.missed_text))
+        if n_lost:
+            found.append(("nan_gradient", None, f"at {counted(n_lost, 'point')} of lines through theta"))
         for one in self.smoothed:
             is_shown = one.cause == "spread" and is_mean and not self.setup.levels  # by draws at theta itself
-            found += [(one.cause, one)] if one.cause and not is_shown else []
+            bias = f"a bias of {span(*one.bias_percent)}%" if one.known else one.remark or "not distinguishable from 0"
+            fact = f"grad J at sigma {self.setup.shown(one.sigma)} after {one.pairs} pairs: {bias}"
+            found += [(one.cause, one, one.remark if one.n_lost else fact)] if one.cause and not is_shown else []
         if self.gradient and len(self.smoothed) < len(self.setup.sigmas):
-            found.append(("unmeasured", None))
+            found.append(("unmeasured", None, ""))
         return sorted(found, key=lambda each: NOISE_CAUSES.index(each[0]))
+
+    @property
+    def missed_text(self) -> str:
+        """How much of the cost's change the gradient misses, and what jumps of one height at even distances show."""
+        tread = f"; jumps of one height, {number(self.tread)}, at even distances on every line" if self.tread else ""
+        return f"along a line the integral of the gradient misses {number(100 * self.missed)}% of the change{tread}"
 
     @property
     def noise_cause(self) -> str:
@@ -560,17 +647,10 @@ class Findings:
         return 2.0**-7 if self.precision == "bfloat16" else float(np.finfo(self.precision).eps)
 
     @property
-    def resolved_parts(self) -> list[Part]:
-        """The components whose differences have at least one correct digit."""
-        return [
-            p for p in self.named.components if math.isfinite(p.error) and p.uncertainty < DIGIT * abs(p.difference)
-        ]
-
-    @property
     def resolution(self) -> float:
         """The smallest relative error that the differences detect."""
-        errors = [CHANCE * part.uncertainty / abs(part.difference) for part in self.resolved_parts]
-        return float(max([resolution(self.unit), *errors]))
+        parts = [p for p in self.named.components if p.uncertainty < DIGIT * abs(p.difference)]
+        return max([resolution(self.unit), *(CHANCE * p.uncertainty / abs(p.difference) for p in parts)])
 
     def recommended(self, one: Smoothed) -> Method | None:
         """Return the fastest usable method at a sigma; None if none is known."""
@@ -581,9 +661,18 @@ class Findings:
             return next((m for m in one.methods if m.name == "smoothing" and math.isfinite(m.seconds)), None)
         return best
 
+    @property
+    def theta(self) -> np.ndarray:
+        """The vector ``(d,)``."""
+        return self.layout.vector
+
+    @property
+    def _shown(self) -> range:
+        return range(min(self.theta.size, SHOWN))
+
     def label(self, part: Part) -> str:
         """Return a part's name: the name of its component of theta, or the name of its direction, ``direction 0``."""
-        return self.names[part.component] if part.component is not None else part.name
+        return part.name if part.component is None else self.layout.name(part.component)
 
     # --------------------------------------------------------------------------------------------------- tables
 
@@ -599,12 +688,11 @@ class Findings:
         rows = []
         for one in self.smoothed:
             best = self.recommended(one)
-            base = {name: getattr(one, name) for name in ("sigma", "norm", "pairs", "bias", "bias_low", "bias_high")}
-            base |= {"norm_se": one.error, "moved": one.moved, "remark": one.remark}
+            names = ("sigma", "norm", "pairs", "bias", "bias_low", "bias_high", "error", "moved", "remark")
+            base = {"norm_se" if name == "error" else name: getattr(one, name) for name in names}
             for method in one.methods or (Method("", *[math.nan] * 4),):
-                each = {"method": method.name, "samples": method.samples, "calls": method.calls}
-                is_best = best is not None and best.name == method.name
-                rows.append(base | each | {"seconds": method.seconds, "best": is_best})
+                each = {name: getattr(method, name) for name in ("samples", "calls", "seconds")}
+                rows.append(base | {"method": method.name} | each | {"best": method is best})
         return rows
 
     def line_rows(self) -> list[dict[str, Any]]:
@@ -619,7 +707,7 @@ class Findings:
         """Return a row per jump or kink: line, position in standard deviations, size, and the first numbers of theta there."""
         return [
             {"line": index + 1, "kind": b.kind, "at": b.at, "size": b.size}
-            | dict(zip(self.names[:SHOWN], (self.theta + b.at * line.direction)[:SHOWN].tolist(), strict=True))
+            | {self.layout.name(i): float((self.theta + b.at * line.direction)[i]) for i in self._shown}
             for index, line in enumerate(self.lines)
             for b in line.breaks
         ]
@@ -637,7 +725,7 @@ class Findings:
     @property
     def breaks(self) -> pd.DataFrame:
         """The table of :meth:`break_rows`."""
-        return _frame(self.break_rows(), ["line", "kind", "at", "size", *self.names[:SHOWN]])
+        return _frame(self.break_rows(), ["line", "kind", "at", "size", *map(self.layout.name, self._shown)])
 
 
 def _frame(rows: list[dict[str, Any]], columns: list[str] | None = None) -> pd.DataFrame:

@@ -139,77 +139,48 @@ def _locate_breaks(
     noise: float,
 ) -> list[Break]:
     """Return the breaks at the given places, found by halving the intervals around all places together."""
-    count = len(places)
-    centre = np.array([t[i + 1] for i in places])
-    width = float(t[1] - t[0])
-    # three points: left, middle, right
-    values = np.stack([[f[i], f[i + 1], f[i + 2]] for i in places])
-    turns, widths = [_second_difference(values)], [width]
-    bends = [turns[0] / width]  # changes of slope: over all five points, as a kink may not be in the middle of three
+    centre, width = t[np.array(places) + 1], float(t[1] - t[0])
+    values = np.stack([f[i : i + 3] for i in places])  # left, middle, right
+    changes = [np.abs(np.diff(values, 2))[:, 0]]
+    bends = [changes[0] / width]  # changes of slope: over all five points, as a kink may not be in the middle of three
     for _ in range(halvings):
         between = along(np.concatenate([centre - width / 2, centre + width / 2])).reshape(2, -1).T
-        five = np.stack([values[:, 0], between[:, 0], values[:, 1], between[:, 1], values[:, 2]], axis=1)
-        changes = np.abs(five[:, :-2] - 2 * five[:, 1:-1] + five[:, 2:])
-        best = np.argmax(np.nan_to_num(changes, nan=-1.0), axis=1)
-        width /= 2
+        five = np.insert(values, [1, 2], between, axis=1)
+        turns, width = np.abs(np.diff(five, 2)), width / 2
+        best = np.argmax(np.nan_to_num(turns, nan=-1.0), axis=1)[:, None]
         bends.append(np.abs((five[:, 4] - five[:, 3]) - (five[:, 1] - five[:, 0])) / width)
-        centre = centre + (best - 1) * width
-        values = np.stack([five[np.arange(count), best + k] for k in range(3)], axis=1)
-        turns.append(_second_difference(values))
-        widths.append(width)
-    # (halvings + 1, places): second differences, of order 2 in the width, 1 for a kink, 0 for a jump
-    change = np.array(turns)
-    breaks, ends = [], []
-    for k in range(count):
-        clear = np.flatnonzero(change[:, k] > GUARD * noise)
-        clear = clear[clear == np.arange(clear.size)]
-        if clear.size < 5:
-            continue
-        last = clear[-min(6, clear.size) :]
-        order = float(np.polyfit(np.log2(np.array(widths)[last]), np.log2(change[last, k]), 1)[0])
-        at, end = float(centre[k]), int(last[-1])
-        if order < 0.5:
-            breaks.append(Break("jump", at, float(change[end, k])))
-        elif order < 1.5:
-            breaks.append(Break("kink", at, float(bends[end][k])))
-        else:
-            continue
-        ends.append(widths[end])
-    breaks = _confirmed(along, breaks, ends, noise)
-    return _without_duplicates(breaks, 4 * (t[1] - t[0]) / 2**halvings)
+        centre = centre + (best[:, 0] - 1) * width
+        values = np.take_along_axis(five, best + np.arange(3), axis=1)
+        changes.append(np.take_along_axis(turns, best, axis=1)[:, 0])
+    found, widths = list[tuple[Break, float]](), float(t[1] - t[0]) * 0.5 ** np.arange(len(changes))
+    # second differences by width are of order 2 for a smooth cost, 1 for a kink, 0 for a jump
+    for at, change, bend in zip(centre.tolist(), np.array(changes).T, np.array(bends).T, strict=True):
+        clear = int(np.argmin([*(change > GUARD * noise), False]))
+        last = slice(max(clear - 6, 0), clear)
+        order = np.polyfit(np.log2(widths[last]), np.log2(change[last]), 1)[0] if clear >= 5 else 2.0
+        kind, sizes = ("jump", change) if order < 0.5 else ("kink", bend)
+        if order < 1.5:
+            found.append((Break(kind, at, float(sizes[clear - 1])), float(widths[clear - 1])))
+    kept: list[Break] = []  # of two at one place a jump, not a kink
+    for one in sorted(_confirmed(along, found, noise), key=lambda b: b.kind):
+        if all(abs(one.at - other.at) > 4 * widths[-1] for other in kept):
+            kept.append(one)
+    return kept
 
 
 def _confirmed(
-    along: Callable[[np.ndarray], np.ndarray], breaks: list[Break], widths: list[float], noise: float
+    along: Callable[[np.ndarray], np.ndarray], found: list[tuple[Break, float]], noise: float
 ) -> list[Break]:
     """Return the breaks on both sides of which the cost is smooth, from four more costs on each side.
 
     A rough cost has second differences of every size, which look like jumps. Beside a jump its values scatter as much as
     across, and beside a kink its slopes do.
     """
-    if not breaks:
-        return []
-    away = np.arange(1, SIDES + 1)
-    at = np.array([one.at for one in breaks])[:, None]
-    step = np.array(widths)[:, None] * WIDER
-    sides = along(np.concatenate([at - step * away, at + step * away], axis=1).ravel()).reshape(len(breaks), 2, SIDES)
-    confirmed = []
-    for one, both, width in zip(breaks, sides, step[:, 0], strict=True):
-        bends = np.abs(np.diff(both, 2, axis=1)).max()
-        size = one.size if one.kind == "jump" else one.size * width
-        if bends <= CONFIRMED * size + 4.0 * noise:
+    away, confirmed = WIDER * np.arange(1, SIDES + 1), []
+    at = [one.at + width * np.concatenate([-away, away]) for one, width in found]
+    sides = along(np.concatenate(at)).reshape(-1, 2, SIDES) if found else np.empty((0, 2, SIDES))
+    for (one, width), both in zip(found, sides, strict=True):
+        size = one.size if one.kind == "jump" else one.size * width * WIDER
+        if np.abs(np.diff(both, 2)).max() <= CONFIRMED * size + 4.0 * noise:
             confirmed.append(one)
     return confirmed
-
-
-def _second_difference(values: np.ndarray) -> np.ndarray:
-    return np.abs(values[:, 0] - 2 * values[:, 1] + values[:, 2])
-
-
-def _without_duplicates(breaks: list[Break], near: float) -> list[Break]:
-    """Return the breaks, without any break within ``near`` of another; jumps take precedence over kinks."""
-    kept: list[Break] = []
-    for one in sorted(breaks, key=lambda b: b.kind):
-        if all(abs(one.at - other.at) > near for other in kept):
-            kept.append(one)
-    return kept

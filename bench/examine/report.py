@@ -15,10 +15,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-AFTER_SIGTERM = "everything after SIGTERM"
-"""What is left out when the process is asked to end."""
-
-
 @dataclass(frozen=True, repr=False)
 class Report(Findings):
     """The findings about a cost and its gradient at one theta; ``print`` shows them as text.

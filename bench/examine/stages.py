@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from copy import copy
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -28,8 +28,8 @@ NOISE_POINTS = 17
 """Costs per direction that no step needs: the centre, and the points at which the noise is measured."""
 SCAN = 7 * 65
 """Number of costs of a staircase search along one direction that is not clearly right."""
-ALL_STEPS, FEW_DRAWS, DRAWS = "all steps and random directions", "2 other thetas", "8 other thetas"
-"""Names of the later stages."""
+ALL_STEPS, FEW, MOST = "all steps and random directions", 2, 8
+"""Name of a later stage, and numbers of other thetas of the last ones."""
 SMALL = 0.6
 """Power of the unit roundoff: a relative difference between equal calls below it is a floor, not a fault."""
 MANY = 10_000
@@ -45,9 +45,9 @@ CELLS, DISTINCT_CELLS = 9, 6
 MOST_OF_IT = 0.9
 """Share of the remaining budget after which a running stage is stopped."""
 SHARE = 0.8
-"""Largest share of the remaining budget of a stage, whatever is measured after it."""
-BEFORE_NOISE = 0.4
-"""Largest such share of a stage on a gradient that looks right, where noise is measured after it."""
+"""Largest share of the remaining budget of a stage before the last."""
+BEFORE_NOISE = 0.6
+"""Largest share of the last stage on a gradient that looks right, where noise is measured after it."""
 STATE = 0.1
 """Largest share of the difference between histories by which a cost with equal histories differs."""
 
@@ -69,38 +69,9 @@ class Repeats:
     floor_of_gradient: float = 0.0
 
     @property
-    def is_small(self) -> bool:
-        """Whether these differences only limit the accuracy of the check."""
-        return not self.is_failing and self.spread <= self.floor and self.of_gradient <= self.floor_of_gradient
-
-
-class Store:
-    """Values by coordinates. A stored value is used once; the next request computes it again and compares."""
-
-    def __init__(self) -> None:
-        self._values: dict[bytes, np.ndarray] = {}
-        self._fresh: set[bytes] = set()
-        self.spread = 0.0
-        """Largest difference between two values of one key."""
-
-    def take(self, key: bytes) -> np.ndarray | None:
-        """Return a value that has not been used since it was computed or refreshed, or None."""
-        if key not in self._fresh:
-            return None
-        self._fresh.remove(key)
-        return self._values[key]
-
-    def put(self, key: bytes, value: np.ndarray) -> None:
-        """Store a computed value."""
-        if key in self._values:
-            with np.errstate(invalid="ignore"):
-                apart = np.abs(self._values[key] - value)
-            self.spread = max(self.spread, float(np.nan_to_num(apart).max(initial=0.0)))
-        self._values[key] = value
-
-    def refresh(self) -> None:
-        """Let every value be used once more."""
-        self._fresh = set(self._values)
+    def is_large(self) -> bool:
+        """Whether these differences are a fault, and no limit of the check's accuracy."""
+        return self.spread > self.floor or self.of_gradient > self.floor_of_gradient
 
 
 class GradientStages:
@@ -139,17 +110,19 @@ class GradientStages:
         self.left_out: list[str] = []
         self.repeats = Repeats(floor_of_gradient=simulator.unit**SMALL)
         self._repeated = False  # whether calls were repeated within the budget
-        self._costs_store, self._gradients_store = Store(), Store()
+        self._before: dict[tuple[bytes, ...], Any] = {}
+        """Costs and gradients by their coordinates and the draw of the simulator's own noise."""
 
     # ------------------------------------------------------------------------------------------------ calls
 
-    def costs(self, thetas: np.ndarray) -> np.ndarray:
+    def costs(self, thetas: np.ndarray, w: np.ndarray | None = None) -> np.ndarray:
         """Return the costs ``(B,)`` of ``thetas (d, B)``, all under the same draw of the simulator's own noise."""
-        return self.simulator.costs(thetas, self.same_noise(thetas.shape[1]))
+        return self.simulator.costs(thetas, self.same_noise(thetas.shape[1], w))
 
-    def same_noise(self, count: int) -> np.ndarray | None:
-        """Return the draw of the simulator's own noise for each of ``count`` thetas, ``(n, count)``; None without noise."""
-        return None if self.w is None else np.repeat(self.w, count, axis=1)
+    def same_noise(self, count: int, w: np.ndarray | None = None) -> np.ndarray | None:
+        """Return a draw ``w (n, 1)`` of the simulator's own noise, by default the first, for each of ``count`` thetas."""
+        w = self.w if w is None else w
+        return None if w is None else np.repeat(w, count, axis=1)
 
     def thetas_along(self, direction: np.ndarray, t: np.ndarray) -> Iterator[np.ndarray]:
         """Yield the thetas at theta + t * direction for ``t (n,)``, a batch at a time, since memory holds few large ones."""
@@ -161,36 +134,29 @@ class GradientStages:
         """Return the costs ``(n,)`` at theta + t * direction for t of n numbers."""
         return np.concatenate([self.costs(thetas) for thetas in self.thetas_along(direction, t.ravel())])
 
-    def gradient_at(self, theta: np.ndarray) -> np.ndarray:
+    def gradient_at(self, theta: np.ndarray, w: np.ndarray | None = None) -> np.ndarray:
         """Return the simulator's gradient at ``theta (d,)``."""
-        return self.simulator.gradients(theta[:, None], self.w)[:, 0]
+        return self.simulator.gradients(theta[:, None], self.same_noise(1, w))[:, 0]
 
-    def _stored_costs(self, space: Subspace, z: np.ndarray) -> np.ndarray:
-        keys = [column.tobytes() for column in np.ascontiguousarray(z.T)]
-        taken = [self._costs_store.take(key) for key in keys]
-        missing = [i for i, value in enumerate(taken) if value is None]
-        # batch by batch, so that an interrupted stage keeps its costs
-        width = self.simulator.width
-        for first in range(0, len(missing), width):
-            part = missing[first : first + width]
-            for i, value in zip(part, space.costs(self.costs, z[:, part], width), strict=True):
-                taken[i] = computed = np.asarray(value)
-                self._costs_store.put(keys[i], computed)
-        return np.array([float(value) for value in taken if value is not None])
+    def _costs_in(self, space: Subspace, w: np.ndarray | None, z: np.ndarray) -> np.ndarray:
+        """Return the costs ``(B,)`` at coordinates ``z (m, B)``."""
+        costs = space.costs(partial(self.costs, w=w), z, self.simulator.width)
+        apart = [self._apart(w, column, cost) for column, cost in zip(z.T, costs, strict=True)]
+        self.repeats.spread = max(self.repeats.spread, *apart)
+        return costs
 
-    def _stored_gradient(self, space: Subspace, z: np.ndarray) -> np.ndarray:
+    def _gradient_in(self, space: Subspace, w: np.ndarray | None, z: np.ndarray) -> np.ndarray:
         """Return the derivatives by the coordinates of a space at ``z (m,)``, ``(m,)``."""
-        key = z.tobytes()
-        value = self._gradients_store.take(key)
-        if value is None:
-            value = space.project(self.gradient_at(space.place(z[:, None])[:, 0]))
-            self._gradients_store.put(key, value)
-        return value
+        gradient = space.project(self.gradient_at(space.place(z[:, None])[:, 0], w))
+        size = float(np.linalg.norm(gradient))
+        apart = self._apart(w, z, gradient) / size if size else 0.0
+        self.repeats.of_gradient = max(self.repeats.of_gradient, apart)
+        return gradient
 
-    def _refresh(self) -> None:
-        """Let the next stage use every stored value once."""
-        for store in (self._costs_store, self._gradients_store):
-            store.refresh()
+    def _apart(self, w: np.ndarray | None, z: np.ndarray, value: Any) -> float:
+        """Return by how much a cost or a gradient differs from that of an equal call before; 0 at the first call."""
+        key = z.tobytes(), b"" if w is None else w.tobytes(), str(np.ndim(value)).encode()
+        return float(np.nan_to_num(np.abs(self._before.setdefault(key, value) - value)).max())
 
     def slopes_along(self, direction: np.ndarray, t: np.ndarray) -> np.ndarray:
         """Return the program's derivatives ``(n,)`` along a direction at theta + t * direction for t of n numbers."""
@@ -231,9 +197,6 @@ class GradientStages:
     def _run_stages(self, explain: Callable[[Check], None]) -> None:
         space = choose(self.layout, self.scale, self.gradient, self.seed)
         self.groups = space.groups
-        if self.gradient is not None:
-            self._gradients_store.put(np.zeros(space.size).tobytes(), space.project(self.gradient))
-            self._gradients_store.refresh()
         try:
             for stage in (partial(self._compare_quickly, space), self._repeat):
                 stage()
@@ -268,13 +231,12 @@ class GradientStages:
     def _compare_quickly(self, space: Subspace) -> None:
         """Compare the gradient with two costs per coordinate, and with more where the full steps do not fit."""
         self.clock.start_stage("one step per component")
-        cost, unit = partial(self._stored_costs, space), self.simulator.unit
+        cost, unit = partial(self._costs_in, space, None), self.simulator.unit
         quick = FewSteps(space, cost, self.gradient, self.value, unit, self.repeats.spread)
         try:
             for _ in ROUNDS:
                 quick.run_round(self.simulator.width)
-                steps = self._plan(space.size, True)["more steps"]
-                if self.clock.can_afford(*self._cost_of(steps, space.size), share=SHARE):
+                if self.clock.can_afford(*self._cost_of(self._options(space.size), space.size), share=SHARE):
                     break
         finally:
             outcome = quick.check()
@@ -285,27 +247,25 @@ class GradientStages:
     def _repeat(self) -> None:
         """Repeat calls, after equal and after other thetas, and compare the results."""
         self.clock.start_stage("repeating a call")
-        theta, other = self.theta, self.theta + 1e-3 * self.scale
-        calls, values = (theta, other, theta, theta, other, theta, theta), []  # the first one follows other thetas
+        other, values = self.theta + 1e-3 * self.scale, [self.value]
+        is_other = (False, False, True, False, False, True, False, False)  # the first call was made before
         try:
-            for at in calls:
-                values.append(float(self.costs(at[:, None])[0]))
+            for each in is_other[1:]:
+                values.append(float(self.costs((other if each else self.theta)[:, None])[0]))
         except OutOfTime:
             self.left_out.append("repeating a call")
         self._repeat_gradient(other)
-        self.repeats.spread = self._costs_store.spread
-        for at in (theta, other):
-            same = [value for value, each in zip(values, calls, strict=False) if each is at] + [self.value] * (
-                at is theta
-            )
+        for each in (False, True):
+            same = [value for value, one in zip(values, is_other, strict=False) if one == each]
             if len(same) > 1 and np.isfinite(same).all():
                 self.repeats.spread = max(self.repeats.spread, float(np.ptp(same)))
-        self._repeated = len(values) == len(calls)
-        if self._repeated and self.repeats.spread > 0:
-            after_theta, after_other = values[3::3], values[2::3]
-            is_alike = max(np.ptp(after_theta), np.ptp(after_other)) <= STATE * abs(after_theta[-1] - after_other[-1])
-            # last digits that vary at random are alike by chance
-            self.repeats.has_state = bool(is_alike and self.repeats.spread > self.repeats.floor)
+        self._repeated = len(values) == len(is_other)
+        if (
+            self._repeated and self.repeats.spread > self.repeats.floor
+        ):  # last digits that vary at random are alike by chance
+            after_theta, after_other = values[4::3], values[3::3]
+            apart = STATE * abs(after_theta[-1] - after_other[-1])
+            self.repeats.has_state = bool(max(np.ptp(after_theta), np.ptp(after_other)) <= apart)
 
     def _repeat_gradient(self, other: np.ndarray) -> None:
         """Compare the gradient with that of an equal call after one at ``other (d,)``."""
@@ -350,28 +310,22 @@ class GradientStages:
         is_constant = _are_equal(np.r_[cells[0], inside[0]]) and _are_equal(np.r_[cells[CELLS // 2], inside[1:]])
         return is_constant and np.unique(cells).size >= DISTINCT_CELLS
 
-    def _plan(self, size: int, is_right: bool) -> dict[str, Options]:
-        """Return the stages after the quick one, from the cheapest to the full check."""
-        unit = self.simulator.unit
-        eps = step_sizes(unit)
-        few = eps[::2] if eps is EPS else eps
-        base = Options(
-            components=size, directions=0, draws=0, eps=few, unit=unit, scanned=0, repeated=False, seed=self.seed,
+    def _options(self, size: int, draws: int = -1) -> Options:
+        """Return the options of the last stage with a number of other thetas, or by default those of more steps."""
+        eps, is_right, is_large = step_sizes(self.simulator.unit), self.check.trusted, self.theta.size > MANY
+        has_all = draws >= 0 and (is_right or is_large or draws != FEW)
+        return Options(
+            components=size, directions=2 * (draws >= 0), draws=max(draws, 0), unit=self.simulator.unit, seed=self.seed,
+            eps=eps if has_all or eps is not EPS else eps[::2],
+            # a wrong gradient is named by its ratios at other thetas first, and then searched for staircases
+            scanned=4 if draws == MOST or (is_right and draws >= 0) else 0,
+            repeated=is_right and draws >= 0 and self.repeats.spread == 0.0,
         )  # fmt: skip
-        whole = replace(base, eps=eps, directions=2)
-        # a wrong gradient is named by its ratios at other thetas first, and then searched for staircases
-        scanned = 4 if is_right else 0
-        stages = {"more steps": base, ALL_STEPS: replace(whole, scanned=scanned, repeated=self.repeats.spread == 0.0)}
-        if self.theta.size > MANY:
-            return stages | {FEW_DRAWS: replace(whole, draws=2, scanned=2)}
-        few_draws = replace(whole, eps=eps if is_right else few, draws=2, scanned=scanned)
-        return stages | {FEW_DRAWS: few_draws, DRAWS: replace(whole, draws=8, scanned=4)}
 
     def _cost_of(self, options: Options, size: int) -> tuple[int, int]:
-        """Return the numbers of costs and gradients of a stage that no stored value makes cheaper."""
+        """Return the numbers of costs and gradients of a stage."""
         each = 2 * options.eps.size + NOISE_POINTS
-        here = (size + options.directions) * (2 if options.repeated else int(not options.draws))
-        costs = (here + options.draws * options.directions) * each
+        costs = ((size + options.directions) * (1 + options.repeated) + options.draws * options.directions) * each
         wrong = sum(part.verdict in FAULTS for part in self.check.parts)
         if wrong and options.draws:
             costs += min(4, options.draws) * wrong * each + 4 * options.draws * each
@@ -383,76 +337,54 @@ class GradientStages:
 
     def _check_in_stages(self, space: Subspace, explain: Callable[[Check], None]) -> None:
         self.clock.start_stage("checking the gradient")
-
-        def fits(options: Options) -> bool:
-            share = BEFORE_NOISE if self._has_noise and self.check.trusted and not self.is_quick else SHARE
-            return self.clock.can_afford(*self._cost_of(options, space.size), share=share)
-
-        for name in self._plan(space.size, True):
-            plan = self._plan(space.size, self.check.trusted)
-            is_wrong = any(part.verdict in FAULTS for part in self.check.parts)
-            if name == ALL_STEPS and is_wrong:
-                explain(self.check)
-                continue  # the ratios at other thetas name the fault, and these stages also have all steps
-            if not fits(plan[name]):
-                self.left_out.append(name)
-                if name != FEW_DRAWS:
-                    break
-                continue
-            # a wrong gradient is named by few thetas first, so that the name does not depend on the time that is left
-            if name == FEW_DRAWS and not is_wrong and DRAWS in plan and fits(plan[DRAWS]):
-                continue
-            self._refresh()
-            self.clock.limit(MOST_OF_IT)
-            try:
-                self._run_stage(space, plan[name])
-            except OutOfTime:
-                self.left_out.append(name)
+        if not self._run_stage("more steps", space, self._options(space.size), SHARE):
+            return
+        draws = [MOST, FEW, 0] if self.theta.size <= MANY else [FEW, 0]
+        is_wrong = any(part.verdict in FAULTS for part in self.check.parts)
+        if is_wrong:
+            explain(self.check)
+            draws = draws[
+                -2::-1
+            ]  # named by few thetas first, so that the name does not depend on the time that is left
+        for count in draws:
+            share = BEFORE_NOISE if self._has_noise and self.check.trusted else MOST_OF_IT
+            name = f"{count} other thetas" if count else ALL_STEPS
+            is_done = self._run_stage(name, space, self._options(space.size, count), share)
+            if is_done != is_wrong:
                 break
-            finally:
-                self.clock.limit(1.0)
-            if name == DRAWS:
-                self.left_out = [left for left in self.left_out if left != FEW_DRAWS]
 
-    def _run_stage(self, space: Subspace, options: Options) -> None:
-        outcome = self._check_once(space, options)
-        self.repeats.spread = max(self.repeats.spread, self._costs_store.spread)
-        self.repeats.of_gradient = max(self.repeats.of_gradient, self._spread_of_gradients(space))
-        if outcome.cause == "nondeterministic" and self.repeats.is_small and self.repeats.spread > 0.0:
-            self._refresh()
-            outcome = self._check_once(space, replace(options, repeated=False))
-        self.check, self.is_quick = space.restore(outcome), False
+    def _run_stage(self, name: str, space: Subspace, options: Options, share: float) -> bool:
+        """Run a stage if it fits a share of the remaining budget, and return whether it has finished."""
+        try:
+            if not self.clock.can_afford(*self._cost_of(options, space.size), share=share):
+                raise OutOfTime
+            self.clock.limit(MOST_OF_IT)
+            self.check, self.is_quick = space.restore(self._check_once(space, options)), False
+        except OutOfTime:
+            self.left_out.append(name)
+            return False
+        finally:
+            self.clock.limit(1.0)
+        return True
 
-    def _check_once(self, space: Subspace, options: Options) -> Check:
+    def _check_once(self, space: Subspace, options: Options, w: np.ndarray | None = None) -> Check:
         outcome = check(
-            partial(self._stored_costs, space),
-            None if self.gradient is None else partial(self._stored_gradient, space),
+            partial(self._costs_in, space, w),
+            None if self.gradient is None else partial(self._gradient_in, space, w),
             np.zeros(space.size),
             replace(options, scale=space.scale),
         )
+        is_own = any(part.verdict == "nondeterministic" for part in outcome.parts)
+        if is_own and options.repeated and not self.repeats.is_large and self.repeats.spread > 0.0:
+            return self._check_once(space, replace(options, repeated=False), w)
         if self.simulator.n_failed_gradients:
             # a gradient that raises at other thetas is reported as such
-            outcome = recaused(
-                replace(outcome, draws=tuple(part for part in outcome.draws if np.isfinite(part.program)))
-            )
-        return _with_roughness(self._without_small_spread(space, _with_zeros(outcome)))
-
-    def _spread_of_gradients(self, space: Subspace) -> float:
-        """Return the largest difference between equal calls of the gradient, relative to its norm."""
-        slope = np.zeros(1) if self.gradient is None else np.nan_to_num(space.project(self.gradient))
-        size = float(np.linalg.norm(slope))
-        return self._gradients_store.spread / size if size else 0.0
-
-    def _without_small_spread(self, space: Subspace, outcome: Check) -> Check:
-        """Return a check without the verdict ``nondeterministic`` where only the last digits of the gradient differ."""
-        is_own = any(part.verdict == "nondeterministic" for part in outcome.parts)
-        if (
-            outcome.cause != "nondeterministic"
-            or is_own
-            or self._spread_of_gradients(space) > self.simulator.unit**SMALL
-        ):
-            return outcome
-        return recaused(outcome)
+            outcome = replace(outcome, draws=tuple(part for part in outcome.draws if np.isfinite(part.program)))
+            outcome = recaused(outcome)
+        outcome = _with_zeros(outcome)
+        if outcome.cause == "nondeterministic" and not is_own and not self.repeats.is_large:
+            outcome = recaused(outcome)  # only the last digits of the gradient differ
+        return _with_roughness(outcome)
 
     def _locate(self, space: Subspace) -> None:
         """Find the numbers that cause the error of each wrong group."""
@@ -463,13 +395,10 @@ class GradientStages:
         try:
             for part in self.check.parts:
                 if part.name in groups and part.verdict in FAULTS and math.isfinite(part.program):
-                    group = groups[part.name]
-                    self.located[part.name], index = locate(
-                        self.layout, group, self.theta, self.gradient, self.costs, part.step,
-                        part.difference - part.program, part.uncertainty,
-                    )  # fmt: skip
-                    if index is not None and index not in space.components:
-                        self._check_number(index, part.verdict)
+                    first, last = locate(groups[part.name], self.theta, self.gradient, self.costs, part)
+                    self.located[part.name] = self.layout.block(first, last)
+                    if last - first == 1 and first not in space.components:
+                        self._check_number(first, part.verdict)
         except OutOfTime:
             self.left_out.append("the place of the error in its group")
 
@@ -494,16 +423,13 @@ class GradientStages:
         if self.w is None or not self.check.trusted or self.is_quick:
             return
         space = choose(self.layout, self.scale, self.gradient, self.seed)
-        options = replace(self._plan(space.size, True)[ALL_STEPS], components=0, scanned=0, repeated=False)
-        if not self.clock.can_afford(*self._cost_of(options, 0), share=SHARE):
-            self.left_out.append("checks under other noise")
-            return
+        options = replace(self._options(space.size, 0), components=0, scanned=0, repeated=False)
         try:
+            if not self.clock.can_afford(*self._cost_of(options, 0), share=SHARE):
+                raise OutOfTime
             for _ in range(OTHER_NOISE):
-                other = copy(self)  # with costs and gradients of its own
-                other.w = self._random.standard_normal((self.simulator.noise, 1))
-                other._costs_store, other._gradients_store = Store(), Store()
-                self.more.append(space.restore(other._check_once(space, options)))
+                w = self._random.standard_normal((self.simulator.noise, 1))
+                self.more.append(space.restore(self._check_once(space, options, w)))
         except OutOfTime:
             self.left_out.append("checks under other noise")
 

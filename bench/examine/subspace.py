@@ -45,19 +45,16 @@ class Subspace:
         self.theta, self.components, self.groups = layout.vector, components, groups
         self.scale = np.r_[scale[components], np.ones(len(groups))]
         """The size of each coordinate ``(m,)``."""
-        self._thetas = np.empty((0, 0))
 
     @property
     def size(self) -> int:
         """Number of coordinates m."""
         return len(self.components) + len(self.groups)
 
-    def place(self, z: np.ndarray, thetas: np.ndarray | None = None) -> np.ndarray:
-        """Return the thetas ``(d, B)`` at coordinates ``z (m, B)``, written into ``thetas`` if given."""
-        thetas = np.empty((self.theta.size, z.shape[1])) if thetas is None else thetas
-        thetas[:] = self.theta[:, None]
-        if self.components:
-            thetas[self.components] += z[: len(self.components)]
+    def place(self, z: np.ndarray) -> np.ndarray:
+        """Return the thetas ``(d, B)`` at coordinates ``z (m, B)``."""
+        thetas = np.repeat(self.theta[:, None], z.shape[1], axis=1)
+        thetas[self.components] += z[: len(self.components)]
         for k, group in enumerate(self.groups, len(self.components)):
             if z[k].any():
                 thetas[group.first : group.last] += group.vector[:, None] * z[k]
@@ -70,14 +67,8 @@ class Subspace:
 
     def costs(self, cost: Callable[[np.ndarray], np.ndarray], z: np.ndarray, width: int) -> np.ndarray:
         """Return the costs ``(B,)`` at ``z (m, B)``, from ``cost`` of at most ``width`` thetas ``(d, width)`` at a time."""
-        # one array for all calls, since new memory for a million numbers takes longer than writing them
-        costs = [np.zeros(0)]
-        for first in range(0, z.shape[1], width):
-            part = z[:, first : first + width]
-            if self._thetas.shape != (self.theta.size, part.shape[1]):
-                self._thetas = np.empty((self.theta.size, part.shape[1]))
-            costs.append(cost(self.place(part, self._thetas)))
-        return np.concatenate(costs)
+        parts = [z[:, first : first + width] for first in range(0, z.shape[1], width)]
+        return np.concatenate([np.zeros(0), *(cost(self.place(part)) for part in parts)])
 
     def restore(self, check: Check) -> Check:
         """Return a check in these coordinates with its parts named after theta's components and groups."""
@@ -107,55 +98,38 @@ def choose(
 
 def groups_of(layout: ParameterTree, scale: np.ndarray, seed: int) -> list[Group]:
     """Return the groups of a theta: each array, several small neighbours together, or blocks of a single array."""
-    random = np.random.default_rng([seed, 0x67726F75])
-    leaves = layout.leaves
-    spans: list[tuple[str, int, int]] = []
-    if len(leaves) == 1:
-        for leaf in leaves:
-            edges = np.linspace(0, leaf.size, min(BLOCKS, leaf.size) + 1).astype(int)
-            for first, last in itertools.pairwise(edges):
-                spans.append((leaf.block(int(first), int(last)), leaf.start + int(first), leaf.start + int(last)))
+    random, starts = np.random.default_rng([seed, 0x67726F75]), np.array([leaf.start for leaf in layout.leaves])
+    if starts.size == 1:
+        edges = np.linspace(0, scale.size, min(BLOCKS, scale.size) + 1).astype(int)
     else:
-        for part in np.array_split(np.arange(len(leaves)), min(GROUPS, len(leaves))):
-            a, b = leaves[int(part[0])], leaves[int(part[-1])]
-            spans.append((a.name if a is b else f"{a.name} to {b.name}", a.start, b.start + b.size))
+        edges = np.array([*(part[0] for part in np.array_split(starts, min(GROUPS, starts.size))), scale.size])
     groups = []
-    for name, first, last in spans:
+    for first, last in itertools.pairwise(edges.tolist()):
         vector = random.standard_normal(last - first)
         vector *= scale[first:last] / np.linalg.norm(vector)
-        groups.append(Group(name, first, last, vector))
+        groups.append(Group(layout.block(first, last), first, last, vector))
     return groups
 
 
 def locate(
-    layout: ParameterTree,
-    group: Group,
-    theta: np.ndarray,
-    gradient: np.ndarray,
-    cost: Callable[[np.ndarray], np.ndarray],
-    step: float,
-    error: float,
-    noise: float,
-) -> tuple[str, int | None]:
-    """Return the name of the numbers of a group that cause the ``error`` of its slope, by halving, and the index of a single one.
+    group: Group, theta: np.ndarray, gradient: np.ndarray, cost: Callable[[np.ndarray], np.ndarray], part: Part
+) -> tuple[int, int]:
+    """Return the first and the last number + 1 of a group that cause the error of its slope, ``part``, by halving.
 
-    Each halving takes two costs. The search ends at one number, at ``noise`` (the uncertainty of a slope), or where both
-    halves have a share of the error.
+    Each halving takes two costs. The search ends at one number, at the uncertainty of the slope, or where both halves have a
+    share of the error.
     """
-    first, last = group.first, group.last
+    first, last, error = group.first, group.last, part.difference - part.program
     while last - first > 1:
         middle = (first + last) // 2
+        vector = group.vector[first - group.first : middle - group.first]
         moved = np.repeat(theta[:, None], 2, axis=1)
-        part = group.vector[first - group.first : middle - group.first]
-        moved[first:middle] += part[:, None] * np.array([-step, step])
-        costs = cost(moved)
-        left_error = float((costs[1] - costs[0]) / (2 * step) - part @ gradient[first:middle])
-        rest = error - left_error
-        if not np.isfinite(left_error) or min(abs(left_error), abs(rest)) > (1 - SHARE) * abs(error):
+        moved[first:middle] += np.outer(vector, [-part.step, part.step])
+        minus, plus = cost(moved)
+        left = float((plus - minus) / (2 * part.step) - vector @ gradient[first:middle])
+        small, large = sorted((abs(left), abs(error - left)))
+        if not (small <= (1 - SHARE) * abs(error) and large >= 2.0 * part.uncertainty):
             break
-        if max(abs(left_error), abs(rest)) < 2.0 * noise:
-            break
-        first, last, error = (first, middle, left_error) if abs(left_error) > abs(rest) else (middle, last, rest)
-    inside = [leaf for leaf in layout.leaves if leaf.start < last and leaf.start + leaf.size > first]
-    blocks = [leaf.block(max(first - leaf.start, 0), min(last - leaf.start, leaf.size)) for leaf in inside]
-    return blocks[0] if len(blocks) == 1 else f"{blocks[0]} to {blocks[-1]}", first if last - first == 1 else None
+        is_left = large == abs(left)
+        first, last, error = (first, middle, left) if is_left else (middle, last, error - left)
+    return first, last

@@ -49,11 +49,12 @@ def noise(values: np.ndarray) -> float:
     """
     if not np.isfinite(values).all():
         return float("inf")
-    levels = []
+    exponent = np.frexp(np.abs(values).max())[1]
+    values, levels = np.ldexp(values, -exponent), []  # a square of a huge number is infinite
     for order in (3, 4, 5):
         scale = factorial(order) ** 2 / factorial(2 * order)
         levels.append(np.sqrt(scale * np.mean(np.diff(values, order, axis=-1) ** 2, axis=-1)))
-    return float(np.max(np.min(levels, axis=0)))
+    return float(np.ldexp(np.max(np.min(levels, axis=0)), exponent))
 
 
 def scatter(step: np.ndarray, differences: np.ndarray) -> float:

@@ -17,16 +17,8 @@ UNITS = {"ms": 1e-3, "s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0, "": 1.0}
 """Seconds per unit of a budget."""
 MIN_ALARM_S, ALARM_INTERVAL_S = 1e-3, 1.0
 """Minimum delay of the alarm, and the interval at which the alarm repeats, in seconds."""
-HANGS = 100.0
-"""Multiple of the mean time of a call above which a call that has not returned is named."""
 PROGRESS_INTERVAL_S = 0.2
 """Minimum time between two updates of the progress line, in seconds."""
-MOST_WAITED = 1.0
-"""Most time lost to other programs that is not charged, in multiples of the budget."""
-READ_INTERVAL_S = 0.02
-"""Minimum time between two readings of the lost time, in seconds."""
-SCHEDULE = "/proc/thread-self/schedstat"
-"""On Linux: nanoseconds on a processor, nanoseconds of waiting for one, and number of time slices."""
 
 
 class OutOfTime(BaseException):
@@ -49,29 +41,18 @@ def parse_duration(budget: float | str, what: str = "budget") -> float:
     return value
 
 
-def _run_delay() -> float:
-    """Return the seconds for which this thread has been ready but waited for a processor; 0 where unknown."""
-    try:
-        with open(SCHEDULE) as file:
-            return int(file.read().split()[1]) * 1e-9
-    except (OSError, ValueError, IndexError):
-        return 0.0
-
-
 class Clock:
     """Remaining budget, time spent per call, and the progress line.
 
     ``budget`` is the time for warm calls and everything between them [s]. The first call of each kind and shape may
-    compile: its time counts against ``compile_budget`` instead. Time for which the process waits because other programs
-    use the processors is not charged, up to as much as the budget. ``calls`` limits the number of costs and
-    gradients together. With a limit of calls and no finite ``budget``, no decision depends on time.
+    compile: its time counts against ``compile_budget`` instead. ``calls`` limits the number of costs and gradients
+    together. With a limit of calls and no finite ``budget``, no decision depends on time.
     """
 
     def __init__(
         self, budget: float, shown: bool = False, calls: float = math.inf, compile_budget: float = math.inf
     ) -> None:
-        self.start, self._delay, self._compile_delay = time.perf_counter(), _run_delay(), 0.0
-        self._read, self._last_read = self._delay, self.start
+        self.start = time.perf_counter()
         self.budget, self.calls, self.compile_budget = budget, calls, compile_budget
         self.costs = self.gradients = 0
         """Number of evaluated costs and gradients, one per sample."""
@@ -79,30 +60,17 @@ class Clock:
         """Seconds spent in cost and gradient calls, except the first call of each shape."""
         self.compile_s = 0.0
         """Seconds spent in the first call of each kind and shape."""
-        self.is_terminated = False
-        """Whether the process was asked to end, by SIGTERM."""
-        self.hung_s = 0.0
-        """Seconds of a call that had not returned when the budget ended, much longer than the others; else 0."""
         self._timed = {"costs": 0, "gradients": 0}
         self._shown = shown and sys.stderr.isatty()
         self._stage, self._last_shown = "", 0.0
         self._deadline, self._last_call = math.inf, math.inf
-        self._is_inside = False
         self.is_interrupted = False
         """Whether the running call was interrupted: compiled code that called back may have made another error of it, or none."""
 
     @property
     def spent(self) -> float:
-        """Seconds since the start, without first calls and without most of the time lost to other programs."""
-        return self.elapsed - self.compile_s - min(self.waited, MOST_WAITED * self.budget)
-
-    @property
-    def waited(self) -> float:
-        """Seconds of warm calls for which this thread waited for a processor that other programs used; 0 where unknown."""
-        now = time.perf_counter()
-        if now - self._last_read > READ_INTERVAL_S:
-            self._last_read, self._read = now, _run_delay()
-        return max(0.0, self._read - self._delay - self._compile_delay)
+        """Seconds since the start, without first calls."""
+        return self.elapsed - self.compile_s
 
     @property
     def elapsed(self) -> float:
@@ -126,7 +94,7 @@ class Clock:
 
     def can_afford(self, costs: float, gradients: float = 0.0, share: float = 1.0) -> bool:
         """Return whether these numbers of costs and gradients fit a share (0 to 1) of the remaining budget."""
-        if self.is_terminated or costs + gradients > share * self.remaining_calls:
+        if costs + gradients > share * self.remaining_calls:
             return False
         if math.isinf(self.budget):
             return True
@@ -138,8 +106,6 @@ class Clock:
     def affordable(self, share: float = 1.0) -> float:
         """Return the number of costs that fit a share (0 to 1) of the remaining budget."""
         each = self.per_cost()
-        if self.is_terminated:
-            return 0.0
         timed = share * self.remaining / each if each > 0 and math.isfinite(self.budget) else math.inf
         return max(0.0, min(timed, share * self.remaining_calls))
 
@@ -150,15 +116,9 @@ class Clock:
 
     def check(self, calls: int = 0) -> None:
         """Raise :class:`OutOfTime` if the budget or the limit of :meth:`limit` is spent, or ``calls`` would exceed it."""
-        if self.is_terminated or self.spent > min(self.budget, self._deadline):
+        if self.spent > min(self.budget, self._deadline):
             raise OutOfTime
         if self.used + calls > min(self.calls, self._last_call):
-            raise OutOfTime
-
-    def terminate(self) -> None:
-        """End the budget now, also inside a call."""
-        self.is_terminated = True
-        if self._is_inside:
             raise OutOfTime
 
     @contextmanager
@@ -170,19 +130,17 @@ class Clock:
         code uses the alarm signal.
         """
         allowed = self.compile_budget - self.compile_s if first else self.remaining
-        began, delay = time.perf_counter(), _run_delay()
+        began = time.perf_counter()
         is_free = threading.current_thread() is threading.main_thread() and hasattr(signal, "setitimer")
         is_free = is_free and math.isfinite(allowed)
         is_free = is_free and signal.getsignal(signal.SIGALRM) in (signal.SIG_DFL, None)
 
         def raise_out_of_time(number: int, frame: FrameType | None) -> None:
-            # time lost to other programs is not charged: the alarm repeats until the budget is really spent
-            if first or self.remaining <= 0.0:
-                self.is_interrupted = True
-                raise OutOfTime
+            self.is_interrupted = True
+            raise OutOfTime
 
+        self.is_interrupted = False
         try:
-            self._is_inside, self.is_interrupted = True, False
             if is_free:
                 signal.signal(signal.SIGALRM, raise_out_of_time)
                 # the alarm repeats, since an exception raised in a callback may be lost
@@ -190,19 +148,12 @@ class Clock:
             yield
             if self.is_interrupted:
                 raise OutOfTime
-        except OutOfTime:
-            took, calls = time.perf_counter() - began, sum(self._timed.values())
-            is_long = calls and took > HANGS * (self.cost_s + self.gradient_s) / calls
-            self.hung_s = took if is_long and took > HANGS * MIN_ALARM_S and not self.is_terminated else 0.0
-            raise
         finally:
-            self._is_inside = False
             if is_free:
                 signal.setitimer(signal.ITIMER_REAL, 0.0)
                 signal.signal(signal.SIGALRM, signal.SIG_DFL)
             if first:
                 self.compile_s += time.perf_counter() - began
-                self._compile_delay += _run_delay() - delay
 
     def count(self, kind: str, calls: int, taken: float, warm: bool) -> None:
         """Add ``calls`` samples of ``kind`` (costs or gradients), and their seconds if ``warm`` (nothing was compiled)."""
@@ -239,26 +190,3 @@ class Clock:
         """Remove the progress line."""
         if self._shown:
             print("\r\x1b[K", end="", file=sys.stderr, flush=True)
-
-
-@contextmanager
-def end_on_sigterm(clock: Clock) -> Iterator[None]:
-    """End the clock's budget when a command of ``bench`` receives SIGTERM, so that its results are still reported.
-
-    A second SIGTERM stops the command. Programs that use ``bench`` as a library handle SIGTERM as before.
-    """
-    is_main = threading.current_thread() is threading.main_thread()
-    previous = signal.getsignal(signal.SIGTERM) if is_main else None
-    if getattr(previous, "__module__", "") != "bench.cli":
-        yield
-        return
-
-    def end(number: int, frame: FrameType | None) -> None:
-        signal.signal(signal.SIGTERM, previous)
-        clock.terminate()
-
-    signal.signal(signal.SIGTERM, end)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, previous)

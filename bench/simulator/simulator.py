@@ -64,7 +64,7 @@ class Simulator:
             raise UserError(f"grad={grad} needs a library that is not installed: pip install {grad}")
         if batch in ("columns", "rows") and not layout.flat:
             raise UserError(
-                f"batch={batch} needs a theta that is one vector; this one is {', '.join(layout.names[:4])}"
+                f"batch={batch} needs a theta that is one vector; this one is {', '.join(leaf.name for leaf in layout.leaves[:4])}"
             )
         self.layout, self.noise, self.clock = layout, noise, clock or Clock(float("inf"))
         self.notes: list[str] = []

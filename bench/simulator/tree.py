@@ -5,10 +5,10 @@ Each number is named by its path: ``mass``, ``gains[3]``, ``legs[0].stiffness``.
 
 from __future__ import annotations
 
-import bisect
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -59,27 +59,6 @@ class Leaf:
         return self.name if last - first == self.size else f"{self.entry(first)} to {self.entry(last - 1)}"
 
 
-class Names(Sequence[str]):
-    """The names of all entries of theta, computed on access, since there may be millions."""
-
-    def __init__(self, leaves: Sequence[Leaf]) -> None:
-        self._leaves = leaves
-        self._starts = [leaf.start for leaf in leaves]
-        self._size = sum(leaf.size for leaf in leaves)
-
-    def __len__(self) -> int:
-        return self._size
-
-    def __getitem__(self, index: Any) -> Any:
-        if isinstance(index, slice):
-            return [self[i] for i in range(*index.indices(self._size))]
-        position = index + self._size if index < 0 else index
-        if not 0 <= position < self._size:
-            raise IndexError(index)
-        leaf = self._leaves[bisect.bisect_right(self._starts, position) - 1]
-        return leaf.entry(position - leaf.start)
-
-
 class ParameterTree:
     """Flattens a theta into a vector ``(d,)``, and rebuilds thetas of the same structure from vectors.
 
@@ -108,13 +87,19 @@ class ParameterTree:
                 f"theta has {start:,} numbers and at most {MAX_SIZE:,} can be examined: give fewer, or a part of them"
             )
         if not np.isfinite(self.vector).all():
-            bad = self.names[int(np.argmin(np.isfinite(self.vector)))]
+            bad = self.name(int(np.argmin(np.isfinite(self.vector))))
             raise UserError(f"{bad} is not finite: give a theta of finite numbers")
 
-    @property
-    def names(self) -> Names:
-        """The name of each entry, ``d`` names."""
-        return Names(self.leaves)
+    def name(self, index: int) -> str:
+        """Return the name of an entry by its index in the vector, ``gains[3]``."""
+        leaf = next(leaf for leaf in self.leaves if index < leaf.start + leaf.size)
+        return leaf.entry(index - leaf.start)
+
+    def block(self, first: int, last: int) -> str:
+        """Return the name of the entries from ``first`` up to ``last``: ``gains``, ``gains[0] to gains[3]``, ``mass to gains``."""
+        inside = [leaf for leaf in self.leaves if leaf.start < last and leaf.start + leaf.size > first]
+        names = [leaf.block(max(first - leaf.start, 0), min(last - leaf.start, leaf.size)) for leaf in inside]
+        return names[0] if len(names) == 1 else f"{names[0]} to {names[-1]}"
 
     def match(self, name: str) -> list[int]:
         """Return the indices of the entries with a name or path: ``gains[3]``, ``gains`` or ``legs[0]``.
@@ -302,33 +287,30 @@ def _arrays(value: Any) -> list[tuple[str, Any]]:
 
 def _traverse(value: Any, path: str) -> Iterator[tuple[str, Any]]:
     """Yield the path and value of each array in a structure; dicts are traversed in insertion order."""
-    if value is None:
-        return
-    if isinstance(value, Mapping):
-        for key in value:
-            yield from _traverse(value[key], f"{path}.{key}" if path else str(key))
-        return
-    fields = _named_fields(value)
-    if fields is not None:
-        for name in fields:
-            yield from _traverse(getattr(value, name), f"{path}.{name}" if path else name)
-    elif _is_structure(value):
-        for index, part in enumerate(value):
-            yield from _traverse(part, f"{path or 'theta'}[{index}]")
-    else:
+    found = _parts(value)
+    if found is None and value is not None:
         yield path, value
+    for name, part in found[0] if found else ():
+        start = path or "theta" * name.startswith("[")
+        yield from _traverse(part, (start + name).removeprefix("."))
 
 
-def _fill(example: Any, parts: Iterator[Any]) -> Any:
-    if example is None:
-        return None
-    if isinstance(example, Mapping):
-        items = {key: _fill(example[key], parts) for key in example}
-        return items if type(example) is dict else type(example)(items)  # type: ignore[call-arg]
-    fields = _named_fields(example)
+def _fill(example: Any, arrays: Iterator[Any]) -> Any:
+    found = _parts(example)
+    if found is None:
+        return None if example is None else next(arrays)
+    return found[1]([_fill(part, arrays) for _, part in found[0]])
+
+
+def _parts(value: Any) -> tuple[list[tuple[str, Any]], Callable[[list[Any]], Any]] | None:
+    """Return the parts of a structure by the ends of their paths, and a function that builds it of others; None for an array."""
+    fields = _named_fields(value)
+    if isinstance(value, Mapping):
+        return [(f".{key}", value[key]) for key in value], lambda parts: type(value)(
+            dict(zip(value, parts, strict=True))
+        )  # type: ignore[call-arg]
     if fields is not None:
-        values = {name: _fill(getattr(example, name), parts) for name in fields}
-        return dataclasses.replace(example, **values) if dataclasses.is_dataclass(example) else type(example)(**values)  # type: ignore[type-var]
-    if _is_structure(example):
-        return type(example)([_fill(part, parts) for part in example])
-    return next(parts)
+        made: Any = partial(dataclasses.replace, value) if dataclasses.is_dataclass(value) else type(value)
+        named = [(f".{name}", getattr(value, name)) for name in fields]
+        return named, lambda parts: made(**dict(zip(fields, parts, strict=True)))
+    return ([(f"[{i}]", part) for i, part in enumerate(value)], type(value)) if _is_structure(value) else None

@@ -30,10 +30,6 @@ def cost(x):
     return (p[0] - 1) ** 2 + p[1] ** 2
 
 
-def right(x):
-    return np.array([cost(np.array(x) + 1e-30j * r).imag for r in np.eye(2)]) / 1e-30
-
-
 def damped(x):
     """Differentiate the last step alone, p fixed, as the attached step of the layer does."""
     p = fit(np.array(x, float))

@@ -38,9 +38,5 @@ def reverse(x, steps=20, factor=1.0):
     return dq
 
 
-def right(x, steps=20):
-    return reverse(x, steps)
-
-
 def doubled(x, steps=20):
     return reverse(x, steps, 2.0)

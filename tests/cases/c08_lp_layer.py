@@ -5,8 +5,6 @@ RIGHT: derivative exactly 0 at theta; under noise N(0, sigma^2 I) grad J is not 
 largest), by quadrature (``smoothed``). ``layer`` returns the solver's leftovers of 1e-8 (barrier mu = 1e-8).
 """
 
-from math import erf, pi, sqrt
-
 import numpy as np
 
 theta = [0.1, 0.2, -0.1]
@@ -27,24 +25,3 @@ def layer(x, mu=1e-8):
     w = mu / (mid - x)
     s = w * w / mu
     return -(np.diag(s) - np.outer(s, s) / s.sum()) @ TRUE
-
-
-def smoothed(x, sigma, n=4001):
-    z = np.linspace(-8, 8, n)
-    cdf = np.vectorize(lambda t: 0.5 * (1 + erf(t / sqrt(2))))
-    pdf = np.exp(-z * z / 2) / sqrt(2 * pi)
-    out = np.zeros(3)
-    for i in range(3):
-        for j in range(3):
-            if i != j:
-                k = 3 - i - j
-                # density that i and j tie at the top
-                t = x[i] + sigma * z
-                tie = pdf * np.exp(-(((t - x[j]) / sigma) ** 2) / 2) / sqrt(2 * pi) / sigma * cdf((t - x[k]) / sigma)
-                rate = np.sum(tie) * (z[1] - z[0])
-                out[i] += -(TRUE[i] - TRUE[j]) * rate
-    return out
-
-
-if __name__ == "__main__":
-    print(layer(theta), smoothed(theta, 0.05), smoothed(theta, 0.2))

@@ -21,9 +21,5 @@ def cost(x):
     return u @ u
 
 
-def right(x):
-    return B.T @ np.linalg.solve(A.T, 2 * np.linalg.solve(A, B @ np.asarray(x)))
-
-
 def adjoint(x):
     return WRONG.T @ np.linalg.solve(A.T, 2 * np.linalg.solve(A, B @ np.asarray(x)))

@@ -14,11 +14,6 @@ def cost(x):
     return np.sum(np.max(np.outer(x, C) + D, axis=1) ** 2)
 
 
-def right(x):
-    values = np.outer(x, C) + D
-    return 2 * values.max(1) * C[values.argmax(1)]
-
-
 def last(x):
     values = np.outer(x, C) + D
     return 2 * values.max(1) * C[-1]

@@ -22,15 +22,14 @@ def rhs(t, y, k):
     return np.array([v, -G + f / M])
 
 
-def rhs_s(t, y, k):
+def rhs_s(t, y, k, damping=D):
     z, _ = y[:2]
     c = float(z < 0)
-    d = rhs(t, y, k)
     S = y[2:].reshape(2, 3)
-    A = np.array([[0, 1], [-k * c / M, -D * c / M]])
+    A = np.array([[0, 1], [-k * c / M, -damping * c / M]])
     B = np.zeros((2, 3))
     B[1, 2] = -z * c / M
-    return np.concatenate([d, (A @ S + B).ravel()])
+    return np.concatenate([rhs(t, y, k), (A @ S + B).ravel()])
 
 
 def cost(x, rtol=1e-6, atol=1e-9):
@@ -47,27 +46,11 @@ def exact(x):
     return np.array([(fine(x + move) - fine(x - move)) / (2 * move.max()) for move in moves])
 
 
-def gradient(x, rtol=1e-6, atol=1e-9):
-    S0 = np.zeros((2, 3))
-    S0[0, 0] = S0[1, 1] = 1
-    s = solve_ivp(rhs_s, (0, T), np.concatenate([[x[0], x[1]], S0.ravel()]), args=(x[2],), rtol=rtol, atol=atol)
-    y = s.y[:, -1]
+def gradient(x, rtol=1e-6, atol=1e-9, damping=D):
+    start = np.array([x[0], x[1], 1, 0, 0, 0, 1, 0])
+    y = solve_ivp(rhs_s, (0, T), start, args=(x[2], damping), rtol=rtol, atol=atol).y[:, -1]
     return 2 * (y[0] - 0.3) * y[2:5]
 
 
 def forgets(x):
-    S0 = np.zeros((2, 3))
-    S0[0, 0] = S0[1, 1] = 1
-
-    def faulty(t, y, k):
-        z, _ = y[:2]
-        c = float(z < 0)
-        S = y[2:].reshape(2, 3)
-        A = np.array([[0, 1], [-k * c / M, 0.0]])
-        B = np.zeros((2, 3))
-        B[1, 2] = -z * c / M
-        return np.concatenate([rhs(t, y, k), (A @ S + B).ravel()])
-
-    s = solve_ivp(faulty, (0, T), np.concatenate([[x[0], x[1]], S0.ravel()]), args=(x[2],), rtol=1e-9, atol=1e-12)
-    y = s.y[:, -1]
-    return 2 * (y[0] - 0.3) * y[2:5]
+    return gradient(x, 1e-9, 1e-12, damping=0.0)

@@ -21,7 +21,3 @@ def unclipped(x, w):
 def pathwise(x, w):
     a = x[0] + w[0]
     return [2 * (a + 0.2) if abs(a) < 1 else 0.0]
-
-
-def policy_cost(x):
-    return float((np.clip(x[0], -1, 1) + 0.2) ** 2 + 1.0)

@@ -1,7 +1,6 @@
 """Minimal: refined= excuses a planted error. Explicit Euler of y' = -k sin y + drive; refined has 50 times the steps.
 
-RIGHT: complex step (``right``). ``five`` is 0.96 times it; for ``coarse`` (8 steps) ``half`` is 0.7 and ``wide`` 1.4
-times its derivative. All are wrong, and farther from the refined cost's derivative than the cost's own derivative is.
+RIGHT: complex step. ``five`` is 0.96 times it, and farther from the refined cost's derivative than the cost's own derivative is.
 """
 
 import numpy as np
@@ -24,33 +23,9 @@ def refined(x):
     return rollout(x, 2000)
 
 
-def coarse(x):
-    return rollout(x, 8)
-
-
 def slope(f, x):
     return np.array([f(np.array(x) + 1e-30j * r).imag for r in np.eye(2)]) / 1e-30
 
 
-def right(x):
-    return slope(cost, x)
-
-
 def five(x):
     return 0.96 * slope(cost, x)
-
-
-def half(x):
-    return 0.7 * slope(coarse, x)
-
-
-def sign(x):
-    return -slope(coarse, x)
-
-
-def wide(x):
-    return 1.4 * slope(coarse, x)
-
-
-if __name__ == "__main__":
-    print(slope(cost, theta), slope(refined, theta), slope(coarse, theta))

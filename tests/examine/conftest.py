@@ -8,5 +8,4 @@ def now(monkeypatch):
     """The time of a clock that only costs move, so that no other program counts: ``now[0] += seconds``."""
     seconds = [0.0]
     monkeypatch.setattr("time.perf_counter", lambda: seconds[0])
-    monkeypatch.setattr("bench.simulator.clock._run_delay", lambda: 0.0)
     return seconds

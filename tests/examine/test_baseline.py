@@ -54,29 +54,22 @@ def test_exit_statuses(sim, capsys):
     assert run(f"{sim}:kinked", "grad=side", "calls=1000") == 1
     assert run(f"{sim}:kinked", "grad=side", "calls=1000", "expect=kink") == 0
     out = capsys.readouterr()
-    assert "the cause is kink, as expected" in out.out
+    assert "expect=kink holds" in out.out
     assert f"next: choose a theta beside it\n  python -m bench examine {sim}:kinked grad=side" in out.out
 
 
-@pytest.mark.parametrize("error", ["BaseException('no')", "GeneratorExit", "ValueError('no')"])
-def test_a_file_that_raises_at_its_import_is_bad_input(tmp_path, capsys, error):
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [("BaseException('no')", "cannot be imported: "), ("SystemExit(0)", "ends the process when it is")],
+)
+def test_a_file_that_raises_at_its_import_is_bad_input(tmp_path, capsys, error, said):
     (tmp_path / "raises.py").write_text(f"raise {error}\n")
-    assert run(f"{tmp_path / 'raises.py'}:cost", "calls=-5") == 2
-    assert "raises.py' cannot be imported: " in capsys.readouterr().err
-
-
-def test_a_number_of_calls_below_1_is_refused(sim, capsys):
-    assert run(f"{sim}:cost", "calls=-5") == 2
-    assert "calls=-5 is not a whole number of at least 1" in capsys.readouterr().err
+    assert run(f"{tmp_path / 'raises.py'}:cost") == 2
+    assert said in capsys.readouterr().err
 
 
 def test_settings_of_the_command_line(sim, capsys):
-    settings = [
-        "tolerance=theta[0]:0.3",
-        "atol=1e-9",
-        "compile_budget=5s",
-        "refined=cost",
-    ]
+    settings = ["tolerance=theta[0]:0.3", "atol=1e-9", "compile_budget=5s", "refined=cost"]
     assert run(f"{sim}:cost", "grad=off", "calls=400", *settings) == 0
     assert "small error, within the tolerance" in capsys.readouterr().out
     assert run(f"{sim}:cost", "expect=nonsense") == 2
@@ -96,10 +89,8 @@ def test_a_folder_that_cannot_be_written_is_an_error_before_the_examination(sim,
 
 def test_a_baseline_accepts_what_was_there_and_refuses_what_is_worse(tmp_path):
     path = tmp_path / "baseline.json"
-    for _ in range(2):  # a run that fails writes no baseline, so it does not pass at the next try
-        first = examined(1.1).compared(path)
-        assert first.status == 1
-        assert "no such file, not written since the status is 1; --bench-update writes it" in str(first)
+    assert examined(1.1).compared(path).status == 1
+    assert not path.exists()  # a run that fails writes no baseline, so it does not pass at the next try
     assert examined(1.1).compared(path, update=True).status == 0
     stored = json.loads(path.read_text())
     assert (stored["cause"], stored["status"]) == ("wrong_adjoint", 1) or stored["cause"] == "wrong_factor"
@@ -131,13 +122,10 @@ pytest_plugins = ["bench.examine.fixture"]
 
 def test_the_fixture_fails_on_a_wrong_gradient_and_compares_with_a_baseline(examine, tmp_path):
     path = tmp_path / "baseline.json"
-    for _ in range(2):
-        with pytest.warns(match="no such file, not written"), pytest.raises(AssertionError, match="wrong_"):
-            examine(cost, [1.0, 0.5], grad=lambda x: grad(x, 1.1), calls=100, baseline=path)
+    with pytest.warns(match="no such file, not written"), pytest.raises(AssertionError, match="wrong_"):
+        examine(cost, [1.0, 0.5], grad=lambda x: grad(x, 1.1), calls=100, baseline=path)
     with pytest.warns(match=f"baseline={path}: no such file, written"):
         examine(cost, [1.0, 0.5], grad=grad, calls=100, baseline=path)
-    with pytest.raises(AssertionError, match=r"wrong_(factor|adjoint)"):
-        examine(cost, [1.0, 0.5], grad=lambda x: grad(x, 1.1), calls=100)
     with pytest.raises(AssertionError, match="derivative was right, is wrong"):
         examine(cost, [1.0, 0.5], grad=lambda x: grad(x, 1.1), calls=100, baseline=path)
 

@@ -1,10 +1,6 @@
 """The budget: what decides comes first, every finished stage is kept, and calls as a budget give the same report anywhere."""
 
 import re
-import signal
-import subprocess
-import sys
-import textwrap
 import time
 from functools import partial
 
@@ -14,7 +10,6 @@ import pytest
 
 import bench
 from bench.errors import UserError
-from bench.simulator.clock import Clock, OutOfTime
 
 examine = partial(bench.examine, progress=False)
 THETA = [0.4, 0.3, 0.5]
@@ -28,7 +23,7 @@ def grad(x):
     return np.array([np.cos(x[0]) * x[1], np.sin(x[0]) + 3 * x[1] ** 2 * x[2], x[1] ** 3])
 
 
-@pytest.mark.parametrize("calls", [8, 15, 29, 79, 243, 700])
+@pytest.mark.parametrize("calls", [8, 29, 243])
 def test_a_gradient_10_percent_off_never_reads_like_a_right_one(calls):
     """8 calls: one cost, one gradient, and two costs per component."""
     right = examine(cost, THETA, grad=grad, calls=calls)
@@ -41,14 +36,14 @@ def test_a_gradient_10_percent_off_never_reads_like_a_right_one(calls):
 
 
 def test_fewer_calls_than_components_decide_nothing():
-    for calls in range(1, 8):
+    for calls in (1, 4, 7):
         report = examine(cost, THETA, grad=grad, calls=calls)
         assert (report.status, report.cause) == (3, "undecided"), calls
         assert re.search(r"[0-2] of 3 components", str(report))
     assert "calls=14" in report.advice
 
 
-@pytest.mark.parametrize(("budget", "size"), [(20, 2), (1, 2), (20, 100)])
+@pytest.mark.parametrize(("budget", "size"), [(1, 2), (20, 100)])
 def test_the_proposed_budget_suffices_for_a_slow_cost(now, budget, size):
     def slow(x):
         now[0] += 20.0
@@ -64,40 +59,29 @@ def test_the_proposed_budget_suffices_for_a_slow_cost(now, budget, size):
     assert examine(slow, np.ones(size), grad=gradient, budget=float(proposed)).derivative == "right"
 
 
-def pendulum_gradients():
-    """Yield gradients of a pendulum by their fault: shared memory, 0.2% off, and none, since one step shares nothing."""
-    yield "overwritten", 20, lambda x, steps: mechanisms.swinging(x, steps, shared=True, slope=True)
-    yield "off", 20, lambda x, steps: mechanisms.swinging(x, steps, slope=True) * [1, 1.002]
-    yield "right", 1, lambda x, steps: mechanisms.swinging(x, steps, shared=True, slope=True)
-
-
-@pytest.mark.parametrize("settings", [{"calls": 400}, {"budget": 3}])
-@pytest.mark.parametrize(("fault", "steps", "slope"), [*pendulum_gradients()])
-def test_verdicts_do_not_depend_on_load(now, fault, steps, slope, settings):
+@pytest.mark.parametrize("factor", [1.0, 1.002])
+def test_verdicts_do_not_depend_on_load(now, factor):
     """A cost that is four times slower, as on a loaded machine, gets the same verdict."""
 
     def swinging(seconds):
-        def cost(x, steps=steps):
+        def cost(x):
             now[0] += seconds
-            return mechanisms.swinging(x, steps)
+            return mechanisms.swinging(x)
 
         return cost
 
-    def grad(x, steps=steps):
-        return slope(x, steps)
+    def slope(x):
+        return mechanisms.swinging(x, slope=True) * [1.0, factor]
 
-    if fault == "overwritten":
-        settings = {**settings, "horizons": [1, 2, 5, 20]}
-    reports = [examine(swinging(seconds), [0.7, 0.3], grad=grad, **settings) for seconds in (1e-4, 4e-4)]
+    reports = [examine(swinging(seconds), [0.7, 0.3], grad=slope, budget=1) for seconds in (1e-4, 4e-4)]
     assert len({(report.status, report.cause) for report in reports}) == 1
-    assert reports[0].status == (fault != "right")
+    assert reports[0].status == (factor > 1.0)
 
 
 def test_sigma_that_was_not_measured_is_not_decided():
     report = examine(cost, THETA, grad=grad, sigma=0.1, calls=60)
     assert (report.status, report.cause, report.derivative) == (3, "unmeasured", "right")
     assert "sigma 0.10: not measured" in report.noise_answer
-    assert "no sigma" not in str(report)
 
 
 def test_first_calls_have_a_budget_of_their_own(now):
@@ -121,74 +105,6 @@ def test_first_calls_have_a_budget_of_their_own(now):
     assert report.spent.seconds < 0.4
 
 
-def test_a_call_that_hangs_is_named():
-    calls = []
-
-    def hangs(x):
-        calls.append(1)
-        if len(calls) >= 30:
-            time.sleep(60)
-        return cost(x)
-
-    report = examine(hangs, THETA, budget=3)
-    assert any("had not returned after " in note for note in report.notes)
-    assert not any("had not returned" in note for note in examine(cost, THETA, calls=100).notes)
-
-
-def test_a_gradient_that_compiles_too_long_is_tried_once():
-    tried = []
-
-    def hangs(x):
-        tried.append(1)
-        time.sleep(60)
-
-    report = examine(cost, THETA, grad=hangs, budget=5, compile_budget=0.2)
-    assert (report.status, report.cause) == (3, "undecided")
-    assert len(tried) == 1
-
-
-@pytest.mark.parametrize("call", [1, 20])
-def test_sigterm_ends_an_examination_with_130_and_a_report_after_the_first_call(tmp_path, call):
-    path, marker = tmp_path / "slow.py", tmp_path / "called"
-    path.write_text(
-        textwrap.dedent(f"""
-            import pathlib, time
-            theta, calls = [0.4, 0.3], []
-            def cost(x):
-                calls.append(1)
-                if len(calls) == {call}: pathlib.Path({str(marker)!r}).touch()
-                time.sleep(0.02 if len(calls) > 1 or {call} > 1 else 60)
-                return x[0] ** 2 * x[1]
-            def grad(x): return [2 * x[0] * x[1], x[0] ** 2]
-        """)
-    )
-    words = [sys.executable, "-m", "bench", "examine", f"{path}:cost", "grad=grad", "budget=300"]
-    process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    started = time.perf_counter()
-    while not marker.exists() and process.poll() is None and time.perf_counter() - started < 60:
-        time.sleep(0.05)
-    process.send_signal(signal.SIGTERM)
-    out, err = process.communicate(timeout=30)
-    assert process.returncode == 130
-    assert ("everything after SIGTERM" in out) == ("Derivative: right. smooth" in out) == (call > 1)
-    assert ("bench: stopped" in err) == (call == 1)
-
-
-def test_time_lost_to_other_programs_is_not_charged(monkeypatch):
-    lost = {"seconds": 0.0}
-    monkeypatch.setattr("bench.simulator.clock._run_delay", lambda: lost["seconds"])
-    monkeypatch.setattr("bench.simulator.clock.READ_INTERVAL_S", 0.0)
-    clock = Clock(10.0)
-    lost["seconds"] = 4.0
-    assert clock.waited == pytest.approx(4.0)
-    assert clock.spent < 0.5
-    lost["seconds"] = 40.0  # at most as much as the budget
-    clock.start -= 25.0
-    assert clock.spent == pytest.approx(15.0, abs=0.5)
-    with pytest.raises(OutOfTime):
-        clock.check()
-
-
 @pytest.mark.parametrize("calls", [0, -1, 2.5])
 def test_calls_is_a_whole_number(calls):
     with pytest.raises(UserError, match="is not a number of calls"):
@@ -204,7 +120,7 @@ def test_a_gradient_that_is_right_at_one_theta_is_said_to_be_right_there_only():
     few = examine(lambda x: float(np.sin(x).sum()), [0.3, 0.7], grad=stale, calls=30)
     assert "at this theta only" in few.conclusion
     assert "other thetas around this one (calls)" in str(few)
-    many = examine(lambda x: float(np.sin(x).sum()), [0.3, 0.7], grad=stale)
+    many = examine(lambda x: float(np.sin(x).sum()), [0.3, 0.7], grad=stale, calls=1000)
     assert many.cause == "stale_gradient"
 
 
@@ -223,12 +139,11 @@ def test_an_interruption_that_a_compiled_library_turns_into_its_own_error_is_the
     assert report.left_out
 
 
-@pytest.mark.parametrize("share", [0.1, 0.3])
-def test_exceptions_at_random_calls_are_named_as_such(share):
+def test_exceptions_at_random_calls_are_named_as_such():
     random = np.random.default_rng(3)
 
     def fragile(x):
-        if random.random() < share and fragile.count:
+        if random.random() < 0.1 and fragile.count:
             raise ValueError("no convergence")
         fragile.count += 1
         return cost(x)
@@ -237,13 +152,3 @@ def test_exceptions_at_random_calls_are_named_as_such(share):
     report = examine(fragile, THETA, grad=grad, calls=2000)
     assert (report.status, report.cause) == (1, "nondeterministic"), str(report)
     assert "equal calls raise an exception or return a number" in report.conclusion
-
-
-def test_exceptions_at_the_same_thetas_are_not_random():
-    def bounded(x):
-        if x[0] > 0.401:
-            raise ValueError("outside")
-        return cost(x)
-
-    report = examine(bounded, THETA, grad=grad, calls=2000)
-    assert report.cause != "nondeterministic", str(report)

@@ -47,9 +47,7 @@ Pair = namedtuple("Pair", "left right")
 @pytest.mark.parametrize(
     ("theta", "names"),
     [
-        ([1.0, 2.0], ["theta[0]", "theta[1]"]),
         (2.0, ["theta"]),
-        ({"mass": 1.0, "gains": np.arange(2.0)}, ["mass", "gains[0]", "gains[1]"]),
         ({"legs": [{"k": 1.0}, {"k": 2.0}]}, ["legs[0].k", "legs[1].k"]),
         (Body(1.0, np.ones((1, 2))), ["mass", "gains[0,0]", "gains[0,1]"]),
         (Pair(1.0, (2.0, 3.0)), ["left", "right[0]", "right[1]"]),
@@ -57,7 +55,7 @@ Pair = namedtuple("Pair", "left right")
 )
 def test_theta_is_taken_apart_and_put_together(theta, names):
     layout = ParameterTree(theta)
-    assert list(layout.names) == names
+    assert [layout.name(i) for i in range(layout.vector.size)] == names
     built = layout.unflatten(layout.vector + 1)
     assert type(built) is type(theta) or isinstance(theta, list)
     np.testing.assert_array_equal(layout.flatten(built), layout.vector + 1)
@@ -85,13 +83,6 @@ def test_gradients_are_matched_by_name_whatever_their_order():
     assert report.status == 0, str(report)
 
 
-def test_list_of_numbers_of_any_library_is_a_vector():
-    layout = ParameterTree([1.0, 2.0])
-    np.testing.assert_array_equal(layout.flatten([np.float32(3), np.array(4.0)]), [3.0, 4.0])
-    with pytest.raises(UserError, match="theta has shape"):
-        layout.flatten([np.float32(3)])
-
-
 MATRIX = np.arange(1.0, 7.0).reshape(2, 3)
 
 
@@ -99,12 +90,9 @@ MATRIX = np.arange(1.0, 7.0).reshape(2, 3)
     ("theta", "turned", "said"),
     [
         (np.ones(2), lambda g: g[:1], r"shape \(1,\), and theta has shape \(2,\)"),
-        (MATRIX, lambda g: g.T, r"shape \(3, 2\), and theta has shape \(2, 3\): is it transposed\?"),
         (MATRIX, lambda g: g.T.tolist(), r"shape \(3, 2\), and theta has shape \(2, 3\): is it transposed\?"),
         ({"w": MATRIX}, lambda g: {"w": g["w"].T}, r"shape w \(3, 2\), and theta has shape w \(2, 3\): is it trans"),
         (np.ones(4), lambda g: g[:, None], r"shape \(4, 1\), and theta has shape \(4,\)$"),
-        (np.ones(4), lambda g: g.reshape(2, 2), r"shape \(2, 2\), and theta has shape \(4,\)$"),
-        (MATRIX, lambda g: g.tolist(), ""),
         (MATRIX, lambda g: g.ravel(), ""),
         (MATRIX.tolist(), lambda g: np.array(g), ""),
         ([MATRIX, 2.0], lambda g: tuple(g), ""),
@@ -128,16 +116,9 @@ def test_gradient_has_the_shape_of_theta(theta, turned, said):
         assert examine(cost, theta, grad=grad, calls=60).status == 0
 
 
-@pytest.mark.parametrize("library", ["jax", "torch"])
-def test_a_library_that_cannot_differentiate_the_cost_is_bad_input(library):
-    with pytest.raises(UserError, match=rf"{library} cannot differentiate the cost: .* or give grad=FUNCTION \("):
-        examine(lambda x: np.sin(np.asarray(x)).sum(), [1.0, 2.0], grad=library)
-
-
-def test_cost_that_takes_its_argument_apart_is_given_another_each_time():
-    report = examine(lambda p: p.pop("mass") ** 2, {"mass": 2.0})
-    assert report.status == 0
-    assert "warning: the cost changes theta in place" in str(report)
+def test_a_library_that_cannot_differentiate_the_cost_is_bad_input():
+    with pytest.raises(UserError, match=r"jax cannot differentiate the cost: .* or give grad=FUNCTION \("):
+        examine(lambda x: np.sin(np.asarray(x)).sum(), [1.0, 2.0], grad="jax")
 
 
 def shifted(x):
@@ -145,20 +126,12 @@ def shifted(x):
     return x[0] - 1.0
 
 
-def halved(x):
-    x["a"] /= 2
-    return {"a": 4.0 * x["a"]}
-
-
 @pytest.mark.parametrize(
     ("cost", "theta", "settings", "names"),
     [
-        (lambda x: float(x[0] ** 2), [1.0], {"grad": lambda x: np.multiply(x, 2, out=x)}, ["the gradient"]),
-        (lambda x: float(x["a"] @ x["a"]), {"a": np.ones(2)}, {"grad": halved}, ["the gradient"]),
-        (shifted, [1.0], {"grad": lambda x: [1.0]}, ["the cost"]),
+        (lambda p: p.pop("mass") ** 2, {"mass": 2.0}, {}, ["the cost"]),
         (shifted, [1.0], {"grad": np.ones_like, "batch": "columns"}, ["the cost"]),
         (shifted, [1.0], {"grad": lambda x: np.multiply(x, 0, out=x) + 1}, ["the cost", "the gradient"]),
-        (lambda x: shifted(x) if x[0] > 1.0 else x[0], [1.0], {"grad": lambda x: [1.0]}, ["the cost"]),
         (lambda x: x[0], [1.0], {"grad": lambda x: [1.0]}, []),
     ],
 )
@@ -197,15 +170,6 @@ def test_a_library_that_is_not_installed_is_named(monkeypatch):
         bench.examine(lambda x: x[0], [1.0], grad="jax")
 
 
-def test_gradient_that_raises_is_a_finding():
-    def broken(x):
-        raise FloatingPointError("no tape")
-
-    report = examine(bowl, [1.0, 0.5], grad=broken)
-    assert (report.status, report.cause) == (1, "raised")
-    assert "no tape" in str(report)
-
-
 # -------------------------------------------------------------------------------------- jumps and noise
 
 
@@ -231,15 +195,6 @@ def test_a_tread_is_the_height_of_four_equal_jumps_at_even_distances(places, hei
     breaks = tuple(Break("jump", *each) for each in zip(places, heights, strict=True))
     line = LineScan(np.ones(1), np.zeros(2), np.zeros(2), breaks, steps=False)
     assert line.tread == pytest.approx(tread)
-
-
-def test_treads_that_a_gradient_misses_are_named_though_they_are_small():
-    def cost(x):
-        return float(np.sin(x[0]) * x[1] + 2e-4 * np.floor(1000 * x[0] + 0.5))
-
-    report = examine(cost, [0.5, 0.7], grad=lambda x: [np.cos(x[0]) * x[1], np.sin(x[0])])
-    assert (report.derivative, report.cause, report.status) == ("right", "staircase", 1)
-    assert "at even distances" in report.noise_answer
 
 
 @pytest.fixture(scope="module")
@@ -328,14 +283,9 @@ def test_bad_settings_say_what_is_allowed(settings, match):
         examine(bowl, [1.0, 0.5], **settings)
 
 
-def test_cost_that_cannot_be_called_is_bad_input():
-    with pytest.raises(UserError, match="cannot be called at theta: KeyError"):
-        examine(lambda p: p["mass"], {"weight": 1.0})
-
-
 @pytest.mark.parametrize(
     ("error", "advice"),
-    [(RuntimeError("contact solver diverged"), "Give a theta at"), (TypeError("no"), "It must accept")],
+    [(RuntimeError("contact solver diverged"), "Give a theta at"), (KeyError("mass"), "It must accept")],
 )
 def test_advice_on_a_cost_that_raises_depends_on_what_it_raises(error, advice):
     def cost(x):
@@ -416,13 +366,12 @@ def mysim(tmp_path):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["{}:cots"], "did you mean 'cost'"),
-        (["{}:cost", "theta=thetta"], "did you mean 'theta'"),
         (["{0}:cost", "grad={0}:rihgt"], "did you mean 'right'"),
         (["nothing.py:cost"], "there is no file"),
         (["{}:cost", "grad=jaxx"], "did you mean 'jax'"),
         (["{}:cost", "thta=1"], "did you mean 'theta'"),
         (["{}:cost", "theta=1,x"], "is not a list of numbers"),
+        (["{}:cost", "calls=-5"], "calls=-5 is not a whole number of at least 1"),
         ([], "name one cost"),
         (["{}:leaves"], "it ended the process by sys.exit"),
         (["{}:nothing"], "the cost returned None"),
@@ -436,20 +385,19 @@ def test_command_says_what_is_wrong_with_its_words(mysim, capsys, words, said):
     assert said in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("size", [1e308, np.inf])
-def test_own_arithmetic_does_not_warn_and_the_cost_still_does(size):
+def test_own_arithmetic_does_not_warn_and_the_cost_still_does():
     """Warnings of the cost are kept with what it prints."""
 
     def cost(x):
         np.float64(1.0) / np.float64(0.0)
-        return float(x[0]) if x[0] <= 1.0 else size * (-1.0 if int(1e6 * x[0]) % 2 else 1.0)
+        return float(x[0]) if x[0] <= 1.0 else 1e308 * (-1.0 if int(1e6 * x[0]) % 2 else 1.0)
 
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         with pytest.raises(bench.UserError, match="divide by zero"):
             examine(cost, [1.0])
         with np.errstate(divide="ignore"):
-            str(examine(cost, [1.0], grad=lambda x: [size]))
+            str(examine(cost, [1.0], grad=lambda x: [1e308]))
 
 
 def test_command_takes_named_numbers(mysim, capsys):
@@ -465,13 +413,6 @@ def test_command_takes_named_numbers(mysim, capsys):
 def test_a_bias_interval_decides_where_grad_j_is_known(error, low, high, cause):
     norm = float(error > 0)
     assert smoothing.Smoothed(0.1, np.zeros(2), error, norm, 64, 0.0, low, high, math.nan, "", ()).cause == cause
-
-
-def test_a_method_costs_its_samples_times_the_calls_of_each():
-    terms = np.array([[1.0, -1.0] * 50])
-    found = smoothing._method("smoothing", (0.0, 0.12), terms, 2.0, 2, 0.5)
-    samples = math.ceil(terms.var(ddof=1) / 4.0 / (0.1**2 - 0.06**2))
-    assert (found.samples, found.calls, found.seconds) == (samples, 2 * samples, samples)
 
 
 def test_the_line_taken_out_of_the_terms_leaves_their_mean():
@@ -492,29 +433,9 @@ def test_size_of_a_gradient_is_without_the_share_of_its_noise():
         assert found.norm == pytest.approx(math.sqrt(square))
 
 
-def test_cost_that_is_constant_between_jumps_is_no_right_gradient():
-    """Its derivative is 0 wherever it exists, as a check of one theta would say."""
-    report = examine(lambda x: np.floor(20 * x[0]) / 20, [1.01], sigma=0.1)
-    assert (report.status, report.cause) == (1, "staircase")
-    assert "staircase: the cost is constant between" in str(report)
-
-
-def test_jumps_off_the_grid_of_steps_are_seen_by_the_integral():
-    """A slope of 1 made of jumps every 1e-4, beside one of 1 that the gradient has."""
-    report = examine(lambda x: x[0] + np.floor(1e4 * x[0]) / 1e4, [1.00005], grad=lambda x: [1.0])
-    assert report.status == 1
-
-
 def test_gradient_that_ends_the_process_is_no_success(mysim, capsys):
     assert cli.main(["examine", f"{mysim}:cost", "grad=leaves", "--quiet"]) == 1
     assert "raised: the gradient could not be computed" in capsys.readouterr().out
-
-
-def test_file_that_ends_the_process_is_bad_input(tmp_path, capsys):
-    path = tmp_path / "script.py"
-    path.write_text("def cost(x): return x[0]\nraise SystemExit(0)\n")
-    assert cli.main(["examine", f"{path}:cost", "theta=1"]) == 2
-    assert "ends the process when it is imported" in capsys.readouterr().err
 
 
 def test_the_next_command_replaces_a_setting(right):
@@ -525,7 +446,7 @@ def test_the_next_command_replaces_a_setting(right):
 def test_the_advice_compares_the_gradient_without_noise_and_mirrored_draws():
     """Of x^3 at 1, whose smoothed gradient is 3 + 3 sigma^2, from 3 (x + sigma u)^2."""
     reports = {
-        sigma: examine(lambda x: x[0] ** 3, [1.0], grad=lambda x: 3 * x**2, sigma=sigma, calls=20_000)
+        sigma: examine(lambda x: x[0] ** 3, [1.0], grad=lambda x: 3 * x**2, sigma=sigma, calls=6000)
         for sigma in (0.1, 0.5)
     }
     methods = {sigma: {m.name: m for m in report.smoothed[0].methods} for sigma, report in reports.items()}

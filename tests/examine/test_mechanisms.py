@@ -29,30 +29,7 @@ def slope(x, steps=20):
     return mechanisms.swinging(x, steps, slope=True)
 
 
-def shared(x, steps=20):
-    return mechanisms.swinging(x, steps, shared=True, slope=True)
-
-
 # ------------------------------------------------------------------------------------- adaptive, overwritten
-
-
-def adaptive(calls, **settings):
-    def cost(x):
-        return mechanisms.adaptive(x, rtol=1e-3)
-
-    def grad(x):
-        return mechanisms.frozen(x, rtol=1e-3)
-
-    return examine(cost, [1.0, 1.0, 0.5], grad=grad, calls=calls, **settings)
-
-
-@pytest.mark.parametrize("calls", [700, pytest.param(1500, marks=pytest.mark.slow)])
-def test_adaptive_steps_are_no_missing_term(calls):
-    """700 calls, as a solver of 50 ms has in a minute on a loaded machine."""
-    report = adaptive(calls)
-    assert (report.status, report.cause, report.derivative) == (3, "adaptive", "not shown")
-    assert "refined=COST" in report.advice
-    assert adaptive(calls, expect="adaptive").status == 0
 
 
 def separate(rtol, calls=3000, forgotten=0.0, **settings):
@@ -65,11 +42,12 @@ def separate(rtol, calls=3000, forgotten=0.0, **settings):
     return examine(lambda x: mechanisms.adaptive(x, rtol), start, grad=grad, calls=calls, **settings)
 
 
-@pytest.mark.parametrize("rtol", [1e-3, *(pytest.param(rtol, marks=pytest.mark.slow) for rtol in (1e-4, 1e-5))])
+@pytest.mark.slow
+@pytest.mark.parametrize("rtol", [1e-3, 1e-4])
 def test_a_separately_solved_adjoint_is_a_discretisation_gap(rtol):
     report = separate(rtol)
     assert (report.status, report.cause) == (3, "adaptive"), str(report)
-    assert separate(rtol, refined=mechanisms.refined).cause == "adaptive"
+    assert separate(rtol, calls=1500, refined=mechanisms.refined).cause == "adaptive"
 
 
 @pytest.mark.slow
@@ -88,40 +66,25 @@ def test_a_small_error_is_not_decided_where_the_budget_ends_before_the_search_fo
     assert separate(1e-4, forgotten=0.5, calls=120).status == 1
 
 
-def test_jumps_of_a_program_with_fixed_steps_excuse_nothing():
-    """Jumps as large as the error do not explain it where no loop depends on theta, or a refined cost has the same slopes."""
-
-    def cost(x):
-        return swing(x) + 1e-4 * np.floor(x[0] * 300 + 0.4)
-
-    def wrong(x):
-        return slope(x) * [1.02, 1.0]
-
-    guessed = examine(cost, START, grad=wrong)
-    assert (guessed.status, guessed.cause) == (1, "wrong_factor"), str(guessed)
-    assert examine(cost, START, grad=wrong, refined=swing).status == 1
-
-
 def test_a_small_jump_on_a_curved_line_is_found():
     """The largest changes of slope on the line are those of its bends, 40 times the jump."""
     line = lines.scan(lambda t: np.cos(t) + 1e-4 * (t > 1.2345), np.ones(1), 1e-16)
     assert [one.at for one in line.jumps] == pytest.approx([1.2345], abs=1e-5)
 
 
-def test_memory_overwritten_between_forward_and_backward_is_named_by_growth():
-    grown = examine(swing, START, grad=shared, horizons=[1, 2, 5, 20])
-    assert (grown.status, grown.cause) == (1, "overwritten")
-    assert [one.steps for one in grown.explained.growth] == [1, 2, 5, 20]
-    errors = [one.error for one in grown.explained.growth]
-    assert errors[0] < 1e-6 < errors[1] < errors[-1]
-    assert examine(swing, START, grad=slope, horizons=[1, 20]).status == 0
+def test_errors_by_number_of_steps_are_those_of_shared_memory():
+    grown = examine(
+        swing, START, grad=partial(mechanisms.swinging, shared=True, slope=True), horizons=[1, 2, 20]
+    ).explained.growth
+    assert [one.steps for one in grown] == [1, 2, 20]
+    assert grown[0].error < 1e-6 < grown[1].error < grown[2].error
 
 
 # ------------------------------------------------------------------------------------- noise and precision
 
 
 def test_last_digits_that_vary_are_never_a_state():
-    for seed in range(20):
+    for seed in range(8):
         random = np.random.default_rng(seed)
 
         def cost(x, random=random):
@@ -132,39 +95,10 @@ def test_last_digits_that_vary_are_never_a_state():
         assert (report.status, report.repeats.has_state) == (0, False), seed
 
 
-def test_noise_above_the_last_digits_is_a_fault_that_does_not_hide_another():
-    random = np.random.default_rng(0)
-    report = examine(lambda x: swing(x) + 1e-7 * random.standard_normal(), START, grad=lambda x: 2 * slope(x))
-    assert report.cause == "nondeterministic"
-    assert "wrong_factor" in str(report)
-
-
-def test_a_warm_start_is_one_finding():
-    solver = mechanisms.WarmStarted()
-    report = examine(solver.cost, [1.0, 2.0], grad=solver.gradient)
-    assert (report.status, report.cause) == (1, "nondeterministic")
-    assert "depends on the call before it" in report.conclusion
-    assert len(report.problems) == 1
-
-
-@pytest.mark.parametrize("is_mixed", [False, True])
-@pytest.mark.parametrize(("factor", "status", "cause"), [(1.0, 0, None), (1.55, 1, "wrong_factor")])
-def test_float32_behind_float_is_checked_as_float32(factor, status, cause, is_mixed):
-    def cost(x):
-        return mechanisms.single(x, is_mixed)
-
-    report = examine(cost, START, grad=lambda x: factor * mechanisms.single_gradient(x))
-    assert report.status == status, str(report)
-    assert cause is None or report.cause == cause
-    assert report.precision == "float32"
-    assert report.check.components[0].step > 1e-4  # where float32 resolves a difference
-
-
 @pytest.mark.parametrize(
     "cost",
     [
         lambda x: float(np.floor(8 * x[0]) + x[0] * 0.5),
-        lambda x: float(np.round(x[0], 5)),
         lambda x: float(np.round(x[0] ** 2, 7)),
         lambda x: 0.5 * x[0] + 1e-7 * np.floor(1e7 * x[0]),
     ],
@@ -172,34 +106,6 @@ def test_float32_behind_float_is_checked_as_float32(factor, status, cause, is_mi
 def test_float64_is_not_taken_for_float32(cost):
     report = examine(cost, [0.75], grad=lambda x: [0.5])
     assert report.precision == "float64"
-
-
-def test_a_seed_taken_from_theta_is_named():
-    def cost(x):
-        seed = int(np.frombuffer(x.tobytes(), np.uint32).sum())
-        return swing(x) + 0.38 * np.random.default_rng(seed).standard_normal()
-
-    report = examine(cost, START, grad=slope)
-    assert (report.status, report.cause) == (1, "rough")
-    assert "a seed or hash taken from theta" in str(report)
-
-
-@pytest.mark.parametrize(("steps", "status", "cause"), [(60, 3, "unsettled"), (3000, 1, "nan_gradient")])
-def test_chaos_is_not_blamed_on_the_gradient_and_an_overflow_is_one(steps, status, cause):
-    """The Henon map: after 60 steps the gradient itself explains that neighbours differ; after 3,000 it is inf - inf."""
-
-    def rollout(x, dq=0.0, dp=0.0):
-        q, p = map(float, x)
-        for _ in range(steps):
-            q, p, dq, dp = 1 - 1.4 * q * q + p, 0.3 * q, -2.8 * q * dq + dp, 0.3 * dq
-        return q, dq
-
-    report = examine(
-        lambda x: rollout(x)[0], [0.1, 0.1], grad=lambda x: [rollout(x, 1.0)[1], rollout(x, 0.0, 1.0)[1]], calls=1500
-    )
-    assert (report.status, report.cause) == (status, cause), str(report)
-    assert "as in chaos" in report.conclusion
-    assert ("overflows" in report.conclusion) == (steps > 60)
 
 
 # ------------------------------------------------------------------------------------- tolerance, zeros, raised
@@ -213,10 +119,9 @@ def test_errors_within_the_tolerance_are_warnings_with_their_size():
     assert strict.status == 1
     assert re.search(r"theta\[1\]: .* off by 0\.1", strict.conclusion)
     assert strict.size == pytest.approx(1e-3, rel=0.01)
-    for tolerance in (2e-3, {"theta[1]": 2e-3}):
-        report = examine(swing, START, grad=off, tolerance=tolerance)
-        assert report.status == 0, str(report)
-        assert "small error, within the tolerance" in str(report)
+    report = examine(swing, START, grad=off, tolerance={"theta[1]": 2e-3})
+    assert report.status == 0, str(report)
+    assert "small error, within the tolerance" in str(report)
     assert examine(swing, START, grad=off, tolerance={"theta[0]": 2e-3}).status == 1
     with pytest.raises(UserError, match=r"unknown input 'theta.7.'"):
         examine(swing, START, grad=off, tolerance={"theta[7]": 1e-3})
@@ -236,29 +141,6 @@ def test_inputs_without_effect_fail_where_they_are_not_allowed():
     assert "zero: friction" in str(reports[None])
     assert reports[False].cause == "no_effect"
     assert not any("zero" in text for text in reports["friction"].warnings)
-
-
-@pytest.mark.parametrize("calls", [8, 30, 3000])
-def test_a_gradient_below_the_rounding_of_a_cost_that_stays_is_zero(calls):
-    """As of a body that rests on the ground at the end: its tape returns 1e-16 beside differences of 0."""
-    report = examine(lambda x: 0.04, [0.12, -1.0], grad=lambda x: [-2.5e-16, -4.7e-18], calls=calls)
-    assert (report.status, report.cause, report.derivative) == (3, "constant", "not shown"), str(report)
-    wrong = examine(lambda x: 0.04, [0.12, -1.0], grad=lambda x: [-2.5e-6, 0.0], calls=calls)
-    assert (wrong.status, wrong.derivative) == (1, "wrong"), str(wrong)
-
-
-def test_an_exception_at_other_thetas_does_not_hide_an_error_at_theta():
-    def grad(x):
-        if abs(x[0] - START[0]) > 1e-3:
-            raise RuntimeError("line one\nline two " * 100)
-        return 75300 * slope(x)
-
-    report = examine(swing, START, grad=grad)
-    assert report.status == 1
-    assert report.cause in ("wrong_factor", "wrong_adjoint")
-    assert "off by 7.5e6%" in report.conclusion
-    assert "raised an exception" in str(report)
-    assert all(len(text) < 400 for text in (*report.problems, *report.warnings))
 
 
 # ------------------------------------------------------------------------------------- inputs
@@ -322,16 +204,15 @@ def test_steep_and_rough_lines_have_no_breaks(cost):
     assert not lines.scan(lambda t: cost(t - 0.113), np.ones(1), 1e-16).breaks
 
 
-@pytest.mark.parametrize("size", [1.0, 1e6])
-def test_changes_in_the_last_digits_are_no_jumps(size):
+def test_changes_in_the_last_digits_are_no_jumps():
     """As after a solver that adds its forces in another order on either side of a place."""
 
     def cost(x):
-        value = size * np.sin(x[0]) * np.cos(x[1])
+        value = 1e6 * np.sin(x[0]) * np.cos(x[1])
         return np.nextafter(value, np.inf) if x[0] > 0.7003 else value
 
     report = examine(
-        cost, START, grad=lambda x: size * np.array([np.cos(x[0]) * np.cos(x[1]), -np.sin(x[0]) * np.sin(x[1])])
+        cost, START, grad=lambda x: 1e6 * np.array([np.cos(x[0]) * np.cos(x[1]), -np.sin(x[0]) * np.sin(x[1])])
     )
     assert report.status == 0
     assert not report.breaks.size
@@ -357,7 +238,7 @@ def examined(factor):
     )
 
 
-@pytest.mark.parametrize("factor", [2.0, -1.0, 1.1])
+@pytest.mark.parametrize("factor", [-1.0, 1.1])
 def test_one_wrong_number_among_10_000_is_not_within_the_tolerance(factor):
     """It changes the slope of its group by less than 0.4%, in proportion less than a tolerated error of the largest number."""
     report = examined(np.where(np.arange(10_000) == 7360, factor, 1.0))
@@ -365,19 +246,13 @@ def test_one_wrong_number_among_10_000_is_not_within_the_tolerance(factor):
     assert "theta[7360]" in report.conclusion
 
 
-def test_wrong_numbers_all_over_a_group_are_not_within_the_tolerance():
-    report = examined(np.where(np.arange(10_000) % 10 == 3, 1.01, 1.0))
-    assert report.derivative == "wrong"
-
-
-@pytest.mark.parametrize(("count", "tolerated"), [(10_000, 0.04), (400, 0.2), (4, 1.0)])
+@pytest.mark.parametrize(("count", "tolerated"), [(10_000, 0.04), (4, 1.0)])
 def test_the_tolerance_along_a_random_direction_of_up_to_10_000_numbers(count, tolerated):
     assert GroupSize(count, allowed=1.0, slope=1.0).tolerated == pytest.approx(tolerated)
 
 
-@pytest.mark.parametrize("errors", [np.full(10_000, 9e-5), 9e-5 * WIDE.choice([-1, 1], 10_000)])
-def test_errors_of_10_000_numbers_within_the_tolerance_are_right(errors):
-    report = examined(1.0 + errors)
+def test_errors_of_10_000_numbers_within_the_tolerance_are_right():
+    report = examined(1.0 + 9e-5 * WIDE.choice([-1, 1], 10_000))
     assert (report.derivative, report.status) == ("right", 0)
     assert any("within the tolerance" in text for text in report.warnings)
 
@@ -388,14 +263,6 @@ def test_the_error_of_one_number_that_its_group_may_hide_is_stated():
     assert report.derivative == "right"
     assert 0 < report.hidden < 0.1
     assert f"an error of one number in a group below {number(100 * report.hidden)}%" in str(report)
-    # a number of the first group that is a thousandth of the root mean square, and not one that hardly moves
-    moves = np.abs(groups_of(ParameterTree(PLACES), np.abs(PLACES), 0)[0].vector / PLACES[:2500])
-    slopes = np.abs(SIZES * np.cos(PLACES) * PLACES)[:2500]
-    size = np.sqrt(np.mean(slopes**2))
-    small = int(np.argmin(np.abs(slopes - size / 1000) + (moves < np.median(moves)) * size))
-    for share, answer in ((0.01, "right"), (2.0, "wrong")):
-        error = share * report.hidden * size / slopes[small]
-        assert examined(1.0 + error * (np.arange(10_000) == small)).derivative == answer
 
 
 MILLION = """

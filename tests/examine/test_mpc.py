@@ -5,16 +5,12 @@ from pathlib import Path
 
 import jax
 import numpy as np
-import pytest
 from scipy.optimize import lsq_linear
-
-import bench
 
 MPC = runpy.run_path(str(Path(__file__).resolve().parents[2] / "examples" / "mpc.py"))
 EXPERT = np.array([0.0, 2.0, -2.0, -1.0])
 SAME = 1e-9
 """Absolute difference in N allowed from another solver of the same program, whose Hessian has a condition of 1e3."""
-QUICK = {"calls": 1500}
 
 
 def test_forces_solve_the_quadratic_program():
@@ -27,12 +23,3 @@ def test_forces_solve_the_quadratic_program():
         limits = (-MPC["LIMIT"], MPC["LIMIT"])
         expected = lsq_linear(rows, right, limits, method="bvls", tol=1e-15).x
         np.testing.assert_allclose(forces, expected, atol=SAME)
-
-
-@pytest.mark.slow
-def test_the_examination_confirms_the_derivative_and_names_the_planted_fault():
-    right = bench.examine(MPC["cost"], np.zeros(4), grad="jax", **QUICK)
-    assert right.status == 0, str(right)
-    faulty = bench.examine(lambda theta: MPC["cost"](theta, by_limits=False), np.zeros(4), grad="jax", **QUICK)
-    assert faulty.status == 1, str(faulty)
-    assert "WRONG. missing_term" in str(faulty).splitlines()[0]

@@ -49,18 +49,12 @@ def adam(watched, seed=0, updates=600, fault="", at=0):
     return log, theta
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_sound_loop_is_silent(seed):
     log, _ = adam(True, seed, updates=200)
     assert log.first is None
     assert "no fault" in str(log)
     assert [row["iteration"] for row in log.rows] == list(range(0, 200, 20))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(10))
-def test_a_long_sound_loop_is_silent(seed):
-    assert adam(True, seed)[0].first is None
 
 
 def test_a_term_that_is_detached_is_named_from_its_iteration_on():
@@ -110,22 +104,18 @@ def test_the_share_of_time_limits_the_checks(monkeypatch):
 
 
 def test_noise_of_the_loop_is_held_in_a_check_and_structures_are_accepted():
-    torch = pytest.importorskip("torch")
-    layer = torch.nn.Linear(3, 1, dtype=torch.float64)
-    data, parameters = torch.randn(64, 3, dtype=torch.float64), dict(layer.named_parameters())
-
-    def cost(values, w):
-        return torch.func.functional_call(layer, values, (data[w.long()],)).square().mean()
-
-    log = bench.watch(cost, every=1, share=math.inf)
-    for _ in range(3):
-        batch = torch.randint(64, (8,)).double()
-        layer.zero_grad()
-        cost(parameters, batch).backward()
-        log(parameters, {name: one.grad for name, one in parameters.items()}, batch)
-    log(parameters, {name: 2 * one.grad for name, one in parameters.items()}, batch)
-    assert [row["reason"] for row in log.rows] == [""] * 4
-    assert log.first[0] == 3
+    data, log = (
+        np.random.default_rng(0).normal(size=64),
+        bench.watch(
+            lambda p, w: float(((p["slope"] * data[w.astype(int)] + p["bias"]) ** 2).mean()), every=1, share=math.inf
+        ),
+    )
+    for factor in (1.0, 1.0, 2.0):
+        batch, p = np.random.default_rng(1).integers(64, size=8), {"slope": 0.5, "bias": np.ones(1)}
+        rest = factor * 2 * (p["slope"] * data[batch] + p["bias"])
+        log(p, {"slope": (rest * data[batch]).mean(), "bias": np.array([rest.mean()])}, batch)
+    assert [row["reason"] for row in log.rows] == [""] * 3
+    assert log.first[0] == 2
 
 
 @pytest.mark.parametrize(

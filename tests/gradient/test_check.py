@@ -148,13 +148,6 @@ def test_fault_of_one_component_is_that_components():
     assert "ratio 0.5" in found.sentence()
 
 
-def test_kink_names_both_slopes():
-    found = check(*FAULTS["kink"][1:], THETA, Options(directions=0))
-    (part,) = found.worst_parts
-    assert (part.left, part.right) == pytest.approx([gradient(THETA)[0] - 1.0, gradient(THETA)[0] + 1.0], rel=1e-4)
-    assert f"slopes {part.left:.6g} and {part.right:.6g}" in found.sentence()
-
-
 def test_many_components_are_checked_by_the_largest_the_smallest_and_random_directions():
     weights = np.arange(1.0, 41.0)
 
@@ -183,6 +176,12 @@ def test_inputs_of_very_different_size_have_steps_of_their_own():
     assert np.array_equal(scales(theta), [1e6, 1e-6, 1.0])
 
 
+@pytest.mark.parametrize("size", [1e200, 1e300])
+def test_a_square_that_overflows_blames_no_gradient_and_hides_no_fault(size):
+    assert check(lambda x: size * cost(x), lambda x: size * gradient(x), THETA).trusted
+    assert check(lambda x: size * cost(x), lambda x: 1.1 * size * gradient(x), THETA).cause == "wrong_factor"
+
+
 def test_cost_that_has_decayed_below_the_smallest_number_is_no_fault():
     found = check(lambda x: 5e-320 * x[0] ** 2, lambda x: 1e-319 * x, np.array([1.0]))
     assert found.trusted, found.sentence()
@@ -192,7 +191,7 @@ def test_cost_that_has_decayed_below_the_smallest_number_is_no_fault():
 def test_amplified_rounding_on_a_slope_is_no_staircase(slope):
     """Rounding a thousandth of the increments in size: some stand out of the others, by a little."""
     steps = np.arange(roughness.SCAN)
-    for seed in range(200):
+    for seed in range(50):
         noise = 3e-9 * np.random.default_rng(seed).standard_normal(steps.size)
         assert not roughness.is_staircase(slope * steps + noise, 1e-15)
     assert roughness.is_staircase(slope * steps + 1e-7 * (steps // 7), 1e-15)
@@ -262,8 +261,8 @@ def chaos(steps):
     return final, slope
 
 
-@pytest.mark.parametrize("steps", [1, 10, 20, 30, 40, 60, 100])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("steps", [1, 10, 30, 60, 100])
+@pytest.mark.parametrize("seed", range(2))
 def test_right_gradient_of_an_amplifying_rollout_is_no_fault(steps, seed):
     """Differences over wide steps agree with each other on nothing, which must not be taken for the derivative."""
     theta = np.random.default_rng(seed).uniform(0.5, 3.0, 2)

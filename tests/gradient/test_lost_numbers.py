@@ -9,20 +9,20 @@ from bench.measure.jumps import sampled_gradients
 from bench.model import compose, registry
 
 GUARDED = """
-import torch
+import math
 theta = [0.0]
-def cost(x):
-    return 0.001 * x[0] + 1 / (1 + torch.exp(-(x[0] - 0.75) / 0.002))
+def cost(x): return 0.001 * x[0]
+def gradient(x): return [0.001 if x[0] > -0.67 else math.nan]
 """
-"""Its gradient is infinite times 0 below -0.67, 2.2 standard deviations from theta, where the cost is 0.001 x."""
+"""A branch that is discarded in the value only, 2.2 standard deviations from theta."""
 LOG = "import numpy as np\ntheta = [0.0]\ndef cost(x): return np.log(x[0] + 0.6)\n"
 
 
 def words(tmp_path, text):
     (tmp_path / "mysim.py").write_text(text)
-    library = ["scene.callable.grad=torch"] if "torch" in text else ["scene.callable.grad=''"]
+    grad = "gradient" if "gradient" in text else "''"
     return [
-        *library, f"scene.callable.cost={tmp_path}/mysim.py:cost", "scene.callable.sigma=0.3", "backends=[callable]",
+        f"scene.callable.grad={grad}", f"scene.callable.cost={tmp_path}/mysim.py:cost", "scene.callable.sigma=0.3", "backends=[callable]",
         "workers=0", f"results_dir={tmp_path}", "formats=[]",
     ]  # fmt: skip
 
