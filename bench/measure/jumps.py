@@ -23,8 +23,6 @@ SINGLE = float(np.finfo(np.float32).eps)
 """Relative rounding of a cost computed in single precision, whose values are all single-precision numbers."""
 MOST_POINTS = 1 << 25
 """Most numbers in the points of one call of the cost (256 MiB)."""
-
-
 REACH = 4.0
 """Distance searched on either side of theta, in standard deviations of the noise."""
 LINES = 16

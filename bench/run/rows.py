@@ -152,7 +152,6 @@ def valid_rows(table: pd.DataFrame, columns: Columns, files: Sequence[Path]) -> 
 
     ``files`` has the file of each row. A line on stderr names each file with the number of rows that are left out.
     """
-
     if len(table) and not ("key" in table and table["key"].map(lambda key: isinstance(key, str) and bool(key)).all()):
         raise StorageError(f"'{files[0]}' has no keys, so its rows belong to no cell; move it away to start afresh")
     reasons = _faults(table, columns)
@@ -168,7 +167,6 @@ def valid_rows(table: pd.DataFrame, columns: Columns, files: Sequence[Path]) -> 
 
 def _faults(table: pd.DataFrame, columns: Columns) -> dict[int, str]:
     """Return why rows are left out, by place: values of a wrong type or out of range, or a missing value."""
-
     reasons: dict[int, str] = {}
     for name in table:
         values, (holds, fault) = table[name], rule(name, columns)
@@ -219,7 +217,6 @@ def rule(name: str, columns: Columns) -> tuple[Callable[[Any], bool], str]:
 
 def _is_in_range(name: str, value: Any) -> Any:
     """Return whether a number, or each number of an array, is in the range of a column; missing numbers are."""
-
     if name in COUNTS:
         with np.errstate(invalid="ignore"):
             return (value != value) | ((value >= COUNTS[name]) & (value <= LARGEST) & (value % 1 == 0))
@@ -241,7 +238,6 @@ def _is_text(value: Any) -> bool:
 
 def _is_list(value: Any, has_texts: bool = True) -> bool:
     """Return whether a value is a flat list of numbers or, with ``has_texts``, of strings too; or missing."""
-
     if isinstance(value, np.ndarray) and value.dtype.kind in "fiub":
         return value.ndim == 1
     if isinstance(value, list | tuple | np.ndarray):

@@ -43,7 +43,7 @@ REFUSED = {
     "plugins=nowhere_at_all": "is not a folder", "plugins=[~nosuchuser]": "unknown user name", "reference=null": "reference.samples=...",
     "--config-dir nowhere_at_all +experiment=quick": "experiment/NAME.yaml", "plan --config-dir ~nosuchuser": "~",
     "seed=" + "9" * 400: "at most",
-f"sweep.seed=[{'9' * 400}]": "at most", "scene.heaviside.sigma=" + "9" * 400: "largest float",
+    f"sweep.seed=[{'9' * 400}]": "at most", "scene.heaviside.sigma=" + "9" * 400: "largest float",
     f"seed={2**53 + 1}": "at most", "results_dir='~nosuchuser/x'": "~", "results_dir=null": "must be a folder",
     "estimators=[reinforce[baseline=center]": "cannot be read", "name=../up": "name='../up'",
     "estimators=[fobg[x=!!python/object:os.system]]": "fobg", "scenes=[heaviside[sigma=2020-13-45]]": "sigma",
