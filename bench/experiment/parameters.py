@@ -13,7 +13,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Collection, Mapping
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
@@ -108,15 +108,10 @@ def completed_rows(rows: pd.DataFrame) -> pd.DataFrame:
 
     The column ``estimator_params``, if there is one, has the parameters that differ from today's defaults.
     """
-    texts = {text: completed_json(text) for text in rows["parameters"].unique()}
-    rows = (
-        rows
-        if all(text == new for text, new in texts.items())
-        else rows.assign(parameters=rows["parameters"].map(texts))
-    )
+    rows = rows.assign(parameters=rows["parameters"].map(completed_json))
     if "estimator_params" not in rows:
         return rows
-    found = rows["parameters"].map({text: labels(parsed(text)).get("estimator_params") for text in texts.values()})
+    found = rows["parameters"].map(cache(lambda text: labels(parsed(text)).get("estimator_params")))
     return rows.assign(estimator_params=found.fillna(rows["estimator_params"]))
 
 
