@@ -160,9 +160,7 @@ def table(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:
     wide = wide.reindex(columns=[*experiment.columns.table, *extra, "study", "parameters"])
     texts = [name for name in experiment.columns.of_kind("text") if name in wide]
     # an apostrophe before a formula's sign, so that a spreadsheet shows the text instead of evaluating it
-    formulas = {name: wide[name].str.lstrip().str[:1].isin(["=", "+", "-", "@"]) for name in texts}
-    changed = {name: wide[name].mask(rows, "'" + wide[name]) for name, rows in formulas.items() if rows.any()}
-    return wide.assign(**changed)
+    return wide.assign(**{name: wide[name].str.replace(r"^(?=\s*[=+@-])", "'", regex=True) for name in texts})
 
 
 def relabel(rows: pd.DataFrame, axes: Sequence[Axis]) -> pd.DataFrame:
