@@ -156,7 +156,7 @@ def _composed_files(name: str, config_dirs: tuple[Path, ...], stamps: object) ->
 
 NEUTRAL = (
     "experiment", "name", "results_dir", "answer", "compares", "formats", "compile_cache", "plugins", "workers", "timeout",
-    "memory", "on_error", "ladder", "versions", "retry", "launcher", "ray", "shard",
+    "memory", "on_error", "ladder", "versions", "retry", "shard",
 )  # fmt: skip
 """Settings that decide no result: with others on the command line, the answer of an experiment's file does not hold."""
 
