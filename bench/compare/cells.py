@@ -10,11 +10,10 @@ import pandas as pd
 from bench.compare import timings
 from bench.compare.judging import judge_cell, rule_of
 from bench.experiment.columns import IDENTITY, Column, Columns
+from bench.experiment.grid import COUNTS
 from bench.experiment.parameters import parsed
 
 OUTCOMES = ("worse", "better", "changed", "same")
-COUNTS = ("samples", "repeats", "seed")
-"""Columns that identify a cell, besides the parameters of its plugins."""
 FIRST = ("outcome", "change", *IDENTITY, "status_before", "status_after")
 """The first columns of a comparison. The columns of :func:`both_sides` follow, then :data:`LAST`."""
 LAST = ("parameters",)

@@ -11,9 +11,10 @@ from pathlib import Path
 import pandas as pd
 
 from bench.compare import timings
-from bench.compare.cells import COUNTS, FIRST, LAST, OUTCOMES, WORSE_IN, both_sides
+from bench.compare.cells import FIRST, LAST, OUTCOMES, WORSE_IN, both_sides
 from bench.compare.judging import NOTES
 from bench.experiment.columns import Column
+from bench.experiment.grid import COUNTS
 from bench.experiment.parameters import flat_rows
 from bench.report.problems import titled, varying_identity
 from bench.report.tables import plain_markdown

@@ -12,10 +12,8 @@ import numpy as np
 from bench.experiment.experiment import Experiment
 from bench.experiment.grid import COUNTS, expand, parameter_name, swept
 from bench.experiment.parameters import (
-    NOT_PLUGINS,
     THETA,
     VIEWS,
-    applies,
     flat_rows,
     labels,
     named,
@@ -162,9 +160,7 @@ def table(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:
     wide = wide.reindex(columns=[*experiment.columns.table, *extra, "study", "parameters"])
     texts = [name for name in experiment.columns.of_kind("text") if name in wide]
     # an apostrophe before a formula's sign, so that a spreadsheet shows the text instead of evaluating it
-    formulas = {name: wide[name].str.lstrip().str[:1].isin(["=", "+", "-", "@"]) for name in texts}
-    changed = {name: wide[name].mask(rows, "'" + wide[name]) for name, rows in formulas.items() if rows.any()}
-    return wide.assign(**changed)
+    return wide.assign(**{name: wide[name].str.replace(r"^(?=\s*[=+@-])", "'", regex=True) for name in texts})
 
 
 def relabel(rows: pd.DataFrame, axes: Sequence[Axis]) -> pd.DataFrame:
@@ -177,13 +173,7 @@ def relabel(rows: pd.DataFrame, axes: Sequence[Axis]) -> pd.DataFrame:
 
     names = [name for axis in axes for name in axis.names]
     views = [name for name in VIEWS if (rows.groupby(["scene", "contact"])[name].nunique() > 1).any()]
-    codes, distinct = pd.factorize(rows["parameters"])
-    lines = []
-    for given in map(parsed, distinct):
-        parts = {axis: part for axis, part in given.items() if part and axis not in NOT_PLUGINS}
-        hidden = {
-            axis: [applies(name, axis, part["name"], part) or "" for name in names] for axis, part in parts.items()
-        }
-        lines.append(labels(given, hidden, views))
+    codes, texts = pd.factorize(rows["parameters"])
+    lines = [labels(parsed(text), names, views) for text in texts]
     found = pd.DataFrame(lines, dtype=object).iloc[codes].set_axis(rows.index)
     return rows.assign(**{name: found[name].fillna(rows[name]) for name in found if name in rows})

@@ -16,7 +16,7 @@ from typing import Any, cast
 from bench.errors import STATUSES, UserError, local_path, printable, unknown
 from bench.experiment.cell import DESCENDED
 from bench.experiment.experiment import Budget, Choice, Execution, Experiment
-from bench.experiment.grid import COUNTS, check_axes, parameter_name, refuse_too_many, share_of, swept
+from bench.experiment.grid import COUNTS, check_axes, coerce_finite, parameter_name, refuse_too_many, share_of, swept
 from bench.experiment.overrides import (
     LISTS_AS,
     TABLES,
@@ -363,10 +363,7 @@ def _folder(value: Any) -> Path:
 def _decision(config: Mapping[str, Any]) -> Decision:
     names = [coerce(str, name, "theta") for name in _as_list(config["theta"])]
     at = config["theta0"]
-    values = None if at is None else tuple(coerce(float, value, "theta0") for value in _as_list(at))
-    if values is not None and not all(map(math.isfinite, values)):
-        raise UserError(f"theta0={list(values)} must be finite")
-    return Decision(tuple(names), values)
+    return Decision(tuple(names), None if at is None else coerce_finite(at, "theta0"))
 
 
 def _path(given: Any) -> dict[str, Choice]:
@@ -412,12 +409,13 @@ def _shard(config: Mapping[str, Any]) -> tuple[int, int] | None:
     if config["shard"] is None:
         return None
     text = str(config["shard"])
-    number, _, count = text.partition("/")
-    if not (number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count)):
+    found = re.fullmatch(r"(\d+)/(\d+)", text, re.ASCII)
+    number, count = map(int, found.groups()) if found else (0, 0)
+    if not 1 <= number <= count:
         raise UserError(f"shard={printable(text)} must be NUMBER/COUNT: of 64 shards, 1/64 to 64/64")
     if config["ladder"]:
         raise UserError("ladder=true needs the rows of all scenes, and shard= runs some: leave one of them out")
-    return int(number), int(count)
+    return number, count
 
 
 def _one_of(key: str, value: Any, allowed: Sequence[str]) -> str:

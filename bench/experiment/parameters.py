@@ -13,9 +13,8 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Collection, Mapping
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -108,19 +107,14 @@ def completed_rows(rows: pd.DataFrame) -> pd.DataFrame:
 
     The column ``estimator_params``, if there is one, has the parameters that differ from today's defaults.
     """
-    texts = {text: completed_json(text) for text in rows["parameters"].unique()}
-    rows = (
-        rows
-        if all(text == new for text, new in texts.items())
-        else rows.assign(parameters=rows["parameters"].map(texts))
-    )
+    rows = rows.assign(parameters=rows["parameters"].map(completed_json))
     if "estimator_params" not in rows:
         return rows
-    found = rows["parameters"].map({text: labels(parsed(text)).get("estimator_params") for text in texts.values()})
+    found = rows["parameters"].map(cache(lambda text: labels(parsed(text)).get("estimator_params")))
     return rows.assign(estimator_params=found.fillna(rows["estimator_params"]))
 
 
-def identity_of(given: Mapping[str, Any], axis: str, omitted: Collection[str] = ()) -> str | None:
+def identity_of(given: Mapping[str, Any], axis: str, omitted: Collection[str | None] = ()) -> str | None:
     """Return the identity string of a plugin in a row's parameters, without its defaults of today and what is ``omitted``.
 
     It is ``none`` where the row has no plugin, and None if the plugin is not installed, or not with all these parameters.
@@ -135,21 +129,18 @@ def identity_of(given: Mapping[str, Any], axis: str, omitted: Collection[str] = 
     return identity(plugin.name, {k: v for k, v in kept.items() if v != defaults.get(k, dataclasses.MISSING)})
 
 
-def labels(
-    given: Mapping[str, Any],
-    hidden: Mapping[str, Collection[str]] = MappingProxyType({}),
-    views: Collection[str] = VIEWS,
-) -> dict[str, str]:
-    """Return identity strings by column, without ``views`` and, by axis, ``hidden`` parameters; none of plugins that are not installed."""
-    law = plugin_class("contact", (given.get("contact") or {}).get("name"))
-    omitted = {
-        axis: {*hidden.get(axis, ()), *(() if axis == "estimator" else views)}
-        for axis in given
+def labels(given: Mapping[str, Any], swept: Collection[str] = (), views: Collection[str] = VIEWS) -> dict[str, str]:
+    """Return identity strings by column, without ``views`` and the parameters of ``swept`` names; none of plugins that are not installed."""
+    hidden = {
+        axis: {applies(name, axis, part["name"], part) for name in swept} if part else set()
+        for axis, part in given.items()
         if axis not in NOT_PLUGINS
     }
+    omitted = {axis: names if axis == "estimator" else {*names, *views} for axis, names in hidden.items()}
+    law = plugin_class("contact", (given.get("contact") or {}).get("name"))
     if law and "smoothing" in views:
         omitted["contact"].add(getattr(law, "smoothing", ""))
-    if law and "stiffness" in parameters(law) and "stiffness" not in hidden.get("scene", ()):
+    if law and "stiffness" in parameters(law) and "stiffness" not in hidden["scene"]:
         omitted["scene"].discard("stiffness")  # the column of that name is the law's
     found = {axis: text for axis, names in omitted.items() if (text := identity_of(given, axis, names))}
     name, _, params = found.pop("estimator", "none").partition("[")

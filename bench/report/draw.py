@@ -79,7 +79,10 @@ def draw(chart: Chart) -> Figure:
     # quantities of the same runs above each other have one scale of x, so that their features can be compared
     stacked = chart.own_scales and across == 1 and is_plot
     ratios = [max(heights[i * across : (i + 1) * across]) for i in range(down)]
-    figure = Figure(figsize=(width, 4 + 2 * sum(ratios)), layout=ConstrainedLayoutEngine(w_pad=0.04, h_pad=PAD))
+    figure = Figure(
+        figsize=(width, 4 + 2 * sum(ratios)),
+        layout=ConstrainedLayoutEngine(w_pad=0.04, h_pad=PAD, rect=(0.006, 0, 0.988, 1)),
+    )
     FigureCanvasAgg(figure)
     grid = figure.subplots(
         down, across, squeeze=False, sharey=is_plot and shared, height_ratios=ratios,
@@ -138,7 +141,7 @@ def _frame(figure: Figure, chart: Chart, legend: Sequence[Any]) -> None:
     look: dict[str, Any] = {"x": 0.06 / width, "ha": "left", "va": "top"}
     figure.text(y=1, s=title, fontsize=SIZE + 1, fontweight="bold", **look)
     # blank lines leave the place of the title
-    below = "\n" * (title.count("\n") + 1) + (subtitle or " ")
+    below = "\n".join([" "] * (title.count("\n") + 1) + [subtitle] * bool(subtitle))
     figure.suptitle(below, fontsize=SIZE, color=GREY, linespacing=1.35, **look)
     if legend:
         figure.legend(

@@ -54,10 +54,7 @@ def write(experiment: Experiment, rows: pd.DataFrame) -> tuple[Views, list[Path]
     """Write tables, charts and page; return the views and the files' paths. Raises :class:`UserError` without rows."""
     if rows.empty:
         raise UserError(f"no rows are stored in '{experiment.directory}': run the experiment first")
-    with (
-        guard.capture_output("a plugin"),
-        guard.protect_process(),
-    ):  # building the commands that repeat cells runs code of plugins
+    with guard.capture_output("a plugin"), guard.protect_process():  # a study's views are a plugin's code
         views = views_of(experiment, rows)
         drawn = writer.drawings(experiment, views)
         paths = writer.write(experiment, views, drawn)

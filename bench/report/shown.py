@@ -11,12 +11,10 @@ import pandas as pd
 from bench.experiment import axes
 from bench.experiment.columns import COMMON, Column
 from bench.experiment.experiment import Experiment
+from bench.experiment.parameters import PROBLEM
 from bench.experiment.views import Table
 from bench.report.problems import axes_of, label_columns, problem_names
 from bench.report.views import arrange, attempted
-
-PROBLEM = ("scene", "contact", "integrator")
-"""Parts of the grid that identify a problem, if a study does not say otherwise."""
 
 
 class Shown:

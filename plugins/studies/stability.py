@@ -395,8 +395,8 @@ def stiffness_limit(integrator: Integrator, dt: float, damping: float, factor: f
 
 def cells_of(experiment: Experiment, rows: pd.DataFrame) -> pd.DataFrame:
     """Return the cells with a verdict, with their stored step size and stiffness, names, colour and mark."""
+    from bench.experiment.parameters import PROBLEM
     from bench.report.problems import axes_of, problem_names, titled
-    from bench.report.shown import PROBLEM
     from bench.report.views import arrange, attempted
 
     shown = arrange(experiment, rows)

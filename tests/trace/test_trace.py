@@ -201,27 +201,21 @@ def planted(spike_at=(), switch_at=(), steps=100):
     )
 
 
-def test_spikes_at_switches_line_up():
-    table = planted(spike_at=(30, 61), switch_at=(30, 60))
-    found = align(table["adjoint_norm"], table["switch"])
-    assert (found.spikes, found.near, found.chance) == (2, 2, 0.06)
-    # two of two draws from the 6 near steps out of 100
-    assert found.p_value == pytest.approx(6 * 5 / (100 * 99))
-    said = verdict(table)
-    assert "no spikes" in said[0]
-    assert ": spikes line up with contact switches (" in said[1]
-
-
-def test_spikes_away_from_switches_do_not():
-    table = planted(spike_at=(10, 80), switch_at=(30, 60))
-    found = align(table["adjoint_norm"], table["switch"])
-    assert (found.spikes, found.near, found.p_value) == (2, 0, 1.0)
-    assert "spikes do not line up" in verdict(table)[1]
-
-
-def test_one_spike_among_many_switches_is_left_open():
-    said = verdict(planted(spike_at=(30,), switch_at=range(10, 90, 5)))
-    assert "chance could explain it" in said[1]
+@pytest.mark.parametrize(
+    ("spike_at", "switch_at", "found", "said"),
+    [
+        # two of two draws from the 6 near steps out of 100
+        ((30, 61), (30, 60), (2, 2, 0.06, 6 * 5 / (100 * 99)), ": spikes line up with contact switches ("),
+        ((10, 80), (30, 60), (2, 0, 0.06, 1.0), "spikes do not line up"),
+        ((30,), range(10, 90, 5), (1, 1, 0.48, 0.48), "chance could explain it"),
+    ],
+)
+def test_spikes_near_switches_are_counted_against_chance(spike_at, switch_at, found, said):
+    table = planted(spike_at, switch_at)
+    assert tuple(align(table["adjoint_norm"], table["switch"])) == pytest.approx(found)
+    quiet, spiked = verdict(table)
+    assert "no spikes" in quiet
+    assert said in spiked
 
 
 # --------------------------------------------------------------------------------------------------------- command

@@ -11,11 +11,11 @@ import pandas as pd
 from bench.experiment.axes import with_axes
 from bench.experiment.columns import COMMON, IDENTITY, Column, text
 from bench.experiment.experiment import Experiment
+from bench.experiment.parameters import PROBLEM
 from bench.experiment.views import Chart, Style, Table, Views
 from bench.gradient import BROKEN, FAULTS, RULES, TRUSTED, UNDECIDED, VERDICTS
 from bench.report.problems import axes_of, label_columns, problem_names, problem_numbers
 from bench.report.reproduce import own_plugins
-from bench.report.shown import PROBLEM
 from bench.report.style import PALETTE
 from bench.report.text import counted
 from bench.report.views import Arranged, arrange
