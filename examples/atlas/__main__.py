@@ -23,6 +23,7 @@ import bench
 from bench.engines import environments
 from bench.errors import Unavailable, UserError, printable
 from bench.examine import command
+from bench.report.text import number
 from bench.simulator import imports
 
 FOLDER = Path(__file__).parent
@@ -44,7 +45,7 @@ INTRODUCTION = """\
 <!-- figures: python -m examples.atlas page -->
 *off*: largest distance of the package's derivative from the truth, relative to the largest component. *s*: processor seconds with compilation.
 A gradient is called usable under noise where the cost is smooth, so that the mean of gradients is the gradient of the mean.
-Last examined on {date}.
+Last examined on {date}. Not examined: jax-fem, which needs PETSc, and fdtdx, rewarped and playground, which pip installs.
 """
 
 
@@ -110,7 +111,7 @@ def report(name, place):
     facts = {
         "bench": bench.__version__, "seconds": round(used.ru_utime + used.ru_stime, 1), "status": found.status,
         "derivative": found.derivative, "use": found.use if found.gradient and found.setup.levels else "",
-        "cause": found.cause, "jumps": "jumps" if any(line.jumps for line in found.lines) else "no jumps", "conclusion": found.conclusion,
+        "cause": found.derivative_cause, "jumps": "jumps" if any(line.jumps for line in found.lines) else "no jumps", "conclusion": found.conclusion,
         "noise": found.noise_answer, "gradient": [f"{x:.9g}" for x in gradient[:8]],
         "truth": [f"{x:.9g}" for x in truth[:8]], "off": off if math.isfinite(off) else None,
     }  # fmt: skip
@@ -149,13 +150,8 @@ def page():
     table = ["| package | simulator | `examine` says | truth | off | | s |", "|---|---|---|---|--:|---|--:|"]
     for each in facts:
         row = rows[each["name"]]
-        said = [
-            row["derivative"],
-            row.get("use"),
-            row.get("jumps", "").removeprefix("no jumps"),
-            f"`{row.get('cause')}`",
-        ]
-        off = f"{100 * row['off']:.1g}%" if row.get("off") is not None else "-"
+        said = [row["derivative"], row.get("use"), each.get("jumps") and row.get("jumps"), f"`{row.get('cause')}`"]
+        off = f"{number(100 * row['off'], 1)}%" if row.get("off") is not None else "-"
         cells = [
             f"{each['package']} {row.get('version', '')}",
             f"[{each['what']}](../examples/atlas/{each['name']}.py)",
