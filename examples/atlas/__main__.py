@@ -39,15 +39,15 @@ GOOD = ("right", "usable", "no jumps")
 INTRODUCTION = """\
 # Simulators that others wrote
 
-`bench.examine` on {count} packages, used as their documentation shows, beside the truth, which `truth()` in the simulator's file in
-`examples/atlas` computes: {score}.
+`bench.examine` on {count} packages, used as their documentation shows or as one writes it first, beside the truth, which `truth()` in the
+simulator's file in `examples/atlas` computes: {score}.
 
     python -m examples.atlas install NAME    # into a Python that it shares with others of its kind
     python -m examples.atlas examine NAME    # or without names: all, then `page` writes this page
 
 <!-- figures: python -m examples.atlas page -->
 *off*: largest distance of the package's derivative from the truth, relative to the largest component. *s*: processor seconds with compilation.
-A gradient is called usable under noise where the cost is smooth, so that the mean of gradients is the gradient of the mean.
+The truth is differentiated by complex steps. A smooth cost's gradient is usable under noise. An empty column: `examine` agrees with the truth.
 Last examined on {date}. Not examined: jax-fem, which needs PETSc, and fdtdx, rewarped and playground, which pip installs.
 """
 
@@ -70,10 +70,12 @@ def python_of(facts):
 
 
 def install(name):
-    """Install what a simulator requires into its environment."""
+    """Install what a simulator and ``examine`` require into its environment; this Python is as it is."""
     facts = about(name)
+    if facts["python"] == "bench":
+        return
     with tempfile.NamedTemporaryFile("w", suffix=".txt") as file:
-        file.write("\n".join(facts["requires"].split()))
+        file.write("\n".join([*facts["requires"].split(), "scipy"]))
         file.flush()
         environments.install(f"atlas-{facts['python']}", Path(file.name))
 
@@ -158,7 +160,13 @@ def page():
             f"{each['package']} {row.get('version', '')}",
             f"[{each['what']}](../examples/atlas/{each['name']}.py)",
         ]
-        cells += [", ".join(filter(None, said)), each["how"], off, words[each["name"]], f"{row.get('seconds', 0):.0f}"]
+        cells += [
+            ", ".join(filter(None, said)),
+            each["how"],
+            off,
+            words[each["name"]].replace("agrees", ""),
+            f"{row.get('seconds', 0):.0f}",
+        ]
         table.append(f"| {' | '.join(cells)} |")
     advice = [f"- **{each['package']}**: {each['advice']}" for each in facts if "advice" in each]
     return "\n".join([intro, *table, "", "## What users should know", "", "<!-- figures: given -->", *advice]) + "\n"

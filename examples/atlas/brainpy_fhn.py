@@ -12,7 +12,7 @@ about = {
     "requires": "brainpy",
     "examine": "grad=jax calls=2000",
     "derivative": "right",
-    "how": "complex step, own RK4",
+    "how": "own RK4",
 }
 theta = np.array([0.7, 0.8, 0.08, 0.5])  # a, b, rate, current
 

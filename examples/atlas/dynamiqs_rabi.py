@@ -1,4 +1,4 @@
-"""A driven qubit (Schroedinger equation), by frequency and detuning of the drive."""
+"""A driven qubit."""
 
 import dynamiqs as dq
 import jax.numpy as jnp
@@ -11,7 +11,7 @@ about = {
     "requires": "dynamiqs",
     "examine": "grad=jax calls=600",
     "derivative": "right",
-    "how": "closed form, complex step",
+    "how": "closed form",
 }
 theta = np.array([1.3, 0.7])
 

@@ -1,4 +1,4 @@
-"""The energy of 64 Lennard-Jones particles with a neighbour list, by sigma and epsilon."""
+"""Lennard-Jones energy by sigma and epsilon."""
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,7 @@ about = {
     "requires": "jax-md",
     "examine": "grad=jax calls=400",
     "derivative": "wrong",
-    "how": "complex step, own sum over pairs",
+    "how": "own sum over pairs",
     "advice": "Reverse mode by sigma or epsilon is NaN (issue 258 of jax-md/jax-md), also of `lennard_jones_pair`; `jax.jacfwd` is right.",
 }
 theta = np.array([1.0, 1.0])

@@ -1,4 +1,4 @@
-"""A box thrown on the ground with soft contacts, 300 steps of 1 ms, by its first speed."""
+"""A box thrown on the ground, soft contacts."""
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ about = {
     "derivative": "right",
     "use": "NOT usable",
     "jumps": "jumps",
-    "how": "differences over two widths; a jump bisected",
+    "how": "differences over two widths",
     "advice": "The place where a thrown box rests jumps by millimetres between neighbouring speeds: gradients are right at each, and their mean is not "
     "the slope of the mean.",
 }

@@ -1,4 +1,4 @@
-"""A ball on a slide that hits the floor, by JAX through MJX with one solver iteration."""
+"""A ball that hits the floor, by JAX with one solver iteration."""
 
 import jax
 import numpy as np
@@ -12,7 +12,7 @@ about = {
     "examine": "grad=jax calls=600",
     "derivative": "right",
     "jumps": "jumps",
-    "how": "complex step, documented contact model, whose damper jumps where the ball lands a step later",
+    "how": "documented contact model",
 }
 XML = """<mujoco><option iterations="1" ls_iterations="4"/><worldbody>
 <geom type="plane" size="5 5 1" condim="1" solimp="0.9 0.9 0.001"/>

@@ -1,4 +1,4 @@
-"""A circuit of two qubits, by its two angles, with exact expectations."""
+"""A circuit of two qubits."""
 
 import numpy as np
 import pennylane as qml

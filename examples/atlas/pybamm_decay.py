@@ -7,10 +7,10 @@ from scipy.integrate import solve_ivp
 about = {
     "package": "pybamm",
     "python": "pybamm",
-    "requires": "pybamm scipy",
+    "requires": "pybamm",
     "examine": "grad=gradient calls=600",
     "derivative": "right",
-    "how": "complex step, SciPy's DOP853 at a tolerance of 1e-12",
+    "how": "SciPy's DOP853 at 1e-12",
 }
 theta = np.array([0.8, 0.3])
 model, x, y = pybamm.BaseModel(), pybamm.Variable("x"), pybamm.Variable("y")
