@@ -1,4 +1,4 @@
-"""The lift of a tapered wing (vortex lattice), by angle of attack and chord, by CasADi's derivatives."""
+"""The lift of a wing (vortex lattice), by CasADi's derivatives."""
 
 import aerosandbox as asb
 import casadi as ca
@@ -10,7 +10,7 @@ about = {
     "requires": "aerosandbox",
     "examine": "grad=gradient calls=600",
     "derivative": "right",
-    "how": "complex step through the package on NumPy",
+    "how": "the package on NumPy, by complex numbers",
 }
 theta = np.array([5.0, 1.0])  # degrees, m
 

@@ -9,7 +9,7 @@ about = {
     "requires": "ceviche",
     "examine": "grad=gradient calls=1500",
     "derivative": "right",
-    "how": "own dense solve and its direct sensitivity",
+    "how": "own dense solve and sensitivity",
 }
 N, DL, OMEGA = 20, 5e-8, 2 * np.pi * 3e8 / 1.5e-6
 EPS, MU = 8.854187817620389e-12, 1.2566370614359173e-06

@@ -1,4 +1,4 @@
-"""A step of an arm with a point contact, by its state, by `calcDiff`."""
+"""A step of an arm with a point contact, by `calcDiff`."""
 
 import crocoddyl
 import numpy as np
@@ -6,7 +6,7 @@ import pinocchio as pin
 
 about = {
     "package": "crocoddyl",
-    "python": "plain",
+    "python": "crocoddyl",
     "requires": "crocoddyl pin==4.0.0",
     "examine": "grad=gradient calls=2000",
     "derivative": "right",

@@ -13,7 +13,7 @@ about = {
     "requires": "diffrax",
     "examine": "grad=jax calls=1500",
     "derivative": "right",
-    "how": "closed form, complex step",
+    "how": "closed form",
 }
 theta = np.array([1.0, 0.3, 0.8])  # height [m], speed [m/s], restitution
 END = 1.5

@@ -1,4 +1,4 @@
-"""A double well with noise by Heun, 16 paths of a VirtualBrownianTree."""
+"""A double well with noise, by Heun."""
 
 import diffrax
 import jax
@@ -12,7 +12,7 @@ about = {
     "requires": "diffrax",
     "examine": "grad=jax calls=1000",
     "derivative": "right",
-    "how": "complex step, own Heun scheme on the same increments",
+    "how": "own Heun scheme of the same increments",
 }
 theta, KEYS = np.array([1.0, 1.0, 0.4]), jax.random.split(jax.random.key(0), 16)  # slopes of the well, noise
 

@@ -13,7 +13,7 @@ about = {
     "examine": "grad=jax sigma=0.1 calls=3000",
     "derivative": "right",
     "use": "usable",
-    "how": "complex step, own filter",
+    "how": "own filter",
 }
 theta = np.array([-2.0, -3.0, 0.1])  # logs of process and observation noise, damping
 SEEN = np.cumsum(np.random.default_rng(0).standard_normal(100)) * 0.1

@@ -14,7 +14,7 @@ about = {
     "derivative": "right",
     "use": "NOT usable",
     "jumps": "jumps",
-    "how": "definition: constant between steps, and not constant",
+    "how": "definition",
     "advice": "The step-ellipsoidal function has a derivative of 0 at almost every point, so that only methods from costs see its slope.",
 }
 theta = np.array([1.23, -0.71, 0.55, 1.37])

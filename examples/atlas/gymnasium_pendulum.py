@@ -1,4 +1,4 @@
-"""A pendulum for 50 steps (Pendulum-v1, costs only), by first state and torque."""
+"""A pendulum for 50 steps (costs only)."""
 
 import gymnasium
 import numpy as np
@@ -9,7 +9,7 @@ about = {
     "requires": "gymnasium",
     "examine": "sigma=0.01 calls=3000",
     "derivative": "none given",
-    "how": "complex step through the published equations",
+    "how": "the published equations",
 }
 theta = np.array([1.0, 0.5, 0.3])  # angle [rad], speed [rad/s], torque
 env = gymnasium.make("Pendulum-v1").unwrapped

@@ -10,7 +10,7 @@ about = {
     "requires": "gymnax",
     "examine": "grad=jax calls=2000",
     "derivative": "wrong",
-    "how": "complex step through the published equations",
+    "how": "the published equations",
     "advice": "By default each step detaches its state, so that a gradient through a rollout has the direct effect on rewards only. "
     "`env.with_transition_gradients()` makes it whole.",
 }

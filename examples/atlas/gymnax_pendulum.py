@@ -1,4 +1,4 @@
-"""A pendulum for 50 steps, by its 50 torques, with transition gradients."""
+"""A pendulum for 50 steps, with transition gradients."""
 
 import gymnax
 import jax
@@ -12,7 +12,7 @@ about = {
     "requires": "gymnax",
     "examine": "grad=jax calls=2000",
     "derivative": "right",
-    "how": "complex step through the published equations",
+    "how": "the published equations",
 }
 theta = np.sin(np.arange(50.0))
 plain, usual = gymnax.make("Pendulum-v1")

@@ -1,4 +1,4 @@
-"""A decaying Taylor-Green vortex (pseudo-spectral, Crank-Nicolson and RK4), by amplitude and viscosity."""
+"""A decaying Taylor-Green vortex (pseudo-spectral)."""
 
 import jax
 import jax.numpy as jnp

@@ -12,7 +12,7 @@ about = {
     "requires": "jaxley",
     "examine": "grad=jax calls=3000",
     "derivative": "right",
-    "how": "complex step, own scheme",
+    "how": "own scheme",
     "advice": "A cell that starts at exactly -55 or -40 mV is NaN from its first step: the rates of `HH` are 0/0 there.",
 }
 theta, DT = {"HH_gNa": 0.12, "HH_gK": 0.036, "HH_gLeak": 0.0003}, 0.025

@@ -1,4 +1,4 @@
-"""A ball on a slide that hits the floor, gradient by `mjd_transitionFD` of each step (MuJoCo)."""
+"""A ball that hits the floor, by `mjd_transitionFD` of each step."""
 
 import mujoco
 import numpy as np
@@ -10,7 +10,7 @@ about = {
     "examine": "grad=gradient calls=1500",
     "derivative": "right",
     "jumps": "jumps",
-    "how": "complex step through the documented contact model, whose damper jumps where the ball lands a step later",
+    "how": "documented contact model",
     "advice": "Contact starts with the force of its damper, so that costs jump where a body lands a step later; gradients are right between.",
 }
 XML = """<mujoco><worldbody><geom type="plane" size="5 5 1" condim="1" solimp="0.9 0.9 0.001"/>

@@ -1,4 +1,4 @@
-"""Sellar's two coupled disciplines by Gauss-Seidel, gradient by `compute_totals`."""
+"""Two coupled disciplines (Sellar), by `compute_totals`."""
 
 import numpy as np
 import openmdao.api as om
@@ -9,7 +9,7 @@ about = {
     "requires": "openmdao",
     "examine": "grad=gradient calls=3000",
     "derivative": "right",
-    "how": "complex step, own iteration",
+    "how": "own iteration",
     "advice": "A run starts from the last one's result, so that equal calls differ by the solver's tolerance.",
 }
 theta = np.array([5.0, 2.0, 1.0])  # z1, z2, x

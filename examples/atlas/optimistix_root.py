@@ -13,7 +13,7 @@ about = {
     "examine": "grad=jax sigma=0.1 calls=3000",
     "derivative": "right",
     "use": "usable",
-    "how": "complex step, own iteration",
+    "how": "own iteration",
 }
 theta = np.array([0.3, -0.5, 0.8, 0.1])
 WEIGHTS = 0.3 * np.random.default_rng(0).standard_normal((4, 4))

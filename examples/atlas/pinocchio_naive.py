@@ -7,9 +7,9 @@ __all__ = ["about", "cost", "gradient", "theta", "truth"]
 about = {
     "package": "pin",
     "python": "plain",
-    "requires": "pin scipy",
+    "requires": "pin",
     "examine": "grad=gradient calls=6000",
     "derivative": "wrong",
-    "how": "complex step through the equations of one body",
+    "how": "the equations of one body",
     "advice": "`computeABADerivatives` are by a tangent step at q. By a step from another pose, multiply by `dIntegrate(..., ARG1)`.",
 }

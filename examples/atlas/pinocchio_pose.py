@@ -7,10 +7,10 @@ from scipy.linalg import expm
 about = {
     "package": "pin",
     "python": "plain",
-    "requires": "pin scipy",
+    "requires": "pin",
     "examine": "grad=gradient calls=6000",
     "derivative": "right",
-    "how": "complex step through the equations of one body",
+    "how": "the equations of one body",
 }
 rng = np.random.default_rng(0)
 velocity, force, weight, theta = rng.standard_normal((4, 6))

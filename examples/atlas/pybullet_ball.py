@@ -1,4 +1,4 @@
-"""A ball that bounces on a plane (Bullet, costs only), by its height and speed."""
+"""A ball that bounces on a plane (costs only)."""
 
 import numpy as np
 import pybullet as p
@@ -10,7 +10,7 @@ about = {
     "examine": "sigma=0.01 calls=4000",
     "derivative": "none given",
     "jumps": "jumps",
-    "how": "complex step, own scheme of the same steps",
+    "how": "own scheme",
     "advice": "The cost jumps where a ball lands a step later: take differences wider than the jumps, or give `sigma` to see them.",
 }
 theta = np.array([0.4, -1.0])  # height [m], speed [m/s]

@@ -1,4 +1,4 @@
-"""A box that slides to a stop on the ground (Chipmunk, costs only), by its speed and friction."""
+"""A box that slides to a stop (costs only)."""
 
 import numpy as np
 import pymunk

@@ -1,4 +1,4 @@
-"""A ball that is thrown over a wall and just misses it (Chipmunk, costs only), by its speeds."""
+"""A ball thrown just over a wall (costs only)."""
 
 import numpy as np
 import pymunk
@@ -10,7 +10,7 @@ about = {
     "examine": "sigma=0.2 calls=4000",
     "derivative": "none given",
     "jumps": "jumps",
-    "how": "closed form of the free flight; a little slower, the ball hits the wall",
+    "how": "closed form of the flight, beside hits",
     "advice": "Hits and misses make jumps that no derivative at theta shows: give `sigma` to see them.",
 }
 theta = np.array([3.0, 5.0])

@@ -1,4 +1,4 @@
-"""Van der Pol by LSODA, gradient by forward sensitivities."""
+"""Van der Pol by LSODA and sensitivities."""
 
 import numpy as np
 from scipy.integrate import solve_ivp
@@ -9,7 +9,7 @@ about = {
     "requires": "scipy",
     "examine": "grad=gradient refined=refined calls=2500",
     "derivative": "right",
-    "how": "sensitivities by DOP853 at a tolerance of 1e-12",
+    "how": "sensitivities by DOP853 at 1e-12",
     "advice": "The cost of an adaptive solver is rough: differences of it need a tolerance of 1e-10, and `examine` the argument `refined`.",
 }
 theta = np.array([5.0, 2.0, 0.0])  # mu, first state

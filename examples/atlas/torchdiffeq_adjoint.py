@@ -1,4 +1,4 @@
-"""The Lorenz system over 1.5 s by `odeint_adjoint` at its default tolerances."""
+"""The Lorenz system by `odeint_adjoint` at default tolerances."""
 
 import numpy as np
 import torch
@@ -9,10 +9,10 @@ torch.set_default_dtype(torch.float64)
 about = {
     "package": "torchdiffeq",
     "python": "torch",
-    "requires": "torch==2.13.0 torchdiffeq scipy",
+    "requires": "torch==2.13.0 torchdiffeq",
     "examine": "grad=gradient calls=150",
     "derivative": "wrong",
-    "how": "complex step, SciPy's DOP853 at a tolerance of 1e-12",
+    "how": "SciPy's DOP853 at 1e-12",
     "advice": "`odeint_adjoint` solves backward in time; where this is unstable, tolerances of 1e-11 or `odeint` give the right gradient.",
 }
 theta = np.array([10.0, 28.0, 8 / 3])

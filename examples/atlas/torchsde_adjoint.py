@@ -1,4 +1,4 @@
-"""A double well by `sdeint_adjoint`, which needs less memory."""
+"""A double well by `sdeint_adjoint`."""
 
 import torchsde
 from torchsde_backprop import cost, theta, truth
@@ -11,7 +11,7 @@ about = {
     "requires": "torch==2.13.0 torchsde",
     "examine": "grad=gradient calls=300",
     "derivative": "wrong",
-    "how": "complex step, own midpoint scheme on the same increments",
+    "how": "own midpoint scheme of the same increments",
     "advice": "`sdeint_adjoint` is off by a share of the step that halves with it: backpropagate through `sdeint`, or take a smaller dt.",
 }
 

@@ -1,4 +1,4 @@
-"""A double well by `sdeint`, backpropagated through the solver, 8 paths."""
+"""A double well by `sdeint`."""
 
 import numpy as np
 import torch
@@ -11,7 +11,7 @@ about = {
     "requires": "torch==2.13.0 torchsde",
     "examine": "grad=gradient calls=300",
     "derivative": "right",
-    "how": "complex step, own midpoint scheme on the same increments",
+    "how": "own midpoint scheme of the same increments",
 }
 theta, N = np.array([1.0, 1.0, 0.4]), 100  # slopes of the well, noise; steps
 NOISE = torchsde.BrownianInterval(0.0, 2.0, (8, 1), dtype=torch.float64, entropy=3)

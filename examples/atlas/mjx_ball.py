@@ -1,0 +1,38 @@
+"""A ball that hits the floor, by JAX with one solver iteration."""
+
+import jax
+import numpy as np
+from mujoco import MjModel, mjx
+
+jax.config.update("jax_enable_x64", True)
+about = {
+    "package": "mujoco-mjx",
+    "python": "bench",
+    "requires": "mujoco-mjx mujoco",
+    "examine": "grad=jax calls=600",
+    "derivative": "right",
+    "jumps": "jumps",
+    "how": "documented contact model",
+}
+XML = """<mujoco><option iterations="1" ls_iterations="4"/><worldbody>
+<geom type="plane" size="5 5 1" condim="1" solimp="0.9 0.9 0.001"/>
+<body pos="0 0 0.1"><joint type="slide" axis="0 0 1"/><geom size="0.1" mass="1" condim="1" solimp="0.9 0.9 0.001"/></body>
+</worldbody></mujoco>"""
+model = mjx.put_model(MjModel.from_xml_string(XML))
+theta = np.array([0.05, -1.0])  # gap [m], speed [m/s]
+
+
+def cost(p):
+    """Return the height after 0.1 s."""
+    start = mjx.make_data(model).replace(qpos=p[:1], qvel=p[1:])
+    return jax.lax.scan(lambda d, _: (mjx.step(model, d), None), start, None, 50)[0].qpos[0]
+
+
+def truth():
+    """Return the derivative: a spring and damper by `solref`, and a tenth of gravity, in touch."""
+    x, v = (theta + 1e-30j * np.eye(2)).T
+    for _ in range(50):
+        pushed = -0.981 + 0.9 * (-2 / 0.018 * v - 0.9 * x / 0.018**2)
+        v = v + 0.002 * np.where((x.real < 0) & (pushed.real > -9.81), pushed, -9.81)
+        x = x + 0.002 * v
+    return x.imag / 1e-30
